@@ -67,6 +67,7 @@ def localize(
     out: str | Path,
     *,
     config: str | Path | None = None,
+    ground_truth: str | Path | None = None,
     recording: bool = True,
     force: bool = False,
     **overrides: object,
@@ -86,6 +87,7 @@ def localize(
         out=checks.path(out, "out"),
         config_file=None if config is None else checks.path(config, "config"),
         overrides=overrides_of(overrides),
+        ground_truth=None if ground_truth is None else checks.path(ground_truth, "ground_truth"),
         force=force,
     )
     return localize_log(job, Unwatched(), draw_localization if recording else lambda folder, localized: None)[0]

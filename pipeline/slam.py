@@ -33,7 +33,7 @@ from scanchain.graph.map_errors import MapErrors, PoseErrors
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.robust.graduation import OutlierRejection
 from scanchain.graph.robust.losses import rejection_limit
-from scanchain.loops import ClosureTable, LoopCloser, refined, spread
+from scanchain.loops import ClosureTable, LoopCloser, MapEvidence, refined, spread
 from scanchain.maps import SavedMap
 from scanchain.odometry import FrontEnd, LiveStamps, Located, checked_start
 from scanchain.point_store import PointStore
@@ -44,7 +44,6 @@ from scanchain.words import counted
 _LOST_SIGMAS = (1.0, 0.2)  # m and rad, standard deviations of the motion over one scan that was lost
 _OPTIMIZE_EVERY = 10  # least number of keyframes between two optimizations
 _LARGEST_SIGMAS = (300.0, 30.0)  # m and rad, of an edge: a pose that hangs on less information is lost to rounding
-_ANYWHERE_M = 1e4  # standard deviation of the place where a log begins in a map
 _GROWTH = 0.05  # share by which the graph grows between two optimizations that change little
 _UPDATE_GROWTH = 0.02  # the same of a large graph, for an optimization that keeps the verdicts
 _CONTRADICTING = 10.0  # times the χ² limit of a loop edge, from which on a closure contradicts a large graph
@@ -137,6 +136,7 @@ class Slam:
         self.contradiction = _CONTRADICTING * rejection_limit(config.graph.robust_scale, self.graph.freedom)
         self.beside: BackgroundOptimization | None = None
         self.first = 0  # number of the first keyframe of this log
+        self.evidence = MapEvidence(self.closer.segments, 0)
         self.by_map: Closure | None = None  # with the map, of the newest keyframe that has one
         self.live_stamps = LiveStamps()
         self.is_finished = False
@@ -155,6 +155,7 @@ class Slam:
         for keyframe in self.keyframes:
             self.map_errors.append(PoseErrors(1.0, np.zeros((self.graph.freedom,) * 2), 1.0))
             self.graph.fix(self.graph.add_pose(keyframe.T_odom_lidar, keyframe.stamp_ns))
+        self.evidence.of_map = self.first
         self.traveled_m = self.closer.begin_in(self.keyframes, prior.folder)
 
     def track(
@@ -220,10 +221,12 @@ class Slam:
         if self.config.loops.enabled:
             progress("closing the last loops")
             self._take(self.closer.finish(self.keyframes, self.graph))
+        self._give_up()
         if self.beside is not None:
             self._take_over(self.beside)
         progress(f"optimizing the graph of {counted(len(self.keyframes), 'keyframe')}")
         state = self._optimize("refined")
+        self._set_apart()
         stamps_ns = self.stamps_ns.rows.copy()
         odometry = self.odometry_poses.rows.copy()
         numbers = np.array([keyframe.scan_index for keyframe in self.keyframes[self.first :]])
@@ -289,9 +292,10 @@ class Slam:
             sigmas = (config.edge_sigma_m, config.edge_sigma_rad)
             if self.lost_scans:
                 sigmas = (self.lost_scans * _LOST_SIGMAS[0], self.lost_scans * _LOST_SIGMAS[1])
-            elsewhere_m = tracked.elsewhere_m if keyframe.index > self.first else _ANYWHERE_M
+            elsewhere_m = tracked.elsewhere_m if keyframe.index > self.first else _LARGEST_SIGMAS[0]
             if elsewhere_m > 0.0:
                 sigmas = (elsewhere_m, np.pi)
+                self._give_up()
                 self.closer.start_segment(keyframe.index)
             self.graph.add_edge(
                 last.index,
@@ -305,6 +309,8 @@ class Slam:
         return keyframe.index
 
     def _close_loops(self, is_keyframe: bool) -> tuple[Closure, ...]:
+        if self.evidence.is_in_vain(self.keyframes):
+            self._give_up()
         closures = self._take(self.closer.advance(self.keyframes, self.graph))
         if is_keyframe:
             closures += self._take(self.closer.close(self.keyframes, self.graph))
@@ -321,7 +327,10 @@ class Slam:
         nearest = int(np.argmin(np.linalg.norm(positions - T_world_lidar[:-1, -1], axis=1)))
         T_nearest_lidar = lie.between(self.graph.poses[nearest], T_world_lidar)
         information = np.diag(lie.by_component(self.graph.freedom, *sigmas) ** -2.0)
+        self.graph.move(self.first, lie.normalize(T_world_lidar @ lie.inverse(self.graph.poses[self.first])))
+        self.graph.remeasure(0)
         self.graph.add_edge(nearest, self.first, T_nearest_lidar, information, is_loop=True)
+        self.evidence.is_given = True
         self._optimize("gnc")
 
     def _odom_by(self, closure: Closure) -> Pose:
@@ -331,19 +340,56 @@ class Slam:
 
     @property
     def is_in_map(self) -> bool:
-        """True if a closure in force joins the newest keyframe to the map."""
+        """True if closures in force join the newest keyframe to the map."""
         components = self.closer.segments.components(self.graph)
-        return self.first > 0 and bool(components[-1] == components[0])
+        return self.first > 0 and not self.evidence.is_gathering and bool(components[-1] == components[0])
 
     def _take(self, closures: tuple[Closure, ...]) -> tuple[Closure, ...]:
         """Keep closures; those accepted become edges of the graph."""
         if not closures:
             return ()
+        closures = self._tested(closures) if self.first else closures
         taken = tuple(
             self._add(closure) if closure.verdict is ClosureVerdict.ACCEPTED else closure for closure in closures
         )
         self.closures.extend(taken)
         return taken
+
+    def _tested(self, closures: tuple[Closure, ...]) -> tuple[Closure, ...]:
+        """Closures; those that would join the newest segment to the map are rejected until they are enough."""
+        start = self.closer.segments.starts[-1]
+        with_map = [each for each in closures if each.target < self.first and each.source >= start]
+        if self.is_in_map:
+            self.evidence.tried |= {each.source for each in with_map}
+            return closures
+        was_tested = self.evidence.is_gathering
+        joining = self.evidence.collect(with_map, self.keyframes)
+        if self.evidence.is_gathering and not was_tested:
+            self._move_segment(self.evidence.waiting[0])
+            self._follow_graph()
+        joined = set(map(id, joining))
+        rest = [each for each in closures if id(each) not in joined]
+        return *(_waiting(each) if each.target < self.first else each for each in rest), *joining
+
+    def _give_up(self) -> None:
+        """The pose in the map that is being tested is wrong: search the newest segment again."""
+        if self.evidence.is_gathering:
+            self.evidence.reset()
+            self.closer.search_again()
+
+    def _set_apart(self) -> None:
+        """Take segments of the log for apart from the map that too little joins to it in the end."""
+        segments, graph = self.closer.segments, self.graph
+        chosen = graph.is_loop & ~graph.is_rejected & (graph.edges[:, 0] < self.first)
+        in_force = graph.edges[chosen & (graph.edges[:, 1] >= self.first), 1]
+        for number, start in enumerate(segments.starts[1:], 1):
+            end = segments.span(start, len(graph))[1]
+            sources = set(in_force[(in_force >= start) & (in_force < end)].tolist())
+            if not sources:
+                continue
+            placed = [replace(self.keyframes[k], T_odom_lidar=graph.poses[k]) for k in range(start, end)]
+            if not self.evidence.joins(placed, sources, self.keyframes):
+                segments.apart.add(number)
 
     def _add(self, closure: Closure) -> Closure:
         """Make an edge of a closure; returns the closure with its innovation in the graph before."""
@@ -357,6 +403,7 @@ class Slam:
         self.moves_map |= lie.apart(expected, Z_ij)[0] > _LARGE_INNOVATION * config.edge_sigma_m
         self.graph.add_edge(closure.target, closure.source, Z_ij, information, is_loop=True)
         if self._joins_segment(closure):
+            self.joined_start, self.joins_segment = self.closer.segments.starts[-1], True
             self._move_segment(closure)
         chi2_before = float(error @ information @ error)
         self.contradicting_closures += chi2_before > self.contradiction
@@ -369,11 +416,13 @@ class Slam:
 
     def _move_segment(self, closure: Closure) -> None:
         """Put the newest segment where its first closure says: from far off, robust losses reject all of them."""
-        self.joined_start, self.joins_segment = self.closer.segments.starts[-1], True
+        start = self.closer.segments.starts[-1]
         self.beside = None  # it would put the segment back
         T_world_source = self.graph.poses[closure.target] @ closure.match.T_target_source
         T_new_old = T_world_source @ lie.inverse(self.graph.poses[closure.source])
-        self.graph.move(self.joined_start, lie.normalize(T_new_old))
+        self.graph.move(start, lie.normalize(T_new_old))
+        if start == self.first:
+            self.graph.remeasure(0)  # the edge that the log hangs on: where it began in the map was not known
 
     def _optimize_when_due(self) -> GraphState | None:
         """Optimize when closures wait: at once where one joins a segment, soon where it moves the map.
@@ -381,6 +430,8 @@ class Slam:
         The required growth is a share of the graph, so that all optimizations together cost little more than a
         few of the last one. The inlier set is refined where the map moves: there a wrong one would last.
         """
+        if self.evidence.is_gathering:
+            return None
         grown = len(self.keyframes) - self.optimized_at
         if self.beside is not None and len(self.keyframes) >= self.beside.due:
             return self._take_over(self.beside)
@@ -463,14 +514,23 @@ def loop_information(closure: Closure, config: LoopsConfig) -> Matrix:
     return edge_information(closure.match.information, config.edge_sigma_m, config.edge_sigma_rad)
 
 
+def _waiting(closure: Closure) -> Closure:
+    """A closure that alone does not join a log to a map."""
+    if closure.verdict is ClosureVerdict.REJECTED:
+        return closure
+    reason = "too few keyframes agree on the place in the map"
+    return replace(closure, verdict=ClosureVerdict.REJECTED, cause=reason, reason=reason)
+
+
 def edge_information(information: Matrix, sigma_m: float, sigma_rad: float) -> Matrix:
     """Information (k, k) of a pose-graph edge: that of the motion (k, k), with a floor under its variances.
 
     Residuals share the map's errors and are far from independent, so that H alone is overconfident.
     """
     k = len(information)
-    floor = lie.by_component(k, sigma_m, sigma_rad) ** 2
-    least = np.maximum(1e-6 / floor, lie.by_component(k, *_LARGEST_SIGMAS) ** -2.0)
+    largest = lie.by_component(k, *_LARGEST_SIGMAS) ** 2
+    floor = np.minimum(lie.by_component(k, sigma_m, sigma_rad) ** 2, largest)
+    least = np.maximum(1e-6 / floor, 1.0 / largest)
     covariance = np.linalg.inv(information + np.diag(least)) + np.diag(floor)
     result = np.linalg.inv(covariance)
     return 0.5 * (result + result.T)

@@ -11,6 +11,7 @@ from scanchain.commands.options import (
     LOG,
     OverrideCommand,
     ground_truth,
+    ground_truth_option,
     limit_options,
     overrides,
     part_of,
@@ -33,11 +34,7 @@ _PATH = click.Path(path_type=Path)
     help="Compare odometry with your own matcher as well, row CLASS.",
 )
 @click.option("--out", metavar="DIR", type=_PATH, help="Directory to create. [default: runs/compare-LOG]")
-@click.option(
-    "--gt",
-    metavar="FILE|TOPIC|none",
-    help="Ground truth: TUM, KITTI or a topic; none to ignore that of the log. [default: /ground_truth]",
-)
+@ground_truth_option
 @click.option(
     "--relations", metavar="FILE", type=_PATH, help="Manually verified relative poses (Kümmerle et al. 2009)."
 )

@@ -13,7 +13,10 @@ from scanchain.commands.options import (
     LOG,
     OverrideCommand,
     collect_garbage_seldom,
+    ground_truth,
+    ground_truth_option,
     matcher_option,
+    max_gap_option,
     method_of,
     overrides,
     part_of,
@@ -42,6 +45,8 @@ if TYPE_CHECKING:
 @click.option("--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file on top of the preset.")
 @part_options()
 @matcher_option
+@ground_truth_option
+@max_gap_option
 @threads_option
 @click.option("--force", is_flag=True, help="Replace an existing directory once the new one is complete.")
 @click.option("--strict", is_flag=True, help="Exit with 1 unless the verdict is trustworthy.")
@@ -54,6 +59,8 @@ def localize(
     out: Path,
     initial: str | None,
     config: Path | None,
+    gt: str | None,
+    max_gap: float | None,
     force: bool,
     strict: bool,
     as_json: bool,
@@ -75,13 +82,16 @@ def localize(
     from scanchain.sessions.localize import Localizing
     from scanchain.sessions.localize import localize as localize_log
 
+    truth_file, truth_topic = ground_truth(gt)
     job = Localizing(
         logs=logs,
         prior=prior,
         out=out,
         initial=None if initial is None else _initial(initial),
         config_file=config,
-        overrides=overrides(ctx, [*part_of(shortcuts), *method_of(shortcuts)]),
+        overrides=overrides(ctx, [*part_of(shortcuts), *method_of(shortcuts), *truth_topic]),
+        ground_truth=truth_file,
+        max_gap_s=max_gap,
         force=force,
         command=tuple(sys.argv),
     )

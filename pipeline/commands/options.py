@@ -169,6 +169,15 @@ def method_of(options: Mapping[str, str | bool | None]) -> tuple[Override, ...]:
     )
 
 
+def ground_truth_option(command: Callable[..., None]) -> Callable[..., None]:
+    """The option ``--gt``."""
+    return click.option(
+        "--gt",
+        metavar="FILE|TOPIC|none",
+        help="Ground truth: TUM, KITTI or a topic; none to ignore that of the log. [default: /ground_truth]",
+    )(command)
+
+
 def max_gap_option(command: Callable[..., None]) -> Callable[..., None]:
     """The option ``--max-gap``."""
     return click.option(

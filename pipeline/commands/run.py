@@ -15,6 +15,7 @@ from scanchain.commands.options import (
     OverrideCommand,
     collect_garbage_seldom,
     ground_truth,
+    ground_truth_option,
     matcher_option,
     max_gap_option,
     method_of,
@@ -49,11 +50,7 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
 )
 @matcher_option
 @no_loops_option
-@click.option(
-    "--gt",
-    metavar="FILE|TOPIC|none",
-    help="Ground truth: TUM, KITTI or a topic; none to ignore that of the log. [default: /ground_truth]",
-)
+@ground_truth_option
 @max_gap_option
 @threads_option
 @click.option("--force", is_flag=True, help="Replace an existing run directory once the new one is complete.")

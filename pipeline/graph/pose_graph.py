@@ -251,6 +251,13 @@ class PoseGraph:
         self._changed()
         self._poses.replace(poses)
 
+    def remeasure(self, edge: int) -> None:
+        """Replace what an edge measures by what the poses of now have between its ends."""
+        measurements, (i, j) = self._measurements.rows.copy(), self.edges[edge].tolist()
+        measurements[edge] = lie.between(self.poses[i], self.poses[j])
+        self._changed()
+        self._measurements.replace(measurements)
+
     def optimize(
         self, config: GraphConfig, *, initialize: Initialization = "auto", rejection: OutlierRejection = "refined"
     ) -> Optimization:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -69,6 +70,12 @@ class LoopCloser:
         """Start a new segment at this keyframe: the motion to it from the one before is unknown."""
         self.segments.start(keyframe)
 
+    def search_again(self) -> None:
+        """Forget where the newest segment was matched in the map: it is not there."""
+        self.near.target_in_map = -1
+        if self.map_search is not None:
+            self.map_search.matched_m = -math.inf
+
     def advance(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
         """Closures by a search that is under way, which goes on with every scan, in slices of equal work."""
         if self.map_search is not None:
@@ -80,7 +87,8 @@ class LoopCloser:
 
         keyframes : all so far; graph : their best known poses, and how they are connected
         """
-        if self.map_search is not None and self.map_search.has_just_matched(keyframes):
+        is_tested = self.segments.is_assumed
+        if self.map_search is not None and not is_tested and self.map_search.has_just_matched(keyframes):
             self.places.skip(keyframes)
             return ()
         components = self.segments.components(graph)
@@ -157,7 +165,7 @@ class ProximityCloser:
         self.target = target if closure.verdict is ClosureVerdict.ACCEPTED else -1
         if closure.verdict is ClosureVerdict.ACCEPTED or self.search is None:
             return (closure,)
-        if not self.search.is_due(keyframes):
+        if self.submaps.segments.is_assumed or not self.search.is_due(keyframes):
             return (closure,)
         if uncertainty_m is None:
             near, uncertainty_m = self._near(graph, old, connected)

@@ -18,6 +18,10 @@ class Segments:
 
     def __init__(self) -> None:
         self.starts = [0]
+        self.is_assumed = False  # whether the newest one counts as joined to the first: its pose is being tested
+        self.apart: set[int] = (
+            set()
+        )  # numbers of those that loops do not join to the first, on what evidence there is
 
     def start(self, keyframe: int) -> None:
         """Start a new segment at this keyframe."""
@@ -42,7 +46,10 @@ class Segments:
         number = np.arange(count)
         for pair in np.unique(ends[:, 0] * count + ends[:, 1]).tolist():
             i, j = divmod(pair, count)
-            number[number == number[j]] = number[i]
+            if i or j not in self.apart:
+                number[number == number[j]] = number[i]
+        if self.is_assumed:
+            number[number == number[-1]] = number[0]
         return np.unique(number, return_inverse=True)[1].astype(np.int64)[segment]
 
 

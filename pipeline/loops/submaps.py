@@ -81,8 +81,8 @@ class VoxelSubmaps:
         self.of_map = KDTree(np.array([keyframe.T_odom_lidar[:-1, -1] for keyframe in keyframes]))
 
     def anchor_of(self, keyframe: int) -> int:
-        """The last keyframe up to this one that has a submap around it."""
-        return keyframe // self.half_width * self.half_width
+        """The last keyframe of its segment, up to this one, that has a submap around it."""
+        return max(keyframe // self.half_width * self.half_width, self.segments.span(keyframe, keyframe + 1)[0])
 
     def around(self, anchor: int, keyframes: Sequence[Keyframe], newest: int) -> VoxelMap:
         """The submap of an anchor out of the keyframes up to ``newest``."""

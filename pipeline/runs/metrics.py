@@ -279,7 +279,7 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
         "  95th perc.   " + "".join(f"{m.p95_ms[stage]:12.2f}" for stage in STAGES),
     ]
     if m.ground_truth is not None:
-        lines += _accuracy_lines(m.ground_truth)
+        lines += accuracy_lines(m.ground_truth)
     lines += [f"warning        {warning}" for warning in m.warnings]
     return "\n".join([*lines, *(f"note           {note}" for note in notes)]) + "\n"
 
@@ -305,7 +305,8 @@ def _accuracy(pairs: Pairs) -> tuple[Accuracy, float]:
     return accuracy, ate.path_length_m
 
 
-def _accuracy_lines(truth: GroundTruth) -> list[str]:
+def accuracy_lines(truth: GroundTruth) -> list[str]:
+    """Accuracy as text, a line each."""
     missing = f"; {truth.optimized.missing}" if truth.optimized.missing else ""
     lines = [
         f"ground truth   {truth.source}: {truth.path_length_m:.1f} m, "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -36,7 +36,7 @@ from scanchain.runs.resume.rescue import rescued
 from scanchain.runs.resume.resuming import Left, find_left
 from scanchain.runs.step_table import StepTable
 from scanchain.runs.warm_up import beside
-from scanchain.settings import dump, load_settings, named
+from scanchain.settings import Override, dump, load_settings, named
 from scanchain.slam import SlamResult
 from scanchain.threads import threads
 from scanchain.trajectory import write_tum
@@ -89,7 +89,7 @@ def _run(
     left = find_left(job.out, dump(settings.config)) if job.resume else None
     directory = RunDirectory(job.out, force=job.force, left=left and left.folder)
     _check_prior(log, settings.config)
-    _check_truth(job, log, truth_file)
+    check_truth(job.overrides, log, truth_file)
     progress.say(f"{log.topic}: {log.dimension}D, {counted(log.scan_count, 'scan')}; {settings.source}")
     for gap in log.gaps:
         progress.announce(f"warning: {gap}")
@@ -102,14 +102,14 @@ def _run(
         provenance.write(directory.path / RUN_FILE)
         write_whole(directory.path / "config.toml", dump(settings.config).encode())
         try:
-            true_poses = partial(_true_poses, log, truth_file, progress)
-            done = process(job, log, settings.config, directory, record, progress, steps, left, true_poses)
+            poses = partial(true_poses, log, truth_file, progress)
+            done = process(job, log, settings.config, directory, record, progress, steps, left, poses)
             run_s = working_s() - started - done.held_s
             compile_s = compiled_s() - compiled_before_s
             stopped = f"stopped by the user after {counted(len(steps), 'scan')}" if progress.stopped else ""
             with directory.results() as folder:
                 source = str(job.ground_truth or log.ground_truth_topic)
-                truth, note = _judge(true_poses, source, job.max_gap_s, done.result, folder)
+                truth, note = accuracy_of(poses, source, job.max_gap_s, done.result, folder)
                 few = _few_scans(len(steps))
                 warnings = (*log.damage, *log.copies, *settings.without_effect, *done.warnings, *few, *note)
                 metrics = measure(
@@ -161,12 +161,12 @@ def _check_prior(log: Log, config: Config) -> None:
         )
 
 
-def _check_truth(job: Job, log: Log, file: TruthFile | None) -> None:
+def check_truth(overrides: Sequence[Override], log: Log, file: TruthFile | None) -> None:
     """Refuse a ground truth that was named and has no time in common with the scans before they are processed."""
     if file is not None:
         file.check(log.expected_stamps(log.topic), log.scan_count)
         return
-    topic = named(job.overrides, "log.ground_truth_topic")
+    topic = named(overrides, "log.ground_truth_topic")
     if topic == NO_TRUTH:
         return
     if topic and not log.ground_truth_topic:
@@ -175,7 +175,7 @@ def _check_truth(job: Job, log: Log, file: TruthFile | None) -> None:
         check_overlap(topic, log.expected_stamps(topic), log.expected_stamps(log.topic))
 
 
-def _true_poses(
+def true_poses(
     log: Log, file: TruthFile | None, progress: Progress, stamps_ns: NDArray[np.int64]
 ) -> Trajectory | None:
     """Poses of the file named, else the log's own; of a KITTI file those of the scans (N,) read before a stop."""
@@ -184,12 +184,12 @@ def _true_poses(
     return (file.first(len(stamps_ns)) if progress.stopped else file).at(stamps_ns)
 
 
-def _judge(
-    true_poses: TruePoses, source: str, gap_s: float | None, result: SlamResult, folder: Path
+def accuracy_of(
+    poses: TruePoses, source: str, gap_s: float | None, result: SlamResult, folder: Path
 ) -> tuple[GroundTruth | None, tuple[str, ...]]:
     """Accuracy where there is a truth; warnings where it does not fit, is of few scans, or far off."""
     try:
-        reference = true_poses(result.trajectory.stamps_ns)
+        reference = poses(result.odometry.stamps_ns)
         if reference is None:
             return None, ()
         truth, misleading = compare_with_truth(result, reference, source, gap_s)

@@ -13,8 +13,8 @@ from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Pose
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.kernels.raycast.free_space import compare_ranges, nearest_ranges
 from scanchain.loops import LoopCloser
+from scanchain.loops.evidence import MIN_SHARE, are_enough, compared, contradiction, is_contradicted
 from scanchain.loops.planar_map_search import PlanarMapSearch
 from scanchain.maps import Edges, SavedMap
 from scanchain.slam import loop_information
@@ -26,21 +26,15 @@ _MAX_TRIES = 5  # largest number of poses at which a map is tried
 _SAME_M, _SAME_RAD = 2.0, 0.2  # distance within which two of these are the same
 _FOUND_M, _FOUND_RAD = 0.5, 0.05  # standard deviations of a pose that was found, and of one session to the next
 _IN_FORCE = 0.5  # least robust weight of a closure that joins two maps
-_MIN_CLOSURES = 3  # least number of keyframes with a closure in force that join two maps
-_MAX_CONTRADICTION = 0.1  # largest share of points in sight that lie in the free space of the other map
 _MIN_CHANGE, _TIMES_WITHIN = 0.025, 3.0  # share of them from which on it is told, and times that within the maps
 _WITHIN_M = 1.0  # least path between two keyframes of one map that are compared
-_NEAR_M = {2: 5.0, 3: 10.0}  # largest distance of two keyframes that are compared for it, by dimension
-_BINS = 360  # of azimuth, 1°; as fine in elevation
-_MARGIN_M, _MARGIN_SHARE = {2: 0.3, 3: 1.0}, 0.05  # by which ranges may differ, beside that share of them
 _CLEAR = 0.3  # share of a map's keyframes with such a closure from which on it is not sought elsewhere
 _RIVAL = 0.5  # share of the most such closures from which on those at another pose make it ambiguous
 _PATH_M, _STEP_M = 8.0, 2.0  # length of paths whose points are sought together, in the plane, and between two
 _AGREE_M, _AGREE_RAD = 0.5, 0.1  # largest difference between poses that confirm each other
 _MAX_PATHS = 200  # largest number of these; along longer sessions they lie farther apart
-_MAX_REPEATED = 0.25  # largest share of the agreeing paths that may look like another place
+MAX_REPEATED = 0.25  # largest share of the agreeing paths that may look like another place
 _MIN_PATHS = 2  # least number of agreeing paths
-_MIN_SHARE = 0.3  # least share of these among the keyframes that closures were tried from
 
 
 @dataclass(frozen=True, slots=True)
@@ -359,15 +353,8 @@ def _after(keyframes: Sequence[Keyframe], index: int, begin_m: float) -> Iterato
 def _is_joined(joined: Joined, old: int) -> bool:
     """True if enough closures in force join the keyframes before ``old`` to the others, and free space agrees."""
     tried = len({closure.source for closure in joined.closures if closure.source >= old})
-    if len(_joining(joined, old)) < max(_MIN_CLOSURES, _MIN_SHARE * tried):
-        return False
-    return contradiction(joined.keyframes[:old], joined.keyframes[old:]) <= _MAX_CONTRADICTION
-
-
-def contradiction(some: Sequence[Keyframe], others: Sequence[Keyframe]) -> float:
-    """Share, of the points of keyframes in view of the nearest one of the others, that lie in its free space."""
-    agreeing, contradicting = _compared(some, others) + _compared(others, some)
-    return float(contradicting / max(agreeing + contradicting, 1))
+    is_enough = are_enough(len(_joining(joined, old)), tried)
+    return is_enough and not is_contradicted(joined.keyframes[:old], joined.keyframes[old:])
 
 
 def changed(joined: Joined) -> dict[int, float]:
@@ -375,7 +362,7 @@ def changed(joined: Joined) -> dict[int, float]:
     parts = {
         number: [joined.keyframes[k] for k in np.flatnonzero(joined.of_map == number)] for number in joined.maps
     }
-    agreeing, contradicting = sum((_compared(part, part, _WITHIN_M) for part in parts.values()), np.zeros(2))
+    agreeing, contradicting = sum((compared(part, part, _WITHIN_M) for part in parts.values()), np.zeros(2))
     least = max(_MIN_CHANGE, _TIMES_WITHIN * contradicting / max(agreeing + contradicting, 1))
     found: dict[int, float] = {}
     for number in joined.maps[1:]:
@@ -386,45 +373,33 @@ def changed(joined: Joined) -> dict[int, float]:
     return found
 
 
-def _compared(
-    viewers: Sequence[Keyframe], viewed: Sequence[Keyframe], min_path_m: float = 0.0
-) -> NDArray[np.int64]:
-    """Numbers of points (2,), of the viewed keyframe nearest to each viewer, that agree and that contradict.
-
-    min_path_m : least path between the two
-    """
-    d = viewers[0].T_odom_lidar.shape[0] - 1
-    ranges_m = np.empty((1 if d == 2 else _BINS // 2, _BINS))
-    positions = np.array([keyframe.T_odom_lidar[:d, d] for keyframe in viewed])
-    traveled_m = np.array([keyframe.traveled_m for keyframe in viewed])
-    counts = np.zeros(2, np.int64)
-    for viewer in viewers:
-        away_m = np.linalg.norm(positions - viewer.T_odom_lidar[:d, d], axis=1)
-        away_m[np.abs(traveled_m - viewer.traveled_m) < min_path_m] = np.inf
-        nearest = int(away_m.argmin())
-        if away_m[nearest] <= _NEAR_M[d]:
-            other = viewed[nearest]
-            nearest_ranges(lie.lift_points(viewer.points), ranges_m)
-            T_viewer_viewed = lie.lift(lie.between(viewer.T_odom_lidar, other.T_odom_lidar))
-            margin_m = _MARGIN_M[d] * viewer.scale
-            counts += compare_ranges(
-                lie.lift_points(other.points), T_viewer_viewed, ranges_m, margin_m, _MARGIN_SHARE
-            )
-    return counts
-
-
 def look_alike(joined: Joined, old: int, config: Config) -> str:
-    """Reason why the keyframes from ``old`` on may agree with those of a look-alike, empty if there is none.
-
-    Where paths that agree fit elsewhere in one of both maps, too, the place repeats itself, maybe beyond the maps.
-    """
+    """Reason why the keyframes from ``old`` on may agree with those of a look-alike, empty if there is none."""
     guest, agreeing = joined.keyframes[old:], _joining(joined, old) - old
+    repeated, paths = repeated_paths(joined.keyframes[:old], guest, agreeing, config)
+    if repeated > MAX_REPEATED * paths:
+        return f"{repeated} of {counted(paths, 'path')} that agree look like other places, too"
+    return "" if paths >= _MIN_PATHS else "they agree along a short path only"
+
+
+def repeated_paths(
+    host: Sequence[Keyframe],
+    guest: Sequence[Keyframe],
+    agreeing: NDArray[np.int64],
+    config: Config,
+    most: int = _MAX_PATHS,
+) -> tuple[int, int]:
+    """Number of paths of the guest that fit elsewhere in one of both maps, too, and of all that agree.
+
+    agreeing : numbers of the guest's keyframes that agree with the host; both in one frame
+    most : largest number of paths, evenly spread over those that agree
+    """
     searches = [
         PlanarMapSearch(part, np.array([each.T_odom_lidar for each in part]), config.local_map.voxel_size_m)
-        for part in (joined.keyframes[:old], guest)
+        for part in (host, guest)
     ]
-    paths = [path for path in _paths(guest) if np.isin(path, agreeing).mean() >= _MIN_SHARE]
-    repeated = 0
+    paths = [path for path in _paths(guest) if np.isin(path, agreeing).mean() >= MIN_SHARE]
+    paths, repeated = paths[:: max(-(-len(paths) // most), 1)], 0
     for path in paths:
         members = [guest[index] for index in path]
         fits = [fit for search in searches if (fit := search.likely(members)) is not None]
@@ -432,9 +407,7 @@ def look_alike(joined: Joined, old: int, config: Config) -> str:
             fit.is_ambiguous or not _agree(fit.T_map_lidar, members[len(members) // 2].T_odom_lidar)
             for fit in fits
         )
-    if repeated > _MAX_REPEATED * len(paths):
-        return f"{repeated} of {counted(len(paths), 'path')} that agree look like other places, too"
-    return "" if len(paths) >= _MIN_PATHS else "they agree along a short path only"
+    return repeated, len(paths)
 
 
 def _joining(joined: Joined, old: int) -> NDArray[np.int64]:

@@ -5,26 +5,31 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from msgspec import Struct, json
-from msgspec.structs import replace
+from msgspec import Struct, json, structs
 from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.clock import working_s
 from scanchain.config import Config
-from scanchain.data import ClosureVerdict, Pose, Trajectory
+from scanchain.data import ClosureVerdict, Pose
 from scanchain.errors import InputError
+from scanchain.evaluation import read_truth
 from scanchain.logs import Log, open_log
+from scanchain.loops.evidence import are_in_sight
 from scanchain.maps import SavedMap, open_saved_map
 from scanchain.runs.directory import POINTS_FILE, RUN_FILE, RunDirectory
 from scanchain.runs.job import Progress
+from scanchain.runs.metrics import GroundTruth, accuracy_lines
 from scanchain.runs.provenance import Hashing, describe_start
+from scanchain.runs.run import accuracy_of, check_truth, true_poses
+from scanchain.sessions.joining import MAX_REPEATED, repeated_paths
 from scanchain.sessions.localizer import Localization, Localizer, MapState
 from scanchain.settings import Override, dump, load_settings
 from scanchain.source import Source
@@ -37,6 +42,8 @@ LOCALIZATION_FILE = "localization.parquet"
 _SHORT_M = {2: 5.0, 3: 20.0}  # path below which a place that is not found says nothing
 _WITHOUT_MAP_M = {2: 2.0, 3: 10.0}  # shortest path without the map that is told as a stretch
 _MOVED_M, _MOVED_SIGMAS = 0.3, 5.0  # between a pose as known at its time and in the end, that is told
+_COMPARED, _PATHS = 200, 12  # largest numbers of keyframes and of paths that are compared with the map in the end
+_MAX_UNMATCHED = 0.5  # largest share of the keyframes in sight of the map's that are not matched to it
 _SHOWN = 3  # stretches that the verdict lists
 
 
@@ -48,7 +55,7 @@ class Localizing:
     ----------
     logs : the files of one log; prior : run directory, or folder, of the map; out : the directory to create
     initial : T_map_lidar of the first scan, where known: a function of the stamp of that scan and of the map
-    config_file, overrides, force, command : as in ``scanchain.runs.job.Job``
+    config_file, overrides, ground_truth, max_gap_s, force, command : as in ``scanchain.runs.job.Job``
     """
 
     logs: tuple[Source, ...]
@@ -57,6 +64,8 @@ class Localizing:
     initial: Callable[[int, SavedMap], Pose] | None = None
     config_file: Path | None = None
     overrides: tuple[Override, ...] = ()
+    ground_truth: Path | None = None
+    max_gap_s: float | None = None
     force: bool = False
     command: tuple[str, ...] = ()
 
@@ -72,6 +81,11 @@ class Part(Struct, frozen=True):
     length_m: float
 
     @property
+    def is_doubtful(self) -> bool:
+        """False where the log was followed all along, if by odometry alone."""
+        return self.kind != MapState.WITHOUT_MAP
+
+    @property
     def text(self) -> str:
         """The part in words."""
         return (
@@ -84,7 +98,8 @@ class LocalizeMetrics(Struct, frozen=True):
     """Contents of metrics.json of a localized log.
 
     ``found_*`` say where the place of the log was first known; −1 and NaN where it never was. ``matches`` are
-    closures of keyframes with the map, ``rejected`` those that the graph left out in the end.
+    closures of keyframes with the map, ``rejected`` those that the graph left out in the end. ``ground_truth`` is
+    the accuracy of the scans that are placed.
     """
 
     verdict: Verdict
@@ -105,6 +120,7 @@ class LocalizeMetrics(Struct, frozen=True):
     median_sigma_m: float
     time_s: float
     warnings: tuple[str, ...]
+    ground_truth: GroundTruth | None = None
 
     @property
     def sentence(self) -> str:
@@ -134,55 +150,64 @@ def localize(
     Raises InputError for a log or a map that cannot be read.
     """
     started = working_s()
+    truth_file = None if job.ground_truth is None else read_truth(job.ground_truth)
     prior = _opened(job)
     RunDirectory(job.out, force=job.force)  # refused before the log is read
     early = load_settings(file=job.config_file, overrides=job.overrides)
     log = open_log(job.logs, early.config.log)
     settings = load_settings(log.dimension, file=job.config_file, overrides=job.overrides, idle=log.idle_keys())
     _check(log, prior, settings.config)
+    check_truth(job.overrides, log, truth_file)
     progress.say(f"{log.topic}: {counted(log.scan_count, 'scan')}; map {prior.name}")
     provenance = describe_start(job.command, job.logs, settings.source)
     with RunDirectory(job.out, force=job.force) as directory, Hashing(job.logs) as hashing:
         provenance.write(directory.path / RUN_FILE)
         write_whole(directory.path / "config.toml", dump(settings.config).encode())
-        scans = log.scans(settings.config.preprocess)
-        localizer: Localizer | None = None
-        with closing(scans):
-            for scan in progress.track(scans, log.scan_count):
-                if localizer is None:
-                    initial = None if job.initial is None else job.initial(scan.stamp_ns, prior)
-                    points_file = directory.path / POINTS_FILE
-                    localizer = Localizer(
-                        prior,
-                        settings.config,
-                        log.T_base_lidar,
-                        initial=initial,
-                        points_file=points_file,
-                        is_live=False,
-                    )
-                localizer.process(scan)
-        if localizer is None:
-            raise InputError(f"{log.name}: has no scan to localize; scanchain doctor says why")
+        localizer = _followed(job, log, prior, settings.config, directory.path / POINTS_FILE, progress)
         progress.say("smoothing the path")
         found = localizer.finish()
         count = counted(len(found.states), "scan")
         stopped = (f"stopped by the user after {count}",) if progress.stopped else ()
         warnings = (*stopped, *log.damage, *log.copies, *settings.without_effect)
-        metrics = measure(found, prior, working_s() - started, warnings)
-        localized = LocalizedLog(directory.path, prior, found, metrics)
-        text = summary(localized, log)
+        metrics = measure(found, prior, settings.config, working_s() - started, warnings)
         progress.say("writing the results")
         with directory.results() as folder:
+            if metrics.placed:
+                poses = partial(true_poses, log, truth_file, progress)
+                source = job.ground_truth or log.ground_truth_topic
+                placed = replace(found.result, trajectory=found.placed)
+                truth, note = accuracy_of(poses, str(source), job.max_gap_s, placed, folder)
+                metrics = structs.replace(metrics, ground_truth=truth, warnings=(*warnings, *note))
+            localized = LocalizedLog(directory.path, prior, found, metrics)
+            text = summary(localized, log)
             _write(folder, localized, text)
             draw(folder, localized)
         localizer.slam.points.close()
         (directory.path / POINTS_FILE).unlink(missing_ok=True)
-        made = replace(
+        made = structs.replace(
             provenance.hashed(hashing), complete=True, stopped="".join(stopped), duration_s=working_s() - started
         )
         made.write(directory.path / RUN_FILE)
         directory.complete()
-    return localized, text
+    return replace(localized, path=directory.path), text
+
+
+def _followed(
+    job: Localizing, log: Log, prior: SavedMap, config: Config, points_file: Path, progress: Progress
+) -> Localizer:
+    """The localizer after the scans of the log. Raises InputError where there is none."""
+    localizer: Localizer | None = None
+    with closing(log.scans(config.preprocess)) as scans:
+        for scan in progress.track(scans, log.scan_count):
+            if localizer is None:
+                initial = None if job.initial is None else job.initial(scan.stamp_ns, prior)
+                localizer = Localizer(
+                    prior, config, log.T_base_lidar, initial=initial, points_file=points_file, is_live=False
+                )
+            localizer.process(scan)
+    if localizer is None:
+        raise InputError(f"{log.name}: has no scan to localize; scanchain doctor says why")
+    return localizer
 
 
 def _opened(job: Localizing) -> SavedMap:
@@ -203,7 +228,9 @@ def _check(log: Log, prior: SavedMap, config: Config) -> None:
         )
 
 
-def measure(found: Localization, prior: SavedMap, time_s: float, warnings: tuple[str, ...]) -> LocalizeMetrics:
+def measure(
+    found: Localization, prior: SavedMap, config: Config, time_s: float, warnings: tuple[str, ...]
+) -> LocalizeMetrics:
     """Figures and verdict of a localized log."""
     first = found.found_at
     seconds = (found.trajectory.stamps_ns - found.trajectory.stamps_ns[0]) * 1e-9
@@ -212,13 +239,13 @@ def measure(found: Localization, prior: SavedMap, time_s: float, warnings: tuple
     in_map = graph.is_loop & (graph.edges[:, 0] < len(prior.keyframes))
     rejected = int((graph.is_rejected & in_map).sum())
     parts = tuple(_parts(found, seconds))
-    verdict, reason = _verdict(found, prior, parts)
+    verdict, reason = _verdict(found, prior, parts, _doubt(found, prior, config))
     sigma_m = found.sigma_m[np.isfinite(found.sigma_m)]
     return LocalizeMetrics(
         verdict=verdict,
         reason=reason,
         parts=parts,
-        map=str(prior.folder),
+        map=str(prior.folder.resolve()),
         map_keyframes=len(prior.keyframes),
         scans=len(found.states),
         placed=int(found.is_placed.sum()),
@@ -259,7 +286,33 @@ def _parts(found: Localization, seconds: NDArray[np.float64]) -> Iterator[Part]:
                 yield Part(kind, begin, end - 1, float(seconds[begin]), float(seconds[end - 1]), length_m)
 
 
-def _verdict(found: Localization, prior: SavedMap, parts: tuple[Part, ...]) -> tuple[Verdict, str]:
+def _doubt(found: Localization, prior: SavedMap, config: Config) -> str:
+    """Reason why a log may be of another place than where it was found; empty if there is none."""
+    result, of_map = found.result, len(prior.keyframes)
+    chosen = [each for each in result.keyframes[of_map:] if found.is_placed[each.scan_index]]
+    if not chosen:
+        return ""
+    numbers = np.array([each.scan_index for each in chosen])
+    placed = [replace(each, T_odom_lidar=found.trajectory.poses[each.scan_index]) for each in chosen]
+    after = np.flatnonzero(found.states[numbers] != MapState.SEARCHING)
+    some = after[:: -(-len(after) // _COMPARED) or 1]
+    is_shown = are_in_sight([placed[k] for k in some.tolist()], prior.keyframes)
+    unmatched = float((found.states[numbers[some]] != MapState.LOCALIZED)[is_shown].sum() / max(is_shown.sum(), 1))
+    if unmatched > _MAX_UNMATCHED:
+        share = f"{100.0 * unmatched:.0f} % of what the map shows of it"
+        return f"{share} does not match: the place has changed, or is another one"
+    if prior.dimension == 3 or found.found_at == 0:  # where it begins was given
+        return ""
+    graph = result.graph
+    sources = graph.edges[graph.is_loop & ~graph.is_rejected & (graph.edges[:, 0] < of_map), 1] - of_map
+    agreeing = np.flatnonzero(np.isin([each.index - of_map for each in chosen], sources))
+    repeated, paths = repeated_paths(prior.keyframes, placed, agreeing, config, _PATHS)
+    return (
+        f"{repeated} of {paths} paths in it look like other places, too" if repeated > MAX_REPEATED * paths else ""
+    )
+
+
+def _verdict(found: Localization, prior: SavedMap, parts: tuple[Part, ...], doubt: str) -> tuple[Verdict, str]:
     scans, path_m = len(found.states), float(found.traveled_m[-1])
     tried = f"{counted(scans, 'scan')} over {path_m:.1f} m"
     if not found.is_placed.any():
@@ -268,15 +321,15 @@ def _verdict(found: Localization, prior: SavedMap, parts: tuple[Part, ...]) -> t
         return Verdict.NOT_TRUSTWORTHY, f"not from this place: nothing in {tried} is in {prior.name}"
     at = found.found_at
     where = f"found in {prior.name}" + (f" after {found.traveled_m[at]:.1f} m" if at >= 0 else " in the end")
-    doubtful = [part for part in parts if part.kind != MapState.WITHOUT_MAP]
+    doubtful = [part for part in parts if part.is_doubtful]
     outside = int((found.states == MapState.WITHOUT_MAP).sum())
-    if not doubtful:
+    if not doubtful and not doubt:
         share = f", {100.0 * outside / scans:.0f} % of them not matched to the map" if outside else ""
         return Verdict.TRUSTWORTHY, f"{where}, and followed: {tried}{share}"
     largest = sorted(doubtful, key=lambda part: part.length_m, reverse=True)[:_SHOWN]
     more = len(doubtful) - len(largest)
-    listed = "; ".join(part.text for part in largest) + (f"; and {more:,} more" if more else "")
-    return Verdict.CHECK, f"{where}; {listed}"
+    listed = [*filter(None, [doubt]), *(part.text for part in largest), *([f"and {more:,} more"] if more else [])]
+    return Verdict.CHECK, "; ".join([where, *listed])
 
 
 def summary(localized: LocalizedLog, log: Log) -> str:
@@ -298,6 +351,8 @@ def summary(localized: LocalizedLog, log: Log) -> str:
         left_out = f", {m.rejected:,} of them left out" if m.rejected else ""
         lines.append(("matches", f"{m.matches:,} with the map{left_out}; overlap {m.median_overlap:.2f} (median)"))
         lines.append(("sigma", f"{m.median_sigma_m:.3f} m, standard deviation of a position at its time (median)"))
+    truth = [] if m.ground_truth is None else accuracy_lines(m.ground_truth)
+    lines += [(line[:15].strip(), line[15:]) for line in truth]
     lines += [("stretch", part.text) for part in m.parts]
     lines += [("warning", warning) for warning in m.warnings]
     rate = f"{m.scans / max(m.time_s, 1e-9):,.0f} scans/s"
@@ -307,10 +362,8 @@ def summary(localized: LocalizedLog, log: Log) -> str:
 
 def _write(folder: Path, localized: LocalizedLog, text: str) -> None:
     found, dimension = localized.localization, localized.prior.dimension
-    placed = found.is_placed
-    if placed.any():
-        trajectory = found.trajectory
-        write_tum(folder / "trajectory.tum", Trajectory(trajectory.stamps_ns[placed], trajectory.poses[placed]))
+    if found.is_placed.any():
+        write_tum(folder / "trajectory.tum", found.placed)
     write_tum(folder / "odometry.tum", found.result.odometry)
     _write_table(folder / LOCALIZATION_FILE, found, dimension)
     (folder / "summary.txt").write_text(text, encoding="utf-8")

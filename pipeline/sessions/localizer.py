@@ -75,6 +75,11 @@ class Localization:
     result: SlamResult
 
     @property
+    def placed(self) -> Trajectory:
+        """Those of its scans that are placed."""
+        return Trajectory(self.trajectory.stamps_ns[self.is_placed], self.trajectory.poses[self.is_placed])
+
+    @property
     def found_at(self) -> int:
         """The first scan whose place was known at its time, −1 if there is none."""
         known = np.flatnonzero(self.states != MapState.SEARCHING)

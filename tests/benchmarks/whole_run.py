@@ -129,7 +129,7 @@ def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]
     watch.over("what moved", results, "moved")
     watch.over("other results", processing, "write_results", "record_results")
     watch.over("other results", StepTable, "write")
-    watch.over("other results", run, "_judge", "measure")
+    watch.over("other results", run, "accuracy_of", "measure")
     watch.over("report", run, "_report")
     open_recording = api.open_recorder
 

@@ -7,10 +7,25 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from scanchain import InputError, Localizer, Trajectory, lie, read_tum, run, simulate, write_tum
+from scanchain import (
+    InputError,
+    Localizer,
+    Trajectory,
+    lie,
+    localize,
+    open_log,
+    read_tum,
+    run,
+    simulate,
+    write_tum,
+)
+from scanchain.config import LogConfig
 from scanchain.maps import Edges, open_saved_map, write_saved_map
 from scanchain.sessions.initial import pose_near
+from scanchain.sessions.localize import measure
 from scanchain.sessions.localizer import MapState
+from scanchain.settings import load_settings
+from scanchain.verdict import Verdict
 
 
 @pytest.fixture(scope="module")
@@ -49,10 +64,13 @@ def test_a_log_is_followed_in_the_map_from_a_rough_pose(office, tmp_path, call):
     live = np.column_stack([table["live_x_m"], table["live_y_m"]])[known]
     error_m = np.linalg.norm(live - true[where][known][:, :2, 2], axis=1)
     assert (error_m < 5.0 * np.array(table["sigma_m"])[known]).mean() > 0.95
+    html = (tmp_path / "loc/report.html").read_text()
+    assert "Stretches without the map" in html and "Stretches to check" not in html
     for name in ("report.html", "recording.rrd", "summary.txt", "config.toml", "run.json"):
         assert (tmp_path / "loc" / name).stat().st_size > 100, name
     metrics = json.loads((tmp_path / "loc/metrics.json").read_text())
     assert metrics["placed"] == metrics["scans"] == len(states)
+    assert "ground truth   /ground_truth: " in out and metrics["ground_truth"]["optimized"]["ate_rmse_m"] < 0.03
     assert call("view", tmp_path / "loc", "--png", tmp_path / "loc.png")[0] == 0
     assert (tmp_path / "loc.png").stat().st_size > 10_000
 
@@ -67,6 +85,48 @@ def test_a_log_of_another_place_is_never_placed(office, tmp_path, call):
     assert json.loads((tmp_path / "loc/metrics.json").read_text())["placed"] == 0
     code, _, error = call("view", tmp_path / "loc", "--png", tmp_path / "loc.png")
     assert code == 2 and "there is no trajectory to draw" in error
+
+
+def test_a_whole_log_of_another_place_that_returns_to_its_start_is_refused_in_one_line(office, tmp_path):
+    simulate("identical", tmp_path / "other.mcap", seed=5, duration_s=60.0)
+    run(tmp_path / "other.mcap", tmp_path / "other", recording=False)
+    found = localize(office / "office.mcap", tmp_path / "other", tmp_path / "loc", recording=False)
+    metrics = found.metrics
+    assert metrics.sentence.startswith("not trustworthy: not from this place: nothing in ")
+    assert metrics.placed == metrics.matches == 0 and metrics.states[MapState.SEARCHING] == metrics.scans
+
+
+def test_a_localized_log_names_the_directory_that_it_was_written_to_and_its_map(
+    office, tmp_path, monkeypatch, call
+):
+    monkeypatch.chdir(office)
+    found = localize(
+        "office.mcap", "map", tmp_path / "loc", recording=False, ground_truth="office.tum", log__end_s=20.0
+    )
+    assert found.path == tmp_path / "loc" and (found.path / "metrics.json").is_file()
+    assert (
+        found.metrics.ground_truth.source == "office.tum"
+        and found.metrics.ground_truth.optimized.ate_rmse_m < 0.03
+    )
+    monkeypatch.chdir(tmp_path)
+    assert call("view", "loc", "--png", "loc.png")[0] == 0
+
+
+def test_a_log_most_of_which_does_not_match_the_map_that_shows_it_is_not_trustworthy(office, monkeypatch):
+    saved, log = open_saved_map(office / "map"), open_log([office / "office.mcap"], LogConfig(end_s=30.0))
+    config = load_settings(2).config
+    localizer = Localizer(saved, config, log.T_base_lidar, is_live=False)
+    for scan in log.scans(config.preprocess):
+        localizer.process(scan)
+    found = localizer.finish()
+    assert measure(found, saved, config, 1.0, ()).verdict == Verdict.TRUSTWORTHY
+    states = found.states.copy()
+    states[found.found_at + 1 :] = MapState.WITHOUT_MAP
+    unmatched = measure(replace(found, states=states), saved, config, 1.0, ())
+    assert unmatched.verdict == Verdict.CHECK and "does not match: the place has changed" in unmatched.reason
+    monkeypatch.setattr("scanchain.sessions.localize.repeated_paths", lambda *_: (2, 6))
+    alike = measure(found, saved, config, 1.0, ())
+    assert alike.verdict == Verdict.CHECK and "2 of 6 paths in it look like other places, too" in alike.reason
 
 
 def test_a_map_that_is_damaged_or_of_another_kind_is_refused_in_one_line(office, tmp_path, call):

@@ -12,9 +12,10 @@ from scanchain import lie
 from scanchain.data import Keyframe, Trajectory
 from scanchain.errors import InputError, ScanchainError
 from scanchain.evaluation import absolute_error, pair
+from scanchain.loops.evidence import contradiction
 from scanchain.maps import Edges, open_saved_map, read_ply
 from scanchain.runs.job import Unwatched
-from scanchain.sessions.joining import Joined, changed, contradiction, graph_of, look_alike
+from scanchain.sessions.joining import Joined, changed, graph_of, look_alike
 from scanchain.sessions.merging import MergeJob, merge
 from scanchain.trajectory import read_tum
 from scanchain.viz.pictures.run import draw_run

@@ -35,6 +35,7 @@ def write_localization_report(folder: Path, localized: LocalizedLog) -> None:
         ("matches with the map", f"{m.matches:,}, {m.rejected:,} left out"),
         ("overlap", f"{m.median_overlap:.2f} (median)" if m.matches else "none"),
         ("standard deviation", f"{m.median_sigma_m:.3f} m (median)" if m.matches else "unknown"),
+        *([] if m.ground_truth is None else [("ATE", f"{m.ground_truth.optimized.ate_rmse_m:.4f} m (rmse)")]),
     )
     subtitle = f"{localized.path.name.split('.partial')[0]} in the map {localized.prior.name}"
     verdict = Section("Verdict", m.sentence)
@@ -54,9 +55,11 @@ def _sections(localized: LocalizedLog) -> Iterator[Section]:
         drawings=(_path(localized),),
     )
     yield Section("State over the path", "", drawings=(_states(localized),))
-    if m.parts:
-        heads = (Head("kind"), Head("scans"), Head("time", "s"), Head("path", "m"))
-        yield Section("Stretches to check", grid=Grid(heads, tuple(map(_row, m.parts))))
+    heads = (Head("kind"), Head("scans"), Head("time", "s"), Head("path", "m"))
+    for title, is_doubtful in (("Stretches to check", True), ("Stretches without the map", False)):
+        rows = tuple(_row(part) for part in m.parts if part.is_doubtful is is_doubtful)
+        if rows:
+            yield Section(title, grid=Grid(heads, rows))
     sessions = tuple(
         Row(each.name, (Cell(f"{each.keyframes:,}"), Cell(_date(each.first_stamp_ns))))
         for each in localized.prior.sessions

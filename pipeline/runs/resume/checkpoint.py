@@ -21,6 +21,7 @@ from scanchain.kernels.voxels.voxel_shapes import Voxels
 from scanchain.loops.closer import LoopCloser, ProximityCloser
 from scanchain.loops.closure_table import ClosureTable
 from scanchain.loops.connectivity import Drift, Segments
+from scanchain.loops.evidence import MapEvidence
 from scanchain.loops.place_closer import PlaceCloser
 from scanchain.loops.relocalization import Find, PlanarSearch, Relocalizer
 from scanchain.loops.submaps import VoxelSubmaps
@@ -76,7 +77,7 @@ _CLASSES = Classes(
         Voxels, PointToShapeMatcher, LoopCloser, ProximityCloser, PlaceCloser, Relocalizer, Find, PlanarSearch,
         VoxelSubmaps, ScanVerifier, SubmapVerifier, Segments, Drift, PoseGraph, Explanation, Slip, GrowingArray,
         Since, MapErrors, PoseErrors, PoseErrorTracker,
-        ClosureTable, BackgroundOptimization, PointStore, StoredPoints,
+        ClosureTable, MapEvidence, BackgroundOptimization, PointStore, StoredPoints,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.ClosureVerdict, data.Proposal,
         config.Config, *(type(getattr(config.Config(), section)) for section in config.Config.__struct_fields__),
     ],

@@ -1,0 +1,151 @@
+"""Evidence that keyframes belong to a map: closures from several of them, and free space that agrees."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from scanchain import lie
+from scanchain.data import Closure, ClosureVerdict, Keyframe, Pose
+from scanchain.kernels.raycast.free_space import compare_ranges, nearest_ranges
+from scanchain.loops.connectivity import Segments
+
+MIN_SHARE = 0.3  # least share of the keyframes in force among those that closures were tried from
+_MIN_KEYFRAMES = 3  # least number of keyframes with a closure in force that join a map
+_MAX_CONTRADICTION = 0.1  # largest share of points in sight that lie in the free space of the other
+_NEAR_M = {2: 5.0, 3: 10.0}  # largest distance of two keyframes that are compared for it, by dimension
+_BINS = 360  # of azimuth, 1°; as fine in elevation
+_MARGIN_M, _MARGIN_SHARE = {2: 0.3, 3: 1.0}, 0.05  # by which ranges may differ, beside that share of them
+_IN_SIGHT = 0.3  # share of the points of a keyframe, from which on those in view of the map's nearest one show it
+_MOST = 200  # largest number of keyframes of a log that are compared, evenly spread over them
+_PATIENCE = 10  # number of new keyframes from which on a pose in the map that was not confirmed is given up
+_AGREE_M, _AGREE_RAD = 1.0, 0.1  # largest difference between the poses that two closures imply
+
+
+def are_enough(in_force: int, tried: int) -> bool:
+    """True if so many keyframes with a closure in force, of those that were tried, join a map."""
+    return in_force >= max(_MIN_KEYFRAMES, MIN_SHARE * tried)
+
+
+def is_contradicted(keyframes: Sequence[Keyframe], others: Sequence[Keyframe]) -> bool:
+    """True if more points of keyframes in one frame than of another day lie in the free space of the others."""
+    return contradiction(keyframes, others) > _MAX_CONTRADICTION
+
+
+def contradiction(some: Sequence[Keyframe], others: Sequence[Keyframe]) -> float:
+    """Share, of the points of keyframes in view of the nearest one of the others, that lie in its free space."""
+    agreeing, contradicting = compared(some, others) + compared(others, some)
+    return float(contradicting / max(agreeing + contradicting, 1))
+
+
+def compared(
+    viewers: Sequence[Keyframe], viewed: Sequence[Keyframe], min_path_m: float = 0.0
+) -> NDArray[np.int64]:
+    """Numbers of points (2,), of the viewed keyframe nearest to each viewer, that agree and that contradict.
+
+    min_path_m : least path between the two
+    """
+    d = viewers[0].T_odom_lidar.shape[0] - 1
+    ranges_m = np.empty((1 if d == 2 else _BINS // 2, _BINS))
+    positions = np.array([keyframe.T_odom_lidar[:d, d] for keyframe in viewed])
+    traveled_m = np.array([keyframe.traveled_m for keyframe in viewed])
+    counts = np.zeros(2, np.int64)
+    for viewer in viewers:
+        away_m = np.linalg.norm(positions - viewer.T_odom_lidar[:d, d], axis=1)
+        away_m[np.abs(traveled_m - viewer.traveled_m) < min_path_m] = np.inf
+        nearest = int(away_m.argmin())
+        if away_m[nearest] <= _NEAR_M[d]:
+            other = viewed[nearest]
+            nearest_ranges(lie.lift_points(viewer.points), ranges_m)
+            T_viewer_viewed = lie.lift(lie.between(viewer.T_odom_lidar, other.T_odom_lidar))
+            margin_m = _MARGIN_M[d] * viewer.scale
+            counts += compare_ranges(
+                lie.lift_points(other.points), T_viewer_viewed, ranges_m, margin_m, _MARGIN_SHARE
+            )
+    return counts
+
+
+def are_in_sight(keyframes: Sequence[Keyframe], others: Sequence[Keyframe]) -> NDArray[np.bool_]:
+    """True for keyframes (N,) that show what the nearest one of the others shows, or what it sees through."""
+    counts = [compared(nearest([each], others), [each]).sum() for each in keyframes]
+    return np.array(counts) >= _IN_SIGHT * np.array([max(len(each.points), 1) for each in keyframes])
+
+
+def nearest(keyframes: Sequence[Keyframe], others: Sequence[Keyframe]) -> list[Keyframe]:
+    """Those of the others that are nearest to some keyframes."""
+    positions, targets = (np.array([each.T_odom_lidar[:-1, -1] for each in part]) for part in (others, keyframes))
+    return [others[index] for index in np.unique(KDTree(positions).query(targets)[1]).tolist()]
+
+
+class MapEvidence:
+    """Closures of the newest segment of a log with a map, which wait until enough keyframes agree on a pose."""
+
+    def __init__(self, segments: Segments, of_map: int) -> None:
+        """of_map : number of the keyframes of the map, which come first."""
+        self.segments = segments
+        self.of_map = of_map
+        self.is_given = False  # whether the pose of the first scan in the map is
+        self.tried: set[int] = set()  # keyframes of the whole log that a closure with the map was tried from
+        self.waiting: list[Closure] = []
+        self.begun = 0  # number of keyframes when the first of these came
+        self.failed: set[int] = set()  # keyframes that were tried in vain since
+
+    @property
+    def is_gathering(self) -> bool:
+        """True while a pose in the map is being tested."""
+        return self.segments.is_assumed
+
+    def collect(self, closures: Sequence[Closure], keyframes: Sequence[Keyframe]) -> tuple[Closure, ...]:
+        """Take closures with the map of a segment that is not joined to it; all that waited, once they join it."""
+        self.tried |= {each.source for each in closures}
+        accepted = [each for each in closures if each.verdict is ClosureVerdict.ACCEPTED]
+        if not self.waiting and not accepted:
+            return ()
+        self.begun = self.begun if self.waiting else len(keyframes)
+        self.segments.is_assumed = True
+        self.waiting += accepted
+        self.failed |= {each.source for each in closures}
+        agreeing = [each for each in self.waiting if self._agrees(each, keyframes)]
+        sources = {each.source for each in agreeing}
+        if not are_enough(len(sources), len(self.failed | sources)):
+            return ()
+        placed = [replace(keyframes[c.source], T_odom_lidar=_pose_of(c, keyframes)) for c in agreeing]
+        if is_contradicted(placed, nearest(placed, keyframes[: self.of_map])):
+            return ()
+        self.reset()
+        return tuple(agreeing)
+
+    def is_in_vain(self, keyframes: Sequence[Keyframe]) -> bool:
+        """True if enough keyframes passed without confirming the pose that is being tested."""
+        return self.is_gathering and len(keyframes) - self.begun > _PATIENCE
+
+    def reset(self) -> None:
+        """Nothing waits, and no pose is being tested."""
+        self.segments.is_assumed = False
+        self.waiting, self.failed = [], set()
+
+    def joins(self, placed: Sequence[Keyframe], in_force: set[int], keyframes: Sequence[Keyframe]) -> bool:
+        """True if closures in force join the keyframes of a segment, at their final poses, to the map."""
+        first = min(in_force)
+        tried = {each.index for each in placed if each.index >= first} & self.tried
+        is_short = self.is_given and len(tried) < _PATIENCE
+        some = placed[:: -(-len(placed) // _MOST)]
+        is_enough = is_short or are_enough(len(in_force), len(tried | in_force))
+        return is_enough and not is_contradicted(some, nearest(some, keyframes[: self.of_map]))
+
+    def _agrees(self, closure: Closure, keyframes: Sequence[Keyframe]) -> bool:
+        """True if a closure implies the pose of its source that the first one does."""
+        first = self.waiting[0]
+        T_first_source = lie.between(keyframes[first.source].T_odom_lidar, keyframes[closure.source].T_odom_lidar)
+        off_m, off_rad = lie.apart(_pose_of(first, keyframes) @ T_first_source, _pose_of(closure, keyframes))
+        scale = keyframes[closure.source].scale
+        return off_m < _AGREE_M * scale and off_rad < _AGREE_RAD
+
+
+def _pose_of(closure: Closure, keyframes: Sequence[Keyframe]) -> Pose:
+    """T_map_source by a closure with the map."""
+    return keyframes[closure.target].T_odom_lidar @ closure.match.T_target_source
