@@ -49,15 +49,7 @@ def run(
     Returns path, metrics, summary and warnings; ``metrics.verdict`` says whether to rely on it.
     Raises InputError for bad input.
     """
-    job = Job(
-        logs=sources_of(log),
-        out=checks.path(out, "out"),
-        config_file=None if config is None else checks.path(config, "config"),
-        overrides=overrides_of(overrides),
-        sinks=frozenset({"save"}) if recording else frozenset(),
-        ground_truth=None if ground_truth is None else checks.path(ground_truth, "ground_truth"),
-        force=force,
-    )
+    job = _job(log, out, config, ground_truth, recording=recording, force=force, overrides=overrides)
     return run_job(job, open_recorder, Unwatched(), write_report)
 
 
@@ -78,19 +70,32 @@ def localize(
     Other arguments as in ``run``; without ``recording`` there is no report either.
     Returns path, metrics and poses. Raises InputError for bad input.
     """
-    from scanchain.sessions.localize import Localizing
     from scanchain.sessions.localize import localize as localize_log
 
-    job = Localizing(
+    job = _job(log, out, config, ground_truth, recording=recording, force=force, overrides=overrides)
+    draw = draw_localization if recording else lambda folder, localized: None
+    return localize_log(job, checks.path(prior, "prior"), Unwatched(), draw)[0]
+
+
+def _job(
+    log: Logs,
+    out: str | Path,
+    config: str | Path | None,
+    ground_truth: str | Path | None,
+    *,
+    recording: bool,
+    force: bool,
+    overrides: dict[str, object],
+) -> Job:
+    return Job(
         logs=sources_of(log),
-        prior=checks.path(prior, "prior"),
         out=checks.path(out, "out"),
         config_file=None if config is None else checks.path(config, "config"),
         overrides=overrides_of(overrides),
+        sinks=frozenset({"save"}) if recording else frozenset(),
         ground_truth=None if ground_truth is None else checks.path(ground_truth, "ground_truth"),
         force=force,
     )
-    return localize_log(job, Unwatched(), draw_localization if recording else lambda folder, localized: None)[0]
 
 
 def merge(

@@ -7,7 +7,7 @@ coordinates in frame b to frame a. The dimension d of a log is 2 or 3; a twist h
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import NamedTuple, Protocol
 
@@ -284,6 +284,10 @@ class Closure:
     proposed_by: Proposal = Proposal.POSITION
     chi2_before: float = float("nan")
     cause: str = ""
+
+    def rejected(self, problem: Problem) -> Closure:
+        """The same, rejected."""
+        return replace(self, verdict=ClosureVerdict.REJECTED, cause=problem.cause, reason=problem.text)
 
 
 REJECTED_WEIGHT = 1e-6  # robust weight below which an edge is not in force

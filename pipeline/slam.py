@@ -19,6 +19,7 @@ from scanchain.data import (
     Keyframe,
     Matrix,
     Pose,
+    Problem,
     RawPoints,
     Scan,
     State,
@@ -362,14 +363,15 @@ class Slam:
         if self.is_in_map:
             self.evidence.tried |= {each.source for each in with_map}
             return closures
-        was_tested = self.evidence.is_gathering
+        others = [each for each in closures if each.target >= self.first or each.source < start]
+        was_gathering = self.evidence.is_gathering
         joining = self.evidence.collect(with_map, self.keyframes)
-        if self.evidence.is_gathering and not was_tested:
+        if self.evidence.is_gathering and not was_gathering:
             self._move_segment(self.evidence.waiting[0])
             self._follow_graph()
-        joined = set(map(id, joining))
-        rest = [each for each in closures if id(each) not in joined]
-        return *(_waiting(each) if each.target < self.first else each for each in rest), *joining
+        too_few = Problem.plain("too few keyframes agree on the place in the map")
+        alone = [each.rejected(too_few) if each.verdict is ClosureVerdict.ACCEPTED else each for each in with_map]
+        return (*others, *(joining or alone))
 
     def _give_up(self) -> None:
         """The pose in the map that is being tested is wrong: search the newest segment again."""
@@ -512,14 +514,6 @@ class Slam:
 def loop_information(closure: Closure, config: LoopsConfig) -> Matrix:
     """Information (k, k) of the pose-graph edge of a closure."""
     return edge_information(closure.match.information, config.edge_sigma_m, config.edge_sigma_rad)
-
-
-def _waiting(closure: Closure) -> Closure:
-    """A closure that alone does not join a log to a map."""
-    if closure.verdict is ClosureVerdict.REJECTED:
-        return closure
-    reason = "too few keyframes agree on the place in the map"
-    return replace(closure, verdict=ClosureVerdict.REJECTED, cause=reason, reason=reason)
 
 
 def edge_information(information: Matrix, sigma_m: float, sigma_rad: float) -> Matrix:

@@ -79,15 +79,13 @@ def localize(
     collect_garbage_seldom()
     from scanchain.api import draw_localization
     from scanchain.commands.terminal import Terminal
-    from scanchain.sessions.localize import Localizing
+    from scanchain.runs.job import Job
     from scanchain.sessions.localize import localize as localize_log
 
     truth_file, truth_topic = ground_truth(gt)
-    job = Localizing(
+    job = Job(
         logs=logs,
-        prior=prior,
         out=out,
-        initial=None if initial is None else _initial(initial),
         config_file=config,
         overrides=overrides(ctx, [*part_of(shortcuts), *method_of(shortcuts), *truth_topic]),
         ground_truth=truth_file,
@@ -95,8 +93,9 @@ def localize(
         force=force,
         command=tuple(sys.argv),
     )
+    first = None if initial is None else _initial(initial)
     with Terminal("scans") as terminal:
-        localized, text = localize_log(job, terminal, draw_localization)
+        localized, text = localize_log(job, prior, terminal, draw_localization, initial=first)
     fails = localized.metrics.verdict.fails(strict=strict)
     if fails and not sys.stdout.isatty():
         click.echo(f"error: {out}: {localized.metrics.sentence}", err=True)

@@ -113,7 +113,7 @@ class MapEvidence:
         sources = {each.source for each in agreeing}
         if not are_enough(len(sources), len(self.failed | sources)):
             return ()
-        placed = [replace(keyframes[c.source], T_odom_lidar=_pose_of(c, keyframes)) for c in agreeing]
+        placed = [replace(keyframes[c.source], T_odom_lidar=pose_in_map(c, c.source, keyframes)) for c in agreeing]
         if is_contradicted(placed, nearest(placed, keyframes[: self.of_map])):
             return ()
         self.reset()
@@ -139,13 +139,12 @@ class MapEvidence:
 
     def _agrees(self, closure: Closure, keyframes: Sequence[Keyframe]) -> bool:
         """True if a closure implies the pose of its source that the first one does."""
-        first = self.waiting[0]
-        T_first_source = lie.between(keyframes[first.source].T_odom_lidar, keyframes[closure.source].T_odom_lidar)
-        off_m, off_rad = lie.apart(_pose_of(first, keyframes) @ T_first_source, _pose_of(closure, keyframes))
-        scale = keyframes[closure.source].scale
-        return off_m < _AGREE_M * scale and off_rad < _AGREE_RAD
+        poses = (pose_in_map(each, closure.source, keyframes) for each in (self.waiting[0], closure))
+        off_m, off_rad = lie.apart(*poses)
+        return off_m < _AGREE_M * keyframes[closure.source].scale and off_rad < _AGREE_RAD
 
 
-def _pose_of(closure: Closure, keyframes: Sequence[Keyframe]) -> Pose:
-    """T_map_source by a closure with the map."""
-    return keyframes[closure.target].T_odom_lidar @ closure.match.T_target_source
+def pose_in_map(closure: Closure, keyframe: int, keyframes: Sequence[Keyframe]) -> Pose:
+    """T_map_keyframe by a closure with the map and odometry."""
+    T_map_source = keyframes[closure.target].T_odom_lidar @ closure.match.T_target_source
+    return T_map_source @ lie.between(keyframes[closure.source].T_odom_lidar, keyframes[keyframe].T_odom_lidar)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Generator, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Points, Po
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
 from scanchain.loops.descriptor import level_frame, upright_frame
+from scanchain.loops.evidence import pose_in_map
 from scanchain.loops.outline import outline_of
 from scanchain.loops.submaps import Submap
 from scanchain.loops.verification import SubmapVerifier
@@ -153,7 +153,7 @@ class MapSearch:
             gone_m = keyframes[closure.source].traveled_m - self.matched_m
             problem = self._contradiction(closure, keyframes, graph.poses, gone_m)
             if problem:
-                return (_rejected(closure, problem),)
+                return (closure.rejected(problem),)
         return self._confirmed(closure, keyframes)
 
     def _found(
@@ -186,7 +186,7 @@ class MapSearch:
         best = max(accepted, key=lambda each: each.overlap)
         if all(_agree(best, each, keyframes) for each in accepted):
             return best
-        return _rejected(best, Problem.plain("another place of the map is as similar"))
+        return best.rejected(Problem.plain("another place of the map is as similar"))
 
     def _seeds(self, points: Points) -> Generator[None, None, tuple[Matrix, int]]:
         """The best poses in the map's level frame (A, 4): x, y, yaw and share; sought coarsely, then refined.
@@ -256,7 +256,7 @@ class MapSearch:
         self, closure: Closure, keyframes: Sequence[Keyframe], T_world: Matrix, traveled_m: float
     ) -> Problem | None:
         """Why a find contradicts the prediction since the last match, None if it does not."""
-        T_found = _implied_pose(closure, closure.source, keyframes)
+        T_found = pose_in_map(closure, closure.source, keyframes)
         moved_m = lie.apart(T_world[closure.source], T_found)[0]
         if moved_m <= max(_DRIFT * traveled_m, self.config.loops.min_radius_m):
             return None
@@ -271,11 +271,7 @@ class MapSearch:
             self.finds = []
             return (*agreeing, closure)
         self.finds = [*old, closure]
-        return (_rejected(closure, Problem.plain("found anywhere, and no other find agrees yet")),)
-
-
-def _rejected(closure: Closure, problem: Problem) -> Closure:
-    return replace(closure, verdict=ClosureVerdict.REJECTED, cause=problem.cause, reason=problem.text)
+        return (closure.rejected(Problem.plain("found anywhere, and no other find agrees yet")),)
 
 
 def _together(members: Sequence[Keyframe], T_level_newest: Pose) -> Points:
@@ -286,11 +282,5 @@ def _together(members: Sequence[Keyframe], T_level_newest: Pose) -> Points:
 
 def _agree(a: Closure, b: Closure, keyframes: Sequence[Keyframe]) -> bool:
     """True if two closures with the map imply the same pose of the newest keyframe."""
-    off_m, off_rad = lie.apart(_implied_pose(a, a.source, keyframes), _implied_pose(b, a.source, keyframes))
+    off_m, off_rad = lie.apart(pose_in_map(a, a.source, keyframes), pose_in_map(b, a.source, keyframes))
     return off_m < _AGREE_M and off_rad < _AGREE_RAD
-
-
-def _implied_pose(closure: Closure, keyframe: int, keyframes: Sequence[Keyframe]) -> Pose:
-    """T_map_keyframe by a closure with the map and odometry."""
-    T_map_source = keyframes[closure.target].T_odom_lidar @ closure.match.T_target_source
-    return T_map_source @ lie.between(keyframes[closure.source].T_odom_lidar, keyframes[keyframe].T_odom_lidar)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -36,7 +36,7 @@ from scanchain.runs.resume.rescue import rescued
 from scanchain.runs.resume.resuming import Left, find_left
 from scanchain.runs.step_table import StepTable
 from scanchain.runs.warm_up import beside
-from scanchain.settings import Override, dump, load_settings, named
+from scanchain.settings import Settings, dump, load_settings, named
 from scanchain.slam import SlamResult
 from scanchain.threads import threads
 from scanchain.trajectory import write_tum
@@ -79,17 +79,10 @@ def _run(
     job: Job, record: OpenRecorder, progress: Progress, report: Callable[[Path], None], hashing: Hashing
 ) -> Finished:
     started, compiled_before_s = working_s(), compiled_s()
-    truth_file = None if job.ground_truth is None else read_truth(job.ground_truth)
-    early = load_settings(file=job.config_file, overrides=job.overrides)
-    RunDirectory(job.out, force=job.force)  # refused before the log is read
-    log = open_log(job.logs, early.config.log)
-    settings = load_settings(
-        log.dimension, file=job.config_file, overrides=job.overrides, idle=_idle_keys(job, log)
-    )
+    log, settings, truth_file = opened(job)
     left = find_left(job.out, dump(settings.config)) if job.resume else None
     directory = RunDirectory(job.out, force=job.force, left=left and left.folder)
     _check_prior(log, settings.config)
-    check_truth(job.overrides, log, truth_file)
     progress.say(f"{log.topic}: {log.dimension}D, {counted(log.scan_count, 'scan')}; {settings.source}")
     for gap in log.gaps:
         progress.announce(f"warning: {gap}")
@@ -127,6 +120,19 @@ def _run(
     return Finished(directory.path, metrics, text, warnings, stopped)
 
 
+def opened(job: Job) -> tuple[Log, Settings, TruthFile | None]:
+    """The log of a job, the settings for it, and the ground truth if a file is named. Raises InputError."""
+    truth_file = None if job.ground_truth is None else read_truth(job.ground_truth)
+    early = load_settings(file=job.config_file, overrides=job.overrides)
+    RunDirectory(job.out, force=job.force)  # refused before the log is read
+    log = open_log(job.logs, early.config.log)
+    settings = load_settings(
+        log.dimension, file=job.config_file, overrides=job.overrides, idle=_idle_keys(job, log)
+    )
+    _check_truth(job, log, truth_file)
+    return log, settings, truth_file
+
+
 def _tell_beginning(job: Job, left: Left | None, progress: Progress) -> None:
     """Announce that an earlier run is resumed, or that one exists and is not."""
     if left is not None:
@@ -161,12 +167,12 @@ def _check_prior(log: Log, config: Config) -> None:
         )
 
 
-def check_truth(overrides: Sequence[Override], log: Log, file: TruthFile | None) -> None:
+def _check_truth(job: Job, log: Log, file: TruthFile | None) -> None:
     """Refuse a ground truth that was named and has no time in common with the scans before they are processed."""
     if file is not None:
         file.check(log.expected_stamps(log.topic), log.scan_count)
         return
-    topic = named(overrides, "log.ground_truth_topic")
+    topic = named(job.overrides, "log.ground_truth_topic")
     if topic == NO_TRUTH:
         return
     if topic and not log.ground_truth_topic:

@@ -20,19 +20,17 @@ from scanchain.clock import working_s
 from scanchain.config import Config
 from scanchain.data import ClosureVerdict, Pose
 from scanchain.errors import InputError
-from scanchain.evaluation import read_truth
-from scanchain.logs import Log, open_log
+from scanchain.logs import Log
 from scanchain.loops.evidence import are_in_sight
 from scanchain.maps import SavedMap, open_saved_map
 from scanchain.runs.directory import POINTS_FILE, RUN_FILE, RunDirectory
-from scanchain.runs.job import Progress
+from scanchain.runs.job import Job, Progress
 from scanchain.runs.metrics import GroundTruth, accuracy_lines
 from scanchain.runs.provenance import Hashing, describe_start
-from scanchain.runs.run import accuracy_of, check_truth, true_poses
+from scanchain.runs.run import accuracy_of, opened, true_poses
 from scanchain.sessions.joining import MAX_REPEATED, repeated_paths
 from scanchain.sessions.localizer import Localization, Localizer, MapState
-from scanchain.settings import Override, dump, load_settings
-from scanchain.source import Source
+from scanchain.settings import dump
 from scanchain.trajectory import write_tum
 from scanchain.verdict import Verdict
 from scanchain.whole_file import write_whole
@@ -45,29 +43,6 @@ _MOVED_M, _MOVED_SIGMAS = 0.3, 5.0  # between a pose as known at its time and in
 _COMPARED, _PATHS = 200, 12  # largest numbers of keyframes and of paths that are compared with the map in the end
 _MAX_UNMATCHED = 0.5  # largest share of the keyframes in sight of the map's that are not matched to it
 _SHOWN = 3  # stretches that the verdict lists
-
-
-@dataclass(frozen=True, slots=True)
-class Localizing:
-    """A log to localize.
-
-    Attributes
-    ----------
-    logs : the files of one log; prior : run directory, or folder, of the map; out : the directory to create
-    initial : T_map_lidar of the first scan, where known: a function of the stamp of that scan and of the map
-    config_file, overrides, ground_truth, max_gap_s, force, command : as in ``scanchain.runs.job.Job``
-    """
-
-    logs: tuple[Source, ...]
-    prior: Path
-    out: Path
-    initial: Callable[[int, SavedMap], Pose] | None = None
-    config_file: Path | None = None
-    overrides: tuple[Override, ...] = ()
-    ground_truth: Path | None = None
-    max_gap_s: float | None = None
-    force: bool = False
-    command: tuple[str, ...] = ()
 
 
 class Part(Struct, frozen=True):
@@ -139,31 +114,33 @@ class LocalizedLog:
 
 
 Draw = Callable[[Path, LocalizedLog], None]
+Initial = Callable[[int, SavedMap], Pose]
 
 
 def localize(
-    job: Localizing, progress: Progress, draw: Draw = lambda folder, localized: None
+    job: Job,
+    map_path: Path,
+    progress: Progress,
+    draw: Draw = lambda folder, localized: None,
+    *,
+    initial: Initial | None = None,
 ) -> tuple[LocalizedLog, str]:
     """Localize a log; returns what is in the directory, and the summary.
 
-    draw : adds report and recording to the folder
+    map_path : run directory, or folder, of the map; draw : adds report and recording to the folder
+    initial : T_map_lidar of the first scan, where known, by the stamp of that scan and the map
     Raises InputError for a log or a map that cannot be read.
     """
     started = working_s()
-    truth_file = None if job.ground_truth is None else read_truth(job.ground_truth)
-    prior = _opened(job)
-    RunDirectory(job.out, force=job.force)  # refused before the log is read
-    early = load_settings(file=job.config_file, overrides=job.overrides)
-    log = open_log(job.logs, early.config.log)
-    settings = load_settings(log.dimension, file=job.config_file, overrides=job.overrides, idle=log.idle_keys())
+    prior = _opened(map_path, job.out)
+    log, settings, truth_file = opened(job)
     _check(log, prior, settings.config)
-    check_truth(job.overrides, log, truth_file)
     progress.say(f"{log.topic}: {counted(log.scan_count, 'scan')}; map {prior.name}")
     provenance = describe_start(job.command, job.logs, settings.source)
     with RunDirectory(job.out, force=job.force) as directory, Hashing(job.logs) as hashing:
         provenance.write(directory.path / RUN_FILE)
         write_whole(directory.path / "config.toml", dump(settings.config).encode())
-        localizer = _followed(job, log, prior, settings.config, directory.path / POINTS_FILE, progress)
+        localizer = _followed(log, prior, settings.config, initial, directory.path / POINTS_FILE, progress)
         progress.say("smoothing the path")
         found = localizer.finish()
         count = counted(len(found.states), "scan")
@@ -193,16 +170,16 @@ def localize(
 
 
 def _followed(
-    job: Localizing, log: Log, prior: SavedMap, config: Config, points_file: Path, progress: Progress
+    log: Log, prior: SavedMap, config: Config, initial: Initial | None, points_file: Path, progress: Progress
 ) -> Localizer:
     """The localizer after the scans of the log. Raises InputError where there is none."""
     localizer: Localizer | None = None
     with closing(log.scans(config.preprocess)) as scans:
         for scan in progress.track(scans, log.scan_count):
             if localizer is None:
-                initial = None if job.initial is None else job.initial(scan.stamp_ns, prior)
+                T = None if initial is None else initial(scan.stamp_ns, prior)
                 localizer = Localizer(
-                    prior, config, log.T_base_lidar, initial=initial, points_file=points_file, is_live=False
+                    prior, config, log.T_base_lidar, initial=T, points_file=points_file, is_live=False
                 )
             localizer.process(scan)
     if localizer is None:
@@ -210,11 +187,11 @@ def _followed(
     return localizer
 
 
-def _opened(job: Localizing) -> SavedMap:
-    """The map of a job. Raises InputError where it cannot be read, or the results would replace it."""
-    prior = open_saved_map(job.prior)
-    if job.out.resolve() in (job.prior.resolve(), prior.folder.resolve()):
-        raise InputError(f"{job.out}: is the map; choose another --out")
+def _opened(path: Path, out: Path) -> SavedMap:
+    """The map. Raises InputError where it cannot be read, or the results would replace it."""
+    prior = open_saved_map(path)
+    if out.resolve() in (path.resolve(), prior.folder.resolve()):
+        raise InputError(f"{out}: is the map; choose another --out")
     return prior
 
 

@@ -60,6 +60,15 @@ def _real(log: str, end_s: float, other: str = "", **options: object) -> Place:
     )
 
 
+def _plane(world: str, **again: object) -> Place:
+    """A world of space, driven through with a planar scanner."""
+    return Place("2d", world=world, options={"sensor": "lms-270"}, again=again)
+
+
+def _space(world: str, **again: object) -> Place:
+    return Place("3d", world=world, options={"sensor": "vlp-16", "duration_s": 25.0}, again=again)
+
+
 PLACES = {
     "intel": _real("2d/intel.mcap", 1400.0),
     "aces": _real("2d/aces.mcap", 700.0),
@@ -67,19 +76,19 @@ PLACES = {
     "mocap": _real("2d/mocap_room_1.bag", 0.0, "2d/mocap_room_2.bag"),
     "office": Place("2d", world="office", again={"changed": 1, "start_m": 20.0}),
     "identical": Place("2d", world="identical", again={"reverse": True, "start_m": 15.0}),
-    "streets": Place("2d", world="town", options={"sensor": "lms-270"}, again={"changed": 1, "start_m": 100.0}),
-    "passage": Place("2d", world="corridor", options={"sensor": "lms-270"}, again={"start_m": 30.0}),
-    "pillars": Place("2d", world="hall", options={"sensor": "lms-270"}, again={"start_m": 20.0}),
-    "trunks": Place("2d", world="forest", options={"sensor": "lms-270"}, again={"reverse": True}),
-    "yard": Place("2d", world="turns", options={"sensor": "lms-270"}, again={}),
-    "town": Place("3d", world="town", options={"sensor": "os1-32"}, again={"changed": 1, "start_m": 100.0}),
-    "highway": Place("3d", world="highway", options={"sensor": "os1-32", "duration_s": 20.0}, again={}),
-    "corridor": Place("3d", world="corridor", again={"start_m": 30.0}),
-    "field": Place("3d", world="field", options={"sensor": "os1-32"}, again={"start_m": 30.0}),
-    "forest": Place("3d", world="forest", again={"reverse": True}),
-    "staircase": Place("3d", world="staircase", again={"reverse": True}),
-    "hall": Place("3d", world="hall", again={"start_m": 20.0}),
-    "turns": Place("3d", world="turns", again={}),
+    "streets": _plane("town", changed=1, start_m=100.0),
+    "passage": _plane("corridor", start_m=30.0),
+    "pillars": _plane("hall", start_m=20.0),
+    "trunks": _plane("forest", reverse=True),
+    "yard": _plane("turns"),
+    "town": _space("town", changed=1, start_m=60.0),
+    "highway": _space("highway", changed=None),
+    "corridor": _space("corridor", start_m=10.0),
+    "field": _space("field", start_m=30.0),
+    "forest": _space("forest", reverse=True),
+    "staircase": _space("staircase", reverse=True),
+    "hall": _space("hall", start_m=20.0),
+    "turns": _space("turns", changed=None),
     "kitti-1": _real("3d/kitti_0001_first54.mcap", 3.0),
     "kitti-5": _real("3d/kitti_0005_first60.mcap", 3.0),
     "pandaset": _real("3d/pandaset_002_sweeps30to55.mcap", 1.5, **PANDAR),
