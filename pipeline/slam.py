@@ -360,8 +360,8 @@ class Slam:
         """Closures; those that would join the newest segment to the map are rejected until they are enough."""
         start = self.closer.segments.starts[-1]
         with_map = [each for each in closures if each.target < self.first and each.source >= start]
+        self.evidence.note(with_map)
         if self.is_in_map:
-            self.evidence.tried |= {each.source for each in with_map}
             return closures
         others = [each for each in closures if each.target >= self.first or each.source < start]
         was_gathering = self.evidence.is_gathering

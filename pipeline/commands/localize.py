@@ -107,7 +107,7 @@ def localize(
 
 
 def _initial(text: str) -> Callable[[int, SavedMap], Pose]:
-    from scanchain.sessions.initial import pose_in_file, pose_near
+    from scanchain.sessions.localize import pose_in_file, pose_near
 
     if text.endswith(".tum"):
         return pose_in_file(Path(text))

@@ -12,7 +12,7 @@ from scanchain import lie
 from scanchain.data import Matrix, Pose, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation.pairing import Pairs, Statistics, pair
-from scanchain.registration.svd import DegeneratePairsError, rigid_transform
+from scanchain.registration.svd_icp import DegeneratePairsError, rigid_transform
 
 _PLANAR = 1e-9  # meters of height and radians of tilt below which poses count as planar
 

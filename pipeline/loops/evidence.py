@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from scanchain import lie
-from scanchain.data import Closure, ClosureVerdict, Keyframe, Pose
+from scanchain.data import Closure, ClosureVerdict, Keyframe, Pose, Proposal
 from scanchain.kernels.raycast.free_space import compare_ranges, nearest_ranges
 from scanchain.loops.connectivity import Segments
 
@@ -71,14 +71,14 @@ def compared(
 
 def are_in_sight(keyframes: Sequence[Keyframe], others: Sequence[Keyframe]) -> NDArray[np.bool_]:
     """True for keyframes (N,) that show what the nearest one of the others shows, or what it sees through."""
-    counts = [compared(nearest([each], others), [each]).sum() for each in keyframes]
-    return np.array(counts) >= _IN_SIGHT * np.array([max(len(each.points), 1) for each in keyframes])
+    pairs = zip(nearest(keyframes, others), keyframes, strict=True)
+    return np.array([compared([a], [b]).sum() >= _IN_SIGHT * max(len(b.points), 1) for a, b in pairs], np.bool_)
 
 
 def nearest(keyframes: Sequence[Keyframe], others: Sequence[Keyframe]) -> list[Keyframe]:
-    """Those of the others that are nearest to some keyframes."""
+    """Of each of some keyframes, the nearest one of the others."""
     positions, targets = (np.array([each.T_odom_lidar[:-1, -1] for each in part]) for part in (others, keyframes))
-    return [others[index] for index in np.unique(KDTree(positions).query(targets)[1]).tolist()]
+    return [others[index] for index in KDTree(positions).query(targets)[1].tolist()]
 
 
 class MapEvidence:
@@ -89,10 +89,10 @@ class MapEvidence:
         self.segments = segments
         self.of_map = of_map
         self.is_given = False  # whether the pose of the first scan in the map is
-        self.tried: set[int] = set()  # keyframes of the whole log that a closure with the map was tried from
+        self.tried: set[int] = set()  # keyframes of the whole log that were tried where they lie in the map
         self.waiting: list[Closure] = []
         self.begun = 0  # number of keyframes when the first of these came
-        self.failed: set[int] = set()  # keyframes that were tried in vain since
+        self.tested: set[int] = set()  # keyframes that were tried since
 
     @property
     def is_gathering(self) -> bool:
@@ -101,23 +101,26 @@ class MapEvidence:
 
     def collect(self, closures: Sequence[Closure], keyframes: Sequence[Keyframe]) -> tuple[Closure, ...]:
         """Take closures with the map of a segment that is not joined to it; all that waited, once they join it."""
-        self.tried |= {each.source for each in closures}
         accepted = [each for each in closures if each.verdict is ClosureVerdict.ACCEPTED]
         if not self.waiting and not accepted:
             return ()
         self.begun = self.begun if self.waiting else len(keyframes)
         self.segments.is_assumed = True
         self.waiting += accepted
-        self.failed |= {each.source for each in closures}
+        self.tested |= {each.source for each in closures}
         agreeing = [each for each in self.waiting if self._agrees(each, keyframes)]
         sources = {each.source for each in agreeing}
-        if not are_enough(len(sources), len(self.failed | sources)):
+        if not are_enough(len(sources), len(self.tested | sources)):
             return ()
         placed = [replace(keyframes[c.source], T_odom_lidar=pose_in_map(c, c.source, keyframes)) for c in agreeing]
-        if is_contradicted(placed, nearest(placed, keyframes[: self.of_map])):
+        if self._is_contradicted(placed, keyframes):
             return ()
         self.reset()
         return tuple(agreeing)
+
+    def note(self, closures: Sequence[Closure]) -> None:
+        """Note from which keyframes closures with the map were tried at the pose where these lie in it."""
+        self.tried |= {each.source for each in closures if each.proposed_by is Proposal.POSITION}
 
     def is_in_vain(self, keyframes: Sequence[Keyframe]) -> bool:
         """True if enough keyframes passed without confirming the pose that is being tested."""
@@ -126,16 +129,27 @@ class MapEvidence:
     def reset(self) -> None:
         """Nothing waits, and no pose is being tested."""
         self.segments.is_assumed = False
-        self.waiting, self.failed = [], set()
+        self.waiting, self.tested = [], set()
 
     def joins(self, placed: Sequence[Keyframe], in_force: set[int], keyframes: Sequence[Keyframe]) -> bool:
-        """True if closures in force join the keyframes of a segment, at their final poses, to the map."""
-        first = min(in_force)
-        tried = {each.index for each in placed if each.index >= first} & self.tried
-        is_short = self.is_given and len(tried) < _PATIENCE
-        some = placed[:: -(-len(placed) // _MOST)]
-        is_enough = is_short or are_enough(len(in_force), len(tried | in_force))
-        return is_enough and not is_contradicted(some, nearest(some, keyframes[: self.of_map]))
+        """True if closures in force join the keyframes of a segment, at their final poses, to the map.
+
+        Keyframes that were tried where the map shows nothing do not count.
+        """
+        begun, of_map = min(in_force), keyframes[: self.of_map]
+        tried = [each for each in placed if each.index >= begun and each.index in self.tried | in_force]
+        tried = tried[:: -(-len(tried) // _MOST)]
+        is_matched = np.isin([each.index for each in tried], list(in_force))
+        known = int((is_matched | are_in_sight(tried, of_map)).sum())
+        is_enough = len(in_force) >= _MIN_KEYFRAMES and is_matched.sum() >= MIN_SHARE * known
+        if self.is_given and known < _PATIENCE:
+            is_enough = True
+        return bool(is_enough) and not self._is_contradicted(placed[:: -(-len(placed) // _MOST)], keyframes)
+
+    def _is_contradicted(self, placed: Sequence[Keyframe], keyframes: Sequence[Keyframe]) -> bool:
+        """True if free space around keyframes at their poses in the map contradicts it, or they it."""
+        around = {each.index: each for each in nearest(placed, keyframes[: self.of_map])}
+        return is_contradicted(placed, list(around.values()))
 
     def _agrees(self, closure: Closure, keyframes: Sequence[Keyframe]) -> bool:
         """True if a closure implies the pose of its source that the first one does."""

@@ -6,8 +6,7 @@ from scanchain.registration.correlative import CorrelativeMap, ScoreGrid, Seed, 
 from scanchain.registration.matcher import Matcher, create_matcher
 from scanchain.registration.place_grid import PlaceGrid, PlaceSearch
 from scanchain.registration.plicp import PointToShapeMatcher
-from scanchain.registration.svd import DegeneratePairsError, rigid_transform
-from scanchain.registration.svd_icp import SvdMatcher
+from scanchain.registration.svd_icp import DegeneratePairsError, SvdMatcher, rigid_transform
 from scanchain.registration.voxel_map import VoxelMap
 
 __all__ = [

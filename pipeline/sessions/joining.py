@@ -23,7 +23,7 @@ from scanchain.words import counted
 _APART_M = 200.0  # path between the last keyframe of a map and the first of the next: no submap holds both
 _OPTIMIZE_EVERY, _GROWTH = 10, 0.05  # keyframes between two optimizations: at least so many, and such a share
 _MAX_TRIES = 5  # largest number of poses at which a map is tried
-_SAME_M, _SAME_RAD = 2.0, 0.2  # distance within which two of these are the same
+_SAME = 2.0, 0.2  # m and rad, distance within which two of these are the same
 _FOUND_M, _FOUND_RAD = 0.5, 0.05  # standard deviations of a pose that was found, and of one session to the next
 _IN_FORCE = 0.5  # least robust weight of a closure that joins two maps
 _MIN_CHANGE, _TIMES_WITHIN = 0.025, 3.0  # share of them from which on it is told, and times that within the maps
@@ -31,7 +31,7 @@ _WITHIN_M = 1.0  # least path between two keyframes of one map that are compared
 _CLEAR = 0.3  # share of a map's keyframes with such a closure from which on it is not sought elsewhere
 _RIVAL = 0.5  # share of the most such closures from which on those at another pose make it ambiguous
 _PATH_M, _STEP_M = 8.0, 2.0  # length of paths whose points are sought together, in the plane, and between two
-_AGREE_M, _AGREE_RAD = 0.5, 0.1  # largest difference between poses that confirm each other
+_AGREE = 0.5, 0.1  # m and rad, largest difference between poses that confirm each other
 _MAX_PATHS = 200  # largest number of these; along longer sessions they lie farther apart
 MAX_REPEATED = 0.25  # largest share of the agreeing paths that may look like another place
 _MIN_PATHS = 2  # least number of agreeing paths
@@ -149,7 +149,7 @@ def join(world: Joined, guest: Joined, config: Config, held: int = -1) -> Joined
     between = msgspec.structs.replace(config, loops=apart)  # no loop is as short as to lie within the guest
     old, tried, trials = len(world.keyframes), list[Matrix](), list[Joined]()
     for target, source, T_world_source in _sought(world, guest, between):
-        if any(_same(T_world_source, poses[source]) for poses in tried):
+        if any(_agree(T_world_source, poses[source], _SAME) for poses in tried):
             continue
         T_world_guest = lie.normalize(T_world_source @ lie.inverse(guest.poses[source]))
         trial = _Closing(world, guest, target, T_world_guest, between, held).finish()
@@ -422,11 +422,6 @@ def _overlap(joined: Joined, world: Joined) -> float:
     return len(_joining(joined, old)) / (len(joined.keyframes) - old)
 
 
-def _same(T_a: Pose, T_b: Pose) -> bool:
+def _agree(T_a: Pose, T_b: Pose, within: tuple[float, float] = _AGREE) -> bool:
     away_m, away_rad = lie.apart(T_a, T_b)
-    return away_m < _SAME_M and away_rad < _SAME_RAD
-
-
-def _agree(T_a: Pose, T_b: Pose) -> bool:
-    away_m, away_rad = lie.apart(T_a, T_b)
-    return away_m < _AGREE_M and away_rad < _AGREE_RAD
+    return away_m < within[0] and away_rad < within[1]

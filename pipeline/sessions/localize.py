@@ -31,7 +31,7 @@ from scanchain.runs.run import accuracy_of, opened, true_poses
 from scanchain.sessions.joining import MAX_REPEATED, repeated_paths
 from scanchain.sessions.localizer import Localization, Localizer, MapState
 from scanchain.settings import dump
-from scanchain.trajectory import write_tum
+from scanchain.trajectory import read_tum, write_tum
 from scanchain.verdict import Verdict
 from scanchain.whole_file import write_whole
 from scanchain.words import counted
@@ -42,6 +42,7 @@ _WITHOUT_MAP_M = {2: 2.0, 3: 10.0}  # shortest path without the map that is told
 _MOVED_M, _MOVED_SIGMAS = 0.3, 5.0  # between a pose as known at its time and in the end, that is told
 _COMPARED, _PATHS = 200, 12  # largest numbers of keyframes and of paths that are compared with the map in the end
 _MAX_UNMATCHED = 0.5  # largest share of the keyframes in sight of the map's that are not matched to it
+_APART_S = 1.0  # largest difference between the first scan and the nearest pose of a file
 _SHOWN = 3  # stretches that the verdict lists
 
 
@@ -307,6 +308,39 @@ def _verdict(found: Localization, prior: SavedMap, parts: tuple[Part, ...], doub
     more = len(doubtful) - len(largest)
     listed = [*filter(None, [doubt]), *(part.text for part in largest), *([f"and {more:,} more"] if more else [])]
     return Verdict.CHECK, "; ".join([where, *listed])
+
+
+def pose_near(x_m: float, y_m: float, yaw_deg: float) -> Initial:
+    """T_map_lidar at a position and heading; in space height and tilt are those of the nearest keyframe."""
+
+    def pose(stamp_ns: int, prior: SavedMap) -> Pose:
+        planar = lie.pose_2d(x_m, y_m, np.radians(yaw_deg))
+        if prior.dimension == 2:
+            return planar
+        poses = prior.poses
+        nearest = poses[np.argmin(np.hypot(poses[:, 0, 3] - x_m, poses[:, 1, 3] - y_m))]
+        T = lie.lift(planar)
+        turn = float(lie.yaw(lie.flatten(nearest)))
+        T[:3, :3] = T[:3, :3] @ lie.lift(lie.pose_2d(0.0, 0.0, -turn))[:3, :3] @ nearest[:3, :3]
+        T[2, 3] = nearest[2, 3]
+        return T
+
+    return pose
+
+
+def pose_in_file(path: Path) -> Initial:
+    """T_map_lidar of the first scan by a TUM file."""
+    trajectory = read_tum(path)
+
+    def pose(stamp_ns: int, prior: SavedMap) -> Pose:
+        nearest = int(np.argmin(np.abs(trajectory.stamps_ns - stamp_ns)))
+        away_s = abs(int(trajectory.stamps_ns[nearest]) - stamp_ns) * 1e-9
+        if away_s > _APART_S:
+            raise InputError(f"{path}: has no pose within {_APART_S:g} s of the first scan ({away_s:.1f} s away)")
+        T = trajectory.poses[nearest]
+        return lie.flatten(T) if prior.dimension == 2 else T
+
+    return pose
 
 
 def summary(localized: LocalizedLog, log: Log) -> str:

@@ -1,14 +1,15 @@
 """Localization in a map from nowhere: ``python -m tests.benchmarks.localize``.
 
-    [--world intel|aces|identical|elsewhere ...] [--starts N] [--half 0|1] [--cache DIR] [--verbose]
+    [--world intel|aces|identical ...] [--starts N] [--half 0|1] [--cache DIR] [--verbose]
 
 From each start a log begins anew, in a map of another log or of an earlier part of its own, and is processed until
-it is found and ``AFTER_M`` farther, or until it has traveled ``GIVE_UP_M``. Starts are evenly spread over places
+it is found and ``AFTER_M`` farther, or until it has traveled ``GIVE_UP_M``; logs of other places are run whole by
+``tests.benchmarks.foreign``. Starts are evenly spread over places
 that the map has seen: of the scans of the next ``SEEN_M`` the share ``SEEN_SHARE`` of points lies on its points.
 Maps, logs and references stay in the cache. --half takes every second start.
 
   found     travel until the first accepted closure to the map
-  wrong     a pose after that is more than 0.5 m or 5° off the reference, or the map is of another place
+  wrong     a pose after that is more than 0.5 m or 5° off the reference
   error     median over the scans after that. The reference is the truth of a simulated log; of a real one it is
             SLAM over the whole log, moved to the map's nearest keyframe
   time      CPU time a scan, over that of odometry alone on the same scans
@@ -50,7 +51,7 @@ FOUND_M = (5.0, 10.0)
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A map, a log to localize in it, and the poses of both by one reference; none where they are of two places.
+    """A map, a log to localize in it, and the poses of both by one reference.
 
     ``map_poses`` are those of the scans that the map was made of, ``poses`` of the log's, ``first`` is its first
     scan that may be started from.
@@ -58,8 +59,8 @@ class Case:
 
     map: SavedMap
     log: Path
-    map_poses: Matrix | None
-    poses: Matrix | None
+    map_poses: Matrix
+    poses: Matrix
     first: int = 0
 
 
@@ -112,32 +113,22 @@ def driven_twice(world: str, **options: float) -> Callable[[Path], Case]:
     return case
 
 
-def elsewhere(cache: Path) -> Case:
-    """A log of CSAIL, in the map of Intel."""
-    return Case(later_part("intel", 1400.0)(cache).map, DATA / "2d" / "mit_csail.mcap", None, None)
-
-
 WORLDS: dict[str, Callable[[Path], Case]] = {
     "intel": later_part("intel", 1400.0),
     "aces": later_part("aces", 700.0),
     "identical": driven_twice("identical"),
-    "elsewhere": elsewhere,
 }
 
 
-def in_map(case: Case) -> Matrix | None:
+def in_map(case: Case) -> Matrix:
     """(N, d+1, d+1) T_map_lidar of the log's scans by the reference, as seen from the map's nearest keyframe."""
-    if case.map_poses is None or case.poses is None:
-        return None
     reference = case.map_poses[[keyframe.scan_index for keyframe in case.map.keyframes]]
     nearest = cKDTree(reference[:, :-1, -1]).query(case.poses[:, :-1, -1])[1]
     return case.map.poses[nearest] @ lie.between(reference[nearest], case.poses)
 
 
-def starts_of(case: Case, scans: Sequence[Scan], poses: Matrix | None) -> NDArray[np.int64]:
+def starts_of(case: Case, scans: Sequence[Scan], poses: Matrix) -> NDArray[np.int64]:
     """Scans from which the log may begin."""
-    if poses is None:
-        return np.arange(case.first, len(scans) * 9 // 10)
     surfaces = cKDTree(np.vstack([lie.transform(k.T_odom_lidar, k.points[::2]) for k in case.map.keyframes]))
     stride = 5
     some = np.arange(case.first, len(scans), stride)
@@ -154,7 +145,7 @@ def starts_of(case: Case, scans: Sequence[Scan], poses: Matrix | None) -> NDArra
     return some[is_seen]
 
 
-def localized(case: Case, scans: Sequence[Scan], start: int, poses: Matrix | None) -> Outcome:
+def localized(case: Case, scans: Sequence[Scan], start: int, poses: Matrix) -> Outcome:
     """What becomes of the log that begins at this scan."""
     config, T_base_lidar = load_settings(case.map.dimension).config, open_log([case.log]).T_base_lidar
     slam, began_s = Slam(config, T_base_lidar, prior=case.map), time.process_time()
@@ -166,7 +157,7 @@ def localized(case: Case, scans: Sequence[Scan], start: int, poses: Matrix | Non
         count += 1
         traveled_m += 0.0 if T_last is None else lie.apart(T_last, step.T_odom_lidar)[0]
         T_last = step.T_odom_lidar
-        if np.isfinite(found_m) and poses is not None:
+        if np.isfinite(found_m):
             errors.append(lie.apart(poses[scan.index], step.T_world_lidar))
         is_found = any(c.verdict is ClosureVerdict.ACCEPTED and c.target < slam.first for c in step.closures)
         if is_found and np.isinf(found_m):
@@ -179,8 +170,8 @@ def localized(case: Case, scans: Sequence[Scan], start: int, poses: Matrix | Non
         odometry.process(scan)
     odometry_s = time.process_time() - began_s
     found = np.array(errors).reshape(-1, 2)
-    is_wrong = bool((found > (WRONG_M, WRONG_RAD)).any()) if poses is not None else np.isfinite(found_m)
-    return Outcome(found_m, found, bool(is_wrong), slam_s, odometry_s)
+    is_wrong = bool((found > (WRONG_M, WRONG_RAD)).any())
+    return Outcome(found_m, found, is_wrong, slam_s, odometry_s)
 
 
 def row(name: str, outcomes: Sequence[Outcome]) -> str:

@@ -141,6 +141,19 @@ def test_a_pose_in_a_map_that_further_keyframes_do_not_confirm_is_given_up():
     assert not evidence.is_gathering and not connected(segments, graph_of(16))[:3].any()
 
 
+@pytest.mark.parametrize(("away_m", "joins"), [(0.0, False), (30.0, True)])
+def test_keyframes_that_do_not_match_count_against_a_log_only_where_the_map_shows_them(away_m, joins):
+    at_m = [*[0.0] * 3, *[0.0] * 4, *[away_m] * 20]
+    keyframes = [
+        Keyframe(k, k, k, stored(square(4.0)), lie.pose_2d(x_m, 0.0, 0.0), 1.0) for k, x_m in enumerate(at_m)
+    ]
+    evidence = MapEvidence(Segments(), 3)
+    closure = Closure(0, 3, match_of(lie.identity(2)), 0.9, ClosureVerdict.REJECTED, "")
+    evidence.note([replace(closure, source=source) for source in range(3, 27)])
+    assert evidence.joins(keyframes[3:], {3, 4, 5, 6}, keyframes) is joins
+    assert not evidence.joins(keyframes[3:], {3, 4}, keyframes), "two are too few"
+
+
 def carried(slam, scans, first, last):
     """The result of a log of which some scans were not recorded, and the scans that start a segment."""
     starts = [

@@ -21,8 +21,7 @@ from scanchain import (
 )
 from scanchain.config import LogConfig
 from scanchain.maps import Edges, open_saved_map, write_saved_map
-from scanchain.sessions.initial import pose_near
-from scanchain.sessions.localize import measure
+from scanchain.sessions.localize import measure, pose_near
 from scanchain.sessions.localizer import MapState
 from scanchain.settings import load_settings
 from scanchain.verdict import Verdict
