@@ -23,6 +23,7 @@ _MARGIN_M, _MARGIN_SHARE = {2: 0.3, 3: 1.0}, 0.05  # by which ranges may differ,
 _IN_SIGHT = 0.3  # share of the points of a keyframe, from which on those in view of the map's nearest one show it
 _MOST = 200  # largest number of keyframes of a log that are compared, evenly spread over them
 _PATIENCE = 10  # number of new keyframes from which on a pose in the map that was not confirmed is given up
+_TESTED = 5  # number of tested ones from which on it is if too few of these agree
 _AGREE_M, _AGREE_RAD = 1.0, 0.1  # largest difference between the poses that two closures imply
 
 
@@ -93,6 +94,7 @@ class MapEvidence:
         self.waiting: list[Closure] = []
         self.begun = 0  # number of keyframes when the first of these came
         self.tested: set[int] = set()  # keyframes that were tried since
+        self.is_hopeless = False  # whether too few of them agree
 
     @property
     def is_gathering(self) -> bool:
@@ -109,8 +111,9 @@ class MapEvidence:
         self.waiting += accepted
         self.tested |= {each.source for each in closures}
         agreeing = [each for each in self.waiting if self._agrees(each, keyframes)]
-        sources = {each.source for each in agreeing}
-        if not are_enough(len(sources), len(self.tested | sources)):
+        sources, count = {each.source for each in agreeing}, len(self.tested)
+        self.is_hopeless = count >= _TESTED and len(sources) < MIN_SHARE * count
+        if not are_enough(len(sources), count):
             return ()
         placed = [replace(keyframes[c.source], T_odom_lidar=pose_in_map(c, c.source, keyframes)) for c in agreeing]
         if self._is_contradicted(placed, keyframes):
@@ -124,12 +127,12 @@ class MapEvidence:
 
     def is_in_vain(self, keyframes: Sequence[Keyframe]) -> bool:
         """True if enough keyframes passed without confirming the pose that is being tested."""
-        return self.is_gathering and len(keyframes) - self.begun > _PATIENCE
+        return self.is_gathering and (self.is_hopeless or len(keyframes) - self.begun > _PATIENCE)
 
     def reset(self) -> None:
         """Nothing waits, and no pose is being tested."""
         self.segments.is_assumed = False
-        self.waiting, self.tested = [], set()
+        self.waiting, self.tested, self.is_hopeless = [], set(), False
 
     def joins(self, placed: Sequence[Keyframe], in_force: set[int], keyframes: Sequence[Keyframe]) -> bool:
         """True if closures in force join the keyframes of a segment, at their final poses, to the map.

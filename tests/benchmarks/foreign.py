@@ -40,7 +40,7 @@ class Place:
     """A real log, or a simulated world, and what its map and its log are made of.
 
     ``mapped`` and ``again`` are options of ``run`` and ``localize``, or of ``simulate``, for the map and for the
-    log that is localized in its own place; ``options`` are those of both.
+    log that is localized in its own place; ``options`` are those of both. Those of one ``site`` are one place.
     """
 
     kind: str
@@ -50,14 +50,12 @@ class Place:
     options: dict[str, object] | None = None
     again: dict[str, object] | None = None
     mapped: dict[str, object] | None = None
+    site: str = ""
 
 
-def _real(log: str, end_s: float, other: str = "", **options: object) -> Place:
+def _real(log: str, end_s: float, **options: object) -> Place:
     """A log whose first seconds are the map of its own place, and the rest is localized in it."""
-    again = {} if other else {"log__start_s": end_s}
-    return Place(
-        log[:2], log, other=other, options=options, again=again, mapped={} if other else {"log__end_s": end_s}
-    )
+    return Place(log[:2], log, options=options, again={"log__start_s": end_s}, mapped={"log__end_s": end_s})
 
 
 def _plane(world: str, **again: object) -> Place:
@@ -73,7 +71,8 @@ PLACES = {
     "intel": _real("2d/intel.mcap", 1400.0),
     "aces": _real("2d/aces.mcap", 700.0),
     "csail": _real("2d/mit_csail.mcap", 212.0),
-    "mocap": _real("2d/mocap_room_1.bag", 0.0, "2d/mocap_room_2.bag"),
+    "mocap": Place("2d", "2d/mocap_room_1.bag", other="2d/mocap_room_2.bag", site="mocap"),
+    "mocap-2": Place("2d", "2d/mocap_room_2.bag", other="2d/mocap_room_1.bag", site="mocap"),
     "office": Place("2d", world="office", again={"changed": 1, "start_m": 20.0}),
     "identical": Place("2d", world="identical", again={"reverse": True, "start_m": 15.0}),
     "streets": _plane("town", changed=1, start_m=100.0),
@@ -166,7 +165,9 @@ def main() -> None:
         for guest in names:
             if options.places and guest not in options.places:
                 continue
-            for host in [guest] if options.own else [name for name in names if name != guest]:
+            site = PLACES[guest].site or guest
+            foreign = [name for name in names if (PLACES[name].site or name) != site]
+            for host in [guest] if options.own else foreign:
                 began_s = process_time()
                 word, line = outcome(guest, host, options.seed, options.cache, options)
                 counts[word] += 1
