@@ -2,7 +2,7 @@
 
 from scanchain.loops.closer import LoopCloser
 from scanchain.loops.closure_table import ClosureTable
-from scanchain.loops.outline import outline_of
+from scanchain.loops.outline import level_of, outline_of
 from scanchain.loops.refinement import refined, spread
 
-__all__ = ["ClosureTable", "LoopCloser", "outline_of", "refined", "spread"]
+__all__ = ["ClosureTable", "LoopCloser", "level_of", "outline_of", "refined", "spread"]
