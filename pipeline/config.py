@@ -92,8 +92,8 @@ class PreprocessConfig(Section, frozen=True, forbid_unknown_fields=True):
     min_range_m : returns nearer than this are not used
     max_range_m : returns farther than this are not used
     deskew : whether the motion of the lidar during a scan is removed, where its points have times
-    calibrate_elevation : whether a constant error of the lidar's vertical angles is estimated from its first scans
-        that move, and corrected from then on
+    calibrate_elevation : whether a constant error of the lidar's vertical angles is estimated as it moves, through
+        the whole log, and corrected
     map_voxel_m : voxel size to which scans are downsampled before they are inserted into the local map
     match_voxel_m : largest voxel size to which scans are downsampled before they are matched
     match_points : number of points to match; the voxels of matching shrink, down to those of the map, until

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -62,7 +63,8 @@ class SlamResult:
 
     ``trajectory`` and ``odometry`` hold every scan, T_world_lidar after and before optimization; ``keyframes``
     the scans that stand in the ``graph``; ``closures`` every loop closure tried. ``elevation_offset_rad`` is what
-    the vertical angles of the lidar were corrected by, from the scan ``calibrated_from`` on; 0 as a rule.
+    the vertical angles of the lidar were corrected by, from the scan ``calibrated_from`` on; 0 as a rule;
+    ``elevation_sigma_rad`` its standard deviation, infinite where none was estimated.
     ``map_errors`` are those of the keyframes against the map.
     ``components`` (K,) numbers the pieces that the keyframes belong to, which no loop joins; one as a rule.
     """
@@ -76,6 +78,7 @@ class SlamResult:
     components: NDArray[np.int64]
     map_errors: MapErrors
     elevation_offset_rad: float = 0.0
+    elevation_sigma_rad: float = math.inf
     calibrated_from: int = 0
 
     @property
@@ -247,6 +250,7 @@ class Slam:
             components=self.closer.segments.components(self.graph),
             map_errors=self.map_errors,
             elevation_offset_rad=self.front_end.odometry.elevation.offset_rad,
+            elevation_sigma_rad=self.front_end.odometry.elevation.sigma_rad,
             calibrated_from=self.front_end.odometry.calibrated_from,
         )
 

@@ -3,7 +3,7 @@
 from scanchain.loops.closer import LoopCloser
 from scanchain.loops.closure_table import ClosureTable
 from scanchain.loops.evidence import MapEvidence
-from scanchain.loops.outline import outline_of
+from scanchain.loops.outline import level_of, outline_of
 from scanchain.loops.refinement import refined, spread
 
-__all__ = ["ClosureTable", "LoopCloser", "MapEvidence", "outline_of", "refined", "spread"]
+__all__ = ["ClosureTable", "LoopCloser", "MapEvidence", "level_of", "outline_of", "refined", "spread"]

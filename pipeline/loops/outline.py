@@ -51,7 +51,7 @@ def outline_of(folder: Path, keyframes: Sequence[Keyframe], config: LocalMapConf
     if stored is not None:
         return stored
     size_m = config.voxel_size_m * float(np.median([keyframe.scale for keyframe in keyframes]))
-    T_map_level = _level(keyframes, config)
+    T_map_level = level_of(keyframes, [keyframe.T_odom_lidar for keyframe in keyframes], config)
     outline = Outline(T_map_level, _columns(keyframes, lie.inverse(T_map_level), size_m), size_m)
     data = io.BytesIO()
     np.savez(
@@ -78,10 +78,11 @@ def _stored(path: Path, count: int) -> Outline | None:
         return None
 
 
-def _level(keyframes: Sequence[Keyframe], config: LocalMapConfig) -> Pose:
-    """T_map_level by the ground around some of the keyframes."""
-    chosen = keyframes[:: max(-(-len(keyframes) // _MAX_LEVELED), 1)]
-    up = sum((k.T_odom_lidar[:3, :3] @ level_frame(k, config)[:3, 2] for k in chosen), np.zeros(3))
+def level_of(keyframes: Sequence[Keyframe], poses: Sequence[Pose] | Matrix, config: LocalMapConfig) -> Pose:
+    """T_map_level by the ground around some of the keyframes, whose poses in the map these are."""
+    step = max(-(-len(keyframes) // _MAX_LEVELED), 1)
+    chosen = zip(keyframes[::step], poses[::step], strict=True)
+    up = sum((T[:3, :3] @ level_frame(k, config)[:3, 2] for k, T in chosen), np.zeros(3))
     return upright_frame(up / np.linalg.norm(up))
 
 

@@ -6,26 +6,29 @@ import math
 from dataclasses import replace
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.data import Matrix, Points, Pose
+from scanchain.config import PreprocessConfig
+from scanchain.data import Matrix, Points, Pose, Scan
+from scanchain.kernels.registration.plane_adjustment import plane_equations, planes
 from scanchain.preprocess import Sweep
+from scanchain.preprocess.sweep import sweep_of
 from scanchain.registration.correlative import evenly
 
-_SCANS = 8  # number of scans that are adjusted together
-_SPACING_VOXELS = 2.0  # least distance between two of them
-_POINTS = 4000  # largest number of points of each, evenly spread
-_ROUNDS, _STEP_RAD = 8, 1e-4  # largest number of Gauss-Newton steps, and the step at which they end
-_FEWEST, _FEWEST_SCANS = 8, 3  # least number of points in a cell that counts as a plane, and of scans that see it
-_THIN, _FLAT, _WIDE = 0.02, 0.15, 0.1  # of a plane: ratio of its variances, largest and least deviation in voxels
-_TUKEY = 1.5 / 0.6745  # scale of the robust weight over the median residual
+_FIRST, _LATER = (14, 0.6), (16, 0.9)  # scans adjusted together, and distance of two in cells: soon, then well
+_CELL_M, _POINT_M = 1.0, 0.3  # edge of a cell, and of the voxels to which scans are downsampled
+_RANGE_CELLS = 14.0  # least number of cells that the median range spans: they are small in narrow surroundings
+_SMALLEST = 0.125  # smallest factor by which they shrink
+_POINTS = 7000  # largest number of points of each scan, evenly spread
+_ROUNDS, _STEP_RAD, _TURN_RAD = 5, 6e-4, 1e-3  # most Gauss-Newton steps, offset and turns of the last of them
+_KERNEL = 1.5 / 0.6745  # scale of the robust weight over the median residual
 _RIDGE = 1e-6  # keeps directions that no plane sees from a division by zero
-_LEAST_RAD = math.radians(0.05)  # smallest offset that is corrected
+_SCATTER_RAD = math.radians(0.02)  # standard deviation assumed of a window, beyond its own, before others are seen
+_SHARED_RAD = math.radians(0.01)  # the part of it that is in every window's weight
+_LEAST_RAD, _SIGMAS = math.radians(0.03), 4.0  # smallest offset that is corrected, and its least significance
 _LARGEST_RAD = math.radians(1.0)  # largest one that is believed
-_SIGMAS, _LARGEST_SIGMA_RAD = 5.0, math.radians(0.02)  # significance of an offset, and its largest σ
-_WINDOWS = 6  # largest number of estimates
 
 
 class Adjustment(NamedTuple):
@@ -35,38 +38,27 @@ class Adjustment(NamedTuple):
     offset_rad: float
     sigma_rad: float
 
-    @property
-    def is_significant(self) -> bool:
-        """True if the offset is well known, worth a correction, and not beyond belief."""
-        least = max(_LEAST_RAD, _SIGMAS * self.sigma_rad)
-        return self.is_accurate and least < abs(self.offset_rad) < _LARGEST_RAD
-
-    @property
-    def is_accurate(self) -> bool:
-        """True if the offset is known well enough to be corrected."""
-        return self.sigma_rad < _LARGEST_SIGMA_RAD
-
-    @property
-    def shows_none(self) -> bool:
-        """True if there is no offset worth a correction."""
-        return self.is_accurate and abs(self.offset_rad) < _LEAST_RAD
-
 
 class ElevationCalibration:
-    """The elevation offset of a lidar, estimated a few times as it moves.
+    """The elevation offset of a lidar, estimated again and again as it moves, ever more seldom.
 
     Ground seen from afar lies too high or too low by the offset times the distance, and a map of such points
     pitches every scan that is aligned to it: an offset of 0.2°, as in KITTI, by 0.01° per meter.
 
     Attributes
     ----------
-    offset_rad : what points are corrected by
+    offset_rad : what points are corrected by: the mean of the windows where it is significant, else 0
+    sigma_rad : standard deviation of that mean, by the scatter of the windows; infinite before the first one
     """
 
-    def __init__(self, *, is_wanted: bool) -> None:
-        self.offset_rad = 0.0
-        self.windows_left = _WINDOWS if is_wanted else 0
-        self.collected: list[tuple[Points, Pose]] = []
+    def __init__(self, config: PreprocessConfig, *, is_wanted: bool) -> None:
+        self.config = msgspec.structs.replace(config, map_voxel_m=_POINT_M)
+        self.is_wanted = is_wanted
+        self.offset_rad, self.sigma_rad = 0.0, math.inf
+        self.scale = 1.0
+        self.windows = 0
+        self.estimates: list[tuple[float, float]] = []  # offset and σ of each window
+        self.forget()
 
     def corrected(self, sweep: Sweep) -> Sweep:
         """The sweep with its points raised by the offset."""
@@ -74,143 +66,103 @@ class ElevationCalibration:
 
     def forget(self) -> None:
         """Forget the scans that were collected: the next pose does not follow from theirs."""
-        self.collected = []
+        self.T_odom_last: Pose | None = None
+        self.left_out = 0
+        self.collected: list[tuple[Points, Points, Pose]] = []
 
-    def take(self, points: Points, T_odom_lidar: Pose, voxel_m: float) -> list[tuple[Points, Pose]]:
-        """Collect a scan (N, 3), deskewed; empty unless it completes a window with a significant offset.
+    def take(self, scan: Scan, points: Points, T_odom_lidar: Pose, velocity: Matrix) -> list[tuple[Points, Pose]]:
+        """Collect a scan; empty unless it completes a window that changes the offset by as much as matters.
 
-        Then ``offset_rad`` includes it, and the scans of the window are returned, corrected, with adjusted poses,
-        of which the last one stays as it was.
+        Then the scans of the window are returned, corrected, with adjusted poses, of which the last one stays as
+        it was. After n windows n scans are left out, and any without a velocity, as the first one.
+
+        points : (N, 3) of the map, deskewed and corrected; velocity : (6,) by which the scan is deskewed
         """
-        if not self.windows_left:
+        if not self.is_wanted or not velocity.any():
             return []
-        if self.collected and lie.apart(self.collected[-1][1], T_odom_lidar)[0] < _SPACING_VOXELS * voxel_m:
+        scans, spacing = _LATER if self.windows else _FIRST
+        spacing_m = spacing * self.scale * _CELL_M
+        if self.T_odom_last is not None and lie.apart(self.T_odom_last, T_odom_lidar)[0] < spacing_m:
             return []
-        self.collected.append((points, T_odom_lidar))
-        if len(self.collected) < _SCANS:
+        self.T_odom_last = T_odom_lidar
+        if self.left_out < self.windows:
+            self.left_out += 1
             return []
-        clouds, poses = zip(*self.collected, strict=True)
-        adjustment = adjusted([evenly(cloud, _POINTS) for cloud in clouds], np.array(poses), voxel_m)
-        self.windows_left = 0 if adjustment.shows_none else self.windows_left - 1
-        self.forget()
-        if not adjustment.is_significant:
+        own = sweep_of(scan, self.config, self.scale).from_middle(velocity)
+        if not self.collected and len(own):
+            octaves = round(math.log2(float(np.median(np.linalg.norm(own, axis=1))) / (_RANGE_CELLS * _CELL_M)))
+            self.scale = min(max(2.0**octaves, _SMALLEST), 1.0)
+        self.collected.append((evenly(own, _POINTS), points, T_odom_lidar))
+        return self._adjust() if len(self.collected) == scans else []
+
+    def _adjust(self) -> list[tuple[Points, Pose]]:
+        own, clouds, poses = zip(*self.collected, strict=True)
+        found = adjusted(list(own), np.array(poses), self.scale * _CELL_M, self.offset_rad)
+        self.windows += 1
+        self.left_out, self.collected = 0, []
+        if not math.isfinite(found.sigma_rad) or abs(found.offset_rad) > _LARGEST_RAD:
             return []
-        self.offset_rad += adjustment.offset_rad
-        corrected = (raised(cloud, adjustment.offset_rad) for cloud in clouds)
-        return list(zip(corrected, adjustment.poses, strict=True))
+        self.estimates.append((found.offset_rad, found.sigma_rad))
+        mean_rad, self.sigma_rad = _combined(np.array(self.estimates))
+        is_significant = abs(mean_rad) > max(_LEAST_RAD, _SIGMAS * self.sigma_rad)
+        before_rad, self.offset_rad = self.offset_rad, mean_rad if is_significant else 0.0
+        change_rad = self.offset_rad - before_rad
+        if abs(change_rad) < _LEAST_RAD:
+            return []
+        corrected = (raised(cloud, change_rad) for cloud in clouds)
+        return list(zip(corrected, found.poses, strict=True))
+
+
+def _combined(estimates: Matrix) -> tuple[float, float]:
+    """Mean of windows (n, 2), each an offset and its σ, and its standard deviation.
+
+    Beyond their own σ windows scatter, as the scans of one share distortions: by as much as they are seen to, and
+    by what is assumed of one of them.
+    """
+    offset_rad, variance = estimates[:, 0], estimates[:, 1] ** 2
+    weight = 1.0 / (variance + _SHARED_RAD**2)
+    weight /= weight.max()
+    mean_rad = float(weight @ offset_rad / weight.sum())
+    scatter = (_SCATTER_RAD**2 + weight @ (offset_rad - mean_rad) ** 2) / weight.sum() ** 2
+    return mean_rad, math.sqrt(scatter + 1.0 / (1.0 / variance).sum())
 
 
 def raised(points: Points, offset_rad: float) -> Points:
     """Points (N, 3) in the lidar frame with their elevation angles raised."""
-    return math.cos(offset_rad) * points + math.sin(offset_rad) * _upward(points)
-
-
-def _upward(points: Points) -> Points:
-    """Derivative (N, 3) of points by their elevation angle."""
     range_m = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-9)
     slope = points[:, 2] / range_m
-    return np.column_stack([-slope * points[:, 0], -slope * points[:, 1], range_m])
+    upward = np.column_stack([-slope * points[:, 0], -slope * points[:, 1], range_m])
+    return math.cos(offset_rad) * points + math.sin(offset_rad) * upward
 
 
-def adjusted(scans: list[Points], poses: Matrix, voxel_m: float) -> Adjustment:
+def adjusted(scans: list[Points], poses: Matrix, cell_m: float, offset_rad: float = 0.0) -> Adjustment:
     """Poses and elevation offset with which the planes that several scans (N, 3) see are thinnest.
 
-    Gauss-Newton over all poses and the offset δ: with p(δ) the raised point of scan k, the residuals are the
-    distances n·(T_k p(δ) − mean) in the cells of a grid whose points, of at least three scans, lie in a plane
-    (plane adjustment; Liu and Zhang 2021). The shape of the ground does not matter: all scans see the same.
+    Gauss-Newton over all poses and the offset δ, from ``offset_rad`` on: with p(δ) the raised point of scan k, the
+    residuals are the distances of T_k p(δ) from the planes, free too, of cells of a grid whose points, of at least
+    three scans, are flat (plane adjustment; Liu and Zhang 2021). The ground may have any shape.
     """
     points, number = np.concatenate(scans), np.repeat(np.arange(len(scans)), [len(scan) for scan in scans])
-    offset_rad, sigma_rad, last = 0.0, math.inf, poses[-1]
+    if not len(points):
+        return Adjustment(poses, 0.0, math.inf)
+    sigma_rad, last, n, size = math.inf, poses[-1], len(points), 6 * len(poses) + 1
+    lifted, beside, normals = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
+    residual, plane = np.empty(n), np.empty(n, np.int32)
     for _ in range(_ROUNDS):
-        equations = _linearized(raised(points, offset_rad), number, poses, voxel_m)
-        if equations is None:
+        count = planes(points, number, poses, offset_rad, cell_m, lifted, beside, residual, plane, normals)
+        if not count:
             return Adjustment(poses, 0.0, math.inf)
-        H, b, variance = equations
-        inverse = np.linalg.inv(H)
-        step = -inverse @ b
+        scale_m = max(_KERNEL * float(np.median(np.abs(residual[plane >= 0]))), 1e-6)
+        H, b = np.zeros((size, size)), np.zeros(size)
+        of_planes = plane, beside, residual, normals[:count]
+        variance, gain = plane_equations(lifted, number, *of_planes, poses, scale_m, H, b)
+        inverse = np.linalg.inv(H + _RIDGE * np.trace(H) / size * np.eye(size))
+        step = -gain * inverse @ b
         sigma_rad = math.sqrt(variance * inverse[-1, -1])
         offset_rad += float(step[-1])
-        poses = poses @ lie.exp(step[:-1].reshape(len(poses), 6))
-        if abs(step[-1]) < _STEP_RAD or abs(offset_rad) > _LARGEST_RAD:
+        twists = step[:-1].reshape(len(poses), 6)
+        poses = poses @ lie.exp(twists)
+        has_converged = abs(step[-1]) < _STEP_RAD and np.abs(twists[:, 3:]).max() < _TURN_RAD
+        if has_converged or abs(offset_rad) > _LARGEST_RAD:
             break
     return Adjustment(last @ lie.between(poses[-1], poses), offset_rad, sigma_rad)
-
-
-def _linearized(
-    points: Points, number: NDArray[np.intp], poses: Matrix, voxel_m: float
-) -> tuple[Matrix, NDArray[np.float64], float] | None:
-    """Normal equations H (6K + 1, 6K + 1), b and variance of the residuals; None where there is no plane."""
-    R = poses[number, :3, :3]
-    world = np.einsum("nij,nj->ni", R, points) + poses[number, :3, 3]
-    cell, chosen, normals, centered = _planes(world, number, len(poses), voxel_m)
-    if not len(cell):
-        return None
-    number, points, R = number[chosen], points[chosen], R[chosen]
-    residual = np.einsum("ni,ni->n", normals, centered)
-    along = np.einsum("nij,ni->nj", R, normals)  # the normal in the scan's frame
-    jacobian = np.column_stack(
-        [along, np.cross(points, along), np.einsum("ni,ni->n", along, _upward(points))]
-    )  # of the twist of T_k, T_k exp(ξ), and of the offset
-    scale = max(_TUKEY * float(np.median(np.abs(residual))), 1e-6)
-    weight = 1.0 / (1.0 + (residual / scale) ** 2) ** 2
-    k, cells = len(poses), int(cell.max()) + 1
-    size = 6 * k + 1
-    H, b = np.zeros((size, size)), np.zeros(size)
-    weighted = weight[:, None] * jacobian
-    for scan in range(k):
-        own = number == scan
-        columns = np.r_[6 * scan : 6 * scan + 6, size - 1]
-        H[np.ix_(columns, columns)] += weighted[own].T @ jacobian[own]
-        b[columns] += np.einsum("ni,n->i", weighted[own], residual[own])
-    # of the weighted Jacobians: the mean of a plane moves with its points; (cells, scans, 6) and (cells,)
-    of_poses = np.stack([np.bincount(cell * k + number, each, cells * k) for each in weighted.T[:6]], axis=-1)
-    of_poses, of_offset = of_poses.reshape(cells, k, 6), np.bincount(cell, weighted[:, -1], cells)
-    of_residual = np.bincount(cell, weight * residual, cells)
-    share = 1.0 / np.bincount(cell, weight, cells)
-    mean = of_poses * share[:, None, None]
-    # scan by scan: products so small are computed in one thread, to the same bits on every machine
-    among = np.matmul(mean.transpose(1, 2, 0)[:, None], of_poses.transpose(1, 0, 2)[None])
-    H[:-1, :-1] -= among.transpose(0, 2, 1, 3).reshape(size - 1, size - 1)
-    with_offset = np.einsum("ckj,c->kj", mean, of_offset).ravel()
-    H[:-1, -1] -= with_offset
-    H[-1, :-1] -= with_offset
-    H[-1, -1] -= (share * of_offset**2).sum()
-    b[:-1] -= np.einsum("ckj,c->kj", mean, of_residual).ravel()
-    b[-1] -= (share * of_offset * of_residual).sum()
-    H += _RIDGE * np.trace(H) / size * np.eye(size)
-    return H, b, float((weight * residual**2).sum() / weight.sum())
-
-
-def _planes(
-    world: Points, number: NDArray[np.intp], scans: int, voxel_m: float
-) -> tuple[NDArray[np.intp], NDArray[np.intp], Points, Points]:
-    """Points that lie in planes: numbers of the cells, of the points, normals, and vectors from the means."""
-    corner = np.floor(world / voxel_m).astype(np.int64)
-    corner -= corner.min(axis=0)
-    spans = corner.max(axis=0) + 1
-    key = (corner[:, 0] * spans[1] + corner[:, 1]) * spans[2] + corner[:, 2]
-    _, cell, count = np.unique(key, return_inverse=True, return_counts=True)
-    seen = np.bincount(np.unique(cell * scans + number) // scans, minlength=len(count))
-    is_rich = (count >= _FEWEST) & (seen >= _FEWEST_SCANS)
-    chosen = np.flatnonzero(is_rich[cell])
-    cell = (np.cumsum(is_rich) - 1)[cell[chosen]]
-    centered, normals, is_plane = _shapes(world[chosen], cell, int(is_rich.sum()), voxel_m)
-    inside = is_plane[cell]
-    cell, chosen = (np.cumsum(is_plane) - 1)[cell[inside]], chosen[inside]
-    return cell, chosen, normals[is_plane][cell], centered[inside]
-
-
-def _shapes(
-    world: Points, cell: NDArray[np.intp], cells: int, voxel_m: float
-) -> tuple[Points, Points, NDArray[np.bool_]]:
-    """Vectors (N, 3) of points from the means of their cells; normals (C, 3), and which cells are planes."""
-    count = np.bincount(cell, minlength=cells)
-    mean = np.column_stack([np.bincount(cell, world[:, axis], cells) for axis in range(3)]) / count[:, None]
-    centered = world - mean[cell]
-    covariance = np.empty((cells, 3, 3))
-    for i in range(3):
-        for j in range(3):
-            covariance[:, i, j] = np.bincount(cell, centered[:, i] * centered[:, j], cells) / count
-    values, vectors = np.linalg.eigh(covariance)
-    is_plane = (values[:, 0] < _THIN * values[:, 1]) & (values[:, 0] < (_FLAT * voxel_m) ** 2)
-    return centered, vectors[:, :, 0], is_plane & (values[:, 1] > (_WIDE * voxel_m) ** 2)

@@ -82,7 +82,8 @@ class Metrics(Struct, frozen=True):
     poses free.
     ``verdict`` is the reliability of the result, ``verdict_reason`` the reason, ``stretches`` are what to look at.
     ``elevation_offset_rad`` is what the lidar's vertical angles were corrected by from the scan
-    ``calibrated_from`` on; 0 where no error was found.
+    ``calibrated_from`` on; 0 where no error was found; ``elevation_sigma_rad`` its standard deviation, null where
+    none was estimated.
     ``odometry_errors`` : drift, slips and jumps of odometry that loop closures show, corrected in the graph
     ``warnings`` : data lost, skipped or wrong, a line each
     """
@@ -124,6 +125,7 @@ class Metrics(Struct, frozen=True):
     stopped: str = ""
     compile_s: float = 0.0
     elevation_offset_rad: float = 0.0
+    elevation_sigma_rad: float | None = None
     calibrated_from: int = 0
     odometry_errors: tuple[str, ...] = ()
 
@@ -238,6 +240,7 @@ def measure(
         warnings=tuple(warnings),
         compile_s=compile_s,
         elevation_offset_rad=result.elevation_offset_rad,
+        elevation_sigma_rad=result.elevation_sigma_rad if math.isfinite(result.elevation_sigma_rad) else None,
         calibrated_from=result.calibrated_from,
         odometry_errors=tuple(result.graph.corrections(scan_numbers, "scans")),
     )
@@ -323,10 +326,10 @@ def accuracy_lines(truth: GroundTruth) -> list[str]:
 
 
 def _calibration_lines(m: Metrics) -> list[str]:
-    if not m.elevation_offset_rad:
+    if not m.elevation_offset_rad or m.elevation_sigma_rad is None:
         return []
-    offset_deg = math.degrees(m.elevation_offset_rad)
+    offset_deg, sigma_deg = math.degrees(m.elevation_offset_rad), math.degrees(m.elevation_sigma_rad)
     return [
-        f"calibration    vertical angles corrected by {offset_deg:+.2f} deg from scan {m.calibrated_from:,} on "
-        "(preprocess.calibrate_elevation)"
+        f"calibration    vertical angles corrected by {offset_deg:+.2f} ± {sigma_deg:.2f} deg from scan "
+        f"{m.calibrated_from:,} on (preprocess.calibrate_elevation)"
     ]

@@ -109,7 +109,15 @@ def process(
         slam.points.close()
         held_s = _hold(recording, progress)
         progress.say("writing the rest of the recording")
-    return Processed(result, results.cloud, final, judged, results.expected, (*notes, *recording.warnings), held_s)
+    return Processed(
+        result,
+        results.cloud,
+        final,
+        judged,
+        results.expected,
+        (*notes, *results.warnings, *recording.warnings),
+        held_s,
+    )
 
 
 class _Taking:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import math
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,13 +13,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from scanchain import lie
 from scanchain.config import Config, MapsConfig
 from scanchain.data import Keyframe, Matrix, Points, Pose
 from scanchain.errors import InputError
 from scanchain.evaluation import ExpectedErrors, expected_errors
 from scanchain.graph.files.g2o_write import rejected_path, write_g2o
 from scanchain.logs import Log
-from scanchain.loops import outline_of
+from scanchain.loops import level_of, outline_of
 from scanchain.maps import (
     MAP_FOLDER,
     Edges,
@@ -44,6 +46,7 @@ from scanchain.slam import SlamResult
 from scanchain.trajectory import write_kitti, write_tum, write_wide_tum
 
 GRAPH_FILE = "graph.g2o"  # the edges in force; rejected ones go to graph_rejected.g2o, if there are any
+_TILTED_RAD = math.radians(5.0)  # tilt of the lidar's first frame to the ground from which on it is said
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +61,8 @@ class Cloud:
 class Results:
     """Everything known after the last scan of a log: the input of the files of a run directory.
 
-    ``drawn`` is the cloud as it is drawn in a thread beside, while the files without it are written.
+    ``drawn`` is the cloud as it is drawn in a thread beside, while the files without it are written. The ``grid``
+    is level in space: ``T_world_level`` (4, 4) turns its z axis to that of the world, along the first lidar's.
     """
 
     log: Log
@@ -69,11 +73,23 @@ class Results:
     drawn: Future[Cloud]
     grid: OccupancyGrid
     expected: ExpectedErrors | None
+    T_world_level: Pose
 
     @property
     def cloud(self) -> Cloud:
         """The cloud, waited for."""
         return self.drawn.result()
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What holds for the maps but not for the trajectory."""
+        tilt_rad = math.acos(min(self.T_world_level[-2, -2], 1.0))
+        if tilt_rad < _TILTED_RAD:
+            return ()
+        return (
+            f"the lidar began tilted by {math.degrees(tilt_rad):.0f} deg to the ground: map.pgm is level, "
+            "trajectory and point cloud are in the frame that the lidar began in",
+        )
 
 
 class Output(NamedTuple):
@@ -130,7 +146,7 @@ OUTPUTS = (  # a new format: a function of path and Results in a file of its own
     Output("map.laz", lambda path, r: write_laz(path, r.cloud.points), lambda config: config.maps.write_laz),
     Output(  # after the maps, which it reads
         "results.mcap",
-        lambda path, r: write_results_mcap(path, r.log, r.steps, r.result),
+        lambda path, r: write_results_mcap(path, r.log, r.steps, r.result, r.T_world_level),
         lambda config: config.outputs.mcap,
     ),
 )
@@ -143,9 +159,11 @@ def results_of(
     beside = ThreadPoolExecutor(1, thread_name_prefix="scanchain-cloud")
     drawn = beside.submit(cloud_of, result, config)
     beside.shutdown(wait=False)
-    return Results(
-        log, config, steps, result, final, drawn, grid_of(result, config.maps), _expected(result, config)
-    )
+    T_world_level = lie.identity(log.dimension)
+    if log.dimension == 3:
+        T_world_level = level_of(result.keyframes, result.T_world_keyframes, config.local_map)
+    grid = grid_of(result, config.maps, lie.inverse(T_world_level))
+    return Results(log, config, steps, result, final, drawn, grid, _expected(result, config), T_world_level)
 
 
 def _expected(result: SlamResult, config: Config) -> ExpectedErrors | None:
@@ -201,7 +219,8 @@ class Posed(Protocol):
 def cloud_of(result: Posed, config: Config) -> Cloud:
     """The cloud of all keyframes, without moving objects if so configured."""
     dimension = result.T_world_keyframes.shape[-1] - 1
-    built = build_point_map(_scans(result), dimension=dimension, voxel_size_m=config.maps.voxel_size_m)
+    scans = zip(result.T_world_keyframes, (keyframe.points for keyframe in result.keyframes), strict=True)
+    built = build_point_map(scans, dimension=dimension, voxel_size_m=config.maps.voxel_size_m)
     points = built.points()
     if not config.maps.remove_moving:
         return Cloud(points, 0)
@@ -213,16 +232,11 @@ def cloud_of(result: Posed, config: Config) -> Cloud:
     return Cloud(points[~gone], int(gone.sum()))
 
 
-def grid_of(result: Posed, config: MapsConfig) -> OccupancyGrid:
-    """The grid of all keyframes, coarser than configured where the world is too large."""
-    resolution_m = fitting_resolution(
-        result.T_world_keyframes, resolution_m=config.grid_resolution_m, max_range_m=config.grid_max_range_m
-    )
+def grid_of(result: Posed, config: MapsConfig, T_grid_world: Pose | None = None) -> OccupancyGrid:
+    """The grid of all keyframes, in a frame or the world, coarser than configured where that is too large."""
+    poses = result.T_world_keyframes if T_grid_world is None else T_grid_world @ result.T_world_keyframes
+    max_range_m = config.grid_max_range_m
+    resolution_m = fitting_resolution(poses, resolution_m=config.grid_resolution_m, max_range_m=max_range_m)
     fitting = msgspec.structs.replace(config, grid_resolution_m=resolution_m)
-    return draw_grid(_scans(result), fitting, max_range_m=config.grid_max_range_m)
-
-
-def _scans(result: Posed) -> Iterator[tuple[Pose, Points]]:
-    """Keyframes with their optimized poses."""
-    for pose, keyframe in zip(result.T_world_keyframes, result.keyframes, strict=True):
-        yield pose, keyframe.points
+    scans = ((pose, keyframe.points) for pose, keyframe in zip(poses, result.keyframes, strict=True))
+    return draw_grid(scans, fitting, max_range_m=max_range_m)

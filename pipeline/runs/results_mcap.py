@@ -12,7 +12,6 @@ from scanchain.data import Matrix, Points, Pose
 from scanchain.logs import Log
 from scanchain.logs.mounting import MovingFrame, moving_frame
 from scanchain.logs.writing.pack import (
-    ORIGIN,
     Link,
     pack_cloud,
     pack_grid,
@@ -30,11 +29,12 @@ _WORLD, _ODOM = "world", "odom"
 _PLANAR = [0, 1, 5]  # x, y, yaw among x, y, z, roll, pitch, yaw
 
 
-def write_results_mcap(path: Path, log: Log, steps: StepTable, result: SlamResult) -> None:
+def write_results_mcap(path: Path, log: Log, steps: StepTable, result: SlamResult, T_world_grid: Pose) -> None:
     """Write /tf and /odometry scan by scan, and /path, /map and /map_cloud at the log time of the first.
 
     world → odom is the correction by loop closures, odom → the robot the odometry; the robot's frame is the root
-    of the log's fixed transforms, so that the log's own sensors follow it. The maps are those beside it.
+    of the log's fixed transforms, so that the log's own sensors follow it. The maps are those beside it, the grid
+    in a frame of its own.
     """
     moving = moving_frame(log.indexes, log.lidar, log.mounting, dimension=log.dimension)
     first = next(steps.rows)
@@ -44,8 +44,10 @@ def write_results_mcap(path: Path, log: Log, steps: StepTable, result: SlamResul
         places = [place(T @ moving.T_lidar_frame) for T in trajectory.poses]
         data = pack_path(first_ns, _WORLD, trajectory.stamps_ns.tolist(), places)
         writer.append("/path", "nav_msgs/msg/Path", data, first_ns, first_log_ns)
-        cells, resolution_m, (x_m, y_m) = read_map(path.parent)
-        data = pack_grid(first_ns, _WORLD, cells, resolution_m, ORIGIN._replace(x=x_m, y=y_m))
+        cells, resolution_m, origin_m = read_map(path.parent)
+        T_grid_corner = lie.identity(log.dimension)
+        T_grid_corner[:2, -1] = origin_m
+        data = pack_grid(first_ns, _WORLD, cells, resolution_m, place(T_world_grid @ T_grid_corner))
         writer.append("/map", "nav_msgs/msg/OccupancyGrid", data, first_ns, first_log_ns)
         data = pack_cloud(first_ns, _WORLD, _rows(read_ply(path.with_name("map.ply"))))
         writer.append("/map_cloud", "sensor_msgs/msg/PointCloud2", data, first_ns, first_log_ns)

@@ -1,5 +1,8 @@
 """Maps: kernels equal their slow twins, files mean to others what the grid means to us."""
 
+import math
+from dataclasses import replace
+
 import laspy
 import numpy as np
 import pytest
@@ -10,6 +13,7 @@ from scanchain import lie
 from scanchain.baselines.open3d_pairs import Open3dPairs
 from scanchain.config import MapsConfig
 from scanchain.errors import InputError
+from scanchain.logs import open_log
 from scanchain.logs.formats.cloud_file import read_pcd
 from scanchain.maps import (
     OccupancyGrid,
@@ -24,9 +28,12 @@ from scanchain.maps import (
     write_pcd,
     write_ply,
 )
-from scanchain.maps.occupancy_grid import _HIGH, _HIT, _LOW, _MISS
-from scanchain.simulation import SENSORS
+from scanchain.maps.occupancy_grid import _HIGH, _HIT, _LOW, _MISS, OCCUPIED_PROBABILITY
+from scanchain.runs.results import results_of
+from scanchain.runs.step_table import StepTable
+from scanchain.simulation import SENSORS, simulate
 from scanchain.simulation.solids import Scenery
+from scanchain.slam import Slam
 from scanchain.trajectory import read_tum
 from tests.support import naive_maps as naive
 from tests.support.scenes import kitti_scans, shared_data
@@ -351,3 +358,19 @@ def test_a_street_of_real_sweeps_becomes_a_map_with_walls_and_free_road():
     cloud = build_point_map(scans, dimension=3, voxel_size_m=0.2, max_range_m=100.0)
     assert 50_000 < len(cloud) < 200_000
     assert np.isfinite(cloud.points()).all()
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 25.0])
+def test_the_grid_is_level_however_the_lidar_is_mounted(tilt_deg, tmp_path):
+    path = tmp_path / "town.mcap"
+    simulate("town", path, duration_s=3.0, sensor="os1-32")
+    T_lidar_level = lie.exp(np.array([0.0, 0.0, 0.0, 0.0, math.radians(tilt_deg), 0.0]))
+    log, slam = open_log(path), Slam(dimension=3)
+    for scan in log.scans():
+        slam.process(replace(scan, points=lie.transform(T_lidar_level, scan.points).astype(np.float32)))
+    found = results_of(log, slam.config, StepTable(), slam.finish(), ())
+    tilt_rad = math.acos(min(found.T_world_level[2, 2], 1.0))
+    assert math.degrees(tilt_rad) == pytest.approx(tilt_deg, abs=2.0)
+    assert [f"tilted by {tilt_deg:.0f} deg" in warning for warning in found.warnings] == [True] * (tilt_deg > 0.0)
+    occupied = found.grid.probability() > OCCUPIED_PROBABILITY
+    assert occupied.sum() > 450

@@ -1,14 +1,21 @@
 """Elevation offset: found on real sweeps and on made-up ground, corrected, and never made up."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from scanchain import lie
+from scanchain.config import PreprocessConfig
+from scanchain.data import Scan
+from scanchain.kernels.registration.plane_adjustment import plane_equations, planes
+from scanchain.logs import open_log
 from scanchain.odometry import Odometry
-from scanchain.odometry.elevation import ElevationCalibration, adjusted, raised
+from scanchain.odometry.elevation import ElevationCalibration, _combined, adjusted, raised
+from scanchain.simulation import simulate
 from scanchain.trajectory import read_tum
+from tests.support import naive
 from tests.support.scenes import configured, kitti_scans, shared_data
 
 POSES = np.stack([lie.exp(np.array([2.0 * k, 0.1 * k, 0.0, 0.0, 0.01 * k, 0.02 * k])) for k in range(8)])
@@ -33,9 +40,25 @@ def test_the_offset_and_the_poses_are_found_on_ground_of_any_shape(offset_deg):
     shifted[-1] = POSES[-1]
     found = adjusted(scans, shifted, 1.0)
     assert found.offset_rad == pytest.approx(offset_rad, abs=math.radians(0.02))
-    assert found.is_accurate and found.is_significant == (offset_deg != 0.0)
-    assert found.shows_none == (offset_deg == 0.0)
+    assert found.sigma_rad < math.radians(0.03)
     assert np.abs(lie.between(found.poses[:-1], found.poses[1:]) - lie.between(POSES[:-1], POSES[1:])).max() < 0.02
+
+
+def test_the_equations_are_those_of_planes_that_are_free():
+    rng = np.random.default_rng(4)
+    scans = [seen(T, rng, 400) for T in POSES[:3]]
+    points, number = np.concatenate(scans), np.repeat(np.arange(3), [len(scan) for scan in scans])
+    n, poses, scale_m = len(points), POSES[:3], 0.05
+    lifted, beside, normals, residual = np.empty((n, 3)), np.zeros((n, 3)), np.empty((n, 3)), np.zeros(n)
+    plane = np.empty(n, np.int32)
+    count = planes(points, number, poses, 0.001, 2.0, lifted, beside, residual, plane, normals)
+    assert count > 20
+    H, b = np.zeros((19, 19)), np.zeros(19)
+    of_planes = plane, beside, residual, normals[:count]
+    plane_equations(lifted, number, *of_planes, poses, scale_m, H, b)
+    wanted = naive.plane_equations(lifted, number, *of_planes, poses, scale_m)
+    assert np.allclose(H, wanted[0], atol=1e-8 * np.abs(H).max())
+    assert np.allclose(b, wanted[1], atol=1e-8 * np.abs(b).max())
 
 
 def test_points_are_raised_by_their_elevation_alone():
@@ -47,18 +70,67 @@ def test_points_are_raised_by_their_elevation_alone():
     assert np.allclose(np.linalg.norm(points, axis=1), np.linalg.norm(moved, axis=1))
 
 
-@pytest.mark.parametrize(("is_wanted", "poses"), [(False, POSES), (True, np.repeat(POSES[:1], 30, axis=0))])
+def test_points_in_planes_are_those_of_flat_cells_that_three_scans_see():
+    rng = np.random.default_rng(5)
+    points, number = np.concatenate([seen(T, rng, 400) for T in POSES]), np.repeat(np.arange(8), 1200)
+    lifted, beside, normals = (np.zeros((9600, 3)) for _ in range(3))
+    residual, plane = np.zeros(9600), np.empty(9600, np.int32)
+    count = planes(points, number, POSES, 0.0, 2.0, lifted, beside, residual, plane, normals)
+    world = np.einsum("nij,nj->ni", POSES[number, :3, :3], points) + POSES[number, :3, 3]
+    wanted = naive.flat_cells(world - POSES[0, :3, 3], number, 2.0)
+    assert count == len(wanted) > 20 and np.allclose(lifted, points)
+    for p, (members, normal) in enumerate(wanted):
+        assert np.array_equal(np.flatnonzero(plane == p), members)
+        assert abs(normals[p] @ normal) == pytest.approx(1.0, abs=1e-6)
+        assert np.allclose(beside[members], world[members] - world[members].mean(axis=0), atol=1e-9)
+        assert np.allclose(residual[members], beside[members] @ normals[p])
+
+
+def calibrated(poses, offset_deg, rng, *, is_wanted=True, points=3000):
+    """A calibration that took scans from these poses, and how often it asked for another map."""
+    calibration, rebuilt = ElevationCalibration(PreprocessConfig(), is_wanted=is_wanted), 0
+    for index, T in enumerate(poses):
+        cloud = raised(seen(T, rng, points), -math.radians(offset_deg))
+        scan = Scan.of(cloud.astype(np.float32), 0.1 * index, index=index)
+        rebuilt += bool(calibration.take(scan, cloud, T, np.ones(6)))
+    return calibration, rebuilt
+
+
+def drive(scans):
+    return np.stack([lie.exp(np.array([1.0 * k, 0.05 * k, 0.0, 0.0, 0.005 * k, 0.01 * k])) for k in range(scans)])
+
+
+@pytest.mark.parametrize(("is_wanted", "poses"), [(False, drive(30)), (True, np.repeat(drive(1), 30, axis=0))])
 def test_nothing_is_estimated_where_unwanted_or_at_rest(is_wanted, poses):
-    rng = np.random.default_rng(2)
-    calibration = ElevationCalibration(is_wanted=is_wanted)
-    assert not any(calibration.take(raised(seen(T, rng, 300), -0.005), T, 1.0) for T in poses)
-    assert calibration.offset_rad == 0.0
+    calibration, rebuilt = calibrated(poses, 0.3, np.random.default_rng(2), is_wanted=is_wanted, points=300)
+    assert calibration.offset_rad == 0.0 and calibration.sigma_rad == math.inf and not rebuilt
+
+
+def test_an_offset_is_refined_as_the_lidar_moves_on_with_a_map_built_anew_but_once():
+    sigma_deg = {}
+    for scans in (14, 48):
+        calibration, rebuilt = calibrated(drive(scans), -0.2, np.random.default_rng(3))
+        assert math.degrees(calibration.offset_rad) == pytest.approx(-0.2, abs=0.02) and rebuilt == 1
+        sigma_deg[scans] = math.degrees(calibration.sigma_rad)
+    assert sigma_deg[48] < 0.6 * sigma_deg[14] < 0.015
+
+
+def test_a_well_calibrated_lidar_is_left_alone_and_known_to_be_one():
+    calibration, rebuilt = calibrated(drive(48), 0.0, np.random.default_rng(3))
+    assert calibration.offset_rad == 0.0 and not rebuilt and math.degrees(calibration.sigma_rad) < 0.015
+
+
+def test_windows_that_contradict_each_other_say_so_in_the_deviation():
+    alike, apart = (_combined(np.radians([[0.2, 0.002], [second, 0.002]])) for second in (0.2, 0.4))
+    assert apart[1] > 3.0 * alike[1]
+    poor = _combined(np.radians([[0.2, 0.002], [-0.9, 0.2]]))
+    assert math.degrees(poor[0]) == pytest.approx(0.2, abs=0.01)
 
 
 def test_a_few_flat_points_give_no_offset():
     rng = np.random.default_rng(3)
-    for scans in ([seen(T, rng, 5) for T in POSES], [np.zeros((50, 3))] * 8):
-        assert not adjusted(scans, POSES, 1.0).is_significant
+    for scans in ([seen(T, rng, 2) for T in POSES], [np.zeros((50, 3))] * 8, [np.empty((0, 3))] * 8):
+        assert adjusted(scans, POSES, 1.0).sigma_rad > math.radians(0.1)
 
 
 def pitch_per_meter(poses, truth):
@@ -69,14 +141,37 @@ def pitch_per_meter(poses, truth):
     return np.mean(np.abs(error[:, 4]) / np.linalg.norm(true[:, :3, 3], axis=1))
 
 
+def driven(scans, changes=None, T_base_lidar=None):
+    odometry = Odometry(configured(3, changes), T_base_lidar)
+    return np.array([odometry.process(scan).T_odom_lidar for scan in scans]), odometry
+
+
 def test_the_vertical_angles_of_kitti_are_corrected_and_its_pitch_drifts_less():
-    scans, error, offset_deg = kitti_scans(54), {}, {}
+    scans, error = kitti_scans(54), {}
     truth = read_tum(shared_data("3d/kitti_0001_first54.tum")).poses
     for is_wanted in (False, True):
-        odometry = Odometry(configured(3, {"preprocess.calibrate_elevation": is_wanted}))
-        poses = np.array([odometry.process(scan).T_odom_lidar for scan in scans])
+        poses, odometry = driven(scans, {"preprocess.calibrate_elevation": is_wanted})
         error[is_wanted] = pitch_per_meter(poses, truth)
-        offset_deg[is_wanted] = math.degrees(odometry.elevation.offset_rad)
-    assert offset_deg[False] == 0.0 and 0.15 < offset_deg[True] < 0.3  # readers of KITTI correct it by 0.205
+    assert math.degrees(odometry.elevation.offset_rad) == pytest.approx(0.2, abs=0.03)  # its readers take 0.205
     assert 0 < odometry.calibrated_from < 20
     assert error[True] < 0.5 * error[False]
+
+
+@pytest.mark.parametrize("voxel_m", [0.5, 1.0])
+def test_the_offset_does_not_depend_on_the_voxels_of_the_map(voxel_m):
+    changes = {"local_map.voxel_size_m": voxel_m, "preprocess.map_voxel_m": voxel_m / 2}
+    _, odometry = driven(kitti_scans(28), changes)
+    assert math.degrees(odometry.elevation.offset_rad) == pytest.approx(0.2, abs=0.03)
+
+
+@pytest.mark.parametrize("offset_deg", [-0.1, 0.3])
+def test_the_offset_is_found_on_a_straight_fast_road(offset_deg, tmp_path):
+    path = tmp_path / "highway.mcap"
+    simulate("highway", path, duration_s=4.0, sensor="os1-32")
+    log = open_log(path)
+    scans = [
+        replace(scan, points=raised(scan.points.astype(float), -math.radians(offset_deg)).astype(np.float32))
+        for scan in log.scans()
+    ]
+    _, odometry = driven(scans, T_base_lidar=log.T_base_lidar)
+    assert math.degrees(odometry.elevation.offset_rad) == pytest.approx(offset_deg, abs=0.03)

@@ -1,5 +1,7 @@
 """Scans made ready for matching: cropped, downsampled, deskewed."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -60,7 +62,7 @@ def test_without_times_or_with_deskewing_off_points_stay_where_they_are(with_tim
     assert not sweep.downsampled(4.0).is_distorted
 
 
-def box_scan(half_m, n=60_000, seed=0):
+def box_scan(half_m, n=30_000, seed=0):
     """A lidar in the middle of a box."""
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(n, 3))
@@ -91,6 +93,29 @@ def test_voxels_change_when_the_place_does_and_not_for_a_glance():
         assert resolution.scale == 0.5
     resolution.downsampled(box_scan(30.0))
     assert resolution.scale == 1.0
+
+
+def test_a_dense_scan_gets_finer_voxels_and_as_many_points_to_match():
+    scale, matched = {}, {}
+    for n in (30_000, 120_000):
+        resolution = Resolution(PreprocessConfig(), 1.0)
+        for k in range(4):
+            _, sparse = resolution.downsampled(box_scan(20.0, n, seed=k))
+        scale[n], matched[n] = resolution.scale, len(sparse.points)
+    assert scale == {30_000: 1.0, 120_000: math.sqrt(0.5)}
+    assert matched[120_000] < 1.2 * matched[30_000]
+    fixed = Resolution(PreprocessConfig(min_scale=1.0), 1.0)
+    fixed.downsampled(box_scan(20.0, 120_000))
+    assert fixed.scale == 1.0
+
+
+def test_voxels_do_not_change_with_a_number_of_returns_that_varies():
+    resolution = Resolution(PreprocessConfig(), 1.0)
+    scales = []
+    for n in (30_000, 55_000, 70_000, 45_000, 35_000, 55_000):
+        resolution.downsampled(box_scan(20.0, n))
+        scales.append(resolution.scale < 1.0)
+    assert scales == [False, False, True, True, False, False]
 
 
 def test_the_plane_keeps_the_voxels_of_its_preset():

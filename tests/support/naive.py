@@ -126,3 +126,43 @@ def first_per_voxel(points, size, low, high):
 
 def deskew(points, shares, twist):
     return np.array([lie.transform(lie.exp(s * twist), p[None])[0] for p, s in zip(points, shares, strict=True)])
+
+
+def flat_cells(world, number, cell_m):
+    """Points of every flat cell that three scans see, in the order of their first points, and its normal."""
+    found, cells = [], {}
+    for index, point in enumerate(world):
+        cells.setdefault(voxel_of(point, cell_m), []).append(index)
+    for members in map(np.array, cells.values()):
+        if len(members) < 8 or len(set(number[members])) < 3:
+            continue
+        values, vectors = np.linalg.eigh(np.cov(world[members].T, bias=True))
+        if values[0] < min(0.02 * values[1], (0.15 * cell_m) ** 2) and values[1] > (0.1 * cell_m) ** 2:
+            found.append((members, vectors[:, 0]))
+    return found
+
+
+def plane_equations(points, number, plane, beside, residual, normals, poses, scale):
+    """Normal equations of poses and an elevation offset, those of the planes eliminated; by finite differences."""
+    size, step = 6 * len(poses) + 1, 1e-6
+    H, b = np.zeros((size, size)), np.zeros(size)
+    for p, normal in enumerate(normals):
+        rows = []
+        members = np.flatnonzero(plane == p)
+        for i in members:
+            J = np.zeros(size + 3)
+            level = np.hypot(points[i, 0], points[i, 1])
+            upward = np.array([-points[i, 2] * points[i, 0] / level, -points[i, 2] * points[i, 1] / level, level])
+            for column in range(6):
+                moved = [poses[number[i]] @ lie.exp(sign * step * np.eye(6)[column]) for sign in (1.0, -1.0)]
+                there = [T[:3, :3] @ points[i] + T[:3, 3] for T in moved]
+                J[6 * number[i] + column] = normal @ (there[0] - there[1]) / (2.0 * step)
+            J[size - 1] = normal @ poses[number[i]][:3, :3] @ upward
+            J[size:] = [1.0, *np.delete(beside[i], np.argmax(np.abs(normal)))]
+            rows.append(J)
+        J, w = np.array(rows), (1.0 + (residual[members] / scale) ** 2) ** -2
+        whole, gradient = J.T @ (w[:, None] * J), J.T @ (w * residual[members])
+        eliminated = whole[:size, size:] @ np.linalg.inv(whole[size:, size:])
+        H += whole[:size, :size] - eliminated @ whole[size:, :size]
+        b += gradient[:size] - eliminated @ gradient[size:]
+    return H, b
