@@ -21,7 +21,7 @@ from scanchain.commands.options import (
     part_options,
 )
 from scanchain.errors import InputError, ScanchainError
-from scanchain.settings import Override
+from scanchain.settings import Override, load_settings
 from scanchain.source import Source
 from scanchain.words import counted
 
@@ -57,9 +57,9 @@ _DAY_S = 86_400.0
 @click.option(
     "--rerun",
     type=click.Choice(["save", "off"]),
-    default="off",
+    default="save",
     show_default=True,
-    help="Whether runs write a recording.",
+    help="Whether runs write a recording, some ten megabytes each.",
 )
 @click.option("--strict", is_flag=True, help="Exit with 1 unless every verdict is trustworthy.")
 @click.pass_context
@@ -81,7 +81,8 @@ def batch(
 ) -> None:
     """Run many logs, each in its own process.
 
-    LOG is a file, folder or address that scanchain run takes, or a quoted glob pattern. A log whose process
+    LOG is a file, folder or address that scanchain run takes, a folder of such logs, or a quoted glob pattern.
+    Files of a folder that follow one another within a minute are the parts of one log. A log whose process
     crashes, hangs or runs out of memory becomes a row with the reason; the others finish, and the exit code is 1.
     Called again, batch runs only the logs that have no result yet. A result belongs to the contents of the log (of
     a remote one: its address, size and version) and the effective configuration. DIR gets a run directory per log,
@@ -90,7 +91,7 @@ def batch(
 
     \b
     Examples:
-      scanchain batch *.mcap --out runs/all
+      scanchain batch logs/ --out runs/all
       scanchain batch 'logs/**/*.mcap' --out runs/all --workers 8 --time-limit 600 --memory-limit 4
       scanchain batch --manifest logs.txt --out runs/svd --matching.matcher svd
       scanchain batch *.bag --out runs/front --topic /lidar_front/points --end 60
@@ -110,7 +111,7 @@ def batch(
         )
     changes = tuple(overrides(ctx, [*part_of(shortcuts), *method_of(shortcuts), *truth_topic]))
     job = Batch(
-        logs=collect(logs, manifests),
+        logs=collect(logs, manifests, load_settings(file=config, overrides=changes).config.log.format),
         out=out.resolve(),
         config_file=config,
         overrides=changes,

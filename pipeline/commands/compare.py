@@ -41,7 +41,14 @@ _PATH = click.Path(path_type=Path)
 @click.option(
     "--relations", metavar="FILE", type=_PATH, help="Manually verified relative poses (Kümmerle et al. 2009)."
 )
-@click.option("--settings", metavar="FILE", type=_PATH, help="TOML file with a table of settings per method.")
+@click.option(
+    "--config",
+    "--settings",
+    "config",
+    metavar="FILE",
+    type=_PATH,
+    help="TOML file on top of the preset, with a table for each method whose settings differ.",
+)
 @click.option(
     "--repeat", type=click.IntRange(1), default=1, show_default=True, help="Runs of every method, interleaved."
 )
@@ -59,7 +66,7 @@ def compare(
     out: Path | None,
     gt: str | None,
     relations: Path | None,
-    settings: Path | None,
+    config: Path | None,
     repeat: int,
     time_limit: float | None,
     memory_mib: float | None,
@@ -82,7 +89,8 @@ def compare(
       open3d-p2p, open3d-gicp, kiss-icp, small-gicp, small-vgicp
       open3d-p2l, genz-icp, genz-icp-indoor, genz-icp-kitti    3D only
       my_module:MyOdometry     your own class, with the methods of scanchain.baselines.Baseline
-    A table of --settings changes the settings of a method, or defines a variant of one under another name:
+    A name that several begin with stands for all of them: kiss, open3d. Sections of --config hold for all of
+    ours, as in scanchain run; a table of a method's name changes that method, one of another name is a variant:
 
     \b
       [kiss-icp]
@@ -96,8 +104,9 @@ def compare(
     \b
     Examples:
       scanchain compare log.mcap
+      scanchain compare log.mcap --methods plicp,kiss,open3d --every 2
       scanchain compare log.mcap --methods plicp,svd,kiss-icp --repeat 5 --out runs/three
-      scanchain compare log.mcap --methods plicp,plicp-fine,mine --settings mine.toml --gt truth.tum
+      scanchain compare log.mcap --methods plicp,plicp-fine,mine --config mine.toml --gt truth.tum
       scanchain compare log.mcap --methods plicp,Mine --matcher mine:Mine
       scanchain compare intel.mcap --relations intel.relations --memory-limit 2 --end 600
     """
@@ -114,7 +123,7 @@ def compare(
         out=Path("runs") / f"compare-{directory_name(logs[0].stem)}" if out is None else out,
         methods=tuple(name.strip() for name in methods.split(",") if name.strip()) if methods else (),
         matcher=matcher,
-        settings_file=settings,
+        config_file=config,
         overrides=overrides(ctx, [*part_of(part), *truth_topic]),
         ground_truth=truth_file,
         relations=relations,

@@ -361,6 +361,10 @@ def test_imu_gnss_and_truth_are_named_with_what_is_made_of_them(tmp_path, capfd)
     ):  # fmt: skip
         assert f"sensor    {line}\n" in text
     assert "wheels    /odom" in text and "/odom:" not in text
+    assert main(["run", str(path), "--out", str(tmp_path / "a"), "--rerun", "off"]) == 0
+    text = capfd.readouterr().out
+    assert "note           IMU /imu/data: not used\n" in text and "note           GNSS /fix: not used\n" in text
+    assert "/ground_truth: evaluates" not in text
     assert main(["info", str(path), "--json"]) == 0
     assert [each["sensor"] for each in json.loads(capfd.readouterr().out)["sensors"]] == [
         "GNSS", "ground truth", "IMU",
