@@ -173,6 +173,7 @@ def max_gap_option(command: Callable[..., None]) -> Callable[..., None]:
     """The option ``--max-gap``."""
     return click.option(
         "--max-gap",
+        "max_gap_s",
         type=float,
         callback=_checked_gap,
         metavar="SECONDS",
