@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from scanchain.commands.options import OnceCommand, check_output, max_gap_option
+from scanchain.commands.options import check_output, max_gap_option
 from scanchain.errors import InputError
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ class _Offset(click.ParamType):
         return value if value == "auto" else click.FLOAT.convert(value, param, ctx)
 
 
-@click.command(cls=OnceCommand)
+@click.command()
 @click.argument("files", metavar="EST.tum... [GT]", nargs=-1, required=True, type=_PATH)
 @click.option("--gt", metavar="FILE", type=_PATH, help="Ground truth. [default: the last of two files or more]")
 @click.option(
@@ -85,7 +85,7 @@ def evaluate(
       scanchain evaluate runs/log truth.tum --align first --rpe 5s,50m --json
     """
     if gt is None and len(files) > 1:
-        *files, gt = files
+        files, gt = files[:-1], files[-1]
     if gt is None and relations is None:
         raise InputError("nothing to compare with; give GT (a TUM or KITTI file) or --relations FILE")
     if kitti and options["time_offset"]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from math import inf
 from pathlib import Path
@@ -26,23 +25,7 @@ def collect_garbage_seldom() -> None:
     gc.set_threshold(_GARBAGE_EVERY)
 
 
-class OnceCommand(click.Command):
-    """Command that refuses a single-valued option given twice; click would silently take the last."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse the arguments once for what is named twice, then as usual."""
-        _, _, named = self.make_parser(ctx).parse_args(args=list(args))
-        for parameter, count in Counter(named).items():
-            if count > 1 and isinstance(parameter, click.Option) and _holds_one_value(parameter):
-                raise click.UsageError(f"{parameter.opts[0]} is given {count} times; give it once", ctx)
-        return super().parse_args(ctx, args)
-
-
-def _holds_one_value(option: click.Option) -> bool:
-    return not (option.multiple or option.is_flag or option.count)
-
-
-class OverrideCommand(OnceCommand):
+class OverrideCommand(click.Command):
     """Command that takes any configuration key as ``--section.key value``.
 
     Options with a dot in their name are taken out of the arguments before click sees the rest.
@@ -201,15 +184,6 @@ _MIB_PER_GIB = 1024.0
 _ABOVE_ZERO = click.FloatRange(0.0, min_open=True)
 
 
-class _MemoryType(click.ParamType):
-    """A number of GiB, handed on in MiB."""
-
-    name = "memory"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        return _MIB_PER_GIB * _ABOVE_ZERO.convert(value, param, ctx)
-
-
 def limit_options(what: str, *, time_default: str, memory_default: str) -> Callable[[Any], Any]:
     """``--time-limit`` as ``time_limit`` in seconds, ``--memory-limit`` as ``memory_mib``; None where not given.
 
@@ -221,7 +195,8 @@ def limit_options(what: str, *, time_default: str, memory_default: str) -> Calla
             click.option(
                 "--memory-limit",
                 "memory_mib",
-                type=_MemoryType(),
+                type=_ABOVE_ZERO,
+                callback=lambda _, __, gib: None if gib is None else _MIB_PER_GIB * gib,
                 metavar="GIB",
                 help=f"Memory limit of {what}. [default: {memory_default}]",
             ),

@@ -18,7 +18,6 @@ from mcap.writer import Writer
 
 from scanchain import lie
 from scanchain.__main__ import scanchain
-from scanchain.commands.options import OnceCommand
 from scanchain.data import Trajectory
 from scanchain.evaluation.metrics import evaluate as scanchain_evaluate
 from scanchain.graph.files.g2o import read_g2o
@@ -611,7 +610,6 @@ def test_the_heading_says_whether_the_wheels_are_used(call, tmp_path, office):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["run", "--topic", "/scan", "--topic", "/other"], ["--topic is given 2 times"]),
         (["run", "--log.every", "2", "--log.every=3"], ["--log.every is given twice (2, 3)"]),
         (
             ["run", "--matcher", "svd", "--matching.matcher", "plicp"],
@@ -619,25 +617,14 @@ def test_the_heading_says_whether_the_wheels_are_used(call, tmp_path, office):
         ),
         (["run", "--no-loops", "--loops.enabled", "true"], ["--no-loops and --loops.enabled both set"]),
         (["run", "--gt", "/truth", "--log.ground_truth_topic", "/odom"], ["--gt and --log.ground_truth_topic"]),
-        (["run", "--out", "b"], ["--out is given 2 times"]),
-        (["compare", "--methods", "svd", "--methods", "plicp"], ["--methods is given 2 times"]),
         (["doctor", "--topic", "/scan", "--log.topic", "/scan"], ["--topic and --log.topic"]),
         (["info", "--log.topic", "/scan", "--log.topic", "/scan"], ["--log.topic is given twice"]),
-        (["batch", "--workers", "1", "--workers", "2"], ["--workers is given 2 times"]),
     ],
 )
 def test_what_has_one_value_is_given_once(refused, tmp_path, office, words, said):
     command, *flags = words
     out = ["--out", tmp_path / "a"] if command in ("run", "compare", "batch") else []
     says(refused(command, office, *out, *flags), *said)
-
-
-def test_every_command_refuses_an_option_given_twice_and_takes_a_flag_twice(call, tmp_path):
-    leaves = [(words, command) for words, command in commands() if not isinstance(command, click.Group)]
-    assert all(isinstance(command, OnceCommand) for _, command in leaves)
-    assert call("config", "show", "--json", "--json")[0] == 0
-    code, _, errors = call("simulate", "office", tmp_path / "a.mcap", "--seed", "1", "--seed", "2")
-    assert code == 2 and "--seed is given 2 times" in errors
 
 
 def test_a_config_file_changes_the_preset_and_is_named(call, tmp_path, office):
