@@ -217,9 +217,10 @@ def collect(named: Sequence[Source], manifests: Sequence[Path], log_format: str 
         raise InputError("no log is named; name some, or a --manifest that does")
     first: dict[Source, Source] = {}
     for path in paths:
-        is_folder = log_format == AUTO and isinstance(path, Path) and path.is_dir()
-        for log in logs_in(path) if is_folder else [path]:
-            first.setdefault(log.resolve(), log)
+        if log_format == AUTO and isinstance(path, Path) and path.is_dir():
+            first |= {log.resolve(): log for log in logs_in(path) if log.resolve() not in first}
+        else:
+            first.setdefault(path.resolve(), path)
     return tuple(first.values())
 
 
