@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import click
 
 from scanchain.commands.options import (
     LOG,
     OverrideCommand,
-    ground_truth,
+    ground_truth_option,
     limit_options,
     overrides,
-    part_of,
     part_options,
     threads_option,
 )
@@ -33,18 +33,14 @@ _PATH = click.Path(path_type=Path)
     help="Compare odometry with your own matcher as well, row CLASS.",
 )
 @click.option("--out", metavar="DIR", type=_PATH, help="Directory to create. [default: runs/compare-LOG]")
-@click.option(
-    "--gt",
-    metavar="FILE|TOPIC|none",
-    help="Ground truth: TUM, KITTI or a topic; none to ignore that of the log. [default: /ground_truth]",
-)
+@ground_truth_option()
 @click.option(
     "--relations", metavar="FILE", type=_PATH, help="Manually verified relative poses (Kümmerle et al. 2009)."
 )
 @click.option(
     "--config",
     "--settings",
-    "config",
+    "config_file",
     metavar="FILE",
     type=_PATH,
     help="TOML file on top of the preset, with a table for each method whose settings differ.",
@@ -62,17 +58,9 @@ def compare(
     ctx: click.Context,
     logs: tuple[Source, ...],
     methods: str | None,
-    matcher: str,
     out: Path | None,
-    gt: str | None,
-    relations: Path | None,
-    config: Path | None,
-    repeat: int,
-    time_limit: float | None,
-    memory_mib: float | None,
-    force: bool,
     as_json: bool,
-    **part: str | None,
+    **options: Any,
 ) -> None:
     """Compare odometry methods on the same decoded scans: accuracy, speed, memory.
 
@@ -117,21 +105,13 @@ def compare(
     from scanchain.comparison.table import TABLE_FILE, text
     from scanchain.runs.directory import directory_name
 
-    truth_file, truth_topic = ground_truth(gt)
     comparison = Comparison(
         logs=logs,
         out=Path("runs") / f"compare-{directory_name(logs[0].stem)}" if out is None else out,
         methods=tuple(name.strip() for name in methods.split(",") if name.strip()) if methods else (),
-        matcher=matcher,
-        config_file=config,
-        overrides=overrides(ctx, [*part_of(part), *truth_topic]),
-        ground_truth=truth_file,
-        relations=relations,
-        repeat=repeat,
-        time_s=time_limit,
-        memory_mib=memory_mib,
-        force=force,
+        overrides=overrides(ctx),
         command=tuple(sys.argv),
+        **options,
     )
     with Terminal("scans") as terminal:
         compared = run_comparison(comparison, present_comparison, terminal)

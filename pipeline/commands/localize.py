@@ -13,10 +13,9 @@ from scanchain.commands.options import (
     LOG,
     OverrideCommand,
     collect_garbage_seldom,
+    config_option,
     matcher_option,
-    method_of,
     overrides,
-    part_of,
     part_options,
     threads_option,
 )
@@ -39,7 +38,7 @@ if TYPE_CHECKING:
     metavar="X,Y,YAW|FILE.tum",
     help="Pose of the first scan in the map: meters and degrees, or a TUM file. [default: searched for]",
 )
-@click.option("--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file on top of the preset.")
+@config_option
 @part_options()
 @matcher_option
 @threads_option
@@ -53,11 +52,10 @@ def localize(
     prior: Path,
     out: Path,
     initial: str | None,
-    config: Path | None,
+    config_file: Path | None,
     force: bool,
     strict: bool,
     as_json: bool,
-    **shortcuts: str | bool | None,
 ) -> None:
     """Find a log in the map of an earlier run, and follow it there.
 
@@ -80,8 +78,8 @@ def localize(
         prior=prior,
         out=out,
         initial=None if initial is None else _initial(initial),
-        config_file=config,
-        overrides=overrides(ctx, [*part_of(shortcuts), *method_of(shortcuts)]),
+        config_file=config_file,
+        overrides=overrides(ctx),
         force=force,
         command=tuple(sys.argv),
     )
