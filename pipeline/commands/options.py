@@ -82,7 +82,7 @@ def key_option(flag: str, key: str, *, value: str | None = None, **attributes: A
         if given not in (None, False):
             _set(ctx, Override(key, value or str(given), flag))
 
-    return click.option(flag, is_flag=value is not None, expose_value=False, callback=keep, **attributes)
+    return click.option(flag, is_flag=True if value else None, expose_value=False, callback=keep, **attributes)
 
 
 def _set(ctx: click.Context, override: Override) -> None:

@@ -87,6 +87,7 @@ def test_of_8_logs_two_are_poison_and_6_have_results_and_a_second_call_runs_only
     for row in done.values():
         metrics = json.loads((out / row["run"] / "metrics.json").read_text())
         assert row["scans"] == metrics["scans"] == 20 and row["ate_rmse_m"] < 0.1
+        assert (out / row["run"] / "recording.rrd").exists()  # as of scanchain run
         assert row["ate_rmse_m"] == metrics["ground_truth"]["optimized"]["ate_rmse_m"]
     assert "8: 6 done, 1 crashed, 1 out of memory" in output
     assert errors == f"error: 2 of 8 logs have no result; {out}/summary.txt has the reason\n"
