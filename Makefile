@@ -4,25 +4,28 @@ SHELL := /bin/bash
 BIN := .venv/bin
 RUNTIME := .venv/runtime-installed
 DEV := .venv/dev-installed
+BASELINES := .venv/baselines-installed
 DOCS := .venv/docs-installed
 
 .PHONY: help demo test lint docs clean
 
 help:
-	@echo "make demo   simulate an office and a town, run both, print their accuracy (about two minutes once installed)"
+	@echo "make demo   simulate an office and a town, run both, compare the town with KISS-ICP and Open3D (within four minutes)"
 	@echo "make test   run the whole test suite"
 	@echo "make lint   format, lint, type and import checks"
 	@echo "make docs   build the documentation into build/docs; warnings are errors"
 	@echo "make clean  remove the environment, logs and runs of the demo"
 
-demo: $(RUNTIME)
+demo: $(BASELINES)
 	$(BIN)/scanchain sequence get demo-office
 	$(BIN)/scanchain run logs/demo-office.mcap --out runs/demo-office --force
 	$(BIN)/scanchain view runs/demo-office --png runs/demo-office.png
 	$(BIN)/scanchain sequence get demo-town
 	$(BIN)/scanchain run logs/demo-town.mcap --out runs/demo-town --force
 	$(BIN)/scanchain view runs/demo-town --png runs/demo-town.png
+	$(BIN)/scanchain compare logs/demo-town.mcap --end 15 --methods plicp,kiss-icp,open3d-p2l --out runs/demo-compare --force
 	@echo
+	@echo "The comparison is runs/demo-compare/report.html."
 	@echo "Look at the pictures in runs/, or open the recordings: $(BIN)/scanchain view runs/demo-town"
 
 test: $(DEV)
@@ -45,6 +48,10 @@ $(RUNTIME): pyproject.toml setup.py
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
 	touch $@
 
+$(BASELINES): pyproject.toml setup.py $(RUNTIME)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[baselines]'
+	touch $@
+
 $(DEV): pyproject.toml setup.py $(RUNTIME)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[baselines,cluster,remote,dev]'
 	touch $@
@@ -54,4 +61,4 @@ $(DOCS): pyproject.toml setup.py $(RUNTIME)
 	touch $@
 
 clean:
-	rm -rf .venv build logs runs/demo-office runs/demo-town runs/demo-office.png runs/demo-town.png
+	rm -rf .venv build logs runs/demo-office runs/demo-town runs/demo-office.png runs/demo-town.png runs/demo-compare

@@ -56,13 +56,6 @@ class Page(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", ta
     steps: str
 
 
-class Local(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="file"):
-    """A file on this machine."""
-
-    path: str
-    sha256: Sha256
-
-
 class Sequence(Struct, frozen=True, forbid_unknown_fields=True):
     """A sequence: description, source, conversion to MCAP, ground truth."""
 
@@ -72,7 +65,7 @@ class Sequence(Struct, frozen=True, forbid_unknown_fields=True):
     conversion: str
     ground_truth: str
     license: str
-    source: Simulated | Download | Page | Local
+    source: Simulated | Download | Page
 
 
 def names() -> tuple[str, ...]:
@@ -126,8 +119,6 @@ def prepare(
             raise InputError(
                 f"{destination}: {name} cannot be downloaded automatically; {source.page}: {source.steps}"
             )
-        case Local():
-            raise InputError(f"{destination}: absent; put {source.path} there as MCAP")
     return destination
 
 

@@ -19,7 +19,9 @@ from rerun.chunk import RrdReader
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from scanchain import lie
 from scanchain.__main__ import main
+from scanchain.logs import open_log
 from scanchain.settings import flatten
 from scanchain.viz.recording import entities
 from tests.support.naive_graph import error
@@ -28,9 +30,9 @@ from tests.support.recordings import EVERY_SCAN, FOR_EVER, column, rows_of, stat
 from tests.support.scenes import ROOT, configured, shared_data
 
 FILES = {
-    "trajectory.tum", "odometry.tum", "trajectory.kitti.txt", "graph.g2o", "map", "map.ply", "map.pgm", "map.yaml",
-    "recording.rrd", "steps.parquet", "loops.parquet", "metrics.json", "summary.txt", "config.toml", "run.json",
-    "report.html",
+    "trajectory.tum", "trajectory_base.tum", "odometry.tum", "trajectory.kitti.txt", "graph.g2o", "map", "map.ply",
+    "map.pgm", "map.yaml", "recording.rrd", "steps.parquet", "loops.parquet", "metrics.json", "summary.txt",
+    "config.toml", "run.json", "report.html",
 }  # fmt: skip
 NOT_TIMED = (
     "trajectory.tum", "odometry.tum", "trajectory.kitti.txt", "graph.g2o", "map.ply", "map.pgm", "map.yaml",
@@ -137,6 +139,14 @@ def test_trajectories_have_a_unit_quaternion_at_the_exact_stamp_of_every_scan(dr
     np.testing.assert_allclose(np.linalg.norm(rows[:, 4:], axis=1), 1.0, atol=1e-8)
     if drive.dimension == 2:
         assert not rows[:, [3, 4, 5]].any()
+
+
+def test_the_robot_has_a_trajectory_of_its_own_in_the_frame_of_the_lidar(drive):
+    T_base_lidar = open_log(drive.log).T_base_lidar
+    mounted = T_base_lidar if drive.dimension == 3 else lie.lift(T_base_lidar)
+    assert abs(mounted[0, 3]) > 0.1 or abs(mounted[2, 3]) > 0.1
+    bases, lidars = matrices(drive.tum("trajectory_base")[:, 1:]), matrices(drive.tum()[:, 1:])
+    np.testing.assert_allclose(bases @ mounted, lidars, atol=1e-7)
 
 
 def test_the_kitti_file_holds_the_same_poses(drive):

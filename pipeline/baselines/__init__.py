@@ -1,7 +1,7 @@
 """Odometries by others behind one protocol, by name.
 
 A new one is a file with a class as ``Baseline`` describes it and a line in ``BASELINES``. Outside the
-package, ``scanchain compare --methods my_module:MyClass`` runs a class of yours, given its table of --settings as
+package, ``scanchain compare --methods my_module:MyClass`` runs a class of yours, given its table of --config as
 keywords.
 """
 

@@ -17,6 +17,7 @@ from scanchain.batch.table import write_table
 from scanchain.batch.task import ROWS_FOLDER, Row, State, Task, attempt, finished_row, key_of, unfinished_row
 from scanchain.errors import InputError
 from scanchain.logs.files import matching, misspelled, spelled
+from scanchain.logs.opening import AUTO, logs_in
 from scanchain.processes import available_mib
 from scanchain.runs.directory import check_outside_runs
 from scanchain.runs.provenance import identity_of
@@ -202,9 +203,10 @@ def _local(workers: int) -> Work:
 _WILD = frozenset("*?[")
 
 
-def collect(named: Sequence[Source], manifests: Sequence[Path]) -> tuple[Source, ...]:
-    """Every log once, in the order named; patterns are replaced by the paths they match, by name.
+def collect(named: Sequence[Source], manifests: Sequence[Path], log_format: str = AUTO) -> tuple[Source, ...]:
+    """Every log once, in the order named; patterns and folders are replaced by the logs in them, by name.
 
+    log_format : a folder is looked into only where the format is not given
     manifests : text files with a path, address or pattern a line, paths relative to the file; # begins a comment
     Raises InputError for a pattern that matches nothing and a manifest that cannot be read.
     """
@@ -215,7 +217,10 @@ def collect(named: Sequence[Source], manifests: Sequence[Path]) -> tuple[Source,
         raise InputError("no log is named; name some, or a --manifest that does")
     first: dict[Source, Source] = {}
     for path in paths:
-        first.setdefault(path.resolve(), path)
+        if log_format == AUTO and isinstance(path, Path) and path.is_dir():
+            first |= {log.resolve(): log for log in logs_in(path) if log.resolve() not in first}
+        else:
+            first.setdefault(path.resolve(), path)
     return tuple(first.values())
 
 

@@ -5,23 +5,23 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 import click
 
 from scanchain.commands.options import (
     LOG,
     OverrideCommand,
-    ground_truth,
+    config_option,
+    ground_truth_option,
     limit_options,
     matcher_option,
-    method_of,
     no_loops_option,
     overrides,
-    part_of,
     part_options,
 )
 from scanchain.errors import InputError, ScanchainError
-from scanchain.settings import Override
+from scanchain.settings import Override, load_settings
 from scanchain.source import Source
 from scanchain.words import counted
 
@@ -35,13 +35,11 @@ _DAY_S = 86_400.0
 @click.option(
     "--manifest", "manifests", multiple=True, metavar="FILE", type=_PATH, help="Text file with one log per line."
 )
-@click.option("--config", metavar="FILE", type=_PATH, help="TOML file on top of the preset.")
+@config_option
 @part_options("each log")
 @matcher_option
 @no_loops_option
-@click.option(
-    "--gt", metavar="TOPIC|none", help="Ground truth in every log; none to ignore it. [default: /ground_truth]"
-)
+@ground_truth_option("TOPIC|none", "Ground truth in every log; none to ignore it. [default: /ground_truth]")
 @click.option(
     "--workers", type=click.IntRange(1), metavar="N", help="Logs run in parallel. [default: one per core]"
 )
@@ -57,9 +55,9 @@ _DAY_S = 86_400.0
 @click.option(
     "--rerun",
     type=click.Choice(["save", "off"]),
-    default="off",
+    default="save",
     show_default=True,
-    help="Whether runs write a recording.",
+    help="Whether runs write a recording, some ten megabytes each.",
 )
 @click.option("--strict", is_flag=True, help="Exit with 1 unless every verdict is trustworthy.")
 @click.pass_context
@@ -68,20 +66,19 @@ def batch(
     logs: tuple[Source, ...],
     out: Path,
     manifests: tuple[Path, ...],
-    config: Path | None,
+    config_file: Path | None,
     workers: int | None,
     ray: str | None,
-    time_limit: float | None,
-    memory_mib: float | None,
-    retries: int,
     rerun: str,
-    gt: str | None,
+    ground_truth: Path | None,
     strict: bool,
-    **shortcuts: str | bool | None,
+    time_s: float | None,
+    **limits: Any,
 ) -> None:
     """Run many logs, each in its own process.
 
-    LOG is a file, folder or address that scanchain run takes, or a quoted glob pattern. A log whose process
+    LOG is a file, folder or address that scanchain run takes, a folder of such logs, or a quoted glob pattern.
+    Files of a folder that follow one another within a minute are the parts of one log. A log whose process
     crashes, hangs or runs out of memory becomes a row with the reason; the others finish, and the exit code is 1.
     Called again, batch runs only the logs that have no result yet. A result belongs to the contents of the log (of
     a remote one: its address, size and version) and the effective configuration. DIR gets a run directory per log,
@@ -90,7 +87,7 @@ def batch(
 
     \b
     Examples:
-      scanchain batch *.mcap --out runs/all
+      scanchain batch logs/ --out runs/all
       scanchain batch 'logs/**/*.mcap' --out runs/all --workers 8 --time-limit 600 --memory-limit 4
       scanchain batch --manifest logs.txt --out runs/svd --matching.matcher svd
       scanchain batch *.bag --out runs/front --topic /lidar_front/points --end 60
@@ -103,22 +100,20 @@ def batch(
 
     if ray is not None and workers is not None:
         raise InputError("--workers is for this machine alone; on a cluster every core takes a log")
-    truth_file, truth_topic = ground_truth(gt)
-    if truth_file is not None:
+    if ground_truth is not None:
         raise InputError(
-            f"--gt {gt}: a batch has no file of true poses for all its logs; name a topic, or use run"
+            f"--gt {ground_truth}: a batch has no file of true poses for all its logs; name a topic, or use run"
         )
-    changes = tuple(overrides(ctx, [*part_of(shortcuts), *method_of(shortcuts), *truth_topic]))
+    changes = overrides(ctx)
     job = Batch(
-        logs=collect(logs, manifests),
+        logs=collect(logs, manifests, load_settings(file=config_file, overrides=changes).config.log.format),
         out=out.resolve(),
-        config_file=config,
+        config_file=config_file,
         overrides=changes,
-        arguments=("--rerun", rerun, *_arguments(config, changes)),
+        arguments=("--rerun", rerun, *_arguments(config_file, changes)),
         workers=workers or os.cpu_count() or 1,
-        time_s=time_limit or _DAY_S,
-        memory_mib=memory_mib,
-        retries=retries,
+        time_s=time_s or _DAY_S,
+        **limits,
     )
     from scanchain.viz.report.batch import write_batch_report
 

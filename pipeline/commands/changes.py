@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from scanchain.commands.options import OnceCommand, threads_option
+from scanchain.commands.options import threads_option
 from scanchain.errors import InputError
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ _PATH = click.Path(path_type=Path)
 _ABOVE_ZERO = click.FloatRange(0.0, min_open=True)
 
 
-@click.command(cls=OnceCommand)
+@click.command()
 @click.argument("earlier", metavar="RUN_A", type=_PATH)
 @click.argument("later", metavar="[RUN_B]", required=False, type=_PATH)
 @click.option("--out", required=True, metavar="DIR", type=_PATH, help="Directory to create.")

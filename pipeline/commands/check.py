@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from scanchain.commands.options import LOG, OverrideCommand, overrides, part_of, part_options
+from scanchain.commands.options import LOG, OverrideCommand, overrides, part_options
 from scanchain.errors import InputError
 from scanchain.source import Source
 
@@ -30,7 +30,6 @@ def check(
     trajectory: Path | None,
     strict: bool,
     as_json: bool,
-    **shortcuts: str | bool | None,
 ) -> None:
     """Recompute the verdict on a run directory, or check any trajectory of a log.
 
@@ -44,7 +43,7 @@ def check(
       scanchain check --trajectory kiss.tum log.mcap
       scanchain check --trajectory other.tum part_0.mcap part_1.mcap --topic /lidar_front/points
     """
-    settings = overrides(ctx, part_of(shortcuts))
+    settings = overrides(ctx)
     if trajectory is None:
         if len(sources) != 1 or not isinstance(sources[0], Path) or settings:
             raise InputError("check takes one run directory; to check a log, name a --trajectory FILE.tum")

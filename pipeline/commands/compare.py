@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import click
 
 from scanchain.commands.options import (
     LOG,
     OverrideCommand,
-    ground_truth,
     ground_truth_option,
     limit_options,
     overrides,
-    part_of,
     part_options,
     threads_option,
 )
@@ -34,11 +33,18 @@ _PATH = click.Path(path_type=Path)
     help="Compare odometry with your own matcher as well, row CLASS.",
 )
 @click.option("--out", metavar="DIR", type=_PATH, help="Directory to create. [default: runs/compare-LOG]")
-@ground_truth_option
+@ground_truth_option()
 @click.option(
     "--relations", metavar="FILE", type=_PATH, help="Manually verified relative poses (Kümmerle et al. 2009)."
 )
-@click.option("--settings", metavar="FILE", type=_PATH, help="TOML file with a table of settings per method.")
+@click.option(
+    "--config",
+    "--settings",
+    "config_file",
+    metavar="FILE",
+    type=_PATH,
+    help="TOML file on top of the preset, with a table for each method whose settings differ.",
+)
 @click.option(
     "--repeat", type=click.IntRange(1), default=1, show_default=True, help="Runs of every method, interleaved."
 )
@@ -52,17 +58,9 @@ def compare(
     ctx: click.Context,
     logs: tuple[Source, ...],
     methods: str | None,
-    matcher: str,
     out: Path | None,
-    gt: str | None,
-    relations: Path | None,
-    settings: Path | None,
-    repeat: int,
-    time_limit: float | None,
-    memory_mib: float | None,
-    force: bool,
     as_json: bool,
-    **part: str | None,
+    **options: Any,
 ) -> None:
     """Compare odometry methods on the same decoded scans: accuracy, speed, memory.
 
@@ -79,7 +77,8 @@ def compare(
       open3d-p2p, open3d-gicp, kiss-icp, small-gicp, small-vgicp
       open3d-p2l, genz-icp, genz-icp-indoor, genz-icp-kitti    3D only
       my_module:MyOdometry     your own class, with the methods of scanchain.baselines.Baseline
-    A table of --settings changes the settings of a method, or defines a variant of one under another name:
+    A name that several begin with stands for all of them: kiss, open3d. Sections of --config hold for all of
+    ours, as in scanchain run; a table of a method's name changes that method, one of another name is a variant:
 
     \b
       [kiss-icp]
@@ -93,8 +92,9 @@ def compare(
     \b
     Examples:
       scanchain compare log.mcap
+      scanchain compare log.mcap --methods plicp,kiss,open3d --every 2
       scanchain compare log.mcap --methods plicp,svd,kiss-icp --repeat 5 --out runs/three
-      scanchain compare log.mcap --methods plicp,plicp-fine,mine --settings mine.toml --gt truth.tum
+      scanchain compare log.mcap --methods plicp,plicp-fine,mine --config mine.toml --gt truth.tum
       scanchain compare log.mcap --methods plicp,Mine --matcher mine:Mine
       scanchain compare intel.mcap --relations intel.relations --memory-limit 2 --end 600
     """
@@ -105,21 +105,13 @@ def compare(
     from scanchain.comparison.table import TABLE_FILE, text
     from scanchain.runs.directory import directory_name
 
-    truth_file, truth_topic = ground_truth(gt)
     comparison = Comparison(
         logs=logs,
         out=Path("runs") / f"compare-{directory_name(logs[0].stem)}" if out is None else out,
         methods=tuple(name.strip() for name in methods.split(",") if name.strip()) if methods else (),
-        matcher=matcher,
-        settings_file=settings,
-        overrides=overrides(ctx, [*part_of(part), *truth_topic]),
-        ground_truth=truth_file,
-        relations=relations,
-        repeat=repeat,
-        time_s=time_limit,
-        memory_mib=memory_mib,
-        force=force,
+        overrides=overrides(ctx),
         command=tuple(sys.argv),
+        **options,
     )
     with Terminal("scans") as terminal:
         compared = run_comparison(comparison, present_comparison, terminal)

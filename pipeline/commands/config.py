@@ -10,13 +10,10 @@ from typing import Any
 
 import click
 
-from scanchain.commands.options import OverrideCommand, overrides
+from scanchain.commands.options import OverrideCommand, config_option, overrides
 from scanchain.config_keys import Value
 from scanchain.settings import Settings, config_keys, dump, flatten, load_settings
 
-_FILE = click.option(
-    "--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file on top of the preset."
-)
 _INDENT = 6 * " "
 _LIDAR = click.option(
     "--lidar", type=click.Choice(["2d", "3d"]), help="The preset that a log of this kind would get."
@@ -35,13 +32,13 @@ def config() -> None:
 
 
 def _effective(command: Callable[..., Any]) -> Callable[..., Any]:
-    return click.pass_context(_FILE(_LIDAR(command)))
+    return click.pass_context(config_option(_LIDAR(command)))
 
 
 @config.command("show", cls=OverrideCommand)
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @_effective
-def show(ctx: click.Context, config: Path | None, lidar: str | None, as_json: bool) -> None:
+def show(ctx: click.Context, config_file: Path | None, lidar: str | None, as_json: bool) -> None:
     """Print every key with its value, unit and range, and what it sets.
 
     \b
@@ -50,7 +47,7 @@ def show(ctx: click.Context, config: Path | None, lidar: str | None, as_json: bo
       scanchain config show --lidar 2d --matching.max_distance_m 0.3
       scanchain config show --config mine.toml --json
     """
-    settings = _settings(ctx, config, lidar)
+    settings = _settings(ctx, config_file, lidar)
     values = flatten(settings.config)
     if as_json:
         keys = config_keys().values()
@@ -86,7 +83,7 @@ def show(ctx: click.Context, config: Path | None, lidar: str | None, as_json: bo
 
 @config.command("dump", cls=OverrideCommand)
 @_effective
-def dump_settings(ctx: click.Context, config: Path | None, lidar: str | None) -> None:
+def dump_settings(ctx: click.Context, config_file: Path | None, lidar: str | None) -> None:
     """Print the effective configuration as TOML, to be edited and given back with --config.
 
     \b
@@ -94,7 +91,7 @@ def dump_settings(ctx: click.Context, config: Path | None, lidar: str | None) ->
       scanchain config dump --lidar 2d > mine.toml
       scanchain config dump --config mine.toml --loops.enabled false
     """
-    click.echo(dump(_settings(ctx, config, lidar).config), nl=False)
+    click.echo(dump(_settings(ctx, config_file, lidar).config), nl=False)
 
 
 def _settings(ctx: click.Context, file: Path | None, lidar: str | None) -> Settings:

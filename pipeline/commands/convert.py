@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from scanchain.commands.options import LOG, OverrideCommand, alias, overrides, part_of, part_options
+from scanchain.commands.options import LOG, OverrideCommand, key_option, overrides, part_options
 from scanchain.errors import InputError
 from scanchain.settings import load_settings
 from scanchain.source import Source
@@ -18,8 +18,11 @@ _KEYS = tuple(f"log.{name}" for name in ("format", "rate_hz", "topic", "start_s"
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--log.key VALUE]...")
 @click.argument("source", metavar="SRC", type=LOG)
 @click.argument("destination", metavar="DST.mcap", type=click.Path(path_type=Path))
-@click.option(
-    "--rate", metavar="HZ", help="Scan rate of a folder of clouds without stamps; short for --log.rate_hz."
+@key_option(
+    "--rate",
+    "log.rate_hz",
+    metavar="HZ",
+    help="Scan rate of a folder of clouds without stamps; short for --log.rate_hz.",
 )
 @part_options(topic="all of them")
 @click.option("--force", is_flag=True, help="Replace an existing file.")
@@ -29,10 +32,8 @@ def convert(
     ctx: click.Context,
     source: Source,
     destination: Path,
-    rate: str | None,
     force: bool,
     as_json: bool,
-    **part: str | None,
 ) -> None:
     """Convert a log of another format to MCAP, or cut one. The other commands read all of these formats directly.
 
@@ -60,7 +61,7 @@ def convert(
       scanchain convert drive.bag minute.mcap --start 60 --end 120
       scanchain convert drive.bag drive.mcap --json
     """
-    chosen = overrides(ctx, [*alias("log.rate_hz", rate, "--rate"), *part_of(part)])
+    chosen = overrides(ctx)
     for override in chosen:
         if override.key not in _KEYS:
             raise InputError(f"{override.flag} has no meaning for convert; its keys are {', '.join(_KEYS)}")

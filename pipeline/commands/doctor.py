@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from scanchain.commands.options import LOG, OverrideCommand, overrides, part_of, part_options
+from scanchain.commands.options import LOG, OverrideCommand, overrides, part_options
 from scanchain.settings import load_settings
 from scanchain.source import Source
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 @part_options()
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.pass_context
-def doctor(ctx: click.Context, logs: tuple[Source, ...], as_json: bool, **part: str | None) -> None:
+def doctor(ctx: click.Context, logs: tuple[Source, ...], as_json: bool) -> None:
     """Check every scan of a log: problems, their effect on the result, and the flags that fix them.
 
     Any configuration key is a flag, as for scanchain run, so that a fix can be tried.
@@ -35,7 +35,7 @@ def doctor(ctx: click.Context, logs: tuple[Source, ...], as_json: bool, **part: 
     from scanchain.commands.terminal import Terminal
     from scanchain.logs.doctor.doctor import examine
 
-    chosen = overrides(ctx, part_of(part))
+    chosen = overrides(ctx)
     early = load_settings(overrides=chosen).config
 
     with Terminal("scans") as terminal:

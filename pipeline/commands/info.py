@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from scanchain.commands.options import LOG, OverrideCommand, overrides, part_of, part_options
+from scanchain.commands.options import LOG, OverrideCommand, overrides, part_options
 from scanchain.settings import load_settings
 from scanchain.source import Source
 from scanchain.words import counted
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 @part_options()
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.pass_context
-def info(ctx: click.Context, logs: tuple[Source, ...], as_json: bool, **part: str | None) -> None:
+def info(ctx: click.Context, logs: tuple[Source, ...], as_json: bool) -> None:
     """Print the topics of a log with types and rates, and which of them a run with the same flags would use.
 
     Exit code 1: such a run would be refused, for the reason named as problem.
@@ -37,7 +37,7 @@ def info(ctx: click.Context, logs: tuple[Source, ...], as_json: bool, **part: st
     """
     from scanchain.logs.info import describe
 
-    chosen = overrides(ctx, part_of(part))
+    chosen = overrides(ctx)
     found = describe(logs, load_settings(overrides=chosen).config.log)
     idle = load_settings(found.dimension or None, overrides=chosen, idle=found.idle_keys).without_effect
     found = replace(found, notes=(*found.notes, *idle))

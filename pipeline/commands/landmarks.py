@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import click
 from click.core import ParameterSource
 
-from scanchain.commands.options import OnceCommand
 from scanchain.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
     from scanchain.landmarks.study import Guess, Study
 
 
-@click.command(cls=OnceCommand)
+@click.command()
 @click.argument("data", metavar="DATA...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option(
     "--out",

@@ -13,13 +13,11 @@ from scanchain.commands.options import (
     LOG,
     OverrideCommand,
     collect_garbage_seldom,
-    ground_truth,
+    config_option,
     ground_truth_option,
     matcher_option,
     max_gap_option,
-    method_of,
     overrides,
-    part_of,
     part_options,
     threads_option,
 )
@@ -42,10 +40,10 @@ if TYPE_CHECKING:
     metavar="X,Y,YAW|FILE.tum",
     help="Pose of the first scan in the map: meters and degrees, or a TUM file. [default: searched for]",
 )
-@click.option("--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file on top of the preset.")
+@config_option
 @part_options()
 @matcher_option
-@ground_truth_option
+@ground_truth_option()
 @max_gap_option
 @threads_option
 @click.option("--force", is_flag=True, help="Replace an existing directory once the new one is complete.")
@@ -58,13 +56,12 @@ def localize(
     prior: Path,
     out: Path,
     initial: str | None,
-    config: Path | None,
-    gt: str | None,
-    max_gap: float | None,
+    config_file: Path | None,
+    ground_truth: Path | None,
+    max_gap_s: float | None,
     force: bool,
     strict: bool,
     as_json: bool,
-    **shortcuts: str | bool | None,
 ) -> None:
     """Find a log in the map of an earlier run, and follow it there.
 
@@ -82,14 +79,13 @@ def localize(
     from scanchain.runs.job import Job
     from scanchain.sessions.localize import localize as localize_log
 
-    truth_file, truth_topic = ground_truth(gt)
     job = Job(
         logs=logs,
         out=out,
-        config_file=config,
-        overrides=overrides(ctx, [*part_of(shortcuts), *method_of(shortcuts), *truth_topic]),
-        ground_truth=truth_file,
-        max_gap_s=max_gap,
+        config_file=config_file,
+        overrides=overrides(ctx),
+        ground_truth=ground_truth,
+        max_gap_s=max_gap_s,
         force=force,
         command=tuple(sys.argv),
     )

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import click
 
-from scanchain.commands.options import OnceCommand
 from scanchain.words import counted
 
 _PATH = click.Path(path_type=Path)
@@ -23,7 +22,7 @@ def map_group() -> None:
     """
 
 
-@map_group.command("import", cls=OnceCommand)
+@map_group.command("import")
 @click.argument("file", metavar="FILE", type=_PATH)
 @click.option("--out", required=True, metavar="DIR", type=_PATH, help="Directory to create.")
 @click.option(

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import click
 
-from scanchain.commands.options import OverrideCommand, overrides, threads_option
+from scanchain.commands.options import OverrideCommand, config_option, overrides, threads_option
 
 
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
 @click.argument("runs", metavar="RUN...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Directory to create.")
-@click.option("--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file on top of the preset.")
+@config_option
 @click.option("--fixed", is_flag=True, help="Leave the poses of the first RUN as they are.")
 @click.option("--update", is_flag=True, help="Remove from older sessions what newer ones saw through.")
 @threads_option
@@ -24,11 +25,8 @@ def merge(
     ctx: click.Context,
     runs: tuple[Path, ...],
     out: Path,
-    config: Path | None,
-    fixed: bool,
-    update: bool,
-    force: bool,
     as_json: bool,
+    **options: Any,
 ) -> None:
     """Merge the maps of several runs into one map in one frame.
 
@@ -50,16 +48,7 @@ def merge(
     from scanchain.sessions.merging import MergeJob
     from scanchain.sessions.merging import merge as merge_maps
 
-    job = MergeJob(
-        runs=runs,
-        out=out,
-        config_file=config,
-        overrides=overrides(ctx),
-        fixed=fixed,
-        update=update,
-        force=force,
-        command=tuple(sys.argv),
-    )
+    job = MergeJob(runs=runs, out=out, overrides=overrides(ctx), command=tuple(sys.argv), **options)
     with Terminal("maps") as terminal:
         merged = merge_maps(job, terminal, present_merge)
     click.echo((merged.path / "metrics.json").read_text() if as_json else merged.summary, nl=False)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, cast
 import click
 
 from scanchain.commands.graph_report import GraphReport
-from scanchain.commands.options import OverrideCommand, alias, check_output, overrides
+from scanchain.commands.options import OverrideCommand, check_output, key_option, overrides
 from scanchain.errors import InputError, remedy_of
 from scanchain.settings import Override, load_settings
 
@@ -30,8 +30,9 @@ _INITIALIZATIONS = ("auto", "given", "odometry", "spanning-tree", "chordal")
 @click.option(
     "--out", metavar="FILE", type=_PATH, help="Write the optimized graph: .g2o, or TORO's .graph or .toro."
 )
-@click.option(
+@key_option(
     "--optimizer",
+    "graph.optimizer",
     metavar="NAME",
     help="levenberg-marquardt, gauss-newton, dogleg, newton or gradient-descent; short for --graph.optimizer.",
 )
@@ -42,8 +43,9 @@ _INITIALIZATIONS = ("auto", "given", "odometry", "spanning-tree", "chordal")
     show_default=True,
     help="Initial guess; auto takes the file's, or the chordal one if that is poor.",
 )
-@click.option(
+@key_option(
     "--robust",
+    "graph.robust",
     metavar="KERNEL",
     help="Robust loss of edges that skip poses: truncated, geman-mcclure, tukey, cauchy, huber. [default: none]",
 )
@@ -77,7 +79,6 @@ def optimize(
     recording: Path | None,
     force: bool,
     as_json: bool,
-    **shortcuts: str | None,
 ) -> None:
     """Optimize a pose graph and certify whether the minimum is global.
 
@@ -95,7 +96,7 @@ def optimize(
     """
     outputs = Outputs(out, marginals, png, recording)
     outputs.check(force)
-    settings = overrides(ctx, _aliases(shortcuts))
+    settings = overrides(ctx)
     config = _config(settings)
     is_robust = config.robust != "none" and any(setting.key == "graph.robust" for setting in settings)
     file = _read(source, cast("Indefinite", indefinite), is_robust)
@@ -184,11 +185,6 @@ def _written(path: Path) -> Generator[None]:
         if remedy_of(error):
             raise
         raise InputError(f"{path}: not writable ({error.strerror}); choose another place") from error
-
-
-def _aliases(options: dict[str, str | None]) -> list[Override]:
-    """Configuration keys set by the short options."""
-    return [each for name, value in options.items() for each in alias(f"graph.{name}", value, f"--{name}")]
 
 
 def _config(settings: Sequence[Override]) -> GraphConfig:

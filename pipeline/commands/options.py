@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import gc
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from functools import reduce
 from math import inf
 from pathlib import Path
 from typing import Any
@@ -26,23 +26,7 @@ def collect_garbage_seldom() -> None:
     gc.set_threshold(_GARBAGE_EVERY)
 
 
-class OnceCommand(click.Command):
-    """Command that refuses a single-valued option given twice; click would silently take the last."""
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse the arguments once for what is named twice, then as usual."""
-        _, _, named = self.make_parser(ctx).parse_args(args=list(args))
-        for parameter, count in Counter(named).items():
-            if count > 1 and isinstance(parameter, click.Option) and _holds_one_value(parameter):
-                raise click.UsageError(f"{parameter.opts[0]} is given {count} times; give it once", ctx)
-        return super().parse_args(ctx, args)
-
-
-def _holds_one_value(option: click.Option) -> bool:
-    return not (option.multiple or option.is_flag or option.count)
-
-
-class OverrideCommand(OnceCommand):
+class OverrideCommand(click.Command):
     """Command that takes any configuration key as ``--section.key value``.
 
     Options with a dot in their name are taken out of the arguments before click sees the rest.
@@ -70,13 +54,13 @@ class OverrideCommand(OnceCommand):
         return super().parse_args(ctx, rest)
 
 
-def overrides(ctx: click.Context, aliases: Sequence[Override] = ()) -> tuple[Override, ...]:
-    """The keys that a command's options set: ``aliases`` as --matcher, and the ``--section.key`` options.
+def overrides(ctx: click.Context) -> tuple[Override, ...]:
+    """The keys that a command's options set: those of ``key_option`` as --matcher, and ``--section.key``.
 
     Raises click.UsageError where two of them set the same key.
     """
     chosen: dict[str, Override] = {}
-    for override in (*aliases, *ctx.meta[_KEY]):
+    for override in (*ctx.meta.get(_ALIASES, ()), *ctx.meta[_KEY]):
         other = chosen.setdefault(override.key, override)
         if other is override:
             continue
@@ -88,12 +72,21 @@ def overrides(ctx: click.Context, aliases: Sequence[Override] = ()) -> tuple[Ove
     return tuple(chosen.values())
 
 
-def alias(key: str, value: Any, flag: str) -> tuple[Override, ...]:
-    """Override of the key that an option sets; empty if the option was not given."""
-    return () if value is None else (Override(key, str(value), flag),)
+_KEY, _ALIASES = "scanchain.commands.overrides", "scanchain.commands.aliases"
 
 
-_KEY = "scanchain.commands.overrides"
+def key_option(flag: str, key: str, *, value: str | None = None, **attributes: Any) -> Callable[[Any], Any]:
+    """An option that sets a configuration key, which ``overrides`` returns; ``value`` is that of a flag."""
+
+    def keep(ctx: click.Context, _: click.Parameter, given: str | bool | None) -> None:
+        if given not in (None, False):
+            _set(ctx, Override(key, value or str(given), flag))
+
+    return click.option(flag, is_flag=True if value else None, expose_value=False, callback=keep, **attributes)
+
+
+def _set(ctx: click.Context, override: Override) -> None:
+    ctx.meta.setdefault(_ALIASES, []).append(override)
 
 
 class _LogType(click.ParamType):
@@ -107,34 +100,20 @@ class _LogType(click.ParamType):
 LOG = _LogType()
 
 
-_PART = (
-    ("topic", "TOPIC", "log.topic", "Lidar topic{of}. [default: {topic}]"),
-    ("start", "SECONDS", "log.start_s", "Skip {log} up to this time, counted from its first message."),
-    ("end", "SECONDS", "log.end_s", "Skip {log} after this time."),
-    ("every", "N", "log.every", "Take every N-th scan."),
-)
-
-
 def part_options(log: str = "the log", *, topic: str = "the only one that fits") -> Callable[[Any], Any]:
-    """``--topic``, ``--start``, ``--end`` and ``--every``, the part of a log; ``part_of`` reads them.
+    """``--topic``, ``--start``, ``--end`` and ``--every``, the part of a log.
 
     log, topic : in words, what is cut and which lidar is taken without ``--topic``
     """
-
-    def decorate(command: Any) -> Any:
-        for name, metavar, _, text in reversed(_PART):
-            of = "" if log == "the log" else f" of {log}"
-            command = click.option(f"--{name}", metavar=metavar, help=text.format(log=log, of=of, topic=topic))(
-                command
-            )
-        return command
-
-    return decorate
-
-
-def part_of(options: Mapping[str, str | bool | None]) -> tuple[Override, ...]:
-    """The keys that ``part_options`` set."""
-    return tuple(each for name, _, key, _ in _PART for each in alias(key, options[name], f"--{name}"))
+    of = "" if log == "the log" else f" of {log}"
+    begin = f"Skip {log} up to this time, counted from its first message."
+    options = (
+        key_option("--topic", "log.topic", metavar="TOPIC", help=f"Lidar topic{of}. [default: {topic}]"),
+        key_option("--start", "log.start_s", metavar="SECONDS", help=begin),
+        key_option("--end", "log.end_s", metavar="SECONDS", help=f"Skip {log} after this time."),
+        key_option("--every", "log.every", metavar="N", help="Take every N-th scan."),
+    )
+    return lambda command: reduce(lambda decorated, option: option(decorated), reversed(options), command)
 
 
 def _use(context: click.Context, parameter: click.Parameter, count: int | None) -> None:
@@ -152,36 +131,29 @@ threads_option = click.option(
 )
 
 
-matcher_option = click.option(
+matcher_option = key_option(
     "--matcher",
+    "matching.matcher",
     metavar="plicp|svd|MODULE:CLASS",
     help="LM-PLICP (the default), SVD-ICP, or your own class (scanchain.registration.Matcher).",
 )
-no_loops_option = click.option("--no-loops", is_flag=True, help="Odometry only, no loop closures.")
+no_loops_option = key_option("--no-loops", "loops.enabled", value="false", help="Odometry only, no loop closures.")
 
 
-def method_of(options: Mapping[str, str | bool | None]) -> tuple[Override, ...]:
-    """The keys that ``matcher_option`` and ``no_loops_option`` set."""
-    no_loops = "false" if options.get("no_loops") else None
-    return (
-        *alias("matching.matcher", options["matcher"], "--matcher"),
-        *alias("loops.enabled", no_loops, "--no-loops"),
-    )
-
-
-def ground_truth_option(command: Callable[..., None]) -> Callable[..., None]:
-    """The option ``--gt``."""
-    return click.option(
-        "--gt",
-        metavar="FILE|TOPIC|none",
-        help="Ground truth: TUM, KITTI or a topic; none to ignore that of the log. [default: /ground_truth]",
-    )(command)
+config_option = click.option(
+    "--config",
+    "config_file",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="TOML file on top of the preset.",
+)
 
 
 def max_gap_option(command: Callable[..., None]) -> Callable[..., None]:
     """The option ``--max-gap``."""
     return click.option(
         "--max-gap",
+        "max_gap_s",
         type=float,
         callback=_checked_gap,
         metavar="SECONDS",
@@ -195,31 +167,29 @@ def _checked_gap(_: click.Context, __: click.Parameter, value: float | None) -> 
     return value
 
 
-def ground_truth(text: str | None) -> tuple[Path | None, tuple[Override, ...]]:
-    """A file, or a topic or "none" as an override; any other word is a file."""
-    if text is None:
-        return None, ()
-    path = Path(text)
-    if text == NO_TRUTH or (text.startswith("/") and not path.exists() and not path.suffix):
-        return None, (Override("log.ground_truth_topic", text, "--gt"),)
-    return path, ()
+def ground_truth_option(
+    metavar: str = "FILE|TOPIC|none",
+    help: str = "Ground truth: TUM, KITTI or a topic; none to ignore that of the log. [default: /ground_truth]",
+) -> Callable[[Any], Any]:
+    """The option ``--gt``: ``ground_truth`` is a file or None, a topic or "none" is an override."""
+
+    def keep(ctx: click.Context, _: click.Parameter, text: str | None) -> Path | None:
+        if text is None:
+            return None
+        path = Path(text)
+        if text == NO_TRUTH or (text.startswith("/") and not path.exists() and not path.suffix):
+            return _set(ctx, Override("log.ground_truth_topic", text, "--gt"))
+        return path
+
+    return click.option("--gt", "ground_truth", metavar=metavar, callback=keep, help=help)
 
 
 _MIB_PER_GIB = 1024.0
 _ABOVE_ZERO = click.FloatRange(0.0, min_open=True)
 
 
-class _MemoryType(click.ParamType):
-    """A number of GiB, handed on in MiB."""
-
-    name = "memory"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        return _MIB_PER_GIB * _ABOVE_ZERO.convert(value, param, ctx)
-
-
 def limit_options(what: str, *, time_default: str, memory_default: str) -> Callable[[Any], Any]:
-    """``--time-limit`` as ``time_limit`` in seconds, ``--memory-limit`` as ``memory_mib``; None where not given.
+    """``--time-limit`` as ``time_s``, ``--memory-limit`` as ``memory_mib``; None where not given.
 
     what : the thing limited, in words; time_default, memory_default : the defaults, in words
     """
@@ -229,12 +199,14 @@ def limit_options(what: str, *, time_default: str, memory_default: str) -> Calla
             click.option(
                 "--memory-limit",
                 "memory_mib",
-                type=_MemoryType(),
+                type=_ABOVE_ZERO,
+                callback=lambda _, __, gib: None if gib is None else _MIB_PER_GIB * gib,
                 metavar="GIB",
                 help=f"Memory limit of {what}. [default: {memory_default}]",
             ),
             click.option(
                 "--time-limit",
+                "time_s",
                 type=_ABOVE_ZERO,
                 metavar="SECONDS",
                 help=f"Time limit of {what}. [default: {time_default}]",

@@ -14,14 +14,12 @@ from scanchain.commands.options import (
     OWN_PROCESS,
     OverrideCommand,
     collect_garbage_seldom,
-    ground_truth,
+    config_option,
     ground_truth_option,
     matcher_option,
     max_gap_option,
-    method_of,
     no_loops_option,
     overrides,
-    part_of,
     part_options,
     threads_option,
 )
@@ -39,7 +37,7 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
 @click.option(
     "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Run directory to create."
 )
-@click.option("--config", metavar="FILE", type=click.Path(path_type=Path), help="TOML file on top of the preset.")
+@config_option
 @part_options()
 @click.option(
     "--rerun",
@@ -50,13 +48,14 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
 )
 @matcher_option
 @no_loops_option
-@ground_truth_option
+@ground_truth_option()
 @max_gap_option
 @threads_option
 @click.option("--force", is_flag=True, help="Replace an existing run directory once the new one is complete.")
 @click.option("--resume", is_flag=True, help="Resume a run that was killed or stopped from its last checkpoint.")
 @click.option(
     "--checkpoint",
+    "checkpoint_s",
     type=click.FloatRange(0.0),
     default=10.0,
     show_default=True,
@@ -70,16 +69,10 @@ def run(
     ctx: click.Context,
     logs: tuple[Source, ...],
     out: Path,
-    config: Path | None,
     rerun: str,
-    gt: str | None,
-    max_gap: float | None,
-    force: bool,
-    resume: bool,
-    checkpoint: float,
     strict: bool,
     as_json: bool,
-    **shortcuts: str | bool | None,
+    **options: Any,
 ) -> None:
     """Compute the trajectory and the map of a log, with a rerun recording.
 
@@ -112,20 +105,8 @@ def run(
             leave_pandas_out()
         return open_recorder(path, **options)
 
-    truth_file, truth_topic = ground_truth(gt)
-    job = Job(
-        logs=logs,
-        out=out,
-        config_file=config,
-        overrides=overrides(ctx, [*part_of(shortcuts), *method_of(shortcuts), *truth_topic]),
-        sinks=_sinks(rerun),
-        ground_truth=truth_file,
-        max_gap_s=max_gap,
-        force=force,
-        resume=resume,
-        checkpoint_s=checkpoint,
-        command=tuple(sys.argv),
-    )
+    command = tuple(sys.argv)
+    job = Job(logs=logs, out=out, overrides=overrides(ctx), sinks=_sinks(rerun), command=command, **options)
     with Terminal("scans") as terminal:
         finished = run_log(job, record, terminal, write_report)
     is_seen = sys.stdout.isatty() and not as_json  # the summary holds the same sentences

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import click
 
-from scanchain.commands.options import OnceCommand
-
 
 @click.group()
 def sequence() -> None:
@@ -21,7 +19,7 @@ def sequence() -> None:
     """
 
 
-@sequence.command("list", cls=OnceCommand)
+@sequence.command("list")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 def list_sequences(as_json: bool) -> None:
     """List the catalog.
@@ -45,7 +43,7 @@ def list_sequences(as_json: bool) -> None:
         click.echo(f"{name:<{width}}  {entry.dimension}D  {kind:<9}  {entry.title}")
 
 
-@sequence.command("get", cls=OnceCommand)
+@sequence.command("get")
 @click.argument("name", metavar="NAME")
 @click.option(
     "--out",

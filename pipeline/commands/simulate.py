@@ -6,12 +6,11 @@ from pathlib import Path
 
 import click
 
-from scanchain.commands.options import OnceCommand
 from scanchain.errors import InputError
 from scanchain.words import counted
 
 
-@click.command(cls=OnceCommand)
+@click.command()
 @click.argument("world", metavar="WORLD")
 @click.argument("destination", metavar="DST.mcap", type=click.Path(path_type=Path))
 @click.option(

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import click
 
-from scanchain.commands.options import OnceCommand, check_output
+from scanchain.commands.options import check_output
 from scanchain.errors import InputError
 
 
-@click.command(cls=OnceCommand)
+@click.command()
 @click.argument("directory", metavar="DIR", type=click.Path(path_type=Path))
 @click.option("--web", is_flag=True, help="Serve it to a browser on this machine, until Ctrl-C.")
 @click.option(

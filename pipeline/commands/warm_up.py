@@ -11,14 +11,13 @@ from time import perf_counter
 
 import click
 
-from scanchain.commands.options import OnceCommand
 from scanchain.errors import ScanchainError
 
 _WORLDS = {"2d": ("office", 8), "3d": ("town", 3)}  # with the seconds driven there
 _EXPECTED = (0, 1)  # 1: logs this short are not all judged trustworthy
 
 
-@click.command(cls=OnceCommand)
+@click.command()
 @click.argument("which", default="all", type=click.Choice(("2d", "3d", "all")))
 def warm_up(which: str) -> None:
     """Compile what run, localize, merge and simulate need into the cache, instead of in the first of them.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
@@ -13,7 +13,7 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.comparison.assessment import assess
-from scanchain.comparison.methods import default_names, resolve
+from scanchain.comparison.methods import default_names, resolve, shared_settings
 from scanchain.comparison.processes import limits_for, run_all
 from scanchain.comparison.results import Reference, Results, write_results
 from scanchain.comparison.scan_store import StoredScans, store
@@ -40,7 +40,8 @@ class Comparison:
     logs : the files of one log
     out : the directory to make
     methods : names; none are all that make sense; matcher : one of the configuration's, compared as well
-    settings_file : a table a method; overrides : keys of the configuration, for the log and all of ours
+    config_file : sections of the configuration and a table a method; overrides : keys of the configuration, for
+        the log and all of ours
     ground_truth : a TUM or KITTI file; None where the log's own is good
     relations : a file of relations
     repeat : runs of every method, in turn
@@ -53,7 +54,7 @@ class Comparison:
     out: Path
     methods: tuple[str, ...] = ()
     matcher: str = ""
-    settings_file: Path | None = None
+    config_file: Path | None = None
     overrides: tuple[Override, ...] = ()
     ground_truth: Path | None = None
     relations: Path | None = None
@@ -83,12 +84,13 @@ def compare(comparison: Comparison, present: Callable[[Path], None], progress: P
     Raises InputError for bad input before anything is run.
     """
     began = perf_counter()
-    log = open_log(comparison.logs, load_settings(overrides=comparison.overrides).config.log)
-    settings = load_settings(log.dimension, overrides=comparison.overrides, idle=log.idle_keys())
+    overrides = (*shared_settings(comparison.config_file), *comparison.overrides)
+    log = open_log(comparison.logs, load_settings(overrides=overrides).config.log)
+    settings = load_settings(log.dimension, overrides=overrides, idle=log.idle_keys())
     methods = resolve(
         comparison.methods or default_names(log.dimension),
         log.dimension,
-        file=comparison.settings_file,
+        file=comparison.config_file,
         overrides=comparison.overrides,
         matcher=comparison.matcher,
     )
@@ -102,12 +104,12 @@ def compare(comparison: Comparison, present: Callable[[Path], None], progress: P
         stopped = (
             f"the user stopped the reading: {counted(len(scans), 'scan')} compared" if progress.stopped else ""
         )
-        reference = _reference(comparison, log, scans)
+        reference = _reference(replace(comparison, overrides=overrides), log, scans)
         limits = limits_for(len(scans), comparison.time_s, comparison.memory_mib)
         outcomes = run_all(
             methods, scans, Path(shared), repeat=comparison.repeat, limits=limits, progress=progress
         )
-        progress.say("evaluating and drawing")
+        progress.announce("evaluating and drawing")
         assessed = {
             name: assess(runs, scans.stamps_ns, reference.truth, reference.relations)
             for name, runs in outcomes.items()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,7 +12,7 @@ import msgspec
 from msgspec import Struct
 
 from scanchain.baselines import BASELINES
-from scanchain.config import MATCHERS
+from scanchain.config import MATCHERS, Config
 from scanchain.errors import InputError
 from scanchain.plugins import is_class_name
 from scanchain.registration import create_matcher
@@ -29,6 +30,8 @@ _ON_REQUEST = (
     "genz-icp-kitti",
 )
 _BASE = "method"  # the key of a table that names the method it is a variant of
+_KINDS = ("matching.matcher", "loops.enabled")  # keys that tell ours apart
+_SECTIONS = Config.__struct_fields__
 _SHARED = ("log", "maps", "recording", "outputs")  # sections of the configuration that no single method has
 
 
@@ -75,16 +78,17 @@ def resolve(
     """The methods of these names, settings checked.
 
     file : TOML, one table a method; a table of another name is a variant of the one that its key ``method`` names
-    overrides : keys of the configuration, for all of ours
+    overrides : keys of the configuration, for all of ours; sections of it in ``file`` are ``shared_settings``
     matcher : one that is compared as well; ours with MODULE:CLASS are called CLASS and CLASS+loops
     Raises InputError for a name or a key that there is not.
     """
-    tables = {} if file is None else _tables(file)
+    tables = {name: table for name, table in _tables(file).items() if name not in _SECTIONS}
+    names = [each for name in names for each in ([name] if name in tables else _spelled_out(name, dimension))]
     if matcher:
         is_class = is_class_name(matcher)
         own = matcher.rpartition(":")[2] if is_class else matcher
         if not {own, f"{own}+loops"} & set(names):
-            names = (*names, own)
+            names = [*names, own]
         for base in (_ANY, f"{_ANY}+loops") if is_class else ():
             name = base.replace(_ANY, own)
             if name in names:
@@ -95,13 +99,24 @@ def resolve(
             f"{file}: [{unused[0]}] is not among the methods: {', '.join(names)}; add it to --methods"
         )
     if len(set(names)) < len(names):
-        raise InputError(f"--methods names one twice: {', '.join(names)}; name a variant in --settings instead")
+        raise InputError(f"--methods names one twice: {', '.join(names)}; name a variant in --config instead")
     for override in overrides:
-        if override.key in ("matching.matcher", "loops.enabled"):
+        if override.key in _KINDS:
             raise InputError(
                 f"{override.flag} distinguishes plicp, svd and +loops; choose by --methods or --matcher"
             )
     return tuple(_method(name, tables.get(name, {}), dimension, file, overrides) for name in names)
+
+
+def shared_settings(file: Path | None) -> tuple[Override, ...]:
+    """The keys that the sections of a file set for the log and all of ours, but for those that tell them apart."""
+    sections = {name: table for name, table in _tables(file).items() if name in _SECTIONS}
+    return tuple(
+        Override(key, str(value), f"{file}: {key}")
+        for section, keys in sections.items()
+        for key, value in _by_key(section, keys).items()
+        if key not in _KINDS
+    )
 
 
 def _method(
@@ -112,15 +127,27 @@ def _method(
     if name.startswith("."):
         raise InputError(f"{name!r} cannot be a folder's name; let the method's begin with a letter")
     if base in OURS:
-        return Method(name, base, _our_settings(base, own, dimension, where, overrides))
+        return Method(name, base, _our_settings(base, own, dimension, where, shared_settings(file), overrides))
     if base in BASELINES:
         return Method(name, base, _their_settings(name, base, own, dimension, where))
     if is_class_name(base):
         return Method(name, base, own)
-    known = ", ".join((*OURS, *BASELINES))
+    known, word = (*OURS, *BASELINES), base.lower()
+    near = [each for each in known if word in each] or difflib.get_close_matches(word, known) or known
     raise InputError(
-        f"there is no method {base!r}; choose among {known}, or say in --settings what [{name}] is a variant of"
+        f"there is no method {base!r}; choose among {', '.join(near)}, or say in --config what [{name}] is a "
+        "variant of"
     )
+
+
+def _spelled_out(name: str, dimension: int) -> Sequence[str]:
+    """The methods that a word stands for: kiss_icp for kiss-icp, open3d for all of Open3D's that apply."""
+    word = name.lower().replace("_", "-")
+    if is_class_name(name) or name in OURS:
+        return [name]
+    return [each for each in default_names(dimension) if word != each and each.startswith(f"{word}-")] or [
+        word if word in BASELINES else name
+    ]
 
 
 def _their_settings(name: str, base: str, own: Mapping[str, Any], dimension: int, where: str) -> dict[str, Any]:
@@ -136,7 +163,12 @@ def _their_settings(name: str, base: str, own: Mapping[str, Any], dimension: int
 
 
 def _our_settings(
-    base: str, own: Mapping[str, Any], dimension: int, where: str, overrides: Sequence[Override]
+    base: str,
+    own: Mapping[str, Any],
+    dimension: int,
+    where: str,
+    shared: Sequence[Override],
+    overrides: Sequence[Override],
 ) -> dict[str, Any]:
     """The configuration of one of ours; no wheels unless requested, since nobody else has them."""
     wheels = Override("odometry.prior", "constant-velocity", "scanchain compare")
@@ -154,7 +186,7 @@ def _our_settings(
         if each.text.lower() != kind.get(each.key, each.text.lower()):
             raise InputError(f"{each.flag} is {each.text}, but {base} has {kind[each.key]}; choose another method")
     fixed = [Override(key, text, "scanchain compare") for key, text in kind.items()]
-    config = load_settings(dimension, overrides=(wheels, *table, *overrides, *fixed)).config
+    config = load_settings(dimension, overrides=(wheels, *shared, *table, *overrides, *fixed)).config
     create_matcher(config.matching)  # raises InputError where a user's class cannot be loaded
     return {name: keys for name, keys in msgspec.to_builtins(config).items() if name not in _SHARED}
 
@@ -166,11 +198,13 @@ def _by_key(section: str, keys: Any) -> dict[str, Any]:
     )
 
 
-def _tables(file: Path) -> dict[str, dict[str, Any]]:
+def _tables(file: Path | None) -> dict[str, dict[str, Any]]:
+    if file is None:
+        return {}
     try:
         tree = tomllib.loads(file.read_text(encoding="utf-8"))
     except OSError as error:
-        raise InputError(f"{file}: cannot be read ({error.strerror}); --settings takes a TOML file") from None
+        raise InputError(f"{file}: cannot be read ({error.strerror}); --config takes a TOML file") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{file}: is not TOML: {' '.join(str(error).split())}") from None
     for name, table in tree.items():

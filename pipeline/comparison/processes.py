@@ -16,6 +16,7 @@ from scanchain.comparison.scan_store import StoredScans
 from scanchain.comparison.worker import METHOD_FILE
 from scanchain.processes import Ending, KilledFor, Limits, available_mib, run_within
 from scanchain.runs.job import Progress
+from scanchain.words import counted
 
 _LEAST_S, _SCAN_S = 300.0, 1.0  # default time limit, seconds: at least, and for each scan
 _SHARE = 0.75  # share of the free memory that is the default limit
@@ -47,10 +48,10 @@ def run_all(
                 continue
             outcome = _run(method, scans, folder / f"run_{turn}_{place}", limits)
             if outcome.is_whole and outcome.report.has_compiled:
-                progress.say(f"{method.name}: compiled its kernels, once after the installation; run again")
+                progress.announce(f"{method.name}: compiled its kernels, once after the installation; run again")
                 outcome = _run(method, scans, folder / f"run_{turn}_{place}_compiled", limits)
             outcomes[method.name].append(outcome)
-            progress.say(_progress_line(method.name, turn, repeat, outcome))
+            progress.announce(_progress_line(method.name, turn, repeat, outcome))
     return outcomes
 
 
@@ -63,7 +64,7 @@ def _run(method: Method, scans: StoredScans, folder: Path, limits: Limits) -> Ou
 def _progress_line(name: str, turn: int, repeat: int, outcome: Outcome) -> str:
     which = f" {turn + 1}/{repeat}" if repeat > 1 else ""
     if outcome.report.status is Status.OK:
-        return f"{name}{which}: {outcome.seconds.sum():.1f} s"
+        return f"{name}{which}: {counted(len(outcome.seconds), 'scan')} in {outcome.seconds.sum():.1f} s"
     return f"{name}{which}: {outcome.report.status}: {outcome.report.reason}"
 
 

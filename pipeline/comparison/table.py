@@ -35,7 +35,7 @@ class Row(Struct, frozen=True):
     Attributes
     ----------
     status, reason : of the first run that did not end well, else ok
-    settings : whole, as a TOML file for --settings would hold them
+    settings : whole, as a TOML file for --config would hold them
     definitions : of its errors, as text
     verdict, verdict_reason : on its trajectory, of other tools by wheels and constant velocity; empty if it failed
     """

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Literal
+
+import numpy as np
 
 from scanchain import checks
-from scanchain.data import Trajectory
+from scanchain.data import Matrix, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation.absolute import AbsoluteError, Alignment, absolute_error
+from scanchain.evaluation.offset_and_scale import find_time_offset, scale_of, scaled, shifted
 from scanchain.evaluation.pairing import Pairs, pair
 from scanchain.evaluation.reference import read_truth
 from scanchain.evaluation.relations import RelationError
@@ -35,12 +39,18 @@ class Results:
     """Metrics by name: those computed, and the reason for each that could not be.
 
     ``pairing`` : which poses were compared with the truth; ``warnings`` : why that may mislead, a line each
+    ``scale``, ``time_offset_s`` : the factor put on the estimate and the seconds added to its stamps before that
+    ``aligned`` : (N, 4, 4) the estimate as the ATE compares it, ``reference`` the true poses beside it
     """
 
     found: dict[str, Result]
     missing: dict[str, str]
     pairing: str = ""
     warnings: Sequence[str] = ()
+    scale: float = 1.0
+    time_offset_s: float = 0.0
+    aligned: Matrix = field(default_factory=lambda: np.empty((0, 4, 4)))
+    reference: Matrix = field(default_factory=lambda: np.empty((0, 4, 4)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +81,8 @@ def evaluate(
     align: str = "rigid",
     max_gap_s: float | None = None,
     rpe: str = "1pose,1s,10m,100m",
+    scale: bool = False,
+    time_offset: float | Literal["auto"] = 0.0,
     source: str = "rpe",
 ) -> Results:
     """Every metric that a trajectory and its ground truth allow: ATE, RPE over each interval, KITTI.
@@ -80,6 +92,8 @@ def evaluate(
     align : "rigid", "first" or "none", for the ATE
     max_gap_s : truth is interpolated over at most this; by default five of its usual intervals, 0.1 to 0.6 s
     rpe : intervals in poses, seconds or meters; ``source`` names them in errors
+    scale : whether the estimate is scaled to fit the truth first (Umeyama 1991), for one of unknown scale
+    time_offset : seconds to add to the stamps of the estimate, or "auto" for those of the least ATE within ±1 s
     Returns ``found`` by name ("ate", "rpe_1_s", "kitti"), ``missing`` with reasons, ``warnings``.
     Raises InputError where no pose has a true one, or an argument is none of these.
     """
@@ -90,13 +104,20 @@ def evaluate(
     if isinstance(truth, str | Path):
         truth = read_truth(Path(truth)).at(trajectory.stamps_ns)
     checks.instance(truth, Trajectory, "truth", "read_tum(path)")
-    pairs = pair(trajectory, truth, gap_s=max_gap_s)
+    if time_offset == "auto":
+        time_offset = find_time_offset(trajectory, truth, gap_s=max_gap_s, with_scale=scale)
+    offset_s = checks.seconds(time_offset, "time_offset")
+    pairs = pair(shifted(trajectory, offset_s), truth, gap_s=max_gap_s)
+    factor = scale_of(pairs) if scale else 1.0
+    pairs = scaled(pairs, factor)
     metrics: dict[str, Callable[[], Result]] = {
         **{interval.name: partial(interval.error, pairs) for interval in intervals},
         "kitti": partial(kitti_error_of_any_path, pairs),
     }
     ate = absolute_error(pairs, Alignment(align))
-    results = Results({"ate": ate}, {}, pairs.description, [*filter(None, [ate.complaint]), *pairs.warnings])
+    warnings = [*filter(None, [ate.complaint]), *pairs.warnings]
+    aligned = ate.T_reference_estimate @ pairs.estimate
+    results = Results({"ate": ate}, {}, pairs.description, warnings, factor, offset_s, aligned, pairs.reference)
     for name, metric in metrics.items():
         try:
             results.found[name] = metric()

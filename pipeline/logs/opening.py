@@ -26,8 +26,9 @@ from scanchain.logs.formats.ros2_bag import claims_ros2_bag, index_ros2_bag, par
 from scanchain.logs.formats.user import index_scans, load_format
 from scanchain.logs.mcap.index import claims_mcap, index_file
 from scanchain.logs.mcap.records import FileIndex
-from scanchain.logs.mcap.selection import complete
+from scanchain.logs.mcap.selection import are_parts, complete
 from scanchain.logs.mcap.summary import index_by_summary
+from scanchain.logs.topics import is_lidar
 from scanchain.source import Source
 
 
@@ -63,6 +64,7 @@ HAS_STAMPS = "the log has its own stamps, it is no folder of clouds"  # why log.
 
 _RUN_FILE = "run.json"
 _PART_SUFFIXES = (".mcap", ".bag", ".db3")
+_LOG_SUFFIXES = (*_PART_SUFFIXES, ".log", ".clf", ".bz2", ".gz")
 _POSE_GRAPH = re.compile(rb"^\s*(VERTEX|EDGE)(2|3|_\w+)?(:QUAT)?\s", re.MULTILINE)  # of g2o or TORO
 _HEAD_BYTES = 64  # number of bytes of a file's head by which formats claim it
 _DEFAULTS = LogConfig()
@@ -94,6 +96,32 @@ def index_files(sources: Sequence[Source], config: LogConfig = _DEFAULTS) -> lis
     if name == AUTO:
         indexes[0].notes += [note for source in sources for note in _other_parts(source)]
     return indexes
+
+
+def logs_in(folder: Path) -> list[Path]:
+    """The logs in a folder, by name; the folder alone where it is one log, or holds the parts of one."""
+    if _is_claimed(folder):
+        return [folder]
+    found = [path for path in sorted(folder.iterdir(), key=natural_order) if _is_named_as_log(path)]
+    return [folder] if len(found) < 2 or (found == _parts(folder) and _is_one_log(found)) else found
+
+
+def _is_named_as_log(path: Path) -> bool:
+    if path.is_file():
+        return path.suffix.lower() in _LOG_SUFFIXES
+    return path.is_dir() and (_is_claimed(path) or _parts(path) != [path])
+
+
+def _is_claimed(folder: Path) -> bool:
+    return (folder / _RUN_FILE).is_file() or any(form.claims(folder, b"") for form in FORMATS.values())
+
+
+def _is_one_log(files: Sequence[Path]) -> bool:
+    """True if the files of a folder follow one another in time, or have no topic of a lidar in common."""
+    try:
+        return are_parts(index_files(files), is_lidar)
+    except InputError:
+        return False
 
 
 def _index(source: Source, number: int, config: LogConfig) -> FileIndex:

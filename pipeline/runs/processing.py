@@ -108,7 +108,8 @@ def process(
             _record_truth(true_poses, job.max_gap_s, result, recording)
         slam.points.close()
         held_s = _hold(recording, progress)
-        progress.say("writing the rest of the recording")
+        if job.sinks:
+            progress.say("writing the rest of the recording")
     return Processed(
         result,
         results.cloud,

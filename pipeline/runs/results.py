@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import Config, MapsConfig
-from scanchain.data import Keyframe, Matrix, Points, Pose
+from scanchain.data import Keyframe, Matrix, Points, Pose, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import ExpectedErrors, expected_errors
 from scanchain.graph.files.g2o_write import rejected_path, write_g2o
@@ -113,6 +113,13 @@ def _write_keyframes(path: Path, results: Results) -> None:
         write_wide_tum(path, results.result.keyframe_trajectory, results.expected.covariances)
 
 
+def _write_base(path: Path, results: Results) -> None:
+    """The robot's trajectory, in the frame of the lidar's; none where the log does not state the mounting."""
+    log, trajectory = results.log, results.result.trajectory
+    if log.mounting.base and log.mounting.motion is None:
+        write_tum(path, Trajectory(trajectory.stamps_ns, trajectory.poses @ lie.inverse(log.T_base_lidar)))
+
+
 def _write_saved_map(path: Path, results: Results) -> None:
     """The map of the largest piece of the log."""
     result, graph = results.result, results.result.graph
@@ -131,6 +138,7 @@ def _write_saved_map(path: Path, results: Results) -> None:
 OUTPUTS = (  # a new format: a function of path and Results in a file of its own, and a line here
     Output("trajectory.tum", lambda path, r: write_tum(path, r.result.trajectory)),
     Output("keyframes.tum", _write_keyframes),
+    Output("trajectory_base.tum", _write_base),
     Output("odometry.tum", lambda path, r: write_tum(path, r.result.odometry)),
     Output("trajectory.kitti.txt", lambda path, r: write_kitti(path, r.result.trajectory)),
     Output(GRAPH_FILE, _write_graph),

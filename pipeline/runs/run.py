@@ -18,6 +18,7 @@ from scanchain.errors import InputError
 from scanchain.evaluation import TruthFile, check_overlap, during, read_truth
 from scanchain.logs import Log, open_log
 from scanchain.logs.mounting import turned_by
+from scanchain.logs.topics import other_sensors
 from scanchain.runs.directory import (
     CHECKPOINT_FILE,
     POINTS_FILE,
@@ -109,7 +110,12 @@ def _run(
                     steps, done.result, done.cloud, done.final, done.judged, done.expected,
                     run_s=run_s, compile_s=compile_s, ground_truth=truth, warnings=warnings, stopped=stopped,
                 )  # fmt: skip
-                text = summary(metrics, _heading(log, settings.config, stopped), settings.source, log.notes)
+                text = summary(
+                    metrics,
+                    _heading(log, settings.config, stopped),
+                    settings.source,
+                    [*log.notes, *_idle_sensors(log)],
+                )
                 metrics.write(folder / "metrics.json")
                 (folder / "summary.txt").write_text(text, encoding="utf-8")
             warnings += _complete(
@@ -221,6 +227,12 @@ def _heading(log: Log, config: Config, stopped: str) -> str:
     is_stated = bool(place.any() or turned or moving)
     known = "; ".join(part for part in (_wheels(log, config), mounting + moving if is_stated else "") if part)
     return f"{paths} {log.topic} ({known})" + (f" (PARTIAL: {stopped})" if stopped else "")
+
+
+def _idle_sensors(log: Log) -> list[str]:
+    """A line on each IMU, GNSS or topic of poses that the log has and a run leaves aside."""
+    found = other_sensors(log.indexes, wheels=log.odometry_topic, truth=log.ground_truth_topic)
+    return [f"{each.sensor} {each.topic}: {each.use}" for each in found if each.use.startswith("not used")]
 
 
 def _wheels(log: Log, config: Config) -> str:

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -86,6 +87,7 @@ def test_of_8_logs_two_are_poison_and_6_have_results_and_a_second_call_runs_only
     for row in done.values():
         metrics = json.loads((out / row["run"] / "metrics.json").read_text())
         assert row["scans"] == metrics["scans"] == 20 and row["ate_rmse_m"] < 0.1
+        assert (out / row["run"] / "recording.rrd").exists()  # as of scanchain run
         assert row["ate_rmse_m"] == metrics["ground_truth"]["optimized"]["ate_rmse_m"]
     assert "8: 6 done, 1 crashed, 1 out of memory" in output
     assert errors == f"error: 2 of 8 logs have no result; {out}/summary.txt has the reason\n"
@@ -251,6 +253,27 @@ def test_logs_are_named_by_path_pattern_and_list_each_once(tmp_path):
         collect([], [])
     with pytest.raises(InputError, match=r"none\.txt: cannot be read"):
         collect([], [tmp_path / "none.txt"])
+
+
+def test_a_folder_is_the_logs_in_it_unless_they_are_the_parts_of_one(tmp_path):
+    simulate("office", tmp_path / "whole.mcap", duration_s=4.0)
+    for place, name in enumerate(("part_0", "part_1")):
+        (tmp_path / name.partition("_")[0]).mkdir(exist_ok=True)
+        part = str(tmp_path / "part" / f"{name}.mcap")
+        cut = ["--start", str(2 * place), "--end", str(2 * place + 1.95)]
+        assert main(["convert", str(tmp_path / "whole.mcap"), part, *cut]) == 0
+    several = tmp_path / "several"
+    (several / "clouds").mkdir(parents=True)
+    (several / "clouds" / "1.pcd").touch()
+    (several / "truth.txt").touch()
+    shutil.copytree(tmp_path / "part", several / "part")
+    for seed in (1, 2):  # of the same time, by the clock of the simulation
+        simulate("office", several / f"{seed}.mcap", duration_s=2.0, seed=seed)
+    assert collect([tmp_path / "part"], []) == (tmp_path / "part",)
+    assert {path.name for path in collect([several], [])} == {"1.mcap", "2.mcap", "clouds", "part"}
+    (several / "clouds" / "1.pcd").unlink()
+    assert [path.name for path in collect([several], [])] == ["part", "1.mcap", "2.mcap"]
+    assert collect([several], [], "my:Format") == (several,)
 
 
 def test_logs_of_the_same_name_are_told_apart_by_their_folders():

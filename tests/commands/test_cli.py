@@ -18,8 +18,8 @@ from mcap.writer import Writer
 
 from scanchain import lie
 from scanchain.__main__ import scanchain
-from scanchain.commands.options import OnceCommand
 from scanchain.data import Trajectory
+from scanchain.evaluation.metrics import evaluate as scanchain_evaluate
 from scanchain.graph.files.g2o import read_g2o
 from scanchain.logs.writing.writer import LogWriter
 from scanchain.settings import flatten
@@ -610,7 +610,6 @@ def test_the_heading_says_whether_the_wheels_are_used(call, tmp_path, office):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["run", "--topic", "/scan", "--topic", "/other"], ["--topic is given 2 times"]),
         (["run", "--log.every", "2", "--log.every=3"], ["--log.every is given twice (2, 3)"]),
         (
             ["run", "--matcher", "svd", "--matching.matcher", "plicp"],
@@ -618,25 +617,14 @@ def test_the_heading_says_whether_the_wheels_are_used(call, tmp_path, office):
         ),
         (["run", "--no-loops", "--loops.enabled", "true"], ["--no-loops and --loops.enabled both set"]),
         (["run", "--gt", "/truth", "--log.ground_truth_topic", "/odom"], ["--gt and --log.ground_truth_topic"]),
-        (["run", "--out", "b"], ["--out is given 2 times"]),
-        (["compare", "--methods", "svd", "--methods", "plicp"], ["--methods is given 2 times"]),
         (["doctor", "--topic", "/scan", "--log.topic", "/scan"], ["--topic and --log.topic"]),
         (["info", "--log.topic", "/scan", "--log.topic", "/scan"], ["--log.topic is given twice"]),
-        (["batch", "--workers", "1", "--workers", "2"], ["--workers is given 2 times"]),
     ],
 )
 def test_what_has_one_value_is_given_once(refused, tmp_path, office, words, said):
     command, *flags = words
     out = ["--out", tmp_path / "a"] if command in ("run", "compare", "batch") else []
     says(refused(command, office, *out, *flags), *said)
-
-
-def test_every_command_refuses_an_option_given_twice_and_takes_a_flag_twice(call, tmp_path):
-    leaves = [(words, command) for words, command in commands() if not isinstance(command, click.Group)]
-    assert all(isinstance(command, OnceCommand) for _, command in leaves)
-    assert call("config", "show", "--json", "--json")[0] == 0
-    code, _, errors = call("simulate", "office", tmp_path / "a.mcap", "--seed", "1", "--seed", "2")
-    assert code == 2 and "--seed is given 2 times" in errors
 
 
 def test_a_config_file_changes_the_preset_and_is_named(call, tmp_path, office):
@@ -914,6 +902,51 @@ def test_evaluate_prints_every_metric_with_its_definition(call, tmp_path):
     assert tree["ate"]["path_length_m"] == pytest.approx(10.0 * math.pi, rel=1e-3)
     assert tree["ate"]["translation_m"]["maximum"] == pytest.approx(0.1 * 20.0 * 2**0.5, rel=1e-6)
     assert tree["kitti"]["translation_share"] == pytest.approx(0.1, rel=0.05)
+
+
+def test_evaluate_finds_scale_and_time_offset_and_measures_without_them(call, refused, tmp_path):
+    t_s, truth = np.arange(400) / 10.0, tmp_path / "gt.tum"
+    rows = (8.0 * np.sin(0.4 * t_s) + 2.0 * np.sin(1.1 * t_s), 6.0 * np.cos(0.3 * t_s), 0.2 * t_s)
+    true = lie.lift(np.array([lie.pose_2d(*row) for row in zip(*rows, strict=True)]))
+    stamps_ns = STAMP_NS + np.arange(400) * SECOND // 10
+    write_tum(truth, Trajectory(stamps_ns, true))
+    poses = lie.lift(lie.pose_2d(3.0, -2.0, 0.7)) @ true
+    poses[:, :3, 3] /= 4.0
+    write_tum(tmp_path / "est.tum", Trajectory(stamps_ns + 130_000_000, poses))
+    words = ["evaluate", tmp_path / "est.tum", truth]
+    assert json.loads(call(*words, "--json")[1])["ate"]["translation_m"]["rmse"] > 1.0
+    tree = json.loads(call(*words, "--scale", "--time-offset", "auto", "--json")[1])
+    assert tree["scale"] == pytest.approx(4.0, rel=1e-3) and tree["time_offset_s"] == pytest.approx(
+        -0.13, abs=1e-3
+    )
+    assert tree["ate"]["translation_m"]["rmse"] < 1e-3
+    _, output, _ = call(*words, "--scale", "--time-offset", "-0.13")
+    says(output, "time offset -0.1300 s added", "scale 4 put on", "ATE rmse 0.0000")
+    result = scanchain_evaluate(tmp_path / "est.tum", truth, scale=True, time_offset="auto")
+    assert (result.scale, result.time_offset_s) == (tree["scale"], tree["time_offset_s"])
+    says(refused(*words, "--time-offset", "soon"), "--time-offset")
+    says(refused("evaluate", truth, truth, "--kitti", "--time-offset", "1"), "files with stamps")
+    write_tum(tmp_path / "still.tum", Trajectory(stamps_ns, np.tile(np.eye(4), (400, 1, 1))))
+    says(refused("evaluate", tmp_path / "still.tum", truth, "--scale"), "undetermined")
+
+
+def test_evaluate_puts_several_estimates_into_a_table_and_a_picture(call, refused, tmp_path, office):
+    call("run", office, "--out", tmp_path / "a", "--rerun", "off", "--every", "2")
+    truth, png = office.with_suffix(".tum"), tmp_path / "paths.png"
+    code, output, _ = call("evaluate", tmp_path / "a", tmp_path / "a" / "odometry.tum", truth, "--png", png)
+    rows = output.splitlines()
+    assert code == 0 and rows[0].split()[:2] == ["estimate", "paired"] and png.stat().st_size > 10_000
+    assert [row.split()[:2] for row in rows[2:4]] == [
+        [f"{tmp_path}/a", "30"],
+        [f"{tmp_path}/a/odometry.tum", "30"],
+    ]
+    trees = json.loads(
+        call("evaluate", tmp_path / "a", tmp_path / "a" / "odometry.tum", "--gt", truth, "--json")[1]
+    )
+    alone = json.loads(call("evaluate", tmp_path / "a" / "trajectory.tum", truth, "--json")[1])
+    assert trees[f"{tmp_path}/a"] == alone
+    assert rows[2].split()[4] == f"{alone['ate']['translation_m']['rmse']:.4f}"
+    says(refused("evaluate", tmp_path / "a", truth, "--png", png), "paths.png: exists")
 
 
 def test_evaluate_of_a_trajectory_with_itself_is_zero(call, tmp_path):

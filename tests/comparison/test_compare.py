@@ -89,7 +89,7 @@ def good(office, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", f"{SUPPORT}:{ROOT}")
         names = ("plicp", "svd+loops", "coarse", "mine", "unsteady")
-        table = run(office, folder, *names, repeat=2, settings_file=toml(folder / "good.toml", GOOD))
+        table = run(office, folder, *names, repeat=2, config_file=toml(folder / "good.toml", GOOD))
     return table, folder / "out"
 
 
@@ -189,7 +189,7 @@ def test_a_verdict_fails_nothing_and_a_method_that_did_not_finish_does(office, g
 
 
 def test_where_all_fail_the_tables_still_say_how(office, tmp_path):
-    table = run(office, tmp_path, "a", "b", settings_file=toml(
+    table = run(office, tmp_path, "a", "b", config_file=toml(
         tmp_path / "a.toml", "".join(f'[{name}]\nmethod = "bad_odometries:Raises"\n' for name in "ab")
     ))  # fmt: skip
     assert text(table).count("at scan 10: ValueError") == markdown(table).count("at scan 10: ValueError") == 2
@@ -225,6 +225,44 @@ def test_a_run_that_compiled_kernels_is_run_anew(monkeypatch, tmp_path):
 # the same scans for all
 
 
+def test_a_word_stands_for_the_methods_that_begin_with_it_and_a_wrong_one_names_those_near():
+    def named(words, dimension):
+        return [method.name for method in resolve(words, dimension, file=None)]
+
+    assert named(["plicp", "KISS", "open3d"], 2) == ["plicp", "kiss-icp", "open3d-p2p", "open3d-gicp"]
+    assert named(["open3d", "kiss_icp"], 3) == ["open3d-p2p", "open3d-p2l", "open3d-gicp", "kiss-icp"]
+    assert named(["genz"], 3) == ["genz-icp"] and named(["plicp+loops"], 3) == ["plicp+loops"]
+    refused(["gicp"], 3, match=r"no method 'gicp'; choose among open3d-gicp, small-gicp, small-vgicp, or")
+    refused(["open3d", "open3d-p2p"], 3, match="names one twice")
+
+
+def test_sections_of_the_configuration_hold_for_all_of_ours_as_in_a_run(office, tmp_path):
+    file = toml(
+        tmp_path / "a.toml",
+        """
+        [log]
+        every = 3
+        [matching]
+        max_iterations = 7
+        matcher = "svd"
+        [svd.matching]
+        max_iterations = 9
+        """,
+    )
+    table = run(office, tmp_path, "plicp", "svd", config_file=file)
+    assert table.scans == -(-len(list(open_log(office).scans())) // 3)
+    assert [each.settings["matching"]["max_iterations"] for each in table.rows] == [7, 9]
+    assert [each.settings["matching"]["matcher"] for each in table.rows] == ["plicp", "svd"]
+
+
+def test_every_method_is_a_line_on_a_pipe_as_it_ends(office, tmp_path, capfd):
+    assert (
+        main(["compare", str(office), "--methods", "plicp,svd", "--end", "2", "--out", str(tmp_path / "a")]) == 0
+    )
+    lines = capfd.readouterr().err.splitlines()
+    assert [line.split(" in ")[0] for line in lines if " in " in line] == ["plicp: 20 scans", "svd: 20 scans"]
+
+
 class StopsAtOnce(Unwatched):
     stopped = True
 
@@ -234,7 +272,7 @@ class StopsAtOnce(Unwatched):
 
 def test_a_reading_that_the_user_stopped_is_told(office, tmp_path):
     settings = toml(tmp_path / "a.toml", '[mine]\nmethod = "bad_odometries:Shifted"\n')
-    comparison = Comparison(logs=(office,), out=tmp_path / "out", methods=("mine",), settings_file=settings)
+    comparison = Comparison(logs=(office,), out=tmp_path / "out", methods=("mine",), config_file=settings)
     table = compare(comparison, lambda _: None, StopsAtOnce()).table
     assert table.scans == 5 and "the user stopped the reading: 5 scans compared" in text(table)
 
@@ -320,7 +358,7 @@ def test_written_settings_can_be_given_back(good):
 
 
 def test_what_does_not_exist_is_refused_by_name(tmp_path):
-    refused(("plicp", "icp"), 3, match=r"no method 'icp'; choose among plicp, svd")
+    refused(("plicp", "icp"), 3, match=r"no method 'icp'; choose among plicp, plicp\+loops, open3d-gicp")
     refused(("genz-icp",), 2, match="made for 3D")
     refused(("plicp", "open3d-p2l"), 2, match="open3d-p2l is made for 3D")
     refused(("plicp", "plicp"), 3, match="twice")
@@ -366,7 +404,7 @@ def test_errors_are_those_of_evaluate_against_the_log_a_tum_or_a_kitti_file(offi
         folder = tmp_path / str(number)
         folder.mkdir()
         settings = toml(folder / "a.toml", '[mine]\nmethod = "bad_odometries:Shifted"\n')
-        figures = run(office, folder, "mine", ground_truth=reference, settings_file=settings).rows[0].figures
+        figures = run(office, folder, "mine", ground_truth=reference, config_file=settings).rows[0].figures
         estimate = read_tum(folder / "out" / "methods" / "mine" / "trajectory.tum")
         assert figures.ate_m == pytest.approx(absolute_error(pair(estimate, truth)).translation_m.rmse, abs=1e-8)
         assert figures.paired_share == 1.0
@@ -376,7 +414,7 @@ def test_scans_without_truth_are_counted_in_a_note_and_a_column(office, tmp_path
     truth = read_tum(office.with_suffix(".tum"))
     write_tum(tmp_path / "part.tum", Trajectory(truth.stamps_ns[6:-9:3], truth.poses[6:-9:3]))
     settings = toml(tmp_path / "a.toml", '[mine]\nmethod = "bad_odometries:Shifted"\n')
-    table = run(office, tmp_path, "mine", ground_truth=tmp_path / "part.tum", settings_file=settings)
+    table = run(office, tmp_path, "mine", ground_truth=tmp_path / "part.tum", config_file=settings)
     known = len(truth.stamps_ns[6:-9:3]) * 3 - 2
     assert table.rows[0].figures.paired_share == pytest.approx(known / 60)
     missing = (
@@ -411,7 +449,7 @@ def test_a_topic_of_true_poses_that_is_named_must_be_there(tmp_path):
 def test_without_truth_there_is_sharpness_and_disagreement_and_it_is_said_that_they_are_none(tmp_path):
     log = shared_data("3d/kitti_0005_first60.mcap")
     table = run(log, tmp_path, "plicp", "svd", "mine", overrides=(Override("log.end_s", "1.6", ""),),
-        settings_file=toml(tmp_path / "a.toml", '[mine]\nmethod = "bad_odometries:StandsStill"\n'))  # fmt: skip
+        config_file=toml(tmp_path / "a.toml", '[mine]\nmethod = "bad_odometries:StandsStill"\n'))  # fmt: skip
     assert table.truth == "" and all(each.figures.ate_m is None for each in table.rows)
     sharp = [row(table, name).figures for name in ("plicp", "mine")]
     assert sharp[1].thickness_m is None or sharp[0].thickness_m < sharp[1].thickness_m

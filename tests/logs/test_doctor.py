@@ -28,8 +28,7 @@ from tests.support.naive_logs import (
 from tests.support.scenes import configured, shared_data
 
 STEP_NS = SECOND // 10
-CHECKS = ["rate", "gaps", "jitter", "stamp order", "clock", "wheels", "damage", "returns", "no return"]
-CHECKS += ["ranges", "surfaces", "duplicates", "rest", "mounting", "sensors"]
+CHECKS = ["gaps", "stamp order", "clock", "wheels", "damage", "returns", "no return", "ranges", "duplicates"]
 
 
 def diagnose(*paths, **config):
@@ -65,8 +64,7 @@ def test_a_healthy_log_is_all_well(tmp_path):
     found = diagnose(saved(tmp_path, drive(wheels=True)))
     assert sorted(found) == sorted(CHECKS)
     assert {finding.severity for finding in found.values()} == {"ok"}
-    assert "10 Hz" in found["rate"].found and "40 readings, 0 of 40" in found["wheels"].found
-    assert "0.200, 0.100" in found["mounting"].found
+    assert found["damage"].found.startswith("40 scans") and "40 readings, 0 of 40" in found["wheels"].found
 
 
 def covered(*numbers):
@@ -104,16 +102,9 @@ def test_a_log_without_a_point_in_range_names_the_settings_and_the_ranges_seen(c
     assert "lie at 0.2 to 0.2 m" in errors
 
 
-def test_a_slow_log_without_wheels_is_noted(tmp_path):
-    slow = {"stamp": lambda k: 9 * k * STEP_NS, "log": lambda k: 9 * k * STEP_NS}
-    finding = diagnose(saved(tmp_path, drive(**slow)))["rate"]
-    assert finding.severity == "note" and "without wheels" in finding.effect
-
-
 def test_the_scans_looked_at_are_those_that_a_run_would_take(tmp_path):
     simulate("town", tmp_path / "town.mcap", duration_s=3.0, sensor="vlp-16")
-    found = diagnose(tmp_path / "town.mcap", every=4)["rate"]
-    assert found.found.startswith("8 scans, 2.5 Hz")
+    assert diagnose(tmp_path / "town.mcap", every=4)["damage"].found.startswith("8 scans")
 
 
 def test_a_gap_is_found_where_it_is(tmp_path):
@@ -138,15 +129,13 @@ def test_a_gap_is_found_where_it_is(tmp_path):
     assert (later.found, later.remedy) == (finding.found, finding.remedy)  # the flag counts from the same moment
 
 
-def test_missing_scans_are_counted_and_are_no_jitter(tmp_path):
+def test_missing_scans_are_counted_though_the_stamps_jitter(tmp_path):
     rng = np.random.default_rng(0)
     shifts = rng.normal(0.0, 0.0002, 100) * SECOND
     missing = {20, 41, 42, 70, 90, 91, 92}
     said = drive(100, stamp=lambda k: int(shifts[k]))
     found = diagnose(saved(tmp_path, [each for k, each in enumerate(said, start=-1) if k not in missing]))
     assert found["gaps"].severity == "note" and found["gaps"].found.endswith("; 7 scans missing in all")
-    assert found["jitter"].severity == "ok"
-    assert 0.2 < float(found["jitter"].found.split(" ms")[0].split()[-1]) < 0.4
     single = diagnose(saved(tmp_path, [each for k, each in enumerate(drive(40), start=-1) if k != 20]))["gaps"]
     assert single.severity == "note" and single.found == "none longer than 2.5 periods; 1 scan missing in all"
 
@@ -164,15 +153,6 @@ def test_returns_below_range_min_are_told(tmp_path):
     assert "below range_min (3 m)" in raised.found
 
 
-def test_jitter_is_measured_against_the_period(tmp_path):
-    rng = np.random.default_rng(0)
-    shifts = rng.normal(0.0, 0.02, 400) * SECOND
-    finding = diagnose(saved(tmp_path, drive(400, stamp=lambda k: int(shifts[k]))))["jitter"]
-    assert finding.severity == "note" and finding.remedy == ""
-    told = float(finding.found.split("(")[1].split(" %")[0])
-    assert told == pytest.approx(100 * 0.02 * np.sqrt(2) / 0.1, rel=0.15)
-
-
 def test_stamps_that_step_back_or_repeat_are_counted(tmp_path):
     finding = diagnose(saved(tmp_path, drive(stamp=lambda k: {5: -2, 9: -2, 20: -1}.get(k, 0) * STEP_NS)))
     assert finding["stamp order"].severity == "warning"
@@ -182,7 +162,7 @@ def test_stamps_that_step_back_or_repeat_are_counted(tmp_path):
 def test_stamps_that_were_never_set_are_a_problem(tmp_path):
     found = diagnose(saved(tmp_path, drive(stamp=lambda k: -STAMP_NS - k * STEP_NS)))
     assert found["stamp order"].severity == "problem" and found["clock"].severity == "warning"
-    assert "10 Hz" in found["rate"].found  # by log time
+    assert found["gaps"].severity == "ok"  # by log time
 
 
 def test_another_clock_is_told_and_wheels_that_miss_for_it_are_counted(tmp_path):
@@ -242,39 +222,6 @@ def test_a_log_that_was_cut_off_is_told(tmp_path):
     assert finding.severity == "warning" and "cut off" in finding.found
 
 
-def test_a_view_that_leaves_a_motion_open_is_told_with_it(tmp_path):
-    angles = np.abs(np.sin(-1.0 + 0.02 * np.arange(100))) + 1e-9
-    along_walls = drive(ranges=lambda k: np.where(1.5 / angles < 9.0, 1.5 / angles, np.nan))
-    finding = diagnose(saved(tmp_path, along_walls))["surfaces"]
-    assert finding.severity == "warning" and "in 10 of 10 scans looked at" in finding.found
-    assert "hardly determine motion along x" in finding.found and "wheel odometry" in finding.effect
-    along_walls = drive(ranges=lambda k: np.where(1.5 / angles < 9.0, 1.5 / angles, np.nan), wheels=True)
-    assert "wheel" not in diagnose(saved(tmp_path, along_walls))["surfaces"].effect
-
-
-def test_clouds_of_one_plane_with_noise_leave_motions_open(tmp_path):
-    rng = np.random.default_rng(0)
-    said = []
-    for k in range(5):
-        rows = np.zeros(2000, [(axis, "<f4") for axis in "xyz"])
-        rows["x"], rows["y"] = rng.uniform(-20.0, 20.0, (2, 2000))
-        rows["z"] = rng.normal(-1.0, 0.01, 2000)
-        time_ns = STAMP_NS + k * STEP_NS
-        said.append(cloud_said(time_ns, point_cloud(time_ns, rows)))
-    finding = diagnose(saved(tmp_path, said))["surfaces"]
-    assert finding.severity == "warning" and "in 5 of 5 scans" in finding.found
-
-
-@pytest.mark.parametrize(
-    ("name", "motion"),
-    [("corridor", "motion along x"), ("field", "rotation about z"), ("town", ""), ("highway", "")],
-)
-def test_worlds_that_leave_a_motion_open_are_told_from_those_that_do_not(tmp_path, name, motion):
-    simulate(name, tmp_path / "a.mcap", duration_s=20.0, sensor="vlp-16")
-    finding = diagnose(tmp_path / "a.mcap")["surfaces"]
-    assert (finding.severity == "ok") == (not motion) and motion in finding.found
-
-
 def test_copies_of_scans_are_counted_and_mended_by_taking_every_second(tmp_path):
     finding = diagnose(saved(tmp_path, drive(ranges=lambda k: room(k // 2))))["duplicates"]
     assert finding.severity == "warning" and "20 of 40 scans" in finding.found and finding.remedy == "--every 2"
@@ -285,49 +232,15 @@ def test_a_stuck_driver_is_told_from_one_that_publishes_too_often(tmp_path):
     assert "19 of 40 scans" in finding.found and "20 of them in a row" in finding.found and not finding.remedy
 
 
-def test_a_planar_lidar_on_its_side_is_told(tmp_path):
-    tilted = transforms_said(STAMP_NS, transforms(("base_link", "laser", 0.2, 0.1, 0.3, np.pi / 2)))
-    assert diagnose(saved(tmp_path, [tilted, *drive(mounted=False)]))["mounting"].severity == "warning"
-
-
-def test_a_rest_at_the_start_is_measured_and_may_be_skipped(tmp_path):
-    rng = np.random.default_rng(0)
-
-    def ranges(k):
-        return room(max(0, k - 80)) + rng.normal(0.0, 0.002, 100)
-
-    finding = diagnose(saved(tmp_path, drive(120, ranges=ranges)))["rest"]
-    assert finding.severity == "note" and finding.remedy in ("--start 7", "--start 8")
-    assert "of 11.9 s" in finding.found
-
-
-def test_wheels_that_move_tell_a_corridor_from_a_rest(tmp_path):
-    still = {"ranges": lambda k: room(0) + 1e-4 * k}
-    assert diagnose(saved(tmp_path, drive(**still)))["rest"].severity == "warning"
-    found = diagnose(saved(tmp_path, drive(wheels=True, **still)))["rest"]
-    assert found.severity == "ok" and found.found.startswith("0.0 of 3.9 s")
-
-
 def test_wheels_without_a_mounting_are_told(tmp_path):
-    finding = diagnose(saved(tmp_path, drive(wheels=True, mounted=False)))["mounting"]
+    finding = diagnose(saved(tmp_path, drive(wheels=True, mounted=False)))["wheels"]
     assert finding.severity == "warning" and "no static transform from base_link to laser" in finding.found
     assert finding.remedy == "--odometry.prior constant-velocity"
 
 
-def test_a_lidar_that_pans_is_told_with_its_joint_and_range(tmp_path):
-    said = drive(mounted=False, wheels=True)
-    for k in range(40):
-        time_ns = STAMP_NS + k * STEP_NS
-        turn = ("base_link", "laser", 0.2, 0.0, 0.1 * k, 0.0)
-        said.append(transforms_said(time_ns, transforms(turn, stamp_ns=time_ns), "/tf"))
-    finding = diagnose(saved(tmp_path, said))["mounting"]
-    assert finding.severity == "note" and "wheels are carried over" in finding.effect
-    assert "base_link → laser in /tf turns from 0 to 223 deg about its z axis" in finding.found
-
-
 def test_scans_of_several_frames_on_one_topic_are_a_problem(tmp_path):
     said = [*drive(20, frame="left"), *drive(20, frame="right", mounted=False)]
-    finding = diagnose(saved(tmp_path, said))["mounting"]
+    finding = diagnose(saved(tmp_path, said))["frames"]
     assert finding.severity == "problem" and "left, right" in finding.found
 
 
@@ -354,10 +267,9 @@ def sweeps(count=20, **options):
     return [cloud_said(stamp, point_cloud(stamp, sweep(k, **options))) for k, stamp in enumerate(stamps_ns)]
 
 
-def test_rings_and_point_times_of_a_healthy_cloud_are_told(tmp_path):
+def test_point_times_of_a_healthy_cloud_are_told(tmp_path):
     found = diagnose(saved(tmp_path, sweeps()))
-    assert sorted(found) == sorted([*CHECKS, "rings", "point times"])
-    assert found["rings"].found == "16 rings"
+    assert sorted(found) == sorted([*CHECKS, "point times"])
     assert "field time (float32) taken as s" in found["point times"].found
     assert "lasts 95 ms" in found["point times"].found and found["point times"].severity == "ok"
 
@@ -408,12 +320,6 @@ def test_a_cloud_without_times_is_told_how_its_azimuth_could_stand_in(tmp_path):
         assert found(rows)[1].remedy == ""
 
 
-def test_rings_that_come_and_go_are_noted(tmp_path):
-    said = [*sweeps(10), *sweeps(20, rings=12)[10:]]
-    finding = diagnose(saved(tmp_path, said))["rings"]
-    assert finding.severity == "note" and finding.found == "12 to 16 rings"
-
-
 def test_returns_beyond_what_a_run_uses_are_noted_with_the_flag(tmp_path):
     def far(k):
         rows = sweep(k)
@@ -442,39 +348,27 @@ def test_wheels_in_millimeters_are_a_problem_with_the_flag_that_leaves_them_out(
     assert "moves at 1e+03 m/s" in finding.found
 
 
-def test_the_rest_at_the_start_of_the_simulated_hall_is_found(tmp_path):
-    path = tmp_path / "hall.mcap"
-    simulate("hall", path, seed=1, duration_s=4.0)
-    truth = open_log(path).ground_truth()
-    moved_m = np.linalg.norm(truth.poses[:, :3, 3] - truth.poses[0, :3, 3], axis=1)
-    until_s = (truth.stamps_ns[np.flatnonzero(moved_m > 0.02)[0]] - truth.stamps_ns[0]) * 1e-9
-    found = diagnose(path)["rest"].found
-    still_s, first_s = float(found.split()[0]), float(found.split(", ")[1].split()[0])
-    assert 2.0 < until_s < 3.5
-    assert still_s == first_s == pytest.approx(until_s, abs=0.15)
-
-
 def test_imu_gnss_and_truth_are_named_with_what_is_made_of_them(tmp_path, capfd):
     said = [*drive(wheels=True), odometry_said(STAMP_NS, odometry(STAMP_NS, 0.0, 0.0), "/ground_truth")]
     names = {"nav_msgs/msg/Path": "sensor_msgs/msg/Imu", "nav_msgs/msg/MapMetaData": "sensor_msgs/msg/NavSatFix"}
     said += [Said(topic, kind, STAMP_NS, b"0") for topic, kind in zip(("/imu/data", "/fix"), names, strict=True)]
     path = saved(tmp_path, said, rename=lambda kind: names.get(kind, kind))
-    finding = diagnose(path)["sensors"]
-    assert finding.severity == "ok"
-    assert finding.found.split("; ") == [
-        "GNSS /fix: not used", "ground truth /ground_truth: evaluates the result, is not used for it",
-        "IMU /imu/data: not used",
-    ]  # fmt: skip
     assert main(["info", str(path)]) == 0
     text = capfd.readouterr().out
-    for line in finding.found.split("; "):
+    for line in (
+        "GNSS /fix: not used", "ground truth /ground_truth: evaluates the result, is not used for it",
+        "IMU /imu/data: not used",
+    ):  # fmt: skip
         assert f"sensor    {line}\n" in text
     assert "wheels    /odom" in text and "/odom:" not in text
+    assert main(["run", str(path), "--out", str(tmp_path / "a"), "--rerun", "off"]) == 0
+    text = capfd.readouterr().out
+    assert "note           IMU /imu/data: not used\n" in text and "note           GNSS /fix: not used\n" in text
+    assert "/ground_truth: evaluates" not in text
     assert main(["info", str(path), "--json"]) == 0
     assert [each["sensor"] for each in json.loads(capfd.readouterr().out)["sensors"]] == [
         "GNSS", "ground truth", "IMU",
     ]  # fmt: skip
-    assert diagnose(saved(tmp_path, drive()))["sensors"].found == "no IMU, GNSS or ground truth"
 
 
 def test_truth_and_wheels_are_named_though_the_lidar_is_not_chosen(tmp_path, capfd):
@@ -514,7 +408,7 @@ def test_the_command_prints_the_gravest_first_and_json_says_the_same(tmp_path, c
 
 
 def test_every_finding_that_is_not_ok_says_what_it_does():
-    for name in ("2d/intel.mcap", "2d/mit_csail.mcap", "3d/kitti_0005_first60.mcap"):
+    for name in ("2d/intel.mcap", "2d/aces.mcap", "3d/kitti_0005_first60.mcap"):
         bad = [finding for finding in diagnose(shared_data(name)).values() if finding.severity != "ok"]
         assert bad and all(finding.effect for finding in bad), bad
 

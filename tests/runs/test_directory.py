@@ -221,6 +221,13 @@ def test_a_run_says_that_it_is_complete_and_what_it_read(tmp_path, office):
     assert said["versions"]["numpy"] == np.__version__ and said["duration_s"] > 0.0
 
 
+@pytest.mark.parametrize("sinks", [(), ("save",)])
+def test_a_run_speaks_of_its_recording_only_where_it_makes_one(tmp_path, office, sinks):
+    telling = Telling()
+    run(Job(logs=(office,), out=tmp_path / "a", sinks=frozenset(sinks)), open_recorder, telling)
+    assert ("writing the rest of the recording" in telling.lines) == bool(sinks)
+
+
 def test_a_run_that_the_user_stops_is_whole_up_to_there_and_marked_partial(tmp_path, office):
     finished = run(job(office, tmp_path / "a"), open_recorder, Watcher(50))
     assert names(tmp_path) == [finished.path.name] and ".partial-" in finished.path.name

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -178,6 +178,13 @@ def _mark_ends(axes: Axes, poses: Matrix) -> None:
     marks = {"color": _OPTIMIZED, "linestyle": "none", "markersize": 6, "markeredgecolor": "white", "zorder": 5}
     axes.plot(*poses[0, :2, -1], marker="o", label="start", **marks)
     axes.plot(*poses[-1, :2, -1], marker="s", label="end", **marks)
+
+
+def draw_evaluated(picture: Path, evaluated: Mapping[str, tuple[Matrix, Matrix]]) -> None:
+    """Draw estimates (N, 4, 4), aligned, over the true poses (N, 4, 4) beside them, those of the longest one."""
+    paths = [(name, aligned) for name, (aligned, _) in evaluated.items()]
+    truth = max((reference for _, reference in evaluated.values()), key=len)
+    draw_map(picture, title="Estimates and ground truth", optimized=truth[:0], sessions=paths, ground_truth=truth)
 
 
 def draw_run(directory: Path, picture: Path) -> None:

@@ -220,7 +220,7 @@ def _collapsibles(directory: Path, table: Table) -> Iterator[Collapsible]:
     if definitions:
         yield Collapsible("Definitions of the errors", "\n\n".join(definitions))
     yield Collapsible(
-        "Settings, in the form of --settings",
+        "Settings, in the form of --config",
         (directory / SETTINGS_FILE).read_text(encoding="utf-8"),
         is_long=True,
     )

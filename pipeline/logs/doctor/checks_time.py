@@ -1,4 +1,4 @@
-"""The doctor's checks of time: rate, gaps, jitter, stamps, clocks, wheels, per-point times."""
+"""The doctor's checks of time: gaps, order of stamps, clocks, wheels, per-point times."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scanchain.config import Config
 from scanchain.logs.doctor.finding import Finding, Severity
@@ -16,10 +15,9 @@ from scanchain.logs.messages.readers import is_scan
 from scanchain.words import counted
 
 _GAP_PERIODS = 2.5
-_MOST_MISSING = 10  # largest number of scans missing in a row at which a step of the stamps counts as jitter
-_JITTER = 0.1  # least jitter that is reported, as a share of the period
+_MOST_MISSING = 10  # largest number of scans missing in a row at which they are counted
+_JITTER = 0.1  # jitter, as a share of the period, from which on scans come as they please
 _LONG_GAP_S, _LONG_GAP_ON_WHEELS_S = 0.5, 10.0
-_SLOW_HZ = 4.0
 _OTHER_CLOCK_S = 1.0
 _LATE_S = 0.2
 _PART_OF_SCAN, _MORE_THAN_SCAN = 0.3, 1.2  # shares of the period outside which a unit of time is implausible
@@ -33,9 +31,7 @@ _NEAR_NS = 500_000_000  # largest distance from a scan's stamp of a wheel readin
 def check_time(seen: Survey, config: Config) -> Iterator[Finding]:
     """Every finding about time. ``config`` is what a run of this log would use."""
     is_on_wheels = bool(seen.wheels) and config.odometry.prior != "constant-velocity"
-    yield _rate(seen, is_on_wheels)
     yield _gaps(seen, is_on_wheels)
-    yield _jitter(seen)
     yield _order(seen)
     yield _clock(seen)
     yield _wheels(seen)
@@ -43,21 +39,10 @@ def check_time(seen: Survey, config: Config) -> Iterator[Finding]:
         yield _point_times(seen)
 
 
-def _rate(seen: Survey, is_on_wheels: bool) -> Finding:
-    rate_hz = 1.0 / seen.period_s if seen.period_s else 0.0
-    found = f"{counted(len(seen.scans), 'scan')}, {rate_hz:.4g} Hz (median period {seen.period_s * 1e3:.4g} ms)"
-    if len(seen.scans) > 1 and rate_hz < _SLOW_HZ and not is_on_wheels:
-        effect = "motions between scans are long and predicted without wheels; searched where matching fails"
-        return Finding("rate", Severity.NOTE, found, effect)
-    return Finding("rate", Severity.OK, found)
-
-
 def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:
     steps_s = np.diff(seen.log_ns) * 1e-9
     gaps = np.flatnonzero(steps_s > _GAP_PERIODS * seen.period_s) if seen.period_s else np.empty(0, np.int64)
-    periods, off_s = _periods(seen)
-    is_even = len(off_s) > 0 and float(np.std(off_s)) < _JITTER * seen.period_s
-    missing = int((periods - 1).sum()) if is_even else 0  # of scans that come as they please none is missing
+    missing = _missing(seen)
     absent = f"; {counted(missing, 'scan')} missing in all" if missing else ""
     if not len(gaps):
         found = f"none longer than {_GAP_PERIODS:g} periods{absent}"
@@ -81,29 +66,16 @@ def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:
     return Finding("gaps", Severity.WARNING, found, effect, f"--end {until_s:g}")
 
 
-def _periods(seen: Survey) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Number of periods between each scan and the scan before, by the stamps, and the seconds left over.
+def _missing(seen: Survey) -> int:
+    """Number of missing scans, by the periods between stamps; 0 of scans that come as they please.
 
-    Missing scans make two periods or more of one; stamps that step back, repeat or jump are left out.
+    Stamps that step back, repeat or jump are left out.
     """
     steps_s = np.diff(seen.stamps_ns) * 1e-9
     steps_s = steps_s[(steps_s > 0.0) & (steps_s < (_MOST_MISSING + 1.5) * seen.period_s)]
     periods = np.maximum(np.rint(steps_s / seen.period_s), 1.0) if len(steps_s) else steps_s
-    return periods, steps_s - periods * seen.period_s
-
-
-def _jitter(seen: Survey) -> Finding:
-    _, off_s = _periods(seen)
-    if not len(off_s):
-        return Finding("jitter", Severity.OK, "too few scans for statistics")
-    jitter_s = float(np.std(off_s))
-    share = jitter_s / seen.period_s
-    found = (
-        f"intervals of stamps are {1e3 * jitter_s:.3g} ms ({100.0 * share:.2g} % of the period) off whole periods"
-    )
-    if share < _JITTER:
-        return Finding("jitter", Severity.OK, found)
-    return Finding("jitter", Severity.NOTE, found, "velocities, and with them deskewing, are off by that share")
+    is_even = len(steps_s) > 0 and float(np.std(steps_s - periods * seen.period_s)) < _JITTER * seen.period_s
+    return int((periods - 1).sum()) if is_even else 0
 
 
 def _order(seen: Survey) -> Finding:
@@ -155,9 +127,14 @@ def _wheels(seen: Survey) -> Finding:
         found += f"; by them the robot moves at {speed_m_s:.3g} m/s"
         effect = "no vehicle does: millimeters, or jumps? Scans are predicted where the robot never was"
         return Finding("wheels", Severity.PROBLEM, found, effect, "--odometry.prior constant-velocity")
-    if not missed:
-        return Finding("wheels", Severity.OK, found)
-    return Finding("wheels", Severity.WARNING, found, "the motion of those is predicted from the scans alone")
+    if missed:
+        return Finding("wheels", Severity.WARNING, found, "the motion of those is predicted from the scans alone")
+    if unmounted := next((line for line in seen.log.notes if line.startswith("no static transform")), ""):
+        effect = "the wheels' turns are taken about the lidar instead of the robot; record /tf_static"
+        return Finding(
+            "wheels", Severity.WARNING, f"{found}; {unmounted}", effect, "--odometry.prior constant-velocity"
+        )
+    return Finding("wheels", Severity.OK, found)
 
 
 def _wheel_speed_m_s(seen: Survey) -> float:

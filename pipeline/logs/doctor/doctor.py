@@ -10,8 +10,7 @@ from scanchain.logs.doctor.checks_scans import check_scans
 from scanchain.logs.doctor.checks_time import check_time
 from scanchain.logs.doctor.finding import Finding, Severity
 from scanchain.logs.doctor.statistics import survey
-from scanchain.logs.log import Log, open_log
-from scanchain.logs.topics import other_sensors
+from scanchain.logs.log import open_log
 from scanchain.source import Source
 
 _ORDER = tuple(reversed(Severity))
@@ -46,13 +45,6 @@ def examine(
     notes = tuple(log.notes)
     seen = survey(log, progress)
     config = config_of(log.dimension)
-    findings = [*check_time(seen, config), *check_scans(seen, config.preprocess), _sensors(log)]
+    findings = [*check_time(seen, config), *check_scans(seen, config.preprocess)]
     ordered = sorted(findings, key=lambda finding: _ORDER.index(finding.severity))
     return Diagnosis(tuple(map(str, log.paths)), log.topic, log.dimension, tuple(ordered), notes, log.idle_keys())
-
-
-def _sensors(log: Log) -> Finding:
-    """Finding on other sensors, and their use by a run."""
-    seen = other_sensors(log.indexes, wheels=log.odometry_topic, truth=log.ground_truth_topic)
-    found = "; ".join(f"{each.sensor} {each.topic}: {each.use}" for each in seen)
-    return Finding("sensors", Severity.OK, found or "no IMU, GNSS or ground truth")

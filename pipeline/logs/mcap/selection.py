@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from math import inf
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.logs.mcap.blocks import DamagedBlockError, read_block
-from scanchain.logs.mcap.records import Block, FileIndex, Message, damage_of, name_of
+from scanchain.logs.mcap.records import Block, Channel, FileIndex, Message, damage_of, name_of
 from scanchain.words import duration
 
 
@@ -101,6 +101,18 @@ def check_one_log(indexes: Sequence[FileIndex], scanned: Collection[int], config
                 f"{before} ends {duration(gap.span.duration_s)} before {behind} begins: they are not parts of one "
                 "log; run each by itself, or all of them with scanchain batch"
             )
+
+
+def are_parts(indexes: Sequence[FileIndex], is_lidar: Callable[[Channel], bool]) -> bool:
+    """True if no two files hold the same lidar's scans of one time, and none begins a minute after the others."""
+    last: dict[str, int] = {}
+    for index in sorted(indexes, key=lambda index: whole_span([index])):
+        span = whole_span([index])
+        for topic in {channel.topic for channel in index.channels.values() if is_lidar(channel)}:
+            if span.begin_ns < last.get(topic, 0):
+                return False
+            last[topic] = span.end_ns
+    return not any(gap.before != gap.behind for gap in _long_gaps(indexes, LogConfig()))
 
 
 def _long_gaps(
