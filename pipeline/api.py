@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from scanchain import checks
-from scanchain.data import Points, Pose
+from scanchain.data import AnyPoints, Points, Pose
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.logs import sources_of
 from scanchain.preprocess import downsample as first_per_voxel
@@ -207,10 +207,10 @@ def optimize(graph: PoseGraph, **overrides: object) -> Optimization:
     return graph.optimize(load_settings(graph.dimension, overrides=changes).config.graph)
 
 
-def downsample(points: Points, voxel_size_m: float) -> Points:
-    """The first point of every voxel, (M, d), in the order of the points (N, d). Raises InputError."""
-    points = checks.points(points, "points", checks.dimension_of(points, "points"))
-    return first_per_voxel(points, checks.positive(voxel_size_m, "voxel_size_m"))
+def downsample(points: AnyPoints, voxel_size_m: float) -> Points:
+    """The first finite point of every voxel, (M, d), in the order of the points (N, d). Raises InputError."""
+    valid, _ = checks.valid_points(points, "points")
+    return first_per_voxel(valid, checks.positive(voxel_size_m, "voxel_size_m"))
 
 
 def open_recorder(

@@ -21,6 +21,7 @@ from scanchain.words import FREEDOM, counted
 Pose = NDArray[np.float64]
 Points = NDArray[np.float64]
 RawPoints = NDArray[np.float32]
+AnyPoints = NDArray[np.floating]  # as arguments, converted where they enter
 Matrix = NDArray[np.float64]
 
 _set = object.__setattr__  # of a record that checks itself
@@ -81,16 +82,16 @@ class Scan:
     @classmethod
     def of(
         cls,
-        points: RawPoints,
+        points: AnyPoints,
         stamp_s: float,
-        times_s: NDArray[np.float32] | None = None,
+        times_s: NDArray[np.floating] | None = None,
         *,
         index: int = 0,
         T_odom_base: Pose | None = None,
     ) -> Scan:
         """A scan as a driver gives it.
 
-        points : (N, d) meters, lidar frame, without NaN
+        points : (N, d) meters, lidar frame; rows that are not finite are invalid returns, counted in ``dropped``
         stamp_s : seconds since any fixed instant; the pose holds then
         times_s : (N,) seconds of each point relative to ``stamp_s``, for deskewing; none where left out
         T_odom_base : pose of the robot by its wheels at ``stamp_s``
@@ -98,8 +99,10 @@ class Scan:
         from scanchain import checks
 
         stamp_ns = round(1e9 * checks.seconds(stamp_s, "stamp_s"))
-        times_s = np.empty(0, np.float32) if times_s is None else times_s
-        return cls(index, stamp_ns, stamp_ns, points, times_s, 0, T_odom_base)
+        valid, is_valid = checks.valid_points(points, "points", dtype=np.float32)
+        seconds = checks.point_times(times_s, "times_s", len(is_valid))
+        seconds = seconds[is_valid] if len(seconds) else seconds
+        return cls(index, stamp_ns, stamp_ns, valid, seconds, len(is_valid) - len(valid), T_odom_base)
 
 
 class State(StrEnum):

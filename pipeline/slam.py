@@ -13,13 +13,13 @@ from scanchain import lie
 from scanchain.clock import working_s
 from scanchain.config import Config, LoopsConfig
 from scanchain.data import (
+    AnyPoints,
     Closure,
     ClosureVerdict,
     GraphState,
     Keyframe,
     Matrix,
     Pose,
-    RawPoints,
     Scan,
     State,
     Step,
@@ -159,9 +159,9 @@ class Slam:
 
     def track(
         self,
-        points: RawPoints,
+        points: AnyPoints,
         stamp_s: float,
-        times_s: NDArray[np.float32] | None = None,
+        times_s: NDArray[np.floating] | None = None,
         *,
         T_odom_base: Pose | None = None,
     ) -> Step:

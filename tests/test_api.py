@@ -1,5 +1,8 @@
 """What scripts call: arrays in, results out, without a log, a configuration or a command line."""
 
+import subprocess
+import sys
+from importlib.metadata import version
 from itertools import islice
 
 import numpy as np
@@ -56,7 +59,45 @@ def test_slam_of_arrays_places_every_scan():
     assert np.linalg.norm(result.trajectory.poses[-1][:2, 2]) > 1.0
 
 
+def test_version_and_modules_of_the_reference_are_attributes_of_a_fresh_package():
+    code = (
+        "import scanchain, sys; assert not any(name.startswith('scanchain.') for name in sys.modules);"
+        "print(scanchain.__version__, scanchain.lie.exp.__name__, scanchain.evaluation.pair.__name__)"
+    )
+    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert printed.split() == [version("scanchain"), "exp", "pair"]
+    with pytest.raises(AttributeError, match="no attribute 'aline'"):
+        sc.aline  # noqa: B018
+
+
+def test_invalid_returns_of_an_organized_cloud_are_dropped_with_their_times_and_counted():
+    scans = kitti_scans(3)
+    whole, organized = sc.Odometry(), sc.Odometry()
+    for scan in scans:
+        stamp_s, count = scan.stamp_ns * 1e-9, len(scan.points)
+        rows = np.sort(np.random.default_rng(0).choice(2 * count, count, replace=False))
+        points, times_s = np.full((2 * count, 3), np.nan), np.zeros(2 * count)
+        points[:9] = np.inf
+        points[rows] = scan.points
+        if len(scan.times_s):
+            times_s[rows] = scan.times_s
+        wanted = whole.track(scan.points, stamp_s, scan.times_s)
+        tracked = organized.track(points, stamp_s, times_s if len(scan.times_s) else None)
+        assert tracked.scan.dropped == count and len(tracked.scan.points) == count
+        assert np.array_equal(tracked.T_odom_lidar, wanted.T_odom_lidar)
+    assert np.array_equal(sc.downsample(points, 1.0), sc.downsample(scan.points, 1.0))
+    match, wanted = (sc.align(scans[0].points, cloud) for cloud in (points, scan.points))
+    assert np.array_equal(match.T_target_source, wanted.T_target_source)
+
+
+class Open3DCloud:
+    """A cloud as Open3D has it."""
+
+    points = np.ones((10, 3))
+
+
 POINTS = np.ones((10, 3), np.float32)
+RECORDS = np.zeros(10, [("x", np.float32), ("y", np.float32), ("z", np.float32), ("intensity", np.float32)])
 
 
 @pytest.mark.parametrize(
@@ -71,6 +112,10 @@ POINTS = np.ones((10, 3), np.float32)
         (lambda: sc.Odometry().track(POINTS, 0.0, np.zeros(9)), "times_s"),
         (lambda: sc.Slam(dimension=3).track(POINTS[:, :2], 0.0), "has 2D points"),
         (lambda: sc.downsample(POINTS, 0.0), "voxel_size_m is 0"),
+        (lambda: sc.align(Open3DCloud(), POINTS), r"target holds objects.*: np\.asarray\(target\.points\)"),
+        (lambda: sc.Odometry().track(Open3DCloud(), 0.0), r"np\.asarray\(points\.points\)"),
+        (lambda: sc.downsample(RECORDS, 1.0), r"np\.stack\(\[points\[axis\] for axis in 'xyz'\], axis=1\)"),
+        (lambda: sc.align(POINTS.reshape(2, 5, 3), POINTS), r"organized\? pass target\.reshape\(-1, 3\)"),
         (lambda: sc.downsample(POINTS[0], 1.0), "points has the shape"),
         (lambda: sc.run("nowhere.mcap", "out"), "nowhere.mcap"),
         (lambda: sc.optimize(sc.PoseGraph(2), robustness="none"), "graph.robustness"),

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scanchain import checks, lie
 from scanchain.clock import working_s
 from scanchain.config import Config
-from scanchain.data import LEAST_FIT, Match, Points, Pose, RawPoints, Scan, State
+from scanchain.data import LEAST_FIT, AnyPoints, Match, Points, Pose, Scan, State
 from scanchain.errors import InputError, shown
 from scanchain.kernels.geometry.validity import largest_magnitude
 from scanchain.odometry.elevation import ElevationCalibration
@@ -88,9 +88,9 @@ class Odometry:
 
     def track(
         self,
-        points: RawPoints,
+        points: AnyPoints,
         stamp_s: float,
-        times_s: NDArray[np.float32] | None = None,
+        times_s: NDArray[np.floating] | None = None,
         *,
         T_odom_base: Pose | None = None,
     ) -> Tracked:

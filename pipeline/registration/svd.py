@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import checks
-from scanchain.data import Points, Pose
+from scanchain.data import AnyPoints, Pose
 from scanchain.errors import InputError, ScanchainError
 from scanchain.words import counted
 
@@ -18,7 +18,7 @@ class DegeneratePairsError(ScanchainError):
     """The pairs leave a rotation free: all on one point, or in 3D on one line."""
 
 
-def rigid_transform(source: Points, target: Points, weight: NDArray[np.float64] | None = None) -> Pose:
+def rigid_transform(source: AnyPoints, target: AnyPoints, weight: NDArray[np.floating] | None = None) -> Pose:
     """The pose T that minimizes Σ wᵢ ‖yᵢ − (R xᵢ + t)‖².
 
     With centered x' and y' and W = Σ wᵢ x'ᵢ y'ᵢᵀ = U Σ Vᵀ,

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import MatchingConfig
-from scanchain.data import Match, Points, Pose, Prior
+from scanchain.data import AnyPoints, Match, Points, Pose, Prior
 from scanchain.kernels.registration import icp
 from scanchain.kernels.registration.association import associate, weighted_pairs
 from scanchain.kernels.registration.icp import SHRINK, Fit
@@ -24,7 +24,7 @@ class SvdMatcher:
         self.config = config
 
     def align(
-        self, points: Points, target: VoxelMap, T_first: Pose, prior: Prior | None = None, *, wide: bool = False
+        self, points: AnyPoints, target: VoxelMap, T_first: Pose, prior: Prior | None = None, *, wide: bool = False
     ) -> Match:
         """Pose of the scan in the map's frame, near the first one; arguments as ``PointToShapeMatcher.align``.
 
