@@ -7,6 +7,7 @@ coordinates in frame b to frame a. The dimension d of a log is 2 or 3; a twist h
 
 from __future__ import annotations
 
+from collections.abc import Sized
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import NamedTuple, Protocol
@@ -25,6 +26,7 @@ AnyPoints = NDArray[np.floating]  # as arguments, converted where they enter
 Matrix = NDArray[np.float64]
 
 _set = object.__setattr__  # of a record that checks itself
+_SHOWN = 60  # longest text of a value in the ``repr`` of a record
 
 LEAST_FIT = 0.6  # of ``Match.fit``: on real logs it is above 0.8 at true poses and below 0.5 at wrong ones
 MOST_COPIES = 5  # largest number of equal scans in a row that a driver which publishes too often leaves
@@ -35,6 +37,25 @@ _WHOLE = (
     ("log_time_ns", "nanoseconds as int; of seconds int(1e9 * time_s)", None),
     ("dropped", "a number of returns, from 0", 0),
 )
+
+
+def brief(self: object) -> str:
+    """A record on one line, for its ``repr``: arrays by their shape, what is long by its kind and number."""
+    values = ((name, getattr(self, name)) for name in getattr(self, "__dataclass_fields__", ()))
+    return f"{type(self).__name__}({', '.join(f'{name}={_brief(value)}' for name, value in values)})"
+
+
+def _brief(value: object) -> str:
+    if isinstance(value, np.ndarray):
+        return f"<{' × '.join(map(str, value.shape))}>"
+    if isinstance(value, float | str):
+        return (
+            f"{value:.6g}" if isinstance(value, float) else repr(f"{value:.{_SHOWN}}{'…' * (len(value) > _SHOWN)}")
+        )
+    if isinstance(value, Sized) and len(value) > 1:
+        return f"<{type(value).__name__} of {len(value):,}>"
+    text = repr(value)
+    return text if len(text) <= 2 * _SHOWN else f"<{type(value).__name__}>"
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +76,8 @@ class Scan:
 
     Arrays are converted where nothing is lost; InputError where a shape, a dtype or a value is none of these.
     """
+
+    __repr__ = brief
 
     index: int
     stamp_ns: int
@@ -169,6 +192,8 @@ class Match:
         poses aligned to the same map have in common; (0, 0) from a matcher that does not say
     """
 
+    __repr__ = brief
+
     T_target_source: Pose
     information: Matrix
     cost: float
@@ -225,6 +250,8 @@ class Keyframe:
     scale : of the voxels that odometry used there, 1 for those of the configuration
     """
 
+    __repr__ = brief
+
     index: int
     scan_index: int
     stamp_ns: int
@@ -278,6 +305,8 @@ class Closure:
     its figures, the same for all closures of its kind.
     """
 
+    __repr__ = brief
+
     target: int
     source: int
     match: Match
@@ -307,6 +336,8 @@ class GraphState:
     edge_chi2 : (E,) eᵀΩe of each edge, without its robust weight
     degrees_of_freedom : numbers that the edges in force measure, less those that they are to determine
     """
+
+    __repr__ = brief
 
     poses: Matrix
     stamps_ns: NDArray[np.int64]
@@ -371,6 +402,8 @@ class Step:
     starts_segment : True if its motion from the scan before is unknown
     """
 
+    __repr__ = brief
+
     scan: Scan
     points: Points
     T_odom_lidar: Pose
@@ -404,6 +437,10 @@ class Trajectory:
             )
         object.__setattr__(self, "stamps_ns", checks.whole_numbers(self.stamps_ns, "stamps_ns", "nanoseconds"))
         object.__setattr__(self, "poses", checks.poses(self.poses, "poses", poses[1] - 1))
+
+    def __repr__(self) -> str:
+        span_s = 1e-9 * float(np.ptp(self.stamps_ns)) if len(self) else 0.0
+        return f"Trajectory({counted(len(self), 'pose')} of SE({self.dimension}) over {span_s:.1f} s)"
 
     @property
     def dimension(self) -> int:

@@ -25,6 +25,7 @@ from scanchain.data import (
     Step,
     Timing,
     Trajectory,
+    brief,
 )
 from scanchain.errors import InputError
 from scanchain.graph.background import BackgroundOptimization
@@ -66,6 +67,8 @@ class SlamResult:
     ``map_errors`` are those of the keyframes against the map.
     ``components`` (K,) numbers the pieces that the keyframes belong to, which no loop joins; one as a rule.
     """
+
+    __repr__ = brief
 
     trajectory: Trajectory
     odometry: Trajectory
@@ -110,7 +113,7 @@ class Slam:
         """
         config, T_base_lidar = checked_start(config, T_base_lidar, dimension)
         self.config = config
-        self.dimension = T_base_lidar.shape[0] - 1
+        self.T_base_lidar, self.dimension = T_base_lidar, T_base_lidar.shape[0] - 1
         self.points = PointStore(self.dimension, points_file)
         self.spans = GrowingArray((2,), np.int64)
         self.keeps_scans = self.dimension == 2 and config.loops.enabled and config.loops.refine

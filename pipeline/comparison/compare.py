@@ -19,7 +19,7 @@ from scanchain.comparison.results import Reference, Results, write_results
 from scanchain.comparison.scan_store import StoredScans, store
 from scanchain.comparison.table import Table, maps_of, summarize, write_table
 from scanchain.config import NO_TRUTH
-from scanchain.data import Trajectory
+from scanchain.data import Trajectory, brief
 from scanchain.errors import InputError
 from scanchain.evaluation import pair, read_relations, read_truth, relation_error
 from scanchain.logs import Log, open_log
@@ -67,6 +67,8 @@ class Comparison:
 @dataclass(frozen=True, slots=True)
 class Compared:
     """A finished comparison, failed methods included."""
+
+    __repr__ = brief
 
     path: Path
     table: Table

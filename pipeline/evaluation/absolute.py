@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix, Pose, Trajectory
 from scanchain.errors import InputError
-from scanchain.evaluation.pairing import Pairs, Statistics, pair
+from scanchain.evaluation.pairing import Pairs, Statistics, pair, summarized
 from scanchain.registration.svd import DegeneratePairsError, rigid_transform
 
 _PLANAR = 1e-9  # meters of height and radians of tilt below which poses count as planar
@@ -97,6 +97,8 @@ class AbsoluteError:
     T_reference_estimate : the alignment that was found
     errors_m, errors_rad : (N,) pose by pose, in the order of the pairs
     """
+
+    __repr__ = summarized
 
     definition: str
     pairing: str

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 from scanchain import checks
 from scanchain.data import Trajectory
@@ -26,6 +27,7 @@ from scanchain.evaluation.relative import (
 from scanchain.trajectory import read_tum
 
 Result = AbsoluteError | RelativeError | KittiError | RelationError
+Kind = TypeVar("Kind", bound=Result)
 
 _INTERVAL = re.compile(r"(\d+(?:\.\d+)?)(poses?|s|m)")
 
@@ -41,6 +43,31 @@ class Results:
     missing: dict[str, str]
     pairing: str = ""
     warnings: Sequence[str] = ()
+
+    def __repr__(self) -> str:
+        return f"<{'; '.join(each.summary for each in self.found.values())}>"
+
+    @property
+    def ate(self) -> AbsoluteError:
+        """The ATE."""
+        return self._of("ate", AbsoluteError)
+
+    @property
+    def rpe(self) -> dict[str, RelativeError]:
+        """The RPE by interval, as "1_pose", "1_s" or "10_m"; without those that the path is too short for."""
+        parts = self.found.items()
+        return {name.removeprefix("rpe_"): error for name, error in parts if isinstance(error, RelativeError)}
+
+    @property
+    def kitti(self) -> KittiError:
+        """The KITTI metric. Raises InputError where the path is too short for it."""
+        return self._of("kitti", KittiError)
+
+    def _of(self, name: str, kind: type[Kind]) -> Kind:
+        error = self.found.get(name)
+        if not isinstance(error, kind):
+            raise InputError(self.missing.get(name, f"{name} was not computed: the result has no ground truth"))
+        return error
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +107,7 @@ def evaluate(
     align : "rigid", "first" or "none", for the ATE
     max_gap_s : truth is interpolated over at most this; by default five of its usual intervals, 0.1 to 0.6 s
     rpe : intervals in poses, seconds or meters; ``source`` names them in errors
-    Returns ``found`` by name ("ate", "rpe_1_s", "kitti"), ``missing`` with reasons, ``warnings``.
+    Returns ``ate``, ``rpe`` by interval ("1_s") and ``kitti``; ``missing`` with reasons, ``warnings``.
     Raises InputError where no pose has a true one, or an argument is none of these.
     """
     checks.one_of(align, tuple(each.value for each in Alignment), "align")

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.data import Matrix, Trajectory
+from scanchain.data import Matrix, Trajectory, brief
 from scanchain.errors import InputError
 from scanchain.words import counted
 
@@ -36,6 +37,8 @@ class Pairs:
     early, late, in_gap : estimated poses without a reference pose: before its begin, after its end, in gaps of it
     gap_s : between true poses that may be interpolated over; widest_s : between those that were
     """
+
+    __repr__ = brief
 
     stamps_ns: NDArray[np.int64]
     estimate: Matrix
@@ -217,6 +220,11 @@ def _no_pairs(estimate: Trajectory, reference: Trajectory, gap_s: float) -> str:
     if here.max() < there.min() or there.max() < here.min():
         return f"{spans}; check that both keep the same clock"
     return f"{spans}, whose neighbors are more than {gap_s:.3g} s apart there; --max-gap allows more"
+
+
+def summarized(self: Any) -> str:
+    """An error for its ``repr``."""
+    return f"<{self.summary}>"
 
 
 @dataclass(frozen=True, slots=True)

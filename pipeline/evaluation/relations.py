@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from scanchain import lie
 from scanchain.data import Matrix, Trajectory
 from scanchain.errors import InputError
-from scanchain.evaluation.pairing import Statistics, nearest
+from scanchain.evaluation.pairing import Statistics, nearest, summarized
 from scanchain.trajectory import numbers, parse_stamp_ns, text_lines
 from scanchain.words import counted
 
@@ -44,6 +44,8 @@ class RelationError:
     used : (K,) int64, the relations compared
     errors_m, errors_rad : (K,) relation by relation
     """
+
+    __repr__ = summarized
 
     definition: str
     translation_m: Statistics

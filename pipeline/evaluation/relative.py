@@ -12,7 +12,7 @@ from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.errors import InputError
 from scanchain.evaluation.absolute import path_length
-from scanchain.evaluation.pairing import Pairs, Statistics
+from scanchain.evaluation.pairing import Pairs, Statistics, summarized
 from scanchain.words import counted
 
 _LARGEST = 2.0  # largest length of a stretch over the requested one
@@ -34,6 +34,8 @@ class RelativeError:
     stretches : (M, 2) int64 places i, j among the pairs
     errors_m, errors_rad : (M,) stretch by stretch
     """
+
+    __repr__ = summarized
 
     size: str
     definition: str
@@ -151,6 +153,8 @@ class KittiError:
     stretches : how many there were
     by_length : the same, length by length
     """
+
+    __repr__ = summarized
 
     definition: str
     pairing: str

@@ -147,6 +147,15 @@ class Log:
         self._opening_notes = tuple(self.notes)
         self._truth: Trajectory | None = None
 
+    def __repr__(self) -> str:
+        return f"Log({self.name!r}: {counted(self.scan_count, f'{self.dimension}D scan')} of {self.topic})"
+
+    def __len__(self) -> int:
+        return self.scan_count
+
+    def __iter__(self) -> Generator[Scan, None, None]:
+        return self.scans()
+
     @property
     def damage(self) -> list[str]:
         """Damage that was met; complete once ``scans`` is through or closed."""

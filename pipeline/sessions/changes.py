@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from scanchain.config import Config
-from scanchain.data import Keyframe, Matrix, Points
+from scanchain.data import Keyframe, Matrix, Points, brief
 from scanchain.errors import InputError
 from scanchain.maps import View, build_point_map, clearly_through, moved, reach_of, sightings
 
@@ -100,6 +100,8 @@ class Changes:
     agreement : share of same points among those that both maps had in sight
     voxel_size_m : edge of the voxels
     """
+
+    __repr__ = brief
 
     names: tuple[str, str]
     points: Points

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.clock import working_s
 from scanchain.config import Config
-from scanchain.data import ClosureVerdict, Pose, Trajectory
+from scanchain.data import ClosureVerdict, Pose, Trajectory, brief
 from scanchain.errors import InputError
 from scanchain.logs import Log, open_log
 from scanchain.maps import SavedMap, open_saved_map
@@ -115,6 +115,8 @@ class LocalizeMetrics(Struct, frozen=True):
 @dataclass(frozen=True, slots=True)
 class LocalizedLog:
     """A localized log for report and recording: its directory, the map, its poses in it, the metrics."""
+
+    __repr__ = brief
 
     path: Path
     prior: SavedMap

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from scanchain import checks, lie
 from scanchain.config import Config
-from scanchain.data import AnyPoints, Closure, Matrix, Pose, Scan, State, Step, Trajectory
+from scanchain.data import AnyPoints, Closure, Matrix, Pose, Scan, State, Step, Trajectory, brief
 from scanchain.maps import SavedMap, open_saved_map
 from scanchain.preprocess import Prepared
 from scanchain.slam import Slam, SlamResult, loop_information
@@ -43,6 +43,8 @@ class Placed:
     step : its odometry and what was compared with the map
     """
 
+    __repr__ = brief
+
     state: MapState
     T_map_lidar: Pose | None
     covariance: Matrix | None
@@ -64,6 +66,8 @@ class Localization:
     closures : with keyframes of the map, or tried
     result : of the whole chain, keyframes of the map first
     """
+
+    __repr__ = brief
 
     states: NDArray[np.str_]
     is_placed: NDArray[np.bool_]

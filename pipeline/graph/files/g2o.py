@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import checks, lie
-from scanchain.data import Matrix
+from scanchain.data import Matrix, brief
 from scanchain.errors import InputError
 from scanchain.graph.edge_checks import nearest_semidefinite, positive_semidefinite
 from scanchain.graph.files.g2o_lines import POSE_NUMBERS, TRIANGLE, G2oLines, Rows, sort_lines
@@ -64,6 +64,8 @@ class G2oFile:
     projection : of the indefinite information matrices; None without any
     note : warning that angles may be degrees; empty where they are radians
     """
+
+    __repr__ = brief
 
     graph: PoseGraph
     ids: NDArray[np.int64]
