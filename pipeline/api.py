@@ -271,7 +271,8 @@ def optimize(graph: PoseGraph, **overrides: object) -> Optimization:
     Raises InputError if the graph is disconnected.
     """
     checks.instance(graph, PoseGraph, "graph", "read_g2o(path).graph")
-    changes = overrides_of({f"graph__{name}": value for name, value in ({"robust": "none"} | overrides).items()})
+    given = {name.removeprefix("graph__"): value for name, value in overrides.items()}
+    changes = overrides_of({"robust": "none"} | given, "graph")
     return graph.optimize(load_settings(graph.dimension, overrides=changes).config.graph)
 
 

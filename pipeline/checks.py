@@ -241,8 +241,13 @@ def path(value: object, name: str) -> Path:
 
 
 @contextmanager
-def writing(path: Path) -> Generator[None]:
-    """A context in which a path that takes no file, or none of this user, raises InputError."""
+def writing(path: Path, *, force: bool = True) -> Generator[None]:
+    """A context in which a path that takes no file, or none of this user, raises InputError.
+
+    force : whether a file that is there may be replaced
+    """
+    if path.exists() and not force:
+        raise InputError(f"{path}: exists; choose another name or pass --force to replace it")
     try:
         yield
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError) as error:

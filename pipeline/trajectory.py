@@ -63,16 +63,17 @@ def _check_tum_row(stamp_ns: int, row: list[float], place: str) -> None:
         raise InputError(f"{place} has a quaternion of length {norm:.3g}, not 1; a TUM line is {_TUM_FIELDS}")
 
 
-def write_tum(path: Path | str, trajectory: Trajectory) -> None:
+def write_tum(path: Path | str, trajectory: Trajectory, *, force: bool = False) -> None:
     """Write a TUM file, nine digits after the point; SE(2) poses lie in the plane z = 0.
 
+    force : whether a file that is there is replaced; else InputError
     Raises InputError where there is no such folder, and OSError where the disk is full.
     """
     path = checks.path(path, "path")
     checks.instance(trajectory, Trajectory, "trajectory", "Trajectory(stamps_ns, poses), or read_tum(path)")
     poses = lie.lift(trajectory.poses)
     rows = np.hstack([poses[:, :3, 3], lie.to_quaternion(poses[:, :3, :3])]).tolist()
-    with checks.writing(path), path.open("w", encoding="utf-8", newline="\n") as file:
+    with checks.writing(path, force=force), path.open("w", encoding="utf-8", newline="\n") as file:
         for stamp_ns, row in zip(trajectory.stamps_ns.tolist(), rows, strict=True):
             file.write(f"{format_stamp(stamp_ns)}{_TUM_ROW % tuple(row)}")
 

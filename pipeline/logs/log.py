@@ -68,7 +68,7 @@ def open_log(
     instance(config, LogConfig, "config", 'load_settings().config.log; a topic is chosen by topic="/points"')
     if changes:
         short = {name.removeprefix("log__"): value for name, value in changes.items()}
-        changed = load_settings(overrides=overrides_of({f"log__{name}": short[name] for name in short})).config.log
+        changed = load_settings(overrides=overrides_of(short, "log")).config.log
         config = replace(config, **{name: getattr(changed, name) for name in short})
     return Log(index_files(named, config), config)
 

@@ -146,6 +146,37 @@ def _triangle(matrix):
     return matrix[np.triu_indices(len(matrix))]
 
 
+def test_information_is_of_a_rotation_vector_or_as_the_comment_says_of_a_quaternion(tmp_path):
+    """g2o's own error is the vector part of the quaternion of Z⁻¹ Tᵢ⁻¹ Tⱼ; χ² of both conventions is the same."""
+    graph, turn = PoseGraph(3), lie.exp(np.array([0.0, 0.0, 0.0, 0.02, -0.01, 0.03]))
+    Z = lie.exp(np.array([1.0, 0.2, 0.0, 0.1, 0.0, 0.4]))
+    root = np.random.default_rng(0).normal(size=(6, 6))
+    for k, pose in enumerate((np.eye(4), Z @ turn)):
+        graph.add_pose(pose, k)
+    graph.add_edge(0, 1, Z, root @ root.T)
+    first, chi2 = {}, graph.state().chi2
+    for rotation in ("vector", "quaternion"):
+        path = tmp_path / f"{rotation}.g2o"
+        write_g2o(path, graph, rotation=rotation)
+        first[rotation], *_, edge = path.read_text().splitlines()
+        information = np.zeros((6, 6))
+        information[np.triu_indices(6)] = [float(word) for word in edge.split()[-21:]]
+        information += np.triu(information, 1).T
+        error = np.zeros(6)
+        error[3:] = lie.log(turn)[3:] if rotation == "vector" else lie.to_quaternion(turn[None, :3, :3])[0, :3]
+        assert error @ information @ error == pytest.approx(chi2, rel=1e-3)
+        back = read_g2o(path)
+        np.testing.assert_allclose(back.graph.information, graph.information, rtol=1e-12)
+        assert back.other_lines == ()
+    assert "rotation vector" in first["vector"] and "unit quaternion" in first["quaternion"]
+    as_vector = read_g2o(tmp_path / "quaternion.g2o", rotation="vector").graph.information[0]
+    np.testing.assert_allclose(as_vector[3:, 3:], 4.0 * graph.information[0, 3:, 3:], rtol=1e-12)
+    with pytest.raises(InputError, match="exists; choose another name or pass force=True"):
+        write_g2o(path, graph)
+    with pytest.raises(InputError, match="rotation is 'euler'; it must be one of vector, quaternion"):
+        write_g2o(path, graph, rotation="euler")
+
+
 def test_a_file_without_vertices_starts_from_its_odometry():
     file = read_g2o(shared_data("graphs/manhattan.g2o"))
     graph = file.graph

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +15,12 @@ from scanchain.errors import InputError
 from scanchain.graph.files.g2o_lines import (
     EDGES,
     POINT,
+    ROTATION_COMMENT,
     SIGHTING,
     TORO_EDGES,
     TORO_VERTICES,
     VERTICES,
+    Rotation,
     to_toro_angles,
     to_toro_triangle,
 )
@@ -27,7 +29,6 @@ from scanchain.whole_file import write_whole
 
 TORO_SUFFIXES = (".graph", ".toro")
 GRAPH_SUFFIXES = (".g2o", *TORO_SUFFIXES)
-
 
 Chosen = Literal["in force", "rejected"]
 
@@ -40,9 +41,9 @@ def write_graph(
     other_lines: Iterable[str] = (),
     edges: Chosen = "in force",
 ) -> None:
-    """Write a g2o file, or a TORO one where the name ends in .graph or .toro. Raises OSError."""
+    """Write or replace a g2o file, or a TORO one where the name ends in .graph or .toro. Raises OSError."""
     write = write_toro if path.suffix in TORO_SUFFIXES else write_g2o
-    write(path, graph, ids=ids, other_lines=other_lines, edges=edges)
+    write(path, graph, ids=ids, other_lines=other_lines, edges=edges, force=True)
 
 
 def rejected_path(path: Path) -> Path:
@@ -57,20 +58,27 @@ def write_g2o(
     ids: NDArray[np.int64] | None = None,
     other_lines: Iterable[str] = (),
     edges: Chosen = "in force",
+    rotation: Rotation = "vector",
+    force: bool = False,
 ) -> None:
     """Write poses, points and edges with full information matrices.
 
-    ids (K,) are the vertex ids, by default 0, 1, …; FIX is written for poses that were held by name. Edges "in
-    force" are written with their robust weight in Ω, so that the poses are the minimum of the file's own χ².
+    ids : (K,) the vertex ids, by default 0, 1, …; FIX is written for poses that were held by name
+    edges : those "in force" with their robust weight in Ω, so that the poses are the minimum of the file's own χ²
+    rotation : of what Ω is in 3D, which the first line of the file says: "vector" for a rotation vector, as this
+        package, GTSAM and published graphs have it, or "quaternion" for the vector part of the unit quaternion,
+        half as long, as g2o itself has it
+    force : whether a file that is there is replaced; else InputError
     """
     checks.instance(graph, PoseGraph, "graph", "read_g2o(path).graph")
+    checks.one_of(rotation, get_args(Rotation), "rotation")
     d = graph.dimension
     names = (np.arange(len(graph)) if ids is None else ids).tolist()
-    lines = []
+    lines = [ROTATION_COMMENT[rotation]] if d == 3 else []
     for name, pose, is_point in zip(names, _numbers(graph.poses).tolist(), graph.is_point.tolist(), strict=True):
         lines.append(f"{POINT} {name} {_text(pose[:2])}" if is_point else f"{VERTICES[d]} {name} {_text(pose)}")
     lines += [f"FIX {names[index]}" for index in graph.held]
-    chosen, triangles = _triangles(graph, edges)
+    chosen, triangles = _triangles(graph, edges, 2.0 if d == 3 and rotation == "quaternion" else 1.0)
     pairs, measured = graph.edges[chosen], _numbers(graph.measurements[chosen])
     sees = graph.is_point[pairs[:, 1]].tolist()
     rows = zip(pairs.tolist(), measured.tolist(), triangles, sees, strict=True)
@@ -81,7 +89,7 @@ def write_g2o(
             )
         else:
             lines.append(f"{EDGES[d]} {names[i]} {names[j]} {_text([*measured, *upper])}")
-    _write(path, [*lines, *other_lines])
+    _write(path, [*lines, *other_lines], force=force)
 
 
 def write_toro(
@@ -91,6 +99,7 @@ def write_toro(
     ids: NDArray[np.int64] | None = None,
     other_lines: Iterable[str] = (),
     edges: Chosen = "in force",
+    force: bool = False,
 ) -> None:
     """Write poses and edges as TORO has them; of Ω the numbers stay, the order changes. TORO has no points."""
     if graph.is_point.any():
@@ -101,16 +110,16 @@ def write_toro(
         f"{TORO_VERTICES[d]} {name} {_text(row)}" for name, row in zip(names, _toro(graph.poses), strict=True)
     ]
     lines += [f"FIX {names[index]}" for index in graph.held]
-    chosen, triangles = _triangles(graph, edges)
+    chosen, triangles = _triangles(graph, edges, 1.0)
     pairs, measured = graph.edges[chosen], _toro(graph.measurements[chosen])
     for (i, j), row, upper in zip(pairs.tolist(), measured, triangles, strict=True):
         lines.append(f"{TORO_EDGES[d]} {names[i]} {names[j]} {_text([*row, *to_toro_triangle(upper)])}")
-    _write(path, [*lines, *other_lines])
+    _write(path, [*lines, *other_lines], force=force)
 
 
-def _write(path: Path | str, lines: list[str]) -> None:
+def _write(path: Path | str, lines: list[str], *, force: bool) -> None:
     path = checks.path(path, "path")
-    with checks.writing(path):
+    with checks.writing(path, force=force):
         write_whole(path, "\n".join([*lines, ""]).encode())
 
 
@@ -129,10 +138,14 @@ def _toro(poses: Matrix) -> list[list[float]]:
     return [[*T[:3, 3].tolist(), *to_toro_angles(T[:3, :3])] for T in poses]
 
 
-def _triangles(graph: PoseGraph, edges: Chosen) -> tuple[NDArray[np.bool_], list[list[float]]]:
-    """Chosen edges, (E,), and Ω of these, upper triangle row by row; w Ω of those in force."""
+def _triangles(graph: PoseGraph, edges: Chosen, per_turn: float) -> tuple[NDArray[np.bool_], list[list[float]]]:
+    """Chosen edges, (E,), and Ω of these, upper triangle row by row; w Ω of those in force.
+
+    per_turn : radians in a unit of rotation
+    """
     upper = np.triu_indices(graph.freedom)
-    triangles = graph.information[:, upper[0], upper[1]]
+    units = lie.by_component(graph.freedom, 1.0, per_turn)
+    triangles = (graph.information * np.outer(units, units))[:, upper[0], upper[1]]
     if edges == "rejected":
         return graph.is_rejected, triangles[graph.is_rejected].tolist()
     return ~graph.is_rejected, (graph.weight[:, None] * triangles)[~graph.is_rejected].tolist()
