@@ -56,7 +56,6 @@ class SlamResult(core.SlamResult):
     """
 
     __repr__ = brief
-
     config: Config = field(kw_only=True)
     steps: pa.Table = field(kw_only=True)
 

@@ -10,6 +10,7 @@ from urllib.parse import urlsplit
 
 import msgspec
 from msgspec import Meta, Struct
+from msgspec.structs import asdict
 
 from scanchain.download import fetch
 from scanchain.errors import InputError
@@ -56,13 +57,6 @@ class Page(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", ta
     steps: str
 
 
-class Local(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="file"):
-    """A file on this machine."""
-
-    path: str
-    sha256: Sha256
-
-
 class Sequence(Struct, frozen=True, forbid_unknown_fields=True):
     """A sequence: description, source, conversion to MCAP, ground truth."""
 
@@ -72,7 +66,7 @@ class Sequence(Struct, frozen=True, forbid_unknown_fields=True):
     conversion: str
     ground_truth: str
     license: str
-    source: Simulated | Download | Page | Local
+    source: Simulated | Download | Page
 
 
 def names() -> tuple[str, ...]:
@@ -108,26 +102,13 @@ def prepare(
         return destination
     match source:
         case Simulated():
-            simulate(
-                source.world,
-                destination,
-                seed=source.seed,
-                duration_s=source.duration_s,
-                sensor=source.sensor,
-                drift=source.drift,
-                noise_m=source.noise_m,
-                dropout=source.dropout,
-                force=True,
-                progress=progress,
-            )
+            simulate(destination=destination, force=True, progress=progress, **asdict(source))
         case Download():
             convert([_download(name, source, folder, progress)], destination, force=True)
         case Page():
             raise InputError(
                 f"{destination}: {name} cannot be downloaded automatically; {source.page}: {source.steps}"
             )
-        case Local():
-            raise InputError(f"{destination}: absent; put {source.path} there as MCAP")
     return destination
 
 

@@ -78,7 +78,6 @@ class Scan:
     """
 
     __repr__ = brief
-
     index: int
     stamp_ns: int
     log_time_ns: int
@@ -193,7 +192,6 @@ class Match:
     """
 
     __repr__ = brief
-
     T_target_source: Pose
     information: Matrix
     cost: float
@@ -251,7 +249,6 @@ class Keyframe:
     """
 
     __repr__ = brief
-
     index: int
     scan_index: int
     stamp_ns: int
@@ -306,7 +303,6 @@ class Closure:
     """
 
     __repr__ = brief
-
     target: int
     source: int
     match: Match
@@ -338,7 +334,6 @@ class GraphState:
     """
 
     __repr__ = brief
-
     poses: Matrix
     stamps_ns: NDArray[np.int64]
     edges: NDArray[np.int64]
@@ -376,11 +371,6 @@ class Timing(msgspec.Struct, frozen=True):
     map_s: float
     loops_s: float
 
-    @property
-    def total_s(self) -> float:
-        """Sum of all stages."""
-        return self.read_s + self.preprocess_s + self.match_s + self.map_s + self.loops_s
-
 
 @dataclass(frozen=True, slots=True)
 class Step:
@@ -403,7 +393,6 @@ class Step:
     """
 
     __repr__ = brief
-
     scan: Scan
     points: Points
     T_odom_lidar: Pose

@@ -69,7 +69,6 @@ class SlamResult:
     """
 
     __repr__ = brief
-
     trajectory: Trajectory
     odometry: Trajectory
     keyframes: tuple[Keyframe, ...]

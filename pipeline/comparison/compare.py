@@ -69,7 +69,6 @@ class Compared:
     """A finished comparison, failed methods included."""
 
     __repr__ = brief
-
     path: Path
     table: Table
 

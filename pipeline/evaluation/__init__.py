@@ -18,6 +18,7 @@ from scanchain.evaluation.map_sharpness import sampled_map as sampled_map
 from scanchain.evaluation.map_sharpness import sampling_step as sampling_step
 from scanchain.evaluation.map_sharpness import sharpness as sharpness
 from scanchain.evaluation.pairing import Pairs as Pairs
+from scanchain.evaluation.pairing import PoseErrors as PoseErrors
 from scanchain.evaluation.pairing import Statistics as Statistics
 from scanchain.evaluation.pairing import during as during
 from scanchain.evaluation.pairing import pair as pair

@@ -29,6 +29,11 @@ from scanchain.trajectory import read_tum
 Result = AbsoluteError | RelativeError | KittiError | RelationError
 Kind = TypeVar("Kind", bound=Result)
 
+_OVER: dict[str, Callable[[Pairs, float], RelativeError]] = {
+    "pose": lambda pairs, size: relative_error_over_frames(pairs, int(size)),
+    "s": relative_error_over_time,
+    "m": relative_error_over_distance,
+}
 _INTERVAL = re.compile(r"(\d+(?:\.\d+)?)(poses?|s|m)")
 
 
@@ -70,27 +75,6 @@ class Results:
         return error
 
 
-@dataclass(frozen=True, slots=True)
-class Interval:
-    """Interval of an RPE in ``pose``, ``s`` or ``m``."""
-
-    size: float
-    unit: str
-
-    @property
-    def name(self) -> str:
-        """Key of its figures."""
-        return f"rpe_{self.size:g}_{self.unit}"
-
-    def error(self, pairs: Pairs) -> RelativeError:
-        """The RPE over it. Raises InputError where the trajectory is too short."""
-        if self.unit == "pose":
-            return relative_error_over_frames(pairs, int(self.size))
-        if self.unit == "s":
-            return relative_error_over_time(pairs, self.size)
-        return relative_error_over_distance(pairs, self.size)
-
-
 def evaluate(
     estimate: Trajectory | str | Path,
     truth: Trajectory | str | Path,
@@ -119,7 +103,7 @@ def evaluate(
     checks.instance(truth, Trajectory, "truth", "read_tum(path)")
     pairs = pair(trajectory, truth, gap_s=max_gap_s)
     metrics: dict[str, Callable[[], Result]] = {
-        **{interval.name: partial(interval.error, pairs) for interval in intervals},
+        **{f"rpe_{size:g}_{unit}": partial(_OVER[unit], pairs, size) for size, unit in intervals},
         "kitti": partial(kitti_error_of_any_path, pairs),
     }
     ate = absolute_error(pairs, Alignment(align))
@@ -132,10 +116,10 @@ def evaluate(
     return results
 
 
-def _intervals(text: str, source: str) -> list[Interval]:
-    """Intervals of a list such as ``1pose,0.5s,10m``."""
+def _intervals(text: str, source: str) -> list[tuple[float, str]]:
+    """Size and unit of each interval of a list such as ``1pose,0.5s,10m``."""
     found = [(word, _INTERVAL.fullmatch(word.strip())) for word in text.split(",")]
     for word, match in found:
         if match is None or float(match[1]) == 0.0 or (match[2].startswith("pose") and "." in match[1]):
             raise InputError(f"{source} has {word!r}; take sizes such as 1pose, 0.5s or 10m, with commas")
-    return [Interval(float(match[1]), "pose" if match[2] == "poses" else match[2]) for _, match in found if match]
+    return [(float(match[1]), match[2].removesuffix("s") or "s") for _, match in found if match]

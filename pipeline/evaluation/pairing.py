@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import astuple, dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +38,6 @@ class Pairs:
     """
 
     __repr__ = brief
-
     stamps_ns: NDArray[np.int64]
     estimate: Matrix
     reference: Matrix
@@ -222,11 +220,6 @@ def _no_pairs(estimate: Trajectory, reference: Trajectory, gap_s: float) -> str:
     return f"{spans}, whose neighbors are more than {gap_s:.3g} s apart there; --max-gap allows more"
 
 
-def summarized(self: Any) -> str:
-    """An error for its ``repr``."""
-    return f"<{self.summary}>"
-
-
 @dataclass(frozen=True, slots=True)
 class Statistics:
     """Figures of a set of absolute errors, in the errors' own unit.
@@ -257,12 +250,35 @@ class Statistics:
             maximum=float(errors.max()),
         )
 
-    def scaled(self, factor: float) -> Statistics:
-        """The same errors in another unit, for print."""
-        return Statistics(
-            self.count,
-            *(
-                value * factor
-                for value in (self.mean, self.std, self.rmse, self.median, self.minimum, self.maximum)
-            ),
-        )
+    @property
+    def degrees(self) -> Statistics:
+        """Those of radians in degrees, for print."""
+        return Statistics(self.count, *(float(np.degrees(value)) for value in astuple(self)[1:]))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoseErrors:
+    """Errors of poses or of motions, one by one, and their figures.
+
+    definition : of the figures, as text; pairing : over which poses
+    errors_m, errors_rad : (N,) one by one; translation_m, rotation_rad : statistics of these
+    """
+
+    definition: str
+    pairing: str = ""
+    errors_m: NDArray[np.float64]
+    errors_rad: NDArray[np.float64]
+    translation_m: Statistics = field(init=False)
+    rotation_rad: Statistics = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "translation_m", Statistics.of(self.errors_m))
+        object.__setattr__(self, "rotation_rad", Statistics.of(self.errors_rad))
+
+    def __repr__(self) -> str:
+        return f"<{self.summary}>"
+
+    @property
+    def summary(self) -> str:
+        """The figures in one line."""
+        raise NotImplementedError

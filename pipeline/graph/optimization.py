@@ -56,7 +56,6 @@ class Optimization:
     """
 
     __repr__ = brief
-
     state: GraphState
     chi2_before: float
     chi2_after: float

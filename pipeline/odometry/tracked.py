@@ -27,7 +27,6 @@ class Tracked:
     """
 
     __repr__ = brief
-
     scan: Scan
     points: Points
     matched: Points

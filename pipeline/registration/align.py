@@ -82,22 +82,17 @@ def align(
             f"T_guess puts the centroid of the source {apart_m:.3g} m from that of the target, which spans about "
             f"{range_m:.3g} m; wanted clouds in one unit that overlap"
         )
-    pivot = lie.inverse(at_source)[:-1, -1]
-    if np.linalg.norm(pivot) > _SEEN_FROM * range_m:
-        pivot = np.zeros(d)
-    match = _matched(
-        target / unit_m, source / unit_m, _scaled(T_first, 1.0 / unit_m), pivot / unit_m, range_m / unit_m, config
-    )
+    is_near = np.linalg.norm(at_source[:-1, -1]) < _SEEN_FROM * range_m
+    T_pivot_source = _scaled(at_source, is_near / unit_m)
+    T_first = _scaled(T_first, 1.0 / unit_m)
+    match = _matched(target / unit_m, source / unit_m, T_first, T_pivot_source, range_m / unit_m, config)
     return _restored(match, at_target, at_source, unit_m)
 
 
 def _matched(
-    target: Points, source: Points, T_first: Pose, pivot: Points, range_m: float, config: Config
+    target: Points, source: Points, T_first: Pose, T_pivot_source: Pose, range_m: float, config: Config
 ) -> Match:
-    """The match of two clouds that fit the configuration; in the plane the best of several beginnings.
-
-    pivot : (d,) of the source, about which it is turned in the plane
-    """
+    """The match of two clouds that fit the configuration; in the plane the best of several about a pivot."""
     local_map = VoxelMap(target.shape[1], config.local_map)
     local_map.insert(downsample(target, config.preprocess.map_voxel_m), lie.identity(target.shape[1]))
     sparse = _downsampled(source, config.preprocess)
@@ -106,10 +101,8 @@ def _matched(
     if local_map.dimension == 3:
         return match
     window = Window(_WINDOW * range_m, _WINDOW_RAD, _SEEDS_APART_M, _RIVAL, _SEEDS)
-    T_pivot_source = _translation(-pivot)
-    seeds = CorrelativeMap(local_map, T_first).search(
-        lie.transform(T_pivot_source, sparse), T_first @ lie.inverse(T_pivot_source), window
-    )
+    T_begin, turned = T_first @ lie.inverse(T_pivot_source), lie.transform(T_pivot_source, sparse)
+    seeds = CorrelativeMap(local_map, T_first).search(turned, T_begin, window)
     found = (lie.pose_2d(x_m, y_m, yaw_rad) @ T_pivot_source for x_m, y_m, yaw_rad, _ in seeds.tolist())
     return _unambiguous([match, *(matcher.align(sparse, local_map, T_seed) for T_seed in found)])
 

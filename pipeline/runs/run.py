@@ -57,7 +57,6 @@ class Finished:
     """A finished run; ``stopped`` is the reason why it did not process the whole log, empty if it did."""
 
     __repr__ = brief
-
     path: Path
     metrics: Metrics
     summary: str

@@ -102,7 +102,6 @@ class Changes:
     """
 
     __repr__ = brief
-
     names: tuple[str, str]
     points: Points
     labels: NDArray[np.uint8]

@@ -117,7 +117,6 @@ class LocalizedLog:
     """A localized log for report and recording: its directory, the map, its poses in it, the metrics."""
 
     __repr__ = brief
-
     path: Path
     prior: SavedMap
     localization: Localization

@@ -44,7 +44,6 @@ class Placed:
     """
 
     __repr__ = brief
-
     state: MapState
     T_map_lidar: Pose | None
     covariance: Matrix | None
@@ -68,7 +67,6 @@ class Localization:
     """
 
     __repr__ = brief
-
     states: NDArray[np.str_]
     is_placed: NDArray[np.bool_]
     trajectory: Trajectory

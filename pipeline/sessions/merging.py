@@ -125,7 +125,6 @@ class Merged:
     """A finished merge: its directory, metrics, summary and warnings."""
 
     __repr__ = brief
-
     path: Path
     metrics: MergeMetrics
     summary: str

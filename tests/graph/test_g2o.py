@@ -7,7 +7,7 @@ from scanchain.config import GraphConfig
 from scanchain.errors import InputError
 from scanchain.graph.edge_checks import check_connected, nearest_semidefinite
 from scanchain.graph.files.g2o import read_g2o
-from scanchain.graph.files.g2o_write import write_g2o, write_toro
+from scanchain.graph.files.g2o_write import write_g2o
 from scanchain.graph.pose_graph import PoseGraph
 from tests.support.scenes import shared_data
 
@@ -92,7 +92,7 @@ def test_points_without_vertices_begin_where_they_are_seen(tmp_path):
 def test_what_is_written_as_toro_reads_back_the_same(name, tmp_path):
     first = read_g2o(shared_data(f"graphs/{name}.g2o"))
     path = tmp_path / "again.graph"
-    write_toro(path, first.graph, ids=first.ids)
+    write_g2o(path, first.graph, ids=first.ids)
     second = read_g2o(path).graph
     assert np.array_equal(first.graph.edges, second.edges)
     assert np.array_equal(first.graph.information, second.information)
@@ -117,7 +117,7 @@ def test_toro_angles_are_roll_pitch_and_yaw_also_looking_straight_up(pitch, tmp_
         graph.add_pose(T, index)
     graph.add_edge(0, 1, graph.poses[1], np.eye(6))
     path = tmp_path / "up.graph"
-    write_toro(path, graph)
+    write_g2o(path, graph)
     assert np.allclose(read_g2o(path).graph.poses, graph.poses, rtol=0, atol=1e-12)
     if abs(pitch) < 1.5:
         assert np.allclose(np.array(path.read_text().split()[5:8], float), angles[0])
@@ -127,7 +127,7 @@ def test_toro_cannot_hold_points(tmp_path):
     path = tmp_path / "square.g2o"
     path.write_text(SQUARE)
     with pytest.raises(InputError, match="TORO has no points, and the graph has 1"):
-        write_toro(tmp_path / "x.graph", read_g2o(path).graph)
+        write_g2o(tmp_path / "x.graph", read_g2o(path).graph)
 
 
 def test_a_quaternion_edge_keeps_its_order_and_its_information(tmp_path):

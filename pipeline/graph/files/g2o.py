@@ -66,7 +66,6 @@ class G2oFile:
     """
 
     __repr__ = brief
-
     graph: PoseGraph
     ids: NDArray[np.int64]
     other_lines: tuple[str, ...]
