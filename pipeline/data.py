@@ -48,14 +48,9 @@ def brief(self: object) -> str:
 def _brief(value: object) -> str:
     if isinstance(value, np.ndarray):
         return f"<{' × '.join(map(str, value.shape))}>"
-    if isinstance(value, float | str):
-        return (
-            f"{value:.6g}" if isinstance(value, float) else repr(f"{value:.{_SHOWN}}{'…' * (len(value) > _SHOWN)}")
-        )
-    if isinstance(value, Sized) and len(value) > 1:
-        return f"<{type(value).__name__} of {len(value):,}>"
-    text = repr(value)
-    return text if len(text) <= 2 * _SHOWN else f"<{type(value).__name__}>"
+    text = f"{value:.6g}" if isinstance(value, float) else repr(value)
+    size = f" of {len(value):,}" if isinstance(value, Sized) else ""
+    return text if len(text) <= _SHOWN else f"<{type(value).__name__}{size}>"
 
 
 @dataclass(frozen=True, slots=True)

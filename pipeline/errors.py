@@ -4,15 +4,10 @@ import errno
 import re
 
 _OPTION = re.compile(r"scanchain [^;,()]*|--([a-z][\w.-]*\w)")  # commands, and arguments of the one that runs
-_KEYWORDS = {
-    "force": "force=True",
-    "gt": "ground_truth",
-    "max-gap": "max_gap_s",
-    "start": "log__start_s",
-    "end": "log__end_s",
-    "every": "log__every",
-    "topic": "log__topic",
-}
+_KEYWORDS = {name: name for name in ("out", "config", "methods", "rpe")} | {
+    "force": "force=True", "gt": "ground_truth", "max-gap": "max_gap_s", "start": "log__start_s",
+    "end": "log__end_s", "every": "log__every", "topic": "log__topic",
+}  # fmt: skip
 
 
 class ScanchainError(Exception):
@@ -40,8 +35,8 @@ class MissingExtraError(InputError):
 
 
 def _keyword(found: re.Match[str]) -> str:
-    option: str | None = found[1]
-    return found[0] if option is None else _KEYWORDS.get(option, option.replace(".", "__"))
+    option: str = found[1] or ""
+    return _KEYWORDS.get(option, option.replace(".", "__") if "." in option else found[0])
 
 
 def shown(value: object) -> str:

@@ -104,10 +104,11 @@ class Slam:
         prior: SavedMap | None = None,
         is_live: bool = False,
     ) -> None:
-        """Arguments as in ``Odometry``, and ``is_live`` as in ``LoopCloser``.
+        """Start before the first scan.
 
+        config, T_base_lidar, dimension : as in ``Odometry``
         points_file : where points go, which stay out of memory; without one, into a temporary file
-        is_live : also whether a large graph is optimized beside the scans
+        is_live : whether no scan may wait: long searches go on over several, large graphs are optimized beside
         prior : a map to localize in: its keyframes come before those of the log, and stay where they are
         """
         config, T_base_lidar = checked_start(config, T_base_lidar, dimension)
@@ -167,7 +168,7 @@ class Slam:
         *,
         T_odom_base: Pose | None = None,
     ) -> Step:
-        """Place a scan as a driver gives it, and whatever it closes, as ``Odometry.track`` does.
+        """Place a scan as a driver gives it, arguments as in ``Odometry.track``, and whatever it closes.
 
         From the first on, a large graph is optimized beside: no scan waits for it.
         """

@@ -146,7 +146,7 @@ def _reference(comparison: Comparison, log: Log, scans: StoredScans) -> Referenc
         except InputError as error:
             if comparison.ground_truth is not None or topic:
                 raise
-            truth, note = None, f"No accuracy against {source}: {error}"
+            truth, note = None, f"No accuracy against {source}: {error.text}"
     sources = [source] if truth is not None else []
     sources += [str(comparison.relations)] if relations is not None else []
     return Reference(truth, relations, " and ".join(sources), note)

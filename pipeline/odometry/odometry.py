@@ -94,8 +94,12 @@ class Odometry:
         *,
         T_odom_base: Pose | None = None,
     ) -> Tracked:
-        """Place a scan as a driver gives it; arguments as in ``Scan.of``.
+        """Place a scan as a driver gives it.
 
+        points : (N, d) meters, lidar frame; rows that are not finite are counted in ``scan.dropped``
+        stamp_s : seconds since any fixed instant; the pose holds then
+        times_s : (N,) seconds of each point relative to ``stamp_s``, for deskewing; none where left out
+        T_odom_base : pose of the robot by its wheels at ``stamp_s``
         Raises InputError, and forgets the scan, where its stamp is not after the last one, or where stamps or
         ``times_s`` cannot be seconds.
         """

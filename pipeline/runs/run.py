@@ -204,7 +204,7 @@ def _judge(
         truth, misleading = compare_with_truth(result, reference, source, gap_s)
         write_tum(folder / TRUTH_FILE, during(reference, result.trajectory.stamps_ns))
     except InputError as error:
-        return None, (f"no accuracy against {source}: {error}",)
+        return None, (f"no accuracy against {source}: {error.text}",)
     return truth, tuple(filter(None, (truth.complaint, *misleading)))
 
 
