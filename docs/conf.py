@@ -18,7 +18,7 @@ autodoc_class_signature = "mixed"
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 autoclass_content = "both"
-autodoc_type_aliases = {name: name for name in ("Logs", "Matrix", "Points", "Pose", "RawPoints")}
+autodoc_type_aliases = {name: name for name in ("AnyPoints", "Logs", "Matrix", "Points", "Pose", "RawPoints")}
 python_use_unqualified_type_names = True
 python_maximum_signature_line_length = 100
 

@@ -6,124 +6,83 @@ The names below are the Python API; each is imported when it is first used, so t
 from __future__ import annotations
 
 TYPE_CHECKING = False  # that of typing, whose import is a moment in which Ctrl-C would show a traceback
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # "as" says that the name is public here
     from typing import Any
 
-    from scanchain.api import changes, compare, downsample, localize, merge, optimize, run
-    from scanchain.config import Config
-    from scanchain.data import Match, Scan, State, Step, Trajectory
-    from scanchain.errors import InputError, ScanchainError
-    from scanchain.evaluation.metrics import evaluate
-    from scanchain.graph.files.g2o import read_g2o
-    from scanchain.graph.files.g2o_write import write_g2o
-    from scanchain.graph.pose_graph import PoseGraph
-    from scanchain.logs import open_log
-    from scanchain.odometry import Odometry
-    from scanchain.registration import VoxelMap, align, create_matcher, rigid_transform
-    from scanchain.sessions.localizer import Localizer
-    from scanchain.settings import load_settings
-    from scanchain.simulation import simulate
-    from scanchain.slam import Slam, SlamResult
-    from scanchain.trajectory import read_tum, write_tum
+    from scanchain import evaluation as evaluation
+    from scanchain import lie as lie
+    from scanchain.api import Slam as Slam
+    from scanchain.api import SlamResult as SlamResult
+    from scanchain.api import changes as changes
+    from scanchain.api import compare as compare
+    from scanchain.api import downsample as downsample
+    from scanchain.api import localize as localize
+    from scanchain.api import merge as merge
+    from scanchain.api import optimize as optimize
+    from scanchain.api import run as run
+    from scanchain.config import Config as Config
+    from scanchain.data import Match as Match
+    from scanchain.data import Scan as Scan
+    from scanchain.data import State as State
+    from scanchain.data import Step as Step
+    from scanchain.data import Trajectory as Trajectory
+    from scanchain.errors import InputError as InputError
+    from scanchain.errors import ScanchainError as ScanchainError
+    from scanchain.evaluation.metrics import evaluate as evaluate
+    from scanchain.graph.files.g2o import read_g2o as read_g2o
+    from scanchain.graph.files.g2o_write import write_g2o as write_g2o
+    from scanchain.graph.pose_graph import PoseGraph as PoseGraph
+    from scanchain.logs import open_log as open_log
+    from scanchain.odometry import Odometry as Odometry
+    from scanchain.registration import VoxelMap as VoxelMap
+    from scanchain.registration import create_matcher as create_matcher
+    from scanchain.registration import rigid_transform as rigid_transform
+    from scanchain.registration.align import align as align
+    from scanchain.sessions.localizer import Localizer as Localizer
+    from scanchain.settings import load_settings as load_settings
+    from scanchain.simulation import simulate as simulate
+    from scanchain.trajectory import read_tum as read_tum
+    from scanchain.trajectory import write_tum as write_tum
 
-_HOMES = {
-    "Config": "config",
-    "InputError": "errors",
-    "Localizer": "sessions.localizer",
-    "Match": "data",
-    "Odometry": "odometry",
-    "PoseGraph": "graph.pose_graph",
-    "Scan": "data",
-    "ScanchainError": "errors",
-    "Slam": "slam",
-    "SlamResult": "slam",
-    "State": "data",
-    "Step": "data",
-    "Trajectory": "data",
-    "VoxelMap": "registration",
-    "align": "registration",
-    "changes": "api",
-    "compare": "api",
-    "create_matcher": "registration",
-    "downsample": "api",
-    "evaluate": "evaluation.metrics",
-    "load_settings": "settings",
-    "localize": "api",
-    "merge": "api",
-    "open_log": "logs",
-    "optimize": "api",
-    "read_g2o": "graph.files.g2o",
-    "read_tum": "trajectory",
-    "rigid_transform": "registration",
-    "run": "api",
-    "simulate": "simulation",
-    "write_g2o": "graph.files.g2o_write",
-    "write_tum": "trajectory",
+    __version__: str
+
+_MODULES = {
+    "api": "Slam SlamResult changes compare downsample localize merge optimize run",
+    "config": "Config",
+    "data": "Match Scan State Step Trajectory",
+    "errors": "InputError ScanchainError",
+    "evaluation.metrics": "evaluate",
+    "graph.files.g2o": "read_g2o",
+    "graph.files.g2o_write": "write_g2o",
+    "graph.pose_graph": "PoseGraph",
+    "logs": "open_log",
+    "odometry": "Odometry",
+    "registration": "VoxelMap create_matcher rigid_transform",
+    "registration.align": "align",
+    "sessions.localizer": "Localizer",
+    "settings": "load_settings",
+    "simulation": "simulate",
+    "trajectory": "read_tum write_tum",
 }
-
-_COMPILED = {
-    "Localizer",
-    "Odometry",
-    "PoseGraph",
-    "Slam",
-    "VoxelMap",
-    "align",
-    "changes",
-    "compare",
-    "create_matcher",
-    "downsample",
-    "evaluate",
-    "localize",
-    "merge",
-    "run",
-    "simulate",
-}
-
-__all__ = [
-    "Config",
-    "InputError",
-    "Localizer",
-    "Match",
-    "Odometry",
-    "PoseGraph",
-    "Scan",
-    "ScanchainError",
-    "Slam",
-    "SlamResult",
-    "State",
-    "Step",
-    "Trajectory",
-    "VoxelMap",
-    "align",
-    "changes",
-    "compare",
-    "create_matcher",
-    "downsample",
-    "evaluate",
-    "load_settings",
-    "localize",
-    "merge",
-    "open_log",
-    "optimize",
-    "read_g2o",
-    "read_tum",
-    "rigid_transform",
-    "run",
-    "simulate",
-    "write_g2o",
-    "write_tum",
-]
+_HOMES = {name: module for module, names in _MODULES.items() for name in names.split()}
+__all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __dir__() -> list[str]:
-    return [*(name for name in globals() if name.startswith("__")), *__all__]
+    return [*(name for name in globals() if name.startswith("__")), "__version__", "evaluation", "lie", *__all__]
 
 
 def __getattr__(name: str) -> Any:
+    import sys
+    from importlib import import_module, metadata
+
+    if name == "__version__":
+        return metadata.version("scanchain")
+    if name in ("evaluation", "lie"):
+        return import_module(f"scanchain.{name}")
     if name not in _HOMES:
         raise AttributeError(f"module 'scanchain' has no attribute {name!r}")
-    from importlib import import_module
-
-    if name in _COMPILED:
+    value = getattr(import_module(f"scanchain.{_HOMES[name]}"), name)
+    if "numba" in sys.modules:  # it may be compiled when it is called
         import_module("scanchain.clock").warn_of_compilation()
-    return globals().setdefault(name, getattr(import_module(f"scanchain.{_HOMES[name]}"), name))
+    return globals().setdefault(name, value)

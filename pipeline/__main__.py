@@ -93,9 +93,9 @@ def _run(words: list[str], obj: object) -> int:
     except click.ClickException as error:
         return _fail(error.format_message(), 2)
     except InputError as error:
-        return _fail(str(error), 2)
+        return _fail(error.text, 2)
     except ScanchainError as error:
-        return _fail(str(error), 1)
+        return _fail(error.text, 1)
     except (KeyboardInterrupt, click.Abort):
         return _fail("interrupted", 1)
     except BrokenPipeError:  # the reader of our output went away, as `head` does

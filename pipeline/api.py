@@ -1,31 +1,98 @@
-"""The commands as functions: process a log, merge maps, compare methods, optimize a graph, downsample points."""
+"""The commands as functions, and SLAM of scans from anywhere with the map and the verdict that a run has."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from scanchain import checks
-from scanchain.data import Points, Pose
+from scanchain import slam as core
+from scanchain.config import Config
+from scanchain.data import AnyPoints, Points, Pose, Step, brief
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.logs import sources_of
 from scanchain.preprocess import downsample as first_per_voxel
+from scanchain.runs.closures import closures_table, final_verdicts
 from scanchain.runs.job import Job, Unwatched
+from scanchain.runs.results import cloud_of
 from scanchain.runs.run import Finished
 from scanchain.runs.run import run as run_job
+from scanchain.runs.step_table import StepTable
+from scanchain.runs.vouching import evidence_of
 from scanchain.settings import load_settings, overrides_of
+from scanchain.verdict import Judged, judge
 
 if TYPE_CHECKING:
+    import pyarrow as pa
+
     from scanchain.comparison.compare import Compared
     from scanchain.config import RecordingConfig
     from scanchain.graph.optimization import Optimization
+    from scanchain.odometry import Located
     from scanchain.runs.job import Recorder, SinkName
     from scanchain.sessions.changes import Changes
     from scanchain.sessions.localize import LocalizedLog
     from scanchain.sessions.merging import Merged
 
 Logs = str | Path | Sequence[str | Path]
+
+
+@dataclass(frozen=True, slots=True)
+class SlamResult(core.SlamResult):
+    """The result of a log, with the map and the verdict that a run has.
+
+    Attributes
+    ----------
+    trajectory, odometry : T_world_lidar of every scan, after and before optimization
+    keyframes : the scans that stand in the graph; T_world_keyframes (K, d+1, d+1) are their final poses
+    closures : every loop closure tried
+    graph, state : the pose graph, and how it was left
+    components : (K,) numbers the pieces that the keyframes belong to, which no loop joins; one as a rule
+    elevation_offset_rad, calibrated_from : what vertical angles were corrected by, from which scan on; 0 as a rule
+    config, steps : what it was made with, and the columns of steps.parquet
+    """
+
+    __repr__ = brief
+    config: Config = field(kw_only=True)
+    steps: pa.Table = field(kw_only=True)
+
+    def cloud(self) -> Points:
+        """(M, d) points of the map, moving objects removed, as in the map.ply of a run."""
+        return cloud_of(self, self.config).points
+
+    def verdict(self) -> Judged:
+        """Whether to rely on the trajectory, with reasons and stretches, as a run is judged."""
+        final = final_verdicts(self.closures, self.state)
+        return judge(evidence_of(self.steps, closures_table(final, self.keyframes, self.trajectory.dimension)))
+
+
+class Slam(core.Slam):
+    """Odometry, loop closing and pose graph: a step for every scan, the result at the end."""
+
+    def place(self, located: Located) -> Step:
+        """Place one scan that ``front_end`` located."""
+        step = super().place(located)
+        self.steps.append(step)
+        return step
+
+    @cached_property
+    def steps(self) -> StepTable:
+        """Figures of the scans so far, without their points."""
+        return StepTable()
+
+    def finish(self, progress: Callable[[str], None] = lambda stage: None) -> SlamResult:
+        """Close what is left, optimize once more, spread the corrections over all scans and refine these.
+
+        progress : called with the name of each stage when it begins
+        Raises InputError without a scan, and when called again.
+        """
+        result = super().finish(progress)
+        steps = self.steps.table(result.trajectory, self.T_base_lidar)
+        parts = {each.name: getattr(result, each.name) for each in fields(result)}
+        return SlamResult(**parts, config=self.config, steps=steps)
 
 
 def run(
@@ -210,14 +277,15 @@ def optimize(graph: PoseGraph, **overrides: object) -> Optimization:
     Raises InputError if the graph is disconnected.
     """
     checks.instance(graph, PoseGraph, "graph", "read_g2o(path).graph")
-    changes = overrides_of({f"graph__{name}": value for name, value in ({"robust": "none"} | overrides).items()})
+    given = {name.removeprefix("graph__"): value for name, value in overrides.items()}
+    changes = overrides_of({"robust": "none"} | given, "graph")
     return graph.optimize(load_settings(graph.dimension, overrides=changes).config.graph)
 
 
-def downsample(points: Points, voxel_size_m: float) -> Points:
-    """The first point of every voxel, (M, d), in the order of the points (N, d). Raises InputError."""
-    points = checks.points(points, "points", checks.dimension_of(points, "points"))
-    return first_per_voxel(points, checks.positive(voxel_size_m, "voxel_size_m"))
+def downsample(points: AnyPoints, voxel_size_m: float) -> Points:
+    """The first finite point of every voxel, (M, d), in the order of the points (N, d). Raises InputError."""
+    valid, _ = checks.valid_points(points, "points")
+    return first_per_voxel(valid, checks.positive(voxel_size_m, "voxel_size_m"))
 
 
 def open_recorder(

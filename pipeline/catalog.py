@@ -10,6 +10,7 @@ from urllib.parse import urlsplit
 
 import msgspec
 from msgspec import Meta, Struct
+from msgspec.structs import asdict
 
 from scanchain.download import fetch
 from scanchain.errors import InputError
@@ -101,18 +102,7 @@ def prepare(
         return destination
     match source:
         case Simulated():
-            simulate(
-                source.world,
-                destination,
-                seed=source.seed,
-                duration_s=source.duration_s,
-                sensor=source.sensor,
-                drift=source.drift,
-                noise_m=source.noise_m,
-                dropout=source.dropout,
-                force=True,
-                progress=progress,
-            )
+            simulate(destination=destination, force=True, progress=progress, **asdict(source))
         case Download():
             convert([_download(name, source, folder, progress)], destination, force=True)
         case Page():

@@ -47,7 +47,7 @@ def dimension_of(value: object, name: str) -> int:
 
 def points(value: object, name: str, d: int, *, dtype: DTypeLike = np.float64) -> NDArray[Any]:
     """Points (N, d), finite; N may be 0."""
-    array = _numbers(value, name, f"an (N, {d}) array of meters", dtype)
+    array = _numbers(value, name, f"an (N, {d}) array of meters{_where(value, name)}", dtype)
     if array.ndim != 2 or array.shape[1] != d:
         raise InputError(
             f"{name} has the shape {array.shape}; wanted (N, {d}), one row a point{_remedy(array, name, d)}"
@@ -61,6 +61,18 @@ def points(value: object, name: str, d: int, *, dtype: DTypeLike = np.float64) -
             f"{name}: {bad:,} of {len(array):,} points are NaN or infinite; leave them out, with their times"
         )
     return array
+
+
+def valid_points(
+    value: object, name: str, d: int | None = None, *, dtype: DTypeLike = np.float64
+) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """The finite ones (M, d) of points, and which (N,) these are; the others are invalid returns of the lidar."""
+    d = dimension_of(value, name) if d is None else d
+    if type(value) is np.ndarray and value.ndim == 2 and value.dtype.kind == "f" and not np.isfinite(value).all():
+        is_valid = np.asarray(np.isfinite(value).all(axis=1))
+        return points(value[is_valid], name, d, dtype=dtype), is_valid
+    array = points(value, name, d, dtype=dtype)
+    return array, np.ones(len(array), np.bool_)
 
 
 def pose(value: object, name: str, d: int) -> NDArray[np.float64]:
@@ -229,8 +241,13 @@ def path(value: object, name: str) -> Path:
 
 
 @contextmanager
-def writing(path: Path) -> Generator[None]:
-    """A context in which a path that takes no file, or none of this user, raises InputError."""
+def writing(path: Path, *, force: bool = True) -> Generator[None]:
+    """A context in which a path that takes no file, or none of this user, raises InputError.
+
+    force : whether a file that is there may be replaced
+    """
+    if path.exists() and not force:
+        raise InputError(f"{path}: exists; choose another name or pass --force to replace it")
     try:
         yield
     except (FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError) as error:
@@ -269,11 +286,20 @@ def _remedy(array: NDArray[Any], name: str, d: int) -> str:
     """Hint for an array of another shape, empty where there is none."""
     if array.ndim == 2 and array.shape[1] > d and array.shape[0] != d:
         return f"; of more columns, as with intensity, pass {name}[:, :{d}]"
+    if array.ndim == 3 and array.shape[2] == d:
+        return f"; organized? pass {name}.reshape(-1, {d})"
     if array.ndim == 2 and array.shape[0] == d:
         return f"; transposed? pass {name}.T"
     if array.ndim == 2 and array.shape[1] == d - 1:
         return f"; {d - 1}D points need a {d - 1}D map or odometry"
     return ""
+
+
+def _where(value: object, name: str) -> str:
+    """Where the coordinates of a cloud of another library lie; empty where that is unknown."""
+    if isinstance(value, np.ndarray) and value.dtype.names:
+        return f": np.stack([{name}[axis] for axis in 'xyz'], axis=1)"
+    return f": np.asarray({name}.points)" if hasattr(value, "points") else ""
 
 
 def _kind(array: NDArray[Any]) -> str:

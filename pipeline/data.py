@@ -7,6 +7,7 @@ coordinates in frame b to frame a. The dimension d of a log is 2 or 3; a twist h
 
 from __future__ import annotations
 
+from collections.abc import Sized
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import NamedTuple, Protocol
@@ -21,9 +22,11 @@ from scanchain.words import FREEDOM, counted
 Pose = NDArray[np.float64]
 Points = NDArray[np.float64]
 RawPoints = NDArray[np.float32]
+AnyPoints = NDArray[np.floating]  # as arguments, converted where they enter
 Matrix = NDArray[np.float64]
 
 _set = object.__setattr__  # of a record that checks itself
+_SHOWN = 60  # longest text of a value in the ``repr`` of a record
 
 LEAST_FIT = 0.6  # of ``Match.fit``: on real logs it is above 0.8 at true poses and below 0.5 at wrong ones
 MOST_COPIES = 5  # largest number of equal scans in a row that a driver which publishes too often leaves
@@ -34,6 +37,20 @@ _WHOLE = (
     ("log_time_ns", "nanoseconds as int; of seconds int(1e9 * time_s)", None),
     ("dropped", "a number of returns, from 0", 0),
 )
+
+
+def brief(self: object) -> str:
+    """A record on one line, for its ``repr``: arrays by their shape, what is long by its kind and number."""
+    values = ((name, getattr(self, name)) for name in getattr(self, "__dataclass_fields__", ()))
+    return f"{type(self).__name__}({', '.join(f'{name}={_brief(value)}' for name, value in values)})"
+
+
+def _brief(value: object) -> str:
+    if isinstance(value, np.ndarray):
+        return f"<{' × '.join(map(str, value.shape))}>"
+    text = f"{value:.6g}" if isinstance(value, float) else repr(value)
+    size = f" of {len(value):,}" if isinstance(value, Sized) else ""
+    return text if len(text) <= _SHOWN else f"<{type(value).__name__}{size}>"
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +72,7 @@ class Scan:
     Arrays are converted where nothing is lost; InputError where a shape, a dtype or a value is none of these.
     """
 
+    __repr__ = brief
     index: int
     stamp_ns: int
     log_time_ns: int
@@ -81,16 +99,16 @@ class Scan:
     @classmethod
     def of(
         cls,
-        points: RawPoints,
+        points: AnyPoints,
         stamp_s: float,
-        times_s: NDArray[np.float32] | None = None,
+        times_s: NDArray[np.floating] | None = None,
         *,
         index: int = 0,
         T_odom_base: Pose | None = None,
     ) -> Scan:
         """A scan as a driver gives it.
 
-        points : (N, d) meters, lidar frame, without NaN
+        points : (N, d) meters, lidar frame; rows that are not finite are invalid returns, counted in ``dropped``
         stamp_s : seconds since any fixed instant; the pose holds then
         times_s : (N,) seconds of each point relative to ``stamp_s``, for deskewing; none where left out
         T_odom_base : pose of the robot by its wheels at ``stamp_s``
@@ -98,8 +116,10 @@ class Scan:
         from scanchain import checks
 
         stamp_ns = round(1e9 * checks.seconds(stamp_s, "stamp_s"))
-        times_s = np.empty(0, np.float32) if times_s is None else times_s
-        return cls(index, stamp_ns, stamp_ns, points, times_s, 0, T_odom_base)
+        valid, is_valid = checks.valid_points(points, "points", dtype=np.float32)
+        seconds = checks.point_times(times_s, "times_s", len(is_valid))
+        seconds = seconds[is_valid] if len(seconds) else seconds
+        return cls(index, stamp_ns, stamp_ns, valid, seconds, len(is_valid) - len(valid), T_odom_base)
 
 
 class State(StrEnum):
@@ -166,6 +186,7 @@ class Match:
         poses aligned to the same map have in common; (0, 0) from a matcher that does not say
     """
 
+    __repr__ = brief
     T_target_source: Pose
     information: Matrix
     cost: float
@@ -222,6 +243,7 @@ class Keyframe:
     scale : of the voxels that odometry used there, 1 for those of the configuration
     """
 
+    __repr__ = brief
     index: int
     scan_index: int
     stamp_ns: int
@@ -275,6 +297,7 @@ class Closure:
     its figures, the same for all closures of its kind.
     """
 
+    __repr__ = brief
     target: int
     source: int
     match: Match
@@ -309,6 +332,7 @@ class GraphState:
     degrees_of_freedom : numbers that the edges in force measure, less those that they are to determine
     """
 
+    __repr__ = brief
     poses: Matrix
     stamps_ns: NDArray[np.int64]
     edges: NDArray[np.int64]
@@ -346,11 +370,6 @@ class Timing(msgspec.Struct, frozen=True):
     map_s: float
     loops_s: float
 
-    @property
-    def total_s(self) -> float:
-        """Sum of all stages."""
-        return self.read_s + self.preprocess_s + self.match_s + self.map_s + self.loops_s
-
 
 @dataclass(frozen=True, slots=True)
 class Step:
@@ -372,6 +391,7 @@ class Step:
     starts_segment : True if its motion from the scan before is unknown
     """
 
+    __repr__ = brief
     scan: Scan
     points: Points
     T_odom_lidar: Pose
@@ -405,6 +425,10 @@ class Trajectory:
             )
         object.__setattr__(self, "stamps_ns", checks.whole_numbers(self.stamps_ns, "stamps_ns", "nanoseconds"))
         object.__setattr__(self, "poses", checks.poses(self.poses, "poses", poses[1] - 1))
+
+    def __repr__(self) -> str:
+        span_s = 1e-9 * float(np.ptp(self.stamps_ns)) if len(self) else 0.0
+        return f"Trajectory({counted(len(self), 'pose')} of SE({self.dimension}) over {span_s:.1f} s)"
 
     @property
     def dimension(self) -> int:

@@ -7,7 +7,6 @@ import http.client
 import urllib.error
 import urllib.request
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -37,71 +36,53 @@ def fetch(url: str, destination: Path, *, sha256: str = "", progress: Progress |
         raise InputError(f"{url}: is no address of a web server; give one with http:// or https://")
     if not destination.exists():
         destination.parent.mkdir(parents=True, exist_ok=True)
-        part = _Part(url, destination.with_name(f".{destination.name}.part"))
-        part.complete(progress)
-        _verify(part.path, sha256, url)
-        part.path.replace(destination)
-        part.validator_path.unlink(missing_ok=True)
+        part = destination.with_name(f".{destination.name}.part")
+        version = part.with_name(f"{part.name}.etag")  # the ETag, or the time of the last change, of what is begun
+        _complete(url, part, version, progress)
+        _verify(part, sha256, url)
+        part.replace(destination)
+        version.unlink(missing_ok=True)
     return _verify(destination, sha256, url)
 
 
-@dataclass(frozen=True, slots=True)
-class _Part:
-    """The part of a file received so far, and beside it the server's validator of that version."""
+def _complete(url: str, part: Path, version: Path, progress: Progress | None) -> None:
+    """Download the missing bytes, with a new request after each interruption."""
+    for attempt in range(1, _ATTEMPTS + 1):
+        try:
+            if _more(url, part, version, progress):
+                return
+            reason = "the server ended too early"
+        except urllib.error.HTTPError as error:
+            if error.code != http.client.REQUESTED_RANGE_NOT_SATISFIABLE:
+                raise DownloadError(f"{url}: {error.code} {error.reason}; see whether its page moved") from error
+            if error.headers.get("Content-Range", "") == f"bytes */{part.stat().st_size}":
+                return
+            part.unlink()
+            reason = "the file on the server is another, and shorter, than the one begun"
+        except _BROKEN as error:
+            reason = str(getattr(error, "reason", error)) or type(error).__name__
+        if attempt == _ATTEMPTS:
+            have = part.stat().st_size if part.exists() else 0
+            raise DownloadError(f"{url}: {reason}; {have:,} bytes are kept, call it again to resume")
 
-    url: str
-    path: Path
 
-    @property
-    def validator_path(self) -> Path:
-        """Holds the ETag, or the time of the last change, that came with the first byte."""
-        return self.path.with_name(f"{self.path.name}.etag")
-
-    def complete(self, progress: Progress | None) -> None:
-        """Download the missing bytes, with a new request after each interruption."""
-        for attempt in range(1, _ATTEMPTS + 1):
-            try:
-                if self._more(progress):
-                    return
-                reason = "the server ended too early"
-            except urllib.error.HTTPError as error:
-                if error.code != http.client.REQUESTED_RANGE_NOT_SATISFIABLE:
-                    raise DownloadError(
-                        f"{self.url}: {error.code} {error.reason}; see whether its page moved"
-                    ) from error
-                if error.headers.get("Content-Range", "") == f"bytes */{self.path.stat().st_size}":
-                    return
-                self.path.unlink()
-                reason = "the file on the server is another, and shorter, than the one begun"
-            except _BROKEN as error:
-                reason = str(getattr(error, "reason", error)) or type(error).__name__
-            if attempt == _ATTEMPTS:
-                have = self.path.stat().st_size if self.path.exists() else 0
-                raise DownloadError(f"{self.url}: {reason}; {have:,} bytes are kept, call it again to resume")
-
-    def _more(self, progress: Progress | None) -> bool:
-        """One request from the first missing byte on; True if the file is complete."""
-        have = self.path.stat().st_size if self.path.exists() else 0
-        validator = self.validator_path.read_text() if have and self.validator_path.exists() else ""
-        have = have if validator else 0
-        headers = {"Range": f"bytes={have}-", "If-Range": validator} if have else {}
-        with urllib.request.urlopen(
-            urllib.request.Request(self.url, headers=headers), timeout=_TIMEOUT_S
-        ) as response:
-            is_rest = response.status == http.client.PARTIAL_CONTENT
-            have = have if is_rest else 0
-            length = response.headers.get("Content-Length")
-            total = have + int(length) if length is not None else 0
-            self.validator_path.write_text(
-                response.headers.get("ETag") or response.headers.get("Last-Modified") or ""
-            )
-            with self.path.open("ab" if is_rest else "wb") as file:
-                while block := response.read(_BLOCK_BYTES):
-                    file.write(block)
-                    have += len(block)
-                    if progress is not None:
-                        progress(have // _MIB, total // _MIB)
-        return not total or have == total
+def _more(url: str, part: Path, version: Path, progress: Progress | None) -> bool:
+    """One request from the first missing byte on; True if the file is complete."""
+    validator = version.read_text() if part.exists() and version.exists() else ""
+    have = part.stat().st_size if validator else 0
+    headers = {"Range": f"bytes={have}-", "If-Range": validator} if have else {}
+    with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=_TIMEOUT_S) as response:
+        is_rest = response.status == http.client.PARTIAL_CONTENT
+        have = have if is_rest else 0
+        total = have + int(response.headers.get("Content-Length", -have))
+        version.write_text(response.headers.get("ETag") or response.headers.get("Last-Modified") or "")
+        with part.open("ab" if is_rest else "wb") as file:
+            while block := response.read(_BLOCK_BYTES):
+                file.write(block)
+                have += len(block)
+                if progress is not None:
+                    progress(have // _MIB, total // _MIB)
+    return not total or have == total
 
 
 def _verify(path: Path, sha256: str, url: str) -> str:

@@ -1,10 +1,26 @@
 """The errors a user can cause or meet; the command line prints each as one line."""
 
 import errno
+import re
+
+_OPTION = re.compile(r"scanchain [^;,()]*|--([a-z][\w.-]*\w)")  # commands, and arguments of the one that runs
+_KEYWORDS = {name: name for name in ("out", "config", "methods", "rpe")} | {
+    "force": "force=True", "gt": "ground_truth", "max-gap": "max_gap_s", "start": "log__start_s",
+    "end": "log__end_s", "every": "log__every", "topic": "log__topic",
+}  # fmt: skip
 
 
 class ScanchainError(Exception):
     """A run failed for a reason its message names: what, where, what to do. Exit code 1."""
+
+    @property
+    def text(self) -> str:
+        """The message as the command line prints it."""
+        return super().__str__()
+
+    def __str__(self) -> str:
+        """The message, options of the command line as arguments of Python."""
+        return _OPTION.sub(_keyword, self.text)
 
 
 class InputError(ScanchainError):
@@ -16,6 +32,11 @@ class MissingExtraError(InputError):
 
     def __init__(self, package: str, extra: str) -> None:
         super().__init__(f"{package} is not installed; install it with: pip install 'scanchain[{extra}]'")
+
+
+def _keyword(found: re.Match[str]) -> str:
+    option: str = found[1] or ""
+    return _KEYWORDS.get(option, option.replace(".", "__") if "." in option else found[0])
 
 
 def shown(value: object) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import functools
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,10 +42,17 @@ class Override:
     flag: str
 
 
-def overrides_of(values: Mapping[str, object]) -> tuple[Override, ...]:
-    """Keyword arguments as overrides, two underscores for the dot: ``loops__drift=0.02``."""
+def overrides_of(values: Mapping[str, object], section: str = "") -> tuple[Override, ...]:
+    """Keyword arguments as overrides, two underscores for the dot: ``loops__drift=0.02``.
+
+    section : that the keys are of, where the arguments do not name it
+    """
     return tuple(
-        Override(name.replace("__", "."), str(value).lower() if isinstance(value, bool) else str(value), name)
+        Override(
+            f"{section}.{name}" if section else name.replace("__", "."),
+            str(value).lower() if isinstance(value, bool) else str(value),
+            name,
+        )
         for name, value in values.items()
     )
 
@@ -83,9 +90,13 @@ def find_key(name: str, source: str) -> ConfigKey:
     if name in keys:
         return keys[name]
     subject = source if name in source else f"{source}: {name}"
-    raise InputError(
-        f"{subject} is not a configuration key; {_remedy(name, tuple(keys), is_keyword=source.isidentifier())}"
-    )
+    remedy = _remedy(name, tuple(keys), lambda key: _as_argument(key, source) if source.isidentifier() else key)
+    raise InputError(f"{subject} is not a configuration key; {remedy}")
+
+
+def _as_argument(key: str, source: str) -> str:
+    """A key as a keyword argument, with its section where the one given has it."""
+    return key.replace(".", "__") if "__" in source else key.rpartition(".")[2]
 
 
 def load_settings(
@@ -271,7 +282,7 @@ def _check_order(
             raise InputError(f"{where}: {lower} is {low:g}; it must be below {upper} ({high:g})")
 
 
-def _remedy(name: str, keys: tuple[str, ...], *, is_keyword: bool) -> str:
+def _remedy(name: str, keys: tuple[str, ...], spell: Callable[[str], str]) -> str:
     section, _, leaf = name.rpartition(".")
     same_leaf = [key for key in keys if key.rpartition(".")[2] == leaf]
     inside = {key.rpartition(".")[2]: key for key in keys if key.startswith(f"{section}.")}
@@ -280,5 +291,5 @@ def _remedy(name: str, keys: tuple[str, ...], *, is_keyword: bool) -> str:
     if not near and not inside:
         near = difflib.get_close_matches(name, keys, n=1)
     listing = "all keys: scanchain config show"
-    spelled = [key.replace(".", "__") if is_keyword else key for key in near]
+    spelled = [spell(key) for key in near]
     return f"did you mean {spelled[0]}? ({listing})" if near else listing

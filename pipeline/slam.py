@@ -14,6 +14,7 @@ from scanchain import lie
 from scanchain.clock import working_s
 from scanchain.config import Config, LoopsConfig
 from scanchain.data import (
+    AnyPoints,
     Closure,
     ClosureVerdict,
     GraphState,
@@ -21,12 +22,12 @@ from scanchain.data import (
     Matrix,
     Pose,
     Problem,
-    RawPoints,
     Scan,
     State,
     Step,
     Timing,
     Trajectory,
+    brief,
 )
 from scanchain.errors import InputError
 from scanchain.graph.background import BackgroundOptimization
@@ -69,6 +70,7 @@ class SlamResult:
     ``components`` (K,) numbers the pieces that the keyframes belong to, which no loop joins; one as a rule.
     """
 
+    __repr__ = brief
     trajectory: Trajectory
     odometry: Trajectory
     keyframes: tuple[Keyframe, ...]
@@ -105,15 +107,16 @@ class Slam:
         prior: SavedMap | None = None,
         is_live: bool = False,
     ) -> None:
-        """Arguments as in ``Odometry``, and ``is_live`` as in ``LoopCloser``.
+        """Start before the first scan.
 
+        config, T_base_lidar, dimension : as in ``Odometry``
         points_file : where points go, which stay out of memory; without one, into a temporary file
-        is_live : also whether a large graph is optimized beside the scans
+        is_live : whether no scan may wait: long searches go on over several, large graphs are optimized beside
         prior : a map to localize in: its keyframes come before those of the log, and stay where they are
         """
         config, T_base_lidar = checked_start(config, T_base_lidar, dimension)
         self.config = config
-        self.dimension = T_base_lidar.shape[0] - 1
+        self.T_base_lidar, self.dimension = T_base_lidar, T_base_lidar.shape[0] - 1
         self.points = PointStore(self.dimension, points_file)
         self.spans = GrowingArray((2,), np.int64)
         self.keeps_scans = self.dimension == 2 and config.loops.enabled and config.loops.refine
@@ -164,13 +167,13 @@ class Slam:
 
     def track(
         self,
-        points: RawPoints,
+        points: AnyPoints,
         stamp_s: float,
-        times_s: NDArray[np.float32] | None = None,
+        times_s: NDArray[np.floating] | None = None,
         *,
         T_odom_base: Pose | None = None,
     ) -> Step:
-        """Place a scan as a driver gives it, and whatever it closes, as ``Odometry.track`` does.
+        """Place a scan as a driver gives it, arguments as in ``Odometry.track``, and whatever it closes.
 
         From the first on, a large graph is optimized beside: no scan waits for it.
         """

@@ -8,6 +8,7 @@ from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scanchain import checks, lie
 from scanchain.data import Matrix, Trajectory
@@ -30,23 +31,10 @@ def read_tum(path: Path | str) -> Trajectory:
 
     Stamps are taken from their decimal text, so that nanoseconds stay exact; they need not increase.
     """
-    stamps_ns: list[int] = []
-    rows: list[list[float]] = []
-    for place, words in text_lines(path):
-        if len(words) != 8:
-            raise InputError(f"{place} has {counted(len(words), 'field')}, a TUM line has 8: {_TUM_FIELDS}")
-        stamps_ns.append(parse_stamp_ns(words[0], place))
-        row = numbers(words[1:], place)
-        _check_tum_row(stamps_ns[-1], row, place)
-        rows.append(row)
-    if not rows:
-        raise InputError(f"{path} has no pose; a TUM file has one a line: {_TUM_FIELDS}")
-    values = np.array(rows)
-    poses = np.zeros((len(rows), 4, 4))
-    poses[:, :3, :3] = lie.from_quaternion(values[:, 3:])
-    poses[:, :3, 3] = values[:, :3]
-    poses[:, 3, 3] = 1.0
-    return Trajectory(np.array(stamps_ns, np.int64), poses)
+    places, stamps_ns, values = table(path, "TUM line", _TUM_FIELDS, stamps=1)
+    for place, stamp_ns, row in zip(places, stamps_ns[:, 0].tolist(), values.tolist(), strict=True):
+        _check_tum_row(stamp_ns, row, place)
+    return Trajectory(stamps_ns[:, 0], posed(lie.from_quaternion(values[:, 3:]), values[:, :3]))
 
 
 def _check_tum_row(stamp_ns: int, row: list[float], place: str) -> None:
@@ -63,16 +51,17 @@ def _check_tum_row(stamp_ns: int, row: list[float], place: str) -> None:
         raise InputError(f"{place} has a quaternion of length {norm:.3g}, not 1; a TUM line is {_TUM_FIELDS}")
 
 
-def write_tum(path: Path | str, trajectory: Trajectory) -> None:
+def write_tum(path: Path | str, trajectory: Trajectory, *, force: bool = False) -> None:
     """Write a TUM file, nine digits after the point; SE(2) poses lie in the plane z = 0.
 
+    force : whether a file that is there is replaced; else InputError
     Raises InputError where there is no such folder, and OSError where the disk is full.
     """
     path = checks.path(path, "path")
     checks.instance(trajectory, Trajectory, "trajectory", "Trajectory(stamps_ns, poses), or read_tum(path)")
     poses = lie.lift(trajectory.poses)
     rows = np.hstack([poses[:, :3, 3], lie.to_quaternion(poses[:, :3, :3])]).tolist()
-    with checks.writing(path), path.open("w", encoding="utf-8", newline="\n") as file:
+    with checks.writing(path, force=force), path.open("w", encoding="utf-8", newline="\n") as file:
         for stamp_ns, row in zip(trajectory.stamps_ns.tolist(), rows, strict=True):
             file.write(f"{format_stamp(stamp_ns)}{_TUM_ROW % tuple(row)}")
 
@@ -102,21 +91,13 @@ def read_kitti(path: Path | str) -> Trajectory:
 
     The format has no time: the stamp of a pose is its line's number, from 0, so that two files pair line by line.
     """
-    rows: list[list[float]] = []
-    for place, words in text_lines(path):
-        if len(words) != 12:
-            raise InputError(f"{place} has {counted(len(words), 'field')}, a KITTI line has 12: {_KITTI_FIELDS}")
-        row = numbers(words, place)
-        R = np.array(row).reshape(3, 4)[:, :3]
-        if np.abs(R.T @ R - np.eye(3)).max() > _ORTHONORMAL or np.linalg.det(R) < 0.0:
-            raise InputError(f"{place} is no rotation: RᵀR is not the identity within {_ORTHONORMAL:g}")
-        rows.append(row)
-    if not rows:
-        raise InputError(f"{path} has no pose; a KITTI file has one a line: {_KITTI_FIELDS}")
-    poses = np.zeros((len(rows), 4, 4))
-    poses[:, :3] = np.array(rows).reshape(-1, 3, 4)
-    poses[:, 3, 3] = 1.0
-    return Trajectory(np.arange(len(rows), dtype=np.int64), _orthonormal(poses))
+    places, _, values = table(path, "KITTI line", _KITTI_FIELDS)
+    rows = values.reshape(-1, 3, 4)
+    error = np.abs(np.swapaxes(rows[:, :, :3], 1, 2) @ rows[:, :, :3] - np.eye(3)).max(axis=(1, 2))
+    for bad in np.flatnonzero((error > _ORTHONORMAL) | (np.linalg.det(rows[:, :, :3]) < 0.0))[:1]:
+        raise InputError(f"{places[bad]} is no rotation: RᵀR is not the identity within {_ORTHONORMAL:g}")
+    U, _, Vt = np.linalg.svd(rows[:, :, :3])
+    return Trajectory(np.arange(len(rows), dtype=np.int64), posed(U @ Vt, rows[:, :, 3]))
 
 
 def write_kitti(path: Path | str, trajectory: Trajectory) -> None:
@@ -145,6 +126,28 @@ def parse_stamp_ns(text: str, place: str) -> int:
             f"{place} has the stamp {text} s, which does not fit 64 bits of nanoseconds; give it in seconds"
         )
     return int(seconds.scaleb(9).to_integral_value())
+
+
+def table(
+    path: Path | str, kind: str, fields: str, *, stamps: int = 0
+) -> tuple[list[str], NDArray[np.int64], Matrix]:
+    """Place (file:line), stamps (N, S) in nanoseconds and numbers (N, M) of the lines of a file, one at least.
+
+    kind : of the line in errors, and its ``fields``, of which the first are ``stamps``
+    """
+    places: list[str] = []
+    times_ns: list[list[int]] = []
+    rows: list[list[float]] = []
+    width = len(fields.split())
+    for place, words in text_lines(path):
+        if len(words) != width:
+            raise InputError(f"{place} has {counted(len(words), 'field')}, a {kind} has {width}: {fields}")
+        places.append(place)
+        times_ns.append([parse_stamp_ns(word, place) for word in words[:stamps]])
+        rows.append(numbers(words[stamps:], place))
+    if not rows:
+        raise InputError(f"{path} has no {kind}; expected one a line: {fields}")
+    return places, np.array(times_ns, np.int64), np.array(rows)
 
 
 def text_lines(path: Path | str) -> Iterator[tuple[str, list[str]]]:
@@ -183,8 +186,8 @@ def numbers(words: list[str], place: str) -> list[float]:
     return values
 
 
-def _orthonormal(poses: Matrix) -> Matrix:
-    """The poses with the nearest proper rotations."""
-    U, _, Vt = np.linalg.svd(poses[:, :3, :3])
-    poses[:, :3, :3] = U @ Vt
+def posed(R: Matrix, t: Matrix) -> Matrix:
+    """Poses (N, 4, 4) of rotations (N, 3, 3) and positions (N, 3)."""
+    poses = np.zeros((len(R), 4, 4))
+    poses[:, :3, :3], poses[:, :3, 3], poses[:, 3, 3] = R, t, 1.0
     return poses

@@ -1,5 +1,8 @@
 """What scripts call: arrays in, results out, without a log, a configuration or a command line."""
 
+import subprocess
+import sys
+from importlib.metadata import version
 from itertools import islice
 
 import numpy as np
@@ -37,13 +40,49 @@ def test_a_log_is_opened_with_keys_of_its_section(office):
     assert sc.open_log(office, log.config, log__every=2).scan_count == 5
     for changes, words in (
         ({"topic": "/nowhere"}, "has no topic /nowhere"),
-        ({"topics": "/scan"}, "log.topics is not a configuration key; did you mean log__topic"),
+        ({"topics": "/scan"}, "log.topics is not a configuration key; did you mean topic"),
         ({"end_s": "soon"}, "log.end_s is 'soon'"),
     ):
         with pytest.raises(InputError, match=words):
             sc.open_log(office, **changes)
     with pytest.raises(InputError, match='a topic is chosen by topic="/points"'):
         sc.open_log(office, "/scan")
+
+
+def test_a_log_has_a_length_and_scans_and_slam_gives_the_cloud_and_the_verdict_of_a_run(office, tmp_path):
+    log = sc.open_log(office)
+    slam = sc.Slam(sc.load_settings(2).config, log.T_base_lidar)
+    steps = [slam.process(scan) for scan in log]
+    result = slam.finish()
+    assert len(steps) == len(log) == 40
+    done = sc.run(office, tmp_path / "run", recording=False)
+    assert result.verdict().sentence == done.metrics.sentence
+    assert len(result.cloud()) == done.metrics.map_points
+    assert done.accuracy.ate_rmse_m == done.metrics.ground_truth.optimized.ate_rmse_m
+    untrue = sc.run(office, tmp_path / "untrue", recording=False, log__ground_truth_topic="none")
+    with pytest.raises(InputError, match="no ground truth; name a file by ground_truth"):
+        untrue.accuracy  # noqa: B018
+    found = sc.evaluate(result.trajectory, log.ground_truth())
+    assert found.ate.translation_m.rmse == pytest.approx(done.accuracy.ate_rmse_m)
+    assert list(found.rpe) == ["1_pose", "1_s"] and found.rpe["1_s"].translation_m.rmse < 0.1
+    with pytest.raises(InputError, match="KITTI metric: no stretch of 10 m fits"):
+        found.kitti  # noqa: B018
+    records = [result, result.graph, result.state, result.keyframes[0], steps[9], steps[9].scan, steps[9].match]
+    for record in (*records, log, done, found, found.ate, result.trajectory, sc.optimize(result.graph)):
+        assert "\n" not in repr(record) and len(repr(record)) < 600, repr(record)
+    assert repr(result.trajectory) == "Trajectory(40 poses of SE(2) over 3.9 s)"
+
+
+def test_errors_of_calls_name_arguments_of_the_call(office, tmp_path):
+    (tmp_path / "taken").mkdir()
+    for call, words in (
+        (lambda: sc.run(office, tmp_path / "taken"), "choose another out or pass force=True to replace it$"),
+        (lambda: sc.run(office, tmp_path / "x", log__topic="/nowhere"), "log__topic"),
+        (lambda: sc.simulate("office", office), "choose another name or pass force=True"),
+    ):
+        with pytest.raises(InputError, match=words) as raised:
+            call()
+        assert "--" not in str(raised.value) and "--" in raised.value.text
 
 
 def test_slam_of_arrays_places_every_scan():
@@ -56,7 +95,45 @@ def test_slam_of_arrays_places_every_scan():
     assert np.linalg.norm(result.trajectory.poses[-1][:2, 2]) > 1.0
 
 
+def test_version_and_modules_of_the_reference_are_attributes_of_a_fresh_package():
+    code = (
+        "import scanchain, sys; assert not any(name.startswith('scanchain.') for name in sys.modules);"
+        "print(scanchain.__version__, scanchain.lie.exp.__name__, scanchain.evaluation.pair.__name__)"
+    )
+    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert printed.split() == [version("scanchain"), "exp", "pair"]
+    with pytest.raises(AttributeError, match="no attribute 'aline'"):
+        sc.aline  # noqa: B018
+
+
+def test_invalid_returns_of_an_organized_cloud_are_dropped_with_their_times_and_counted():
+    scans = kitti_scans(3)
+    whole, organized = sc.Odometry(), sc.Odometry()
+    for scan in scans:
+        stamp_s, count = scan.stamp_ns * 1e-9, len(scan.points)
+        rows = np.sort(np.random.default_rng(0).choice(2 * count, count, replace=False))
+        points, times_s = np.full((2 * count, 3), np.nan), np.zeros(2 * count)
+        points[:9] = np.inf
+        points[rows] = scan.points
+        if len(scan.times_s):
+            times_s[rows] = scan.times_s
+        wanted = whole.track(scan.points, stamp_s, scan.times_s)
+        tracked = organized.track(points, stamp_s, times_s if len(scan.times_s) else None)
+        assert tracked.scan.dropped == count and len(tracked.scan.points) == count
+        assert np.array_equal(tracked.T_odom_lidar, wanted.T_odom_lidar)
+    assert np.array_equal(sc.downsample(points, 1.0), sc.downsample(scan.points, 1.0))
+    match, wanted = (sc.align(scans[0].points, cloud) for cloud in (points, scan.points))
+    assert np.array_equal(match.T_target_source, wanted.T_target_source)
+
+
+class Open3DCloud:
+    """A cloud as Open3D has it."""
+
+    points = np.ones((10, 3))
+
+
 POINTS = np.ones((10, 3), np.float32)
+RECORDS = np.zeros(10, [("x", np.float32), ("y", np.float32), ("z", np.float32), ("intensity", np.float32)])
 
 
 @pytest.mark.parametrize(
@@ -71,9 +148,14 @@ POINTS = np.ones((10, 3), np.float32)
         (lambda: sc.Odometry().track(POINTS, 0.0, np.zeros(9)), "times_s"),
         (lambda: sc.Slam(dimension=3).track(POINTS[:, :2], 0.0), "has 2D points"),
         (lambda: sc.downsample(POINTS, 0.0), "voxel_size_m is 0"),
+        (lambda: sc.align(Open3DCloud(), POINTS), r"target holds objects.*: np\.asarray\(target\.points\)"),
+        (lambda: sc.Odometry().track(Open3DCloud(), 0.0), r"np\.asarray\(points\.points\)"),
+        (lambda: sc.downsample(RECORDS, 1.0), r"np\.stack\(\[points\[axis\] for axis in 'xyz'\], axis=1\)"),
+        (lambda: sc.align(POINTS.reshape(2, 5, 3), POINTS), r"organized\? pass target\.reshape\(-1, 3\)"),
         (lambda: sc.downsample(POINTS[0], 1.0), "points has the shape"),
         (lambda: sc.run("nowhere.mcap", "out"), "nowhere.mcap"),
         (lambda: sc.optimize(sc.PoseGraph(2), robustness="none"), "graph.robustness"),
+        (lambda: sc.optimize(sc.PoseGraph(2), max_iter=3), r"did you mean max_iterations\?"),
         (lambda: sc.optimize("graph.g2o"), r"graph is 'graph.g2o'; wanted a PoseGraph: read_g2o\(path\).graph"),
         (lambda: sc.read_g2o(3), "path is 3; wanted a path"),
         (lambda: sc.write_g2o("/nope/x.g2o", sc.PoseGraph(2)), "/nope/x.g2o: cannot be written"),

@@ -30,6 +30,13 @@ def test_poses_survive_a_tum_file_to_nine_digits(tmp_path):
     np.testing.assert_allclose(read_tum(tmp_path / "a.tum").poses, trajectory.poses, atol=1e-8)
 
 
+def test_a_file_that_is_there_is_replaced_only_on_request(tmp_path):
+    write_tum(tmp_path / "a.tum", wandering())
+    with pytest.raises(InputError, match=r"a\.tum: exists; choose another name or pass force=True"):
+        write_tum(tmp_path / "a.tum", wandering())
+    write_tum(tmp_path / "a.tum", wandering(), force=True)
+
+
 def test_planar_poses_are_written_into_the_plane(tmp_path):
     pose = lie.pose_2d(1.5, -2.0, 0.7)
     write_tum(tmp_path / "a.tum", Trajectory(np.array([5], np.int64), pose[None]))

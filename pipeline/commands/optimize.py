@@ -146,17 +146,17 @@ class Outputs:
     def write(self, report: GraphReport) -> list[Path]:
         """Write them all and return their paths."""
         from scanchain.graph.covariance import chosen_poses, write_covariances
-        from scanchain.graph.files.g2o_write import write_graph
+        from scanchain.graph.files.g2o_write import write_g2o
 
         file = report.file
         chosen = chosen_poses(self.marginals, file.ids) if self.marginals is not None else file.ids[:0]
         written = self.paths
         if self.graph is not None and self.rejected is not None:
             with _written(self.graph):
-                write_graph(self.graph, file.graph, ids=file.ids, other_lines=file.other_lines)
+                write_g2o(self.graph, file.graph, ids=file.ids, other_lines=file.other_lines, force=True)
             with _written(self.rejected):
                 if file.graph.is_rejected.any():
-                    write_graph(self.rejected, file.graph, ids=file.ids, edges="rejected")
+                    write_g2o(self.rejected, file.graph, ids=file.ids, edges="rejected", force=True)
                     written.insert(1, self.rejected)
                 else:  # of an earlier report, whose place --force gave away
                     self.rejected.unlink(missing_ok=True)

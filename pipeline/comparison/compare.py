@@ -19,7 +19,7 @@ from scanchain.comparison.results import Reference, Results, write_results
 from scanchain.comparison.scan_store import StoredScans, store
 from scanchain.comparison.table import Table, maps_of, summarize, write_table
 from scanchain.config import NO_TRUTH
-from scanchain.data import Trajectory
+from scanchain.data import Trajectory, brief
 from scanchain.errors import InputError
 from scanchain.evaluation import pair, read_relations, read_truth, relation_error
 from scanchain.logs import Log, open_log
@@ -69,6 +69,7 @@ class Comparison:
 class Compared:
     """A finished comparison, failed methods included."""
 
+    __repr__ = brief
     path: Path
     table: Table
 
@@ -147,7 +148,7 @@ def _reference(comparison: Comparison, log: Log, scans: StoredScans) -> Referenc
         except InputError as error:
             if comparison.ground_truth is not None or topic:
                 raise
-            truth, note = None, f"No accuracy against {source}: {error}"
+            truth, note = None, f"No accuracy against {source}: {error.text}"
     sources = [source] if truth is not None else []
     sources += [str(comparison.relations)] if relations is not None else []
     return Reference(truth, relations, " and ".join(sources), note)

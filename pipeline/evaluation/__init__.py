@@ -1,77 +1,42 @@
 """Metrics of a trajectory: ATE, RPE, the KITTI metric, relations, sharpness; each with its definition."""
 
-from scanchain.evaluation.absolute import (
-    AbsoluteError,
-    Alignment,
-    absolute_error,
-    absolute_error_of_any_path,
-    align,
-    far_off,
-    on_the_estimate,
-)
-from scanchain.evaluation.consistency import disagreement, motion_nees
-from scanchain.evaluation.expected import ExpectedError, ExpectedErrors, expected_ate, expected_errors
-from scanchain.evaluation.pairing import Pairs, Statistics, during, pair
-from scanchain.evaluation.reference import TruthFile, check_overlap, read_truth
-from scanchain.evaluation.relations import (
-    RELATION_LIMIT_S,
-    RelationError,
-    Relations,
-    read_relations,
-    relation_error,
-)
-from scanchain.evaluation.relative import (
-    KITTI_LENGTHS_M,
-    SHORT_LENGTHS_M,
-    KittiError,
-    LengthError,
-    RelativeError,
-    kitti_error,
-    kitti_error_of_any_path,
-    relative_error_over_distance,
-    relative_error_over_frames,
-    relative_error_over_time,
-)
-from scanchain.evaluation.sharpness import Sharpness, sampled_map, sampling_step, sharpness
-
-__all__ = [
-    "KITTI_LENGTHS_M",
-    "RELATION_LIMIT_S",
-    "SHORT_LENGTHS_M",
-    "AbsoluteError",
-    "Alignment",
-    "ExpectedError",
-    "ExpectedErrors",
-    "KittiError",
-    "LengthError",
-    "Pairs",
-    "RelationError",
-    "Relations",
-    "RelativeError",
-    "Sharpness",
-    "Statistics",
-    "TruthFile",
-    "absolute_error",
-    "absolute_error_of_any_path",
-    "align",
-    "check_overlap",
-    "disagreement",
-    "during",
-    "expected_ate",
-    "expected_errors",
-    "far_off",
-    "kitti_error",
-    "kitti_error_of_any_path",
-    "motion_nees",
-    "on_the_estimate",
-    "pair",
-    "read_relations",
-    "read_truth",
-    "relation_error",
-    "relative_error_over_distance",
-    "relative_error_over_frames",
-    "relative_error_over_time",
-    "sampled_map",
-    "sampling_step",
-    "sharpness",
-]
+from scanchain.evaluation.absolute import AbsoluteError as AbsoluteError
+from scanchain.evaluation.absolute import Alignment as Alignment
+from scanchain.evaluation.absolute import absolute_error as absolute_error
+from scanchain.evaluation.absolute import absolute_error_of_any_path as absolute_error_of_any_path
+from scanchain.evaluation.absolute import align as align
+from scanchain.evaluation.absolute import far_off as far_off
+from scanchain.evaluation.absolute import on_the_estimate as on_the_estimate
+from scanchain.evaluation.consistency import disagreement as disagreement
+from scanchain.evaluation.consistency import motion_nees as motion_nees
+from scanchain.evaluation.expected import ExpectedError as ExpectedError
+from scanchain.evaluation.expected import ExpectedErrors as ExpectedErrors
+from scanchain.evaluation.expected import expected_ate as expected_ate
+from scanchain.evaluation.expected import expected_errors as expected_errors
+from scanchain.evaluation.map_sharpness import Sharpness as Sharpness
+from scanchain.evaluation.map_sharpness import sampled_map as sampled_map
+from scanchain.evaluation.map_sharpness import sampling_step as sampling_step
+from scanchain.evaluation.map_sharpness import sharpness as sharpness
+from scanchain.evaluation.pairing import Pairs as Pairs
+from scanchain.evaluation.pairing import PoseErrors as PoseErrors
+from scanchain.evaluation.pairing import Statistics as Statistics
+from scanchain.evaluation.pairing import during as during
+from scanchain.evaluation.pairing import pair as pair
+from scanchain.evaluation.reference import TruthFile as TruthFile
+from scanchain.evaluation.reference import check_overlap as check_overlap
+from scanchain.evaluation.reference import read_truth as read_truth
+from scanchain.evaluation.relations import RELATION_LIMIT_S as RELATION_LIMIT_S
+from scanchain.evaluation.relations import RelationError as RelationError
+from scanchain.evaluation.relations import Relations as Relations
+from scanchain.evaluation.relations import read_relations as read_relations
+from scanchain.evaluation.relations import relation_error as relation_error
+from scanchain.evaluation.relative import KITTI_LENGTHS_M as KITTI_LENGTHS_M
+from scanchain.evaluation.relative import SHORT_LENGTHS_M as SHORT_LENGTHS_M
+from scanchain.evaluation.relative import KittiError as KittiError
+from scanchain.evaluation.relative import LengthError as LengthError
+from scanchain.evaluation.relative import RelativeError as RelativeError
+from scanchain.evaluation.relative import kitti_error as kitti_error
+from scanchain.evaluation.relative import kitti_error_of_any_path as kitti_error_of_any_path
+from scanchain.evaluation.relative import relative_error_over_distance as relative_error_over_distance
+from scanchain.evaluation.relative import relative_error_over_frames as relative_error_over_frames
+from scanchain.evaluation.relative import relative_error_over_time as relative_error_over_time

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix, Pose, Trajectory
 from scanchain.errors import InputError
-from scanchain.evaluation.pairing import Pairs, Statistics, pair
+from scanchain.evaluation.pairing import Pairs, PoseErrors, pair
 from scanchain.registration.svd_icp import DegeneratePairsError, rigid_transform
 
 _PLANAR = 1e-9  # meters of height and radians of tilt below which poses count as planar
@@ -83,30 +83,23 @@ def far_off(ate_rmse_m: float, share: float | None, path_length_m: float) -> str
     )
 
 
-@dataclass(frozen=True, slots=True)
-class AbsoluteError:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class AbsoluteError(PoseErrors):
     """ATE over paired poses (Sturm et al. 2012, eq. 3; Zhang & Scaramuzza 2018).
 
     Attributes
     ----------
-    definition : of the figures, as text; pairing : over which poses
     alignment : how the frames were brought together
     translation_m : of ‖t_ref − t_est‖
     rotation_rad : of the angle of R_refᵀ R_est; after a rigid alignment turned by the best common rotation
     path_length_m : of the reference, over the paired poses
     T_reference_estimate : the alignment that was found
-    errors_m, errors_rad : (N,) pose by pose, in the order of the pairs
+    errors_m, errors_rad : (N,) in the order of the pairs
     """
 
-    definition: str
-    pairing: str
     alignment: Alignment
-    translation_m: Statistics
-    rotation_rad: Statistics
     path_length_m: float
     T_reference_estimate: Pose
-    errors_m: NDArray[np.float64]
-    errors_rad: NDArray[np.float64]
 
     @property
     def share_of_path(self) -> float | None:
@@ -121,7 +114,7 @@ class AbsoluteError:
     @property
     def summary(self) -> str:
         """The figures in one line."""
-        rotation, share = self.rotation_rad.scaled(np.degrees(1.0)), self.share_of_path
+        rotation, share = self.rotation_rad.degrees, self.share_of_path
         of_path = "" if share is None else f"; {100.0 * share:.3f} % of {self.path_length_m:.1f} m"
         return (
             f"ATE rmse {self.translation_m.rmse:.4f} m (mean {self.translation_m.mean:.4f}, "
@@ -146,8 +139,6 @@ def absolute_error(pairs: Pairs, alignment: Alignment = Alignment.RIGID) -> Abso
         ),
         pairing=pairs.description,
         alignment=alignment,
-        translation_m=Statistics.of(errors_m),
-        rotation_rad=Statistics.of(errors_rad),
         path_length_m=float(path_length(pairs.reference)[-1]),
         T_reference_estimate=T,
         errors_m=errors_m,

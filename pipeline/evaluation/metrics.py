@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -30,7 +30,13 @@ from scanchain.evaluation.relative import (
 from scanchain.trajectory import read_tum
 
 Result = AbsoluteError | RelativeError | KittiError | RelationError
+Kind = TypeVar("Kind", bound=Result)
 
+_OVER: dict[str, Callable[[Pairs, float], RelativeError]] = {
+    "pose": lambda pairs, size: relative_error_over_frames(pairs, int(size)),
+    "s": relative_error_over_time,
+    "m": relative_error_over_distance,
+}
 _INTERVAL = re.compile(r"(\d+(?:\.\d+)?)(poses?|s|m)")
 
 
@@ -52,26 +58,30 @@ class Results:
     aligned: Matrix = field(default_factory=lambda: np.empty((0, 4, 4)))
     reference: Matrix = field(default_factory=lambda: np.empty((0, 4, 4)))
 
-
-@dataclass(frozen=True, slots=True)
-class Interval:
-    """Interval of an RPE in ``pose``, ``s`` or ``m``."""
-
-    size: float
-    unit: str
+    def __repr__(self) -> str:
+        return f"<{'; '.join(each.summary for each in self.found.values())}>"
 
     @property
-    def name(self) -> str:
-        """Key of its figures."""
-        return f"rpe_{self.size:g}_{self.unit}"
+    def ate(self) -> AbsoluteError:
+        """The ATE."""
+        return self._of("ate", AbsoluteError)
 
-    def error(self, pairs: Pairs) -> RelativeError:
-        """The RPE over it. Raises InputError where the trajectory is too short."""
-        if self.unit == "pose":
-            return relative_error_over_frames(pairs, int(self.size))
-        if self.unit == "s":
-            return relative_error_over_time(pairs, self.size)
-        return relative_error_over_distance(pairs, self.size)
+    @property
+    def rpe(self) -> dict[str, RelativeError]:
+        """The RPE by interval, as "1_pose", "1_s" or "10_m"; without those that the path is too short for."""
+        parts = self.found.items()
+        return {name.removeprefix("rpe_"): error for name, error in parts if isinstance(error, RelativeError)}
+
+    @property
+    def kitti(self) -> KittiError:
+        """The KITTI metric. Raises InputError where the path is too short for it."""
+        return self._of("kitti", KittiError)
+
+    def _of(self, name: str, kind: type[Kind]) -> Kind:
+        error = self.found.get(name)
+        if not isinstance(error, kind):
+            raise InputError(self.missing.get(name, f"{name} was not computed: the result has no ground truth"))
+        return error
 
 
 def evaluate(
@@ -94,7 +104,7 @@ def evaluate(
     rpe : intervals in poses, seconds or meters; ``source`` names them in errors
     scale : whether the estimate is scaled to fit the truth first (Umeyama 1991), for one of unknown scale
     time_offset : seconds to add to the stamps of the estimate, or "auto" for those of the least ATE within ±1 s
-    Returns ``found`` by name ("ate", "rpe_1_s", "kitti"), ``missing`` with reasons, ``warnings``.
+    Returns ``ate``, ``rpe`` by interval ("1_s") and ``kitti``; ``missing`` with reasons, ``warnings``.
     Raises InputError where no pose has a true one, or an argument is none of these.
     """
     checks.one_of(align, tuple(each.value for each in Alignment), "align")
@@ -111,7 +121,7 @@ def evaluate(
     factor = scale_of(pairs) if scale else 1.0
     pairs = scaled(pairs, factor)
     metrics: dict[str, Callable[[], Result]] = {
-        **{interval.name: partial(interval.error, pairs) for interval in intervals},
+        **{f"rpe_{size:g}_{unit}": partial(_OVER[unit], pairs, size) for size, unit in intervals},
         "kitti": partial(kitti_error_of_any_path, pairs),
     }
     ate = absolute_error(pairs, Alignment(align))
@@ -126,10 +136,10 @@ def evaluate(
     return results
 
 
-def _intervals(text: str, source: str) -> list[Interval]:
-    """Intervals of a list such as ``1pose,0.5s,10m``."""
+def _intervals(text: str, source: str) -> list[tuple[float, str]]:
+    """Size and unit of each interval of a list such as ``1pose,0.5s,10m``."""
     found = [(word, _INTERVAL.fullmatch(word.strip())) for word in text.split(",")]
     for word, match in found:
         if match is None or float(match[1]) == 0.0 or (match[2].startswith("pose") and "." in match[1]):
             raise InputError(f"{source} has {word!r}; take sizes such as 1pose, 0.5s or 10m, with commas")
-    return [Interval(float(match[1]), "pose" if match[2] == "poses" else match[2]) for _, match in found if match]
+    return [(float(match[1]), match[2].removesuffix("s") or "s") for _, match in found if match]

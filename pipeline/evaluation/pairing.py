@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.data import Matrix, Trajectory
+from scanchain.data import Matrix, Trajectory, brief
 from scanchain.errors import InputError
 from scanchain.words import counted
 
@@ -37,6 +37,7 @@ class Pairs:
     gap_s : between true poses that may be interpolated over; widest_s : between those that were
     """
 
+    __repr__ = brief
     stamps_ns: NDArray[np.int64]
     estimate: Matrix
     reference: Matrix
@@ -249,12 +250,35 @@ class Statistics:
             maximum=float(errors.max()),
         )
 
-    def scaled(self, factor: float) -> Statistics:
-        """The same errors in another unit, for print."""
-        return Statistics(
-            self.count,
-            *(
-                value * factor
-                for value in (self.mean, self.std, self.rmse, self.median, self.minimum, self.maximum)
-            ),
-        )
+    @property
+    def degrees(self) -> Statistics:
+        """Those of radians in degrees, for print."""
+        return Statistics(self.count, *(float(np.degrees(value)) for value in astuple(self)[1:]))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoseErrors:
+    """Errors of poses or of motions, one by one, and their figures.
+
+    definition : of the figures, as text; pairing : over which poses
+    errors_m, errors_rad : (N,) one by one; translation_m, rotation_rad : statistics of these
+    """
+
+    definition: str
+    pairing: str = ""
+    errors_m: NDArray[np.float64]
+    errors_rad: NDArray[np.float64]
+    translation_m: Statistics = field(init=False)
+    rotation_rad: Statistics = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "translation_m", Statistics.of(self.errors_m))
+        object.__setattr__(self, "rotation_rad", Statistics.of(self.errors_rad))
+
+    def __repr__(self) -> str:
+        return f"<{self.summary}>"
+
+    @property
+    def summary(self) -> str:
+        """The figures in one line."""
+        raise NotImplementedError

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from scanchain import lie
 from scanchain.data import Matrix, Trajectory
 from scanchain.errors import InputError
-from scanchain.evaluation.pairing import Statistics, nearest
-from scanchain.trajectory import numbers, parse_stamp_ns, text_lines
+from scanchain.evaluation.pairing import PoseErrors, Statistics, nearest
+from scanchain.trajectory import posed, table
 from scanchain.words import counted
 
 RELATION_LIMIT_S = 1e-3
@@ -31,35 +31,27 @@ class Relations:
         return len(self.stamps_ns)
 
 
-@dataclass(frozen=True, slots=True)
-class RelationError:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class RelationError(PoseErrors):
     """Error over relations (Kümmerle et al. 2009, eq. 4, its translational and rotational parts apart).
 
     Attributes
     ----------
-    definition : of the figures, as text
     translation_m, translation_squared_m2 : of ‖trans(δ*⁻¹ δ)‖ and of its square
     rotation_rad, rotation_squared_rad2 : of |rot(δ*⁻¹ δ)| and of its square
     missing : relations left out because the trajectory has no pose at one of their stamps
     used : (K,) int64, the relations compared
-    errors_m, errors_rad : (K,) relation by relation
     """
 
-    definition: str
-    translation_m: Statistics
     translation_squared_m2: Statistics
-    rotation_rad: Statistics
     rotation_squared_rad2: Statistics
     missing: int
     used: NDArray[np.int64]
-    errors_m: NDArray[np.float64]
-    errors_rad: NDArray[np.float64]
 
     @property
     def summary(self) -> str:
         """The figures as published: mean ± std, absolute and squared, meters and degrees."""
-        degrees = np.degrees(1.0)
-        rotation, squared = self.rotation_rad.scaled(degrees), self.rotation_squared_rad2.scaled(degrees**2)
+        rotation, squared = self.rotation_rad.degrees, self.rotation_squared_rad2.degrees.degrees
         return (
             f"relations: translation {self.translation_m.mean:.4f} ± {self.translation_m.std:.4f} m, squared "
             f"{self.translation_squared_m2.mean:.4f} ± {self.translation_squared_m2.std:.4f} m²; rotation "
@@ -70,21 +62,9 @@ class RelationError:
 
 def read_relations(path: Path | str) -> Relations:
     """Relations of a text file, ``stamp1 stamp2 x y z roll pitch yaw`` a line, angles in radians."""
-    stamps_ns: list[list[int]] = []
-    rows: list[list[float]] = []
-    for place, words in text_lines(path):
-        if len(words) != 8:
-            raise InputError(f"{place} has {counted(len(words), 'field')}, a relation has 8: {_FIELDS}")
-        stamps_ns.append([parse_stamp_ns(word, place) for word in words[:2]])
-        rows.append(numbers(words[2:], place))
-    if not rows:
-        raise InputError(f"{path} has no relation; expected one a line: {_FIELDS}")
-    values = np.array(rows)
-    T = np.zeros((len(rows), 4, 4))
-    T[:, :3, :3] = Rotation.from_euler("xyz", values[:, 3:]).as_matrix()
-    T[:, :3, 3] = values[:, :3]
-    T[:, 3, 3] = 1.0
-    return Relations(np.array(stamps_ns, np.int64), T)
+    _, stamps_ns, values = table(path, "relation", _FIELDS, stamps=2)
+    R = Rotation.from_euler("xyz", values[:, 3:]).as_matrix()
+    return Relations(stamps_ns, posed(R, values[:, :3]))
 
 
 def relation_error(
@@ -115,9 +95,7 @@ def relation_error(
             f"nearest in time within {limit_s:g} s; {len(used)} of {len(relations)} relations, "
             f"{len(relations) - len(used)} without a pose"
         ),
-        translation_m=Statistics.of(errors_m),
         translation_squared_m2=Statistics.of(errors_m**2),
-        rotation_rad=Statistics.of(errors_rad),
         rotation_squared_rad2=Statistics.of(errors_rad**2),
         missing=len(relations) - len(used),
         used=used,

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.data import Matrix
+from scanchain.data import Matrix, brief
 from scanchain.errors import InputError
 from scanchain.evaluation.absolute import path_length
-from scanchain.evaluation.pairing import Pairs, Statistics
+from scanchain.evaluation.pairing import Pairs, PoseErrors
 from scanchain.words import counted
 
 _LARGEST = 2.0  # largest length of a stretch over the requested one
@@ -22,32 +22,24 @@ SHORT_LENGTHS_M = (10.0, 20.0, 40.0)
 _LONG_PATH_M = 200.0  # length of the path from which on the published lengths leave a choice of starts
 
 
-@dataclass(frozen=True, slots=True)
-class RelativeError:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class RelativeError(PoseErrors):
     """RPE over stretches of one size (Sturm et al. 2012, eq. 1; Kümmerle et al. 2009).
 
     Attributes
     ----------
     size : of the stretches, in words
-    definition : of the figures, as text; pairing : over which poses
     translation_m, rotation_rad : of E = (R_i⁻¹ R_j)⁻¹ (P_i⁻¹ P_j), R the reference and P the estimate
     stretches : (M, 2) int64 places i, j among the pairs
-    errors_m, errors_rad : (M,) stretch by stretch
     """
 
     size: str
-    definition: str
-    pairing: str
-    translation_m: Statistics
-    rotation_rad: Statistics
     stretches: NDArray[np.int64]
-    errors_m: NDArray[np.float64]
-    errors_rad: NDArray[np.float64]
 
     @property
     def summary(self) -> str:
         """The figures in one line."""
-        rotation = self.rotation_rad.scaled(np.degrees(1.0))
+        rotation = self.rotation_rad.degrees
         return (
             f"RPE over {self.size}: rmse {self.translation_m.rmse:.4f} m (mean {self.translation_m.mean:.4f}, "
             f"max {self.translation_m.maximum:.4f}), rotation rmse {rotation.rmse:.4f} deg "
@@ -121,8 +113,6 @@ def _relative_error(pairs: Pairs, end: NDArray[np.int64], size: str) -> Relative
             f"{counted(len(stretches), 'stretch', 'stretches')}"
         ),
         pairing=pairs.description,
-        translation_m=Statistics.of(errors_m),
-        rotation_rad=Statistics.of(errors_rad),
         stretches=stretches,
         errors_m=errors_m,
         errors_rad=errors_rad,
@@ -152,6 +142,7 @@ class KittiError:
     by_length : the same, length by length
     """
 
+    __repr__ = brief
     definition: str
     pairing: str
     translation_share: float

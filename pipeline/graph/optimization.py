@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.config import GraphConfig
-from scanchain.data import GraphState, Matrix, fit_text
+from scanchain.data import GraphState, Matrix, brief, fit_text
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.edge_checks import has_loop
 from scanchain.graph.initialize import Initialization, first_guess
@@ -55,6 +55,7 @@ class Optimization:
     time_s : wall time
     """
 
+    __repr__ = brief
     state: GraphState
     chi2_before: float
     chi2_after: float

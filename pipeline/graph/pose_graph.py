@@ -71,6 +71,10 @@ class PoseGraph:
     def __len__(self) -> int:
         return len(self._poses)
 
+    def __repr__(self) -> str:
+        edges = f"{counted(len(self.edges), 'edge')}, {self.is_loop.sum():,} of them loops"
+        return f"PoseGraph({counted(len(self), 'pose')} of SE({self.dimension}), {edges})"
+
     @property
     def poses(self) -> Matrix:
         """T_world_lidar of every pose, (K, d+1, d+1)."""

@@ -96,7 +96,7 @@ def _open(indexes: Sequence[FileIndex], config: LogConfig) -> tuple[Log | None, 
     try:
         return Log(indexes, config), ""
     except InputError as error:
-        return None, str(error)
+        return None, error.text
 
 
 def _pose_topics(indexes: Sequence[FileIndex], config: LogConfig) -> tuple[str, str, list[str]]:

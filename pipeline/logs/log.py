@@ -68,7 +68,7 @@ def open_log(
     instance(config, LogConfig, "config", 'load_settings().config.log; a topic is chosen by topic="/points"')
     if changes:
         short = {name.removeprefix("log__"): value for name, value in changes.items()}
-        changed = load_settings(overrides=overrides_of({f"log__{name}": short[name] for name in short})).config.log
+        changed = load_settings(overrides=overrides_of(short, "log")).config.log
         config = replace(config, **{name: getattr(changed, name) for name in short})
     return Log(index_files(named, config), config)
 
@@ -146,6 +146,15 @@ class Log:
         self.copies: list[str] = []
         self._opening_notes = tuple(self.notes)
         self._truth: Trajectory | None = None
+
+    def __repr__(self) -> str:
+        return f"Log({self.name!r}: {counted(self.scan_count, f'{self.dimension}D scan')} of {self.topic})"
+
+    def __len__(self) -> int:
+        return self.scan_count
+
+    def __iter__(self) -> Generator[Scan, None, None]:
+        return self.scans()
 
     @property
     def damage(self) -> list[str]:

@@ -10,26 +10,7 @@ from scanchain.maps.point_map import PointMap, build_point_map
 from scanchain.maps.saved_map import MAP_FOLDER, Edges, SavedMap, Session, open_saved_map, write_saved_map
 
 __all__ = [
-    "MAP_FOLDER",
-    "Edges",
-    "OccupancyGrid",
-    "PointMap",
-    "SavedMap",
-    "Session",
-    "View",
-    "build_point_map",
-    "clearly_through",
-    "draw_grid",
-    "fitting_resolution",
-    "moved",
-    "open_saved_map",
-    "reach_of",
-    "read_map",
-    "read_ply",
-    "sightings",
-    "write_laz",
-    "write_map",
-    "write_pcd",
-    "write_ply",
-    "write_saved_map",
-]
+    "MAP_FOLDER", "Edges", "OccupancyGrid", "PointMap", "SavedMap", "Session", "View", "build_point_map",
+    "clearly_through", "draw_grid", "fitting_resolution", "moved", "open_saved_map", "reach_of", "read_map",
+    "read_ply", "sightings", "write_laz", "write_map", "write_pcd", "write_ply", "write_saved_map",
+]  # fmt: skip

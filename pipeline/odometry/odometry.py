@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scanchain import checks, lie
 from scanchain.clock import working_s
 from scanchain.config import Config
-from scanchain.data import LEAST_FIT, Match, Points, Pose, RawPoints, Scan, State
+from scanchain.data import LEAST_FIT, AnyPoints, Match, Points, Pose, Scan, State
 from scanchain.errors import InputError, shown
 from scanchain.kernels.geometry.validity import largest_magnitude
 from scanchain.odometry.elevation import ElevationCalibration
@@ -88,14 +88,18 @@ class Odometry:
 
     def track(
         self,
-        points: RawPoints,
+        points: AnyPoints,
         stamp_s: float,
-        times_s: NDArray[np.float32] | None = None,
+        times_s: NDArray[np.floating] | None = None,
         *,
         T_odom_base: Pose | None = None,
     ) -> Tracked:
-        """Place a scan as a driver gives it; arguments as in ``Scan.of``.
+        """Place a scan as a driver gives it.
 
+        points : (N, d) meters, lidar frame; rows that are not finite are counted in ``scan.dropped``
+        stamp_s : seconds since any fixed instant; the pose holds then
+        times_s : (N,) seconds of each point relative to ``stamp_s``, for deskewing; none where left out
+        T_odom_base : pose of the robot by its wheels at ``stamp_s``
         Raises InputError, and forgets the scan, where its stamp is not after the last one, or where stamps or
         ``times_s`` cannot be seconds.
         """

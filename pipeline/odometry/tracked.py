@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import MatchingConfig, PreprocessConfig
-from scanchain.data import Match, Points, Pose, Prior, Scan, State
+from scanchain.data import Match, Points, Pose, Prior, Scan, State, brief
 from scanchain.odometry.prediction import Prediction
 from scanchain.registration import as_ambiguous, with_source_frame
 
@@ -26,6 +26,7 @@ class Tracked:
     ``elsewhere_m`` is its largest possible distance where its motion is unknown, 0 as a rule.
     """
 
+    __repr__ = brief
     scan: Scan
     points: Points
     matched: Points

@@ -11,7 +11,7 @@ import numpy as np
 
 from scanchain import checks, lie
 from scanchain.config import Config, PreprocessConfig
-from scanchain.data import Match, Points, Pose
+from scanchain.data import AnyPoints, Match, Points, Pose
 from scanchain.errors import InputError
 from scanchain.preprocess import downsample
 from scanchain.registration.correlative import CorrelativeMap, Window
@@ -22,14 +22,17 @@ from scanchain.settings import Override, load_settings
 _RANGE_VOXELS = {2: 40.0, 3: 14.0}  # that the median distance from the centroid spans, at most
 _WINDOW, _WINDOW_RAD = 0.5, 1.0  # half the window searched in the plane: share of that distance, and angle
 _SEEDS, _SEEDS_APART_M, _RIVAL = 6, 1.0, 0.6  # beginnings in the plane: number, distance, share of the best score
+_SEEN_FROM = (
+    3.0  # times that distance from the centroid, up to which the origin of a cloud is where it was seen from
+)
 _ELSEWHERE_M, _ELSEWHERE_RAD = 0.1, 0.05  # distance from which on two matches are distinct
 AMBIGUOUS = 1.4  # times the cost of the best match, below which a distinct one is a rival: 25 surfaces, odds 150
 _APART = 10.0  # times that distance between the centroids, from which on the clouds cannot overlap
 
 
 def align(
-    target: Points,
-    source: Points,
+    target: AnyPoints,
+    source: AnyPoints,
     T_guess: Pose | None = None,
     *,
     voxel_size_m: float | None = None,
@@ -41,9 +44,10 @@ def align(
     (search radius, kernel scale, tolerance) are the preset's, too. The unit of the clouds is therefore free: where
     the text says meters, read that unit.
 
-    target, source : (N, d) and (M, d), d = 2 or 3, meters
+    target, source : (N, d) and (M, d), d = 2 or 3, meters; rows that are not finite are left out
     T_guess : (d+1, d+1), the identity where left out; motions of about three voxels are found from there, in the
-        plane of half the target's median range and 1 rad (branch and bound; Olson 2009, Hess et al. 2016)
+        plane shifts by half the target's median range and turns of 1 rad about the origin of the source, or about
+        its centroid where the origin is far off (branch and bound; Olson 2009, Hess et al. 2016)
     voxel_size_m : of the map made of the target; where left out, a fraction of the target's extent such that about
         a point lies in each voxel of a surface, or more
     matcher : "plicp" or "svd"
@@ -52,10 +56,14 @@ def align(
     Raises InputError naming the argument that is no cloud, pose, size or matcher.
     """
     d = checks.dimension_of(target, "target")
-    target, source = checks.points(target, "target", d), checks.points(source, "source", d)
+    target, source = (
+        checks.valid_points(each, name, d)[0] for each, name in ((target, "target"), (source, "source"))
+    )
     for name, cloud in (("target", target), ("source", source)):
         if not len(cloud):
-            raise InputError(f"{name} has no points; wanted (N, {d}) with N of at least a few hundred")
+            raise InputError(
+                f"{name} has no points that are finite; wanted (N, {d}) with N of at least a few hundred"
+            )
     T_guess = lie.identity(d) if T_guess is None else checks.pose(T_guess, "T_guess", d)
     config = load_settings(d, overrides=(Override("matching.matcher", matcher, "matcher"),)).config
     at_target, at_source = _translation(target.mean(axis=0)), _translation(source.mean(axis=0))
@@ -74,12 +82,17 @@ def align(
             f"T_guess puts the centroid of the source {apart_m:.3g} m from that of the target, which spans about "
             f"{range_m:.3g} m; wanted clouds in one unit that overlap"
         )
-    match = _matched(target / unit_m, source / unit_m, _scaled(T_first, 1.0 / unit_m), range_m / unit_m, config)
+    is_near = np.linalg.norm(at_source[:-1, -1]) < _SEEN_FROM * range_m
+    T_pivot_source = _scaled(at_source, is_near / unit_m)
+    T_first = _scaled(T_first, 1.0 / unit_m)
+    match = _matched(target / unit_m, source / unit_m, T_first, T_pivot_source, range_m / unit_m, config)
     return _restored(match, at_target, at_source, unit_m)
 
 
-def _matched(target: Points, source: Points, T_first: Pose, range_m: float, config: Config) -> Match:
-    """The match of two clouds that fit the configuration; in the plane the best of several beginnings."""
+def _matched(
+    target: Points, source: Points, T_first: Pose, T_pivot_source: Pose, range_m: float, config: Config
+) -> Match:
+    """The match of two clouds that fit the configuration; in the plane the best of several about a pivot."""
     local_map = VoxelMap(target.shape[1], config.local_map)
     local_map.insert(downsample(target, config.preprocess.map_voxel_m), lie.identity(target.shape[1]))
     sparse = _downsampled(source, config.preprocess)
@@ -88,8 +101,9 @@ def _matched(target: Points, source: Points, T_first: Pose, range_m: float, conf
     if local_map.dimension == 3:
         return match
     window = Window(_WINDOW * range_m, _WINDOW_RAD, _SEEDS_APART_M, _RIVAL, _SEEDS)
-    seeds = CorrelativeMap(local_map, T_first).search(sparse, T_first, window)
-    found = (lie.pose_2d(x_m, y_m, yaw_rad) for x_m, y_m, yaw_rad, _ in seeds.tolist())
+    T_begin, turned = T_first @ lie.inverse(T_pivot_source), lie.transform(T_pivot_source, sparse)
+    seeds = CorrelativeMap(local_map, T_first).search(turned, T_begin, window)
+    found = (lie.pose_2d(x_m, y_m, yaw_rad) @ T_pivot_source for x_m, y_m, yaw_rad, _ in seeds.tolist())
     return _unambiguous([match, *(matcher.align(sparse, local_map, T_seed) for T_seed in found)])
 
 

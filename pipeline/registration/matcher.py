@@ -9,7 +9,7 @@ import numpy as np
 
 from scanchain import checks, plugins
 from scanchain.config import MATCHERS, MatchingConfig
-from scanchain.data import Match, Points, Pose, Prior
+from scanchain.data import AnyPoints, Match, Pose, Prior
 from scanchain.errors import InputError, one_line, shown
 from scanchain.registration.voxel_map import VoxelMap
 
@@ -25,7 +25,7 @@ class Matcher(Protocol):
     """
 
     def align(
-        self, points: Points, target: VoxelMap, T_first: Pose, prior: Prior | None = None, *, wide: bool = False
+        self, points: AnyPoints, target: VoxelMap, T_first: Pose, prior: Prior | None = None, *, wide: bool = False
     ) -> Match:
         """Pose of the scan in the map's frame, near the first one.
 
@@ -53,7 +53,7 @@ class CheckedMatcher:
             ) from error
 
     def align(
-        self, points: Points, target: VoxelMap, T_first: Pose, prior: Prior | None = None, *, wide: bool = False
+        self, points: AnyPoints, target: VoxelMap, T_first: Pose, prior: Prior | None = None, *, wide: bool = False
     ) -> Match:
         """The result of the user's ``align``, its arrays of the shape and dtype wanted."""
         try:

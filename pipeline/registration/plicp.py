@@ -8,7 +8,7 @@ import numpy as np
 
 from scanchain import checks, lie
 from scanchain.config import MatchingConfig
-from scanchain.data import LEAST_FIT, Match, Points, Pose, Prior, Problem
+from scanchain.data import LEAST_FIT, AnyPoints, Match, Points, Pose, Prior, Problem
 from scanchain.kernels.geometry.validity import largest_magnitude
 from scanchain.kernels.registration import icp
 from scanchain.kernels.registration.icp import Settings
@@ -46,7 +46,7 @@ class PointToShapeMatcher:
         self.config = config
 
     def align(
-        self, points: Points, target: VoxelMap, T_first: Pose, prior: Prior | None = None, *, wide: bool = False
+        self, points: AnyPoints, target: VoxelMap, T_first: Pose, prior: Prior | None = None, *, wide: bool = False
     ) -> Match:
         """Pose of the scan in the map's frame, near the first one.
 
@@ -61,13 +61,13 @@ class PointToShapeMatcher:
         return match_of(result, len(points), target, self.config)
 
 
-def checked(points: Points, target: VoxelMap, T_first: Pose) -> tuple[Points, Pose]:
+def checked(points: AnyPoints, target: VoxelMap, T_first: Pose) -> tuple[Points, Pose]:
     """Points and first pose of an alignment to a map. Raises InputError where they do not fit it."""
     checks.instance(target, VoxelMap, "target", "target = VoxelMap(3, config.local_map); target.insert(points, T)")
-    points = checks.points(points, "points", target.dimension)
+    sound = checks.points(points, "points", target.dimension)
     T_first = checks.pose(T_first, "T_first", target.dimension)
-    checks.within_map(points, T_first, target.voxels.size_m, "points")
-    return points, T_first
+    checks.within_map(sound, T_first, target.voxels.size_m, "points")
+    return sound, T_first
 
 
 def settings_of(config: MatchingConfig, target: VoxelMap, *, wide: bool) -> Settings:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from scanchain import checks, lie
 from scanchain.config import MatchingConfig
-from scanchain.data import Match, Points, Pose, Prior
+from scanchain.data import AnyPoints, Match, Points, Pose, Prior
 from scanchain.errors import InputError, ScanchainError
 from scanchain.kernels.registration import icp
 from scanchain.kernels.registration.association import associate, weighted_pairs
@@ -25,7 +25,7 @@ class DegeneratePairsError(ScanchainError):
     """The pairs leave a rotation free: all on one point, or in 3D on one line."""
 
 
-def rigid_transform(source: Points, target: Points, weight: NDArray[np.float64] | None = None) -> Pose:
+def rigid_transform(source: AnyPoints, target: AnyPoints, weight: NDArray[np.floating] | None = None) -> Pose:
     """The pose T that minimizes Σ wᵢ ‖yᵢ − (R xᵢ + t)‖².
 
     With centered x' and y' and W = Σ wᵢ x'ᵢ y'ᵢᵀ = U Σ Vᵀ,
@@ -70,7 +70,7 @@ class SvdMatcher:
         self.config = config
 
     def align(
-        self, points: Points, target: VoxelMap, T_first: Pose, prior: Prior | None = None, *, wide: bool = False
+        self, points: AnyPoints, target: VoxelMap, T_first: Pose, prior: Prior | None = None, *, wide: bool = False
     ) -> Match:
         """Pose of the scan in the map's frame, near the first one; arguments as ``PointToShapeMatcher.align``.
 

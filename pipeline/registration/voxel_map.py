@@ -6,7 +6,7 @@ import numpy as np
 
 from scanchain import checks, lie
 from scanchain.config import LocalMapConfig
-from scanchain.data import Points, Pose
+from scanchain.data import AnyPoints, Points, Pose
 from scanchain.kernels.voxels.voxel_shapes import CELL, Voxels, insert, keep
 
 _SLOTS_PER_VOXEL = 4  # keeps the hash table at most a quarter full
@@ -35,7 +35,7 @@ class VoxelMap:
     def __len__(self) -> int:
         return int(self.voxels.used[0])
 
-    def insert(self, points: Points, T_map_lidar: Pose) -> None:
+    def insert(self, points: AnyPoints, T_map_lidar: Pose) -> None:
         """Add points (N, d) of the lidar frame; every so often forget what is far or old.
 
         Raises InputError where points or pose do not fit the map.

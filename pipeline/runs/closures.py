@@ -6,11 +6,15 @@ from collections import defaultdict, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from scanchain.data import REJECTED_WEIGHT, Closure, ClosureVerdict, GraphState, Keyframe
 from scanchain.runs.step_table import pose_columns
+
+if TYPE_CHECKING:
+    import pyarrow as pa
 
 VERIFICATION, BACK_END = "verification", "back end"  # either may reject a closure
 
@@ -70,9 +74,15 @@ def _loop_edges(state: GraphState) -> defaultdict[tuple[int, int], deque[tuple[f
 def write_closures(
     path: Path, final: Sequence[FinalClosure], keyframes: Sequence[Keyframe], dimension: int
 ) -> None:
-    """Write every closure tried, with its final verdict and the robust weight that the optimizer left to it."""
-    import pyarrow as pa
+    """Write the table of ``closures_table``."""
     import pyarrow.parquet as pq
+
+    pq.write_table(closures_table(final, keyframes, dimension), path, compression="zstd")
+
+
+def closures_table(final: Sequence[FinalClosure], keyframes: Sequence[Keyframe], dimension: int) -> pa.Table:
+    """Every closure tried, with its final verdict and the robust weight that the optimizer left to it."""
+    import pyarrow as pa
 
     k = 3 if dimension == 2 else 6
     closures = [item.closure for item in final]
@@ -118,4 +128,4 @@ def write_closures(
         "chi2_before chi2_after": "of its edge, when it entered the graph and at the end; null where it never did",
         "weight": "robust weight after the last optimization, 0 for closures that never entered the graph",
     }
-    pq.write_table(pa.table(columns).replace_schema_metadata(notes), path, compression="zstd")
+    return pa.table(columns).replace_schema_metadata(notes)

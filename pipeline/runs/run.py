@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.config import NO_TRUTH, Config, RecordingConfig
-from scanchain.data import Trajectory
+from scanchain.data import Trajectory, brief
 from scanchain.errors import InputError
 from scanchain.evaluation import TruthFile, check_overlap, during, read_truth
 from scanchain.logs import Log, open_log
@@ -29,7 +29,7 @@ from scanchain.runs.directory import (
     resumable,
 )
 from scanchain.runs.job import Job, OpenRecorder, Progress
-from scanchain.runs.metrics import GroundTruth, Metrics, compare_with_truth, measure, summary
+from scanchain.runs.metrics import Accuracy, GroundTruth, Metrics, compare_with_truth, measure, summary
 from scanchain.runs.processing import TruePoses, process
 from scanchain.runs.provenance import Hashing, Provenance, describe_start
 from scanchain.runs.resume.journal import JOURNAL_FILE
@@ -57,11 +57,20 @@ def _no_report(folder: Path) -> None:
 class Finished:
     """A finished run; ``stopped`` is the reason why it did not process the whole log, empty if it did."""
 
+    __repr__ = brief
     path: Path
     metrics: Metrics
     summary: str
     warnings: tuple[str, ...]
     stopped: str
+
+    @property
+    def accuracy(self) -> Accuracy:
+        """Accuracy of the trajectory against the ground truth. Raises InputError where there is none."""
+        if self.metrics.ground_truth is None:
+            reason = next((each for each in self.warnings if each.startswith("no accuracy")), "no ground truth")
+            raise InputError(f"{self.path}: {reason}; name a file by ground_truth, or a topic of the log")
+        return self.metrics.ground_truth.optimized
 
 
 def run(
@@ -207,7 +216,7 @@ def accuracy_of(
         truth, misleading = compare_with_truth(result, reference, source, gap_s)
         write_tum(folder / TRUTH_FILE, during(reference, result.trajectory.stamps_ns))
     except InputError as error:
-        return None, (f"no accuracy against {source}: {error}",)
+        return None, (f"no accuracy against {source}: {error.text}",)
     return truth, tuple(filter(None, (truth.complaint, *misleading)))
 
 

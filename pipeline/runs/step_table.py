@@ -142,8 +142,13 @@ class StepTable:
 
     def write(self, path: Path, trajectory: Trajectory, T_base_lidar: Pose | None = None) -> None:
         """Write the table; ``trajectory`` has the final pose of each step, ``T_base_lidar`` is for the wheels."""
-        import pyarrow as pa
         import pyarrow.parquet as pq
+
+        pq.write_table(self.table(trajectory, T_base_lidar), path, compression="zstd")
+
+    def table(self, trajectory: Trajectory, T_base_lidar: Pose | None = None) -> pa.Table:
+        """The table, as ``write`` writes it."""
+        import pyarrow as pa
 
         steps = self.columns
         covariances, is_sound = _covariances(steps)
@@ -170,8 +175,7 @@ class StepTable:
             name: pa.array(np.ascontiguousarray(values)) if isinstance(values, np.ndarray) else values
             for name, values in columns.items()
         }
-        table = pa.table(arrays).replace_schema_metadata(_NOTES)
-        pq.write_table(table, path, compression="zstd")
+        return pa.table(arrays).replace_schema_metadata(_NOTES)
 
     def _packed(self, rows: Sequence[StepRow]) -> NDArray[np.void]:
         first = rows[0]

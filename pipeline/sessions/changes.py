@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
 from scanchain.config import Config
-from scanchain.data import Keyframe, Matrix, Points
+from scanchain.data import Keyframe, Matrix, Points, brief
 from scanchain.errors import InputError
 from scanchain.maps import View, build_point_map, clearly_through, moved, reach_of, sightings
 
@@ -101,6 +101,7 @@ class Changes:
     voxel_size_m : edge of the voxels
     """
 
+    __repr__ = brief
     names: tuple[str, str]
     points: Points
     labels: NDArray[np.uint8]

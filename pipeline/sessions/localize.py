@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.clock import working_s
 from scanchain.config import Config
-from scanchain.data import ClosureVerdict, Pose
+from scanchain.data import ClosureVerdict, Pose, brief
 from scanchain.errors import InputError
 from scanchain.logs import Log
 from scanchain.loops.evidence import are_in_sight
@@ -108,6 +108,7 @@ class LocalizeMetrics(Struct, frozen=True):
 class LocalizedLog:
     """A localized log for report and recording: its directory, the map, its poses in it, the metrics."""
 
+    __repr__ = brief
     path: Path
     prior: SavedMap
     localization: Localization

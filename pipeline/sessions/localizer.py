@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from scanchain import checks, lie
 from scanchain.config import Config
-from scanchain.data import Closure, Matrix, Pose, RawPoints, Scan, State, Step, Trajectory
+from scanchain.data import AnyPoints, Closure, Matrix, Pose, Scan, State, Step, Trajectory, brief
 from scanchain.maps import SavedMap, open_saved_map
 from scanchain.preprocess import Prepared
 from scanchain.slam import Slam, SlamResult, loop_information
@@ -43,6 +43,7 @@ class Placed:
     step : its odometry and what was compared with the map
     """
 
+    __repr__ = brief
     state: MapState
     T_map_lidar: Pose | None
     covariance: Matrix | None
@@ -65,6 +66,7 @@ class Localization:
     result : of the whole chain, keyframes of the map first
     """
 
+    __repr__ = brief
     states: NDArray[np.str_]
     is_placed: NDArray[np.bool_]
     trajectory: Trajectory
@@ -126,9 +128,9 @@ class Localizer:
 
     def track(
         self,
-        points: RawPoints,
+        points: AnyPoints,
         stamp_s: float,
-        times_s: NDArray[np.float32] | None = None,
+        times_s: NDArray[np.floating] | None = None,
         *,
         T_odom_base: Pose | None = None,
     ) -> Placed:

@@ -149,7 +149,7 @@ def write_merged(folder: Path, merged: MergedMap, final: Sequence[FinalClosure],
         merged.last_seen_ns,
     )
     for session, trajectory in zip(merged.sessions, merged.trajectories, strict=True):
-        write_tum(folder / f"{session.name}.tum", trajectory)
+        write_tum(folder / f"{session.name}.tum", trajectory, force=True)
     write_ply(folder / "map.ply", merged.cloud.points)
     if merged.joined.dimension == 2:
         write_map(folder, grid_of(_Posed(merged.keyframes, poses), config.maps))

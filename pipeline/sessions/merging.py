@@ -12,7 +12,7 @@ import numpy as np
 
 from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.config import Config
-from scanchain.data import REJECTED_WEIGHT, ClosureVerdict
+from scanchain.data import REJECTED_WEIGHT, ClosureVerdict, brief
 from scanchain.errors import InputError, ScanchainError
 from scanchain.graph.optimization import fit
 from scanchain.maps import SavedMap, Session, open_saved_map
@@ -124,6 +124,7 @@ class MergeMetrics(msgspec.Struct, frozen=True):
 class Merged:
     """A finished merge: its directory, metrics, summary and warnings."""
 
+    __repr__ = brief
     path: Path
     metrics: MergeMetrics
     summary: str

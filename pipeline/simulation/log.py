@@ -100,7 +100,7 @@ def record(
             _write_sweep(log, sweep, drive.sensor, stamp_ns)
             if progress is not None:
                 progress(done + 1, len(truth))
-    write_tum(destination.with_suffix(".tum"), truth)
+    write_tum(destination.with_suffix(".tum"), truth, force=True)
     return truth
 
 

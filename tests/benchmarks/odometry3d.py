@@ -44,7 +44,7 @@ LEGEND = """\
   x: over the same of the first row of ours; CPU ms: median, all threads together
   peak: resident memory of a process that reads the log and runs this method only; growth: of it, after one scan
   ATE: rmse after rigid alignment; RPE: rmse from scan to scan; KITTI: mean over all stretches of 10, 20 and 40 m
-  entropy, planes: mean map entropy and plane thickness, lower is sharper (scanchain.evaluation.sharpness)
+  entropy, planes: mean map entropy and plane thickness, lower is sharper (scanchain.evaluation.map_sharpness)
   to KISS: median distance between the motion of a scan and that which KISS-ICP finds"""
 
 

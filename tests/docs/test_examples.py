@@ -8,8 +8,13 @@ Whole numbers agree exactly, others within one unit of the last digit shown.
 """
 
 import ast
+import json
 import re
 import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -111,6 +116,41 @@ def test_every_example_prints_what_the_page_says(page, folder, capsys):
     assert compared or not ran, f"{page.name}: no example says what it prints"
 
 
+def test_examples_and_their_results_pass_a_type_checker_where_the_package_is_installed(tmp_path):
+    installed, examples = tmp_path / "site/scanchain", tmp_path / "examples"
+    ignored = shutil.ignore_patterns("__pycache__", "viz")
+    shutil.copytree(ROOT / "pipeline", installed, ignore=ignored)
+    shutil.copytree(ROOT / "viz", installed / "viz", ignore=ignored)
+    examples.mkdir()
+    for page in PAGES:
+        for number, (language, contents) in enumerate(fences(page.read_text(encoding="utf-8"))):
+            if language == "python":
+                (examples / f"{page.stem}_{number}.py").write_text(contents, encoding="utf-8")
+    (examples / "further.py").write_text(FURTHER, encoding="utf-8")
+    options = {"include": ["examples"], "extraPaths": ["site"], "typeCheckingMode": "standard"}
+    (tmp_path / "pyrightconfig.json").write_text(json.dumps(options | {"reportMissingTypeStubs": False}))
+    checker = Path(sys.executable).with_name("basedpyright")
+    if not checker.exists():
+        pytest.skip("basedpyright is not installed")
+    command = [checker, "--pythonpath", sys.executable, "--project", tmp_path]
+    checked = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert checked.returncode == 0, checked.stdout
+
+
+FURTHER = """
+import numpy as np
+import scanchain
+from scanchain.evaluation import sharpness
+
+print(scanchain.align(np.zeros((9, 3)), np.zeros((9, 3), np.float32)).converged)
+found = scanchain.evaluate("a.tum", "b.tum")
+print(found.ate.translation_m.rmse, found.rpe["1_s"].rotation_rad.mean, found.kitti.translation_share)
+print(scanchain.__version__, scanchain.lie.exp(np.zeros(6)), scanchain.evaluation.pair)
+print(sharpness([np.zeros((9, 3))]))
+scanchain.Odometry().track(np.zeros((9, 3)), 0.0, np.zeros(9))
+"""
+
+
 @pytest.mark.parametrize(
     ("said", "printed", "verdict"),
     [
@@ -152,7 +192,8 @@ def test_a_command_that_prints_something_else_fails(capsys):
 
 
 def test_every_public_name_is_in_the_reference_of_the_api():
-    assert {name for name in dir(scanchain) if not name.startswith("_")} == set(scanchain.__all__)
+    public = {name for name in dir(scanchain) if not name.startswith("_")}
+    assert public == {*scanchain.__all__, "evaluation", "lie"}
     documented = re.findall(r"^\.\. auto\w+:: (\w+)(?:\(.*)?$", (ROOT / "docs/api.md").read_text(), re.MULTILINE)
     assert sorted(documented) == sorted(scanchain.__all__)
 

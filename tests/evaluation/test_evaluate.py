@@ -333,7 +333,7 @@ def test_a_stamp_rounded_to_milliseconds_is_that_of_the_truth_at_its_ends_too():
 
 def test_truth_too_sparse_to_interpolate_says_so_and_how_to_allow_it():
     sparse = at_rate(drive(100), 20)
-    with pytest.raises(InputError, match=r"more than 0\.6 s apart.*--max-gap"):
+    with pytest.raises(InputError, match=r"more than 0\.6 s apart.*max_gap_s"):
         pair(at_rate(drive(100), 1, late_ns=50_000_000), sparse)
     assert len(pair(at_rate(drive(100), 1, late_ns=50_000_000), sparse, gap_s=2.0)) == 80
 

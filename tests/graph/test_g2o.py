@@ -7,7 +7,7 @@ from scanchain.config import GraphConfig
 from scanchain.errors import InputError
 from scanchain.graph.edge_checks import check_connected, nearest_semidefinite
 from scanchain.graph.files.g2o import read_g2o
-from scanchain.graph.files.g2o_write import write_g2o, write_toro
+from scanchain.graph.files.g2o_write import write_g2o
 from scanchain.graph.pose_graph import PoseGraph
 from tests.support.scenes import shared_data
 
@@ -92,7 +92,7 @@ def test_points_without_vertices_begin_where_they_are_seen(tmp_path):
 def test_what_is_written_as_toro_reads_back_the_same(name, tmp_path):
     first = read_g2o(shared_data(f"graphs/{name}.g2o"))
     path = tmp_path / "again.graph"
-    write_toro(path, first.graph, ids=first.ids)
+    write_g2o(path, first.graph, ids=first.ids)
     second = read_g2o(path).graph
     assert np.array_equal(first.graph.edges, second.edges)
     assert np.array_equal(first.graph.information, second.information)
@@ -117,7 +117,7 @@ def test_toro_angles_are_roll_pitch_and_yaw_also_looking_straight_up(pitch, tmp_
         graph.add_pose(T, index)
     graph.add_edge(0, 1, graph.poses[1], np.eye(6))
     path = tmp_path / "up.graph"
-    write_toro(path, graph)
+    write_g2o(path, graph)
     assert np.allclose(read_g2o(path).graph.poses, graph.poses, rtol=0, atol=1e-12)
     if abs(pitch) < 1.5:
         assert np.allclose(np.array(path.read_text().split()[5:8], float), angles[0])
@@ -127,7 +127,7 @@ def test_toro_cannot_hold_points(tmp_path):
     path = tmp_path / "square.g2o"
     path.write_text(SQUARE)
     with pytest.raises(InputError, match="TORO has no points, and the graph has 1"):
-        write_toro(tmp_path / "x.graph", read_g2o(path).graph)
+        write_g2o(tmp_path / "x.graph", read_g2o(path).graph)
 
 
 def test_a_quaternion_edge_keeps_its_order_and_its_information(tmp_path):
@@ -144,6 +144,37 @@ def test_a_quaternion_edge_keeps_its_order_and_its_information(tmp_path):
 
 def _triangle(matrix):
     return matrix[np.triu_indices(len(matrix))]
+
+
+def test_information_is_of_a_rotation_vector_or_as_the_comment_says_of_a_quaternion(tmp_path):
+    """g2o's own error is the vector part of the quaternion of Z⁻¹ Tᵢ⁻¹ Tⱼ; χ² of both conventions is the same."""
+    graph, turn = PoseGraph(3), lie.exp(np.array([0.0, 0.0, 0.0, 0.02, -0.01, 0.03]))
+    Z = lie.exp(np.array([1.0, 0.2, 0.0, 0.1, 0.0, 0.4]))
+    root = np.random.default_rng(0).normal(size=(6, 6))
+    for k, pose in enumerate((np.eye(4), Z @ turn)):
+        graph.add_pose(pose, k)
+    graph.add_edge(0, 1, Z, root @ root.T)
+    first, chi2 = {}, graph.state().chi2
+    for rotation in ("vector", "quaternion"):
+        path = tmp_path / f"{rotation}.g2o"
+        write_g2o(path, graph, rotation=rotation)
+        first[rotation], *_, edge = path.read_text().splitlines()
+        information = np.zeros((6, 6))
+        information[np.triu_indices(6)] = [float(word) for word in edge.split()[-21:]]
+        information += np.triu(information, 1).T
+        error = np.zeros(6)
+        error[3:] = lie.log(turn)[3:] if rotation == "vector" else lie.to_quaternion(turn[None, :3, :3])[0, :3]
+        assert error @ information @ error == pytest.approx(chi2, rel=1e-3)
+        back = read_g2o(path)
+        np.testing.assert_allclose(back.graph.information, graph.information, rtol=1e-12)
+        assert back.other_lines == ()
+    assert "rotation vector" in first["vector"] and "unit quaternion" in first["quaternion"]
+    as_vector = read_g2o(tmp_path / "quaternion.g2o", rotation="vector").graph.information[0]
+    np.testing.assert_allclose(as_vector[3:, 3:], 4.0 * graph.information[0, 3:, 3:], rtol=1e-12)
+    with pytest.raises(InputError, match="exists; choose another name or pass force=True"):
+        write_g2o(path, graph)
+    with pytest.raises(InputError, match="rotation is 'euler'; it must be one of vector, quaternion"):
+        write_g2o(path, graph, rotation="euler")
 
 
 def test_a_file_without_vertices_starts_from_its_odometry():

@@ -118,7 +118,7 @@ def test_a_log_without_messages(tmp_path):
 
 def test_a_topic_that_is_absent_lists_what_there_is(tmp_path):
     path = write(tmp_path / "a.mcap", office(2))
-    says(complaint(path, topic="/velodyne"), "/velodyne", "--topic", "/scan", "sensor_msgs/LaserScan")
+    says(complaint(path, topic="/velodyne"), "/velodyne", "log__topic", "/scan", "sensor_msgs/LaserScan")
 
 
 def test_a_topic_that_is_no_lidar_says_what_it_is(tmp_path):
@@ -129,7 +129,7 @@ def test_a_topic_that_is_no_lidar_says_what_it_is(tmp_path):
 def test_several_lidars_are_listed(tmp_path):
     said = [*office(2), scan_said(STAMP_NS, laser_scan(STAMP_NS, [1.0]), "/rear")]
     path = write(tmp_path / "a.mcap", said)
-    says(complaint(path), "--topic", "/scan", "/rear")
+    says(complaint(path), "log__topic", "/scan", "/rear")
     log = open_log([path], LogConfig(topic="/rear"))
     assert len(list(log.scans())) == log.scan_count == 1
 

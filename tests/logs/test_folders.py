@@ -227,7 +227,7 @@ def test_files_that_are_only_numbered_need_a_rate(tmp_path):
     said = recorders.clouds(12)
     for k, cloud in enumerate(said):
         xyzi(cloud).tofile(tmp_path / f"scan{k}.bin")
-    with pytest.raises(InputError, match=r"scan0\.bin hold no stamp.*--log\.rate_hz 10"):
+    with pytest.raises(InputError, match=r"scan0\.bin hold no stamp.*log__rate_hz 10"):
         read(tmp_path)
     log, scans = read(tmp_path, rate_hz=20.0)
     assert_points(scans, said)  # scan2 comes before scan10

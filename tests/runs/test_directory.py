@@ -95,7 +95,7 @@ def test_parents_are_made(tmp_path):
 
 def test_an_existing_directory_is_refused_even_if_it_is_empty(tmp_path):
     (tmp_path / "a").mkdir()
-    with pytest.raises(InputError, match=r"a: exists; choose another --out or pass --force"):
+    with pytest.raises(InputError, match=r"a: exists; choose another out or pass force=True"):
         RunDirectory(tmp_path / "a", force=False)
 
 
@@ -150,7 +150,7 @@ def test_the_leftovers_of_a_dead_process_of_the_same_number_are_cleared(tmp_path
 def test_a_place_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "file").touch()
     with (
-        pytest.raises(InputError, match=r"file/a: cannot be made .*choose another --out"),
+        pytest.raises(InputError, match=r"file/a: cannot be made .*choose another out"),
         RunDirectory(tmp_path / "file" / "a", force=False),
     ):
         pytest.fail("it was made")
@@ -159,7 +159,7 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path):
 def test_a_run_is_not_written_into_another(tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "run.json").write_text('{"versions": {"scanchain": "1"}}')
-    with pytest.raises(InputError, match=r"lies in the run directory .*a; choose another --out"):
+    with pytest.raises(InputError, match=r"lies in the run directory .*a; choose another out"):
         RunDirectory(tmp_path / "a" / "b" / "c", force=True)
 
 
@@ -336,13 +336,11 @@ def test_what_a_stopped_run_left_is_named_with_resume_where_its_name_or_that_of_
     left = run(job(office, tmp_path / "a"), open_recorder, Watcher(20)).path.rename(
         tmp_path / f"a.partial-{_NO_PROCESS}"
     )
-    with pytest.raises(
-        InputError, match=rf"{left.name}: exists; .*: --out {tmp_path / 'a'} --resume continues it"
-    ):
+    with pytest.raises(InputError, match=rf"{left.name}: exists; .*: out {tmp_path / 'a'} --resume continues it"):
         RunDirectory(left, force=False)
     an_old_run(tmp_path / "a")
     with pytest.raises(
-        InputError, match=rf"a: exists; .*; {left.name} is of a run .*: --force --resume continues"
+        InputError, match=rf"a: exists; .*; {left.name} is of a run .*: force=True --resume continues"
     ):
         RunDirectory(tmp_path / "a", force=False)
     resumed = run(job(office, tmp_path / "a", force=True, resume=True), open_recorder, Unwatched())

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import checks, lie
-from scanchain.data import Matrix
+from scanchain.data import Matrix, brief
 from scanchain.errors import InputError
 from scanchain.graph.edge_checks import nearest_semidefinite, positive_semidefinite
-from scanchain.graph.files.g2o_lines import POSE_NUMBERS, TRIANGLE, G2oLines, Rows, sort_lines
+from scanchain.graph.files.g2o_lines import POSE_NUMBERS, TRIANGLE, G2oLines, Rotation, Rows, sort_lines
 from scanchain.graph.initialize import follow_odometry
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.words import counted
@@ -65,6 +65,7 @@ class G2oFile:
     note : warning that angles may be degrees; empty where they are radians
     """
 
+    __repr__ = brief
     graph: PoseGraph
     ids: NDArray[np.int64]
     other_lines: tuple[str, ...]
@@ -79,13 +80,18 @@ class G2oFile:
 
 
 def read_g2o(
-    path: Path | str, *, loops: Literal["quadratic", "robust"] = "quadratic", indefinite: Indefinite = "project"
+    path: Path | str,
+    *,
+    loops: Literal["quadratic", "robust"] = "quadratic",
+    indefinite: Indefinite = "project",
+    rotation: Rotation | None = None,
 ) -> G2oFile:
     """Read a graph.
 
     loops : "robust" marks edges between poses that do not follow each other for the robust loss
     indefinite : what to do about indefinite information matrices: "project" each to the nearest positive
         semidefinite one and warn, or "refuse" the file
+    rotation : of what the information is in 3D, as in ``write_g2o``; as the file says, else "vector"
     """
     path = checks.path(path, "path")
     lines = sort_lines(path)
@@ -95,6 +101,9 @@ def read_g2o(
     ids = np.concatenate([pose_ids, point_ids])
     pairs = _places(path, lines.edges, 2, pose_ids)
     measurements, information = _measurements(path, lines.edges, dimension)
+    if dimension == 3 and (rotation or lines.rotation) == "quaternion":
+        units = lie.by_component(6, 1.0, 0.5)
+        information *= np.outer(units, units)
     sightings, seen, certainty = _sightings(path, lines.sightings, pose_ids, point_ids)
     bad = [
         _indefinite(path, *rows, indefinite) for rows in ((lines.edges, information), (lines.sightings, certainty))

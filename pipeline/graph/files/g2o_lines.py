@@ -23,6 +23,11 @@ EDGES = {2: "EDGE_SE2", 3: "EDGE_SE3:QUAT"}
 POINT, SIGHTING = "VERTEX_XY", "EDGE_SE2_XY"
 POSE_NUMBERS = {2: 3, 3: 7}  # x y θ, or x y z qx qy qz qw
 TRIANGLE = {2: 6, 3: 21}  # upper triangle of an information matrix
+Rotation = Literal["vector", "quaternion"]  # of which Ω is in 3D
+ROTATION_COMMENT: dict[Rotation, str] = {
+    "vector": "# information of EDGE_SE3:QUAT is of (translation, rotation vector in radians)",
+    "quaternion": "# information of EDGE_SE3:QUAT is of (translation, vector part of unit quaternion), as g2o",
+}
 _LARGEST_ID = 2**63 - 1  # int64
 _WHOLE_TURN = 2.0 * pi + 1e-3  # rad, above which an angle is a turn too many, or degrees
 
@@ -113,6 +118,7 @@ class G2oLines:
     """A file's lines by kind; ``dimension`` is 2 or 3, and 0 where it holds neither poses nor edges.
 
     ``turns`` : line and size of angles beyond a turn, which may be degrees
+    ``rotation`` : of which the information is, by the comment that ``write_g2o`` writes
     """
 
     dimension: int = 0
@@ -123,6 +129,7 @@ class G2oLines:
     fixed: Rows = field(default_factory=Rows)
     others: list[str] = field(default_factory=list)
     turns: list[tuple[int, float]] = field(default_factory=list)
+    rotation: Rotation = "vector"
 
 
 def sort_lines(path: Path) -> G2oLines:
@@ -152,6 +159,10 @@ def _sort_line(path: Path, number: int, words: list[str], line: str, result: G2o
             _append(path, number, [tag, word], 1, 0, result.fixed)
         return
     kind = _KINDS.get(tag)
+    for rotation, comment in ROTATION_COMMENT.items():
+        if line == comment:
+            result.rotation = rotation
+            return
     if kind is None:
         result.others.append(line)
         return

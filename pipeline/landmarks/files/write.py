@@ -127,7 +127,7 @@ def write_estimate(directory: Path, study: Study) -> None:
     file = directory / f"{stem}_landmarks.csv"
     _write_csv(file, "landmark", numbers, ["x_m", "y_m"], state.landmarks, study.landmark_covariance)
     if study.trajectory is not None:
-        write_tum(directory / f"{stem}.tum", study.trajectory)
+        write_tum(directory / f"{stem}.tum", study.trajectory, force=True)
 
 
 def _write_csv(

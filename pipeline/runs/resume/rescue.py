@@ -54,7 +54,7 @@ def rescued(
     if isinstance(error, KeyboardInterrupt | OSError) and (directory.path / CHECKPOINT_FILE).is_file():
         where += f"; {how_to_resume(provenance.command)}"
     if isinstance(error, InputError):
-        return InputError(f"{error}; {where}")
+        return InputError(f"{error.text}; {where}")
     kind = f"{type(error).__name__}: " if is_bug else ""
     return PartialRunError(f"{kind}{reason}; {where}")
 
@@ -75,7 +75,7 @@ def _keep(bug: BaseException | None, folder: Path, steps: StepTable, provenance:
         if bug is not None:
             written[2].write_text("".join(traceback.format_exception(bug)), encoding="utf-8")
         if len(steps) and not (folder / "metrics.json").exists():  # else the results are better
-            write_tum(written[0], steps.odometry)
+            write_tum(written[0], steps.odometry, force=True)
             steps.write(written[1], steps.best_known)
     except OSError:
         for path in written:
