@@ -240,7 +240,8 @@ class Keyframe:
     stored : its points, which ``points`` reads
     T_odom_lidar : pose in the odometry frame
     traveled_m : length of the path up to it, by odometry
-    scale : of the voxels that odometry used there, 1 for those of the configuration
+    scale : of the voxels that odometry used there, 1 for those of the configuration; finer ones of dense scans are
+        not counted, so that places compare whatever lidar saw them
     """
 
     __repr__ = brief

@@ -33,7 +33,7 @@ class Motion(NamedTuple):
 class Located(msgspec.Struct, frozen=True):
     """A scan as odometry placed it, with the state of odometry that the back end needs.
 
-    ``scale`` is that of its voxels, ``local_map`` (L, d) its map, odom frame, empty unless ``is_keyframe``;
+    ``scale`` is that of its voxels, whether its scans are dense or not, ``local_map`` (L, d) its map, odom frame, empty unless ``is_keyframe``;
     ``information`` (k, k) is that of its motion since the last keyframe, a twist in its own frame, zero unless
     ``is_keyframe``;
     ``errors`` are those of its pose against the map, of the first scan unless ``is_keyframe``;
@@ -87,7 +87,7 @@ class FrontEnd:
         return Located(
             tracked=tracked,
             is_keyframe=is_keyframe,
-            scale=local_map.scale,
+            scale=self.odometry.resolution.octave,
             local_map=local_map.points() if is_keyframe else self.no_points,
             information=information,
             errors=self.errors,
