@@ -79,7 +79,7 @@ def are_in_sight(keyframes: Sequence[Keyframe], others: Sequence[Keyframe]) -> N
 def nearest(keyframes: Sequence[Keyframe], others: Sequence[Keyframe]) -> list[Keyframe]:
     """Of each of some keyframes, the nearest one of the others."""
     positions, targets = (np.array([each.T_odom_lidar[:-1, -1] for each in part]) for part in (others, keyframes))
-    return [others[index] for index in KDTree(positions).query(targets)[1].tolist()]
+    return [others[index] for index in np.atleast_1d(KDTree(positions).query(targets)[1]).tolist()]
 
 
 class MapEvidence:
