@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -56,12 +56,9 @@ def localize(
     prior: Path,
     out: Path,
     initial: str | None,
-    config_file: Path | None,
-    ground_truth: Path | None,
-    max_gap_s: float | None,
-    force: bool,
     strict: bool,
     as_json: bool,
+    **options: Any,
 ) -> None:
     """Find a log in the map of an earlier run, and follow it there.
 
@@ -79,16 +76,7 @@ def localize(
     from scanchain.runs.job import Job
     from scanchain.sessions.localize import localize as localize_log
 
-    job = Job(
-        logs=logs,
-        out=out,
-        config_file=config_file,
-        overrides=overrides(ctx),
-        ground_truth=ground_truth,
-        max_gap_s=max_gap_s,
-        force=force,
-        command=tuple(sys.argv),
-    )
+    job = Job(logs=logs, out=out, overrides=overrides(ctx), command=tuple(sys.argv), **options)
     first = None if initial is None else _initial(initial)
     with Terminal("scans") as terminal:
         localized, text = localize_log(job, prior, terminal, draw_localization, initial=first)
