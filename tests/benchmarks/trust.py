@@ -138,7 +138,7 @@ def _gap(result: SlamResult, expected: ExpectedErrors, truth: Trajectory) -> flo
     with tempfile.TemporaryDirectory() as folder:
         estimate, reference = Path(folder, "keyframes.tum"), Path(folder, "truth.tum")
         write_wide_tum(estimate, result.keyframe_trajectory, expected.covariances)
-        write_tum(reference, truth)
+        write_tum(reference, truth, force=True)
         frames = ("--est-body-frame", "lidar", "--ref-body-frame", "lidar", "--t_max_diff", "0.02")
         said = io.StringIO()
         quiet = contextlib.redirect_stderr(io.StringIO())

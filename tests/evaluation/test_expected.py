@@ -71,7 +71,7 @@ def test_smfeval_finds_the_covariances_of_keyframes_neither_far_too_tight_nor_fa
     result, _, truth, expected = driven(folder, *drive)
     estimate, reference, said = folder / "keyframes.tum", folder / "truth.tum", io.StringIO()
     write_wide_tum(estimate, result.keyframe_trajectory, expected.covariances)
-    write_tum(reference, truth)
+    write_tum(reference, truth, force=True)
     frames = ["--est-body-frame", "lidar", "--ref-body-frame", "lidar"]
     with redirect_stdout(said), redirect_stderr(io.StringIO()):
         smfeval.main(["nees", str(estimate), str(reference), *frames])
