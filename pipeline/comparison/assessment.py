@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import msgspec
@@ -28,8 +28,8 @@ from scanchain.evaluation import (
     relative_error_over_time,
 )
 from scanchain.runs.step_table import COLUMNS, nees_of_steps
-from scanchain.runs.vouching import evidence_of_trajectory, judge_run
-from scanchain.verdict import Judged, judge
+from scanchain.runs.vouching import evidence_of_run, evidence_of_trajectory, expected_of_run, judge_run
+from scanchain.verdict import Judged, Verdict, apart_m, judge
 
 Answer = TypeVar("Answer")
 
@@ -93,14 +93,33 @@ def observability(outcome: Outcome) -> NDArray[np.float64]:
     return pq.read_table(path, columns=["observability"])["observability"].to_numpy()
 
 
-def judged(outcome: Outcome, scans: StoredScans) -> Judged | None:
-    """The verdict: on ours by all that is known, on others by wheels and velocity; None after a failure."""
-    if not outcome.is_whole:
-        return None
-    if (outcome.folder / STEPS_FILE).exists():
-        return judge_run(outcome.folder)
+def judged(outcomes: Mapping[str, Outcome], scans: StoredScans) -> dict[str, Judged]:
+    """The verdict on each whole run: on ours by all that is known, on others by wheels and constant velocity.
+
+    The error of one that has no expected ATE is bounded by the wheels and by a trustworthy run that has one.
+    """
+    whole = {name: outcome for name, outcome in outcomes.items() if outcome.is_whole}
+    expected = {name: expected_of_run(outcome.folder) for name, outcome in whole.items()}
+    ours = {name: judge_run(whole[name].folder) for name, error in expected.items() if error is not None}
+    bases = {
+        name: (whole[name].trajectory.poses, error.high)
+        for name, error in expected.items()
+        if error is not None and ours[name].verdict is Verdict.TRUSTWORTHY
+    }
     wheels = scans.wheels @ scans.T_base_lidar
-    return judge(evidence_of_trajectory(outcome.trajectory, scans.log_times_ns, wheels, scans.points))
+    others = {}
+    for name in whole.keys() - ours.keys():
+        poses = whole[name].trajectory.poses
+        bounds_m = {
+            of: apart_m(poses[:, :-1, -1], base[:, :-1, -1]) + high_m for of, (base, high_m) in bases.items()
+        }
+        evidence = evidence_of_trajectory(
+            whole[name].trajectory, scans.log_times_ns, wheels, scans.points, bounds_m
+        )
+        if (whole[name].folder / STEPS_FILE).exists():
+            evidence = replace(evidence_of_run(whole[name].folder, None), error=evidence.error)
+        others[name] = judge(evidence)
+    return ours | others
 
 
 def _start(stamps_ns: NDArray[np.int64], truth: Trajectory | None) -> Pose:

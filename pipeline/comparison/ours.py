@@ -13,6 +13,7 @@ from scanchain.config import Config
 from scanchain.data import Pose, Scan, Step, Timing, Trajectory
 from scanchain.odometry import Odometry
 from scanchain.runs.closures import final_verdicts, write_closures
+from scanchain.runs.metrics import METRICS_FILE, expected_ate_of
 from scanchain.runs.step_table import StepTable
 from scanchain.slam import Slam
 
@@ -79,6 +80,8 @@ class OurChain:
         """The final poses; tables go into the folder."""
         result = self.slam.finish()
         self.steps.write(folder / STEPS_FILE, result.trajectory, self.T_base_lidar)
+        expected = msgspec.json.encode({"expected_ate_m": expected_ate_of(result)})
+        (folder / METRICS_FILE).write_bytes(expected)
         final = final_verdicts(result.closures, result.state)
         write_closures(folder / CLOSURES_FILE, final, result.keyframes, odometry.dimension)
         return result.trajectory

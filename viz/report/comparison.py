@@ -43,7 +43,9 @@ from scanchain.viz.report.sections import (
     uncertainty_section,
 )
 
-_VERDICT = Head("verdict", "", "of other tools by wheels and constant velocity alone")
+_VERDICT = Head(
+    "verdict", "", "of other tools by wheels and constant velocity alone, with the error that it vouches for"
+)
 _WIDEST = 10  # largest number of columns of a table beside the summary
 _NEARLY = 1.25  # thickness of a map over that of the sharpest, up to which it frames the pictures
 
@@ -89,7 +91,7 @@ def _warnings(table: Table) -> Iterator[str]:
         if row.status.is_failure:
             yield f"{row.name} {row.status}: {row.reason}"
         if row.is_doubted:
-            yield f"{row.name}: {row.verdict}: {row.verdict_reason}"
+            yield f"{row.name}: {row.sentence}"
 
 
 def _figures(table: Table, trajectories: Sequence[DrawnTrajectory]) -> Iterator[Section]:
@@ -121,7 +123,7 @@ def _grid(
     for row in rows:
         cells = tuple(Cell(each[row.name].text, each[row.name].is_best) for each in shown)
         if has_verdicts:
-            cells += (verdict_cell(row.verdict),)
+            cells += (verdict_cell(row.verdict, row.vouched),)
         if row.status is not Status.OK:
             cells = (Cell(f"{row.status}: {row.reason}", is_wide=True),)
         lines.append(Row(row.name, cells, chips.get(row.name)))
