@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import Enum
+from itertools import product
 
 import numpy as np
 
 from scanchain import lie
 from scanchain.data import Matrix
+from scanchain.verdict.checks import Floats
 from scanchain.verdict.loops import Closures
 
 _FEWEST, _MOST = 3, 20  # closures around a stretch that decide: at least, and the shortest of more
-_RATIO = 1.0 / 3.0  # of the contradictions of closures by one source and by the other, up to which they decide
-_EXPLAINED = 0.5  # share of a disagreement that a jump of the wheels must explain
+_MOST_PARTS = 8  # largest number of stretches within a closure that are told apart
+_RATIO = 1.0 / 3.0  # of what is left unexplained by the right source and by the wrong one, at most
+_EXPLAINED = (
+    0.5  # share of a disagreement that the wrong source leaves unexplained, or a jump of the wheels explains
+)
 _IMPOSSIBLE_M = 1.0  # smallest change of the wheels' motion from scan to scan that is a jump
 
 
@@ -24,42 +30,67 @@ class Slipped(Enum):
     WHEELS = 2
 
 
-def slipped(first: int, last: int, size_m: float, odometry: Matrix, wheels: Matrix, closures: Closures) -> Slipped:
-    """Which of scans and wheels is wrong from one scan to another, where they disagree by ``size_m``.
+def which_slipped(
+    parts: Sequence[slice], odometry: Matrix, wheels: Matrix, closures: Closures
+) -> list[tuple[Slipped, float]]:
+    """Which of scans and wheels is wrong in each part of a trajectory where they disagree, and by how many meters.
 
-    Each closure around the stretch measures the motion over it once more. It is predicted by the odometry of the
-    scans, and by the same with the wheels' motion over the stretch in its place; the one whose predictions are far
-    off where the others are right is wrong. Wheels that jump, which no vehicle does, are wrong without closures.
+    A closure around a part measures once more where its two scans lie. It is predicted with the motion of each
+    part by scans or by wheels, in every combination, and with that of the rest by either, in the directions
+    of the scans. Of a part, the source is wrong without which the closures are predicted well, and with which they
+    are not. Wheels that jump, which no vehicle does, need no closure.
     odometry, wheels : (N, d+1, d+1), of the lidar; wheels NaN where unknown
     """
-    known = np.flatnonzero(np.isfinite(wheels[:, 0, 0]))
-    first, last = (int(known[np.argmin(np.abs(known - scan))]) for scan in (max(first - 1, 0), last))
-    if first >= last:
-        return Slipped.UNKNOWN
-    if _largest_jump_m(wheels[first : last + 1]) > max(
-        _IMPOSSIBLE_M + 2.0 * _largest_jump_m(odometry[first : last + 1]), _EXPLAINED * size_m
-    ):
-        return Slipped.WHEELS
-    low, high = np.minimum(closures.target, closures.source), np.maximum(closures.target, closures.source)
-    around = np.flatnonzero(closures.is_accepted & (low <= first) & (high >= last))
-    around = around[np.argsort(high[around] - low[around], kind="stable")][:_MOST]
-    if len(around) < _FEWEST:
-        return Slipped.UNKNOWN
-    is_forward = (closures.target <= closures.source)[around, None, None]
-    T_low_high = closures.T_target_source[around]
-    T_low_high = np.where(is_forward, T_low_high, lie.inverse(T_low_high))
-    scans, rolled = (lie.between(each[first], each[last]) for each in (odometry, wheels))
-    straight = scans.copy()  # as the wheels are far, in the direction of the scans
-    straight[:-1, -1] = rolled[:-1, -1]
-    before = lie.between(odometry[low[around]], np.broadcast_to(odometry[first], T_low_high.shape))
-    after = lie.between(np.broadcast_to(odometry[last], T_low_high.shape), odometry[high[around]])
-    by_scans, *by_wheels = (
-        float(np.median(np.linalg.norm(lie.between(before @ motion @ after, T_low_high)[:, :-1, -1], axis=1)))
-        for motion in (scans, straight, rolled)
+    steps = np.nan_to_num(
+        lie.between(wheels[:-1], wheels[1:])[:, :-1, -1] - lie.between(odometry[:-1], odometry[1:])[:, :-1, -1]
     )
-    if by_scans <= _RATIO * min(by_wheels):
-        return Slipped.WHEELS
-    return Slipped.SCANS if min(by_wheels) <= _RATIO * by_scans else Slipped.UNKNOWN
+    excess = np.zeros((len(odometry), odometry.shape[-1] - 1))  # of the wheels' path over that of the scans
+    excess[1:] = np.cumsum(np.einsum("nij,nj->ni", odometry[:-1, :-1, :-1], steps), axis=0)
+    ends = np.array([(max(part.start - 1, 0), part.stop - 1) for part in parts], np.int64).reshape(-1, 2)
+    apart = excess[ends[:, 1]] - excess[ends[:, 0]]
+    low, high = np.minimum(closures.target, closures.source), np.maximum(closures.target, closures.source)
+    is_forward = (closures.target <= closures.source)[:, None, None]
+    T_low_high = np.where(is_forward, closures.T_target_source, lie.inverse(closures.T_target_source))
+    off = (odometry[low] @ T_low_high)[:, :-1, -1] - odometry[high][:, :-1, -1]
+    found = []
+    for place, (first, last) in enumerate(ends.tolist()):
+        size_m = float(np.linalg.norm(apart[place]))
+        jumps_m = [_largest_jump_m(poses[first : last + 1]) for poses in (wheels, odometry)]
+        if jumps_m[0] > max(_IMPOSSIBLE_M + 2.0 * jumps_m[1], _EXPLAINED * size_m):
+            found.append((Slipped.WHEELS, size_m))
+            continue
+        around = np.flatnonzero(closures.is_accepted & (low <= first) & (high >= last))
+        around = around[np.argsort(high[around] - low[around], kind="stable")][:_MOST]
+        left = []
+        for closure in around.tolist():
+            within = np.flatnonzero((ends[:, 0] >= low[closure]) & (ends[:, 1] <= high[closure]))
+            if len(within) <= _MOST_PARTS:
+                rest = excess[high[closure]] - excess[low[closure]] - apart[within].sum(axis=0)
+                is_this = within == place
+                left.append(
+                    [_left_m(each, apart[within], is_this) for each in (off[closure], off[closure] - rest)]
+                )
+        found.append((_decided(np.array(left), size_m), size_m))
+    return found
+
+
+def _left_m(off: Floats, apart: Floats, is_this: Floats) -> tuple[float, float]:
+    """What the best combination of parts (K, d) leaves of ``off`` (d,), with one of them by scans, by wheels."""
+    by_wheels = np.array(list(product((0.0, 1.0), repeat=len(apart))))
+    left_m = np.linalg.norm(off - by_wheels @ apart, axis=1)
+    has_this = by_wheels @ is_this > 0.0
+    return float(left_m[~has_this].min()), float(left_m[has_this].min())
+
+
+def _decided(left_m: Floats, size_m: float) -> Slipped:
+    """By what closures leave (C, 2, 2), with the rest by scans, by wheels, with the part by scans, by wheels."""
+    if len(left_m) < _FEWEST:
+        return Slipped.UNKNOWN
+    by_scans, by_wheels = np.median(left_m, axis=0).T
+    for right, wrong, slipped in ((by_scans, by_wheels, Slipped.WHEELS), (by_wheels, by_scans, Slipped.SCANS)):
+        if (right <= _RATIO * wrong).all() and (wrong >= _EXPLAINED * size_m).all():
+            return slipped
+    return Slipped.UNKNOWN
 
 
 def _largest_jump_m(poses: Matrix) -> float:

@@ -14,7 +14,7 @@ from scipy.ndimage import median_filter
 from scanchain.data import LEAST_FIT, MOST_COPIES, Matrix
 from scanchain.verdict.checks import VELOCITY_LIMIT, WHEEL_LIMIT, Floats, WheelCheck
 from scanchain.verdict.loops import Closures, contradicting_groups
-from scanchain.verdict.slips import Slipped, slipped
+from scanchain.verdict.slips import Slipped, which_slipped
 
 _LEAST_OVERLAP = 2.0 / 3.0  # smallest ``overlap`` that is no finding
 _GAP = 3.0  # intervals of usual length from which on the motion is not predicted
@@ -205,15 +205,18 @@ def _of_wheels(evidence: Evidence, measured: Sequence[Stretch]) -> Iterator[Stre
     measured : stretches of badly measured scans, where closures that agree with them may be of look-alikes
     """
     is_marked = evidence.wheels.innovation > WHEEL_LIMIT
-    odometry = evidence.poses if evidence.odometry is None else evidence.odometry
-    for part in merged(is_marked):
+    odometry, parts = evidence.poses if evidence.odometry is None else evidence.odometry, merged(is_marked)
+    culprits = which_slipped(parts, odometry, evidence.wheels.poses, evidence.closures)
+    for part, (culprit, whole_m) in zip(parts, culprits, strict=True):
         first, last = part.start, part.stop - 1
-        sizes = [float(np.nanmax(each[part])) for each in (evidence.wheels.apart_m, evidence.wheels.apart_rad)]
-        culprit = slipped(first, last, sizes[0], odometry, evidence.wheels.poses, evidence.closures)
+        size_m, size_rad = (
+            float(np.nanmax(each[part])) for each in (evidence.wheels.apart_m, evidence.wheels.apart_rad)
+        )
         kind = {Slipped.SCANS: Kind.SCANS_SLIP, Slipped.WHEELS: Kind.WHEELS_SLIP}.get(culprit, Kind.WHEELS)
         if kind is Kind.WHEELS_SLIP and any(each.first <= last and first <= each.last for each in measured):
             kind = Kind.WHEELS
-        yield _stretch(evidence, kind, first, last, int(is_marked[part].sum()), *sizes)
+        size_m = size_m if kind is Kind.WHEELS else max(size_m, whole_m)
+        yield _stretch(evidence, kind, first, last, int(is_marked[part].sum()), size_m, size_rad)
 
 
 def _of_acceleration(evidence: Evidence) -> Iterator[Stretch]:

@@ -9,7 +9,7 @@ from enum import StrEnum
 import numpy as np
 
 from scanchain import lie
-from scanchain.data import LEAST_FIT
+from scanchain.data import LEAST_FIT, Matrix
 from scanchain.verdict.checks import WINDOW_M
 from scanchain.verdict.stretches import KNOWN, Evidence, Kind, Stretch, find_stretches
 from scanchain.words import counted
@@ -193,13 +193,13 @@ class _Rest:
     def of(cls, evidence: Evidence) -> _Rest:
         motion = np.abs(lie.log(lie.between(evidence.poses[:1], evidence.poses)))
         d = evidence.poses.shape[-1] - 1
-        positions, seconds = evidence.poses[:, :-1, -1], float(evidence.seconds[-1])
-        extent_m = float(np.linalg.norm(positions - positions[0], axis=1).max())
-        limit_m = min(_REST_M, _REST_M_S * seconds)
+        seconds, has_wheels = float(evidence.seconds[-1]), evidence.wheels.known_share >= KNOWN
+        extent_m, limit_m = _extent_m(evidence.poses), min(_REST_M, _REST_M_S * seconds)
         is_there = bool(extent_m < limit_m and motion[:, d:].max() < _REST_RAD)
+        is_there &= not has_wheels or _extent_m(evidence.wheels.poses) < limit_m
         is_open = evidence.is_degenerate | evidence.is_lost | evidence.is_contradicted
         is_observed = bool(np.isfinite(evidence.fit).any() and is_open.mean() <= _MOST_OPEN_AT_REST)
-        is_shown = is_there and (is_observed or evidence.wheels.known_share >= KNOWN)
+        is_shown = is_there and (is_observed or has_wheels)
         text = f"does not move (stays within {extent_m:.3f} m for {seconds:.1f} s)"
         if not is_shown:
             text = (
@@ -207,6 +207,12 @@ class _Rest:
                 "which everything looks the same; nothing in the log tells which"
             )
         return cls(is_there, is_shown, extent_m, text)
+
+
+def _extent_m(poses: Matrix) -> float:
+    """Largest distance of poses (N, d+1, d+1) from the first that is known."""
+    positions = poses[np.isfinite(poses[:, 0, 0]), :-1, -1]
+    return float(np.linalg.norm(positions - positions[0], axis=1).max())
 
 
 def _unlike_wheels(evidence: Evidence) -> Iterator[str]:
