@@ -24,7 +24,7 @@ from scanchain.evaluation import Sharpness, disagreement, sampled_map, sampling_
 from scanchain.logs import Log
 from scanchain.processes import Limits
 from scanchain.runs.provenance import Provenance, package_version
-from scanchain.verdict import Judged, Verdict, sentence
+from scanchain.verdict import Judged, Verdict
 
 TABLE_FILE = "table.json"
 
@@ -61,8 +61,8 @@ class Row(Struct, frozen=True):
 
     @property
     def sentence(self) -> str:
-        """Verdict, error and reason; empty if it failed."""
-        return sentence(Verdict(self.verdict), self.verdict_error, self.verdict_reason) if self.verdict else ""
+        """Verdict, error and reason of one that did not fail."""
+        return Judged(Verdict(self.verdict), self.verdict_reason, error=self.verdict_error).sentence
 
     @property
     def is_doubted(self) -> bool:

@@ -26,7 +26,7 @@ from scanchain.runs.closures import BACK_END, VERIFICATION, FinalClosure
 from scanchain.runs.results import Cloud
 from scanchain.runs.step_table import STAGES, StepTable, inlier_shares
 from scanchain.slam import SlamResult
-from scanchain.verdict import Judged, Stretch, Verdict, sentence
+from scanchain.verdict import Judged, Stretch, Verdict
 from scanchain.words import counted
 
 METRICS_FILE = "metrics.json"
@@ -146,9 +146,14 @@ class Metrics(Struct, frozen=True):
         return self.expected_ate_m.text + condition[self.verdict]
 
     @property
+    def judged(self) -> Judged:
+        """Verdict, the error that it vouches for, reason and stretches."""
+        return Judged(self.verdict, self.verdict_reason, self.stretches, self.verdict_error)
+
+    @property
     def sentence(self) -> str:
-        """Verdict, the error that it vouches for, and reason."""
-        return sentence(self.verdict, self.verdict_error, self.verdict_reason)
+        """The verdict in words."""
+        return self.judged.sentence
 
     @property
     def residual(self) -> str:

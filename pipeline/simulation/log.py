@@ -30,7 +30,7 @@ class Slip(NamedTuple):
     end_s: float
     size_m: float
 
-    def slipped_m(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def slipped_m(self, times_s: NDArray[np.floating]) -> NDArray[np.floating]:
         """(N,) up to each instant."""
         return self.size_m * np.clip((times_s - self.start_s) / (self.end_s - self.start_s), 0.0, 1.0)
 

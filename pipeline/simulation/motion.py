@@ -109,7 +109,7 @@ def stand_on_ground(xy: Matrix, forward: Matrix, solids: Solids) -> Matrix:
 
 
 def wheel_odometry(
-    T_world_base: Matrix, *, drift: float, rng: np.random.Generator, slips_m: NDArray[np.float64] | float = 0.0
+    T_world_base: Matrix, *, drift: float, rng: np.random.Generator, slips_m: NDArray[np.floating] | float = 0.0
 ) -> Matrix:
     """T_odom_base (N, 3, 3) that wheels report for the poses (N, 4, 4), starting at the identity.
 

@@ -11,7 +11,7 @@ from scanchain.verdict.checks import (
 )
 from scanchain.verdict.loops import Closures
 from scanchain.verdict.stretches import KNOWN, Evidence, Kind, Stretch
-from scanchain.verdict.verdict import MOST_CONTRADICTED, Judged, Verdict, judge, sentence
+from scanchain.verdict.verdict import MOST_CONTRADICTED, Judged, Verdict, judge
 from scanchain.verdict.worst_place import WorstPlace, worst_place
 
 __all__ = [
@@ -31,7 +31,6 @@ __all__ = [
     "check_velocity",
     "check_wheels",
     "judge",
-    "sentence",
     "smallest_jump_m",
     "wheel_bound_m",
     "worst_place",

@@ -47,25 +47,24 @@ class Judged:
 
     verdict: Verdict
     reason: str
-    stretches: tuple[Stretch, ...]
-    error: str = "error unknown"
+    stretches: tuple[Stretch, ...] = ()
+    error: str = ""
+
+    @property
+    def vouched(self) -> str:
+        """The error as far as it is vouched for: elsewhere than in the stretches to check, or not at all."""
+        words = {Verdict.TRUSTWORTHY: "", Verdict.CHECK: "otherwise "}
+        return f"{words[self.verdict]}{self.error}" if self.error and self.verdict in words else ""
 
     @property
     def sentence(self) -> str:
         """Verdict, error and reasons."""
-        return sentence(self.verdict, self.error, self.reason)
+        return f"{self.verdict}{f' ({self.vouched})' if self.vouched else ''}: {self.reason}"
 
     @property
     def unnamed(self) -> tuple[Stretch, ...]:
         """Stretches that the reason does not name."""
         return tuple(each for each in self.stretches if each.text not in self.reason)
-
-
-def sentence(verdict: Verdict, error: str, reason: str) -> str:
-    """A verdict with the error that it vouches for, where it does, and the reasons."""
-    if verdict is Verdict.NOT_TRUSTWORTHY or not error:
-        return f"{verdict}: {reason}"
-    return f"{verdict} ({'otherwise ' if verdict is Verdict.CHECK else ''}{error}): {reason}"
 
 
 def judge(evidence: Evidence) -> Judged:
@@ -90,7 +89,7 @@ def judge(evidence: Evidence) -> Judged:
     if not reasons:
         verdict, reasons = (
             Verdict.TRUSTWORTHY,
-            [f"nothing to check in {counted(len(evidence), 'scan')}{_by(evidence)}"],
+            list(_nothing(evidence)),
         )
     return Judged(verdict, "; ".join([*reasons, *notes]), stretches, error)
 
@@ -256,17 +255,16 @@ def _listed(stretches: Sequence[Stretch]) -> str:
     return "; ".join(each.text for each in largest) + (f"; and {more:,} more" if more else "")
 
 
-def _by(evidence: Evidence) -> str:
-    """States of the scans and names of the checks that were made, as text."""
-    checks = [
-        *(["fit"] if np.isfinite(evidence.fit).any() else []),
-        *(["overlap"] if np.isfinite(evidence.overlap).any() else []),
-        *(["constant velocity"] if np.isfinite(evidence.velocity).any() else []),
-        *(["wheels"] if np.isfinite(evidence.wheels.innovation).any() else []),
-        *(["loop closures"] if len(evidence.closures.target) else []),
-    ]
-    parts = [
-        *([evidence.states] if evidence.states else []),
-        *([f"checked by {', '.join(checks)}"] if checks else []),
-    ]
-    return f" ({'; '.join(parts)})" if parts else ""
+def _nothing(evidence: Evidence) -> Iterator[str]:
+    """That no check found anything, with the states of the scans and the checks that were made."""
+    states = f": {evidence.states}" if evidence.states else ""
+    yield f"nothing to check in {counted(len(evidence), 'scan')}{states}"
+    checks = {
+        "fit": evidence.fit,
+        "overlap": evidence.overlap,
+        "constant velocity": evidence.velocity,
+        "wheels": evidence.wheels.innovation,
+        "loop closures": evidence.closures.target,
+    }
+    if made := [name for name, values in checks.items() if np.isfinite(values).any()]:
+        yield f"checked by {', '.join(made)}"

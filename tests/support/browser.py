@@ -12,7 +12,7 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"
 _NARROWEST = 500  # pixels of Chromium's window
 _PROBE = """
 <script>
-const texts = [...document.querySelectorAll("figure > svg")].map(svg => {
+const texts = [...document.querySelectorAll("figure > svg")].filter(svg => svg.clientWidth).map(svg => {
   const frame = svg.getBoundingClientRect();
   const boxes = [...svg.querySelectorAll("text")].map(t => [t.textContent, t.getBoundingClientRect()]);
   const cut = boxes.filter(([, b]) => b.left < frame.left - 1 || b.right > frame.right + 1 ||

@@ -210,7 +210,7 @@ def test_a_verdict_counts_states_as_the_scans_have_them():
     fit = np.where(np.arange(N) % 40 == 0, 0.4, 0.9)
     judged = judge(evidence(poses, fit=fit, is_degenerate=marked(5, 8)))
     assert judged.verdict is Verdict.TRUSTWORTHY and "contradiction" not in judged.sentence
-    assert "nothing to check in 1,200 scans (1,166 ok, 30 contradicted, 4 degenerate; checked by" in judged.reason
+    assert "nothing to check in 1,200 scans: 1,166 ok, 30 contradicted, 4 degenerate; checked by" in judged.reason
 
 
 def test_a_stretch_counts_every_contradicted_scan_within_it():

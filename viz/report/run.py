@@ -23,7 +23,6 @@ from scanchain.runs.provenance import Provenance
 from scanchain.runs.step_table import STAGES, nees_of_steps
 from scanchain.settings import read_layer
 from scanchain.trajectory import read_tum
-from scanchain.verdict import Verdict
 from scanchain.viz.pictures.trajectory_figures import DrawnTrajectory, Floats, color_of
 from scanchain.viz.report.checks import verdict_section
 from scanchain.viz.report.page import REPORT_FILE, Cell, Collapsible, Grid, Head, Page, Row, Section, write_page
@@ -48,7 +47,7 @@ def write_run_report(directory: Path) -> None:
         title=f"Run of {', '.join(Path(log.path).name for log in made.logs)}",
         subtitle=heading,
         facts=tuple(_facts(metrics, made)),
-        warnings=tuple(line for line in (_doubts(metrics), made.stopped, *metrics.warnings) if line),
+        warnings=tuple(line for line in (made.stopped, *metrics.warnings) if line),
         notes=tuple(notes),
         sections=tuple(_sections(directory, metrics)),
         collapsibles=(
@@ -56,6 +55,7 @@ def write_run_report(directory: Path) -> None:
             Collapsible("Configuration", (directory / "config.toml").read_text(encoding="utf-8"), is_long=True),
         ),
         script=SCRIPT,
+        judged=metrics.judged,
     )
     write_page(directory / REPORT_FILE, page)
 
@@ -67,14 +67,8 @@ def _summary_lines(directory: Path) -> list[str]:
     return [heading, *(line.removeprefix("note").strip() for line in lines if line.startswith("note"))]
 
 
-def _doubts(m: Metrics) -> str:
-    """The verdict where it is none to rely on."""
-    return "" if m.verdict is Verdict.TRUSTWORTHY else m.sentence
-
-
 def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
-    """Facts of a run: the verdict first, then the result, its cost last."""
-    yield "verdict", str(m.verdict)
+    """Facts of a run: the result first, its cost last."""
     yield "trajectory", f"{m.traveled_m:.1f} m, {counted(m.keyframes, 'keyframe')}"
     yield "accuracy", _accuracy(m)
     yield "expected ATE", m.expected_ate
@@ -215,7 +209,8 @@ def accuracy_section(truth: GroundTruth) -> Section:
     text = (
         f"Against {truth.source}, {truth.path_length_m:.1f} m: {counted(truth.optimized.pairs, 'scan')}{missing}."
     )
-    return Section("Accuracy", text, grid=Grid(heads, rows, (truth.optimized.definition,)))
+    definitions = (truth.optimized.definition, truth.optimized.kitti_definition)
+    return Section("Accuracy", text, grid=Grid(heads, rows, tuple(filter(None, definitions))))
 
 
 def _stages(metrics: Metrics) -> Grid:
