@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
 from scanchain.errors import InputError
 from scanchain.words import counted
-
-if TYPE_CHECKING:
-    from scanchain.simulation import Slip
 
 
 @click.command()
@@ -27,7 +23,9 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--wheels-slip",
-    metavar="START:END:METERS",
+    nargs=3,
+    type=float,
+    metavar="START END METERS",
     help="Let the wheels turn so far ahead between these seconds, and the robot not move by it.",
 )
 @click.option(
@@ -52,7 +50,7 @@ def simulate(
     duration: float | None,
     sensor: str | None,
     drift: float,
-    wheels_slip: str | None,
+    wheels_slip: tuple[float, float, float] | None,
     noise: float | None,
     dropout: float | None,
     changed: int | None,
@@ -87,12 +85,12 @@ def simulate(
       scanchain simulate office later.mcap --changed 1
       scanchain simulate town sparse.mcap --sensor vlp-16 --noise 0.05 --dropout 0.1
       scanchain simulate town again.mcap --changed 1 --reverse --start-at 100
-      scanchain simulate office slips.mcap --wheels-slip 20:24:3
+      scanchain simulate office slips.mcap --wheels-slip 20 24 3
     """
     if destination.suffix != ".mcap":
         raise InputError(f"{destination}: does not end in .mcap; name it {destination.with_suffix('.mcap')}")
     from scanchain.commands.terminal import Terminal
-    from scanchain.simulation import NO_SLIP
+    from scanchain.simulation import NO_SLIP, Slip
     from scanchain.simulation import simulate as simulate_log
 
     with Terminal("scans") as terminal:
@@ -103,7 +101,7 @@ def simulate(
             duration_s=duration,
             sensor=sensor,
             drift=drift,
-            wheels_slip=NO_SLIP if wheels_slip is None else _slip(wheels_slip),
+            wheels_slip=NO_SLIP if wheels_slip is None else Slip(*wheels_slip),
             noise_m=noise,
             dropout=dropout,
             changed=changed,
@@ -117,13 +115,3 @@ def simulate(
         f"{destination}: {counted(len(truth), 'scan')}, {size_mb:.1f} MB; ground truth in it and in "
         f"{destination.with_suffix('.tum')}"
     )
-
-
-def _slip(text: str) -> Slip:
-    from scanchain.simulation import Slip
-
-    try:
-        start_s, end_s, size_m = map(float, text.split(":"))
-    except ValueError:
-        raise InputError(f"--wheels-slip {text}: give START:END:METERS, as 20:24:3") from None
-    return Slip(start_s, end_s, size_m)

@@ -69,7 +69,11 @@ def simulate(
     Returns the truth, SE(2) for a laser scanner and SE(3) for a lidar.
     """
     check_range("drift", drift, 0.0, 100.0)
-    wheels_slip = _checked(wheels_slip)
+    start_s, end_s, size_m = wheels_slip
+    if not (0.0 <= start_s < end_s < np.inf and np.isfinite(size_m)):
+        raise InputError(
+            f"wheels_slip from {start_s:g} to {end_s:g} s by {size_m:g} m: begin at 0 s or later, end later"
+        )
     destination = checks.path(destination, "destination")
     truth_file = destination.with_suffix(".tum")
     if truth_file.exists() and not force:
@@ -95,15 +99,6 @@ def simulate(
     if changed is not None:
         write_changes(changes_file, drive.changes)
     return truth
-
-
-def _checked(slip: Slip) -> Slip:
-    start_s, end_s, size_m = slip
-    if not (0.0 <= start_s < end_s < np.inf and np.isfinite(size_m)):
-        raise InputError(
-            f"wheels_slip is {start_s:g}:{end_s:g}:{size_m:g}; give START:END:METERS, START below END"
-        )
-    return Slip(start_s, end_s, size_m)
 
 
 def record(

@@ -1,13 +1,14 @@
 """Independent checks of a trajectory, and the verdict on it."""
 
-from scanchain.verdict.bounds import apart_m, wheel_bound_m
 from scanchain.verdict.checks import (
     VELOCITY_LIMIT,
     WHEEL_LIMIT,
+    apart_m,
     check_overlap,
     check_velocity,
     check_wheels,
     smallest_jump_m,
+    wheel_bound_m,
 )
 from scanchain.verdict.loops import Closures
 from scanchain.verdict.stretches import KNOWN, Evidence, Kind, Stretch

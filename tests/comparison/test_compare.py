@@ -3,6 +3,7 @@
 import csv
 import itertools
 import json
+import re
 
 import msgspec
 import numpy as np
@@ -186,6 +187,23 @@ def test_a_verdict_fails_nothing_and_a_method_that_did_not_finish_does(office, g
     output = capfd.readouterr()
     assert output.err == "error: did not finish: plicp; see the table for the reason\n"
     assert "plicp: not trustworthy: most are lost" in output.out
+
+
+def test_every_verdict_names_the_error_that_its_checks_resolve(good):
+    table, _ = good
+    bounds_m = {}
+    for each in table.rows:
+        if each.name == "svd+loops":
+            low_m, high_m = map(float, re.findall(r"ATE ([\d.]+) to ([\d.]+) m with 95 %", each.verdict_error)[0])
+            assert low_m < high_m and each.vouched == f"trustworthy, {each.verdict_error}"
+        else:
+            (bound,) = re.findall(r"ATE below ([\d.]+) m by (?:svd\+loops|wheels)", each.verdict_error)
+            bounds_m[each.name] = float(bound)
+    for name, bound_m in bounds_m.items():
+        assert row(table, name).figures.ate_m < 1.05 * bound_m, name
+    assert bounds_m["plicp"] < bounds_m["mine"]
+    for shown in (text(table), markdown(table)):
+        assert row(table, "plicp").verdict_error in shown
 
 
 def test_where_all_fail_the_tables_still_say_how(office, tmp_path):

@@ -38,7 +38,7 @@ def verdict_section(metrics: Metrics, steps: pa.Table, overlay_file: Path) -> Se
     largest = f", largest of {size} neighboring scans" if size > 1 else ""
     drawing = Drawing(
         "Innovations",
-        f"Normalized innovations over their limits{largest}; above 1 (dotted) is a finding.",
+        f"Normalized innovations over their limits{largest}; above 1 (dotted) is a finding, or wheels that slip.",
         innovations(curves, shaded, is_wide=is_alone),
         is_wide=is_alone,
     )

@@ -21,6 +21,7 @@ from scanchain.runs.metrics import VERDICT, Accuracy, GroundTruth, Metrics
 from scanchain.runs.overlay import OVERLAY_FILE
 from scanchain.runs.provenance import Provenance
 from scanchain.runs.step_table import STAGES, nees_of_steps
+from scanchain.runs.vouching import poses_of
 from scanchain.settings import read_layer
 from scanchain.trajectory import read_tum
 from scanchain.viz.pictures.trajectory_figures import DrawnTrajectory, Floats, color_of
@@ -97,7 +98,8 @@ def _accuracy(m: Metrics) -> str:
 def _sections(directory: Path, metrics: Metrics) -> Iterator[Section]:
     """Accuracy, trajectory and map, closures, errors, uncertainty; time last."""
     steps = pq.ParquetFile(directory / "steps.parquet").read()  # read_table imports much more
-    trajectory, odometry = _trajectory(steps, ""), _trajectory(steps, "odom_")
+    stamps_ns = steps["stamp_ns"].to_numpy()
+    trajectory, odometry = (Trajectory(stamps_ns, poses_of(steps, prefix)) for prefix in ("", "odom_"))
     truth_file, config = directory / TRUTH_FILE, read_layer(directory / "config.toml")
     truth = read_tum(truth_file) if truth_file.exists() and metrics.ground_truth is not None else None
     gap_s = None if metrics.ground_truth is None else metrics.ground_truth.max_gap_s
@@ -174,15 +176,6 @@ def _drawn(
         nees=unknown if nees is None else nees,
         observability=unknown if steps is None else steps["observability"].to_numpy(),
     )
-
-
-def _trajectory(steps: pa.Table, prefix: str) -> Trajectory:
-    """The poses of columns whose names begin so."""
-    columns = [steps[f"{prefix}{name}"].to_numpy() for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
-    poses = np.tile(np.eye(4), (len(steps), 1, 1))
-    poses[:, :3, :3] = lie.from_quaternion(np.stack(columns[3:], axis=1))
-    poses[:, :3, 3] = np.stack(columns[:3], axis=1)
-    return Trajectory(steps["stamp_ns"].to_numpy(), poses)
 
 
 def _seconds(steps: pa.Table) -> Floats:
