@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TypeVar
 
 import msgspec
@@ -28,7 +28,7 @@ from scanchain.evaluation import (
     relative_error_over_time,
 )
 from scanchain.runs.step_table import COLUMNS, nees_of_steps
-from scanchain.runs.vouching import evidence_of_run, evidence_of_trajectory, expected_of_run, judge_run
+from scanchain.runs.vouching import evidence_of_trajectory, expected_of_run, judge_run
 from scanchain.verdict import Judged, Verdict, apart_m, judge
 
 Answer = TypeVar("Answer")
@@ -96,30 +96,22 @@ def observability(outcome: Outcome) -> NDArray[np.float64]:
 def judged(outcomes: Mapping[str, Outcome], scans: StoredScans) -> dict[str, Judged]:
     """The verdict on each whole run: on ours by all that is known, on others by wheels and constant velocity.
 
-    The error of one that has no expected ATE is bounded by the wheels and by a trustworthy run that has one.
+    The error of others is bounded by the wheels, and by each of ours that is trustworthy.
     """
     whole = {name: outcome for name, outcome in outcomes.items() if outcome.is_whole}
-    expected = {name: expected_of_run(outcome.folder) for name, outcome in whole.items()}
-    ours = {name: judge_run(whole[name].folder) for name, error in expected.items() if error is not None}
-    bases = {
-        name: (whole[name].trajectory.poses, error.high)
-        for name, error in expected.items()
-        if error is not None and ours[name].verdict is Verdict.TRUSTWORTHY
-    }
+    found = {name: judge_run(each.folder) for name, each in whole.items() if (each.folder / STEPS_FILE).exists()}
+    expected = {name: expected_of_run(whole[name].folder) for name in found}
+    positions = {name: each.trajectory.poses[:, :-1, -1] for name, each in whole.items()}
     wheels = scans.wheels @ scans.T_base_lidar
-    others = {}
-    for name in whole.keys() - ours.keys():
-        poses = whole[name].trajectory.poses
+    for name in [name for name in whole if name not in found]:
         bounds_m = {
-            of: apart_m(poses[:, :-1, -1], base[:, :-1, -1]) + high_m for of, (base, high_m) in bases.items()
+            ours: apart_m(positions[name], positions[ours]) + error.high
+            for ours, error in expected.items()
+            if error is not None and found[ours].verdict is Verdict.TRUSTWORTHY
         }
-        evidence = evidence_of_trajectory(
-            whole[name].trajectory, scans.log_times_ns, wheels, scans.points, bounds_m
-        )
-        if (whole[name].folder / STEPS_FILE).exists():
-            evidence = replace(evidence_of_run(whole[name].folder, None), error=evidence.error)
-        others[name] = judge(evidence)
-    return ours | others
+        trajectory = whole[name].trajectory
+        found[name] = judge(evidence_of_trajectory(trajectory, scans.log_times_ns, wheels, scans.points, bounds_m))
+    return found
 
 
 def _start(stamps_ns: NDArray[np.int64], truth: Trajectory | None) -> Pose:

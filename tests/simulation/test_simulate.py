@@ -1,5 +1,6 @@
 """Simulated sequences: the truth is true, the log says what the sensor saw, the same seed gives the same bytes."""
 
+import html
 import re
 from dataclasses import replace
 from functools import cache
@@ -545,6 +546,9 @@ def test_wheels_that_slip_are_named_and_doubt_no_run_that_closes_loops_around(tm
         float, re.findall(r"wheels slip at ([\d.]+) to ([\d.]+) s \(([\d.]+) m\)", metrics.verdict_reason)[0]
     )
     assert 19.0 < start_s < 21.0 and 23.0 < end_s < 25.0 and 4.0 < size_m < 6.5
+    stated = metrics.ground_truth.optimized.kitti_definition
+    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert "stretches of 10, 20, 40 m from every pose" in stated and stated in html.unescape(page)
 
 
 # --- the log ---------------------------------------------------------------------------------------------------
