@@ -33,7 +33,7 @@ from scanchain.viz.report.sections import (
 )
 
 _VERDICT = page.Head(
-    "verdict", "", "of other tools by wheels and constant velocity alone, with the error that it vouches for"
+    "verdict", "", "of other tools by wheels and constant velocity alone, with the error that it vouches for", True
 )
 _WIDEST = 10  # largest number of columns of a table beside the summary
 _NEARLY = 1.25  # thickness of a map over that of the sharpest, up to which it frames the pictures
