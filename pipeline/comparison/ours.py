@@ -12,7 +12,8 @@ from scanchain.comparison.outcome import CLOSURES_FILE, STEPS_FILE
 from scanchain.config import Config
 from scanchain.data import Pose, Scan, Trajectory
 from scanchain.runs.closures import final_verdicts, write_closures
-from scanchain.runs.metrics import METRICS_FILE, expected_ate_of
+from scanchain.runs.metrics import METRICS_FILE
+from scanchain.runs.results import expected_of
 from scanchain.runs.step_table import StepTable
 from scanchain.slam import Slam
 
@@ -21,7 +22,7 @@ class Ours:
     """Odometry, with loop closures and pose graph where the method closes loops."""
 
     def __init__(self, method: Method, T_base_lidar: Pose) -> None:
-        config = msgspec.convert(method.settings, Config)
+        self.config = config = msgspec.convert(method.settings, Config)
         self.has_loops = config.loops.enabled
         closing = "; loops closed, pose graph optimized at the end" if self.has_loops else ""
         self.description = f"{_description(config)}{closing}"
@@ -40,8 +41,9 @@ class Ours:
         result = self.slam.finish()
         trajectory = result.trajectory if self.has_loops else odometry
         self.steps.write(folder / STEPS_FILE, trajectory, self.T_base_lidar)
-        expected = {"expected_ate_m": expected_ate_of(result)}
-        (folder / METRICS_FILE).write_bytes(msgspec.json.encode(expected))
+        expected = expected_of(result, self.config)
+        known = {"expected_ate_m": expected and expected.ate}
+        (folder / METRICS_FILE).write_bytes(msgspec.json.encode(known))
         if self.has_loops:
             final = final_verdicts(result.closures, result.state)
             write_closures(folder / CLOSURES_FILE, final, result.keyframes, odometry.dimension)
