@@ -29,7 +29,15 @@ from scanchain.runs.directory import (
     resumable,
 )
 from scanchain.runs.job import Job, OpenRecorder, Progress
-from scanchain.runs.metrics import METRICS_FILE, Accuracy, GroundTruth, Metrics, compare_with_truth, measure, summary
+from scanchain.runs.metrics import (
+    METRICS_FILE,
+    Accuracy,
+    GroundTruth,
+    Metrics,
+    compare_with_truth,
+    measure,
+    summary,
+)
 from scanchain.runs.processing import TruePoses, process
 from scanchain.runs.provenance import Hashing, Provenance, describe_start
 from scanchain.runs.resume.journal import JOURNAL_FILE

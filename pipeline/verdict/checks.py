@@ -11,7 +11,7 @@ from scipy.ndimage import median_filter
 
 from scanchain import lie
 from scanchain.data import Matrix
-from scanchain.registration.svd import DegeneratePairsError, rigid_transform
+from scanchain.registration.svd_icp import DegeneratePairsError, rigid_transform
 
 Floats = NDArray[np.float64]
 
