@@ -7,6 +7,8 @@ STRETCH_COLORS = {
     Kind.LOST: "#d6453d",
     Kind.CONTRADICTED: "#a55bd6",
     Kind.WHEELS: "#d6308f",
+    Kind.SCANS_SLIP: "#be123c",
+    Kind.WHEELS_SLIP: "#64748b",
     Kind.ACCELERATION: "#8a1c1c",
     Kind.LOOPS: "#0f9bb5",
     Kind.OVERLAP: "#b7791f",

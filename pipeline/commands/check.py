@@ -71,5 +71,10 @@ def _text(judged: Judged) -> str:
 def _json(judged: Judged) -> str:
     import msgspec
 
-    tree = {"verdict": judged.verdict, "verdict_reason": judged.reason, "stretches": judged.stretches}
+    tree = {
+        "verdict": judged.verdict,
+        "verdict_reason": judged.reason,
+        "verdict_error": judged.error,
+        "stretches": judged.stretches,
+    }
     return msgspec.json.format(msgspec.json.encode(tree), indent=2).decode()

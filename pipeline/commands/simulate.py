@@ -22,6 +22,13 @@ from scanchain.words import counted
     "--drift", default=1.0, show_default=True, metavar="FACTOR", help="Scale of the errors of the wheel odometry."
 )
 @click.option(
+    "--wheels-slip",
+    nargs=3,
+    type=float,
+    metavar="START END METERS",
+    help="Let the wheels turn so far ahead between these seconds, and the robot not move by it.",
+)
+@click.option(
     "--noise", type=float, metavar="METERS", help="Standard deviation of the ranges. [default: the sensor's]"
 )
 @click.option(
@@ -43,6 +50,7 @@ def simulate(
     duration: float | None,
     sensor: str | None,
     drift: float,
+    wheels_slip: tuple[float, float, float] | None,
     noise: float | None,
     dropout: float | None,
     changed: int | None,
@@ -77,10 +85,12 @@ def simulate(
       scanchain simulate office later.mcap --changed 1
       scanchain simulate town sparse.mcap --sensor vlp-16 --noise 0.05 --dropout 0.1
       scanchain simulate town again.mcap --changed 1 --reverse --start-at 100
+      scanchain simulate office slips.mcap --wheels-slip 20 24 3
     """
     if destination.suffix != ".mcap":
         raise InputError(f"{destination}: does not end in .mcap; name it {destination.with_suffix('.mcap')}")
     from scanchain.commands.terminal import Terminal
+    from scanchain.simulation import NO_SLIP, Slip
     from scanchain.simulation import simulate as simulate_log
 
     with Terminal("scans") as terminal:
@@ -91,6 +101,7 @@ def simulate(
             duration_s=duration,
             sensor=sensor,
             drift=drift,
+            wheels_slip=NO_SLIP if wheels_slip is None else Slip(*wheels_slip),
             noise_m=noise,
             dropout=dropout,
             changed=changed,

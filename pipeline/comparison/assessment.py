@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -28,8 +28,8 @@ from scanchain.evaluation import (
     relative_error_over_time,
 )
 from scanchain.runs.step_table import COLUMNS, nees_of_steps
-from scanchain.runs.vouching import evidence_of_trajectory, judge_run
-from scanchain.verdict import Judged, judge
+from scanchain.runs.vouching import evidence_of_trajectory, expected_of_run, judge_run
+from scanchain.verdict import Judged, Verdict, apart_m, judge
 
 Answer = TypeVar("Answer")
 
@@ -93,14 +93,25 @@ def observability(outcome: Outcome) -> NDArray[np.float64]:
     return pq.read_table(path, columns=["observability"])["observability"].to_numpy()
 
 
-def judged(outcome: Outcome, scans: StoredScans) -> Judged | None:
-    """The verdict: on ours by all that is known, on others by wheels and velocity; None after a failure."""
-    if not outcome.is_whole:
-        return None
-    if (outcome.folder / STEPS_FILE).exists():
-        return judge_run(outcome.folder)
+def judged(outcomes: Mapping[str, Outcome], scans: StoredScans) -> dict[str, Judged]:
+    """The verdict on each whole run: on ours by all that is known, on others by wheels and constant velocity.
+
+    The error of others is bounded by the wheels, and by each of ours that is trustworthy.
+    """
+    whole = {name: outcome for name, outcome in outcomes.items() if outcome.is_whole}
+    found = {name: judge_run(each.folder) for name, each in whole.items() if (each.folder / STEPS_FILE).exists()}
+    expected = {name: expected_of_run(whole[name].folder) for name in found}
+    positions = {name: each.trajectory.poses[:, :-1, -1] for name, each in whole.items()}
     wheels = scans.wheels @ scans.T_base_lidar
-    return judge(evidence_of_trajectory(outcome.trajectory, scans.log_times_ns, wheels, scans.points))
+    for name in [name for name in whole if name not in found]:
+        bounds_m = {
+            ours: apart_m(positions[name], positions[ours]) + error.high
+            for ours, error in expected.items()
+            if error is not None and found[ours].verdict is Verdict.TRUSTWORTHY
+        }
+        trajectory = whole[name].trajectory
+        found[name] = judge(evidence_of_trajectory(trajectory, scans.log_times_ns, wheels, scans.points, bounds_m))
+    return found
 
 
 def _start(stamps_ns: NDArray[np.int64], truth: Trajectory | None) -> Pose:

@@ -10,61 +10,22 @@ import numpy as np
 from scanchain.comparison.methods import Method
 from scanchain.comparison.outcome import CLOSURES_FILE, STEPS_FILE
 from scanchain.config import Config
-from scanchain.data import Pose, Scan, Step, Timing, Trajectory
-from scanchain.odometry import Odometry
+from scanchain.data import Pose, Scan, Trajectory
 from scanchain.runs.closures import final_verdicts, write_closures
+from scanchain.runs.metrics import METRICS_FILE
+from scanchain.runs.results import expected_of
 from scanchain.runs.step_table import StepTable
 from scanchain.slam import Slam
 
 
-def start_ours(method: Method, T_base_lidar: Pose) -> OurOdometry | OurChain:
-    """One of ours before its first scan."""
-    config = msgspec.convert(method.settings, Config)
-    return (OurChain if config.loops.enabled else OurOdometry)(config, T_base_lidar)
+class Ours:
+    """Odometry, with loop closures and pose graph where the method closes loops."""
 
-
-class OurOdometry:
-    """Odometry alone."""
-
-    def __init__(self, config: Config, T_base_lidar: Pose) -> None:
-        self.description = _description(config)
-        self.odometry = Odometry(config, T_base_lidar)
-        self.T_base_lidar = T_base_lidar
-        self.steps = StepTable()
-
-    def track(self, scan: Scan) -> Pose:
-        """T_odom_lidar (d+1, d+1)."""
-        tracked = self.odometry.process(scan)
-        self.steps.append(
-            Step(
-                scan=scan,
-                points=tracked.matched,
-                T_odom_lidar=tracked.T_odom_lidar,
-                T_world_lidar=tracked.T_odom_lidar,
-                match=tracked.match,
-                state=tracked.state,
-                reason=tracked.reason,
-                keyframe=-1,
-                local_map=tracked.matched[:0],
-                closures=(),
-                graph=None,
-                timing=Timing(0.0, tracked.preprocess_s, tracked.match_s, tracked.map_s, 0.0),
-                starts_segment=tracked.elsewhere_m > 0.0,
-            )
-        )
-        return tracked.T_odom_lidar
-
-    def finish(self, odometry: Trajectory, folder: Path) -> Trajectory:
-        """The final poses; tables go into the folder."""
-        self.steps.write(folder / STEPS_FILE, odometry, self.T_base_lidar)
-        return odometry
-
-
-class OurChain:
-    """With loop closures and pose graph."""
-
-    def __init__(self, config: Config, T_base_lidar: Pose) -> None:
-        self.description = f"{_description(config)}; loops closed, pose graph optimized at the end"
+    def __init__(self, method: Method, T_base_lidar: Pose) -> None:
+        self.config = config = msgspec.convert(method.settings, Config)
+        self.has_loops = config.loops.enabled
+        closing = "; loops closed, pose graph optimized at the end" if self.has_loops else ""
+        self.description = f"{_description(config)}{closing}"
         self.slam = Slam(config, T_base_lidar)
         self.T_base_lidar = T_base_lidar
         self.steps = StepTable()
@@ -76,12 +37,17 @@ class OurChain:
         return step.T_odom_lidar
 
     def finish(self, odometry: Trajectory, folder: Path) -> Trajectory:
-        """The final poses; tables go into the folder."""
+        """The final poses; tables and the expected ATE go into the folder."""
         result = self.slam.finish()
-        self.steps.write(folder / STEPS_FILE, result.trajectory, self.T_base_lidar)
-        final = final_verdicts(result.closures, result.state)
-        write_closures(folder / CLOSURES_FILE, final, result.keyframes, odometry.dimension)
-        return result.trajectory
+        trajectory = result.trajectory if self.has_loops else odometry
+        self.steps.write(folder / STEPS_FILE, trajectory, self.T_base_lidar)
+        expected = expected_of(result, self.config)
+        known = {"expected_ate_m": expected and expected.ate}
+        (folder / METRICS_FILE).write_bytes(msgspec.json.encode(known))
+        if self.has_loops:
+            final = final_verdicts(result.closures, result.state)
+            write_closures(folder / CLOSURES_FILE, final, result.keyframes, odometry.dimension)
+        return trajectory
 
 
 def _description(config: Config) -> str:

@@ -24,7 +24,7 @@ from scanchain.evaluation import Sharpness, disagreement, sampled_map, sampling_
 from scanchain.logs import Log
 from scanchain.processes import Limits
 from scanchain.runs.provenance import Provenance, package_version
-from scanchain.verdict import Verdict
+from scanchain.verdict import Judged, Verdict
 
 TABLE_FILE = "table.json"
 
@@ -38,6 +38,7 @@ class Row(Struct, frozen=True):
     settings : whole, as a TOML file for --config would hold them
     definitions : of its errors, as text
     verdict, verdict_reason : on its trajectory, of other tools by wheels and constant velocity; empty if it failed
+    verdict_error : the error that the verdict vouches for
     """
 
     name: str
@@ -50,6 +51,18 @@ class Row(Struct, frozen=True):
     definitions: list[str]
     verdict: str = ""
     verdict_reason: str = ""
+    verdict_error: str = ""
+
+    @property
+    def vouched(self) -> str:
+        """Verdict and error in a cell; empty if it failed."""
+        is_known = self.verdict_error and self.verdict == Verdict.TRUSTWORTHY
+        return f"{self.verdict}, {self.verdict_error}" if is_known else self.verdict
+
+    @property
+    def sentence(self) -> str:
+        """Verdict, error and reason of one that did not fail."""
+        return Judged(Verdict(self.verdict), self.verdict_reason, error=self.verdict_error).sentence
 
     @property
     def is_doubted(self) -> bool:
@@ -123,7 +136,7 @@ def markdown(table: Table) -> str:
         cells = [f"**{cells[place].text}**" if cells[place].is_best else cells[place].text for cells in shown]
         if row.status is not Status.OK:
             cells = [f"{row.status}: {row.reason}".replace("|", bar), *[""] * (len(columns) - 1)]
-        lines.append(f"| {row.name.replace('|', bar)} | {' | '.join([*cells, row.verdict])} |")
+        lines.append(f"| {row.name.replace('|', bar)} | {' | '.join([*cells, row.vouched])} |")
     notes = [f"- *{column.heading}*: {column.definition}" for column in columns]
     return "\n".join([*lines, "", table.against, "", *notes]) + "\n"
 
@@ -141,11 +154,11 @@ def text(table: Table) -> str:
         cells = [cells[place] for place in tried]
         texts = [column.head, column.unit, *(cell.text + (" ", "*")[cell.is_best] for cell in cells)]
         lines = [f"{line}  {text:>{max(map(len, texts))}}" for line, text in zip(lines, texts, strict=True)]
-    verdicts = ["verdict", "", *(row.verdict for row in rows)]
+    verdicts = ["verdict", "", *(row.vouched for row in rows)]
     lines = [f"{line}  {verdict}" for line, verdict in zip(lines, verdicts, strict=True)]
     endings = [f"{row.name}: {row.status}: {row.reason}" for row in rows if row.status is not Status.OK]
     endings += _not_installed(table)
-    endings += [f"{row.name}: {row.verdict}: {row.verdict_reason}" for row in table.rows if row.is_doubted]
+    endings += [f"{row.name}: {row.sentence}" for row in table.rows if row.is_doubted]
     endings += [table.provenance.stopped] if table.provenance.stopped else []
     known = [line.rstrip() for line in lines]
     return "\n".join([*known, f"* best of its column. {table.against}", *endings]) + "\n"
@@ -164,19 +177,21 @@ def _csv(table: Table) -> str:
     keys = [column.key for column in COLUMNS]
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(["method", "status", "verdict", *keys])
+    writer.writerow(["method", "status", "verdict", "verdict_error", *keys])
     for row in table.rows:
-        writer.writerow([row.name, row.status, row.verdict, *(getattr(row.figures, key) for key in keys)])
+        writer.writerow(
+            [row.name, row.status, row.verdict, row.verdict_error, *(getattr(row.figures, key) for key in keys)]
+        )
     return buffer.getvalue()
 
 
 def summarize(results: Results, log: Log, limits: Limits, provenance: Provenance) -> Table:
     """Every method's row, with figures that depend on all of them: sharpness and disagreement."""
     scans, sharp = results.scans, sharpness_of(results.maps)
-    finals = [representative(results.outcomes[method.name]).trajectory.poses for method in results.methods]
-    apart_m = disagreement(finals)
+    chosen = {method.name: representative(results.outcomes[method.name]) for method in results.methods}
+    apart_m, judgments = disagreement([each.trajectory.poses for each in chosen.values()]), judged(chosen, scans)
     rows = [
-        _row(results, method, sharp.get(method.name), np.delete(apart_m[place], place))
+        _row(results, method, sharp.get(method.name), np.delete(apart_m[place], place), judgments.get(method.name))
         for place, method in enumerate(results.methods)
     ]
     packages = sorted({BASELINES[method.base].package for method in results.methods if method.base in BASELINES})
@@ -201,11 +216,12 @@ def summarize(results: Results, log: Log, limits: Limits, provenance: Provenance
     )
 
 
-def _row(results: Results, method: Method, sharp: Sharpness | None, apart_m: np.ndarray) -> Row:
+def _row(
+    results: Results, method: Method, sharp: Sharpness | None, apart_m: np.ndarray, judgment: Judged | None
+) -> Row:
     outcomes, assessed = results.outcomes[method.name], results.assessed[method.name]
     end = _end([outcome.report for outcome in outcomes])
     known = apart_m[np.isfinite(apart_m)]
-    judgment = judged(representative(outcomes), results.scans)
     figures: Figures = msgspec.structs.replace(
         assessed.figures,
         thickness_m=sharp.thickness_m if sharp else None,
@@ -220,6 +236,7 @@ def _row(results: Results, method: Method, sharp: Sharpness | None, apart_m: np.
         description=representative(outcomes).report.description,
         verdict="" if judgment is None else str(judgment.verdict),
         verdict_reason="" if judgment is None else judgment.reason,
+        verdict_error="" if judgment is None else judgment.error,
         settings=method.settings,
         figures=figures,
         definitions=list(assessed.definitions),

@@ -59,9 +59,9 @@ def start(method: Method, T_base_lidar: Pose) -> Runner:
     """The method before its first scan. Raises MissingExtraError where its package is not installed."""
     if not method.is_ours:
         return _Others(method, len(T_base_lidar) - 1)
-    from scanchain.comparison.ours import start_ours  # much code, which is not to count as memory of the others
+    from scanchain.comparison.ours import Ours  # much code, which is not to count as memory of the others
 
-    return start_ours(method, T_base_lidar)
+    return Ours(method, T_base_lidar)
 
 
 def can_start_again(method: Method) -> bool:

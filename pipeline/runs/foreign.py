@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import Match, Matrix, Scan, Trajectory
+from scanchain.data import Match, Matrix, Pose, Scan, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import pair
 from scanchain.logs import Log, open_log
@@ -22,7 +22,7 @@ from scanchain.runs.vouching import evidence_of_trajectory
 from scanchain.settings import Override, load_settings
 from scanchain.source import Source
 from scanchain.trajectory import read_tum
-from scanchain.verdict import Evidence, Judged, check_overlap, judge
+from scanchain.verdict import Evidence, Judged, apart_m, check_overlap, judge
 
 _FEWEST = 3  # scans with a pose
 
@@ -44,12 +44,15 @@ def judge_trajectory(file: Path, logs: Sequence[Source], overrides: Sequence[Ove
     found = pairs.places
     T_world_lidar = lie.flatten(pairs.reference) if log.dimension == 2 else pairs.reference
     trajectory = Trajectory(stamps_ns[found], T_world_lidar)
-    evidence = evidence_of_trajectory(trajectory, log_times_ns[found], wheels[found], points[found])
     is_chosen = np.zeros(len(stamps_ns), np.bool_)
     is_chosen[found] = True
     scans = (scan for scan in log.scans(config.preprocess) if is_chosen[scan.index])
-    matched = _with_matches(evidence, _matches(scans, trajectory, config), config)
-    return judge(matched), len(stamps_ns) - len(pairs)
+    matches = _matches(scans, trajectory, config)
+    evidence = evidence_of_trajectory(
+        trajectory, log_times_ns[found], wheels[found], points[found],
+        {"scan matching": _matched_bound_m(trajectory.poses, [T for _, T in matches])},
+    )  # fmt: skip
+    return judge(_with_matches(evidence, matches, config)), len(stamps_ns) - len(pairs)
 
 
 def _table(log: Log, config: Config) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Matrix]:
@@ -63,22 +66,35 @@ def _table(log: Log, config: Config) -> tuple[NDArray[np.int64], NDArray[np.int6
     return stamps_ns, log_times_ns, points, np.array(wheels)
 
 
-def _matches(scans: Iterable[Scan], trajectory: Trajectory, config: Config) -> list[tuple[Match | None, float]]:
-    """Each scan aligned from its given pose, with the distance to the result, to a map of those before."""
+def _matched_bound_m(poses: Matrix, corrections: Sequence[Pose]) -> float:
+    """Difference of a trajectory from the one that goes on from each pose as the next scan is matched.
+
+    A scan is matched to a map at the given poses. An error that grows along the path shows in every correction, so
+    that their sum is larger than it.
+    """
+    motions = lie.between(poses[:-1], poses[1:]) @ np.array(corrections)[1:]
+    chained = [poses[0]]
+    for motion in motions:
+        chained.append(chained[-1] @ motion)
+    return apart_m(poses[:, :-1, -1], np.array(chained)[:, :-1, -1])
+
+
+def _matches(scans: Iterable[Scan], trajectory: Trajectory, config: Config) -> list[tuple[Match | None, Pose]]:
+    """Each scan aligned from its given pose to a map of those before, and the correction of the pose by it."""
     resolution = Resolution(config.preprocess, config.local_map.voxel_size_m)
     keeper, matcher = MapKeeper(trajectory.dimension, config.local_map), create_matcher(config.matching)
     velocities = _velocities(trajectory)
-    matches: list[tuple[Match | None, float]] = []
+    matches: list[tuple[Match | None, Pose]] = []
     for scan, T_world_lidar, velocity in zip(scans, trajectory.poses, velocities, strict=True):
         sweep, sparse = resolution.downsampled(scan)
         keeper.resize(resolution.scale)
         points = sparse.from_middle(velocity)
         T_world_middle = T_world_lidar @ lie.exp(sweep.middle_s * velocity)
-        match = None
+        match, T_matched = None, T_world_middle
         if len(keeper.surfaces) and len(points):
             match = matcher.align(points, keeper.surfaces, T_world_middle)
-        away_m = 0.0 if match is None else lie.apart(T_world_middle, match.T_target_source)[0]
-        matches.append((match, away_m))
+            T_matched = match.T_target_source
+        matches.append((match, lie.between(T_world_middle, T_matched)))
         keeper.extend(sweep.from_middle(velocity), T_world_middle)
     return matches
 
@@ -91,7 +107,7 @@ def _velocities(trajectory: Trajectory) -> NDArray[np.float64]:
     return np.vstack([velocities, velocities[-1:]])
 
 
-def _with_matches(evidence: Evidence, matches: Sequence[tuple[Match | None, float]], config: Config) -> Evidence:
+def _with_matches(evidence: Evidence, matches: Sequence[tuple[Match | None, Pose]], config: Config) -> Evidence:
     """With states and fit by the matches; one that ends elsewhere contradicts the pose."""
     least, farthest_m = config.matching.min_inlier_share, config.matching.max_distance_m
     return replace(
@@ -99,5 +115,10 @@ def _with_matches(evidence: Evidence, matches: Sequence[tuple[Match | None, floa
         is_lost=np.array([match is not None and match.inlier_share < least for match, _ in matches]),
         is_degenerate=np.array([match is not None and match.observability < 1.0 for match, _ in matches]),
         overlap=check_overlap(np.array([1.0 if match is None else match.inlier_share for match, _ in matches])),
-        fit=np.array([np.nan if m is None else m.fit if away_m < farthest_m else 0.0 for m, away_m in matches]),
+        fit=np.array(
+            [
+                np.nan if match is None else match.fit * (np.linalg.norm(T[:-1, -1]) < farthest_m)
+                for match, T in matches
+            ]
+        ),
     )

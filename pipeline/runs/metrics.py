@@ -29,6 +29,7 @@ from scanchain.slam import SlamResult
 from scanchain.verdict import Judged, Stretch, Verdict
 from scanchain.words import counted
 
+METRICS_FILE = "metrics.json"
 VERDICT = "verdict"  # first word of a summary
 _NOTICEABLE_S = 0.5  # seconds of compilation time below which it is not reported
 
@@ -49,6 +50,7 @@ class Accuracy(Struct, frozen=True):
     kitti_translation_share: float | None
     kitti_rotation_rad_per_m: float | None
     definition: str
+    kitti_definition: str = ""
 
 
 class GroundTruth(Struct, frozen=True):
@@ -80,7 +82,8 @@ class Metrics(Struct, frozen=True):
     ``contradicted`` scans are matched, but their correspondences contradict the pose (``fit`` below 0.6).
     ``expected_ate_m`` is the ATE by the covariances of the graph; null where it has no edge or these leave
     poses free.
-    ``verdict`` is the reliability of the result, ``verdict_reason`` the reason, ``stretches`` are what to look at.
+    ``verdict`` is the reliability of the result, ``verdict_reason`` the reason, ``verdict_error`` the error that
+    it vouches for, ``stretches`` are what to look at.
     ``elevation_offset_rad`` is what the lidar's vertical angles were corrected by from the scan
     ``calibrated_from`` on; 0 where no error was found; ``elevation_sigma_rad`` its standard deviation, null where
     none was estimated.
@@ -128,6 +131,7 @@ class Metrics(Struct, frozen=True):
     elevation_sigma_rad: float | None = None
     calibrated_from: int = 0
     odometry_errors: tuple[str, ...] = ()
+    verdict_error: str = ""
 
     @property
     def expected_ate(self) -> str:
@@ -142,9 +146,14 @@ class Metrics(Struct, frozen=True):
         return self.expected_ate_m.text + condition[self.verdict]
 
     @property
+    def judged(self) -> Judged:
+        """Verdict, the error that it vouches for, reason and stretches."""
+        return Judged(self.verdict, self.verdict_reason, self.stretches, self.verdict_error)
+
+    @property
     def sentence(self) -> str:
-        """Verdict and reason."""
-        return f"{self.verdict}: {self.verdict_reason}"
+        """The verdict in words."""
+        return self.judged.sentence
 
     @property
     def residual(self) -> str:
@@ -235,6 +244,7 @@ def measure(
         verdict=judged.verdict,
         verdict_reason=judged.reason,
         stretches=judged.stretches,
+        verdict_error=judged.error,
         expected_ate_m=None if expected is None else expected.ate,
         stopped=stopped,
         warnings=tuple(warnings),
@@ -304,6 +314,7 @@ def _accuracy(pairs: Pairs) -> tuple[Accuracy, float]:
         kitti_translation_share=None if kitti is None else kitti.translation_share,
         kitti_rotation_rad_per_m=None if kitti is None else kitti.rotation_rad_per_m,
         definition=f"{ate.definition}, over {ate.pairing}",
+        kitti_definition="" if kitti is None else kitti.definition,
     )
     return accuracy, ate.path_length_m
 

@@ -98,7 +98,7 @@ def process(
         with directory.results() as folder:
             results = results_of(log, config, steps, result, final)
             write_results(folder, results)
-            evidence = evidence_of_run(folder)
+            evidence = evidence_of_run(folder, results.expected and results.expected.ate)
             judged = judge(evidence)
             worst = worst_place(judged.stretches, evidence)
             if worst is not None:

@@ -171,10 +171,10 @@ def results_of(
     if log.dimension == 3:
         T_world_level = level_of(result.keyframes, result.T_world_keyframes, config.local_map)
     grid = grid_of(result, config.maps, lie.inverse(T_world_level))
-    return Results(log, config, steps, result, final, drawn, grid, _expected(result, config), T_world_level)
+    return Results(log, config, steps, result, final, drawn, grid, expected_of(result, config), T_world_level)
 
 
-def _expected(result: SlamResult, config: Config) -> ExpectedErrors | None:
+def expected_of(result: SlamResult, config: Config) -> ExpectedErrors | None:
     """Expected errors of the keyframes; None without an edge, or where these leave poses free."""
     starts = [keyframe.scan_index for keyframe in result.keyframes]
     if len(starts) < 2:

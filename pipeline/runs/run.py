@@ -29,7 +29,15 @@ from scanchain.runs.directory import (
     resumable,
 )
 from scanchain.runs.job import Job, OpenRecorder, Progress
-from scanchain.runs.metrics import Accuracy, GroundTruth, Metrics, compare_with_truth, measure, summary
+from scanchain.runs.metrics import (
+    METRICS_FILE,
+    Accuracy,
+    GroundTruth,
+    Metrics,
+    compare_with_truth,
+    measure,
+    summary,
+)
 from scanchain.runs.processing import TruePoses, process
 from scanchain.runs.provenance import Hashing, Provenance, describe_start
 from scanchain.runs.resume.journal import JOURNAL_FILE
@@ -125,7 +133,7 @@ def _run(
                     settings.source,
                     [*log.notes, *_idle_sensors(log)],
                 )
-                metrics.write(folder / "metrics.json")
+                metrics.write(folder / METRICS_FILE)
                 (folder / "summary.txt").write_text(text, encoding="utf-8")
             warnings += _complete(
                 directory, provenance, hashing, stopped, run_s + compile_s, partial(_draw, progress, report)

@@ -2,28 +2,59 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.data import Matrix, Proposal, State, Trajectory
 from scanchain.errors import InputError
+from scanchain.evaluation import ExpectedError
 from scanchain.runs.closures import VERIFICATION
-from scanchain.verdict import Closures, Evidence, Judged, check_overlap, check_velocity, check_wheels, judge
+from scanchain.runs.metrics import METRICS_FILE
+from scanchain.verdict import (
+    KNOWN,
+    Closures,
+    Evidence,
+    Judged,
+    check_overlap,
+    check_velocity,
+    check_wheels,
+    judge,
+    smallest_jump_m,
+    wheel_bound_m,
+)
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
 
+class _Known(msgspec.Struct):
+    """What a verdict takes from the metrics of a run."""
+
+    expected_ate_m: ExpectedError | None = None
+
+
 def judge_run(folder: Path) -> Judged:
     """The verdict on the tables of a run directory. Raises InputError where it has none."""
-    return judge(evidence_of_run(folder))
+    return judge(evidence_of_run(folder, expected_of_run(folder)))
 
 
-def evidence_of_run(folder: Path) -> Evidence:
+def expected_of_run(folder: Path) -> ExpectedError | None:
+    """The expected ATE in the metrics of a run directory; None where these know none."""
+    try:
+        known = msgspec.json.decode((folder / METRICS_FILE).read_bytes(), type=_Known)
+    except (OSError, msgspec.DecodeError):
+        return None
+    return known.expected_ate_m
+
+
+def evidence_of_run(folder: Path, expected: ExpectedError | None) -> Evidence:
     """Evidence of every scan in a run directory. Raises InputError where it has no tables."""
     import pyarrow.parquet as pq
 
@@ -39,16 +70,18 @@ def evidence_of_run(folder: Path) -> Evidence:
     except (OSError, ValueError) as error:
         raise InputError(f"{folder}: no steps.parquet that can be read ({error}); name a run directory") from None
     loops_file = folder / "loops.parquet"
-    return evidence_of(steps, pq.ParquetFile(loops_file).read() if loops_file.exists() else None)
+    return evidence_of(steps, pq.ParquetFile(loops_file).read() if loops_file.exists() else None, expected)
 
 
-def evidence_of(steps: pa.Table, closures: pa.Table | None) -> Evidence:
+def evidence_of(steps: pa.Table, closures: pa.Table | None, expected: ExpectedError | None = None) -> Evidence:
     """Evidence of every scan in the tables of a run."""
     dimension = 2 if steps.schema.field("covariance").type.list_size == 9 else 3
-    poses = _poses(steps, "", dimension)
+    poses = poses_of(steps, "", dimension)
     states = np.array(steps["state"].to_pylist())
     stamps_ns, log_times_ns = steps["stamp_ns"].to_numpy(), steps["log_time_ns"].to_numpy()
-    wheels = _poses(steps, "wheel_", dimension) if "wheel_x" in steps.column_names else np.full_like(poses, np.nan)
+    wheels = (
+        poses_of(steps, "wheel_", dimension) if "wheel_x" in steps.column_names else np.full_like(poses, np.nan)
+    )
     is_copy = np.zeros(len(poses), np.bool_)
     if "is_copy" in steps.column_names:  # older runs have none
         is_copy = steps["is_copy"].to_numpy(zero_copy_only=False)
@@ -65,15 +98,24 @@ def evidence_of(steps: pa.Table, closures: pa.Table | None) -> Evidence:
         velocity=check_velocity(stamps_ns, log_times_ns, poses),
         overlap=check_overlap(steps["inliers"].to_numpy() / np.maximum(steps["points"].to_numpy(), 1)),
         closures=_no_closures(poses) if closures is None else _verified(closures, dimension),
+        odometry=poses_of(steps, "odom_", dimension),
+        error="" if expected is None else f"ATE {expected.low:.3f} to {expected.high:.3f} m with 95 %",
     )
 
 
 def evidence_of_trajectory(
-    trajectory: Trajectory, log_times_ns: NDArray[np.int64], wheels: Matrix, points: NDArray[np.int64]
+    trajectory: Trajectory,
+    log_times_ns: NDArray[np.int64],
+    wheels: Matrix,
+    points: NDArray[np.int64],
+    bounds_m: Mapping[str, float] | None = None,
 ) -> Evidence:
-    """Evidence of a trajectory without matches: wheels (N, d+1, d+1), NaN where unknown, at the same scans."""
+    """Evidence of a trajectory without matches: wheels (N, d+1, d+1), NaN where unknown, at the same scans.
+
+    bounds_m : on its error, by the name of another estimate of the same motion; the wheels are one as well
+    """
     n, unknown = len(trajectory), np.zeros(len(trajectory), np.bool_)
-    return Evidence(
+    found = Evidence(
         seconds=(log_times_ns - log_times_ns[0]) * 1e-9,
         poses=trajectory.poses,
         is_lost=unknown,
@@ -87,6 +129,12 @@ def evidence_of_trajectory(
         overlap=np.full(n, np.nan),
         closures=_no_closures(trajectory.poses),
     )
+    bounds = dict(bounds_m or {})
+    if found.wheels.known_share >= KNOWN:
+        bounds["wheels"] = wheel_bound_m(trajectory.poses, wheels)
+    by = min(bounds, key=bounds.__getitem__, default="")
+    error = f"no jump above {smallest_jump_m(found.seconds):.2g} m, drift unchecked"
+    return replace(found, error=f"ATE below {bounds[by]:.2g} m by {by}" if by else error)
 
 
 def _verified(table: pa.Table, dimension: int) -> Closures:
@@ -96,7 +144,7 @@ def _verified(table: pa.Table, dimension: int) -> Closures:
     return Closures(
         table["target_scan"].to_numpy()[chosen],
         table["source_scan"].to_numpy()[chosen],
-        _poses(table, "", dimension)[chosen],
+        poses_of(table, "", dimension)[chosen],
         rejected_by[chosen] == "",
         tried=table["proposed_by"].to_pylist().count(Proposal.POSITION),
     )
@@ -107,7 +155,7 @@ def _no_closures(poses: Matrix) -> Closures:
     return Closures(nothing, nothing, poses[:0], np.empty(0, np.bool_))
 
 
-def _poses(table: pa.Table, prefix: str, dimension: int) -> Matrix:
+def poses_of(table: pa.Table, prefix: str = "", dimension: int = 3) -> Matrix:
     """(N, d+1, d+1) of the columns whose names begin so, NaN where one is null."""
     names = ("x", "y", "z", "qx", "qy", "qz", "qw")
     values = np.stack(

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scanchain import checks
 from scanchain.data import Matrix, Trajectory
@@ -21,6 +23,21 @@ from scanchain.trajectory import write_tum
 ODOMETRY_PERIOD_NS = 20_000_000
 
 
+class Slip(NamedTuple):
+    """Distance that the wheels turn ahead without moving the vehicle, evenly between two seconds of the drive."""
+
+    start_s: float
+    end_s: float
+    size_m: float
+
+    def slipped_m(self, times_s: NDArray[np.floating]) -> NDArray[np.floating]:
+        """(N,) up to each instant."""
+        return self.size_m * np.clip((times_s - self.start_s) / (self.end_s - self.start_s), 0.0, 1.0)
+
+
+NO_SLIP = Slip(0.0, 1.0, 0.0)
+
+
 def simulate(
     world: str,
     destination: str | Path,
@@ -29,6 +46,7 @@ def simulate(
     duration_s: float | None = None,
     sensor: str | None = None,
     drift: float = 1.0,
+    wheels_slip: Slip = NO_SLIP,
     noise_m: float | None = None,
     dropout: float | None = None,
     changed: int | None = None,
@@ -42,15 +60,20 @@ def simulate(
     A scan's stamp is the instant of its first ray, point times count from there, and it is recorded at its end.
     The log holds /scan or /points, /odom (50 Hz, T_odom_base, drifts), /ground_truth (T_world_lidar at the stamp
     of every scan, exact) and /tf_static (T_base_lidar); in the dropouts of a world, /odom alone goes on. ``drift``
-    multiplies the errors of the wheel odometry; ``noise_m`` and ``dropout`` replace the sensor's own; with
-    ``changed``, a seed, it is another day: furniture or parked cars came, went and moved, as .changes.csv beside
-    the log lists, and the drive is repeated with other deviations and noise;
+    multiplies the errors of the wheel odometry, which slips once by ``wheels_slip``; ``noise_m`` and ``dropout``
+    replace the sensor's own; with ``changed``, a seed, it is another day: furniture or parked cars came, went and
+    moved, as .changes.csv beside the log lists, and the drive is repeated with other deviations and noise;
     ``reverse`` drives the other way round, from ``start_m`` along that route;
     ``progress`` is called with the scans done and in all.
 
     Returns the truth, SE(2) for a laser scanner and SE(3) for a lidar.
     """
     check_range("drift", drift, 0.0, 100.0)
+    start_s, end_s, size_m = wheels_slip
+    if not (0.0 <= start_s < end_s < np.inf and np.isfinite(size_m)):
+        raise InputError(
+            f"wheels_slip from {start_s:g} to {end_s:g} s by {size_m:g} m: begin at 0 s or later, end later"
+        )
     destination = checks.path(destination, "destination")
     truth_file = destination.with_suffix(".tum")
     if truth_file.exists() and not force:
@@ -69,7 +92,10 @@ def simulate(
         reverse=reverse,
         start_m=start_m,
     )
-    truth = record(drive, destination, seed=seed, changed=changed, drift=drift, force=force, progress=progress)
+    truth = record(
+        drive, destination, seed=seed, changed=changed, drift=drift, wheels_slip=wheels_slip, force=force,
+        progress=progress,
+    )  # fmt: skip
     if changed is not None:
         write_changes(changes_file, drive.changes)
     return truth
@@ -82,6 +108,7 @@ def record(
     seed: int = 0,
     changed: int | None = None,
     drift: float = 1.0,
+    wheels_slip: Slip = NO_SLIP,
     force: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Trajectory:
@@ -91,7 +118,7 @@ def record(
     with LogWriter(destination, force=force) as log:
         log.static_transform(EPOCH_NS, "base_link", "lidar", drive.T_base_lidar)
         end_ns = int(truth.stamps_ns[-1]) - EPOCH_NS + period_ns
-        wheels = _Wheels(log, drive.motion, end_ns, drift, random_numbers(seed, WHEELS, changed))
+        wheels = _Wheels(log, drive.motion, end_ns, drift, wheels_slip, random_numbers(seed, WHEELS, changed))
         for done, sweep in enumerate(_sweeps(drive, random_numbers(seed, RANGES, changed))):
             stamp_ns = int(truth.stamps_ns[done])
             wheels.write_until(stamp_ns - 1)  # in a dropout
@@ -124,12 +151,13 @@ class _Wheels:
     """Writer of the wheel odometry up to the log's present time."""
 
     def __init__(
-        self, log: LogWriter, motion: Motion, end_ns: int, drift: float, rng: np.random.Generator
+        self, log: LogWriter, motion: Motion, end_ns: int, drift: float, slip: Slip, rng: np.random.Generator
     ) -> None:
         self._log = log
         self._stamps_ns = EPOCH_NS + np.arange(0, end_ns + 1, ODOMETRY_PERIOD_NS)
         times_s = (self._stamps_ns - EPOCH_NS) * 1e-9
-        self._poses = wheel_odometry(motion.base(times_s), drift=drift, rng=rng)
+        slips_m = np.diff(slip.slipped_m(times_s))
+        self._poses = wheel_odometry(motion.base(times_s), drift=drift, rng=rng, slips_m=slips_m)
         self._covariance = np.diag([1e-4, 1e-4, 1e-6, 1e-6, 1e-6, 1e-4]) * max(drift, 1e-3) ** 2
         self._next = 0
 

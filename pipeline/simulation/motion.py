@@ -108,11 +108,14 @@ def stand_on_ground(xy: Matrix, forward: Matrix, solids: Solids) -> Matrix:
     return stand(xy, solids.ground_height(xy), solids.ground_slope(xy), forward)
 
 
-def wheel_odometry(T_world_base: Matrix, *, drift: float, rng: np.random.Generator) -> Matrix:
+def wheel_odometry(
+    T_world_base: Matrix, *, drift: float, rng: np.random.Generator, slips_m: NDArray[np.floating] | float = 0.0
+) -> Matrix:
     """T_odom_base (N, 3, 3) that wheels report for the poses (N, 4, 4), starting at the identity.
 
     Each step is wrong by a scale and a bias that stay the same for the whole drive, drawn from ``rng``, and by
     noise that grows with the root of the distance. ``drift`` multiplies every error; 0 is the planar truth.
+    ``slips_m`` (N-1,) is what they turn ahead in a step without moving the vehicle, below 0 what they do not turn.
     """
     planar = lie.flatten(T_world_base)
     steps = lie.inverse(planar[:-1]) @ planar[1:]
@@ -120,7 +123,7 @@ def wheel_odometry(T_world_base: Matrix, *, drift: float, rng: np.random.Generat
     scale, turn, bias = drift * rng.choice([-1.0, 1.0], 3) * rng.uniform(0.5, 1.5, 3)
     noise = drift * np.sqrt(traveled)[:, None] * rng.standard_normal((len(steps), 2))
     moved = steps[:, :2, 2] * (1.0 + scale * _SCALE_SHARE)
-    moved[:, 0] += _NOISE_M * noise[:, 0]
+    moved[:, 0] += _NOISE_M * noise[:, 0] + slips_m
     turned = (
         lie.yaw(steps) * (1.0 + turn * _TURN_SHARE) + bias * _BIAS_RAD_PER_M * traveled + _NOISE_RAD * noise[:, 1]
     )

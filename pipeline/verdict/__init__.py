@@ -1,12 +1,22 @@
 """Independent checks of a trajectory, and the verdict on it."""
 
-from scanchain.verdict.checks import check_overlap, check_velocity, check_wheels
+from scanchain.verdict.checks import (
+    VELOCITY_LIMIT,
+    WHEEL_LIMIT,
+    apart_m,
+    check_overlap,
+    check_velocity,
+    check_wheels,
+    smallest_jump_m,
+    wheel_bound_m,
+)
 from scanchain.verdict.loops import Closures
-from scanchain.verdict.stretches import VELOCITY_LIMIT, WHEEL_LIMIT, Evidence, Kind, Stretch
+from scanchain.verdict.stretches import KNOWN, Evidence, Kind, Stretch
 from scanchain.verdict.verdict import MOST_CONTRADICTED, Judged, Verdict, judge
 from scanchain.verdict.worst_place import WorstPlace, worst_place
 
 __all__ = [
+    "KNOWN",
     "MOST_CONTRADICTED",
     "VELOCITY_LIMIT",
     "WHEEL_LIMIT",
@@ -17,9 +27,12 @@ __all__ = [
     "Stretch",
     "Verdict",
     "WorstPlace",
+    "apart_m",
     "check_overlap",
     "check_velocity",
     "check_wheels",
     "judge",
+    "smallest_jump_m",
+    "wheel_bound_m",
     "worst_place",
 ]

@@ -11,9 +11,11 @@ from scipy.ndimage import median_filter
 
 from scanchain import lie
 from scanchain.data import Matrix
+from scanchain.registration.svd_icp import DegeneratePairsError, rigid_transform
 
 Floats = NDArray[np.float64]
 
+WHEEL_LIMIT, VELOCITY_LIMIT = 8.0, 4.0  # largest innovations that are no finding, standard deviations
 WINDOW_M = 4.0  # path over which wheels and trajectory are compared
 _SHORTEST_M = 0.5  # shortest path of a window that is checked
 _LARGEST_CORRECTION = 0.1  # m/m and rad/m: a larger one is no calibration of the wheels
@@ -26,6 +28,9 @@ _TAIL, _TAIL_SIGMAS = 90.0, 1.645  # percentile of the residuals from which σ i
 
 _LEAST_TURN_RAD = 1.0  # turns of the wheels over a log, below which their sense is not compared
 _GRID_M, _MEDIAN = 0.1, 21  # of the medians along the path: spacing and number of values
+
+_SPUN_M = 0.5  # of path that wheels alone make in a scan, at most: of more they slip, or a reading is wrong
+_WILD = 2.0  # m/m and rad/m by which wheels are wrong in a window, above which it calibrates nothing
 
 _ACCELERATION_M_S2, _ACCELERATION_RAD_S2 = 4.0, 12.0  # σ: a fifth to a third of what vehicles and hands can do
 _MOTION_M, _MOTION_RAD = 0.05, 0.01  # σ of a motion between scans by matching
@@ -42,6 +47,7 @@ class WheelCheck(NamedTuple):
     ----------
     innovation : (N,) standard deviations
     apart_m, apart_rad : (N,) difference of the motions over ``WINDOW_M`` after calibration
+    poses : (N, d+1, d+1) of the lidar by the wheels, NaN where unknown
     turn_ratio : turns of the trajectory over those of the wheels; NaN where these turn too little to say
     known_share : share of the scans whose motion the wheels know, at rest too
     """
@@ -49,6 +55,7 @@ class WheelCheck(NamedTuple):
     innovation: Floats
     apart_m: Floats
     apart_rad: Floats
+    poses: Matrix
     turn_ratio: float = np.nan
     known_share: float = 0.0
 
@@ -64,12 +71,12 @@ def check_wheels(poses: Matrix, wheel_poses: Matrix) -> WheelCheck:
     d, n = poses.shape[-1] - 1, len(poses)
     known = np.isfinite(wheel_poses[:, 0, 0])
     nothing = np.full(n, np.nan)
-    check = WheelCheck(nothing, nothing.copy(), nothing.copy(), known_share=float(known.mean()))
+    check = WheelCheck(nothing, nothing.copy(), nothing.copy(), wheel_poses, known_share=float(known.mean()))
     ends = np.flatnonzero(known & np.concatenate([[False], known[:-1]]))
     matched, wheels = np.zeros((2, n, lie.twist_size(poses[0])))
     matched[ends] = lie.log(lie.between(poses[ends - 1], poses[ends]))
     wheels[ends] = lie.log(lie.between(wheel_poses[ends - 1], wheel_poses[ends]))
-    single_m = np.maximum(_lengths(matched[:, :d]), _lengths(wheels[:, :d]))
+    single_m = np.maximum(_lengths(matched[:, :d]), np.minimum(_lengths(wheels[:, :d]), _SPUN_M))
     single_m += _TURN_M_RAD * np.maximum(_lengths(matched[:, d:]), _lengths(wheels[:, d:]))
     path_m = np.cumsum(single_m)
     first = np.searchsorted(path_m, path_m - 0.5 * WINDOW_M, side="left")
@@ -121,11 +128,20 @@ def check_velocity(stamps_ns: NDArray[np.int64], log_times_ns: NDArray[np.int64]
         before, after = plausible_s[:-1], plausible_s[1:]
         change = motions[1:] - (after / before)[:, None] * motions[:-1]
         span_s2 = 0.5 * after * (before + after)
-        sigma_m = np.hypot(_ACCELERATION_M_S2 * span_s2, _MOTION_M)
+        sigma_m = _sigma_m(span_s2)
         sigma_rad = np.hypot(_ACCELERATION_RAD_S2 * span_s2, _MOTION_RAD)
         best = np.minimum(best, np.maximum(_lengths(change[:, :d]) / sigma_m, _lengths(change[:, d:]) / sigma_rad))
     innovation[2:] = best
     return innovation
+
+
+def smallest_jump_m(seconds: Floats) -> float:
+    """Smallest jump of a position that ``check_velocity`` finds at the usual interval of times (N,)."""
+    return VELOCITY_LIMIT * float(_sigma_m(np.median(np.diff(seconds)) ** 2)) if len(seconds) > 1 else np.inf
+
+
+def _sigma_m(span_s2: Floats | float) -> Floats:
+    return np.hypot(_ACCELERATION_M_S2 * span_s2, _MOTION_M)
 
 
 def check_overlap(inlier_share: Floats) -> Floats:
@@ -141,6 +157,26 @@ def check_overlap(inlier_share: Floats) -> Floats:
     if n > _BEFORE:
         usual[_BEFORE:] = np.median(sliding_window_view(inlier_share[:-1], _BEFORE), axis=1)
     return inlier_share / np.maximum(usual, _LEAST_USUAL)
+
+
+def apart_m(positions: Floats, others: Floats) -> float:
+    """Root mean squared distance of positions (N, d) after rigid alignment, as of an ATE."""
+    weights = np.ones(len(positions))
+    try:
+        moved = lie.transform(rigid_transform(positions, others, weights), positions)
+    except DegeneratePairsError:  # on a line, about which a rotation is free
+        moved = positions - positions.mean(axis=0) + others.mean(axis=0)
+    return float(np.sqrt(((moved - others) ** 2).sum(axis=1).mean()))
+
+
+def wheel_bound_m(poses: Matrix, wheels: Matrix) -> float:
+    """Difference of a trajectory (N, d+1, d+1) from the wheels, NaN where unknown, seen from above.
+
+    Two estimates whose errors are independent differ by more than either errs, so that this bounds its error.
+    """
+    known = np.flatnonzero(np.isfinite(wheels[:, 0, 0]))
+    level = wheels[known[0]] @ lie.between(poses[known[0]], poses[known])  # in the frame of the wheels
+    return apart_m(level[:, :2, -1], wheels[known, :2, -1])
 
 
 def _turn_ratio(matched: Matrix, wheels: Matrix, first: NDArray[np.intp], last: NDArray[np.intp]) -> float:
@@ -169,13 +205,13 @@ def _smoothed(values: Matrix, path_m: Floats) -> Matrix:
 def _calibration(inputs: Matrix, outputs: Matrix, length_m: Floats) -> Matrix:
     """Linear map from inputs (M, a) to outputs (M, b), by reweighted least squares (Cauchy) per length."""
     A, B = inputs / length_m[:, None], outputs / length_m[:, None]
-    weight = np.ones(len(A))
+    weight = (_lengths(B) < _WILD).astype(np.float64)
     correction: Matrix = np.zeros((A.shape[1], B.shape[1]))
     for _ in range(_ROUNDS):
         H = (A * weight[:, None]).T @ A + _RIDGE * len(A) * np.eye(A.shape[1])
         correction = np.linalg.solve(H, (A * weight[:, None]).T @ B).astype(np.float64, copy=False)
         error = _lengths(B - A @ correction)
-        weight = 1.0 / (1.0 + (error / max(1.5 * float(np.median(error)), 1e-3)) ** 2)
+        weight = 1.0 / (1.0 + (error / max(1.5 * float(np.median(error)), 1e-3)) ** 2) * (weight > 0.0)
     return correction
 
 

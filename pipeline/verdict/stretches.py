@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from scanchain.data import LEAST_FIT, MOST_COPIES, Matrix
-from scanchain.verdict.checks import Floats, WheelCheck
+from scanchain.verdict.checks import VELOCITY_LIMIT, WHEEL_LIMIT, Floats, WheelCheck
 from scanchain.verdict.loops import Closures, contradicting_groups
+from scanchain.verdict.slips import Slipped, which_slipped
 
-WHEEL_LIMIT, VELOCITY_LIMIT = 8.0, 4.0  # largest innovations that are no finding, standard deviations
 _LEAST_OVERLAP = 2.0 / 3.0  # smallest ``overlap`` that is no finding
 _GAP = 3.0  # intervals of usual length from which on the motion is not predicted
 _GAP_SCANS = 10  # longest gap within a stretch
@@ -34,6 +34,8 @@ class Kind(StrEnum):
     LOST = "lost"
     CONTRADICTED = "contradicted"
     WHEELS = "wheels disagree"
+    SCANS_SLIP = "scans slip"
+    WHEELS_SLIP = "wheels slip"
     ACCELERATION = "impossible acceleration"
     LOOPS = "loop closures disagree"
     DISCONNECTED = "disconnected"
@@ -63,13 +65,18 @@ class Stretch(Struct, frozen=True):
     @property
     def text(self) -> str:
         """The stretch in words."""
-        size = "" if self.size_m is None else f" by {self.size_m:.1f} m"
+        size = "" if self.size_m is None else f" by {self.size_m:,.1f} m"
         turn_rad = self.size_rad or 0.0
         if turn_rad > _SMALL_RAD:
             size += f" and {np.degrees(turn_rad):.0f} deg"
         place = f"scan {self.first:,}" if self.first == self.last else f"scans {self.first:,} to {self.last:,}"
+        return f"{place} ({self.times}): {self.kind}{size}"
+
+    @property
+    def times(self) -> str:
+        """Its seconds as text, one where both ends are the same to a digit."""
         start, end = f"{self.start_s:.1f}", f"{self.end_s:.1f}"
-        return f"{place} ({start if start == end else f'{start} to {end}'} s): {self.kind}{size}"
+        return f"{start if start == end else f'{start} to {end}'} s"
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +94,8 @@ class Evidence:
     points : valid returns
     wheels, velocity, overlap : checks
     closures : those that verification accepted
+    odometry : (N, d+1, d+1) before optimization; None where nothing was optimized
+    error : what is known of the error of a trajectory that is right everywhere, in words; empty for nothing
     """
 
     seconds: Floats
@@ -101,6 +110,8 @@ class Evidence:
     velocity: Floats
     overlap: Floats
     closures: Closures
+    odometry: Matrix | None = None
+    error: str = ""
 
     @property
     def is_contradicted(self) -> NDArray[np.bool_]:
@@ -118,19 +129,32 @@ class Evidence:
         intervals_s = np.diff(self.seconds, prepend=self.seconds[0])
         return intervals_s > _GAP * np.median(intervals_s)
 
+    @property
+    def states(self) -> str:
+        """Number of scans in each state that there is, as text; empty without matches."""
+        if not np.isfinite(self.fit).any():
+            return ""
+        marks = {"contradicted": self.is_contradicted, "degenerate": self.is_degenerate, "lost": self.is_lost}
+        counts = {name: int(is_marked.sum()) for name, is_marked in marks.items()}
+        counts = {"ok": len(self) - sum(counts.values())} | counts
+        return ", ".join(f"{count:,} {name}" for name, count in counts.items() if count)
+
     def __len__(self) -> int:
         return len(self.seconds)
 
 
 def find_stretches(evidence: Evidence) -> list[Stretch]:
-    """Every stretch, by kind and time."""
-    found = [
+    """Every stretch, by time, and those where the wheels slipped, which are none of the trajectory."""
+    measured = [
         *_of_states(evidence, Kind.LOST, evidence.is_lost),
         *_of_states(evidence, Kind.DEGENERATE, evidence.is_degenerate),
         *_of_states(evidence, Kind.CONTRADICTED, evidence.is_contradicted & _fits_badly(evidence)),
-        *_of_wheels(evidence),
-        *_of_acceleration(evidence),
         *_of_overlap(evidence),
+        *_of_acceleration(evidence),
+    ]
+    found = [
+        *measured,
+        *_of_wheels(evidence, measured),
         *_of_copies(evidence),
         *_of_loops(evidence),
         *_of_segments(evidence),
@@ -148,7 +172,8 @@ def _of_states(evidence: Evidence, kind: Kind, is_marked: NDArray[np.bool_]) -> 
         inner = merged(is_marked[part], 0 if kind is not Kind.CONTRADICTED else _GAP_SCANS)
         runs = [slice(part.start + run.start, part.start + run.stop) for run in inner]
         if any(_extent_m(evidence, run, kind) > _passed_m(evidence, run) for run in runs):
-            yield _stretch(evidence, kind, part.start, part.stop - 1, int(is_marked[part].sum()))
+            counted = evidence.is_contradicted if kind is Kind.CONTRADICTED else is_marked
+            yield _stretch(evidence, kind, part.start, part.stop - 1, int(counted[part].sum()))
 
 
 def _extent_m(evidence: Evidence, part: slice, kind: Kind) -> float:
@@ -174,11 +199,24 @@ def _fits_badly(evidence: Evidence) -> NDArray[np.bool_]:
     return (evidence.is_after_gap & ~evidence.is_held_by_wheels) | (median < LEAST_FIT)
 
 
-def _of_wheels(evidence: Evidence) -> Iterator[Stretch]:
+def _of_wheels(evidence: Evidence, measured: Sequence[Stretch]) -> Iterator[Stretch]:
+    """Stretches that wheels contradict, by which of the two slipped.
+
+    measured : stretches of badly measured scans, where closures that agree with them may be of look-alikes
+    """
     is_marked = evidence.wheels.innovation > WHEEL_LIMIT
-    for part in merged(is_marked):
-        sizes = [float(np.nanmax(each[part])) for each in (evidence.wheels.apart_m, evidence.wheels.apart_rad)]
-        yield _stretch(evidence, Kind.WHEELS, part.start, part.stop - 1, int(is_marked[part].sum()), *sizes)
+    odometry, parts = evidence.poses if evidence.odometry is None else evidence.odometry, merged(is_marked)
+    culprits = which_slipped(parts, odometry, evidence.wheels.poses, evidence.closures)
+    for part, (culprit, whole_m) in zip(parts, culprits, strict=True):
+        first, last = part.start, part.stop - 1
+        size_m, size_rad = (
+            float(np.nanmax(each[part])) for each in (evidence.wheels.apart_m, evidence.wheels.apart_rad)
+        )
+        kind = {Slipped.SCANS: Kind.SCANS_SLIP, Slipped.WHEELS: Kind.WHEELS_SLIP}.get(culprit, Kind.WHEELS)
+        if kind is Kind.WHEELS_SLIP and any(each.first <= last and first <= each.last for each in measured):
+            kind = Kind.WHEELS
+        size_m = size_m if kind is Kind.WHEELS else max(size_m, whole_m)
+        yield _stretch(evidence, kind, first, last, int(is_marked[part].sum()), size_m, size_rad)
 
 
 def _of_acceleration(evidence: Evidence) -> Iterator[Stretch]:

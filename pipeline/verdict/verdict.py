@@ -9,7 +9,7 @@ from enum import StrEnum
 import numpy as np
 
 from scanchain import lie
-from scanchain.data import LEAST_FIT
+from scanchain.data import LEAST_FIT, Matrix
 from scanchain.verdict.checks import WINDOW_M
 from scanchain.verdict.stretches import KNOWN, Evidence, Kind, Stretch, find_stretches
 from scanchain.words import counted
@@ -23,6 +23,7 @@ _UNMEASURED = (Kind.DEGENERATE, Kind.LOST, Kind.CONTRADICTED, Kind.OVERLAP)
 _MOST_OPEN = 0.2  # largest share of degenerate scans of a trajectory that is trustworthy
 _MEDIAN_LIMIT = 2.0  # largest median innovation of the wheels; about 1 where their calibration and σ are right
 _REST_M, _REST_RAD, _REST_M_S = 1.0, 0.5, 0.1  # extent and speed of a trajectory, up to which it is one of rest
+_MOST_OPEN_AT_REST = 0.05  # largest share of scans that leave a direction open, of those that show a rest
 _FEWEST_TRIED, _LEAST_ACCEPTED = 10, 0.2  # loop closures that must be tried, and share of them that must fit
 _OPPOSED = -0.5  # turns of the trajectory over those of the wheels, below which one of the two is mirrored
 _SHOWN = 3  # stretches that the sentence lists
@@ -42,16 +43,23 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """A verdict, its reasons in words, and the suspicious stretches."""
+    """A verdict, its reasons in words, the suspicious stretches, and the error that it vouches for in words."""
 
     verdict: Verdict
     reason: str
-    stretches: tuple[Stretch, ...]
+    stretches: tuple[Stretch, ...] = ()
+    error: str = ""
+
+    @property
+    def vouched(self) -> str:
+        """The error as far as it is vouched for: elsewhere than in the stretches to check, or not at all."""
+        words = {Verdict.TRUSTWORTHY: "", Verdict.CHECK: "otherwise "}
+        return f"{words[self.verdict]}{self.error}" if self.error and self.verdict in words else ""
 
     @property
     def sentence(self) -> str:
-        """Verdict and reasons."""
-        return f"{self.verdict}: {self.reason}"
+        """Verdict, error and reasons."""
+        return f"{self.verdict}{f' ({self.vouched})' if self.vouched else ''}: {self.reason}"
 
     @property
     def unnamed(self) -> tuple[Stretch, ...]:
@@ -65,17 +73,25 @@ def judge(evidence: Evidence) -> Judged:
     Not trustworthy is one most of which is predicted, many of whose scans are contradicted, that accelerates
     impossibly, that the wheels contradict where it is not well measured, or that loop closures and wheels
     contradict at the same place by about the same distance. To be checked is any with a suspicious stretch, and
-    one that is suspicious as a whole: it does not move, wheels disagree all along, many scans are degenerate, or
-    revisited places do not look as mapped.
+    one that is suspicious as a whole: nothing shows whether it moves, wheels disagree all along, many scans are
+    degenerate, or revisited places do not look as mapped. Wheels that slipped, as scans and closures or the wheels
+    themselves show, are named and count for nothing.
     """
-    stretches = tuple(find_stretches(evidence))
-    reasons = list(_grave(evidence, stretches))
-    if reasons:
-        return Judged(Verdict.NOT_TRUSTWORTHY, "; ".join(reasons), stretches)
-    doubts = list(_doubts(evidence, stretches))
-    if doubts:
-        return Judged(Verdict.CHECK, "; ".join(doubts), stretches)
-    return Judged(Verdict.TRUSTWORTHY, f"no contradiction in {counted(len(evidence), 'scan')}{_by(evidence)}", ())
+    found = find_stretches(evidence)
+    stretches = tuple(each for each in found if each.kind is not Kind.WHEELS_SLIP)
+    slips = [f"{each.kind} at {each.times} ({each.size_m:,.1f} m)" for each in found if each not in stretches]
+    rest = _Rest.of(evidence)
+    notes = [*([rest.text] if rest.is_shown else []), *slips]
+    error = evidence.error or (f"error below {rest.extent_m:.2g} m" if rest.is_shown else "error unknown")
+    verdict, reasons = Verdict.NOT_TRUSTWORTHY, list(_grave(evidence, stretches))
+    if not reasons:
+        verdict, reasons = Verdict.CHECK, list(_doubts(evidence, stretches, rest))
+    if not reasons:
+        verdict, reasons = (
+            Verdict.TRUSTWORTHY,
+            list(_nothing(evidence)),
+        )
+    return Judged(verdict, "; ".join([*reasons, *notes]), stretches, error)
 
 
 def _grave(evidence: Evidence, stretches: Sequence[Stretch]) -> Iterator[str]:
@@ -86,6 +102,8 @@ def _grave(evidence: Evidence, stretches: Sequence[Stretch]) -> Iterator[str]:
     jumps = [each for each in stretches if each.kind is Kind.ACCELERATION and (each.size_m or 0.0) > _LARGE_M]
     if jumps:
         yield _listed(jumps)
+    for slip in (each for each in stretches if each.kind is Kind.SCANS_SLIP):
+        yield f"{slip.kind} at {slip.times} ({slip.size_m:,.1f} m): wheels and loop closures agree with each other"
     slips = [each for each in stretches if each.kind is Kind.WHEELS]
     for slip in slips:
         cause = next((each for each in stretches if each.kind in _UNMEASURED and _overlap(each, slip)), None)
@@ -119,11 +137,13 @@ def _confirms(slip: Stretch, loop: Stretch) -> bool:
 
 
 def _many_contradicted(evidence: Evidence) -> Iterator[str]:
+    total = int(evidence.is_contradicted.sum())
     count = int((evidence.is_contradicted & ~evidence.is_held_by_wheels).sum())
     if count > MOST_CONTRADICTED * len(evidence):
+        held = f", {total - count:,} of them where the wheels agree" if count < total else ""
         yield (
-            f"{count:,} of {len(evidence):,} scans contradict the map where they were placed (fit below "
-            f"{LEAST_FIT:g}): the motion between scans may be larger than the search, or the log is "
+            f"{total:,} of {len(evidence):,} scans are contradicted by the map where they were placed (fit below "
+            f"{LEAST_FIT:g}{held}): the motion between scans may be larger than the search, or the log is "
             "at fault (scanchain doctor)"
         )
 
@@ -144,9 +164,10 @@ def _mostly_predicted(evidence: Evidence) -> Iterator[str]:
         yield f"{line}: the surroundings do not constrain it there, or the log is faulty (scanchain doctor)"
 
 
-def _doubts(evidence: Evidence, stretches: Sequence[Stretch]) -> Iterator[str]:
+def _doubts(evidence: Evidence, stretches: Sequence[Stretch], rest: _Rest) -> Iterator[str]:
     yield from _opposed(evidence)
-    yield from _at_rest(evidence)
+    if rest.is_there and not rest.is_shown:
+        yield rest.text
     yield from _unlike_wheels(evidence)
     yield from _degenerate(evidence)
     yield from _unlike_map(evidence)
@@ -154,20 +175,43 @@ def _doubts(evidence: Evidence, stretches: Sequence[Stretch]) -> Iterator[str]:
         yield _listed(stretches)
 
 
-def _at_rest(evidence: Evidence) -> Iterator[str]:
-    """A trajectory that stays where it began, without wheels that say so."""
-    if evidence.wheels.known_share >= KNOWN:
-        return
-    motion = np.abs(lie.log(lie.between(evidence.poses[:1], evidence.poses)))
-    d = evidence.poses.shape[-1] - 1
-    positions, seconds = evidence.poses[:, :-1, -1], float(evidence.seconds[-1])
-    extent_m = float(np.linalg.norm(positions - positions[0], axis=1).max())
-    limit_m = min(_REST_M, _REST_M_S * seconds)
-    if extent_m < limit_m and motion[:, d:].max() < _REST_RAD:
-        yield (
-            f"the trajectory stays within {extent_m:.2f} m for {seconds:.1f} s: the lidar was at rest, or moved "
-            "where everything it sees looks the same or moves along; nothing in the log tells which"
-        )
+@dataclass(frozen=True, slots=True)
+class _Rest:
+    """Whether a trajectory stays where it began, and whether anything shows that the lidar did.
+
+    Scans that constrain every direction show it, as do wheels. Along a direction that they leave open, a lidar in
+    motion sees the same as one at rest.
+    """
+
+    is_there: bool
+    is_shown: bool
+    extent_m: float
+    text: str
+
+    @classmethod
+    def of(cls, evidence: Evidence) -> _Rest:
+        motion = np.abs(lie.log(lie.between(evidence.poses[:1], evidence.poses)))
+        d = evidence.poses.shape[-1] - 1
+        seconds, has_wheels = float(evidence.seconds[-1]), evidence.wheels.known_share >= KNOWN
+        extent_m, limit_m = _extent_m(evidence.poses), min(_REST_M, _REST_M_S * seconds)
+        is_there = bool(extent_m < limit_m and motion[:, d:].max() < _REST_RAD)
+        is_there &= not has_wheels or _extent_m(evidence.wheels.poses) < limit_m
+        is_open = evidence.is_degenerate | evidence.is_lost | evidence.is_contradicted
+        is_observed = bool(np.isfinite(evidence.fit).any() and is_open.mean() <= _MOST_OPEN_AT_REST)
+        is_shown = is_there and (is_observed or has_wheels)
+        text = f"does not move (stays within {extent_m:.3f} m for {seconds:.1f} s)"
+        if not is_shown:
+            text = (
+                f"stays within {extent_m:.2f} m for {seconds:.1f} s: at rest, or in motion along a direction in "
+                "which everything looks the same; nothing in the log tells which"
+            )
+        return cls(is_there, is_shown, extent_m, text)
+
+
+def _extent_m(poses: Matrix) -> float:
+    """Largest distance of poses (N, d+1, d+1) from the first that is known."""
+    positions = poses[np.isfinite(poses[:, 0, 0]), :-1, -1]
+    return float(np.linalg.norm(positions - positions[0], axis=1).max())
 
 
 def _unlike_wheels(evidence: Evidence) -> Iterator[str]:
@@ -211,13 +255,16 @@ def _listed(stretches: Sequence[Stretch]) -> str:
     return "; ".join(each.text for each in largest) + (f"; and {more:,} more" if more else "")
 
 
-def _by(evidence: Evidence) -> str:
-    """Names of the checks that were made, as text."""
-    checks = [
-        *(["fit"] if np.isfinite(evidence.fit).any() else []),
-        *(["overlap"] if np.isfinite(evidence.overlap).any() else []),
-        *(["constant velocity"] if np.isfinite(evidence.velocity).any() else []),
-        *(["wheels"] if np.isfinite(evidence.wheels.innovation).any() else []),
-        *(["loop closures"] if len(evidence.closures.target) else []),
-    ]
-    return f" (checked by {', '.join(checks)})" if checks else ""
+def _nothing(evidence: Evidence) -> Iterator[str]:
+    """That no check found anything, with the states of the scans and the checks that were made."""
+    states = f": {evidence.states}" if evidence.states else ""
+    yield f"nothing to check in {counted(len(evidence), 'scan')}{states}"
+    checks = {
+        "fit": evidence.fit,
+        "overlap": evidence.overlap,
+        "constant velocity": evidence.velocity,
+        "wheels": evidence.wheels.innovation,
+        "loop closures": evidence.closures.target,
+    }
+    if made := [name for name, values in checks.items() if np.isfinite(values).any()]:
+        yield f"checked by {', '.join(made)}"

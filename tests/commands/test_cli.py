@@ -447,7 +447,7 @@ def test_a_run_whose_scans_tell_too_little_says_so_first_and_fails_with_its_resu
     for summary in (output, (out / "summary.txt").read_text()):
         assert summary.splitlines()[0] == f"verdict        not trustworthy: {why}"
         assert summary.splitlines()[1].startswith(f"{path} /radar")
-    says((out / "report.html").read_text(), why.replace("'", "&#39;"))
+    says((out / "report.html").read_text(), *why.replace("'", "&#39;").split("; "))
     assert json.loads((out / "run.json").read_text())["complete"] and (out / "map.ply").exists()
     code, output, errors = call("run", path, "--out", out, "--force", "--rerun", "off", "--json")
     assert code == 1 and json.loads(output)["verdict"] == metrics["verdict"] == "not trustworthy"
@@ -471,11 +471,17 @@ def test_a_run_of_the_office_is_trustworthy_and_so_is_its_true_trajectory_but_no
     assert code == 0 and metrics["verdict"] == "trustworthy" and metrics["stretches"] == []
     code, output, _ = call("check", out, "--json")
     assert code == 0 and json.loads(output) == {
-        name: metrics[name] for name in ("verdict", "verdict_reason", "stretches")
+        name: metrics[name] for name in ("verdict", "verdict_error", "verdict_reason", "stretches")
     }
+    expected = metrics["expected_ate_m"]
+    assert metrics["verdict_error"] == f"ATE {expected['low']:.3f} to {expected['high']:.3f} m with 95 %"
+    first, *_ = (out / "summary.txt").read_text().splitlines()
+    assert first == f"verdict        trustworthy ({metrics['verdict_error']}): {metrics['verdict_reason']}"
+    assert metrics["verdict_reason"].startswith(f"nothing to check in 60 scans: {metrics['ok']} ok")
     truth = office.with_suffix(".tum")
     code, output, _ = call("check", "--trajectory", truth, office)
-    assert code == 0 and output.startswith("trustworthy: ") and "wheels" in output
+    (bound_m,) = map(float, re.findall(r"^trustworthy \(ATE below ([\d.]+) m by scan matching\): ", output))
+    assert code == 0 and 0.0 < bound_m < 0.1 and "wheels" in output
     poses = read_tum(truth)
     poses.poses[len(poses) // 2 :, 0, 3] += 3.0
     write_tum(tmp_path / "jump.tum", poses)

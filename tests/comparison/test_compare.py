@@ -3,6 +3,7 @@
 import csv
 import itertools
 import json
+import re
 
 import msgspec
 import numpy as np
@@ -186,6 +187,20 @@ def test_a_verdict_fails_nothing_and_a_method_that_did_not_finish_does(office, g
     output = capfd.readouterr()
     assert output.err == "error: did not finish: plicp; see the table for the reason\n"
     assert "plicp: not trustworthy: most are lost" in output.out
+
+
+def test_every_verdict_names_the_error_that_its_checks_resolve(good):
+    table, _ = good
+    ours = ("plicp", "svd+loops", "coarse")
+    for each in table.rows:
+        bounds = re.findall(r"ATE ([\d.]+) to ([\d.]+) m with 95 %", each.verdict_error)
+        others = re.findall(r"ATE below ([\d.]+) m by (?:plicp|svd\+loops|coarse|wheels)", each.verdict_error)
+        assert (len(bounds), len(others)) == ((1, 0) if each.name in ours else (0, 1)), each.verdict_error
+        if each.name in ours and each.verdict == "trustworthy":
+            assert each.vouched == f"trustworthy, {each.verdict_error}"
+            assert each.vouched in text(table) and each.vouched in markdown(table)
+        elif each.name not in ours:
+            assert each.figures.ate_m < 1.05 * float(others[0])
 
 
 def test_where_all_fail_the_tables_still_say_how(office, tmp_path):

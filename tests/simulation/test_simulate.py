@@ -1,5 +1,7 @@
 """Simulated sequences: the truth is true, the log says what the sensor saw, the same seed gives the same bytes."""
 
+import html
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -9,9 +11,11 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
+import scanchain
 from scanchain import catalog, lie
+from scanchain.__main__ import main
 from scanchain.errors import InputError
-from scanchain.simulation import SENSORS, WORLDS, plan, simulate
+from scanchain.simulation import NO_SLIP, SENSORS, WORLDS, Slip, plan, simulate
 from scanchain.simulation.motion import wheel_odometry
 from scanchain.simulation.sensors import take_sweep
 from scanchain.simulation.solids import Solids
@@ -515,6 +519,36 @@ def test_wheel_odometry_drifts_more_the_larger_the_drift(drives, name):
         errors.append(np.linalg.norm(odometry[:, :2, 2] - truth[:, :2, 2], axis=1).max() / length)
     assert errors[0] < errors[1] < errors[2]
     assert 0.002 < errors[1] < 0.1
+
+
+def test_wheels_slip_once_between_two_seconds_and_nowhere_else(tmp_path):
+    logs = {}
+    for name, slip in (("straight", NO_SLIP), ("slips", Slip(2.0, 3.0, 1.5)), ("stands", Slip(2.0, 3.0, -0.4))):
+        simulate("office", tmp_path / f"{name}.mcap", duration_s=5.0, drift=0.0, wheels_slip=slip)
+        places = [each.pose.pose.position for _, each in messages(tmp_path / f"{name}.mcap", "/odom")]
+        logs[name] = np.array([(place.x, place.y) for place in places])
+    steps_m = {name: np.linalg.norm(np.diff(each, axis=0), axis=1) for name, each in logs.items()}
+    for name, size_m in (("slips", 1.5), ("stands", -0.4)):
+        more_m = steps_m[name] - steps_m["straight"]
+        assert more_m[100:150].sum() == pytest.approx(size_m, abs=0.05)
+        assert np.abs(more_m[:99]).max() < 1e-6 and np.abs(more_m[151:]).max() < 1e-6
+    with pytest.raises(InputError, match="wheels_slip from 3 to 2 s"):
+        simulate("office", tmp_path / "a.mcap", wheels_slip=Slip(3.0, 2.0, 1.0))
+
+
+def test_wheels_that_slip_are_named_and_doubt_no_run_that_closes_loops_around(tmp_path):
+    code = main(
+        ["simulate", "office", str(tmp_path / "a.mcap"), "--duration", "60", "--wheels-slip", "20", "24", "6"]
+    )
+    metrics = scanchain.run(tmp_path / "a.mcap", tmp_path / "run", recording=False).metrics
+    assert code == 0 and metrics.verdict == "trustworthy" and metrics.stretches == ()
+    start_s, end_s, size_m = map(
+        float, re.findall(r"wheels slip at ([\d.]+) to ([\d.]+) s \(([\d.]+) m\)", metrics.verdict_reason)[0]
+    )
+    assert 19.0 < start_s < 21.0 and 23.0 < end_s < 25.0 and 4.0 < size_m < 6.5
+    stated = metrics.ground_truth.optimized.kitti_definition
+    page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert "stretches of 10, 20, 40 m from every pose" in stated and stated in html.unescape(page)
 
 
 # --- the log ---------------------------------------------------------------------------------------------------

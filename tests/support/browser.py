@@ -12,7 +12,7 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"
 _NARROWEST = 500  # pixels of Chromium's window
 _PROBE = """
 <script>
-const texts = [...document.querySelectorAll("figure > svg")].map(svg => {
+const texts = [...document.querySelectorAll("figure > svg")].filter(svg => svg.clientWidth).map(svg => {
   const frame = svg.getBoundingClientRect();
   const boxes = [...svg.querySelectorAll("text")].map(t => [t.textContent, t.getBoundingClientRect()]);
   const cut = boxes.filter(([, b]) => b.left < frame.left - 1 || b.right > frame.right + 1 ||
@@ -23,12 +23,14 @@ const texts = [...document.querySelectorAll("figure > svg")].map(svg => {
     const height = Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top);
     if (width > 1 && height > 3) overlapping.push(t + " | " + u);
   }));
-  return {width: frame.width, height: frame.height, cut, overlapping};
+  const letters = Math.min(...boxes.map(([, b]) => Math.min(b.width, b.height)).filter(size => size > 0));
+  return {width: frame.width, height: frame.height, letters, cut, overlapping};
 });
+const scrolled = [...document.querySelectorAll("figure")].filter(f => f.scrollWidth > f.clientWidth + 1).length;
 const outside = [...document.querySelectorAll("main *")].filter(e => !e.closest(".scroll, svg") &&
   e.getBoundingClientRect().right > document.documentElement.clientWidth + 1).map(e => e.tagName);
 window.parent.document.title = "PROBE" + JSON.stringify({
-  svgs: texts, outside, scripts: document.scripts.length, wide: document.documentElement.scrollWidth,
+  svgs: texts, outside, scrolled, scripts: document.scripts.length, wide: document.documentElement.scrollWidth,
   width: document.documentElement.clientWidth, paper: getComputedStyle(document.body).backgroundColor,
   tables: document.querySelectorAll("table").length, rows: document.querySelectorAll("table tbody tr").length,
   names: Math.max(0, ...[...document.querySelectorAll("tbody th")].map(e => e.getBoundingClientRect().width)),

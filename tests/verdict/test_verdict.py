@@ -1,5 +1,6 @@
 """The verdict on made-up trajectories: right ones are trustworthy; slips, jumps and wrong loops are named."""
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -12,7 +13,7 @@ from scanchain import lie
 from scanchain.data import Trajectory
 from scanchain.runs.overlay import read_overlay, write_overlay
 from scanchain.runs.step_table import StepTable
-from scanchain.runs.vouching import evidence_of
+from scanchain.runs.vouching import evidence_of, evidence_of_trajectory
 from scanchain.verdict import (
     Closures,
     Evidence,
@@ -21,10 +22,12 @@ from scanchain.verdict import (
     Stretch,
     Verdict,
     WorstPlace,
+    apart_m,
     check_overlap,
     check_velocity,
     check_wheels,
     judge,
+    wheel_bound_m,
     worst_place,
 )
 from scanchain.viz.stretch_colors import STRETCH_COLORS
@@ -151,6 +154,126 @@ def test_a_slip_that_agreeing_loops_confirm_is_not_trustworthy():
     assert "wheels disagree" in judged.reason and "4 loop closures between scans 25 and 610" in judged.reason
 
 
+def closed(poses, *, by_m=0.01):
+    """Six accepted closures around the middle of a course, as measured at these poses."""
+    pairs = np.array([(10 + 5 * k, 610 + 5 * k) for k in range(6)])
+    off = [lie.pose_2d(*each) for each in np.random.default_rng(3).normal(0.0, [by_m, by_m, 0.001], (6, 3))]
+    T = lie.between(poses[pairs[:, 0]], poses[pairs[:, 1]]) @ np.array(off)
+    return Closures(pairs[:, 0], pairs[:, 1], T, np.ones(6, bool))
+
+
+def test_wheels_that_slip_are_the_suspect_where_closures_around_agree_with_the_scans():
+    poses, stalled = course(slip=(300, 330))
+    found = evidence(poses, wheels=wheels_of(stalled))  # the wheels stood still while the robot slid on
+    alone = judge(found)
+    assert alone.verdict is Verdict.CHECK and "wheels disagree" in alone.reason
+    judged = judge(replace(found, closures=closed(poses)))
+    assert judged.verdict is Verdict.TRUSTWORTHY and judged.stretches == ()
+    start_s, end_s, size_m = map(float, re.findall(r"wheels slip at (.+) to (.+) s \((.+) m\)", judged.reason)[0])
+    assert 54.0 < start_s < 62.0 and 64.0 < end_s < 72.0 and 2.0 < size_m < 3.5
+
+
+def test_scans_that_slip_are_the_suspect_where_closures_around_agree_with_the_wheels():
+    truth, slipped = course(slip=(300, 330))
+    found = evidence(slipped, wheels=wheels_of(truth))
+    judged = judge(replace(found, closures=closed(truth)))
+    assert judged.verdict is Verdict.NOT_TRUSTWORTHY
+    assert "scans slip at" in judged.reason and "wheels and loop closures agree with each other" in judged.reason
+    (stretch,) = (each for each in judged.stretches if each.kind is Kind.SCANS_SLIP)
+    assert stretch.first <= 300 and stretch.last >= 325 and 2.0 < stretch.size_m < 3.5
+
+
+def test_closures_acquit_no_scans_that_are_badly_measured_and_none_that_they_do_not_span():
+    poses, stalled = course(slip=(300, 330))
+    found = replace(evidence(poses, wheels=wheels_of(stalled)), closures=closed(poses))
+    doubtful = replace(found, is_degenerate=marked(290, 340))
+    assert judge(doubtful).verdict is Verdict.NOT_TRUSTWORTHY
+    poses, stalled = course(slip=(800, 830))
+    beside = replace(evidence(poses, wheels=wheels_of(stalled)), closures=closed(poses))
+    assert judge(beside).verdict is Verdict.CHECK
+
+
+@pytest.mark.parametrize("jump_m", [6.0, 1e6])
+def test_wheels_that_jump_are_wrong_without_closures(jump_m):
+    poses, _ = course()
+    wheels = wheels_of(poses)
+    wheels[600:, 0, 2] += jump_m
+    judged = judge(evidence(poses, wheels=wheels))
+    assert judged.verdict is Verdict.TRUSTWORTHY and f"s ({jump_m:,.0f}"[:4] in judged.reason
+    once = wheels_of(poses)
+    once[600, 0, 2] += jump_m
+    assert judge(evidence(poses, wheels=once)).verdict is Verdict.TRUSTWORTHY
+
+
+def test_a_verdict_counts_states_as_the_scans_have_them():
+    poses, _ = course()
+    fit = np.where(np.arange(N) % 40 == 0, 0.4, 0.9)
+    judged = judge(evidence(poses, fit=fit, is_degenerate=marked(5, 8)))
+    assert judged.verdict is Verdict.TRUSTWORTHY and "contradiction" not in judged.sentence
+    assert "nothing to check in 1,200 scans: 1,166 ok, 30 contradicted, 4 degenerate; checked by" in judged.reason
+
+
+def test_a_stretch_counts_every_contradicted_scan_within_it():
+    poses, _ = course()
+    fit = np.where(marked(300, 340), 0.5, 0.9)
+    fit[345] = 0.5  # alone
+    (stretch,) = judge(evidence(poses, fit=fit)).stretches
+    assert stretch.scans == int((fit[stretch.first : stretch.last + 1] < 0.6).sum())
+
+
+@pytest.mark.parametrize("share", [0.3, 0.09])
+def test_many_contradicted_scans_are_counted_as_in_the_summary_also_where_wheels_agree(share):
+    poses, _ = course()
+    fit = np.where(np.arange(N) < share * N, 0.4, 0.9)
+    held = wheels_of(poses)
+    held[100:] = np.nan
+    judged = judge(evidence(poses, fit=fit, wheels=held))
+    counted = f"{int((fit < 0.6).sum()):,} of 1,200 scans are contradicted"
+    assert (counted in judged.reason) is (share > 0.1)
+
+
+def test_a_verdict_names_the_error_that_it_vouches_for_where_it_vouches():
+    poses, _ = course()
+    right = replace(evidence(poses), error="ATE 0.010 to 0.020 m with 95 %")
+    assert judge(right).sentence.startswith("trustworthy (ATE 0.010 to 0.020 m with 95 %): nothing to check")
+    doubted = replace(right, fit=np.where(marked(300, 330), 0.5, 0.9))
+    assert judge(doubted).sentence.startswith("check these stretches (otherwise ATE 0.010 to 0.020 m with 95 %): ")
+    wrong = replace(right, is_lost=marked(100, 1000))
+    assert judge(wrong).sentence.startswith("not trustworthy: ")
+
+
+@pytest.mark.parametrize("error_m", [0.05, 0.5])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_error_of_another_tool_is_below_its_distance_to_an_independent_estimate(dimension, error_m):
+    truth, _ = course(dimension)
+    rng = np.random.default_rng(4)
+    estimate, other = (
+        truth
+        @ lie.exp(
+            np.cumsum(
+                rng.normal(0.0, error_m / 20.0, (N, 3 * dimension - 3))
+                * ([1.0] * 2 + [0.0] * (3 * dimension - 5)),
+                axis=0,
+            )
+        )
+        for _ in range(2)
+    )
+    positions = [poses[:, :-1, -1] for poses in (estimate, other, truth)]
+    bound_m, true_m = apart_m(positions[0], positions[1]), apart_m(positions[0], positions[2])
+    assert 0.5 * true_m < bound_m < 4.0 * true_m
+    assert wheel_bound_m(estimate, other) == pytest.approx(bound_m, rel=0.2)
+    unknown = np.full_like(truth, np.nan)
+    times_ns = (1e9 * INTERVAL_S * np.arange(N)).astype(np.int64)
+    trajectory = Trajectory(times_ns, estimate)
+    for wheels, bounds, error in (
+        (unknown, {}, "no jump above 0.67 m, drift unchecked"),
+        (other, {}, f"ATE below {wheel_bound_m(estimate, other):.2g} m by wheels"),
+        (other, {"ours": 0.001}, "ATE below 0.001 m by ours"),
+    ):
+        found = evidence_of_trajectory(trajectory, times_ns, wheels, np.full(N, 500), bounds)
+        assert judge(found).error == error
+
+
 @pytest.mark.parametrize(("count", "verdict"), [(2, Verdict.TRUSTWORTHY), (3, Verdict.CHECK)])
 def test_rejected_closures_that_agree_with_each_other_are_a_finding_from_three_on(count, verdict):
     poses, _ = course()
@@ -274,14 +397,30 @@ def test_a_corridor_that_the_wheels_hold_is_to_be_checked_and_not_wrong():
     assert judge(evidence(poses, wheels=wheels, is_degenerate=marked(300, 330))).verdict is Verdict.TRUSTWORTHY
 
 
-def test_a_trajectory_that_stays_where_it_began_is_to_be_checked_unless_the_wheels_rest_too():
+@pytest.mark.parametrize("open_scans", [8, 40])
+def test_a_trajectory_that_does_not_move_is_at_rest_unless_scans_leave_a_direction_open(open_scans):
     rng = np.random.default_rng(0)
     rested = chained(np.zeros((200, 3)), rng, 0.001)
-    judged = judge(evidence(rested))
-    assert judged.verdict is Verdict.CHECK and "the lidar was at rest, or moved" in judged.reason
-    assert judge(evidence(rested, wheels=chained(np.zeros((200, 3)), rng))).verdict is Verdict.TRUSTWORTHY
+    is_open = np.arange(201) % 200 < open_scans
+    judged = judge(evidence(rested, is_degenerate=is_open))
+    if open_scans == 8:
+        assert judged.verdict is Verdict.TRUSTWORTHY and judged.error == "error below 0.015 m"
+        assert "does not move (stays within 0.015 m for 40.0 s)" in judged.reason
+    else:
+        assert judged.verdict is Verdict.CHECK and "nothing in the log tells which" in judged.reason
+        assert "does not move" not in judged.reason
     turning = chained(np.tile([0.0, 0.0, 0.05], (200, 1)), rng, 0.001)
-    assert judge(evidence(turning)).verdict is Verdict.TRUSTWORTHY
+    assert "stays within" not in judge(evidence(turning)).reason
+
+
+def test_of_a_trajectory_that_does_not_move_the_wheels_say_whether_the_lidar_rested():
+    rng = np.random.default_rng(0)
+    rested, is_open = chained(np.zeros((200, 3)), rng, 0.001), np.ones(201, bool)
+    still = judge(evidence(rested, wheels=chained(np.zeros((200, 3)), rng), is_degenerate=is_open & False))
+    assert still.verdict is Verdict.TRUSTWORTHY and "does not move" in still.reason
+    rolled = wheels_of(chained(np.tile([0.1, 0.0, 0.0], (200, 1)), rng))
+    moved = judge(evidence(rested, wheels=rolled, is_degenerate=is_open))
+    assert moved.verdict is not Verdict.TRUSTWORTHY and "does not move" not in moved.reason
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

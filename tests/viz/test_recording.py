@@ -535,7 +535,7 @@ def test_the_verdict_is_recorded_as_text_with_its_stretches_as_lines_and_events(
         Stretch(Kind.LOOPS, 5, 50, 4, 0.5, 5.0, 2.0),
         Stretch(Kind.WHEELS, 20, 30, 9, 2.0, 3.0, 1.5),
     )
-    judged = Judged(Verdict.CHECK, "; ".join(each.text for each in stretches), stretches)
+    judged = Judged(Verdict.CHECK, "; ".join(each.text for each in stretches), stretches, "ATE below 1 m")
     with Recording(
         tmp_path / "a.rrd", dimension=2, name="a", sinks=frozenset({"save"}), config=RecordingConfig()
     ) as r:
@@ -555,7 +555,8 @@ def test_the_verdict_is_recorded_as_text_with_its_stretches_as_lines_and_events(
     (strips,) = statics[entities.STRETCHES].column("LineStrips3D:strips").to_pylist()
     assert [len(strip) for strip in strips] == [2, 12]
     (document,) = statics[entities.VERDICT].column("TextDocument:text").to_pylist()
-    assert document[0].startswith("## check these stretches") and stretches[0].text in document[0]
+    assert document[0].startswith("## check these stretches\n\notherwise ATE below 1 m\n")
+    assert stretches[0].text in document[0]
 
 
 def test_the_legend_has_no_table_whose_lines_the_viewer_would_cut_off(tmp_path):

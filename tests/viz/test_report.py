@@ -10,6 +10,7 @@ from base64 import b64decode, b64encode
 from hashlib import sha256
 from types import SimpleNamespace
 
+import msgspec
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -23,10 +24,11 @@ from scanchain.comparison.figures import COLUMNS
 from scanchain.comparison.table import read_table
 from scanchain.logs.writing.writer import LogWriter
 from scanchain.maps import read_ply
+from scanchain.runs.metrics import Metrics
 from scanchain.runs.overlay import OVERLAY_FILE
 from scanchain.simulation import simulate
-from scanchain.verdict import Kind, Stretch
-from scanchain.viz.pictures.map_figures import AFTER, BEFORE, surroundings
+from scanchain.verdict import Judged, Kind, Stretch, Verdict
+from scanchain.viz.pictures.map_figures import AFTER, BEFORE, path_over_map, surroundings
 from scanchain.viz.pictures.trajectory_figures import DrawnTrajectory, PathLine, plan
 from scanchain.viz.report.page import Chip, Collapsible, Drawing, Grid, Head, Page, Row, Section, write_page
 from scanchain.viz.report.run import write_run_report
@@ -100,6 +102,7 @@ def test_nothing_is_cut_and_nothing_overlaps(which, width, dark, request, tmp_pa
     for number, drawing in enumerate(seen["svgs"]):
         assert drawing["cut"] == [] and drawing["overlapping"] == [], number
         assert drawing["width"] > 200 and drawing["height"] > 80
+    assert seen["scrolled"] == 0
     assert seen["paper"] == ("rgb(20, 23, 27)" if dark else "rgb(255, 255, 255)")
 
 
@@ -193,7 +196,38 @@ def test_a_run_tells_its_result_first_and_its_time_last(one_run):
         "Time per scan", "How it was made",
     ]  # fmt: skip
     facts = re.findall(r"<dt>(.*?)</dt>", page)
-    assert facts[:3] == ["verdict", "trajectory", "accuracy"] and facts[-2:] == ["speed", "machine"]
+    assert facts[:2] == ["trajectory", "accuracy"] and facts[-2:] == ["speed", "machine"]
+
+
+@pytest.mark.parametrize("verdict", list(Verdict))
+def test_the_verdict_stands_at_the_head_in_its_color_with_its_error_and_a_line_a_reason(tmp_path, verdict):
+    judged = Judged(verdict, "first <b>; second", error="ATE below 1 m")
+    write_page(tmp_path / "a.html", Page("title", "", (("fact", "1"),), ("warned",), (), (), judged=judged))
+    page = (tmp_path / "a.html").read_text(encoding="utf-8").partition("<main>")[2]
+    (head,) = re.findall(r'<div class="verdict ([\w-]+)"', page)
+    assert head == verdict.replace(" ", "-")
+    assert f"<strong>{verdict}</strong>" in page and "<li>first &lt;b&gt;</li><li>second</li>" in page
+    assert page.index("<strong>") < page.index("warned") < page.index("<dt>fact")
+    assert ("ATE below 1 m" in page) is (verdict is not Verdict.NOT_TRUSTWORTHY)
+    assert ("otherwise ATE" in page) is (verdict is Verdict.CHECK)
+
+
+def test_a_run_says_its_verdict_at_its_head_and_the_error_that_it_vouches_for(one_run):
+    page = (one_run / "report.html").read_text(encoding="utf-8")
+    metrics = msgspec.json.decode((one_run / "metrics.json").read_bytes(), type=Metrics)
+    assert 'class="verdict trustworthy"' in page and metrics.verdict_error in page
+    assert re.fullmatch(r"ATE \d\.\d{3} to \d\.\d{3} m with 95 %", metrics.verdict_error)
+    assert metrics.ground_truth.optimized.kitti_definition == ""  # no stretch of 10 m fits
+
+
+def test_ends_of_a_path_are_outlines_beneath_it_so_that_the_shortest_is_seen():
+    path = np.array([[0.0, 0.0, 0.0], [0.001, 0.0, 0.0]])
+    low, high = np.array([-5.0, -5.0, 0.0]), np.array([5.0, 5.0, 1.0])
+    svg = path_over_map(np.empty((0, 3)), path, [PathLine(path, "#123456", 1.2)], low, high)
+    styles = re.findall(r'<path d="[^"]*" style="([^"]*)"', svg.partition("</svg>")[0])
+    assert [("fill: var" in style, "#123456" in style) for style in styles[-3:]] == [
+        (False, False), (False, False), (False, True),
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

@@ -62,30 +62,37 @@ class SvgFigure:
     ) -> None:
         self.x, self.y = (Axis(is_logarithmic=name == logarithmic) for name in "xy")
         self.has_grid = False
-        self.size = ((_WHOLE if is_wide else _WIDTH) * _INCH, height_inches * _INCH)
-        self.corner = (_LEFT * _INCH, _TOP * _INCH)  # of the axes, on the left and above
-        self.extent = (
-            self.size[0] - (_LEFT + _RIGHT + spare_inches) * _INCH,
-            self.size[1] - (_TOP + _BOTTOM) * _INCH,
-        )
+        self.is_wide, self.spare, self.proportions = is_wide, spare_inches, (0.0, 0.0)  # of a plan
+        self._lay_out(height_inches, is_wide=is_wide)
         self._within: list[Callable[[], str]] = []
         self._beside: list[Callable[[], str]] = []
 
     @classmethod
     def of_plan(cls, low: Floats, high: Floats, spare_inches: float = 0.0, *, is_wide: bool = False) -> SvgFigure:
         """A figure in the proportions of the box between two corners."""
-        width, height = high[0] - low[0], high[1] - low[1]
-        whole, highest = (_WHOLE, _HIGHEST_WHOLE) if is_wide else (_WIDTH, _HIGHEST)
-        needed = (whole - _LEFT - _RIGHT - spare_inches) * height / width + _BOTTOM + _TOP
-        figure = cls(float(np.clip(needed, _LOWEST, highest)), spare_inches=spare_inches, is_wide=is_wide)
+        figure = cls(spare_inches=spare_inches, is_wide=is_wide)
         figure.x.limit(low[0], high[0])
         figure.y.limit(low[1], high[1])
         figure.x.label, figure.y.label = "x [m]", "y [m]"
-        scale = min(figure.extent[0] / width, figure.extent[1] / height)
-        (left, top), (across, down) = figure.corner, figure.extent
-        figure.extent = (float(scale * width), float(scale * height))
-        figure.corner = (left + 0.5 * (across - figure.extent[0]), top + 0.5 * (down - figure.extent[1]))
+        figure.proportions = (float(high[0] - low[0]), float(high[1] - low[1]))
+        figure._lay_out(0.0, is_wide=is_wide)
         return figure
+
+    def _lay_out(self, height_inches: float, *, is_wide: bool) -> None:
+        """Size of the figure, and corner and extent of its axes; of a plan so that a meter is equal along both."""
+        whole, (width, height) = _WHOLE if is_wide else _WIDTH, self.proportions
+        across = whole - _LEFT - _RIGHT - self.spare
+        if width:
+            needed = across * height / width + _BOTTOM + _TOP
+            height_inches = float(np.clip(needed, _LOWEST, _HIGHEST_WHOLE if is_wide else _HIGHEST))
+        down = height_inches - _TOP - _BOTTOM
+        self.size, fitting = (whole * _INCH, height_inches * _INCH), (across, down)
+        if width:
+            scale = min(across / width, down / height)
+            fitting = (scale * width, scale * height)
+        self.extent = (fitting[0] * _INCH, fitting[1] * _INCH)
+        left, top = _LEFT + 0.5 * (across - fitting[0]), _TOP + 0.5 * (down - fitting[1])
+        self.corner = (left * _INCH, top * _INCH)  # of the axes, on the left and above
 
     def line(
         self,
@@ -203,12 +210,21 @@ class SvgFigure:
         self._beside.append(drawn)
 
     def svg(self) -> Markup:
-        """The figure as SVG for a page; no text of a log is ever drawn."""
+        """The figure as SVG for a page, a wide one once more for a narrow page; no text of a log is ever drawn."""
+        if not self.is_wide:
+            return Markup(self._drawn())
+        wide, height_inches = self._drawn("wide"), self.size[1] / _INCH
+        self._lay_out(height_inches, is_wide=False)
+        narrow = self._drawn("narrow")
+        self._lay_out(height_inches, is_wide=True)
+        return Markup(wide + narrow)
+
+    def _drawn(self, name: str = "") -> str:
         (left, top), (width, height) = self.corner, self.extent
         across = [(left + place * width, text) for place, text in self.x.ticks(width, is_upright=False)]
         up = [(top + (1.0 - place) * height, text) for place, text in self.y.ticks(height, is_upright=True)]
         bottom = top + height
-        parts = [f'<svg viewBox="0 0 {self.size[0]:g} {self.size[1]:g}" style="{_STYLE}">']
+        parts = [f'<svg class="{name}" viewBox="0 0 {self.size[0]:g} {self.size[1]:g}" style="{_STYLE}">']
         if self.has_grid:
             parts += [_rule(x, bottom, f"v{-height:.2f}", 0.5) for x, _ in across]
             parts += [_rule(left, y, f"h{width:.2f}", 0.5) for y, _ in up]
@@ -227,7 +243,7 @@ class SvgFigure:
         if self.y.label:
             parts.append(_text(beside, top + 0.5 * height, self.y.label, is_upright=True))
         parts += [drawn() for drawn in self._beside]
-        return Markup("".join([*parts, "</svg>"]))
+        return "".join([*parts, "</svg>"])
 
     def _include(self, x: Floats, y: Floats) -> None:
         self.x.include(x)

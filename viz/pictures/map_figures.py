@@ -65,16 +65,21 @@ def map_picture(points: Points, low: Floats, high: Floats) -> Markup:
 def path_over_map(
     points: Points, path: Floats, lines: Sequence[PathLine], low: Floats, high: Floats, *, is_wide: bool = False
 ) -> Markup:
-    """Lines over the map (gray), seen from above, within corners; circle and square begin and end the path."""
+    """Lines over the map (gray), seen from above, within corners; ring and square begin and end the path."""
     figure = SvgFigure.of_plan(low, high, is_wide=is_wide)
     draw_points(figure, points, low, high)
+    mark_ends(figure, path)
     for line in lines:
         x, y = line.positions[:, :2].T
         figure.line(x, y, line.color, line.width, (3.0, 3.0) if line.is_dashed else ())
-    for place, shape in ((0, "o"), (-1, "s")):
-        x, y = path[place, :2, None]
-        figure.marks(x, y, shape, INK, 5.0)
     return figure.svg()
+
+
+def mark_ends(figure: SvgFigure, path: Floats, ends: Sequence[tuple[int, str]] = ((0, "o"), (-1, "s"))) -> None:
+    """Outlines around begin and end of a path (N, 3), however short it is: it is drawn over them."""
+    for place, shape in ends:
+        x, y = path[place, :2, None]
+        figure.marks(x, y, shape, INK, 7.0, line=1.0)
 
 
 def layers_picture(
@@ -159,12 +164,11 @@ def loops_picture(
 ) -> Markup:
     """The trajectory (gray) and its closures (E, 2, 3) in the colors of ``CLOSURES``, over the whole page."""
     figure = SvgFigure.of_plan(low, high, is_wide=True)
+    mark_ends(figure, trajectory.positions, ((0, "o"),))
     figure.line(trajectory.positions[:, 0], trajectory.positions[:, 1], _POINTS, 0.7)
     for by, (_, color) in CLOSURES.items():
         chosen = edges[rejected_by == by][:, :, :2]
         gaps = np.full((len(chosen), 1, 2), np.nan)
         x, y = np.concatenate([chosen, gaps], axis=1).reshape(-1, 2).T
         figure.line(x, y, color, 0.9)
-    x, y = trajectory.positions[0, :2, None]
-    figure.marks(x, y, "o", INK, 5.0)
     return figure.svg()

@@ -175,7 +175,7 @@ def _mark_stretches(axes: Axes, poses: Matrix, stretches: Sequence[Stretch]) -> 
 def _mark_ends(axes: Axes, poses: Matrix) -> None:
     if not len(poses):
         return
-    marks = {"color": _OPTIMIZED, "linestyle": "none", "markersize": 6, "markeredgecolor": "white", "zorder": 5}
+    marks = {"color": _OPTIMIZED, "linestyle": "none", "markersize": 7, "markerfacecolor": "none"}
     axes.plot(*poses[0, :2, -1], marker="o", label="start", **marks)
     axes.plot(*poses[-1, :2, -1], marker="s", label="end", **marks)
 

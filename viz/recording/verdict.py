@@ -39,7 +39,8 @@ def verdict_messages(judged: Judged, trajectory: Trajectory) -> list[Message]:
 def _text(judged: Judged) -> str:
     listed = "".join(f"- {each.text}\n" for each in judged.unnamed[:_LISTED])
     more = len(judged.unnamed) - _LISTED
-    return f"## {judged.verdict}\n\n{judged.reason}\n\n{listed}" + (f"- and {more:,} more\n" if more > 0 else "")
+    head = f"## {judged.verdict}\n\n{judged.vouched}\n\n{judged.reason}\n\n"
+    return head + listed + (f"- and {more:,} more\n" if more > 0 else "")
 
 
 def _line(path: shapes.Floats, stretch: Stretch) -> shapes.Floats:

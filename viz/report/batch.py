@@ -21,17 +21,6 @@ from scanchain.viz.pictures.figure import SvgFigure
 from scanchain.viz.pictures.trajectory_figures import color_of
 from scanchain.viz.report import page
 from scanchain.viz.report.checks import verdict_cell
-from scanchain.viz.report.page import (
-    REPORT_FILE,
-    Cell,
-    Collapsible,
-    Drawing,
-    Grid,
-    Head,
-    Page,
-    Section,
-    write_page,
-)
 from scanchain.words import counted
 
 _MAX_TRAJECTORIES = 60
@@ -40,22 +29,22 @@ _BOX = np.array([1.0, 0.84])  # proportions of the plan of a trajectory
 _BEYOND = 1.05  # of the greatest value, so that its mark is whole
 _MANY_DEGENERATE, _MANY_LOST = 0.5, 0.01  # shares of the scans above which a figure is marked
 _HEADS = (
-    Head("log"),
-    Head("verdict", "", "reliability of the trajectory; its stretches are in the run's report"),
-    Head("scans"),
-    Head("contr.", "", "contradicted scans: their correspondences contradict the pose"),
-    Head("degen.", "", "degenerate scans: a direction of motion is unobservable"),
-    Head("lost", "", "scans that could not be matched"),
-    Head("warn.", "", "warnings of the run: data lost, skipped or wrong"),
-    Head("path", "m", "length of the trajectory"),
-    Head("loops", "", "loop closures accepted"),
-    Head("ATE", "m", "rmse against the ground truth in the log, after optimization"),
-    Head("KITTI", "%", "translational error of the KITTI metric"),
-    Head("inliers", "%", "median over the scans"),
-    Head("residual", "mm", "median over the scans"),
-    Head("speed", "× real time"),
-    Head("time", "s", "of the whole process"),
-    Head("memory", "MiB", "peak of the process"),
+    page.Head("log"),
+    page.Head("verdict", "", "reliability of the trajectory; its stretches are in the run's report"),
+    page.Head("scans"),
+    page.Head("contr.", "", "contradicted scans: their correspondences contradict the pose"),
+    page.Head("degen.", "", "degenerate scans: a direction of motion is unobservable"),
+    page.Head("lost", "", "scans that could not be matched"),
+    page.Head("warn.", "", "warnings of the run: data lost, skipped or wrong"),
+    page.Head("path", "m", "length of the trajectory"),
+    page.Head("loops", "", "loop closures accepted"),
+    page.Head("ATE", "m", "rmse against the ground truth in the log, after optimization"),
+    page.Head("KITTI", "%", "translational error of the KITTI metric"),
+    page.Head("inliers", "%", "median over the scans"),
+    page.Head("residual", "mm", "median over the scans"),
+    page.Head("speed", "× real time"),
+    page.Head("time", "s", "of the whole process"),
+    page.Head("memory", "MiB", "peak of the process"),
 )
 
 
@@ -64,7 +53,7 @@ def write_batch_report(directory: Path, rows: Sequence[Row], command: Sequence[s
     done, names = [row for row in rows if row.metrics is not None], names_of([row.log for row in rows])
     missing = len(rows) - len(done)
     doubted = [f"{row.log} is not trustworthy: {row.why}" for row in rows if row.state is State.NOT_TRUSTWORTHY]
-    page = Page(
+    whole = page.Page(
         title=f"Batch of {counted(len(rows), 'log')}",
         subtitle="Each was run in its own process.",
         facts=tuple(totals(rows)),
@@ -74,11 +63,11 @@ def write_batch_report(directory: Path, rows: Sequence[Row], command: Sequence[s
         notes=(),
         sections=(_logs(directory, rows, names), *_spread(done), *_trajectories(directory, done, names)),
         collapsibles=(
-            Collapsible("Command", shlex.join(without_keys(command))),
-            Collapsible("Paths", "\n".join(map(_paths, rows))),
+            page.Collapsible("Command", shlex.join(without_keys(command))),
+            page.Collapsible("Paths", "\n".join(map(_paths, rows))),
         ),
     )
-    write_page(directory / REPORT_FILE, page)
+    page.write_page(directory / page.REPORT_FILE, whole)
 
 
 def names_of(logs: Sequence[str]) -> dict[str, str]:
@@ -92,11 +81,11 @@ def names_of(logs: Sequence[str]) -> dict[str, str]:
     return names
 
 
-def _logs(directory: Path, rows: Sequence[Row], names: dict[str, str]) -> Section:
+def _logs(directory: Path, rows: Sequence[Row], names: dict[str, str]) -> page.Section:
     legend = tuple(f"{head.text}: {head.hint}" for head in _HEADS if head.hint)
     text = "A name links to the report of its run, or to its output if there is none."
-    return Section(
-        "Logs", text, grid=Grid(_HEADS, tuple(_row(directory, row, names[row.log]) for row in rows), legend)
+    return page.Section(
+        "Logs", text, grid=page.Grid(_HEADS, tuple(_row(directory, row, names[row.log]) for row in rows), legend)
     )
 
 
@@ -104,32 +93,32 @@ def _row(directory: Path, row: Row, name: str) -> page.Row:
     """The figures of a log, or the reason for none."""
     m, link = row.metrics, _link(directory, row)
     if m is None:
-        return page.Row(name, (Cell(f"{row.state}: {row.why}", is_wide=True),), link=link)
+        return page.Row(name, (page.Cell(f"{row.state}: {row.why}", is_wide=True),), link=link)
     truth = None if m.ground_truth is None else m.ground_truth.optimized
     is_far_off = m.ground_truth is not None and bool(m.ground_truth.complaint)
     cells = (
         verdict_cell(m.verdict),
-        Cell(f"{m.scans:,}"),
-        Cell(f"{m.contradicted:,}", is_bad=m.contradicted > MOST_CONTRADICTED * m.scans),
-        Cell(f"{m.degenerate:,}", is_bad=m.degenerate > _MANY_DEGENERATE * m.scans),
-        Cell(f"{m.lost:,}", is_bad=m.lost > _MANY_LOST * m.scans),
-        Cell(f"{row.warnings:,}", is_bad=row.warnings > 0),
-        Cell(f"{m.traveled_m:,.1f}"),
-        Cell(f"{m.closures_accepted:,}"),
-        Cell(_figure(None if truth is None else truth.ate_rmse_m, 1.0, 4), is_bad=is_far_off),
-        Cell(_figure(None if truth is None else truth.kitti_translation_share, 100.0, 3)),
-        Cell(f"{100.0 * m.median_inlier_share:.0f}"),
-        Cell(_figure(m.median_residual_m, 1e3, 1)),
-        Cell(f"{m.times_real_time:.1f}"),
-        Cell(f"{row.duration_s:.1f}"),
-        Cell(f"{row.peak_mib:,.0f}"),
+        page.Cell(f"{m.scans:,}"),
+        page.Cell(f"{m.contradicted:,}", is_bad=m.contradicted > MOST_CONTRADICTED * m.scans),
+        page.Cell(f"{m.degenerate:,}", is_bad=m.degenerate > _MANY_DEGENERATE * m.scans),
+        page.Cell(f"{m.lost:,}", is_bad=m.lost > _MANY_LOST * m.scans),
+        page.Cell(f"{row.warnings:,}", is_bad=row.warnings > 0),
+        page.Cell(f"{m.traveled_m:,.1f}"),
+        page.Cell(f"{m.closures_accepted:,}"),
+        page.Cell(_figure(None if truth is None else truth.ate_rmse_m, 1.0, 4), is_bad=is_far_off),
+        page.Cell(_figure(None if truth is None else truth.kitti_translation_share, 100.0, 3)),
+        page.Cell(f"{100.0 * m.median_inlier_share:.0f}"),
+        page.Cell(_figure(m.median_residual_m, 1e3, 1)),
+        page.Cell(f"{m.times_real_time:.1f}"),
+        page.Cell(f"{row.duration_s:.1f}"),
+        page.Cell(f"{row.peak_mib:,.0f}"),
     )
     return page.Row(name, cells, link=link)
 
 
 def _link(directory: Path, row: Row) -> str:
     """The run's report, else what the last try printed, from this page; empty where there is neither."""
-    for path in (Path(row.run) / REPORT_FILE if row.run else None, output_file(Path(), row.key)):
+    for path in (Path(row.run) / page.REPORT_FILE if row.run else None, output_file(Path(), row.key)):
         if path is not None and (directory / path).is_file():
             return quote(path.as_posix())
     return ""
@@ -143,7 +132,7 @@ def _paths(row: Row) -> str:
     return f"{row.log}  {row.run or '–'}  sha256 {row.sha256 or '–'}"
 
 
-def _spread(done: Sequence[Row]) -> Iterator[Section]:
+def _spread(done: Sequence[Row]) -> Iterator[page.Section]:
     """Distributions of the figures, if there are several logs."""
     drawn = (
         ("ATE", "m", lambda row, m: None if m.ground_truth is None else m.ground_truth.optimized.ate_rmse_m),
@@ -151,12 +140,12 @@ def _spread(done: Sequence[Row]) -> Iterator[Section]:
         ("Memory", "MiB", lambda row, m: row.peak_mib),
     )
     drawings = [
-        Drawing(title, "", _sorted_values(title, unit, values))
+        page.Drawing(title, "", _sorted_values(title, unit, values))
         for title, unit, figure in drawn
         if len(values := _values(done, figure)) > 1
     ]
     if drawings:
-        yield Section(
+        yield page.Section(
             "Distributions", "Cumulative distribution over the logs.", drawings=tuple(drawings), is_small=True
         )
 
@@ -177,15 +166,17 @@ def _sorted_values(name: str, unit: str, values: Sequence[float]) -> Markup:
     return figure.svg()
 
 
-def _trajectories(directory: Path, done: Sequence[Row], names: dict[str, str]) -> Iterator[Section]:
+def _trajectories(directory: Path, done: Sequence[Row], names: dict[str, str]) -> Iterator[page.Section]:
     """Every trajectory from above, as far as a page can hold them."""
     drawings = [
-        Drawing(names[row.log], f"{row.run}", _trajectory(directory / row.run / "trajectory.tum"))
+        page.Drawing(names[row.log], f"{row.run}", _trajectory(directory / row.run / "trajectory.tum"))
         for row in done[:_MAX_TRAJECTORIES]
     ]
     text = f"The first {_MAX_TRAJECTORIES} of {len(done):,}." if len(done) > _MAX_TRAJECTORIES else ""
     if drawings:
-        yield Section("Optimized trajectories, seen from above", text, drawings=tuple(drawings), is_small=True)
+        yield page.Section(
+            "Optimized trajectories, seen from above", text, drawings=tuple(drawings), is_small=True
+        )
 
 
 def _trajectory(trajectory: Path) -> Markup:

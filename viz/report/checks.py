@@ -38,7 +38,7 @@ def verdict_section(metrics: Metrics, steps: pa.Table, overlay_file: Path) -> Se
     largest = f", largest of {size} neighboring scans" if size > 1 else ""
     drawing = Drawing(
         "Innovations",
-        f"Normalized innovations over their limits{largest}; above 1 (dotted) is a finding.",
+        f"Normalized innovations over their limits{largest}; above 1 (dotted) is a finding, or wheels that slip.",
         innovations(curves, shaded, is_wide=is_alone),
         is_wide=is_alone,
     )
@@ -60,9 +60,9 @@ def verdict_section(metrics: Metrics, steps: pa.Table, overlay_file: Path) -> Se
     return Section("Checks", "", chips, tuple(drawings), Grid(heads, rows) if rows else None)
 
 
-def verdict_cell(verdict: str) -> Cell:
-    """A verdict in a table, in the color of its severity; empty for none."""
-    return Cell(verdict, is_bad=verdict == Verdict.NOT_TRUSTWORTHY, is_doubted=verdict == Verdict.CHECK)
+def verdict_cell(verdict: str, text: str = "") -> Cell:
+    """A verdict in a table, in other words if there are any, in the color of its severity; empty for none."""
+    return Cell(text or verdict, is_bad=verdict == Verdict.NOT_TRUSTWORTHY, is_doubted=verdict == Verdict.CHECK)
 
 
 def _row(stretch: Stretch) -> Row:

@@ -19,19 +19,8 @@ from scanchain.viz.pictures import trajectory_figures as figures
 from scanchain.viz.pictures.compared_trajectories import read_trajectories
 from scanchain.viz.pictures.map_figures import map_picture, surroundings
 from scanchain.viz.pictures.trajectory_figures import DrawnTrajectory, Floats
+from scanchain.viz.report import page
 from scanchain.viz.report.checks import verdict_cell
-from scanchain.viz.report.page import (
-    REPORT_FILE,
-    Cell,
-    Collapsible,
-    Drawing,
-    Grid,
-    Head,
-    Page,
-    Row,
-    Section,
-    write_page,
-)
 from scanchain.viz.report.sections import (
     chip,
     error_section,
@@ -43,7 +32,9 @@ from scanchain.viz.report.sections import (
     uncertainty_section,
 )
 
-_VERDICT = Head("verdict", "", "of other tools by wheels and constant velocity alone")
+_VERDICT = page.Head(
+    "verdict", "", "of other tools by wheels and constant velocity alone, with the error that it vouches for", True
+)
 _WIDEST = 10  # largest number of columns of a table beside the summary
 _NEARLY = 1.25  # thickness of a map over that of the sharpest, up to which it frames the pictures
 
@@ -53,7 +44,7 @@ def write_compare_report(directory: Path) -> None:
     table, trajectories = read_table(directory), read_trajectories(directory)
     truth_file = directory / TRUTH_FILE
     truth = read_tum(truth_file).poses[:, :3, 3] if truth_file.exists() else None
-    page = Page(
+    whole = page.Page(
         title=f"Comparison on {Path(table.log.split(', ')[0]).name}",
         subtitle=_subtitle(table),
         facts=_facts(table),
@@ -62,7 +53,7 @@ def write_compare_report(directory: Path) -> None:
         sections=tuple(_sections(directory, table, trajectories, truth)),
         collapsibles=tuple(_collapsibles(directory, table)),
     )
-    write_page(directory / REPORT_FILE, page)
+    page.write_page(directory / page.REPORT_FILE, whole)
 
 
 def _subtitle(table: Table) -> str:
@@ -89,13 +80,13 @@ def _warnings(table: Table) -> Iterator[str]:
         if row.status.is_failure:
             yield f"{row.name} {row.status}: {row.reason}"
         if row.is_doubted:
-            yield f"{row.name}: {row.verdict}: {row.verdict_reason}"
+            yield f"{row.name}: {row.sentence}"
 
 
-def _figures(table: Table, trajectories: Sequence[DrawnTrajectory]) -> Iterator[Section]:
+def _figures(table: Table, trajectories: Sequence[DrawnTrajectory]) -> Iterator[page.Section]:
     """The summary, and all else in one table more, or in two where that would be too wide."""
     summary = columns_of(table.figures, "summary")
-    yield Section("Summary", grid=_grid(table, table.rows, trajectories, summary, has_verdicts=True))
+    yield page.Section("Summary", grid=_grid(table, table.rows, trajectories, summary, has_verdicts=True))
     ended = [row for row in table.rows if row.status is Status.OK]
     accuracy, time = columns_of(table.figures, "accuracy"), columns_of(table.figures, "time")
     parts = {"More on accuracy": accuracy, "More on time": time}
@@ -103,7 +94,7 @@ def _figures(table: Table, trajectories: Sequence[DrawnTrajectory]) -> Iterator[
         parts = {"More figures": [*accuracy, *time]}
     for title, columns in parts.items():
         if columns:
-            yield Section(title, grid=_grid(table, ended, trajectories, columns))
+            yield page.Section(title, grid=_grid(table, ended, trajectories, columns))
 
 
 def _grid(
@@ -113,30 +104,30 @@ def _grid(
     columns: Sequence[Column],
     *,
     has_verdicts: bool = False,
-) -> Grid:
+) -> page.Grid:
     """A row a method; the end of a failed one in place of its figures."""
     chips = {trajectory.name: chip(trajectory) for trajectory in trajectories}
     shown = [dict(zip((row.name for row in table.rows), c.cells(table.figures), strict=True)) for c in columns]
     lines = []
     for row in rows:
-        cells = tuple(Cell(each[row.name].text, each[row.name].is_best) for each in shown)
+        cells = tuple(page.Cell(each[row.name].text, each[row.name].is_best) for each in shown)
         if has_verdicts:
-            cells += (verdict_cell(row.verdict),)
+            cells += (verdict_cell(row.verdict, row.vouched),)
         if row.status is not Status.OK:
-            cells = (Cell(f"{row.status}: {row.reason}", is_wide=True),)
-        lines.append(Row(row.name, cells, chips.get(row.name)))
+            cells = (page.Cell(f"{row.status}: {row.reason}", is_wide=True),)
+        lines.append(page.Row(row.name, cells, chips.get(row.name)))
     heads = (
-        Head("method"),
-        *(Head(column.head, column.unit, column.definition) for column in columns),
+        page.Head("method"),
+        *(page.Head(column.head, column.unit, column.definition) for column in columns),
         *((_VERDICT,) if has_verdicts else ()),
     )
     notes = tuple(f"{column.heading}: {column.definition}" for column in columns)
-    return Grid(heads, tuple(lines), notes)
+    return page.Grid(heads, tuple(lines), notes)
 
 
 def _sections(
     directory: Path, table: Table, trajectories: Sequence[DrawnTrajectory], truth: Floats | None
-) -> Iterator[Section]:
+) -> Iterator[page.Section]:
     yield from _figures(table, trajectories)
     is_planar = table.dimension == 2
     drawn = [trajectory for trajectory in trajectories if len(trajectory.positions)]
@@ -182,7 +173,7 @@ def _map_section(
     framing: Sequence[DrawnTrajectory],
     box: tuple[Floats, Floats],
     dimension: int,
-) -> Iterator[Section]:
+) -> Iterator[page.Section]:
     """Maps, all within the same corners; those of ``framing`` must be seen whole."""
     files = [(trajectory, method_folder(directory, trajectory.name) / MAP_FILE) for trajectory in trajectories]
     maps = [(trajectory, read_ply(file)) for trajectory, file in files if file.exists()]
@@ -191,35 +182,37 @@ def _map_section(
     whole = {trajectory.name for trajectory in framing}
     corners = surroundings(*box, [points for trajectory, points in maps if trajectory.name in whole])
     drawings = tuple(
-        Drawing(trajectory.name, "", map_picture(points, *corners), chip(trajectory))
+        page.Drawing(trajectory.name, "", map_picture(points, *corners), chip(trajectory))
         for trajectory, points in maps
     )
     text = "The same points of the same scans, placed by the poses of each method."
     text += " Dark is low, bright is high." if dimension == 3 else ""
-    yield Section("Maps", text, drawings=drawings, is_small=True)
+    yield page.Section("Maps", text, drawings=drawings, is_small=True)
 
 
-def _disagreement(table: Table) -> Section:
+def _disagreement(table: Table) -> page.Section:
     names = [row.name for row in table.rows]
     rows = [
-        Row(name, tuple(Cell("–" if value is None else f"{1e3 * value:.1f}") for value in values))
+        page.Row(name, tuple(page.Cell("–" if value is None else f"{1e3 * value:.1f}") for value in values))
         for name, values in zip(names, table.disagreement_m, strict=True)
     ]
-    return Section(
+    return page.Section(
         "Disagreement",
         "Median distance between the motions that two methods find for a scan, in millimeters. "
         "Not a measure of accuracy: two methods with the same error agree.",
-        grid=Grid((Head("mm"), *(Head(name) for name in names)), tuple(rows)),
+        grid=page.Grid((page.Head("mm"), *(page.Head(name) for name in names)), tuple(rows)),
     )
 
 
-def _collapsibles(directory: Path, table: Table) -> Iterator[Collapsible]:
+def _collapsibles(directory: Path, table: Table) -> Iterator[page.Collapsible]:
     yield from provenance_sections(table.provenance, table.baselines)
-    yield Collapsible("Methods", "\n".join(f"{row.name}: {row.description or row.reason}" for row in table.rows))
+    yield page.Collapsible(
+        "Methods", "\n".join(f"{row.name}: {row.description or row.reason}" for row in table.rows)
+    )
     definitions = dict.fromkeys(definition for row in table.rows for definition in row.definitions)
     if definitions:
-        yield Collapsible("Definitions of the errors", "\n\n".join(definitions))
-    yield Collapsible(
+        yield page.Collapsible("Definitions of the errors", "\n\n".join(definitions))
+    yield page.Collapsible(
         "Settings, in the form of --config",
         (directory / SETTINGS_FILE).read_text(encoding="utf-8"),
         is_long=True,

@@ -19,19 +19,7 @@ from scanchain.viz.pictures.landmarks import (
     svg_before,
     svg_factor,
 )
-from scanchain.viz.report.page import (
-    REPORT_FILE,
-    Cell,
-    Chip,
-    Collapsible,
-    Drawing,
-    Grid,
-    Head,
-    Page,
-    Row,
-    Section,
-    write_page,
-)
+from scanchain.viz.report import page
 
 _TIMES = (
     "Times are medians; each method solves from scratch with what it needs to know about the pattern (again: with "
@@ -56,13 +44,13 @@ def write_report(directory: Path, studies: Sequence[Study]) -> None:
         title = f"Landmark problem{'s' if len(studies) > 1 else ''}"
         names = ", ".join(study.name for study in studies)
         definitions = dict.fromkeys(study.after.accuracy.definition for study in studies)
-        fold = Collapsible("Definition of the errors", "\n\n".join(definitions))
-        write_page(directory / REPORT_FILE, Page(title, names, (), (), (), sections, (fold,)))
+        fold = page.Collapsible("Definition of the errors", "\n\n".join(definitions))
+        page.write_page(directory / page.REPORT_FILE, page.Page(title, names, (), (), (), sections, (fold,)))
     except OSError as error:
         raise InputError(f"{directory}: not writable ({error.strerror}); choose another --out") from error
 
 
-def _sections(study: Study) -> Iterator[Section]:
+def _sections(study: Study) -> Iterator[page.Section]:
     """The estimate, then the linear solvers."""
     (_, before), (_, after), _ = accuracy_lines(study)
     facts = (
@@ -71,24 +59,24 @@ def _sections(study: Study) -> Iterator[Section]:
         *((fact.label, fact.value) for fact in study.facts),
     )
     is_known = bool(len(study.true_poses) or np.isfinite(study.true_landmarks).any())
-    truth = (Chip("truth", "var(--ink)", is_dashed=True),) if is_known else ()
-    chips = (Chip("before", BEFORE), Chip("after", AFTER), *truth)
+    truth = (page.Chip("truth", "var(--ink)", is_dashed=True),) if is_known else ()
+    chips = (page.Chip("before", BEFORE), page.Chip("after", AFTER), *truth)
     marks = "Circles: landmarks" + ("; crosses: true ones" if is_known else "")
     drawings = (
-        Drawing("Before optimization", f"{marks}.", svg_before(study)),
-        Drawing("After optimization", f"{marks}; ellipses: 95 %.", svg_after(study)),
+        page.Drawing("Before optimization", f"{marks}.", svg_before(study)),
+        page.Drawing("After optimization", f"{marks}; ellipses: 95 %.", svg_after(study)),
     )
-    yield Section(study.name, facts=facts, chips=chips, drawings=drawings)
+    yield page.Section(study.name, facts=facts, chips=chips, drawings=drawings)
     factors = tuple(
-        Drawing(f"{method.method}: {method.factor.name}", "", svg_factor(method)) for method in study.methods
+        page.Drawing(f"{method.method}: {method.factor.name}", "", svg_factor(method)) for method in study.methods
     )
     text = f"The Jacobian A has {size_of(study)}. Drawn is where the factor of every method is not zero."
-    yield Section(f"Linear solvers on {study.name}", text, grid=_grid(study), drawings=factors, is_small=True)
+    yield page.Section(f"Linear solvers on {study.name}", text, grid=_grid(study), drawings=factors, is_small=True)
 
 
-def _grid(study: Study) -> Grid:
+def _grid(study: Study) -> page.Grid:
     headings, *rows = table_of(study)
     split = [heading.partition(" ms") for heading in headings]
-    heads = tuple(Head(name, unit.strip()) for name, unit, _ in split)
+    heads = tuple(page.Head(name, unit.strip()) for name, unit, _ in split)
     notes = (_TIMES, *((_DIFFERS, _PINV) if len(rows) > 1 else ("--methods all compares the linear solvers.",)))
-    return Grid(heads, tuple(Row(name, tuple(map(Cell, cells))) for name, *cells in rows), notes)
+    return page.Grid(heads, tuple(page.Row(name, tuple(map(page.Cell, cells))) for name, *cells in rows), notes)

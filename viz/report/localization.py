@@ -10,6 +10,7 @@ import numpy as np
 from scanchain import lie
 from scanchain.sessions.localize import LocalizedLog, Part
 from scanchain.sessions.localizer import MapState
+from scanchain.verdict import Judged
 from scanchain.viz.pictures.figure import INK, SvgFigure
 from scanchain.viz.pictures.map_figures import extent, map_points, path_over_map
 from scanchain.viz.pictures.trajectory_figures import PathLine
@@ -38,9 +39,10 @@ def write_localization_report(folder: Path, localized: LocalizedLog) -> None:
         *([] if m.ground_truth is None else [("ATE", f"{m.ground_truth.optimized.ate_rmse_m:.4f} m (rmse)")]),
     )
     subtitle = f"{localized.path.name.split('.partial')[0]} in the map {localized.prior.name}"
-    verdict = Section("Verdict", m.sentence)
-    sections = (verdict, *_sections(localized))
-    write_page(folder / REPORT_FILE, Page("Localization", subtitle, facts, m.warnings, (), sections))
+    sections, judged = tuple(_sections(localized)), Judged(m.verdict, m.reason)
+    write_page(
+        folder / REPORT_FILE, Page("Localization", subtitle, facts, m.warnings, (), sections, judged=judged)
+    )
 
 
 def _sections(localized: LocalizedLog) -> Iterator[Section]:

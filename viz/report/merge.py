@@ -16,30 +16,18 @@ from scanchain.viz.pictures.map_figures import surroundings
 from scanchain.viz.pictures.merge import DrawnMerge, picture, read_merge
 from scanchain.viz.pictures.trajectory_figures import PathLine
 from scanchain.viz.recording.shapes import in_space
-from scanchain.viz.report.page import (
-    REPORT_FILE,
-    Cell,
-    Chip,
-    Collapsible,
-    Drawing,
-    Grid,
-    Head,
-    Page,
-    Row,
-    Section,
-    write_page,
-)
+from scanchain.viz.report import page
 from scanchain.viz.report.sections import provenance_sections
-from scanchain.viz.report.trajectory_map import SCRIPT, map_scene
+from scanchain.viz.report.trajectory_map import SCRIPT, interactive_map
 from scanchain.words import counted
 
 _HEADS = (
-    Head("session"),
-    Head("from", "UTC", is_text=True),
-    Head("keyframes"),
-    Head("closures", "", "closures in force between this session and those of other maps"),
+    page.Head("session"),
+    page.Head("from", "UTC", is_text=True),
+    page.Head("keyframes"),
+    page.Head("closures", "", "closures in force between this session and those of other maps"),
 )
-_GONE = Head("gone", "points", "points of its keyframes that newer sessions saw through, removed")
+_GONE = page.Head("gone", "points", "points of its keyframes that newer sessions saw through, removed")
 
 
 def write_merge_report(directory: Path) -> None:
@@ -48,7 +36,7 @@ def write_merge_report(directory: Path) -> None:
     made = msgspec.json.decode((directory / RUN_FILE).read_bytes(), type=Provenance)
     summary = (directory / "summary.txt").read_text(encoding="utf-8")
     drawn = read_merge(directory)
-    page = Page(
+    whole = page.Page(
         title="Merged map",
         subtitle=summary.partition("\n")[0].removeprefix("merged").strip(),
         facts=tuple(_facts(metrics)),
@@ -57,11 +45,13 @@ def write_merge_report(directory: Path) -> None:
         sections=(_map_section(directory, drawn, metrics), _sessions(drawn, metrics)),
         collapsibles=(
             *provenance_sections(made, {}),
-            Collapsible("Configuration", (directory / "config.toml").read_text(encoding="utf-8"), is_long=True),
+            page.Collapsible(
+                "Configuration", (directory / "config.toml").read_text(encoding="utf-8"), is_long=True
+            ),
         ),
         script=SCRIPT,
     )
-    write_page(directory / REPORT_FILE, page)
+    page.write_page(directory / page.REPORT_FILE, whole)
 
 
 def _facts(m: MergeMetrics) -> Iterator[tuple[str, str]]:
@@ -74,48 +64,43 @@ def _facts(m: MergeMetrics) -> Iterator[tuple[str, str]]:
     yield "time", f"{m.run_s:.1f} s"
 
 
-def _map_section(directory: Path, drawn: DrawnMerge, metrics: MergeMetrics) -> Section:
+def _map_section(directory: Path, drawn: DrawnMerge, metrics: MergeMetrics) -> page.Section:
     points = in_space(read_ply(directory / "map.ply")).astype(float)
     low, high = surroundings(drawn.positions.min(axis=0), drawn.positions.max(axis=0), [points])
     lines = [PathLine(each.positions, each.color, 1.4) for each in drawn.sessions]
     is_flat = metrics.dimension == 2
-    drag = "Drag to move" if is_flat else "Drag to rotate, Shift-drag to move"
     drawings = (
-        Drawing(
+        page.Drawing(
             "Sessions over the map",
             "Seen from above; thin lines: closures in force between sessions.",
             picture(drawn, points, low, high),
         ),
-        Drawing(
-            "Interactive map",
-            f"{drag}, click it and scroll to zoom, double-click to reset; two fingers zoom and move.",
-            map_scene(points, lines, low, high, grain_m=drawn.grain_m, is_flat=is_flat),
-        ),
+        interactive_map(points, lines, low, high, grain_m=drawn.grain_m, is_flat=is_flat),
     )
-    chips = tuple(Chip(each.name, each.color) for each in drawn.sessions)
-    return Section("Map", chips=chips, drawings=drawings)
+    chips = tuple(page.Chip(each.name, each.color) for each in drawn.sessions)
+    return page.Section("Map", chips=chips, drawings=drawings)
 
 
-def _sessions(drawn: DrawnMerge, metrics: MergeMetrics) -> Section:
+def _sessions(drawn: DrawnMerge, metrics: MergeMetrics) -> page.Section:
     rows = tuple(
-        Row(
+        page.Row(
             each.name,
             (
-                Cell(_date(each.first_stamp_ns)),
-                Cell(f"{each.keyframes:,}"),
-                Cell(f"{each.closures:,}"),
-                *([Cell(f"{each.removed_points:,}")] if metrics.updated else []),
+                page.Cell(_date(each.first_stamp_ns)),
+                page.Cell(f"{each.keyframes:,}"),
+                page.Cell(f"{each.closures:,}"),
+                *([page.Cell(f"{each.removed_points:,}")] if metrics.updated else []),
             ),
-            chip=Chip(each.name, line.color),
+            chip=page.Chip(each.name, line.color),
         )
         for each, line in zip(metrics.sessions, drawn.sessions, strict=True)
     )
     apart = tuple(
-        Row(name, (Cell(warning.partition(": ")[2], is_wide=True, is_bad=True),))
+        page.Row(name, (page.Cell(warning.partition(": ")[2], is_wide=True, is_bad=True),))
         for group, warning in zip(metrics.apart, metrics.warnings, strict=False)  # of the map come last
         for name in group
     )
-    return Section("Sessions", grid=Grid((*_HEADS, _GONE) if metrics.updated else _HEADS, rows + apart))
+    return page.Section("Sessions", grid=page.Grid((*_HEADS, _GONE) if metrics.updated else _HEADS, rows + apart))
 
 
 def _date(stamp_ns: int) -> str:

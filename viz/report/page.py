@@ -10,6 +10,7 @@ from pathlib import Path
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from scanchain.verdict import Judged
 from scanchain.whole_file import write_whole
 
 REPORT_FILE = "report.html"
@@ -111,7 +112,7 @@ class Collapsible:
 class Page:
     """A report; ``facts`` are label and value, ``warnings`` stand out, ``notes`` do not.
 
-    ``script`` : the only one that the page may run
+    ``script`` : the only one that the page may run; ``judged`` : the verdict, which stands at its head
     """
 
     title: str
@@ -122,6 +123,7 @@ class Page:
     sections: tuple[Section, ...]
     collapsibles: tuple[Collapsible, ...] = ()
     script: str = ""
+    judged: Judged | None = None
 
 
 def write_page(path: Path, page: Page) -> None:

@@ -21,9 +21,9 @@ from scanchain.runs.metrics import VERDICT, Accuracy, GroundTruth, Metrics
 from scanchain.runs.overlay import OVERLAY_FILE
 from scanchain.runs.provenance import Provenance
 from scanchain.runs.step_table import STAGES, nees_of_steps
+from scanchain.runs.vouching import poses_of
 from scanchain.settings import read_layer
 from scanchain.trajectory import read_tum
-from scanchain.verdict import Verdict
 from scanchain.viz.pictures.trajectory_figures import DrawnTrajectory, Floats, color_of
 from scanchain.viz.report.checks import verdict_section
 from scanchain.viz.report.page import REPORT_FILE, Cell, Collapsible, Grid, Head, Page, Row, Section, write_page
@@ -48,7 +48,7 @@ def write_run_report(directory: Path) -> None:
         title=f"Run of {', '.join(Path(log.path).name for log in made.logs)}",
         subtitle=heading,
         facts=tuple(_facts(metrics, made)),
-        warnings=tuple(line for line in (_doubts(metrics), made.stopped, *metrics.warnings) if line),
+        warnings=tuple(line for line in (made.stopped, *metrics.warnings) if line),
         notes=tuple(notes),
         sections=tuple(_sections(directory, metrics)),
         collapsibles=(
@@ -56,6 +56,7 @@ def write_run_report(directory: Path) -> None:
             Collapsible("Configuration", (directory / "config.toml").read_text(encoding="utf-8"), is_long=True),
         ),
         script=SCRIPT,
+        judged=metrics.judged,
     )
     write_page(directory / REPORT_FILE, page)
 
@@ -67,14 +68,8 @@ def _summary_lines(directory: Path) -> list[str]:
     return [heading, *(line.removeprefix("note").strip() for line in lines if line.startswith("note"))]
 
 
-def _doubts(m: Metrics) -> str:
-    """The verdict where it is none to rely on."""
-    return "" if m.verdict is Verdict.TRUSTWORTHY else m.sentence
-
-
 def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
-    """Facts of a run: the verdict first, then the result, its cost last."""
-    yield "verdict", str(m.verdict)
+    """Facts of a run: the result first, its cost last."""
     yield "trajectory", f"{m.traveled_m:.1f} m, {counted(m.keyframes, 'keyframe')}"
     yield "accuracy", _accuracy(m)
     yield "expected ATE", m.expected_ate
@@ -103,7 +98,8 @@ def _accuracy(m: Metrics) -> str:
 def _sections(directory: Path, metrics: Metrics) -> Iterator[Section]:
     """Accuracy, trajectory and map, closures, errors, uncertainty; time last."""
     steps = pq.ParquetFile(directory / "steps.parquet").read()  # read_table imports much more
-    trajectory, odometry = _trajectory(steps, ""), _trajectory(steps, "odom_")
+    stamps_ns = steps["stamp_ns"].to_numpy()
+    trajectory, odometry = (Trajectory(stamps_ns, poses_of(steps, prefix)) for prefix in ("", "odom_"))
     truth_file, config = directory / TRUTH_FILE, read_layer(directory / "config.toml")
     truth = read_tum(truth_file) if truth_file.exists() and metrics.ground_truth is not None else None
     gap_s = None if metrics.ground_truth is None else metrics.ground_truth.max_gap_s
@@ -182,15 +178,6 @@ def _drawn(
     )
 
 
-def _trajectory(steps: pa.Table, prefix: str) -> Trajectory:
-    """The poses of columns whose names begin so."""
-    columns = [steps[f"{prefix}{name}"].to_numpy() for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
-    poses = np.tile(np.eye(4), (len(steps), 1, 1))
-    poses[:, :3, :3] = lie.from_quaternion(np.stack(columns[3:], axis=1))
-    poses[:, :3, 3] = np.stack(columns[:3], axis=1)
-    return Trajectory(steps["stamp_ns"].to_numpy(), poses)
-
-
 def _seconds(steps: pa.Table) -> Floats:
     """All stages but reading."""
     return np.sum([steps[f"{stage}_s"].to_numpy() for stage in STAGES[1:]], axis=0)
@@ -215,7 +202,8 @@ def accuracy_section(truth: GroundTruth) -> Section:
     text = (
         f"Against {truth.source}, {truth.path_length_m:.1f} m: {counted(truth.optimized.pairs, 'scan')}{missing}."
     )
-    return Section("Accuracy", text, grid=Grid(heads, rows, (truth.optimized.definition,)))
+    definitions = (truth.optimized.definition, truth.optimized.kitti_definition)
+    return Section("Accuracy", text, grid=Grid(heads, rows, tuple(filter(None, definitions))))
 
 
 def _stages(metrics: Metrics) -> Grid:

@@ -66,18 +66,12 @@ def trajectory_section(
     is_flat = not np.ptp(points[:, 2]) if len(points) else True
     lines, chips = zip(*_lines(trajectory.positions, tables, truth), strict=True)
     low, high = surroundings(*figures.frame([trajectory], truth), [points])
-    drag = "Drag to move" if is_flat else "Drag to rotate, Shift-drag to move"
     above = "seen from above; dark is low, bright is high."
     over_map = path_over_map(points, trajectory.positions, lines, low, high)
     drawings = (
         Drawing("Trajectory over the map", "Seen from above; circle: start, square: end.", over_map),
         *(() if is_flat else (Drawing("Map", f"map.ply, {above}", map_picture(points, low, high)),)),
-        Drawing(
-            "Interactive map",
-            f"{drag}, click it and scroll to zoom, double-click to reset; two fingers zoom and move.",
-            map_scene(points, lines, low, high, grain_m=grain_m, is_flat=is_flat),
-            is_wide=not is_flat,
-        ),
+        interactive_map(points, lines, low, high, grain_m=grain_m, is_flat=is_flat, is_wide=not is_flat),
     )
     return Section("Trajectory and map", chips=chips, drawings=drawings)
 
@@ -154,6 +148,17 @@ _BULK = (3.0, 97.0)  # percentiles of the points: what is in view at first, and 
 _BULK_2D, _MARGIN = (0.5, 99.5), 0.03  # the same of a flat map, and its share that is added on each side
 _WIDEST = 3.0  # greatest width of a flat map's canvas over its height
 _WIDER = 1.8  # lines, on the canvas
+
+
+def interactive_map(
+    points: Points, lines: Sequence[PathLine], low: Floats, high: Floats, *, grain_m: float, is_flat: bool,
+    is_wide: bool = False,
+) -> Drawing:  # fmt: skip
+    """A map and lines to move and turn, as ``map_scene`` makes it."""
+    drag = "Drag to move" if is_flat else "Drag to rotate, Shift-drag to move"
+    text = f"{drag}, click it and scroll to zoom, double-click to reset; two fingers zoom and move."
+    scene = map_scene(points, lines, low, high, grain_m=grain_m, is_flat=is_flat)
+    return Drawing("Interactive map", text, scene, is_wide=is_wide)
 
 
 def map_scene(
