@@ -33,7 +33,8 @@ class Motion(NamedTuple):
 class Located(msgspec.Struct, frozen=True):
     """A scan as odometry placed it, with the state of odometry that the back end needs.
 
-    ``scale`` is that of its voxels, whether its scans are dense or not, ``local_map`` (L, d) its map, odom frame, empty unless ``is_keyframe``;
+    ``scale`` is that of its voxels, dense scans or not, ``local_map`` (L, d) its map, odom frame, empty unless
+    ``is_keyframe``;
     ``information`` (k, k) is that of its motion since the last keyframe, a twist in its own frame, zero unless
     ``is_keyframe``;
     ``errors`` are those of its pose against the map, of the first scan unless ``is_keyframe``;
