@@ -7,7 +7,15 @@ from scanchain.maps.occupancy_grid import OccupancyGrid, draw_grid, fitting_reso
 from scanchain.maps.pcd import write_pcd
 from scanchain.maps.ply import read_ply, write_ply
 from scanchain.maps.point_map import PointMap, build_point_map
-from scanchain.maps.saved_map import MAP_FOLDER, Edges, SavedMap, Session, open_saved_map, write_saved_map
+from scanchain.maps.saved_map import (
+    MAP_FOLDER,
+    Edges,
+    SavedMap,
+    Session,
+    open_saved_map,
+    read_arrays,
+    write_saved_map,
+)
 
 __all__ = [
     "MAP_FOLDER",
@@ -24,6 +32,7 @@ __all__ = [
     "moved",
     "open_saved_map",
     "reach_of",
+    "read_arrays",
     "read_map",
     "read_ply",
     "sightings",
