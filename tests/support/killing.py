@@ -18,6 +18,7 @@ from scanchain.maps import MAP_FOLDER, open_saved_map, read_map, read_ply
 from scanchain.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RECORDING_FILE
 from scanchain.runs.resume.checkpoint import read_checkpoint
 from scanchain.runs.resume.journal import JOURNAL_FILE, read_journal
+from scanchain.settings import load_settings
 from scanchain.trajectory import read_kitti, read_tum
 from scanchain.viz.recording import entities
 from tests.support.scenes import ROOT
@@ -155,8 +156,13 @@ def _left(out, after_s):
     return Killed(after_s, where, steps)
 
 
+def config_of(folder):
+    """The configuration of a run that was left."""
+    return load_settings(file=folder / "config.toml").config
+
+
 def _read_checkpoint(path):
-    steps = read_checkpoint(path.parent).scans
+    steps = read_checkpoint(path.parent, config_of(path.parent)).scans
     assert steps <= len(read_journal(path.parent)[0]), "the checkpoint is ahead of the journal"
 
 
