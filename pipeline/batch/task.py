@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import sys
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
@@ -161,15 +160,15 @@ def attempt(task: Task, stop: Event | None = None) -> Row:
 
 
 def _tried(task: Task, stop: Event | None) -> Row:
-    command = [sys.executable, "-P", "-m", "scanchain", "run", "--out", str(task.run), "--force", *task.arguments]
+    words = ["run", "--out", str(task.run), "--force", *task.arguments, "--", task.log]
     task.output_file.parent.mkdir(parents=True, exist_ok=True)
     ending = run_within(
         Limits(task.time_s, task.memory_mib),
-        [*command, "--", task.log],
+        "scanchain.processes",
+        ["scanchain", *words],
         os.environ | dict.fromkeys(_THREADS, "1"),  # a process a core: threads would only get in each other's way
         output=task.output_file,
         interval_s=_LOOK_S,
-        is_own_session=True,
         stop=stop,
     )
     state, reason = _verdict(task, ending)

@@ -17,7 +17,6 @@ from scanchain.settings import Override
 from scanchain.source import Source, source_of
 from scanchain.threads import use_threads
 
-OWN_PROCESS = object()  # what a command of its own process finds in click.Context.obj
 _GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to search them often costs a twentieth
 
 

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import subprocess
 import time
 from pathlib import Path
 
@@ -48,6 +49,21 @@ class Eats(StandsStill):
 
 class Dies(StandsStill):
     def misbehave(self):
+        os.kill(os.getpid(), signal.SIGSEGV)
+
+
+class Spawns(StandsStill):
+    """Starts a process of its own and forgets it."""
+
+    def misbehave(self):
+        if self.scans == 11:
+            child = subprocess.Popen(["sleep", "600"])
+            Path(os.environ["SPAWNED_FILE"]).write_text(str(child.pid))
+
+
+class SpawnsAndDies(Spawns):
+    def misbehave(self):
+        super().misbehave()
         os.kill(os.getpid(), signal.SIGSEGV)
 
 

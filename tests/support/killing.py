@@ -1,14 +1,17 @@
 """Killing runs at random moments, reading what is left of them, and going on."""
 
 import json
+import os
 import random
 import subprocess
 import sys
 import time
 import tomllib
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
+import psutil
 import pyarrow as pa
 import pyarrow.parquet as pq
 from rerun.chunk import RrdReader
@@ -41,6 +44,23 @@ def start(log, out, *words, **options):
     command = [sys.executable, "-m", "scanchain", "run", str(log), "--out", str(out), *words]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL} | options
     return subprocess.Popen(command, cwd=ROOT, **quiet)
+
+
+def processes_about(folder):
+    """Other processes on whose command line a folder stands."""
+    found = []
+    for process in psutil.process_iter():
+        with suppress(psutil.Error):
+            if process.pid != os.getpid() and str(folder) in " ".join(process.cmdline()):
+                found.append(process)
+    return found
+
+
+def wait_until(condition, within_s=120.0):
+    began = time.monotonic()
+    while not condition():
+        assert time.monotonic() - began < within_s
+        time.sleep(0.05)
 
 
 def partial(out):
