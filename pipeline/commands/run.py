@@ -10,6 +10,7 @@ import click
 
 from scanchain.commands.options import (
     LOG,
+    NumberRange,
     OverrideCommand,
     collect_garbage_seldom,
     config_option,
@@ -54,7 +55,7 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
 @click.option(
     "--checkpoint",
     "checkpoint_s",
-    type=click.FloatRange(0.0),
+    type=NumberRange(0.0),
     default=10.0,
     show_default=True,
     metavar="SECONDS",

@@ -21,7 +21,7 @@ from scanchain.comparison.table import Table, maps_of, summarize, write_table
 from scanchain.config import NO_TRUTH
 from scanchain.data import Trajectory
 from scanchain.errors import InputError
-from scanchain.evaluation import pair, read_relations, read_truth, relation_error
+from scanchain.evaluation import absolute_error_of_any_path, pair, read_relations, read_truth, relation_error
 from scanchain.logs import Log, open_log
 from scanchain.runs.directory import RUN_FILE, RunDirectory
 from scanchain.runs.job import Progress
@@ -147,8 +147,9 @@ def _reference(comparison: Comparison, log: Log, scans: StoredScans) -> Referenc
         raise InputError(f"{log.name}: has no poses on {topic}; scanchain info lists the topics that have")
     if truth is not None:
         try:
-            missing = pair(standing, truth).missing
-            note = missing and f"Of {len(scans):,} scans {missing}"
+            pairs = pair(standing, truth)
+            absolute_error_of_any_path(pairs)
+            note = pairs.missing and f"Of {len(scans):,} scans {pairs.missing}"
         except InputError as error:
             if comparison.ground_truth is not None or topic:
                 raise
