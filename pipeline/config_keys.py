@@ -75,8 +75,9 @@ class ConfigKey:
         if parsed is None:
             subject = f"{source} is" if self.name in source else f"{source}: {self.name} is"
             unit = f", in {self.unit}" if self.unit else ""
-            is_large = isinstance(value, float) and abs(value) > _LARGEST
-            finite = "" if not is_large else " and finite" if math.isinf(value) else f" and at most {_LARGEST:g}"
+            finite = ""
+            if isinstance(value, float) and abs(value) > _LARGEST:
+                finite = " and finite" if math.isinf(value) else f" and at most {_LARGEST:g}"
             raise InputError(f"{subject} {text or shown(value)}; it must be {self._demand}{finite}{unit}")
         return parsed
 

@@ -21,6 +21,7 @@ from scanchain.settings import Override, dump, load_settings
 from scanchain.source import source_of
 from scanchain.threads import VARIABLE
 from scanchain.verdict import Verdict
+from scanchain.whole_file import write_whole
 
 ROWS_FOLDER = "rows"  # folder of a batch's directory with the result of each log
 
@@ -113,9 +114,7 @@ class Row(Struct, frozen=True):
     def write(self, path: Path) -> None:
         """Write as JSON, whole or not at all."""
         path.parent.mkdir(parents=True, exist_ok=True)
-        new = path.with_suffix(".new")
-        new.write_bytes(msgspec.json.encode(self))
-        new.replace(path)
+        write_whole(path, msgspec.json.encode(self))
 
 
 def output_file(out: Path, key: str) -> Path:

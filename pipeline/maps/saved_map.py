@@ -85,18 +85,14 @@ class Edges:
     @classmethod
     def chained(cls, *parts: Edges) -> Edges:
         """Those of several, one after the other."""
-        names = ("pairs", "measurements", "information", "is_loop", "weight")
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in _EDGE_ARRAYS))
 
     def where(self, kept: NDArray[np.bool_]) -> Edges:
         """Those for which ``kept`` (E,) holds."""
-        return Edges(
-            self.pairs[kept],
-            self.measurements[kept],
-            self.information[kept],
-            self.is_loop[kept],
-            self.weight[kept],
-        )
+        return Edges(*(getattr(self, name)[kept] for name in _EDGE_ARRAYS))
+
+
+_EDGE_ARRAYS = Edges.__match_args__
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,14 +183,7 @@ def write_saved_map(
         traveled_m=np.array([keyframe.traveled_m for keyframe in keyframes]),
         scale=np.array([keyframe.scale for keyframe in keyframes]),
     )
-    np.savez(
-        folder / _EDGES,
-        pairs=edges.pairs,
-        measurements=edges.measurements,
-        information=edges.information,
-        is_loop=edges.is_loop,
-        weight=edges.weight,
-    )
+    np.savez(folder / _EDGES, **{name: getattr(edges, name) for name in _EDGE_ARRAYS})
     crc32 = {name: _crc32(folder / name) for name in (_KEYFRAMES, _EDGES, _POINTS)}
     dimension: Literal[2, 3] = 2 if poses.shape[-1] == 3 else 3
     index = _Index(VERSION, dimension, len(keyframes), int(count.sum()), tuple(sessions), crc32)
@@ -228,12 +217,9 @@ def open_saved_map(path: Path) -> SavedMap:
         raise _damaged(folder / _KEYFRAMES, f"counts other than the {index.points:,} points of {_INDEX}")
     if not np.isin(rows["session"], np.arange(len(index.sessions))).all():
         raise _damaged(folder / _KEYFRAMES, f"names sessions that {_INDEX} does not list")
-    E, k = -1, 3 if d == 2 else 6  # as many as there are
-    edges = _arrays(
-        folder / _EDGES,
-        {"pairs": ("i", (E, 2)), "measurements": ("f", (E, d + 1, d + 1)), "information": ("f", (E, k, k))}
-        | {"is_loop": ("b", (E,)), "weight": ("f", (E,))},
-    )
+    k = 3 if d == 2 else 6
+    shapes = (("i", (-1, 2)), ("f", (-1, d + 1, d + 1)), ("f", (-1, k, k)), ("b", (-1,)), ("f", (-1,)))
+    edges = _arrays(folder / _EDGES, dict(zip(_EDGE_ARRAYS, shapes, strict=True)))
     if (
         len({len(array) for array in edges.values()}) > 1
         or not ((edges["pairs"] >= 0) & (edges["pairs"] < K)).all()

@@ -10,7 +10,6 @@ import bz2
 import gzip
 import io
 import math
-import os
 import zlib
 from collections import Counter
 from collections.abc import Iterator
@@ -271,7 +270,7 @@ def read_text(path: Path) -> tuple[bytes, str]:
                 if len(text) > most:
                     raise InputError(f"{path}: unpacks to more than {most:,} bytes; is it a CARMEN log?")
     except (zlib.error, EOFError, ValueError, OSError) as error:
-        if getattr(error, "errno", None) is not None:  # of the system, not of bz2 or gzip
-            raise InputError(f"{path}: cannot be read ({os.strerror(error.errno)}); check the file") from error
+        if isinstance(error, OSError) and error.errno is not None:  # of the system, not of bz2 or gzip
+            raise InputError(f"{path}: cannot be read ({error.strerror}); check the file") from error
         return bytes(text), f"{path}: does not unpack beyond byte {len(text)} of the text ({error})"
     return bytes(text), ""
