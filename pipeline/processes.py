@@ -39,12 +39,13 @@ def peak_mib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _MIB  # bytes on macOS
 
 
-def resident_mib(pid: int) -> float:
-    """Resident memory of a process and its children; 0 once it is gone."""
-    total = 0
+def resident_mib(pid: int, seen: dict[int, psutil.Process] | None = None) -> float:
+    """Resident memory of a process and its children, which ``seen`` takes; 0 once it is gone."""
+    total, seen = 0, {} if seen is None else seen
     for each in _family(pid):
         with suppress(psutil.Error):
-            total += psutil.Process(each).memory_info().rss
+            seen[each] = seen.get(each) or psutil.Process(each)
+            total += seen[each].memory_info().rss
     return total / _MIB
 
 
@@ -157,18 +158,28 @@ def run_within(
             env=environment,
             start_new_session=True,
         )
+        seen: dict[int, psutil.Process] = {}
         try:
-            return _watch(process, limits, interval_s, stop or Event())
+            return _watch(process, limits, interval_s, stop or Event(), seen)
         finally:
             _kill(process.pid, with_group=_HAS_GROUPS)
+            for each in seen.values():  # those in groups of their own that lost their parent, too
+                with suppress(psutil.Error):
+                    each.kill()
             process.communicate()
 
 
-def _watch(process: subprocess.Popen[bytes], limits: Limits, interval_s: float, stop: Event) -> Ending:
-    """Wait for the end, or for the moment at which there is a reason to kill it."""
+def _watch(
+    process: subprocess.Popen[bytes],
+    limits: Limits,
+    interval_s: float,
+    stop: Event,
+    seen: dict[int, psutil.Process],
+) -> Ending:
+    """Wait for the end, or for the moment at which there is a reason to kill it; ``seen`` takes all below it."""
     began, peak = monotonic(), 0.0
     while process.poll() is None:
-        peak = max(peak, resident_mib(process.pid))
+        peak = max(peak, resident_mib(process.pid, seen))
         if peak > limits.memory_mib:
             return Ending(0, KilledFor.MEMORY, peak, monotonic() - began)
         if monotonic() - began > limits.time_s:

@@ -164,7 +164,7 @@ def test_what_one_did_until_it_failed_is_kept_scan_by_scan(bad):
 
 def test_children_of_a_method_end_with_it(office, tmp_path, monkeypatch):
     monkeypatch.setenv("SPAWNED_FILE", str(tmp_path / "spawned"))
-    for name, status in (("Spawns", Status.OK), ("SpawnsAndDies", Status.CRASHED)):
+    for name, status in (("Spawns", Status.OK), ("SpawnsAway", Status.OK), ("SpawnsAndDies", Status.CRASHED)):
         found = run(office, tmp_path / name, f"bad_odometries:{name}")
         assert [row.status for row in found.rows] == [status]
         spawned = int((tmp_path / "spawned").read_text())

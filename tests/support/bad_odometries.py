@@ -55,10 +55,17 @@ class Dies(StandsStill):
 class Spawns(StandsStill):
     """Starts a process of its own and forgets it."""
 
+    is_away = False
+
     def misbehave(self):
         if self.scans == 11:
-            child = subprocess.Popen(["sleep", "600"])
+            child = subprocess.Popen(["sleep", "600"], start_new_session=self.is_away)
             Path(os.environ["SPAWNED_FILE"]).write_text(str(child.pid))
+            time.sleep(0.5)
+
+
+class SpawnsAway(Spawns):
+    is_away = True
 
 
 class SpawnsAndDies(Spawns):
