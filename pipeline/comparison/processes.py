@@ -30,13 +30,7 @@ def limits_for(scans: int, time_s: float | None, memory_mib: float | None) -> Li
 
 
 def run_all(
-    methods: Sequence[Method],
-    scans: StoredScans,
-    folder: Path,
-    *,
-    repeat: int,
-    limits: Limits,
-    progress: Progress,
+    methods: Sequence[Method], scans: StoredScans, folder: Path, *, repeat: int, limits: Limits, progress: Progress
 ) -> dict[str, list[Outcome]]:
     """``repeat`` runs of every method, each round starting with another one; one not installed is tried once."""
     outcomes: dict[str, list[Outcome]] = {method.name: [] for method in methods}
