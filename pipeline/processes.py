@@ -177,16 +177,16 @@ def _watch(
     seen: dict[int, psutil.Process],
 ) -> Ending:
     """Wait for the end, or for the moment at which there is a reason to kill it; ``seen`` takes all below it."""
-    began, peak = monotonic(), 0.0
-    while process.poll() is None:
+    began, peak, reason = monotonic(), 0.0, KilledFor.NOTHING
+    while reason is KilledFor.NOTHING and process.poll() is None:
         peak = max(peak, resident_mib(process.pid, seen))
         if peak > limits.memory_mib:
-            return Ending(0, KilledFor.MEMORY, peak, monotonic() - began)
-        if monotonic() - began > limits.time_s:
-            return Ending(0, KilledFor.TIME, peak, monotonic() - began)
-        if stop.wait(interval_s):
-            return Ending(0, KilledFor.STOP, peak, monotonic() - began)
-    return Ending(process.returncode, KilledFor.NOTHING, peak, monotonic() - began)
+            reason = KilledFor.MEMORY
+        elif monotonic() - began > limits.time_s:
+            reason = KilledFor.TIME
+        elif stop.wait(interval_s):
+            reason = KilledFor.STOP
+    return Ending(process.returncode or 0, reason, peak, monotonic() - began)
 
 
 def _kill(pid: int, *, with_group: bool) -> None:
