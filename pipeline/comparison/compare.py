@@ -110,9 +110,7 @@ def compare(comparison: Comparison, present: Callable[[Path], None], progress: P
         )
         reference = _reference(replace(comparison, overrides=overrides), log, scans)
         limits = limits_for(len(scans), comparison.time_s, comparison.memory_mib)
-        outcomes = run_all(
-            methods, scans, shared, repeat=comparison.repeat, limits=limits, progress=progress
-        )
+        outcomes = run_all(methods, scans, shared, repeat=comparison.repeat, limits=limits, progress=progress)
         progress.announce("evaluating and drawing")
         assessed = {
             name: assess(runs, scans.stamps_ns, reference.truth, reference.relations)
