@@ -26,7 +26,6 @@ from scanchain.commands.localize import localize
 from scanchain.commands.map import map_group
 from scanchain.commands.merge import merge
 from scanchain.commands.optimize import optimize
-from scanchain.commands.options import OWN_PROCESS
 from scanchain.commands.run import run
 from scanchain.commands.sequence import sequence
 from scanchain.commands.simulate import simulate
@@ -65,8 +64,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments : those of the process where left out, which then ends with that code
     """
     if arguments is None:
-        _leave(_run(sys.argv[1:], OWN_PROCESS))
-    return _run(list(arguments), None)
+        _leave(_run(sys.argv[1:]))
+    return _run(list(arguments))
 
 
 def _leave(code: int) -> NoReturn:
@@ -77,11 +76,11 @@ def _leave(code: int) -> NoReturn:
     os._exit(code)
 
 
-def _run(words: list[str], obj: object) -> int:
+def _run(words: list[str]) -> int:
     """Exit code of a command."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small: threads would wait for each other
     try:
-        return scanchain.main(words, prog_name="scanchain", standalone_mode=False, obj=obj) or 0
+        return scanchain.main(words, prog_name="scanchain", standalone_mode=False) or 0
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
         return 2

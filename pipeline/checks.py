@@ -18,9 +18,10 @@ from numpy.typing import DTypeLike, NDArray
 
 from scanchain.errors import InputError, one_line, shown
 from scanchain.kernels.geometry.validity import largest_magnitude, largest_moved, rigidity_error
+from scanchain.kernels.voxels.hashing import REACH
 
 _RIGID = 1e-3  # largest entry of RᵀR − I; poses printed with four digits stay below it
-_MOST_VOXELS = float((1 << 20) - 64)  # largest distance from the origin, beyond which keys of voxels repeat
+_LARGEST_VOXEL = float(1 << 31)  # of 32 bits, in which voxels are counted along an axis
 _MOST_WHOLE = 1 << 63  # whole numbers from which on 64 bits do not hold them
 _LATEST_S = 1e11  # latest stamp, seconds: the year 5138
 SMALLER_UNITS = " (from milliseconds: 1e-3 * stamp, microseconds: 1e-6, nanoseconds: 1e-9)"
@@ -108,13 +109,30 @@ def poses(value: object, name: str, d: int) -> NDArray[np.float64]:
 def within_map(points: NDArray[np.floating], T: NDArray[np.float64], voxel_m: float, name: str) -> None:
     """Refuse points that, moved by T, lie beyond what a voxel map can address."""
     at_most_m = math.sqrt(points.shape[1]) * largest_magnitude(points) + largest_magnitude(T[:-1, -1].copy())
-    if at_most_m < _MOST_VOXELS * voxel_m:  # without moving them
+    if at_most_m < REACH * voxel_m:  # without moving them
         return
     farthest_m = largest_moved(points, T)
-    if not farthest_m < _MOST_VOXELS * voxel_m:
+    if not farthest_m < REACH * voxel_m:
         raise InputError(
             f"{name} reach {farthest_m:.3g} m from the origin; a map of {voxel_m:g} m voxels holds "
-            f"{_MOST_VOXELS * voxel_m:.3g} m: give meters, and coordinates near the lidar (subtract a map offset)"
+            f"{REACH * voxel_m:.3g} m: give meters, and coordinates near the lidar (subtract a map offset)"
+        )
+
+
+def within_voxels(
+    points: NDArray[np.floating], voxel_m: float, name: str, *, max_range_m: float = math.inf
+) -> None:
+    """Refuse points within a range that lie so far away, or apart, in voxels that several would have one key."""
+    if max_range_m < REACH * voxel_m or largest_magnitude(points) < REACH * voxel_m:
+        return
+    used = points[np.linalg.norm(points, axis=1) <= max_range_m] if math.isfinite(max_range_m) else points
+    apart_m = float(np.ptp(used, axis=0).max()) if len(used) else 0.0
+    farthest_m = float(np.abs(used).max(initial=0.0))
+    if not (apart_m < 2.0 * REACH * voxel_m and farthest_m < _LARGEST_VOXEL * voxel_m):
+        raise InputError(
+            f"{name} lie up to {farthest_m:.3g} m from the origin and {apart_m:.3g} m apart; voxels of "
+            f"{voxel_m:g} m reach {_LARGEST_VOXEL * voxel_m:.3g} and {2.0 * REACH * voxel_m:.3g} m: take larger "
+            "ones, give meters, and coordinates near the lidar (subtract a map offset)"
         )
 
 

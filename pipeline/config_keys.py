@@ -22,6 +22,7 @@ _UNITS = {  # by the ending of a name; the first that fits
     "_voxels": "voxels", "_keyframes": "keyframes",
 }  # fmt: skip
 _YES, _NO = ("true", "yes", "on", "1"), ("false", "no", "off", "0")
+_LARGEST = 1e50  # beyond which products of a few numbers are infinite
 _UNLIMITED = ("log.end_s", "log.max_range_m", "preprocess.max_range_m", "local_map.max_distance_m")  # take inf
 
 
@@ -74,7 +75,9 @@ class ConfigKey:
         if parsed is None:
             subject = f"{source} is" if self.name in source else f"{source}: {self.name} is"
             unit = f", in {self.unit}" if self.unit else ""
-            finite = " and finite" if isinstance(value, float) and math.isinf(value) else ""
+            finite = ""
+            if isinstance(value, float) and abs(value) > _LARGEST:
+                finite = " and finite" if math.isinf(value) else f" and at most {_LARGEST:g}"
             raise InputError(f"{subject} {text or shown(value)}; it must be {self._demand}{finite}{unit}")
         return parsed
 
@@ -120,7 +123,8 @@ class ConfigKey:
         except OverflowError:  # an int of hundreds of digits
             return None
         above = number >= self.low if self.low_is_allowed else number > self.low
-        if not above or number > self.high or (math.isinf(number) and self.name not in _UNLIMITED):
+        is_limited = math.isfinite(number) or self.name not in _UNLIMITED
+        if not above or number > self.high or (abs(number) > _LARGEST and is_limited):
             return None
         return number if self.kind == "float" else int(number) if number.is_integer() else None
 

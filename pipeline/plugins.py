@@ -10,8 +10,6 @@ from types import ModuleType
 
 from scanchain.errors import InputError, one_line
 
-foreign: set[str] = set()  # modules of the user's that were imported
-
 
 def is_class_name(text: str) -> bool:
     """True if a text has the form ``package.module:Class``."""
@@ -29,8 +27,6 @@ def load(name: str, *methods: str) -> type:
     if not module_name or not class_name:
         raise InputError(f"{name!r} names no class; wanted module:Class, as in my_module:MyClass")
     module = _imported(module_name, name)
-    if not module_name.startswith("scanchain."):
-        foreign.add(module_name)
     found = getattr(module, class_name, None)
     if not isinstance(found, type):
         own = [key for key, value in vars(module).items() if getattr(value, "__module__", "") == module.__name__]

@@ -81,6 +81,10 @@ class PointStore:
         finally:
             self.file.close()
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """Pickled with all its points; unpickled, they lie in a file without a name."""
+        return _restored, (self.dimension, self.read(0, self.rows))
+
     def _take(self, file: FileIO) -> None:
         """Use a file, which is closed when the store is garbage-collected."""
         self.file, self.lock = file, threading.Lock()
@@ -102,6 +106,12 @@ class StoredPoints:
     def read(self) -> NDArray[np.float64]:
         """(count, d) meters."""
         return self.store.read(self.first, self.count).astype(np.float64)
+
+
+def _restored(dimension: int, points: NDArray[np.float32]) -> PointStore:
+    store = PointStore(dimension)
+    store.add(points)
+    return store
 
 
 def _nameless() -> FileIO:

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import ctypes
 import os
+import runpy
+import shutil
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum, auto
-from importlib.abc import MetaPathFinder
 from pathlib import Path
 from threading import Event
 from time import monotonic
-from types import ModuleType
 
 import psutil
 
 _MIB = 1024.0**2
+_HAS_GROUPS = sys.platform != "win32"
+_KILL = signal.SIGKILL if sys.platform != "win32" else signal.SIGTERM
 
 
 def peak_mib() -> float:
@@ -36,12 +39,13 @@ def peak_mib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _MIB  # bytes on macOS
 
 
-def resident_mib(pid: int) -> float:
-    """Resident memory of a process and its children; 0 once it is gone."""
-    total = 0
+def resident_mib(pid: int, seen: dict[int, psutil.Process] | None = None) -> float:
+    """Resident memory of a process and its children, which ``seen`` takes; 0 once it is gone."""
+    total, seen = 0, {} if seen is None else seen
     for each in _family(pid):
         with suppress(psutil.Error):
-            total += psutil.Process(each).memory_info().rss
+            seen[each] = seen.get(each) or psutil.Process(each)
+            total += seen[each].memory_info().rss
     return total / _MIB
 
 
@@ -68,28 +72,6 @@ def return_freed_memory() -> None:
 def available_mib() -> float:
     """Memory that the machine can give without swapping."""
     return psutil.virtual_memory().available / _MIB
-
-
-def leave_pandas_out() -> None:
-    """Let pyarrow do without pandas, which it would import in a quarter of a second.
-
-    For a process of our own: pyarrow looks for pandas once, and converts nothing to it where it found none.
-    """
-    if "pandas" in sys.modules:
-        return
-    import pyarrow as pa
-
-    sys.meta_path.insert(0, _WithoutPandas())
-    pa.scalar(0)  # it looks now
-    del sys.meta_path[0]
-
-
-class _WithoutPandas(MetaPathFinder):
-    """Finds nothing but that pandas is not installed."""
-
-    def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> None:
-        if fullname == "pandas":
-            raise ModuleNotFoundError("left out", name="pandas")
 
 
 def die_first() -> None:
@@ -134,58 +116,89 @@ class Ending:
         return signal.Signals(-self.code).name if self.code < 0 else f"exit code {self.code}"
 
 
+def die_with_parent(leftover: Path | None = None) -> None:
+    """Kill this process and its group once the one that started it by ``run_within`` is gone, however it ended.
+
+    leftover : folder that is removed before
+    """
+    watched = os.dup(sys.stdin.fileno())  # a pipe that nobody writes to; the other end closes with the parent
+    os.dup2(os.open(os.devnull, os.O_RDONLY), sys.stdin.fileno())
+
+    def wait() -> None:
+        os.read(watched, 1)
+        if leftover is not None:
+            shutil.rmtree(leftover, ignore_errors=True)
+        _kill(os.getpid(), with_group=_HAS_GROUPS and os.getpgrp() == os.getpid())
+
+    threading.Thread(target=wait, name="parent", daemon=True).start()
+
+
 def run_within(
     limits: Limits,
-    command: Sequence[str],
+    module: str,
+    arguments: Sequence[str],
     environment: Mapping[str, str],
     *,
     output: Path,
-    errors: Path | None = None,
     interval_s: float,
-    is_own_session: bool = False,
     stop: Event | None = None,
 ) -> Ending:
-    """Run a command to its end, or kill it and its children when it takes too much or ``stop`` is set.
+    """Run a module of Python to its end, or kill it when it takes too much or ``stop`` is set.
 
-    output, errors : files for stdout and stderr; without ``errors`` both go into one
+    Its group of processes ends with it, and is no other's: a Ctrl-C on the terminal does not reach it. The module
+    calls ``die_with_parent``, or is run by this one, ``python -m scanchain.processes MODULE``, which does.
     interval_s : seconds between two readings of its memory
-    is_own_session : whether a Ctrl-C on the terminal does not reach it
     """
-    with output.open("wb") as out, (errors or output).open("ab") as err:
+    with output.open("wb") as out:
         process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
+            [sys.executable, "-P", "-m", module, *arguments],
+            stdin=subprocess.PIPE,
             stdout=out,
-            stderr=err if errors else subprocess.STDOUT,
+            stderr=subprocess.STDOUT,
             env=environment,
-            start_new_session=is_own_session,
+            start_new_session=True,
         )
+        seen: dict[int, psutil.Process] = {}
         try:
-            return _watch(process, limits, interval_s, stop or Event())
+            return _watch(process, limits, interval_s, stop or Event(), seen)
         finally:
-            _end(process)
+            _kill(process.pid, with_group=_HAS_GROUPS)
+            for each in seen.values():  # those in groups of their own that lost their parent, too
+                with suppress(psutil.Error):
+                    each.kill()
+            process.communicate()
 
 
-def _watch(process: subprocess.Popen[bytes], limits: Limits, interval_s: float, stop: Event) -> Ending:
-    """Wait for the end, or for the moment at which there is a reason to kill it."""
-    began, peak = monotonic(), 0.0
-    while process.poll() is None:
-        peak = max(peak, resident_mib(process.pid))
+def _watch(
+    process: subprocess.Popen[bytes],
+    limits: Limits,
+    interval_s: float,
+    stop: Event,
+    seen: dict[int, psutil.Process],
+) -> Ending:
+    """Wait for the end, or for the moment at which there is a reason to kill it; ``seen`` takes all below it."""
+    began, peak, reason = monotonic(), 0.0, KilledFor.NOTHING
+    while reason is KilledFor.NOTHING and process.poll() is None:
+        peak = max(peak, resident_mib(process.pid, seen))
         if peak > limits.memory_mib:
-            return Ending(0, KilledFor.MEMORY, peak, monotonic() - began)
-        if monotonic() - began > limits.time_s:
-            return Ending(0, KilledFor.TIME, peak, monotonic() - began)
-        if stop.wait(interval_s):
-            return Ending(0, KilledFor.STOP, peak, monotonic() - began)
-    return Ending(process.returncode, KilledFor.NOTHING, peak, monotonic() - began)
+            reason = KilledFor.MEMORY
+        elif monotonic() - began > limits.time_s:
+            reason = KilledFor.TIME
+        elif stop.wait(interval_s):
+            reason = KilledFor.STOP
+    return Ending(process.returncode or 0, reason, peak, monotonic() - began)
 
 
-def _end(process: subprocess.Popen[bytes]) -> None:
-    """Kill the process and its children."""
-    if process.poll() is None:
-        family = psutil.Process(process.pid).children(recursive=True)
-        process.kill()
-        for child in family:
-            if child.is_running():
-                child.kill()
-    process.wait()
+def _kill(pid: int, *, with_group: bool) -> None:
+    """Kill a process, all below it, and the group that it leads, where members may be that lost their parent."""
+    for each in reversed(_family(pid)[1:]):
+        with suppress(OSError):
+            os.kill(each, _KILL)
+    with suppress(OSError):
+        (os.killpg if with_group else os.kill)(pid, _KILL)
+
+
+if __name__ == "__main__":
+    die_with_parent()
+    del sys.argv[0]
+    runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)

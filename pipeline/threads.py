@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 
 VARIABLE = "SCANCHAIN_THREADS"
+MOST = 256
 
 
 def use_threads(count: int) -> None:
@@ -16,5 +17,5 @@ def threads() -> int:
     """Number of threads for what is computed in parts; by default one for each core that this process may use."""
     text = os.environ.get(VARIABLE, "")
     if text.isdigit() and int(text):
-        return int(text)
+        return min(int(text), MOST)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

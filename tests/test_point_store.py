@@ -1,10 +1,13 @@
 """Points kept in a file: what goes in comes out, and a state that was kept is gone on from."""
 
+import copy
 import gc
+import pickle
 
 import numpy as np
 import pytest
 
+from scanchain import Slam, open_log, simulate
 from scanchain.errors import InputError
 from scanchain.point_store import PointStore
 from scanchain.processes import resident_mib
@@ -28,6 +31,22 @@ def test_what_lies_one_after_the_other_is_read_at_once():
     first, second = store.add(np.zeros((2, 2))), store.add(np.ones((3, 2)))
     assert np.array_equal(store.read(first.first, 5)[:, 0], [0, 0, 1, 1, 1])
     assert second.first == 2 and store.rows == 5
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda value: pickle.loads(pickle.dumps(value))])
+def test_a_result_is_pickled_with_its_points_and_lives_without_the_first(tmp_path, copied):
+    simulate("office", tmp_path / "office.mcap", duration_s=6.0)
+    slam = Slam(dimension=2)
+    for scan in open_log(tmp_path / "office.mcap").scans():
+        slam.process(scan)
+    result = slam.finish()
+    again = copied(result)
+    expected = [keyframe.points for keyframe in result.keyframes]
+    slam.points.close()
+    assert again.trajectory.poses.tobytes() == result.trajectory.poses.tobytes() and len(expected) > 3
+    for keyframe, points in zip(again.keyframes, expected, strict=True):
+        assert np.array_equal(keyframe.points, points)
+    assert len({id(keyframe.stored.store) for keyframe in again.keyframes}) == 1
 
 
 def test_points_stay_out_of_memory():

@@ -200,6 +200,7 @@ def test_a_key_like_none_there_is_points_to_the_list(key):
         ("log.every", "1.5", "a whole number >= 1"),
         ("log.every", "inf", "a whole number >= 1"),
         ("local_map.voxel_size_m", "inf", "a number > 0 and finite, in m"),
+        ("matching.max_distance_m", "1e+308", "a number > 0 and at most 1e+50, in m"),
         ("log.start_s", "-0.1", "a number >= 0, in s"),
         ("maps.slice_min_z_m", "-inf", "a number and finite, in m"),
     ],

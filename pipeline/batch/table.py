@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -11,24 +12,15 @@ import numpy as np
 from scanchain.batch.task import Row, State
 from scanchain.runs.metrics import Metrics
 from scanchain.verdict import Verdict
+from scanchain.whole_file import write_whole
 from scanchain.words import counted, duration
 
 TABLE_FILE, SUMMARY_FILE = "batch.parquet", "summary.txt"
 _NUMBERS = (
-    "scans",
-    "dimension",
-    "ok",
-    "contradicted",
-    "degenerate",
-    "lost",
-    "keyframes",
-    "closures_tried",
-    "closures_rejected_by_verification",
-    "closures_verified",
-    "closures_rejected_by_back_end",
-    "closures_accepted",
+    "scans", "dimension", "ok", "contradicted", "degenerate", "lost", "keyframes", "closures_tried",
+    "closures_rejected_by_verification", "closures_verified", "closures_rejected_by_back_end", "closures_accepted",
     "degrees_of_freedom",
-)
+)  # fmt: skip
 _FIGURES = ("log_span_s", "run_s", "scans_per_s", "times_real_time", "traveled_m", "chi2", "median_residual_m")
 _ERRORS = ("ate_rmse_m", "ate_share_of_path", "kitti_translation_share", "kitti_rotation_rad_per_m")
 
@@ -40,12 +32,8 @@ def write_table(folder: Path, rows: Sequence[Row]) -> str:
 
     schema = pa.schema(
         [(name, pa.string()) for name in ("log", "sha256", "key", "run", "state", "reason", "verdict")]
-        + [
-            ("warnings", pa.int64()),
-            ("tries", pa.int64()),
-            ("duration_s", pa.float64()),
-            ("peak_mib", pa.float64()),
-        ]
+        + [(name, pa.int64()) for name in ("warnings", "tries")]
+        + [(name, pa.float64()) for name in ("duration_s", "peak_mib")]
         + [(name, pa.int64()) for name in _NUMBERS]
         + [(name, pa.float64()) for name in (*_FIGURES, *_ERRORS, "odometry_ate_rmse_m")]
     )
@@ -56,11 +44,10 @@ def write_table(folder: Path, rows: Sequence[Row]) -> str:
         "ate_*, kitti_*": "against the ground truth in the log, after optimization; null without any",
     }
     table = pa.Table.from_pylist([_cells(row) for row in rows], schema=schema.with_metadata(notes))
-    pq.write_table(table, folder / f"{TABLE_FILE}.new", compression="zstd")
-    (folder / f"{TABLE_FILE}.new").replace(folder / TABLE_FILE)
-    text = summary(rows)
-    (folder / f"{SUMMARY_FILE}.new").write_text(text, encoding="utf-8")
-    (folder / f"{SUMMARY_FILE}.new").replace(folder / SUMMARY_FILE)
+    data, text = io.BytesIO(), summary(rows)
+    pq.write_table(table, data, compression="zstd")
+    write_whole(folder / TABLE_FILE, data.getvalue())
+    write_whole(folder / SUMMARY_FILE, text.encode())
     return text
 
 
@@ -120,11 +107,9 @@ def _distance(length_m: float) -> str:
 
 def _cells(row: Row) -> dict[str, object]:
     metrics = row.metrics
-    cells: dict[str, object] = {
-        name: getattr(row, name)
-        for name in ("log", "sha256", "key", "run", "reason", "warnings", "tries", "duration_s")
-    }
-    cells |= {"state": str(row.state), "peak_mib": row.peak_mib}
+    names = ("log", "sha256", "key", "run", "reason", "warnings", "tries", "duration_s", "peak_mib")
+    cells: dict[str, object] = {name: getattr(row, name) for name in names}
+    cells["state"] = str(row.state)
     if metrics is None:
         return cells
     cells |= {name: getattr(metrics, name) for name in (*_NUMBERS, *_FIGURES)}

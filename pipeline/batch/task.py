@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import sys
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
@@ -22,6 +21,7 @@ from scanchain.settings import Override, dump, load_settings
 from scanchain.source import source_of
 from scanchain.threads import VARIABLE
 from scanchain.verdict import Verdict
+from scanchain.whole_file import write_whole
 
 ROWS_FOLDER = "rows"  # folder of a batch's directory with the result of each log
 
@@ -114,9 +114,7 @@ class Row(Struct, frozen=True):
     def write(self, path: Path) -> None:
         """Write as JSON, whole or not at all."""
         path.parent.mkdir(parents=True, exist_ok=True)
-        new = path.with_suffix(".new")
-        new.write_bytes(msgspec.json.encode(self))
-        new.replace(path)
+        write_whole(path, msgspec.json.encode(self))
 
 
 def output_file(out: Path, key: str) -> Path:
@@ -161,15 +159,15 @@ def attempt(task: Task, stop: Event | None = None) -> Row:
 
 
 def _tried(task: Task, stop: Event | None) -> Row:
-    command = [sys.executable, "-P", "-m", "scanchain", "run", "--out", str(task.run), "--force", *task.arguments]
+    words = ["run", "--out", str(task.run), "--force", *task.arguments, "--", task.log]
     task.output_file.parent.mkdir(parents=True, exist_ok=True)
     ending = run_within(
         Limits(task.time_s, task.memory_mib),
-        [*command, "--", task.log],
+        "scanchain.processes",
+        ["scanchain", *words],
         os.environ | dict.fromkeys(_THREADS, "1"),  # a process a core: threads would only get in each other's way
         output=task.output_file,
         interval_s=_LOOK_S,
-        is_own_session=True,
         stop=stop,
     )
     state, reason = _verdict(task, ending)

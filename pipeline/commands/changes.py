@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from scanchain.commands.options import threads_option
+from scanchain.commands.options import NumberRange, threads_option
 from scanchain.errors import InputError
 
 if TYPE_CHECKING:
     from scanchain.data import Pose
 
 _PATH = click.Path(path_type=Path)
-_ABOVE_ZERO = click.FloatRange(0.0, min_open=True)
+_ABOVE_ZERO = NumberRange(0.0, min_open=True)
 
 
 @click.command()

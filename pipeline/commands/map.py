@@ -6,10 +6,11 @@ from pathlib import Path
 
 import click
 
+from scanchain.commands.options import NumberRange
 from scanchain.words import counted
 
 _PATH = click.Path(path_type=Path)
-_ABOVE_ZERO = click.FloatRange(0.0, min_open=True)
+_ABOVE_ZERO = NumberRange(0.0, min_open=True)
 
 
 @click.group("map")
@@ -32,7 +33,12 @@ def map_group() -> None:
     help="Distance between the positions that the map is seen from. [default: 1.5 in the plane, 6 in space]",
 )
 @click.option(
-    "--height", type=float, default=1.6, show_default=True, metavar="METERS", help="Of the lidar above the ground."
+    "--height",
+    type=_ABOVE_ZERO,
+    default=1.6,
+    show_default=True,
+    metavar="METERS",
+    help="Of the lidar above the ground.",
 )
 @click.option("--force", is_flag=True, help="Replace an existing map once the new one is complete.")
 def import_file(file: Path, out: Path, spacing: float | None, height: float, force: bool) -> None:

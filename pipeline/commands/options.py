@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 from collections.abc import Callable, Sequence
 from functools import reduce
-from math import inf
+from math import inf, isnan
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +15,25 @@ from scanchain.config import NO_TRUTH
 from scanchain.errors import InputError
 from scanchain.settings import Override
 from scanchain.source import Source, source_of
-from scanchain.threads import use_threads
+from scanchain.threads import MOST, use_threads
 
-OWN_PROCESS = object()  # what a command of its own process finds in click.Context.obj
 _GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to search them often costs a twentieth
 
 
 def collect_garbage_seldom() -> None:
     """Search for garbage less often, for commands that process a log."""
     gc.set_threshold(_GARBAGE_EVERY)
+
+
+class NumberRange(click.FloatRange):
+    """A range that NaN, which compares with nothing, is outside of."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """The number."""
+        number = super().convert(value, param, ctx)
+        if isnan(number):
+            self.fail(f"{value} is no number.", param, ctx)
+        return number
 
 
 class OverrideCommand(click.Command):
@@ -123,7 +133,7 @@ def _use(context: click.Context, parameter: click.Parameter, count: int | None) 
 
 threads_option = click.option(
     "--threads",
-    type=click.IntRange(1),
+    type=click.IntRange(1, MOST),
     metavar="N",
     callback=_use,
     expose_value=False,
@@ -185,7 +195,7 @@ def ground_truth_option(
 
 
 _MIB_PER_GIB = 1024.0
-_ABOVE_ZERO = click.FloatRange(0.0, min_open=True)
+_ABOVE_ZERO = NumberRange(0.0, min_open=True)
 
 
 def limit_options(what: str, *, time_default: str, memory_default: str) -> Callable[[Any], Any]:

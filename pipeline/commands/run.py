@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from scanchain import plugins
 from scanchain.commands.options import (
     LOG,
-    OWN_PROCESS,
+    NumberRange,
     OverrideCommand,
     collect_garbage_seldom,
     config_option,
@@ -27,7 +26,7 @@ from scanchain.errors import InputError, ScanchainError
 from scanchain.source import Source
 
 if TYPE_CHECKING:
-    from scanchain.runs.job import Recorder, SinkName
+    from scanchain.runs.job import SinkName
 
 _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
 
@@ -56,7 +55,7 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
 @click.option(
     "--checkpoint",
     "checkpoint_s",
-    type=click.FloatRange(0.0),
+    type=NumberRange(0.0),
     default=10.0,
     show_default=True,
     metavar="SECONDS",
@@ -95,20 +94,14 @@ def run(
     collect_garbage_seldom()
     from scanchain.api import open_recorder, write_report
     from scanchain.commands.terminal import Terminal
-    from scanchain.processes import leave_pandas_out
     from scanchain.runs.job import Job
     from scanchain.runs.resume.rescue import how_to_resume
     from scanchain.runs.run import run as run_log
 
-    def record(path: Path | None, **options: Any) -> Recorder:
-        if ctx.obj is OWN_PROCESS and not plugins.foreign:
-            leave_pandas_out()
-        return open_recorder(path, **options)
-
     command = tuple(sys.argv)
     job = Job(logs=logs, out=out, overrides=overrides(ctx), sinks=_sinks(rerun), command=command, **options)
     with Terminal("scans") as terminal:
-        finished = run_log(job, record, terminal, write_report)
+        finished = run_log(job, open_recorder, terminal, write_report)
     is_seen = sys.stdout.isatty() and not as_json  # the summary holds the same sentences
     fails = finished.metrics.verdict.fails(strict=strict)
     if fails and not is_seen:

@@ -126,6 +126,8 @@ def _start(stamps_ns: NDArray[np.int64], truth: Trajectory | None) -> Pose:
 
 def _against(truth: Trajectory, outcome: Outcome, assessed: Assessed) -> Assessed:
     pairs = pair(outcome.trajectory, truth)
+    if len(pairs) < 2:  # of a method that failed early
+        return assessed
     ate = absolute_error_of_any_path(pairs)
     kitti = _or_none(lambda: kitti_error_of_any_path(pairs))
     second = _or_none(lambda: relative_error_over_time(pairs, 1.0))

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from time import perf_counter
 
 import msgspec
@@ -21,7 +21,7 @@ from scanchain.comparison.table import Table, maps_of, summarize, write_table
 from scanchain.config import NO_TRUTH
 from scanchain.data import Trajectory, brief
 from scanchain.errors import InputError
-from scanchain.evaluation import pair, read_relations, read_truth, relation_error
+from scanchain.evaluation import absolute_error_of_any_path, pair, read_relations, read_truth, relation_error
 from scanchain.logs import Log, open_log
 from scanchain.runs.directory import RUN_FILE, RunDirectory
 from scanchain.runs.job import Progress
@@ -29,6 +29,8 @@ from scanchain.runs.provenance import Hashing, describe_start
 from scanchain.settings import Override, load_settings, named
 from scanchain.source import Source
 from scanchain.words import counted
+
+_SHARED = "scans"  # in the directory until it is complete: what all methods read, and where each writes
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,17 +101,17 @@ def compare(comparison: Comparison, present: Callable[[Path], None], progress: P
         progress.announce(line)
     directory = RunDirectory(comparison.out, force=comparison.force)
     provenance = describe_start(comparison.command, comparison.logs, ", ".join(method.name for method in methods))
-    with directory, Hashing(comparison.logs) as hashing, TemporaryDirectory(dir=directory.path.parent) as shared:
+    with directory, Hashing(comparison.logs) as hashing:
+        shared = directory.path / _SHARED
+        shared.mkdir()
         decoded = progress.track(log.scans(settings.config.preprocess), log.scan_count)
-        scans = store(decoded, log.T_base_lidar, Path(shared))
+        scans = store(decoded, log.T_base_lidar, shared)
         stopped = (
             f"the user stopped the reading: {counted(len(scans), 'scan')} compared" if progress.stopped else ""
         )
         reference = _reference(replace(comparison, overrides=overrides), log, scans)
         limits = limits_for(len(scans), comparison.time_s, comparison.memory_mib)
-        outcomes = run_all(
-            methods, scans, Path(shared), repeat=comparison.repeat, limits=limits, progress=progress
-        )
+        outcomes = run_all(methods, scans, shared, repeat=comparison.repeat, limits=limits, progress=progress)
         progress.announce("evaluating and drawing")
         assessed = {
             name: assess(runs, scans.stamps_ns, reference.truth, reference.relations)
@@ -123,6 +125,7 @@ def compare(comparison: Comparison, present: Callable[[Path], None], progress: P
         provenance.write(directory.path / RUN_FILE)
         table = summarize(results, log, limits, provenance)
         write_table(directory.path, table)
+        shutil.rmtree(shared)
         present(directory.path)
         directory.complete()
     return Compared(directory.path, table)
@@ -143,8 +146,9 @@ def _reference(comparison: Comparison, log: Log, scans: StoredScans) -> Referenc
         raise InputError(f"{log.name}: has no poses on {topic}; scanchain info lists the topics that have")
     if truth is not None:
         try:
-            missing = pair(standing, truth).missing
-            note = missing and f"Of {len(scans):,} scans {missing}"
+            pairs = pair(standing, truth)
+            absolute_error_of_any_path(pairs)
+            note = pairs.missing and f"Of {len(scans):,} scans {pairs.missing}"
         except InputError as error:
             if comparison.ground_truth is not None or topic:
                 raise

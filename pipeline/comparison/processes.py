@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -31,13 +30,7 @@ def limits_for(scans: int, time_s: float | None, memory_mib: float | None) -> Li
 
 
 def run_all(
-    methods: Sequence[Method],
-    scans: StoredScans,
-    folder: Path,
-    *,
-    repeat: int,
-    limits: Limits,
-    progress: Progress,
+    methods: Sequence[Method], scans: StoredScans, folder: Path, *, repeat: int, limits: Limits, progress: Progress
 ) -> dict[str, list[Outcome]]:
     """``repeat`` runs of every method, each round starting with another one; one not installed is tried once."""
     outcomes: dict[str, list[Outcome]] = {method.name: [] for method in methods}
@@ -76,10 +69,16 @@ _KILLED = -9
 def run_watched(method: Method, scans: Path, folder: Path, limits: Limits) -> EndReport:
     """Run a method over stored scans; its own folder takes what it writes and prints."""
     (folder / METHOD_FILE).write_bytes(msgspec.msgpack.encode(method))
-    command = [sys.executable, "-P", "-m", "scanchain.comparison.worker", str(scans), str(folder)]
     # small_gicp's threads spin by default: where somebody else has a core, they spin away the other thread's time
     environment = os.environ | {"OMP_WAIT_POLICY": os.environ.get("OMP_WAIT_POLICY", "PASSIVE")}
-    ending = run_within(limits, command, environment, output=folder / "output.txt", interval_s=_INTERVAL_S)
+    ending = run_within(
+        limits,
+        "scanchain.comparison.worker",
+        [str(scans), str(folder)],
+        environment,
+        output=folder / "output.txt",
+        interval_s=_INTERVAL_S,
+    )
     if ending.killed_for is KilledFor.TIME:
         return _ended(Status.TIMED_OUT, f"took longer than --time-limit ({limits.time_s:.3g} s)", ending, folder)
     if ending.killed_for is KilledFor.MEMORY:

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from scanchain.data import Pose, Scan
 
 _POINTS, _TIMES, _TABLE = "points.f32", "times.f32", "scans.npz"
-_FLOAT_BYTES = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,17 +26,14 @@ class StoredScans:
     Attributes
     ----------
     folder : where their points and times lie
-    first_point, points : (N,) where each scan starts in the file of points, and how many it has
-    first_time, times : (N,) the same of its times
+    points, times : (N,) numbers of points and of times of each scan, which lie one after the other
     stamps_ns, log_times_ns, dropped : (N,) as in ``Scan``
     wheels : (N, d+1, d+1) T_odom_base, NaN where the log has none
     T_base_lidar : (d+1, d+1)
     """
 
     folder: Path
-    first_point: NDArray[np.int64]
     points: NDArray[np.int64]
-    first_time: NDArray[np.int64]
     times: NDArray[np.int64]
     stamps_ns: NDArray[np.int64]
     log_times_ns: NDArray[np.int64]
@@ -62,8 +58,8 @@ class StoredScans:
                     index=index,
                     stamp_ns=int(self.stamps_ns[index]),
                     log_time_ns=int(self.log_times_ns[index]),
-                    points=_read(points, self.first_point[index], self.points[index], self.dimension),
-                    times_s=_read(times, self.first_time[index], self.times[index], 1)[:, 0],
+                    points=_read(points, self.points[index] * self.dimension).reshape(-1, self.dimension),
+                    times_s=_read(times, self.times[index]),
                     dropped=int(self.dropped[index]),
                     T_odom_base=wheels if np.isfinite(wheels).all() else None,
                 )
@@ -76,10 +72,7 @@ def store(scans: Iterable[Scan], T_base_lidar: Pose, folder: Path) -> StoredScan
     unknown = np.full(T_base_lidar.shape, np.nan)
     with (folder / _POINTS).open("wb") as points, (folder / _TIMES).open("wb") as times:
         for scan in scans:
-            at = points.tell() // (_FLOAT_BYTES * len(unknown[:-1])), times.tell() // _FLOAT_BYTES
-            rows.append(
-                (at[0], len(scan.points), at[1], len(scan.times_s), scan.stamp_ns, scan.log_time_ns, scan.dropped)
-            )
+            rows.append((len(scan.points), len(scan.times_s), scan.stamp_ns, scan.log_time_ns, scan.dropped))
             wheels.append(unknown if scan.T_odom_base is None else scan.T_odom_base)
             points.write(np.ascontiguousarray(scan.points, np.float32).data)
             times.write(np.ascontiguousarray(scan.times_s, np.float32).data)
@@ -90,14 +83,11 @@ def store(scans: Iterable[Scan], T_base_lidar: Pose, folder: Path) -> StoredScan
 def open_store(folder: Path) -> StoredScans:
     """The scans that ``store`` wrote."""
     with np.load(folder / _TABLE) as table:
-        first_point, points, first_time, times, stamps_ns, log_times_ns, dropped = table["rows"].T.copy()
-        return StoredScans(
-            folder, first_point, points, first_time, times, stamps_ns, log_times_ns, dropped, table["wheels"],
-            table["T_base_lidar"],
-        )  # fmt: skip
+        points, times, stamps_ns, log_times_ns, dropped = table["rows"].T.copy()
+        wheels, T_base_lidar = table["wheels"], table["T_base_lidar"]
+    return StoredScans(folder, points, times, stamps_ns, log_times_ns, dropped, wheels, T_base_lidar)
 
 
-def _read(file: BinaryIO, first: int, count: int, width: int) -> NDArray[np.float32]:
-    """(count, width) floats from row ``first`` on."""
-    file.seek(_FLOAT_BYTES * width * int(first))
-    return np.fromfile(file, np.float32, int(count) * width).reshape(-1, width)
+def _read(file: BinaryIO, count: int) -> NDArray[np.float32]:
+    """The next floats (count,)."""
+    return np.fromfile(file, np.float32, int(count))

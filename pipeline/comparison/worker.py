@@ -1,6 +1,7 @@
 """``python -m scanchain.comparison.worker SCANS FOLDER``: one method over all scans, in this process alone.
 
-FOLDER holds method.msgpack; poses and times are written into it scan by scan: those until a crash are there.
+FOLDER holds method.msgpack; poses and times are written into it scan by scan: those until a crash are there. SCANS
+lies in the directory of the comparison, which is removed where its process is killed.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from scanchain.comparison.outcome import (
 from scanchain.comparison.scan_store import StoredScans, open_store
 from scanchain.data import Pose, Scan, Trajectory
 from scanchain.errors import MissingExtraError, ScanchainError, shown
-from scanchain.processes import die_first, peak_mib
+from scanchain.processes import die_first, die_with_parent, peak_mib
 from scanchain.runs.job import Unwatched
 
 
@@ -134,6 +135,7 @@ def main() -> None:
     """Run the method and write the report."""
     store, folder = Path(sys.argv[1]), Path(sys.argv[2])
     die_first()
+    die_with_parent(leftover=store.parent)
     method = msgspec.msgpack.decode((folder / METHOD_FILE).read_bytes(), type=Method)
     compiler = _Compiler()
     with announcing_compilation(compiler.say) if method.is_ours else nullcontext():

@@ -45,6 +45,8 @@ def align(estimate: Matrix, reference: Matrix, alignment: Alignment) -> Pose:
     """
     if alignment is Alignment.NONE:
         return np.eye(4)
+    if len(estimate) == 1:
+        raise InputError("one paired pose alone: aligned by it the error is 0, whatever the trajectory; give two")
     if alignment is Alignment.FIRST:
         return reference[0] @ lie.inverse(estimate[0])
     d = 2 if _is_planar(estimate) and _is_planar(reference) else 3

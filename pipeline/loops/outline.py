@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import zipfile
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -15,7 +14,9 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.config import LocalMapConfig
 from scanchain.data import Keyframe, Matrix, Pose
+from scanchain.errors import InputError
 from scanchain.loops.descriptor import level_frame, upright_frame
+from scanchain.maps.saved_map import read_arrays
 from scanchain.registration import upright_columns
 from scanchain.whole_file import write_whole
 
@@ -70,11 +71,11 @@ def outline_of(folder: Path, keyframes: Sequence[Keyframe], config: LocalMapConf
 def _stored(path: Path, count: int) -> Outline | None:
     """The outline on disk; None where there is none of this version and number of keyframes."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            if (int(file["version"]), int(file["keyframes"])) != (VERSION, count):
-                return None
-            return Outline(file["T_map_level"], file["columns"].astype(np.float64), float(file["size_m"]))
-    except (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile):
+        file = read_arrays(path)
+        if (int(file["version"]), int(file["keyframes"])) != (VERSION, count):
+            return None
+        return Outline(file["T_map_level"], file["columns"].astype(np.float64), float(file["size_m"]))
+    except (InputError, ValueError, KeyError, TypeError):
         return None
 
 

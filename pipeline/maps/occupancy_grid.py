@@ -106,8 +106,10 @@ class OccupancyGrid:
         if not size.size or not size.all():
             self.origin_m = np.floor(extent[:2] / self.resolution_m) * self.resolution_m
             size = np.zeros(2, np.int64)
-        lower = np.floor((extent[:2] - self.origin_m) / self.resolution_m).astype(np.int64) - _MARGIN
-        upper = np.floor((extent[2:] - self.origin_m) / self.resolution_m).astype(np.int64) + _MARGIN + 1
+        lower = np.floor((extent[:2] - self.origin_m) / self.resolution_m) - _MARGIN
+        upper = np.floor((extent[2:] - self.origin_m) / self.resolution_m) + _MARGIN + 1
+        self._check(*(np.maximum(upper, size) - np.minimum(lower, 0)).tolist())
+        lower, upper = lower.astype(np.int64), upper.astype(np.int64)
         if (lower >= 0).all() and (upper <= size).all():
             return
         spare = (_GROWTH * np.maximum(size, upper - lower)).astype(np.int64)
@@ -117,16 +119,15 @@ class OccupancyGrid:
         if columns * rows > self.max_cells:
             before, after = np.maximum(-lower, 0), np.maximum(upper - size, 0)
             columns, rows = (before + size + after).tolist()
-        self._check(columns, rows)
         self.origin_m = self.origin_m - before * self.resolution_m
         self.log_odds = _enlarged(self.log_odds, rows, columns, before)
         self.drawn = _enlarged(self.drawn, rows, columns, before)
 
-    def _check(self, columns: int, rows: int) -> None:
-        if columns * rows > self.max_cells:
+    def _check(self, columns: float, rows: float) -> None:
+        if not columns * rows <= self.max_cells:
             raise InputError(
-                f"the occupancy grid needs {columns} x {rows} cells of {self.resolution_m:g} m, more than "
-                f"{self.max_cells}; raise maps.grid_resolution_m"
+                f"the occupancy grid needs {columns:.15g} x {rows:.15g} cells of {self.resolution_m:g} m, more "
+                f"than {self.max_cells}; raise maps.grid_resolution_m"
             )
 
 

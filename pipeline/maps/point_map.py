@@ -7,6 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
+from scanchain.checks import LARGEST
 from scanchain.data import Points, Pose
 from scanchain.errors import InputError
 from scanchain.kernels.voxels import point_map as kernels
@@ -21,7 +22,8 @@ class PointMap:
 
     Attributes
     ----------
-    voxel_size_m : edge of a voxel; doubled each time that ``max_voxels`` of them do not suffice
+    voxel_size_m : edge of a voxel; doubled each time that ``max_voxels`` of them do not suffice, or that a point
+        lies a million of them from the first scan
     dimension : 2 or 3, of the points
     """
 
@@ -38,6 +40,7 @@ class PointMap:
         self.max_range_m = max_range_m
         self.max_voxels = max_voxels
         self.used = 0
+        self.center_m = np.zeros(3)
         self._allocate(min(_FIRST_VOXELS, max_voxels))
 
     def __len__(self) -> int:
@@ -45,12 +48,14 @@ class PointMap:
 
     def insert(self, T_world_lidar: Pose, points: NDArray[np.floating]) -> None:
         """Add one scan: points (N, d), meters, lidar frame; those beyond ``max_range_m`` are left out."""
-        if not np.isfinite(T_world_lidar).all():
+        if not np.abs(T_world_lidar).max() < LARGEST:
             raise InputError("a scan added to the map has a pose that is not finite")
+        if not self.used:
+            self.center_m[: self.dimension] = T_world_lidar[:-1, -1]
         done = 0
         while done < len(points):
             self.used, count = kernels.add_points(
-                T_world_lidar, points[done:], self.max_range_m, self.voxel_size_m,
+                T_world_lidar, points[done:], self.max_range_m, self.voxel_size_m, self.center_m,
                 self.slots, self.cells, self.sums, self.counts, self.used,
             )  # fmt: skip
             done += count
@@ -62,13 +67,13 @@ class PointMap:
         return self.sums[: self.used] / self.counts[: self.used, None]
 
     def _make_room(self) -> None:
-        """Double the rows or, where that is too many, the size of the voxels."""
+        """Double the rows or, where that is too many or the keys do not reach, the size of the voxels."""
         sums, counts = self.sums[: self.used], self.counts[: self.used]
-        if len(self.counts) < self.max_voxels:
+        if self.used == len(self.counts) < self.max_voxels:
             self._allocate(min(2 * len(self.counts), self.max_voxels))
         else:
             self.voxel_size_m *= 2.0
-            self._allocate(self.max_voxels)
+            self._allocate(len(self.counts))
         self.used = kernels.merge_voxels(
             sums, counts, self.voxel_size_m, self.slots, self.cells, self.sums, self.counts
         )

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from scanchain import checks
 from scanchain.config import PreprocessConfig
 from scanchain.data import Points, Scan
 from scanchain.kernels.voxels import downsample as kernels
@@ -85,7 +86,11 @@ def downsample(points: Points, voxel_m: float) -> Points:
 def first_per_voxel(
     points: NDArray[np.floating], voxel_m: float, min_range_m: float, max_range_m: float
 ) -> NDArray[np.int32]:
-    """Indices (M,) of the first point (N, d) in each voxel, near and far points left out."""
+    """Indices (M,) of the first point (N, d) in each voxel, near and far points left out.
+
+    Raises InputError where the voxels are too small for the points.
+    """
+    checks.within_voxels(points, voxel_m, "points", max_range_m=max_range_m)
     while True:
         table, chosen = _scratch.room(len(points))
         count = kernels.first_per_voxel(points, voxel_m, min_range_m, max_range_m, table, chosen)

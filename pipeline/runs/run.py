@@ -98,7 +98,7 @@ def _run(
 ) -> Finished:
     started, compiled_before_s = working_s(), compiled_s()
     log, settings, truth_file = opened(job)
-    left = find_left(job.out, dump(settings.config)) if job.resume else None
+    left = find_left(job.out, settings.config) if job.resume else None
     directory = RunDirectory(job.out, force=job.force, left=left and left.folder)
     _check_prior(log, settings.config)
     progress.say(f"{log.topic}: {log.dimension}D, {counted(log.scan_count, 'scan')}; {settings.source}")

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from scanchain.maps.ply import as_rows
+from scanchain.maps.clouds import as_rows
 from scanchain.sessions.changes import Changes, Cluster, Label
 from scanchain.words import counted
 

@@ -20,6 +20,7 @@ from scanchain.errors import InputError
 from scanchain.kernels.raycast.free_space import nearest_ranges
 from scanchain.logs.formats.cloud_file import SUFFIXES, CloudFileError, read_cloud_file
 from scanchain.maps import MAP_FOLDER, Edges, Session, write_saved_map
+from scanchain.maps.occupancy_grid import MAX_CELLS
 from scanchain.preprocess.resolution import Resolution
 from scanchain.runs.directory import RUN_FILE, RunDirectory
 from scanchain.runs.provenance import describe_start
@@ -38,6 +39,7 @@ _SECTORS, _LEAST_SECTORS = 36, 0.6  # of azimuth, and share of them with points 
 _LEAST_POINTS = 100  # in view
 _FLAT_M = 1e-6  # extent in height of points in the plane
 _MAX_POSITIONS = 20_000
+_LEAST_CELL_M, _LARGEST_CELL_M = 1e-3, 1e2  # of a grid
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,28 +151,36 @@ def _read_grid(file: Path) -> _Surfaces:
 
     try:
         stated: dict[str, Any] = YAML(typ="safe").load(file)
-        image = np.asarray(Image.open(file.parent / stated["image"]).convert("L"), np.float64)[::-1]
+        with Image.open(file.parent / stated["image"]) as picture:
+            if picture.width * picture.height > MAX_CELLS:
+                raise ValueError(f"its image has {picture.width} x {picture.height} cells, over {MAX_CELLS:,}")
+            image = np.asarray(picture.convert("L"))[::-1]
         resolution_m, (x, y, yaw_rad) = float(stated["resolution"]), map(float, stated["origin"])
         occupied_from, free_to = float(stated["occupied_thresh"]), float(stated["free_thresh"])
         is_negated = bool(int(stated.get("negate", 0)))
+        if not (_LEAST_CELL_M <= resolution_m <= _LARGEST_CELL_M and np.isfinite([x, y, yaw_rad]).all()):
+            raise ValueError(f"resolution {resolution_m:g} m, origin {x:g}, {y:g}, {yaw_rad:g}")
     except OSError as error:
         raise InputError(f"{error.filename or file}: cannot be read ({error.strerror or error})") from error
-    except (YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
+    except (
+        YAMLError, KeyError, TypeError, ValueError, AttributeError, RecursionError, Image.DecompressionBombError
+    ) as error:  # fmt: skip
         raise InputError(
             f"{file}: is no map of map_server ({type(error).__name__}: {error}); wanted image, resolution, "
             "origin, occupied_thresh, free_thresh"
         ) from error
-    probability = image / 255.0 if is_negated else 1.0 - image / 255.0
+    levels = np.arange(256) / 255.0
+    probability = levels if is_negated else 1.0 - levels
     T_map_image = lie.pose_2d(x, y, yaw_rad)
 
     def centers(cells: NDArray[np.bool_]) -> Points:
         rows, columns = np.nonzero(cells)
         return lie.transform(T_map_image, (np.column_stack([columns, rows]) + 0.5) * resolution_m)
 
-    points = centers(probability > occupied_from)
+    points = centers((probability > occupied_from)[image])
     if not len(points):
         raise InputError(f"{file}: has no occupied cells; look at occupied_thresh and negate")
-    return _Surfaces(points, centers(probability < free_to))
+    return _Surfaces(points, centers((probability < free_to)[image]))
 
 
 def _positions(surfaces: _Surfaces, spacing_m: float, height_m: float) -> Points:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import REJECTED_WEIGHT, Keyframe, Matrix, Trajectory
-from scanchain.errors import InputError
 from scanchain.graph.files.g2o_write import write_g2o
 from scanchain.loops import refined, spread
 from scanchain.maps import MAP_FOLDER, SavedMap, Session, write_map, write_ply, write_saved_map
@@ -190,10 +189,9 @@ def _trajectory(saved: SavedMap, index: int, poses: Matrix) -> Trajectory:
 
 
 def _read(file: Path, dimension: int) -> Trajectory | None:
-    """A trajectory of poses of this dimension; None where there is none that can be read."""
-    try:
-        trajectory = read_tum(file)
-    except InputError:
+    """A trajectory of poses of this dimension; None where there is none. Raises InputError for a damaged one."""
+    if not file.exists():
         return None
+    trajectory = read_tum(file)
     poses = lie.flatten(trajectory.poses) if dimension == 2 else trajectory.poses
     return Trajectory(trajectory.stamps_ns, poses)

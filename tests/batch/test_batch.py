@@ -24,6 +24,7 @@ from scanchain.simulation import simulate
 from scanchain.source import Address
 from scanchain.viz.report.batch import names_of
 from tests.support.browser import look
+from tests.support.killing import processes_about, wait_until
 from tests.support.scenes import ROOT
 from tests.support.web_server import serving
 
@@ -239,6 +240,25 @@ def test_ctrl_c_kills_what_runs_and_the_table_says_what_was_not_run(drawers, tmp
     states = [row["state"] for row in table(out).values()]
     assert len(states) == 6 and 1 <= states.count("done") < 6
     assert states.count("done") + states.count("not run") == 6
+
+
+def test_what_a_killed_batch_started_ends_with_it(tmp_path):
+    simulate("office", tmp_path / "long.mcap", duration_s=120.0)
+    command = [
+        sys.executable,
+        "-m",
+        "scanchain",
+        "batch",
+        str(tmp_path / "long.mcap"),
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    child = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    wait_until(lambda: list((tmp_path / "out").glob("*.partial-*/steps.journal")))
+    assert processes_about(tmp_path)
+    child.kill()
+    child.wait()
+    wait_until(lambda: not processes_about(tmp_path))
 
 
 def test_logs_are_named_by_path_pattern_and_list_each_once(tmp_path):

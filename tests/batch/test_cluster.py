@@ -49,7 +49,7 @@ def test_of_two_nodes_one_dies_and_nothing_is_lost(tmp_path, monkeypatch):
         batched = run_batch(Batch(tuple(logs), tmp_path / "out", arguments=("--rerun", "off")), watching, work)
     finally:
         cluster.shutdown()
-    assert batched.failures == ""
+    assert batched.failures == "", batched.summary
     table = pq.read_table(tmp_path / "out" / "batch.parquet").to_pylist()
     assert [row["state"] for row in table] == ["done"] * 6 and [row["scans"] for row in table] == [20] * 6
     assert len(list((tmp_path / "out").glob("log_*/metrics.json"))) == 6

@@ -374,6 +374,30 @@ def test_the_other_commands_refuse_in_one_line_too(refused, monkeypatch, tmp_pat
     says(refused(*words), *parts)
 
 
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (("--checkpoint", "nan"), "nan is no number"),
+        (("--threads", "100000"), "--threads"),
+        (("--matching.max_distance_m", "1e308"), "at most 1e+50"),
+    ],
+)
+def test_a_number_that_no_run_can_use_is_refused_before_it_begins(refused, tmp_path, office, flags, words):
+    assert words in refused("run", office, "--out", tmp_path / "run", *flags)
+
+
+def test_one_true_pose_is_no_accuracy(call, tmp_path, office):
+    truth = read_tum(office.with_suffix(".tum"))
+    write_tum(tmp_path / "one.tum", Trajectory(truth.stamps_ns[:1], truth.poses[:1]))
+    flags = ("--out", tmp_path / "run", "--rerun", "off", "--gt", tmp_path / "one.tum")
+    code, output, _ = call("run", office, *flags)
+    assert code == 0 and "\nATE " not in output
+    says(output, "no accuracy against", "one.tum: one paired pose alone")
+    code, output, errors = call("evaluate", tmp_path / "run" / "trajectory.tum", tmp_path / "one.tum")
+    assert code == 2 and "0.0000 m" not in output
+    says(errors, "one paired pose alone")
+
+
 @pytest.mark.parametrize("limit", ["nan", "-1", "inf"])
 def test_a_gap_that_is_no_time_is_refused(refused, office, limit):
     truth = office.with_suffix(".tum")

@@ -4,9 +4,12 @@ import csv
 import itertools
 import json
 import re
+import subprocess
+import sys
 
 import msgspec
 import numpy as np
+import psutil
 import pyarrow.parquet as pq
 import pytest
 
@@ -31,6 +34,7 @@ from scanchain.runs.provenance import Provenance
 from scanchain.settings import Override, load_settings
 from scanchain.simulation import simulate
 from scanchain.trajectory import read_tum, write_kitti, write_tum
+from tests.support.killing import processes_about, wait_until
 from tests.support.scenes import ROOT, shared_data
 
 SUPPORT = ROOT / "tests" / "support"
@@ -157,6 +161,32 @@ def test_what_one_did_until_it_failed_is_kept_scan_by_scan(bad):
     scans = pq.read_table(bad[1] / "per_scan.parquet").to_pandas()
     assert scans.groupby("method").size()["raises"] == 10
     assert scans.groupby("method").size()["plicp"] == 60
+
+
+def test_children_of_a_method_end_with_it(office, tmp_path, monkeypatch):
+    monkeypatch.setenv("SPAWNED_FILE", str(tmp_path / "spawned"))
+    for name, status in (("Spawns", Status.OK), ("SpawnsAway", Status.OK), ("SpawnsAndDies", Status.CRASHED)):
+        found = run(office, tmp_path / name, f"bad_odometries:{name}")
+        assert [row.status for row in found.rows] == [status]
+        spawned = int((tmp_path / "spawned").read_text())
+        wait_until(lambda pid=spawned: not psutil.pid_exists(pid) or psutil.Process(pid).status() == "zombie")
+
+
+def test_a_killed_comparison_leaves_neither_processes_nor_folders(office, tmp_path, monkeypatch):
+    monkeypatch.setenv("HANGS_FILE", str(tmp_path / "hanging"))
+    command = [sys.executable, "-m", "scanchain", "compare", str(office), "--out", str(tmp_path / "out" / "table")]
+    child = subprocess.Popen(
+        [*command, "--methods", "bad_odometries:Hangs"],
+        cwd=ROOT,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    wait_until((tmp_path / "hanging").exists)
+    assert len(processes_about(tmp_path)) == 2
+    child.kill()
+    child.wait()
+    wait_until(lambda: not processes_about(tmp_path))
+    assert not list((tmp_path / "out").iterdir())
 
 
 def test_one_that_is_not_installed_is_a_gap_with_the_command_that_fills_it(office, tmp_path, monkeypatch):

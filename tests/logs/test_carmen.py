@@ -2,6 +2,7 @@
 
 import bz2
 import gzip
+import tracemalloc
 from itertools import islice, zip_longest
 
 import numpy as np
@@ -142,6 +143,17 @@ def test_a_packed_log_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path):
     (tmp_path / "a.log.gz").write_bytes(packed[: len(packed) // 2])
     log, scans = read(tmp_path / "a.log.gz")
     assert 500 < len(scans) < 1500 and "does not unpack" in log.damage[0]
+
+
+@pytest.mark.parametrize("text", [b"\0", b"FLASER 0\n"], ids=["zeros", "lines"])
+def test_a_bomb_takes_no_more_memory_than_a_log_of_its_size_could(tmp_path, text):
+    (tmp_path / "bomb.clf").write_bytes(bz2.compress(text * ((100 << 20) // len(text))))
+    tracemalloc.start()
+    with pytest.raises(InputError, match=r"bomb.clf: unpacks to more than [\d,]+ bytes"):
+        open_log(tmp_path / "bomb.clf")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 50 << 20
 
 
 def test_a_text_that_is_no_carmen_log_says_so(tmp_path):

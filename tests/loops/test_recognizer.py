@@ -97,7 +97,7 @@ def test_a_recognizer_of_ones_own_closes_loops_and_survives_checkpoints_bit_by_b
         assert a.T_world_lidar.tobytes() == b.T_world_lidar.tobytes()
         if scan.index in breaks:
             Checkpoints(folder, 10.0).write(broken)
-            broken = read_checkpoint(folder).slam
+            broken = read_checkpoint(folder, config).slam
             broken.points.reopen(folder / POINTS_FILE)
     a, b = straight.finish(), broken.finish()
     assert len(by_place(a.closures)) > 3

@@ -253,6 +253,25 @@ def test_a_grid_too_large_for_memory_is_refused_and_a_coarser_one_fits():
     assert fitting_resolution(poses[:1], resolution_m=RESOLUTION_M, max_range_m=80.0) == RESOLUTION_M
 
 
+def test_cells_beyond_what_64_bits_count_are_refused_and_not_drawn_elsewhere():
+    for far_m in (1e12, 1e30, 1e140):
+        grid = OccupancyGrid(CONFIG, max_range_m=np.inf)
+        with pytest.raises(InputError, match=r"raise maps\.grid_resolution_m"):
+            grid.insert(np.eye(3), np.array([[1.0, 2.0], [far_m, 0.0]]))
+        grid.insert(np.eye(3), np.array([[1.0, 2.0]]))
+        with pytest.raises(InputError, match=r"raise maps\.grid_resolution_m"):
+            grid.insert(np.eye(3), np.array([[far_m, 0.0], [far_m, 1.0]]))
+
+
+def test_voxels_whose_keys_would_repeat_are_doubled_and_a_map_far_from_the_origin_is_not():
+    near, apart = np.array([[0.2, 0.0], [2.0**21, 0.0], [2.0**22, 0.0]]), PointMap(2, 1.0)
+    apart.insert(np.eye(3), near)
+    assert sorted(apart.points().tolist()) == sorted(near.tolist()) and apart.voxel_size_m == 8.0
+    utm = PointMap(2, 0.05)
+    utm.insert(lie.pose_2d(5e5, 5.4e6, 0.3), np.random.default_rng(0).uniform(-50.0, 50.0, (1000, 2)))
+    assert utm.voxel_size_m == 0.05 and len(utm) > 990
+
+
 def test_a_pose_that_is_not_finite_is_refused():
     with pytest.raises(InputError, match="not finite"):
         OccupancyGrid(CONFIG).insert(np.full((3, 3), np.nan), np.array([[1.0, 0.0]]))

@@ -29,6 +29,7 @@ from scanchain.trajectory import read_tum
 from scanchain.viz.recording import entities
 from tests.support.killing import (
     assert_readable,
+    config_of,
     kill_at_random,
     partial,
     same_result,
@@ -82,7 +83,7 @@ def test_interrupted_again_and_again_a_run_goes_on_to_the_same_result_and_record
         wait_for_steps(child, out, share * len(stamps_ns))
         child.send_signal(interruption)
         child.wait()
-        reached.append(read_checkpoint(partial(out)).scans)
+        reached.append(read_checkpoint(partial(out), config_of(partial(out))).scans)
         assert (partial(out) / RECORDING_FILE).exists()
         table, _ = read_journal(partial(out))  # readable, and those of the undisturbed run
         np.testing.assert_array_equal(table.odometry.stamps_ns, stamps_ns[: len(table)])
@@ -176,7 +177,7 @@ def test_a_chain_that_is_put_down_and_taken_up_places_every_scan_to_the_same_bit
         assert a.match.information.tobytes() == b.match.information.tobytes()
         if scan.index in breaks:
             Checkpoints(tmp_path, 10.0).write(broken)
-            broken = read_checkpoint(tmp_path).slam
+            broken = read_checkpoint(tmp_path, config).slam
             broken.points.reopen(points_file)
     a, b = straight.finish(), broken.finish()
     assert len(a.closures) == len(b.closures)
@@ -205,7 +206,7 @@ def test_an_optimization_beside_ends_alike_after_a_break(office, tmp_path, monke
         if broken.beside is not None and not is_beside:
             breaks += 1
             Checkpoints(tmp_path, 10.0).write(broken)
-            broken = read_checkpoint(tmp_path).slam
+            broken = read_checkpoint(tmp_path, config).slam
             broken.points.reopen(tmp_path / POINTS_FILE)
     assert breaks > 0 and len(followed) > 0
     assert straight.finish().trajectory.poses.tobytes() == broken.finish().trajectory.poses.tobytes()
@@ -368,6 +369,26 @@ def test_a_snapshot_makes_only_what_is_listed(tmp_path):
     assert read_snapshot(tmp_path / "c", _CLASSES) == config
     with pytest.raises(InputError, match="'Config', which does not belong"):
         read_snapshot(tmp_path / "c", Classes([], {}, _CLASSES.version))
+
+
+def test_a_checkpoint_that_names_code_or_another_configuration_is_not_resumed(office, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "evil_matcher.py").write_text("open('executed', 'w')\nclass Cls:\n    align = print\n")
+    monkeypatch.chdir(tmp_path)
+    config = configured(2)
+    slam = Slam(config, open_log(office).T_base_lidar, tmp_path / POINTS_FILE)
+    for changed, message in (
+        ("evil_matcher:Cls", "names the code 'evil_matcher:Cls'"),
+        ("svd", "has another config"),
+    ):
+        slam.config = slam.front_end.odometry.config = configured(2, {"matching.matcher": changed})
+        Checkpoints(tmp_path, 10.0).write(slam)
+        with pytest.raises(InputError, match=message):
+            read_checkpoint(tmp_path, config)
+    assert not (tmp_path / "executed").exists()
+    slam.config = slam.front_end.odometry.config = config
+    Checkpoints(tmp_path, 10.0).write(slam)
+    assert read_checkpoint(tmp_path, config).slam.config == config
 
 
 def test_arrays_come_back_with_their_order_their_type_and_their_bits(tmp_path):

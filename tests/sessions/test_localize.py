@@ -1,7 +1,11 @@
 """A simulated office: a map of its first half, in which the rest is localized."""
 
+import io
 import json
-from dataclasses import replace
+import shutil
+import zipfile
+import zlib
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -20,7 +24,8 @@ from scanchain import (
     write_tum,
 )
 from scanchain.config import LogConfig
-from scanchain.maps import Edges, open_saved_map, write_saved_map
+from scanchain.data import Keyframe
+from scanchain.maps import Edges, Session, open_saved_map, write_saved_map
 from scanchain.sessions.localize import measure, pose_near
 from scanchain.sessions.localizer import MapState
 from scanchain.settings import load_settings
@@ -139,19 +144,19 @@ def test_a_map_that_is_damaged_or_of_another_kind_is_refused_in_one_line(office,
 
     points = copy("cut") / "points.i16"
     points.write_bytes(points.read_bytes()[:-7])
-    with pytest.raises(InputError, match=r"points.i16: has [\d,]+ bytes of [\d,]+; run the log again"):
+    with pytest.raises(InputError, match=r"points.i16: is damaged or cut off: .*; make the map again"):
         open_saved_map(tmp_path / "cut")
     index = copy("newer") / "map.json"
-    index.write_text(index.read_text().replace('"version": 1', '"version": 99'))
-    with pytest.raises(InputError, match="is of version 99, this scanchain reads 1"):
+    index.write_text(index.read_text().replace('"version": 2', '"version": 1'))
+    with pytest.raises(InputError, match=r"is of version 1, this scanchain reads 2 .*; make the map again"):
         open_saved_map(tmp_path / "newer")
     for name in ("keyframes.npz", "edges.npz"):
         broken = copy(name.split(".")[0]) / name
         broken.write_bytes(broken.read_bytes()[:100])
-        with pytest.raises(InputError, match=f"{name} cannot be read"):
+        with pytest.raises(InputError, match=f"{name}: is damaged or cut off"):
             open_saved_map(broken.parent)
         broken.unlink()
-        with pytest.raises(InputError, match=f"{name} cannot be read"):
+        with pytest.raises(InputError, match=f"{name}: cannot be read"):
             open_saved_map(broken.parent)
     simulate("town", tmp_path / "town.mcap", duration_s=1.0)
     code, _, error = call("localize", tmp_path / "town.mcap", "--map", office / "map", "--out", tmp_path / "loc")
@@ -196,6 +201,91 @@ def test_a_saved_map_holds_its_keyframes_to_the_millimeter_and_the_poses_to_the_
         assert replace(one, stored=None, T_odom_lidar=None) == replace(other, stored=None, T_odom_lidar=None)
     half = saved.edges.among(np.arange(5, 20))
     assert half.pairs.max() < 15 and len(half.pairs) < len(saved.edges.pairs)
+
+
+def test_every_flipped_bit_of_a_saved_map_is_refused_with_its_file(office, tmp_path):
+    shutil.copytree(office / "map" / "map", tmp_path / "map")
+    random = np.random.default_rng(0)
+    for name in ("keyframes.npz", "edges.npz", "points.i16"):
+        file = tmp_path / "map" / name
+        whole = file.read_bytes()
+        for place in random.integers(len(whole), size=20).tolist():
+            file.write_bytes(whole[:place] + bytes([whole[place] ^ 0x10]) + whole[place + 1 :])
+            with pytest.raises(InputError, match=f"{name}: is damaged"):
+                open_saved_map(tmp_path)
+        file.write_bytes(whole)
+    open_saved_map(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("file", "name", "change", "message"),
+    [
+        ("keyframes", "count", lambda a: 3 * a, "counts other than"),
+        ("keyframes", "count", lambda a: np.concatenate([a[1:], [-1]]), "below 0"),
+        ("keyframes", "step_m", lambda a: -a, "below 0"),
+        ("keyframes", "step_m", lambda a: np.full(len(a), np.nan), "NaN or infinite"),
+        ("keyframes", "session", lambda a: a + 1, "names sessions that map.json does not list"),
+        ("keyframes", "stamps_ns", lambda a: a[3:], "wanted"),
+        ("keyframes", "poses", lambda a: np.tile(np.eye(4), (len(a), 1, 1)), "wanted"),
+        ("edges", "measurements", lambda a: a[:-3], "keyframes that are not there, or of different numbers"),
+        ("edges", "pairs", lambda a: a - 100_000, "keyframes that are not there"),
+        ("edges", "pairs", lambda a: a.astype(float), "lacks pairs"),
+    ],
+)
+def test_a_saved_map_that_contradicts_itself_is_refused_with_its_file(
+    office, tmp_path, file, name, change, message
+):
+    folder = shutil.copytree(office / "map" / "map", tmp_path / "map")
+    with np.load(folder / f"{file}.npz") as arrays:
+        np.savez(folder / f"{file}.npz", **(dict(arrays) | {name: change(arrays[name])}))
+    index = json.loads((folder / "map.json").read_text())
+    index["crc32"][f"{file}.npz"] = zlib.crc32((folder / f"{file}.npz").read_bytes())  # as if written so
+    (folder / "map.json").write_text(json.dumps(index))
+    with pytest.raises(InputError, match=f"{file}.npz: .*{message}"):
+        open_saved_map(tmp_path)
+
+
+def test_archives_that_no_reader_unpacks_are_refused_with_their_name(office, tmp_path):
+    file = shutil.copytree(office / "map" / "map", tmp_path / "map") / "keyframes.npz"
+    index = json.loads((tmp_path / "map" / "map.json").read_text())
+    huge = io.BytesIO()
+    np.lib.format.write_array_header_1_0(huge, {"descr": "<f8", "fortran_order": False, "shape": (10**11, 3, 3)})
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("poses.npy", huge.getvalue())
+    claims = file.read_bytes()
+    np.savez_compressed(file, poses=np.random.default_rng(0).normal(size=(99, 3, 3)))
+    packed = bytearray(file.read_bytes())
+    packed[200:260] = bytes(60)
+    encrypted = bytearray(claims)
+    encrypted[6] |= 1
+    encrypted[encrypted.index(b"PK\x01\x02") + 8] |= 1
+    for data in (claims, packed, encrypted):
+        file.write_bytes(data)
+        index["crc32"]["keyframes.npz"] = zlib.crc32(data)
+        (tmp_path / "map" / "map.json").write_text(json.dumps(index))
+        with pytest.raises(InputError, match=r"keyframes.npz: cannot be read"):
+            open_saved_map(tmp_path)
+
+
+def test_one_far_return_does_not_make_the_points_of_its_keyframe_coarse(tmp_path):
+    near, far = np.array([[1.2345, -2.0], [0.0, 3.3333]]), np.array([[5e4, 0.0]])
+    keyframes = [
+        Keyframe(k, k, k, _Points(points), np.eye(3), float(k), 1.0)
+        for k, points in enumerate((near, np.vstack([near, far]), near))
+    ]
+    none = Edges(np.empty((0, 2), int), np.empty((0, 3, 3)), np.empty((0, 3, 3)), np.empty(0, bool), np.empty(0))
+    session = Session("made up", 0, 2, 3)
+    write_saved_map(tmp_path / "map", keyframes, np.tile(np.eye(3), (3, 1, 1)), np.zeros(3, int), (session,), none)
+    for before, after in zip(keyframes, open_saved_map(tmp_path).keyframes, strict=True):
+        np.testing.assert_allclose(after.points, before.points, atol=1e-3)
+
+
+@dataclass
+class _Points:
+    points: np.ndarray
+
+    def read(self):
+        return self.points
 
 
 def vars_of(edges: Edges):

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import subprocess
 import time
 from pathlib import Path
 
@@ -48,6 +49,28 @@ class Eats(StandsStill):
 
 class Dies(StandsStill):
     def misbehave(self):
+        os.kill(os.getpid(), signal.SIGSEGV)
+
+
+class Spawns(StandsStill):
+    """Starts a process of its own and forgets it."""
+
+    is_away = False
+
+    def misbehave(self):
+        if self.scans == 11:
+            child = subprocess.Popen(["sleep", "600"], start_new_session=self.is_away)
+            Path(os.environ["SPAWNED_FILE"]).write_text(str(child.pid))
+            time.sleep(0.5)
+
+
+class SpawnsAway(Spawns):
+    is_away = True
+
+
+class SpawnsAndDies(Spawns):
+    def misbehave(self):
+        super().misbehave()
         os.kill(os.getpid(), signal.SIGSEGV)
 
 

@@ -1,14 +1,17 @@
 """Killing runs at random moments, reading what is left of them, and going on."""
 
 import json
+import os
 import random
 import subprocess
 import sys
 import time
 import tomllib
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
+import psutil
 import pyarrow as pa
 import pyarrow.parquet as pq
 from rerun.chunk import RrdReader
@@ -18,6 +21,7 @@ from scanchain.maps import MAP_FOLDER, open_saved_map, read_map, read_ply
 from scanchain.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RECORDING_FILE
 from scanchain.runs.resume.checkpoint import read_checkpoint
 from scanchain.runs.resume.journal import JOURNAL_FILE, read_journal
+from scanchain.settings import load_settings
 from scanchain.trajectory import read_kitti, read_tum
 from scanchain.viz.recording import entities
 from tests.support.scenes import ROOT
@@ -40,6 +44,23 @@ def start(log, out, *words, **options):
     command = [sys.executable, "-m", "scanchain", "run", str(log), "--out", str(out), *words]
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL} | options
     return subprocess.Popen(command, cwd=ROOT, **quiet)
+
+
+def processes_about(folder):
+    """Other processes on whose command line a folder stands."""
+    found = []
+    for process in psutil.process_iter():
+        with suppress(psutil.Error):
+            if process.pid != os.getpid() and str(folder) in " ".join(process.cmdline()):
+                found.append(process)
+    return found
+
+
+def wait_until(condition, within_s=120.0):
+    began = time.monotonic()
+    while not condition():
+        assert time.monotonic() - began < within_s
+        time.sleep(0.05)
 
 
 def partial(out):
@@ -155,8 +176,13 @@ def _left(out, after_s):
     return Killed(after_s, where, steps)
 
 
+def config_of(folder):
+    """The configuration of a run that was left."""
+    return load_settings(file=folder / "config.toml").config
+
+
 def _read_checkpoint(path):
-    steps = read_checkpoint(path.parent).scans
+    steps = read_checkpoint(path.parent, config_of(path.parent)).scans
     assert steps <= len(read_journal(path.parent)[0]), "the checkpoint is ahead of the journal"
 
 

@@ -259,18 +259,6 @@ assert "matplotlib" not in sys.modules
     assert (one_run / "report.html").read_bytes() == page
 
 
-def test_a_command_leaves_pandas_out_for_pyarrow_alone():
-    program = """
-import sys
-from scanchain.processes import leave_pandas_out
-leave_pandas_out()
-import pyarrow as pa
-assert pa.array([1.0, None]).to_numpy(zero_copy_only=False)[0] == 1.0 and "pandas" not in sys.modules
-import pandas
-"""
-    subprocess.run([sys.executable, "-c", program], check=True)
-
-
 def test_warnings_of_a_run_stand_above_everything_and_a_large_error_is_one(evil, tmp_path, capfd):
     """The truth of a log twice as large as it is."""
     truth = np.loadtxt(evil.parent / "office.tum")

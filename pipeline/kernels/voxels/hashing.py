@@ -7,6 +7,7 @@ from scanchain.kernels.compiling import njit
 EMPTY = np.int64(-1)
 _OFFSET = 1 << 20
 _LIMIT = (1 << 21) - 1
+REACH = float(_OFFSET - 64)  # voxels around any point of the space, within which no two have one key
 
 
 @njit(inline="always")

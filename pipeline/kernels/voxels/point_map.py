@@ -3,18 +3,20 @@
 import numpy as np
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.voxels.hashing import find, key_of
+from scanchain.kernels.voxels.hashing import REACH, find, key_of
 
 _LARGEST = 1e300  # m²; keeps points at infinity out where the range has no limit
 
 
 @njit(nogil=True)
-def add_points(T, points, max_range_m, voxel_m, slots, cells, sums, counts, used):
+def add_points(T, points, max_range_m, voxel_m, center, slots, cells, sums, counts, used):
     """Move points by a pose and add each to the sum of its voxel, until the table is full.
+
+    center : (3,) meters, of the space in which each voxel has a key of its own; it counts as full beyond
 
     T : (d+1, d+1); points : (N, d) meters. slots : (S,) int64 keys and cells : (S,) int32 the row that each key
     has; sums : (C, d) meters and counts : (C,) int64, of which the first ``used`` rows are taken.
-    Returns the rows taken now and the number of points done: fewer than N where C rows did not suffice.
+    Returns the rows taken now and the number of points done: fewer than N where rows or keys did not suffice.
     """
     d = points.shape[1]
     scale = 1.0 / voxel_m
@@ -31,7 +33,9 @@ def add_points(T, points, max_range_m, voxel_m, slots, cells, sums, counts, used
             for axis in range(d):
                 value += T[row, axis] * points[i, axis]
             moved[row] = value
-        used, row = _row_of(moved, scale, slots, cells, counts, used)
+        row = np.int64(-1)
+        if max(abs(moved[0] - center[0]), abs(moved[1] - center[1]), abs(moved[2] - center[2])) < REACH * voxel_m:
+            used, row = _row_of(moved, scale, slots, cells, counts, used)
         if row < 0:
             return used, i
         for axis in range(d):

@@ -7,13 +7,15 @@ where stamps step back. Format: https://carmen.sourceforge.net/logger_playback.h
 from __future__ import annotations
 
 import bz2
+import gzip
+import io
 import math
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
 from pathlib import Path
-from typing import IO, NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,8 +37,11 @@ _STEPS_RAD = {180: math.pi / 180, 181: math.pi / 180, 360: math.pi / 360, 361: m
 _HALF_TURN = math.pi
 
 _MOST_BYTES = 2 << 30  # largest size of the text in bytes
-_PLAIN_BYTES = 1 << 20  # bytes read at once
-_PACKED_BYTES = 64  # unpacked at once: what comes of so many before damage is lost with it
+_MOST_RATIO, _LEAST_BYTES = (
+    1000,
+    1 << 24,
+)  # largest ratio of packing that is accepted, beyond so many bytes of text
+_AT_ONCE = 1 << 12  # bytes of text that are unpacked at once, and lost with damage among them
 
 
 def claims_carmen(_: Path, head: bytes) -> bool:
@@ -112,7 +117,7 @@ class _Carmen:
     def _find(self) -> Iterator[Line]:
         """Every line of a known kind, in the order of the file."""
         begin, log_ns = 0, 0
-        for number, raw in enumerate(self.text.splitlines(keepends=True), start=1):
+        for number, raw in enumerate(io.BytesIO(self.text), start=1):
             kind = raw[:16].split(maxsplit=1)[0] if raw[:16].strip() else b"#"
             end = begin + len(raw)
             if kind in KINDS:
@@ -249,58 +254,23 @@ def _mounting(laser: list[float], robot: list[float]) -> Place:
     return planar(cosine * dx + sine * dy, cosine * dy - sine * dx, dyaw)
 
 
-class Text(NamedTuple):
-    """Unpacked text of a file; ``damage`` describes what is missing, empty where all is well."""
+def read_text(path: Path) -> tuple[bytes, str]:
+    """The text of a file, unpacked, and what is missing of it, empty where all is well.
 
-    data: bytes
-    damage: str
-
-
-class _Unpacker(Protocol):
-    @property
-    def eof(self) -> bool: ...
-    @property
-    def unused_data(self) -> bytes: ...
-    def decompress(self, data: bytes, /) -> bytes: ...
-
-
-def read_text(path: Path) -> Text:
-    """The text of a file. Raises InputError where it cannot be read or unpacks to more than the limit."""
+    Raises InputError where it cannot be read or unpacks to more than any log does.
+    """
     text = bytearray()
     try:
         with path.open("rb") as file:
-            for block in _blocks(file):
+            head, most = file.read(3), min(_MOST_BYTES, _LEAST_BYTES + _MOST_RATIO * path.stat().st_size)
+        opened = bz2.open if head == b"BZh" else gzip.open if head[:2] == b"\x1f\x8b" else Path.open
+        with opened(path, "rb") as file:
+            while block := file.read1(_AT_ONCE):
                 text += block
-                if len(text) > _MOST_BYTES:
-                    raise InputError(f"{path}: unpacks to more than {_MOST_BYTES:,} bytes; is it a CARMEN log?")
-    except (zlib.error, EOFError, ValueError) as error:
-        return Text(bytes(text), f"{path}: does not unpack beyond byte {len(text)} of the text ({error})")
-    except OSError as error:
-        if error.errno is None:  # of bz2, not of the system
-            return Text(bytes(text), f"{path}: does not unpack beyond byte {len(text)} of the text ({error})")
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the file") from error
-    return Text(bytes(text), "")
-
-
-def _blocks(file: IO[bytes]) -> Iterator[bytes]:
-    head = file.read(3)
-    file.seek(0)
-    if head == b"BZh":
-        yield from _unpacked(file, bz2.BZ2Decompressor)
-    elif head[:2] == b"\x1f\x8b":
-        yield from _unpacked(file, lambda: zlib.decompressobj(zlib.MAX_WBITS | 16))
-    else:
-        while block := file.read(_PLAIN_BYTES):
-            yield block
-
-
-def _unpacked(file: IO[bytes], begin: Callable[[], _Unpacker]) -> Iterator[bytes]:
-    """Unpacked blocks of one packed stream after the other. Raises EOFError where the last is cut off."""
-    unpacker = begin()
-    while packed := file.read(_PACKED_BYTES):
-        while packed:
-            unpacker = begin() if unpacker.eof else unpacker
-            yield unpacker.decompress(packed)
-            packed = unpacker.unused_data
-    if not unpacker.eof:
-        raise EOFError("it is cut off")
+                if len(text) > most:
+                    raise InputError(f"{path}: unpacks to more than {most:,} bytes; is it a CARMEN log?")
+    except (zlib.error, EOFError, ValueError, OSError) as error:
+        if isinstance(error, OSError) and error.errno is not None:  # of the system, not of bz2 or gzip
+            raise InputError(f"{path}: cannot be read ({error.strerror}); check the file") from error
+        return bytes(text), f"{path}: does not unpack beyond byte {len(text)} of the text ({error})"
+    return bytes(text), ""

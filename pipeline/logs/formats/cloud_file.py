@@ -5,6 +5,7 @@ PCD: https://pointclouds.org/documentation/tutorials/pcd_file_format.html. PLY: 
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Iterator
 from itertools import islice
@@ -50,7 +51,7 @@ def ascii_rows(file: IO[bytes], point: np.dtype[np.void], count: int) -> NDArray
 
 def binary_rows(file: IO[bytes], point: np.dtype[np.void], count: int) -> NDArray[np.void]:
     """``count`` points, one after the other."""
-    data = file.read(count * point.itemsize)
+    data = file.read(min(count * point.itemsize, os.fstat(file.fileno()).st_size))  # whatever a header claims
     return _all_of(np.frombuffer(data, point, len(data) // max(point.itemsize, 1)), count)
 
 
@@ -94,7 +95,7 @@ def read_npy(path: Path) -> NDArray[np.void]:
     """The points of a NumPy array, (N, 3) or more columns, x y z first, or (N,) with fields of these names."""
     try:
         array = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError) as error:
+    except (ValueError, EOFError, MemoryError) as error:
         raise CloudFileError("is no .npy array of numbers") from error
     if not isinstance(array, np.ndarray):
         raise CloudFileError("is an archive of arrays, no .npy array; save each cloud in a file of its own")

@@ -8,8 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 
-from scanchain import config, data
+from scanchain import data
 from scanchain.clock import working_s
+from scanchain.config import Config
+from scanchain.errors import InputError
 from scanchain.graph.background import BackgroundOptimization
 from scanchain.graph.explanation import Explanation
 from scanchain.graph.growing_array import GrowingArray
@@ -43,6 +45,7 @@ from scanchain.registration import PointToShapeMatcher, VoxelMap, create_matcher
 from scanchain.runs.directory import CHECKPOINT_FILE
 from scanchain.runs.provenance import package_version
 from scanchain.runs.resume.snapshot import Classes, read_snapshot, write_snapshot
+from scanchain.settings import flatten
 from scanchain.slam import Slam
 
 _LEISURE = 20.0  # least time between two checkpoints over the time that one takes to write
@@ -79,7 +82,7 @@ _CLASSES = Classes(
         Since, MapErrors, PoseErrors, PoseErrorTracker,
         ClosureTable, MapEvidence, BackgroundOptimization, PointStore, StoredPoints,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.ClosureVerdict, data.Proposal,
-        config.Config, *(type(getattr(config.Config(), section)) for section in config.Config.__struct_fields__),
+        Config, *(type(getattr(Config(), section)) for section in Config.__struct_fields__),
     ],
     {
         (PoseGraph, "_problem"): lambda graph: None,
@@ -125,6 +128,15 @@ class Checkpoints:
         self.next_s = now + max(self.every_s, _LEISURE * (now - started))
 
 
-def read_checkpoint(folder: Path) -> Checkpoint:
-    """The last checkpoint of a run. Raises InputError for one that is damaged or that other code made."""
-    return read_snapshot(folder / CHECKPOINT_FILE, _CLASSES)
+def read_checkpoint(folder: Path, config: Config) -> Checkpoint:
+    """The last checkpoint of a run. Raises InputError for one that is damaged or that other code made.
+
+    config : of the resuming user, with which it must have been made
+    """
+    words = flatten(config).values()
+    checkpoint = read_snapshot(
+        folder / CHECKPOINT_FILE, _CLASSES, named=[word for word in words if isinstance(word, str)]
+    )
+    if checkpoint.slam.config != config:
+        raise InputError(f"{folder / CHECKPOINT_FILE}: has another configuration; run again without --resume")
+    return checkpoint

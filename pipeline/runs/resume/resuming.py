@@ -7,6 +7,7 @@ from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from scanchain.config import Config
 from scanchain.data import Scan
 from scanchain.errors import InputError
 from scanchain.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RECORDING_FILE, RUN_FILE, left_behind
@@ -14,6 +15,7 @@ from scanchain.runs.job import Recorder
 from scanchain.runs.resume.checkpoint import Checkpoint, Checkpoints, read_checkpoint
 from scanchain.runs.resume.journal import JOURNAL_FILE, read_journal
 from scanchain.runs.step_table import StepRow, StepTable
+from scanchain.settings import dump
 from scanchain.words import counted
 
 _REMEDY = "run without --resume"
@@ -30,17 +32,17 @@ class Left:
     journal_bytes: int
 
 
-def find_left(out: Path, configuration: str) -> Left | None:
+def find_left(out: Path, config: Config) -> Left | None:
     """State of an earlier run into ``out``, None if it had no checkpoint.
 
-    configuration : that of now, as TOML. Raises InputError where that run's, or its version, was another.
+    config : that of now. Raises InputError where that run's, or its version, was another.
     """
     folder = left_behind(out)
     if folder is None:
         return None
-    if (folder / "config.toml").read_text(encoding="utf-8") != configuration:
+    if (folder / "config.toml").read_text(encoding="utf-8") != dump(config):
         raise InputError(f"{folder}: was run with another configuration; repeat its flags, or {_REMEDY}")
-    checkpoint = read_checkpoint(folder)
+    checkpoint = read_checkpoint(folder, config)
     steps, size = read_journal(folder, checkpoint.scans)
     if len(steps) < checkpoint.scans:
         raise InputError(f"{folder / JOURNAL_FILE}: is damaged at step {len(steps)}; {_REMEDY}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import zlib
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from enum import Enum
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from scanchain.errors import InputError
+from scanchain.plugins import is_class_name
 
 _MAGIC = b"scanchain snapshot 1\n"
 _PLAIN = {"list": list, "tuple": tuple, "set": set}
@@ -60,8 +61,11 @@ def write_snapshot(path: Path, value: Any, classes: Classes) -> None:
         raise
 
 
-def read_snapshot(path: Path, classes: Classes) -> Any:
-    """The value again. Raises InputError for a file that is not whole, no snapshot or of other code."""
+def read_snapshot(path: Path, classes: Classes, named: Container[str] = ()) -> Any:
+    """The value again. Raises InputError for a file that is not whole, no snapshot or of other code.
+
+    named : MODULE:CLASS of the reading user, who alone names code; a text of this form that is another is refused
+    """
     data = path.read_bytes()
     body, end = data[:-_END], data[-_END:]
     size = int.from_bytes(end[:8], "little")
@@ -70,7 +74,7 @@ def read_snapshot(path: Path, classes: Classes) -> Any:
     version = body[len(_MAGIC) :].split(b"\n", 1)[0].decode()
     if version != classes.version:
         raise InputError(f"{path}: was made by {version}, this is {classes.version}; run again without --resume")
-    return _Unpacker(body, classes).unpack(msgspec.msgpack.decode(body[len(body) - size :]))
+    return _Unpacker(body, classes, named).unpack(msgspec.msgpack.decode(body[len(body) - size :]))
 
 
 class _Packer:
@@ -133,11 +137,13 @@ class _Packer:
 class _Unpacker:
     """Builds the value again, objects without calling anything of theirs."""
 
-    def __init__(self, body: bytes, classes: Classes) -> None:
-        self.body, self.classes = body, classes
+    def __init__(self, body: bytes, classes: Classes, named: Container[str]) -> None:
+        self.body, self.classes, self.named = body, classes, named
         self.seen: dict[int, Any] = {}
 
     def unpack(self, node: Any) -> Any:
+        if isinstance(node, str) and is_class_name(node) and node not in self.named:
+            raise InputError(f"a snapshot names the code {node!r}, the configuration does not; it is not read")
         if not isinstance(node, list):
             return node
         match node:
