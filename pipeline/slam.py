@@ -38,7 +38,7 @@ from scanchain.graph.robust.graduation import OutlierRejection
 from scanchain.graph.robust.losses import rejection_limit
 from scanchain.loops import ClosureTable, LoopCloser, MapEvidence, refined, spread
 from scanchain.maps import SavedMap
-from scanchain.odometry import FrontEnd, LiveStamps, Located, checked_start
+from scanchain.odometry import FrontEnd, LiveStamps, Located, checked_start, owned
 from scanchain.point_store import PointStore
 from scanchain.preprocess import Prepared
 from scanchain.processes import return_freed_memory
@@ -67,6 +67,7 @@ class SlamResult:
     the vertical angles of the lidar were corrected by, from the scan ``calibrated_from`` on; 0 as a rule;
     ``elevation_sigma_rad`` its standard deviation, infinite where none was estimated.
     ``map_errors`` are those of the keyframes against the map.
+    ``warnings`` has a line on wheels that were left out.
     ``components`` (K,) numbers the pieces that the keyframes belong to, which no loop joins; one as a rule.
     """
 
@@ -79,6 +80,7 @@ class SlamResult:
     state: GraphState
     components: NDArray[np.int64]
     map_errors: MapErrors
+    warnings: tuple[str, ...] = ()
     elevation_offset_rad: float = 0.0
     elevation_sigma_rad: float = math.inf
     calibrated_from: int = 0
@@ -198,6 +200,7 @@ class Slam:
         if self.config.loops.enabled:
             closures = self._close_loops(keyframe >= 0)
             state = self._optimize_when_due()
+        tracked = owned(tracked)
         timing = Timing(scan.waited_s, tracked.preprocess_s, tracked.match_s, tracked.map_s, working_s() - started)
         return Step(
             scan=scan,
@@ -252,6 +255,7 @@ class Slam:
             state=state,
             components=self.closer.segments.components(self.graph),
             map_errors=self.map_errors,
+            warnings=self.front_end.odometry.predictor.warnings(),
             elevation_offset_rad=self.front_end.odometry.elevation.offset_rad,
             elevation_sigma_rad=self.front_end.odometry.elevation.sigma_rad,
             calibrated_from=self.front_end.odometry.calibrated_from,

@@ -208,6 +208,10 @@ def test_stamps_and_times_that_cannot_be_seconds_are_refused(stamps_s, span_s, w
             start(stamps_s, span_s)
 
 
+def test_a_burst_of_scans_at_the_start_is_not_taken_for_times_in_another_unit():
+    live([0.0, 0.001, 0.002, 0.003, 0.004, 0.1, 0.2], span_s=0.1)
+
+
 def live_slam(stamps_s, span_s):
     slam = sc.Slam()
     for stamp_s in stamps_s:

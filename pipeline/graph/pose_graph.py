@@ -405,8 +405,8 @@ class PoseGraph:
         order, problem = self._order(), self._prepared()
         chi2 = problem.chi2(problem.errors(self.poses))
         return GraphState(
-            poses=self.poses,
-            stamps_ns=self.stamps_ns,
+            poses=self.poses.copy(),
+            stamps_ns=self.stamps_ns.copy(),
             edges=self.edges[order],
             is_loop=self.is_loop[order],
             weight=self.weight[order],

@@ -167,6 +167,11 @@ class ScanCounts:
     def notes(self) -> list[str]:
         """Lines on stamps out of order and missing wheel odometry."""
         lines = []
+        if self.copies and not self.copied():
+            share = f"{self.copies} of {counted(self.scans, 'scan')} of {self.topic}"
+            lines.append(
+                f"{share} logged twice, to the last bit: such a copy has the pose of the first, and no other use"
+            )
         if self.backwards:
             steps = counted(self.backwards, "step")
             lines.append(f"{steps} back in the header stamps of {self.topic}; the log's order is kept")

@@ -3,5 +3,6 @@
 from scanchain.odometry.front_end import FrontEnd, Located
 from scanchain.odometry.live_stamps import LiveStamps
 from scanchain.odometry.odometry import Odometry, Tracked, checked_start
+from scanchain.odometry.tracked import owned
 
-__all__ = ["FrontEnd", "LiveStamps", "Located", "Odometry", "Tracked", "checked_start"]
+__all__ = ["FrontEnd", "LiveStamps", "Located", "Odometry", "Tracked", "checked_start", "owned"]

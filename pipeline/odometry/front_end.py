@@ -72,11 +72,12 @@ class FrontEnd:
 
     def locate(self, scan: Scan | Prepared) -> Located:
         """Place one scan by odometry; it becomes a keyframe where it moved far enough from the last one."""
-        tracked = self.odometry.process(scan)
+        tracked = self.odometry.place(scan)
         is_keyframe = not self.scans or tracked.elsewhere_m > 0.0 or self._moved_enough(tracked)
         self.scans += 1
-        self._take(tracked)
-        self.error_tracker.take(tracked)
+        if not tracked.is_repeated:
+            self._take(tracked)
+            self.error_tracker.take(tracked)
         information = self.sum_up() if is_keyframe else self.at_keyframe
         if is_keyframe:
             T_keyframe_lidar = lie.between(self.T_odom_keyframe, tracked.T_odom_lidar)

@@ -5,14 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeVar
 
+import numpy as np
+
 from scanchain.checks import SMALLER_UNITS
 from scanchain.data import Scan
 from scanchain.errors import InputError
+from scanchain.odometry.intervals import SHORTEST_S
 from scanchain.trajectory import format_stamp
 
 Result = TypeVar("Result")
 
 _LOOKED_AT = 3  # intervals: of fewer, a burst or a gap may be the rule
+_REMEMBERED = 10  # the same where they are shorter than any lidar's, and number of the last ones that are kept
 _MOST_SWEEPS = 2.0  # intervals between scans that the times of a scan's points may span
 _SLOWEST_S = 15.0  # between scans, above which regular intervals are not of seconds but of a smaller unit
 _REGULAR = 1.1  # ratio of the intervals of a driver, above which people or gaps set them
@@ -44,13 +48,15 @@ class LiveStamps:
         recent_s = self._with(scan)
         if len(recent_s) < _LOOKED_AT:
             return
-        shortest_s, longest_s = min(recent_s), max(recent_s)
+        shortest_s, longest_s = min(recent_s[-_LOOKED_AT:]), max(recent_s[-_LOOKED_AT:])
         if shortest_s > _SLOWEST_S and longest_s < _REGULAR * shortest_s:
             raise InputError(
                 f"stamp_s grows by {longest_s:.6g} from scan to scan, which no lidar takes in seconds; wanted "
                 f"seconds{SMALLER_UNITS}"
             )
-        span_s = float(scan.times_s.max() - scan.times_s.min()) if len(scan.times_s) else 0.0
+        longest_s = max(recent_s)
+        is_burst = longest_s < SHORTEST_S and len(recent_s) < _REMEMBERED
+        span_s = float(np.ptp(scan.times_s)) if len(scan.times_s) and not is_burst else 0.0
         if span_s > _MOST_SWEEPS * longest_s:
             raise InputError(
                 f"times_s spans {span_s:.3g} s, but scans follow each other within {longest_s:.3g} s; wanted "
@@ -66,4 +72,4 @@ class LiveStamps:
     def _with(self, scan: Scan) -> list[float]:
         """The last intervals, this scan's included."""
         assert self.last_ns is not None
-        return [*self.intervals_s, 1e-9 * (scan.stamp_ns - self.last_ns)][-_LOOKED_AT:]
+        return [*self.intervals_s, 1e-9 * (scan.stamp_ns - self.last_ns)][-_REMEMBERED:]

@@ -19,20 +19,25 @@ from scanchain.odometry.elevation import ElevationCalibration
 from scanchain.odometry.live_stamps import LiveStamps
 from scanchain.odometry.map_keeper import MapKeeper
 from scanchain.odometry.prediction import Prediction, Predictor
-from scanchain.odometry.recovery import Recovery
+from scanchain.odometry.recovery import CLEARLY, Recovery, is_sound
 from scanchain.odometry.standstill import Standstill
 from scanchain.odometry.tracked import (
+    COPY,
     NEW_MAP,
     Tracked,
     blurred,
     first_match,
     nothing_to_match,
+    owned,
     seen_from,
     spread,
 )
 from scanchain.preprocess import Prepared, Resolution, Sweep, prepare
 from scanchain.registration import VoxelMap, create_matcher
 from scanchain.settings import check_dimension, check_order, load_settings
+
+_SAMPLE = 1000  # number of points of two scans, evenly spread, which are compared
+_FEWEST_COPIED = 10  # least number of points of a scan that may be a copy
 
 
 class _Registered(msgspec.Struct, frozen=True):
@@ -80,6 +85,8 @@ class Odometry:
         self.first_points = self.first_sweep.points  # deskewed to its stamp, once the second scan is there
         self.live_stamps = LiveStamps()
         self.scans = 0
+        self.last: Tracked | None = None
+        self.last_sample = self.first_points[:0]  # of its raw points
 
     @property
     def local_map(self) -> VoxelMap:
@@ -107,18 +114,34 @@ class Odometry:
         return self.live_stamps.passed(scan, self.process)
 
     def process(self, scan: Scan | Prepared) -> Tracked:
-        """Predict, correct by registration, extend the map. Raises InputError for a scan of another dimension."""
-        self._check_dimension(scan.scan if isinstance(scan, Prepared) else scan)
-        return self._process(scan if isinstance(scan, Prepared) else prepare(scan, self.resolution))
+        """Predict, correct by registration, extend the map. Raises InputError for a scan of another dimension.
 
-    def _process(self, prepared: Prepared) -> Tracked:
+        A scan that is the one before once more, to the last bit, has its pose and changes nothing; its ``reason``
+        says so.
+        """
+        tracked = self.place(scan)
+        return replace(owned(tracked), points=tracked.points.copy())
+
+    def place(self, scan: Scan | Prepared) -> Tracked:
+        """As ``process``, but nobody may write into the arrays: they are those of odometry."""
+        self._check_dimension(scan.scan if isinstance(scan, Prepared) else scan)
+        prepared = scan if isinstance(scan, Prepared) else prepare(scan, self.resolution)
+        scan, self.resolution = prepared.scan, prepared.after
         self.scans += 1
+        sample = scan.points[:: len(scan.points) // _SAMPLE + 1].copy()
+        if self.last is not None and len(sample) >= _FEWEST_COPIED and np.array_equal(sample, self.last_sample):
+            repeated = scan if scan.is_copy else replace(scan, is_copy=True)
+            return replace(self.last, scan=repeated, reason=COPY, is_repeated=True, elsewhere_m=0.0)
+        self.last_sample = sample
+        self.last = self._placed(prepared)
+        return self.last
+
+    def _placed(self, prepared: Prepared) -> Tracked:
         started, scan = working_s(), prepared.scan
-        self.resolution = prepared.after
         sweep, sparse = self.elevation.corrected(prepared.sweep), self.elevation.corrected(prepared.sparse)
         self.map.resize(self.resolution.scale)
         began = working_s()
-        prediction = self.predictor.predict(scan)
+        prediction = self._predicted(scan, sparse)
         registered = self._register(scan, sweep, sparse, prediction)
         aligned = working_s()
         self.predictor.correct(scan, registered.prediction, registered.match, registered.state)
@@ -127,7 +150,7 @@ class Odometry:
         self._calibrate(scan, points, registered.state)
         match = registered.match if registered.rival is None else spread(registered.match, registered.rival)
         tracked = Tracked(
-            scan=scan,
+            scan=replace(scan, T_odom_base=None) if self.predictor.is_contradicted else scan,
             points=points,
             matched=registered.points,
             T_odom_lidar=self.predictor.T_odom_lidar,
@@ -141,6 +164,26 @@ class Odometry:
             elsewhere_m=registered.elsewhere_m,
         )
         return self._at_stamp(tracked, sweep, prediction)
+
+    def _predicted(self, scan: Scan, sparse: Sweep) -> Prediction:
+        """The predicted pose; without the wheels where they jump, and the scan fits where they do not lead."""
+        prediction = self.predictor.predict(scan)
+        jump_m = self.predictor.jump_m(prediction)
+        if jump_m == 0.0 or not len(self.map.surfaces):
+            return prediction
+        free = self.predictor.predict(scan, by_wheels=False)
+        is_wrong = jump_m > free.farthest_m
+        points = sparse.from_middle(free.velocity)
+        if not is_wrong and len(points):
+            there, here = (
+                self.matcher.align(points, self.local_map, each.T_odom_lidar, each.prior, wide=True)
+                for each in (prediction, free)
+            )
+            is_wrong = is_sound(here) and here.cost < CLEARLY * there.cost
+        if not is_wrong:
+            return prediction
+        self.predictor.drop_wheels(scan, jump_m)
+        return free
 
     def _register(self, scan: Scan, sweep: Sweep, sparse: Sweep, prediction: Prediction) -> _Registered:
         """The match of a scan: aligned as predicted, deskewed by the motion that was found, and aligned again."""
@@ -165,7 +208,9 @@ class Odometry:
         if sparse.is_distorted and is_placed:
             points, match, prediction = self._deskewed(sparse, match, prediction)
         state = self._judge(match)
-        if state is not State.LOST and may_stand:
+        if not may_stand:
+            self.standstill.leave()
+        elif state is not State.LOST:
             self.standstill.follow(match)
         if prediction.is_out_of_reach and self.recovery.fits_badly(match, state, usual_cost):
             return self._reset_map(points, prediction)
@@ -219,7 +264,9 @@ class Odometry:
         self.recovery.take(registered.state)
         T_odom_lidar = self.predictor.T_odom_lidar
         if registered.state is not State.LOST:
-            self.map.extend(points, T_odom_lidar, is_standing=registered.is_standing)
+            has_left = registered.is_standing or not self.standstill.is_standing
+            if has_left:  # else it may have been drawn aside by what moves past
+                self.map.extend(points, T_odom_lidar, is_standing=registered.is_standing)
         elif self.recovery.has_given_up:
             self.map.insert(points, T_odom_lidar)
 
@@ -239,10 +286,10 @@ class Odometry:
         The stamp lies between two middles, or just beyond: by the mean velocity between them, which in rotation
         changes at the rate of the last two motions, with an error as large; in translation that would be noise.
         """
-        if sweep.middle_s == 0.0 or prediction.interval_s <= 0.0:
+        if sweep.middle_s == 0.0 or prediction.lasted_s <= 0.0:
             return tracked
-        mean = lie.log(self.predictor.T_previous_current) / prediction.interval_s
-        change = (1.0 - sweep.middle_s / prediction.interval_s) * (self.predictor.velocity - mean)
+        mean = lie.log(self.predictor.T_previous_current) / prediction.lasted_s
+        change = (1.0 - sweep.middle_s / prediction.lasted_s) * (self.predictor.velocity - mean)
         change[: self.dimension] = 0.0
         tracked = replace(tracked, match=blurred(tracked.match, sweep.middle_s * change))
         return seen_from(tracked, lie.exp(sweep.middle_s * (mean + change)))

@@ -16,12 +16,15 @@ from scanchain.kernels.registration.observability import WEAK, definite_inverse
 from scanchain.odometry.error_statistics import ErrorStatistics
 from scanchain.odometry.intervals import Intervals
 from scanchain.odometry.motion_filter import MotionFilter
+from scanchain.words import counted
 
 _EVEN = 2.0  # largest ratio of two intervals from which an acceleration is computed
 _LEAST_WINDOW_M, _LEAST_WINDOW_RAD = 0.3, 0.3  # least half width where stamps lie too close
 _LARGEST_WINDOW_M = 5.0  # largest half width of the search window
 _ACCELERATION_M_S2 = 4.0  # of a car, which limits the distance in space from the predicted pose
 _FASTEST_M_S, _LARGEST_REACH_M = 40.0, 30.0  # of a car whose speed is unknown; largest half width in space
+_BURST = 0.05  # of the usual interval: scans that follow each other faster came in a burst and have no velocity
+_JUMP = 1.0  # m and rad, difference of two motions over a scan, from which on the wheels may have jumped
 
 
 class Prediction(msgspec.Struct, frozen=True):
@@ -61,6 +64,16 @@ class Prediction(msgspec.Struct, frozen=True):
         return self.prior.T_target_source
 
     @property
+    def lasted_s(self) -> float:
+        """The interval, for a velocity: in a burst of stamps the usual one."""
+        return self.usual_s if self.interval_s < _BURST * self.usual_s else self.interval_s
+
+    @property
+    def before_s(self) -> float:
+        """The same of the interval before."""
+        return self.usual_s if self.last_s < _BURST * self.usual_s else self.last_s
+
+    @property
     def is_second(self) -> bool:
         """True if no motion is known yet: one scan at most has been corrected."""
         return self.last_s == 0.0
@@ -70,6 +83,12 @@ class Prediction(msgspec.Struct, frozen=True):
         """Largest distance from the last scan."""
         speed_m_s = float(np.linalg.norm(self.T_previous_current[:-1, -1])) / max(self.usual_s, 1e-3)
         return self.silence_s * max(self.config.max_speed_m_s, speed_m_s)
+
+    @property
+    def farthest_m(self) -> float:
+        """Largest distance from the predicted pose that a vehicle gets to."""
+        elapsed_s = max(self.interval_s, self.usual_s, self.silence_s) + self.lost_s
+        return 1.0 + elapsed_s * max(self.config.max_speed_m_s, _FASTEST_M_S)
 
     @property
     def is_out_of_reach(self) -> bool:
@@ -118,12 +137,12 @@ class Prediction(msgspec.Struct, frozen=True):
 
         The mean since the last scan, carried on by half an interval with the acceleration between the last two.
         """
-        if self.interval_s <= 0.0:
+        if self.lasted_s <= 0.0:
             return self.velocity
-        mean = motion / self.interval_s
-        if not 0.0 < self.interval_s < _EVEN * self.last_s < _EVEN**2 * self.interval_s:
+        mean = motion / self.lasted_s
+        if not 0.0 < self.lasted_s < _EVEN * self.before_s < _EVEN**2 * self.lasted_s:
             return mean
-        return mean + self.interval_s / (self.interval_s + self.last_s) * (mean - self._velocity_before())
+        return mean + self.lasted_s / (self.lasted_s + self.before_s) * (mean - self._velocity_before())
 
     def deskewing_error(self, T_odom_lidar: Pose, duration_s: float) -> NDArray[np.float64]:
         """(k,) approximate error of a scan of this duration after deskewing at constant velocity.
@@ -131,14 +150,14 @@ class Prediction(msgspec.Struct, frozen=True):
         Under an acceleration a the points lie ½ a t² off at the time t from the middle, on average a T²/24 over a
         scan of T seconds; a by the last two motions.
         """
-        if self.interval_s <= 0.0 or self.is_second:
+        if self.lasted_s <= 0.0 or self.is_second:
             return np.zeros(len(self.velocity))
-        mean = lie.log(lie.between(self.T_odom_last, T_odom_lidar)) / self.interval_s
-        return (mean - self._velocity_before()) / self.interval_s * duration_s**2 / 24.0
+        mean = lie.log(lie.between(self.T_odom_last, T_odom_lidar)) / self.lasted_s
+        return (mean - self._velocity_before()) / self.lasted_s * duration_s**2 / 24.0
 
     def _velocity_before(self) -> NDArray[np.float64]:
         """Mean twist (k,) per second between the last two scans."""
-        return self.motion_before / self.last_s
+        return self.motion_before / self.before_s
 
 
 class Predictor:
@@ -162,12 +181,16 @@ class Predictor:
         self.filter = MotionFilter(np.diag(self.by_velocity.first_sigma**2))
         self.intervals = Intervals()
         self.lost_s = 0.0
+        self.T_odom_base: Pose | None = None  # by the wheels at the last scan, where nothing contradicts it
+        self.is_contradicted = False  # the reading at this scan
+        self.contradicted, self.first_contradicted, self.longest_jump_m = 0, 0, 0.0
 
-    def predict(self, scan: Scan) -> Prediction:
+    def predict(self, scan: Scan, *, by_wheels: bool = True) -> Prediction:
         """The predicted pose of a scan that follows the last one corrected."""
         times = self.intervals
         interval_s = times.to(scan)
-        wheel, is_guess = self._wheel_motion(scan), False
+        wheel, is_guess = self._wheel_motion(scan) if by_wheels else None, False
+        self.is_contradicted = False
         if wheel is not None:
             motion, statistics = wheel, self.by_wheels
             covariance = np.diag(self.by_wheels.variances)
@@ -194,6 +217,32 @@ class Predictor:
             config=self.config,
         )
 
+    def jump_m(self, prediction: Prediction) -> float:
+        """Distance of a pose by the wheels from where the motion so far leads; 0 if it may have changed so."""
+        if not prediction.prior.is_measured:
+            return 0.0
+        wheel = lie.between(self.T_odom_lidar, prediction.T_odom_lidar)
+        scans = max(prediction.interval_s / self.intervals.usual_s, 1.0) if self.intervals.usual_s else 1.0
+        if np.abs(wheel - self.filter.motion).max() <= _JUMP * scans:
+            return 0.0
+        return float(np.linalg.norm(wheel[:-1, -1] - scans * self.filter.motion[:-1, -1]))
+
+    def drop_wheels(self, scan: Scan, jump_m: float) -> None:
+        """Leave out the reading at this scan, which is off by so much, here and for the motion to the next."""
+        self.is_contradicted = True
+        self.first_contradicted = self.first_contradicted if self.contradicted else scan.index
+        self.contradicted += 1
+        self.longest_jump_m = max(self.longest_jump_m, jump_m)
+
+    def warnings(self) -> tuple[str, ...]:
+        """A line on readings of the wheels that were left out."""
+        if not self.contradicted:
+            return ()
+        return (
+            f"wheel odometry jumps by up to {self.longest_jump_m:.3g} m where the scans fit without it: left out "
+            f"at {counted(self.contradicted, 'scan')} (the first: scan {self.first_contradicted:,})",
+        )
+
     def correct(self, scan: Scan, prediction: Prediction, match: Match, state: State) -> None:
         """Take the pose of a scan: that of its match or, where it is lost, the predicted one."""
         T_odom_lidar = prediction.T_odom_lidar if state is State.LOST else match.T_target_source
@@ -204,6 +253,8 @@ class Predictor:
             self.velocity = prediction.velocity_by(self.motion)
             self._update(prediction, match, state)
         self.intervals.take(scan)
+        is_lacking = scan.T_odom_base is None or self.is_contradicted
+        self.T_odom_base = None if is_lacking else np.array(scan.T_odom_base)
         self.T_odom_lidar = T_odom_lidar
 
     def _update(self, prediction: Prediction, match: Match, state: State) -> None:
@@ -227,13 +278,13 @@ class Predictor:
         """Motion of the lidar since the last scan by the wheels; None without a reading at both ends."""
         if self.config.prior == "constant-velocity" or self.intervals.last_scan is None:
             return None
-        last, now = self.intervals.last_scan.T_odom_base, scan.T_odom_base
+        last, now = self.T_odom_base, scan.T_odom_base
+        if now is None and self.config.prior == "wheel":
+            raise InputError(
+                f"scan {scan.index} has no wheel odometry although odometry.prior is 'wheel'; "
+                "set log.odometry_topic, or odometry.prior to 'auto'"
+            )
         if last is None or now is None:
-            if self.config.prior == "wheel":
-                raise InputError(
-                    f"scan {scan.index} has no wheel odometry although odometry.prior is 'wheel'; "
-                    "set log.odometry_topic, or odometry.prior to 'auto'"
-                )
             return None
         return lie.between(self.T_base_lidar, lie.between(last, now) @ self.T_base_lidar)
 

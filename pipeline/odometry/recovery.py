@@ -22,7 +22,7 @@ _UNCERTAIN = 2.0  # cost per point over its running mean, from which on other in
 _ELSEWHERE = 3.0  # cost per point over its running mean, from which on a scan after a gap does not fit the map
 _ROUGH = 0.05  # share of the cost of a point without a correspondence, below which no match is uncertain
 _UNUSUAL = 1.5  # cost per point over its running mean, from which on a contradicted pose in space is searched
-_CLEARLY = 0.8  # share of the cost of the present pose, below which another one replaces it
+CLEARLY = 0.8  # share of the cost of the present pose, below which another one replaces it
 _SAME_RAD = 0.05  # largest angle between two poses of one minimum, which lie within a voxel
 _SEEDS = 3  # number of poses from the bird's-eye search that are aligned
 _LONG_S = 1.0  # shortest gap after which a robot may have turned around
@@ -61,7 +61,7 @@ class Recovery:
         is_contradicted = surfaces.dimension == 3 and self._is_contradicted(best)
         if is_contradicted:
             best = self._searched(tried, matcher, points, sweep, surfaces, prediction)
-        is_found = is_contradicted and _is_sound(best)
+        is_found = is_contradicted and is_sound(best)
         if not is_found and self._is_uncertain(best.cost / len(points), prediction):
             for guess in _guesses(points, surfaces, prediction):
                 other = matcher.align(points, surfaces, guess, wide=True)
@@ -71,7 +71,7 @@ class Recovery:
         rival = None
         if _is_free(prediction):
             best, rival = self._decided(best, tried, surfaces, prediction)
-        if surfaces.dimension == 2 or _is_sound(best):
+        if surfaces.dimension == 2 or is_sound(best):
             cost = best.cost / len(points)
             self.usual_cost = _MEMORY * self.usual_cost + (1.0 - _MEMORY) * cost if self.usual_cost else cost
         return Aligned(best, rival)
@@ -136,9 +136,9 @@ class Recovery:
                 if not any(_is_near(seed, match.T_target_source, surfaces.voxels.size_m) for match in tried):
                     tried.append(matcher.align(points, surfaces, seed, wide=True))
             found = min(tried, key=lambda match: self._cost(match, prediction))
-            if found.observability >= 1.0 and found.cost < _CLEARLY * best.cost:
+            if found.observability >= 1.0 and found.cost < CLEARLY * best.cost:
                 best = found
-            if _is_sound(best):
+            if is_sound(best):
                 break
         return best
 
@@ -149,7 +149,7 @@ class Recovery:
             for match in tried
             if match.cost < AMBIGUOUS * best.cost
             and match.inlier_share >= self.config.min_inlier_share
-            and _is_sound(match)
+            and is_sound(match)
             and not _is_near(match.T_target_source, best.T_target_source, surfaces.voxels.size_m)
         ]
         if not distinct:
@@ -176,7 +176,7 @@ def _away(match: Match, prediction: Prediction) -> float:
     return float(away @ away)
 
 
-def _is_sound(match: Match) -> bool:
+def is_sound(match: Match) -> bool:
     """True if the correspondences determine the pose and agree with it."""
     return match.fit >= LEAST_FIT and match.observability >= 1.0
 

@@ -1,4 +1,4 @@
-"""Standstill: matches that agree with one pose, which is held until they contradict it."""
+"""Standstill: a pose that is held as long as matches agree with one another, though they lie beside it."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ from scanchain.data import Match, Pose
 from scanchain.kernels.registration.observability import definite_inverse
 
 _SCANS = 10  # number of scans that agree with one pose, from which on the lidar stands
+_AGAIN = 30  # the same of scans beside a pose that is held
+_SETTLING = 0.2  # least weight of a match in the mean of the first ones, whose map is that of few scans
+_SETTLING_M, _SETTLING_RAD = 0.004, 0.001  # smallest standard deviation of them
 _SUDDEN = 5.0  # standard deviations beyond which one innovation contradicts a standstill
 _LASTING = 3.0  # the same for the running mean of the innovations
 _CAUTION = 2.0  # factor from the root mean square to the standard deviation that is used
@@ -19,87 +22,156 @@ _AVERAGED = 0.25  # least variance of that mean over that of one innovation: err
 _KNOWN = 5  # number of steps from which on their scatter replaces the variance of a match
 _LEAST_M, _LEAST_RAD = 0.002, 0.0005  # smallest standard deviation of a match
 _LARGEST_M, _LARGEST_RAD = 0.01, 0.005  # largest one; weaker matches cannot show a standstill
+_FIRST_M, _FIRST_RAD = 0.015, 0.002  # largest distance of a match to a map of a single scan, whose noise it shares
+_NEAR_M, _NEAR_RAD = 0.02, 0.004  # distance from the mean beyond which (and _SUDDEN) the lidar has set off
+_SAME_M, _SAME_RAD = 0.002, 0.001  # distance between two means up to which they are one standstill
 
 
 class Standstill:
     """Zero-velocity hypothesis, tested by the innovation of every match against the mean of those before.
 
-    The variance of a match follows from the steps between successive matches (von Neumann 1941), which a slow
-    motion does not inflate. The hypothesis is rejected by one innovation, or by the running mean of the last ones,
-    which shows a motion too slow for one scan.
+    A map of few scans has an error that all matches share: they agree with one another, some millimeters beside.
+    The pose that is held is that of the first scan, or the mean of the first ten after a motion. It follows the
+    mean of the matches where that moves away, not where it comes nearer as the map gets better. People and cars
+    that move past draw matches aside for a while: the lidar stands where it stood unless it sets off, or ten scans
+    in a row agree with another pose.
 
     Attributes
     ----------
-    T_odom_lidar : mean pose of the matches that agree
-    scans : how many they are; a log begins at a standstill
+    T_odom_lidar : the pose that is held
+    bias : (k,) from it to the mean of the matches
     """
 
     def __init__(self, dimension: int) -> None:
-        k = 3 if dimension == 2 else 6
-        self.least = lie.by_component(k, _LEAST_M, _LEAST_RAD) ** 2
-        self.largest = lie.by_component(k, _LARGEST_M, _LARGEST_RAD) ** 2
         self.begin(lie.identity(dimension))
-        self.scans = _SCANS
+        self.is_beginning = True
 
     def begin(self, T_odom_lidar: Pose) -> None:
         """Start from a pose that may be the first of a standstill."""
-        self.T_odom_lidar = self.T_odom_matched = T_odom_lidar
-        self.scans, self.steps = 1, 0
-        self.mean_innovation = np.zeros(len(self.least))
-        self.squares = np.zeros(len(self.least))
+        self.T_odom_lidar = T_odom_lidar
+        self.bias = np.zeros(lie.twist_size(T_odom_lidar))
+        self.held: AgreeingMatches | None = None
+        self.beside: AgreeingMatches | None = AgreeingMatches(
+            T_odom_lidar
+        )  # of the last matches, none of which confirmed it
+        self.is_beginning = self.is_settling = False
 
     @property
     def is_standing(self) -> bool:
-        """True if enough scans agree with one pose."""
-        return self.scans >= _SCANS
+        """True if enough scans agreed with one pose, and the lidar has not left it."""
+        return self.held is not None
 
     def confirms(self, match: Match) -> bool:
         """True if the lidar stands and the match, which is taken then, does not contradict it.
 
         A degenerate match cannot: along a corridor it follows the prediction, which is to stand.
         """
-        if not (self.is_standing and match.observability >= 1.0 and self._agrees(match)):
+        if match.observability < 1.0:
             return False
-        self._take(match)
+        if self.is_beginning:
+            self.is_beginning = False
+            self.bias = lie.log(lie.between(self.T_odom_lidar, match.T_target_source))
+            limits = np.maximum(_limits(self.bias, _FIRST_M, _FIRST_RAD), _LASTING * np.sqrt(_variances(match)))
+            self.is_settling = bool((np.abs(self.bias) < limits).all())
+            self.held = AgreeingMatches(match.T_target_source) if self.is_settling else None
+            return self.is_settling
+        if self.held is None or not self.held.takes(match, is_settling=self.is_settling):
+            return False
+        self.beside = None
+        self.is_settling = self.is_settling and self.held.scans < _SCANS
+        if self.is_settling:
+            self.bias = lie.log(lie.between(self.T_odom_lidar, self.held.T_mean))
+        else:
+            self._hold(self.held, np.zeros(len(self.bias)))
         return True
 
     def follow(self, match: Match) -> None:
-        """Take a match of a lidar that does not stand: one more near the same pose, or the first near another."""
-        if not self.is_standing and self._agrees(match):
-            self._take(match)
+        """Take a match that does not confirm a standstill: one of several that agree, or the first of them."""
+        sigma = np.sqrt(_variances(match))
+        if self.held is not None:
+            away = np.abs(lie.log(lie.between(self.held.T_mean, match.T_target_source)))
+            if (away > np.maximum(_limits(away, _NEAR_M, _NEAR_RAD), _SUDDEN * sigma)).any():
+                self.held = None
+        if self.beside is None or not self.beside.takes(match):
+            self.beside = AgreeingMatches(match.T_target_source)
+        if self.beside.scans < (_SCANS if self.held is None else _AGAIN):
+            return
+        if self.held is None:
+            self.begin(self.beside.T_mean)
+            self.held = self.beside
         else:
-            self.begin(match.T_target_source)
+            self._hold(self.beside, sigma)
+        self.beside = None
 
-    def _agrees(self, match: Match) -> bool:
-        variances = self._variances(match)
-        innovation = self._innovation(match)
-        mean = self.mean_innovation + self._gain * (innovation - self.mean_innovation)
-        share = max(_AVERAGED, 1.0 / (self.steps + 1))
-        is_sudden = np.any(innovation**2 > _SUDDEN**2 * variances)
-        is_lasting = np.any(mean**2 > _LASTING**2 * share * variances)
-        return not (is_sudden or is_lasting)
+    def leave(self) -> None:
+        """Forget the pose that was held: another sensor measures the motion."""
+        self.held, self.is_beginning = None, False
 
-    def _take(self, match: Match) -> None:
-        innovation = self._innovation(match)
-        step = lie.log(lie.between(self.T_odom_matched, match.T_target_source))
-        self.mean_innovation += self._gain * (innovation - self.mean_innovation)
-        scatter_gain = max(_SCATTER_GAIN, 1.0 / (self.steps + 1))
-        self.squares += scatter_gain * (0.5 * step**2 - self.squares)
+    def _hold(self, mean: AgreeingMatches, sigma: NDArray[np.float64]) -> None:
+        """Move the pose that is held where the mean of the matches moved away from it, by more than sigma (k,)."""
+        assert self.held is not None
+        away = lie.log(lie.between(self.T_odom_lidar, mean.T_mean))
+        if self.is_settling:
+            self.bias, self.held, self.is_settling = away, mean, False
+            return
+        bias = np.clip(away, np.minimum(self.bias, 0.0), np.maximum(self.bias, 0.0))
+        moved = away - bias
+        self.bias = bias
+        if (np.abs(moved) < np.maximum(_limits(moved, _SAME_M, _SAME_RAD), sigma)).all():
+            self.held.mean_innovation = (
+                np.zeros(len(moved)) if mean is not self.held else self.held.mean_innovation
+            )
+            return
+        self.T_odom_lidar = lie.normalize(self.T_odom_lidar @ lie.exp(moved))
+        self.held = mean
+
+
+class AgreeingMatches:
+    """Matches that agree with their mean.
+
+    The variance of a match follows from the steps between successive matches (von Neumann 1941), which a slow
+    motion does not inflate. A match is contradicted by its innovation, or by the running mean of the last ones,
+    which shows a motion too slow for one scan.
+    """
+
+    def __init__(self, T_odom_lidar: Pose) -> None:
+        self.T_mean = self.T_last = T_odom_lidar
+        self.scans, self.steps = 1, 0
+        self.mean_innovation = self.squares = np.zeros(lie.twist_size(T_odom_lidar))
+
+    def takes(self, match: Match, *, is_settling: bool = False) -> bool:
+        """True if a match agrees, which is taken then; the mean of the innovations includes it in any case."""
+        innovation = lie.log(lie.between(self.T_mean, match.T_target_source))
+        variances = _variances(match)
+        if self.steps >= _KNOWN:
+            variances = np.clip(
+                _CAUTION**2 * self.squares, _limits(innovation, _LEAST_M, _LEAST_RAD) ** 2, variances
+            )
+        if is_settling:
+            variances = np.maximum(variances, _limits(innovation, _SETTLING_M, _SETTLING_RAD) ** 2)
+        latest = 1.0 / (self.steps + 1)
+        self.mean_innovation = self.mean_innovation + max(_GAIN, latest) * (innovation - self.mean_innovation)
+        is_sudden = innovation**2 > _SUDDEN**2 * variances
+        is_lasting = self.mean_innovation**2 > _LASTING**2 * max(_AVERAGED, latest) * variances
+        if is_sudden.any() or is_lasting.any():
+            return False
+        step = lie.log(lie.between(self.T_last, match.T_target_source))
+        self.squares = self.squares + max(_SCATTER_GAIN, latest) * (0.5 * step**2 - self.squares)
         self.steps += 1
         self.scans += 1
-        self.T_odom_matched = match.T_target_source
-        self.T_odom_lidar = lie.normalize(self.T_odom_lidar @ lie.exp(innovation / self.scans))
+        self.T_last = match.T_target_source
+        weight = max(_SETTLING if is_settling else 0.0, 1.0 / self.scans)
+        self.T_mean = lie.normalize(self.T_mean @ lie.exp(weight * innovation))
+        return True
 
-    @property
-    def _gain(self) -> float:
-        return max(_GAIN, 1.0 / (self.steps + 1))
 
-    def _innovation(self, match: Match) -> NDArray[np.float64]:
-        return lie.log(lie.between(self.T_odom_lidar, match.T_target_source))
+def _variances(match: Match) -> NDArray[np.float64]:
+    """(k,) of a match by its own information, within the limits."""
+    variances = np.diag(definite_inverse(match.information))
+    least, largest = _limits(variances, _LEAST_M, _LEAST_RAD), _limits(variances, _LARGEST_M, _LARGEST_RAD)
+    return np.clip(variances, least**2, largest**2)
 
-    def _variances(self, match: Match) -> NDArray[np.float64]:
-        """(k,) of an innovation: that of the match or, once known, of the scatter of the last ones, if smaller."""
-        variances = np.diag(definite_inverse(match.information))
-        if self.steps >= _KNOWN:
-            variances = np.minimum(variances, _CAUTION**2 * self.squares)
-        return np.clip(variances, self.least, self.largest)
+
+def _limits(twist: NDArray[np.float64], meters: float, radians: float) -> NDArray[np.float64]:
+    """(k,) limits of the components of a twist (k,)."""
+    return lie.by_component(len(twist), meters, radians)

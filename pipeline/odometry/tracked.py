@@ -13,6 +13,7 @@ from scanchain.data import Match, Points, Pose, Prior, Scan, State, brief
 from scanchain.odometry.prediction import Prediction
 from scanchain.registration import as_ambiguous, with_source_frame
 
+COPY = "the scan before once more, to the last bit: it has that pose, and says nothing of a motion since"
 NEW_MAP = "a new map begins"  # in the reason of a scan whose motion from the one before is unknown
 
 
@@ -23,7 +24,8 @@ class Tracked:
     ``points`` (M, d) are all that went into the map, ``matched`` those that were aligned, both deskewed, as seen
     from the lidar at the scan's stamp, where ``T_odom_lidar`` holds too; the seconds are its times by stage.
     ``prior`` is that of this pose, its covariance that at the middle of the scan;
-    ``elsewhere_m`` is its largest possible distance where its motion is unknown, 0 as a rule.
+    ``elsewhere_m`` is its largest possible distance where its motion is unknown, 0 as a rule;
+    ``is_repeated`` if its points are those of the scan before.
     """
 
     __repr__ = brief
@@ -39,6 +41,19 @@ class Tracked:
     match_s: float
     map_s: float
     elsewhere_m: float = 0.0
+    is_repeated: bool = False
+
+
+def owned(tracked: Tracked) -> Tracked:
+    """The same with arrays of its own, except for ``points``: whoever writes into them moves no later pose."""
+    match, prior = tracked.match, tracked.prior
+    return replace(
+        tracked,
+        matched=tracked.matched.copy(),
+        T_odom_lidar=tracked.T_odom_lidar.copy(),
+        match=replace(match, T_target_source=match.T_target_source.copy(), information=match.information.copy()),
+        prior=Prior(prior[0].copy(), prior[1].copy(), prior[2].copy(), prior.is_measured),
+    )
 
 
 def first_match(T_odom_lidar: Pose, points: Points, config: MatchingConfig) -> Match:

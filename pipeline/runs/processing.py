@@ -116,7 +116,7 @@ def process(
         final,
         judged,
         results.expected,
-        (*notes, *results.warnings, *recording.warnings),
+        (*notes, *result.warnings, *results.warnings, *recording.warnings),
         held_s,
     )
 

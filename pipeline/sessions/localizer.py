@@ -138,6 +138,11 @@ class Localizer:
         scan = Scan.of(points, stamp_s, times_s, index=len(self.states), T_odom_base=T_odom_base)
         return self.slam.live_stamps.passed(scan, self.process)
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Lines on wheels that were left out."""
+        return self.slam.front_end.odometry.predictor.warnings()
+
     def process(self, scan: Scan | Prepared) -> Placed:
         """Place one scan of a log."""
         step = self.slam.process(scan)

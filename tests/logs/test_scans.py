@@ -493,6 +493,13 @@ def test_copies_of_scans_are_a_warning(tmp_path):
     assert len(scans) == 20 and "6 of 20 scans of /scan are the one before once more" in line
 
 
+def test_a_few_copies_of_scans_are_a_note(tmp_path):
+    ranges = [1.0 + 0.05 * np.arange(31) + 0.01 * min(k, 18) for k in range(20)]
+    said = [scan_said(STAMP_NS + k * SECOND, laser_scan(STAMP_NS + k, each)) for k, each in enumerate(ranges)]
+    log, _ = read(write(tmp_path / "a.mcap", said))
+    assert not log.copies and any("1 of 20 scans of /scan logged twice" in note for note in log.notes)
+
+
 def test_a_cloud_keeps_the_full_mounting(tmp_path):
     rows = np.array([(1, 2, 3)], dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
     said = [

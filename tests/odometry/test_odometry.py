@@ -268,7 +268,7 @@ def test_where_scans_see_nothing_along_uncertainty_grows_over_those_without_a_wh
             prior = Prior(T, 1e-4 * np.eye(3), np.ones(3), is_measured)
             match = replace(first_match(T, np.zeros((9, 2)), configured(2).matching), information=SEES_ACROSS)
             tracked = Tracked(None, NOTHING, NOTHING, T, match, State.DEGENERATE, "", prior, 0.0, 0.0, 0.0)
-            front_end.odometry.process = lambda scan, tracked=tracked: tracked
+            front_end.odometry.place = lambda scan, tracked=tracked: tracked
             front_end.locate(None)
             told.append(front_end.sum_up())
         return np.sqrt(np.linalg.inv(np.array(told) + 1e-9 * np.eye(3))[:, 0, 0])
@@ -288,7 +288,7 @@ def test_a_motion_over_a_scan_that_correspondences_contradict_is_known_as_predic
         prior = Prior(T @ lie.exp(off), 1e-4 * np.eye(6), np.ones(6), is_measured)
         match = replace(first_match(T, nothing, configured(3).matching), information=1e6 * np.eye(6), fit=fit)
         tracked = Tracked(None, nothing, nothing, T, match, State.OK, "", prior, 0.0, 0.0, 0.0)
-        front_end.odometry.process = lambda scan, tracked=tracked: tracked
+        front_end.odometry.place = lambda scan, tracked=tracked: tracked
         front_end.locate(None)
         told.append(np.linalg.inv(front_end.sum_up()))
     sigmas = np.sqrt(np.diagonal(told, axis1=1, axis2=2))
@@ -410,3 +410,99 @@ def test_every_motion_agrees_with_kiss_icp_to_two_centimeters():
 def test_the_configuration_survives_the_presets():
     assert msgspec.to_builtins(configured(3)) == msgspec.to_builtins(Config())
     assert configured(2).local_map.voxel_size_m == 0.1
+
+
+def shifted(scan, ns):
+    return replace(scan, stamp_ns=scan.stamp_ns + ns, log_time_ns=scan.log_time_ns + ns)
+
+
+@pytest.mark.parametrize("early", [1, 3, 6])
+@pytest.mark.parametrize("apart_ns", [1_000, 1_000_000])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_burst_at_the_start_of_a_log_is_no_usual_interval(office, town, dimension, early, apart_ns):
+    scans, T_base_lidar, _ = office if dimension == 2 else town
+    begin_ns = scans[early].stamp_ns - early * apart_ns
+    burst = [shifted(scan, begin_ns + k * apart_ns - scan.stamp_ns) for k, scan in enumerate(scans[:early])]
+    for source in (lambda scan: scan, lambda scan: replace(scan, times_s=scan.times_s[:0])):
+        steps = tracked(map(source, [*burst, *scans[early:50]]), T_base_lidar, configured(dimension))
+        usual = tracked(map(source, scans[:50]), T_base_lidar, configured(dimension))
+        away_m, _ = lie.apart(steps[-1].T_odom_lidar, usual[-1].T_odom_lidar)
+        assert away_m < 0.03
+        assert State.LOST not in {step.state for step in steps}
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("late_ns", [1_000, 20_000_000])
+def test_a_scan_that_is_logged_twice_changes_no_pose(office, town, dimension, late_ns):
+    scans, T_base_lidar, _ = office if dimension == 2 else town
+    once = tracked(scans[:40], T_base_lidar, configured(dimension))
+    twice = [each for scan in scans[:40] for each in (scan, replace(scan, log_time_ns=scan.log_time_ns + late_ns))]
+    steps = tracked(twice, T_base_lidar, configured(dimension))
+    for step, copy, expected in zip(steps[::2], steps[1::2], once, strict=True):
+        assert np.array_equal(step.T_odom_lidar, expected.T_odom_lidar)
+        assert np.array_equal(copy.T_odom_lidar, expected.T_odom_lidar)
+        assert copy.is_repeated and copy.scan.is_copy and "once more" in copy.reason
+
+
+def test_a_driver_that_is_given_the_same_cloud_says_so(town):
+    scans, T_base_lidar, _ = town
+    odometry, buffer = Odometry(configured(3), T_base_lidar), scans[0].points.copy()
+    for index, scan in enumerate((scans[0], scans[0], scans[1])):
+        buffer = np.resize(buffer, scan.points.shape)
+        buffer[:] = scan.points  # a driver may fill one buffer again and again
+        step = odometry.track(buffer, 0.1 * index)
+        assert step.is_repeated == (index == 1)
+
+
+def scribbled(value, seen=None):
+    """Write into every array that is reached from a value that was returned, but for what was given: the scan."""
+    seen = set() if seen is None else seen
+    if id(value) in seen or isinstance(value, Scan):
+        return
+    seen.add(id(value))
+    if isinstance(value, np.ndarray):
+        if value.dtype.kind == "f" and value.flags.writeable:
+            value[...] = 7.0
+        return
+    fields = getattr(value, "__dataclass_fields__", None) or getattr(value, "__struct_fields__", ())
+    for each in value if isinstance(value, tuple | list) else (getattr(value, name) for name in fields):
+        scribbled(each, seen)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+@pytest.mark.parametrize("has_times", [True, False])
+@pytest.mark.parametrize("make", [Odometry, Slam])
+def test_whoever_writes_into_what_is_returned_moves_no_later_pose(office, town, dimension, has_times, make):
+    scans, T_base_lidar, _ = office if dimension == 2 else town
+    if not has_times:
+        scans = [replace(scan, times_s=scan.times_s[:0]) for scan in scans]
+    poses = []
+    for writes in (False, True):
+        found = make(configured(dimension), T_base_lidar)
+        poses.append([])
+        for scan in scans[: 250 if dimension == 2 and make is Slam else 40]:
+            step = found.process(scan)
+            poses[-1].append(step.T_odom_lidar.copy())
+            if writes:
+                scribbled(step)
+    assert np.array_equal(*poses)
+
+
+@pytest.mark.parametrize("jump_m", [0.6, 3.0, 100.0, 1e4, 1e6])
+@pytest.mark.parametrize("lasts", [False, True])
+def test_a_jump_of_the_wheels_that_the_scans_contradict_is_left_out(office, jump_m, lasts):
+    scans, T_base_lidar, _ = office
+
+    def jumped(scan):
+        T_odom_base = scan.T_odom_base.copy()
+        T_odom_base[0, 2] += jump_m * (scan.index >= 30 if lasts else scan.index == 30)
+        return replace(scan, T_odom_base=T_odom_base)
+
+    usual = tracked(scans[:60], T_base_lidar, configured(2))
+    odometry = Odometry(configured(2), T_base_lidar)
+    steps = [odometry.process(jumped(scan)) for scan in scans[:60]]
+    assert lie.apart(steps[-1].T_odom_lidar, usual[-1].T_odom_lidar)[0] < 0.02
+    if jump_m > 1.0:
+        (line,) = odometry.predictor.warnings()
+        assert f"jumps by up to {jump_m:.3g} m" in line and "left out at 1 scan (the first: scan 30)" in line
+        assert [step.scan.index for step in steps if step.scan.T_odom_base is None] == [30]

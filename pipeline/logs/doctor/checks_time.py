@@ -17,6 +17,7 @@ from scanchain.words import counted
 _GAP_PERIODS = 2.5
 _MOST_MISSING = 10  # largest number of scans missing in a row at which they are counted
 _JITTER = 0.1  # jitter, as a share of the period, from which on scans come as they please
+_BURST = 0.05  # share of the period within which a scan follows the one before in a burst
 _LONG_GAP_S, _LONG_GAP_ON_WHEELS_S = 0.5, 10.0
 _OTHER_CLOCK_S = 1.0
 _LATE_S = 0.2
@@ -32,11 +33,22 @@ def check_time(seen: Survey, config: Config) -> Iterator[Finding]:
     """Every finding about time. ``config`` is what a run of this log would use."""
     is_on_wheels = bool(seen.wheels) and config.odometry.prior != "constant-velocity"
     yield _gaps(seen, is_on_wheels)
+    yield from _bursts(seen)
     yield _order(seen)
     yield _clock(seen)
     yield _wheels(seen)
     if not is_scan(seen.log.lidar):
         yield _point_times(seen)
+
+
+def _bursts(seen: Survey) -> Iterator[Finding]:
+    """A finding where scans follow each other faster than the lidar takes them."""
+    steps_s = np.diff(seen.stamps_ns) * 1e-9
+    soon = np.flatnonzero((steps_s > 0.0) & (steps_s < _BURST * seen.period_s))
+    if len(soon):
+        found = f"{len(soon):,} within {1e3 * steps_s[soon].max():.2g} ms of the one before (scan {soon[0] + 1:,})"
+        effect = "a burst shows no velocity: a run takes the usual interval for it"
+        yield Finding("bursts", Severity.NOTE, found, effect)
 
 
 def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:

@@ -38,7 +38,8 @@ from scanchain.odometry.motion_filter import MotionFilter
 from scanchain.odometry.pose_errors import PoseErrorTracker
 from scanchain.odometry.prediction import Predictor
 from scanchain.odometry.recovery import Recovery
-from scanchain.odometry.standstill import Standstill
+from scanchain.odometry.standstill import AgreeingMatches, Standstill
+from scanchain.odometry.tracked import Tracked
 from scanchain.point_store import PointStore, StoredPoints
 from scanchain.preprocess import Resolution, Sweep
 from scanchain.registration import PointToShapeMatcher, VoxelMap, create_matcher
@@ -76,12 +77,14 @@ class Checkpoint:
 _CLASSES = Classes(
     [
         Checkpoint, Slam, FrontEnd, Motion, Odometry, LiveStamps, Predictor, MotionFilter, Intervals,
-        ErrorStatistics, Recovery, Standstill, ElevationCalibration, MapKeeper, Resolution, Sweep, VoxelMap,
+        ErrorStatistics, Recovery, Standstill, AgreeingMatches, Tracked, ElevationCalibration, MapKeeper,
+        Resolution, Sweep, VoxelMap,
         Voxels, PointToShapeMatcher, LoopCloser, ProximityCloser, PlaceCloser, Relocalizer, Find, PlanarSearch,
         VoxelSubmaps, ScanVerifier, SubmapVerifier, Segments, Drift, PoseGraph, Explanation, Slip, GrowingArray,
         Since, MapErrors, PoseErrors, PoseErrorTracker,
         ClosureTable, MapEvidence, BackgroundOptimization, PointStore, StoredPoints,
-        data.Scan, data.Keyframe, data.Closure, data.Match, data.ClosureVerdict, data.Proposal,
+        data.Scan, data.Keyframe, data.Closure, data.Match, data.ClosureVerdict, data.Proposal, data.Prior,
+        data.State,
         Config, *(type(getattr(Config(), section)) for section in Config.__struct_fields__),
     ],
     {
