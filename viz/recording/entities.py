@@ -6,7 +6,7 @@ correction that loop closures make. A 2D log is drawn in the plane z = 0.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import numpy as np
 import rerun as rr
@@ -146,9 +146,11 @@ def dots(color: Color, radius: float, positions: NDArray[np.float32] | None = No
     return rr.Points3D.from_fields(positions=positions, colors=[color], radii=[pixels(radius)])
 
 
-def lines(color: Color, radius: float, strips: Sequence[NDArray[np.float32]] | None = None) -> rr.LineStrips3D:
+def lines(color: Color, radius: float, strips: Iterable[NDArray[np.float32]] | None = None) -> rr.LineStrips3D:
     """Line strips, (N, 3) each, of one color and radius; without strips the style of those to come."""
-    return rr.LineStrips3D.from_fields(strips=strips, colors=[color], radii=[pixels(radius)])
+    return rr.LineStrips3D.from_fields(
+        strips=None if strips is None else [*strips], colors=[color], radii=[pixels(radius)]
+    )
 
 
 def rgb(color: str) -> Color:
