@@ -50,11 +50,7 @@ class MethodResult:
 
 def compare_linear(system: LinearSystem, methods: Sequence[str], repeats: int) -> tuple[MethodResult, ...]:
     """Solve A x = b by every method, interleaved; slow ones once only."""
-
-    def solve(solver: _Tally) -> NDArray[np.float64]:
-        return solver.solve(system).x
-
-    return _compare(solve, methods, repeats)
+    return _compare(lambda solver: solver.solve(system).x, methods, repeats)
 
 
 def compare_nonlinear(

@@ -87,6 +87,12 @@ def begun_at(route: Matrix, start_m: float) -> Matrix:
     return np.vstack([first, route[ahead:], route[:ahead]])
 
 
+def sampled(route: Matrix, step_m: float) -> Matrix:
+    """Points along the straight segments of the closed route, both corners of each and one about every step."""
+    segments = zip(route, np.roll(route, -1, axis=0), strict=True)
+    return np.vstack([np.linspace(a, b, max(int(np.linalg.norm(b - a) / step_m), 2)) for a, b in segments])
+
+
 def _densify(route: Matrix, reach_m: float, step_m: float) -> Matrix:
     """Points every ``step_m`` along as many laps of the closed route as ``reach_m`` takes."""
     lap = np.vstack([route, route[:1]])

@@ -406,7 +406,7 @@ def test_what_is_recorded_at_once_is_written_whole_or_not_at_all(tmp_path, monke
     path, up = tmp_path / "a.rrd", [Message("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)]
 
     def write():
-        write_recording(path, open_stream("a", 2, uuid4()), blueprint(2), up)
+        write_recording(path, "a", 2, blueprint(2), up)
 
     write()
     assert RrdReader(str(path)).blueprints()

@@ -67,7 +67,7 @@ def svg_after(study: Study) -> Markup:
     """The same after it."""
     figure = _svg(study, study.after, AFTER)
     x, y = _in_truth(study.after)[1].T
-    figure.ellipses(x, y, *_ellipses(study), AFTER, _ELLIPSE_WIDTH, _ELLIPSE_OPACITY)
+    figure.ellipses(x, y, *ellipses(study), AFTER, _ELLIPSE_WIDTH, _ELLIPSE_OPACITY)
     return figure.svg()
 
 
@@ -162,7 +162,7 @@ def _draw_state(axes: Axes, estimate: Estimate, color: str, when: str) -> None:
     )  # fmt: skip
 
 
-def _ellipses(study: Study) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def ellipses(study: Study) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The 95 % ellipse of every landmark: half axes (N, 2) in meters, the longer first, and angle to x (N,)."""
     turn = study.after.T_truth_estimate[:2, :2]
     values, vectors = np.linalg.eigh(turn @ study.landmark_covariance @ turn.T)
@@ -173,13 +173,13 @@ def _ellipses(study: Study) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 def _draw_ellipses(axes: Axes, study: Study) -> None:
     from matplotlib.collections import EllipseCollection
 
-    axes_m, angles_rad = _ellipses(study)
-    ellipses = EllipseCollection(
+    axes_m, angles_rad = ellipses(study)
+    drawn = EllipseCollection(
         2.0 * axes_m[:, 0], 2.0 * axes_m[:, 1], np.degrees(angles_rad), units="xy",
         offsets=_in_truth(study.after)[1], offset_transform=axes.transData, facecolors="none", edgecolors=AFTER,
         linewidths=_ELLIPSE_WIDTH, alpha=_ELLIPSE_OPACITY, zorder=2,
     )  # fmt: skip
-    axes.add_collection(ellipses)
+    axes.add_collection(drawn)
 
 
 def _legend(figure: Figure) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from uuid import uuid4
 
 import numpy as np
 import rerun as rr
@@ -15,7 +14,7 @@ from scanchain.sessions.changes import Changes, Label
 from scanchain.viz.recording import entities, shapes
 from scanchain.viz.recording.blueprint import scene
 from scanchain.viz.recording.messages import Message
-from scanchain.viz.recording.sinks import open_stream, write_recording
+from scanchain.viz.recording.sinks import write_recording
 
 _FLAT_M = 0.02  # height of a box in the plane
 _RADII = {Label.SAME: 0.75, Label.UNKNOWN: 1.0, Label.APPEARED: 2.0, Label.VANISHED: 2.0}
@@ -23,16 +22,13 @@ _RADII = {Label.SAME: 0.75, Label.UNKNOWN: 1.0, Label.APPEARED: 2.0, Label.VANIS
 
 def record_changes(directory: Path, changes: Changes) -> None:
     """Write recording.rrd into a directory that holds summary.txt. Raises OSError."""
-    stream = open_stream(directory.name.split(".partial")[0], changes.dimension, uuid4())
     points = shapes.in_space(changes.points)
     messages = [
-        Message(entities.WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP),
+        entities.UP,
         Message("summary", rr.TextDocument((directory / SUMMARY_FILE).read_text(encoding="utf-8"))),
     ]
     for label, radius in _RADII.items():
-        chosen = rr.Points3D(
-            points[changes.labels == label], colors=[COLORS[label]], radii=entities.pixels(radius)
-        )
+        chosen = entities.dots(COLORS[label], radius, points[changes.labels == label])
         messages.append(Message(f"world/{label.name.lower()}", chosen))
     messages += [_boxes(changes, label) for label in (Label.APPEARED, Label.VANISHED)]
     messages.append(_arrows(changes))
@@ -40,7 +36,8 @@ def record_changes(directory: Path, changes: Changes) -> None:
     text = rrb.TextDocumentView(origin="summary", name="summary")
     world = scene("changes", changes.dimension, box)
     layout = rrb.Blueprint(rrb.Horizontal(world, text, column_shares=[3, 1]), collapse_panels=True)
-    write_recording(directory / RECORDING_FILE, stream, layout, messages)
+    name = directory.name.split(".partial")[0]
+    write_recording(directory / RECORDING_FILE, name, changes.dimension, layout, messages)
 
 
 def _boxes(changes: Changes, label: Label) -> Message:

@@ -31,20 +31,17 @@ _PLOTS = {"error": "position error [m]", "time": "time of a scan [ms]"}
 def record_comparison(directory: Path) -> None:
     """Write compare.rrd into a comparison's directory. Raises OSError."""
     table, trajectories = read_table(directory), read_trajectories(directory)
-    stream = rr.RecordingStream(f"scanchain comparison {table.dimension}D")
-    stream.set_log_time_enabled(False)
-    stream.send_recording_name(Path(table.log.split(", ")[0]).name)
-    messages = _messages(directory, trajectories, _stamps(directory))
-    write_recording(directory / RECORDING_FILE, stream, _blueprint(trajectories, table), messages)
+    name, messages = Path(table.log.split(", ")[0]).name, _messages(directory, trajectories, _stamps(directory))
+    layout = _blueprint(trajectories, table)
+    write_recording(directory / RECORDING_FILE, name, table.dimension, layout, messages, kind="comparison ")
 
 
 def _messages(directory: Path, trajectories: Sequence[DrawnTrajectory], stamps_ns: np.ndarray) -> list[Message]:
-    messages = [Message(entities.WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)]
+    messages = [entities.UP]
     truth_file = directory / TRUTH_FILE
     if truth_file.exists():
         path = shapes.positions(read_tum(truth_file).poses)
-        line = rr.LineStrips3D([path], colors=[entities.WHITE], radii=[entities.pixels(0.75)])
-        messages.append(Message(entities.GROUND_TRUTH, line))
+        messages.append(Message(entities.GROUND_TRUTH, entities.lines(entities.WHITE, 0.75, [path])))
     for trajectory in trajectories:
         messages += _of(trajectory, method_folder(directory, trajectory.name) / MAP_FILE, stamps_ns)
     return messages
@@ -53,25 +50,22 @@ def _messages(directory: Path, trajectories: Sequence[DrawnTrajectory], stamps_n
 def _of(trajectory: DrawnTrajectory, map_file: Path, stamps_ns: np.ndarray) -> list[Message]:
     """The trajectory in segments, the lidar on it, the map, and the plots."""
     name = rr.escape_entity_path_part(trajectory.name)
-    color, positions = _rgb(trajectory.color), trajectory.positions.astype(np.float32)
+    color, positions = entities.rgb(trajectory.color), trajectory.positions.astype(np.float32)
     times = Times(np.arange(len(positions)), stamps_ns[: len(positions)])
     before = np.concatenate([positions[:1], positions[:-1]])
     strips = rr.LineStrips3D.columns(strips=shapes.segments(before, positions))
     messages = [
-        Message(
-            f"world/{name}/trajectory", rr.LineStrips3D.from_fields(colors=[color], radii=[entities.pixels(1.5)])
-        ),
+        Message(f"world/{name}/trajectory", entities.lines(color, 1.5)),
         Message(f"world/{name}/trajectory", strips, times),
-        Message(f"world/{name}/lidar", rr.Points3D.from_fields(colors=[color], radii=[entities.pixels(5.0)])),
+        Message(f"world/{name}/lidar", entities.dots(color, 5.0)),
         Message(
             f"world/{name}/lidar", rr.Points3D.columns(positions=positions).partition([1] * len(positions)), times
         ),
     ]
     if map_file.exists():
         points = shapes.in_space(shapes.at_most(read_ply(map_file), _MAP_POINTS))
-        faint = tuple((value + shade) // 2 for value, shade in zip(color, entities.GRAY, strict=True))
-        archetype = rr.Points3D(points, colors=[faint], radii=[entities.pixels(0.5)])
-        messages.append(Message(f"world/{name}/map", archetype))
+        red, green, blue = ((value + shade) // 2 for value, shade in zip(color, entities.GRAY, strict=True))
+        messages.append(Message(f"world/{name}/map", entities.dots((red, green, blue), 0.5, points)))
     for plot, values in _series(trajectory).items():
         known = np.isfinite(values)
         if known.any():
@@ -120,9 +114,3 @@ def _stamps(directory: Path) -> np.ndarray:
     table = pq.read_table(directory / SCANS_FILE, columns=["index", "stamp_ns"])
     indices, first = np.unique(table["index"].to_numpy(), return_index=True)
     return table["stamp_ns"].to_numpy()[first] if len(indices) else np.empty(0, np.int64)
-
-
-def _rgb(color: str) -> tuple[int, int, int]:
-    """The parts of #rrggbb."""
-    red, green, blue = bytes.fromhex(color[1:])
-    return red, green, blue

@@ -6,6 +6,8 @@ correction that loop closures make. A 2D log is drawn in the plane z = 0.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
@@ -46,6 +48,7 @@ VERDICT = "verdict"
 STAGES = ("read", "preprocess", "match", "map", "loops")
 COVARIANCE_SCALE = 100.0  # a standard deviation of 1 mm is drawn 10 cm long
 
+Color = tuple[int, int, int]
 YELLOW, GRAY, WHITE = (255, 205, 60), (110, 120, 135), (235, 235, 235)
 BLUE, GREEN, RED, ORANGE, VIOLET = (70, 150, 255), (60, 200, 90), (235, 70, 60), (255, 140, 40), (190, 120, 255)
 CYAN = (70, 210, 210)
@@ -76,6 +79,9 @@ back.
 """
 
 
+UP = Message(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+
+
 def height_colors(points: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Colors (N, 3) of points (N, 3) by height, from the 2nd to the 98th percentile."""
     low, high = np.percentile(points[:, 2], (2.0, 98.0))
@@ -89,17 +95,17 @@ def constants(dimension: int) -> list[Message]:
     """Static messages: axes, colors, line widths, names of the series."""
     size_m = 0.5 if dimension == 2 else 2.0
     return [
-        Message(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP),
+        UP,
         Message(LIDAR, rr.TransformAxes3D(axis_length=size_m)),
-        Message(SCAN, _dots(YELLOW, 2.0)),
-        Message(LOCAL_MAP, _dots(GRAY, 1.2)),
+        Message(SCAN, dots(YELLOW, 2.0)),
+        Message(LOCAL_MAP, dots(GRAY, 1.2)),
         Message(COVARIANCE, rr.Ellipsoids3D.from_fields(colors=[VIOLET], line_radii=[pixels(1.0)])),
-        Message(ODOMETRY, _lines(ORANGE, 1.0)),
-        Message(TRAJECTORY, _lines(BLUE, 1.5)),
-        Message(KEYFRAMES, _dots(VIOLET, 2.0)),
-        Message(ODOMETRY_EDGES, _lines(GRAY, 0.75)),
+        Message(ODOMETRY, lines(ORANGE, 1.0)),
+        Message(TRAJECTORY, lines(BLUE, 1.5)),
+        Message(KEYFRAMES, dots(VIOLET, 2.0)),
+        Message(ODOMETRY_EDGES, lines(GRAY, 0.75)),
         Message(ACCEPTED, rr.LineStrips3D.from_fields(radii=[pixels(1.5)])),
-        Message(REJECTED, _lines(RED, 0.75)),
+        Message(REJECTED, lines(RED, 0.75)),
         Message(LEGEND, rr.TextDocument(_LEGEND, media_type=rr.MediaType.MARKDOWN)),
         Message(VERDICT, rr.TextDocument("The verdict comes with the end of the run.")),
         *_series(),
@@ -125,7 +131,7 @@ def _series() -> list[Message]:
     ]
 
 
-def _steps(names: list[str], colors: list[tuple[int, int, int]]) -> rr.SeriesLines:
+def _steps(names: list[str], colors: list[Color]) -> rr.SeriesLines:
     """Series that hold their value until the next."""
     return rr.SeriesLines(names=names, colors=colors, interpolation_mode=rr.components.InterpolationMode.StepAfter)
 
@@ -135,9 +141,19 @@ def pixels(radius: float) -> float:
     return -radius
 
 
-def _dots(color: tuple[int, int, int], radius: float) -> rr.Points3D:
-    return rr.Points3D.from_fields(colors=[color], radii=[pixels(radius)])
+def dots(color: Color, radius: float, positions: NDArray[np.float32] | None = None) -> rr.Points3D:
+    """Points (N, 3) of one color and radius on the screen; without positions the style of those to come."""
+    return rr.Points3D.from_fields(positions=positions, colors=[color], radii=[pixels(radius)])
 
 
-def _lines(color: tuple[int, int, int], radius: float) -> rr.LineStrips3D:
-    return rr.LineStrips3D.from_fields(colors=[color], radii=[pixels(radius)])
+def lines(color: Color, radius: float, strips: Iterable[NDArray[np.float32]] | None = None) -> rr.LineStrips3D:
+    """Line strips, (N, 3) each, of one color and radius; without strips the style of those to come."""
+    return rr.LineStrips3D.from_fields(
+        strips=None if strips is None else [*strips], colors=[color], radii=[pixels(radius)]
+    )
+
+
+def rgb(color: str) -> Color:
+    """The parts of #rrggbb."""
+    red, green, blue = bytes.fromhex(color.removeprefix("#"))
+    return red, green, blue

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from uuid import uuid4
 
 import numpy as np
 import rerun as rr
@@ -14,7 +13,7 @@ from scanchain.data import GraphState
 from scanchain.graph.optimization import GraphChange
 from scanchain.viz.recording import entities, shapes
 from scanchain.viz.recording.messages import Message, Times
-from scanchain.viz.recording.sinks import open_stream, write_recording
+from scanchain.viz.recording.sinks import write_recording
 
 
 def record_graph(change: GraphChange, path: Path) -> None:
@@ -22,15 +21,14 @@ def record_graph(change: GraphChange, path: Path) -> None:
 
     Raises OSError.
     """
-    stream = open_stream(change.name, change.after.poses.shape[-1] - 1, uuid4())
     layout = rrb.Blueprint(
         rrb.Spatial3DView(origin=entities.WORLD, name="graph", line_grid=rrb.LineGrid3D(visible=False)),
         rrb.TimePanel(timeline="scan", state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
     )
-    up = Message(entities.WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-    write_recording(path, stream, layout, [up, *_messages(change.before, 0), *_messages(change.after, 1)])
+    messages = [entities.UP, *_messages(change.before, 0), *_messages(change.after, 1)]
+    write_recording(path, change.name, change.after.poses.shape[-1] - 1, layout, messages)
 
 
 def _messages(state: GraphState, when: int) -> list[Message]:

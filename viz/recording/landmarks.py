@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from uuid import uuid4
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
 from scanchain import lie
-from scanchain.data import Matrix
 from scanchain.landmarks.files.write import file_stem
 from scanchain.landmarks.study import Estimate, Study
+from scanchain.viz.pictures.landmarks import ellipses
 from scanchain.viz.recording import entities, shapes
 from scanchain.viz.recording.messages import Message, Times
-from scanchain.viz.recording.sinks import open_stream, write_recording
+from scanchain.viz.recording.sinks import write_recording
 
-_DEVIATIONS = 2.4477  # that hold 95 % of a Gaussian in the plane
 _FLAT_M = 1e-4  # height of an ellipse
 
 
@@ -28,7 +26,6 @@ def record_landmarks(studies: Sequence[Study], path: Path) -> None:
     All is in the frame of the truth where there is one; landmarks after it carry their 95 % ellipses.
     Raises OSError.
     """
-    stream = open_stream(", ".join(study.name for study in studies), 2, uuid4())
     views = [rrb.Spatial3DView(origin=_root(study), name=study.name) for study in studies]
     layout = rrb.Blueprint(
         rrb.Grid(*views), rrb.TimePanel(timeline="scan", state="collapsed"), collapse_panels=True
@@ -37,7 +34,7 @@ def record_landmarks(studies: Sequence[Study], path: Path) -> None:
     for study in studies:
         messages += [Message(_root(study), rr.ViewCoordinates.RIGHT_HAND_Z_UP), *_truth(study)]
         messages += [*_state(study, study.before, 0), *_state(study, study.after, 1), _ellipses(study)]
-    write_recording(path, stream, layout, messages)
+    write_recording(path, ", ".join(study.name for study in studies), 2, layout, messages)
 
 
 def _root(study: Study) -> str:
@@ -47,8 +44,8 @@ def _root(study: Study) -> str:
 def _truth(study: Study) -> list[Message]:
     """True trajectory and landmarks, for ever."""
     known = study.true_landmarks[np.isfinite(study.true_landmarks).all(axis=1)]
-    path = rr.LineStrips3D([shapes.in_space(study.true_poses)], colors=[entities.GRAY], radii=entities.pixels(1.0))
-    marks = rr.Points3D(shapes.in_space(known), colors=[entities.GRAY], radii=entities.pixels(4.0))
+    path = entities.lines(entities.GRAY, 1.0, [shapes.in_space(study.true_poses)])
+    marks = entities.dots(entities.GRAY, 4.0, shapes.in_space(known))
     return [Message(f"{_root(study)}/truth/trajectory", path), Message(f"{_root(study)}/truth/landmarks", marks)]
 
 
@@ -70,18 +67,14 @@ def _state(study: Study, estimate: Estimate, when: int) -> list[Message]:
 
 def _ellipses(study: Study) -> Message:
     """The 95 % ellipse of every landmark after optimization."""
-    T = study.after.T_truth_estimate
-    turn: Matrix = T[:2, :2]
-    values, axes = np.linalg.eigh(turn @ study.landmark_covariance @ turn.T)
-    half_sizes = np.full((len(values), 3), _FLAT_M, np.float32)
-    half_sizes[:, :2] = _DEVIATIONS * np.sqrt(np.maximum(values, 0.0))
-    angle = np.arctan2(axes[:, 1, 0], axes[:, 0, 0])
-    upright = np.zeros((len(values), 4), np.float32)
+    axes_m, angle = ellipses(study)
+    half_sizes = np.pad(axes_m, ((0, 0), (0, 1)), constant_values=_FLAT_M).astype(np.float32)
+    upright = np.zeros((len(axes_m), 4), np.float32)
     upright[:, 2], upright[:, 3] = np.sin(0.5 * angle), np.cos(0.5 * angle)
     drawn = rr.Ellipsoids3D.columns(
-        centers=shapes.in_space(lie.transform(T, study.after.state.landmarks)),
+        centers=shapes.in_space(lie.transform(study.after.T_truth_estimate, study.after.state.landmarks)),
         half_sizes=half_sizes,
         quaternions=upright,
-        colors=[entities.BLUE] * len(values),
+        colors=[entities.BLUE] * len(axes_m),
     )
-    return Message(f"{_root(study)}/ellipses", drawn.partition([len(values)]), Times.at(1, 1))
+    return Message(f"{_root(study)}/ellipses", drawn.partition([len(axes_m)]), Times.at(1, 1))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from uuid import uuid4
 
 import numpy as np
 import rerun as rr
@@ -16,7 +15,7 @@ from scanchain.viz.pictures.map_figures import map_points
 from scanchain.viz.recording import entities, shapes
 from scanchain.viz.recording.blueprint import scene, time_panel, whole_log
 from scanchain.viz.recording.messages import Message, Times
-from scanchain.viz.recording.sinks import open_stream, write_recording
+from scanchain.viz.recording.sinks import write_recording
 
 _LIVE, _FINAL, _SCAN = "world/lidar", "world/final", "world/lidar/scan"
 _ACCEPTED, _REJECTED, _SIGMA = "world/matches/accepted", "world/matches/rejected", "plots/sigma"
@@ -32,15 +31,14 @@ _MAX_SCAN_POINTS = 5_000
 def record_localization(path: Path, localized: LocalizedLog) -> None:
     """Write a .rrd file. Raises OSError."""
     found, prior = localized.localization, localized.prior
-    stream = open_stream(localized.path.name.split(".partial")[0], prior.dimension, uuid4())
     points = shapes.in_space(map_points(prior))
     messages = [
-        Message(entities.WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP),
+        entities.UP,
         Message(
             entities.MAP, rr.Points3D(points, colors=entities.height_colors(points), radii=entities.pixels(1.0))
         ),
         Message(_LIVE, rr.TransformAxes3D(axis_length=0.5 if prior.dimension == 2 else 2.0)),
-        Message(_SCAN, rr.Points3D.from_fields(colors=[entities.YELLOW], radii=[entities.pixels(2.0)])),
+        Message(_SCAN, entities.dots(entities.YELLOW, 2.0)),
         Message(entities.VERDICT, rr.TextDocument(localized.metrics.sentence)),
         Message(_SIGMA, rr.SeriesLines(names=["sigma [m]"], colors=[entities.BLUE])),
         Message(
@@ -54,8 +52,7 @@ def record_localization(path: Path, localized: LocalizedLog) -> None:
     ]
     if found.is_placed.any():
         placed = shapes.positions(found.trajectory.poses[found.is_placed])
-        line = rr.LineStrips3D([placed], colors=[entities.CYAN], radii=entities.pixels(1.0))
-        messages.append(Message(_FINAL, line))
+        messages.append(Message(_FINAL, entities.lines(entities.CYAN, 1.0, [placed])))
     box = np.array([points.min(axis=0), points.max(axis=0)]) if len(points) else None
     side = rrb.Vertical(
         rrb.TextDocumentView(origin=entities.VERDICT, name="verdict"),
@@ -66,7 +63,7 @@ def record_localization(path: Path, localized: LocalizedLog) -> None:
     layout = rrb.Blueprint(
         rrb.Horizontal(world, side, column_shares=[5, 2]), time_panel(len(found.states)), collapse_panels=True
     )
-    write_recording(path, stream, layout, messages)
+    write_recording(path, localized.path.name.split(".partial")[0], prior.dimension, layout, messages)
 
 
 def _times(localized: LocalizedLog) -> Times:

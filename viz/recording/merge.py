@@ -23,28 +23,22 @@ _MAP_POINTS = 300_000
 def record_merge(directory: Path) -> None:
     """Write recording.rrd into a merge's directory. Raises OSError."""
     drawn = read_merge(directory)
-    stream = rr.RecordingStream(f"scanchain merge {drawn.dimension}D")
-    stream.set_log_time_enabled(False)
-    stream.send_recording_name(directory.name.partition(".partial-")[0])
+    name = directory.name.partition(".partial-")[0]
     box = np.array([drawn.positions.min(axis=0), drawn.positions.max(axis=0)])
     world = scene("sessions over the map", drawn.dimension, box)
     layout = rrb.Blueprint(world, rrb.TimePanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"))
-    write_recording(directory / RECORDING_FILE, stream, layout, list(_messages(directory, drawn)))
+    messages = _messages(directory, drawn)
+    write_recording(directory / RECORDING_FILE, name, drawn.dimension, layout, messages, kind="merge ")
 
 
 def _messages(directory: Path, drawn: DrawnMerge) -> Iterator[Message]:
-    yield Message(entities.WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+    yield entities.UP
     points = shapes.in_space(shapes.at_most(read_ply(directory / "map.ply"), _MAP_POINTS))
-    yield Message(entities.MAP, rr.Points3D(points, colors=[entities.GRAY], radii=[entities.pixels(0.75)]))
-    closures = drawn.closures.astype(np.float32)
-    yield Message(
-        entities.ACCEPTED, rr.LineStrips3D(closures, colors=[entities.GREEN], radii=[entities.pixels(0.75)])
-    )
+    yield Message(entities.MAP, entities.dots(entities.GRAY, 0.75, points))
+    closures = entities.lines(entities.GREEN, 0.75, drawn.closures.astype(np.float32))
+    yield Message(entities.ACCEPTED, closures)
     for session in drawn.sessions:
-        color = [int(session.color[at : at + 2], 16) for at in (1, 3, 5)]
-        name = rr.escape_entity_path_part(session.name)
-        path = [session.positions.astype(np.float32)]
-        line = rr.LineStrips3D(path, colors=[color], radii=[entities.pixels(1.5)])
-        yield Message(f"world/sessions/{name}/trajectory", line)
-        dots = rr.Points3D(path[0], colors=[color], radii=[entities.pixels(2.5)])
-        yield Message(f"world/sessions/{name}/keyframes", dots)
+        color, name = entities.rgb(session.color), rr.escape_entity_path_part(session.name)
+        path = session.positions.astype(np.float32)
+        yield Message(f"world/sessions/{name}/trajectory", entities.lines(color, 1.5, [path]))
+        yield Message(f"world/sessions/{name}/keyframes", entities.dots(color, 2.5, path))

@@ -149,7 +149,7 @@ class Recording:
 
     def log_ground_truth(self, poses: Matrix) -> None:
         """Record true poses (N, 4, 4), aligned to the optimized trajectory."""
-        line = rr.LineStrips3D([shapes.positions(poses)], colors=[entities.WHITE], radii=[entities.pixels(0.75)])
+        line = entities.lines(entities.WHITE, 0.75, [shapes.positions(poses)])
         self._send(lambda: [Message(entities.GROUND_TRUTH, line)])
 
     def log_map(self, points: NDArray[np.floating]) -> None:
@@ -233,10 +233,8 @@ class Recording:
         return [*messages, *self.graph.draw(self.now)]
 
     def _trajectory(self, times: Times, poses: Matrix) -> list[Message]:
-        path = shapes.positions(poses)
-        line = rr.LineStrips3D([path], colors=[entities.CYAN], radii=[entities.pixels(0.75)])
         return [
-            Message(entities.OPTIMIZED, line),
+            Message(entities.OPTIMIZED, entities.lines(entities.CYAN, 0.75, [shapes.positions(poses)])),
             Message(entities.OPTIMIZED_LIDAR, shapes.transforms(poses), times),
         ]
 

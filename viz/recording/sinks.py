@@ -12,10 +12,10 @@ import ctypes
 import queue
 import threading
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from time import perf_counter
-from uuid import UUID
+from uuid import UUID, uuid4
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -150,9 +150,9 @@ class Sink:
             rr.unregister_shutdown()
 
 
-def open_stream(name: str, dimension: int, recording_id: UUID) -> rr.RecordingStream:
-    """A stream that knows its recording's name and adds no timeline of its own."""
-    stream = rr.RecordingStream(f"scanchain {dimension}D", recording_id=recording_id)
+def open_stream(name: str, dimension: int, recording_id: UUID, kind: str = "") -> rr.RecordingStream:
+    """A stream that knows its recording's name and adds no timeline of its own; each ``kind`` has its layout."""
+    stream = rr.RecordingStream(f"scanchain {kind}{dimension}D", recording_id=recording_id)
     stream.set_log_time_enabled(False)
     stream.send_recording_name(name)
     return stream
@@ -176,9 +176,10 @@ def file_sink(path: Path, stream: rr.RecordingStream, blueprint: rrb.Blueprint) 
 
 
 def write_recording(
-    path: Path, stream: rr.RecordingStream, blueprint: rrb.Blueprint, messages: Sequence[Message]
+    path: Path, name: str, dimension: int, blueprint: rrb.Blueprint, messages: Iterable[Message], *, kind: str = ""
 ) -> None:
     """Write a .rrd file of complete data, whole or not at all. Raises OSError."""
+    stream = open_stream(name, dimension, uuid4(), kind)
     memory = stream.memory_recording()
     stream.send_blueprint(blueprint, make_active=False)
     for message in messages:

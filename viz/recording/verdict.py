@@ -24,7 +24,7 @@ def verdict_messages(judged: Judged, trajectory: Trajectory) -> list[Message]:
         path = shapes.positions(trajectory.poses)
         lines = rr.LineStrips3D(
             [_line(path, each) for each in judged.stretches],
-            colors=[_rgb(STRETCH_COLORS[each.kind]) for each in judged.stretches],
+            colors=[entities.rgb(STRETCH_COLORS[each.kind]) for each in judged.stretches],
             radii=[entities.pixels(_RADIUS)],
             labels=[str(each.kind) for each in judged.stretches],
             show_labels=False,
@@ -48,7 +48,3 @@ def _line(path: shapes.Floats, stretch: Stretch) -> shapes.Floats:
     if stretch.kind is Kind.LOOPS:
         return path[[stretch.first, stretch.last]]
     return path[max(stretch.first - 1, 0) : stretch.last + 1]
-
-
-def _rgb(color: str) -> tuple[int, ...]:
-    return tuple(bytes.fromhex(color.removeprefix("#")))

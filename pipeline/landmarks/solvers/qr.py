@@ -15,10 +15,10 @@ from scipy.sparse import coo_matrix, csc_matrix, csr_matrix
 from scipy.sparse.linalg import spsolve_triangular
 
 from scanchain.errors import MissingExtraError
-from scanchain.graph.solvers.cholesky import front_rows
+from scanchain.graph.solvers.cholesky import BlockPattern, analyze, front_rows
 from scanchain.kernels.graph import symbolic
 from scanchain.kernels.graph.fronts import Fronts, lay_out_fronts
-from scanchain.kernels.landmarks import column_order, normal_equations, sparse_qr
+from scanchain.kernels.landmarks import normal_equations, sparse_qr
 from scanchain.landmarks.solvers.solution import LOST_DIGITS, Factor, Solution, Stopwatch, undetermined
 from scanchain.landmarks.system import LinearSystem, Pattern
 
@@ -81,17 +81,17 @@ class QrSolver:
 
 
 def _analyze(pattern: Pattern, ordering: Ordering) -> _Analysis:
-    """Order the columns and lay out the fronts.
+    """Order the columns, those of "colamd" by minimum degree in AᵀA, and lay out the fronts.
 
     Within that order the fronts follow a postorder of the elimination tree, which leaves every entry of R as
     it is (Liu 1990), so that R can be given in the requested order.
     """
     n = pattern.shape[1]
-    column_start, rows = pattern.by_column()
+    start, others, _ = normal_equations.product_structure(pattern.row_start, pattern.columns, *pattern.by_column())
     order = np.arange(n)
     if ordering == "colamd":
-        order = column_order.column_minimum_degree(pattern.row_start, pattern.columns, column_start, rows)
-    start, others, _ = normal_equations.product_structure(pattern.row_start, pattern.columns, column_start, rows)
+        pairs = np.stack([np.repeat(order, np.diff(start)), others], axis=1)
+        order = analyze(BlockPattern(np.ones(n, np.int64), pairs)).order
     start, neighbors = _neighbor_lists(start, others)
     after = symbolic.postorder(symbolic.elimination_tree(start, neighbors, order))
     eliminated = order[after]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain.data import Matrix
 from scanchain.simulation.motion import Vehicle, mount
+from scanchain.simulation.routes import sampled
 from scanchain.simulation.solids import Scenery, Solids
 from scanchain.simulation.worlds.outdoors import BELOW_M
 
@@ -37,7 +37,7 @@ def forest(rng: np.random.Generator) -> Solids:
     """The forest: a tree somewhere in every square of 4.6 m that is free of the route."""
     scenery = Scenery(_relief(rng))
     low, high = ROUTE.min(axis=0) - _BEYOND_M, ROUTE.max(axis=0) + _BEYOND_M
-    route = _sampled_route()
+    route = sampled(ROUTE, 0.2)
     for x in np.arange(low[0], high[0], _SPACING_M):
         for y in np.arange(low[1], high[1], _SPACING_M):
             place = np.array([x, y]) + rng.uniform(0.0, _SPACING_M, 2)
@@ -86,11 +86,3 @@ def _undergrowth(scenery: Scenery, place: NDArray[np.float64], room: float, rng:
     else:
         length, thickness = min(rng.uniform(1.5, 5.0), 1.9 * room), rng.uniform(0.2, 0.45)
         scenery.box((x, y), (length, thickness), (-0.3, thickness), rng.uniform(0.0, np.pi))
-
-
-def _sampled_route() -> Matrix:
-    """Points along the route's straight segments, one every 20 cm."""
-    segments = []
-    for a, b in zip(ROUTE, np.roll(ROUTE, -1, axis=0), strict=True):
-        segments.append(np.linspace(a, b, int(np.linalg.norm(b - a) / 0.2)))
-    return np.vstack(segments)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from scanchain.data import Matrix
 from scanchain.simulation.motion import Vehicle
+from scanchain.simulation.routes import sampled
 from scanchain.simulation.solids import Scenery, Solids
 from scanchain.simulation.worlds.interior import CEILING_M, Furnisher, Room, Wall, build_wall
 
@@ -58,7 +58,7 @@ def office(rng: np.random.Generator) -> Solids:
     scenery.box((8.25, 9.0), (2.4, 5.88), (0.0, CEILING_M))  # lift shaft in the closed part of the core
     _line_corridor(scenery, rng)
     doors = np.array([wall.at(place) for wall in _WALLS for place in wall.doors])
-    furnisher = Furnisher(scenery, _sampled_route(), doors, rng)
+    furnisher = Furnisher(scenery, sampled(ROUTE, 0.05), doors, rng)
     for room in _ROOMS:
         furnisher.furnish(room)
     return scenery.finish()
@@ -75,11 +75,3 @@ def _line_corridor(scenery: Scenery, rng: np.random.Generator) -> None:
         scenery.box((x, y), (size_x, size_y), (0.0, rng.uniform(0.8, 1.9)))
     for place in ((14.6, 4.28), (4.3, 4.3), (21.7, 13.7), (14.9, 13.72), (5.72, 10.8), (20.26, 7.0)):
         scenery.cylinder(place, rng.uniform(0.12, 0.2), (0.0, 0.9))
-
-
-def _sampled_route() -> Matrix:
-    """Points along the route's straight segments, one every 5 cm."""
-    segments = []
-    for a, b in zip(ROUTE, np.roll(ROUTE, -1, axis=0), strict=True):
-        segments.append(np.linspace(a, b, max(int(np.linalg.norm(b - a) / 0.05), 2)))
-    return np.vstack(segments)
