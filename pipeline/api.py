@@ -17,7 +17,7 @@ from scanchain.logs import sources_of
 from scanchain.preprocess import downsample as first_per_voxel
 from scanchain.runs.closures import closures_table, final_verdicts
 from scanchain.runs.job import Job, Unwatched
-from scanchain.runs.results import cloud_of
+from scanchain.runs.results import cloud_of, expected_of
 from scanchain.runs.run import Finished
 from scanchain.runs.run import run as run_job
 from scanchain.runs.step_table import StepTable
@@ -52,6 +52,7 @@ class SlamResult(core.SlamResult):
     graph, state : the pose graph, and how it was left
     components : (K,) numbers the pieces that the keyframes belong to, which no loop joins; one as a rule
     elevation_offset_rad, calibrated_from : what vertical angles were corrected by, from which scan on; 0 as a rule
+    map_errors : of the keyframes, against the map that they were aligned to
     config, steps : what it was made with, and the columns of steps.parquet
     """
 
@@ -65,8 +66,9 @@ class SlamResult(core.SlamResult):
 
     def verdict(self) -> Judged:
         """Whether to rely on the trajectory, with reasons and stretches, as a run is judged."""
-        final = final_verdicts(self.closures, self.state)
-        return judge(evidence_of(self.steps, closures_table(final, self.keyframes, self.trajectory.dimension)))
+        final, expected = final_verdicts(self.closures, self.state), expected_of(self, self.config)
+        table = closures_table(final, self.keyframes, self.trajectory.dimension)
+        return judge(evidence_of(self.steps, table, expected and expected.ate))
 
 
 class Slam(core.Slam):

@@ -32,7 +32,7 @@ from scanchain.data import (
 from scanchain.errors import InputError
 from scanchain.graph.background import BackgroundOptimization
 from scanchain.graph.growing_array import GrowingArray
-from scanchain.graph.map_errors import MapErrors, PoseErrors
+from scanchain.graph.map_errors import KeyframeErrors, MapErrors
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.robust.graduation import OutlierRejection
 from scanchain.graph.robust.losses import rejection_limit
@@ -162,7 +162,7 @@ class Slam:
         self.keyframes += prior.keyframes
         self.first = self.optimized_at = len(self.keyframes)
         for keyframe in self.keyframes:
-            self.map_errors.append(PoseErrors(1.0, np.zeros((self.graph.freedom,) * 2), 1.0))
+            self.map_errors.append(KeyframeErrors(1.0, np.zeros((self.graph.freedom,) * 2), 1.0))
             self.graph.fix(self.graph.add_pose(keyframe.T_odom_lidar, keyframe.stamp_ns))
         self.evidence.of_map = self.first
         self.traveled_m = self.closer.begin_in(self.keyframes, prior.folder)

@@ -11,7 +11,7 @@ from scanchain.data import Matrix
 from scanchain.graph.growing_array import GrowingArray
 
 
-class PoseErrors(NamedTuple):
+class KeyframeErrors(NamedTuple):
     """Errors of a keyframe's pose against the map, and of the map since the keyframe before.
 
     Attributes
@@ -27,7 +27,7 @@ class PoseErrors(NamedTuple):
 
 
 class MapErrors:
-    """``PoseErrors`` of all keyframes, in columns."""
+    """``KeyframeErrors`` of all keyframes, in columns."""
 
     def __init__(self, freedom: int) -> None:
         self._variance_factor = GrowingArray((), np.float64)
@@ -52,7 +52,7 @@ class MapErrors:
         """(K,)."""
         return self._renewal.rows
 
-    def append(self, errors: PoseErrors) -> None:
+    def append(self, errors: KeyframeErrors) -> None:
         """Append those of the next keyframe."""
         self._variance_factor.append(errors.variance_factor)
         self._systematic.append(errors.systematic)

@@ -10,9 +10,9 @@ import numpy as np
 from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import LEAST_FIT, Matrix, Points, Pose, Scan, State
-from scanchain.graph.map_errors import PoseErrors
+from scanchain.graph.map_errors import KeyframeErrors
+from scanchain.odometry.keyframe_errors import KeyframeErrorTracker
 from scanchain.odometry.odometry import Odometry
-from scanchain.odometry.pose_errors import PoseErrorTracker
 from scanchain.odometry.tracked import Tracked
 from scanchain.preprocess import Prepared
 
@@ -46,7 +46,7 @@ class Located(msgspec.Struct, frozen=True):
     scale: float
     local_map: Points
     information: Matrix
-    errors: PoseErrors
+    errors: KeyframeErrors
     first_points: Points
 
 
@@ -61,8 +61,8 @@ class FrontEnd:
         self.at_keyframe = np.zeros((lie.twist_size(T_base_lidar),) * 2)
         self.covariance: Matrix | None = self.at_keyframe  # of the motion since the keyframe, None where unknown
         self.doubt = self.at_keyframe  # of the motion, by scans that their correspondences contradict
-        self.error_tracker = PoseErrorTracker(len(self.at_keyframe))
-        self.errors = PoseErrors(1.0, self.at_keyframe, 0.0)  # of the last keyframe
+        self.error_tracker = KeyframeErrorTracker(len(self.at_keyframe))
+        self.errors = KeyframeErrors(1.0, self.at_keyframe, 0.0)  # of the last keyframe
         self.has_wheels = False
         self.since_keyframe = 0
         self.scans = 0

@@ -17,7 +17,7 @@ import numpy as np
 from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import Keyframe, Matrix, Points, Pose, Prior, Scan, State
-from scanchain.graph.map_errors import PoseErrors
+from scanchain.graph.map_errors import KeyframeErrors
 from scanchain.kernels.registration.icp import Fit, Problem, align, fit_at
 from scanchain.kernels.registration.observability import agreement, signal_along
 from scanchain.kernels.registration.residuals import gradient_spread
@@ -123,7 +123,7 @@ def _located(keyframe: Keyframe, config: Config) -> Located:
     match = first_match(keyframe.T_odom_lidar, points, config.matching)
     prior = Prior(keyframe.T_odom_lidar, np.eye(len(match.information)), np.ones(len(match.information)))
     tracked = Tracked(scan, points, points, keyframe.T_odom_lidar, match, State.OK, "", prior, 0.0, 0.0, 0.0)
-    errors = PoseErrors(1.0, np.zeros_like(match.information), 0.0)
+    errors = KeyframeErrors(1.0, np.zeros_like(match.information), 0.0)
     return Located(tracked, True, 1.0, points, match.information, errors, points)
 
 

@@ -10,7 +10,7 @@ from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import ClosureVerdict, Keyframe, Matrix, Points, Prior, RawPoints, Scan, State
 from scanchain.errors import InputError
-from scanchain.graph.map_errors import PoseErrors
+from scanchain.graph.map_errors import KeyframeErrors
 from scanchain.maps import SavedMap
 from scanchain.odometry.front_end import Located
 from scanchain.odometry.tracked import Tracked, first_match
@@ -75,5 +75,5 @@ def _located(keyframe: Keyframe, information: Matrix, first_points: Points, conf
     covariance = np.linalg.inv(information).astype(np.float64)
     prior = Prior(T, covariance, np.zeros(len(information)))
     tracked = Tracked(scan, points, points, T, match, State.OK, "", prior, 0.0, 0.0, 0.0)
-    errors = PoseErrors(1.0, np.zeros_like(information), 0.0)
+    errors = KeyframeErrors(1.0, np.zeros_like(information), 0.0)
     return Located(tracked, True, keyframe.scale, points[:0], information, errors, first_points)

@@ -15,7 +15,7 @@ from scanchain.errors import InputError
 from scanchain.graph.background import BackgroundOptimization
 from scanchain.graph.explanation import Explanation
 from scanchain.graph.growing_array import GrowingArray
-from scanchain.graph.map_errors import MapErrors, PoseErrors
+from scanchain.graph.map_errors import KeyframeErrors, MapErrors
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.robust.slips import Slip
 from scanchain.graph.robust.update import Since
@@ -33,9 +33,9 @@ from scanchain.odometry.elevation import ElevationCalibration
 from scanchain.odometry.error_statistics import ErrorStatistics
 from scanchain.odometry.front_end import Motion
 from scanchain.odometry.intervals import Intervals
+from scanchain.odometry.keyframe_errors import KeyframeErrorTracker
 from scanchain.odometry.map_keeper import MapKeeper
 from scanchain.odometry.motion_filter import MotionFilter
-from scanchain.odometry.pose_errors import PoseErrorTracker
 from scanchain.odometry.prediction import Predictor
 from scanchain.odometry.recovery import Recovery
 from scanchain.odometry.standstill import AgreeingMatches, Standstill
@@ -81,7 +81,7 @@ _CLASSES = Classes(
         Resolution, Sweep, VoxelMap,
         Voxels, PointToShapeMatcher, LoopCloser, ProximityCloser, PlaceCloser, Relocalizer, Find, PlanarSearch,
         VoxelSubmaps, ScanVerifier, SubmapVerifier, Segments, Drift, PoseGraph, Explanation, Slip, GrowingArray,
-        Since, MapErrors, PoseErrors, PoseErrorTracker,
+        Since, MapErrors, KeyframeErrors, KeyframeErrorTracker,
         ClosureTable, MapEvidence, BackgroundOptimization, PointStore, StoredPoints,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.ClosureVerdict, data.Proposal, data.Prior,
         data.State,

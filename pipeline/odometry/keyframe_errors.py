@@ -6,13 +6,13 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.data import LEAST_FIT, Pose, State
-from scanchain.graph.map_errors import PoseErrors
+from scanchain.graph.map_errors import KeyframeErrors
 from scanchain.odometry.tracked import Tracked
 
 _LATEST = 0.1  # weight of the last scan in the mean of the systematic errors
 
 
-class PoseErrorTracker:
+class KeyframeErrorTracker:
     """Mean systematic error of the scans, and what the map was renewed by since the last keyframe."""
 
     def __init__(self, freedom: int) -> None:
@@ -31,7 +31,7 @@ class PoseErrorTracker:
                 match.systematic - self.systematic
             )
 
-    def at_keyframe(self, tracked: Tracked, T_keyframe_lidar: Pose) -> PoseErrors:
+    def at_keyframe(self, tracked: Tracked, T_keyframe_lidar: Pose) -> KeyframeErrors:
         """Errors at a new keyframe, ``T_keyframe_lidar`` seen from the one before.
 
         A map as wide as the scans is renewed by the distance over their root mean square range, and, where they do
@@ -44,4 +44,4 @@ class PoseErrorTracker:
         renewal = 1.0 if self.is_open else min(renewal, 1.0)
         self.is_open = False
         factor = 1.0 if tracked.state is State.LOST else tracked.match.variance_factor
-        return PoseErrors(factor, self.systematic, renewal)
+        return KeyframeErrors(factor, self.systematic, renewal)
