@@ -141,7 +141,7 @@ I3, I4 = np.eye(3), np.eye(4)
         (lambda: read_tum("a\0b"), "path is .*; wanted a path"),
         (lambda: load_settings(overrides="x"), "overrides is 'x'; wanted a list of Override"),
         (lambda: load_settings(3, file=3), "file is 3; wanted the path"),
-        (lambda: evaluate(Trajectory([0], I4[None]), Trajectory([0], I4[None])), "3 in space, not 1"),
+        (lambda: evaluate(Trajectory([0], I4[None]), Trajectory([0], I4[None])), "one paired pose alone"),
         (lambda: Trajectory(np.arange(3), np.zeros((2, 4, 4))), r"poses has the shape \(2, 4, 4\)"),
     ],
 )  # fmt: skip

@@ -33,7 +33,7 @@ def complaint(**arguments):
     """The one line that loading ends with."""
     with pytest.raises(InputError) as caught:
         load_settings(**arguments)
-    text = str(caught.value)
+    text = caught.value.text
     assert "\n" not in text
     return text
 

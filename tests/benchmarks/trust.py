@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import re
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -144,8 +145,8 @@ def _gap(result: SlamResult, expected: ExpectedErrors, truth: Trajectory) -> flo
         quiet = contextlib.redirect_stderr(io.StringIO())
         with contextlib.redirect_stdout(said), quiet, contextlib.suppress(SystemExit):
             main(["nees", str(estimate), str(reference), *frames])
-    words = said.getvalue().split()
-    return float(words[words.index("k") + 2].rstrip(",")) if "k" in words else np.nan
+    found = re.findall(r"\bk = ([0-9.e+-]+)", said.getvalue())
+    return float(found[0]) if found else np.nan
 
 
 def along_and_across(error: Floats, covariance: Matrix) -> Floats:

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.data import Matrix
-from scanchain.simulation import SENSORS, Drive, information, plan, record
+from scanchain.simulation import SENSORS, Drive, plan, record
 from scanchain.simulation.motion import Motion
 from scanchain.simulation.sensors import Rays, Sensor
 from scanchain.simulation.solids import Solids
 from tests.benchmarks.backward_logs import play_backward
+from tests.support.scan_information import information
 
 DATA = Path(os.environ.get("SCANCHAIN_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 WHEELS = ("wheels", "checked", "no wheels")  # prior and check; check alone; none in the log

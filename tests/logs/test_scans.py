@@ -596,12 +596,12 @@ def test_a_tilting_planar_lidar_is_refused_with_its_frames_and_its_range(tmp_pat
         "/scan",
         "--end",
     ):
-        assert part in str(caught.value)
+        assert part in caught.value.text
     for words in (["run", path, "--out", tmp_path / "a"], ["doctor", path]):
         assert main([str(word) for word in words]) == 2
-        assert capfd.readouterr().err == f"error: {caught.value}\n"
+        assert capfd.readouterr().err == f"error: {caught.value.text}\n"
     assert main(["info", str(path)]) == 1
-    assert f"problem   {caught.value}" in capfd.readouterr().out
+    assert f"problem   {caught.value.text}" in capfd.readouterr().out
 
 
 def test_the_part_of_a_log_in_which_a_planar_lidar_rests_is_read(tmp_path):

@@ -37,11 +37,8 @@ _STEPS_RAD = {180: math.pi / 180, 181: math.pi / 180, 360: math.pi / 360, 361: m
 _HALF_TURN = math.pi
 
 _MOST_BYTES = 2 << 30  # largest size of the text in bytes
-_MOST_RATIO, _LEAST_BYTES = (
-    1000,
-    1 << 24,
-)  # largest ratio of packing that is accepted, beyond so many bytes of text
-_AT_ONCE = 1 << 12  # bytes of text that are unpacked at once, and lost with damage among them
+_MOST_RATIO, _LEAST_BYTES = 1000, 1 << 24  # largest ratio of packing, beyond so many bytes of text
+_AT_ONCE, _CLOSELY = 1 << 12, 64  # bytes of text that are unpacked at once, and of a damaged file
 
 
 def claims_carmen(_: Path, head: bytes) -> bool:
@@ -259,13 +256,19 @@ def read_text(path: Path) -> tuple[bytes, str]:
 
     Raises InputError where it cannot be read or unpacks to more than any log does.
     """
+    text, damage = _unpacked(path, _AT_ONCE)
+    return _unpacked(path, _CLOSELY) if damage else (text, damage)
+
+
+def _unpacked(path: Path, at_once: int) -> tuple[bytes, str]:
+    """As ``read_text``, so many bytes of text at once; damage among them loses all of these."""
     text = bytearray()
     try:
         with path.open("rb") as file:
             head, most = file.read(3), min(_MOST_BYTES, _LEAST_BYTES + _MOST_RATIO * path.stat().st_size)
         opened = bz2.open if head == b"BZh" else gzip.open if head[:2] == b"\x1f\x8b" else Path.open
         with opened(path, "rb") as file:
-            while block := file.read1(_AT_ONCE):
+            while block := file.read1(at_once):
                 text += block
                 if len(text) > most:
                     raise InputError(f"{path}: unpacks to more than {most:,} bytes; is it a CARMEN log?")
