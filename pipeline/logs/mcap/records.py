@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import mmap
 import struct
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from scanchain.logs.mcap.read_ahead import ReadAhead
 from scanchain.source import Source
 from scanchain.words import counted
 
@@ -107,17 +106,17 @@ class FileIndex:
     Attributes
     ----------
     number : its place among the files of the log
-    data : the bytes of an MCAP file; ``remote`` reads those of one that lies elsewhere; of another format ``make``
-        makes the contents of a block, of all channels or of those wanted
+    data : the bytes of an MCAP file; ``fetch`` reads those of a remote one, by offset and size; of another
+        format ``make`` makes the contents of a block, of all channels or of those wanted
     counts : messages by channel id; ``is_counted`` once they are complete
-    damaged_summary : opcodes and bodies of records of a damaged summary, for channels defined nowhere else
+    uncertain_channels : those of a damaged summary, for channels defined nowhere else
     is_consistent : whether the counts of blocks by channel agree with the statistics of the file
     """
 
     path: Source
     number: int
     data: mmap.mmap | bytes
-    remote: ReadAhead | None = None
+    fetch: Callable[[int, int], bytes] | None = None
     make: Callable[[Block, AbstractSet[int] | None], Contents] | None = None
     profile: str = ""
     library: str = ""
@@ -128,7 +127,7 @@ class FileIndex:
     is_counted: bool = False
     takes_rate: bool = False
     is_consistent: bool = True
-    damaged_summary: list[tuple[int, int]] = field(default_factory=list)
+    uncertain_channels: dict[int, Channel] = field(default_factory=dict)
     damage: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -142,14 +141,9 @@ class FileIndex:
 
     def bytes_at(self, offset: int, size: int) -> memoryview:
         """A part of an MCAP file, wherever it lies."""
-        if self.remote is None:
-            return memoryview(self.data)[offset : offset + size]
-        return self.remote.read(offset, size)
-
-    def expect(self, blocks: Iterable[Block]) -> None:
-        """Announce the blocks that will be read next, in this order."""
-        if self.remote is not None:
-            self.remote.expect([(block.chunk_offset, block.offset + block.size) for block in blocks])
+        if self.fetch is not None:
+            return memoryview(self.fetch(offset, size))
+        return memoryview(self.data)[offset : offset + size]
 
     def add_schema(self, body: memoryview | mmap.mmap | bytes, offset: int) -> None:
         """Take in the schema record whose body starts at the offset."""
@@ -173,17 +167,6 @@ class FileIndex:
         if not self.is_consistent or not block.entries:
             return True
         return any(entry.channel in channels for entry in block.entries)
-
-    def take_from_damaged_summary(self, wanted: AbstractSet[int]) -> None:
-        """Add channels from a damaged summary, as they are defined nowhere else."""
-        for opcode, body in self.damaged_summary:
-            try:
-                if opcode == SCHEMA:
-                    self.add_schema(self.data, body)
-                elif opcode == CHANNEL and struct.unpack_from("<H", self.data, body)[0] in wanted:
-                    self.add_channel(self.data, body)
-            except (struct.error, UnicodeDecodeError):
-                continue
 
     def note_damage(self, line: str) -> None:
         """Note a line once, however often the damage is met."""

@@ -197,7 +197,9 @@ def complete(index: FileIndex) -> None:
         if not block.entries:
             counts.update(message.channel.key[1] for message in messages)
         unknown = {number for number in unknown if not index.knows(number)}
-    index.take_from_damaged_summary(unknown)
+    index.channels |= {
+        number: channel for number, channel in index.uncertain_channels.items() if number in unknown
+    }
     if not index.is_counted:
         index.counts = dict(counts)
         index.is_counted = True
