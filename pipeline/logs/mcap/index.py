@@ -35,7 +35,7 @@ from scanchain.logs.mcap.records import (
     Block,
     Entry,
     FileIndex,
-    read_string,
+    read_strings,
 )
 from scanchain.logs.mcap.resync import (
     CHUNK_HEAD,
@@ -109,6 +109,8 @@ def index_by_summary(file: RemoteFile, number: int) -> FileIndex | None:
         return None
     missing = file.size - len(tail) - begin
     summary = file.read(begin, missing) + tail if missing > 0 else tail[-missing:]
+    if not _agrees(summary, 0):
+        return None
     index = FileIndex(file.address, number, b"", lru_cache(_REPEATED)(file.read))
     walk, offset = _Walk(index, summary), 0
     while 0 <= offset < len(summary) - len(footer):
@@ -118,8 +120,8 @@ def index_by_summary(file: RemoteFile, number: int) -> FileIndex | None:
     walk.check_claims()
     index.blocks.sort(key=lambda block: block.offset)
     is_inside = all(block.chunk_offset >= 0 and block.offset + block.size <= file.size for block in index.blocks)
-    is_sound = index.is_counted and is_inside and not index.damage and _agrees(summary, 0)
-    return index if is_sound and offset == len(summary) - len(footer) else None
+    is_complete = index.is_counted and not index.damage and offset == len(summary) - len(footer)
+    return index if is_inside and is_complete else None
 
 
 def _map(path: Path) -> mmap.mmap:
@@ -193,9 +195,7 @@ class _Walk:
 
     def check_claims(self) -> None:
         """Accept the counts of blocks by channel where they add up to the statistics; note where they do not."""
-        index, totals = self.index, Counter[int]()
-        for entry in (entry for block in index.blocks for entry in block.entries):
-            totals[entry.channel] += entry.messages
+        index, totals = self.index, self.index.indexed_counts()
         stated = {number: count for number, count in index.counts.items() if count}
         chunks = sum(block.is_chunk for block in index.blocks)
         index.is_consistent = index.is_counted and stated == dict(totals) and chunks == self.chunks_stated
@@ -237,8 +237,8 @@ class _Walk:
             self.defining = FileIndex(index.path, index.number, b"", schemas=dict(index.schemas))
             index.uncertain_channels = self.defining.channels
         elif opcode == HEADER:
-            index.profile, body = read_string(self.data, body)
-            index.library, _ = read_string(self.data, body)
+            (profile, library), _ = read_strings(self.data, body, 2)
+            index.profile, index.library = profile.decode(), library.decode()
         elif opcode >= PRIVATE:
             self.private.append(body - RECORD.size)
 
@@ -267,7 +267,8 @@ class _Walk:
 
     def _chunk(self, body: int, end: int) -> None:
         start_ns, end_ns, uncompressed, crc = CHUNK_HEAD.unpack_from(self.data, body)
-        compression, records = read_string(self.data, body + CHUNK_HEAD.size)
+        (name,), records = read_strings(self.data, body + CHUNK_HEAD.size, 1)
+        compression = name.decode()
         size = end - records - 8
         if is_plausible_size(size, uncompressed):
             number = self.index.number
@@ -284,7 +285,7 @@ class _Walk:
         at = body + 36
         stated = sorted(struct.unpack_from("<HQ", self.data, place)[::-1] for place in range(at, at + size, 10))
         (indexed,) = struct.unpack_from("<Q", self.data, at + size)
-        compression, at = read_string(self.data, at + size + 8)
+        (name,), at = read_strings(self.data, at + size + 8, 1)
         compressed, uncompressed = struct.unpack_from("<QQ", self.data, at)
         if not is_plausible_size(compressed, uncompressed):
             raise struct.error("chunk of an implausible size")
@@ -296,7 +297,7 @@ class _Walk:
             if end - begin >= 16
         )
         payload, number = chunk + length - compressed, self.index.number
-        return Block(number, payload, compressed, compression, uncompressed, None, start_ns, end_ns, entries)
+        return Block(number, payload, compressed, name.decode(), uncompressed, None, start_ns, end_ns, entries)
 
     def _statistics(self, body: int, end: int) -> None:
         (self.chunks_stated,) = struct.unpack_from("<I", self.data, body + 22)

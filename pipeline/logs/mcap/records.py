@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import mmap
 import struct
+from collections import Counter
 from collections.abc import Callable, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 from scanchain.source import Source
 from scanchain.words import counted
@@ -20,7 +21,9 @@ MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish ti
 
 _CRC = struct.Struct("<I")
 _CRC_AT = RECORD.size + 24  # of a chunk record
-_LONGEST_STRING = 1 << 16  # longest name in bytes; a longer one is damage
+_LONGEST_STRING = 1 << 24  # longest name or definition in bytes; a longer one is damage
+
+Bytes: TypeAlias = memoryview | mmap.mmap | bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,22 +148,31 @@ class FileIndex:
             return memoryview(self.fetch(offset, size))
         return memoryview(self.data)[offset : offset + size]
 
-    def add_schema(self, body: memoryview | mmap.mmap | bytes, offset: int) -> None:
+    def add_schema(self, body: Bytes, offset: int) -> None:
         """Take in the schema record whose body starts at the offset."""
         (number,) = struct.unpack_from("<H", body, offset)
-        name, offset = read_string(body, offset + 2)
-        encoding, offset = read_string(body, offset)
-        self.schemas[number] = (name, encoding, _read_octets(body, offset))
+        (name, encoding, definition), _ = read_strings(body, offset + 2, 3)
+        self.schemas[number] = (name.decode(), encoding.decode(), definition)
 
-    def add_channel(self, body: memoryview | mmap.mmap | bytes, offset: int) -> None:
+    def add_channel(self, body: Bytes, offset: int) -> None:
         """Take in the channel record whose body starts at the offset; one that is fully known stays."""
         number, schema = struct.unpack_from("<HH", body, offset)
-        if self.knows(number):
-            return
-        topic, offset = read_string(body, offset + 4)
-        encoding, _ = read_string(body, offset)
-        known = self.schemas.get(schema, ("", "", b""))
-        self.channels[number] = Channel((self.number, number), topic, encoding, schema, *known)
+        if not self.knows(number):
+            (topic, encoding), _ = read_strings(body, offset + 4, 2)
+            known = self.schemas.get(schema, ("", "", b""))
+            key = (self.number, number)
+            self.channels[number] = Channel(key, topic.decode(), encoding.decode(), schema, *known)
+
+    def numbers_of(self, topic: str) -> list[int]:
+        """Ids of the channels of a topic."""
+        return [number for number, channel in self.channels.items() if channel.topic == topic]
+
+    def indexed_counts(self) -> Counter[int]:
+        """Messages by channel id, as the blocks state them."""
+        counts = Counter[int]()
+        for entry in (entry for block in self.blocks for entry in block.entries):
+            counts[entry.channel] += entry.messages
+        return counts
 
     def may_hold(self, block: Block, channels: AbstractSet[int]) -> bool:
         """True if a block can have messages of the channels."""
@@ -179,21 +191,16 @@ class FileIndex:
         return channel is not None and (channel.schema == 0 or channel.type_name != "")
 
 
-def read_string(data: memoryview | mmap.mmap | bytes, offset: int) -> tuple[str, int]:
-    """A string with its length before it, and the byte behind it."""
-    (length,) = struct.unpack_from("<I", data, offset)
-    end = offset + 4 + length
-    if end > len(data) or length > _LONGEST_STRING:
-        raise struct.error("string beyond the end")
-    return bytes(data[offset + 4 : end]).decode(), end
-
-
-def _read_octets(data: memoryview | mmap.mmap | bytes, offset: int) -> bytes:
-    (length,) = struct.unpack_from("<I", data, offset)
-    end = offset + 4 + length
-    if end > len(data):
-        raise struct.error("bytes beyond the end")
-    return bytes(data[offset + 4 : end])
+def read_strings(data: Bytes, offset: int, count: int) -> tuple[list[bytes], int]:
+    """Strings with their lengths before them, and the byte behind the last."""
+    strings = []
+    for _ in range(count):
+        begin = offset + 4
+        offset = begin + struct.unpack_from("<I", data, offset)[0]
+        if offset > min(len(data), begin + _LONGEST_STRING):
+            raise struct.error("string beyond the end")
+        strings.append(bytes(data[begin:offset]))
+    return strings, offset
 
 
 def name_of(indexes: Sequence[FileIndex]) -> str:

@@ -42,9 +42,7 @@ def decoded_messages(
 
     At most ``ahead`` blocks wait decoded. What is damaged is left out and named in ``damage``.
     """
-    wanted = [
-        {number for number, channel in index.channels.items() if channel.topic in decoders} for index in indexes
-    ]
+    wanted = [{number for topic in decoders for number in index.numbers_of(topic)} for index in indexes]
 
     def decode(block: Block) -> tuple[list[Decoded], str]:
         contents = read_block(indexes[block.file], block, wanted[block.file])
@@ -132,21 +130,14 @@ def spread_messages(
 ) -> Iterator[T]:
     """Decoded messages of a topic in blocks from all over a span; malformed ones are passed over."""
     blocks = [block for block in _blocks_of(indexes, topic) if span.meets(block)]
-    chosen = (
-        blocks
-        if len(blocks) <= _SAMPLED_BLOCKS
-        else [blocks[k * (len(blocks) - 1) // (_SAMPLED_BLOCKS - 1)] for k in range(_SAMPLED_BLOCKS)]
-    )
-    yield from _decoded_in(indexes, chosen, topic, decode, span)
+    spread = sorted({k * (len(blocks) - 1) // (_SAMPLED_BLOCKS - 1) for k in range(_SAMPLED_BLOCKS)})
+    yield from _decoded_in(indexes, [blocks[k] for k in spread if blocks], topic, decode, span)
 
 
 def _blocks_of(indexes: Sequence[FileIndex], topic: str) -> list[Block]:
     """Those that may hold messages of the topic, by time."""
     blocks = [
-        block
-        for index in indexes
-        for block in index.blocks
-        if index.may_hold(block, {n for n, channel in index.channels.items() if channel.topic == topic})
+        block for index in indexes for block in index.blocks if index.may_hold(block, set(index.numbers_of(topic)))
     ]
     return sorted(blocks, key=lambda block: block.start_ns)
 
