@@ -233,9 +233,8 @@ class _Walk:
             index.blocks.append(self._indexed(body))
         elif opcode == STATISTICS and self.defining is index:
             self._statistics(body, end)
-        elif opcode == DATA_END and not self._is_summary_intact(end):
-            self.defining = FileIndex(index.path, index.number, b"", schemas=dict(index.schemas))
-            index.uncertain_channels = self.defining.channels
+        elif opcode == DATA_END:
+            self._begin_summary(end)
         elif opcode == HEADER:
             (profile, library), _ = read_strings(self.data, body, 2)
             index.profile, index.library = profile.decode(), library.decode()
@@ -307,17 +306,17 @@ class _Walk:
             self.index.counts[number] = count
         self.index.is_counted = True
 
-    def _is_summary_intact(self, summary: int) -> bool:
-        """True if the summary from this byte on agrees with its CRC, or has none; else it is noted as damage."""
-        footer = len(self.data) - _FOOTER_BYTES
-        if footer < summary or self.data[-len(MAGIC) :] != MAGIC or self.data[footer] != FOOTER:
-            return False
-        if _agrees(self.data, summary):
-            return True
-        self.index.damage.append(
-            f"{self.index.path}: the summary at byte {summary} has a wrong CRC and was discarded"
-        )
-        return False
+    def _begin_summary(self, summary: int) -> None:
+        """Take in what the summary from this byte on defines; by itself where it is damaged."""
+        index, footer = self.index, len(self.data) - _FOOTER_BYTES
+        is_there = footer >= summary and self.data[-len(MAGIC) :] == MAGIC and self.data[footer] == FOOTER
+        self.defining = index
+        if is_there and _agrees(self.data, summary):
+            return
+        if is_there:
+            index.damage.append(f"{index.path}: the summary at byte {summary} has a wrong CRC and was discarded")
+        self.defining = FileIndex(index.path, index.number, b"", schemas=dict(index.schemas))
+        index.uncertain_channels = self.defining.channels
 
 
 def _agrees(data: mmap.mmap | bytes, summary: int) -> bool:
