@@ -24,10 +24,9 @@ from scanchain.logs.formats.on_demand import UnknownFormatError, left_out, natur
 from scanchain.logs.formats.ros1_bag import claims_ros1_bag, index_ros1_bag
 from scanchain.logs.formats.ros2_bag import claims_ros2_bag, index_ros2_bag, parts_of_bag
 from scanchain.logs.formats.user import index_scans, load_format
-from scanchain.logs.mcap.index import claims_mcap, index_file
+from scanchain.logs.mcap.index import claims_mcap, index_by_summary, index_file
 from scanchain.logs.mcap.records import FileIndex
 from scanchain.logs.mcap.selection import are_parts, complete
-from scanchain.logs.mcap.summary import index_by_summary
 from scanchain.logs.topics import is_lidar
 from scanchain.source import Source
 

@@ -202,12 +202,12 @@ class _Bag:
     def finish(self) -> None:
         """Count the messages, opening the chunks without a complete index."""
         index = self.index
-        is_inconsistent = bool(self.stated) and self.stated != _counts(index.blocks)
+        is_inconsistent = bool(self.stated) and self.stated != index.indexed_counts()
         index.blocks = [
             self._unpacked(block) if is_inconsistent or not self._is_known(block) else block
             for block in index.blocks
         ]
-        index.counts = dict(_counts(index.blocks))
+        index.counts = dict(index.indexed_counts())
         index.channels = {number: c for number, c in index.channels.items() if index.counts.get(number)}
         index.is_counted = True
 
@@ -305,11 +305,3 @@ class _Bag:
         times_ns = [message.log_time_ns for message in messages] or [0]
         entries = tuple(Entry(number, -1, count) for number, count in counts.items())
         return replace(block, start_ns=min(times_ns), end_ns=max(times_ns), entries=entries)
-
-
-def _counts(blocks: list[Block]) -> Counter[int]:
-    """Messages by connection."""
-    counts: Counter[int] = Counter()
-    for entry in (entry for block in blocks for entry in block.entries):
-        counts[entry.channel] += entry.messages
-    return counts

@@ -59,18 +59,29 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
         damage = "a record in it is malformed; what follows was left out"
         return Contents(messages, "" if block.is_cut else f"{_name(index, block)}: {damage}")
     stated = sum(entry.messages for entry in block.entries)
+    damage = f"holds {met} of the {stated} indexed messages" if met < stated else ""
     if undefined:
-        return Contents(
-            messages, f"{_name(index, block)}: {counted(undefined, 'message')} of a channel that nothing defines"
-        )
-    return Contents(
-        messages, f"{_name(index, block)}: holds {met} of the {stated} indexed messages" * (met < stated)
-    )
+        damage = f"{counted(undefined, 'message')} of a channel that nothing defines"
+    return Contents(messages, damage and f"{_name(index, block)}: {damage}")
 
 
 def unpack(index: FileIndex, block: Block) -> memoryview:
     """The records of a block; of one that is cut off those that are there, unchecked. Raises DamagedBlockError."""
-    return memoryview(_unpack_start(index, block) if block.is_cut else _unpack(index, block))
+    stored, crc = index.stored(block)
+    size = block.uncompressed_size
+    try:
+        payload = _decompressed(stored, block.compression, size, is_cut=block.is_cut)
+    except (zstandard.ZstdError, RuntimeError, MemoryError, EOFError, OSError, ValueError) as error:
+        if block.is_cut:
+            return memoryview(b"")
+        raise DamagedBlockError(
+            f"{_name(index, block)}: does not unpack ({one_line(error) or type(error).__name__})"
+        ) from error
+    if not block.is_cut and len(payload) != size:
+        raise DamagedBlockError(f"{_name(index, block)}: unpacks to {len(payload)} bytes instead of {size}")
+    if not block.is_cut and crc and zlib.crc32(payload) != crc:
+        raise DamagedBlockError(f"{_name(index, block)}: its CRC is wrong")
+    return memoryview(payload)
 
 
 def release(index: FileIndex, block: Block) -> None:
@@ -91,51 +102,22 @@ def _records(payload: memoryview) -> Iterator[tuple[int, int, int]]:
         yield opcode, begin, offset
 
 
-def _unpack(index: FileIndex, block: Block) -> bytes | memoryview:
-    stored, crc = index.stored(block)
-    size = block.uncompressed_size
-    try:
-        if not size:
-            payload = b""
-        elif block.compression == "zstd":
-            if zstandard.frame_content_size(stored) not in (-1, size):
-                raise DamagedBlockError(f"{_name(index, block)}: lies about the size it unpacks to")
-            payload = zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
-        elif block.compression == "lz4":
-            payload = lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=size)
-        elif block.compression == "bz2":
-            payload = bz2.BZ2Decompressor().decompress(stored, max_length=size)
-        elif block.compression == "":
-            payload = stored
-        else:
-            raise DamagedBlockError(
-                f"{_name(index, block)}: compression {block.compression!r} is not known (none, lz4 and zstd are)"
-            )
-    except (zstandard.ZstdError, RuntimeError, MemoryError, EOFError, OSError) as error:
-        raise DamagedBlockError(
-            f"{_name(index, block)}: does not unpack ({one_line(error) or type(error).__name__})"
-        ) from error
-    if len(payload) != size:
-        raise DamagedBlockError(f"{_name(index, block)}: unpacks to {len(payload)} bytes instead of {size}")
-    if crc and zlib.crc32(payload) != crc:
-        raise DamagedBlockError(f"{_name(index, block)}: its CRC is wrong")
-    return payload
-
-
-def _unpack_start(index: FileIndex, block: Block) -> bytes | memoryview:
-    """The unpacked beginning of a chunk, as far as it unpacks; nothing of it has been checked."""
-    stored, _ = index.stored(block)
-    try:
-        if block.compression == "zstd":
-            with zstandard.ZstdDecompressor().stream_reader(BytesIO(stored)) as reader:
-                return reader.read(block.uncompressed_size)
-        if block.compression == "lz4":
-            return lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=block.uncompressed_size)
-        if block.compression == "bz2":
-            return bz2.BZ2Decompressor().decompress(stored, max_length=block.uncompressed_size)
-    except (zstandard.ZstdError, RuntimeError, EOFError, OSError):
-        return b""
-    return stored if block.compression == "" else b""
+def _decompressed(stored: memoryview, compression: str, size: int, *, is_cut: bool) -> bytes | memoryview:
+    """At most so many bytes; of what is cut off as many as there are."""
+    if not size or compression == "":
+        return stored if size else b""
+    if compression == "zstd" and is_cut:
+        with zstandard.ZstdDecompressor().stream_reader(BytesIO(stored)) as reader:
+            return reader.read(size)
+    if compression == "zstd":
+        if zstandard.frame_content_size(stored) not in (-1, size):
+            raise ValueError("it lies about the size it unpacks to")
+        return zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
+    if compression == "lz4":
+        return lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=size)
+    if compression == "bz2":
+        return bz2.BZ2Decompressor().decompress(stored, max_length=size)
+    raise ValueError(f"compression {compression!r} is not known; none, lz4 and zstd are")
 
 
 def _name(index: FileIndex, block: Block) -> str:

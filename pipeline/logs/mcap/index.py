@@ -1,4 +1,4 @@
-"""Index of an MCAP file: its blocks of messages, channels and damage, found by walking the records.
+"""Index of an MCAP file: its blocks of messages, channels and damage, found by walking its records or its summary.
 
 A walk reads nine bytes a record and a chunk's header, never its contents, and needs no summary: files that were
 cut off or never finished are indexed like any other. Behind damage it goes on at the next record that is one.
@@ -11,14 +11,17 @@ import mmap
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 from scanchain.errors import InputError
+from scanchain.logs.files import RemoteFile
 from scanchain.logs.mcap.records import (
     CHANNEL,
     CHUNK,
+    CHUNK_INDEX,
     DATA_END,
     FOOTER,
     HEADER,
@@ -32,13 +35,23 @@ from scanchain.logs.mcap.records import (
     Block,
     Entry,
     FileIndex,
-    read_string,
+    read_strings,
 )
-from scanchain.logs.mcap.resync import CHUNK_HEAD, PRIVATE, Resync, is_end, record_end, states_length_twice
+from scanchain.logs.mcap.resync import (
+    CHUNK_HEAD,
+    PRIVATE,
+    is_end,
+    next_record,
+    record_end,
+    sought_behind,
+    states_length_twice,
+)
 from scanchain.source import Source
 from scanchain.words import counted
 
-FOOTER_BODY = struct.Struct("<QQI")  # byte of the summary, byte of its offsets, CRC-32
+_FOOTER_BYTES = RECORD.size + 20 + len(MAGIC)  # the closing magic included
+_TAIL_BYTES = 65_536  # number of bytes of a remote file read at first; most summaries lie in it
+_REPEATED = 4  # number of ranges of a remote file retained: the first blocks are read more than once
 _LARGEST_CHUNK = 1 << 30  # largest size of a chunk in bytes; one beyond is damage
 _MODEST_CHUNK = 1 << 25  # size in bytes up to which a chunk's stated size is accepted at any ratio
 _MOST_TIMES = 20  # largest ratio of the unpacked to the stored size of a larger chunk
@@ -56,17 +69,19 @@ def index_file(path: Path, number: int, source: Source | None = None) -> FileInd
     source : the original of a copy, named in messages; None for itself
     """
     index = FileIndex(source or path, number, _map(path))
-    data, walk, resync = index.data, Walk(index), Resync(index.data)
+    data, walk = index.data, _Walk(index, index.data)
+    sought: AbstractSet[int] = frozenset()
     offset, end = len(MAGIC), record_end(index.data, len(MAGIC))
     while not is_end(data, offset):
         following = record_end(data, end) if end else 0
         if end and (following or is_end(data, end)):
-            walk.take(offset)
+            walk.take(offset, end)
             offset, end = end, following
             continue
-        resumed = resync.behind(offset)
+        sought = sought or sought_behind(data, offset)
+        resumed = next_record(data, offset + 1, sought)
         if end and (states_length_twice(data, offset) or not 0 < resumed < end):
-            walk.take(offset)
+            walk.take(offset, end)
             offset = resumed if 0 < resumed < end else end
         if not resumed:
             break
@@ -77,6 +92,36 @@ def index_file(path: Path, number: int, source: Source | None = None) -> FileInd
         offset, end = resumed, record_end(data, resumed)
     walk.finish(offset)
     return index
+
+
+def index_by_summary(file: RemoteFile, number: int) -> FileIndex | None:
+    """Index of a remote file by its summary alone, in two or three requests; None where that is incomplete.
+
+    A file whose summary is absent, damaged, or does not give the position of every message has to be walked, which
+    takes all its bytes.
+    """
+    tail = file.read(max(file.size - _TAIL_BYTES, 0), min(file.size, _TAIL_BYTES))
+    footer = tail[-_FOOTER_BYTES:]
+    if len(footer) < _FOOTER_BYTES or not footer.endswith(MAGIC) or footer[0] != FOOTER:
+        return None
+    (begin,) = struct.unpack_from("<Q", footer, RECORD.size)
+    if not 0 < begin <= file.size - len(footer):
+        return None
+    missing = file.size - len(tail) - begin
+    summary = file.read(begin, missing) + tail if missing > 0 else tail[-missing:]
+    if not _agrees(summary, 0):
+        return None
+    index = FileIndex(file.address, number, b"", lru_cache(_REPEATED)(file.read))
+    walk, offset = _Walk(index, summary), 0
+    while 0 <= offset < len(summary) - len(footer):
+        end = record_end(summary, offset)
+        walk.take(offset, end)
+        offset = end or -1
+    walk.check_claims()
+    index.blocks.sort(key=lambda block: block.offset)
+    is_inside = all(block.chunk_offset >= 0 and block.offset + block.size <= file.size for block in index.blocks)
+    is_complete = index.is_counted and not index.damage and offset == len(summary) - len(footer)
+    return index if is_inside and is_complete else None
 
 
 def _map(path: Path) -> mmap.mmap:
@@ -95,50 +140,49 @@ def _map(path: Path) -> mmap.mmap:
     return data
 
 
-class Walk:
+class _Walk:
     """Sorts records into an index; a chunk waits for its message index, loose messages for each other."""
 
-    def __init__(self, index: FileIndex) -> None:
+    def __init__(self, index: FileIndex, data: mmap.mmap | bytes) -> None:
         self.index = index
-        self.is_inconsistent = False  # in a summary of a wrong CRC
+        self.data = data
+        self.defining = index  # what schemas and channels are defined in
         self.chunks_stated = 0  # by the statistics
         self.private: list[int] = []  # offsets of records of some application
         self.chunk: Block | None = None
         self.entries: list[Entry] = []
         self.loose_from = -1
         self.loose_times: list[int] = []
-        self.loose_counts: dict[int, int] = {}
+        self.loose_counts: Counter[int] = Counter()
 
-    def take(self, offset: int) -> None:
-        """Sort one whole record in."""
-        opcode, length = RECORD.unpack_from(self.index.data, offset)
-        self._take(opcode, offset, length)
+    def take(self, offset: int, end: int) -> None:
+        """Sort in the record of these bytes."""
+        try:
+            self._sort(self.data[offset], offset + RECORD.size, end)
+        except (struct.error, UnicodeDecodeError):
+            self.index.damage.append(
+                f"{self.index.path}: the record at byte {offset} is malformed and was left out"
+            )
 
     def finish(self, offset: int) -> None:
         """End the walk at this byte; of a chunk that is cut off there the beginning is retained."""
-        index, size = self.index, len(self.index.data)
-        if is_end(index.data, offset):
-            self.close(offset, complete=True)
-        else:
-            self.close(offset, complete=False)
-            self._cut(offset, size)
-        check_claims(index, self.chunks_stated, self.private)
-
-    def _cut(self, offset: int, size: int) -> None:
-        where = f", inside the record at byte {offset}" if offset + RECORD.size <= size else ""
-        self.index.damage.append(f"{self.index.path}: cut off at byte {size}{where}, without the closing magic")
-        if not where or self.index.data[offset] != CHUNK:
-            return
-        self._take(CHUNK, offset, size - offset - RECORD.size)
-        if self.chunk is not None:
-            self.chunk = replace(self.chunk, is_cut=True, crc=0)
-            self.close(offset, complete=False)
+        index, size = self.index, len(self.data)
+        is_whole = is_end(self.data, offset)
+        self.close(offset, complete=is_whole)
+        if not is_whole:
+            where = f", inside the record at byte {offset}" if offset + RECORD.size <= size else ""
+            index.damage.append(f"{index.path}: cut off at byte {size}{where}, without the closing magic")
+            if where and self.data[offset] == CHUNK:
+                self.take(offset, size)
+                if self.chunk is not None:
+                    self.chunk = replace(self.chunk, is_cut=True, crc=0)
+                    self.close(offset, complete=False)
+        self.check_claims()
 
     def close(self, offset: int, *, complete: bool) -> None:
         """End the chunk or the run of loose messages at this byte; incomplete entries are discarded."""
         if self.chunk is not None:
-            entries = tuple(self.entries) if complete else ()
-            self.index.blocks.append(replace(self.chunk, entries=entries))
+            self.index.blocks.append(replace(self.chunk, entries=tuple(self.entries) if complete else ()))
         if self.loose_times:
             first, last = min(self.loose_times), max(self.loose_times)
             size = offset - self.loose_from
@@ -147,63 +191,71 @@ class Walk:
                 Block(self.index.number, self.loose_from, size, "", size, 0, first, last, entries, is_chunk=False)
             )
         self.chunk, self.entries = None, []
-        self.loose_from, self.loose_times, self.loose_counts = -1, [], {}
+        self.loose_from, self.loose_times, self.loose_counts = -1, [], Counter()
 
-    def _take(self, opcode: int, offset: int, length: int) -> None:
-        try:
-            self._sort(opcode, offset, offset + RECORD.size, length)
-        except (struct.error, UnicodeDecodeError):
-            self.index.damage.append(
-                f"{self.index.path}: the record at byte {offset} is malformed and was left out"
+    def check_claims(self) -> None:
+        """Accept the counts of blocks by channel where they add up to the statistics; note where they do not."""
+        index, totals = self.index, self.index.indexed_counts()
+        stated = {number: count for number, count in index.counts.items() if count}
+        chunks = sum(block.is_chunk for block in index.blocks)
+        index.is_consistent = index.is_counted and stated == dict(totals) and chunks == self.chunks_stated
+        is_indexed = all(block.entries for block in index.blocks)
+        if index.is_counted and not index.is_consistent and (is_indexed or chunks != self.chunks_stated):
+            index.damage.append(
+                f"{index.path}: its {counted(chunks, 'chunk')} and {counted(totals.total(), 'indexed message')} "
+                f"are not the {self.chunks_stated} and {sum(stated.values())} of its statistics"
+            )
+        if self.private and not index.is_counted:  # one of them may have been a chunk
+            index.damage.append(
+                f"{index.path}: passed over {counted(len(self.private), 'record')} of unknown kinds, "
+                f"the first at byte {self.private[0]}"
             )
 
-    def _sort(self, opcode: int, offset: int, body: int, length: int) -> None:
-        if self.is_inconsistent and opcode in (SCHEMA, CHANNEL, STATISTICS):
-            self.index.damaged_summary.append((opcode, body))
-            return
+    def _sort(self, opcode: int, body: int, end: int) -> None:
         if opcode == MESSAGE:
-            self._message(offset, body, length)
+            self._message(body, end)
         elif opcode == MESSAGE_INDEX:
-            self._entry(body, length)
+            self._entry(body, end)
         elif opcode == SCHEMA:
-            self.index.add_schema(self.index.data, body)
+            self.defining.add_schema(self.data, body)
         elif opcode == CHANNEL:
-            self.index.add_channel(self.index.data, body)
+            self.defining.add_channel(self.data, body)
         else:
-            self.close(offset, complete=True)
-            if opcode == CHUNK:
-                self._chunk(offset, body, length)
-            elif opcode == STATISTICS:
-                self._statistics(body, length)
-            else:
-                self._frame(opcode, body, length)
+            self.close(body - RECORD.size, complete=True)
+            self._frame(opcode, body, end)
 
-    def _frame(self, opcode: int, body: int, length: int) -> None:
-        """The records that begin and end the file and its parts."""
-        if opcode == DATA_END:
-            self.is_inconsistent = not _is_summary_intact(self.index, body + length)
+    def _frame(self, opcode: int, body: int, end: int) -> None:
+        """The chunks, and the records that begin, end and describe the file."""
+        index = self.index
+        if opcode == CHUNK:
+            self._chunk(body, end)
+        elif opcode == CHUNK_INDEX and index.fetch is not None:
+            index.blocks.append(self._indexed(body))
+        elif opcode == STATISTICS and self.defining is index:
+            self._statistics(body, end)
+        elif opcode == DATA_END:
+            self._begin_summary(end)
         elif opcode == HEADER:
-            self.index.profile, body = read_string(self.index.data, body)
-            self.index.library, _ = read_string(self.index.data, body)
+            (profile, library), _ = read_strings(self.data, body, 2)
+            index.profile, index.library = profile.decode(), library.decode()
         elif opcode >= PRIVATE:
             self.private.append(body - RECORD.size)
 
-    def _message(self, offset: int, body: int, length: int) -> None:
+    def _message(self, body: int, end: int) -> None:
+        offset = body - RECORD.size
         if self.chunk is not None:
             self.close(offset, complete=True)
-        if length < MESSAGE_HEAD.size:
-            raise struct.error("message without its head")
+        channel, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(self.data, body)
         if self.loose_from < 0:
             self.loose_from = offset
-        channel, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(self.index.data, body)
         self.loose_times.append(log_time_ns)
-        self.loose_counts[channel] = self.loose_counts.get(channel, 0) + 1
-        if body + length - self.loose_from > _LOOSE_BYTES:
-            self.close(body + length, complete=True)
+        self.loose_counts[channel] += 1
+        if end - self.loose_from > _LOOSE_BYTES:
+            self.close(end, complete=True)
 
-    def _entry(self, body: int, length: int) -> None:
-        channel, size = struct.unpack_from("<HI", self.index.data, body)
-        if size > length - 6:
+    def _entry(self, body: int, end: int) -> None:
+        channel, size = struct.unpack_from("<HI", self.data, body)
+        if size > end - body - 6:
             raise struct.error("message index beyond its record")
         if self.chunk is None:
             self.index.note_damage(
@@ -212,67 +264,68 @@ class Walk:
         elif size:
             self.entries.append(Entry(channel, body + 6, size // 16))
 
-    def _chunk(self, offset: int, body: int, length: int) -> None:
-        index = self.index
-        start_ns, end_ns, uncompressed, crc = CHUNK_HEAD.unpack_from(index.data, body)
-        compression, records = read_string(index.data, body + CHUNK_HEAD.size)
-        size = body + length - records - 8
-        if not is_plausible_size(size, uncompressed):
-            index.damage.append(
-                f"{index.path}: the chunk at byte {offset} claims to unpack from {size} to {uncompressed} bytes, "
-                f"more than is accepted, and was left out"
-            )
+    def _chunk(self, body: int, end: int) -> None:
+        start_ns, end_ns, uncompressed, crc = CHUNK_HEAD.unpack_from(self.data, body)
+        (name,), records = read_strings(self.data, body + CHUNK_HEAD.size, 1)
+        compression = name.decode()
+        size = end - records - 8
+        if is_plausible_size(size, uncompressed):
+            number = self.index.number
+            self.chunk = Block(number, records + 8, size, compression, uncompressed, crc, start_ns, end_ns)
             return
-        self.chunk = Block(index.number, records + 8, size, compression, uncompressed, crc, start_ns, end_ns)
+        self.index.damage.append(
+            f"{self.index.path}: the chunk at byte {body - RECORD.size} claims to unpack from {size} to "
+            f"{uncompressed} bytes, more than is accepted, and was left out"
+        )
 
-    def _statistics(self, body: int, length: int) -> None:
-        data = self.index.data
-        offset = body + struct.calcsize("<QHIIIIQQ")
-        (size,) = struct.unpack_from("<I", data, offset)
-        for entry in range(offset + 4, min(offset + 4 + size, body + length - 9), 10):
-            number, count = struct.unpack_from("<HQ", data, entry)
+    def _indexed(self, body: int) -> Block:
+        """A chunk by its index; where the next message index begins states the number of a channel's messages."""
+        start_ns, end_ns, chunk, length, size = struct.unpack_from("<QQQQI", self.data, body)
+        at = body + 36
+        stated = sorted(struct.unpack_from("<HQ", self.data, place)[::-1] for place in range(at, at + size, 10))
+        (indexed,) = struct.unpack_from("<Q", self.data, at + size)
+        (name,), at = read_strings(self.data, at + size + 8, 1)
+        compressed, uncompressed = struct.unpack_from("<QQ", self.data, at)
+        if not is_plausible_size(compressed, uncompressed):
+            raise struct.error("chunk of an implausible size")
+        begins = [offset + RECORD.size + 6 for offset, _ in stated]
+        ends = [*(offset for offset, _ in stated[1:]), chunk + length + indexed]
+        entries = tuple(
+            Entry(channel, begin, (end - begin) // 16)
+            for (_, channel), begin, end in zip(stated, begins, ends[: len(stated)], strict=True)
+            if end - begin >= 16
+        )
+        payload, number = chunk + length - compressed, self.index.number
+        return Block(number, payload, compressed, name.decode(), uncompressed, None, start_ns, end_ns, entries)
+
+    def _statistics(self, body: int, end: int) -> None:
+        (self.chunks_stated,) = struct.unpack_from("<I", self.data, body + 22)
+        (size,) = struct.unpack_from("<I", self.data, body + 42)
+        for entry in range(body + 46, min(body + 46 + size, end - 9), 10):
+            number, count = struct.unpack_from("<HQ", self.data, entry)
             self.index.counts[number] = count
-        (self.chunks_stated,) = struct.unpack_from("<I", data, body + 22)
         self.index.is_counted = True
+
+    def _begin_summary(self, summary: int) -> None:
+        """Take in what the summary from this byte on defines; by itself where it is damaged."""
+        index, footer = self.index, len(self.data) - _FOOTER_BYTES
+        is_there = footer >= summary and self.data[-len(MAGIC) :] == MAGIC and self.data[footer] == FOOTER
+        self.defining = index
+        if is_there and _agrees(self.data, summary):
+            return
+        if is_there:
+            index.damage.append(f"{index.path}: the summary at byte {summary} has a wrong CRC and was discarded")
+        self.defining = FileIndex(index.path, index.number, b"", schemas=dict(index.schemas))
+        index.uncertain_channels = self.defining.channels
+
+
+def _agrees(data: mmap.mmap | bytes, summary: int) -> bool:
+    """True if the summary from this byte to the end of the file agrees with its CRC, or has none."""
+    crc_at = len(data) - len(MAGIC) - 4
+    (crc,) = struct.unpack_from("<I", data, crc_at)
+    return not crc or zlib.crc32(data[summary:crc_at]) == crc
 
 
 def is_plausible_size(size: int, uncompressed: int) -> bool:
     """True if a chunk of so many bytes may unpack to the size that its record states."""
     return uncompressed <= min(max(_MODEST_CHUNK, _MOST_TIMES * size), _LARGEST_CHUNK)
-
-
-def _is_summary_intact(index: FileIndex, summary: int) -> bool:
-    """True if the summary from this byte on agrees with its CRC, or has none; else it is noted as damage."""
-    data = index.data
-    footer = len(data) - len(MAGIC) - FOOTER_BODY.size - RECORD.size
-    if footer < summary or data[-len(MAGIC) :] != MAGIC or data[footer] != FOOTER:
-        return False
-    crc = FOOTER_BODY.unpack_from(data, footer + RECORD.size)[2]
-    if not crc or zlib.crc32(data[summary : footer + RECORD.size + FOOTER_BODY.size - 4]) == crc:
-        return True
-    index.damage.append(f"{index.path}: the summary at byte {summary} has a wrong CRC and was discarded")
-    return False
-
-
-def check_claims(index: FileIndex, chunks_stated: int, private: Sequence[int]) -> None:
-    """Accept the counts of blocks by channel where they add up to the statistics; note where they do not.
-
-    chunks_stated : by the statistics; private : where records of unknown kinds lie
-    """
-    totals: Counter[int] = Counter()
-    for entry in (entry for block in index.blocks for entry in block.entries):
-        totals[entry.channel] += entry.messages
-    stated = {number: count for number, count in index.counts.items() if count}
-    chunks = sum(block.is_chunk for block in index.blocks)
-    index.is_consistent = index.is_counted and stated == dict(totals) and chunks == chunks_stated
-    is_indexed = all(block.entries for block in index.blocks)
-    if index.is_counted and not index.is_consistent and (is_indexed or chunks != chunks_stated):
-        index.damage.append(
-            f"{index.path}: its {counted(chunks, 'chunk')} and {counted(totals.total(), 'indexed message')} "
-            f"are not the {chunks_stated} and {sum(stated.values())} of its statistics"
-        )
-    if private and not index.is_counted:  # one of them may have been a chunk
-        index.damage.append(
-            f"{index.path}: passed over {counted(len(private), 'record')} of unknown kinds, "
-            f"the first at byte {private[0]}"
-        )

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import mmap
 import struct
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
-from scanchain.logs.mcap.read_ahead import ReadAhead
 from scanchain.source import Source
 from scanchain.words import counted
 
@@ -21,7 +21,9 @@ MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish ti
 
 _CRC = struct.Struct("<I")
 _CRC_AT = RECORD.size + 24  # of a chunk record
-_LONGEST_STRING = 1 << 16  # longest name in bytes; a longer one is damage
+_LONGEST_STRING = 1 << 24  # longest name or definition in bytes; a longer one is damage
+
+Bytes: TypeAlias = memoryview | mmap.mmap | bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,17 +109,17 @@ class FileIndex:
     Attributes
     ----------
     number : its place among the files of the log
-    data : the bytes of an MCAP file; ``remote`` reads those of one that lies elsewhere; of another format ``make``
-        makes the contents of a block, of all channels or of those wanted
+    data : the bytes of an MCAP file; ``fetch`` reads those of a remote one, by offset and size; of another
+        format ``make`` makes the contents of a block, of all channels or of those wanted
     counts : messages by channel id; ``is_counted`` once they are complete
-    damaged_summary : opcodes and bodies of records of a damaged summary, for channels defined nowhere else
+    uncertain_channels : those of a damaged summary, for channels defined nowhere else
     is_consistent : whether the counts of blocks by channel agree with the statistics of the file
     """
 
     path: Source
     number: int
     data: mmap.mmap | bytes
-    remote: ReadAhead | None = None
+    fetch: Callable[[int, int], bytes] | None = None
     make: Callable[[Block, AbstractSet[int] | None], Contents] | None = None
     profile: str = ""
     library: str = ""
@@ -128,7 +130,7 @@ class FileIndex:
     is_counted: bool = False
     takes_rate: bool = False
     is_consistent: bool = True
-    damaged_summary: list[tuple[int, int]] = field(default_factory=list)
+    uncertain_channels: dict[int, Channel] = field(default_factory=dict)
     damage: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -142,48 +144,41 @@ class FileIndex:
 
     def bytes_at(self, offset: int, size: int) -> memoryview:
         """A part of an MCAP file, wherever it lies."""
-        if self.remote is None:
-            return memoryview(self.data)[offset : offset + size]
-        return self.remote.read(offset, size)
+        if self.fetch is not None:
+            return memoryview(self.fetch(offset, size))
+        return memoryview(self.data)[offset : offset + size]
 
-    def expect(self, blocks: Iterable[Block]) -> None:
-        """Announce the blocks that will be read next, in this order."""
-        if self.remote is not None:
-            self.remote.expect([(block.chunk_offset, block.offset + block.size) for block in blocks])
-
-    def add_schema(self, body: memoryview | mmap.mmap | bytes, offset: int) -> None:
+    def add_schema(self, body: Bytes, offset: int) -> None:
         """Take in the schema record whose body starts at the offset."""
         (number,) = struct.unpack_from("<H", body, offset)
-        name, offset = read_string(body, offset + 2)
-        encoding, offset = read_string(body, offset)
-        self.schemas[number] = (name, encoding, _read_octets(body, offset))
+        (name, encoding, definition), _ = read_strings(body, offset + 2, 3)
+        self.schemas[number] = (name.decode(), encoding.decode(), definition)
 
-    def add_channel(self, body: memoryview | mmap.mmap | bytes, offset: int) -> None:
+    def add_channel(self, body: Bytes, offset: int) -> None:
         """Take in the channel record whose body starts at the offset; one that is fully known stays."""
         number, schema = struct.unpack_from("<HH", body, offset)
-        if self.knows(number):
-            return
-        topic, offset = read_string(body, offset + 4)
-        encoding, _ = read_string(body, offset)
-        known = self.schemas.get(schema, ("", "", b""))
-        self.channels[number] = Channel((self.number, number), topic, encoding, schema, *known)
+        if not self.knows(number):
+            (topic, encoding), _ = read_strings(body, offset + 4, 2)
+            known = self.schemas.get(schema, ("", "", b""))
+            key = (self.number, number)
+            self.channels[number] = Channel(key, topic.decode(), encoding.decode(), schema, *known)
+
+    def numbers_of(self, topic: str) -> list[int]:
+        """Ids of the channels of a topic."""
+        return [number for number, channel in self.channels.items() if channel.topic == topic]
+
+    def indexed_counts(self) -> Counter[int]:
+        """Messages by channel id, as the blocks state them."""
+        counts = Counter[int]()
+        for entry in (entry for block in self.blocks for entry in block.entries):
+            counts[entry.channel] += entry.messages
+        return counts
 
     def may_hold(self, block: Block, channels: AbstractSet[int]) -> bool:
         """True if a block can have messages of the channels."""
         if not self.is_consistent or not block.entries:
             return True
         return any(entry.channel in channels for entry in block.entries)
-
-    def take_from_damaged_summary(self, wanted: AbstractSet[int]) -> None:
-        """Add channels from a damaged summary, as they are defined nowhere else."""
-        for opcode, body in self.damaged_summary:
-            try:
-                if opcode == SCHEMA:
-                    self.add_schema(self.data, body)
-                elif opcode == CHANNEL and struct.unpack_from("<H", self.data, body)[0] in wanted:
-                    self.add_channel(self.data, body)
-            except (struct.error, UnicodeDecodeError):
-                continue
 
     def note_damage(self, line: str) -> None:
         """Note a line once, however often the damage is met."""
@@ -196,21 +191,16 @@ class FileIndex:
         return channel is not None and (channel.schema == 0 or channel.type_name != "")
 
 
-def read_string(data: memoryview | mmap.mmap | bytes, offset: int) -> tuple[str, int]:
-    """A string with its length before it, and the byte behind it."""
-    (length,) = struct.unpack_from("<I", data, offset)
-    end = offset + 4 + length
-    if end > len(data) or length > _LONGEST_STRING:
-        raise struct.error("string beyond the end")
-    return bytes(data[offset + 4 : end]).decode(), end
-
-
-def _read_octets(data: memoryview | mmap.mmap | bytes, offset: int) -> bytes:
-    (length,) = struct.unpack_from("<I", data, offset)
-    end = offset + 4 + length
-    if end > len(data):
-        raise struct.error("bytes beyond the end")
-    return bytes(data[offset + 4 : end])
+def read_strings(data: Bytes, offset: int, count: int) -> tuple[list[bytes], int]:
+    """Strings with their lengths before them, and the byte behind the last."""
+    strings = []
+    for _ in range(count):
+        begin = offset + 4
+        offset = begin + struct.unpack_from("<I", data, offset)[0]
+        if offset > min(len(data), begin + _LONGEST_STRING):
+            raise struct.error("string beyond the end")
+        strings.append(bytes(data[begin:offset]))
+    return strings, offset
 
 
 def name_of(indexes: Sequence[FileIndex]) -> str:

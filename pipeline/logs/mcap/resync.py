@@ -13,28 +13,12 @@ from scanchain.logs.mcap.records import CHANNEL, CHUNK, FOOTER, MAGIC, MESSAGE, 
 PRIVATE = 0x80  # opcodes from here on are those of applications
 CHUNK_HEAD = struct.Struct("<QQQI")  # start, end, uncompressed size, CRC-32
 
-_LEAST_BYTES = {
-    1: 8,
-    2: 20,
-    3: 14,
-    4: 16,
-    5: 22,
-    6: 40,
-    7: 6,
-    8: 64,
-    9: 36,
-    10: 48,
-    11: 46,
-    12: 8,
-    13: 20,
-    14: 17,
-    15: 4,
-}
-_EXACT_BYTES = {2: 20, 14: 17, 15: 4}  # footer, summary offset, end of data
+_LEAST_BYTES = (0, 8, 20, 14, 16, 22, 40, 6, 64, 36, 48, 46, 8, 20, 17, 4)  # of a record's body, by opcode
+_FIXED = {FOOTER, 14, 15}  # opcodes of records of exactly that size: footer, summary offset, end of data
 _PARTS = {1: (0, 2), 3: (2, 3), 4: (4, 3), 9: (16, 2), 12: (0, 2)}  # fixed bytes, then parts behind their length
 _COMPRESSIONS = 64  # bytes; no name of a compression is longer
 _COMPRESSED = (b"\4\0\0\0zstd", b"\3\0\0\0lz4")
-_ANY = frozenset(_LEAST_BYTES)
+_ANY = frozenset(range(1, len(_LEAST_BYTES)))
 _OUTSIDE_CHUNKS = _ANY - {SCHEMA, CHANNEL, MESSAGE}  # of a file that keeps its messages in chunks
 _WINDOW = 1 << 20  # bytes searched at once
 
@@ -45,11 +29,10 @@ def record_end(data: mmap.mmap | bytes, offset: int) -> int:
         return 0
     opcode, length = RECORD.unpack_from(data, offset)
     end = offset + RECORD.size + length
-    if end > len(data) or _EXACT_BYTES.get(opcode, length) != length:
-        return 0
-    if opcode >= PRIVATE:
-        return end
-    if length < _LEAST_BYTES.get(opcode, len(data)) or not _has_parts(data, offset, end):
+    if end > len(data) or opcode >= PRIVATE:
+        return end if end <= len(data) else 0
+    least = _LEAST_BYTES[opcode] if opcode in _ANY else len(data)
+    if length < least or (opcode in _FIXED and length > least) or not _has_parts(data, offset, end):
         return 0
     return end if states_length_twice(data, offset) or opcode not in (CHUNK, MESSAGE_INDEX) else 0
 
@@ -69,32 +52,22 @@ def states_length_twice(data: mmap.mmap | bytes, offset: int) -> bool:
     return struct.unpack_from("<Q", data, body + size_at)[0] == length - size_at - 8
 
 
-class Resync:
-    """Resynchronization in a file behind damage.
+def sought_behind(data: mmap.mmap | bytes, offset: int) -> AbstractSet[int]:
+    """Opcodes of the records that are searched behind damage.
 
-    In one with chunks no message is searched outside of them: what is left of a damaged chunk, unchecked, is not
-    taken for messages.
+    No message is searched outside of the chunks of a file that has them: what is left of a damaged chunk,
+    unchecked, is not taken for messages.
     """
-
-    def __init__(self, data: mmap.mmap | bytes) -> None:
-        self.data = data
-        self._sought: AbstractSet[int] = frozenset()
-
-    def behind(self, offset: int) -> int:
-        """The first byte behind ``offset`` at which a record begins that others follow; 0 where there is none."""
-        if not self._sought:
-            places = (offset, record_end(self.data, offset))
-            begun = any(_begins_chunk(self.data, at) for at in places)
-            has_chunks = begun or _next(self.data, len(MAGIC), {CHUNK, MESSAGE_INDEX}) > 0
-            self._sought = _OUTSIDE_CHUNKS if has_chunks else _ANY
-        return _next(self.data, offset + 1, self._sought)
+    begun = any(_begins_chunk(data, at) for at in (offset, record_end(data, offset)))
+    return _OUTSIDE_CHUNKS if begun or next_record(data, len(MAGIC), {CHUNK, MESSAGE_INDEX}) else _ANY
 
 
-def _next(data: mmap.mmap | bytes, offset: int, sought: AbstractSet[int]) -> int:
+def next_record(data: mmap.mmap | bytes, offset: int, sought: AbstractSet[int]) -> int:
+    """The first byte from ``offset`` on at which a record begins that others follow; 0 where there is none."""
     for begin in range(offset, len(data) - RECORD.size, _WINDOW):
         window = np.frombuffer(data, np.uint8, min(_WINDOW + 8, len(data) - begin), begin)
         opcodes, high = window[:-8], (window[6:-2] | window[7:-1] | window[8:])
-        likely = np.flatnonzero((opcodes > 0) & (opcodes <= max(_LEAST_BYTES)) & (high == 0))
+        likely = np.flatnonzero((opcodes > 0) & (opcodes < len(_LEAST_BYTES)) & (high == 0))
         for candidate in (begin + likely).tolist():
             if data[candidate] in sought and _is_start(data, candidate):
                 return candidate

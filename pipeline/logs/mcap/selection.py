@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from math import inf
 from typing import NamedTuple
@@ -52,7 +51,7 @@ def whole_span(indexes: Sequence[FileIndex]) -> Span:
 
 def chosen_span(whole: Span, config: LogConfig) -> Span:
     """From ``log.start_s`` to ``log.end_s``, counted from the first message; everything where neither is set."""
-    if config.start_s == 0.0 and config.end_s == float("inf"):
+    if config.start_s == 0.0 and config.end_s == inf:
         return EVERYTHING
     begin_ns = whole.begin_ns + round(config.start_s * 1e9)
     end_s = min(config.end_s, whole.duration_s)
@@ -140,7 +139,7 @@ def count_messages(indexes: Sequence[FileIndex], topic: str, span: Span) -> int:
     """Number of messages of a topic in the span."""
     count = 0
     for index in indexes:
-        for number in (number for number, channel in index.channels.items() if channel.topic == topic):
+        for number in index.numbers_of(topic):
             for block in filter(span.meets, index.blocks):
                 if block.entries and span.covers(block):
                     count += sum(entry.messages for entry in block.entries if entry.channel == number)
@@ -153,12 +152,7 @@ def count_messages(indexes: Sequence[FileIndex], topic: str, span: Span) -> int:
 def count_scans(indexes: Sequence[FileIndex], topic: str, whole: Span, config: LogConfig) -> int:
     """Number of scans of the topic in the chosen part, every n-th. Raises InputError where there is none."""
     name, span = name_of(indexes), chosen_span(whole, config)
-    total = sum(
-        index.counts.get(number, 0)
-        for index in indexes
-        for number, channel in index.channels.items()
-        if channel.topic == topic
-    )
+    total = sum(index.counts.get(number, 0) for index in indexes for number in index.numbers_of(topic))
     if not total:
         remedy = damage_of(indexes) or "; scanchain info lists what there is"
         raise InputError(f"{name}: topic {topic} has no messages{remedy}")
@@ -170,34 +164,25 @@ def count_scans(indexes: Sequence[FileIndex], topic: str, whole: Span, config: L
 
 def nothing_in_part(what: str, whole: Span, config: LogConfig) -> InputError:
     """Error of a part that holds nothing."""
-    return InputError(f"{what} lies {_part_in_words(config)}; the log is {whole.duration_s:.1f} s long")
-
-
-def _part_in_words(config: LogConfig) -> str:
-    """The chosen part as text."""
     start, end = f"--start {config.start_s:g} s", f"--end {config.end_s:g} s"
-    if config.end_s == float("inf"):
-        return f"after {start}"
-    return f"between {start} and {end}" if config.start_s else f"before {end}"
+    part = f"between {start} and {end}" if config.start_s else f"before {end}"
+    part = f"after {start}" if config.end_s == inf else part
+    return InputError(f"{what} lies {part}; the log is {whole.duration_s:.1f} s long")
 
 
 def complete(index: FileIndex) -> None:
     """Add the channels and counts that a file without a full summary has inside its chunks."""
-    needed = set(index.counts) | {entry.channel for block in index.blocks for entry in block.entries}
-    unknown = {number for number in needed if not index.knows(number)}
-    counts: Counter[int] = Counter()
+    counts = index.indexed_counts()
+    unknown = {number for number in {*index.counts, *counts} if not index.knows(number)}
     for block in index.blocks:
-        for entry in block.entries:
-            counts[entry.channel] += entry.messages
-        if block.entries and not unknown & {entry.channel for entry in block.entries}:
-            continue
-        if not block.entries and index.is_counted and not unknown:
-            continue
-        messages = messages_of(index, block)
-        if not block.entries:
-            counts.update(message.channel.key[1] for message in messages)
-        unknown = {number for number in unknown if not index.knows(number)}
-    index.take_from_damaged_summary(unknown)
+        held = {entry.channel for entry in block.entries}
+        if unknown & held or (not held and (unknown or not index.is_counted)):
+            messages = messages_of(index, block)
+            counts.update(message.channel.key[1] for message in messages if not block.entries)
+            unknown = {number for number in unknown if not index.knows(number)}
+    index.channels |= {
+        number: channel for number, channel in index.uncertain_channels.items() if number in unknown
+    }
     if not index.is_counted:
         index.counts = dict(counts)
         index.is_counted = True
@@ -208,22 +193,17 @@ def times_of(indexes: Sequence[FileIndex], topic: str) -> tuple[int, int, int]:
 
     Exact where a file has a message index, else as exact as its chunks.
     """
-    messages, ends_ns = 0, []
+    messages, ends_ns = 0, list[int]()
     for index in indexes:
-        for number in (number for number, channel in index.channels.items() if channel.topic == topic):
+        for number in index.numbers_of(topic):
             messages += index.counts.get(number, 0)
             holding = [block for block in index.blocks if any(entry.channel == number for entry in block.entries)]
-            for block in {id(block): block for block in holding[:1] + holding[-1:]}.values():
-                ends_ns += _ends(index, block, number)
+            for block in holding[:1] + holding[1:][-1:]:
+                has_times = any(entry.channel == number and entry.offset >= 0 for entry in block.entries)
+                times_ns = log_times(index, block, number) if has_times else ()
+                found = len(times_ns) > 0
+                ends_ns += [int(min(times_ns)), int(max(times_ns))] if found else [block.start_ns, block.end_ns]
     return messages, min(ends_ns, default=0), max(ends_ns, default=0)
-
-
-def _ends(index: FileIndex, block: Block, channel: int) -> list[int]:
-    """Log times of the first and last message of a channel in a block that holds some."""
-    if not any(e.channel == channel and e.offset >= 0 for e in block.entries):
-        return [block.start_ns, block.end_ns]
-    times_ns = log_times(index, block, channel)
-    return [int(times_ns.min()), int(times_ns.max())] if len(times_ns) else [block.start_ns, block.end_ns]
 
 
 def messages_of(index: FileIndex, block: Block) -> list[Message]:

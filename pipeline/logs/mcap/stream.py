@@ -20,6 +20,7 @@ from scanchain.threads import threads
 
 Decoders = Mapping[str, Callable[[memoryview], object]]
 _BLOCKS_AHEAD = 4  # that wait decoded, at most
+_REMOTE_TIMES = 2  # as many wait of a remote log, each one request
 _MOST_BYTES_AHEAD = 256_000_000
 
 T = TypeVar("T")
@@ -41,9 +42,7 @@ def decoded_messages(
 
     At most ``ahead`` blocks wait decoded. What is damaged is left out and named in ``damage``.
     """
-    wanted = [
-        {number for number, channel in index.channels.items() if channel.topic in decoders} for index in indexes
-    ]
+    wanted = [{number for topic in decoders for number in index.numbers_of(topic)} for index in indexes]
 
     def decode(block: Block) -> tuple[list[Decoded], str]:
         contents = read_block(indexes[block.file], block, wanted[block.file])
@@ -62,10 +61,10 @@ def decoded_messages(
         if span.meets(block) and index.may_hold(block, wanted[block.file])
     ]
     blocks.sort(key=lambda block: (block.start_ns, block.file, block.offset))
-    for index in indexes:
-        index.expect(block for block in blocks if block.file == index.number)
     waiting: list[tuple[int, int, int, int, Decoded]] = []
-    results = _ahead(blocks, decode, ahead, damage)
+    is_remote = any(index.fetch is not None for index in indexes)
+    ahead *= _REMOTE_TIMES if is_remote else 1
+    results = _ahead(blocks, decode, ahead, damage, workers=max(threads(), ahead * is_remote))
     for (block, following), messages in zip(pairwise([*blocks, None]), results, strict=True):
         assert block is not None
         for place, message in enumerate(messages):
@@ -84,12 +83,17 @@ def _decode(decoder: Callable[[memoryview], object], message: Message) -> object
 
 
 def _ahead(
-    blocks: Sequence[Block], decode: Callable[[Block], tuple[list[Decoded], str]], ahead: int, damage: list[str]
+    blocks: Sequence[Block],
+    decode: Callable[[Block], tuple[list[Decoded], str]],
+    ahead: int,
+    damage: list[str],
+    *,
+    workers: int,
 ) -> Iterator[list[Decoded]]:
     """Contents in the order of the blocks, decoded by threads that end when the iterator is closed."""
     running: deque[tuple[Block, Future[tuple[list[Decoded], str]]]] = deque()
     size = 0
-    pool = ThreadPoolExecutor(threads(), thread_name_prefix="scanchain-read")
+    pool = ThreadPoolExecutor(workers, thread_name_prefix="scanchain-read")
     try:
         for block in blocks:
             running.append((block, pool.submit(decode, block)))
@@ -126,21 +130,14 @@ def spread_messages(
 ) -> Iterator[T]:
     """Decoded messages of a topic in blocks from all over a span; malformed ones are passed over."""
     blocks = [block for block in _blocks_of(indexes, topic) if span.meets(block)]
-    chosen = (
-        blocks
-        if len(blocks) <= _SAMPLED_BLOCKS
-        else [blocks[k * (len(blocks) - 1) // (_SAMPLED_BLOCKS - 1)] for k in range(_SAMPLED_BLOCKS)]
-    )
-    yield from _decoded_in(indexes, chosen, topic, decode, span)
+    spread = sorted({k * (len(blocks) - 1) // (_SAMPLED_BLOCKS - 1) for k in range(_SAMPLED_BLOCKS)})
+    yield from _decoded_in(indexes, [blocks[k] for k in spread if blocks], topic, decode, span)
 
 
 def _blocks_of(indexes: Sequence[FileIndex], topic: str) -> list[Block]:
     """Those that may hold messages of the topic, by time."""
     blocks = [
-        block
-        for index in indexes
-        for block in index.blocks
-        if index.may_hold(block, {n for n, channel in index.channels.items() if channel.topic == topic})
+        block for index in indexes for block in index.blocks if index.may_hold(block, set(index.numbers_of(topic)))
     ]
     return sorted(blocks, key=lambda block: block.start_ns)
 
