@@ -409,7 +409,7 @@ def test_the_report_on_a_phone_shows_figures_beside_long_names_and_links_to_ever
     page = (out / "report.html").read_text(encoding="utf-8")
     cells = {row["log"]: re.search(f"{name}</a>.*?</tr>", page, re.DOTALL)[0] for name, row in rows.items()}
     blind, fine, _ = (re.findall(r"<td([^>]*)>([^<]*)</td>", each) for each in cells.values())
-    assert blind[:2] == [(' class="bad"', "not trustworthy"), ("", "20")] and fine[0][1] == "check these stretches"
+    assert blind[:2] == [(' class="bad"', "not trustworthy"), ("", "20")] and fine[0][1] == "trustworthy"
     assert blind[3] == (' class="bad"', str(rows[two_lidars[0].name]["degenerate"]))
     assert fine[2] == fine[3] == fine[4] == ("", "0") and rows[two_lidars[0].name]["degenerate"] > 10
     links = re.findall(r'<a href="([^"]+)">', page)
