@@ -14,9 +14,9 @@ from msgspec import Struct
 
 from scanchain.logs.files import spelled
 from scanchain.processes import Ending, KilledFor, Limits, run_within
-from scanchain.runs.directory import directory_name
+from scanchain.runs.directory import RUN_FILE, directory_name
 from scanchain.runs.metrics import Metrics
-from scanchain.runs.provenance import package_version
+from scanchain.runs.provenance import Provenance, package_version
 from scanchain.settings import Override, dump, load_settings
 from scanchain.source import source_of
 from scanchain.threads import VARIABLE
@@ -48,9 +48,8 @@ class Task(Struct, frozen=True):
 
     Attributes
     ----------
-    log : the file, folder or address; sha256 : that of its contents, of a remote log that of its address, size
-        and version, empty where it cannot be read
-    key : of its contents and all that decides about the result
+    log : the file, folder or address; identity : of its path, size and last change, empty where it cannot be read
+    key : of its identity and all that decides about the result
     out : the batch's directory
     arguments : for ``scanchain run``
     time_s, memory_mib : limits of its process
@@ -58,7 +57,7 @@ class Task(Struct, frozen=True):
     """
 
     log: str
-    sha256: str
+    identity: str
     key: str
     out: str
     arguments: tuple[str, ...]
@@ -88,7 +87,7 @@ class Task(Struct, frozen=True):
 
 
 class Row(Struct, frozen=True):
-    """Result of a log; ``peak_mib`` and ``duration_s`` are those of the last try's process."""
+    """Result of a log; ``sha256`` from its run, ``peak_mib`` and ``duration_s`` of the last try's process."""
 
     log: str
     sha256: str
@@ -134,13 +133,13 @@ def finished_row(task: Task) -> Row | None:
 
 def unfinished_row(task: Task, state: State, reason: str) -> Row:
     """Row of a task that was not run."""
-    return Row(task.name, task.sha256, task.key, "", state, reason, 0, 0.0, 0.0, None)
+    return Row(task.name, "", task.key, "", state, reason, 0, 0.0, 0.0, None)
 
 
-def key_of(sha256: str, config_file: Path | None, overrides: Sequence[Override]) -> str:
-    """Hash of a log's contents, of the configuration in effect for it, and of the version that would run it."""
+def key_of(identity: str, config_file: Path | None, overrides: Sequence[Override]) -> str:
+    """Hash of a log's identity, of the configuration in effect for it, and of the version that would run it."""
     settings = [load_settings(d, file=config_file, overrides=overrides).config for d in (2, 3)]
-    parts = (package_version("scanchain"), sha256, *map(dump, settings))
+    parts = (package_version("scanchain"), identity, *map(dump, settings))
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
@@ -173,9 +172,12 @@ def _tried(task: Task, stop: Event | None) -> Row:
     state, reason = _verdict(task, ending)
     metrics = _metrics(task) if state.has_result else None
     run = task.run.name if metrics is not None else ""
-    return Row(
-        task.name, task.sha256, task.key, run, state, reason, 1, ending.duration_s, ending.peak_mib, metrics
-    )
+    sha256 = _sha256(task) if run else ""
+    return Row(task.name, sha256, task.key, run, state, reason, 1, ending.duration_s, ending.peak_mib, metrics)
+
+
+def _sha256(task: Task) -> str:
+    return msgspec.json.decode((task.run / RUN_FILE).read_bytes(), type=Provenance).logs[0].sha256
 
 
 def _metrics(task: Task) -> Metrics:
