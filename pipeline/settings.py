@@ -105,32 +105,29 @@ def load_settings(
         raise InputError(f"file is {shown(file)}; wanted the path of a TOML file")
     if not (isinstance(overrides, Sequence) and all(isinstance(each, Override) for each in overrides)):
         raise InputError(f"overrides is {shown(overrides)}; wanted a list of Override(key, text, flag)")
-    layer: dict[str, Value] = {}
-    source = "defaults"
-    if dimension is not None:
-        if not (isinstance(dimension, int) and dimension in PRESETS):
-            raise InputError(f"dimension is {shown(dimension)}; it must be 2 (laser scans) or 3 (clouds)")
-        layer = read_layer(preset_path(PRESETS[dimension]))
-        source = f"preset {PRESETS[dimension]} of {dimension}D logs"
-    source += "" if file is None else f", {file}"
-    preset = {key: spec.default for key, spec in config_keys().items()} | layer
-    values = preset | ({} if file is None else read_layer(Path(file)))
-    if dimension is not None and file is not None:
-        _check_dimension(
-            values, dimension, str(file), f"scanchain config dump --lidar {dimension}d prints what they take"
-        )
+    if dimension is not None and not (isinstance(dimension, int) and dimension in PRESETS):
+        raise InputError(f"dimension is {shown(dimension)}; it must be 2 (laser scans) or 3 (clouds)")
+    source = "defaults" if dimension is None else f"preset {PRESETS[dimension]} of {dimension}D logs"
+    values = dict(_preset_values(dimension))
+    if file is not None:
+        source += f", {file}"
+        values |= read_layer(Path(file))
+        if dimension is not None:
+            remedy = f"scanchain config dump --lidar {dimension}d prints what they take"
+            _check_dimension(values, dimension, str(file), remedy)
     for override in overrides:
         values[override.key] = find_key(override.key, override.flag).parse(override.text, override.flag)
     flags = {override.key: override.flag for override in overrides}
     is_final = dimension is not None  # else a preset may still change all but log.*
     _check_order(values, source, flags, [pair for pair in _ORDERED if is_final or pair[0].startswith("log.")])
-    changed = "".join(f", {key} {_as_in_toml(values[key])}" for key in flags)
-    return Settings(msgspec.convert(_tree(values), Config), source + changed)
-
-
-def _as_in_toml(value: Value) -> str:
-    """The value as a file holds it."""
-    return str(value).lower() if isinstance(value, bool) else str(value)
+    for key in flags:
+        text = str(values[key])
+        source += f", {key} {text.lower() if isinstance(values[key], bool) else text}"
+    tree: dict[str, dict[str, Value]] = {field.name: {} for field in fields(Config)}
+    for key, value in values.items():
+        section, _, leaf = key.partition(".")
+        tree[section][leaf] = value
+    return Settings(msgspec.convert(tree, Config), source)
 
 
 def read_layer(file: Path) -> dict[str, Value]:
@@ -195,9 +192,10 @@ def _check_dimension(values: Mapping[str, Value], dimension: int, source: str, r
 
 
 @functools.cache
-def _preset_values(dimension: int) -> Mapping[str, Value]:
-    """Every key as the preset of logs of this dimension sets it."""
-    return {key: spec.default for key, spec in config_keys().items()} | read_layer(preset_path(PRESETS[dimension]))
+def _preset_values(dimension: int | None) -> Mapping[str, Value]:
+    """Every key as the preset of logs of this dimension sets it, of None the defaults."""
+    layer = {} if dimension is None else read_layer(preset_path(PRESETS[dimension]))
+    return {key: spec.default for key, spec in config_keys().items()} | layer
 
 
 def _leaves(tree: Mapping[str, object]) -> Iterator[tuple[str, object]]:
@@ -208,14 +206,6 @@ def _leaves(tree: Mapping[str, object]) -> Iterator[tuple[str, object]]:
             yield from ((f"{section}.{leaf}", value) for leaf, value in branch.items())
         else:
             yield section, branch
-
-
-def _tree(values: Mapping[str, Value]) -> dict[str, dict[str, Value]]:
-    tree: dict[str, dict[str, Value]] = {}
-    for key, value in values.items():
-        section, _, leaf = key.partition(".")
-        tree.setdefault(section, {})[leaf] = value
-    return tree
 
 
 def _check_order(
