@@ -80,11 +80,6 @@ class Task(Struct, frozen=True):
         """File of its row, beside the run directory."""
         return Path(self.out) / ROWS_FOLDER / f"{self.key}.json"
 
-    @property
-    def output_file(self) -> Path:
-        """Output of the last try."""
-        return output_file(Path(self.out), self.key)
-
 
 class Row(Struct, frozen=True):
     """Result of a log; ``sha256`` from its run, ``peak_mib`` and ``duration_s`` of the last try's process."""
@@ -159,13 +154,14 @@ def attempt(task: Task, stop: Event | None = None) -> Row:
 
 def _tried(task: Task, stop: Event | None) -> Row:
     words = ["run", "--out", str(task.run), "--force", *task.arguments, "--", task.log]
-    task.output_file.parent.mkdir(parents=True, exist_ok=True)
+    output = output_file(Path(task.out), task.key)
+    output.parent.mkdir(parents=True, exist_ok=True)
     ending = run_within(
         Limits(task.time_s, task.memory_mib),
         "scanchain.processes",
         ["scanchain", *words],
         os.environ | dict.fromkeys(_THREADS, "1"),  # a process a core: threads would only get in each other's way
-        output=task.output_file,
+        output=output,
         interval_s=_LOOK_S,
         stop=stop,
     )
@@ -202,7 +198,7 @@ def _own_ending(ending: Ending, task: Task) -> tuple[State, str]:
     """End state and reason, from exit code and output."""
     if ending.code == 0:
         return State.DONE, ""
-    output = task.output_file.read_text(encoding="utf-8", errors="replace").splitlines()
+    output = output_file(Path(task.out), task.key).read_text(encoding="utf-8", errors="replace").splitlines()
     error = next((line for line in reversed(output) if line.startswith("error: ")), "")
     if ending.code == 1 and (task.run / "metrics.json").is_file():
         metrics = _metrics(task)
