@@ -18,12 +18,6 @@ from scanchain.config_keys import ConfigKey, Value, section_keys
 from scanchain.errors import InputError, one_line, shown
 
 PRESETS = {2: "lidar2d", 3: "lidar3d"}
-_WHEEL_KEYS = ("odometry.wheel_sigma_m", "odometry.wheel_sigma_rad", "log.odometry_topic")
-_REVOLUTION_KEYS = ("log.revolution_s", "log.revolution_start_rad")
-_PLACE_KEYS = ("loops.place_radius_m",)
-_SPATIAL_KEYS = ("preprocess.calibrate_elevation", "maps.slice_min_z_m", "maps.slice_max_z_m")
-_PLANAR_KEYS = ("loops.refine", "odometry.max_turn_rad_s")
-_NOTHING: Mapping[str, str] = {}
 _ORDERED = (
     ("log.start_s", "log.end_s"),
     ("log.min_range_m", "log.max_range_m"),
@@ -69,13 +63,11 @@ class Settings:
     Attributes
     ----------
     config : the whole tree
-    source : where it came from, in words; of the flags, those that have an effect
-    without_effect : a line for each setting of the file or the flags that has none, with the reason
+    source : where it came from, in words
     """
 
     config: Config
     source: str
-    without_effect: tuple[str, ...] = ()
 
 
 @functools.cache
@@ -104,87 +96,38 @@ def load_settings(
     *,
     file: Path | str | None = None,
     overrides: Sequence[Override] = (),
-    idle: Mapping[str, str] = _NOTHING,
 ) -> Settings:
     """Defaults < the preset for logs of this dimension, if it is known < ``file`` < ``overrides``.
 
-    idle : keys that have no effect on the log at hand, and why
     Raises InputError naming the file or the flag, the key and its limits, or the nearest key there is.
     """
     if not isinstance(file, str | Path | None):
         raise InputError(f"file is {shown(file)}; wanted the path of a TOML file")
     if not (isinstance(overrides, Sequence) and all(isinstance(each, Override) for each in overrides)):
         raise InputError(f"overrides is {shown(overrides)}; wanted a list of Override(key, text, flag)")
-    if not (isinstance(idle, Mapping) and all(isinstance(text, str) for each in idle.items() for text in each)):
-        raise InputError(f"idle is {shown(idle)}; wanted a mapping of keys without effect to the reasons")
-    layer: dict[str, Value] = {}
-    source = "defaults"
-    if dimension is not None:
-        if not (isinstance(dimension, int) and dimension in PRESETS):
-            raise InputError(f"dimension is {shown(dimension)}; it must be 2 (laser scans) or 3 (clouds)")
-        layer = read_layer(preset_path(PRESETS[dimension]))
-        source = f"preset {PRESETS[dimension]} of {dimension}D logs"
-    source += "" if file is None else f", {file}"
-    preset = {key: spec.default for key, spec in config_keys().items()} | layer
-    values = preset | ({} if file is None else read_layer(Path(file)))
-    if dimension is not None and file is not None:
-        _check_dimension(
-            values, dimension, str(file), f"scanchain config dump --lidar {dimension}d prints what they take"
-        )
-    origins = {key: str(file) for key in values if values[key] != preset[key]}
+    if dimension is not None and not (isinstance(dimension, int) and dimension in PRESETS):
+        raise InputError(f"dimension is {shown(dimension)}; it must be 2 (laser scans) or 3 (clouds)")
+    source = "defaults" if dimension is None else f"preset {PRESETS[dimension]} of {dimension}D logs"
+    values = dict(_preset_values(dimension))
+    if file is not None:
+        source += f", {file}"
+        values |= read_layer(Path(file))
+        if dimension is not None:
+            remedy = f"scanchain config dump --lidar {dimension}d prints what they take"
+            _check_dimension(values, dimension, str(file), remedy)
     for override in overrides:
         values[override.key] = find_key(override.key, override.flag).parse(override.text, override.flag)
     flags = {override.key: override.flag for override in overrides}
     is_final = dimension is not None  # else a preset may still change all but log.*
     _check_order(values, source, flags, [pair for pair in _ORDERED if is_final or pair[0].startswith("log.")])
-    unused = {**_idle_keys(values, dimension), **idle} if is_final else {}
-    changed = "".join(f", {key} {_as_in_toml(values[key])}" for key in flags if key not in unused)
-    without_effect = tuple(
-        f"{_named(key, values[key], origin)} has no effect: {unused[key]}"
-        for key, origin in (origins | flags).items()
-        if key in unused
-    )
-    return Settings(msgspec.convert(_tree(values), Config), source + changed, without_effect)
-
-
-def _named(key: str, value: Value, origin: str) -> str:
-    """A setting as the user wrote it."""
-    text = f"{value:g}" if isinstance(value, float) else _as_in_toml(value)
-    return f"{origin} {text}" if origin.startswith("--") else f"{origin}: {key} {text}"
-
-
-def _as_in_toml(value: Value) -> str:
-    """The value as a file holds it."""
-    return str(value).lower() if isinstance(value, bool) else str(value)
-
-
-def _idle_keys(values: Mapping[str, Value], dimension: int | None) -> dict[str, str]:
-    """The keys without an effect under other keys, or for this kind of log, with the reason."""
-    matches_all = float(values["preprocess.match_voxel_m"]) <= float(values["preprocess.map_voxel_m"])
-    recognizer = str(values["loops.recognizer"])
-    is_own = ":" in recognizer
-    reasons = {
-        "loops.recognizer is none": _PLACE_KEYS if recognizer == "none" else (),
-        "it is of 2D logs alone": _PLANAR_KEYS if dimension == 3 else (),
-        "it is of 3D logs alone": (*_SPATIAL_KEYS, *(() if is_own else _PLACE_KEYS)) if dimension == 2 else (),
-        "loops.enabled is false": () if values["loops.enabled"] else _keys_of("loops", "loops.enabled"),
-        "graph.robust is none": ("graph.robust_scale",) if values["graph.robust"] == "none" else (),
-        "preprocess.match_voxel_m is not above preprocess.map_voxel_m": (
-            ("preprocess.match_points",) if matches_all else ()
-        ),
-        "matching.matcher is svd": ("matching.optimizer",) if values["matching.matcher"] == "svd" else (),
-        "log.point_times is not clockwise or counterclockwise": (
-            () if values["log.point_times"] in ("clockwise", "counterclockwise") else _REVOLUTION_KEYS
-        ),
-        "odometry.prior is constant-velocity": (
-            _WHEEL_KEYS if values["odometry.prior"] == "constant-velocity" else ()
-        ),
-    }
-    return {key: reason for reason, keys in reasons.items() for key in keys}
-
-
-def _keys_of(section: str, *exceptions: str) -> tuple[str, ...]:
-    return tuple(key for key in config_keys() if key.startswith(f"{section}.") and key not in exceptions)
+    for key in flags:
+        text = str(values[key])
+        source += f", {key} {text.lower() if isinstance(values[key], bool) else text}"
+    tree: dict[str, dict[str, Value]] = {field.name: {} for field in fields(Config)}
+    for key, value in values.items():
+        section, _, leaf = key.partition(".")
+        tree[section][leaf] = value
+    return Settings(msgspec.convert(tree, Config), source)
 
 
 def read_layer(file: Path) -> dict[str, Value]:
@@ -249,9 +192,10 @@ def _check_dimension(values: Mapping[str, Value], dimension: int, source: str, r
 
 
 @functools.cache
-def _preset_values(dimension: int) -> Mapping[str, Value]:
-    """Every key as the preset of logs of this dimension sets it."""
-    return {key: spec.default for key, spec in config_keys().items()} | read_layer(preset_path(PRESETS[dimension]))
+def _preset_values(dimension: int | None) -> Mapping[str, Value]:
+    """Every key as the preset of logs of this dimension sets it, of None the defaults."""
+    layer = {} if dimension is None else read_layer(preset_path(PRESETS[dimension]))
+    return {key: spec.default for key, spec in config_keys().items()} | layer
 
 
 def _leaves(tree: Mapping[str, object]) -> Iterator[tuple[str, object]]:
@@ -262,14 +206,6 @@ def _leaves(tree: Mapping[str, object]) -> Iterator[tuple[str, object]]:
             yield from ((f"{section}.{leaf}", value) for leaf, value in branch.items())
         else:
             yield section, branch
-
-
-def _tree(values: Mapping[str, Value]) -> dict[str, dict[str, Value]]:
-    tree: dict[str, dict[str, Value]] = {}
-    for key, value in values.items():
-        section, _, leaf = key.partition(".")
-        tree.setdefault(section, {})[leaf] = value
-    return tree
 
 
 def _check_order(

@@ -14,11 +14,6 @@ from tests.support.messages import says
 from tests.support.scenes import ROOT, configured
 
 
-@pytest.mark.parametrize("idle", [3, "keys", {"log.rate_hz": 3}, ["log.rate_hz"]])
-def test_idle_keys_that_are_no_mapping_are_refused(idle):
-    assert "wanted a mapping of keys without effect to the reasons" in complaint(dimension=2, idle=idle)
-
-
 def flag(key, text):
     return Override(key, text, f"--{key}")
 
@@ -36,41 +31,6 @@ def complaint(**arguments):
     text = caught.value.text
     assert "\n" not in text
     return text
-
-
-# what has no effect
-
-
-@pytest.mark.parametrize(
-    ("dimension", "key", "text", "why"),
-    [
-        (2, "loops.place_radius_m", "9", "it is of 3D logs alone"),
-        (2, "maps.slice_min_z_m", "-1", "it is of 3D logs alone"),
-        (3, "loops.refine", "false", "it is of 2D logs alone"),
-        (3, "odometry.max_turn_rad_s", "3", "it is of 2D logs alone"),
-        (3, "log.revolution_s", "0.2", "log.point_times"),
-        (2, "graph.robust_scale", "2", "graph.robust"),
-        (2, "preprocess.match_points", "300", "preprocess.match_voxel_m is not above preprocess.map_voxel_m"),
-    ],
-)
-def test_a_flag_without_effect_is_told_with_its_reason_and_not_as_in_force(dimension, key, text, why):
-    others = [flag("graph.robust", "none")]
-    settings = load_settings(dimension, overrides=[*others, flag(key, text)])
-    assert key not in settings.source and "graph.robust none" in settings.source
-    (line,) = settings.without_effect
-    says(line, f"--{key} {text}", "no effect", why)
-
-
-def test_what_a_file_sets_without_effect_is_told_too_and_what_it_repeats_is_not(tmp_path):
-    file = written(tmp_path, "[loops]\nenabled = false\ndrift = 0.2\nmin_travel_m = 10.0\n")
-    settings = load_settings(2, file=file)
-    assert settings.without_effect == (f"{file}: loops.drift 0.2 has no effect: loops.enabled is false",)
-    assert load_settings(2, overrides=[flag("loops.drift", "0.2")]).without_effect == ()
-
-
-def test_a_whole_configuration_given_back_has_only_settings_with_effect(tmp_path):
-    file = written(tmp_path, dump(configured(2)))
-    assert load_settings(2, file=file).without_effect == ()
 
 
 # what wins

@@ -6,12 +6,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from glob import glob
-from hashlib import sha256 as hashed
 from pathlib import Path
 from threading import Event
 from typing import Protocol
-
-import msgspec
 
 from scanchain.batch.table import write_table
 from scanchain.batch.task import ROWS_FOLDER, Row, State, Task, attempt, finished_row, key_of, unfinished_row
@@ -26,7 +23,6 @@ from scanchain.source import Source, source_of
 from scanchain.verdict import Verdict
 from scanchain.words import counted
 
-_SHA256_OF_NOTHING = hashed().hexdigest()  # of an empty file, and of an empty folder
 _SHARE = 0.75  # of the memory that is free, for all workers together
 
 Work = Callable[[Sequence[Task]], Iterator[Row]]
@@ -94,7 +90,7 @@ class Batched:
 
 
 def run_batch(batch: Batch, progress: BatchProgress, work: Work | None = None) -> Batched:
-    """Run the logs without a result and write the table; logs of the same contents are run once.
+    """Run the logs without a result and write the table.
 
     work : where the tasks are run; None for processes on this machine
     On Ctrl-C what runs is killed, and the table lists what was not run. Raises InputError for a directory that
@@ -110,7 +106,7 @@ def run_batch(batch: Batch, progress: BatchProgress, work: Work | None = None) -
     rows = {task.key: row for task in tasks if (row := finished_row(task)) is not None}
     kept = sum(task.key in rows for task in tasks)
     missing = {task.key: task for task in tasks if task.key not in rows}
-    readable = [task for task in missing.values() if task.sha256]
+    readable = [task for task in missing.values() if task.identity]
     if kept:
         progress.say(f"{kept:,} of {len(tasks):,} logs are done already")
     try:
@@ -121,7 +117,7 @@ def run_batch(batch: Batch, progress: BatchProgress, work: Work | None = None) -
             progress.count(kept + done, len(tasks))
     except KeyboardInterrupt:
         progress.say("stopped")
-    table = tuple(_row_of(task, rows) for task in tasks)
+    table = tuple(rows.get(task.key) or _unread(task) for task in tasks)
     return Batched(table, kept, write_table(batch.out, table))
 
 
@@ -148,39 +144,24 @@ def _tasks(batch: Batch) -> list[Task]:
         memory_mib = _SHARE * available_mib() / batch.workers
     tasks = []
     for log in batch.logs:
-        sha256 = "" if misspelled(log) else identity_of(log)
         path = str(log.absolute()) if isinstance(log, Path) else log.url
-        is_told_by_contents = sha256 not in ("", _SHA256_OF_NOTHING)
+        identity = "" if misspelled(log) else identity_of(log)
+        key = key_of(identity or spelled(path), batch.config_file, batch.overrides)
         tasks.append(
-            Task(
-                log=path,
-                sha256=sha256,
-                key=key_of(sha256 if is_told_by_contents else spelled(path), batch.config_file, batch.overrides),
-                out=str(batch.out),
-                arguments=batch.arguments,
-                time_s=batch.time_s,
-                memory_mib=memory_mib,
-                retries=batch.retries,
-            )
+            Task(path, identity, key, str(batch.out), batch.arguments, batch.time_s, memory_mib, batch.retries)
         )
     return tasks
 
 
-def _row_of(task: Task, rows: dict[str, Row]) -> Row:
-    """The row of a task: its own, that of a log with the same contents, or one with the reason for none."""
-    if task.key in rows:
-        row = rows[task.key]
-        if row.log != task.name and not row.state.has_result:
-            row = msgspec.structs.replace(row, reason=f"has the contents of {row.log}: {row.reason}")
-        return Row(task.name, *(getattr(row, name) for name in row.__struct_fields__[1:]))
+def _unread(task: Task) -> Row:
+    """The row of a log that was not run, with the reason."""
     source = source_of(task.log)
-    if complaint := misspelled(source):
-        return unfinished_row(task, State.FAILED, complaint)
-    if not task.sha256:
-        if isinstance(source, Path) and not source.exists():
-            return unfinished_row(task, State.FAILED, "no such file; check the path")
-        return unfinished_row(task, State.FAILED, f"cannot be read; scanchain info {task.name} shows the reason")
-    return unfinished_row(task, State.NOT_RUN, "stopped by the user")
+    if task.identity:
+        return unfinished_row(task, State.NOT_RUN, "stopped by the user")
+    reason = misspelled(source) or f"cannot be read; scanchain info {task.name} shows the reason"
+    if isinstance(source, Path) and not source.exists():
+        reason = "no such file; check the path"
+    return unfinished_row(task, State.FAILED, reason)
 
 
 def _local(workers: int) -> Work:

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from scanchain.batch.task import Row, State
@@ -106,16 +107,9 @@ def _distance(length_m: float) -> str:
 
 
 def _cells(row: Row) -> dict[str, object]:
-    metrics = row.metrics
-    names = ("log", "sha256", "key", "run", "reason", "warnings", "tries", "duration_s", "peak_mib")
-    cells: dict[str, object] = {name: getattr(row, name) for name in names}
-    cells["state"] = str(row.state)
-    if metrics is None:
-        return cells
-    cells |= {name: getattr(metrics, name) for name in (*_NUMBERS, *_FIGURES)}
-    cells["verdict"] = str(metrics.verdict)
-    if metrics.ground_truth is not None:
-        truth = metrics.ground_truth
-        cells |= {name: getattr(truth.optimized, name) for name in _ERRORS}
-        cells["odometry_ate_rmse_m"] = truth.odometry.ate_rmse_m
-    return cells
+    """Cells by column, and more; what a log without result or ground truth lacks becomes null."""
+    cells = msgspec.to_builtins(row)
+    metrics = cells["metrics"] or {}
+    truth = metrics.get("ground_truth") or {"optimized": {}, "odometry": {}}
+    figures = metrics | truth["optimized"] | {"odometry_ate_rmse_m": truth["odometry"].get("ate_rmse_m")}
+    return figures | cells | {"warnings": row.warnings}

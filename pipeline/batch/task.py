@@ -14,9 +14,9 @@ from msgspec import Struct
 
 from scanchain.logs.files import spelled
 from scanchain.processes import Ending, KilledFor, Limits, run_within
-from scanchain.runs.directory import directory_name
+from scanchain.runs.directory import RUN_FILE, directory_name
 from scanchain.runs.metrics import Metrics
-from scanchain.runs.provenance import package_version
+from scanchain.runs.provenance import Provenance, package_version
 from scanchain.settings import Override, dump, load_settings
 from scanchain.source import source_of
 from scanchain.threads import VARIABLE
@@ -48,9 +48,8 @@ class Task(Struct, frozen=True):
 
     Attributes
     ----------
-    log : the file, folder or address; sha256 : that of its contents, of a remote log that of its address, size
-        and version, empty where it cannot be read
-    key : of its contents and all that decides about the result
+    log : the file, folder or address; identity : of its path, size and last change, empty where it cannot be read
+    key : of its identity and all that decides about the result
     out : the batch's directory
     arguments : for ``scanchain run``
     time_s, memory_mib : limits of its process
@@ -58,7 +57,7 @@ class Task(Struct, frozen=True):
     """
 
     log: str
-    sha256: str
+    identity: str
     key: str
     out: str
     arguments: tuple[str, ...]
@@ -81,14 +80,9 @@ class Task(Struct, frozen=True):
         """File of its row, beside the run directory."""
         return Path(self.out) / ROWS_FOLDER / f"{self.key}.json"
 
-    @property
-    def output_file(self) -> Path:
-        """Output of the last try."""
-        return output_file(Path(self.out), self.key)
-
 
 class Row(Struct, frozen=True):
-    """Result of a log; ``peak_mib`` and ``duration_s`` are those of the last try's process."""
+    """Result of a log; ``sha256`` from its run, ``peak_mib`` and ``duration_s`` of the last try's process."""
 
     log: str
     sha256: str
@@ -134,13 +128,13 @@ def finished_row(task: Task) -> Row | None:
 
 def unfinished_row(task: Task, state: State, reason: str) -> Row:
     """Row of a task that was not run."""
-    return Row(task.name, task.sha256, task.key, "", state, reason, 0, 0.0, 0.0, None)
+    return Row(task.name, "", task.key, "", state, reason, 0, 0.0, 0.0, None)
 
 
-def key_of(sha256: str, config_file: Path | None, overrides: Sequence[Override]) -> str:
-    """Hash of a log's contents, of the configuration in effect for it, and of the version that would run it."""
+def key_of(identity: str, config_file: Path | None, overrides: Sequence[Override]) -> str:
+    """Hash of a log's identity, of the configuration in effect for it, and of the version that would run it."""
     settings = [load_settings(d, file=config_file, overrides=overrides).config for d in (2, 3)]
-    parts = (package_version("scanchain"), sha256, *map(dump, settings))
+    parts = (package_version("scanchain"), identity, *map(dump, settings))
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
@@ -160,22 +154,26 @@ def attempt(task: Task, stop: Event | None = None) -> Row:
 
 def _tried(task: Task, stop: Event | None) -> Row:
     words = ["run", "--out", str(task.run), "--force", *task.arguments, "--", task.log]
-    task.output_file.parent.mkdir(parents=True, exist_ok=True)
+    output = output_file(Path(task.out), task.key)
+    output.parent.mkdir(parents=True, exist_ok=True)
     ending = run_within(
         Limits(task.time_s, task.memory_mib),
         "scanchain.processes",
         ["scanchain", *words],
         os.environ | dict.fromkeys(_THREADS, "1"),  # a process a core: threads would only get in each other's way
-        output=task.output_file,
+        output=output,
         interval_s=_LOOK_S,
         stop=stop,
     )
     state, reason = _verdict(task, ending)
     metrics = _metrics(task) if state.has_result else None
     run = task.run.name if metrics is not None else ""
-    return Row(
-        task.name, task.sha256, task.key, run, state, reason, 1, ending.duration_s, ending.peak_mib, metrics
-    )
+    sha256 = _sha256(task) if run else ""
+    return Row(task.name, sha256, task.key, run, state, reason, 1, ending.duration_s, ending.peak_mib, metrics)
+
+
+def _sha256(task: Task) -> str:
+    return msgspec.json.decode((task.run / RUN_FILE).read_bytes(), type=Provenance).logs[0].sha256
 
 
 def _metrics(task: Task) -> Metrics:
@@ -200,7 +198,7 @@ def _own_ending(ending: Ending, task: Task) -> tuple[State, str]:
     """End state and reason, from exit code and output."""
     if ending.code == 0:
         return State.DONE, ""
-    output = task.output_file.read_text(encoding="utf-8", errors="replace").splitlines()
+    output = output_file(Path(task.out), task.key).read_text(encoding="utf-8", errors="replace").splitlines()
     error = next((line for line in reversed(output) if line.startswith("error: ")), "")
     if ending.code == 1 and (task.run / "metrics.json").is_file():
         metrics = _metrics(task)

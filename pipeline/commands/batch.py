@@ -80,10 +80,10 @@ def batch(
     LOG is a file, folder or address that scanchain run takes, a folder of such logs, or a quoted glob pattern.
     Files of a folder that follow one another within a minute are the parts of one log. A log whose process
     crashes, hangs or runs out of memory becomes a row with the reason; the others finish, and the exit code is 1.
-    Called again, batch runs only the logs that have no result yet. A result belongs to the contents of the log (of
-    a remote one: its address, size and version) and the effective configuration. DIR gets a run directory per log,
-    batch.parquet with a row per log, report.html and summary.txt. Logs with different lidar topics need separate
-    calls, each with its --topic.
+    Called again, batch runs only the logs that have no result yet. A result belongs to the path, size and last
+    change of the log (of a remote one: its address, size and version) and the effective configuration. DIR gets a
+    run directory per log, batch.parquet with a row per log, report.html and summary.txt. Logs with different lidar
+    topics need separate calls, each with its --topic.
 
     \b
     Examples:

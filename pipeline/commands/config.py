@@ -65,8 +65,6 @@ def show(ctx: click.Context, config_file: Path | None, lidar: str | None, as_jso
         click.echo(json.dumps(rows, indent=2))
         return
     click.echo(f"# {settings.source}; * differs from the default")
-    for line in settings.without_effect:
-        click.echo(f"# {line}")
     cells = [
         (f"{'*' if values[k.name] != k.default else ' '} {k.name}", _text(values[k.name]), k.unit, k.range)
         for k in config_keys().values()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 import click
@@ -42,8 +42,6 @@ def doctor(ctx: click.Context, logs: tuple[Source, ...], as_json: bool) -> None:
         found = examine(
             logs, lambda dimension: load_settings(dimension, overrides=chosen).config, early.log, terminal.count
         )
-    idle = load_settings(found.dimension, overrides=chosen, idle=found.idle_keys).without_effect
-    found = replace(found, notes=(*found.notes, *idle))
     click.echo(json.dumps(asdict(found), indent=2) if as_json else _text(found))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
@@ -39,8 +39,6 @@ def info(ctx: click.Context, logs: tuple[Source, ...], as_json: bool) -> None:
 
     chosen = overrides(ctx)
     found = describe(logs, load_settings(overrides=chosen).config.log)
-    idle = load_settings(found.dimension or None, overrides=chosen, idle=found.idle_keys).without_effect
-    found = replace(found, notes=(*found.notes, *idle))
     click.echo(json.dumps(asdict(found), indent=2) if as_json else _text(found))
     if found.problem:
         ctx.exit(1)

@@ -89,7 +89,7 @@ def compare(comparison: Comparison, present: Callable[[Path], None], progress: P
     began = perf_counter()
     overrides = (*shared_settings(comparison.config_file), *comparison.overrides)
     log = open_log(comparison.logs, load_settings(overrides=overrides).config.log)
-    settings = load_settings(log.dimension, overrides=overrides, idle=log.idle_keys())
+    settings = load_settings(log.dimension, overrides=overrides)
     methods = resolve(
         comparison.methods or default_names(log.dimension),
         log.dimension,
@@ -97,8 +97,6 @@ def compare(comparison: Comparison, present: Callable[[Path], None], progress: P
         overrides=comparison.overrides,
         matcher=comparison.matcher,
     )
-    for line in settings.without_effect:
-        progress.announce(line)
     directory = RunDirectory(comparison.out, force=comparison.force)
     provenance = describe_start(comparison.command, comparison.logs, ", ".join(method.name for method in methods))
     with directory, Hashing(comparison.logs) as hashing:

@@ -39,8 +39,7 @@ class LogInfo:
     ``sensors`` are those beside lidar and wheels.
     ``lidar`` is empty where a run could not choose a topic, for the reason in ``problem``. Meters, radians,
     nanoseconds; ``T_base_lidar`` row by row, the first one where the lidar moves (``mount_motion``);
-    ``base_frame`` is empty where the log does not state it. ``idle_keys`` are the settings that have no effect on
-    it, and why.
+    ``base_frame`` is empty where the log does not state it.
     """
 
     files: tuple[str, ...]
@@ -57,7 +56,6 @@ class LogInfo:
     T_base_lidar: tuple[tuple[float, ...], ...]
     base_frame: str
     mount_motion: str
-    idle_keys: dict[str, str]
     notes: tuple[str, ...]
     damage: tuple[str, ...]
     problem: str
@@ -85,7 +83,6 @@ def describe(sources: Sequence[Source], config: LogConfig | None = None) -> LogI
         T_base_lidar=() if log is None else tuple(tuple(row) for row in log.T_base_lidar.tolist()),
         base_frame="" if log is None else log.mounting.base,
         mount_motion="" if log is None or log.mounting.motion is None else str(log.mounting.motion),
-        idle_keys={} if log is None else log.idle_keys(),
         notes=tuple(notes if log is None else log.notes),
         damage=tuple(grouped(line for index in indexes for line in index.damage)),
         problem=problem,

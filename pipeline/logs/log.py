@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Generator, Iterator, Sequence
-from itertools import islice
-from pathlib import Path
 
 import numpy as np
 from msgspec.structs import replace
@@ -42,7 +40,7 @@ from scanchain.logs.mounting import (
     joint_topics,
     leaves_plane,
 )
-from scanchain.logs.opening import HAS_STAMPS, index_files
+from scanchain.logs.opening import index_files
 from scanchain.logs.recorded_poses import PosesAtScan, RecordedPoses
 from scanchain.logs.topics import files_with_scans, find_ground_truth, find_lidar, find_odometry
 from scanchain.settings import load_settings, overrides_of
@@ -52,8 +50,6 @@ from scanchain.words import counted, grouped
 _DEFAULTS = LogConfig()
 _HOLD_NS = 500_000_000  # log time that a scan waits for the wheel reading behind it
 _HOLD_SCANS = 32
-_POINT_TIME_KEYS = ("log.point_times", "log.revolution_s", "log.revolution_start_rad")
-_WHEEL_KEYS = ("odometry.prior", "odometry.wheel_sigma_m", "odometry.wheel_sigma_rad")
 
 
 def open_log(
@@ -170,30 +166,6 @@ class Log:
     def has_odometry(self) -> bool:
         """True if scans carry the wheels' pose."""
         return self.odometry_topic != ""
-
-    def idle_keys(self) -> dict[str, str]:
-        """Settings without an effect on this log, with the reason."""
-        idle: dict[str, str] = {}
-        if not self._has_point_times():
-            idle |= dict.fromkeys(
-                ("log.point_times", "preprocess.deskew"), "the scans have no times of their points"
-            )
-        if is_scan(self.lidar):
-            idle |= dict.fromkeys(_POINT_TIME_KEYS, "a laser scan states the times of its beams")
-        if not any(index.takes_rate for index in self.indexes):
-            idle["log.rate_hz"] = HAS_STAMPS
-        if not self.has_odometry:
-            idle |= dict.fromkeys(_WHEEL_KEYS, "the log has no wheel odometry that is used")
-        return idle
-
-    def _has_point_times(self) -> bool:
-        """True if the first scan has per-point times; assumed of a laser scan of a remote log."""
-        if not is_scan(self.lidar):
-            return self._sampled_times.are_found
-        if not all(isinstance(path, Path) for path in self.paths):
-            return True
-        returns = first_messages(self.indexes, self.topic, self.decoder(self._sampled_times).decode)
-        return any(len(each.times_s) > 0 for each in islice((each for each in returns if len(each.points)), 1))
 
     def scans(self, preprocess: PreprocessConfig | None = None) -> Generator[Scan, None, None]:
         """Scans in the order of log time, each with the wheels' pose at its stamp.

@@ -59,7 +59,6 @@ FORMATS: dict[str, LogFormat] = {  # the first that claims a path reads it
     "clouds": LogFormat("a folder of PCD, PLY, .npy or .bin files", claims_clouds, index_clouds, takes_rate=True),
 }
 AUTO = "auto"  # value of log.format: the format that claims the path
-HAS_STAMPS = "the log has its own stamps, it is no folder of clouds"  # why log.rate_hz has no effect
 
 _RUN_FILE = "run.json"
 _PART_SUFFIXES = (".mcap", ".bag", ".db3")

@@ -35,7 +35,7 @@ def judge_trajectory(file: Path, logs: Sequence[Source], overrides: Sequence[Ove
     """
     poses = read_tum(file)
     log = open_log(logs, load_settings(overrides=overrides).config.log)
-    config = load_settings(log.dimension, overrides=overrides, idle=log.idle_keys()).config
+    config = load_settings(log.dimension, overrides=overrides).config
     stamps_ns, log_times_ns, points, wheels = _table(log, config)
     placeholders = np.tile(np.eye(4), (len(stamps_ns), 1, 1))
     pairs = pair(Trajectory(stamps_ns, placeholders), poses)

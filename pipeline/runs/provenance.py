@@ -133,15 +133,17 @@ def sha256_of(path: Path, cancelled: threading.Event | None = None) -> str:
 
 
 def identity_of(source: Source) -> str:
-    """SHA-256 of a file or folder, of a remote file of its address, size and version; empty where unreadable."""
-    if isinstance(source, Path):
-        return sha256_of(source)
+    """Hash of the path, of size and last change of each file, remote ones' version; empty where unreadable."""
     try:
-        file = RemoteFile(source)
-    except InputError:
+        if isinstance(source, Path):
+            files = [(file, file.stat()) for file in files_of(source.resolve(strict=True))]
+            parts = [str(source.resolve()), *(f"{file} {each.st_size} {each.st_mtime_ns}" for file, each in files)]
+        else:
+            remote = RemoteFile(source)
+            parts = [str(source) if remote.version else source.url, str(remote.size), remote.version]
+    except (OSError, InputError):
         return ""
-    address = str(source) if file.version else source.url
-    return hashlib.sha256(f"{address}\0{file.size}\0{file.version}".encode()).hexdigest()
+    return hashlib.sha256(os.fsencode("\0".join(parts))).hexdigest()
 
 
 def package_version(package: str) -> str:

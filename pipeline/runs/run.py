@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.clock import announcing_compilation, compiled_s, working_s
-from scanchain.config import NO_TRUTH, Config, RecordingConfig
+from scanchain.config import NO_TRUTH, Config
 from scanchain.data import Trajectory, brief
 from scanchain.errors import InputError
 from scanchain.evaluation import TruthFile, check_overlap, during, read_truth
@@ -52,7 +52,6 @@ from scanchain.trajectory import write_tum
 from scanchain.whole_file import write_whole
 from scanchain.words import counted
 
-_RECORDING_KEYS = RecordingConfig.__struct_fields__
 _FEW_SCANS = 2  # scans whose trajectory shows at most one motion
 _FOR_RESUMING = (JOURNAL_FILE, CHECKPOINT_FILE, POINTS_FILE)
 
@@ -122,7 +121,7 @@ def _run(
                 source = str(job.ground_truth or log.ground_truth_topic)
                 truth, note = accuracy_of(poses, source, job.max_gap_s, done.result, folder)
                 few = _few_scans(len(steps))
-                warnings = (*log.damage, *log.copies, *settings.without_effect, *done.warnings, *few, *note)
+                warnings = (*log.damage, *log.copies, *done.warnings, *few, *note)
                 metrics = measure(
                     steps, done.result, done.cloud, done.final, done.judged, done.expected,
                     run_s=run_s, compile_s=compile_s, ground_truth=truth, warnings=warnings, stopped=stopped,
@@ -149,9 +148,7 @@ def opened(job: Job) -> tuple[Log, Settings, TruthFile | None]:
     early = load_settings(file=job.config_file, overrides=job.overrides)
     RunDirectory(job.out, force=job.force)  # refused before the log is read
     log = open_log(job.logs, early.config.log)
-    settings = load_settings(
-        log.dimension, file=job.config_file, overrides=job.overrides, idle=_idle_keys(job, log)
-    )
+    settings = load_settings(log.dimension, file=job.config_file, overrides=job.overrides)
     _check_truth(job, log, truth_file)
     return log, settings, truth_file
 
@@ -172,13 +169,6 @@ def _tell_beginning(job: Job, left: Left | None, progress: Progress) -> None:
 def _draw(progress: Progress, report: Callable[[Path], None], folder: Path) -> None:
     progress.say("drawing the report")
     report(folder)
-
-
-def _idle_keys(job: Job, log: Log) -> dict[str, str]:
-    """Keys without an effect on this job, with the reason."""
-    recording = {} if job.sinks else {f"recording.{name}": "no recording is made" for name in _RECORDING_KEYS}
-    truth = {} if job.ground_truth is None else {"log.ground_truth_topic": "--gt names a file"}
-    return log.idle_keys() | recording | truth
 
 
 def _check_prior(log: Log, config: Config) -> None:

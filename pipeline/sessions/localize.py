@@ -147,7 +147,7 @@ def localize(
         found = localizer.finish()
         count = counted(len(found.states), "scan")
         stopped = (f"stopped by the user after {count}",) if progress.stopped else ()
-        warnings = (*stopped, *log.damage, *log.copies, *localizer.warnings, *settings.without_effect)
+        warnings = (*stopped, *log.damage, *log.copies, *localizer.warnings)
         metrics = measure(found, prior, settings.config, working_s() - started, warnings)
         progress.say("writing the results")
         with directory.results() as folder:

@@ -576,55 +576,11 @@ def test_the_short_flags_stand_for_keys(call, tmp_path, office):
     assert config(tmp_path / "a") == flatten(configured(2)) | expected
 
 
-def test_a_setting_that_cannot_apply_to_the_log_is_told_and_not_listed_as_in_force(call, tmp_path, office):
-    words = ["--log.point_times", "clockwise", "--log.rate_hz=5", "--recording.local_map_every", "5"]
-    code, output, errors = call("run", office, "--rerun", "off", "--out", tmp_path / "a", *words)
-    assert code == 0
-    (line,) = [line for line in output.splitlines() if line.startswith("configuration")]
-    assert line.endswith("preset lidar2d of 2D logs")
-    for said, why in (
-        ("point_times clockwise", "laser scan"),
-        ("rate_hz 5", "stamps"),
-        ("every 5", "no recording"),
-    ):
-        (warning,) = [line for line in errors.splitlines() if said in line]
-        says(warning, "has no effect", why)
-    _, output, _ = call("doctor", office, "--log.point_times", "clockwise")
-    says(output, "--log.point_times clockwise has no effect")
-
-
-@pytest.mark.parametrize("command", ["info", "doctor"])
-def test_flags_about_times_or_wheels_that_a_log_of_clouds_lacks_are_told(call, tmp_path, command):
-    points = np.zeros(400, [(axis, "<f4") for axis in "xyz"])
-    for axis in "xyz":
-        points[axis] = np.random.default_rng(ord(axis)).uniform(-9.0, 9.0, 400)
-    times = [STAMP_NS + k * SECOND // 10 for k in range(5)]
-    path = write(tmp_path / "a.mcap", [cloud_said(time, point_cloud(time, points)) for time in times])
-    flags = {
-        "--log.point_times ns": "the scans have no times of their points",
-        "--preprocess.deskew false": "the scans have no times of their points",
-        "--odometry.prior constant-velocity": "the log has no wheel odometry",
-        "--log.rate_hz 5": "the log has its own stamps",
-    }
-    code, output, _ = call(command, path, *" ".join(flags).split())
-    assert code == 0
-    for words, why in flags.items():
-        says(output, f"{words} has no effect: {why}")
-    assert "no effect" not in call(command, path, "--log.point_times", "clockwise")[1]
-
-
 def test_a_run_killed_before_its_first_checkpoint_is_named_when_it_starts_over(call, tmp_path, office):
     (tmp_path / "a.partial-1").mkdir()
     code, _, errors = call("run", office, "--rerun", "off", "--out", tmp_path / "a", "--resume")
     assert code == 0
     says(errors, "a.partial-1: no checkpoint to resume from, this run starts over")
-
-
-def test_leaving_out_point_times_that_a_log_has_is_an_effect(call, tmp_path):
-    call("simulate", "town", tmp_path / "town.mcap", "--duration", "0.5", "--sensor", "vlp-16")
-    code, output, _ = call("info", tmp_path / "town.mcap", "--log.point_times", "none")
-    assert code == 0
-    assert "no effect" not in output
 
 
 def test_the_heading_says_whether_the_wheels_are_used(call, tmp_path, office):

@@ -2,33 +2,83 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
+from itertools import groupby
 
-from scanchain.config import Config, LogConfig
-from scanchain.logs.doctor.checks_scans import check_scans
-from scanchain.logs.doctor.checks_time import check_time
-from scanchain.logs.doctor.finding import Finding, Severity
-from scanchain.logs.doctor.statistics import survey
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain.config import Config, LogConfig, PreprocessConfig
+from scanchain.data import MOST_COPIES
+from scanchain.logs.bad_scans import are_millimeters, most_bad_scans
+from scanchain.logs.doctor.statistics import Survey, survey
 from scanchain.logs.log import open_log
+from scanchain.logs.messages.point_times import UNITS_S
+from scanchain.logs.messages.readers import is_scan
 from scanchain.source import Source
+from scanchain.words import counted
 
-_ORDER = tuple(reversed(Severity))
+_GAP_PERIODS = 2.5
+_MOST_MISSING = 10  # largest number of scans missing in a row at which they are counted
+_JITTER = 0.1  # jitter, as a share of the period, from which on scans come as they please
+_BURST = 0.05  # share of the period within which a scan follows the one before in a burst
+_LONG_GAP_S, _LONG_GAP_ON_WHEELS_S = 0.5, 10.0
+_OTHER_CLOCK_S = 1.0
+_LATE_S = 0.2
+_PART_OF_SCAN, _MORE_THAN_SCAN = 0.3, 1.2  # shares of the period outside which a unit of time is implausible
+_SPINS_AT_S = (0.04, 0.25)
+_SURE = 0.9  # least share of the scans that turn alike, and least agreement of their starts
+_FASTEST_M_S = 100.0  # speed by the wheels above which their unit is another
+_LEAST_STEP_M = 1e-3  # length of a step between two readings from which on the wheels turn
+_NEAR_NS = 500_000_000  # largest distance from a scan's stamp of a wheel reading that a run uses
+_MANY_LOST = 0.5
+_MANY_UNUSED = 0.3  # share of unused returns, from which on a wider range is recommended
+_SOME_BELOW = 0.05  # share of beams below range_min that is reported
+_STUCK_SHARE = 0.01  # share of beams at one farthest range that is reported
+_FEW_POINTS = 50
+
+
+class Severity(StrEnum):
+    """Severity of a finding for a run."""
+
+    OK = "ok"
+    NOTE = "note"
+    WARNING = "warning"
+    PROBLEM = "problem"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Result of one check.
+
+    Attributes
+    ----------
+    check : what was looked at, one word or two
+    found : what was measured, with units
+    effect : what it does to the result, empty where it does nothing
+    remedy : flags of ``scanchain run`` that help, as they are typed and nothing else; empty where none does
+    """
+
+    check: str
+    severity: Severity
+    found: str
+    effect: str = ""
+    remedy: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """The findings about a log, the gravest first.
-
-    ``notes`` are what opening it assumed, ``idle_keys`` the settings that have no effect on it, and why.
-    """
+    """The findings about a log, the gravest first; ``notes`` are what opening it assumed."""
 
     files: tuple[str, ...]
     topic: str
     dimension: int
     findings: tuple[Finding, ...]
     notes: tuple[str, ...]
-    idle_keys: dict[str, str]
 
 
 def examine(
@@ -44,7 +94,302 @@ def examine(
     log = open_log(sources, log_config)
     notes = tuple(log.notes)
     seen = survey(log, progress)
-    config = config_of(log.dimension)
-    findings = [*check_time(seen, config), *check_scans(seen, config.preprocess)]
-    ordered = sorted(findings, key=lambda finding: _ORDER.index(finding.severity))
-    return Diagnosis(tuple(map(str, log.paths)), log.topic, log.dimension, tuple(ordered), notes, log.idle_keys())
+    found = list(_check(seen, config_of(log.dimension)))
+    ordered = tuple(finding for grade in reversed(Severity) for finding in found if finding.severity is grade)
+    return Diagnosis(tuple(map(str, log.paths)), log.topic, log.dimension, ordered, notes)
+
+
+def _check(seen: Survey, config: Config) -> Iterator[Finding]:
+    """Every finding about a log. ``config`` is what a run of it would use."""
+    yield _gaps(seen, bool(seen.wheels) and config.odometry.prior != "constant-velocity")
+    yield from _bursts(seen)
+    yield _order(seen)
+    yield _clock(seen)
+    yield _wheels(seen)
+    if not is_scan(seen.log.lidar):
+        yield _point_times(seen)
+    yield _damage(seen, config.preprocess)
+    yield from _frames(seen)
+    yield _returns(seen)
+    yield _no_return(seen)
+    yield _ranges(seen, config.preprocess)
+    yield _duplicates(seen)
+
+
+def _bursts(seen: Survey) -> Iterator[Finding]:
+    """A finding where scans follow each other faster than the lidar takes them."""
+    steps_s = np.diff(seen.stamps_ns) * 1e-9
+    soon = np.flatnonzero((steps_s > 0.0) & (steps_s < _BURST * seen.period_s))
+    if len(soon):
+        found = f"{len(soon):,} within {1e3 * steps_s[soon].max():.2g} ms of the one before (scan {soon[0] + 1:,})"
+        effect = "a burst shows no velocity: a run takes the usual interval for it"
+        yield Finding("bursts", Severity.NOTE, found, effect)
+
+
+def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:
+    steps_s = np.diff(seen.log_ns) * 1e-9
+    gaps = np.flatnonzero(steps_s > _GAP_PERIODS * seen.period_s) if seen.period_s else np.empty(0, np.int64)
+    missing = _missing(seen)
+    absent = f"; {counted(missing, 'scan')} missing in all" if missing else ""
+    if not len(gaps):
+        found = f"none longer than {_GAP_PERIODS:g} periods{absent}"
+        if not missing:
+            return Finding("gaps", Severity.OK, found)
+        return Finding("gaps", Severity.NOTE, found, "after a missing scan the prediction is off by one motion")
+    longest = gaps[np.argmax(steps_s[gaps])]
+    at_s = seen.into_log_s(int(seen.log_ns[longest]))
+    found = (
+        f"{len(gaps):,} longer than {_GAP_PERIODS:g} periods, the longest {steps_s[longest]:.3g} s, "
+        f"{at_s:.1f} s into the log{absent}"
+    )
+    predicted = f"the motion over a gap is predicted {'by the wheels' if is_on_wheels else 'at constant velocity'}"
+    if steps_s[longest] < (_LONG_GAP_ON_WHEELS_S if is_on_wheels else _LONG_GAP_S):
+        return Finding("gaps", Severity.NOTE, found, predicted)
+    until_s, again_s = math.ceil(10.0 * at_s) / 10.0, math.floor(10.0 * (at_s + steps_s[longest])) / 10.0
+    effect = (
+        f"{predicted}; after a long one the match may settle elsewhere: run what comes before it, as below, and "
+        f"the rest, --start {again_s:g}, apart"
+    )
+    return Finding("gaps", Severity.WARNING, found, effect, f"--end {until_s:g}")
+
+
+def _missing(seen: Survey) -> int:
+    """Number of missing scans, by the periods between stamps; 0 of scans that come as they please.
+
+    Stamps that step back, repeat or jump are left out.
+    """
+    steps_s = np.diff(seen.stamps_ns) * 1e-9
+    steps_s = steps_s[(steps_s > 0.0) & (steps_s < (_MOST_MISSING + 1.5) * seen.period_s)]
+    periods = np.maximum(np.rint(steps_s / seen.period_s), 1.0) if len(steps_s) else steps_s
+    is_even = len(steps_s) > 0 and float(np.std(steps_s - periods * seen.period_s)) < _JITTER * seen.period_s
+    return int((periods - 1).sum()) if is_even else 0
+
+
+def _order(seen: Survey) -> Finding:
+    steps_ns = np.diff(seen.stamps_ns)
+    backwards, repeated = int(np.count_nonzero(steps_ns < 0)), int(np.count_nonzero(steps_ns == 0))
+    if not backwards and not repeated:
+        return Finding("stamp order", Severity.OK, "header stamps rise from scan to scan")
+    found = f"{counted(backwards, 'step')} back in the header stamps, {repeated:,} repeated"
+    effect = "scans are taken in the order of log time; poses in the results hold at stamps that are not in order"
+    if repeated < len(steps_ns):
+        return Finding("stamp order", Severity.WARNING, found, effect)
+    effect += "; record with stamps: the driver left them out"
+    return Finding("stamp order", Severity.PROBLEM, found, effect)
+
+
+def _clock(seen: Survey) -> Finding:
+    """Header stamp against log time."""
+    late_s = (seen.log_ns - seen.stamps_ns) * 1e-9
+    least, median, most = (float(value) for value in np.percentile(late_s, [0.0, 50.0, 100.0]))
+    found = f"logged {median:.4g} s after the header stamp (from {least:.4g} to {most:.4g} s)"
+    if abs(median) > _OTHER_CLOCK_S:
+        effect = (
+            "header stamps are of another clock than log times: --start and --end count by log time, results by "
+        )
+        effect += "header stamps, and wheels or ground truth of the recorder's clock do not meet the scans"
+        return Finding("clock", Severity.WARNING, found, effect)
+    if most - least > _LATE_S:
+        effect = "some scans were recorded late; results hold at header stamps and do not suffer"
+        return Finding("clock", Severity.NOTE, found, effect)
+    return Finding("clock", Severity.OK, found)
+
+
+def _wheels(seen: Survey) -> Finding:
+    if not seen.log.odometry_topic:
+        effect = "the motion is predicted from the scans alone"
+        return Finding("wheels", Severity.OK, "no wheel odometry", effect)
+    stamps_ns = np.sort(np.array([pose.stamp_ns for pose in seen.wheels], np.int64))
+    topic = seen.log.odometry_topic
+    if not len(stamps_ns):
+        return Finding("wheels", Severity.WARNING, f"{topic} has no readable pose", "it is as if there were none")
+    after = np.searchsorted(stamps_ns, seen.stamps_ns)
+    before_ns = np.abs(seen.stamps_ns - stamps_ns[np.maximum(after - 1, 0)])
+    after_ns = np.abs(stamps_ns[np.minimum(after, len(stamps_ns) - 1)] - seen.stamps_ns)
+    scans = counted(len(seen.scans), "scan")
+    missed = int(np.count_nonzero(np.minimum(before_ns, after_ns) > _NEAR_NS))
+    found = f"{topic}: {counted(len(stamps_ns), 'reading')}, {missed} of {scans} without one within 0.5 s"
+    if (speed_m_s := _wheel_speed_m_s(seen)) > _FASTEST_M_S:
+        found += f"; by them the robot moves at {speed_m_s:.3g} m/s"
+        effect = "no vehicle does: millimeters, or jumps? Scans are predicted where the robot never was"
+        return Finding("wheels", Severity.PROBLEM, found, effect, "--odometry.prior constant-velocity")
+    if missed:
+        return Finding("wheels", Severity.WARNING, found, "the motion of those is predicted from the scans alone")
+    if unmounted := next((line for line in seen.log.notes if line.startswith("no static transform")), ""):
+        effect = "the wheels' turns are taken about the lidar instead of the robot; record /tf_static"
+        return Finding(
+            "wheels", Severity.WARNING, f"{found}; {unmounted}", effect, "--odometry.prior constant-velocity"
+        )
+    return Finding("wheels", Severity.OK, found)
+
+
+def _wheel_speed_m_s(seen: Survey) -> float:
+    """Median speed by the wheels while they turn; 0 where they stand still."""
+    stamps_ns, order = np.unique([pose.stamp_ns for pose in seen.wheels], return_index=True)
+    positions = np.array([seen.wheels[k].T_parent_child[:-1, -1] for k in order])
+    steps_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    moving = steps_m > _LEAST_STEP_M
+    return float(np.median(steps_m[moving] / (1e-9 * np.diff(stamps_ns)[moving]))) if moving.any() else 0.0
+
+
+def _point_times(seen: Survey) -> Finding:
+    spans_s = np.array([scan.time_span_s for scan in seen.scans])
+    spans_s = spans_s[np.isfinite(spans_s)]
+    if not len(spans_s):
+        effect = "scans are not freed of the lidar's own motion, which bends them unless the driver did it"
+        return Finding("point times", Severity.NOTE, "none", effect, _by_azimuth(seen))
+    span_s = float(np.median(spans_s))
+    found = f"{seen.point_times.removeprefix('point times: ')}; a scan lasts {1e3 * span_s:.4g} ms"
+    part = span_s / seen.period_s if seen.period_s else 1.0
+    if _PART_OF_SCAN < part < _MORE_THAN_SCAN:
+        return Finding("point times", Severity.OK, found)
+    found += f", {part:.2g} of the period"
+    effect = "if that is the wrong unit, deskewing bends every scan instead of straightening it"
+    return Finding("point times", Severity.WARNING, found, effect, _other_unit(seen, part))
+
+
+def _by_azimuth(seen: Survey) -> str:
+    """Flags for a spinning lidar's times by azimuth, where the order of its points shows how it turns."""
+    turns = np.array([scan.turn for scan in seen.scans])
+    sense = int(np.sign(turns.sum()))
+    start = complex(np.mean(np.exp(1j * np.array([scan.start_rad for scan in seen.scans])[turns == sense])))
+    if not sense or np.mean(turns == sense) < _SURE or abs(start) < _SURE:
+        return ""
+    low_s, high_s = _SPINS_AT_S
+    revolution_s = f"{seen.period_s:.3g}" if low_s < seen.period_s < high_s else "0.1"
+    direction = "counterclockwise" if sense > 0 else "clockwise"
+    start_rad = f"{np.angle(start) % (2.0 * np.pi):.3g}"
+    return (
+        f"--log.point_times {direction} --log.revolution_s {revolution_s} --log.revolution_start_rad {start_rad}"
+    )
+
+
+def _other_unit(seen: Survey, part: float) -> str:
+    """The flag for the unit in which scans last about a period; where none fits times too long, that for none.
+
+    part : of the period that scans last in the unit that was taken
+    """
+    taken = next((unit for unit in UNITS_S if f"taken as {unit} " in seen.point_times), "")
+    if not taken:
+        return ""
+    for unit, unit_s in UNITS_S.items():
+        if unit != taken and _PART_OF_SCAN < part * unit_s / UNITS_S[taken] < _MORE_THAN_SCAN:
+            return f"--log.point_times {unit}"
+    return "--log.point_times none" if part > _MORE_THAN_SCAN else ""
+
+
+def _damage(seen: Survey, preprocess: PreprocessConfig) -> Finding:
+    empty = sum(scan.kept == 0 for scan in seen.scans)
+    low_m, high_m = preprocess.min_range_m, preprocess.max_range_m
+    outside = sum(bool(scan.ranges_m[0] > high_m or scan.ranges_m[-1] < low_m) for scan in seen.scans)
+    bad = len(seen.malformed) + empty + outside
+    lines = list(seen.damage)
+    if seen.malformed:
+        lines.append(f"{counted(len(seen.malformed), 'malformed scan')} (the first: {seen.malformed[0]})")
+    if empty:
+        lines.append(f"{counted(empty, 'scan')} without a valid point")
+    if outside:
+        limits = f"preprocess.min_range_m ({low_m:g}) and preprocess.max_range_m ({high_m:g})"
+        lines.append(f"{counted(outside, 'scan')} without a point between {limits}")
+    if not lines:
+        return Finding("damage", Severity.OK, f"{counted(len(seen.scans), 'scan')}, all readable and with points")
+    messages = len(seen.scans) + len(seen.malformed)
+    if bad > most_bad_scans(messages, seen.log.config):
+        effect = "a run stops: these are more bad scans than log.max_bad_scans_percent allows"
+        remedy = f"--log.max_bad_scans_percent {math.ceil(100 * bad / messages)}" if bad < messages else ""
+        return Finding("damage", Severity.PROBLEM, "; ".join(lines), effect, remedy)
+    effect = "what was damaged is left out, the rest is used"
+    return Finding("damage", Severity.WARNING, "; ".join(lines), effect)
+
+
+def _frames(seen: Survey) -> Iterator[Finding]:
+    frames = sorted({scan.frame for scan in seen.scans})
+    if len(frames) > 1:
+        effect = "only the first frame's mounting is used; scans of the others are taken to sit there, too"
+        yield Finding("frames", Severity.PROBLEM, f"scans in several frames: {', '.join(frames)}", effect)
+
+
+def _returns(seen: Survey) -> Finding:
+    undefined, zero = seen.share(lambda scan: scan.undefined), seen.share(lambda scan: scan.zero)
+    below = seen.share(lambda scan: scan.below)
+    kept = np.array([scan.kept for scan in seen.scans])
+    found = f"{100 * undefined:.2g} % NaN or infinite, {100 * zero:.2g} % zero, "
+    if below:
+        least_m = np.median([scan.limits_m[0] for scan in seen.scans])
+        found += f"{100 * below:.2g} % below range_min ({least_m:.3g} m), "
+    found += f"{int(np.median(kept)):,} valid a scan (median)"
+    poor = kept < _FEW_POINTS
+    if few := int(np.count_nonzero(poor)):
+        effect = f"{counted(few, 'scan')} with fewer than {_FEW_POINTS} returns: matches are weak there, or lost"
+        return Finding("returns", Severity.WARNING, found, effect, _without_ends(seen, poor))
+    if undefined + zero + below > _MANY_LOST:
+        return Finding("returns", Severity.NOTE, found, "they are left out; what is left may determine too little")
+    if below > _SOME_BELOW:
+        effect = "what lies below range_min is not used: the sensor's own limit"
+        return Finding("returns", Severity.NOTE, found, effect)
+    return Finding("returns", Severity.OK, found)
+
+
+def _without_ends(seen: Survey, poor: NDArray[np.bool_]) -> str:
+    """The flags that leave out scans at the start and at the end, where these are the poor ones and no others."""
+    good = np.flatnonzero(~poor)
+    if not len(good) or poor[good[0] : good[-1] + 1].any():
+        return ""
+    start_s, end_s = (seen.into_log_s(int(seen.log_ns[place])) for place in (good[0], good[-1]))
+    flags = [f"--start {math.floor(1e3 * start_s) / 1e3:g}"] if poor[0] else []
+    return " ".join([*flags, *([f"--end {math.ceil(1e3 * end_s) / 1e3:g}"] if poor[-1] else [])])
+
+
+def _no_return(seen: Survey) -> Finding:
+    """Finding on beams that all have one farthest range, as of scanners that write a number for no return."""
+    values = Counter(scan.farthest_m for scan in seen.scans if np.isfinite(scan.farthest_m))
+    farthest_m = max(values, default=0.0)
+    below_m = np.floor(1e3 * farthest_m) / 1e3  # the flag must lie below the stated range, to the last bit
+    stuck = sum(scan.at_farthest for scan in seen.scans if scan.farthest_m == farthest_m)
+    share = stuck / max(sum(scan.beams for scan in seen.scans), 1)
+    stated_m = min((scan.limits_m[1] for scan in seen.scans), default=float("inf"))
+    limit_m = min(stated_m, seen.log.config.max_range_m)
+    if share < _STUCK_SHARE:
+        return Finding("no return", Severity.OK, "no range is so frequent that it must mean no return")
+    found = f"{100 * share:.2g} % of the beams have exactly {farthest_m:.6g} m, the farthest there is"
+    if farthest_m >= limit_m:
+        return Finding("no return", Severity.OK, f"{found}; range limits take it out")
+    effect = "if it stands for no return, it is taken for a wall that moves along"
+    return Finding("no return", Severity.WARNING, found, effect, f"--log.max_range_m {below_m:g}")
+
+
+def _ranges(seen: Survey, preprocess: PreprocessConfig) -> Finding:
+    ranges_m = np.array([scan.ranges_m for scan in seen.scans if scan.kept], np.float64)
+    near_m, far_m = np.median(ranges_m[:, [1, 99]], axis=0).tolist() if len(ranges_m) else (np.nan, np.nan)
+    found = f"98 % of the returns lie between {near_m:.3g} and {far_m:.4g} m (medians)"
+    low_m, high_m = preprocess.min_range_m, preprocess.max_range_m
+    if far_m > high_m:
+        unused = float(np.mean(ranges_m > high_m))
+        effect = f"{100 * unused:.3g} % lie beyond {high_m:g} m and are not used"
+        if are_millimeters(float(np.median(ranges_m)), preprocess):
+            return Finding("ranges", Severity.PROBLEM, found, f"{effect}: millimeters? convert them to meters")
+        remedy = f"--preprocess.max_range_m {np.ceil(far_m):g}" if unused > _MANY_UNUSED else ""
+        return Finding("ranges", Severity.NOTE, found, effect, remedy)
+    if near_m < low_m:
+        unused = float(np.mean(ranges_m < low_m))
+        effect = f"{100 * unused:.3g} % lie nearer than {low_m:g} m and are not used (right for the robot itself)"
+        remedy = f"--preprocess.min_range_m {0.9 * near_m:.2g}" if unused > _MANY_UNUSED else ""
+        return Finding("ranges", Severity.NOTE, found, effect, remedy)
+    return Finding("ranges", Severity.OK, found)
+
+
+def _duplicates(seen: Survey) -> Finding:
+    digests = [scan.digest for scan in seen.scans]
+    runs = [len(list(copies)) for _, copies in groupby(digests)]
+    same = len(digests) - len(runs)
+    if not same:
+        return Finding("duplicates", Severity.OK, "no scan is the one before once more")
+    found = f"{same} of {len(digests):,} scans are the one before once more, to the last bit"
+    if max(runs) > MOST_COPIES:
+        found += f", {max(runs):,} of them in a row"
+        effect = "the driver was stuck, or a simulation without noise at rest: the trajectory stands still there"
+        return Finding("duplicates", Severity.WARNING, found, effect)
+    effect = "a copy looks like a stop: the prediction at constant velocity stands still, then has to catch up"
+    every = round(len(digests) / (len(digests) - same))
+    remedy = f"--every {every}" if every > 1 else ""
+    return Finding("duplicates", Severity.WARNING, found, effect, remedy)

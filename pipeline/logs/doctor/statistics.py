@@ -97,16 +97,14 @@ def survey(log: Log, progress: Callable[[int, int], None] | None = None) -> Surv
     if not scans:
         reasons = "; ".join([*malformed[:1], *grouped(damage)]) or "the chosen part is empty"
         raise InputError(f"{log.name}: no scan of {log.topic} could be read: {reasons}")
-    stamps_ns = np.array([scan.stamp_ns for scan in scans], np.int64)
-    assumed = "" if is_scan(log.lidar) else times.assumed
     return Survey(
         log=log,
         scans=tuple(scans),
         log_ns=np.array(log_ns, np.int64),
-        stamps_ns=stamps_ns,
+        stamps_ns=np.array([scan.stamp_ns for scan in scans], np.int64),
         wheels=tuple(wheels),
         malformed=tuple(malformed),
-        point_times=assumed,
+        point_times="" if is_scan(log.lidar) else times.assumed,
         damage=tuple(grouped(damage)),
     )
 
@@ -159,12 +157,11 @@ def _of_scan(decoder: LaserScanDecoder, message: LaserScanMessage) -> ScanFacts:
 
 
 def _of_cloud(decoder: PointCloudDecoder, message: PointCloudMessage) -> ScanFacts:
-    returns = decoder.returns(message)
     x, y, z = (np.asarray(column(message, name), np.float32) for name in "xyz")
     with np.errstate(over="ignore", invalid="ignore"):
         ranges_m = np.sqrt(x * x + y * y + z * z)
     limits_m = (decoder.limits.min_m, float("inf"))
-    return _facts(returns, message.frame, ranges_m, limits_m, zlib.crc32(message.data))
+    return _facts(decoder.returns(message), message.frame, ranges_m, limits_m, zlib.crc32(message.data))
 
 
 def _facts(

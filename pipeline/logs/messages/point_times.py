@@ -32,11 +32,6 @@ class PointTimes:
         self.by_azimuth = config.point_times in ("clockwise", "counterclockwise")
         self.assumed = _NONE
 
-    @property
-    def are_found(self) -> bool:
-        """True once a scan had times."""
-        return self.assumed != _NONE
-
     def wants(self, field: str) -> bool:
         """True if times are taken from a field of this name."""
         return field in NAMES and not self.by_azimuth and self.config.point_times != "none"

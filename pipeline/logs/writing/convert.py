@@ -19,7 +19,7 @@ from scanchain.logs.mcap.selection import (
     whole_span,
 )
 from scanchain.logs.mcap.stream import Decoded, decoded_messages
-from scanchain.logs.opening import AUTO, HAS_STAMPS, index_files
+from scanchain.logs.opening import AUTO, index_files
 from scanchain.logs.topics import find_lidar, is_lidar, topics_of
 from scanchain.logs.writing.writer import LogWriter
 from scanchain.source import Source
@@ -82,7 +82,7 @@ def convert(
             )
     notes = (*(line for index in indexes for line in index.notes), *notes_on(indexes, config))
     if config.rate_hz and not any(index.takes_rate for index in indexes):
-        notes += (f"log.rate_hz {config.rate_hz:g} has no effect: {HAS_STAMPS}",)
+        notes += (f"log.rate_hz {config.rate_hz:g} has no effect: the log has its own stamps",)
     return Converted(destination, counts, notes, tuple(grouped(damage)))
 
 
