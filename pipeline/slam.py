@@ -186,10 +186,13 @@ class Slam:
     def process(self, scan: Scan | Prepared) -> Step:
         """Place one scan, and whatever it closes. Raises InputError after ``finish``."""
         self._check_unfinished()
-        return self.place(self.front_end.locate(scan))
+        located = self.front_end.locate(scan)
+        mine = owned(located.tracked)
+        step = self.place(located)
+        return replace(step, points=mine.matched, T_odom_lidar=mine.T_odom_lidar, match=mine.match)
 
     def place(self, located: Located) -> Step:
-        """Place one scan that ``front_end`` located."""
+        """Place one scan that ``front_end`` located; nobody may write into the arrays of the step."""
         self._check_unfinished()
         tracked = located.tracked
         scan = tracked.scan
@@ -200,7 +203,6 @@ class Slam:
         if self.config.loops.enabled:
             closures = self._close_loops(keyframe >= 0)
             state = self._optimize_when_due()
-        tracked = owned(tracked)
         timing = Timing(scan.waited_s, tracked.preprocess_s, tracked.match_s, tracked.map_s, working_s() - started)
         return Step(
             scan=scan,

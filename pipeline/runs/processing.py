@@ -86,8 +86,8 @@ def process(
         notes = () if left is None else (resume_recording(directory.path, left, recording, checkpoints),)
         read = _previewed(scans, compiled_before_s, recording) if left is None else scans
         with _Taking(recording, journal, steps) as taking:
-            for step in map(slam.process, _ahead(progress.track(read, log.scan_count - len(steps)), slam)):
-                taking.take(step)
+            for scan in _ahead(progress.track(read, log.scan_count - len(steps)), slam):
+                taking.take(slam.place(slam.front_end.locate(scan)))
                 if checkpoints.are_due():
                     taking.enter()
                     checkpoints.write(slam, recording.secure())
