@@ -221,6 +221,21 @@ class Match:
         return self.at_minimum and self.fit >= LEAST_FIT
 
 
+class KeyframeErrors(NamedTuple):
+    """Errors of a keyframe's pose against the map, and of the map since the keyframe before.
+
+    Attributes
+    ----------
+    variance_factor : of the covariance by the residuals, as in ``Match``
+    systematic : (k, k) covariance by how sectors of the scans disagree, of a twist in the lidar's own frame
+    renewal : share of the map that the lidar exchanged for another since the keyframe before, 0 to 1
+    """
+
+    variance_factor: float
+    systematic: Matrix
+    renewal: float
+
+
 class KeyframePoints(Protocol):
     """Points of a keyframe that lie on disk."""
 

@@ -19,6 +19,7 @@ from scanchain.data import (
     ClosureVerdict,
     GraphState,
     Keyframe,
+    KeyframeErrors,
     Matrix,
     Pose,
     Problem,
@@ -32,7 +33,6 @@ from scanchain.data import (
 from scanchain.errors import InputError
 from scanchain.graph.background import BackgroundOptimization
 from scanchain.graph.growing_array import GrowingArray
-from scanchain.graph.map_errors import KeyframeErrors, MapErrors
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.robust.graduation import OutlierRejection
 from scanchain.graph.robust.losses import rejection_limit
@@ -79,7 +79,7 @@ class SlamResult:
     graph: PoseGraph
     state: GraphState
     components: NDArray[np.int64]
-    map_errors: MapErrors
+    map_errors: Sequence[KeyframeErrors]
     warnings: tuple[str, ...] = ()
     elevation_offset_rad: float = 0.0
     elevation_sigma_rad: float = math.inf
@@ -132,7 +132,7 @@ class Slam:
         self.odometry_poses = GrowingArray((self.dimension + 1,) * 2, np.float64)
         self.T_odom_last = lie.identity(self.dimension)
         self.T_world_odom = lie.identity(self.dimension)
-        self.map_errors = MapErrors(self.graph.freedom)
+        self.map_errors: list[KeyframeErrors] = []
         self.traveled_m = 0.0
         self.waiting_closures = 0
         self.moves_map = False
@@ -256,7 +256,7 @@ class Slam:
             graph=self.graph,
             state=state,
             components=self.closer.segments.components(self.graph),
-            map_errors=self.map_errors,
+            map_errors=tuple(self.map_errors),
             warnings=self.front_end.odometry.predictor.warnings(),
             elevation_offset_rad=self.front_end.odometry.elevation.offset_rad,
             elevation_sigma_rad=self.front_end.odometry.elevation.sigma_rad,

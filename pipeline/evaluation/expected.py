@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,9 +11,8 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import Matrix
+from scanchain.data import KeyframeErrors, Matrix
 from scanchain.graph.between import turns
-from scanchain.graph.map_errors import MapErrors
 from scanchain.graph.pose_graph import PoseGraph
 
 _BATCHES, _BATCH = 50, 10  # of samples, which together would fill the memory
@@ -58,7 +58,7 @@ def expected_ate(graph: PoseGraph, scans: NDArray[np.int64] | None = None) -> Ex
 
 
 def expected_errors(
-    graph: PoseGraph, map_errors: MapErrors, config: Config, scans: NDArray[np.int64] | None = None
+    graph: PoseGraph, map_errors: Sequence[KeyframeErrors], config: Config, scans: NDArray[np.int64] | None = None
 ) -> ExpectedErrors:
     """Errors of keyframes that were aligned to a map, by ``with_map_errors``.
 
@@ -72,7 +72,9 @@ def expected_errors(
     return _sampled(drifting, scans, R @ own @ np.swapaxes(R, 1, 2), _SCALE_SIGMA)
 
 
-def with_map_errors(graph: PoseGraph, map_errors: MapErrors, config: Config) -> tuple[PoseGraph, Matrix]:
+def with_map_errors(
+    graph: PoseGraph, map_errors: Sequence[KeyframeErrors], config: Config
+) -> tuple[PoseGraph, Matrix]:
     """The graph with covariances of edges for judging it, and covariances (K, k, k) of each pose by itself.
 
     Poses that are aligned to one map err by themselves against it, and together as it drifts. With N the
@@ -90,8 +92,9 @@ def with_map_errors(graph: PoseGraph, map_errors: MapErrors, config: Config) -> 
     )
     is_loop = graph.is_loop[:, None, None]
     floor = np.where(is_loop, np.diag(of_loops**2), np.diag(of_odometry**2))
-    noise = map_errors.variance_factor[source, None, None] * (np.linalg.inv(graph.information) - floor)
-    systematic, u = map_errors.systematic[source], map_errors.renewal[source, None, None]
+    factor, systematic, u = (np.array(column)[source] for column in zip(*map_errors, strict=True))
+    factor, u = factor[:, None, None], u[:, None, None]
+    noise = factor * (np.linalg.inv(graph.information) - floor)
     drift = np.minimum(_DRIFT_OF_NOISE * u, 1.0) ** 2 * noise + (_DRIFT_OF_SYSTEMATIC * u) ** 2 * systematic
     covariance = np.where(is_loop, noise + _REVISIT * systematic, drift)
     information = np.linalg.inv(covariance + _LEAST_VARIANCE * np.eye(k))

@@ -9,8 +9,7 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import LEAST_FIT, Matrix, Points, Pose, Scan, State
-from scanchain.graph.map_errors import KeyframeErrors
+from scanchain.data import LEAST_FIT, KeyframeErrors, Matrix, Points, Pose, Scan, State
 from scanchain.odometry.keyframe_errors import KeyframeErrorTracker
 from scanchain.odometry.odometry import Odometry
 from scanchain.odometry.tracked import Tracked

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from scanchain import lie
-from scanchain.data import LEAST_FIT, Pose, State
-from scanchain.graph.map_errors import KeyframeErrors
+from scanchain.data import LEAST_FIT, KeyframeErrors, Pose, State
 from scanchain.odometry.tracked import Tracked
 
 _LATEST = 0.1  # weight of the last scan in the mean of the systematic errors

@@ -16,8 +16,7 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import Keyframe, Matrix, Points, Pose, Prior, Scan, State
-from scanchain.graph.map_errors import KeyframeErrors
+from scanchain.data import Keyframe, KeyframeErrors, Matrix, Points, Pose, Prior, Scan, State
 from scanchain.kernels.registration.icp import Fit, Problem, align, fit_at
 from scanchain.kernels.registration.observability import agreement, signal_along
 from scanchain.kernels.registration.residuals import gradient_spread

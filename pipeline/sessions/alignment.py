@@ -8,9 +8,8 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import ClosureVerdict, Keyframe, Matrix, Points, Prior, RawPoints, Scan, State
+from scanchain.data import ClosureVerdict, Keyframe, KeyframeErrors, Matrix, Points, Prior, RawPoints, Scan, State
 from scanchain.errors import InputError
-from scanchain.graph.map_errors import KeyframeErrors
 from scanchain.maps import SavedMap
 from scanchain.odometry.front_end import Located
 from scanchain.odometry.tracked import Tracked, first_match

@@ -15,7 +15,6 @@ from scanchain.errors import InputError
 from scanchain.graph.background import BackgroundOptimization
 from scanchain.graph.explanation import Explanation
 from scanchain.graph.growing_array import GrowingArray
-from scanchain.graph.map_errors import KeyframeErrors, MapErrors
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.robust.slips import Slip
 from scanchain.graph.robust.update import Since
@@ -81,7 +80,7 @@ _CLASSES = Classes(
         Resolution, Sweep, VoxelMap,
         Voxels, PointToShapeMatcher, LoopCloser, ProximityCloser, PlaceCloser, Relocalizer, Find, PlanarSearch,
         VoxelSubmaps, ScanVerifier, SubmapVerifier, Segments, Drift, PoseGraph, Explanation, Slip, GrowingArray,
-        Since, MapErrors, KeyframeErrors, KeyframeErrorTracker,
+        Since, data.KeyframeErrors, KeyframeErrorTracker,
         ClosureTable, MapEvidence, BackgroundOptimization, PointStore, StoredPoints,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.ClosureVerdict, data.Proposal, data.Prior,
         data.State,
