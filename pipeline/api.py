@@ -65,7 +65,7 @@ class SlamResult(core.SlamResult):
         return cloud_of(self, self.config).points
 
     def verdict(self) -> Judged:
-        """Whether to rely on the trajectory, with reasons and stretches, as a run is judged."""
+        """The verdict on the trajectory, with reasons and stretches, as a run is judged."""
         final, expected = final_verdicts(self.closures, self.state), expected_of(self, self.config)
         table = closures_table(final, self.keyframes, self.trajectory.dimension)
         return judge(evidence_of(self.steps, table, expected and expected.ate))

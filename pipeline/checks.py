@@ -314,7 +314,7 @@ def _remedy(array: NDArray[Any], name: str, d: int) -> str:
 
 
 def _where(value: object, name: str) -> str:
-    """Where the coordinates of a cloud of another library lie; empty where that is unknown."""
+    """Hint at the coordinates of a cloud of another library; empty where unknown."""
     if isinstance(value, np.ndarray) and value.dtype.names:
         return f": np.stack([{name}[axis] for axis in 'xyz'], axis=1)"
     return f": np.asarray({name}.points)" if hasattr(value, "points") else ""

@@ -1,4 +1,4 @@
-"""What rigid alignment leaves out: the offset of two clocks, and the scale of an estimate."""
+"""Time offset and scale of an estimate, which rigid alignment leaves out."""
 
 from __future__ import annotations
 

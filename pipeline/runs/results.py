@@ -82,7 +82,7 @@ class Results:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What holds for the maps but not for the trajectory."""
+        """Warnings about the maps, not the trajectory."""
         tilt_rad = math.acos(min(self.T_world_level[-2, -2], 1.0))
         if tilt_rad < _TILTED_RAD:
             return ()

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 class _Known(msgspec.Struct):
-    """What a verdict takes from the metrics of a run."""
+    """Figures of a run's metrics that a verdict needs."""
 
     expected_ate_m: ExpectedError | None = None
 

@@ -1,4 +1,4 @@
-"""Which slipped where wheels and scans disagree: the one that two other sources of evidence contradict."""
+"""Slips of wheels or of scans where the two disagree: of the one that other evidence contradicts."""
 
 from __future__ import annotations
 
@@ -16,9 +16,7 @@ from scanchain.verdict.loops import Closures
 _FEWEST, _MOST = 3, 20  # closures around a stretch that decide: at least, and the shortest of more
 _MOST_PARTS = 8  # largest number of stretches within a closure that are told apart
 _RATIO = 1.0 / 3.0  # of what is left unexplained by the right source and by the wrong one, at most
-_EXPLAINED = (
-    0.5  # share of a disagreement that the wrong source leaves unexplained, or a jump of the wheels explains
-)
+_EXPLAINED = 0.5  # share of a disagreement that the wrong source leaves, or that a jump of the wheels explains
 _IMPOSSIBLE_M = 1.0  # smallest change of the wheels' motion from scan to scan that is a jump
 
 
@@ -33,7 +31,7 @@ class Slipped(Enum):
 def which_slipped(
     parts: Sequence[slice], odometry: Matrix, wheels: Matrix, closures: Closures
 ) -> list[tuple[Slipped, float]]:
-    """Which of scans and wheels is wrong in each part of a trajectory where they disagree, and by how many meters.
+    """The wrong one of scans and wheels in each part of a trajectory where they disagree, and its error in m.
 
     A closure around a part measures once more where its two scans lie. It is predicted with the motion of each
     part by scans or by wheels, in every combination, and with that of the rest by either, in the directions
@@ -75,7 +73,7 @@ def which_slipped(
 
 
 def _left_m(off: Floats, apart: Floats, is_this: Floats) -> tuple[float, float]:
-    """What the best combination of parts (K, d) leaves of ``off`` (d,), with one of them by scans, by wheels."""
+    """Rest of ``off`` (d,) that the best combination of parts (K, d) leaves, with one by scans, by wheels."""
     by_wheels = np.array(list(product((0.0, 1.0), repeat=len(apart))))
     left_m = np.linalg.norm(off - by_wheels @ apart, axis=1)
     has_this = by_wheels @ is_this > 0.0

@@ -177,7 +177,7 @@ def _doubts(evidence: Evidence, stretches: Sequence[Stretch], rest: _Rest) -> It
 
 @dataclass(frozen=True, slots=True)
 class _Rest:
-    """Whether a trajectory stays where it began, and whether anything shows that the lidar did.
+    """Rest of a trajectory that stays where it began, and whether that of the lidar is shown.
 
     Scans that constrain every direction show it, as do wheels. Along a direction that they leave open, a lidar in
     motion sees the same as one at rest.

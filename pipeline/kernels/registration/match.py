@@ -33,9 +33,7 @@ from scanchain.kernels.registration.residuals import gradient_spread, sector_gra
 
 _SECTORS, _TURN_INFORMATION = 8, 25.0  # of a scan; rad⁻² of a turn that nothing determines
 _POOLED_RESIDUALS = 10.0  # number of residuals that the sensor's variance counts for
-_UNSHARED = (
-    0.5  # share of the variance of planar residuals that is not the map's, by the NEES of simulated motions
-)
+_UNSHARED = 0.5  # share of the variance of planar residuals that is not the map's, by NEES of simulated motions
 _POOLED = 0.02  # weight of the variance that all residuals have in common against that of each surface
 _SIGMAS = 2.0  # standard deviations of the prediction that the kernel's first scale spans
 

@@ -91,7 +91,7 @@ def _add(sums, x: float, y: float, z: float):
 
 @njit()
 def _is_plane(sums, cell_m: float, normal) -> bool:
-    """Whether points of these sums lie in a plane, whose normal (3,) is written."""
+    """True if points of these sums lie in a plane, whose normal (3,) is written."""
     x, y, z = sums[1] / sums[0], sums[2] / sums[0], sums[3] / sums[0]
     xx, xy, xz = sums[4] / sums[0] - x * x, sums[5] / sums[0] - x * y, sums[6] / sums[0] - x * z
     yy, yz, zz = sums[7] / sums[0] - y * y, sums[8] / sums[0] - y * z, sums[9] / sums[0] - z * z

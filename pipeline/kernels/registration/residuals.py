@@ -257,9 +257,8 @@ def gradient_spread(voxels, points, T, origin, correspondence, weight, scale_m: 
 def sector_gradients(voxels, points, T, origin, correspondence, weight, scale_m: float, range_m: float, sums):
     """Gradients b of ``normal_equations`` by sector, added to sums (8, k).
 
-    Sectors lie ahead or behind, left or right, near or far.
-
-    Calibration, motion within the scan and surfaces that repeat shift the points of a sector together.
+    Sectors lie ahead or behind, left or right, near or far. Calibration, motion within the scan and surfaces that
+    repeat shift the points of a sector together.
     range_m : from which on points are far
     """
     s2, k = scale_m * scale_m, sums.shape[1]
