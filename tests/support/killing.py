@@ -190,6 +190,10 @@ def _read_html(path):
     assert path.read_text(encoding="utf-8").rstrip().endswith("</html>")
 
 
+def _read_wide_tum(path):
+    assert np.loadtxt(path, ndmin=2).shape[1] == 8 + 21  # a pose, and its covariance's upper triangle
+
+
 def _read_text(path):
     assert path.read_text(encoding="utf-8").endswith("\n")
 
@@ -199,6 +203,7 @@ _READ = {
     CHECKPOINT_FILE: _read_checkpoint,
     MAP_FOLDER: open_saved_map,
     POINTS_FILE: lambda path: np.fromfile(path, np.float32),
+    "keyframes.tum": _read_wide_tum,
     ".tum": lambda path: len(read_tum(path)),
     "trajectory.kitti.txt": lambda path: len(read_kitti(path)),
     "summary.txt": _read_text,
