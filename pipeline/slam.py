@@ -36,7 +36,7 @@ from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.robust.graduation import OutlierRejection
 from scanchain.graph.robust.losses import rejection_limit
-from scanchain.loops import ClosureTable, LoopCloser, MapEvidence, refined, spread
+from scanchain.loops import ClosureTable, LoopCloser, PlaceTest, refined, spread
 from scanchain.maps import SavedMap
 from scanchain.odometry import FrontEnd, LiveStamps, Located, checked_start, owned
 from scanchain.point_store import PointStore
@@ -68,6 +68,8 @@ class SlamResult:
     ``elevation_sigma_rad`` its standard deviation, infinite where none was estimated.
     ``map_errors`` are those of the keyframes against the map.
     ``warnings`` has a line on wheels that were left out.
+    ``map_log_odds`` are those that the log is where it was placed in a prior map, or, where they do not suffice,
+    might have been; NaN without a map, and where nothing spoke for a place in it.
     ``components`` (K,) numbers the pieces that the keyframes belong to, which no loop joins; one as a rule.
     """
 
@@ -84,6 +86,7 @@ class SlamResult:
     elevation_offset_rad: float = 0.0
     elevation_sigma_rad: float = math.inf
     calibrated_from: int = 0
+    map_log_odds: float = math.nan
 
     @property
     def keyframe_trajectory(self) -> Trajectory:
@@ -145,7 +148,7 @@ class Slam:
         self.contradiction = _CONTRADICTING * rejection_limit(config.graph.robust_scale, self.graph.freedom)
         self.beside: BackgroundOptimization | None = None
         self.first = 0  # number of the first keyframe of this log
-        self.evidence = MapEvidence(self.closer.segments, 0)
+        self.evidence = PlaceTest(self.closer.segments, 0)
         self.by_map: Closure | None = None  # with the map, of the newest keyframe that has one
         self.live_stamps = LiveStamps()
         self.is_finished = False
@@ -261,6 +264,7 @@ class Slam:
             elevation_offset_rad=self.front_end.odometry.elevation.offset_rad,
             elevation_sigma_rad=self.front_end.odometry.elevation.sigma_rad,
             calibrated_from=self.front_end.odometry.calibrated_from,
+            map_log_odds=self.evidence.best,
         )
 
     def _check_unfinished(self) -> None:
@@ -323,7 +327,7 @@ class Slam:
         return keyframe.index
 
     def _close_loops(self, is_keyframe: bool) -> tuple[Closure, ...]:
-        if self.evidence.is_in_vain(self.keyframes):
+        if self.evidence.is_in_vain:
             self._give_up()
         closures = self._take(self.closer.advance(self.keyframes, self.graph))
         if is_keyframe:
@@ -375,7 +379,7 @@ class Slam:
         with_map = [each for each in closures if each.target < self.first and each.source >= start]
         self.evidence.note(with_map)
         if self.is_in_map:
-            return closures
+            return closures if self.evidence.follow(with_map, self.keyframes) else self._withdrawn(closures)
         others = [each for each in closures if each.target >= self.first or each.source < start]
         was_gathering = self.evidence.is_gathering
         joining = self.evidence.collect(with_map, self.keyframes)
@@ -386,10 +390,27 @@ class Slam:
         alone = [each.rejected(too_few) if each.verdict is ClosureVerdict.ACCEPTED else each for each in with_map]
         return (*others, *(joining or alone))
 
+    def _withdrawn(self, closures: tuple[Closure, ...]) -> tuple[Closure, ...]:
+        """The newest segment is not where it was joined to the map: take back all that joins it; search again."""
+        start = self.closer.segments.starts[-1]
+        problem = Problem.plain("withdrawn: what was seen since contradicts the place in the map")
+
+        def is_wrong(closure: Closure) -> bool:
+            is_accepted = closure.verdict is ClosureVerdict.ACCEPTED
+            return is_accepted and closure.target < self.first and closure.source >= start
+
+        edges = self.graph.edges
+        self.graph.remove_loops(self.graph.is_loop & (edges[:, 0] < self.first) & (edges[:, 1] >= start))
+        self.closures.reject(is_wrong, problem)
+        self.evidence.drop(start)
+        self.closer.search_again()
+        self.beside, self.by_map, self.joined_start = None, None, 0
+        return tuple(each.rejected(problem) if is_wrong(each) else each for each in closures)
+
     def _give_up(self) -> None:
         """The pose in the map that is being tested is wrong: search the newest segment again."""
         if self.evidence.is_gathering:
-            self.evidence.reset()
+            self.evidence.drop(self.closer.segments.starts[-1])
             self.closer.search_again()
 
     def _set_apart(self) -> None:
@@ -399,11 +420,10 @@ class Slam:
         in_force = graph.edges[chosen & (graph.edges[:, 1] >= self.first), 1]
         for number, start in enumerate(segments.starts[1:], 1):
             end = segments.span(start, len(graph))[1]
-            sources = set(in_force[(in_force >= start) & (in_force < end)].tolist())
-            if not sources:
+            if not ((in_force >= start) & (in_force < end)).any():
                 continue
             placed = [replace(self.keyframes[k], T_odom_lidar=graph.poses[k]) for k in range(start, end)]
-            if not self.evidence.joins(placed, sources, self.keyframes):
+            if not self.evidence.holds(placed, self.keyframes):
                 segments.apart.add(number)
 
     def _add(self, closure: Closure) -> Closure:

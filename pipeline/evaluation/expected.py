@@ -87,20 +87,32 @@ def with_map_errors(
     map_errors, config : of the run
     """
     k, source = graph.freedom, graph.edges.max(axis=1)
-    of_loops, of_odometry = (
-        lie.by_component(k, each.edge_sigma_m, each.edge_sigma_rad) for each in (config.loops, config.odometry)
-    )
-    is_loop = graph.is_loop[:, None, None]
-    floor = np.where(is_loop, np.diag(of_loops**2), np.diag(of_odometry**2))
-    factor, systematic, u = (np.array(column)[source] for column in zip(*map_errors, strict=True))
-    factor, u = factor[:, None, None], u[:, None, None]
-    noise = factor * (np.linalg.inv(graph.information) - floor)
-    drift = np.minimum(_DRIFT_OF_NOISE * u, 1.0) ** 2 * noise + (_DRIFT_OF_SYSTEMATIC * u) ** 2 * systematic
-    covariance = np.where(is_loop, noise + _REVISIT * systematic, drift)
+    chosen = [map_errors[index] for index in source.tolist()]
+    covariance, by_itself = edge_errors(graph.information, graph.is_loop, chosen, config)
     information = np.linalg.inv(covariance + _LEAST_VARIANCE * np.eye(k))
     own = np.zeros((len(graph), k, k))
-    own[source[~graph.is_loop]] = (noise + systematic)[~graph.is_loop]
+    own[source[~graph.is_loop]] = by_itself[~graph.is_loop]
     return graph.with_information(0.5 * (information + np.swapaxes(information, 1, 2))), own
+
+
+def edge_errors(
+    information: Matrix, is_loop: NDArray[np.bool_], map_errors: Sequence[KeyframeErrors], config: Config
+) -> tuple[Matrix, Matrix]:
+    """Covariances (E, k, k) of edges, and of the later pose of each by itself, by ``with_map_errors``.
+
+    information : (E, k, k) of the edges in the graph; map_errors : of the later keyframe of each
+    """
+    of_loops, of_odometry = (
+        lie.by_component(information.shape[-1], each.edge_sigma_m, each.edge_sigma_rad)
+        for each in (config.loops, config.odometry)
+    )
+    is_loop = is_loop[:, None, None]
+    floor = np.where(is_loop, np.diag(of_loops**2), np.diag(of_odometry**2))
+    factor, systematic, u = (np.array(column) for column in zip(*map_errors, strict=True))
+    factor, u = factor[:, None, None], u[:, None, None]
+    noise: Matrix = (factor * (np.linalg.inv(information) - floor)).astype(np.float64)
+    drift = np.minimum(_DRIFT_OF_NOISE * u, 1.0) ** 2 * noise + (_DRIFT_OF_SYSTEMATIC * u) ** 2 * systematic
+    return np.where(is_loop, noise + _REVISIT * systematic, drift), noise + systematic
 
 
 def _rotations(poses: Matrix, freedom: int) -> Matrix:

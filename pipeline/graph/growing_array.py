@@ -47,5 +47,6 @@ class GrowingArray:
         return view
 
     def replace(self, rows: NDArray[Any]) -> None:
-        """Put other values into all rows; views handed out before keep the old ones."""
+        """Put these in place of all rows; views handed out before keep the old ones."""
         self._room = np.array(rows, self._room.dtype)
+        self._count = len(rows)

@@ -225,6 +225,15 @@ class PoseGraph:
         self._is_loop.extend(is_loop)
         self._weight.extend(np.ones(len(edges)))
 
+    def remove_loops(self, is_removed: NDArray[np.bool_]) -> None:
+        """Take loop edges out of the graph, True for each of the edges (E,) that goes."""
+        self._changed()
+        for column in (
+            self._edges, self._measurements, self._information, self._rank, self._is_loop, self._weight,
+        ):  # fmt: skip
+            column.replace(column.rows[~is_removed])
+        self.since = Since(0, 0)
+
     def add_sightings(self, edges: NDArray[np.int64], positions: NDArray[np.float64], information: Matrix) -> None:
         """Add points as observed from poses: edges (E, 2) pose and point, positions (E, 2) there, Ω (E, 2, 2)."""
         edges = checks.indices(edges, "edges")

@@ -73,6 +73,7 @@ class LoopCloser:
     def search_again(self) -> None:
         """Forget where the newest segment was matched in the map: it is not there."""
         self.near.target_in_map = -1
+        self.near.drift = Drift(self.config.loops.drift)
         if self.map_search is not None:
             self.map_search.matched_m = -math.inf
 

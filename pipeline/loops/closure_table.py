@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields
 from typing import Any, overload
 
 import numpy as np
 
-from scanchain.data import Closure, ClosureVerdict, Match, Proposal
+from scanchain.data import Closure, ClosureVerdict, Match, Problem, Proposal
 from scanchain.graph.growing_array import GrowingArray
 
 _TEXTS = {"reason": str, "cause": str, "verdict": ClosureVerdict, "proposed_by": Proposal}  # kept as numbers
@@ -31,6 +31,12 @@ class ClosureTable(Sequence[Closure]):
         for closure in closures:
             self._append(self._closures, closure)
             self._append(self._matches, closure.match)
+
+    def reject(self, chosen: Callable[[Closure], bool], problem: Problem) -> None:
+        """Reject closures that were accepted."""
+        kept = [each.rejected(problem) if chosen(each) else each for each in self]
+        self._closures, self._matches = {}, {}
+        self.extend(kept)
 
     @overload
     def __getitem__(self, index: int) -> Closure: ...

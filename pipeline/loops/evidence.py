@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from scanchain import lie
-from scanchain.data import Closure, ClosureVerdict, Keyframe, Pose, Proposal
+from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Pose, Proposal
 from scanchain.kernels.raycast.free_space import compare_ranges, nearest_ranges
 from scanchain.loops.connectivity import Segments
 
@@ -22,8 +23,19 @@ _BINS = 360  # of azimuth, 1°; as fine in elevation
 _MARGIN_M, _MARGIN_SHARE = {2: 0.3, 3: 1.0}, 0.05  # by which ranges may differ, beside that share of them
 _IN_SIGHT = 0.3  # share of the points of a keyframe, from which on those in view of the map's nearest one show it
 _MOST = 200  # largest number of keyframes of a log that are compared, evenly spread over them
-_PATIENCE = 10  # number of new keyframes from which on a pose in the map that was not confirmed is given up
-_TESTED = 5  # number of tested ones from which on it is if too few of these agree
+_RISK = 1e-3  # that a pose is taken up which is wrong
+_DROPPED = -3.0  # log-odds down to which a pose is tested
+_RESERVE = 5.0  # log-odds above that bound that are kept: what was right for long may turn out wrong
+_FOLLOWED_M = 50.0  # path since the last match, up to which keyframes without one speak against the place
+_LARGEST_RATIO = 2.0  # of one keyframe, as a logarithm
+_OF_FIT, _OF_NO_FIT, _OF_CONTRADICTION = 2.8, 0.4, 4.9  # weights of the evidence of a keyframe
+_OF_FIND = (
+    4.0  # log-odds of what a search found: it finds 0.9 of the right places, and something in 0.004 of others
+)
+_SEARCHED_M = {2: 8.0, 3: 20.0}  # path whose points are sought together, at full scale
+_NO_OVERLAP = 0.3  # overlap from which on a fit is evidence
+_IN_SIGHT_OF_BOTH = 0.2  # share of the points in view of the other side, from which on that knows the place
+_INDEPENDENT_M = {2: 1.0, 3: 3.0}  # path from which on two keyframes are independent, at full scale
 _AGREE_M, _AGREE_RAD = 1.0, 0.1  # largest difference between the poses that two closures imply
 
 
@@ -82,83 +94,176 @@ def nearest(keyframes: Sequence[Keyframe], others: Sequence[Keyframe]) -> list[K
     return [others[index] for index in np.atleast_1d(KDTree(positions).query(targets)[1]).tolist()]
 
 
-class MapEvidence:
-    """Closures of the newest segment of a log with a map, which wait until enough keyframes agree on a pose."""
+class PlaceTest:
+    """Sequential test (Wald 1945) of the pose in a map where the newest segment of a log is taken to be.
+
+    Each keyframe that was tried against the map there adds the logarithm of how much likelier what it shows is at
+    a right pose than at the best of wrong ones; keyframes closer than they are independent count in part. The pose
+    is taken up where the sum passes what the risk asks for, over all the path sought. It is dropped where
+    the sum says that it is wrong: withdrawn, if it had been taken up.
+    """
 
     def __init__(self, segments: Segments, of_map: int) -> None:
         """of_map : number of the keyframes of the map, which come first."""
         self.segments = segments
         self.of_map = of_map
         self.is_given = False  # whether the pose of the first scan in the map is
-        self.tried: set[int] = set()  # keyframes of the whole log that were tried where they lie in the map
-        self.waiting: list[Closure] = []
-        self.begun = 0  # number of keyframes when the first of these came
-        self.tested: set[int] = set()  # keyframes that were tried since
-        self.is_hopeless = False  # whether too few of them agree
+        self.positions = np.empty((0, 0))
+        self.searches = 1.0  # for independent parts of the path so far
+        self.log_odds = 0.0  # of the present one
+        self.best = math.nan  # of those that the log ended with, or a segment
+        self.matched_m = 0.0  # path up to the last match with the map
+        self.waiting: list[Closure] = []  # with the map, accepted and agreeing with the first
+        self.counted_m: list[float] = []  # places along the path of the keyframes that counted
+        self.tried: dict[int, Closure] = {}  # of each keyframe, the best closure with the map at its pose there
 
     @property
     def is_gathering(self) -> bool:
         """True while a pose in the map is being tested."""
         return self.segments.is_assumed
 
+    @property
+    def bound(self) -> float:
+        """Log-odds from which on a pose is taken up: the longer the path that was sought, the higher."""
+        return math.log(max(self.searches, 1.0) / _RISK)
+
     def collect(self, closures: Sequence[Closure], keyframes: Sequence[Keyframe]) -> tuple[Closure, ...]:
         """Take closures with the map of a segment that is not joined to it; all that waited, once they join it."""
-        accepted = [each for each in closures if each.verdict is ClosureVerdict.ACCEPTED]
-        if not self.waiting and not accepted:
+        if not self.is_gathering:
+            if not any(each.verdict is ClosureVerdict.ACCEPTED for each in closures):
+                return ()
+            self.segments.is_assumed = True
+            newest, start = keyframes[-1], keyframes[self.segments.starts[-1]]
+            searched_m = _SEARCHED_M[newest.T_odom_lidar.shape[0] - 1] * newest.scale
+            searches = (newest.traveled_m - start.traveled_m) / searched_m
+            self.searches = max(searches, self.searches)
+            self.log_odds, self.counted_m = _OF_FIND, []
+        for each in _best_of_each(closures):
+            agrees = not self.waiting or self._agrees(each, keyframes)
+            if each.verdict is ClosureVerdict.ACCEPTED and agrees:
+                self.waiting.append(each)
+            ratio = self._ratio(each, keyframes) if agrees else -_LARGEST_RATIO
+            self.log_odds += self._weight(keyframes[each.source]) * ratio
+        if self.log_odds < self.bound or not self.waiting:
             return ()
-        self.begun = self.begun if self.waiting else len(keyframes)
-        self.segments.is_assumed = True
-        self.waiting += accepted
-        self.tested |= {each.source for each in closures}
-        agreeing = [each for each in self.waiting if self._agrees(each, keyframes)]
-        sources, count = {each.source for each in agreeing}, len(self.tested)
-        self.is_hopeless = count >= _TESTED and len(sources) < MIN_SHARE * count
-        if not are_enough(len(sources), count):
-            return ()
-        placed = [replace(keyframes[c.source], T_odom_lidar=pose_in_map(c, c.source, keyframes)) for c in agreeing]
-        if self._is_contradicted(placed, keyframes):
-            return ()
+        joining = tuple(self.waiting)
+        self.matched_m = max(keyframes[each.source].traveled_m for each in joining)
         self.reset()
-        return tuple(agreeing)
+        return joining
+
+    def follow(self, closures: Sequence[Closure], keyframes: Sequence[Keyframe]) -> bool:
+        """Take closures with the map of a segment that is joined to it; False once they say that it is not there.
+
+        Far from the last match nothing counts: drift may have led away from the map.
+        """
+        for each in _best_of_each([each for each in closures if _is_there(each)]):
+            if keyframes[each.source].traveled_m - self.matched_m <= _FOLLOWED_M * keyframes[each.source].scale:
+                self.log_odds += self._weight(keyframes[each.source]) * self._ratio(each, keyframes)
+            if each.verdict is ClosureVerdict.ACCEPTED:
+                self.matched_m = keyframes[each.source].traveled_m
+        self.log_odds = min(self.log_odds, self.bound + _RESERVE)
+        return self.log_odds > _DROPPED
 
     def note(self, closures: Sequence[Closure]) -> None:
-        """Note from which keyframes closures with the map were tried at the pose where these lie in it."""
-        self.tried |= {each.source for each in closures if each.proposed_by is Proposal.POSITION}
+        """Note closures with the map that were tried at the pose where their keyframes lie in it."""
+        for each in filter(_is_there, closures):
+            known = self.tried.get(each.source)
+            if known is None or _rank(each) > _rank(known):
+                self.tried[each.source] = each
 
-    def is_in_vain(self, keyframes: Sequence[Keyframe]) -> bool:
-        """True if enough keyframes passed without confirming the pose that is being tested."""
-        return self.is_gathering and (self.is_hopeless or len(keyframes) - self.begun > _PATIENCE)
+    @property
+    def is_in_vain(self) -> bool:
+        """True if the pose that is being tested is wrong."""
+        return self.is_gathering and self.log_odds <= _DROPPED
 
     def reset(self) -> None:
         """Nothing waits, and no pose is being tested."""
         self.segments.is_assumed = False
-        self.waiting, self.tested, self.is_hopeless = [], set(), False
+        self.waiting = []
 
-    def joins(self, placed: Sequence[Keyframe], in_force: set[int], keyframes: Sequence[Keyframe]) -> bool:
-        """True if closures in force join the keyframes of a segment, at their final poses, to the map.
+    def drop(self, start: int) -> None:
+        """The newest segment, from a keyframe on, is not where it was tested; forget what was tried."""
+        self._remember()
+        self.tried = {source: each for source, each in self.tried.items() if source < start}
+        self.reset()
 
-        Keyframes that were tried where the map shows nothing do not count.
-        """
-        begun, of_map = min(in_force), keyframes[: self.of_map]
-        tried = [each for each in placed if each.index >= begun and each.index in self.tried | in_force]
-        tried = tried[:: -(-len(tried) // _MOST)]
-        is_matched = np.isin([each.index for each in tried], list(in_force))
-        known = int((is_matched | are_in_sight(tried, of_map)).sum())
-        is_enough = len(in_force) >= _MIN_KEYFRAMES and is_matched.sum() >= MIN_SHARE * known
-        if self.is_given and known < _PATIENCE:
-            is_enough = True
-        return bool(is_enough) and not self._is_contradicted(placed[:: -(-len(placed) // _MOST)], keyframes)
+    def holds(self, placed: Sequence[Keyframe], keyframes: Sequence[Keyframe]) -> bool:
+        """True if keyframes of a segment, at their final poses, stand in the map where they are."""
+        self.counted_m, self.log_odds = [], self.bound - _DROPPED if self.is_given else 0.0
+        for each in placed:
+            if each.index in self.tried:
+                self.log_odds += self._weight(each) * self._ratio_at(each, self.tried[each.index], keyframes)
+        self._remember()
+        return self.log_odds >= self.bound
 
-    def _is_contradicted(self, placed: Sequence[Keyframe], keyframes: Sequence[Keyframe]) -> bool:
-        """True if free space around keyframes at their poses in the map contradicts it, or they it."""
-        around = {each.index: each for each in nearest(placed, keyframes[: self.of_map])}
-        return is_contradicted(placed, list(around.values()))
+    def _remember(self) -> None:
+        """Keep the log-odds of the present pose, if they are the best so far of those not known to be wrong."""
+        if self.log_odds > _DROPPED:
+            self.best = float(np.fmax(self.best, self.log_odds))
+
+    def _weight(self, keyframe: Keyframe) -> float:
+        """Share of an independent observation that a keyframe is, after those that counted."""
+        apart_m = _INDEPENDENT_M[keyframe.T_odom_lidar.shape[0] - 1] * keyframe.scale
+        since_m = min((abs(keyframe.traveled_m - each) for each in self.counted_m), default=apart_m)
+        self.counted_m.append(keyframe.traveled_m)
+        return min(since_m / apart_m, 1.0)
+
+    def _ratio(self, closure: Closure, keyframes: Sequence[Keyframe]) -> float:
+        T_map_source = pose_in_map(closure, closure.source, keyframes)
+        placed = replace(keyframes[closure.source], T_odom_lidar=T_map_source)
+        return self._ratio_at(placed, closure, keyframes)
+
+    def _ratio_at(self, placed: Keyframe, closure: Closure, keyframes: Sequence[Keyframe]) -> float:
+        """Logarithm of the likelihood ratio of what a keyframe at a pose shows, of a right pose to a wrong one."""
+        away_m = np.linalg.norm(self._positions(keyframes) - placed.T_odom_lidar[:-1, -1], axis=1)
+        beside = keyframes[int(away_m.argmin())]
+        agreeing, contradicting = (compared([placed], [beside]) + compared([beside], [placed])).tolist()
+        return log_ratio(closure, agreeing, contradicting, len(placed.points) + len(beside.points))
+
+    def _positions(self, keyframes: Sequence[Keyframe]) -> Matrix:
+        """(K, d) of the keyframes of the map."""
+        if len(self.positions) != self.of_map:
+            self.positions = np.array([each.T_odom_lidar[:-1, -1] for each in keyframes[: self.of_map]])
+        return self.positions
 
     def _agrees(self, closure: Closure, keyframes: Sequence[Keyframe]) -> bool:
         """True if a closure implies the pose of its source that the first one does."""
         poses = (pose_in_map(each, closure.source, keyframes) for each in (self.waiting[0], closure))
         off_m, off_rad = lie.apart(*poses)
         return off_m < _AGREE_M * keyframes[closure.source].scale and off_rad < _AGREE_RAD
+
+
+def log_ratio(closure: Closure, agreeing: int, contradicting: int, points: int) -> float:
+    """Logarithm of how much likelier a closure with a map is at a right pose than at the best of wrong ones.
+
+    A fit that overlaps speaks for the pose; points in the free space of the other side against it, and no fit
+    where the map shows what the scan does. The three weights are a logistic regression over keyframes at right
+    and at wrong poses (tests.benchmarks.place_odds).
+    agreeing, contradicting : numbers of points in view of the other side, of so many points of both
+    """
+    fits = max(closure.overlap - _NO_OVERLAP, 0.0) / (1.0 - _NO_OVERLAP) if closure.match.is_fit else 0.0
+    seen = agreeing + contradicting
+    in_sight = min(seen / max(_IN_SIGHT_OF_BOTH * points, 1.0), 1.0)
+    against = _OF_NO_FIT * (1.0 - fits) + _OF_CONTRADICTION * contradicting / max(seen, 1)
+    return min(max(_OF_FIT * fits - in_sight * against, -_LARGEST_RATIO), _LARGEST_RATIO)
+
+
+def _is_there(closure: Closure) -> bool:
+    """True for a closure that was tried where its keyframe lies, and for one that a search found."""
+    return closure.proposed_by is Proposal.POSITION or closure.verdict is ClosureVerdict.ACCEPTED
+
+
+def _best_of_each(closures: Sequence[Closure]) -> list[Closure]:
+    """Of the closures of each keyframe, the best."""
+    best: dict[int, Closure] = {}
+    for each in closures:
+        if each.source not in best or _rank(each) > _rank(best[each.source]):
+            best[each.source] = each
+    return list(best.values())
+
+
+def _rank(closure: Closure) -> tuple[bool, float]:
+    return closure.verdict is ClosureVerdict.ACCEPTED, closure.overlap
 
 
 def pose_in_map(closure: Closure, keyframe: int, keyframes: Sequence[Keyframe]) -> Pose:

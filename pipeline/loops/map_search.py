@@ -40,6 +40,7 @@ _LEVEL_M = 2.0  # least difference in height of two stories
 _MAX_LEVELS = 3  # number of stories that are tried
 _STEP_M = 1.0  # least path between two searches
 _BACKOFF = 0.1  # path between two searches, as a share of what was searched so far
+_INTERVAL_M = 10.0  # largest path between two searches
 _AGREE_M, _AGREE_RAD = 1.0, 0.05  # largest difference between the poses that two finds imply
 _MATCH_M = 3.5  # path between two matches with the map, at full scale
 _TRACKED_M = 20.0  # path since the last match with the map, up to which it is not searched
@@ -69,7 +70,6 @@ class MapSearch:
         self.has_advanced = False  # in the present scan
         self.next_m = 0.0
         self.matched_m = -math.inf  # path up to the last match with the map
-        self.finds: list[Closure] = []
 
     def has_just_matched(self, keyframes: Sequence[Keyframe]) -> bool:
         """True while the last match with the map lies so little behind the newest keyframe that none is due."""
@@ -100,7 +100,9 @@ class MapSearch:
         is_due = newest.traveled_m >= self.next_m or newest.index == start
         if self.search is None and is_due:
             begun_m = self._begun_m(keyframes, components)
-            self.next_m = newest.traveled_m + max(_BACKOFF * (newest.traveled_m - begun_m), _STEP_M)
+            self.next_m = newest.traveled_m + min(
+                max(_BACKOFF * (newest.traveled_m - begun_m), _STEP_M), _INTERVAL_M
+            )
             members = keyframes[max(start, len(keyframes) - _MEMBERS) :]
             self.search = self._found(members, keyframes)
         return () if self.has_advanced else self._go_on(keyframes, graph, components)
@@ -154,7 +156,7 @@ class MapSearch:
             problem = self._contradiction(closure, keyframes, graph.poses, gone_m)
             if problem:
                 return (closure.rejected(problem),)
-        return self._confirmed(closure, keyframes)
+        return (closure,)
 
     def _found(
         self, members: Sequence[Keyframe], keyframes: Sequence[Keyframe]
@@ -262,16 +264,6 @@ class MapSearch:
             return None
         limit = f"from the prediction, more than {100.0 * _DRIFT:g} % of the path between"
         return Problem(f"far {limit}", f"{moved_m:.1f} m {limit}")
-
-    def _confirmed(self, closure: Closure, keyframes: Sequence[Keyframe]) -> tuple[Closure, ...]:
-        """The closure and the older ones that agree with it; rejected while there are none."""
-        old = [each for each in self.finds if each.source >= self.segments.starts[-1]]
-        agreeing = [each for each in old if _agree(closure, each, keyframes)]
-        if agreeing:
-            self.finds = []
-            return (*agreeing, closure)
-        self.finds = [*old, closure]
-        return (closure.rejected(Problem.plain("found anywhere, and no other find agrees yet")),)
 
 
 def _together(members: Sequence[Keyframe], T_level_newest: Pose) -> Points:

@@ -30,6 +30,7 @@ _AMBIGUOUS = 0.9  # share of the best score, from which on a result elsewhere ma
 _FIRST_M = 1.0  # distance traveled in a new segment before the first search of the whole map
 _BACKOFF = 0.2  # share of the distance searched in vain that is traveled before the next search
 _APART_M = 0.5  # least distance traveled between two searches
+_INTERVAL_M = 3.0  # largest distance traveled between two searches
 _PATH_M = 8.0  # length of the path whose points are searched for: over it odometry drifts less than a cell or two
 _AGREE_M, _AGREE_RAD = 0.5, 0.1  # largest difference between two results that confirm each other
 _SOURCES, _SUBMAPS = (
@@ -174,10 +175,7 @@ class Relocalizer:
         if not agreeing:
             return ()
         path = np.arange(_path_begin(keyframes, start), len(keyframes))
-        closures = self._verified(find, path, old, keyframes, T_world)
-        if any(closure.verdict is ClosureVerdict.ACCEPTED for closure in closures):
-            self.found = []
-        return closures
+        return self._verified(find, path, old, keyframes, T_world)
 
     def _next_component(self, unknown: NDArray[np.int64], components: NDArray[np.int64]) -> NDArray[np.int64]:
         """Keyframes of the next component, in rotation: two may show the same location."""
@@ -190,7 +188,7 @@ class Relocalizer:
         traveled_m = keyframes[-1].traveled_m - keyframes[start].traveled_m
         if traveled_m < _FIRST_M or keyframes[-1].traveled_m < self.next_m:
             return False
-        self.next_m = keyframes[-1].traveled_m + max(_BACKOFF * traveled_m, _APART_M)
+        self.next_m = keyframes[-1].traveled_m + min(max(_BACKOFF * traveled_m, _APART_M), _INTERVAL_M)
         return True
 
     def _begin(self, start: int, old: NDArray[np.int64], keyframes: Sequence[Keyframe], T_world: Matrix) -> None:

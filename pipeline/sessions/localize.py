@@ -21,7 +21,6 @@ from scanchain.config import Config
 from scanchain.data import ClosureVerdict, Pose, brief
 from scanchain.errors import InputError
 from scanchain.logs import Log
-from scanchain.loops.evidence import are_in_sight
 from scanchain.maps import SavedMap, open_saved_map
 from scanchain.runs.directory import POINTS_FILE, RUN_FILE, RunDirectory
 from scanchain.runs.job import Job, Progress
@@ -40,8 +39,7 @@ LOCALIZATION_FILE = "localization.parquet"
 _SHORT_M = {2: 5.0, 3: 20.0}  # path below which a place that is not found says nothing
 _WITHOUT_MAP_M = {2: 2.0, 3: 10.0}  # shortest path without the map that is told as a stretch
 _MOVED_M, _MOVED_SIGMAS = 0.3, 5.0  # between a pose as known at its time and in the end, that is told
-_COMPARED, _PATHS = 200, 12  # largest numbers of keyframes and of paths that are compared with the map in the end
-_MAX_UNMATCHED = 0.5  # largest share of the keyframes in sight of the map's that are not matched to it
+_PATHS = 12  # largest number of paths that are compared with the map in the end
 _APART_S = 1.0  # largest difference between the first scan and the nearest pose of a file
 _SHOWN = 3  # stretches that the verdict lists
 
@@ -59,7 +57,7 @@ class Part(Struct, frozen=True):
     @property
     def is_doubtful(self) -> bool:
         """False where the log was followed all along, if by odometry alone."""
-        return self.kind != MapState.WITHOUT_MAP
+        return self.kind not in (MapState.UNMATCHED, MapState.OUTSIDE)
 
     @property
     def text(self) -> str:
@@ -74,7 +72,9 @@ class LocalizeMetrics(Struct, frozen=True):
     """Contents of metrics.json of a localized log.
 
     ``found_*`` say where the place of the log was first known; −1 and NaN where it never was. ``matches`` are
-    closures of keyframes with the map, ``rejected`` those that the graph left out in the end. ``ground_truth`` is
+    closures of keyframes with the map, ``rejected`` those that the graph left out in the end. ``log_odds`` are
+    those that the log is where it was placed, or, where they do not suffice, might have been; NaN for nothing
+    found. Standard deviations are medians, of positions as known at their time and in the end. ``ground_truth`` is
     the accuracy of the scans that are placed.
     """
 
@@ -94,6 +94,8 @@ class LocalizeMetrics(Struct, frozen=True):
     rejected: int
     median_overlap: float
     median_sigma_m: float
+    median_final_sigma_m: float
+    log_odds: float
     time_s: float
     warnings: tuple[str, ...]
     ground_truth: GroundTruth | None = None
@@ -219,7 +221,6 @@ def measure(
     rejected = int((graph.is_rejected & in_map).sum())
     parts = tuple(_parts(found, seconds))
     verdict, reason = _verdict(found, prior, parts, _doubt(found, prior, config))
-    sigma_m = found.sigma_m[np.isfinite(found.sigma_m)]
     return LocalizeMetrics(
         verdict=verdict,
         reason=reason,
@@ -236,10 +237,18 @@ def measure(
         matches=len(with_map),
         rejected=rejected,
         median_overlap=float(np.median([each.overlap for each in with_map])) if with_map else np.nan,
-        median_sigma_m=float(np.median(sigma_m)) if len(sigma_m) else np.nan,
+        median_sigma_m=_median(found.sigma_m),
+        median_final_sigma_m=_median(found.final_sigma_m),
+        log_odds=found.result.map_log_odds,
         time_s=time_s,
         warnings=warnings,
     )
+
+
+def _median(values: NDArray[np.float64]) -> float:
+    """Median of the finite ones, NaN if there are none."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else np.nan
 
 
 def _parts(found: Localization, seconds: NDArray[np.float64]) -> Iterator[Part]:
@@ -254,7 +263,8 @@ def _parts(found: Localization, seconds: NDArray[np.float64]) -> Iterator[Part]:
         ("not joined to the map", ~found.is_placed, 0.0),
         ("lost", after & found.is_placed & (found.states == MapState.LOST), 0.0),
         ("place unknown at the time", after & found.is_placed & (found.states == MapState.SEARCHING), 0.0),
-        (MapState.WITHOUT_MAP.value, found.is_placed & (found.states == MapState.WITHOUT_MAP), 1.0),
+        (MapState.UNMATCHED.value, found.is_placed & (found.states == MapState.UNMATCHED), 1.0),
+        (MapState.OUTSIDE.value, found.is_placed & (found.states == MapState.OUTSIDE), 1.0),
         ("place corrected later", wrong, 0.0),
     )
     for kind, chosen, shortest in kinds:
@@ -269,19 +279,9 @@ def _doubt(found: Localization, prior: SavedMap, config: Config) -> str:
     """Reason why a log may be of another place than where it was found; empty if there is none."""
     result, of_map = found.result, len(prior.keyframes)
     chosen = [each for each in result.keyframes[of_map:] if found.is_placed[each.scan_index]]
-    if not chosen:
+    if not chosen or prior.dimension == 3 or found.found_at == 0:  # where it begins was given
         return ""
-    numbers = np.array([each.scan_index for each in chosen])
     placed = [replace(each, T_odom_lidar=found.trajectory.poses[each.scan_index]) for each in chosen]
-    after = np.flatnonzero(found.states[numbers] != MapState.SEARCHING)
-    some = after[:: -(-len(after) // _COMPARED) or 1]
-    is_shown = are_in_sight([placed[k] for k in some.tolist()], prior.keyframes)
-    unmatched = float((found.states[numbers[some]] != MapState.LOCALIZED)[is_shown].sum() / max(is_shown.sum(), 1))
-    if unmatched > _MAX_UNMATCHED:
-        share = f"{100.0 * unmatched:.0f} % of what the map shows of it"
-        return f"{share} does not match: the place has changed, or is another one"
-    if prior.dimension == 3 or found.found_at == 0:  # where it begins was given
-        return ""
     graph = result.graph
     sources = graph.edges[graph.is_loop & ~graph.is_rejected & (graph.edges[:, 0] < of_map), 1] - of_map
     agreeing = np.flatnonzero(np.isin([each.index - of_map for each in chosen], sources))
@@ -297,18 +297,35 @@ def _verdict(found: Localization, prior: SavedMap, parts: tuple[Part, ...], doub
     if not found.is_placed.any():
         if path_m < _SHORT_M[found.trajectory.dimension]:
             return Verdict.NOT_TRUSTWORTHY, f"not found in {prior.name}: {tried} are too short a way to tell"
+        log_odds = found.result.map_log_odds
+        if np.isfinite(log_odds):
+            return Verdict.NOT_TRUSTWORTHY, (
+                f"not certain: {tried} may be in {prior.name}, with log-odds of {log_odds:.1f}, which are too low"
+            )
         return Verdict.NOT_TRUSTWORTHY, f"not from this place: nothing in {tried} is in {prior.name}"
     at = found.found_at
     where = f"found in {prior.name}" + (f" after {found.traveled_m[at]:.1f} m" if at >= 0 else " in the end")
     doubtful = [part for part in parts if part.is_doubtful]
-    outside = int((found.states == MapState.WITHOUT_MAP).sum())
     if not doubtful and not doubt:
-        share = f", {100.0 * outside / scans:.0f} % of them not matched to the map" if outside else ""
-        return Verdict.TRUSTWORTHY, f"{where}, and followed: {tried}{share}"
+        return Verdict.TRUSTWORTHY, f"{where}, and followed: {tried}; {_evidence(found)}"
     largest = sorted(doubtful, key=lambda part: part.length_m, reverse=True)[:_SHOWN]
     more = len(doubtful) - len(largest)
-    listed = [*filter(None, [doubt]), *(part.text for part in largest), *([f"and {more:,} more"] if more else [])]
+    listed = [
+        _evidence(found),
+        *filter(None, [doubt]),
+        *(part.text for part in largest),
+        *([f"and {more:,} more"] if more else []),
+    ]
     return Verdict.CHECK, "; ".join([where, *listed])
+
+
+def _evidence(found: Localization) -> str:
+    """What speaks for the place: how much of what is in the map matches it, and the log-odds."""
+    unmatched, matched = (int((found.states == state).sum()) for state in (MapState.UNMATCHED, MapState.LOCALIZED))
+    outside = int((found.states == MapState.OUTSIDE).sum())
+    share = f"{100.0 * matched / max(matched + unmatched, 1):.0f} % of the scans within the map matched"
+    away = f", {100.0 * outside / len(found.states):.0f} % outside of it" if outside else ""
+    return f"{share}{away}; log-odds {found.result.map_log_odds:.0f}"
 
 
 def pose_near(x_m: float, y_m: float, yaw_deg: float) -> Initial:
@@ -362,7 +379,15 @@ def summary(localized: LocalizedLog, log: Log) -> str:
     if m.matches:
         left_out = f", {m.rejected:,} of them left out" if m.rejected else ""
         lines.append(("matches", f"{m.matches:,} with the map{left_out}; overlap {m.median_overlap:.2f} (median)"))
-        lines.append(("sigma", f"{m.median_sigma_m:.3f} m, standard deviation of a position at its time (median)"))
+        at_its_time, in_the_end = (
+            f"{m.median_sigma_m:.3f} m at its time",
+            f"{m.median_final_sigma_m:.3f} m in the end",
+        )
+        at_its_time, in_the_end = (
+            f"{m.median_sigma_m:.3f} m at its time",
+            f"{m.median_final_sigma_m:.3f} m in the end",
+        )
+        lines.append(("sigma", f"{at_its_time}, {in_the_end}: standard deviation of a position (median)"))
     truth = [] if m.ground_truth is None else accuracy_lines(m.ground_truth)
     lines += [(line[:15].strip(), line[15:]) for line in truth]
     lines += [("stretch", part.text) for part in m.parts]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 
@@ -12,13 +12,14 @@ from numpy.typing import NDArray
 
 from scanchain import checks, lie
 from scanchain.config import Config
-from scanchain.data import AnyPoints, Closure, Matrix, Pose, Scan, State, Step, Trajectory, brief
+from scanchain.data import AnyPoints, Closure, Keyframe, Matrix, Pose, Scan, State, Step, Trajectory, brief
+from scanchain.evaluation.expected import edge_errors, with_map_errors
+from scanchain.loops.evidence import are_in_sight
 from scanchain.maps import SavedMap, open_saved_map
 from scanchain.preprocess import Prepared
 from scanchain.slam import Slam, SlamResult, loop_information
 
 _RECENT_KEYFRAMES = 3  # since the last match with the map, up to which a scan counts as localized
-_TURN = 0.1  # drift in radians a meter, as a share of loops.drift
 INITIAL_SIGMAS = (2.0, 0.35)  # m and rad, standard deviations of a pose that the user gives
 
 
@@ -27,7 +28,8 @@ class MapState(StrEnum):
 
     SEARCHING = "searching"
     LOCALIZED = "localized"
-    WITHOUT_MAP = "tracking without map"
+    UNMATCHED = "not matched to the map"
+    OUTSIDE = "outside of the map"
     LOST = "lost"
 
 
@@ -61,6 +63,7 @@ class Localization:
     trajectory : every scan, T_map_lidar; without meaning where not ``is_placed``
     live : (N, d+1, d+1) poses as known at the time, NaN while searching
     sigma_m : (N,) standard deviation of the position at the time, NaN while searching
+    final_sigma_m : (N,) of the position in the end, NaN where not placed
     traveled_m : (N,) length of the path up to each scan, by odometry
     closures : with keyframes of the map, or tried
     result : of the whole chain, keyframes of the map first
@@ -72,6 +75,7 @@ class Localization:
     trajectory: Trajectory
     live: Matrix
     sigma_m: NDArray[np.float64]
+    final_sigma_m: NDArray[np.float64]
     traveled_m: NDArray[np.float64]
     closures: tuple[Closure, ...]
     result: SlamResult
@@ -124,7 +128,10 @@ class Localizer:
         self.traveled_m: list[float] = []
         self.start_m = self.slam.traveled_m
         self.is_in_map = False
-        self.by_map: tuple[Closure | None, Matrix] = None, np.empty((0, 0))
+        self.state = MapState.SEARCHING  # of the newest keyframe
+        self.covariance = np.empty((0, 0))  # of its pose, but for its own error, once it is in the map
+        self.own = self.covariance  # covariance of its own error
+        self.by_map: Closure | None = None  # its match, or the last one before
 
     def track(
         self,
@@ -168,43 +175,71 @@ class Localizer:
             side="right",
         )
         is_joined = result.components[self.slam.first :] == result.components[0]
+        is_placed = is_joined[keyframe_of - 1]
+        sigma_m = (
+            self._final_sigma_m(result)[keyframe_of - 1] if is_placed.any() else np.full(len(is_placed), np.nan)
+        )
         return Localization(
             states=np.array(self.states, np.str_),
-            is_placed=is_joined[keyframe_of - 1],
+            is_placed=is_placed,
             trajectory=result.trajectory,
             live=np.array(self.live),
             sigma_m=np.array(self.sigma_m),
+            final_sigma_m=np.where(is_placed, sigma_m, np.nan),
             traveled_m=np.array(self.traveled_m),
             closures=tuple(each for each in result.closures if each.target < self.slam.first),
             result=result,
         )
+
+    def _final_sigma_m(self, result: SlamResult) -> NDArray[np.float64]:
+        """(K,) of the keyframes of the log: by all matches in force, the map held."""
+        graph, own = with_map_errors(result.graph, result.map_errors, self.slam.config)
+        covariances = (graph.covariances() + own)[self.slam.first :]
+        return np.sqrt(np.einsum("kii->k", covariances[:, : graph.dimension, : graph.dimension]))
 
     def _placed(self, step: Step) -> Placed:
         slam = self.slam
         if step.closures or step.graph is not None or step.starts_segment or not self.states:
             self.is_in_map = slam.is_in_map
         if not self.is_in_map:
+            self.covariance = np.empty((0, 0))
             return Placed(MapState.SEARCHING, None, None, step)
-        state = MapState.LOCALIZED
-        if slam.by_map is None or len(slam.keyframes) - 1 - slam.by_map.source > _RECENT_KEYFRAMES:
-            state = MapState.WITHOUT_MAP
-        if step.state is State.LOST:
-            state = MapState.LOST
+        if step.keyframe >= 0 or not len(self.covariance):
+            self._follow()
         T_map_lidar = slam.T_world_odom @ step.T_odom_lidar
-        return Placed(state, T_map_lidar, self._covariance(step.T_odom_lidar), step)
+        covariance = _moved(self.covariance, slam.keyframes[-1], step.T_odom_lidar) + self.own
+        return Placed(MapState.LOST if step.state is State.LOST else self.state, T_map_lidar, covariance, step)
 
-    def _covariance(self, T_odom_lidar: Pose) -> Matrix:
-        """Covariance of a pose by the last match with the map and the drift since."""
-        slam, config, k = self.slam, self.slam.config.loops, self.slam.graph.freedom
-        by_map = slam.by_map
-        since_m = slam.traveled_m - (self.start_m if by_map is None else slam.keyframes[by_map.source].traveled_m)
-        drift = lie.by_component(k, config.drift * since_m, _TURN * config.drift * since_m)
-        if by_map is None:
-            return np.diag(lie.by_component(k, *INITIAL_SIGMAS) ** 2 + drift**2)
-        if self.by_map[0] is not by_map:
-            self.by_map = by_map, np.asarray(np.linalg.inv(loop_information(by_map, config)), np.float64)
-        T_source_lidar = lie.between(slam.keyframes[by_map.source].T_odom_lidar, T_odom_lidar)
-        Ad = lie.adjoint(lie.inverse(T_source_lidar))
-        covariance = Ad @ self.by_map[1] @ Ad.T
-        covariance.flat[:: k + 1] += drift * drift
-        return covariance
+    def _follow(self) -> None:
+        """State and covariance of the newest keyframe: by its match with the map, or by the motion to it."""
+        slam, by_map, newest = self.slam, self.slam.by_map, self.slam.keyframes[-1]
+        of_newest = (slam.graph.edges[:, 1] == newest.index) & ~slam.graph.is_loop
+        information = slam.graph.added_since(int(np.flatnonzero(of_newest)[-1]))[1][:1]
+        motion, own = self._errors(information, newest.index, is_loop=False)
+        if by_map is not None and (by_map is not self.by_map or not len(self.covariance)):
+            loop = loop_information(by_map, slam.config.loops)[None]
+            matched = self._errors(loop, by_map.source, is_loop=True)[0]
+            self.covariance = _moved(matched, slam.keyframes[by_map.source], newest.T_odom_lidar)
+        elif by_map is None and not len(self.covariance):
+            self.covariance = np.diag(lie.by_component(slam.graph.freedom, *INITIAL_SIGMAS) ** 2)
+        else:
+            self.covariance = _moved(self.covariance, slam.keyframes[-2], newest.T_odom_lidar) + motion
+        self.by_map, self.own = by_map, own
+        if by_map is not None and newest.index - by_map.source <= _RECENT_KEYFRAMES:
+            self.state = MapState.LOCALIZED
+        else:
+            placed = replace(newest, T_odom_lidar=slam.graph.poses[-1])
+            is_known = are_in_sight([placed], slam.keyframes[: slam.first])[0]
+            self.state = MapState.UNMATCHED if is_known else MapState.OUTSIDE
+
+    def _errors(self, information: Matrix, keyframe: int, *, is_loop: bool) -> tuple[Matrix, Matrix]:
+        """Covariances (k, k) of an edge to a keyframe, and of the pose of that by itself."""
+        errors = self.slam.map_errors[keyframe : keyframe + 1]
+        edge, own = edge_errors(information, np.array([is_loop]), errors, self.slam.config)
+        return edge[0], own[0]
+
+
+def _moved(covariance: Matrix, keyframe: Keyframe, T_odom_lidar: Pose) -> Matrix:
+    """Covariance of the pose of a keyframe as that of another pose, whose motion from it is known."""
+    Ad = lie.adjoint(lie.between(T_odom_lidar, keyframe.T_odom_lidar))
+    return Ad @ covariance @ Ad.T

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from scanchain import lie
-from scanchain.data import Closure, ClosureVerdict, Keyframe
+from scanchain.data import Closure, ClosureVerdict, Keyframe, Proposal
 from scanchain.evaluation import absolute_error, pair
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.logs import open_log
 from scanchain.loops.connectivity import Segments
-from scanchain.loops.evidence import MapEvidence
+from scanchain.loops.evidence import _OF_FIND as FOUND
+from scanchain.loops.evidence import PlaceTest
 from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.odometry import Odometry
 from scanchain.odometry.tracked import first_match
@@ -101,57 +102,105 @@ def square(half_m):
     return np.vstack([*sides, *(side[:, ::-1] for side in sides)])
 
 
-@pytest.mark.parametrize(("half_m", "joins"), [(4.0, True), (9.0, False)])
-def test_three_keyframes_that_agree_join_a_log_to_a_map_unless_it_was_seen_through(half_m, joins):
-    points = [stored(square(4.0))] * 3 + [stored(square(half_m))] * 6
-    keyframes = [Keyframe(k, k, k, points[k], lie.pose_2d(0.5 * (k % 3), 0.0, 0.0), 1.0 * k) for k in range(9)]
-    segments = Segments()
-    segments.start(3)
-    evidence = MapEvidence(segments, 3)
-
-    def closures(*sources, y_m=0.0):
-        return [
-            Closure(k % 3, k, match_of(lie.pose_2d(0.0, y_m, 0.0)), 0.9, ClosureVerdict.ACCEPTED, "")
-            for k in sources
-        ]
-
-    graph = graph_of(9)
-    assert not evidence.collect(closures(3), keyframes[:4]) and connected(segments, graph).all()
-    assert not evidence.collect(closures(4), keyframes[:5])
-    assert not evidence.collect(closures(5, y_m=3.0), keyframes[:6]), "it is at another pose"
-    assert [each.source for each in evidence.collect(closures(6), keyframes[:7])] == ([3, 4, 6] if joins else [])
-    assert evidence.is_gathering is not joins
-    assert connected(segments, graph).tolist() == [not joins] * 3 + [True] * 6
-
-
-def test_a_pose_in_a_map_that_further_keyframes_do_not_confirm_is_given_up():
-    segments = Segments()
-    segments.start(3)
-    evidence = MapEvidence(segments, 3)
-    keyframes = [Keyframe(k, k, k, stored(square(4.0)), lie.identity(2), 1.0 * k) for k in range(20)]
-    closure = Closure(0, 3, match_of(lie.identity(2)), 0.9, ClosureVerdict.ACCEPTED, "")
-    evidence.collect([closure, replace(closure, source=4)], keyframes[:5])
-    for source in range(5, 9):
-        evidence.collect(
-            [replace(closure, source=source, verdict=ClosureVerdict.REJECTED)], keyframes[: source + 1]
-        )
-    assert evidence.is_gathering and not evidence.is_in_vain(keyframes[:15])
-    assert evidence.is_in_vain(keyframes[:16])
-    evidence.reset()
-    assert not evidence.is_gathering and not connected(segments, graph_of(16))[:3].any()
-
-
-@pytest.mark.parametrize(("away_m", "joins"), [(0.0, False), (30.0, True)])
-def test_keyframes_that_do_not_match_count_against_a_log_only_where_the_map_shows_them(away_m, joins):
-    at_m = [*[0.0] * 3, *[0.0] * 4, *[away_m] * 20]
-    keyframes = [
-        Keyframe(k, k, k, stored(square(4.0)), lie.pose_2d(x_m, 0.0, 0.0), 1.0) for k, x_m in enumerate(at_m)
+def keyframes_in(rooms, away_m=()):
+    """Three keyframes of a map in a room of 8 m, and a log's, a meter apart, in rooms of these half widths."""
+    sizes = [4.0] * 3 + list(rooms)
+    at_m = [0.0] * 3 + (list(away_m) or [0.0] * len(rooms))
+    return [
+        Keyframe(k, k, k, stored(square(size)), lie.pose_2d(x_m, 0.0, 0.0), 1.0 * k)
+        for k, (size, x_m) in enumerate(zip(sizes, at_m, strict=True))
     ]
-    evidence = MapEvidence(Segments(), 3)
-    closure = Closure(0, 3, match_of(lie.identity(2)), 0.9, ClosureVerdict.REJECTED, "")
-    evidence.note([replace(closure, source=source) for source in range(3, 27)])
-    assert evidence.joins(keyframes[3:], {3, 4, 5, 6}, keyframes) is joins
-    assert not evidence.joins(keyframes[3:], {3, 4}, keyframes), "two are too few"
+
+
+def begun():
+    segments = Segments()
+    segments.start(3)
+    return PlaceTest(segments, 3), segments
+
+
+def tried(*sources, y_m=0.0, overlap=0.95, verdict=ClosureVerdict.ACCEPTED):
+    match = match_of(lie.pose_2d(0.0, y_m, 0.0))
+    return [Closure(0, source, match, overlap, verdict, "") for source in sources]
+
+
+def test_keyframes_that_fit_one_place_join_a_log_to_a_map_once_they_are_enough():
+    keyframes = keyframes_in([4.0] * 8)
+    evidence, segments = begun()
+    graph = graph_of(11)
+    assert not evidence.collect(tried(3, overlap=0.61), keyframes[:4]) and connected(segments, graph).all()
+    assert not evidence.collect(tried(4, overlap=0.61), keyframes[:5])
+    assert not evidence.collect(tried(5, y_m=3.0), keyframes[:6]), "it is at another pose"
+    joining = [evidence.collect(tried(source, overlap=0.61), keyframes[: source + 1]) for source in range(6, 9)]
+    assert [[each.source for each in closures] for closures in joining] == [[], [], [3, 4, 6, 7, 8]]
+    assert not evidence.is_gathering and evidence.bound == pytest.approx(np.log(1e3))
+    assert connected(segments, graph).tolist() == [False] * 3 + [True] * 8
+
+
+def test_a_place_that_was_seen_through_is_dropped_however_well_the_scans_fit():
+    keyframes = keyframes_in([9.0] * 8)
+    evidence, _ = begun()
+    for source in range(3, 9):
+        assert not evidence.collect(tried(source), keyframes[: source + 1])
+    assert evidence.is_in_vain
+    evidence.drop(3)
+    assert not evidence.is_gathering and np.isnan(evidence.best)
+
+
+def test_keyframes_closer_than_a_meter_count_for_the_path_between_them():
+    apart, close = keyframes_in([4.0] * 8), keyframes_in([4.0] * 8)
+    close = [replace(each, traveled_m=3.0 + 0.25 * each.index) for each in close]
+    odds = []
+    for keyframes in (apart, close):
+        evidence, _ = begun()
+        evidence.collect(tried(3), keyframes[:4])
+        evidence.collect(tried(4), keyframes[:5])
+        odds.append(evidence.log_odds)
+    assert [each - FOUND for each in odds] == pytest.approx([4.0, 2.5])
+
+
+def test_the_longer_the_path_that_was_sought_the_more_a_place_has_to_show():
+    keyframes = [replace(each, traveled_m=20.0 * each.index) for each in keyframes_in([4.0] * 8)]
+    evidence, _ = begun()
+    evidence.collect(tried(3, overlap=0.61), keyframes[:4])
+    assert evidence.bound == pytest.approx(np.log(1e3))
+    evidence.drop(3)
+    assert evidence.best == pytest.approx(evidence.log_odds), "that was cut short, and so is not certain"
+    evidence.collect(tried(7, overlap=0.61), keyframes[:8])
+    assert evidence.bound == pytest.approx(np.log(1e3 * 80.0 / 8.0))
+
+
+def test_what_is_joined_is_withdrawn_once_the_place_is_seen_through_and_not_before():
+    keyframes = keyframes_in([4.0] * 6 + [9.0] * 12)
+    evidence, _ = begun()
+    for source in range(3, 7):
+        evidence.collect(tried(source), keyframes[: source + 1])
+    assert not evidence.is_gathering
+    holds = [evidence.follow(tried(source), keyframes[: source + 1]) for source in range(9, 21)]
+    assert holds[0] and holds[3] and not holds[-1]
+
+
+def test_places_proposed_elsewhere_say_nothing_about_a_place_that_is_joined():
+    keyframes = keyframes_in([4.0] * 6)
+    evidence, _ = begun()
+    for source in range(3, 7):
+        evidence.collect(tried(source), keyframes[: source + 1])
+    before = evidence.log_odds
+    elsewhere = [
+        replace(each, proposed_by=Proposal.PLACE)
+        for each in tried(8, y_m=9.0, overlap=0.1, verdict=ClosureVerdict.REJECTED)
+    ]
+    assert evidence.follow(elsewhere, keyframes) and evidence.log_odds == before
+
+
+@pytest.mark.parametrize(("away_m", "holds"), [(0.0, False), (30.0, True)])
+def test_what_does_not_match_counts_against_a_log_only_where_the_map_shows_it(away_m, holds):
+    keyframes = keyframes_in([4.0] * 6 + [9.0] * 20, [0.0] * 6 + [away_m] * 20)
+    evidence, _ = begun()
+    evidence.note(tried(*range(3, 9)))
+    at_wrong = tried(*range(9, 29), overlap=0.2, verdict=ClosureVerdict.REJECTED)
+    evidence.note(at_wrong)
+    assert evidence.holds(keyframes[3:], keyframes) is holds
+    assert np.isfinite(evidence.best) is np.bool_(holds)
 
 
 def carried(slam, scans, first, last):

@@ -116,7 +116,11 @@ def test_a_localized_log_names_the_directory_that_it_was_written_to_and_its_map(
     assert call("view", "loc", "--png", "loc.png")[0] == 0
 
 
-def test_a_log_most_of_which_does_not_match_the_map_that_shows_it_is_not_trustworthy(office, monkeypatch):
+def found_text(found, saved, config):
+    return measure(found, saved, config, 1.0, ()).reason
+
+
+def test_the_verdict_names_what_speaks_for_the_place(office, monkeypatch):
     saved, log = open_saved_map(office / "map"), open_log([office / "office.mcap"], LogConfig(end_s=30.0))
     config = load_settings(2).config
     localizer = Localizer(saved, config, log.T_base_lidar, is_live=False)
@@ -124,10 +128,16 @@ def test_a_log_most_of_which_does_not_match_the_map_that_shows_it_is_not_trustwo
         localizer.process(scan)
     found = localizer.finish()
     assert measure(found, saved, config, 1.0, ()).verdict == Verdict.TRUSTWORTHY
-    states = found.states.copy()
-    states[found.found_at + 1 :] = MapState.WITHOUT_MAP
-    unmatched = measure(replace(found, states=states), saved, config, 1.0, ())
-    assert unmatched.verdict == Verdict.CHECK and "does not match: the place has changed" in unmatched.reason
+    assert "100 % of the scans within the map matched" in found_text(found, saved, config)
+    states = found.states.astype("U30")
+    states[len(states) // 2 :], states[-10:] = MapState.UNMATCHED, MapState.OUTSIDE
+    text = found_text(replace(found, states=states), saved, config)
+    assert "% of the scans within the map matched, 3 % outside of it; log-odds " in text
+    nowhere = replace(
+        found, is_placed=np.zeros_like(found.is_placed), result=replace(found.result, map_log_odds=2.5)
+    )
+    assert "not certain: 300 scans over" in found_text(nowhere, saved, config)
+    assert "log-odds of 2.5" in found_text(nowhere, saved, config)
     monkeypatch.setattr("scanchain.sessions.localize.repeated_paths", lambda *_: (2, 6))
     alike = measure(found, saved, config, 1.0, ())
     assert alike.verdict == Verdict.CHECK and "2 of 6 paths in it look like other places, too" in alike.reason

@@ -22,7 +22,8 @@ _ACCEPTED, _REJECTED, _SIGMA = "world/matches/accepted", "world/matches/rejected
 _COLORS = {
     MapState.SEARCHING: entities.GRAY,
     MapState.LOCALIZED: entities.GREEN,
-    MapState.WITHOUT_MAP: entities.ORANGE,
+    MapState.UNMATCHED: entities.ORANGE,
+    MapState.OUTSIDE: entities.VIOLET,
     MapState.LOST: entities.RED,
 }
 _MAX_SCAN_POINTS = 5_000

@@ -20,7 +20,8 @@ from scanchain.words import counted
 COLORS = {
     MapState.SEARCHING: "#8c9096",
     MapState.LOCALIZED: "#3f9b2f",
-    MapState.WITHOUT_MAP: "#c77800",
+    MapState.UNMATCHED: "#c77800",
+    MapState.OUTSIDE: "#6a5acd",
     MapState.LOST: "#d6453d",
 }
 _PLACED_LATER = "#0f9bb5"
@@ -35,7 +36,8 @@ def write_localization_report(folder: Path, localized: LocalizedLog) -> None:
         ("found", f"after {m.found_after_m:.1f} m, {m.found_after_s:.1f} s" if m.found_scan >= 0 else "not"),
         ("matches with the map", f"{m.matches:,}, {m.rejected:,} left out"),
         ("overlap", f"{m.median_overlap:.2f} (median)" if m.matches else "none"),
-        ("standard deviation", f"{m.median_sigma_m:.3f} m (median)" if m.matches else "unknown"),
+        ("standard deviation", f"{m.median_final_sigma_m:.3f} m (median)" if m.matches else "unknown"),
+        ("log-odds of the place", f"{m.log_odds:.0f}" if np.isfinite(m.log_odds) else "none"),
         *([] if m.ground_truth is None else [("ATE", f"{m.ground_truth.optimized.ate_rmse_m:.4f} m (rmse)")]),
     )
     subtitle = f"{localized.path.name.split('.partial')[0]} in the map {localized.prior.name}"

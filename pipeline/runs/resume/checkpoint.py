@@ -22,7 +22,7 @@ from scanchain.kernels.voxels.voxel_shapes import Voxels
 from scanchain.loops.closer import LoopCloser, ProximityCloser
 from scanchain.loops.closure_table import ClosureTable
 from scanchain.loops.connectivity import Drift, Segments
-from scanchain.loops.evidence import MapEvidence
+from scanchain.loops.evidence import PlaceTest
 from scanchain.loops.place_closer import PlaceCloser
 from scanchain.loops.relocalization import Find, PlanarSearch, Relocalizer
 from scanchain.loops.submaps import VoxelSubmaps
@@ -81,7 +81,7 @@ _CLASSES = Classes(
         Voxels, PointToShapeMatcher, LoopCloser, ProximityCloser, PlaceCloser, Relocalizer, Find, PlanarSearch,
         VoxelSubmaps, ScanVerifier, SubmapVerifier, Segments, Drift, PoseGraph, Explanation, Slip, GrowingArray,
         Since, data.KeyframeErrors, KeyframeErrorTracker,
-        ClosureTable, MapEvidence, BackgroundOptimization, PointStore, StoredPoints,
+        ClosureTable, PlaceTest, BackgroundOptimization, PointStore, StoredPoints,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.ClosureVerdict, data.Proposal, data.Prior,
         data.State,
         Config, *(type(getattr(Config(), section)) for section in Config.__struct_fields__),
