@@ -30,7 +30,7 @@ from scanchain.logs.messages.laser_scan import LaserScanDecoder
 from scanchain.logs.messages.point_cloud import PlanarCloudDecoder, PointCloudDecoder, plane_height_m
 from scanchain.logs.messages.point_times import PointTimes
 from scanchain.logs.messages.poses import StampedPose
-from scanchain.logs.messages.readers import cloud_reader, is_scan, pose_reader, scan_reader, transforms_reader
+from scanchain.logs.messages.readers import is_scan, pose_reader, reader
 from scanchain.logs.messages.returns import RangeLimits, Returns
 from scanchain.logs.mounting import (
     find_mounting,
@@ -135,9 +135,7 @@ class Log:
             if channel is not None
         }
         if self.mounting.joints:
-            self.pose_decoders |= {
-                topic: transforms_reader(channel) for topic, channel in joint_topics(indexes).items()
-            }
+            self.pose_decoders |= {topic: reader(channel) for topic, channel in joint_topics(indexes).items()}
         self.scans_with_wheels = 0
         self.copies: list[str] = []
         self._opening_notes = tuple(self.notes)
@@ -314,15 +312,15 @@ class Log:
         """Decoder of the lidar's messages to points; ``times`` collects its assumptions about theirs."""
         limits = RangeLimits(self.config.min_range_m, self.config.max_range_m)
         if is_scan(self.lidar):
-            return LaserScanDecoder(limits, scan_reader(self.lidar))
+            return LaserScanDecoder(limits, reader(self.lidar))
         if self.plane_height_m is None:
-            return PointCloudDecoder(limits, times, cloud_reader(self.lidar))
-        return PlanarCloudDecoder(limits, times, cloud_reader(self.lidar), self.plane_height_m)
+            return PointCloudDecoder(limits, times, reader(self.lidar))
+        return PlanarCloudDecoder(limits, times, reader(self.lidar), self.plane_height_m)
 
     def _plane_height_m(self) -> float | None:
         """Height of all points of the first clouds, None where they differ; samples their point times, too."""
         limits = RangeLimits(self.config.min_range_m, self.config.max_range_m)
-        decoder = PointCloudDecoder(limits, self._sampled_times, cloud_reader(self.lidar))
+        decoder = PointCloudDecoder(limits, self._sampled_times, reader(self.lidar))
         height_m = plane_height_m(first_messages(self.indexes, self.topic, decoder.decode))
         if height_m is not None:
             self.notes.append(

@@ -16,13 +16,10 @@ from scanchain.logs.mcap.selection import Span
 from scanchain.logs.mcap.stream import first_messages, spread_messages
 from scanchain.logs.messages.poses import StampedPose, chain, frames_between
 from scanchain.logs.messages.readers import (
-    cloud_reader,
     has_transforms,
     is_odometry,
-    is_scan,
     pose_reader,
-    scan_reader,
-    transforms_reader,
+    reader,
 )
 from scanchain.logs.topics import topics_of
 
@@ -177,7 +174,7 @@ def _moving_transforms(
     """Messages of each transform that may change, from parts of the log spread over it."""
     found: dict[Edge, list[StampedPose]] = {}
     for topic, channel in topics.items():
-        for transforms in spread_messages(indexes, topic, transforms_reader(channel), span):
+        for transforms in spread_messages(indexes, topic, reader(channel), span):
             for each in transforms:
                 found.setdefault(edge(each), []).append(each)
     return found
@@ -300,12 +297,12 @@ def static_transforms(indexes: Sequence[FileIndex]) -> list[StampedPose]:
     found: list[StampedPose] = []
     for topic, channel in topics_of(indexes).items():
         if topic.endswith("tf_static") and has_transforms(channel):
-            for transforms in first_messages(indexes, topic, transforms_reader(channel)):
+            for transforms in first_messages(indexes, topic, reader(channel)):
                 found += transforms
     return found
 
 
 def _frame_of(indexes: Sequence[FileIndex], lidar: Channel) -> str:
     """The frame of a lidar's first messages, empty where they name none."""
-    read = scan_reader(lidar) if is_scan(lidar) else cloud_reader(lidar)
+    read = reader(lidar)
     return next(first_messages(indexes, lidar.topic, lambda data: read(data).frame), "").lstrip("/")

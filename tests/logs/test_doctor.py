@@ -227,11 +227,6 @@ def test_copies_of_scans_are_counted_and_mended_by_taking_every_second(tmp_path)
     assert finding.severity == "warning" and "20 of 40 scans" in finding.found and finding.remedy == "--every 2"
 
 
-def test_a_burst_at_the_start_of_a_log_is_named(tmp_path):
-    finding = diagnose(saved(tmp_path, drive(stamp=lambda k: 99_000_000 if k == 0 else 0)))["bursts"]
-    assert finding.severity == "note" and "1 within 1 ms of the one before (scan 1)" in finding.found
-
-
 def test_a_stuck_driver_is_told_from_one_that_publishes_too_often(tmp_path):
     finding = diagnose(saved(tmp_path, drive(ranges=lambda k: room(min(k, 20)))))["duplicates"]
     assert "19 of 40 scans" in finding.found and "20 of them in a row" in finding.found and not finding.remedy

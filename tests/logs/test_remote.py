@@ -15,6 +15,9 @@ from scanchain.__main__ import main
 from scanchain.config import LogConfig
 from scanchain.errors import InputError, MissingExtraError
 from scanchain.logs import files, open_log
+from scanchain.logs.mcap.index import walked
+from scanchain.logs.mcap.records import FileIndex
+from scanchain.logs.mcap.selection import complete
 from scanchain.logs.opening import index_files
 from scanchain.logs.writing import writer
 from scanchain.runs.provenance import Provenance, identity_of
@@ -61,11 +64,14 @@ def same_scans(first, second):
 
 
 def test_an_index_by_the_summary_is_that_of_walking_the_file(site, log_file):
-    (walked,), (asked,) = index_files([log_file]), index_files([Address(site.log)])
+    (local,), (asked,) = index_files([log_file]), index_files([Address(site.log)])
     assert len(site.asked) == 2 and site.sent <= 65_537  # the last byte, and the tail
     checked = [replace(block, crc=asked.stored(block)[1]) for block in asked.blocks]
-    assert checked == walked.blocks and all(block.crc for block in checked)
-    assert (asked.channels, asked.counts, asked.is_consistent) == (walked.channels, walked.counts, True)
+    walk = walked(FileIndex(log_file, 0, log_file.read_bytes()))
+    complete(walk)
+    assert checked == walk.blocks and all(block.crc for block in checked)
+    assert asked.channels == local.channels == walk.channels and asked.counts == local.counts == walk.counts
+    assert local.blocks == asked.blocks and not walk.damage
 
 
 def test_scans_and_truth_are_those_of_the_file_and_every_byte_is_fetched_once(site, log_file):

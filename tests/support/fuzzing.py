@@ -23,14 +23,12 @@ from scanchain.logs.messages.laser_scan import LaserScanDecoder
 from scanchain.logs.messages.point_cloud import PointCloudDecoder
 from scanchain.logs.messages.point_times import PointTimes
 from scanchain.logs.messages.readers import (
-    cloud_reader,
     has_poses,
     has_transforms,
     is_cloud,
     is_scan,
     pose_reader,
-    scan_reader,
-    transforms_reader,
+    reader,
 )
 from scanchain.logs.messages.returns import RangeLimits
 from tests.support import recorders
@@ -190,11 +188,11 @@ def _messages(folder):
 def decoder_of(channel):
     limits = RangeLimits(0.0, float("inf"))
     if is_scan(channel):
-        return LaserScanDecoder(limits, scan_reader(channel)).decode
+        return LaserScanDecoder(limits, reader(channel)).decode
     if is_cloud(channel):
-        return PointCloudDecoder(limits, PointTimes(LogConfig()), cloud_reader(channel)).decode
+        return PointCloudDecoder(limits, PointTimes(LogConfig()), reader(channel)).decode
     if has_transforms(channel):
-        return transforms_reader(channel)
+        return reader(channel)
     assert has_poses(channel), channel
     return pose_reader(channel, 2)
 

@@ -25,7 +25,6 @@ from scanchain.words import counted
 _GAP_PERIODS = 2.5
 _MOST_MISSING = 10  # largest number of scans missing in a row at which they are counted
 _JITTER = 0.1  # jitter, as a share of the period, from which on scans come as they please
-_BURST = 0.05  # share of the period within which a scan follows the one before in a burst
 _LONG_GAP_S, _LONG_GAP_ON_WHEELS_S = 0.5, 10.0
 _OTHER_CLOCK_S = 1.0
 _LATE_S = 0.2
@@ -102,7 +101,6 @@ def examine(
 def _check(seen: Survey, config: Config) -> Iterator[Finding]:
     """Every finding about a log. ``config`` is what a run of it would use."""
     yield _gaps(seen, bool(seen.wheels) and config.odometry.prior != "constant-velocity")
-    yield from _bursts(seen)
     yield _order(seen)
     yield _clock(seen)
     yield _wheels(seen)
@@ -114,16 +112,6 @@ def _check(seen: Survey, config: Config) -> Iterator[Finding]:
     yield _no_return(seen)
     yield _ranges(seen, config.preprocess)
     yield _duplicates(seen)
-
-
-def _bursts(seen: Survey) -> Iterator[Finding]:
-    """A finding where scans follow each other faster than the lidar takes them."""
-    steps_s = np.diff(seen.stamps_ns) * 1e-9
-    soon = np.flatnonzero((steps_s > 0.0) & (steps_s < _BURST * seen.period_s))
-    if len(soon):
-        found = f"{len(soon):,} within {1e3 * steps_s[soon].max():.2g} ms of the one before (scan {soon[0] + 1:,})"
-        effect = "a burst shows no velocity: a run takes the usual interval for it"
-        yield Finding("bursts", Severity.NOTE, found, effect)
 
 
 def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:

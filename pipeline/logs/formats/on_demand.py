@@ -34,7 +34,7 @@ def add_block(
 
 def on_demand_index(path: Path, number: int) -> FileIndex:
     """An index without channels or blocks; the format sets ``index.make``, which converts a block."""
-    return FileIndex(path, number, b"", is_counted=True, profile="ros2")
+    return FileIndex(path, number, b"", is_counted=True)
 
 
 def natural_order(path: Path) -> tuple[tuple[int, ...], str]:

@@ -156,7 +156,7 @@ def index_ros1_bag(path: Path, number: int) -> FileIndex:
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise InputError(f"{path}: is a bag of an old version; rosbag migrate makes one of version 2.0 of it")
-        index = FileIndex(path, number, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ), profile="ros1")
+        index = FileIndex(path, number, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
     bag = _Bag(index)
     index.make = bag.make
     bag.walk()

@@ -138,13 +138,5 @@ def _channel(key: tuple[int, int], connection: Any) -> Channel:
     stated = connection.msgdef
     encoding = connection.ext.serialization_format
     language = "ros2idl" if stated.format.name == "IDL" else "ros2msg"
-    definition = stated.data.encode() or _definition(connection.msgtype)
+    definition = stated.data.encode() or schema_text(connection.msgtype)
     return Channel(key, connection.topic, encoding, key[1], connection.msgtype, language, definition)
-
-
-def _definition(type_name: str) -> bytes:
-    """Definition of a type that an old bag does not define, empty for an unknown type."""
-    try:
-        return schema_text(type_name)
-    except (KeyError, ValueError):
-        return b""

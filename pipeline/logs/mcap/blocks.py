@@ -6,7 +6,6 @@ import bz2
 import mmap
 import struct
 import zlib
-from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
 from io import BytesIO
 
@@ -18,12 +17,12 @@ from scanchain.logs.mcap.records import (
     CHANNEL,
     MESSAGE,
     MESSAGE_HEAD,
-    RECORD,
     SCHEMA,
     Block,
     Contents,
     FileIndex,
     Message,
+    records_of,
 )
 from scanchain.words import counted
 
@@ -43,7 +42,7 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
     messages: list[Message] = []
     met = undefined = 0
     try:
-        for opcode, begin, end in _records(payload):
+        for opcode, begin, end in records_of(payload):
             if opcode == SCHEMA:
                 index.add_schema(payload, begin)
             elif opcode == CHANNEL:
@@ -55,6 +54,8 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
                 undefined += channel is None
                 if channel is not None and (wanted is None or number in wanted):
                     messages.append(Message(channel, log_time_ns, payload[begin + MESSAGE_HEAD.size : end]))
+            else:
+                raise struct.error("record of no kind that a chunk may hold")
     except (struct.error, UnicodeDecodeError):
         damage = "a record in it is malformed; what follows was left out"
         return Contents(messages, "" if block.is_cut else f"{_name(index, block)}: {damage}")
@@ -89,17 +90,6 @@ def release(index: FileIndex, block: Block) -> None:
     if isinstance(index.data, mmap.mmap) and hasattr(index.data, "madvise"):
         begin = block.offset - block.offset % mmap.PAGESIZE
         index.data.madvise(mmap.MADV_DONTNEED, begin, block.offset + block.size - begin)
-
-
-def _records(payload: memoryview) -> Iterator[tuple[int, int, int]]:
-    """Opcode, begin and end of each record. Raises struct.error for one that does not belong there."""
-    offset = 0
-    while offset < len(payload):
-        opcode, length = RECORD.unpack_from(payload, offset)
-        begin, offset = offset + RECORD.size, offset + RECORD.size + length
-        if offset > len(payload) or opcode not in (SCHEMA, CHANNEL, MESSAGE):
-            raise struct.error("record beyond the end, or of no kind that a chunk may hold")
-        yield opcode, begin, offset
 
 
 def _decompressed(stored: memoryview, compression: str, size: int, *, is_cut: bool) -> bytes | memoryview:

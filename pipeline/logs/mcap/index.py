@@ -1,7 +1,8 @@
-"""Index of an MCAP file: its blocks of messages, channels and damage, found by walking its records or its summary.
+"""Index of an MCAP file: its blocks of messages, channels and damage, by its summary or by walking its records.
 
-A walk reads nine bytes a record and a chunk's header, never its contents, and needs no summary: files that were
-cut off or never finished are indexed like any other. Behind damage it goes on at the next record that is one.
+A summary that agrees with its CRC and its statistics gives the position of every message; a damaged chunk shows
+when it is unpacked. Files that were cut off, never finished or damaged there are walked: nine bytes a record and
+a chunk's header are read, never its contents, and behind damage it goes on at the next record that is one.
 Format: https://mcap.dev/spec
 """
 
@@ -11,10 +12,16 @@ import mmap
 import struct
 import zlib
 from collections import Counter
+from collections.abc import Callable
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
 from functools import lru_cache
+from io import BytesIO
 from pathlib import Path
+
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.records import ChunkIndex, Statistics
 
 from scanchain.errors import InputError
 from scanchain.logs.files import RemoteFile
@@ -24,7 +31,6 @@ from scanchain.logs.mcap.records import (
     CHUNK_INDEX,
     DATA_END,
     FOOTER,
-    HEADER,
     MAGIC,
     MESSAGE,
     MESSAGE_HEAD,
@@ -36,6 +42,7 @@ from scanchain.logs.mcap.records import (
     Entry,
     FileIndex,
     read_strings,
+    records_of,
 )
 from scanchain.logs.mcap.resync import (
     CHUNK_HEAD,
@@ -68,10 +75,28 @@ def index_file(path: Path, number: int, source: Source | None = None) -> FileInd
 
     source : the original of a copy, named in messages; None for itself
     """
-    index = FileIndex(source or path, number, _map(path))
-    data, walk = index.data, _Walk(index, index.data)
+    data = _map(path)
+    index = FileIndex(source or path, number, data)
+    summary = _summary(lambda offset, size: data[offset : offset + size], len(data), needs_crc=True)
+    return index if _take_summary(index, summary, len(data)) else walked(FileIndex(index.path, number, data))
+
+
+def index_by_summary(file: RemoteFile, number: int) -> FileIndex | None:
+    """Index of a remote file by its summary alone, in two or three requests; None where that is incomplete.
+
+    Any other file has to be walked, which takes all its bytes.
+    """
+    index = FileIndex(file.address, number, b"", lru_cache(_REPEATED)(file.read))
+    summary = _summary(file.read, file.size, needs_crc=False)
+    return index if _take_summary(index, summary, file.size) else None
+
+
+def walked(index: FileIndex) -> FileIndex:
+    """The index, filled by walking the records of its file."""
+    data, walk = index.data, _Walk(index)
+    index.is_consistent = False
     sought: AbstractSet[int] = frozenset()
-    offset, end = len(MAGIC), record_end(index.data, len(MAGIC))
+    offset, end = len(MAGIC), record_end(data, len(MAGIC))
     while not is_end(data, offset):
         following = record_end(data, end) if end else 0
         if end and (following or is_end(data, end)):
@@ -94,34 +119,71 @@ def index_file(path: Path, number: int, source: Source | None = None) -> FileInd
     return index
 
 
-def index_by_summary(file: RemoteFile, number: int) -> FileIndex | None:
-    """Index of a remote file by its summary alone, in two or three requests; None where that is incomplete.
-
-    A file whose summary is absent, damaged, or does not give the position of every message has to be walked, which
-    takes all its bytes.
-    """
-    tail = file.read(max(file.size - _TAIL_BYTES, 0), min(file.size, _TAIL_BYTES))
+def _summary(read: Callable[[int, int], bytes], size: int, *, needs_crc: bool) -> bytes:
+    """The summary of a file of this size, to its end; empty where there is none or its CRC is wrong."""
+    tail = read(max(size - _TAIL_BYTES, 0), min(size, _TAIL_BYTES))
     footer = tail[-_FOOTER_BYTES:]
     if len(footer) < _FOOTER_BYTES or not footer.endswith(MAGIC) or footer[0] != FOOTER:
-        return None
-    (begin,) = struct.unpack_from("<Q", footer, RECORD.size)
-    if not 0 < begin <= file.size - len(footer):
-        return None
-    missing = file.size - len(tail) - begin
-    summary = file.read(begin, missing) + tail if missing > 0 else tail[-missing:]
-    if not _agrees(summary, 0):
-        return None
-    index = FileIndex(file.address, number, b"", lru_cache(_REPEATED)(file.read))
-    walk, offset = _Walk(index, summary), 0
-    while 0 <= offset < len(summary) - len(footer):
-        end = record_end(summary, offset)
-        walk.take(offset, end)
-        offset = end or -1
-    walk.check_claims()
+        return b""
+    begin, _, crc = struct.unpack_from("<QQI", footer, RECORD.size)
+    if not 0 < begin <= size - len(footer) or (needs_crc and not crc):
+        return b""
+    missing = size - len(tail) - begin
+    summary = read(begin, missing) + tail if missing > 0 else tail[-missing:]
+    return summary if not crc or zlib.crc32(summary[: -len(MAGIC) - 4]) == crc else b""
+
+
+def _take_summary(index: FileIndex, summary: bytes, size: int) -> bool:
+    """Fill the index by the summary of a file of this size; False where that does not give every message."""
+    statistics = None
+    try:
+        for opcode, begin, end in records_of(summary[: -len(MAGIC)]):
+            body = ReadDataStream(BytesIO(summary[begin:end]))
+            if opcode == SCHEMA:
+                index.add_schema(summary, begin)
+            elif opcode == CHANNEL:
+                index.add_channel(summary, begin)
+            elif opcode == CHUNK_INDEX:
+                index.blocks.append(_indexed(ChunkIndex.read(body), index.number))
+            elif opcode == STATISTICS:
+                statistics = Statistics.read(body)
+    except (McapError, struct.error, UnicodeDecodeError):
+        return False
+    if statistics is None or statistics.chunk_count != len(index.blocks):
+        return False
     index.blocks.sort(key=lambda block: block.offset)
-    is_inside = all(block.chunk_offset >= 0 and block.offset + block.size <= file.size for block in index.blocks)
-    is_complete = index.is_counted and not index.damage and offset == len(summary) - len(footer)
-    return index if is_inside and is_complete else None
+    index.counts, index.is_counted = dict(statistics.channel_message_counts), True
+    is_complete = +Counter(index.counts) == index.indexed_counts()
+    return is_complete and all(
+        block.chunk_offset >= 0
+        and block.offset + block.size <= size
+        and is_plausible_size(block.size, block.uncompressed_size)
+        for block in index.blocks
+    )
+
+
+def _indexed(chunk: ChunkIndex, file: int) -> Block:
+    """A chunk by its index; where the next message index begins gives the number of a channel's messages."""
+    end = chunk.chunk_start_offset + chunk.chunk_length
+    stated = sorted((offset, channel) for channel, offset in chunk.message_index_offsets.items())
+    ends = [*(offset for offset, _ in stated[1:]), end + chunk.message_index_length]
+    begins = [offset + RECORD.size + 6 for offset, _ in stated]
+    entries = tuple(
+        Entry(channel, begin, (end - begin) // 16)
+        for (_, channel), begin, end in zip(stated, begins, ends, strict=False)
+        if end - begin >= 16
+    )
+    return Block(
+        file,
+        end - chunk.compressed_size,
+        chunk.compressed_size,
+        chunk.compression,
+        chunk.uncompressed_size,
+        None,
+        chunk.message_start_time,
+        chunk.message_end_time,
+        entries,
+    )
 
 
 def _map(path: Path) -> mmap.mmap:
@@ -143,11 +205,10 @@ def _map(path: Path) -> mmap.mmap:
 class _Walk:
     """Sorts records into an index; a chunk waits for its message index, loose messages for each other."""
 
-    def __init__(self, index: FileIndex, data: mmap.mmap | bytes) -> None:
+    def __init__(self, index: FileIndex) -> None:
         self.index = index
-        self.data = data
+        self.data = index.data
         self.defining = index  # what schemas and channels are defined in
-        self.chunks_stated = 0  # by the statistics
         self.private: list[int] = []  # offsets of records of some application
         self.chunk: Block | None = None
         self.entries: list[Entry] = []
@@ -177,7 +238,11 @@ class _Walk:
                 if self.chunk is not None:
                     self.chunk = replace(self.chunk, is_cut=True, crc=0)
                     self.close(offset, complete=False)
-        self.check_claims()
+        if self.private:  # one of them may have been a chunk
+            index.damage.append(
+                f"{index.path}: passed over {counted(len(self.private), 'record')} of unknown kinds, "
+                f"the first at byte {self.private[0]}"
+            )
 
     def close(self, offset: int, *, complete: bool) -> None:
         """End the chunk or the run of loose messages at this byte; incomplete entries are discarded."""
@@ -193,24 +258,6 @@ class _Walk:
         self.chunk, self.entries = None, []
         self.loose_from, self.loose_times, self.loose_counts = -1, [], Counter()
 
-    def check_claims(self) -> None:
-        """Accept the counts of blocks by channel where they add up to the statistics; note where they do not."""
-        index, totals = self.index, self.index.indexed_counts()
-        stated = {number: count for number, count in index.counts.items() if count}
-        chunks = sum(block.is_chunk for block in index.blocks)
-        index.is_consistent = index.is_counted and stated == dict(totals) and chunks == self.chunks_stated
-        is_indexed = all(block.entries for block in index.blocks)
-        if index.is_counted and not index.is_consistent and (is_indexed or chunks != self.chunks_stated):
-            index.damage.append(
-                f"{index.path}: its {counted(chunks, 'chunk')} and {counted(totals.total(), 'indexed message')} "
-                f"are not the {self.chunks_stated} and {sum(stated.values())} of its statistics"
-            )
-        if self.private and not index.is_counted:  # one of them may have been a chunk
-            index.damage.append(
-                f"{index.path}: passed over {counted(len(self.private), 'record')} of unknown kinds, "
-                f"the first at byte {self.private[0]}"
-            )
-
     def _sort(self, opcode: int, body: int, end: int) -> None:
         if opcode == MESSAGE:
             self._message(body, end)
@@ -222,24 +269,13 @@ class _Walk:
             self.defining.add_channel(self.data, body)
         else:
             self.close(body - RECORD.size, complete=True)
-            self._frame(opcode, body, end)
-
-    def _frame(self, opcode: int, body: int, end: int) -> None:
-        """The chunks, and the records that begin, end and describe the file."""
-        index = self.index
-        if opcode == CHUNK:
-            self._chunk(body, end)
-        elif opcode == CHUNK_INDEX and index.fetch is not None:
-            index.blocks.append(self._indexed(body))
-        elif opcode == STATISTICS and self.defining is index:
-            self._statistics(body, end)
-        elif opcode == DATA_END:
-            self._begin_summary(end)
-        elif opcode == HEADER:
-            (profile, library), _ = read_strings(self.data, body, 2)
-            index.profile, index.library = profile.decode(), library.decode()
-        elif opcode >= PRIVATE:
-            self.private.append(body - RECORD.size)
+            if opcode == CHUNK:
+                self._chunk(body, end)
+            elif opcode >= PRIVATE:
+                self.private.append(body - RECORD.size)
+            elif opcode == DATA_END:  # the summary behind it, damaged or unchecked, is the last resort
+                uncertain = self.index.uncertain_channels
+                self.defining = FileIndex(self.index.path, self.index.number, b"", channels=uncertain)
 
     def _message(self, body: int, end: int) -> None:
         offset = body - RECORD.size
@@ -277,53 +313,6 @@ class _Walk:
             f"{self.index.path}: the chunk at byte {body - RECORD.size} claims to unpack from {size} to "
             f"{uncompressed} bytes, more than is accepted, and was left out"
         )
-
-    def _indexed(self, body: int) -> Block:
-        """A chunk by its index; where the next message index begins states the number of a channel's messages."""
-        start_ns, end_ns, chunk, length, size = struct.unpack_from("<QQQQI", self.data, body)
-        at = body + 36
-        stated = sorted(struct.unpack_from("<HQ", self.data, place)[::-1] for place in range(at, at + size, 10))
-        (indexed,) = struct.unpack_from("<Q", self.data, at + size)
-        (name,), at = read_strings(self.data, at + size + 8, 1)
-        compressed, uncompressed = struct.unpack_from("<QQ", self.data, at)
-        if not is_plausible_size(compressed, uncompressed):
-            raise struct.error("chunk of an implausible size")
-        begins = [offset + RECORD.size + 6 for offset, _ in stated]
-        ends = [*(offset for offset, _ in stated[1:]), chunk + length + indexed]
-        entries = tuple(
-            Entry(channel, begin, (end - begin) // 16)
-            for (_, channel), begin, end in zip(stated, begins, ends[: len(stated)], strict=True)
-            if end - begin >= 16
-        )
-        payload, number = chunk + length - compressed, self.index.number
-        return Block(number, payload, compressed, name.decode(), uncompressed, None, start_ns, end_ns, entries)
-
-    def _statistics(self, body: int, end: int) -> None:
-        (self.chunks_stated,) = struct.unpack_from("<I", self.data, body + 22)
-        (size,) = struct.unpack_from("<I", self.data, body + 42)
-        for entry in range(body + 46, min(body + 46 + size, end - 9), 10):
-            number, count = struct.unpack_from("<HQ", self.data, entry)
-            self.index.counts[number] = count
-        self.index.is_counted = True
-
-    def _begin_summary(self, summary: int) -> None:
-        """Take in what the summary from this byte on defines; by itself where it is damaged."""
-        index, footer = self.index, len(self.data) - _FOOTER_BYTES
-        is_there = footer >= summary and self.data[-len(MAGIC) :] == MAGIC and self.data[footer] == FOOTER
-        self.defining = index
-        if is_there and _agrees(self.data, summary):
-            return
-        if is_there:
-            index.damage.append(f"{index.path}: the summary at byte {summary} has a wrong CRC and was discarded")
-        self.defining = FileIndex(index.path, index.number, b"", schemas=dict(index.schemas))
-        index.uncertain_channels = self.defining.channels
-
-
-def _agrees(data: mmap.mmap | bytes, summary: int) -> bool:
-    """True if the summary from this byte to the end of the file agrees with its CRC, or has none."""
-    crc_at = len(data) - len(MAGIC) - 4
-    (crc,) = struct.unpack_from("<I", data, crc_at)
-    return not crc or zlib.crc32(data[summary:crc_at]) == crc
 
 
 def is_plausible_size(size: int, uncompressed: int) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import mmap
 import struct
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from typing import NamedTuple, TypeAlias
@@ -14,7 +14,7 @@ from scanchain.source import Source
 from scanchain.words import counted
 
 MAGIC = b"\x89MCAP0\r\n"
-HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = 1, 2, 3, 4, 5, 6, 7, 8
+FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = 2, 3, 4, 5, 6, 7, 8
 STATISTICS, DATA_END = 0x0B, 0x0F
 RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
@@ -112,8 +112,8 @@ class FileIndex:
     data : the bytes of an MCAP file; ``fetch`` reads those of a remote one, by offset and size; of another
         format ``make`` makes the contents of a block, of all channels or of those wanted
     counts : messages by channel id; ``is_counted`` once they are complete
-    uncertain_channels : those of a damaged summary, for channels defined nowhere else
-    is_consistent : whether the counts of blocks by channel agree with the statistics of the file
+    uncertain_channels : those of a summary that was not accepted, for channels defined nowhere else
+    is_consistent : whether the channels that blocks state were checked
     """
 
     path: Source
@@ -121,8 +121,6 @@ class FileIndex:
     data: mmap.mmap | bytes
     fetch: Callable[[int, int], bytes] | None = None
     make: Callable[[Block, AbstractSet[int] | None], Contents] | None = None
-    profile: str = ""
-    library: str = ""
     blocks: list[Block] = field(default_factory=list)
     schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
@@ -189,6 +187,17 @@ class FileIndex:
         """True if the channel and its schema are in the index."""
         channel = self.channels.get(number)
         return channel is not None and (channel.schema == 0 or channel.type_name != "")
+
+
+def records_of(data: memoryview | bytes) -> Iterator[tuple[int, int, int]]:
+    """Opcode of each record, begin and end of its body. Raises struct.error for one beyond the end."""
+    offset = 0
+    while offset < len(data):
+        opcode, length = RECORD.unpack_from(data, offset)
+        begin, offset = offset + RECORD.size, offset + RECORD.size + length
+        if offset > len(data):
+            raise struct.error("record beyond the end")
+        yield opcode, begin, offset
 
 
 def read_strings(data: Bytes, offset: int, count: int) -> tuple[list[bytes], int]:
