@@ -48,7 +48,10 @@ def dimension_of(value: object, name: str) -> int:
 
 def points(value: object, name: str, d: int, *, dtype: DTypeLike = np.float64) -> NDArray[Any]:
     """Points (N, d), finite; N may be 0."""
-    array = _numbers(value, name, f"an (N, {d}) array of meters{_where(value, name)}", dtype)
+    if _is_ready(value, dtype):
+        array: NDArray[Any] = value  # type: ignore[assignment]
+    else:
+        array = _numbers(value, name, f"an (N, {d}) array of meters{_where(value, name)}", dtype)
     if array.ndim != 2 or array.shape[1] != d:
         raise InputError(
             f"{name} has the shape {array.shape}; wanted (N, {d}), one row a point{_remedy(array, name, d)}"
@@ -108,7 +111,7 @@ def poses(value: object, name: str, d: int) -> NDArray[np.float64]:
 
 def within_map(points: NDArray[np.floating], T: NDArray[np.float64], voxel_m: float, name: str) -> None:
     """Refuse points that, moved by T, lie beyond what a voxel map can address."""
-    at_most_m = math.sqrt(points.shape[1]) * largest_magnitude(points) + largest_magnitude(T[:-1, -1].copy())
+    at_most_m = math.sqrt(points.shape[1]) * largest_magnitude(points) + math.hypot(*T[:-1, -1].tolist())
     if at_most_m < REACH * voxel_m:  # without moving them
         return
     farthest_m = largest_moved(points, T)

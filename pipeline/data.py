@@ -41,7 +41,8 @@ _WHOLE = (
 
 def brief(self: object) -> str:
     """A record on one line, for its ``repr``: arrays by their shape, what is long by its kind and number."""
-    values = ((name, getattr(self, name)) for name in getattr(self, "__dataclass_fields__", ()))
+    names = getattr(self, "__dataclass_fields__", ()) or getattr(self, "__struct_fields__", ())
+    values = ((name, getattr(self, name)) for name in names)
     return f"{type(self).__name__}({', '.join(f'{name}={_brief(value)}' for name, value in values)})"
 
 

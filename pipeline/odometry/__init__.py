@@ -1,7 +1,7 @@
 """Predict, match against the local map, extend it."""
 
 from scanchain.odometry.front_end import FrontEnd, Located
-from scanchain.odometry.live_stamps import LiveStamps
+from scanchain.odometry.intervals import LiveStamps
 from scanchain.odometry.odometry import Odometry, Tracked, checked_start
 from scanchain.odometry.tracked import owned
 

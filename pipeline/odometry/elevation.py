@@ -12,7 +12,7 @@ import numpy as np
 from scanchain import lie
 from scanchain.config import PreprocessConfig
 from scanchain.data import Matrix, Points, Pose, Scan
-from scanchain.kernels.registration.plane_adjustment import plane_equations, planes
+from scanchain.kernels.registration.plane_adjustment import lift, plane_equations, planes
 from scanchain.preprocess import Sweep
 from scanchain.preprocess.sweep import sweep_of
 from scanchain.registration.correlative import evenly
@@ -22,7 +22,7 @@ _CELL_M, _POINT_M = 1.0, 0.3  # edge of a cell, and of the voxels to which scans
 _RANGE_CELLS = 14.0  # least number of cells that the median range spans: they are small in narrow surroundings
 _SMALLEST = 0.125  # smallest factor by which they shrink
 _POINTS = 7000  # largest number of points of each scan, evenly spread
-_ROUNDS, _STEP_RAD, _TURN_RAD = 5, 6e-4, 1e-3  # most Gauss-Newton steps, offset and turns of the last of them
+_ROUNDS, _STEP_RAD, _TURN_RAD = 8, 1e-4, 1e-3  # most Gauss-Newton steps, offset and turns of the last of them
 _KERNEL = 1.5 / 0.6745  # scale of the robust weight over the median residual
 _RIDGE = 1e-6  # keeps directions that no plane sees from a division by zero
 _SCATTER_RAD = math.radians(0.02)  # standard deviation assumed of a window, beyond its own, before others are seen
@@ -129,10 +129,9 @@ def _combined(estimates: Matrix) -> tuple[float, float]:
 
 def raised(points: Points, offset_rad: float) -> Points:
     """Points (N, 3) in the lidar frame with their elevation angles raised."""
-    range_m = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-9)
-    slope = points[:, 2] / range_m
-    upward = np.column_stack([-slope * points[:, 0], -slope * points[:, 1], range_m])
-    return math.cos(offset_rad) * points + math.sin(offset_rad) * upward
+    lifted = np.empty(points.shape)
+    lift(np.ascontiguousarray(points, np.float64), offset_rad, lifted)
+    return lifted
 
 
 def adjusted(scans: list[Points], poses: Matrix, cell_m: float, offset_rad: float = 0.0) -> Adjustment:
@@ -146,16 +145,16 @@ def adjusted(scans: list[Points], poses: Matrix, cell_m: float, offset_rad: floa
     if not len(points):
         return Adjustment(poses, 0.0, math.inf)
     sigma_rad, last, n, size = math.inf, poses[-1], len(points), 6 * len(poses) + 1
-    lifted, beside, normals = np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
-    residual, plane = np.empty(n), np.empty(n, np.int32)
+    beside, normals, residual, plane = np.empty((n, 3)), np.empty((n, 3)), np.empty(n), np.empty(n, np.int32)
     for _ in range(_ROUNDS):
-        count = planes(points, number, poses, offset_rad, cell_m, lifted, beside, residual, plane, normals)
+        lifted = raised(points, offset_rad)
+        count = planes(lifted, number, poses, cell_m, beside, residual, plane, normals)
         if not count:
             return Adjustment(poses, 0.0, math.inf)
         scale_m = max(_KERNEL * float(np.median(np.abs(residual[plane >= 0]))), 1e-6)
-        H, b = np.zeros((size, size)), np.zeros(size)
-        of_planes = plane, beside, residual, normals[:count]
-        variance, gain = plane_equations(lifted, number, *of_planes, poses, scale_m, H, b)
+        H, of_planes = np.zeros((size + 1, size + 1)), (plane, beside, residual, normals[:count])
+        variance, gain = plane_equations(lifted, number, *of_planes, poses, scale_m, H)
+        H, b = H[:-1, :-1], H[:-1, -1]
         inverse = np.linalg.inv(H + _RIDGE * np.trace(H) / size * np.eye(size))
         step = -gain * inverse @ b
         sigma_rad = math.sqrt(variance * inverse[-1, -1])

@@ -79,8 +79,7 @@ class FrontEnd:
             self.error_tracker.take(tracked)
         information = self.sum_up() if is_keyframe else self.at_keyframe
         if is_keyframe:
-            T_keyframe_lidar = lie.between(self.T_odom_keyframe, tracked.T_odom_lidar)
-            self.errors = self.error_tracker.at_keyframe(tracked, T_keyframe_lidar)
+            self.errors = self.error_tracker.at_keyframe(tracked, self.T_odom_keyframe)
             self.T_odom_keyframe = tracked.T_odom_lidar
             self.covariance, self.since_keyframe = self.at_keyframe, 0
             self.doubt = self.at_keyframe
@@ -133,12 +132,12 @@ class FrontEnd:
             return self._doubted(motion.information)
         predicted = n * motion.covariance
         if n > 1:
-            predicted = predicted + n / (n - 1) * Ad @ self.covariance @ Ad.T
+            predicted = predicted + (n / (n - 1) * Ad).dot(self.covariance).dot(Ad.T)
         information = np.asarray(np.linalg.inv(predicted), np.float64)
         if not motion.is_lost:
             information += motion.information
         self.covariance = np.asarray(np.linalg.inv(information), np.float64)
-        return self._doubted(information)
+        return information if motion.doubt is None else self._doubted(information)
 
     def _doubted(self, information: Matrix) -> Matrix:
         """Information with the doubt added to the covariance."""

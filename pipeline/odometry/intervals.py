@@ -1,14 +1,21 @@
-"""Seconds between successive scans, by stamps that need not be plausible."""
+"""Seconds between successive scans, by stamps that need not be plausible, and stamps that are certainly wrong."""
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
 
+from scanchain.checks import SMALLER_UNITS
 from scanchain.data import Scan
+from scanchain.errors import InputError
+from scanchain.trajectory import format_stamp
 
-SHORTEST_S = 0.005  # below the period of any lidar: scans that follow each other faster came in a burst
+Result = TypeVar("Result")
+
+_SHORTEST_S = 0.005  # below the period of any lidar: scans that follow each other faster came in a burst
 _GAP = 5.0  # times the usual interval: a longer one means that scans are missing
 _ALIKE = 1.4  # largest ratio of two intervals that agree
 _LONGEST = 100.0  # times the usual interval: a longer one is no plausible interval of stamps
@@ -17,6 +24,11 @@ _MEMORY = 0.9  # weight of the usual interval so far against the next one
 _RECENT = 15  # number of the last intervals that are remembered
 _FEWEST = 4  # of them, before a gap follows from intervals that are shorter than any lidar's
 _PART = 0.5  # of the time over which its points were measured, which the first interval is not shorter than
+_LOOKED_AT = 3  # intervals: of fewer, a burst or a gap may be the rule
+_REMEMBERED = 10  # the same where they are shorter than any lidar's, and number of the last ones that are kept
+_MOST_SWEEPS = 2.0  # intervals between scans that the times of a scan's points may span
+_SLOWEST_S = 15.0  # between scans, above which regular intervals are not of seconds but of a smaller unit
+_REGULAR = 1.1  # ratio of the intervals of a driver, above which people or gaps set them
 
 
 class Intervals:
@@ -28,17 +40,17 @@ class Intervals:
         self.usual_s = 0.0
         self.recent_s: deque[float] = deque(maxlen=_RECENT)
 
-    def take(self, scan: Scan) -> None:
-        """Remember a scan.
+    def take(self, scan: Scan, interval_s: float) -> None:
+        """Remember a scan, so long after the last one.
 
         The usual interval is a running mean that leaves out gaps. Where it disagrees with the median of the last
         ones, it came from a burst or from stamps that were wrong: the median takes its place.
         """
         if self.last_scan is not None:
-            self.last_s = self.to(scan)
+            self.last_s = interval_s
             stamped_s, logged_s = _since(self.last_scan, scan)
             latest_s = (stamped_s if stamped_s > 0.0 else logged_s) if self.usual_s else self.last_s
-            if latest_s >= SHORTEST_S or self.usual_s < SHORTEST_S:
+            if latest_s >= _SHORTEST_S or self.usual_s < _SHORTEST_S:
                 self.recent_s.append(latest_s)
             if not self.is_gap(self.last_s):
                 gain = 1.0 - _MEMORY if self.usual_s else 1.0
@@ -75,8 +87,61 @@ class Intervals:
 
     def is_gap(self, interval_s: float) -> bool:
         """True of an interval in which scans are missing."""
-        is_known = self.usual_s >= SHORTEST_S or len(self.recent_s) >= _FEWEST
+        is_known = self.usual_s >= _SHORTEST_S or len(self.recent_s) >= _FEWEST
         return is_known and interval_s > _GAP * self.usual_s > 0.0
+
+
+class LiveStamps:
+    """Remembers the last stamps, and refuses those that are certainly wrong."""
+
+    def __init__(self) -> None:
+        self.last_ns: int | None = None
+        self.intervals_s: list[float] = []
+
+    def passed(self, scan: Scan, process: Callable[[Scan], Result]) -> Result:
+        """The result of a scan, which is checked before and remembered after it. Raises InputError."""
+        self.check(scan)
+        result = process(scan)
+        self.take(scan)
+        return result
+
+    def check(self, scan: Scan) -> None:
+        """Refuse a scan whose stamp or point times contradict those before. Raises InputError; nothing changes."""
+        if self.last_ns is None:
+            return
+        if scan.stamp_ns <= self.last_ns:
+            raise InputError(
+                f"stamp_s is {format_stamp(scan.stamp_ns)}, that of the scan before {format_stamp(self.last_ns)}; "
+                "wanted seconds that increase from scan to scan"
+            )
+        recent_s = self._with(scan)
+        if len(recent_s) < _LOOKED_AT:
+            return
+        shortest_s, longest_s = min(recent_s[-_LOOKED_AT:]), max(recent_s[-_LOOKED_AT:])
+        if shortest_s > _SLOWEST_S and longest_s < _REGULAR * shortest_s:
+            raise InputError(
+                f"stamp_s grows by {longest_s:.6g} from scan to scan, which no lidar takes in seconds; wanted "
+                f"seconds{SMALLER_UNITS}"
+            )
+        longest_s = max(recent_s)
+        is_burst = longest_s < _SHORTEST_S and len(recent_s) < _REMEMBERED
+        span_s = float(np.ptp(scan.times_s)) if len(scan.times_s) and not is_burst else 0.0
+        if span_s > _MOST_SWEEPS * longest_s:
+            raise InputError(
+                f"times_s spans {span_s:.3g} s, but scans follow each other within {longest_s:.3g} s; wanted "
+                "seconds relative to stamp_s (of times from 0 to 1 over a sweep: times its duration)"
+            )
+
+    def take(self, scan: Scan) -> None:
+        """Remember a scan."""
+        if self.last_ns is not None:
+            self.intervals_s = self._with(scan)
+        self.last_ns = scan.stamp_ns
+
+    def _with(self, scan: Scan) -> list[float]:
+        """The last intervals, this scan's included."""
+        assert self.last_ns is not None
+        return [*self.intervals_s, 1e-9 * (scan.stamp_ns - self.last_ns)][-_REMEMBERED:]
 
 
 def _since(last: Scan, scan: Scan) -> tuple[float, float]:

@@ -30,13 +30,13 @@ class KeyframeErrorTracker:
                 match.systematic - self.systematic
             )
 
-    def at_keyframe(self, tracked: Tracked, T_keyframe_lidar: Pose) -> KeyframeErrors:
-        """Errors at a new keyframe, ``T_keyframe_lidar`` seen from the one before.
+    def at_keyframe(self, tracked: Tracked, T_odom_keyframe: Pose) -> KeyframeErrors:
+        """Errors at a new keyframe after that of another pose.
 
         A map as wide as the scans is renewed by the distance over their root mean square range, and, where they do
         not look around, by turning.
         """
-        distance_m, angle_rad = lie.apart(lie.identity(len(T_keyframe_lidar) - 1), T_keyframe_lidar)
+        distance_m, angle_rad = lie.apart(T_odom_keyframe, tracked.T_odom_lidar)
         points = tracked.matched
         range_m = float(np.sqrt(np.einsum("ij,ij->", points, points) / max(len(points), 1)))
         renewal = distance_m / max(range_m, 1e-6) + angle_rad / np.pi

@@ -16,7 +16,7 @@ from scanchain.data import LEAST_FIT, AnyPoints, Match, Points, Pose, Scan, Stat
 from scanchain.errors import InputError, shown
 from scanchain.kernels.geometry.validity import largest_magnitude
 from scanchain.odometry.elevation import ElevationCalibration
-from scanchain.odometry.live_stamps import LiveStamps
+from scanchain.odometry.intervals import LiveStamps
 from scanchain.odometry.map_keeper import MapKeeper
 from scanchain.odometry.prediction import Prediction, Predictor
 from scanchain.odometry.recovery import CLEARLY, Recovery, is_sound
@@ -86,7 +86,7 @@ class Odometry:
         self.live_stamps = LiveStamps()
         self.scans = 0
         self.last: Tracked | None = None
-        self.last_sample = self.first_points[:0]  # of its raw points
+        self.last_sample = b""  # of its raw points
 
     @property
     def local_map(self) -> VoxelMap:
@@ -120,7 +120,7 @@ class Odometry:
         says so.
         """
         tracked = self.place(scan)
-        return replace(owned(tracked), points=tracked.points.copy())
+        return msgspec.structs.replace(owned(tracked), points=tracked.points.copy())
 
     def place(self, scan: Scan | Prepared) -> Tracked:
         """As ``process``, but nobody may write into the arrays: they are those of odometry."""
@@ -128,10 +128,12 @@ class Odometry:
         prepared = scan if isinstance(scan, Prepared) else prepare(scan, self.resolution)
         scan, self.resolution = prepared.scan, prepared.after
         self.scans += 1
-        sample = scan.points[:: len(scan.points) // _SAMPLE + 1].copy()
-        if self.last is not None and len(sample) >= _FEWEST_COPIED and _are_equal(sample, self.last_sample):
+        sample = scan.points[:: len(scan.points) // _SAMPLE + 1].tobytes()
+        if self.last is not None and sample == self.last_sample and len(scan.points) >= _FEWEST_COPIED:
             repeated = scan if scan.is_copy else replace(scan, is_copy=True)
-            return replace(self.last, scan=repeated, reason=COPY, is_repeated=True, elsewhere_m=0.0)
+            return msgspec.structs.replace(
+                self.last, scan=repeated, reason=COPY, is_repeated=True, elsewhere_m=0.0
+            )
         self.last_sample = sample
         self.last = self._placed(prepared)
         return self.last
@@ -168,11 +170,10 @@ class Odometry:
     def _predicted(self, scan: Scan, sparse: Sweep) -> Prediction:
         """The predicted pose; without the wheels where they jump, and the scan fits where they do not lead."""
         prediction = self.predictor.predict(scan)
-        jump_m = self.predictor.jump_m(prediction)
-        if jump_m == 0.0 or not len(self.map.surfaces):
+        if prediction.jump_m == 0.0 or not len(self.map.surfaces):
             return prediction
         free = self.predictor.predict(scan, by_wheels=False)
-        is_wrong = jump_m > free.farthest_m
+        is_wrong = prediction.jump_m > free.farthest_m
         points = sparse.from_middle(free.velocity)
         if not is_wrong and len(points):
             there, here = (
@@ -182,7 +183,7 @@ class Odometry:
             is_wrong = is_sound(here) and here.cost < CLEARLY * there.cost
         if not is_wrong:
             return prediction
-        self.predictor.drop_wheels(scan, jump_m)
+        self.predictor.drop_wheels(scan, prediction.jump_m)
         return free
 
     def _register(self, scan: Scan, sweep: Sweep, sparse: Sweep, prediction: Prediction) -> _Registered:
@@ -291,7 +292,7 @@ class Odometry:
         mean = lie.log(self.predictor.T_previous_current) / prediction.lasted_s
         change = (1.0 - sweep.middle_s / prediction.lasted_s) * (self.predictor.velocity - mean)
         change[: self.dimension] = 0.0
-        tracked = replace(tracked, match=blurred(tracked.match, sweep.middle_s * change))
+        tracked = msgspec.structs.replace(tracked, match=blurred(tracked.match, sweep.middle_s * change))
         return seen_from(tracked, lie.exp(sweep.middle_s * (mean + change)))
 
     def _check_dimension(self, scan: Scan) -> None:
@@ -315,11 +316,6 @@ class Odometry:
             f"({self.config.preprocess.min_range_m:g}) and preprocess.max_range_m "
             f"({self.config.preprocess.max_range_m:g}); give meters, or widen them"
         )
-
-
-def _are_equal(sample: AnyPoints, other: AnyPoints) -> bool:
-    """True if two samples of points (N, d) are the same to the last bit; most differ in their first number."""
-    return len(other) > 0 and bool(sample[0, 0] == other[0, 0]) and np.array_equal(sample, other)
 
 
 def _reported(registered: _Registered) -> State:

@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import OdometryConfig
-from scanchain.data import Match, Pose, Prior, Scan, State
+from scanchain.data import Match, Matrix, Pose, Prior, Scan, State
 from scanchain.errors import InputError
+from scanchain.kernels.geometry.validity import largest_magnitude
 from scanchain.kernels.registration.observability import WEAK, definite_inverse
-from scanchain.odometry.error_statistics import ErrorStatistics
 from scanchain.odometry.intervals import Intervals
-from scanchain.odometry.motion_filter import MotionFilter
 from scanchain.words import counted
 
 _EVEN = 2.0  # largest ratio of two intervals from which an acceleration is computed
@@ -25,6 +24,83 @@ _ACCELERATION_M_S2 = 4.0  # of a car, which limits the distance in space from th
 _FASTEST_M_S, _LARGEST_REACH_M = 40.0, 30.0  # of a car whose speed is unknown; largest half width in space
 _BURST = 0.05  # of the usual interval: scans that follow each other faster came in a burst and have no velocity
 _JUMP = 1.0  # m and rad, difference of two motions over a scan, from which on the wheels may have jumped
+_MEMORY = 0.9  # weight of the mean of the squared errors so far against the next one
+_SUDDEN = 0.25  # share of the last squared error below which the mean does not fall
+_KNOWN = 5  # number of errors needed before the mean is used
+_CAUTION = 2.0  # factor from the root mean square to the standard deviation that is given
+_LEAST_M, _LEAST_RAD = 0.002, 0.0005  # smallest standard deviation that is given
+
+
+class ErrorStatistics:
+    """Prediction error statistics: a running mean of squared errors, one for every component of a twist."""
+
+    def __init__(self, first_sigma: NDArray[np.float64]) -> None:
+        """first_sigma : (k,) standard deviations until errors are known, and the largest that are given."""
+        self.first_sigma = first_sigma
+        self.covariance = np.diag(first_sigma**2)  # (k, k) of the next prediction, rather too large than too small
+        self.least = (lie.by_component(len(first_sigma), _LEAST_M, _LEAST_RAD) ** 2).tolist()
+        self.most = (first_sigma**2).tolist()
+        self.squares = [0.0] * len(first_sigma)
+        self.count = 0
+
+    def update(self, error: NDArray[np.float64], variance: NDArray[np.float64]) -> None:
+        """Take the error (k,) of a prediction against a match of this variance (k,), which is subtracted."""
+        self.count += 1
+        gain = max(1.0 - _MEMORY, 1.0 / self.count)
+        for m, (e, of_match) in enumerate(zip(error.tolist(), variance.tolist(), strict=True)):
+            square = max(e * e - of_match, 0.0)
+            self.squares[m] = max(self.squares[m] + gain * (square - self.squares[m]), _SUDDEN * square)
+        if self.count >= _KNOWN:
+            bounds = zip(self.squares, self.least, self.most, strict=True)
+            self.covariance = np.diag([min(max(_CAUTION**2 * s, least), most) for s, least, most in bounds])
+
+
+class MotionFilter:
+    """Constant velocity: the pose moves on by the motion, the motion stays but for its noise.
+
+    A match measures the pose. One that is a little off moves the pose, and the motion by as much as their errors
+    are known to go together: the next match, which is right again, does not reverse the motion.
+
+    Attributes
+    ----------
+    motion : T_previous_current, (d+1, d+1), over one scan
+    pose_covariance, motion_covariance : (k, k) of twists in the lidar's own frame
+    covariance : (k, k) of both, pose by motion
+    """
+
+    def __init__(self, any_motion: Matrix) -> None:
+        """any_motion : (k, k) covariance of the motion before the first correction."""
+        self.any_motion = any_motion
+        self.nothing = np.zeros_like(any_motion)
+        self.begin(lie.identity(2 if len(any_motion) == 3 else 3))
+
+    def begin(self, motion: Pose) -> None:
+        """Start from a given pose and a motion of covariance ``any_motion``."""
+        self.motion = motion
+        self.motion_covariance = self.any_motion
+        self.pose_covariance = self.covariance = self.nothing
+
+    def predicted_covariance(self, noise: Matrix) -> Matrix:
+        """(k, k) of the next pose; noise (k, k): covariance of the motion's change."""
+        return self._predicted(noise)[0]
+
+    def correct(self, innovation: NDArray[np.float64], information: Matrix, noise: Matrix) -> None:
+        """Take a pose that was measured (k,) away from the predicted one, with this information (k, k)."""
+        pose, covariance, motion = self._predicted(noise)
+        known = np.linalg.inv(np.linalg.inv(pose) + information)
+        gain = np.linalg.solve(pose, covariance).T  # how the motion follows the pose
+        self.motion = lie.normalize(self.motion @ lie.exp(gain @ known @ information @ innovation))
+        self.pose_covariance = known
+        self.covariance = known @ gain.T
+        self.motion_covariance = motion - gain @ (pose - known) @ gain.T
+
+    def _predicted(self, noise: Matrix) -> tuple[Matrix, Matrix, Matrix]:
+        """Covariances (k, k) of the next pose, of pose and motion, and of the motion."""
+        motion = self.motion_covariance + noise
+        A = lie.adjoint(lie.inverse(self.motion))
+        covariance = A @ self.covariance
+        pose = A @ self.pose_covariance @ A.T + covariance + covariance.T + motion
+        return pose, covariance + motion, motion
 
 
 class Prediction(msgspec.Struct, frozen=True):
@@ -41,6 +117,7 @@ class Prediction(msgspec.Struct, frozen=True):
     interval_s, last_s, usual_s : since the last scan, before that one, and as a rule; 0 where unknown
     silence_s : since the last scan by stamps that the log confirms, else 0
     lost_s : for how long scans have been lost
+    jump_m : distance of a pose by the wheels from where the motion so far leads; 0 if it may have changed so
     config : largest speed and turn rate
     """
 
@@ -56,6 +133,7 @@ class Prediction(msgspec.Struct, frozen=True):
     usual_s: float
     silence_s: float
     lost_s: float
+    jump_m: float
     config: OdometryConfig
 
     @property
@@ -137,12 +215,13 @@ class Prediction(msgspec.Struct, frozen=True):
 
         The mean since the last scan, carried on by half an interval with the acceleration between the last two.
         """
-        if self.lasted_s <= 0.0:
+        lasted_s, before_s = self.lasted_s, self.before_s
+        if lasted_s <= 0.0:
             return self.velocity
-        mean = motion / self.lasted_s
-        if not 0.0 < self.lasted_s < _EVEN * self.before_s < _EVEN**2 * self.lasted_s:
+        mean = motion / lasted_s
+        if not 0.0 < lasted_s < _EVEN * before_s < _EVEN**2 * lasted_s:
             return mean
-        return mean + self.lasted_s / (self.lasted_s + self.before_s) * (mean - self._velocity_before())
+        return mean + lasted_s / (lasted_s + before_s) * (mean - self.motion_before / before_s)
 
     def deskewing_error(self, T_odom_lidar: Pose, duration_s: float) -> NDArray[np.float64]:
         """(k,) approximate error of a scan of this duration after deskewing at constant velocity.
@@ -153,11 +232,7 @@ class Prediction(msgspec.Struct, frozen=True):
         if self.lasted_s <= 0.0 or self.is_second:
             return np.zeros(len(self.velocity))
         mean = lie.log(lie.between(self.T_odom_last, T_odom_lidar)) / self.lasted_s
-        return (mean - self._velocity_before()) / self.lasted_s * duration_s**2 / 24.0
-
-    def _velocity_before(self) -> NDArray[np.float64]:
-        """Mean twist (k,) per second between the last two scans."""
-        return self.motion_before / self.before_s
+        return (mean - self.motion_before / self.before_s) / self.lasted_s * duration_s**2 / 24.0
 
 
 class Predictor:
@@ -189,18 +264,18 @@ class Predictor:
         """The predicted pose of a scan that follows the last one corrected."""
         times = self.intervals
         interval_s = times.to(scan)
-        wheel, is_guess = self._wheel_motion(scan) if by_wheels else None, False
+        wheel, is_guess, jump_m = self._wheel_motion(scan) if by_wheels else None, False, 0.0
         self.is_contradicted = False
         if wheel is not None:
-            motion, statistics = wheel, self.by_wheels
-            covariance = np.diag(self.by_wheels.variances)
+            motion, statistics, jump_m = wheel, self.by_wheels, self._jump_m(wheel, interval_s)
+            covariance = statistics.covariance
         elif times.is_gap(interval_s):
             motion = _stretched(self.T_previous_current, interval_s, times.last_s, times.usual_s)
             covariance, statistics, is_guess = self.filter.any_motion, self.by_velocity, True
         else:
-            covariance = self.filter.predicted_covariance(self.by_velocity.variances)
+            covariance = self.filter.predicted_covariance(self.by_velocity.covariance)
             motion, statistics = self.filter.motion, self.by_velocity
-        T_predicted = lie.normalize(self.T_odom_lidar @ motion)
+        T_predicted = lie.normalize(self.T_odom_lidar.dot(motion))  # here and below: half the time of @
         return Prediction(
             prior=Prior(T_predicted, covariance, statistics.first_sigma, statistics is self.by_wheels),
             statistics=statistics,
@@ -214,16 +289,13 @@ class Predictor:
             usual_s=times.usual_s,
             silence_s=times.silence_s(scan),
             lost_s=self.lost_s,
+            jump_m=jump_m,
             config=self.config,
         )
 
-    def jump_m(self, prediction: Prediction) -> float:
-        """Distance of a pose by the wheels from where the motion so far leads; 0 if it may have changed so."""
-        if not prediction.prior.is_measured:
-            return 0.0
-        wheel = lie.between(self.T_odom_lidar, prediction.T_odom_lidar)
-        scans = max(prediction.interval_s / self.intervals.usual_s, 1.0) if self.intervals.usual_s else 1.0
-        if np.abs(wheel - self.filter.motion).max() <= _JUMP * scans:
+    def _jump_m(self, wheel: Pose, interval_s: float) -> float:
+        scans = max(interval_s / self.intervals.usual_s, 1.0) if self.intervals.usual_s else 1.0
+        if largest_magnitude(wheel - self.filter.motion) <= _JUMP * scans:
             return 0.0
         return float(np.linalg.norm(wheel[:-1, -1] - scans * self.filter.motion[:-1, -1]))
 
@@ -252,9 +324,9 @@ class Predictor:
             self.motion = lie.log(self.T_previous_current)
             self.velocity = prediction.velocity_by(self.motion)
             self._update(prediction, match, state)
-        self.intervals.take(scan)
+        self.intervals.take(scan, prediction.interval_s)
         is_lacking = scan.T_odom_base is None or self.is_contradicted
-        self.T_odom_base = None if is_lacking else np.array(scan.T_odom_base)
+        self.T_odom_base = None if is_lacking else scan.T_odom_base.copy()
         self.T_odom_lidar = T_odom_lidar
 
     def _update(self, prediction: Prediction, match: Match, state: State) -> None:
@@ -267,12 +339,12 @@ class Predictor:
         else:
             innovation = lie.log(lie.between(prediction.T_odom_lidar, match.T_target_source))
             if prediction.statistics is self.by_velocity:
-                self.filter.correct(innovation, match.information, self.by_velocity.variances)
+                self.filter.correct(innovation, match.information, self.by_velocity.covariance)
             else:
                 self.filter.begin(self.T_previous_current)
             is_independent = not prediction.prior.is_measured or match.observability >= WEAK
             if state is State.OK and is_independent and not prediction.is_second:
-                prediction.statistics.update(innovation, np.diag(definite_inverse(match.information)))
+                prediction.statistics.update(innovation, definite_inverse(match.information).diagonal())
 
     def _wheel_motion(self, scan: Scan) -> Pose | None:
         """Motion of the lidar since the last scan by the wheels; None without a reading at both ends."""
@@ -286,7 +358,7 @@ class Predictor:
             )
         if last is None or now is None:
             return None
-        return lie.between(self.T_base_lidar, lie.between(last, now) @ self.T_base_lidar)
+        return lie.between(self.T_base_lidar, lie.between(last, now).dot(self.T_base_lidar))
 
 
 def _stretched(

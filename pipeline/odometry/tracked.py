@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,8 +18,7 @@ COPY = "the scan before once more, to the last bit: it has that pose, and says n
 NEW_MAP = "a new map begins"  # in the reason of a scan whose motion from the one before is unknown
 
 
-@dataclass(frozen=True, slots=True)
-class Tracked:
+class Tracked(msgspec.Struct, frozen=True):
     """A scan with its pose in the odometry frame.
 
     ``points`` (M, d) are all that went into the map, ``matched`` those that were aligned, both deskewed, as seen
@@ -47,7 +47,7 @@ class Tracked:
 def owned(tracked: Tracked) -> Tracked:
     """The same with arrays of its own, except for ``points``: whoever writes into them moves no later pose."""
     match, prior = tracked.match, tracked.prior
-    return replace(
+    return msgspec.structs.replace(
         tracked,
         matched=tracked.matched.copy(),
         T_odom_lidar=tracked.T_odom_lidar.copy(),
@@ -119,7 +119,7 @@ def spread(match: Match, rival: NDArray[np.float64]) -> Match:
 def seen_from(tracked: Tracked, T_new_old: Pose) -> Tracked:
     """The same scan as seen from another frame that moves with it: points, poses, information."""
     T_old_new = lie.inverse(T_new_old)
-    return replace(
+    return msgspec.structs.replace(
         tracked,
         points=lie.transform(T_new_old, tracked.points),
         matched=lie.transform(T_new_old, tracked.matched),

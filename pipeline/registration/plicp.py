@@ -28,6 +28,7 @@ _REACH, _LARGEST_REACH = 0.4, 8  # share of the largest distance that is searche
 _LEAST_OVERLAP = 0.75  # share of the points with a correspondence: made-up places have more at right poses
 _REDUNDANCY = 10  # correspondences on surfaces for each degree of freedom, below which wrong poses fit by chance
 _SPAN_VOXELS = 4.0  # root mean square range of the points, below which voxels do not resolve their shape
+_NO_PROBLEM = Problem("", "")
 _ENDINGS = {
     icp.OUT_OF_ITERATIONS: "out of iterations (matching.max_iterations)",
     icp.NO_CORRESPONDENCES: "no point has a correspondence in the map",
@@ -102,7 +103,7 @@ def match_of(result: Result, points: int, target: VoxelMap, config: MatchingConf
     observability = min(
         _ratio(result.eigenvalue, config.min_information), _ratio(result.signal, config.min_signal)
     )
-    problem = _problem(result, points, target, observability, config) or Problem("", "")
+    problem = _problem(result, points, target, observability, config) or _NO_PROBLEM
     return Match(
         T_target_source=result.T,
         information=result.information,

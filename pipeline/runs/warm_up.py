@@ -35,7 +35,7 @@ _POINTS = 100
 def fit(dimension: int) -> None:
     """Compile the alignment of points to a voxel map, the largest of the kernels."""
     problem, T = _problem(dimension)
-    align.compile_inner(problem, T, np.zeros(lie.twist_size(T)), 1.0, 1.0)
+    align.compile_inner(problem, T, np.zeros(lie.twist_size(T)), 1.0)
 
 
 def judge(dimension: int) -> None:
@@ -65,6 +65,8 @@ def _problem(dimension: int) -> tuple[Problem, Pose]:
         np.eye(k),
         np.empty(0, np.int32),
         np.empty(0),
+        np.zeros((8, k)),
+        1.0,
         settings_of(config.matching, target, wide=False),
     )
     return problem, T

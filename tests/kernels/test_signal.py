@@ -7,7 +7,7 @@ from scanchain import lie
 from scanchain.config import LocalMapConfig, MatchingConfig
 from scanchain.data import Prior
 from scanchain.kernels.registration import icp, observability
-from scanchain.kernels.registration.residuals import normal_equations, sector_gradients
+from scanchain.kernels.registration.residuals import normal_equations
 from scanchain.registration import VoxelMap, create_matcher
 from scanchain.registration.plicp import settings_of
 from tests.support.naive_evidence import signal_along
@@ -54,7 +54,7 @@ def test_the_signal_is_that_of_its_slow_twin(twist, scans):
     T = lie.exp(np.array([0.02, -0.01, 0.03, 0.001, 0.002, -0.003]))
     settings = settings_of(LIMITS, voxel_map, wide=False)
     problem = icp.problem_of(voxel_map.voxels, points, T, np.zeros((6, 6)), settings)
-    icp.align(problem, T, np.zeros(6), 5.0, settings.first_scale_m)
+    icp.align(problem, T, np.zeros(6), settings.first_scale_m)
     found = observability.signal_along(problem, T, twist)
     assert found == pytest.approx(signal_along(voxel_map, problem, T, twist), rel=1e-9)
 
@@ -108,11 +108,9 @@ def test_gradients_of_the_sectors_are_those_of_their_points(d):
     k, settings = d * (d + 1) // 2, settings_of(LIMITS, voxel_map, wide=False)
     T = lie.exp(np.array([0.02, -0.01, 0.03] if d == 2 else [0.02, -0.01, 0.03, 0.001, 0.002, -0.003]))
     problem = icp.problem_of(voxel_map.voxels, points, T, np.zeros((k, k)), settings)
-    icp.align(problem, T, np.zeros(k), 5.0, settings.first_scale_m)
+    icp.align(problem, T, np.zeros(k), settings.first_scale_m)
     map_side = problem.voxels, problem.points, T, problem.origin
-    found = np.zeros((8, k))
-    sector_gradients(*map_side, problem.correspondence, problem.weight, settings.scale_m, 4.0, found)
-    far = np.linalg.norm(points, axis=1) > 4.0
+    found, far = problem.gradients, np.linalg.norm(points, axis=1) > problem.range_m
     number = (points[:, 0] > 0.0) + 2 * (points[:, 1] > 0.0) + 4 * far
     for sector in range(8):
         H, b = np.zeros((k, k)), np.zeros(k)

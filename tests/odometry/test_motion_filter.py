@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from scanchain import lie
-from scanchain.odometry.motion_filter import MotionFilter
+from scanchain.odometry.prediction import MotionFilter
 
 
 def textbook(any_motion, noise, measurements, information):
@@ -32,7 +32,7 @@ def test_along_a_line_it_is_the_kalman_filter_of_pose_and_motion(d):
         x += found.motion[0, -1]
         surprise = np.zeros(k)
         surprise[0] = place - x
-        found.correct(surprise, information * np.eye(k), np.full(k, noise))
+        found.correct(surprise, information * np.eye(k), noise * np.eye(k))
         x += (found.pose_covariance * information)[0, 0] * surprise[0]
     assert found.motion[0, -1] == pytest.approx(state[1], abs=1e-12)
     assert found.motion_covariance[0, 0] == pytest.approx(P[1, 1], abs=1e-12)
@@ -42,7 +42,7 @@ def test_along_a_line_it_is_the_kalman_filter_of_pose_and_motion(d):
 
 def test_a_pose_that_is_off_once_does_not_throw_the_motion():
     """At 2.5 m/s and 10 Hz, by matches good to 1 cm, one of which is 3 cm off."""
-    found, noise, information = MotionFilter(0.25 * np.eye(6)), np.full(6, 1e-5), 1e4 * np.eye(6)
+    found, noise, information = MotionFilter(0.25 * np.eye(6)), 1e-5 * np.eye(6), 1e4 * np.eye(6)
     along = np.eye(6)[0]
     found.correct(0.25 * along, information, noise)
     for off in [0.0] * 10 + [0.03, -0.03, 0.0, 0.0]:
@@ -51,7 +51,7 @@ def test_a_pose_that_is_off_once_does_not_throw_the_motion():
 
 
 def test_along_a_direction_that_nothing_tells_of_the_motion_goes_on_and_its_doubt_grows():
-    found, noise = MotionFilter(0.25 * np.eye(6)), np.full(6, 1e-4)
+    found, noise = MotionFilter(0.25 * np.eye(6)), 1e-4 * np.eye(6)
     blind = np.diag([0.0, 1.0, 1.0, 1.0, 1.0, 1.0]) * 1e4
     found.correct(np.array([0.25, 0.0, 0.0, 0.0, 0.0, 0.0]), 1e4 * np.eye(6), noise)
     before = found.motion_covariance.copy()

@@ -1,7 +1,6 @@
 """Odometry with its drift turned up, so that loop closure has something to do on logs that are tracked well."""
 
-from dataclasses import replace
-
+import msgspec
 import numpy as np
 
 from scanchain import lie
@@ -24,7 +23,7 @@ class DriftingOdometry:
         motion = lie.inverse(self.T_odom_lidar) @ tracked.T_odom_lidar
         self.T_odom_lidar = tracked.T_odom_lidar
         self.T_drifted = lie.normalize(self.T_drifted @ self.drifted(motion))
-        return replace(tracked, T_odom_lidar=self.T_drifted)
+        return msgspec.structs.replace(tracked, T_odom_lidar=self.T_drifted)
 
 
 def drifting_slam(config, T_base_lidar, drifted):

@@ -158,7 +158,7 @@ def plane_equations(points, number, plane, beside, residual, normals, poses, sca
                 there = [T[:3, :3] @ points[i] + T[:3, 3] for T in moved]
                 J[6 * number[i] + column] = normal @ (there[0] - there[1]) / (2.0 * step)
             J[size - 1] = normal @ poses[number[i]][:3, :3] @ upward
-            J[size:] = [1.0, *np.delete(beside[i], np.argmax(np.abs(normal)))]
+            J[size:] = [1.0, *np.delete(beside[i] - residual[i] * normal, np.argmax(np.abs(normal)))]
             rows.append(J)
         J, w = np.array(rows), (1.0 + (residual[members] / scale) ** 2) ** -2
         whole, gradient = J.T @ (w[:, None] * J), J.T @ (w * residual[members])

@@ -49,8 +49,7 @@ def refine(voxels, points, starts, poses, prior, least_share, settings):
     for k, (first, last) in enumerate(pairwise(starts)):
         T = poses[k].copy()
         scan = points[first:last]
-        range_m = np.sqrt((scan**2).sum(axis=1).mean())
         problem = problem_of(voxels, scan, T, prior, settings)
-        fit = align(problem, T, np.zeros(len(prior)), range_m, settings.first_scale_m)
+        fit = align(problem, T, np.zeros(len(prior)), settings.first_scale_m)
         if fit.ending == CONVERGED and fit.pairs >= least_share * (last - first):
             poses[k] = T

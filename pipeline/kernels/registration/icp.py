@@ -25,6 +25,7 @@ SHRINK = 0.6  # ratio of the kernel's scale from one iteration to the next
 SLACK = 0.02  # voxels that points may move before they are associated again
 PATIENCE = 20  # steps at the last scale, after which correspondences are fixed
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e8
+_SECTORS = 8  # of a scan, in ``information``
 _COST, _WEIGHT, _SQUARES, _DAMPING = 0, 1, 2, 3  # entries of ``Iterate.sums``
 
 
@@ -64,7 +65,8 @@ class Problem(NamedTuple):
 
     origin : (3,), map frame, that twists rotate about
     prior : (k, k) information of the predicted pose times the variance of a residual, along the map's axes
-    correspondence, weight : (N,) of the last association
+    correspondence, weight : (N,) of the last association; gradients (8, k) of sectors of the points at a ``Fit``
+    range_m : root mean square of the points' ranges
     """
 
     voxels: Voxels
@@ -73,6 +75,8 @@ class Problem(NamedTuple):
     prior: NDArray[np.float64]
     correspondence: NDArray[np.int32]
     weight: NDArray[np.float64]
+    gradients: NDArray[np.float64]
+    range_m: float
     settings: Settings
 
 
@@ -116,17 +120,18 @@ def problem_of(voxels, points, T_first, prior, settings):
     origin, N = np.zeros(3), points.shape[0]
     for axis in range(points.shape[1]):
         origin[axis] = T_first[axis, points.shape[1]]
-    return Problem(voxels, points, origin, prior, np.empty(N, np.int32), np.empty(N), settings)
+    gradients, range_m = np.zeros((_SECTORS, prior.shape[0])), root_mean_square_range(points)
+    return Problem(voxels, points, origin, prior, np.empty(N, np.int32), np.empty(N), gradients, range_m, settings)
 
 
 @njit(nogil=True)
-def align(problem, T, offset, range_m: float, first_scale_m: float):
+def align(problem, T, offset, first_scale_m: float):
     """``Fit`` at a minimum near T (d+1, d+1), which is moved there in place.
 
     The cost is the robust sum of ``normal_equations`` plus ½ ξᵀ prior ξ, ξ being the twist from the predicted
     pose, ``offset`` (k,) at first. Points are associated again when they have moved by more than SLACK, until
     PATIENCE steps were taken with the kernel at its last scale: correspondences may alternate without end.
-    range_m : root mean square of the points' ranges; first_scale_m : that the kernel's scale shrinks from
+    first_scale_m : that the kernel's scale shrinks from
     """
     settings, size_m, k = problem.settings, problem.voxels.size_m, offset.shape[0]
     now = Iterate(T, offset.copy(), np.zeros((k, k)), np.zeros(k), np.zeros(4))
@@ -149,7 +154,7 @@ def align(problem, T, offset, range_m: float, first_scale_m: float):
         slack_m = -1.0  # a scale that shrinks changes all weights
         if scale_m <= settings.scale_m:
             slack_m = SLACK * size_m - moved_m if steps_at_last + 1 < PATIENCE else np.inf
-        if not _descend(problem, scale_m, range_m, slack_m, now, trial, x, factor):
+        if not _descend(problem, scale_m, slack_m, now, trial, x, factor):
             ending = SINGULAR
             break
         if scale_m <= settings.scale_m:
@@ -157,7 +162,7 @@ def align(problem, T, offset, range_m: float, first_scale_m: float):
                 ending = CONVERGED
                 break
             steps_at_last += 1
-        moved_m += _largest_move(x, range_m)
+        moved_m += _largest_move(x, problem.range_m)
         last_scale_m, scale_m = scale_m, max(settings.scale_m, SHRINK * scale_m)
     orthonormalize(T)
     cost = now.sums[_COST] - _prior_cost(problem.prior, now.offset)
@@ -209,8 +214,10 @@ def shape_information(problem, T):
         problem.correspondence,
         problem.weight,
         problem.settings.scale_m,
+        problem.range_m,
         H,
         unweighted,
+        problem.gradients,
     )
     return H, unweighted
 
@@ -229,7 +236,7 @@ def refine(voxels, points, starts, poses, prior, least_share, settings):
         scan = points[starts[k] : starts[k + 1]]
         T = poses[k].copy()
         problem = problem_of(voxels, scan, T, prior, settings)
-        fit = align(problem, T, offset, root_mean_square_range(scan), settings.first_scale_m)
+        fit = align(problem, T, offset, settings.first_scale_m)
         if fit.ending == CONVERGED and fit.pairs >= least_share * scan.shape[0]:
             for i in range(T.shape[0]):
                 for j in range(T.shape[0]):
@@ -247,7 +254,7 @@ def root_mean_square_range(points) -> float:
 
 
 @njit(nogil=True)
-def _descend(problem, scale_m: float, range_m: float, slack_m: float, now, trial, x, factor) -> bool:
+def _descend(problem, scale_m: float, slack_m: float, now, trial, x, factor) -> bool:
     """True if one step x (k,) was taken with the present correspondences; False where H is singular.
 
     Levenberg–Marquardt takes back a step that raises the cost and damps harder (Marquardt 1963), by a factor
@@ -260,7 +267,7 @@ def _descend(problem, scale_m: float, range_m: float, slack_m: float, now, trial
         perturb(x, now.T, problem.origin, trial.T)
         for i in range(x.shape[0]):
             trial.offset[i] = now.offset[i] + x[i]
-        if _largest_move(x, range_m) > slack_m:
+        if _largest_move(x, problem.range_m) > slack_m:
             _evaluate(problem, scale_m, trial)
         else:
             _linearize(problem, scale_m, trial)

@@ -14,7 +14,6 @@ from scanchain.kernels.registration.icp import (
     align,
     fit_at,
     problem_of,
-    root_mean_square_range,
 )
 from scanchain.kernels.registration.observability import (
     WEAK,
@@ -29,9 +28,10 @@ from scanchain.kernels.registration.observability import (
     weak_prior,
     worst,
 )
-from scanchain.kernels.registration.residuals import gradient_spread, sector_gradients
+from scanchain.kernels.registration.optimizers import factorize, substitute
+from scanchain.kernels.registration.residuals import gradient_spread
 
-_SECTORS, _TURN_INFORMATION = 8, 25.0  # of a scan; rad⁻² of a turn that nothing determines
+_TURN_INFORMATION = 25.0  # rad⁻² of a turn that nothing determines
 _POOLED_RESIDUALS = 10.0  # number of residuals that the sensor's variance counts for
 _UNSHARED = 0.5  # share of the variance of planar residuals that is not the map's, by NEES of simulated motions
 _POOLED = 0.02  # weight of the variance that all residuals have in common against that of each surface
@@ -74,21 +74,20 @@ def match(voxels, points, T_first, expected, settings):
         T_first, zeros and infinite
     """
     k = 3 if points.shape[1] == 2 else 6
-    range_m = root_mean_square_range(points)
     prior = np.zeros((k, k))
     for i in range(k):
         prior[i, i] = expected.widest[i] ** -2.0
     prior = _about_target(prior, T_first, settings.variance)
     offset = _twist_between(expected.T_target_source, T_first)
-    uncertainty_m = _uncertainty_of(expected.covariance, range_m)
-    first_scale_m = min(max(settings.first_scale_m, _SIGMAS * uncertainty_m), settings.widest_scale_m)
     problem = problem_of(voxels, points, T_first, prior, settings)
+    uncertainty_m = _uncertainty_of(expected.covariance, problem.range_m)
+    first_scale_m = min(max(settings.first_scale_m, _SIGMAS * uncertainty_m), settings.widest_scale_m)
     T = T_first.copy()
     is_fused = expected.is_measured and points.shape[1] == 2
     is_remapped = False
     while True:
-        fit = align(problem, T, offset, range_m, first_scale_m)
-        spectrum = spectrum_of(fit.H, fit.total_weight, range_m)
+        fit = align(problem, T, offset, first_scale_m)
+        spectrum = spectrum_of(fit.H, fit.total_weight, problem.range_m)
         if is_fused or points.shape[1] == 3:
             add_signals(problem, T, spectrum)
         if is_remapped or not is_below(spectrum, 0, 1.0 if is_fused else WEAK, settings):
@@ -108,7 +107,7 @@ def match(voxels, points, T_first, expected, settings):
         add_signals(problem, T, spectrum)
     if is_fused:
         remove_noise(spectrum, fit.H, fit.total_weight, settings)
-    return _result(problem, T, T_first, fit, last, spectrum, range_m, spread)
+    return _result(problem, T, T_first, fit, last, spectrum, spread)
 
 
 @njit(nogil=True)
@@ -119,16 +118,15 @@ def assess(voxels, points, T, fit, settings):
     therefore that of the surfaces.
     """
     k = 3 if points.shape[1] == 2 else 6
-    range_m = root_mean_square_range(points)
     problem = problem_of(voxels, points, T, np.zeros((k, k)), settings)
     last = fit_at(problem, T, fit)
-    spectrum = spectrum_of(last.H, last.total_weight, range_m)
+    spectrum = spectrum_of(last.H, last.total_weight, problem.range_m)
     add_signals(problem, T, spectrum)
-    return _result(problem, T, T, fit, last, spectrum, range_m, np.zeros((0, 0)))
+    return _result(problem, T, T, fit, last, spectrum, np.zeros((0, 0)))
 
 
 @njit(nogil=True)
-def _result(problem, T, T_first, fit, last, spectrum, range_m: float, spread):
+def _result(problem, T, T_first, fit, last, spectrum, spread):
     """``Result`` in the source's own frame: information by ``fit``, quality by the ``last`` correspondences.
 
     spread : (k, k) covariance of the gradient, empty to have one variance for all residuals
@@ -147,8 +145,8 @@ def _result(problem, T, T_first, fit, last, spectrum, range_m: float, spread):
         direction,
         max(spectrum.values[0], 0.0),
         spectrum.signals[m],
-        agreement(last.H, last.unweighted, range_m),
-        range_m,
+        agreement(last.H, last.unweighted, problem.range_m),
+        problem.range_m,
         _residual_of(last),
         fit.cost,
         last.pairs,
@@ -156,7 +154,7 @@ def _result(problem, T, T_first, fit, last, spectrum, range_m: float, spread):
         fit.iterations,
         fit.ending if last.pairs else NO_CORRESPONDENCES,
         1.0 if len(spread) else _variance_factor(problem, fit),
-        _systematic(problem, T, T_first, fit, range_m),
+        _systematic(problem, T, T_first, fit),
     )
 
 
@@ -196,30 +194,27 @@ def _variance_factor(problem, fit) -> float:
 
 
 @njit(nogil=True)
-def _systematic(problem, T, T_first, fit, range_m: float):
+def _systematic(problem, T, T_first, fit):
     """Covariance (k, k) in the source's own frame by how the gradients b_s of sectors differ.
 
     H⁻¹ (Σ b_s b_sᵀ) H⁻¹ G / (G − 1) of G sectors with correspondences, H with the prior (cluster-robust
     covariance, as ``gradient_spread``). Directions that neither determines are known to a meter and 0.2 rad.
     """
-    k, H = fit.H.shape[0], fit.H + problem.prior
+    k, H, groups = fit.H.shape[0], fit.H + problem.prior, 0
     for m in range(k):
         is_turn = m >= (2 if k == 3 else 3)
         H[m, m] += _variance(problem, fit) * (_TURN_INFORMATION if is_turn else 1.0)
-    sums = np.zeros((_SECTORS, k))
-    sector_gradients(
-        problem.voxels, problem.points, T, problem.origin, problem.correspondence, problem.weight,
-        problem.settings.scale_m, range_m, sums,
-    )  # fmt: skip
-    spread, groups = np.zeros((k, k)), 0
-    for sector in range(_SECTORS):
-        b = sums[sector]
-        groups += np.any(b != 0.0)
+    spread, factor, shift = np.zeros((k, k)), np.empty((k, k)), np.empty(k)
+    if not factorize(H, 0.0, factor):
+        return spread
+    for b in problem.gradients:
+        groups += b[0] != 0.0 or b[1] != 0.0
+        substitute(factor, b, shift)
         for m in range(k):
             for n in range(k):
-                spread[m, n] += b[m] * b[n]
+                spread[m, n] += shift[m] * shift[n]
     to_source = np.ascontiguousarray(adjoint(inverse(centered(T, T_first))).T)
-    return congruent(to_source, congruent(definite_inverse(H), spread)) * (groups / max(groups - 1.0, 1.0))
+    return congruent(to_source, spread) * (groups / max(groups - 1.0, 1.0))
 
 
 @njit(nogil=True)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scanchain.kernels.compiling import njit
 from scanchain.kernels.geometry.eigen import eigensystem
 from scanchain.kernels.geometry.poses import adjoint, centered
-from scanchain.kernels.registration.optimizers import solve
+from scanchain.kernels.registration.optimizers import factorize, substitute
 from scanchain.kernels.voxels.hashing import unpack
 from scanchain.kernels.voxels.voxel_shapes import (
     ACROSS,
@@ -276,14 +276,12 @@ def seen_from_source(T, T_first, H, direction, variance: float):
 def definite_inverse(matrix):
     """Inverse of a positive definite (k, k), of another zeros."""
     k = matrix.shape[0]
-    out, factor, b, column = np.zeros((k, k)), np.zeros((k, k)), np.zeros(k), np.zeros(k)
-    for j in range(k):
-        b[j] = -1.0
-        if not solve(matrix, b, 0.0, factor, column):
-            return np.zeros((k, k))
-        b[j] = 0.0
-        for i in range(k):
-            out[i, j] = column[i]
+    out, factor, b = np.zeros((k, k)), np.zeros((k, k)), np.zeros(k)
+    if factorize(matrix, 0.0, factor):
+        for j in range(k):
+            b[j] = -1.0
+            substitute(factor, b, out[:, j])
+            b[j] = 0.0
     return out
 
 

@@ -39,7 +39,16 @@ def step(optimizer: int, H, b, damping: float, factor, x) -> bool:
 @njit(nogil=True)
 def solve(H, b, damping: float, factor, x) -> bool:
     """Write −(H + damping · diag(H))⁻¹ b to ``x`` by Cholesky; False where that is not positive definite."""
-    k = b.shape[0]
+    if not factorize(H, damping, factor):
+        return False
+    substitute(factor, b, x)
+    return True
+
+
+@njit(nogil=True)
+def factorize(H, damping: float, factor) -> bool:
+    """Write L with L Lᵀ = H + damping · diag(H) to the lower half of ``factor``; False where there is none."""
+    k = H.shape[0]
     for i in range(k):
         for j in range(i + 1):
             total = H[i, j] + (damping * abs(H[i, i]) if i == j else 0.0)
@@ -51,6 +60,13 @@ def solve(H, b, damping: float, factor, x) -> bool:
                 return False
             else:
                 factor[i, i] = math.sqrt(total)
+    return True
+
+
+@njit(nogil=True)
+def substitute(factor, b, x):
+    """Write −(L Lᵀ)⁻¹ b to ``x``."""
+    k = b.shape[0]
     for i in range(k):
         total = -b[i]
         for m in range(i):
@@ -61,7 +77,6 @@ def solve(H, b, damping: float, factor, x) -> bool:
         for m in range(i + 1, k):
             total -= factor[m, i] * x[m]
         x[i] = total / factor[i, i]
-    return True
 
 
 @njit(nogil=True)

@@ -7,6 +7,7 @@ import numpy as np
 from scanchain.kernels.compiling import njit
 from scanchain.kernels.geometry.eigen import eigenvalues_3d, eigenvector_3d
 from scanchain.kernels.voxels.hashing import find_row, key_of
+from scanchain.kernels.voxels.voxel_shapes import move
 
 _FEWEST, _FEWEST_SCANS = 8, 3  # least number of points in a cell that counts as a plane, and of scans that see it
 _THIN, _FLAT, _WIDE = 0.02, 0.15, 0.1  # of a plane: ratio of its variances, largest and least deviation in cells
@@ -15,27 +16,34 @@ _LEAST_SLOPE = 0.4  # of Σψ' over Σw, which bounds how much longer steps beco
 
 
 @njit(nogil=True)
-def planes(points, number, poses, offset_rad: float, cell_m: float, lifted, beside, residual, plane, normals):
+def lift(points, offset_rad: float, lifted):
+    """Write points (N, 3) of lidar frames with their elevation angles raised."""
+    sine, cosine = math.sin(offset_rad), math.cos(offset_rad)
+    for i in range(points.shape[0]):
+        level = max(math.sqrt(points[i, 0] ** 2 + points[i, 1] ** 2), 1e-9)
+        stretch = cosine - sine * points[i, 2] / level
+        lifted[i, 0], lifted[i, 1] = stretch * points[i, 0], stretch * points[i, 1]
+        lifted[i, 2] = cosine * points[i, 2] + sine * level
+
+
+@njit(nogil=True)
+def planes(points, number, poses, cell_m: float, beside, residual, plane, normals):
     """Find the cells of a grid whose points, of several scans, lie in a plane; returns how many, P.
 
     points : (N, 3) of lidar frames, by scans; number : (N,) of the scan of each; poses (K, 4, 4)
-    Filled are lifted (N, 3), the points with elevations raised by the offset; plane (N,), the number of the plane
-    of each, −1 outside; within, beside (N, 3), from the plane's mean, and residual (N,), along its normal; the
-    first P rows of normals (N, 3), unit.
+    Filled are plane (N,), the number of the plane of each point, −1 outside; beside (N, 3), from the plane's mean,
+    and residual (N,), along its normal; the first P rows of normals (N, 3), unit.
     """
     n, slots = points.shape[0], 2
     while slots < 2 * n:
         slots *= 2
     rows, keys = np.full(slots, -1, np.int32), np.empty(n, np.int64)
     sums, seen, last = np.zeros((n, 10)), np.zeros(n, np.int32), np.full(n, -1, np.int32)
-    cells, sine, cosine = 0, math.sin(offset_rad), math.cos(offset_rad)
+    cells = 0
     for i in range(n):
-        level = max(math.sqrt(points[i, 0] ** 2 + points[i, 1] ** 2), 1e-9)
-        stretch = cosine - sine * points[i, 2] / level
-        lifted[i, 0], lifted[i, 1] = stretch * points[i, 0], stretch * points[i, 1]
-        lifted[i, 2] = cosine * points[i, 2] + sine * level
-        _seen_from(poses[number[i]], poses[0], lifted[i], beside[i])
-        x, y, z = beside[i, 0], beside[i, 1], beside[i, 2]
+        T = poses[number[i]]
+        x, y, z = move(T, points, i)
+        x, y, z = x - poses[0, 0, 3], y - poses[0, 1, 3], z - poses[0, 2, 3]
         key = key_of(x, y, z, 1.0 / cell_m)
         cell = find_row(rows, keys, key)
         if cell < 0:
@@ -46,7 +54,8 @@ def planes(points, number, poses, offset_rad: float, cell_m: float, lifted, besi
         if last[cell] != number[i]:
             last[cell] = number[i]
             seen[cell] += 1
-        _add(sums[cell], x, y, z)
+        beside[i, 0], beside[i, 1], beside[i, 2] = x, y, z
+        _add(sums, cell, x, y, z)
         plane[i] = cell
     count = 0
     for cell in range(cells):
@@ -59,34 +68,32 @@ def planes(points, number, poses, offset_rad: float, cell_m: float, lifted, besi
         cell = plane[i]
         plane[i] = p = seen[cell]
         if p >= 0:
-            residual[i] = 0.0
-            for axis in range(3):
-                beside[i, axis] -= sums[cell, 1 + axis] / sums[cell, 0]
-                residual[i] += normals[p, axis] * beside[i, axis]
+            residual[i] = _from_mean(sums, cell, normals, p, beside, i)
     return count
 
 
 @njit(inline="always")
-def _seen_from(T, T_origin, point, out):
-    """Write T point (3,) with its coordinates relative to the position of T_origin, so that nothing cancels."""
-    for row in range(3):
-        out[row] = T[row, 3] - T_origin[row, 3]
-        for column in range(3):
-            out[row] += T[row, column] * point[column]
+def _from_mean(sums, cell: int, normals, p: int, beside, i: int) -> float:
+    """Distance of a point from its plane; the point becomes that from the plane's mean."""
+    residual = 0.0
+    for axis in range(3):
+        beside[i, axis] -= sums[cell, 1 + axis] / sums[cell, 0]
+        residual += normals[p, axis] * beside[i, axis]
+    return residual
 
 
 @njit(inline="always")
-def _add(sums, x: float, y: float, z: float):
-    sums[0] += 1.0
-    sums[1] += x
-    sums[2] += y
-    sums[3] += z
-    sums[4] += x * x
-    sums[5] += x * y
-    sums[6] += x * z
-    sums[7] += y * y
-    sums[8] += y * z
-    sums[9] += z * z
+def _add(sums, cell: int, x: float, y: float, z: float):
+    sums[cell, 0] += 1.0
+    sums[cell, 1] += x
+    sums[cell, 2] += y
+    sums[cell, 3] += z
+    sums[cell, 4] += x * x
+    sums[cell, 5] += x * y
+    sums[cell, 6] += x * z
+    sums[cell, 7] += y * y
+    sums[cell, 8] += y * z
+    sums[cell, 9] += z * z
 
 
 @njit()
@@ -103,7 +110,7 @@ def _is_plane(sums, cell_m: float, normal) -> bool:
 
 
 @njit(nogil=True)
-def plane_equations(points, number, plane, beside, residual, normals, poses, scale_m: float, H, b):
+def plane_equations(points, number, plane, beside, residual, normals, poses, scale_m: float, H):
     """Add up the normal equations of poses and offset; returns what scales H⁻¹ to a covariance, and a step.
 
     With p the raised point of scan k in a plane of unit normal n and mean x̄, and a = R_kᵀ n, T_k ← T_k exp(ξ) and
@@ -113,99 +120,93 @@ def plane_equations(points, number, plane, beside, residual, normals, poses, sca
     their step is too short by Σψ'/Σw, and the variance is Σψ² Σw / (Σψ')² (Huber 1964).
 
     points : (N, 3) of lidar frames, raised; number, plane, residual (N,), beside (N, 3), normals (P, 3) of planes
-    H (6K + 1, 6K + 1), b (6K + 1,) : zeros, filled
+    H (6K + 2, 6K + 2) : zeros, filled; the gradient in its last column
     """
-    count, scans = normals.shape[0], poses.shape[0]
-    J, g, total, squares, slopes = np.empty(7), np.empty(3), 0.0, 0.0, 0.0
-    sums, S = np.zeros((count, scans, 6, 3)), np.zeros((count, 3, 3))
-    of_offset, of_residual = np.zeros((count, 3)), np.zeros((count, 3))
+    count, size, total, squares, slopes = normals.shape[0], H.shape[0], 0.0, 0.0, 0.0
+    J, g, among = np.empty(8), np.empty(3), np.zeros((poses.shape[0], 8, 8))  # of (ρ, φ, δ, r)
+    sums, S = np.zeros((count, 3, size)), np.zeros((count, 3, 3))
     for i in range(points.shape[0]):
         k, p = number[i], plane[i]
         if p < 0:
             continue
         square = (residual[i] / scale_m) ** 2
         weight = 1.0 / (1.0 + square) ** 2
-        _jacobian(points[i], normals[p], poses[k], J)
-        _terms(beside[i], normals[p], g)
-        _add_point(J, 6 * k, weight, residual[i], H, b)
-        for m in range(3):
-            weighted = weight * g[m]
-            for row in range(6):
-                sums[p, k, row, m] += weighted * J[row]
-            of_offset[p, m] += weighted * J[6]
-            of_residual[p, m] += weighted * residual[i]
-            for other in range(m + 1):
-                S[p, m, other] += weighted * g[other]
+        _jacobian(points, i, normals, p, poses, k, J)
+        J[7] = residual[i]
+        _terms(beside, residual, i, normals, p, g)
+        _add_point(among, k, J, weight)
+        _add_to_plane(sums, S, p, k, J, g, weight)
         total += weight
         squares += (weight * residual[i]) ** 2
         slopes += weight * (1.0 - 3.0 * square) / (1.0 + square)
+    _unfold(among, H)
     for p in range(count):
-        _eliminate(sums[p], of_offset[p], of_residual[p], S[p], H, b)
-    for row in range(H.shape[0]):
-        for column in range(row):
-            H[row, column] = H[column, row]
+        _factorize(S[p])
+        _eliminate(S[p], sums[p], H)
+    for row in range(size):
+        H[row + 1 :, row] = H[row, row + 1 :]
     slopes = max(slopes, _LEAST_SLOPE * total)
     return squares * total / slopes**2, total / slopes
 
 
-@njit()
-def _terms(beside, normal, g):
-    """Write the derivative (3,) of a plane at a point by its parameters, height and slopes along two axes."""
-    x, y, z = abs(normal[0]), abs(normal[1]), abs(normal[2])
+@njit(inline="always")
+def _add_point(among, k: int, J, weight: float):
+    for row in range(8):
+        weighted = weight * J[row]
+        for column in range(8):
+            among[k, row, column] += weighted * J[column]
+
+
+@njit(inline="always")
+def _add_to_plane(sums, S, p: int, k: int, J, g, weight: float):
+    for m in range(3):
+        weighted = weight * g[m]
+        for row in range(6):
+            sums[p, m, 6 * k + row] += weighted * J[row]
+        sums[p, m, -2] += weighted * J[6]
+        sums[p, m, -1] += weighted * J[7]
+        for other in range(m + 1):
+            S[p, m, other] += weighted * g[other]
+
+
+@njit(nogil=True)
+def _unfold(among, H):
+    """Write sums (K, 8, 8) over the points of each scan, of pose, offset and residual, to the upper half of H."""
+    last = H.shape[0] - 2
+    for k in range(among.shape[0]):
+        for row in range(8):
+            for column in range(row, 8):
+                at = 6 * k + row if row < 6 else last + row - 6
+                H[at, 6 * k + column if column < 6 else last + column - 6] += among[k, row, column]
+
+
+@njit(inline="always")
+def _terms(beside, residual, i: int, normals, p: int, g):
+    """Write the derivative (3,) of a plane at a point by its parameters, height and slopes along two axes.
+
+    Where the point is projected to the plane, so that turns of all poses together are slopes and no more.
+    """
+    x, y, z = abs(normals[p, 0]), abs(normals[p, 1]), abs(normals[p, 2])
     across = 0 if x >= max(y, z) else 1 if y >= z else 2
-    g[0], g[1], g[2] = 1.0, beside[(across + 1) % 3], beside[(across + 2) % 3]
+    g[0] = 1.0
+    for m in range(1, 3):
+        axis = (across + m) % 3
+        g[m] = beside[i, axis] - residual[i] * normals[p, axis]
 
 
-@njit()
-def _jacobian(point, normal, T, J):
+@njit(inline="always")
+def _jacobian(points, i: int, normals, p: int, poses, k: int, J):
     """Write ∂r/∂(ρ, φ, δ) (7,)."""
-    x, y, z = point[0], point[1], point[2]
+    x, y, z = points[i, 0], points[i, 1], points[i, 2]
     for axis in range(3):
-        J[axis] = T[0, axis] * normal[0] + T[1, axis] * normal[1] + T[2, axis] * normal[2]
+        J[axis] = (
+            poses[k, 0, axis] * normals[p, 0]
+            + poses[k, 1, axis] * normals[p, 1]
+            + poses[k, 2, axis] * normals[p, 2]
+        )
     J[3], J[4], J[5] = y * J[2] - z * J[1], z * J[0] - x * J[2], x * J[1] - y * J[0]
     level = max(math.sqrt(x * x + y * y), 1e-9)
     J[6] = level * J[2] - z / level * (x * J[0] + y * J[1])
-
-
-@njit(inline="always")
-def _add_point(J, first: int, weight: float, residual: float, H, b):
-    """Add JᵀJ and Jᵀr to the upper half of H and to b, with the columns of a pose from ``first`` on."""
-    last = H.shape[0] - 1
-    for row in range(7):
-        at = first + row if row < 6 else last
-        for column in range(row, 7):
-            H[at, first + column if column < 6 else last] += weight * J[row] * J[column]
-        b[at] += weight * J[row] * residual
-
-
-@njit()
-def _eliminate(sums, of_offset, of_residual, S, H, b):
-    """Subtract the Schur complement of a plane from its weighted sums, which are overwritten: S = L Lᵀ."""
-    last = H.shape[0] - 1
-    _factorize(S)
-    _solve(S, of_offset)
-    _solve(S, of_residual)
-    for m in range(3):
-        H[last, last] -= of_offset[m] ** 2
-        b[last] -= of_offset[m] * of_residual[m]
-    for k in range(sums.shape[0]):
-        if sums[k, 0, 0] == 0.0 and sums[k, 1, 0] == 0.0 and sums[k, 2, 0] == 0.0:
-            continue
-        for row in range(6):
-            _solve(S, sums[k, row])
-            for m in range(3):
-                H[6 * k + row, last] -= sums[k, row, m] * of_offset[m]
-                b[6 * k + row] -= sums[k, row, m] * of_residual[m]
-        for before in range(k + 1):
-            _subtract_product(sums[before], sums[k], H[6 * before : 6 * before + 6, 6 * k : 6 * k + 6])
-
-
-@njit(inline="always")
-def _subtract_product(A, B, out):
-    for row in range(6):
-        for column in range(6):
-            for m in range(3):
-                out[row, column] -= A[row, m] * B[column, m]
 
 
 @njit(inline="always")
@@ -218,10 +219,18 @@ def _factorize(S):
             S[m, other] = S[m, other] / S[other, other] if other < m else math.sqrt(max(S[m, m], 1e-12))
 
 
-@njit(inline="always")
-def _solve(L, right):
-    """The right side (3,) ← L⁻¹ right."""
+@njit(nogil=True)
+def _eliminate(L, sums, H):
+    """Subtract the Schur complement of a plane from the upper half of H; sums ← L⁻¹ sums (3, 6K + 2)."""
+    size = H.shape[0]
     for m in range(3):
         for i in range(m):
-            right[m] -= L[m, i] * right[i]
-        right[m] /= L[m, m]
+            for column in range(size):
+                sums[m, column] -= L[m, i] * sums[i, column]
+        for column in range(size):
+            sums[m, column] /= L[m, m]
+    for row in range(size - 1):
+        x, y, z = sums[0, row], sums[1, row], sums[2, row]
+        if x != 0.0 or y != 0.0 or z != 0.0:
+            for column in range(row, size):
+                H[row, column] -= x * sums[0, column] + y * sums[1, column] + z * sums[2, column]

@@ -167,16 +167,30 @@ def _plus_point(h, b, w, moved, residual):
 
 
 @njit(nogil=True)
-def information(voxels, points, T, origin, correspondence, weight, scale_m: float, H, unweighted):
-    """H = Σ w JᵀJ of ``normal_equations``, and ``unweighted`` (k, k), the same without robust weights."""
+def information(
+    voxels, points, T, origin, correspondence, weight, scale_m: float, range_m: float, H, unweighted, gradients
+):
+    """H = Σ w JᵀJ of ``normal_equations``, and ``unweighted`` (k, k), the same without robust weights.
+
+    Written as well are the gradients (8, k), b of ``normal_equations`` by sector, which lie ahead or behind, left
+    or right, nearer or farther than range_m. Calibration, motion within the scan and surfaces that repeat shift
+    the points of a sector together.
+    """
+    gradients.fill(0.0)
     if H.shape[0] == 6:
-        _information_in_space(voxels, points, T, origin, correspondence, weight, scale_m, H, unweighted)
+        _information_in_space(
+            voxels, points, T, origin, correspondence, weight, scale_m, range_m, H, unweighted, gradients
+        )
     else:
-        _information_in_plane(voxels, points, T, origin, correspondence, weight, scale_m, H, unweighted)
+        _information_in_plane(
+            voxels, points, T, origin, correspondence, weight, scale_m, range_m, H, unweighted, gradients
+        )
 
 
 @njit(nogil=True)
-def _information_in_space(voxels, points, T, origin, correspondence, weight, scale_m: float, H, unweighted):
+def _information_in_space(
+    voxels, points, T, origin, correspondence, weight, scale_m: float, range_m: float, H, unweighted, gradients
+):
     """``information`` in space."""
     s2, none = scale_m * scale_m, (0.0,) * 6
     upper, plain = (0.0,) * 21, (0.0,) * 21
@@ -189,14 +203,19 @@ def _information_in_space(voxels, points, T, origin, correspondence, weight, sca
         residual, along, r2 = _residual(shape, q, normal, x, y, z)
         moved = x - origin[0], y - origin[1], z - origin[2]
         ratio = s2 / (s2 + r2 * weight[i])
-        upper, _ = _plus(upper, none, weight[i] * ratio * ratio, shape, normal, moved, residual, along)
+        upper, b = _plus(upper, none, weight[i] * ratio * ratio, shape, normal, moved, residual, along)
         plain, _ = _plus(plain, none, weight[i], shape, normal, moved, residual, along)
+        sector = _sector(points, i, range_m)
+        for m in range(6):
+            gradients[sector, m] += b[m]
     _unfold(upper, H)
     _unfold(plain, unweighted)
 
 
 @njit(nogil=True)
-def _information_in_plane(voxels, points, T, origin, correspondence, weight, scale_m: float, H, unweighted):
+def _information_in_plane(
+    voxels, points, T, origin, correspondence, weight, scale_m: float, range_m: float, H, unweighted, gradients
+):
     """``information`` in the plane."""
     s2, none = scale_m * scale_m, (0.0,) * 3
     upper, plain = (0.0,) * 6, (0.0,) * 6
@@ -209,10 +228,21 @@ def _information_in_plane(voxels, points, T, origin, correspondence, weight, sca
         residual, along, r2 = _residual(shape, q, normal, x, y, z)
         moved = x - origin[0], y - origin[1], z - origin[2]
         ratio = s2 / (s2 + r2 * weight[i])
-        upper, _ = _plus_in_plane(upper, none, weight[i] * ratio * ratio, shape, normal, moved, residual, along)
+        upper, b = _plus_in_plane(upper, none, weight[i] * ratio * ratio, shape, normal, moved, residual, along)
         plain, _ = _plus_in_plane(plain, none, weight[i], shape, normal, moved, residual, along)
+        sector = _sector(points, i, range_m)
+        for m in range(3):
+            gradients[sector, m] += b[m]
     _unfold(upper, H)
     _unfold(plain, unweighted)
+
+
+@njit(inline="always")
+def _sector(points, i: int, range_m: float) -> int:
+    squared = 0.0
+    for axis in range(points.shape[1]):
+        squared += points[i, axis] * points[i, axis]
+    return (points[i, 0] > 0.0) + 2 * (points[i, 1] > 0.0) + 4 * (squared > range_m * range_m)
 
 
 @njit(nogil=True)
@@ -251,39 +281,6 @@ def gradient_spread(voxels, points, T, origin, correspondence, weight, scale_m: 
                 for n in range(6):
                     spread[m, n] += sums[slot, m] * sums[slot, n]
     return spread
-
-
-@njit(nogil=True)
-def sector_gradients(voxels, points, T, origin, correspondence, weight, scale_m: float, range_m: float, sums):
-    """Gradients b of ``normal_equations`` by sector, added to sums (8, k).
-
-    Sectors lie ahead or behind, left or right, near or far. Calibration, motion within the scan and surfaces that
-    repeat shift the points of a sector together.
-    range_m : from which on points are far
-    """
-    s2, k = scale_m * scale_m, sums.shape[1]
-    for i in range(points.shape[0]):
-        voxel = correspondence[i]
-        if voxel < 0 or weight[i] == 0.0:
-            continue
-        squared = 0.0
-        for axis in range(points.shape[1]):
-            squared += points[i, axis] * points[i, axis]
-        sector = (points[i, 0] > 0.0) + 2 * (points[i, 1] > 0.0) + 4 * (squared > range_m * range_m)
-        x, y, z = move(T, points, i)
-        shape, q, normal = shape_of(voxels.cells, voxel)
-        residual, along, r2 = _residual(shape, q, normal, x, y, z)
-        moved = x - origin[0], y - origin[1], z - origin[2]
-        ratio = s2 / (s2 + r2 * weight[i])
-        w = weight[i] * ratio * ratio
-        if k == 3:
-            _, gradient = _plus_in_plane((0.0,) * 6, (0.0,) * 3, w, shape, normal, moved, residual, along)
-            for m in range(3):
-                sums[sector, m] += gradient[m]
-        else:
-            _, gradient6 = _plus((0.0,) * 21, (0.0,) * 6, w, shape, normal, moved, residual, along)
-            for m in range(6):
-                sums[sector, m] += gradient6[m]
 
 
 @njit(nogil=True)

@@ -29,13 +29,11 @@ from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.loops.verification import ScanVerifier, SubmapVerifier
 from scanchain.odometry import FrontEnd, LiveStamps, Odometry
 from scanchain.odometry.elevation import ElevationCalibration
-from scanchain.odometry.error_statistics import ErrorStatistics
 from scanchain.odometry.front_end import Motion
 from scanchain.odometry.intervals import Intervals
 from scanchain.odometry.keyframe_errors import KeyframeErrorTracker
 from scanchain.odometry.map_keeper import MapKeeper
-from scanchain.odometry.motion_filter import MotionFilter
-from scanchain.odometry.prediction import Predictor
+from scanchain.odometry.prediction import ErrorStatistics, MotionFilter, Predictor
 from scanchain.odometry.recovery import Recovery
 from scanchain.odometry.standstill import AgreeingMatches, Standstill
 from scanchain.odometry.tracked import Tracked

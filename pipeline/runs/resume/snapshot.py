@@ -93,7 +93,7 @@ class _Packer:
         self.offset += memoryview(data).nbytes
 
     def pack(self, value: Any) -> Any:
-        if value is None or type(value) in (bool, int, float, str):
+        if value is None or type(value) in (bool, int, float, str, bytes):
             return value
         if isinstance(value, np.generic):
             return ["scalar", value.dtype.str, value.tobytes()]
