@@ -1,8 +1,9 @@
-"""Descent over a pose graph with one robust loss: cost, quadratic model and step rule."""
+"""Minimization over a pose graph with one robust loss: cost and quadratic model."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem, NormalEquations
 from scanchain.graph.robust.inliers import InlierSet
 from scanchain.graph.robust.losses import RobustLoss
-from scanchain.graph.solvers.descent import Optimizer, Vector, descend, step_rule
+from scanchain.graph.solvers.descent import LocalModel, Optimizer, Vector, descend, step_rule
 
 _STEP = 1e-6  # step, m or rad, of the central differences
 Loss = RobustLoss | InlierSet
@@ -111,48 +112,32 @@ class Minimizer:
 
     def descend(self, now: Evaluation, loss: Loss, max_iterations: int, tolerance: float) -> Minimum:
         """Iterate until convergence."""
-        descent = descend(_Landscape(self, loss), now, self._rule, max_iterations, tolerance)
+
+        def moved(start: Evaluation, step: Vector) -> Evaluation:
+            return self.evaluate(self.problem.moved(start.poses, step), loss)
+
+        descent = descend(partial(self._model, loss), moved, now, self._rule, max_iterations, tolerance)
         weights = self.weights(descent.end.chi2, loss)
         return Minimum(descent.end, weights, descent.iterations, descent.converged, descent.reason)
+
+    def _model(self, loss: Loss, now: Evaluation) -> LocalModel:
+        """H = Σ w JᵀΩJ and the curvature that steps are solved with: H, or the second derivative for Newton."""
+        problem = self.problem
+        equations = problem.linearize(now.poses, now.errors, self.weights(now.chi2, loss))
+        is_full = self.optimizer == "newton"
+        curvature = full_curvature(problem, now, equations) if is_full else equations.values
+        diagonal = equations.values[problem.pattern.diagonal]
+
+        def solve(damping: float) -> Vector:
+            damped = curvature.copy()
+            damped[problem.pattern.diagonal] += damping * np.where(diagonal > 0.0, diagonal, 1.0)
+            problem.cholesky.factorize(damped)
+            return problem.cholesky.solve(-equations.gradient)
+
+        return LocalModel(equations.gradient, diagonal, solve, partial(problem.pattern.multiply, equations.values))
 
     def _cost(self, chi2: NDArray[np.float64], loss: Loss) -> float:
         if loss.kernel == "none" or not len(self.loops):
             return float(chi2.sum())
         loops = chi2[self.loops]
         return float(chi2.sum() - loops.sum() + loss.loss(loops).sum())
-
-
-class _Landscape:
-    """The cost of a graph with one loss."""
-
-    def __init__(self, minimizer: Minimizer, loss: Loss) -> None:
-        self._minimizer, self._loss = minimizer, loss
-
-    def model(self, now: Evaluation) -> _Model:
-        minimizer = self._minimizer
-        weights = minimizer.weights(now.chi2, self._loss)
-        equations = minimizer.problem.linearize(now.poses, now.errors, weights)
-        is_full = minimizer.optimizer == "newton"
-        curvature = full_curvature(minimizer.problem, now, equations) if is_full else equations.values
-        return _Model(minimizer.problem, equations, curvature)
-
-    def moved(self, now: Evaluation, step: Vector) -> Evaluation:
-        return self._minimizer.evaluate(self._minimizer.problem.moved(now.poses, step), self._loss)
-
-
-class _Model:
-    """H = Σ w JᵀΩJ and the curvature that steps are solved with: H, or the second derivative for Newton."""
-
-    def __init__(self, problem: BetweenProblem, equations: NormalEquations, curvature: Vector) -> None:
-        self._problem, self._values, self._curvature = problem, equations.values, curvature
-        self.gradient = equations.gradient
-        self.diagonal = equations.values[problem.pattern.diagonal]
-
-    def solve(self, damping: float) -> Vector:
-        damped = self._curvature.copy()
-        damped[self._problem.pattern.diagonal] += damping * np.where(self.diagonal > 0.0, self.diagonal, 1.0)
-        self._problem.cholesky.factorize(damped)
-        return self._problem.cholesky.solve(-self.gradient)
-
-    def bend(self, step: Vector) -> Vector:
-        return self._problem.pattern.multiply(self._values, step)
