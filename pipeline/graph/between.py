@@ -129,6 +129,18 @@ class BetweenProblem:
         scatter.scatter_between(jacobian, errors, self.information, weights, self.slots, blocks, gradient)
         return NormalEquations(self.packing.values(blocks), self.packing.rows(gradient), weights)
 
+    def scattered(self, of_i: Matrix, of_j: Matrix, coupling: Matrix) -> Matrix:
+        """Blocks (B, b, b) of the pattern, of what every edge adds (E, b, b): to those of i, of j and of the pair.
+
+        coupling : row i, column j
+        """
+        blocks = np.zeros((len(self.pattern.rows), *coupling.shape[1:]))
+        i, j, pair = self.slots.T
+        lower = np.where((i > j)[:, None, None], coupling, np.swapaxes(coupling, 1, 2))
+        for slot, added in ((i, of_i), (j, of_j), (pair, lower)):
+            np.add.at(blocks, slot[slot >= 0], added[slot >= 0])
+        return blocks
+
     def moved(self, poses: Matrix, step: NDArray[np.float64]) -> Matrix:
         """Poses after left twists: exp(ξ) T of every free pose; step (scalars of the pattern,)."""
         result = poses.copy()

@@ -153,23 +153,15 @@ def _least_squares(
 ) -> Matrix:
     """X (K, b, m) that minimizes Σ w ‖X_j − A X_i − c‖², with A (E, b, b) orthogonal and X given where fixed."""
     size, columns = known.shape[1:]
-    n = len(problem.free)
-    blocks = np.zeros((n + len(problem.pattern.pairs), size, size))
-    right = np.zeros((n, size, columns))
-    i, j = problem.slots[:, 0], problem.slots[:, 1]
-    pair = problem.slots[:, 2]
-    w = weight[:, None, None]
-    joined = pair >= 0
-    coupling = np.where((j > i)[:, None, None], -w * A, -w * np.swapaxes(A, 1, 2))
-    np.add.at(blocks, pair[joined], coupling[joined])
+    n, w = len(problem.free), weight[:, None, None]
+    A_t = np.swapaxes(A, 1, 2)
     held = np.where((problem.variable < 0)[:, None, None], known, 0.0)
-    for_i = w * (np.swapaxes(A, 1, 2) @ (held[problem.edges[:, 1]] - offset))
+    for_i = w * (A_t @ (held[problem.edges[:, 1]] - offset))
     for_j = w * (A @ held[problem.edges[:, 0]] + offset)
-    degree = np.zeros(n)
-    for end, target in ((i, for_i), (j, for_j)):
+    right = np.zeros((n, size, columns))
+    for end, target in ((problem.slots[:, 0], for_i), (problem.slots[:, 1], for_j)):
         np.add.at(right, end[end >= 0], target[end >= 0])
-        np.add.at(degree, end[end >= 0], weight[end >= 0])
-    blocks[:n] = degree[:, None, None] * np.eye(size)
+    blocks = problem.scattered(w * np.eye(size), w * np.eye(size), -w * A_t)
     pattern = BlockPattern(np.full(n, size, np.int64), problem.pattern.pairs)
     factor = SparseCholesky(pattern, problem.cholesky.analysis)
     factor.factorize(blocks.reshape(-1))

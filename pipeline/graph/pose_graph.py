@@ -21,13 +21,14 @@ from scanchain.graph.explanation import Explained, Explainer, Explanation, corre
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.initialize import Initialization
 from scanchain.graph.observability import (
+    LOST,
+    WEAK,
     FreePose,
     free_poses,
     free_text,
-    lost,
+    hanging,
     lost_text,
     own_equations,
-    weakly_joined,
 )
 from scanchain.graph.optimization import Optimization, Solved, solve
 from scanchain.graph.robust.drift import corrected
@@ -398,7 +399,7 @@ class PoseGraph:
 
     def weakly_joined(self) -> NDArray[np.int64]:
         """Names of the poses that hang on edges in force of next to no information."""
-        return self.names[weakly_joined(*self._edges_in_force, self.fixed)]
+        return self.names[hanging(*self._edges_in_force, self.fixed, WEAK)]
 
     def state(self) -> GraphState:
         """The graph as it is, for files and recordings; odometry edges first."""
@@ -497,7 +498,7 @@ class PoseGraph:
 
     def _undetermined(self) -> str:
         """Unobservable directions, with which nothing can be computed, as text; empty without any."""
-        names = self.names[lost(*self._edges_in_force, self.fixed)]
+        names = self.names[hanging(*self._edges_in_force, self.fixed, LOST)]
         free = () if len(names) else self.free_poses()
         return lost_text(names) if len(names) else free_text(free) if free else ""
 

@@ -59,14 +59,9 @@ def full_curvature(problem: BetweenProblem, now: Evaluation, equations: NormalEq
             ahead, back = (_slopes(problem, now.poses, equations.weights, end, sign * twist) for sign in (1, -1))
             turned[end, axis] = (ahead - back) / (2.0 * _STEP)
     by_i, by_j = turned.transpose(0, 2, 1, 3)  # (E, k, k): row is the axis moved, column that of the slope at j
-    both = 0.5 * (by_i - np.swapaxes(by_j, 1, 2))
-    blocks = np.zeros((len(problem.pattern.rows), k, k))
-    i, j, pair = problem.slots.T
-    for slot, block in ((i, -by_i), (j, by_j)):
-        np.add.at(blocks, slot[slot >= 0], 0.5 * (block + np.swapaxes(block, 1, 2))[slot >= 0])
-    coupling = np.where((i > j)[:, None, None], both, np.swapaxes(both, 1, 2))
-    np.add.at(blocks, pair[pair >= 0], coupling[pair >= 0])
-    return problem.packing.values(blocks)
+    coupling = 0.5 * (by_i - np.swapaxes(by_j, 1, 2))
+    of_i, of_j = (0.5 * (block + np.swapaxes(block, 1, 2)) for block in (-by_i, by_j))
+    return problem.packing.values(problem.scattered(of_i, of_j, coupling))
 
 
 def _slopes(
