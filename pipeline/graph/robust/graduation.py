@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from scanchain.data import REJECTED_WEIGHT, Matrix
 from scanchain.graph.between import WASTE
 from scanchain.graph.edge_checks import is_connected
-from scanchain.graph.robust.groups import Contradiction, agreeing_groups
-from scanchain.graph.robust.inliers import InlierSet, contradictions, fair_price
+from scanchain.graph.robust.consistency import Consistency
+from scanchain.graph.robust.groups import agreeing_groups
+from scanchain.graph.robust.inliers import InlierSet, fair_price
 from scanchain.graph.robust.losses import Graduation, RobustLoss, rejection_limit
 from scanchain.graph.solvers.minimizer import Evaluation, Minimizer, Minimum
 
@@ -197,33 +198,27 @@ def _next_group(
     """The group whose change promises the largest fall of the cost; none where no group of edges is left out."""
     problem, poses, is_loop = minimizer.problem, minimum.estimate.poses, minimizer.is_loop
     kept = minimum.weights > 0.5
-    against = np.zeros(len(kept))
-    against[minimizer.loops] = _against(minimizer, minimum, price)
-    out = agreeing_groups(problem, poses, is_loop, is_loop & ~kept, limit)
     best, most = np.empty(0, np.int64), 0.0
+    out = agreeing_groups(problem, poses, is_loop, is_loop & ~kept, limit)
     if not out:
         return best
-    contradiction = Contradiction(problem, poses, kept)
+    consistency = Consistency(problem, poses, kept)
+    against = consistency.of_each(price)
     for group in (*out, *agreeing_groups(problem, poses, is_loop, is_loop & kept, limit)):
-        is_kept, worth = bool(kept[group[0]]), price * len(group)
+        is_kept, worth, rest = bool(kept[group[0]]), price * len(group), kept.copy()
+        rest[group] = False
         if tuple(group.tolist()) in tried or (not is_kept and against[group].max() > worth):
             continue
-        if is_kept and not is_connected(problem.edges[_without(kept, group)], problem.variable < 0):
+        if is_kept and not is_connected(problem.edges[rest], problem.variable < 0):
             continue
-        rise = worth - contradiction.of(group, kept=is_kept)
+        rise = worth - consistency.of_group(group)
         gain = -rise if is_kept else rise
         if gain > most:
             best, most = group, gain
     return best
 
 
-def _without(kept: NDArray[np.bool_], group: NDArray[np.int64]) -> NDArray[np.bool_]:
-    rest = kept.copy()
-    rest[group] = False
-    return rest
-
-
 def _against(minimizer: Minimizer, minimum: Minimum, price: float) -> NDArray[np.float64]:
     """Cost of every loop edge in the χ² of the others, (L,)."""
     kept = minimum.weights > 0.5
-    return contradictions(minimizer.problem, minimum.estimate.poses, kept, price)[minimizer.loops]
+    return Consistency(minimizer.problem, minimum.estimate.poses, kept).of_each(price)[minimizer.loops]

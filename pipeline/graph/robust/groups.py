@@ -1,4 +1,4 @@
-"""Groups of loop edges that agree with each other, and how much a group contradicts all other edges."""
+"""Groups of loop edges that agree with each other."""
 
 from __future__ import annotations
 
@@ -11,13 +11,11 @@ from scipy.spatial import KDTree
 from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem
-from scanchain.graph.covariance import difference_covariances
 
 FEWEST = 3  # least number of edges of a group; fewer may agree by chance
 _REACH = 5  # largest difference of the poses of two agreeing edges, at either end, in the order of the poses
 _MOST = 50  # largest number of edges of a group that is looked at as one
 _AT_ONCE = 10_000  # pairs of edges that are compared at once, of many
-_ROUNDING = 1e-9  # keeps a group without which its poses would be loose from a division by zero
 
 
 def agreeing_groups(
@@ -73,34 +71,3 @@ def apart(ends: NDArray[np.int64], edges: NDArray[np.int64]) -> NDArray[np.int64
     for place, near in enumerate(KDTree(ends[edges]).query_ball_point(ends[edges], _REACH, p=np.inf)):
         is_chosen[place] = not is_chosen[near].any()
     return edges[is_chosen]
-
-
-class Contradiction:
-    """Squared Mahalanobis distance between what groups of edges measure and what all other kept edges predict.
-
-    Of kept edges it is what the χ² of the whole graph falls by without them, of others what it rises by with them,
-    to first order, as ``contradictions`` has it of single edges.
-    """
-
-    def __init__(self, problem: BetweenProblem, poses: Matrix, kept: NDArray[np.bool_]) -> None:
-        """Kept (E,): the edges in force at these poses."""
-        self._problem = problem
-        self._errors = problem.errors(poses)
-        self._jacobians = problem.jacobians(poses, self._errors)
-        self._sparse = problem.weighed(poses, self._errors, kept)
-
-    def of(self, group: NDArray[np.int64], *, kept: bool) -> float:
-        """The distance of the edges of a group, all of them kept or none."""
-        k, count = self._problem.freedom, len(group)
-        predicted = np.empty((k * count, k * count))
-        joints = difference_covariances(self._sparse, self._problem.edges[group])
-        for place, edge in enumerate(group):
-            joint = self._jacobians[group] @ joints[place] @ self._jacobians[edge].T
-            predicted[:, k * place : k * (place + 1)] = joint.reshape(-1, k)
-        information = np.zeros((count, k, count, k))
-        information[np.arange(count), :, np.arange(count)] = self._problem.information[group]
-        information = information.reshape(k * count, k * count)
-        errors = self._errors[group].ravel()
-        sign = -1.0 if kept else 1.0
-        matrix = (1.0 + _ROUNDING) * np.eye(len(errors)) + sign * (predicted @ information)
-        return float(errors @ information @ np.linalg.solve(matrix, errors))

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.graph.edge_checks import is_connected
+from scanchain.graph.robust.consistency import Consistency
 from scanchain.graph.robust.graduation import Focus, settle
-from scanchain.graph.robust.groups import Contradiction, agreeing_groups
+from scanchain.graph.robust.groups import agreeing_groups
 from scanchain.graph.robust.inliers import InlierSet
 from scanchain.graph.robust.losses import RobustLoss
 from scanchain.graph.solvers.minimizer import Evaluation, Minimizer, Minimum
@@ -66,9 +67,9 @@ def _promising(minimizer: Minimizer, minimum: Minimum, limit: float, since: Sinc
     groups = agreeing_groups(problem, poses, minimizer.is_loop, left_out, limit)
     for group in groups:
         left_out[group] = False
-    contradiction = Contradiction(problem, poses, kept)
+    consistency = Consistency(problem, poses, kept)
     return [
         group
         for group in (*groups, *np.flatnonzero(left_out)[:, None])
-        if group.max() >= since.updated and contradiction.of(group, kept=False) < limit * len(group)
+        if group.max() >= since.updated and consistency.of_group(group) < limit * len(group)
     ]
