@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
@@ -29,40 +31,40 @@ def agreeing_groups(
     loops = np.flatnonzero(chosen & is_loop)
     if len(loops) < FEWEST:
         return []
-    pairs = KDTree(problem.edges[loops]).query_pairs(_REACH, p=np.inf, output_type="ndarray")
+    edges, Z = problem.edges[loops], problem.measurements[loops]
     noise = np.linalg.pinv(problem.information[loops], hermitian=True)
     odometry = problem.information[~is_loop]
     step = np.linalg.pinv(np.median(odometry, axis=0), hermitian=True) if len(odometry) else 0.0
-    parts = np.array_split(pairs, 1 + len(pairs) // _AT_ONCE)
-    agree = np.concatenate([_distances(problem, poses, loops, each, noise, step) < limit for each in parts])
-    a, b = pairs[agree].T
-    links = coo_array((np.ones(len(a)), (a, b)), shape=(len(loops), len(loops)))
-    label = connected_components(links, directed=False)[1]
-    order = np.argsort(label, kind="stable")
-    members = np.split(loops[order], 1 + np.flatnonzero(np.diff(label[order])))
-    return [each for each in members if FEWEST <= len(each) <= _MOST]
+
+    def agree(a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.bool_]:
+        errors = lie.log(lie.between(Z[b], carried(poses, edges[a], Z[a], edges[b])))
+        steps = np.abs(edges[a] - edges[b]).sum(axis=1)
+        covariance = noise[a] + noise[b] + steps[:, None, None] * step
+        return np.einsum("ea,eab,eb->e", errors, np.linalg.pinv(covariance, hermitian=True), errors) < limit
+
+    groups = connected(KDTree(edges).query_pairs(_REACH, p=np.inf, output_type="ndarray"), len(loops), agree)
+    return [loops[each] for each in groups if len(each) <= _MOST]
 
 
-def _distances(
-    problem: BetweenProblem,
-    poses: Matrix,
-    loops: NDArray[np.int64],
+def carried(poses: Matrix, edges: NDArray[np.int64], Z: Matrix, others: NDArray[np.int64]) -> Matrix:
+    """What edges (P, 2) that measure Z predict of other pairs (P, 2), along the poses between their ends."""
+    before = lie.between(poses[others[:, 0]], poses[edges[:, 0]])
+    after = lie.between(poses[edges[:, 1]], poses[others[:, 1]])
+    return before @ Z @ after
+
+
+def connected(
     pairs: NDArray[np.int64],
-    noise: Matrix,
-    step: Matrix | float,
-) -> NDArray[np.float64]:
-    """Squared Mahalanobis distance (P,) of one loop edge of each pair (P, 2) from what the other predicts.
-
-    noise : (L, k, k) covariances of the loop edges (L,); step : of an edge of odometry
-    """
-    a, b = pairs.T
-    (i, j), (k, m) = problem.edges[loops[a]].T, problem.edges[loops[b]].T
-    before, after = lie.between(poses[k], poses[i]), lie.between(poses[j], poses[m])
-    predicted = before @ problem.measurements[loops[a]] @ after
-    errors = lie.log(lie.between(problem.measurements[loops[b]], predicted))
-    steps = np.abs(i - k) + np.abs(j - m)
-    covariance = noise[a] + noise[b] + steps[:, None, None] * step
-    return np.einsum("ea,eab,eb->e", errors, np.linalg.pinv(covariance, hermitian=True), errors)
+    count: int,
+    agree: Callable[..., NDArray[np.bool_]],
+) -> list[NDArray[np.int64]]:
+    """Groups of at least ``FEWEST`` of so many, connected by pairs (P, 2) that agree: a (P,) and b (P,), bool."""
+    parts = np.array_split(pairs, 1 + len(pairs) // _AT_ONCE)
+    a, b = pairs[np.concatenate([agree(*part.T) for part in parts])].T
+    label = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(count, count)), directed=False)[1]
+    order = np.argsort(label, kind="stable")
+    members = np.split(order, 1 + np.flatnonzero(np.diff(label[order])))
+    return [each for each in members if len(each) >= FEWEST]
 
 
 def apart(ends: NDArray[np.int64], edges: NDArray[np.int64]) -> NDArray[np.int64]:
