@@ -33,7 +33,7 @@ from scanchain.graph.observability import (
 from scanchain.graph.optimization import Optimization, Solved, solve
 from scanchain.graph.robust.drift import corrected
 from scanchain.graph.robust.graduation import Graduated, OutlierRejection
-from scanchain.graph.robust.slips import Slip
+from scanchain.graph.robust.loosened import Slip
 from scanchain.graph.robust.update import Since
 from scanchain.graph.solvers.cholesky import SingularMatrixError
 from scanchain.graph.solvers.minimizer import Evaluation
@@ -101,7 +101,7 @@ class PoseGraph:
 
     @property
     def measurements(self) -> Matrix:
-        """T_ij of every edge, (E, d+1, d+1), odometry corrected by ``drift`` and ``slips``."""
+        """T_ij of every edge, (E, d+1, d+1), odometry corrected by ``drift``."""
         return self._applied(self._explanation)[0]
 
     @property
@@ -115,7 +115,11 @@ class PoseGraph:
     @property
     def slips(self) -> tuple[Slip, ...]:
         """Stretches of odometry that loop edges show to be off by more than their edges say."""
-        return self._explanation.slips
+        if not self._explanation.loosened:
+            return ()
+        odometry, errors = odometry_of(self.edges, self.is_loop), self._prepared().errors(self.poses)
+        arrays = errors[odometry], self._measurements.rows[odometry], self._information.rows[odometry]
+        return tuple(stretch.slip(*arrays) for stretch in self._explanation.loosened if not stretch.is_jump)
 
     @property
     def jumps(self) -> tuple[int, ...]:
@@ -125,19 +129,18 @@ class PoseGraph:
     def corrections(self, names: NDArray[np.int64], noun: str = "poses") -> list[str]:
         """Drift, slips and jumps in words, a line each; ``names`` (K,) number the poses for the reader."""
         edges = self.edges[odometry_of(self.edges, self.is_loop)]
-        return corrections(self._explanation, edges, names, noun)
+        return corrections(self._explanation, self.slips, edges, names, noun)
 
     @property
     def information(self) -> Matrix:
-        """Ω of every edge, (E, k, k), as ``measurements``."""
+        """Ω of every edge, (E, k, k), that of odometry loosened in ``slips`` and ``jumps``."""
         return self._applied(self._explanation)[1]
 
     def added_since(self, first: int) -> tuple[Matrix, Matrix]:
         """``measurements`` and ``information`` of the edges from this one on, at the cost of these alone."""
         explanation, new = self._explanation, slice(first, None)
         before = int((~self.is_loop[:first]).sum())
-        ends = (*explanation.jumps, *(slip.edges.stop - 1 for slip in explanation.slips))
-        if any(end >= before for end in ends):
+        if any(stretch.edges.stop > before for stretch in explanation.loosened):
             return self.measurements[new], self.information[new]
         drift = Explanation(explanation.drift)
         return drift.applied(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,13 @@ from scanchain.graph.solvers.descent import LocalModel, Optimizer, Vector, desce
 
 _STEP = 1e-6  # step, m or rad, of the central differences
 Loss = RobustLoss | InlierSet
+
+
+class Limits(NamedTuple):
+    """End of a descent: largest number of iterations, and relative change of the cost, gradient or step."""
+
+    max_iterations: int
+    tolerance: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,9 +86,11 @@ def _slopes(
 class Minimizer:
     """Minimizes Σ χ² of the quadratic edges plus Σ ρ(χ²) of loop edges, with one step rule throughout."""
 
-    def __init__(self, problem: BetweenProblem, is_loop: NDArray[np.bool_], optimizer: Optimizer) -> None:
+    def __init__(
+        self, problem: BetweenProblem, is_loop: NDArray[np.bool_], optimizer: Optimizer, limits: Limits
+    ) -> None:
         """Loop edges (E,) bool get the robust loss; the others stay quadratic."""
-        self.problem = problem
+        self.problem, self.limits = problem, limits
         self.optimizer: Optimizer = optimizer
         self.is_loop, self.loops = is_loop, np.flatnonzero(is_loop)
         self._rule = step_rule(optimizer)
@@ -97,7 +107,7 @@ class Minimizer:
 
     def restricted(self, kept: NDArray[np.bool_]) -> Minimizer:
         """The same with a subset of the edges, kept (E,)."""
-        return Minimizer(self.problem.restricted(kept), self.is_loop[kept], self.optimizer)
+        return Minimizer(self.problem.restricted(kept), self.is_loop[kept], self.optimizer, self.limits)
 
     def weights(self, chi2: NDArray[np.float64], loss: Loss) -> NDArray[np.float64]:
         """Robust weight of every edge, (E,); 1 for the quadratic ones."""
@@ -105,13 +115,13 @@ class Minimizer:
         result[self.loops] = loss.weight(chi2[self.loops])
         return result
 
-    def descend(self, now: Evaluation, loss: Loss, max_iterations: int, tolerance: float) -> Minimum:
-        """Iterate until convergence."""
+    def descend(self, now: Evaluation, loss: Loss, limits: Limits | None = None) -> Minimum:
+        """Iterate until convergence, by default within the limits of all descents."""
 
         def moved(start: Evaluation, step: Vector) -> Evaluation:
             return self.evaluate(self.problem.moved(start.poses, step), loss)
 
-        descent = descend(partial(self._model, loss), moved, now, self._rule, max_iterations, tolerance)
+        descent = descend(partial(self._model, loss), moved, now, self._rule, *(limits or self.limits))
         weights = self.weights(descent.end.chi2, loss)
         return Minimum(descent.end, weights, descent.iterations, descent.converged, descent.reason)
 
