@@ -20,7 +20,7 @@ _MOST = 100  # largest number of directions of the null space that are computed
 _MOVES = 1e-6  # share of the largest component of a null vector below which a pose stays where it is
 _NAMED = 1e-2  # component of a direction from which its axis is named
 _NOTHING = 1e-20  # share of the largest entry up to which a diagonal entry is rounding noise
-_FREE = 1e-14  # share of the information pose by pose up to which there is none along a direction
+_FREE = 1e-11  # share of the information of a pose alone up to which what is left of it beside the others is none
 WEAK = 1e-6  # share of the median information up to which an edge is a weak one
 LOST = 1e-10  # share up to which too few digits of an edge are left beside the others to determine a pose
 
@@ -113,32 +113,16 @@ def _null_space(problem: BetweenProblem, poses: Matrix, information: Matrix, apa
     while len(vanished) <= _MOST:
         values[pattern.diagonal] = diagonal + held
         try:
-            problem.cholesky.factorize(values)
-            scalar = _overlooked(problem, values, prior)
-        except SingularMatrixError as error:
-            scalar = error.scalar
-        if scalar is None:
+            problem.cholesky.factorize(values, _FREE)
             break
-        vanished.append(scalar)
-        which = scalar if len(vanished) < _MOST else slice(None)
+        except SingularMatrixError as error:
+            vanished.append(error.scalar)
+        which = vanished[-1] if len(vanished) < _MOST else slice(None)
         held[which] = prior[which]
     ends = np.zeros((pattern.scalars, len(vanished)))
     ends[vanished, np.arange(len(vanished))] = 1.0
     null = problem.packing.spread_rows(problem.cholesky.solve(ends))
     return null / np.abs(null).max(axis=(0, 1), initial=0.0)
-
-
-def _overlooked(problem: BetweenProblem, values: NDArray[np.float64], prior: NDArray[np.float64]) -> int | None:
-    """The scalar that moves most in a direction that is free though no pivot vanished, from rounding; or none.
-
-    The direction is the one of least information, by inverse iteration.
-    """
-    z = np.random.default_rng(0).normal(size=len(prior)) * np.sqrt(prior)
-    for _ in range(3):
-        z = problem.cholesky.solve(z / np.abs(z).max())
-    if z @ problem.pattern.multiply(values, z) > _FREE * (prior * z**2).sum():
-        return None
-    return int(np.argmax(prior * z**2))
 
 
 def hanging(

@@ -150,9 +150,12 @@ class SparseCholesky:
         """Multiplications of a factorization, roughly: the pivots of every front times its entries."""
         return float((self._fronts.pivots * np.diff(self._fronts.row_start).astype(np.float64) ** 2).sum())
 
-    def factorize(self, values: NDArray[np.float64]) -> None:
-        """Factor the matrix of these block values; raises SingularMatrixError if it is not definite."""
-        self._floor[self._places] = _LOST_DIGITS * np.abs(values[self.pattern.diagonal])
+    def factorize(self, values: NDArray[np.float64], lost: float = _LOST_DIGITS) -> None:
+        """Factor the matrix of these block values; raises SingularMatrixError if it is not definite.
+
+        lost : share of its diagonal entry up to which a pivot counts as vanished
+        """
+        self._floor[self._places] = lost * np.abs(values[self.pattern.diagonal])
         if self._factor is None:
             self._factor = np.empty(int(self._fronts.factor_start[-1]))
         failed = cholesky.factorize(self._fronts, self._blocks, values, self._floor, self._factor, *self._room())
