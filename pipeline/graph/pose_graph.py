@@ -360,15 +360,9 @@ class PoseGraph:
     def copy(self) -> PoseGraph:
         """The graph as it is, independent of what becomes of this one."""
         result = PoseGraph(self.dimension, self._names)
-        result._poses.extend(self.poses)
-        result._stamps_ns.extend(self.stamps_ns)
-        result._is_point.extend(self.is_point)
-        result._edges.extend(self.edges)
-        result._measurements.extend(self._measurements.rows)
-        result._information.extend(self._information.rows)
-        result._rank.extend(self._rank.rows)
-        result._is_loop.extend(self.is_loop)
-        result._weight.extend(self.weight)
+        for name, rows in vars(self).items():
+            if isinstance(rows, GrowingArray):
+                getattr(result, name).extend(rows.rows)
         result._fixed, result._explanation = set(self._fixed), self._explanation
         result.since, result.work = self.since, self.work
         return result

@@ -135,10 +135,6 @@ class SparseCholesky:
         self._every_front = np.arange(len(self._fronts.pivots))
         self._first_pivot = np.cumsum(self._fronts.pivots) - self._fronts.pivots
         self._front_of = np.repeat(self._every_front, self._fronts.pivots)
-        first_update = self._fronts.row_start[:-1] + self._fronts.pivots
-        has_parent = first_update < self._fronts.row_start[1:]
-        self._parent = np.full(len(has_parent), -1)
-        self._parent[has_parent] = self._front_of[self._fronts.rows[first_update[has_parent]]]
 
     @property
     def entries(self) -> int:
@@ -213,7 +209,7 @@ class SparseCholesky:
         for front in np.unique(self._front_of[places]).tolist():
             while front >= 0 and front not in path:
                 path.add(front)
-                front = int(self._parent[front])
+                front = int(self._fronts.parent[front])
         return np.array(sorted(path), np.int64)
 
     def draw(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -53,28 +53,14 @@ class LocalModel:
     bend: Callable[[Vector], Vector]
 
 
-class StepRule(Protocol):
-    """A rule for steps; may adapt from one to the next."""
-
-    def move(self, now: E, model: LocalModel, moved: Callable[[Vector], E]) -> tuple[Vector, E] | None:
-        """A step (n,) and the estimate after it, or None where no step lowers the cost."""
-        ...
-
-
-def step_rule(optimizer: Optimizer, first_damping: float = _FIRST_DAMPING) -> StepRule:
-    """The rule by its name; Newton is damped as Levenberg-Marquardt is, on a model with the full curvature."""
-    if optimizer == "gauss-newton":
-        return GaussNewton()
-    if optimizer in ("levenberg-marquardt", "newton"):
-        return Damped(first_damping)
-    return Dogleg() if optimizer == "dogleg" else GradientDescent()
-
-
 class GaussNewton:
     """x ← x − H⁻¹ g, whether or not the cost falls."""
 
     def move(self, now: E, model: LocalModel, moved: Callable[[Vector], E]) -> tuple[Vector, E] | None:
-        """Raises SingularMatrixError where the equations leave something free."""
+        """A step (n,) and the estimate after it, or None where no step lowers the cost, as in the other rules.
+
+        Raises SingularMatrixError where the equations leave something free.
+        """
         step = model.solve(0.0)
         to = moved(step)
         return (step, to) if np.isfinite(to.cost) else None
@@ -147,6 +133,18 @@ class GradientDescent:
                 return share * step, to
             share *= 0.5
         return None
+
+
+StepRule = GaussNewton | Damped | Dogleg | GradientDescent
+
+
+def step_rule(optimizer: Optimizer, first_damping: float = _FIRST_DAMPING) -> StepRule:
+    """The rule by its name; Newton is damped as Levenberg-Marquardt is, on a model with the full curvature."""
+    if optimizer == "gauss-newton":
+        return GaussNewton()
+    if optimizer in ("levenberg-marquardt", "newton"):
+        return Damped(first_damping)
+    return Dogleg() if optimizer == "dogleg" else GradientDescent()
 
 
 def steepest_descent(model: LocalModel) -> Vector:
