@@ -15,6 +15,7 @@ from scanchain.graph.solvers.cholesky import BlockPattern, Packing, SparseCholes
 from scanchain.kernels.graph import between_se2, between_se3, scatter
 
 WASTE = 0.1  # share of edges without weight that is worth a new analysis
+_FEW = 0.03  # the same where H⁻¹ is wanted too, which fill-in slows down more
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +96,7 @@ class BetweenProblem:
 
     def weighed(self, poses: Matrix, errors: Matrix, kept: NDArray[np.bool_]) -> BetweenProblem:
         """As ``factored``; where few edges are left out, these weigh nothing, which takes no new analysis."""
-        if kept.mean() < 1.0 - WASTE:
+        if kept.mean() < 1.0 - _FEW:
             return self.factored(poses, errors, kept)
         self.cholesky.factorize(self.linearize(poses, errors, kept.astype(np.float64)).values)
         return self

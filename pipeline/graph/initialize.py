@@ -118,7 +118,7 @@ def follow_spanning_tree(poses: Matrix, fixed: NDArray[np.bool_], edges: NDArray
 
 def _distinct_pairs(edges: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Number of every pair of poses that edges (E, 2) join, ascending, and the first edge of each."""
-    return np.unique(_pairs(*edges.T, count), return_index=True)
+    return np.unique(_pairs(edges[:, 0], edges[:, 1], count), return_index=True)
 
 
 def _pairs(i: NDArray[np.int64], j: NDArray[np.int64], count: int) -> NDArray[np.int64]:

@@ -144,10 +144,11 @@ def sort_lines(path: Path) -> G2oLines:
         raise InputError(
             f"{path}: cannot be read as g2o: {reason}; give a text file of vertices and edges"
         ) from error
-    dimension, rotation = 0, "vector"
+    dimension = 0
+    rotation: Rotation = "vector"
     others, fixed, turns = list[str](), list[tuple[int, int]](), list[tuple[int, float]]()
     by_tag = defaultdict[str, list[tuple[int, list[str]]]](list)
-    comments = {comment: name for name, comment in ROTATION_COMMENT.items()}
+    comments: dict[str, Rotation] = {comment: name for name, comment in ROTATION_COMMENT.items()}
     for number, line in enumerate(text.splitlines(), start=1):
         words = line.split()
         if not words:
@@ -177,9 +178,13 @@ def _joined(parts: list[Rows], ids: int) -> Rows:
     """Rows of several tags, or none."""
     if not parts:
         return Rows(np.empty(0, np.int64), np.empty((0, ids), np.int64), np.empty((0, 0)), np.empty(0, np.bool_))
-    rows = Rows(*map(np.concatenate, zip(*parts, strict=True)))
-    order = np.lexsort((rows.lines, rows.is_point))
-    return Rows(*(column[order] for column in rows))
+    lines, is_point = (
+        np.concatenate([part.lines for part in parts]),
+        np.concatenate([part.is_point for part in parts]),
+    )
+    names, numbers = np.concatenate([part.ids for part in parts]), np.concatenate([part.numbers for part in parts])
+    order = np.lexsort((lines, is_point))
+    return Rows(lines[order], names[order], numbers[order], is_point[order])
 
 
 def _rows(path: Path, tag: Tag, lines: list[tuple[int, list[str]]], turns: list[tuple[int, float]]) -> Rows:

@@ -141,7 +141,7 @@ def next_loosened(
     b = _means(pull_t @ left_out.errors[left_out.odometry][..., None], first, count)[..., 0]
     costs = cost_of(claimed, is_jump=is_jump, price=price, nominal=nominal)
     e, price = left_out.errors[left_out.edges], left_out.stride * price
-    M = left_out.stride * np.linalg.inv(left_out.covariances)
+    M = np.asarray(left_out.stride * np.linalg.inv(left_out.covariances), np.float64)
     alone = (b * np.linalg.solve(A, b[..., None])[..., 0]).sum(axis=1) / len(e)  # without any of them explained
     hoped = -costs
     for error, weight, shift in zip(e, M, left_out.shifts(B), strict=True):
