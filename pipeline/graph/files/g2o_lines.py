@@ -147,7 +147,7 @@ def sort_lines(path: Path) -> G2oLines:
     dimension = 0
     rotation: Rotation = "vector"
     others, fixed, turns = list[str](), list[tuple[int, int]](), list[tuple[int, float]]()
-    by_tag = defaultdict[str, list[tuple[int, list[str]]]](list)
+    by_tag = defaultdict[str, list[tuple[int, list[int], list[float]]]](list)
     comments: dict[str, Rotation] = {comment: name for name, comment in ROTATION_COMMENT.items()}
     for number, line in enumerate(text.splitlines(), start=1):
         words = line.split()
@@ -166,8 +166,8 @@ def sort_lines(path: Path) -> G2oLines:
             )
         else:
             dimension = tag.dimension
-            by_tag[words[0]].append((number, words))
-    rows = {name: _rows(path, TAGS[name], lines, turns) for name, lines in by_tag.items()}
+            by_tag[words[0]].append((number, *_parsed(f"{path}:{number}: {words[0]}", tag, words)))
+    rows = {name: _rows(path, name, lines, turns) for name, lines in by_tag.items()}
     vertices, edges = (_joined([rows[name] for name in rows if TAGS[name].ids == ids], ids) for ids in (1, 2))
     if not len(edges.ids):
         raise InputError(f"{path}: holds no EDGE_SE2 and no EDGE_SE3:QUAT line; is it a g2o pose graph?")
@@ -187,26 +187,28 @@ def _joined(parts: list[Rows], ids: int) -> Rows:
     return Rows(lines[order], names[order], numbers[order], is_point[order])
 
 
-def _rows(path: Path, tag: Tag, lines: list[tuple[int, list[str]]], turns: list[tuple[int, float]]) -> Rows:
-    """Lines of one tag, checked, as numbers; angles beyond a turn are added to ``turns``."""
-    ids, values = [], []
-    for number, words in lines:
-        place = f"{path}:{number}: {words[0]}"
-        if len(words) != 1 + tag.ids + len(tag.columns):
-            count, wanted = counted(len(words) - 1, "value"), tag.ids + len(tag.columns)
-            raise InputError(f"{place} has {count}, needs {wanted}")
-        ids.append([_vertex_id(place, word) for word in words[1 : 1 + tag.ids]])
-        try:
-            values.append([float(word) for word in words[1 + tag.ids :]])
-        except ValueError as error:
-            raise InputError(f"{place}: {error}") from error
-    numbers, places = np.array(values), np.array([number for number, _ in lines])
+def _parsed(place: str, tag: Tag, words: list[str]) -> tuple[list[int], list[float]]:
+    """Vertex ids and numbers of a line; ``place`` is for messages."""
+    if len(words) != 1 + tag.ids + len(tag.columns):
+        count, wanted = counted(len(words) - 1, "value"), tag.ids + len(tag.columns)
+        raise InputError(f"{place} has {count}, needs {wanted}")
+    ids = [_vertex_id(place, word) for word in words[1 : 1 + tag.ids]]
+    try:
+        return ids, list(map(float, words[1 + tag.ids :]))
+    except ValueError as error:
+        raise InputError(f"{place}: {error}") from error
+
+
+def _rows(
+    path: Path, name: str, lines: list[tuple[int, list[int], list[float]]], turns: list[tuple[int, float]]
+) -> Rows:
+    """Lines of one tag as arrays, checked; angles beyond a turn are added to ``turns``."""
+    tag = TAGS[name]
+    places, ids, numbers = (np.array(column) for column in zip(*lines, strict=True))
     for row in np.flatnonzero(~np.isfinite(numbers).all(axis=1))[:1]:
-        raise InputError(
-            f"{path}:{places[row]}: {lines[row][1][0]} has a value that is not finite; remove or mend the line"
-        )
+        raise InputError(f"{path}:{places[row]}: {name} has a value that is not finite; remove or mend the line")
     for row, column in np.argwhere(np.abs(numbers) > LARGEST)[:1]:
-        start = " ".join(lines[row][1][: 1 + tag.ids])
+        start = " ".join([name, *map(str, ids[row].tolist())])
         raise InputError(
             f"{path}:{places[row]}: {start} has the value {numbers[row, column]:g}, over {LARGEST:g}; "
             "write meters and radians, and an inverse covariance of these"
@@ -221,7 +223,7 @@ def _rows(path: Path, tag: Tag, lines: list[tuple[int, list[str]]], turns: list[
         whole[:, tag.columns] = numbers
     elif tag.is_toro:
         whole = np.hstack([numbers[:, :3], from_angles(numbers[:, 3:6]), numbers[:, 6:]])
-    return Rows(places, np.array(ids), whole, np.full(len(numbers), tag.is_point))
+    return Rows(places, ids, whole, np.full(len(numbers), tag.is_point))
 
 
 def _vertex_id(place: str, word: str) -> int:
