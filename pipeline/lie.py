@@ -103,7 +103,7 @@ def rotation_angle(T: Pose) -> NDArray[np.float64]:
     """Angle of a pose's rotation, rad, in [0, π]; accurate near 0 and near π."""
     if T.shape[-1] == 3:
         return np.abs(yaw(T))
-    return np.linalg.norm(_log_so3(T[..., :3, :3]), axis=-1)
+    return np.linalg.norm(_log_se3(T)[..., 3:], axis=-1)
 
 
 def hat(v: NDArray[np.float64]) -> Matrix:
@@ -236,13 +236,6 @@ def _so3_coefficients(theta: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
     b = np.where(small, 0.5 - theta2 / 24.0, 2.0 * np.sin(0.5 * safe) ** 2 / safe**2)
     c = np.where(small, 1.0 / 6.0 - theta2 / 120.0, (safe - np.sin(safe)) / safe**3)
     return a, b, c
-
-
-def _log_so3(R: Matrix) -> NDArray[np.float64]:
-    """Rotation vectors (..., 3) by the quaternion, which is well conditioned from 0 to π."""
-    result = np.empty((*R.shape[:-2], 3))
-    pose_log.rotation_vectors(_stack(R), result.reshape(-1, 3))
-    return result
 
 
 def _log_se3(T: Pose) -> NDArray[np.float64]:

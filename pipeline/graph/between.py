@@ -15,6 +15,7 @@ from scanchain.graph.solvers.cholesky import BlockPattern, Packing, SparseCholes
 from scanchain.kernels.graph import between_se2, between_se3, scatter
 
 WASTE = 0.1  # share of edges without weight that is worth a new analysis
+_FEW = 0.03  # the same where H⁻¹ is wanted too, which fill-in slows down more
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +96,7 @@ class BetweenProblem:
 
     def weighed(self, poses: Matrix, errors: Matrix, kept: NDArray[np.bool_]) -> BetweenProblem:
         """As ``factored``; where few edges are left out, these weigh nothing, which takes no new analysis."""
-        if kept.mean() < 1.0 - WASTE:
+        if kept.mean() < 1.0 - _FEW:
             return self.factored(poses, errors, kept)
         self.cholesky.factorize(self.linearize(poses, errors, kept.astype(np.float64)).values)
         return self
@@ -128,6 +129,18 @@ class BetweenProblem:
         jacobian = self.jacobians(poses, errors)
         scatter.scatter_between(jacobian, errors, self.information, weights, self.slots, blocks, gradient)
         return NormalEquations(self.packing.values(blocks), self.packing.rows(gradient), weights)
+
+    def scattered(self, of_i: Matrix, of_j: Matrix, coupling: Matrix) -> Matrix:
+        """Blocks (B, b, b) of the pattern, of what every edge adds (E, b, b): to those of i, of j and of the pair.
+
+        coupling : row i, column j
+        """
+        blocks = np.zeros((len(self.pattern.rows), *coupling.shape[1:]))
+        i, j, pair = self.slots.T
+        lower = np.where((i > j)[:, None, None], coupling, np.swapaxes(coupling, 1, 2))
+        for slot, added in ((i, of_i), (j, of_j), (pair, lower)):
+            np.add.at(blocks, slot[slot >= 0], added[slot >= 0])
+        return blocks
 
     def moved(self, poses: Matrix, step: NDArray[np.float64]) -> Matrix:
         """Poses after left twists: exp(ξ) T of every free pose; step (scalars of the pattern,)."""

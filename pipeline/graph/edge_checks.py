@@ -1,4 +1,4 @@
-"""Checks of a pose graph's edges: numbers, positive semidefiniteness, connectivity."""
+"""Checks of a pose graph's edges: numbers, positive semidefiniteness, rank, connectivity."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from scanchain.checks import LARGEST
 from scanchain.data import Matrix
 from scanchain.errors import InputError
 from scanchain.kernels.geometry.validity import largest_magnitude
-from scanchain.kernels.graph.semidefinite import find_semidefinite
 
 _NO_INFORMATION = 1e-9  # eigenvalue of a matrix of unit diagonal up to which a direction is not measured
 _ROUNDING = 1e-6  # share of the largest entry that a negative eigenvalue may have, from printed digits
@@ -48,9 +47,12 @@ def check_edges(edges: NDArray[np.int64], measurements: Matrix, information: Mat
 
 def positive_semidefinite(information: Matrix) -> NDArray[np.bool_]:
     """True for each of the matrices (E, k, k) that is finite, symmetric and positive semidefinite, (E,)."""
-    result = np.empty(len(information), np.bool_)
-    find_semidefinite(np.ascontiguousarray(information), _ROUNDING, result)
-    return result
+    largest = np.abs(information).max(axis=(1, 2), initial=0.0)
+    is_finite = np.isfinite(largest)
+    known = np.where(is_finite[:, None, None], information, 0.0)
+    margin = np.where(is_finite, _ROUNDING * largest, 0.0)
+    asymmetry = np.abs(known - np.swapaxes(known, 1, 2)).max(axis=(1, 2), initial=0.0)
+    return is_finite & (asymmetry <= margin) & (np.linalg.eigvalsh(known)[:, 0] >= -margin)
 
 
 def nearest_semidefinite(information: Matrix) -> Matrix:
@@ -62,17 +64,10 @@ def nearest_semidefinite(information: Matrix) -> Matrix:
 
 def ranks(information: Matrix) -> NDArray[np.int64]:
     """Rank of each of the positive semidefinite matrices (E, k, k), whatever their units, (E,)."""
-    k = information.shape[-1]
     diagonal = np.einsum("eaa->ea", information)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     correlation = scale[:, :, None] * information * scale[:, None, :]
-    is_full = np.empty(len(information), np.bool_)
-    find_semidefinite(correlation - _NO_INFORMATION * np.eye(k), 0.0, is_full)
-    result = np.full(len(information), k, np.int64)
-    if is_full.all():
-        return result
-    result[~is_full] = (np.linalg.eigvalsh(correlation[~is_full]) > _NO_INFORMATION).sum(axis=1)
-    return result
+    return np.count_nonzero(np.linalg.eigvalsh(correlation) > _NO_INFORMATION, axis=1)
 
 
 def check_connected(edges: NDArray[np.int64], fixed: NDArray[np.bool_], names: NDArray[np.int64]) -> None:

@@ -16,11 +16,9 @@ from scanchain.graph.optimization import Solved, solve
 from scanchain.graph.robust.drift import FEWEST, corrected, drift_step, penalty, rescaled, size
 from scanchain.graph.robust.graduation import Graduated
 from scanchain.graph.robust.groups import apart
-from scanchain.graph.robust.jumps import loosened, next_jump
-from scanchain.graph.robust.jumps import price_of as price_of_jumps
 from scanchain.graph.robust.left_out import LeftOut
+from scanchain.graph.robust.loosened import Loosened, Slip, cost_of, loosened, next_loosened
 from scanchain.graph.robust.losses import rejection_limit
-from scanchain.graph.robust.slips import Slip, next_slip, price_of, without_slips
 
 _LARGE = 2000  # edges of odometry from which on groups of loop edges are judged once, under the last explanation
 _FEWEST = 2  # least number of loop edges left out, none near another, that are to be explained
@@ -35,13 +33,11 @@ class Explanation:
     Attributes
     ----------
     drift : (2,) or (4,) share of its way by which odometry is too short, and radians a meter it turns too little
-    slips : stretches of odometry that are too short by more than their edges say
-    jumps : edges of odometry, in the order of the poses, whose motion is wrong altogether
+    loosened : slips and jumps, stretches of odometry that are off by more than their edges say
     """
 
     drift: NDArray[np.float64]
-    slips: tuple[Slip, ...] = ()
-    jumps: tuple[int, ...] = ()
+    loosened: tuple[Loosened, ...] = ()
 
     @classmethod
     def none(cls, freedom: int) -> Explanation:
@@ -51,31 +47,40 @@ class Explanation:
     def applied(
         self, edges: NDArray[np.int64], measured: Matrix, information: Matrix, is_loop: NDArray[np.bool_]
     ) -> tuple[Matrix, Matrix]:
-        """Measurements (E, d+1, d+1) and their information (E, k, k), drift, slips and jumps taken out."""
-        if not self.drift.any() and not self.slips and not self.jumps:
+        """Measurements (E, d+1, d+1) without drift, and their information (E, k, k), slips and jumps loosened."""
+        if not self.drift.any() and not self.loosened:
             return measured, information
         odometry = odometry_of(edges, is_loop)
+        of_odometry, Z = information[odometry], measured[odometry]
+        for stretch in self.loosened:
+            twists = stretch.spread(Z, information[odometry])
+            of_odometry[stretch.edges] = loosened(of_odometry[stretch.edges], twists)
         measured, information = measured.copy(), information.copy()
-        slipped = without_slips(measured[odometry], information[odometry], self.slips)
-        measured[odometry] = corrected(slipped, self.drift, _sign(edges[odometry]))
-        information[odometry] = rescaled(information[odometry], self.drift)
-        lost = odometry[list(self.jumps)]
-        information[lost] = loosened(information[lost])
+        measured[odometry] = corrected(Z, self.drift, _sign(edges[odometry]))
+        information[odometry] = rescaled(of_odometry, self.drift)
         return measured, information
 
     def with_later(self, other: Explanation, before: int) -> Explanation:
         """The same with slips and jumps of another, of the edges of odometry that come after so many."""
-        slips = (replace(slip, first=slip.first + before) for slip in other.slips)
-        return replace(self, slips=(*self.slips, *slips), jumps=(*self.jumps, *(j + before for j in other.jumps)))
+        later = (replace(stretch, first=stretch.first + before) for stretch in other.loosened)
+        return replace(self, loosened=(*self.loosened, *later))
 
     def cost(self, measured: Matrix, information: Matrix, price: float, nominal: float) -> float:
         """Cost of the explanation itself, where a loop edge left out costs this price; the arrays of odometry.
 
         nominal : price where the noise model is right
         """
-        of_slips = sum(price_of(slip, measured, information) for slip in self.slips)
-        of_jumps = float(price_of_jumps(information[list(self.jumps)], price, nominal).sum())
-        return of_slips + of_jumps + penalty(self.drift) + (FEWEST * price if self.drift.any() else 0.0)
+        result = penalty(self.drift) + (FEWEST * price if self.drift.any() else 0.0)
+        for stretch in self.loosened:
+            B = stretch.spread(measured, information)
+            claimed = (np.swapaxes(B, 1, 2) @ information[stretch.edges] @ B).sum(axis=0)
+            result += float(cost_of(claimed, is_jump=stretch.is_jump, price=price, nominal=nominal))
+        return result
+
+    @property
+    def jumps(self) -> tuple[int, ...]:
+        """Edges of odometry, in the order of the poses, whose motion is wrong altogether."""
+        return tuple(stretch.first for stretch in self.loosened if stretch.is_jump)
 
 
 def odometry_of(edges: NDArray[np.int64], is_loop: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -90,27 +95,27 @@ def _sign(edges: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def corrections(
-    explanation: Explanation, edges: NDArray[np.int64], names: NDArray[np.int64], noun: str
+    explanation: Explanation,
+    slips: tuple[Slip, ...],
+    edges: NDArray[np.int64],
+    names: NDArray[np.int64],
+    noun: str,
 ) -> list[str]:
     """Corrections of odometry in words, a line each.
 
     edges : (O, 2) those of odometry, in the order of the poses
     names (K,), noun : numbers of the poses for the reader, and what they number
     """
-    lines = []
+    found = []
     if explanation.drift.any():
         scale, *turns = explanation.drift.tolist()
         turn = ", ".join(f"{1e3 * rad_per_m:+.1f}" for rad_per_m in turns)
-        lines.append(f"corrected by loop closures: length {100.0 * scale:+.1f} %, turn {turn} mrad/m")
-    for slip in explanation.slips:
-        first, last = (names[pose] for pose in (edges[slip.edges].min(), edges[slip.edges].max()))
-        lines.append(
-            f"corrected by loop closures: a slip of {slip.size_m:+.1f} m between {noun} {first:,} and {last:,}"
-        )
-    for jump in explanation.jumps:
-        first, last = sorted(names[edges[jump]].tolist())
-        lines.append(f"corrected by loop closures: a jump between {noun} {first:,} and {last:,}")
-    return lines
+        found.append(f"length {100.0 * scale:+.1f} %, turn {turn} mrad/m")
+    stretches = [(f"a slip of {slip.size_m:+.1f} m", slip.first, slip.count) for slip in slips]
+    for what, first, count in [*stretches, *(("a jump", jump, 1) for jump in explanation.jumps)]:
+        poses = edges[first : first + count]
+        found.append(f"{what} between {noun} {names[poses.min()]:,} and {names[poses.max()]:,}")
+    return [f"corrected by loop closures: {what}" for what in found]
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,18 +187,21 @@ class Explainer:
         found: list[tuple[float, Explanation, Matrix]] = []
         if not self._jumps and (now.drift.any() or len(rejected) > FEWEST):
             gain, change = drift_step(left_out, _sign(problem.edges[odometry]), now.drift, price)
-            found.append(
-                (
-                    gain - (0.0 if now.drift.any() else FEWEST * price),
-                    replace(now, drift=now.drift + change),
-                    poses,
-                )
+            gain -= 0.0 if now.drift.any() else FEWEST * price
+            found.append((gain, replace(now, drift=now.drift + change), poses))
+        for is_jump in (False, True)[: 1 + self._jumps]:
+            next_one = next_loosened(
+                left_out,
+                self._measured[odometry],
+                now.loosened,
+                is_jump=is_jump,
+                price=price,
+                nominal=self._nominal,
             )
-        gain, slips = next_slip(left_out, self._measured[odometry], now.slips, price)
-        found.append((gain, replace(now, slips=slips), poses))
-        if self._jumps:
-            gain, edge, twist = next_jump(left_out, now.jumps, price, self._nominal)
-            found.append((gain, replace(now, jumps=(*now.jumps, edge)), left_out.moved(poses, edge, twist)))
+            if next_one is not None:
+                gain, stretch, twists = next_one
+                start = left_out.moved(poses, twists, stretch.edges)
+                found.append((gain, replace(now, loosened=(*now.loosened, stretch)), start))
         found.sort(key=lambda each: -each[0])
         return [(explanation, start) for gain, explanation, start in found if gain > _SETTLED * price]
 

@@ -7,12 +7,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import minimum_spanning_tree
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
+from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.solvers.cholesky import BlockPattern, SingularMatrixError, SparseCholesky
-from scanchain.kernels.graph.tree import follow_tree
 
 Initialization = Literal["auto", "given", "odometry", "spanning-tree", "chordal"]
 
@@ -88,24 +88,42 @@ def _with_points(
     return poses.copy(), source
 
 
-def follow_spanning_tree(poses: Matrix, fixed: NDArray[np.bool_], edges: NDArray[np.int64], Z: Matrix) -> Matrix:
-    """Poses (K, d+1, d+1) chained from the fixed ones along the shortest paths; unreachable ones stay."""
-    result, reached = poses.copy(), fixed.astype(np.int64)
-    ends = edges.T.reshape(-1)
-    order = np.argsort(ends, kind="stable")
-    start = np.searchsorted(ends[order], np.arange(len(poses) + 1))
-    follow_tree(start, order % max(len(edges), 1), edges, Z, result, reached)
-    return result
-
-
 def follow_odometry(poses: Matrix, fixed: NDArray[np.bool_], edges: NDArray[np.int64], Z: Matrix) -> Matrix:
     """Poses chained along the edges between successive poses, and where one is missing, the next shortest leap."""
-    low, high = edges.min(axis=1), edges.max(axis=1)
-    _, first = np.unique(low * len(poses) + high, return_index=True)
-    leaps = csr_matrix(((high - low)[first], (low[first], high[first])), shape=(len(poses), len(poses)))
-    tree = minimum_spanning_tree(leaps).tocoo()
-    kept = first[np.isin((low * len(poses) + high)[first], tree.row.astype(np.int64) * len(poses) + tree.col)]
+    pairs, first = _distinct_pairs(edges, len(poses))
+    low, high = np.divmod(pairs, len(poses))
+    tree = minimum_spanning_tree(csr_matrix((high - low, (low, high)), shape=(len(poses), len(poses)))).tocoo()
+    kept = first[np.isin(pairs, tree.row.astype(np.int64) * len(poses) + tree.col)]
     return follow_spanning_tree(poses, fixed, edges[kept], Z[kept])
+
+
+def follow_spanning_tree(poses: Matrix, fixed: NDArray[np.bool_], edges: NDArray[np.int64], Z: Matrix) -> Matrix:
+    """Poses (K, d+1, d+1) chained from the fixed ones along the fewest edges; unreachable ones stay."""
+    count, fixed_poses = len(poses), np.flatnonzero(fixed)
+    from_root = np.stack([np.full(len(fixed_poses), count), fixed_poses])  # one root more, beside every fixed pose
+    ends = np.concatenate([edges.T, from_root], axis=1)
+    links = csr_matrix((np.ones(ends.shape[1]), (ends[0], ends[1])), shape=(count + 1, count + 1))
+    _, parent = breadth_first_order(links, count, directed=False)
+    parent = np.where((parent[:-1] >= 0) & (parent[:-1] < count), parent[:-1], np.arange(count)).astype(np.int64)
+    child = np.flatnonzero(parent != np.arange(count))
+    pairs, first = _distinct_pairs(edges, count)
+    edge = first[np.searchsorted(pairs, _pairs(parent[child], child, count))]
+    is_forward = (edges[edge, 1] == child)[:, None, None]
+    motion = np.tile(lie.identity(poses.shape[-1] - 1), (count, 1, 1))
+    motion[child] = np.where(is_forward, Z[edge], lie.inverse(Z[edge]))
+    while (parent[parent] != parent).any():  # each round, every motion begins twice as far back
+        motion, parent = motion[parent] @ motion, parent[parent]
+    return poses[parent] @ motion
+
+
+def _distinct_pairs(edges: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Number of every pair of poses that edges (E, 2) join, ascending, and the first edge of each."""
+    return np.unique(_pairs(edges[:, 0], edges[:, 1], count), return_index=True)
+
+
+def _pairs(i: NDArray[np.int64], j: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Number of each unordered pair of poses, of so many."""
+    return np.minimum(i, j) * count + np.maximum(i, j)
 
 
 def relax_chordally(problem: BetweenProblem, poses: Matrix) -> Matrix:
@@ -135,23 +153,15 @@ def _least_squares(
 ) -> Matrix:
     """X (K, b, m) that minimizes Σ w ‖X_j − A X_i − c‖², with A (E, b, b) orthogonal and X given where fixed."""
     size, columns = known.shape[1:]
-    n = len(problem.free)
-    blocks = np.zeros((n + len(problem.pattern.pairs), size, size))
-    right = np.zeros((n, size, columns))
-    i, j = problem.slots[:, 0], problem.slots[:, 1]
-    pair = problem.slots[:, 2]
-    w = weight[:, None, None]
-    joined = pair >= 0
-    coupling = np.where((j > i)[:, None, None], -w * A, -w * np.swapaxes(A, 1, 2))
-    np.add.at(blocks, pair[joined], coupling[joined])
+    n, w = len(problem.free), weight[:, None, None]
+    A_t = np.swapaxes(A, 1, 2)
     held = np.where((problem.variable < 0)[:, None, None], known, 0.0)
-    for_i = w * (np.swapaxes(A, 1, 2) @ (held[problem.edges[:, 1]] - offset))
+    for_i = w * (A_t @ (held[problem.edges[:, 1]] - offset))
     for_j = w * (A @ held[problem.edges[:, 0]] + offset)
-    degree = np.zeros(n)
-    for end, target in ((i, for_i), (j, for_j)):
+    right = np.zeros((n, size, columns))
+    for end, target in ((problem.slots[:, 0], for_i), (problem.slots[:, 1], for_j)):
         np.add.at(right, end[end >= 0], target[end >= 0])
-        np.add.at(degree, end[end >= 0], weight[end >= 0])
-    blocks[:n] = degree[:, None, None] * np.eye(size)
+    blocks = problem.scattered(w * np.eye(size), w * np.eye(size), -w * A_t)
     pattern = BlockPattern(np.full(n, size, np.int64), problem.pattern.pairs)
     factor = SparseCholesky(pattern, problem.cholesky.analysis)
     factor.factorize(blocks.reshape(-1))

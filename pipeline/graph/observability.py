@@ -19,10 +19,10 @@ _AXES = {3: ("x", "y", "yaw"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
 _MOST = 100  # largest number of directions of the null space that are computed
 _MOVES = 1e-6  # share of the largest component of a null vector below which a pose stays where it is
 _NAMED = 1e-2  # component of a direction from which its axis is named
-_NOTHING = 1e-20  # share of the largest entry of its kind up to which a diagonal entry is rounding noise
-_FREE = 1e-18  # share of what a twist changes pose by pose up to which it changes nothing edge by edge
-_WEAK = 1e-6  # share of the median information up to which an edge is a weak one
-_LOST = 1e-10  # share up to which too few digits of an edge are left beside the others to determine a pose
+_NOTHING = 1e-20  # share of the largest entry up to which a diagonal entry is rounding noise
+_FREE = 1e-11  # share of the information of a pose alone up to which what is left of it beside the others is none
+WEAK = 1e-6  # share of the median information up to which an edge is a weak one
+LOST = 1e-10  # share up to which too few digits of an edge are left beside the others to determine a pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,78 +62,89 @@ def free_poses(
     """Poses with directions of their own frames that no edge constrains, at these poses and weights (E,).
 
     ranks (E,) are those of the information matrices. Where edges of full rank, weak along no axis, join every pose
-    to a fixed one, nothing is free. Else the normal equations, without the axes along which an edge says next to
-    nothing, are factored, and every pivot that vanishes gets a prior: with H' = H + Σ h e eᵀ over
-    these, the null space of H is spanned by the columns of H'⁻¹ e.
+    to a fixed one, nothing is free. Else those that move together in the null space of H, without the axes along
+    which an edge says next to nothing.
     """
-    fixed = problem.variable < 0
-    kept = weights > 0.0
-    shares = _shares(problem.information)
-    is_strong = kept & (ranks == problem.freedom) & (shares.min(axis=1) > _WEAK)
+    fixed, axes = problem.variable < 0, _AXES[problem.freedom]
+    kept, shares = weights > 0.0, _shares(problem.information)
+    is_strong = kept & (ranks == problem.freedom) & (shares.min(axis=1) > WEAK)
     if is_connected(problem.edges[is_strong], fixed):
         return ()
     apart = loose(problem.edges[kept & (ranks > 0)], fixed)
-    measured = np.where(shares > _LOST, np.sqrt(weights * kept)[:, None], 0.0)
+    found = [FreePose(int(names[i]), axes[: 2 if problem.is_point[i] else None]) for i in apart.tolist()]
+    measured = np.where(shares > LOST, np.sqrt(weights * kept)[:, None], 0.0)
     information = measured[:, :, None] * problem.information * measured[:, None, :]
     null = _null_space(problem, poses, information, problem.variable[apart])
-    bodies = _bodies(problem, poses, null)
-    axes = {body[0]: _axes(null[problem.variable[body[0]]]) for body in bodies}
-    axes |= {pose: _AXES[problem.freedom][: 2 if problem.is_point[pose] else None] for pose in apart}
-    bodies += list(apart[:, None])
-    bodies.sort(key=lambda body: body[0])
-    return tuple(FreePose(int(names[b[0]]), axes[b[0]], tuple(names[b[1:]].tolist())) for b in bodies)
+    for body in _bodies(problem, poses, null):
+        first, *followers = problem.free[body].tolist()
+        reach = np.abs(null[body[0]]).max(axis=1)
+        along = tuple(axis for axis, size in zip(axes, reach, strict=True) if size > _NAMED * reach.max())
+        found.append(FreePose(int(names[first]), along, tuple(names[followers].tolist())))
+    place = {name: index for index, name in enumerate(names.tolist())}
+    return tuple(sorted(found, key=lambda pose: place[pose.name]))
 
 
 def _bodies(problem: BetweenProblem, poses: Matrix, null: Matrix) -> list[NDArray[np.int64]]:
-    """The poses that move in the null space (n, k, m), those together that have the same twists in the world."""
+    """Variables that move in the null space (n, k, m), those together that have the same twists in the world."""
     moving = np.flatnonzero((np.abs(null) > _MOVES).any(axis=(1, 2)))
-    middle = poses[problem.free, :-1, -1].mean(axis=0)
-    centered = poses[problem.free[moving]]
-    centered[:, :-1, -1] -= middle
+    of_moving = problem.free[moving]
+    centered = poses[of_moving]
+    centered[:, :-1, -1] -= poses[problem.free, :-1, -1].mean(axis=0)
     twists = (lie.adjoint(centered) @ null[moving]).reshape(len(moving), null.shape[1] * null.shape[2])
-    largest = np.abs(twists).max(initial=0.0) or 1.0
-    _, body = np.unique(np.round(twists / largest, 6), axis=0, return_inverse=True)
-    body = np.where(problem.is_point[problem.free[moving]], len(moving) + np.arange(len(moving)), body.reshape(-1))
-    return [problem.free[moving[body == one]] for one in np.unique(body)]
+    _, body = np.unique(np.round(twists / np.abs(twists).max(initial=1e-300), 6), axis=0, return_inverse=True)
+    body = np.where(problem.is_point[of_moving], len(moving) + np.arange(len(moving)), body.reshape(-1))
+    return [moving[body == one] for one in np.unique(body)]
 
 
-def _axes(null: Matrix) -> tuple[str, ...]:
-    """The axes along which twists of one pose (k, m) lie."""
-    U, values, _ = np.linalg.svd(null, full_matrices=False)
-    reach = np.abs(U[:, values > _MOVES]).max(axis=1, initial=0.0)
-    return tuple(axis for axis, size in zip(_AXES[len(null)], reach, strict=True) if size > _NAMED)
+def _null_space(problem: BetweenProblem, poses: Matrix, information: Matrix, apart: NDArray[np.int64]) -> Matrix:
+    """Own-frame twists (n, k, m), at most 1, of all variables that change no edge; those ``apart`` are fixed.
+
+    Every pivot of H that vanishes gets a prior: with H' = H + Σ h e eᵀ over these, the null space of H is spanned
+    by the columns of H'⁻¹ e, each of which moves one of these scalars alone.
+    """
+    pattern = problem.pattern
+    values = own_equations(problem, poses, information)
+    diagonal = values[pattern.diagonal]
+    largest = diagonal.max(initial=0.0)
+    diagonal[diagonal <= _NOTHING * largest] = 0.0
+    prior = np.where(diagonal > 0.0, diagonal, max(largest, 1.0))
+    held = np.where(np.repeat(np.isin(np.arange(len(problem.free)), apart), pattern.sizes), prior, 0.0)
+    vanished = list[int]()
+    while len(vanished) <= _MOST:
+        values[pattern.diagonal] = diagonal + held
+        try:
+            problem.cholesky.factorize(values, _FREE)
+            break
+        except SingularMatrixError as error:
+            vanished.append(error.scalar)
+        which = vanished[-1] if len(vanished) < _MOST else slice(None)
+        held[which] = prior[which]
+    ends = np.zeros((pattern.scalars, len(vanished)))
+    ends[vanished, np.arange(len(vanished))] = 1.0
+    null = problem.packing.spread_rows(problem.cholesky.solve(ends))
+    return null / np.abs(null).max(axis=(0, 1), initial=0.0)
 
 
-def weakly_joined(edges: NDArray[np.int64], information: Matrix, fixed: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Poses that hang on edges of less than a millionth of the median information of positions and rotations."""
-    return _hanging(edges, information, fixed, _WEAK)
-
-
-def lost(edges: NDArray[np.int64], information: Matrix, fixed: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Those of them whose edges have too little information to compute a position."""
-    return _hanging(edges, information, fixed, _LOST)
+def hanging(
+    edges: NDArray[np.int64], information: Matrix, fixed: NDArray[np.bool_], share: float
+) -> NDArray[np.int64]:
+    """Poses joined to a fixed one only by edges of at most this share of the median information."""
+    return loose(edges[_shares(information).max(axis=1, initial=0.0) > share], fixed)
 
 
 def weak_text(names: NDArray[np.int64]) -> str:
-    """The weakly joined poses as one line of text."""
+    """Poses that hang on weak edges as one line of text."""
     return f"{_group(names)} by edges of less than a millionth of the usual information"
 
 
 def lost_text(names: NDArray[np.int64]) -> str:
-    """The lost poses as one line of text."""
+    """Poses that hang on edges of too little information as one line of text."""
     hang = "hangs" if len(names) == 1 else "hang"
-    return f"{_group(names)} {hang} on edges of next to no information, {_LOST:.0e} of the usual or less"
+    return f"{_group(names)} {hang} on edges of next to no information, {LOST:.0e} of the usual or less"
 
 
 def _group(names: NDArray[np.int64]) -> str:
     return f"pose {names[0]}" if len(names) == 1 else f"poses {listed(names)} ({len(names):,})"
-
-
-def _hanging(
-    edges: NDArray[np.int64], information: Matrix, fixed: NDArray[np.bool_], share: float
-) -> NDArray[np.int64]:
-    """Poses joined to a fixed one only by edges of at most this share of the usual information."""
-    return loose(edges[_shares(information).max(axis=1, initial=0.0) > share], fixed)
 
 
 def _shares(information: Matrix) -> Matrix:
@@ -146,84 +157,11 @@ def _shares(information: Matrix) -> Matrix:
     return result
 
 
-def _null_space(problem: BetweenProblem, poses: Matrix, information: Matrix, apart: NDArray[np.int64]) -> Matrix:
-    """Own-frame twists (n, k, m), at most 1, of all variables that change no edge; those ``apart`` are fixed."""
-    pattern, k = problem.pattern, problem.freedom
-    values = own_equations(problem, poses, information)
-    is_turn = (np.arange(k) >= poses.shape[-1] - 1).astype(np.float64)
-    is_rotation = problem.packing.rows(np.tile(is_turn, (len(problem.free), 1))) > 0.0
-    diagonal = values[pattern.diagonal]
-    largest = np.where(is_rotation, *(diagonal[kind].max(initial=0.0) for kind in (is_rotation, ~is_rotation)))
-    is_nothing = diagonal <= _NOTHING * largest
-    values[pattern.diagonal[is_nothing]] = 0.0
-    prior = np.where(is_nothing, np.maximum(largest, 1.0), diagonal)
-    is_apart = np.zeros(len(problem.free), np.bool_)
-    is_apart[apart] = True
-    held = np.where(np.repeat(is_apart, pattern.sizes), prior, 0.0)
-    bare, vanished = values.copy(), list[int]()
-    while len(vanished) <= _MOST:
-        values[pattern.diagonal] = bare[pattern.diagonal] + held
-        try:
-            problem.cholesky.factorize(values)
-            scalar = _overlooked(problem, poses, information, held, prior)
-        except SingularMatrixError as error:
-            scalar = error.scalar
-        if scalar is None:
-            break
-        vanished.append(scalar)
-        held = held + (
-            prior if len(vanished) == _MOST else np.where(np.arange(pattern.scalars) == scalar, prior, 0.0)
-        )
-    if not vanished:
-        return np.zeros((len(problem.free), k, 0))
-    ends = np.zeros((pattern.scalars, len(vanished)))
-    ends[vanished, np.arange(len(vanished))] = 1.0
-    null = problem.packing.spread_rows(problem.cholesky.solve(ends))
-    return null / np.abs(null).max(axis=(0, 1))
-
-
-def _overlooked(
-    problem: BetweenProblem,
-    poses: Matrix,
-    information: Matrix,
-    held: NDArray[np.float64],
-    prior: NDArray[np.float64],
-) -> int | None:
-    """The scalar that moves most in a direction that is free though no pivot vanished, from rounding; or none.
-
-    The direction is the one that inverse iteration finds. What it changes is summed up edge by edge, where a free
-    one leaves but the square of the rounding.
-    """
-    z = np.random.default_rng(0).normal(size=len(prior)) * np.sqrt(prior)
-    for _ in range(3):
-        z = problem.cholesky.solve(z / np.abs(z).max())
-    blocks = np.concatenate([problem.packing.spread_rows(z), np.zeros((1, problem.freedom))])  # last: a fixed pose
-    moved = [
-        (J @ blocks[problem.variable[end], :, None])[..., 0]
-        for J, end in zip(_own_jacobians(problem, poses), problem.edges.T, strict=True)
-    ]
-    change = np.einsum("ea,eab,eb->", sum(moved), information, sum(moved)) + (held * z**2).sum()
-    if change > _FREE * (prior * z**2).sum():
-        return None
-    return int(np.argmax(prior * z**2))
-
-
 def own_equations(problem: BetweenProblem, poses: Matrix, information: Matrix) -> NDArray[np.float64]:
     """Block values of H = Σ JᵀΩJ, with Ω (E, k, k), over twists of every pose in its own frame, T exp(ξ)."""
-    k = problem.freedom
-    J_i, J_j = _own_jacobians(problem, poses)
-    blocks = np.zeros((len(problem.pattern.rows), k, k))
-    slot_i, slot_j, pair = problem.slots.T
-    for slot, J in ((slot_i, J_i), (slot_j, J_j)):
-        np.add.at(blocks, slot[slot >= 0], (np.swapaxes(J, 1, 2) @ information @ J)[slot >= 0])
-    coupling = np.swapaxes(J_i, 1, 2) @ information @ J_j
-    coupling = np.where((slot_i > slot_j)[:, None, None], coupling, np.swapaxes(coupling, 1, 2))
-    np.add.at(blocks, pair[pair >= 0], coupling[pair >= 0])
-    return problem.packing.values(blocks)
-
-
-def _own_jacobians(problem: BetweenProblem, poses: Matrix) -> tuple[Matrix, Matrix]:
-    """Of the errors of all edges, (E, k, k), by own-frame twists of pose i and of pose j."""
     jacobian, adjoint = problem.jacobians(poses, problem.errors(poses)), lie.adjoint(poses)
     i, j = problem.edges.T
-    return -jacobian @ adjoint[i], jacobian @ adjoint[j]
+    J_i, J_j = -jacobian @ adjoint[i], jacobian @ adjoint[j]
+    J_i_t, J_j_t = np.swapaxes(J_i, 1, 2), np.swapaxes(J_j, 1, 2)
+    blocks = problem.scattered(J_i_t @ information @ J_i, J_j_t @ information @ J_j, J_i_t @ information @ J_j)
+    return problem.packing.values(blocks)

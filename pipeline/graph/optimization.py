@@ -14,8 +14,8 @@ from scanchain.graph.edge_checks import has_loop
 from scanchain.graph.initialize import Initialization, first_guess
 from scanchain.graph.robust.graduation import Graduated, minimize
 from scanchain.graph.robust.losses import robust_loss
-from scanchain.graph.robust.update import Since, update
-from scanchain.graph.solvers.minimizer import Minimizer, Minimum
+from scanchain.graph.robust.update import LIMITS, Since, update
+from scanchain.graph.solvers.minimizer import Limits, Minimizer, Minimum
 from scanchain.words import counted
 
 
@@ -99,11 +99,11 @@ def solve(
     shift = guess[:, :-1, -1].mean(axis=0)  # left twists turn about the origin: bring it into the middle
     guess[:, :-1, -1] -= shift
     loss = robust_loss(config.robust, config.robust_scale, problem.freedom)
-    minimizer = Minimizer(problem, is_loop, config.optimizer)
     if isinstance(rejection, Since):
-        minimum = update(minimizer, minimizer.evaluate(guess, loss), loss, rejection)
+        minimum = update(Minimizer(problem, is_loop, config.optimizer, LIMITS), guess, loss, rejection)
     else:
-        minimum = minimize(minimizer, guess, loss, config.max_iterations, config.tolerance, rejection)
+        limits = Limits(config.max_iterations, config.tolerance)
+        minimum = minimize(Minimizer(problem, is_loop, config.optimizer, limits), guess, loss, rejection)
     found = _orthonormal(minimum.estimate.poses)
     found[:, :-1, -1] += shift
     fixed = problem.variable < 0

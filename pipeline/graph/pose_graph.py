@@ -21,18 +21,19 @@ from scanchain.graph.explanation import Explained, Explainer, Explanation, corre
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.initialize import Initialization
 from scanchain.graph.observability import (
+    LOST,
+    WEAK,
     FreePose,
     free_poses,
     free_text,
-    lost,
+    hanging,
     lost_text,
     own_equations,
-    weakly_joined,
 )
 from scanchain.graph.optimization import Optimization, Solved, solve
 from scanchain.graph.robust.drift import corrected
 from scanchain.graph.robust.graduation import Graduated, OutlierRejection
-from scanchain.graph.robust.slips import Slip
+from scanchain.graph.robust.loosened import Slip
 from scanchain.graph.robust.update import Since
 from scanchain.graph.solvers.cholesky import SingularMatrixError
 from scanchain.graph.solvers.minimizer import Evaluation
@@ -100,7 +101,7 @@ class PoseGraph:
 
     @property
     def measurements(self) -> Matrix:
-        """T_ij of every edge, (E, d+1, d+1), odometry corrected by ``drift`` and ``slips``."""
+        """T_ij of every edge, (E, d+1, d+1), odometry corrected by ``drift``."""
         return self._applied(self._explanation)[0]
 
     @property
@@ -114,7 +115,11 @@ class PoseGraph:
     @property
     def slips(self) -> tuple[Slip, ...]:
         """Stretches of odometry that loop edges show to be off by more than their edges say."""
-        return self._explanation.slips
+        if not self._explanation.loosened:
+            return ()
+        odometry, errors = odometry_of(self.edges, self.is_loop), self._prepared().errors(self.poses)
+        arrays = errors[odometry], self._measurements.rows[odometry], self._information.rows[odometry]
+        return tuple(stretch.slip(*arrays) for stretch in self._explanation.loosened if not stretch.is_jump)
 
     @property
     def jumps(self) -> tuple[int, ...]:
@@ -124,19 +129,18 @@ class PoseGraph:
     def corrections(self, names: NDArray[np.int64], noun: str = "poses") -> list[str]:
         """Drift, slips and jumps in words, a line each; ``names`` (K,) number the poses for the reader."""
         edges = self.edges[odometry_of(self.edges, self.is_loop)]
-        return corrections(self._explanation, edges, names, noun)
+        return corrections(self._explanation, self.slips, edges, names, noun)
 
     @property
     def information(self) -> Matrix:
-        """Ω of every edge, (E, k, k), as ``measurements``."""
+        """Ω of every edge, (E, k, k), that of odometry loosened in ``slips`` and ``jumps``."""
         return self._applied(self._explanation)[1]
 
     def added_since(self, first: int) -> tuple[Matrix, Matrix]:
         """``measurements`` and ``information`` of the edges from this one on, at the cost of these alone."""
         explanation, new = self._explanation, slice(first, None)
         before = int((~self.is_loop[:first]).sum())
-        ends = (*explanation.jumps, *(slip.edges.stop - 1 for slip in explanation.slips))
-        if any(end >= before for end in ends):
+        if any(stretch.edges.stop > before for stretch in explanation.loosened):
             return self.measurements[new], self.information[new]
         drift = Explanation(explanation.drift)
         return drift.applied(
@@ -365,15 +369,9 @@ class PoseGraph:
     def copy(self) -> PoseGraph:
         """The graph as it is, independent of what becomes of this one."""
         result = PoseGraph(self.dimension, self._names)
-        result._poses.extend(self.poses)
-        result._stamps_ns.extend(self.stamps_ns)
-        result._is_point.extend(self.is_point)
-        result._edges.extend(self.edges)
-        result._measurements.extend(self._measurements.rows)
-        result._information.extend(self._information.rows)
-        result._rank.extend(self._rank.rows)
-        result._is_loop.extend(self.is_loop)
-        result._weight.extend(self.weight)
+        for name, rows in vars(self).items():
+            if isinstance(rows, GrowingArray):
+                getattr(result, name).extend(rows.rows)
         result._fixed, result._explanation = set(self._fixed), self._explanation
         result.since, result.work = self.since, self.work
         return result
@@ -407,7 +405,7 @@ class PoseGraph:
 
     def weakly_joined(self) -> NDArray[np.int64]:
         """Names of the poses that hang on edges in force of next to no information."""
-        return self.names[weakly_joined(*self._edges_in_force, self.fixed)]
+        return self.names[hanging(*self._edges_in_force, self.fixed, WEAK)]
 
     def state(self) -> GraphState:
         """The graph as it is, for files and recordings; odometry edges first."""
@@ -506,7 +504,7 @@ class PoseGraph:
 
     def _undetermined(self) -> str:
         """Unobservable directions, with which nothing can be computed, as text; empty without any."""
-        names = self.names[lost(*self._edges_in_force, self.fixed)]
+        names = self.names[hanging(*self._edges_in_force, self.fixed, LOST)]
         free = () if len(names) else self.free_poses()
         return lost_text(names) if len(names) else free_text(free) if free else ""
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scanchain.graph.robust.losses import RobustLoss
 from scanchain.graph.solvers.cholesky import SingularMatrixError
-from scanchain.graph.solvers.descent import descend, step_rule
+from scanchain.graph.solvers.descent import LocalModel, descend, step_rule
 from scanchain.kernels.landmarks import normal_equations
 from scanchain.landmarks.bearing_range import BearingRangeProblem, Linearization
 from scanchain.landmarks.problem import Values
@@ -74,9 +74,16 @@ def minimize(
     """
     start = problem.linearize(guess)
     here = Evaluation(guess, start, _cost(start, loss))
-    descent = descend(
-        _Landscape(problem, solver, loss), here, step_rule(optimizer, first_damping), max_iterations, tolerance
-    )
+
+    def moved(now: Evaluation, step: NDArray[np.float64]) -> Evaluation:
+        state = now.state.moved(step)
+        at = problem.linearize(state)
+        return Evaluation(state, at, _cost(at, loss))
+
+    def model_at(now: Evaluation) -> LocalModel:
+        return _model(problem, solver, problem.system(now.at, loss.weight(now.at.observation_chi2)))
+
+    descent = descend(model_at, moved, here, step_rule(optimizer, first_damping), max_iterations, tolerance)
     end = descent.end
     weights = loss.weight(end.at.observation_chi2)
     return Minimum(end.state, end.at, weights, end.cost, descent.iterations, descent.converged, descent.reason)
@@ -91,45 +98,22 @@ class Evaluation:
     cost: float
 
 
-class _Landscape:
-    """The cost of a problem with one loss."""
-
-    def __init__(self, problem: BearingRangeProblem, solver: LinearSolver, loss: Loss) -> None:
-        self._problem, self._solver, self._loss = problem, solver, loss
-
-    def model(self, now: Evaluation) -> _Model:
-        weights = self._loss.weight(now.at.observation_chi2)
-        return _Model(self._problem, self._solver, self._problem.system(now.at, weights))
-
-    def moved(self, now: Evaluation, step: NDArray[np.float64]) -> Evaluation:
-        state = now.state.moved(step)
-        at = self._problem.linearize(state)
-        return Evaluation(state, at, _cost(at, self._loss))
-
-
-class _Model:
+def _model(problem: BearingRangeProblem, solver: LinearSolver, system: LinearSystem) -> LocalModel:
     """H = AᵀA and g = −Aᵀb."""
+    pattern = system.pattern
+    downhill, diagonal = np.empty(pattern.shape[1]), np.empty(pattern.shape[1])
+    normal_equations.gradient(pattern.row_start, pattern.columns, system.values, system.b, downhill, diagonal)
 
-    def __init__(self, problem: BearingRangeProblem, solver: LinearSolver, system: LinearSystem) -> None:
-        self._problem, self._solver, self._system = problem, solver, system
-        pattern = system.pattern
-        downhill, self.diagonal = np.empty(pattern.shape[1]), np.empty(pattern.shape[1])
-        normal_equations.gradient(
-            pattern.row_start, pattern.columns, system.values, system.b, downhill, self.diagonal
-        )
-        self.gradient = -downhill
-
-    def solve(self, damping: float) -> NDArray[np.float64]:
+    def solve(damping: float) -> NDArray[np.float64]:
         if not damping:
-            return self._solver.solve(self._system).x
+            return solver.solve(system).x
         try:
-            return self._solver.solve(self._problem.damped(self._system, damping * self.diagonal)).x
+            return solver.solve(problem.damped(system, damping * diagonal)).x
         except UndeterminedError as error:
             column = int(error.columns[0])
             raise SingularMatrixError(column, column) from error
 
-    def bend(self, step: NDArray[np.float64]) -> NDArray[np.float64]:
-        return self._system.A.T @ (self._system.A @ step)
+    return LocalModel(-downhill, diagonal, solve, lambda step: system.A.T @ (system.A @ step))
 
 
 def _cost(at: Linearization, loss: Loss) -> float:

@@ -325,8 +325,8 @@ class Predictor:
             self.velocity = prediction.velocity_by(self.motion)
             self._update(prediction, match, state)
         self.intervals.take(scan, prediction.interval_s)
-        is_lacking = scan.T_odom_base is None or self.is_contradicted
-        self.T_odom_base = None if is_lacking else scan.T_odom_base.copy()
+        T_odom_base = None if self.is_contradicted else scan.T_odom_base
+        self.T_odom_base = None if T_odom_base is None else T_odom_base.copy()
         self.T_odom_lidar = T_odom_lidar
 
     def _update(self, prediction: Prediction, match: Match, state: State) -> None:

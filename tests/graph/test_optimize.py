@@ -12,7 +12,7 @@ from scanchain.graph.background import BackgroundOptimization
 from scanchain.graph.explanation import Explanation
 from scanchain.graph.files.g2o import read_g2o
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.graph.robust.slips import Slip
+from scanchain.graph.robust.loosened import Loosened
 from scanchain.graph.solvers.descent import Optimizer
 from scanchain.graph.solvers.minimizer import Evaluation, full_curvature
 from tests.support.naive_graph import dense, normal_equations
@@ -233,7 +233,7 @@ def test_an_optimization_beside_takes_the_graph_as_it_was_and_moves_what_was_add
 @pytest.mark.parametrize("first", [0, 12, 18, 40, 60])
 def test_edges_added_are_corrected_as_among_all_others(first):
     graph, _ = ring(2, count=60, noise=0.03)
-    graph._explanation = Explanation(np.array([0.02, 0.001]), (Slip(10, 4, 0.5),), (20,))
+    graph._explanation = Explanation(np.array([0.02, 0.001]), (Loosened(10, 4, False), Loosened(20, 1, True)))
     for added, every in zip(graph.added_since(first), (graph.measurements, graph.information), strict=True):
         assert np.allclose(added, every[first:], rtol=1e-12, atol=1e-12)
 

@@ -11,8 +11,8 @@ from scanchain.errors import InputError
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.files.g2o import read_g2o
 from scanchain.graph.pose_graph import PoseGraph
+from scanchain.graph.robust.consistency import Consistency
 from scanchain.graph.robust.drift import corrected
-from scanchain.graph.robust.inliers import contradictions
 from tests.benchmarks.wrong_edges import try_wrong_loops
 from tests.support.scenes import shared_data
 
@@ -104,11 +104,11 @@ def test_a_contradiction_is_what_chi2_falls_by_without_the_edge_and_rises_by_wit
         others = everything.copy()
         others[edge] = False
         without, chi2 = optimized(others)
-        falls = contradictions(problem, whole.poses, everything, np.inf)[edge]
-        rises = contradictions(problem, without.poses, others, np.inf)[edge]
+        falls = Consistency(problem, whole.poses, everything).of_each(np.inf)[edge]
+        rises = Consistency(problem, without.poses, others).of_each(np.inf)[edge]
         assert falls == pytest.approx(with_all - chi2, rel=0.05, abs=1e-3)
         assert rises == pytest.approx(with_all - chi2, rel=0.05, abs=1e-3)
-        bound = contradictions(problem, without.poses, others, 0.0)[edge]
+        bound = Consistency(problem, without.poses, others).of_each(0.0)[edge]
         assert bound <= rises * (1.0 + 1e-9)
 
 

@@ -1,4 +1,4 @@
-"""Which information matrices a graph takes: the compiled answer is that of eigenvalues."""
+"""Which information matrices a graph takes: finite, symmetric and positive semidefinite ones."""
 
 import numpy as np
 import pytest

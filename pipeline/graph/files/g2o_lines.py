@@ -1,135 +1,138 @@
-"""The lines of a g2o or TORO file by kind, as numbers, and TORO's conventions for these."""
+"""Lines of g2o and TORO files as numbers and back: every tag is a choice of the numbers that g2o has."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from math import atan2, cos, hypot, pi, sin
+from collections import defaultdict
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation as Turn
 
+from scanchain import lie
 from scanchain.checks import LARGEST
 from scanchain.data import Matrix
 from scanchain.errors import InputError, shown
 from scanchain.words import counted
 
-TORO_VERTICES = {2: "VERTEX2", 3: "VERTEX3"}
-TORO_EDGES = {2: "EDGE2", 3: "EDGE3"}
-_IN_THE_PLANE = [0, 1, 4, 2, 5, 3]  # TORO's xx xy yy θθ xθ yθ as the upper triangle xx xy xθ yy yθ θθ
-VERTICES = {2: "VERTEX_SE2", 3: "VERTEX_SE3:QUAT"}
-EDGES = {2: "EDGE_SE2", 3: "EDGE_SE3:QUAT"}
-POINT, SIGHTING = "VERTEX_XY", "EDGE_SE2_XY"
-POSE_NUMBERS = {2: 3, 3: 7}  # x y θ, or x y z qx qy qz qw
-TRIANGLE = {2: 6, 3: 21}  # upper triangle of an information matrix
 Rotation = Literal["vector", "quaternion"]  # of which Ω is in 3D
 ROTATION_COMMENT: dict[Rotation, str] = {
     "vector": "# information of EDGE_SE3:QUAT is of (translation, rotation vector in radians)",
     "quaternion": "# information of EDGE_SE3:QUAT is of (translation, vector part of unit quaternion), as g2o",
 }
 _LARGEST_ID = 2**63 - 1  # int64
-_WHOLE_TURN = 2.0 * pi + 1e-3  # rad, above which an angle is a turn too many, or degrees
-
-
-def from_toro(numbers: list[float], dimension: int) -> list[float]:
-    """A vertex' or an edge's numbers as g2o has them: x y z qx qy qz qw, Ω row by row."""
-    if dimension == 2:
-        return numbers[:3] + [numbers[3:][place] for place in _IN_THE_PLANE[: len(numbers) - 3]]
-    return numbers[:3] + _quaternion(*numbers[3:6]) + numbers[6:]
-
-
-def to_toro_angles(R: NDArray[np.float64]) -> list[float]:
-    """Roll, pitch and yaw with R = Rz(yaw) Ry(pitch) Rx(roll); exact at a pitch of ±π/2 too, where one is free."""
-    yaw = atan2(R[1, 0], R[0, 0]) if hypot(R[0, 0], R[1, 0]) > 1e-9 else 0.0
-    c, s = cos(yaw), sin(yaw)
-    pitch = atan2(-R[2, 0], c * R[0, 0] + s * R[1, 0])
-    roll = atan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])
-    return [roll, pitch, yaw]
-
-
-def to_toro_triangle(upper: list[float]) -> list[float]:
-    """Ω of an edge, upper triangle row by row, in TORO's order."""
-    if len(upper) != len(_IN_THE_PLANE):
-        return upper
-    result = [0.0] * len(upper)
-    for value, place in zip(upper, _IN_THE_PLANE, strict=True):
-        result[place] = value
-    return result
-
-
-def _quaternion(roll: float, pitch: float, yaw: float) -> list[float]:
-    """Quaternion xyzw of Rz(yaw) Ry(pitch) Rx(roll)."""
-    cr, sr = cos(0.5 * roll), sin(0.5 * roll)
-    cp, sp = cos(0.5 * pitch), sin(0.5 * pitch)
-    cy, sy = cos(0.5 * yaw), sin(0.5 * yaw)
-    return [
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-        cr * cp * cy + sr * sp * sy,
-    ]
+_WHOLE_TURN = 2.0 * np.pi + 1e-3  # rad, above which an angle is a turn too many, or degrees
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
-    """A tag's kind: destination of its lines, ids and numbers on each, True if they are written as in TORO."""
+class Tag:
+    """Kind of a line.
 
-    name: Literal["vertices", "edges", "points", "sightings"]
+    Attributes
+    ----------
+    dimension : 2 or 3
+    ids : number of vertex ids that it begins with: 1 of a vertex, 2 of an edge
+    columns : which numbers of a whole line follow: a pose (x y θ, or x y z qx qy qz qw), and of an edge the upper
+        triangle of Ω, row by row. TORO has roll, pitch and yaw for the quaternion
+    is_point : whether it is a point, or an edge to one
+    """
+
     dimension: int
     ids: int
-    numbers: int
+    columns: tuple[int, ...]
+    is_point: bool = False
     is_toro: bool = False
 
 
-_KINDS = {
-    VERTICES[2]: Kind("vertices", 2, 1, 3),
-    VERTICES[3]: Kind("vertices", 3, 1, 7),
-    EDGES[2]: Kind("edges", 2, 2, 9),
-    EDGES[3]: Kind("edges", 3, 2, 28),
-    POINT: Kind("points", 2, 1, 2),
-    SIGHTING: Kind("sightings", 2, 2, 5),
-    TORO_VERTICES[2]: Kind("vertices", 2, 1, 3, is_toro=True),
-    TORO_VERTICES[3]: Kind("vertices", 3, 1, 6, is_toro=True),
-    TORO_EDGES[2]: Kind("edges", 2, 2, 9, is_toro=True),
-    TORO_EDGES[3]: Kind("edges", 3, 2, 27, is_toro=True),
+TAGS = {
+    "VERTEX_SE2": Tag(2, 1, (0, 1, 2)),
+    "EDGE_SE2": Tag(2, 2, tuple(range(9))),
+    "VERTEX_XY": Tag(2, 1, (0, 1), is_point=True),
+    "EDGE_SE2_XY": Tag(2, 2, (0, 1, 3, 4, 6), is_point=True),
+    "VERTEX_SE3:QUAT": Tag(3, 1, tuple(range(7))),
+    "EDGE_SE3:QUAT": Tag(3, 2, tuple(range(28))),
+    "VERTEX2": Tag(2, 1, (0, 1, 2), is_toro=True),
+    "EDGE2": Tag(2, 2, (0, 1, 2, 3, 4, 6, 8, 5, 7), is_toro=True),  # Ω as xx xy yy θθ xθ yθ
+    "VERTEX3": Tag(3, 1, tuple(range(6)), is_toro=True),
+    "EDGE3": Tag(3, 2, tuple(range(27)), is_toro=True),
 }
 
 
-@dataclass(slots=True)
-class Rows:
-    """The lines of one kind: where they stand, the vertex ids they begin with, the numbers that follow."""
+def write_lines(
+    dimension: int, ids: NDArray[np.int64], numbers: Matrix, is_point: NDArray[np.bool_], *, is_toro: bool
+) -> list[str]:
+    """Lines of vertices, ids (n, 1), or edges (n, 2), of whole lines as g2o has them (n, m).
 
-    lines: list[int] = field(default_factory=list)
-    ids: list[list[int]] = field(default_factory=list)
-    numbers: list[list[float]] = field(default_factory=list)
+    Every number is the shortest that reads back as the same.
+    """
+    if is_toro and dimension == 3:
+        numbers = np.hstack([numbers[:, :3], to_angles(numbers[:, 3:7]), numbers[:, 7:]])
+    tags = {
+        tag.is_point: (name, tag.columns)
+        for name, tag in TAGS.items()
+        if (tag.dimension, tag.ids, tag.is_toro) == (dimension, ids.shape[1], is_toro)
+    }
+    lines = []
+    for names, row, point in zip(ids.tolist(), numbers.tolist(), is_point.tolist(), strict=True):
+        name, columns = tags[point]
+        lines.append(" ".join([name, *map(repr, names), *(repr(row[column]) for column in columns)]))
+    return lines
 
-    def ids_array(self, width: int) -> NDArray[np.int64]:
-        """Vertex ids (n, width)."""
-        return np.array(self.ids, np.int64).reshape(-1, width)
 
-    def numbers_array(self, width: int) -> Matrix:
-        """Numbers (n, width)."""
-        return np.array(self.numbers, np.float64).reshape(-1, width)
+def from_angles(angles: Matrix) -> Matrix:
+    """Quaternions xyzw (n, 4) of roll, pitch and yaw (n, 3), Rz(yaw) Ry(pitch) Rx(roll)."""
+    return Turn.from_euler("ZYX", angles[:, ::-1]).as_quat()
 
 
-@dataclass(slots=True)
-class G2oLines:
-    """A file's lines by kind; ``dimension`` is 2 or 3, and 0 where it holds neither poses nor edges.
+def to_angles(quat_xyzw: Matrix) -> Matrix:
+    """Roll, pitch and yaw (n, 3); exact at a pitch of ±π/2 too, where yaw is free and taken as zero."""
+    R = lie.from_quaternion(quat_xyzw)
+    yaw = np.where(np.hypot(R[:, 0, 0], R[:, 1, 0]) > 1e-9, np.arctan2(R[:, 1, 0], R[:, 0, 0]), 0.0)
+    c, s = np.cos(yaw), np.sin(yaw)
+    pitch = np.arctan2(-R[:, 2, 0], c * R[:, 0, 0] + s * R[:, 1, 0])
+    roll = np.arctan2(s * R[:, 0, 2] - c * R[:, 1, 2], c * R[:, 1, 1] - s * R[:, 0, 1])
+    return np.stack([roll, pitch, yaw], axis=1)
 
-    ``turns`` : line and size of angles beyond a turn, which may be degrees
-    ``rotation`` : of which the information is, by the comment that ``write_g2o`` writes
+
+class Rows(NamedTuple):
+    """Vertices or edges, those of poses before those of points, each in the order of the file.
+
+    Attributes
+    ----------
+    lines : (n,) where they stand
+    ids : (n, 1) or (n, 2) vertex ids
+    numbers : (n, m) whole lines as g2o has them, zero where a tag has no number
+    is_point : (n,) bool, points or edges to points
     """
 
-    dimension: int = 0
-    vertices: Rows = field(default_factory=Rows)
-    edges: Rows = field(default_factory=Rows)
-    points: Rows = field(default_factory=Rows)
-    sightings: Rows = field(default_factory=Rows)
-    fixed: Rows = field(default_factory=Rows)
-    others: list[str] = field(default_factory=list)
-    turns: list[tuple[int, float]] = field(default_factory=list)
-    rotation: Rotation = "vector"
+    lines: NDArray[np.int64]
+    ids: NDArray[np.int64]
+    numbers: Matrix
+    is_point: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class G2oLines:
+    """Content of a file.
+
+    Attributes
+    ----------
+    dimension : 2 or 3
+    fixed : line and vertex id of every pose that is held
+    others : lines of other tags
+    rotation : of which the information is, by the comment that ``write_g2o`` writes
+    turns : line and size of angles beyond a turn, which may be degrees
+    """
+
+    dimension: int
+    vertices: Rows
+    edges: Rows
+    fixed: list[tuple[int, int]]
+    others: list[str]
+    rotation: Rotation
+    turns: list[tuple[int, float]]
 
 
 def sort_lines(path: Path) -> G2oLines:
@@ -141,76 +144,93 @@ def sort_lines(path: Path) -> G2oLines:
         raise InputError(
             f"{path}: cannot be read as g2o: {reason}; give a text file of vertices and edges"
         ) from error
-    result = G2oLines()
+    dimension = 0
+    rotation: Rotation = "vector"
+    others, fixed, turns = list[str](), list[tuple[int, int]](), list[tuple[int, float]]()
+    by_tag = defaultdict[str, list[tuple[int, list[int], list[float]]]](list)
+    comments: dict[str, Rotation] = {comment: name for name, comment in ROTATION_COMMENT.items()}
     for number, line in enumerate(text.splitlines(), start=1):
         words = line.split()
-        if words:
-            _sort_line(path, number, words, line, result)
-    if not result.edges.ids and not result.sightings.ids:
-        raise InputError(f"{path}: holds no EDGE_SE2 and no EDGE_SE3:QUAT line; is it a g2o pose graph?")
-    return result
-
-
-def _sort_line(path: Path, number: int, words: list[str], line: str, result: G2oLines) -> None:
-    """Sort one line in."""
-    tag = words[0]
-    if tag == "FIX":
-        for word in words[1:]:
-            _append(path, number, [tag, word], 1, 0, result.fixed)
-        return
-    kind = _KINDS.get(tag)
-    for rotation, comment in ROTATION_COMMENT.items():
-        if line == comment:
-            result.rotation = rotation
-            return
-    if kind is None:
-        result.others.append(line)
-        return
-    if result.dimension not in (0, kind.dimension):
-        raise InputError(
-            f"{path}:{number}: {tag} in an SE({result.dimension}) graph; keep to one dimension a file"
-        )
-    result.dimension = kind.dimension
-    rows: Rows = getattr(result, kind.name)
-    _append(path, number, words, kind.ids, kind.numbers, rows)
-    angles = rows.numbers[-1][3:6] if kind.is_toro and kind.dimension == 3 else rows.numbers[-1][2:3]
-    if (kind.is_toro or kind.dimension == 2) and kind.name in ("vertices", "edges"):
-        largest = max(map(abs, angles))
-        if largest > _WHOLE_TURN:
-            result.turns.append((number, largest))
-    if kind.is_toro:
-        rows.numbers[-1] = from_toro(rows.numbers[-1], kind.dimension)
-
-
-def _append(path: Path, number: int, words: list[str], ids: int, numbers: int, rows: Rows) -> None:
-    """Add a line's ids and numbers, each checked."""
-    if len(words) != 1 + ids + numbers:
-        raise InputError(
-            f"{path}:{number}: {words[0]} has {counted(len(words) - 1, 'value')}, needs {ids + numbers}"
-        )
-    try:
-        rows.ids.append([_vertex_id(word) for word in words[1 : 1 + ids]])
-        values = [float(word) for word in words[1 + ids :]]
-    except ValueError as error:
-        raise InputError(f"{path}:{number}: {words[0]}: {error}") from error
-    if not np.isfinite(values).all():
-        raise InputError(f"{path}:{number}: {words[0]} has a value that is not finite; remove or mend the line")
-    for value in values:
-        if abs(value) > LARGEST:
+        if not words:
+            continue
+        tag = TAGS.get(words[0])
+        if words[0] == "FIX":
+            fixed += [(number, _vertex_id(f"{path}:{number}: FIX", word)) for word in words[1:]]
+        elif line in comments:
+            rotation = comments[line]
+        elif tag is None:
+            others.append(line)
+        elif dimension not in (0, tag.dimension):
             raise InputError(
-                f"{path}:{number}: {' '.join(words[: 1 + ids])} has the value {value:g}, over {LARGEST:g}; "
-                "write meters and radians, and an inverse covariance of these"
+                f"{path}:{number}: {words[0]} in an SE({dimension}) graph; keep to one dimension a file"
             )
-    rows.numbers.append(values)
-    rows.lines.append(number)
+        else:
+            dimension = tag.dimension
+            by_tag[words[0]].append((number, *_parsed(f"{path}:{number}: {words[0]}", tag, words)))
+    rows = {name: _rows(path, name, lines, turns) for name, lines in by_tag.items()}
+    vertices, edges = (_joined([rows[name] for name in rows if TAGS[name].ids == ids], ids) for ids in (1, 2))
+    if not len(edges.ids):
+        raise InputError(f"{path}: holds no EDGE_SE2 and no EDGE_SE3:QUAT line; is it a g2o pose graph?")
+    return G2oLines(dimension, vertices, edges, fixed, others, rotation, turns)
 
 
-def _vertex_id(word: str) -> int:
-    """Raises ValueError."""
+def _joined(parts: list[Rows], ids: int) -> Rows:
+    """Rows of several tags, or none."""
+    if not parts:
+        return Rows(np.empty(0, np.int64), np.empty((0, ids), np.int64), np.empty((0, 0)), np.empty(0, np.bool_))
+    lines, is_point = (
+        np.concatenate([part.lines for part in parts]),
+        np.concatenate([part.is_point for part in parts]),
+    )
+    names, numbers = np.concatenate([part.ids for part in parts]), np.concatenate([part.numbers for part in parts])
+    order = np.lexsort((lines, is_point))
+    return Rows(lines[order], names[order], numbers[order], is_point[order])
+
+
+def _parsed(place: str, tag: Tag, words: list[str]) -> tuple[list[int], list[float]]:
+    """Vertex ids and numbers of a line; ``place`` is for messages."""
+    if len(words) != 1 + tag.ids + len(tag.columns):
+        count, wanted = counted(len(words) - 1, "value"), tag.ids + len(tag.columns)
+        raise InputError(f"{place} has {count}, needs {wanted}")
+    ids = [_vertex_id(place, word) for word in words[1 : 1 + tag.ids]]
+    try:
+        return ids, list(map(float, words[1 + tag.ids :]))
+    except ValueError as error:
+        raise InputError(f"{place}: {error}") from error
+
+
+def _rows(
+    path: Path, name: str, lines: list[tuple[int, list[int], list[float]]], turns: list[tuple[int, float]]
+) -> Rows:
+    """Lines of one tag as arrays, checked; angles beyond a turn are added to ``turns``."""
+    tag = TAGS[name]
+    places, ids, numbers = (np.array(column) for column in zip(*lines, strict=True))
+    for row in np.flatnonzero(~np.isfinite(numbers).all(axis=1))[:1]:
+        raise InputError(f"{path}:{places[row]}: {name} has a value that is not finite; remove or mend the line")
+    for row, column in np.argwhere(np.abs(numbers) > LARGEST)[:1]:
+        start = " ".join([name, *map(str, ids[row].tolist())])
+        raise InputError(
+            f"{path}:{places[row]}: {start} has the value {numbers[row, column]:g}, over {LARGEST:g}; "
+            "write meters and radians, and an inverse covariance of these"
+        )
+    if not tag.is_point and (tag.dimension == 2 or tag.is_toro):
+        largest = np.abs(numbers[:, 3:6] if tag.dimension == 3 else numbers[:, 2:3]).max(axis=1)
+        beyond = largest > _WHOLE_TURN
+        turns += zip(places[beyond].tolist(), largest[beyond].tolist(), strict=True)
+    whole = numbers
+    if tag.dimension == 2:
+        whole = np.zeros((len(numbers), 3 if tag.ids == 1 else 9))
+        whole[:, tag.columns] = numbers
+    elif tag.is_toro:
+        whole = np.hstack([numbers[:, :3], from_angles(numbers[:, 3:6]), numbers[:, 6:]])
+    return Rows(places, ids, whole, np.full(len(numbers), tag.is_point))
+
+
+def _vertex_id(place: str, word: str) -> int:
     try:
         value = int(word)
     except ValueError:
-        raise ValueError(f"vertex id {shown(word)} is not a whole number; write 0, 1, 2, ...") from None
+        raise InputError(f"{place}: vertex id {shown(word)} is not a whole number; write 0, 1, 2, ...") from None
     if abs(value) > _LARGEST_ID:
-        raise ValueError(f"vertex id {shown(word)} is too large; the limit is {_LARGEST_ID}")
+        raise InputError(f"{place}: vertex id {shown(word)} is too large; the limit is {_LARGEST_ID}")
     return value

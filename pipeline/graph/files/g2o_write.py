@@ -1,4 +1,4 @@
-"""Pose graphs written as g2o or TORO text, every number to its last digit."""
+"""Pose graphs written as g2o or TORO text."""
 
 from __future__ import annotations
 
@@ -12,18 +12,7 @@ from numpy.typing import NDArray
 from scanchain import checks, lie
 from scanchain.data import Matrix
 from scanchain.errors import InputError
-from scanchain.graph.files.g2o_lines import (
-    EDGES,
-    POINT,
-    ROTATION_COMMENT,
-    SIGHTING,
-    TORO_EDGES,
-    TORO_VERTICES,
-    VERTICES,
-    Rotation,
-    to_toro_angles,
-    to_toro_triangle,
-)
+from scanchain.graph.files.g2o_lines import ROTATION_COMMENT, Rotation, write_lines
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.whole_file import write_whole
 
@@ -63,56 +52,26 @@ def write_g2o(
     is_toro = path.suffix in TORO_SUFFIXES
     if is_toro and graph.is_point.any():
         raise InputError(f"{path}: TORO has no points, and the graph has {graph.is_point.sum()}; write .g2o")
-    vertex, edge, rows_of = (
-        (TORO_VERTICES[d], TORO_EDGES[d], _toro) if is_toro else (VERTICES[d], EDGES[d], _numbers)
-    )
-    names = (np.arange(len(graph)) if ids is None else ids).tolist()
+    names = np.arange(len(graph)) if ids is None else ids
     has_quaternions = d == 3 and not is_toro
-    lines = [ROTATION_COMMENT[rotation]] if has_quaternions else []
-    for name, row, is_point in zip(names, rows_of(graph.poses), graph.is_point.tolist(), strict=True):
-        lines.append(f"{POINT} {name} {_text(row[:2])}" if is_point else f"{vertex} {name} {_text(row)}")
-    lines += [f"FIX {names[index]}" for index in graph.held]
-    chosen, triangles = _triangles(graph, edges, 2.0 if has_quaternions and rotation == "quaternion" else 1.0)
+    chosen = graph.is_rejected if edges == "rejected" else ~graph.is_rejected
     pairs = graph.edges[chosen]
-    sees = graph.is_point[pairs[:, 1]].tolist()
-    rows = zip(pairs.tolist(), rows_of(graph.measurements[chosen]), triangles, sees, strict=True)
-    for (i, j), row, upper, is_sighting in rows:
-        tag, numbers = edge, [*row, *(to_toro_triangle(upper) if is_toro else upper)]
-        if is_sighting:
-            tag, numbers = SIGHTING, [*row[:2], upper[0], upper[1], upper[3]]
-        lines.append(f"{tag} {names[i]} {names[j]} {_text(numbers)}")
+    units = lie.by_component(graph.freedom, 1.0, 2.0 if has_quaternions and rotation == "quaternion" else 1.0)
+    weight = np.ones(len(pairs)) if edges == "rejected" else graph.weight[chosen]
+    information = weight[:, None, None] * (graph.information[chosen] * np.outer(units, units))
+    triangles = information[:, *np.triu_indices(graph.freedom)]
+    of_edges = np.hstack([_numbers(graph.measurements[chosen]), triangles])
+    lines = [ROTATION_COMMENT[rotation]] if has_quaternions else []
+    lines += write_lines(d, names[:, None], _numbers(graph.poses), graph.is_point, is_toro=is_toro)
+    lines += [f"FIX {names[index]}" for index in graph.held]
+    lines += write_lines(d, names[pairs], of_edges, graph.is_point[pairs[:, 1]], is_toro=is_toro)
     with checks.writing(path, force=force):
         write_whole(path, "\n".join([*lines, *other_lines, ""]).encode())
 
 
-def _numbers(poses: Matrix) -> list[list[float]]:
+def _numbers(poses: Matrix) -> Matrix:
     """Poses as rows x y θ, or x y z qx qy qz qw."""
     d = poses.shape[-1] - 1
     if d == 2:
-        return np.column_stack([poses[:, :2, 2], lie.yaw(poses)]).tolist()
-    return np.hstack([poses[:, :3, 3], lie.to_quaternion(poses[:, :3, :3])]).tolist()
-
-
-def _toro(poses: Matrix) -> list[list[float]]:
-    """Poses as rows x y θ, or x y z roll pitch yaw."""
-    if poses.shape[-1] == 3:
-        return _numbers(poses)
-    return [[*T[:3, 3].tolist(), *to_toro_angles(T[:3, :3])] for T in poses]
-
-
-def _triangles(graph: PoseGraph, edges: Chosen, per_turn: float) -> tuple[NDArray[np.bool_], list[list[float]]]:
-    """Chosen edges, (E,), and Ω of these, upper triangle row by row; w Ω of those in force.
-
-    per_turn : radians in a unit of rotation
-    """
-    upper = np.triu_indices(graph.freedom)
-    units = lie.by_component(graph.freedom, 1.0, per_turn)
-    triangles = (graph.information * np.outer(units, units))[:, upper[0], upper[1]]
-    if edges == "rejected":
-        return graph.is_rejected, triangles[graph.is_rejected].tolist()
-    return ~graph.is_rejected, (graph.weight[:, None] * triangles)[~graph.is_rejected].tolist()
-
-
-def _text(row: list[float]) -> str:
-    """Shortest decimals that read back as the same numbers."""
-    return " ".join(map(repr, row))
+        return np.column_stack([poses[:, :2, 2], lie.yaw(poses)])
+    return np.hstack([poses[:, :3, 3], lie.to_quaternion(poses[:, :3, :3])])

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from scanchain.data import REJECTED_WEIGHT, Matrix
 from scanchain.graph.between import WASTE
 from scanchain.graph.edge_checks import is_connected
-from scanchain.graph.robust.groups import Contradiction, agreeing_groups
-from scanchain.graph.robust.inliers import InlierSet, contradictions, fair_price
+from scanchain.graph.robust.consistency import Consistency
+from scanchain.graph.robust.groups import agreeing_groups
+from scanchain.graph.robust.inliers import InlierSet, fair_price
 from scanchain.graph.robust.losses import Graduation, RobustLoss, rejection_limit
-from scanchain.graph.solvers.minimizer import Evaluation, Minimizer, Minimum
+from scanchain.graph.solvers.minimizer import Evaluation, Limits, Minimizer, Minimum
 
 Graduated = Literal["gnc", "edges", "refined"]
 OutlierRejection = Literal[Graduated, "retained", "recent", "explained"]
@@ -24,14 +25,7 @@ _MAX_FAILED = 4  # largest number of groups tried in a row without success
 _FEWER, _FEWEST = 0.3, 1e-3  # share of the changes tried after a round that does not help: at first, at least
 
 
-def minimize(
-    minimizer: Minimizer,
-    poses: Matrix,
-    loss: RobustLoss,
-    max_iterations: int,
-    tolerance: float,
-    rejection: Graduated,
-) -> Minimum:
+def minimize(minimizer: Minimizer, poses: Matrix, loss: RobustLoss, rejection: Graduated) -> Minimum:
     """Minimize from these poses; a kernel that is not convex is graduated first (Yang et al. 2020).
 
     rejection : of truncated edges: as GNC leaves it, or refined by how much each edge contradicts the others, and
@@ -42,23 +36,21 @@ def minimize(
     if graduation is not None and len(minimizer.loops):
         now, loss, used = _graduate(minimizer, now, graduation)
     if rejection != "gnc" and loss.kernel == "truncated" and len(minimizer.loops):
-        minimum = _refine(minimizer, now, loss, max_iterations, tolerance, rejection)
+        minimum = _refine(minimizer, now, loss, rejection)
     else:
-        minimum = minimizer.descend(now, loss, max_iterations, tolerance)
+        minimum = minimizer.descend(now, loss)
         if loss.kernel not in ("none", "truncated"):
-            minimum = _settle_without_outliers(minimizer, minimum, loss, max_iterations, tolerance)
+            minimum = _settle_without_outliers(minimizer, minimum, loss)
     return replace(minimum, iterations=used + minimum.iterations)
 
 
-def settle(
-    minimizer: Minimizer, start: Evaluation, inliers: InlierSet, max_iterations: int, tolerance: float
-) -> Minimum:
+def settle(minimizer: Minimizer, start: Evaluation, inliers: InlierSet) -> Minimum:
     """The minimum with these inliers."""
     weights = minimizer.weights(start.chi2, inliers)
     chosen = Focus(minimizer).on(weights)
     kept = inliers.kept
     inner = InlierSet(kept if chosen is minimizer else kept[kept], inliers.price)
-    minimum = chosen.descend(chosen.evaluate(start.poses, inner), inner, max_iterations, tolerance)
+    minimum = chosen.descend(chosen.evaluate(start.poses, inner), inner)
     return replace(minimum, estimate=minimizer.evaluate(minimum.estimate.poses, inliers), weights=weights)
 
 
@@ -68,15 +60,13 @@ def _graduate(minimizer: Minimizer, now: Evaluation, graduation: Graduation) -> 
     while not graduation.is_over(now.chi2[minimizer.loops]):
         loss = graduation.loss
         chosen = focus.on(minimizer.weights(now.chi2, loss))
-        minimum = chosen.descend(chosen.evaluate(now.poses, loss), loss, 1, 0.0)
+        minimum = chosen.descend(chosen.evaluate(now.poses, loss), loss, Limits(1, 0.0))
         now, used = minimizer.evaluate(minimum.estimate.poses, loss), used + minimum.iterations
         graduation.tighten()
     return minimizer.reweighed(now, graduation.loss), graduation.loss, used
 
 
-def _settle_without_outliers(
-    minimizer: Minimizer, minimum: Minimum, loss: RobustLoss, max_iterations: int, tolerance: float
-) -> Minimum:
+def _settle_without_outliers(minimizer: Minimizer, minimum: Minimum, loss: RobustLoss) -> Minimum:
     """The minimum without the edges that this one shows to be false, whose weight becomes 0.
 
     A loss that does not cut edges off leaves them some weight. They keep it where poses would be loose without.
@@ -86,7 +76,7 @@ def _settle_without_outliers(
     if not rejected.any() or not is_connected(problem.edges[~rejected], problem.variable < 0):
         return minimum
     rest = minimizer.restricted(~rejected)
-    settled = rest.descend(rest.evaluate(minimum.estimate.poses, loss), loss, max_iterations, tolerance)
+    settled = rest.descend(rest.evaluate(minimum.estimate.poses, loss), loss)
     weights = np.zeros(len(rejected))
     weights[~rejected] = settled.weights
     return replace(
@@ -115,37 +105,23 @@ class Focus:
         return self._chosen
 
 
-def _refine(
-    minimizer: Minimizer,
-    now: Evaluation,
-    loss: RobustLoss,
-    max_iterations: int,
-    tolerance: float,
-    rejection: Graduated,
-) -> Minimum:
+def _refine(minimizer: Minimizer, now: Evaluation, loss: RobustLoss, rejection: Graduated) -> Minimum:
     """The minimum with the present inliers, and then with those that the other edges do not contradict."""
     kept, nominal = loss.weight(now.chi2[minimizer.loops]) > 0.5, loss.scale**2
-    minimum = settle(minimizer, now, InlierSet(kept, nominal), max_iterations, tolerance)
+    minimum = settle(minimizer, now, InlierSet(kept, nominal))
     problem = minimizer.problem
     if not is_connected(problem.edges[minimum.weights > 0.5], problem.variable < 0):
         return minimum
     against = _against(minimizer, minimum, nominal)
     price = fair_price(against[kept], nominal, problem.freedom)
     minimum = replace(minimum, estimate=minimizer.reweighed(minimum.estimate, InlierSet(kept, price)))
-    minimum = _refine_edges(minimizer, minimum, against, price, max_iterations, tolerance)
+    minimum = _refine_edges(minimizer, minimum, against, price)
     if rejection == "refined":
-        minimum = _refine_groups(minimizer, minimum, price, nominal, max_iterations, tolerance)
+        minimum = _refine_groups(minimizer, minimum, price, nominal)
     return replace(minimum, price=price)
 
 
-def _refine_edges(
-    minimizer: Minimizer,
-    minimum: Minimum,
-    against: NDArray[np.float64],
-    price: float,
-    max_iterations: int,
-    tolerance: float,
-) -> Minimum:
+def _refine_edges(minimizer: Minimizer, minimum: Minimum, against: NDArray[np.float64], price: float) -> Minimum:
     """The minimum after rounds of changes of single edges, as long as the cost falls; ``against`` (L,) them."""
     kept, share = minimum.weights[minimizer.loops] > 0.5, 1.0
     for _ in range(_MAX_ROUNDS):
@@ -153,7 +129,7 @@ def _refine_edges(
         if share < _FEWEST or not (gain > 0.0).any():
             break
         inliers = InlierSet(kept ^ (gain > (1.0 - share) * gain.max()), price)
-        trial = settle(minimizer, minimum.estimate, inliers, max_iterations, tolerance)
+        trial = settle(minimizer, minimum.estimate, inliers)
         used = minimum.iterations + trial.iterations
         if not trial.estimate.cost < minimum.estimate.cost:
             minimum, share = replace(minimum, iterations=used), _FEWER * share
@@ -163,9 +139,7 @@ def _refine_edges(
     return minimum
 
 
-def _refine_groups(
-    minimizer: Minimizer, minimum: Minimum, price: float, limit: float, max_iterations: int, tolerance: float
-) -> Minimum:
+def _refine_groups(minimizer: Minimizer, minimum: Minimum, price: float, limit: float) -> Minimum:
     """The minimum after changes of groups of edges that agree, each followed by those of single ones.
 
     Wrong edges that agree shield each other: without any one of them, the others predict it. So do the true ones
@@ -181,9 +155,9 @@ def _refine_groups(
         kept = minimum.weights > 0.5
         kept[group] ^= True
         inliers = InlierSet(kept[minimizer.loops], price)
-        trial = settle(minimizer, minimum.estimate, inliers, max_iterations, tolerance)
+        trial = settle(minimizer, minimum.estimate, inliers)
         against = _against(minimizer, trial, price)
-        trial = _refine_edges(minimizer, trial, against, price, max_iterations, tolerance)
+        trial = _refine_edges(minimizer, trial, against, price)
         used = minimum.iterations + trial.iterations
         is_better = trial.estimate.cost < minimum.estimate.cost
         failed = 0 if is_better else failed + 1
@@ -197,33 +171,27 @@ def _next_group(
     """The group whose change promises the largest fall of the cost; none where no group of edges is left out."""
     problem, poses, is_loop = minimizer.problem, minimum.estimate.poses, minimizer.is_loop
     kept = minimum.weights > 0.5
-    against = np.zeros(len(kept))
-    against[minimizer.loops] = _against(minimizer, minimum, price)
-    out = agreeing_groups(problem, poses, is_loop, is_loop & ~kept, limit)
     best, most = np.empty(0, np.int64), 0.0
+    out = agreeing_groups(problem, poses, is_loop, is_loop & ~kept, limit)
     if not out:
         return best
-    contradiction = Contradiction(problem, poses, kept)
+    consistency = Consistency(problem, poses, kept)
+    against = consistency.of_each(price)
     for group in (*out, *agreeing_groups(problem, poses, is_loop, is_loop & kept, limit)):
-        is_kept, worth = bool(kept[group[0]]), price * len(group)
+        is_kept, worth, rest = bool(kept[group[0]]), price * len(group), kept.copy()
+        rest[group] = False
         if tuple(group.tolist()) in tried or (not is_kept and against[group].max() > worth):
             continue
-        if is_kept and not is_connected(problem.edges[_without(kept, group)], problem.variable < 0):
+        if is_kept and not is_connected(problem.edges[rest], problem.variable < 0):
             continue
-        rise = worth - contradiction.of(group, kept=is_kept)
+        rise = worth - consistency.of_group(group)
         gain = -rise if is_kept else rise
         if gain > most:
             best, most = group, gain
     return best
 
 
-def _without(kept: NDArray[np.bool_], group: NDArray[np.int64]) -> NDArray[np.bool_]:
-    rest = kept.copy()
-    rest[group] = False
-    return rest
-
-
 def _against(minimizer: Minimizer, minimum: Minimum, price: float) -> NDArray[np.float64]:
     """Cost of every loop edge in the χ² of the others, (L,)."""
     kept = minimum.weights > 0.5
-    return contradictions(minimizer.problem, minimum.estimate.poses, kept, price)[minimizer.loops]
+    return Consistency(minimizer.problem, minimum.estimate.poses, kept).of_each(price)[minimizer.loops]

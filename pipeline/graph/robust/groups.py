@@ -1,6 +1,8 @@
-"""Groups of loop edges that agree with each other, and how much a group contradicts all other edges."""
+"""Groups of loop edges that agree with each other."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,13 +13,11 @@ from scipy.spatial import KDTree
 from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem
-from scanchain.graph.covariance import difference_covariances
 
 FEWEST = 3  # least number of edges of a group; fewer may agree by chance
 _REACH = 5  # largest difference of the poses of two agreeing edges, at either end, in the order of the poses
 _MOST = 50  # largest number of edges of a group that is looked at as one
 _AT_ONCE = 10_000  # pairs of edges that are compared at once, of many
-_ROUNDING = 1e-9  # keeps a group without which its poses would be loose from a division by zero
 
 
 def agreeing_groups(
@@ -31,40 +31,40 @@ def agreeing_groups(
     loops = np.flatnonzero(chosen & is_loop)
     if len(loops) < FEWEST:
         return []
-    pairs = KDTree(problem.edges[loops]).query_pairs(_REACH, p=np.inf, output_type="ndarray")
+    edges, Z = problem.edges[loops], problem.measurements[loops]
     noise = np.linalg.pinv(problem.information[loops], hermitian=True)
     odometry = problem.information[~is_loop]
     step = np.linalg.pinv(np.median(odometry, axis=0), hermitian=True) if len(odometry) else 0.0
-    parts = np.array_split(pairs, 1 + len(pairs) // _AT_ONCE)
-    agree = np.concatenate([_distances(problem, poses, loops, each, noise, step) < limit for each in parts])
-    a, b = pairs[agree].T
-    links = coo_array((np.ones(len(a)), (a, b)), shape=(len(loops), len(loops)))
-    label = connected_components(links, directed=False)[1]
-    order = np.argsort(label, kind="stable")
-    members = np.split(loops[order], 1 + np.flatnonzero(np.diff(label[order])))
-    return [each for each in members if FEWEST <= len(each) <= _MOST]
+
+    def agree(a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.bool_]:
+        errors = lie.log(lie.between(Z[b], carried(poses, edges[a], Z[a], edges[b])))
+        steps = np.abs(edges[a] - edges[b]).sum(axis=1)
+        covariance = noise[a] + noise[b] + steps[:, None, None] * step
+        return np.einsum("ea,eab,eb->e", errors, np.linalg.pinv(covariance, hermitian=True), errors) < limit
+
+    groups = connected(KDTree(edges).query_pairs(_REACH, p=np.inf, output_type="ndarray"), len(loops), agree)
+    return [loops[each] for each in groups if len(each) <= _MOST]
 
 
-def _distances(
-    problem: BetweenProblem,
-    poses: Matrix,
-    loops: NDArray[np.int64],
+def carried(poses: Matrix, edges: NDArray[np.int64], Z: Matrix, others: NDArray[np.int64]) -> Matrix:
+    """What edges (P, 2) that measure Z predict of other pairs (P, 2), along the poses between their ends."""
+    before = lie.between(poses[others[:, 0]], poses[edges[:, 0]])
+    after = lie.between(poses[edges[:, 1]], poses[others[:, 1]])
+    return before @ Z @ after
+
+
+def connected(
     pairs: NDArray[np.int64],
-    noise: Matrix,
-    step: Matrix | float,
-) -> NDArray[np.float64]:
-    """Squared Mahalanobis distance (P,) of one loop edge of each pair (P, 2) from what the other predicts.
-
-    noise : (L, k, k) covariances of the loop edges (L,); step : of an edge of odometry
-    """
-    a, b = pairs.T
-    (i, j), (k, m) = problem.edges[loops[a]].T, problem.edges[loops[b]].T
-    before, after = lie.between(poses[k], poses[i]), lie.between(poses[j], poses[m])
-    predicted = before @ problem.measurements[loops[a]] @ after
-    errors = lie.log(lie.between(problem.measurements[loops[b]], predicted))
-    steps = np.abs(i - k) + np.abs(j - m)
-    covariance = noise[a] + noise[b] + steps[:, None, None] * step
-    return np.einsum("ea,eab,eb->e", errors, np.linalg.pinv(covariance, hermitian=True), errors)
+    count: int,
+    agree: Callable[..., NDArray[np.bool_]],
+) -> list[NDArray[np.int64]]:
+    """Groups of at least ``FEWEST`` of so many, connected by pairs (P, 2) that agree: a (P,) and b (P,), bool."""
+    parts = np.array_split(pairs, 1 + len(pairs) // _AT_ONCE)
+    a, b = pairs[np.concatenate([agree(*part.T) for part in parts])].T
+    label = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(count, count)), directed=False)[1]
+    order = np.argsort(label, kind="stable")
+    members = np.split(order, 1 + np.flatnonzero(np.diff(label[order])))
+    return [each for each in members if len(each) >= FEWEST]
 
 
 def apart(ends: NDArray[np.int64], edges: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -73,34 +73,3 @@ def apart(ends: NDArray[np.int64], edges: NDArray[np.int64]) -> NDArray[np.int64
     for place, near in enumerate(KDTree(ends[edges]).query_ball_point(ends[edges], _REACH, p=np.inf)):
         is_chosen[place] = not is_chosen[near].any()
     return edges[is_chosen]
-
-
-class Contradiction:
-    """Squared Mahalanobis distance between what groups of edges measure and what all other kept edges predict.
-
-    Of kept edges it is what the χ² of the whole graph falls by without them, of others what it rises by with them,
-    to first order, as ``contradictions`` has it of single edges.
-    """
-
-    def __init__(self, problem: BetweenProblem, poses: Matrix, kept: NDArray[np.bool_]) -> None:
-        """Kept (E,): the edges in force at these poses."""
-        self._problem = problem
-        self._errors = problem.errors(poses)
-        self._jacobians = problem.jacobians(poses, self._errors)
-        self._sparse = problem.weighed(poses, self._errors, kept)
-
-    def of(self, group: NDArray[np.int64], *, kept: bool) -> float:
-        """The distance of the edges of a group, all of them kept or none."""
-        k, count = self._problem.freedom, len(group)
-        predicted = np.empty((k * count, k * count))
-        joints = difference_covariances(self._sparse, self._problem.edges[group])
-        for place, edge in enumerate(group):
-            joint = self._jacobians[group] @ joints[place] @ self._jacobians[edge].T
-            predicted[:, k * place : k * (place + 1)] = joint.reshape(-1, k)
-        information = np.zeros((count, k, count, k))
-        information[np.arange(count), :, np.arange(count)] = self._problem.information[group]
-        information = information.reshape(k * count, k * count)
-        errors = self._errors[group].ravel()
-        sign = -1.0 if kept else 1.0
-        matrix = (1.0 + _ROUNDING) * np.eye(len(errors)) + sign * (predicted @ information)
-        return float(errors @ information @ np.linalg.solve(matrix, errors))

@@ -71,38 +71,38 @@ class LeftOut:
             both[place] = moved[end] - moved[begin]
         return cls(problem, factored, edges, stride, odometry, errors, jacobians, covariances, predicted, both)
 
-    def shifts(self, twists: Matrix) -> Iterator[Matrix]:
-        """∂e (O, k, p) of each of these loop edges, by right twists (O, k, p) on the measurements of odometry."""
-        problem, odometry = self.problem, self.odometry
-        pull = np.swapaxes(self.jacobians[odometry], 1, 2) @ problem.information[odometry]
-        for edge, joint in zip(self.edges, self.joint, strict=True):
-            yield self.jacobians[edge] @ np.swapaxes(joint, 1, 2) @ pull @ twists
+    def shifts(self, twists: Matrix, among: slice = slice(None)) -> Iterator[Matrix]:
+        """∂e (n, k, p) of each of these loop edges, by right twists (n, k, p) on some edges of odometry."""
+        problem, odometry = self.problem, self.odometry[among]
+        pull = np.swapaxes(self.jacobians[odometry], 1, 2) @ (problem.information[odometry] @ twists)
+        for edge, joint in zip(self.edges, self.joint[:, among], strict=True):
+            yield self.jacobians[edge] @ (np.swapaxes(joint, 1, 2) @ pull)
 
-    def quadratic(self, twists: Matrix) -> tuple[NDArray[np.float64], Matrix]:
-        """Slope b (p,) and curvature A (p, p) of right twists τ (O, k, p) on the odometry.
+    def quadratic(self, twists: Matrix, among: slice = slice(None)) -> tuple[NDArray[np.float64], Matrix]:
+        """Slope b (p,) and curvature A (p, p) of right twists τ (n, k, p) on some edges of odometry.
 
         With g = Σ JᵀΩτ, twists τδ move the poses by H⁻¹gδ; the cost of the kept edges changes by δᵀAδ − 2 bᵀδ,
         where A = Σ τᵀΩτ − gᵀH⁻¹g and b = Σ τᵀΩe.
         """
-        problem, odometry = self.problem, self.odometry
-        weighted = problem.information[odometry] @ twists
-        g = self._pull(weighted)
+        odometry = self.odometry[among]
+        weighted = self.problem.information[odometry] @ twists
+        g = self._pull(weighted, odometry)
         A = np.einsum("oap,oaq->pq", twists, weighted) - g.T @ self.factored.cholesky.solve(g)
         b = np.einsum("oap,oa->p", weighted, self.errors[odometry])
         return b, A
 
-    def moved(self, poses: Matrix, edge: int, twist: NDArray[np.float64]) -> Matrix:
-        """These poses after a right twist (k,) on the measurement of one edge of odometry."""
-        weighted = np.zeros((len(self.odometry), len(twist), 1))
-        weighted[edge, :, 0] = self.problem.information[self.odometry[edge]] @ twist
-        return self.problem.moved(poses, self.factored.cholesky.solve(self._pull(weighted))[:, 0])
+    def moved(self, poses: Matrix, twists: Matrix, among: slice) -> Matrix:
+        """These poses after right twists (n, k) on the measurements of some edges of odometry."""
+        odometry = self.odometry[among]
+        weighted = self.problem.information[odometry] @ twists[..., None]
+        return self.problem.moved(poses, self.factored.cholesky.solve(self._pull(weighted, odometry))[:, 0])
 
-    def _pull(self, weighted: Matrix) -> Matrix:
-        """Σ JᵀΩτ of the poses, (scalars, p), of Ωτ (O, k, p)."""
+    def _pull(self, weighted: Matrix, edges: NDArray[np.int64]) -> Matrix:
+        """Σ JᵀΩτ of the poses, (scalars, p), of Ωτ (n, k, p) of some edges."""
         problem = self.problem
-        forces = np.swapaxes(self.jacobians[self.odometry], 1, 2) @ weighted
+        forces = np.swapaxes(self.jacobians[edges], 1, 2) @ weighted
         whole = np.zeros((len(problem.variable), *forces.shape[1:]))
-        begin, end = problem.edges[self.odometry].T
+        begin, end = problem.edges[edges].T
         np.add.at(whole, end, forces)
         np.add.at(whole, begin, -forces)
         return self.factored.packing.rows(whole[problem.free])

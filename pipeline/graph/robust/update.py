@@ -7,15 +7,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from scanchain.data import Matrix
 from scanchain.graph.edge_checks import is_connected
+from scanchain.graph.robust.consistency import Consistency
 from scanchain.graph.robust.graduation import Focus, settle
-from scanchain.graph.robust.groups import Contradiction, agreeing_groups
+from scanchain.graph.robust.groups import agreeing_groups
 from scanchain.graph.robust.inliers import InlierSet
 from scanchain.graph.robust.losses import RobustLoss
-from scanchain.graph.solvers.minimizer import Evaluation, Minimizer, Minimum
+from scanchain.graph.solvers.minimizer import Evaluation, Limits, Minimizer, Minimum
 
-_TOLERANCE = 1e-3  # relative change of the cost below which the poses have settled; the next update goes on
-_MAX_ITERATIONS = 3  # largest number of steps with one set of edges
+# a few steps with one set of edges, until the poses have settled roughly; the next update goes on
+LIMITS = Limits(max_iterations=3, tolerance=1e-3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,13 +28,13 @@ class Since:
     updated: int
 
 
-def update(minimizer: Minimizer, now: Evaluation, loss: RobustLoss, since: Since) -> Minimum:
+def update(minimizer: Minimizer, poses: Matrix, loss: RobustLoss, since: Since) -> Minimum:
     """The minimum of the truncated loss near these poses.
 
     The graph predicts a revisit the less surely, the longer the path since the last: an edge with a large residual
     may agree with it all the same. New ones and groups of them that do are taken in where the cost falls.
     """
-    minimum = _descend(minimizer, now, loss)
+    minimum = _descend(minimizer, minimizer.evaluate(poses, loss), loss)
     left_out = minimizer.is_loop & (minimum.weights < 0.5)
     problem = minimizer.problem
     if not left_out[since.updated :].any() or not is_connected(problem.edges[~left_out], problem.variable < 0):
@@ -43,7 +45,7 @@ def update(minimizer: Minimizer, now: Evaluation, loss: RobustLoss, since: Since
     kept = ~left_out
     kept[np.concatenate(promising)] = True
     inliers = InlierSet(kept[minimizer.loops], loss.scale**2)
-    trial = settle(minimizer, minimum.estimate, inliers, _MAX_ITERATIONS, _TOLERANCE)
+    trial = settle(minimizer, minimum.estimate, inliers)
     used = minimum.iterations + trial.iterations
     trial = _descend(minimizer, minimizer.reweighed(trial.estimate, loss), loss)
     best = trial if trial.estimate.cost < minimum.estimate.cost else minimum
@@ -53,7 +55,7 @@ def update(minimizer: Minimizer, now: Evaluation, loss: RobustLoss, since: Since
 def _descend(minimizer: Minimizer, now: Evaluation, loss: RobustLoss) -> Minimum:
     """The minimum near these poses."""
     chosen = Focus(minimizer).on(minimizer.weights(now.chi2, loss))
-    minimum = chosen.descend(chosen.evaluate(now.poses, loss), loss, _MAX_ITERATIONS, _TOLERANCE)
+    minimum = chosen.descend(chosen.evaluate(now.poses, loss), loss)
     estimate = minimizer.evaluate(minimum.estimate.poses, loss)
     return replace(minimum, estimate=estimate, weights=minimizer.weights(estimate.chi2, loss))
 
@@ -66,9 +68,9 @@ def _promising(minimizer: Minimizer, minimum: Minimum, limit: float, since: Sinc
     groups = agreeing_groups(problem, poses, minimizer.is_loop, left_out, limit)
     for group in groups:
         left_out[group] = False
-    contradiction = Contradiction(problem, poses, kept)
+    consistency = Consistency(problem, poses, kept)
     return [
         group
         for group in (*groups, *np.flatnonzero(left_out)[:, None])
-        if group.max() >= since.updated and contradiction.of(group, kept=False) < limit * len(group)
+        if group.max() >= since.updated and consistency.of_group(group) < limit * len(group)
     ]

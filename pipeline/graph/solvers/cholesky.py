@@ -135,10 +135,6 @@ class SparseCholesky:
         self._every_front = np.arange(len(self._fronts.pivots))
         self._first_pivot = np.cumsum(self._fronts.pivots) - self._fronts.pivots
         self._front_of = np.repeat(self._every_front, self._fronts.pivots)
-        first_update = self._fronts.row_start[:-1] + self._fronts.pivots
-        has_parent = first_update < self._fronts.row_start[1:]
-        self._parent = np.full(len(has_parent), -1)
-        self._parent[has_parent] = self._front_of[self._fronts.rows[first_update[has_parent]]]
 
     @property
     def entries(self) -> int:
@@ -150,9 +146,12 @@ class SparseCholesky:
         """Multiplications of a factorization, roughly: the pivots of every front times its entries."""
         return float((self._fronts.pivots * np.diff(self._fronts.row_start).astype(np.float64) ** 2).sum())
 
-    def factorize(self, values: NDArray[np.float64]) -> None:
-        """Factor the matrix of these block values; raises SingularMatrixError if it is not definite."""
-        self._floor[self._places] = _LOST_DIGITS * np.abs(values[self.pattern.diagonal])
+    def factorize(self, values: NDArray[np.float64], lost: float = _LOST_DIGITS) -> None:
+        """Factor the matrix of these block values; raises SingularMatrixError if it is not definite.
+
+        lost : share of its diagonal entry up to which a pivot counts as vanished
+        """
+        self._floor[self._places] = lost * np.abs(values[self.pattern.diagonal])
         if self._factor is None:
             self._factor = np.empty(int(self._fronts.factor_start[-1]))
         failed = cholesky.factorize(self._fronts, self._blocks, values, self._floor, self._factor, *self._room())
@@ -210,7 +209,7 @@ class SparseCholesky:
         for front in np.unique(self._front_of[places]).tolist():
             while front >= 0 and front not in path:
                 path.add(front)
-                front = int(self._parent[front])
+                front = int(self._fronts.parent[front])
         return np.array(sorted(path), np.int64)
 
     def draw(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Generic, Literal, Protocol, TypeVar
 
 import numpy as np
@@ -31,60 +33,37 @@ class Estimate(Protocol):
         ...
 
 
-class LocalModel(Protocol):
-    """cost(ξ) ≈ cost + 2 gᵀξ + ξᵀH ξ; ``gradient`` g and ``diagonal`` diag H, (n,)."""
-
-    @property
-    def gradient(self) -> Vector: ...  # noqa: D102
-
-    @property
-    def diagonal(self) -> Vector: ...  # noqa: D102
-
-    def solve(self, damping: float) -> Vector:
-        """−(C + damping diag H)⁻¹ g, C the curvature of choice; raises SingularMatrixError."""
-        ...
-
-    def bend(self, step: Vector) -> Vector:
-        """H ξ."""
-        ...
-
-
 E = TypeVar("E", bound=Estimate)
 
 
 @dataclass(frozen=True, slots=True)
-class Move(Generic[E]):
-    """A step (n,), and the estimate after it."""
+class LocalModel:
+    """Quadratic model of the cost, cost(ξ) ≈ cost + 2 gᵀξ + ξᵀH ξ.
 
-    step: Vector
-    to: E
+    Attributes
+    ----------
+    gradient, diagonal : (n,) g and diag H
+    solve : −(C + λ diag H)⁻¹ g for a damping λ, C the curvature of choice; raises SingularMatrixError
+    bend : H ξ of a step ξ (n,)
+    """
 
-
-class StepRule(Protocol):
-    """A rule for steps; may adapt from one to the next."""
-
-    def move(self, now: E, model: LocalModel, moved: Callable[[Vector], E]) -> Move[E] | None:
-        """One move, or None where no step lowers the cost."""
-        ...
-
-
-def step_rule(optimizer: Optimizer, first_damping: float = _FIRST_DAMPING) -> StepRule:
-    """The rule by its name; Newton is damped as Levenberg-Marquardt is, on a model with the full curvature."""
-    if optimizer == "gauss-newton":
-        return GaussNewton()
-    if optimizer in ("levenberg-marquardt", "newton"):
-        return Damped(first_damping)
-    return Dogleg() if optimizer == "dogleg" else GradientDescent()
+    gradient: Vector
+    diagonal: Vector
+    solve: Callable[[float], Vector]
+    bend: Callable[[Vector], Vector]
 
 
 class GaussNewton:
     """x ← x − H⁻¹ g, whether or not the cost falls."""
 
-    def move(self, now: E, model: LocalModel, moved: Callable[[Vector], E]) -> Move[E] | None:
-        """Raises SingularMatrixError where the equations leave something free."""
+    def move(self, now: E, model: LocalModel, moved: Callable[[Vector], E]) -> tuple[Vector, E] | None:
+        """A step (n,) and the estimate after it, or None where no step lowers the cost, as in the other rules.
+
+        Raises SingularMatrixError where the equations leave something free.
+        """
         step = model.solve(0.0)
         to = moved(step)
-        return Move(step, to) if np.isfinite(to.cost) else None
+        return (step, to) if np.isfinite(to.cost) else None
 
 
 class Damped:
@@ -93,30 +72,22 @@ class Damped:
     def __init__(self, first_damping: float) -> None:
         self._first, self._damping, self._growth = first_damping, first_damping, _GROWTH
 
-    def move(self, now: E, model: LocalModel, moved: Callable[[Vector], E]) -> Move[E] | None:
+    def move(self, now: E, model: LocalModel, moved: Callable[[Vector], E]) -> tuple[Vector, E] | None:
         """Damp more until the cost falls."""
         while self._damping < _MOST_DAMPING:
-            try:
+            with suppress(SingularMatrixError):
                 step = model.solve(self._damping)
-            except SingularMatrixError:
-                self._damp()
-                continue
-            to = moved(step)
-            if to.cost <= now.cost:
-                predicted = float((step * (self._damping * model.diagonal * step - model.gradient)).sum())
-                self._ease((now.cost - to.cost) / max(predicted, 1e-300))
-                return Move(step, to)
-            self._damp()
+                to = moved(step)
+                if to.cost <= now.cost:
+                    predicted = float((step * (self._damping * model.diagonal * step - model.gradient)).sum())
+                    gain = min((now.cost - to.cost) / max(predicted, 1e-300), 1.0)
+                    eased = self._damping * max(0.1, 1.0 - (2.0 * gain - 1.0) ** 3)
+                    self._damping, self._growth = max(eased, _LEAST_DAMPING), _GROWTH
+                    return step, to
+            self._damping *= self._growth
+            self._growth *= 4.0
         self._damping, self._growth = self._first, _GROWTH
         return None
-
-    def _damp(self) -> None:
-        self._damping *= self._growth
-        self._growth *= 4.0
-
-    def _ease(self, gain: float) -> None:
-        eased = self._damping * max(0.1, 1.0 - (2.0 * min(gain, 1.0) - 1.0) ** 3)
-        self._damping, self._growth = max(eased, _LEAST_DAMPING), _GROWTH
 
 
 class Dogleg:
@@ -128,7 +99,7 @@ class Dogleg:
     def __init__(self) -> None:
         self._radius = 0.0
 
-    def move(self, now: E, model: LocalModel, moved: Callable[[Vector], E]) -> Move[E] | None:
+    def move(self, now: E, model: LocalModel, moved: Callable[[Vector], E]) -> tuple[Vector, E] | None:
         """Shrink the region until the cost falls; radius by Madsen et al. (2004), algorithm 3.21."""
         scale = np.sqrt(model.diagonal)
         newton, cauchy = model.solve(0.0), steepest_descent(model)
@@ -145,7 +116,7 @@ class Dogleg:
             elif not gain > 0.25:
                 self._radius = 0.5 * min(self._radius, length)
             if to.cost <= now.cost:
-                return Move(step, to)
+                return step, to
         self._radius = 0.0
         return None
 
@@ -153,15 +124,27 @@ class Dogleg:
 class GradientDescent:
     """Steepest descent in the measure of diag H, to the lowest point of the model, halved until it helps."""
 
-    def move(self, now: E, model: LocalModel, moved: Callable[[Vector], E]) -> Move[E] | None:
+    def move(self, now: E, model: LocalModel, moved: Callable[[Vector], E]) -> tuple[Vector, E] | None:
         """Go down the gradient."""
         step, share = steepest_descent(model), 1.0
         while share > _SHORTEST:
             to = moved(share * step)
             if to.cost <= now.cost:
-                return Move(share * step, to)
+                return share * step, to
             share *= 0.5
         return None
+
+
+StepRule = GaussNewton | Damped | Dogleg | GradientDescent
+
+
+def step_rule(optimizer: Optimizer, first_damping: float = _FIRST_DAMPING) -> StepRule:
+    """The rule by its name; Newton is damped as Levenberg-Marquardt is, on a model with the full curvature."""
+    if optimizer == "gauss-newton":
+        return GaussNewton()
+    if optimizer in ("levenberg-marquardt", "newton"):
+        return Damped(first_damping)
+    return Dogleg() if optimizer == "dogleg" else GradientDescent()
 
 
 def steepest_descent(model: LocalModel) -> Vector:
@@ -183,18 +166,6 @@ def _within(newton: Vector, cauchy: Vector, scale: Vector, radius: float) -> Vec
     return cauchy + (newton - cauchy) * ((-ab + np.sqrt(ab * ab + bb * (radius**2 - length**2))) / bb)
 
 
-class Landscape(Protocol[E]):
-    """A cost to minimize."""
-
-    def model(self, now: E) -> LocalModel:
-        """Quadratic model of the cost at an estimate."""
-        ...
-
-    def moved(self, now: E, step: Vector) -> E:
-        """The estimate after a step (n,)."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class Descent(Generic[E]):
     """End of a minimization: estimate, number of steps and reason."""
@@ -205,25 +176,35 @@ class Descent(Generic[E]):
     reason: str
 
 
-def descend(landscape: Landscape[E], now: E, rule: StepRule, max_iterations: int, tolerance: float) -> Descent[E]:
+def descend(
+    model_at: Callable[[E], LocalModel],
+    moved: Callable[[E, Vector], E],
+    now: E,
+    rule: StepRule,
+    max_iterations: int,
+    tolerance: float,
+) -> Descent[E]:
     """Go downhill; done where the relative change of χ², every entry of the gradient or the step is that small.
 
     Entries of the gradient count in units of their own curvature; the largest counts as 1 where all are below.
+
+    model_at : quadratic model of the cost at an estimate
+    moved : the estimate after a step (n,)
     """
     for iteration in range(max_iterations):
-        model = landscape.model(now)
+        model = model_at(now)
         unit = np.sqrt(min(model.diagonal.max(initial=0.0), 1.0))
         if np.all(np.abs(model.gradient) <= unit * tolerance * np.sqrt(np.maximum(model.diagonal, 1e-300))):
             return Descent(now, iteration, True, "gradient below the tolerance")
-        start = now
-        move = rule.move(now, model, lambda step, start=start: landscape.moved(start, step))
+        move = rule.move(now, model, partial(moved, now))
         if move is None:
             return Descent(now, iteration, False, "no step lowers χ²")
-        gained, now = now.cost - move.to.cost, move.to
+        step, to = move
+        gained, now = now.cost - to.cost, to
         if gained < 0.0:
             continue
         if gained <= tolerance * now.cost:
             return Descent(now, iteration + 1, True, "χ² change below the tolerance")
-        if np.abs(move.step).max(initial=0.0) <= tolerance:
+        if np.abs(step).max(initial=0.0) <= tolerance:
             return Descent(now, iteration + 1, True, "step below the tolerance")
     return Descent(now, max_iterations, False, f"{counted(max_iterations, 'iteration')} reached")

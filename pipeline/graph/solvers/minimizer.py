@@ -1,8 +1,10 @@
-"""Descent over a pose graph with one robust loss: cost, quadratic model and step rule."""
+"""Minimization over a pose graph with one robust loss: cost and quadratic model."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +14,17 @@ from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem, NormalEquations
 from scanchain.graph.robust.inliers import InlierSet
 from scanchain.graph.robust.losses import RobustLoss
-from scanchain.graph.solvers.descent import Optimizer, Vector, descend, step_rule
+from scanchain.graph.solvers.descent import LocalModel, Optimizer, Vector, descend, step_rule
 
 _STEP = 1e-6  # step, m or rad, of the central differences
 Loss = RobustLoss | InlierSet
+
+
+class Limits(NamedTuple):
+    """End of a descent: largest number of iterations, and relative change of the cost, gradient or step."""
+
+    max_iterations: int
+    tolerance: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,14 +67,9 @@ def full_curvature(problem: BetweenProblem, now: Evaluation, equations: NormalEq
             ahead, back = (_slopes(problem, now.poses, equations.weights, end, sign * twist) for sign in (1, -1))
             turned[end, axis] = (ahead - back) / (2.0 * _STEP)
     by_i, by_j = turned.transpose(0, 2, 1, 3)  # (E, k, k): row is the axis moved, column that of the slope at j
-    both = 0.5 * (by_i - np.swapaxes(by_j, 1, 2))
-    blocks = np.zeros((len(problem.pattern.rows), k, k))
-    i, j, pair = problem.slots.T
-    for slot, block in ((i, -by_i), (j, by_j)):
-        np.add.at(blocks, slot[slot >= 0], 0.5 * (block + np.swapaxes(block, 1, 2))[slot >= 0])
-    coupling = np.where((i > j)[:, None, None], both, np.swapaxes(both, 1, 2))
-    np.add.at(blocks, pair[pair >= 0], coupling[pair >= 0])
-    return problem.packing.values(blocks)
+    coupling = 0.5 * (by_i - np.swapaxes(by_j, 1, 2))
+    of_i, of_j = (0.5 * (block + np.swapaxes(block, 1, 2)) for block in (-by_i, by_j))
+    return problem.packing.values(problem.scattered(of_i, of_j, coupling))
 
 
 def _slopes(
@@ -82,9 +86,11 @@ def _slopes(
 class Minimizer:
     """Minimizes Σ χ² of the quadratic edges plus Σ ρ(χ²) of loop edges, with one step rule throughout."""
 
-    def __init__(self, problem: BetweenProblem, is_loop: NDArray[np.bool_], optimizer: Optimizer) -> None:
+    def __init__(
+        self, problem: BetweenProblem, is_loop: NDArray[np.bool_], optimizer: Optimizer, limits: Limits
+    ) -> None:
         """Loop edges (E,) bool get the robust loss; the others stay quadratic."""
-        self.problem = problem
+        self.problem, self.limits = problem, limits
         self.optimizer: Optimizer = optimizer
         self.is_loop, self.loops = is_loop, np.flatnonzero(is_loop)
         self._rule = step_rule(optimizer)
@@ -101,7 +107,7 @@ class Minimizer:
 
     def restricted(self, kept: NDArray[np.bool_]) -> Minimizer:
         """The same with a subset of the edges, kept (E,)."""
-        return Minimizer(self.problem.restricted(kept), self.is_loop[kept], self.optimizer)
+        return Minimizer(self.problem.restricted(kept), self.is_loop[kept], self.optimizer, self.limits)
 
     def weights(self, chi2: NDArray[np.float64], loss: Loss) -> NDArray[np.float64]:
         """Robust weight of every edge, (E,); 1 for the quadratic ones."""
@@ -109,50 +115,34 @@ class Minimizer:
         result[self.loops] = loss.weight(chi2[self.loops])
         return result
 
-    def descend(self, now: Evaluation, loss: Loss, max_iterations: int, tolerance: float) -> Minimum:
-        """Iterate until convergence."""
-        descent = descend(_Landscape(self, loss), now, self._rule, max_iterations, tolerance)
+    def descend(self, now: Evaluation, loss: Loss, limits: Limits | None = None) -> Minimum:
+        """Iterate until convergence, by default within the limits of all descents."""
+
+        def moved(start: Evaluation, step: Vector) -> Evaluation:
+            return self.evaluate(self.problem.moved(start.poses, step), loss)
+
+        descent = descend(partial(self._model, loss), moved, now, self._rule, *(limits or self.limits))
         weights = self.weights(descent.end.chi2, loss)
         return Minimum(descent.end, weights, descent.iterations, descent.converged, descent.reason)
+
+    def _model(self, loss: Loss, now: Evaluation) -> LocalModel:
+        """H = Σ w JᵀΩJ and the curvature that steps are solved with: H, or the second derivative for Newton."""
+        problem = self.problem
+        equations = problem.linearize(now.poses, now.errors, self.weights(now.chi2, loss))
+        is_full = self.optimizer == "newton"
+        curvature = full_curvature(problem, now, equations) if is_full else equations.values
+        diagonal = equations.values[problem.pattern.diagonal]
+
+        def solve(damping: float) -> Vector:
+            damped = curvature.copy()
+            damped[problem.pattern.diagonal] += damping * np.where(diagonal > 0.0, diagonal, 1.0)
+            problem.cholesky.factorize(damped)
+            return problem.cholesky.solve(-equations.gradient)
+
+        return LocalModel(equations.gradient, diagonal, solve, partial(problem.pattern.multiply, equations.values))
 
     def _cost(self, chi2: NDArray[np.float64], loss: Loss) -> float:
         if loss.kernel == "none" or not len(self.loops):
             return float(chi2.sum())
         loops = chi2[self.loops]
         return float(chi2.sum() - loops.sum() + loss.loss(loops).sum())
-
-
-class _Landscape:
-    """The cost of a graph with one loss."""
-
-    def __init__(self, minimizer: Minimizer, loss: Loss) -> None:
-        self._minimizer, self._loss = minimizer, loss
-
-    def model(self, now: Evaluation) -> _Model:
-        minimizer = self._minimizer
-        weights = minimizer.weights(now.chi2, self._loss)
-        equations = minimizer.problem.linearize(now.poses, now.errors, weights)
-        is_full = minimizer.optimizer == "newton"
-        curvature = full_curvature(minimizer.problem, now, equations) if is_full else equations.values
-        return _Model(minimizer.problem, equations, curvature)
-
-    def moved(self, now: Evaluation, step: Vector) -> Evaluation:
-        return self._minimizer.evaluate(self._minimizer.problem.moved(now.poses, step), self._loss)
-
-
-class _Model:
-    """H = Σ w JᵀΩJ and the curvature that steps are solved with: H, or the second derivative for Newton."""
-
-    def __init__(self, problem: BetweenProblem, equations: NormalEquations, curvature: Vector) -> None:
-        self._problem, self._values, self._curvature = problem, equations.values, curvature
-        self.gradient = equations.gradient
-        self.diagonal = equations.values[problem.pattern.diagonal]
-
-    def solve(self, damping: float) -> Vector:
-        damped = self._curvature.copy()
-        damped[self._problem.pattern.diagonal] += damping * np.where(self.diagonal > 0.0, self.diagonal, 1.0)
-        self._problem.cholesky.factorize(damped)
-        return self._problem.cholesky.solve(-self.gradient)
-
-    def bend(self, step: Vector) -> Vector:
-        return self._problem.pattern.multiply(self._values, step)

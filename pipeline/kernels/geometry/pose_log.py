@@ -1,8 +1,6 @@
-"""Logarithms of rotations and poses in space, many at a time."""
+"""Quaternions of rotations and logarithms of poses in space, many at a time."""
 
 import math
-
-import numpy as np
 
 from scanchain.kernels.compiling import njit
 
@@ -21,13 +19,6 @@ def quaternions(R, out):
 
 
 @njit()
-def rotation_vectors(R, out):
-    """Write the rotation vectors, angles in [0, π], of rotations (N, 3, 3) to ``out`` (N, 3)."""
-    for n in range(R.shape[0]):
-        _rotation_vector(R[n], out[n])
-
-
-@njit()
 def twists(T, out):
     """Write the twists (ρ, φ) of poses (N, 4, 4) to ``out`` (N, 6)."""
     for n in range(T.shape[0]):
@@ -36,34 +27,32 @@ def twists(T, out):
 
 @njit()
 def twist_3d(T, out):
-    """Write the twist (ρ, φ) of a pose (4, 4) to ``out`` (6,): φ = log R, ρ = V(φ)⁻¹ t.
+    """Write the twist (ρ, φ) of a pose, its first three rows (3, 4), to ``out`` (6,): φ = log R, ρ = V(φ)⁻¹ t.
 
+    φ comes from the quaternion, which is well conditioned from 0 to π.
     V(φ)⁻¹ t = t − ½ φ × t + e φ × (φ × t), e = (1 − θ/2 cot θ/2) / θ²    (Barfoot 2017, eq. 7.86)
     """
-    _rotation_vector(T, out[3:])
-    x, y, z = out[3], out[4], out[5]
+    _quaternion(T, out[:4])
+    x, y, z = out[0], out[1], out[2]
+    norm = math.sqrt(x * x + y * y + z * z)
+    scale = 2.0 if norm < _SMALL else 2.0 * math.atan2(norm, out[3]) / norm
+    x, y, z = scale * x, scale * y, scale * z
     u, v, w = T[0, 3], T[1, 3], T[2, 3]
-    theta2 = x * x + y * y + z * z
-    if theta2 < 1e-6:
-        e = 1.0 / 12.0 + theta2 / 720.0
-    else:
-        half = 0.5 * math.sqrt(theta2)
-        e = (1.0 - half / math.tan(half)) / theta2
+    e = second_coefficient(x * x + y * y + z * z)
     cu, cv, cw = y * w - z * v, z * u - x * w, x * v - y * u
     out[0] = u - 0.5 * cu + e * (y * cw - z * cv)
     out[1] = v - 0.5 * cv + e * (z * cu - x * cw)
     out[2] = w - 0.5 * cw + e * (x * cv - y * cu)
+    out[3], out[4], out[5] = x, y, z
 
 
 @njit()
-def _rotation_vector(R, out):
-    """Write the rotation vector of R, whose first three rows and columns are a rotation, to ``out`` (3,)."""
-    quat = np.empty(4)
-    _quaternion(R, quat)
-    norm = math.sqrt(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2])
-    scale = 2.0 if norm < _SMALL else 2.0 * math.atan2(norm, quat[3]) / norm
-    for axis in range(3):
-        out[axis] = scale * quat[axis]
+def second_coefficient(theta2):
+    """(1 − θ/2 cot θ/2) / θ² of the squared angle, the factor of the squared hat in V(φ)⁻¹."""
+    if theta2 < 1e-6:
+        return 1.0 / 12.0 + theta2 / 720.0
+    half = 0.5 * math.sqrt(theta2)
+    return (1.0 - half / math.tan(half)) / theta2
 
 
 @njit()

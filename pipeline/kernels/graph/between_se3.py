@@ -4,22 +4,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.kernels.compiling import njit
+from scanchain.kernels.geometry.pose_log import second_coefficient, twist_3d
 
-_SMALL = 1e-3  # rad; below this angle the series replaces the closed form
 _Array = NDArray[np.float64]
 
 
 @njit(nogil=True)
 def residuals(poses: _Array, edges: NDArray[np.int64], measurements: _Array, errors: _Array) -> None:
-    """Fill e = (ρ, φ) = log(Z⁻¹ T_i⁻¹ T_j) of every edge: φ = log R_E, ρ = V(φ)⁻¹ t_E (Barfoot 2017, eq. 7.100).
+    """Fill e = (ρ, φ) = log(Z⁻¹ T_i⁻¹ T_j) of every edge.
 
     poses (K, 4, 4), edges (E, 2) pose indices (i, j), measurements (E, 4, 4) Z, errors (E, 6) filled: m, rad
     """
-    E, quat = np.empty((3, 4)), np.empty(4)
+    E = np.empty((3, 4))
     for e in range(edges.shape[0]):
         _relative(poses[edges[e, 0]], poses[edges[e, 1]], measurements[e], E)
-        _rotation_vector(E, quat, errors[e])
-        _translation_part(E, errors[e])
+        twist_3d(E, errors[e])
 
 
 @njit(nogil=True)
@@ -68,58 +67,10 @@ def _relative(T_i: _Array, T_j: _Array, Z: _Array, E: _Array) -> None:
 
 
 @njit(nogil=True)
-def _rotation_vector(R: _Array, quat: _Array, error: _Array) -> None:
-    """Write φ = log R into error[3:6] by the quaternion xyzw, which is well conditioned from 0 to π.
-
-    The quaternion comes from its largest component (Shepperd 1978).
-    """
-    trace = R[0, 0] + R[1, 1] + R[2, 2]
-    largest = 3
-    value = trace
-    for a in range(3):
-        if R[a, a] > value:
-            largest, value = a, R[a, a]
-    if largest == 3:
-        quat[3] = 1.0 + trace
-        quat[0], quat[1], quat[2] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
-    else:
-        a, b, c = largest, (largest + 1) % 3, (largest + 2) % 3
-        quat[a] = 1.0 + R[a, a] - R[b, b] - R[c, c]
-        quat[b] = R[b, a] + R[a, b]
-        quat[c] = R[c, a] + R[a, c]
-        quat[3] = R[c, b] - R[b, c]
-    norm = np.sqrt(quat[0] ** 2 + quat[1] ** 2 + quat[2] ** 2)
-    sign = -1.0 if quat[3] < 0.0 else 1.0
-    scale = 0.0 if norm == 0.0 else 2.0 * sign * np.arctan2(norm, sign * quat[3]) / norm
-    error[3], error[4], error[5] = scale * quat[0], scale * quat[1], scale * quat[2]
-
-
-@njit(nogil=True)
-def _translation_part(E: _Array, error: _Array) -> None:
-    """Write ρ = V(φ)⁻¹ t = t − ½ φ×t + k φ×(φ×t) into error[0:3]."""
-    p, q, r = error[3], error[4], error[5]
-    x, y, z = E[0, 3], E[1, 3], E[2, 3]
-    k = _second_coefficient(p * p + q * q + r * r)
-    u, v, w = q * z - r * y, r * x - p * z, p * y - q * x
-    error[0] = x - 0.5 * u + k * (q * w - r * v)
-    error[1] = y - 0.5 * v + k * (r * u - p * w)
-    error[2] = z - 0.5 * w + k * (p * v - q * u)
-
-
-@njit(nogil=True)
-def _second_coefficient(theta2: float) -> float:
-    """(1 − (θ/2)/tan(θ/2)) / θ², of the squared hat in V(φ)⁻¹."""
-    if theta2 < _SMALL * _SMALL:
-        return 1.0 / 12.0 + theta2 / 720.0
-    half = 0.5 * np.sqrt(theta2)
-    return (1.0 - half * np.cos(half) / np.sin(half)) / theta2
-
-
-@njit(nogil=True)
 def _inverse_left_jacobian(p: float, q: float, r: float, C: _Array) -> None:
     """Fill C = J_l(φ)⁻¹ = I − ½ [φ]× + k [φ]×² of SO(3)."""
     theta2 = p * p + q * q + r * r
-    k = _second_coefficient(theta2)
+    k = second_coefficient(theta2)
     diagonal = 1.0 - k * theta2
     C[0, 0], C[1, 1], C[2, 2] = diagonal + k * p * p, diagonal + k * q * q, diagonal + k * r * r
     C[0, 1], C[1, 0] = k * p * q + 0.5 * r, k * p * q - 0.5 * r

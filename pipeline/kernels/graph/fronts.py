@@ -19,7 +19,7 @@ class Fronts(NamedTuple):
     rows : scalar position in the elimination order of every row of every front
     pivots : (F,) number of scalar columns that the front eliminates
     factor_start : (F + 1,) into the factor's values; front f keeps the rows of its pivots, from the diagonal on
-    children : (F,) fronts that hand their update matrix to this one
+    parent, children : (F,) the front that takes the update matrix, -1 for none, and how many hand theirs to it
     place : like ``rows``: row of the parent front that an update row falls on
     stack_size : most scalars of update matrices, their upper triangles, waiting at one time
     widest : most rows of a front
@@ -29,6 +29,7 @@ class Fronts(NamedTuple):
     rows: _Index
     pivots: _Index
     factor_start: _Index
+    parent: _Index
     children: _Index
     place: _Index
     stack_size: int
@@ -95,7 +96,7 @@ def lay_out_fronts(groups: _Index, begin: _Index, rows: _Index, sizes: _Index) -
             parent[f] = front_of[rows[begin[last]]]
             children[parent[f]] += 1
     widest, stack_size = _walk(row_start, scalar_rows, pivots, children, parent, place)
-    return Fronts(row_start, scalar_rows, pivots, factor_start, children, place, stack_size, widest)
+    return Fronts(row_start, scalar_rows, pivots, factor_start, parent, children, place, stack_size, widest)
 
 
 @njit(nogil=True)

@@ -5,9 +5,9 @@ from numpy.typing import NDArray
 
 from scanchain.kernels.compiling import njit
 from scanchain.kernels.graph.fronts import Blocks, Fronts, triangle
+from scanchain.kernels.graph.symbolic import families
 
 _Array = NDArray[np.float64]
-_Index = NDArray[np.int64]
 
 
 @njit(nogil=True)
@@ -23,7 +23,7 @@ def selected_inverse(
     factor : as ``graph_cholesky.factorize`` left it; inverse : block values, laid out as those of A, filled
     stack : fronts.stack_size scalars of room, work : fronts.widest² scalars of room
     """
-    first_child, sibling = _families(fronts)
+    first_child, sibling = families(fronts.parent)
     depth = 0
     for f in range(fronts.pivots.size - 1, -1, -1):
         height, pivots = fronts.row_start[f + 1] - fronts.row_start[f], fronts.pivots[f]
@@ -49,25 +49,6 @@ def selected_inverse(
                     stack[depth] = Z[place[a], place[b]]
                     depth += 1
             child = sibling[child]
-
-
-@njit(nogil=True)
-def _families(fronts: Fronts) -> tuple[_Index, _Index]:
-    """First child of every front, and the next child of its parent, ascending; -1 where there is none."""
-    count = fronts.pivots.size
-    parent, waiting, top = np.full(count, -1, np.int64), np.empty(count, np.int64), 0
-    for f in range(count):
-        for _ in range(fronts.children[f]):
-            top -= 1
-            parent[waiting[top]] = f
-        waiting[top] = f
-        top += 1
-    first_child, sibling = np.full(count, -1, np.int64), np.full(count, -1, np.int64)
-    for f in range(count - 1, -1, -1):
-        if parent[f] != -1:
-            sibling[f] = first_child[parent[f]]
-            first_child[parent[f]] = f
-    return first_child, sibling
 
 
 @njit(nogil=True)

@@ -36,14 +36,22 @@ def elimination_tree(start: _Index, neighbors: _Index, order: _Index) -> _Index:
 
 
 @njit(nogil=True)
-def postorder(parent: _Index) -> _Index:
-    """Positions in an order in which every subtree is contiguous and children precede parents."""
+def families(parent: _Index) -> tuple[_Index, _Index]:
+    """First child of every node of a tree, and the next child of its parent, ascending; -1 where there is none."""
     n = parent.size
     first_child, sibling = np.full(n, -1, np.int64), np.full(n, -1, np.int64)
     for j in range(n - 1, -1, -1):
         if parent[j] != -1:
             sibling[j] = first_child[parent[j]]
             first_child[parent[j]] = j
+    return first_child, sibling
+
+
+@njit(nogil=True)
+def postorder(parent: _Index) -> _Index:
+    """Positions in an order in which every subtree is contiguous and children precede parents."""
+    n = parent.size
+    first_child, sibling = families(parent)
     result, stack = np.empty(n, np.int64), np.empty(n, np.int64)
     count = 0
     for root in range(n):
@@ -75,11 +83,7 @@ def column_structures(start: _Index, neighbors: _Index, order: _Index, parent: _
     place = np.empty(n, np.int64)
     for k in range(n):
         place[order[k]] = k
-    first_child, sibling = np.full(n, -1, np.int64), np.full(n, -1, np.int64)
-    for j in range(n - 1, -1, -1):
-        if parent[j] != -1:
-            sibling[j] = first_child[parent[j]]
-            first_child[parent[j]] = j
+    first_child, sibling = families(parent)
     begin = np.zeros(n + 1, np.int64)
     rows = np.empty(max(4 * neighbors.size, 16), np.int64)
     mark = np.full(n, -1, np.int64)

@@ -16,7 +16,7 @@ from scanchain.graph.background import BackgroundOptimization
 from scanchain.graph.explanation import Explanation
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.graph.robust.slips import Slip
+from scanchain.graph.robust.loosened import Loosened
 from scanchain.graph.robust.update import Since
 from scanchain.kernels.voxels.voxel_shapes import Voxels
 from scanchain.loops.closer import LoopCloser, ProximityCloser
@@ -77,8 +77,8 @@ _CLASSES = Classes(
         ErrorStatistics, Recovery, Standstill, AgreeingMatches, Tracked, ElevationCalibration, MapKeeper,
         Resolution, Sweep, VoxelMap,
         Voxels, PointToShapeMatcher, LoopCloser, ProximityCloser, PlaceCloser, Relocalizer, Find, PlanarSearch,
-        VoxelSubmaps, ScanVerifier, SubmapVerifier, Segments, Drift, PoseGraph, Explanation, Slip, GrowingArray,
-        Since, data.KeyframeErrors, KeyframeErrorTracker,
+        VoxelSubmaps, ScanVerifier, SubmapVerifier, Segments, Drift, PoseGraph, Explanation, Loosened,
+        GrowingArray, Since, data.KeyframeErrors, KeyframeErrorTracker,
         ClosureTable, PlaceTest, BackgroundOptimization, PointStore, StoredPoints,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.ClosureVerdict, data.Proposal, data.Prior,
         data.State,
