@@ -27,8 +27,8 @@ _RISK = 1e-3  # that a pose is taken up which is wrong
 _DROPPED = -3.0  # log-odds down to which a pose is tested
 _RESERVE = 5.0  # log-odds above that bound that are kept: what was right for long may turn out wrong
 _FOLLOWED_M = 50.0  # path since the last match, up to which keyframes without one speak against the place
-_LARGEST_RATIO = 2.0  # of one keyframe, as a logarithm
-_OF_FIT, _OF_NO_FIT, _OF_CONTRADICTION = 2.8, 0.4, 4.9  # weights of the evidence of a keyframe
+LARGEST_RATIO = 2.0  # of one keyframe, as a logarithm
+WEIGHTS = (2.8, -0.4, -4.9)  # of fit, no fit and contradiction in the evidence of a keyframe
 _OF_FIND = (
     4.0  # log-odds of what a search found: it finds 0.9 of the right places, and something in 0.004 of others
 )
@@ -142,7 +142,7 @@ class PlaceTest:
             agrees = not self.waiting or self._agrees(each, keyframes)
             if each.verdict is ClosureVerdict.ACCEPTED and agrees:
                 self.waiting.append(each)
-            ratio = self._ratio(each, keyframes) if agrees else -_LARGEST_RATIO
+            ratio = self._ratio(each, keyframes) if agrees else -LARGEST_RATIO
             self.log_odds += self._weight(keyframes[each.source]) * ratio
         if self.log_odds < self.bound or not self.waiting:
             return ()
@@ -236,16 +236,23 @@ class PlaceTest:
 def log_ratio(closure: Closure, agreeing: int, contradicting: int, points: int) -> float:
     """Logarithm of how much likelier a closure with a map is at a right pose than at the best of wrong ones.
 
-    A fit that overlaps speaks for the pose; points in the free space of the other side against it, and no fit
-    where the map shows what the scan does. The three weights are a logistic regression over keyframes at right
-    and at wrong poses (tests.benchmarks.place_odds).
+    The weights of its ``features`` are a logistic regression over keyframes at right and at wrong poses
+    (tests.benchmarks.place_odds).
+    """
+    shown = features(closure, agreeing, contradicting, points)
+    ratio = sum(weight * each for weight, each in zip(WEIGHTS, shown, strict=True))
+    return min(max(ratio, -LARGEST_RATIO), LARGEST_RATIO)
+
+
+def features(closure: Closure, agreeing: int, contradicting: int, points: int) -> tuple[float, float, float]:
+    """What speaks for and against a pose: a fit, none where the map shows what the scan does, free space.
+
     agreeing, contradicting : numbers of points in view of the other side, of so many points of both
     """
-    fits = max(closure.overlap - _NO_OVERLAP, 0.0) / (1.0 - _NO_OVERLAP) if closure.match.is_fit else 0.0
+    fit = max(closure.overlap - _NO_OVERLAP, 0.0) / (1.0 - _NO_OVERLAP) if closure.match.is_fit else 0.0
     seen = agreeing + contradicting
     in_sight = min(seen / max(_IN_SIGHT_OF_BOTH * points, 1.0), 1.0)
-    against = _OF_NO_FIT * (1.0 - fits) + _OF_CONTRADICTION * contradicting / max(seen, 1)
-    return min(max(_OF_FIT * fits - in_sight * against, -_LARGEST_RATIO), _LARGEST_RATIO)
+    return fit, in_sight * (1.0 - fit), in_sight * contradicting / max(seen, 1)
 
 
 def _is_there(closure: Closure) -> bool:

@@ -1,0 +1,139 @@
+"""What a keyframe shows at right and at wrong poses in a map: ``python -m tests.benchmarks.place_odds [--cache DIR]``.
+
+Right poses are those of logs that enter a map (the real cases of ``late_entry``), up to 5 m from its keyframes and
+disturbed by 0.3 m and 0.03 rad. Wrong ones are the best that a search finds for paths of real logs in the maps of
+other buildings, and the keyframes up to 12 before and after. At each a keyframe is aligned as for a loop closure.
+
+Prints the weights of a logistic regression over fit, no fit and contradicted free space, the two classes of equal
+weight, beside those of ``loops.evidence.log_ratio``; and for both the share of pairs that they order rightly and
+the mean log-odds of a keyframe.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import permutations
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+import scanchain as sc
+from scanchain import lie
+from scanchain.data import Keyframe, Matrix, Pose
+from scanchain.loops import LoopCloser, evidence
+from scanchain.loops.planar_map_search import PlanarMapSearch, WholeSearch
+from scanchain.maps import SavedMap, open_saved_map
+from scanchain.sessions.joining import paths_of
+from scanchain.settings import load_settings
+from tests.benchmarks.foreign import CACHE, log_of
+from tests.benchmarks.late_entry import CASES, REAL, at, prepared, true_in_map
+
+NEAR_M, AROUND, STEP = 5.0, 12, 4
+LEAST = 0.25  # share of the highest score from which on a wrong pose is taken
+
+
+class Shown:
+    """Features of keyframes at poses in a map: fit, no fit, contradiction; see ``log_ratio``."""
+
+    def __init__(self, saved: SavedMap) -> None:
+        self.config = load_settings(2).config
+        self.saved, self.closer = saved, LoopCloser(self.config, 2)
+        self.closer.begin_in(list(saved.keyframes))
+
+    def of(self, keyframe: Keyframe, T_map_lidar: Pose) -> tuple[float, float, float] | None:
+        """None where the map has nothing near."""
+        saved = self.saved
+        near = self._nearest(T_map_lidar)
+        if lie.apart(saved.poses[near], T_map_lidar)[0] > NEAR_M:
+            return None
+        target = self.closer.near.submaps.anchor_of(near)
+        keyframes = [*saved.keyframes, replace(keyframe, index=len(saved.keyframes))]
+        verified = self.closer.near.verifier.verify(
+            keyframes, len(saved.keyframes), target, lie.between(saved.poses[target], T_map_lidar),
+            newest=len(saved.keyframes) - 1, in_map=True,
+        )  # fmt: skip
+        T = saved.poses[target] @ verified.match.T_target_source
+        placed, beside = replace(keyframe, T_odom_lidar=T), saved.keyframes[self._nearest(T)]
+        counts = evidence.compared([placed], [beside]) + evidence.compared([beside], [placed])
+        points = len(keyframe.points) + len(beside.points)
+        return evidence.features(verified.closure(target, keyframes[-1].index), *counts.tolist(), points)
+
+    def _nearest(self, T: Pose) -> int:
+        return int(np.linalg.norm(self.saved.poses[:, :2, 2] - T[:2, 2], axis=1).argmin())
+
+
+def right(name: str, cache: Path) -> Iterator[tuple[float, float, float]]:
+    """Features at right poses of a log that enters a map."""
+    out, _, options, map_truth, truth = prepared(name, 0, cache)
+    saved, whole = open_saved_map(out), open_saved_map(cache / f"{CASES[name].log}_whole.run")
+    shown, random = Shown(saved), np.random.default_rng(0)
+    begin_ns = whole.keyframes[0].stamp_ns
+    for keyframe in whole.keyframes[::2]:
+        expected, away_m = true_in_map(saved, map_truth, at(truth, np.array([keyframe.stamp_ns])))
+        after_s = (keyframe.stamp_ns - begin_ns) * 1e-9
+        if away_m[0] < NEAR_M and float(str(options["log__start_s"])) <= after_s <= float(
+            str(options["log__end_s"])
+        ):
+            off = lie.pose_2d(*random.normal(0.0, (0.3, 0.3, 0.03)).tolist())
+            found = shown.of(keyframe, lie.flatten(expected[0]) @ off)
+            yield from [] if found is None else [found]
+
+
+def wrong(guest: SavedMap, host: SavedMap) -> Iterator[tuple[float, float, float]]:
+    """Features at the best poses of paths of a log in the map of another building."""
+    shown, search = Shown(host), PlanarMapSearch(host.keyframes, host.poses, 0.1)
+    for path in paths_of(guest.keyframes)[::STEP]:
+        members, middle = guest.keyframes[path.start : path.stop], guest.keyframes[path[len(path) // 2]]
+        T_middle_odom = lie.inverse(middle.T_odom_lidar)
+        points = np.vstack([lie.transform(T_middle_odom @ each.T_odom_lidar, each.points) for each in members])
+        sought = WholeSearch(search, points, LEAST)
+        while not sought.is_done:
+            sought.advance()
+        best = sought.best()
+        if best is None:
+            continue
+        for each in guest.keyframes[max(middle.index - AROUND, 0) : middle.index + AROUND]:
+            found = shown.of(each, best.T_map_lidar @ T_middle_odom @ each.T_odom_lidar)
+            yield from [] if found is None else [found]
+
+
+def told(name: str, weights: NDArray[np.float64], ours: Matrix, others: Matrix) -> str:
+    """A row of the table."""
+    odds = [np.clip(part @ weights, -evidence.LARGEST_RATIO, evidence.LARGEST_RATIO) for part in (ours, others)]
+    ordered = (odds[0][:, None] > odds[1]).mean() + 0.5 * (odds[0][:, None] == odds[1]).mean()
+    shown = ", ".join(f"{each:.1f}" for each in weights.tolist())
+    return f"| {name} | {shown} | {100.0 * ordered:.1f} % | {odds[0].mean():+.2f} | {odds[1].mean():+.2f} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cache", type=Path, default=CACHE)
+    cache = parser.parse_args().cache
+    cache.mkdir(parents=True, exist_ok=True)
+    for log in REAL:
+        if not (cache / f"{log}_whole.run").exists():
+            sc.run(log_of(log, 0, cache, again=False), cache / f"{log}_whole.run", recording=False)
+    maps = {log: open_saved_map(cache / f"{log}_whole.run") for log in REAL}
+    ours = np.array([each for name, case in CASES.items() if case.log in REAL for each in right(name, cache)])
+    others = np.array([each for a, b in permutations(REAL, 2) for each in wrong(maps[a], maps[b])])
+    signs, shares = (
+        np.repeat([1.0, -1.0], (len(ours), len(others))),
+        np.repeat([0.5, 0.5], (len(ours), len(others))),
+    )
+    shares /= np.repeat([len(ours), len(others)], (len(ours), len(others)))
+    rows = np.vstack([ours, others])
+    fitted = minimize(lambda w: float(shares @ np.logaddexp(0.0, -signs * (rows @ w))), np.zeros(3)).x
+    print(f"{len(ours):,} keyframes at right poses, {len(others):,} at wrong ones\n")
+    print(
+        "| weights | fit, no fit, contradiction | ordered rightly | mean, right | mean, wrong |\n|---|---|---|---|---|"
+    )
+    print(told("fitted", fitted, ours, others))
+    print(told("in use", np.array(evidence.WEIGHTS), ours, others))
+
+
+if __name__ == "__main__":
+    main()
