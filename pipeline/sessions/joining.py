@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
@@ -86,32 +87,53 @@ class Joined:
         return replace(self, keyframes=tuple(replace(each, T_odom_lidar=pose) for each, pose in moved))
 
 
-@dataclass(frozen=True, slots=True)
-class Doubt:
-    """A pose at which a map might join others, without enough evidence.
+class Doubt(msgspec.Struct, frozen=True):
+    """A session that might lie in the frame of another one, but stays apart.
 
     Attributes
     ----------
-    guest : number of the map; host : of that whose frame the pose is given in
-    T_host_guest : pose of the guest's first keyframe
+    position_m, yaw_deg : of its first keyframe there
     reason : why it is not certain
     """
 
-    guest: int
-    host: int
-    T_host_guest: Pose
+    session: str
+    frame: str
+    position_m: tuple[float, ...]
+    yaw_deg: float
     reason: str
+
+    @property
+    def text(self) -> str:
+        """The doubt as a clause."""
+        position = ", ".join(f"{each:.1f}" for each in self.position_m)
+        return (
+            f"{self.session} might begin at ({position}) m, heading {self.yaw_deg:.0f} deg, in the frame of "
+            f"{self.frame}; not certain: {self.reason}"
+        )
+
+    @classmethod
+    def of(cls, session: str, frame: str, T_frame_session: Pose, reason: str) -> Doubt:
+        """The doubt about a pose (d+1, d+1)."""
+        T = T_frame_session
+        position_m, yaw_deg = np.round(T[:-1, -1], 2), np.round(np.degrees(np.arctan2(T[1, 0], T[0, 0])), 1)
+        return cls(session, frame, tuple(position_m.tolist()), float(yaw_deg), reason)
 
 
 def join_all(
-    maps: Sequence[SavedMap], order: Sequence[int], config: Config, held: int, say: Callable[[str], None]
+    maps: Sequence[SavedMap],
+    order: Sequence[int],
+    names: Sequence[str],
+    config: Config,
+    held: int,
+    say: Callable[[str], None],
 ) -> tuple[list[Joined], list[Doubt]]:
     """Maps that belong together, each group in one frame, that of its first map; and what might belong to them.
 
     Of those that are found in a group the one that shares most of its path joins it. One that is not found is
     sought again once the group has grown into an area that it had not reached.
 
-    order : numbers of the maps; held : number of a map whose keyframes stay where they are, −1 for none
+    order : numbers of the maps; names : of their first sessions
+    held : number of a map whose keyframes stay where they are, −1 for none
     """
     groups: list[Joined] = []
     doubts: dict[int, Doubt] = {}
@@ -134,7 +156,7 @@ def join_all(
                 if joined is not None:
                     sought[number] = 0
                 elif reason := doubt_about(trial, old, config):
-                    doubts[number] = Doubt(number, world.maps[0], trial.poses[old], reason)
+                    doubts[number] = Doubt.of(names[number], names[world.maps[0]], trial.poses[old], reason)
                 else:
                     joined = trial
                     waiting.remove(number)
@@ -223,16 +245,6 @@ def _body(joined: Joined, held: int) -> int:
     return int((joined.of_map == held).sum()) or 1
 
 
-def _paths(keyframes: Sequence[Keyframe]) -> list[range]:
-    """Numbers of the keyframes along overlapping paths of some length."""
-    traveled_m = np.array([keyframe.traveled_m for keyframe in keyframes]) - keyframes[0].traveled_m
-    length_m = max(min(_PATH_M, 0.5 * traveled_m[-1]), _STEP_M)
-    step_m = max(_STEP_M, traveled_m[-1] / _MAX_PATHS)
-    begin_m = np.arange(0.0, max(traveled_m[-1] - length_m, 0.0) + step_m, step_m)
-    ends = np.searchsorted(traveled_m, [begin_m, begin_m + length_m])
-    return [range(first, end) for first, end in np.unique(ends, axis=1).T.tolist() if first < end]
-
-
 def changed(joined: Joined) -> dict[int, float]:
     """Contradiction of maps with those they joined, by number, where it is far more than within them."""
     parts = {
@@ -285,7 +297,12 @@ def repeated_paths(
         PlanarMapSearch(part, np.array([each.T_odom_lidar for each in part]), config.local_map.voxel_size_m)
         for part in (host, guest)
     ]
-    paths = [path for path in _paths(guest) if np.isin(path, agreeing).mean() >= MIN_SHARE]
+    traveled_m = np.array([keyframe.traveled_m for keyframe in guest]) - guest[0].traveled_m
+    length_m = max(min(_PATH_M, 0.5 * traveled_m[-1]), _STEP_M)
+    step_m = max(_STEP_M, traveled_m[-1] / _MAX_PATHS)
+    begin_m = np.arange(0.0, max(traveled_m[-1] - length_m, 0.0) + step_m, step_m)
+    ends = np.unique(np.searchsorted(traveled_m, [begin_m, begin_m + length_m]), axis=1).T.tolist()
+    paths = [range(*each) for each in ends if np.isin(range(*each), agreeing).sum() > MIN_SHARE * np.diff(each)]
     paths, repeated = paths[:: max(-(-len(paths) // most), 1)], 0
     for path in paths:
         members = [guest[index] for index in path]
