@@ -145,7 +145,8 @@ def join_all(
         while joined is not None:
             world, joined = joined, None
             old, trials = len(world.keyframes), dict[int, Joined]()
-            for number in [each for each in waiting if _has_grown(world, sought[each])]:
+            due = [number for number in waiting if _has_grown(world, sought[number])]
+            for number in sorted(due, key=lambda number: sought[number] > 0):
                 say(f"{maps[number].name}: searching in a map of {old:,} keyframes")
                 trial, sought[number] = join(world, Joined.of(number, maps), config, held), old
                 if trial is not None:
