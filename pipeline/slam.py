@@ -110,6 +110,7 @@ class Slam:
         *,
         dimension: int | None = None,
         prior: SavedMap | None = None,
+        prior_is_final: bool = True,
         is_live: bool = False,
     ) -> None:
         """Start before the first scan.
@@ -118,6 +119,7 @@ class Slam:
         points_file : where points go, which stay out of memory; without one, into a temporary file
         is_live : whether no scan may wait: long searches go on over several, large graphs are optimized beside
         prior : a map to localize in: its keyframes come before those of the log, and stay where they are
+        prior_is_final : whether they lie as well as they ever will; else scans are matched to one pass of them
         """
         config, T_base_lidar = checked_start(config, T_base_lidar, dimension)
         self.config = config
@@ -153,9 +155,9 @@ class Slam:
         self.live_stamps = LiveStamps()
         self.is_finished = False
         if prior is not None:
-            self._begin_in(prior)
+            self._begin_in(prior, prior_is_final)
 
-    def _begin_in(self, prior: SavedMap) -> None:
+    def _begin_in(self, prior: SavedMap, is_final: bool) -> None:
         """Take the keyframes of a map, fixed where they are; the log begins somewhere, perhaps in it."""
         if prior.dimension != self.dimension:
             raise InputError(
@@ -168,7 +170,7 @@ class Slam:
             self.map_errors.append(KeyframeErrors(1.0, np.zeros((self.graph.freedom,) * 2), 1.0))
             self.graph.fix(self.graph.add_pose(keyframe.T_odom_lidar, keyframe.stamp_ns))
         self.evidence.of_map = self.first
-        self.traveled_m = self.closer.begin_in(self.keyframes, prior.folder)
+        self.traveled_m = self.closer.begin_in(self.keyframes, prior.folder, is_final=is_final)
 
     def track(
         self,

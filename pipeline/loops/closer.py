@@ -50,18 +50,18 @@ class LoopCloser:
         self.places = PlaceCloser(config, dimension, self.segments, verifier)
 
     def begin_in(
-        self, keyframes: Sequence[Keyframe], folder: Path | None = None, *, is_fixed: bool = True
+        self, keyframes: Sequence[Keyframe], folder: Path | None = None, *, is_final: bool = True
     ) -> float:
         """Take the keyframes of a map, which loops close to first; where the path of the log begins, in meters.
 
         folder : of a map on disk, which keeps its outline; without one, places are recognized by descriptors
-        is_fixed : whether they stay where they are; else only those of one pass make a submap
+        is_final : whether they stay where they are; else only those of one pass make a submap
         """
-        if is_fixed:
-            self.near.of_map = len(keyframes)
+        self.near.of_map = len(keyframes)
+        if is_final:
             self.near.submaps.begin_in(keyframes)
-            if self.relocalizer is not None and self.config.loops.enabled:
-                self.relocalizer.begin_in(keyframes, np.array([each.T_odom_lidar for each in keyframes]))
+        if self.relocalizer is not None and self.config.loops.enabled:
+            self.relocalizer.begin_in(keyframes, np.array([each.T_odom_lidar for each in keyframes]))
         if folder is not None and self.relocalizer is None and self.config.loops.enabled:
             self.map_search = MapSearch(self.config, self.segments, keyframes, folder)
         return self.places.begin_in(keyframes, are_added=self.map_search is None)

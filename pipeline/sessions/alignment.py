@@ -1,67 +1,156 @@
-"""Alignment of a map to another one: its keyframes are placed in it by loop closures, as a log's scans are."""
+"""A map placed in another one: its keyframes pass through the chain as a log's scans do in ``localize``."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
 
+import msgspec
 import numpy as np
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import ClosureVerdict, Keyframe, KeyframeErrors, Matrix, Points, Prior, RawPoints, Scan, State
+from scanchain.data import (
+    Closure,
+    ClosureVerdict,
+    Keyframe,
+    KeyframeErrors,
+    Matrix,
+    Points,
+    Pose,
+    Prior,
+    RawPoints,
+    Scan,
+    State,
+)
 from scanchain.errors import InputError
-from scanchain.maps import SavedMap
+from scanchain.maps import Edges, SavedMap
 from scanchain.odometry.front_end import Located
 from scanchain.odometry.tracked import Tracked, first_match
 from scanchain.slam import Slam
 from scanchain.words import counted
 
+_LATE = 10  # number of keyframes before the first one that was matched, from which on these are matched, too
+_FOUND = 0.5, 0.05  # m and rad, standard deviations of the pose that they start from
+
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """A map placed in another one.
+    """Keyframes placed among those of a map, which stay as they are.
 
     Attributes
     ----------
-    poses : (K, d+1, d+1) T_target_lidar of its keyframes
-    loops : number of loop closures between the two that are in force
+    poses : (K, d+1, d+1) T_target_lidar of the keyframes, without meaning where not ``is_found``
+    closures : tried with the map; ``source`` is the number of the map's keyframes plus that of the keyframe
+    loops : number of them in force
+    is_found : whether they join all keyframes to the map, by the evidence that ``localize`` asks for
     """
 
     poses: Matrix
+    closures: tuple[Closure, ...]
     loops: int
+    is_found: bool
+
+    @property
+    def accepted(self) -> tuple[Closure, ...]:
+        """The closures that were accepted."""
+        return tuple(each for each in self.closures if each.verdict is ClosureVerdict.ACCEPTED)
 
 
 def align_maps(target: SavedMap, source: SavedMap, config: Config) -> Alignment:
-    """The keyframes of ``source`` in the frame of ``target``, wherever they are in it; the target stays as it is.
+    """The keyframes of ``source`` in the frame of ``target``, wherever they are in it.
 
     Raises InputError where the source is not found in the target.
     """
-    slam = Slam(config, dimension=source.dimension, prior=target)
-    first, information = source.keyframes[0], _information(source, config)
-    for keyframe, known in zip(source.keyframes, information, strict=True):
-        slam.place(_located(keyframe, known, first.points, config))
-    result = slam.finish()
-    fixed = len(target.keyframes)
-    pairs = result.state.edges[result.state.is_loop & ~result.state.is_rejected]
-    loops = int(((pairs < fixed).any(axis=1) & (pairs >= fixed).any(axis=1)).sum())
-    if not loops or result.components[0] != result.components[-1]:
-        tried = [closure.verdict for closure in slam.closures if closure.target < fixed]
-        accepted = tried.count(ClosureVerdict.ACCEPTED)
+    found = align(target, source.keyframes, source.edges, config, is_final=True)
+    if not found.is_found:
         raise InputError(
-            f"{source.name}: is not found in {target.name} ({counted(len(tried), 'place')} tried, "
-            f"{accepted} fit); give maps of one place, or the transform between them"
+            f"{source.name}: is not found in {target.name} ({counted(len(found.closures), 'place')} tried, "
+            f"{len(found.accepted)} fit); give maps of one place, or the transform between them"
         )
-    return Alignment(result.trajectory.poses, loops)
+    return found
 
 
-def _information(source: SavedMap, config: Config) -> Matrix:
-    """(K, k, k) of the motion to each keyframe from the one before, from its edge where there is one."""
-    k = lie.twist_size(source.keyframes[0].T_odom_lidar)
+def align(
+    target: SavedMap, keyframes: Sequence[Keyframe], edges: Edges, config: Config, *, is_final: bool
+) -> Alignment:
+    """Keyframes with the edges between them, placed in the target along their path, or else against it.
+
+    On its way into the map a path is searched ever less often the longer it is: one that shares its end alone with
+    the map is found from there. From where it is found late it is followed to its other end, too.
+
+    is_final : whether the target's keyframes lie as well as they ever will
+    """
+    path_m = keyframes[-1].traveled_m - keyframes[0].traveled_m
+    loops = msgspec.structs.replace(config.loops, min_travel_m=max(path_m, config.loops.min_travel_m) + 1.0)
+    between = msgspec.structs.replace(config, loops=loops)  # no loop is as short as to lie within the path
+    walked = partial(_walked, target, keyframes, edges, config=between, is_final=is_final)
+    order, old = list(range(len(keyframes))), len(target.keyframes)
+    found = walked(order)
+    if not found.accepted:
+        order.reverse()
+        found = walked(order, most=len(order) // 2)
+    begun = min((order.index(each.source - old) for each in found.accepted), default=0)
+    if begun < _LATE:
+        return found
+    back = walked(order[begun::-1], T_target_first=found.poses[order[begun]])
+    found.poses[order[:begun]] = back.poses[order[:begun]]
+    return replace(found, closures=found.closures + back.closures, loops=found.loops + back.loops)
+
+
+def _walked(
+    target: SavedMap,
+    keyframes: Sequence[Keyframe],
+    edges: Edges,
+    order: Sequence[int],
+    *,
+    config: Config,
+    is_final: bool,
+    T_target_first: Pose | None = None,
+    most: int = sys.maxsize,
+) -> Alignment:
+    """Keyframes, in this order of some of their numbers, placed in the target one after the other.
+
+    config, is_final : as of ``align``, but that no loop is closed within the path
+    T_target_first : pose of the first of them, where it is known
+    most : number of them that are sought; where none of these is found, the search ends
+    """
+    slam = Slam(config, dimension=target.dimension, prior=target, prior_is_final=is_final)
+    information, first_points = _information(keyframes, edges, order, config), keyframes[order[0]].points
+    for n, number in enumerate(order):
+        if n == most and not slam.is_in_map:
+            break
+        slam.place(_located(keyframes[number], information[n], first_points, config))
+        if n == 0 and T_target_first is not None:
+            slam.begin_at(T_target_first, _FOUND)
+    result, old = slam.finish(), len(target.keyframes)
+    i, j = result.state.edges[result.state.is_loop & ~result.state.is_rejected].T
+    loops = int(((i < old) & (j >= old)).sum())
+    is_found = loops > 0 and result.components[0] == result.components[-1]
+    poses = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
+    poses[order[: len(result.trajectory)]] = result.trajectory.poses
+    closures = (replace(c, source=old + order[c.source - old]) for c in result.closures if c.target < old)
+    return Alignment(poses, tuple(closures), loops, bool(is_found))
+
+
+def _information(keyframes: Sequence[Keyframe], edges: Edges, order: Sequence[int], config: Config) -> Matrix:
+    """(N, k, k) of the motion to each keyframe from the one before in this order, by the edge between them if any.
+
+    T_ji = T_ij⁻¹: where the order is against the path, a twist ξ on it is one of −Ad(T_ji) ξ on T_ij.
+    """
+    k = lie.twist_size(keyframes[0].T_odom_lidar)
     usual = lie.by_component(k, config.odometry.edge_sigma_m, config.odometry.edge_sigma_rad) ** -2.0
-    result = np.tile(np.diag(usual), (len(source.keyframes), 1, 1))
-    edges = source.edges
-    is_step = (edges.pairs[:, 1] == edges.pairs[:, 0] + 1) & ~edges.is_loop
-    result[edges.pairs[is_step, 1]] = edges.information[is_step]
+    result = np.tile(np.diag(usual), (len(order), 1, 1))
+    odometry = edges.where(~edges.is_loop)
+    known = dict(zip(map(tuple, odometry.pairs.tolist()), odometry.information, strict=True))
+    for n, (i, j) in enumerate(pairwise(order), 1):
+        result[n] = known.get((i, j), result[n])
+        if (j, i) in known:
+            Ad = lie.adjoint(lie.between(keyframes[i].T_odom_lidar, keyframes[j].T_odom_lidar))
+            result[n] = Ad.T @ known[j, i] @ Ad
     return result
 
 

@@ -19,7 +19,7 @@ from scanchain.maps import MAP_FOLDER, SavedMap, Session, write_map, write_ply, 
 from scanchain.point_store import PointStore
 from scanchain.runs.closures import FinalClosure, final_verdicts, write_closures
 from scanchain.runs.directory import directory_name
-from scanchain.runs.results import GRAPH_FILE, Cloud, cloud_of, grid_of
+from scanchain.runs.results import GRAPH_FILE, Cloud, grid_of
 from scanchain.sessions.joining import Joined, graph_of
 from scanchain.sessions.updating import updated
 from scanchain.trajectory import read_tum, write_tum
@@ -36,7 +36,6 @@ class MergedMap:
     sessions : of all maps, with names that differ, in the order of time
     session : (K,) number of each keyframe's session
     trajectories : of the sessions; of all scans where a run has them, else of the keyframes
-    cloud : the point cloud of all keyframes
     last_seen_ns : (K,) stamp of the newest keyframe known to have seen the surroundings of each
     removed : (K,) number of each keyframe's points that newer sessions saw through, where the map was updated
     warnings : of the update
@@ -47,7 +46,6 @@ class MergedMap:
     sessions: tuple[Session, ...]
     session: NDArray[np.int64]
     trajectories: tuple[Trajectory, ...]
-    cloud: Cloud
     last_seen_ns: NDArray[np.int64]
     removed: NDArray[np.int64]
     warnings: tuple[str, ...] = ()
@@ -56,14 +54,6 @@ class MergedMap:
     def keyframes(self) -> tuple[Keyframe, ...]:
         """Keyframes of all sessions."""
         return self.joined.keyframes
-
-
-@dataclass(frozen=True, slots=True)
-class _Posed:
-    """Keyframes with their final poses, as point cloud and grid are made of."""
-
-    keyframes: Sequence[Keyframe]
-    T_world_keyframes: Matrix
 
 
 def session_names(maps: Sequence[SavedMap], order: Sequence[int]) -> dict[tuple[int, int], str]:
@@ -120,10 +110,7 @@ def merged_map(
         joined = replace(joined, keyframes=new.keyframes)
         last_seen_ns = np.maximum(last_seen_ns, new.last_seen_ns)
         removed, warnings = new.removed, new.warnings
-    cloud = cloud_of(_Posed(joined.keyframes, poses), config)
-    return MergedMap(
-        joined, poses, tuple(sessions), session, tuple(trajectories), cloud, last_seen_ns, removed, warnings
-    )
+    return MergedMap(joined, poses, tuple(sessions), session, tuple(trajectories), last_seen_ns, removed, warnings)
 
 
 def final_closures(merged: MergedMap) -> tuple[FinalClosure, ...]:
@@ -134,7 +121,9 @@ def final_closures(merged: MergedMap) -> tuple[FinalClosure, ...]:
     return final_verdicts(merged.joined.closures, replace(state, is_loop=between, weight=edges.weight[order]))
 
 
-def write_merged(folder: Path, merged: MergedMap, final: Sequence[FinalClosure], config: Config) -> None:
+def write_merged(
+    folder: Path, merged: MergedMap, cloud: Cloud, final: Sequence[FinalClosure], config: Config
+) -> None:
     """Write map, trajectories, point cloud, grid, graph and closures into a directory."""
     edges, poses = merged.joined.edges, merged.T_world_keyframes
     in_force = edges.where(edges.weight >= REJECTED_WEIGHT)
@@ -149,9 +138,9 @@ def write_merged(folder: Path, merged: MergedMap, final: Sequence[FinalClosure],
     )
     for session, trajectory in zip(merged.sessions, merged.trajectories, strict=True):
         write_tum(folder / f"{session.name}.tum", trajectory, force=True)
-    write_ply(folder / "map.ply", merged.cloud.points)
+    write_ply(folder / "map.ply", cloud.points)
     if merged.joined.dimension == 2:
-        write_map(folder, grid_of(_Posed(merged.keyframes, poses), config.maps))
+        write_map(folder, grid_of(merged, config.maps))
     write_g2o(folder / GRAPH_FILE, graph_of(replace(merged.joined, edges=in_force)))
     write_closures(folder / "loops.parquet", final, merged.keyframes, merged.joined.dimension)
 
@@ -174,24 +163,17 @@ def _trajectory(saved: SavedMap, index: int, poses: Matrix) -> Trajectory:
     keyframes = [saved.keyframes[k] for k in np.flatnonzero(saved.session == index).tolist()]
     stamps_ns = np.array([keyframe.stamp_ns for keyframe in keyframes], np.int64)
     before = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
-    file = "trajectory.tum" if len(saved.sessions) == 1 else f"{saved.sessions[index].name}.tum"
-    scans = _read(saved.folder.parent / file, saved.dimension)
+    file = saved.folder.parent / (
+        "trajectory.tum" if len(saved.sessions) == 1 else f"{saved.sessions[index].name}.tum"
+    )
+    scans = read_tum(file) if file.exists() else Trajectory(stamps_ns[:0], before[:0])
+    known = lie.flatten(scans.poses) if saved.dimension == 2 and len(scans) else scans.poses
     rows = np.array([keyframe.scan_index for keyframe in keyframes], np.int64)
-    if scans is not None:
-        for first in (0, int(rows[0])):  # a merged map's file begins at the first keyframe
-            found = rows - first
-            if found[-1] < len(scans) and np.array_equal(scans.stamps_ns[found], stamps_ns):
-                if np.array_equal(poses, before):
-                    return Trajectory(scans.stamps_ns[found[0] :], scans.poses[found[0] :])
-                moved = spread(poses, found - found[0], scans.poses[found[0] :])
-                return Trajectory(scans.stamps_ns[found[0] :], moved)
+    for first in (0, int(rows[0])):  # a merged map's file begins at the first keyframe
+        begin, found = int(rows[0]) - first, rows - rows[0]
+        if rows[-1] - first < len(scans) and np.array_equal(scans.stamps_ns[rows - first], stamps_ns):
+            is_still = np.array_equal(poses, before)
+            return Trajectory(
+                scans.stamps_ns[begin:], known[begin:] if is_still else spread(poses, found, known[begin:])
+            )
     return Trajectory(stamps_ns, poses)
-
-
-def _read(file: Path, dimension: int) -> Trajectory | None:
-    """A trajectory of poses of this dimension; None where there is none. Raises InputError for a damaged one."""
-    if not file.exists():
-        return None
-    trajectory = read_tum(file)
-    poses = lie.flatten(trajectory.poses) if dimension == 2 else trajectory.poses
-    return Trajectory(trajectory.stamps_ns, poses)

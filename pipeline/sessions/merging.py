@@ -8,7 +8,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import msgspec
-import numpy as np
 
 from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.config import Config
@@ -20,6 +19,7 @@ from scanchain.runs.closures import FinalClosure
 from scanchain.runs.directory import RUN_FILE, RunDirectory
 from scanchain.runs.job import Progress
 from scanchain.runs.provenance import Hashing, describe_start
+from scanchain.runs.results import Cloud, cloud_of
 from scanchain.sessions.joining import Doubt, Joined, changed, graph_of, join_all
 from scanchain.sessions.merged_map import MergedMap, final_closures, merged_map, session_names, write_merged
 from scanchain.settings import Override, dump, load_settings
@@ -69,22 +69,6 @@ class SessionMetrics(msgspec.Struct, frozen=True):
     removed_points: int = 0
 
 
-class UncertainJoin(msgspec.Struct, frozen=True):
-    """A session that might lie in the frame of another one, but stays apart.
-
-    Attributes
-    ----------
-    position_m, yaw_deg : of its first keyframe there
-    reason : why it is not certain
-    """
-
-    session: str
-    frame: str
-    position_m: tuple[float, ...]
-    yaw_deg: float
-    reason: str
-
-
 class MergeMetrics(msgspec.Struct, frozen=True):
     """Contents of metrics.json of a merge.
 
@@ -102,7 +86,6 @@ class MergeMetrics(msgspec.Struct, frozen=True):
 
     dimension: int
     sessions: tuple[SessionMetrics, ...]
-    apart: tuple[tuple[str, ...], ...]
     keyframes: int
     closures_tried: int
     closures_in_force: int
@@ -113,11 +96,12 @@ class MergeMetrics(msgspec.Struct, frozen=True):
     certificate: str
     map_points: int
     moving_points_removed: int
-    run_s: float
-    compile_s: float
-    warnings: tuple[str, ...]
+    apart: tuple[tuple[str, ...], ...] = ()
+    uncertain: tuple[Doubt, ...] = ()
+    warnings: tuple[str, ...] = ()
     updated: bool = False
-    uncertain: tuple[UncertainJoin, ...] = ()
+    run_s: float = 0.0
+    compile_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,28 +123,33 @@ def merge(job: MergeJob, progress: Progress, report: Callable[[Path], None]) -> 
     started, compiled_before_s = working_s(), compiled_s()
     directory = RunDirectory(job.out, force=job.force)
     maps = _opened(job)
-    dimension = maps[0].dimension
-    settings = load_settings(dimension, file=job.config_file, overrides=job.overrides)
+    settings = load_settings(maps[0].dimension, file=job.config_file, overrides=job.overrides)
     config, held = settings.config, 0 if job.fixed else -1
     order = _canonical(maps, held)
     names = session_names(maps, order)
     provenance = describe_start(job.command, [saved.folder for saved in maps], settings.source)
     with directory, announcing_compilation(progress.say), Hashing([saved.folder for saved in maps]) as hashing:
-        groups, doubts = join_all(maps, order, config, held, progress.say)
-        uncertain = tuple(_uncertain(doubt, names) for doubt in doubts)
+        firsts = [names[number, 0] for number in range(len(maps))]
+        groups, uncertain = join_all(maps, order, firsts, config, held, progress.say)
         joined = _chosen(groups, held, [saved.folder.parent for saved in maps], uncertain)
         progress.say(f"making the map of {counted(len(joined.keyframes), 'keyframe')}")
         first = min(joined.maps)
         merged = merged_map(joined, maps, names, config, first=first, held=held, update=job.update)
-        final = final_closures(merged)
-        write_merged(directory.path, merged, final, config)
+        cloud, final = cloud_of(merged, config), final_closures(merged)
+        write_merged(directory.path, merged, cloud, final, config)
         apart = tuple(_names(group, maps, names) for group in groups if group is not joined)
         different = (_changed_text(names[number, 0], share) for number, share in changed(joined).items())
         warnings = (*(_apart_text(each, uncertain) for each in apart), *different, *merged.warnings)
-        compile_s = compiled_s() - compiled_before_s
-        run_s = working_s() - started
-        metrics = _measured(merged, final, config, held, apart, run_s, compile_s, warnings, updated=job.update)
-        metrics = msgspec.structs.replace(metrics, uncertain=uncertain)
+        compile_s, run_s = compiled_s() - compiled_before_s, working_s() - started
+        metrics = msgspec.structs.replace(
+            _measured(merged, cloud, final, config, held),
+            apart=apart,
+            run_s=run_s,
+            compile_s=compile_s,
+            warnings=warnings,
+            updated=job.update,
+            uncertain=tuple(uncertain),
+        )
         write_whole(directory.path / "metrics.json", msgspec.json.format(msgspec.json.encode(metrics)) + b"\n")
         text = _summary(metrics, names[first, 0], settings.source, fixed=job.fixed)
         (directory.path / "summary.txt").write_text(text, encoding="utf-8")
@@ -220,9 +209,7 @@ def _canonical(maps: Sequence[SavedMap], held: int) -> list[int]:
     return sorted(range(len(maps)), key=key)
 
 
-def _chosen(
-    groups: Sequence[Joined], held: int, runs: Sequence[Path], uncertain: Sequence[UncertainJoin]
-) -> Joined:
+def _chosen(groups: Sequence[Joined], held: int, runs: Sequence[Path], uncertain: Sequence[Doubt]) -> Joined:
     """The group with the held map, else the one of most maps and, of equal ones, keyframes."""
     if held >= 0:
         chosen = next(group for group in groups if held in group.maps)
@@ -231,7 +218,7 @@ def _chosen(
     if len(chosen.maps) < 2:
         what = f"nothing belongs to {runs[held]}" if held >= 0 else "no two of the maps belong together"
         if uncertain:
-            raise ScanchainError(f"{what} for certain: {'; '.join(map(_uncertain_text, uncertain))}")
+            raise ScanchainError(f"{what} for certain: {'; '.join(each.text for each in uncertain)}")
         raise ScanchainError(
             f"{what}: too few closures between them agree; merge runs that saw the same place, or raise "
             "--loops.max_radius_m where they have drifted far"
@@ -239,28 +226,13 @@ def _chosen(
     return chosen
 
 
-def _uncertain(doubt: Doubt, names: dict[tuple[int, int], str]) -> UncertainJoin:
-    T, d = doubt.T_host_guest, len(doubt.T_host_guest) - 1
-    position_m, yaw_deg = np.round(T[:d, d], 2), np.round(np.degrees(np.arctan2(T[1, 0], T[0, 0])), 1)
-    session, frame = names[doubt.guest, 0], names[doubt.host, 0]
-    return UncertainJoin(session, frame, tuple(position_m.tolist()), float(yaw_deg), doubt.reason)
-
-
-def _uncertain_text(join: UncertainJoin) -> str:
-    position = ", ".join(f"{each:.1f}" for each in join.position_m)
-    return (
-        f"{join.session} might begin at ({position}) m, heading {join.yaw_deg:.0f} deg, in the frame of "
-        f"{join.frame}; not certain: {join.reason}"
-    )
-
-
 def _names(group: Joined, maps: Sequence[SavedMap], names: dict[tuple[int, int], str]) -> tuple[str, ...]:
     return tuple(names[number, k] for number in group.maps for k in range(len(maps[number].sessions)))
 
 
-def _apart_text(names: Sequence[str], uncertain: Sequence[UncertainJoin]) -> str:
+def _apart_text(names: Sequence[str], uncertain: Sequence[Doubt]) -> str:
     together = "; they belong together: merge them on their own" if len(names) > 1 else ""
-    doubts = [_uncertain_text(join) for join in uncertain if {join.session, join.frame} & set(names)]
+    doubts = [each.text for each in uncertain if {each.session, each.frame} & set(names)]
     reason = "; ".join(doubts) if doubts else "too few closures agree"
     return f"{', '.join(names)}: not in this map; {reason}{together}"
 
@@ -273,17 +245,9 @@ def _changed_text(name: str, share: float) -> str:
 
 
 def _measured(
-    merged: MergedMap,
-    final: Sequence[FinalClosure],
-    config: Config,
-    held: int,
-    apart: tuple[tuple[str, ...], ...],
-    run_s: float,
-    compile_s: float,
-    warnings: tuple[str, ...],
-    *,
-    updated: bool,
+    merged: MergedMap, cloud: Cloud, final: Sequence[FinalClosure], config: Config, held: int
 ) -> MergeMetrics:
+    """The metrics of a map but for what joined it."""
     graph = graph_of(merged.joined, held)
     state = graph.optimize(config.graph, initialize="given", rejection="refined").state
     certificate = graph.certify()
@@ -303,7 +267,6 @@ def _measured(
             )
             for number, each in enumerate(merged.sessions)
         ),
-        apart=apart,
         keyframes=len(merged.keyframes),
         closures_tried=len(final),
         closures_in_force=sum(item.verdict is ClosureVerdict.ACCEPTED for item in final),
@@ -312,12 +275,8 @@ def _measured(
         fit=fit(state),
         certified=certificate.certified,
         certificate=certificate.verdict,
-        map_points=len(merged.cloud.points),
-        moving_points_removed=merged.cloud.removed,
-        run_s=run_s,
-        compile_s=compile_s,
-        warnings=warnings,
-        updated=updated,
+        map_points=len(cloud.points),
+        moving_points_removed=cloud.removed,
     )
 
 

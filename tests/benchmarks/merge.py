@@ -3,8 +3,9 @@
 Intel is run whole, and in four parts of a quarter of its time, which are merged; the error over the relations of
 Kümmerle et al. (2009) is that of all scans of both. A simulated town (64 rings) is cut in two, which share 4 s,
 ATE over all scans of both after rigid alignment. CSAIL is added to the parts of Intel. Eight parts of Intel of
-2,000 scans each are merged; their time is that of their runs together. Runs stay in the cache; what is there is
-not run again, its time is that of then. Six parts of a walk through identical corridors are merged pair by pair.
+2,000 scans each are merged; their time is that of their runs together. ACES, CSAIL and a staircase are cut into
+halves and quarters that share nothing but the moment of the cut. Runs stay in the cache; what is there is not run
+again, its time is that of then. Six parts of a walk through identical corridors are merged pair by pair.
 Prints a Markdown table.
 """
 
@@ -30,6 +31,7 @@ from scanchain.trajectory import read_tum
 
 DATA = Path(os.environ.get("SCANCHAIN_DATA", Path(__file__).resolve().parents[3] / "shared" / "data")) / "2d"
 INTEL, RELATIONS, CSAIL = DATA / "intel.mcap", DATA / "intel.relations", DATA / "mit_csail.mcap"
+ACES = DATA / "aces.mcap"
 LENGTH_S, SCANS = 2691.3, 2000
 
 
@@ -95,6 +97,31 @@ def town(cache: Path, folder: Path) -> None:
     show("town, two sessions", parts, merged, f"ATE {error:.4f} m")
 
 
+def cut(cache: Path, folder: Path) -> None:
+    stairs = cache / "staircase.mcap"
+    if not stairs.exists():
+        sc.simulate("staircase", stairs, seed=1)
+    for name, log in (("aces", ACES), ("csail", CSAIL), ("staircase", stairs)):
+        whole = read_tum(run(cache, name, log) / "trajectory.tum")
+        length_s = float(np.ptp(whole.stamps_ns)) * 1e-9
+        for count in (2, 4):
+            cuts_s = [*np.linspace(0.0, length_s, count, endpoint=False).tolist(), np.inf]
+            parts = [run(cache, f"{name}-{count}-{k}", log, *cuts_s[k : k + 2]) for k in range(count)]
+            try:
+                merged = sc.merge(parts, folder / f"{name}-{count}")
+            except sc.ScanchainError as error:
+                print(f"| {name} in {count} parts | none: {error} |", flush=True)
+                continue
+            error = ""
+            if name == "aces":
+                relations = read_relations(ACES.with_suffix(".relations"))
+                found, known = (
+                    relation_error(e, relations).translation_m.mean for e in (trajectory(merged), whole)
+                )
+                error = f"relations {1e3 * found:.1f} mm, uncut {1e3 * known:.1f} mm"
+            show(f"{name} in {count} parts", parts, merged, error)
+
+
 def look_alikes(cache: Path, folder: Path) -> None:
     log = cache / "identical.mcap"
     truth = read_tum(log.with_suffix(".tum")) if log.exists() else sc.simulate("identical", log)
@@ -121,7 +148,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         runs = cache or Path(folder) / "runs"
         runs.mkdir(parents=True, exist_ok=True)
-        for part in (intel, eight, town, look_alikes):
+        for part in (intel, eight, cut, town, look_alikes):
             part(runs, Path(folder))
 
 

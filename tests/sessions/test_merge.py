@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -12,10 +13,13 @@ from scanchain import lie
 from scanchain.data import Keyframe, Trajectory
 from scanchain.errors import InputError, ScanchainError
 from scanchain.evaluation import absolute_error, pair
+from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.evidence import contradiction
+from scanchain.loops.planar_map_search import WholeSearch
+from scanchain.loops.verification import ScanVerifier
 from scanchain.maps import Edges, open_saved_map, read_ply
 from scanchain.runs.job import Unwatched
-from scanchain.sessions.joining import Joined, changed, graph_of, look_alike
+from scanchain.sessions.joining import Joined, changed, doubt_about, graph_of
 from scanchain.sessions.merging import MergeJob, merge
 from scanchain.trajectory import read_tum
 from scanchain.viz.pictures.run import draw_run
@@ -349,7 +353,7 @@ def test_a_join_without_enough_evidence_is_not_made_but_told_with_its_pose(runs,
     def doubt(joined, old, config):
         return "a reason" if evening in joined.maps else ""
 
-    monkeypatch.setattr("scanchain.sessions.joining.look_alike", doubt)
+    monkeypatch.setattr("scanchain.sessions.joining.doubt_about", doubt)
     code, _, said = call("merge", *(folder / name for name in PARTS), "--out", tmp_path / "out")
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert code == 0
@@ -363,7 +367,7 @@ def test_a_join_without_enough_evidence_is_not_made_but_told_with_its_pose(runs,
     assert np.linalg.norm(lie.between(*true)[:2, 2] - join["position_m"]) < 0.1
     assert "noon might begin at" in said + (tmp_path / "out" / "summary.txt").read_text()
     assert "noon might begin at" in (tmp_path / "out" / "report.html").read_text()
-    monkeypatch.setattr("scanchain.sessions.joining.look_alike", lambda joined, old, config: "a reason")
+    monkeypatch.setattr("scanchain.sessions.joining.doubt_about", lambda joined, old, config: "a reason")
     code, _, said = call("merge", folder / "noon", folder / "evening", "--out", tmp_path / "two")
     assert code == 1
     assert "no two of the maps belong together for certain: noon might begin at" in said
@@ -380,12 +384,13 @@ def test_agreement_with_one_of_several_equal_places_is_no_evidence_for_a_join(re
     pairs = np.column_stack([np.arange(count), np.arange(count, 2 * count)])
     eyes = np.tile(np.eye(3), (count, 1, 1))
     edges = Edges(pairs, eyes, eyes, np.ones(count, np.bool_), np.ones(count))
-    joined = Joined((0, 1), (*path, *path), np.repeat([0, 1], count), edges)
+    keyframes = tuple(replace(each, index=k) for k, each in enumerate((*path, *path)))
+    joined = Joined((0, 1), keyframes, np.repeat([0, 1], count), edges)
     config = sc.load_settings(2).config
-    doubt = look_alike(joined, count, config)
+    doubt = doubt_about(joined, count, config)
     assert ("look like other places" in doubt) == bool(doubt) == repeats
     few = replace(joined, edges=edges.where(pairs[:, 0] < 3))
-    assert "short path" in look_alike(few, count, config)
+    assert "short path" in doubt_about(few, count, config)
 
 
 def _corridor(x_m, index, depths_m):
@@ -403,3 +408,29 @@ def _corridor(x_m, index, depths_m):
             return points
 
     return Keyframe(index, index, index, Points(), lie.pose_2d(x_m, 0.0, 0.0), x_m)
+
+
+def test_merging_searches_and_aligns_no_more_than_runs_do(runs, tmp_path, monkeypatch):
+    folder, _ = runs
+    truth = sc.simulate("office", tmp_path / "office.mcap", seed=2)
+    quarter_s = float(np.ptp(truth.stamps_ns)) * 1e-9 / 4.0
+    parts = [tmp_path / f"part-{k}" for k in range(4)]
+    for k, part in enumerate(parts):
+        span = {"log__start_s": k * quarter_s, "log__end_s": (k + 1) * quarter_s}
+        sc.run(tmp_path / "office.mcap", part, recording=False, **span)
+    work: Counter[str] = Counter()
+    for owner, name in ((WholeSearch, "__init__"), (ScanVerifier, "verify"), (PoseGraph, "optimize")):
+        monkeypatch.setattr(owner, name, _counted(getattr(owner, name), owner.__name__, work))
+    merged = quietly(*parts, folder / "stranger", out=tmp_path / "out")
+    assert merged.metrics.apart == (("stranger",),)
+    assert work["WholeSearch"] < merged.metrics.keyframes / 4
+    assert work["ScanVerifier"] < merged.metrics.keyframes
+    assert work["PoseGraph"] < merged.metrics.keyframes / 5
+
+
+def _counted(function, name, work):
+    def called(*args, **options):
+        work[name] += 1
+        return function(*args, **options)
+
+    return called
