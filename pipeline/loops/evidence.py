@@ -15,14 +15,10 @@ from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Pose, Prop
 from scanchain.kernels.raycast.free_space import compare_ranges, nearest_ranges
 from scanchain.loops.connectivity import Segments
 
-MIN_SHARE = 0.3  # least share of the keyframes in force among those that closures were tried from
-_MIN_KEYFRAMES = 3  # least number of keyframes with a closure in force that join a map
-_MAX_CONTRADICTION = 0.1  # largest share of points in sight that lie in the free space of the other
 _NEAR_M = {2: 5.0, 3: 10.0}  # largest distance of two keyframes that are compared for it, by dimension
 _BINS = 360  # of azimuth, 1°; as fine in elevation
 _MARGIN_M, _MARGIN_SHARE = {2: 0.3, 3: 1.0}, 0.05  # by which ranges may differ, beside that share of them
 _IN_SIGHT = 0.3  # share of the points of a keyframe, from which on those in view of the map's nearest one show it
-_MOST = 200  # largest number of keyframes of a log that are compared, evenly spread over them
 _RISK = 1e-3  # that a pose is taken up which is wrong
 _DROPPED = -3.0  # log-odds down to which a pose is tested
 _RESERVE = 5.0  # log-odds above that bound that are kept: what was right for long may turn out wrong
@@ -37,16 +33,6 @@ _NO_OVERLAP = 0.3  # overlap from which on a fit is evidence
 _IN_SIGHT_OF_BOTH = 0.2  # share of the points in view of the other side, from which on that knows the place
 _INDEPENDENT_M = {2: 1.0, 3: 3.0}  # path from which on two keyframes are independent, at full scale
 _AGREE_M, _AGREE_RAD = 1.0, 0.1  # largest difference between the poses that two closures imply
-
-
-def are_enough(in_force: int, tried: int) -> bool:
-    """True if so many keyframes with a closure in force, of those that were tried, join a map."""
-    return in_force >= max(_MIN_KEYFRAMES, MIN_SHARE * tried)
-
-
-def is_contradicted(keyframes: Sequence[Keyframe], others: Sequence[Keyframe]) -> bool:
-    """True if more points of keyframes in one frame than of another day lie in the free space of the others."""
-    return contradiction(keyframes, others) > _MAX_CONTRADICTION
 
 
 def contradiction(some: Sequence[Keyframe], others: Sequence[Keyframe]) -> float:

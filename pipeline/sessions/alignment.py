@@ -79,8 +79,8 @@ def align(
 ) -> Alignment:
     """Keyframes with the edges between them, placed in the target along their path, or else against it.
 
-    On its way into the map a path is searched ever less often the longer it is: one that shares its end alone with
-    the map is found from there. From where it is found late it is followed to its other end, too.
+    A path that shares no more than its end with the map is found from there. From where it is found late it is
+    followed to its other end, too.
 
     is_final : whether the target's keyframes lie as well as they ever will
     """

@@ -17,7 +17,7 @@ from scanchain.config import Config
 from scanchain.data import Closure, Keyframe, Matrix, Pose
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
-from scanchain.loops.evidence import MIN_SHARE, MapEvidence, compared, contradiction
+from scanchain.loops.evidence import PlaceTest, compared, contradiction
 from scanchain.loops.planar_map_search import PlanarMapSearch
 from scanchain.maps import Edges, SavedMap
 from scanchain.sessions.alignment import align
@@ -33,6 +33,7 @@ _MIN_CHANGE, _TIMES_WITHIN = 0.025, 3.0  # share of them from which on it is tol
 _WITHIN_M = 1.0  # least path between two keyframes of one map that are compared
 _PATH_M, _STEP_M = 8.0, 2.0  # length of paths whose points are sought together, in the plane, and between two
 _AGREE_M, _AGREE_RAD = 0.5, 0.1  # largest difference between poses that confirm each other
+_AGREEING = 0.3  # least share of the keyframes of an agreeing path that agree
 _MAX_PATHS = 200  # largest number of these; along longer sessions they lie farther apart
 _SOUGHT = 8  # largest number of paths that are sought elsewhere
 MAX_REPEATED = 0.25  # largest share of the agreeing paths that may look like another place
@@ -268,10 +269,13 @@ def doubt_about(joined: Joined, old: int, config: Config) -> str:
     The evidence is that of a log in a map, at the poses that fit all closures; in the plane paths that agree are
     sought elsewhere, too.
     """
-    in_force, evidence, guest = _joining(joined, old), MapEvidence(Segments(), old), joined.keyframes[old:]
+    in_force, evidence, guest = _joining(joined, old), PlaceTest(Segments(), old), joined.keyframes[old:]
     evidence.note([closure for closure in joined.closures if closure.source >= old])
-    if not evidence.joins(guest, set(in_force.tolist()), joined.keyframes):
-        return f"{counted(len(in_force), 'keyframe')} of it agree, but others contradict that"
+    if not evidence.holds(guest, joined.keyframes):
+        return (
+            f"{counted(len(in_force), 'keyframe')} of it agree, but all that was tried has log-odds of "
+            f"{evidence.log_odds:.1f}, of at least {evidence.bound:.1f}"
+        )
     if len(in_force) < _MIN_KEYFRAMES:
         return _SHORT
     if joined.dimension == 3:
@@ -303,7 +307,7 @@ def repeated_paths(
     step_m = max(_STEP_M, traveled_m[-1] / _MAX_PATHS)
     begin_m = np.arange(0.0, max(traveled_m[-1] - length_m, 0.0) + step_m, step_m)
     ends = np.unique(np.searchsorted(traveled_m, [begin_m, begin_m + length_m]), axis=1).T.tolist()
-    paths = [range(*each) for each in ends if np.isin(range(*each), agreeing).sum() > MIN_SHARE * np.diff(each)]
+    paths = [range(*each) for each in ends if np.isin(range(*each), agreeing).sum() > _AGREEING * np.diff(each)]
     paths, repeated = paths[:: max(-(-len(paths) // most), 1)], 0
     for path in paths:
         members = [guest[index] for index in path]

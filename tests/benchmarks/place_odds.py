@@ -1,4 +1,4 @@
-"""What a keyframe shows at right and at wrong poses in a map: ``python -m tests.benchmarks.place_odds [--cache DIR]``.
+"""What keyframes show at right and wrong poses in a map: ``python -m tests.benchmarks.place_odds [--cache DIR]``.
 
 Right poses are those of logs that enter a map (the real cases of ``late_entry``), up to 5 m from its keyframes and
 disturbed by 0.3 m and 0.03 rad. Wrong ones are the best that a search finds for paths of real logs in the maps of
@@ -27,12 +27,12 @@ from scanchain.data import Keyframe, Matrix, Pose
 from scanchain.loops import LoopCloser, evidence
 from scanchain.loops.planar_map_search import PlanarMapSearch, WholeSearch
 from scanchain.maps import SavedMap, open_saved_map
-from scanchain.sessions.joining import paths_of
 from scanchain.settings import load_settings
 from tests.benchmarks.foreign import CACHE, log_of
 from tests.benchmarks.late_entry import CASES, REAL, at, prepared, true_in_map
 
-NEAR_M, AROUND, STEP = 5.0, 12, 4
+NEAR_M, AROUND = 5.0, 12
+PATH_M, STEP_M = 8.0, 8.0  # length of the paths, and between their begins
 LEAST = 0.25  # share of the highest score from which on a wrong pose is taken
 
 
@@ -86,8 +86,10 @@ def right(name: str, cache: Path) -> Iterator[tuple[float, float, float]]:
 def wrong(guest: SavedMap, host: SavedMap) -> Iterator[tuple[float, float, float]]:
     """Features at the best poses of paths of a log in the map of another building."""
     shown, search = Shown(host), PlanarMapSearch(host.keyframes, host.poses, 0.1)
-    for path in paths_of(guest.keyframes)[::STEP]:
-        members, middle = guest.keyframes[path.start : path.stop], guest.keyframes[path[len(path) // 2]]
+    traveled_m = np.array([each.traveled_m for each in guest.keyframes])
+    for begin_m in np.arange(traveled_m[0], traveled_m[-1] - PATH_M, STEP_M).tolist():
+        first, end = np.searchsorted(traveled_m, (begin_m, begin_m + PATH_M)).tolist()
+        members, middle = guest.keyframes[first:end], guest.keyframes[(first + end) // 2]
         T_middle_odom = lie.inverse(middle.T_odom_lidar)
         points = np.vstack([lie.transform(T_middle_odom @ each.T_odom_lidar, each.points) for each in members])
         sought = WholeSearch(search, points, LEAST)
@@ -128,9 +130,8 @@ def main() -> None:
     rows = np.vstack([ours, others])
     fitted = minimize(lambda w: float(shares @ np.logaddexp(0.0, -signs * (rows @ w))), np.zeros(3)).x
     print(f"{len(ours):,} keyframes at right poses, {len(others):,} at wrong ones\n")
-    print(
-        "| weights | fit, no fit, contradiction | ordered rightly | mean, right | mean, wrong |\n|---|---|---|---|---|"
-    )
+    print("| weights | fit, no fit, contradiction | ordered rightly | right, mean | wrong, mean |")
+    print("|---|---|---|---|---|")
     print(told("fitted", fitted, ours, others))
     print(told("in use", np.array(evidence.WEIGHTS), ours, others))
 

@@ -10,7 +10,7 @@ import pytest
 
 import scanchain as sc
 from scanchain import lie
-from scanchain.data import Keyframe, Trajectory
+from scanchain.data import Closure, ClosureVerdict, Keyframe, Trajectory
 from scanchain.errors import InputError, ScanchainError
 from scanchain.evaluation import absolute_error, pair
 from scanchain.graph.pose_graph import PoseGraph
@@ -18,6 +18,7 @@ from scanchain.loops.evidence import contradiction
 from scanchain.loops.planar_map_search import WholeSearch
 from scanchain.loops.verification import ScanVerifier
 from scanchain.maps import Edges, open_saved_map, read_ply
+from scanchain.odometry.tracked import first_match
 from scanchain.runs.job import Unwatched
 from scanchain.sessions.joining import Joined, changed, doubt_about, graph_of
 from scanchain.sessions.merging import MergeJob, merge
@@ -385,8 +386,10 @@ def test_agreement_with_one_of_several_equal_places_is_no_evidence_for_a_join(re
     eyes = np.tile(np.eye(3), (count, 1, 1))
     edges = Edges(pairs, eyes, eyes, np.ones(count, np.bool_), np.ones(count))
     keyframes = tuple(replace(each, index=k) for k, each in enumerate((*path, *path)))
-    joined = Joined((0, 1), keyframes, np.repeat([0, 1], count), edges)
     config = sc.load_settings(2).config
+    match = first_match(lie.identity(2), np.empty((0, 2)), config.matching)
+    closures = tuple(Closure(i, j, match, 0.95, ClosureVerdict.ACCEPTED, "") for i, j in pairs.tolist())
+    joined = Joined((0, 1), keyframes, np.repeat([0, 1], count), edges, closures)
     doubt = doubt_about(joined, count, config)
     assert ("look like other places" in doubt) == bool(doubt) == repeats
     few = replace(joined, edges=edges.where(pairs[:, 0] < 3))
