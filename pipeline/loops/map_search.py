@@ -40,11 +40,12 @@ _LEVEL_M = 2.0  # least difference in height of two stories
 _MAX_LEVELS = 3  # number of stories that are tried
 _STEP_M = 1.0  # least path between two searches
 _BACKOFF = 0.1  # path between two searches, as a share of what was searched so far
-_INTERVAL_M = 10.0  # largest path between two searches
+_INTERVAL_M = 5.0  # largest path between two searches
 _AGREE_M, _AGREE_RAD = 1.0, 0.05  # largest difference between the poses that two finds imply
 _MATCH_M = 3.5  # path between two matches with the map, at full scale
 _TRACKED_M = 20.0  # path since the last match with the map, up to which it is not searched
 _DRIFT = 0.1  # largest distance from the prediction, as a share of the path since the last match
+_ALIKE = Problem.plain("another place of the map is as similar")
 
 
 class MapSearch:
@@ -158,6 +159,15 @@ class MapSearch:
                 return (closure.rejected(problem),)
         return (closure,)
 
+    def is_repeated(self, newest: int, keyframes: Sequence[Keyframe]) -> bool:
+        """True if what keyframes of the map up to one of them show is elsewhere in the map as well."""
+        search = self._found(keyframes[max(newest + 1 - _MEMBERS, 0) : newest + 1], keyframes)
+        while True:
+            try:
+                next(search)
+            except StopIteration as over:
+                return over.value is not None and over.value.cause == _ALIKE.cause
+
     def _found(
         self, members: Sequence[Keyframe], keyframes: Sequence[Keyframe]
     ) -> Generator[None, None, Closure | None]:
@@ -188,7 +198,7 @@ class MapSearch:
         best = max(accepted, key=lambda each: each.overlap)
         if all(_agree(best, each, keyframes) for each in accepted):
             return best
-        return best.rejected(Problem.plain("another place of the map is as similar"))
+        return best.rejected(_ALIKE)
 
     def _seeds(self, points: Points) -> Generator[None, None, tuple[Matrix, int]]:
         """The best poses in the map's level frame (A, 4): x, y, yaw and share; sought coarsely, then refined.

@@ -18,6 +18,7 @@ from scanchain.data import Closure, Keyframe, Matrix, Pose
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
 from scanchain.loops.evidence import PlaceTest, compared, contradiction
+from scanchain.loops.map_search import MapSearch
 from scanchain.loops.planar_map_search import PlanarMapSearch
 from scanchain.maps import Edges, SavedMap
 from scanchain.sessions.alignment import align
@@ -266,8 +267,7 @@ def changed(joined: Joined) -> dict[int, float]:
 def doubt_about(joined: Joined, old: int, config: Config) -> str:
     """Reason why the keyframes from ``old`` on may belong elsewhere, empty if there is none.
 
-    The evidence is that of a log in a map, at the poses that fit all closures; in the plane paths that agree are
-    sought elsewhere, too.
+    The evidence is that of a log in a map, at the poses that fit all closures. What agrees is sought elsewhere.
     """
     in_force, evidence, guest = _joining(joined, old), PlaceTest(Segments(), old), joined.keyframes[old:]
     evidence.note([closure for closure in joined.closures if closure.source >= old])
@@ -278,9 +278,13 @@ def doubt_about(joined: Joined, old: int, config: Config) -> str:
         )
     if len(in_force) < _MIN_KEYFRAMES:
         return _SHORT
-    if joined.dimension == 3:
-        return ""
-    repeated, paths = repeated_paths(joined.keyframes[:old], guest, in_force - old, config)
+    if joined.dimension == 2:
+        repeated, paths = repeated_paths(joined.keyframes[:old], guest, in_force - old, config)
+    else:
+        some = in_force[:: -(-len(in_force) // _SOUGHT)].tolist()
+        with TemporaryDirectory() as folder:
+            search = MapSearch(config, Segments(), joined.keyframes, Path(folder))
+        repeated, paths = sum(search.is_repeated(each, joined.keyframes) for each in some), len(some)
     if repeated > MAX_REPEATED * paths:
         return f"{repeated} of {counted(paths, 'path')} that agree look like other places, too"
     return "" if paths >= _MIN_PATHS else _SHORT

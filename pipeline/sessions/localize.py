@@ -417,6 +417,7 @@ def _write_table(path: Path, found: Localization, dimension: int) -> None:
         "placed": pa.array(found.is_placed),
         "traveled_m": pa.array(found.traveled_m),
         "sigma_m": pa.array(found.sigma_m, from_pandas=True),
+        "final_sigma_m": pa.array(found.final_sigma_m, from_pandas=True),
     }
     for name, poses in (("live", found.live), ("final", final)):
         spatial = lie.lift(poses)

@@ -61,12 +61,12 @@ CASES = {
     "intel-114": Case("intel", (673.0, 1121.0), (1234.0, 2691.0)),
     "intel-76": Case("intel", (2355.0, 2691.0), (897.0, 2355.0)),
     "office": Case("office", (60.0, 60.0), (0.0, 100.0)),
-    "streets": _planar("town", (420.0, 30.0), (100.0, 90.0)),
-    "streets-changed": _planar("town", (150.0, 30.0), (0.0, 40.0)),
-    "town": _space("town", (420.0, 20.0), (100.0, 70.0)),
-    "town-150": _space("town", (150.0, 20.0), (0.0, 35.0)),
+    "streets": _planar("town", (190.0, 10.0), (280.0, 45.0)),
+    "streets-changed": _planar("town", (90.0, 10.0), (180.0, 45.0)),
+    "town": _space("town", (190.0, 10.0), (280.0, 45.0)),
+    "town-changed": _space("town", (90.0, 10.0), (180.0, 45.0)),
     "forest": _space("forest", (100.0, 20.0), (0.0, 60.0)),
-    "highway": _space("highway", (300.0, 10.0), (0.0, 20.0)),
+    "highway": _space("highway", (300.0, 10.0), (0.0, 25.0)),
 }
 REAL = ("csail", "aces", "intel")
 

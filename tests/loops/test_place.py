@@ -350,6 +350,8 @@ def test_of_two_places_that_are_the_same_none_is_said_to_be_it(tmp_path):
     closures, _ = sought([*there, *again], passage(street(4.0, True)[4:7]), tmp_path)
     reasons = {closure.reason for closure in sum(closures, ())}
     assert reasons == {"another place of the map is as similar"}
+    assert begun_live([*there, *again], there[0], tmp_path)[0].map_search.is_repeated(10, [*there, *again])
+    assert not begun_live(there, there[0], tmp_path)[0].map_search.is_repeated(10, there)
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.3])
