@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -77,10 +76,9 @@ def align_maps(target: SavedMap, source: SavedMap, config: Config) -> Alignment:
 def align(
     target: SavedMap, keyframes: Sequence[Keyframe], edges: Edges, config: Config, *, is_final: bool
 ) -> Alignment:
-    """Keyframes with the edges between them, placed in the target along their path, or else against it.
+    """Keyframes with the edges between them, placed in the target along their path.
 
-    A path that shares no more than its end with the map is found from there. From where it is found late it is
-    followed to its other end, too.
+    From where the path is found late it is followed back to its begin, too.
 
     is_final : whether the target's keyframes lie as well as they ever will
     """
@@ -88,16 +86,13 @@ def align(
     loops = msgspec.structs.replace(config.loops, min_travel_m=max(path_m, config.loops.min_travel_m) + 1.0)
     between = msgspec.structs.replace(config, loops=loops)  # no loop is as short as to lie within the path
     walked = partial(_walked, target, keyframes, edges, config=between, is_final=is_final)
-    order, old = list(range(len(keyframes))), len(target.keyframes)
-    found = walked(order)
-    if not found.accepted:
-        order.reverse()
-        found = walked(order, most=len(order) // 2)
-    begun = min((order.index(each.source - old) for each in found.accepted), default=0)
+    old = len(target.keyframes)
+    found = walked(range(len(keyframes)))
+    begun = min((each.source - old for each in found.accepted), default=0)
     if begun < _LATE:
         return found
-    back = walked(order[begun::-1], T_target_first=found.poses[order[begun]])
-    found.poses[order[:begun]] = back.poses[order[:begun]]
+    back = walked(range(begun, -1, -1), T_target_first=found.poses[begun])
+    found.poses[:begun] = back.poses[:begun]
     return replace(found, closures=found.closures + back.closures, loops=found.loops + back.loops)
 
 
@@ -110,19 +105,15 @@ def _walked(
     config: Config,
     is_final: bool,
     T_target_first: Pose | None = None,
-    most: int = sys.maxsize,
 ) -> Alignment:
     """Keyframes, in this order of some of their numbers, placed in the target one after the other.
 
     config, is_final : as of ``align``, but that no loop is closed within the path
     T_target_first : pose of the first of them, where it is known
-    most : number of them that are sought; where none of these is found, the search ends
     """
     slam = Slam(config, dimension=target.dimension, prior=target, prior_is_final=is_final)
     information, first_points = _information(keyframes, edges, order, config), keyframes[order[0]].points
     for n, number in enumerate(order):
-        if n == most and not slam.is_in_map:
-            break
         slam.place(_located(keyframes[number], information[n], first_points, config))
         if n == 0 and T_target_first is not None:
             slam.begin_at(T_target_first, _FOUND)
@@ -131,7 +122,7 @@ def _walked(
     loops = int(((i < old) & (j >= old)).sum())
     is_found = loops > 0 and result.components[0] == result.components[-1]
     poses = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
-    poses[order[: len(result.trajectory)]] = result.trajectory.poses
+    poses[list(order)] = result.trajectory.poses
     closures = (replace(c, source=old + order[c.source - old]) for c in result.closures if c.target < old)
     return Alignment(poses, tuple(closures), loops, bool(is_found))
 

@@ -39,6 +39,7 @@ _MAX_PATHS = 200  # largest number of these; along longer sessions they lie fart
 _SOUGHT = 8  # largest number of paths that are sought elsewhere
 MAX_REPEATED = 0.25  # largest share of the agreeing paths that may look like another place
 _MIN_PATHS, _MIN_KEYFRAMES = 2, 5  # least numbers of agreeing paths, in the plane, and of keyframes
+_STORIES = 5.0  # log-odds that are asked for in space beyond the usual: stories are alike from end to end
 _SHORT = "they agree along a short path only"
 
 
@@ -271,11 +272,11 @@ def doubt_about(joined: Joined, old: int, config: Config) -> str:
     """
     in_force, evidence, guest = _joining(joined, old), PlaceTest(Segments(), old), joined.keyframes[old:]
     evidence.note([closure for closure in joined.closures if closure.source >= old])
-    if not evidence.holds(guest, joined.keyframes):
-        return (
-            f"{counted(len(in_force), 'keyframe')} of it agree, but all that was tried has log-odds of "
-            f"{evidence.log_odds:.1f}, of at least {evidence.bound:.1f}"
-        )
+    evidence.holds(guest, joined.keyframes)
+    asked = evidence.bound + (_STORIES if joined.dimension == 3 else 0.0)
+    if evidence.log_odds < asked:
+        agree = f"{counted(len(in_force), 'keyframe')} of it agree"
+        return f"{agree}, but all that was tried has log-odds of {evidence.log_odds:.1f}, of at least {asked:.1f}"
     if len(in_force) < _MIN_KEYFRAMES:
         return _SHORT
     if joined.dimension == 2:
