@@ -350,7 +350,7 @@ class Slam:
         self.graph.move(self.first, lie.normalize(T_world_lidar @ lie.inverse(self.graph.poses[self.first])))
         self.graph.remeasure(0)
         self.graph.add_edge(nearest, self.first, T_nearest_lidar, information, is_loop=True)
-        self.evidence.is_given = True
+        self.evidence.give()
         self._optimize("gnc")
 
     def _odom_by(self, closure: Closure) -> Pose:

@@ -1,4 +1,4 @@
-"""Evidence that keyframes belong to a map: closures from several of them, and free space that agrees."""
+"""Evidence that keyframes belong to a map: a sequential test of their fits, and of free space that agrees."""
 
 from __future__ import annotations
 
@@ -25,12 +25,11 @@ _RESERVE = 5.0  # log-odds above that bound that are kept: what was right for lo
 _FOLLOWED_M = 50.0  # path since the last match, up to which keyframes without one speak against the place
 LARGEST_RATIO = 2.0  # of one keyframe, as a logarithm
 WEIGHTS = (2.8, -0.4, -4.9)  # of fit, no fit and contradiction in the evidence of a keyframe
-_OF_FIND = (
-    4.0  # log-odds of what a search found: it finds 0.9 of the right places, and something in 0.004 of others
-)
+_OF_FIND = 4.0  # log-odds of what a search found: it finds 0.9 of right places, something in 0.004 of others
 _SEARCHED_M = {2: 8.0, 3: 20.0}  # path whose points are sought together, at full scale
 _NO_OVERLAP = 0.3  # overlap from which on a fit is evidence
 _IN_SIGHT_OF_BOTH = 0.2  # share of the points in view of the other side, from which on that knows the place
+_LATEST = 10  # number of the last keyframes that counted, from which the next one may not be independent
 _INDEPENDENT_M = {2: 1.0, 3: 3.0}  # path from which on two keyframes are independent, at full scale
 _AGREE_M, _AGREE_RAD = 1.0, 0.1  # largest difference between the poses that two closures imply
 
@@ -137,6 +136,10 @@ class PlaceTest:
         self.reset()
         return joining
 
+    def give(self) -> None:
+        """The pose of the first scan in the map is given: it is believed until what is seen contradicts it."""
+        self.is_given, self.log_odds = True, self.bound + _RESERVE
+
     def follow(self, closures: Sequence[Closure], keyframes: Sequence[Keyframe]) -> bool:
         """Take closures with the map of a segment that is joined to it; False once they say that it is not there.
 
@@ -171,11 +174,12 @@ class PlaceTest:
         """The newest segment, from a keyframe on, is not where it was tested; forget what was tried."""
         self._remember()
         self.tried = {source: each for source, each in self.tried.items() if source < start}
+        self.is_given = False
         self.reset()
 
     def holds(self, placed: Sequence[Keyframe], keyframes: Sequence[Keyframe]) -> bool:
         """True if keyframes of a segment, at their final poses, stand in the map where they are."""
-        self.counted_m, self.log_odds = [], self.bound - _DROPPED if self.is_given else 0.0
+        self.counted_m, self.log_odds = [], self.bound + _RESERVE if self.is_given else 0.0
         for each in placed:
             if each.index in self.tried:
                 self.log_odds += self._weight(each) * self._ratio_at(each, self.tried[each.index], keyframes)
@@ -190,7 +194,7 @@ class PlaceTest:
     def _weight(self, keyframe: Keyframe) -> float:
         """Share of an independent observation that a keyframe is, after those that counted."""
         apart_m = _INDEPENDENT_M[keyframe.T_odom_lidar.shape[0] - 1] * keyframe.scale
-        since_m = min((abs(keyframe.traveled_m - each) for each in self.counted_m), default=apart_m)
+        since_m = min((abs(keyframe.traveled_m - each) for each in self.counted_m[-_LATEST:]), default=apart_m)
         self.counted_m.append(keyframe.traveled_m)
         return min(since_m / apart_m, 1.0)
 

@@ -179,6 +179,17 @@ def test_what_is_joined_is_withdrawn_once_the_place_is_seen_through_and_not_befo
     assert holds[0] and holds[3] and not holds[-1]
 
 
+def test_a_place_that_was_given_is_believed_until_it_is_seen_through():
+    keyframes = keyframes_in([4.0] * 2 + [9.0] * 12)
+    evidence, _ = begun()
+    evidence.give()
+    assert evidence.holds(keyframes[3:], keyframes), "nothing was tried"
+    holds = [evidence.follow(tried(source), keyframes[: source + 1]) for source in range(3, 17)]
+    assert all(holds[:6]) and not holds[-1]
+    evidence.note(tried(*range(3, 17)))
+    assert not evidence.holds(keyframes[3:], keyframes)
+
+
 def test_places_proposed_elsewhere_say_nothing_about_a_place_that_is_joined():
     keyframes = keyframes_in([4.0] * 6)
     evidence, _ = begun()
