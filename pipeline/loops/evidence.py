@@ -25,7 +25,10 @@ _RESERVE = 5.0  # log-odds above that bound that are kept: what was right for lo
 _FOLLOWED_M = 50.0  # path since the last match, up to which keyframes without one speak against the place
 LARGEST_RATIO = 2.0  # of one keyframe, as a logarithm
 WEIGHTS = (2.8, -0.4, -4.9)  # of fit, no fit and contradiction in the evidence of a keyframe
-_OF_FIND = 4.0  # log-odds of what a search found: it finds 0.9 of right places, something in 0.004 of others
+_OF_FIND = {
+    2: 4.0,
+    3: 5.0,
+}  # log-odds of what a search found: it finds most right places, others in 0.004 and 0.001
 _SEARCHED_M = {2: 8.0, 3: 20.0}  # path whose points are sought together, at full scale
 _NO_OVERLAP = 0.3  # overlap from which on a fit is evidence
 _IN_SIGHT_OF_BOTH = 0.2  # share of the points in view of the other side, from which on that knows the place
@@ -119,10 +122,10 @@ class PlaceTest:
                 return ()
             self.segments.is_assumed = True
             newest, start = keyframes[-1], keyframes[self.segments.starts[-1]]
-            searched_m = _SEARCHED_M[newest.T_odom_lidar.shape[0] - 1] * newest.scale
-            searches = (newest.traveled_m - start.traveled_m) / searched_m
+            d = newest.T_odom_lidar.shape[0] - 1
+            searches = (newest.traveled_m - start.traveled_m) / (_SEARCHED_M[d] * newest.scale)
             self.searches = max(searches, self.searches)
-            self.log_odds, self.counted_m = _OF_FIND, []
+            self.log_odds, self.counted_m = _OF_FIND[d], []
         for each in _best_of_each(closures):
             agrees = not self.waiting or self._agrees(each, keyframes)
             if each.verdict is ClosureVerdict.ACCEPTED and agrees:
