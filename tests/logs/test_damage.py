@@ -39,6 +39,27 @@ def complaint(*paths, **config):
     return text
 
 
+def records_of(content):
+    """Records of an MCAP file up to the end of its data."""
+    at = 8
+    while content[at] != 15:
+        end = at + 9 + struct.unpack_from("<Q", content, at + 1)[0]
+        yield content[at:end]
+        at = end
+
+
+@pytest.mark.parametrize("opcode", [1, 2, 3, 4, 7, 8, 9, 10, 11, 12, 13, 14, 0x90])
+def test_a_chunk_whose_opcode_is_damaged_is_told_where_nothing_else_names_it(tmp_path, opcode):
+    whole = write(tmp_path / "a.mcap", office(40)).read_bytes()
+    header, *chunks = [record for record in records_of(whole) if record[0] in (1, 6)]
+    assert len(chunks) > 2
+    before = b"".join([whole[:8], header, *chunks[:-2]])
+    (tmp_path / "b.mcap").write_bytes(before + bytes([opcode]) + chunks[-2][1:] + chunks[-1])
+    log = open_log([tmp_path / "b.mcap"])
+    assert 0 < len(list(log.scans())) < 40
+    says(" ".join(log.damage), f"at byte {len(before)}")
+
+
 # bad input
 
 

@@ -10,12 +10,16 @@ import numpy as np
 
 from scanchain.logs.mcap.records import CHANNEL, CHUNK, FOOTER, MAGIC, MESSAGE, MESSAGE_INDEX, RECORD, SCHEMA
 
+ATTACHMENT = 9
 PRIVATE = 0x80  # opcodes from here on are those of applications
 CHUNK_HEAD = struct.Struct("<QQQI")  # start, end, uncompressed size, CRC-32
 
 _LEAST_BYTES = (0, 8, 20, 14, 16, 22, 40, 6, 64, 36, 48, 46, 8, 20, 17, 4)  # of a record's body, by opcode
 _FIXED = {FOOTER, 14, 15}  # opcodes of records of exactly that size: footer, summary offset, end of data
-_PARTS = {1: (0, 2), 3: (2, 3), 4: (4, 3), 9: (16, 2), 12: (0, 2)}  # fixed bytes, then parts behind their length
+_PARTS = {  # fixed bytes, then parts behind their length
+    1: (0, 2), 3: (2, 3), 4: (4, 3), 8: (32, 1), 9: (16, 2), 10: (40, 2), 11: (42, 1), 12: (0, 2), 13: (16, 1),
+}  # fmt: skip
+_MOST_BEHIND = 256  # bytes behind these; a longer rest is that of another record with a damaged opcode
 _COMPRESSIONS = 64  # bytes; no name of a compression is longer
 _COMPRESSED = (b"\4\0\0\0zstd", b"\3\0\0\0lz4")
 _ANY = frozenset(range(1, len(_LEAST_BYTES)))
@@ -80,14 +84,18 @@ def is_end(data: mmap.mmap | bytes, offset: int) -> bool:
 
 
 def _has_parts(data: mmap.mmap | bytes, offset: int, end: int) -> bool:
-    """True if the strings and other parts that a record begins with end inside it."""
-    fixed, count = _PARTS.get(data[offset], (0, 0))
+    """True if the strings and other parts that a record begins with end inside it, and near its end."""
+    if data[offset] not in _PARTS:
+        return True
+    fixed, count = _PARTS[data[offset]]
     at = offset + RECORD.size + fixed
     for _ in range(count):
         if at + 4 > end:
             return False
         at += 4 + struct.unpack_from("<I", data, at)[0]
-    return at <= end
+    if data[offset] == ATTACHMENT and at + 8 <= end:
+        at += 8 + struct.unpack_from("<Q", data, at)[0]
+    return at <= end <= at + _MOST_BEHIND
 
 
 def _begins_chunk(data: mmap.mmap | bytes, offset: int) -> bool:
