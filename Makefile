@@ -34,29 +34,28 @@ test: $(DEV)
 lint: $(DEV)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	rm -rf build/lint && mkdir -p build/lint && cp -R pipeline build/lint/scanchain && cp -R viz build/lint/scanchain/viz
-	$(BIN)/basedpyright | sed 's|[^ ]*build/lint/scanchain/viz|viz|; s|[^ ]*build/lint/scanchain|pipeline|'
-	cd build/lint && ../../$(BIN)/lint-imports --config ../../pyproject.toml
+	$(BIN)/basedpyright
+	PYTHONPATH=pipeline:viz $(BIN)/lint-imports
 
 docs: $(DOCS)
 	$(BIN)/python -m sphinx -W --keep-going -q -d build/docs/.doctrees docs build/docs
 	@echo "Open build/docs/index.html"
 
-$(RUNTIME): pyproject.toml setup.py
+$(RUNTIME): pyproject.toml
 	@$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11) and 'Python 3.11 or newer is needed: make PYTHON=python3.12')"
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
 	touch $@
 
-$(BASELINES): pyproject.toml setup.py $(RUNTIME)
+$(BASELINES): pyproject.toml $(RUNTIME)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[baselines]'
 	touch $@
 
-$(DEV): pyproject.toml setup.py $(RUNTIME)
+$(DEV): pyproject.toml $(RUNTIME)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[baselines,cluster,remote,dev]'
 	touch $@
 
-$(DOCS): pyproject.toml setup.py $(RUNTIME)
+$(DOCS): pyproject.toml $(RUNTIME)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
 	touch $@
 
