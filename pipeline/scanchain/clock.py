@@ -58,43 +58,39 @@ def working_s() -> float:
 
 
 @contextmanager
-def announcing_compilation(say: Callable[[str], None], warm_up: Sequence[Sequence[str]] = ()) -> Iterator[None]:
+def announcing_compilation(say: Callable[[str], None], beside: Sequence[str] = ()) -> Iterator[None]:
     """Name each module of kernels when its compilation begins; kernels from the cache on disk are not named.
 
-    warm_up : arguments of ``python -m`` for each process that compiles what this one will need later
+    beside : arguments of ``python -m`` of a process that meanwhile compiles what this one will need later
     """
-    announcer = _Announcer(say, warm_up)
+    announcer = _Announcer(say, beside)
     try:
         with event.install_listener("numba:compile", announcer):
             yield
     finally:
-        for process in announcer.beside:
-            process.kill()
-            process.wait()
+        if announcer.process is not None:
+            announcer.process.kill()
+            announcer.process.wait()
 
 
 class _Announcer(event.Listener):
-    def __init__(self, say: Callable[[str], None], warm_up: Sequence[Sequence[str]]) -> None:
-        self.say, self.warm_up = say, warm_up
+    def __init__(self, say: Callable[[str], None], beside: Sequence[str]) -> None:
+        self.say, self.beside = say, beside
         self.modules: set[str] = set()
-        self.beside: list[subprocess.Popen[bytes]] = []
+        self.process: subprocess.Popen[bytes] | None = None
 
     def on_start(self, event: Any) -> None:
         module = event.data["dispatcher"].py_func.__module__
-        if module.startswith("scanchain.") and module not in self.modules:
-            if not self.modules:
-                self.say("compiling, once after the installation:")
-                self.beside += map(_started, self.warm_up)
-            self.modules.add(module)
-            self.say(f"  {module.removeprefix('scanchain.')}")
+        if not module.startswith("scanchain.") or module in self.modules:
+            return
+        if not self.modules:
+            self.say("compiling, once after the installation:")
+            if self.beside:
+                command = [sys.executable, "-P", "-m", *self.beside]
+                nothing = subprocess.DEVNULL
+                self.process = subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing)
+        self.modules.add(module)
+        self.say(f"  {module.removeprefix('scanchain.')}")
 
     def on_end(self, event: Any) -> None:
         pass
-
-
-def _started(arguments: Sequence[str]) -> subprocess.Popen[bytes]:
-    """``python -m`` with these arguments, its output discarded."""
-    nothing = subprocess.DEVNULL
-    return subprocess.Popen(
-        [sys.executable, "-P", "-m", *arguments], stdin=nothing, stdout=nothing, stderr=nothing
-    )

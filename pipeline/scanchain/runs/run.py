@@ -44,10 +44,8 @@ from scanchain.runs.resume.journal import JOURNAL_FILE
 from scanchain.runs.resume.rescue import rescued
 from scanchain.runs.resume.resuming import Left, find_left
 from scanchain.runs.step_table import StepTable
-from scanchain.runs.warm_up import beside
 from scanchain.settings import Settings, dump, load_settings, named
 from scanchain.slam import SlamResult
-from scanchain.threads import threads
 from scanchain.trajectory import write_tum
 from scanchain.whole_file import write_whole
 from scanchain.words import counted
@@ -107,7 +105,7 @@ def _run(
     steps = StepTable() if left is None else left.steps
     started -= 0.0 if left is None else left.checkpoint.run_s
     _tell_beginning(job, left, progress)
-    compiling = announcing_compilation(progress.say, beside(log.dimension, threads()))
+    compiling = announcing_compilation(progress.say, ("scanchain.runs.warm_up", str(log.dimension)))
     with directory, compiling:
         provenance.write(directory.path / RUN_FILE)
         write_whole(directory.path / "config.toml", dump(settings.config).encode())

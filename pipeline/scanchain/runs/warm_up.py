@@ -1,81 +1,33 @@
-"""``python -m scanchain.runs.warm_up 3 fit maps``: compile parts of what a run needs, with synthetic scans.
+"""``python -m scanchain.runs.warm_up 3``: compile what a run needs after its first scans, with synthetic ones.
 
-A run whose kernels have to be compiled first starts this beside itself, on cores that it does not need yet; what
-one process is compiling the others wait for. Each part imports what it needs, as it is to begin at once.
+A run whose kernels have to be compiled first starts this beside itself, on a core that it does not need yet.
 """
 
 from __future__ import annotations
 
 import gc
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import Keyframe, KeyframeErrors, Matrix, Points, Pose, Prior, Scan, State
-from scanchain.kernels.registration.icp import Fit, Problem, align, fit_at
-from scanchain.kernels.registration.observability import agreement, signal_along
-from scanchain.kernels.registration.residuals import gradient_spread
+from scanchain.data import Keyframe, KeyframeErrors, Matrix, Points, Prior, Scan, State
 from scanchain.odometry import Located
 from scanchain.odometry.tracked import Tracked, first_match
-from scanchain.registration import VoxelMap
-from scanchain.registration.correlative import CorrelativeMap, Window
-from scanchain.registration.plicp import settings_of
+from scanchain.runs import results
 from scanchain.settings import load_settings
+from scanchain.slam import Slam
 
 _SCANS = 3
 _STEP_M = 1.0
 _POINTS = 100
 
 
-def fit(dimension: int) -> None:
-    """Compile the alignment of points to a voxel map, the largest of the kernels."""
-    problem, T = _problem(dimension)
-    align.compile_inner(problem, T, np.zeros(lie.twist_size(T)), 1.0)
-
-
-def judge(dimension: int) -> None:
-    """Compile what tells the reliability of an alignment, and the search for one in the plane."""
-    problem, T = _problem(dimension)
-    k = lie.twist_size(T)
-    if dimension == 2:
-        grid = CorrelativeMap(VoxelMap(2, load_settings(2).config.local_map), T)
-        grid.search(np.ones((1, 2)), T, Window(0.0, 0.0, 1.0, 1.0, answers=1))
-    correspondences = problem.correspondence, problem.weight
-    gradient_spread.compile_inner(problem.voxels, problem.points, T, problem.origin, *correspondences, 1.0)
-    agreement.compile_inner(np.eye(k), np.eye(k), 1.0)
-    signal_along.compile_inner(problem, T, np.zeros(k))
-    fit_at.compile_inner(problem, T, Fit(np.eye(k), np.eye(k), 0.0, 0.0, 0.0, 0, 0, 0))
-
-
-def _problem(dimension: int) -> tuple[Problem, Pose]:
-    """The alignment of no points to an empty map, and the pose it begins at."""
-    config = load_settings(dimension).config
-    target = VoxelMap(dimension, config.local_map)
-    T = lie.identity(dimension)
-    k = lie.twist_size(T)
-    problem = Problem(
-        target.voxels,
-        np.empty((0, dimension)),
-        np.zeros(3),
-        np.eye(k),
-        np.empty(0, np.int32),
-        np.empty(0),
-        np.zeros((8, k)),
-        1.0,
-        settings_of(config.matching, target, wide=False),
-    )
-    return problem, T
-
-
 def graph(dimension: int) -> None:
     """Compile the optimization of a pose graph, errors of its poses, and the covariances that loops need."""
-    from scanchain.slam import Slam
-
     slam = Slam(load_settings(dimension).config, lie.identity(dimension))
     for keyframe in _straight_on(dimension):
         slam.place(_located(keyframe, slam.config))
@@ -88,8 +40,6 @@ def graph(dimension: int) -> None:
 
 def maps(dimension: int) -> None:
     """Compile what draws both maps."""
-    from scanchain.runs import results
-
     keyframes = _straight_on(dimension)
     driven = _Driven(keyframes, np.array([each.T_odom_lidar for each in keyframes]))
     config = load_settings(dimension).config
@@ -128,21 +78,7 @@ def _located(keyframe: Keyframe, config: Config) -> Located:
     return Located(tracked, True, 1.0, points, match.information, errors, points)
 
 
-_PARTS: Mapping[str, Callable[[int], None]] = MappingProxyType(
-    {"fit": fit, "judge": judge, "graph": graph, "maps": maps}
-)
-
-
-def beside(dimension: int, cores: int) -> Sequence[Sequence[str]]:
-    """Arguments of ``python -m`` of the processes beside a run that compiles, by the order of first use.
-
-    There are as many as cores, as the run itself often waits for them.
-    """
-    count = min(cores, len(_PARTS))
-    return [("scanchain.runs.warm_up", str(dimension), *list(_PARTS)[first::count]) for first in range(count)]
-
-
 if __name__ == "__main__":
     gc.disable()  # a process that compiles and ends
-    for part in sys.argv[2:]:
-        _PARTS[part](int(sys.argv[1]))
+    graph(int(sys.argv[1]))
+    maps(int(sys.argv[1]))
