@@ -4,7 +4,7 @@ from setuptools import find_packages, setup
 
 FOLDERS = {
     "scanchain": "pipeline",
-    "scanchain.viz": "viz",
+    "scanchain_viz": "viz",
     "scanchain.presets": "configs",
     "scanchain.sequences": "sequences",
 }
@@ -14,6 +14,6 @@ setup(
     packages=[
         *FOLDERS,
         *(f"scanchain.{name}" for name in find_packages("pipeline")),
-        *(f"scanchain.viz.{name}" for name in find_packages("viz")),
+        *(f"scanchain_viz.{name}" for name in find_packages("viz")),
     ],
 )

@@ -36,7 +36,7 @@ from scanchain.runs.run import run
 from scanchain.settings import load_settings
 from scanchain.simulation import simulate
 from scanchain.slam import Slam
-from scanchain.viz.recording.recording import Recording
+from scanchain_viz.recording.recording import Recording
 
 
 class Told(Unwatched):
