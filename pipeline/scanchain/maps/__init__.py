@@ -1,7 +1,6 @@
 """Maps of the world: a point cloud and an occupancy grid, written in formats others read."""
 
-from scanchain.maps.clouds import read_ply, write_laz, write_pcd, write_ply
-from scanchain.maps.map_files import read_map, write_map
+from scanchain.maps.files import read_map, read_ply, write_laz, write_map, write_pcd, write_ply
 from scanchain.maps.moving import View, clearly_through, moved, reach_of, sightings
 from scanchain.maps.occupancy_grid import OccupancyGrid, draw_grid, fitting_resolution
 from scanchain.maps.point_map import PointMap, build_point_map

@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from scanchain.maps.clouds import as_rows
+from scanchain.maps import write_ply
 from scanchain.sessions.changes import Changes, Cluster, Label
 from scanchain.words import counted
 
@@ -22,22 +22,8 @@ COLORS = {
     Label.UNKNOWN: (96, 125, 175),
 }
 _LARGEST = 10  # clusters of each kind in the summary
-_VERTEX = np.dtype([("xyz", "<f4", 3), ("rgb", "u1", 3), ("label", "u1"), ("cluster", "<i4")])
-_HEADER = """ply
-format binary_little_endian 1.0
-comment scanchain changes, meters, frame of the earlier map
-comment label 0 same, 1 appeared, 2 vanished, 3 unknown; cluster 0 for none
-element vertex {count}
-property float x
-property float y
-property float z
-property uchar red
-property uchar green
-property uchar blue
-property uchar label
-property int cluster
-end_header
-"""
+_COMMENT = """scanchain changes, meters, frame of the earlier map
+label 0 same, 1 appeared, 2 vanished, 3 unknown; cluster 0 for none"""
 
 
 def write_change_files(folder: Path, changes: Changes, alignment: str) -> None:
@@ -45,7 +31,10 @@ def write_change_files(folder: Path, changes: Changes, alignment: str) -> None:
 
     alignment : how the later map came into the frame of the earlier one, in words
     """
-    _write_cloud(folder / CLOUD_FILE, changes)
+    colors = np.array([COLORS[label] for label in Label], np.uint8)[changes.labels]
+    columns = dict(zip(("red", "green", "blue"), colors.T, strict=True))
+    columns |= {"label": changes.labels, "cluster": changes.of_cluster.astype("<i4")}
+    write_ply(folder / CLOUD_FILE, changes.points, columns, _COMMENT)
     rows = [_row(cluster, changes) for cluster in changes.clusters]
     with (folder / TABLE_FILE).open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(_columns(changes.dimension)), lineterminator="\n")
@@ -122,14 +111,3 @@ def _row(cluster: Cluster, changes: Changes) -> dict[str, object]:
     numbers = [*cluster.center.tolist(), *cluster.size_m.tolist(), cluster.yaw_rad, cluster.volume]
     values = [cluster.number, cluster.kind, *(round(x, 4) for x in numbers), cluster.points, cluster.counterpart]
     return dict(zip(_columns(changes.dimension), values, strict=True))
-
-
-def _write_cloud(path: Path, changes: Changes) -> None:
-    """A binary PLY with colors, labels and clusters; points of the plane lie at z = 0."""
-    rows = np.empty(len(changes.points), _VERTEX)
-    rows["xyz"] = as_rows(changes.points)
-    rows["rgb"] = np.array([COLORS[label] for label in Label], np.uint8)[changes.labels]
-    rows["label"], rows["cluster"] = changes.labels, changes.of_cluster
-    with path.open("wb") as file:
-        file.write(_HEADER.format(count=len(rows)).encode("ascii"))
-        file.write(rows.tobytes())
