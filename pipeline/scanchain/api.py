@@ -218,20 +218,18 @@ def changes(
     recording : whether report and recording are written
     Returns points, labels and clusters. Raises InputError for bad input, and for maps that are not of one place.
     """
-    from scanchain.sessions.change_run import Comparison, compare_maps
+    from scanchain.sessions.change_run import compare_maps
 
     first = checks.path(earlier, "earlier")
-    size_m = None if voxel_size_m is None else checks.positive(voxel_size_m, "voxel_size_m")
-    comparison = Comparison(
-        earlier=first,
-        later=None if later is None else checks.path(later, "later"),
-        out=checks.path(out, "out"),
-        transform=None if T_earlier_later is None else _pose_in(first, T_earlier_later),
-        voxel_size_m=size_m,
+    return compare_maps(
+        [first] if later is None else [first, checks.path(later, "later")],
+        checks.path(out, "out"),
+        present_changes if recording else lambda directory, found: None,
+        T_earlier_later=None if T_earlier_later is None else _pose_in(first, T_earlier_later),
+        voxel_size_m=None if voxel_size_m is None else checks.positive(voxel_size_m, "voxel_size_m"),
         min_size_m=checks.positive(min_size_m, "min_size_m"),
         force=force,
     )
-    return compare_maps(comparison, present_changes if recording else lambda directory, found: None)
 
 
 def _pose_in(path: Path, T: Pose) -> Pose:
