@@ -184,19 +184,19 @@ def merge(
     Other arguments as in ``run``. Returns path, metrics, summary and warnings: runs that do not belong to the map
     are named there. Raises InputError for bad input, ScanchainError where no two runs belong together.
     """
-    from scanchain.sessions.merging import MergeJob
     from scanchain.sessions.merging import merge as merge_maps
 
-    job = MergeJob(
-        runs=tuple(checks.path(run, "runs") for run in runs),
-        out=checks.path(out, "out"),
+    return merge_maps(
+        [checks.path(run, "runs") for run in runs],
+        checks.path(out, "out"),
+        Unwatched(),
+        present_merge,
         config_file=None if config is None else checks.path(config, "config"),
         overrides=overrides_of(overrides),
         fixed=checks.truth(fixed, "fixed"),
         update=checks.truth(update, "update"),
         force=force,
     )
-    return merge_maps(job, Unwatched(), present_merge)
 
 
 def changes(
