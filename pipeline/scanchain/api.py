@@ -184,19 +184,19 @@ def merge(
     Other arguments as in ``run``. Returns path, metrics, summary and warnings: runs that do not belong to the map
     are named there. Raises InputError for bad input, ScanchainError where no two runs belong together.
     """
-    from scanchain.sessions.merging import MergeJob
     from scanchain.sessions.merging import merge as merge_maps
 
-    job = MergeJob(
-        runs=tuple(checks.path(run, "runs") for run in runs),
-        out=checks.path(out, "out"),
+    return merge_maps(
+        [checks.path(run, "runs") for run in runs],
+        checks.path(out, "out"),
+        Unwatched(),
+        present_merge,
         config_file=None if config is None else checks.path(config, "config"),
         overrides=overrides_of(overrides),
         fixed=checks.truth(fixed, "fixed"),
         update=checks.truth(update, "update"),
         force=force,
     )
-    return merge_maps(job, Unwatched(), present_merge)
 
 
 def changes(
@@ -218,20 +218,18 @@ def changes(
     recording : whether report and recording are written
     Returns points, labels and clusters. Raises InputError for bad input, and for maps that are not of one place.
     """
-    from scanchain.sessions.change_run import Comparison, compare_maps
+    from scanchain.sessions.change_run import compare_maps
 
     first = checks.path(earlier, "earlier")
-    size_m = None if voxel_size_m is None else checks.positive(voxel_size_m, "voxel_size_m")
-    comparison = Comparison(
-        earlier=first,
-        later=None if later is None else checks.path(later, "later"),
-        out=checks.path(out, "out"),
-        transform=None if T_earlier_later is None else _pose_in(first, T_earlier_later),
-        voxel_size_m=size_m,
+    return compare_maps(
+        [first] if later is None else [first, checks.path(later, "later")],
+        checks.path(out, "out"),
+        present_changes if recording else lambda directory, found: None,
+        T_earlier_later=None if T_earlier_later is None else _pose_in(first, T_earlier_later),
+        voxel_size_m=None if voxel_size_m is None else checks.positive(voxel_size_m, "voxel_size_m"),
         min_size_m=checks.positive(min_size_m, "min_size_m"),
         force=force,
     )
-    return compare_maps(comparison, present_changes if recording else lambda directory, found: None)
 
 
 def _pose_in(path: Path, T: Pose) -> Pose:

@@ -67,17 +67,24 @@ def changes(
     """
     from scanchain.api import present_changes
     from scanchain.commands.terminal import Terminal
-    from scanchain.sessions.change_files import METRICS_FILE, SUMMARY_FILE
-    from scanchain.sessions.change_run import Comparison, compare_maps
+    from scanchain.sessions.change_run import METRICS_FILE, SUMMARY_FILE, compare_maps
 
     if aligned and transform is not None:
         raise click.UsageError("--aligned and --transform are both given; give one of them")
     if later is None and (aligned or transform is not None):
         raise click.UsageError("--aligned and --transform are for two maps; give RUN_B, or leave them out")
     T = _pose(earlier, "0,0,0" if aligned else transform)
-    comparison = Comparison(earlier, later, out, T, voxel, min_size, force)
     with Terminal("maps") as terminal:
-        compare_maps(comparison, present_changes, terminal.say)
+        compare_maps(
+            [earlier] if later is None else [earlier, later],
+            out,
+            present_changes,
+            terminal.say,
+            T_earlier_later=T,
+            voxel_size_m=voxel,
+            min_size_m=min_size,
+            force=force,
+        )
     click.echo((out / (METRICS_FILE if as_json else SUMMARY_FILE)).read_text(encoding="utf-8"), nl=False)
     if not as_json:
         click.echo(f"written        {out}")

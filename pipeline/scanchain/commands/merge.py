@@ -45,12 +45,12 @@ def merge(
     """
     from scanchain.api import present_merge
     from scanchain.commands.terminal import Terminal
-    from scanchain.sessions.merging import MergeJob
     from scanchain.sessions.merging import merge as merge_maps
 
-    job = MergeJob(runs=runs, out=out, overrides=overrides(ctx), command=tuple(sys.argv), **options)
     with Terminal("maps") as terminal:
-        merged = merge_maps(job, terminal, present_merge)
+        merged = merge_maps(
+            runs, out, terminal, present_merge, overrides=overrides(ctx), command=tuple(sys.argv), **options
+        )
     click.echo((merged.path / "metrics.json").read_text() if as_json else merged.summary, nl=False)
     if not as_json:
         click.echo(f"written        {out}")

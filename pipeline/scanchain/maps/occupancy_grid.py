@@ -33,20 +33,17 @@ class OccupancyGrid:
     resolution_m : edge of a cell
     origin_m : (2,) outer corner of cell (0, 0), the one of least x and y
     log_odds : (rows, columns) float32, row along y; 0 where nothing was seen
-    scans, beams, skipped : scans and beams drawn, and returns left out as out of range or of the slice
+    drawn : (rows, columns) number of the last scan that was seen in a cell, from 1; 0 for none
     """
 
-    def __init__(self, config: MapsConfig, *, max_range_m: float = 80.0, max_cells: int = MAX_CELLS) -> None:
+    def __init__(self, config: MapsConfig, *, max_range_m: float = 80.0) -> None:
         self.config = config
         self.resolution_m = config.grid_resolution_m
         self.max_range_m = max_range_m
-        self.max_cells = max_cells
         self.origin_m = np.zeros(2)
         self.log_odds = np.zeros((0, 0), np.float32)
         self.drawn = np.zeros((0, 0), np.int32)
         self.scans = 0
-        self.beams = 0
-        self.skipped = 0
 
     def insert(self, T_world_lidar: Pose, points: NDArray[np.floating]) -> None:
         """Draw one scan: points (N, d), meters, lidar frame."""
@@ -64,12 +61,9 @@ class OccupancyGrid:
                 config.slice_min_z_m, config.slice_max_z_m, starts[part], ends[part],
             )  # fmt: skip
             kept[k + 1] = kept[k] + count
-        beams = int(kept[-1])
-        self.skipped += int(offsets[-1] - offsets[0]) - beams
-        if beams:
+        if beams := int(kept[-1]):
             self._draw(starts[:beams], ends[:beams], kept)
         self.scans += len(poses)
-        self.beams += beams
 
     def probability(self) -> NDArray[np.float32]:
         """(rows, columns) probability that a cell is occupied; ½ where nothing was seen."""
@@ -79,9 +73,8 @@ class OccupancyGrid:
         """The same grid without the unseen rows and columns around what was seen."""
         seen = self.drawn > 0
         rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
-        result = OccupancyGrid(self.config, max_range_m=self.max_range_m, max_cells=self.max_cells)
-        result.scans, result.beams, result.skipped = self.scans, self.beams, self.skipped
-        result.resolution_m = self.resolution_m
+        result = OccupancyGrid(self.config, max_range_m=self.max_range_m)
+        result.scans = self.scans
         if len(rows):
             box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
             result.origin_m = self.origin_m + self.resolution_m * np.array([columns[0], rows[0]])
@@ -108,27 +101,23 @@ class OccupancyGrid:
             size = np.zeros(2, np.int64)
         lower = np.floor((extent[:2] - self.origin_m) / self.resolution_m) - _MARGIN
         upper = np.floor((extent[2:] - self.origin_m) / self.resolution_m) + _MARGIN + 1
-        self._check(*(np.maximum(upper, size) - np.minimum(lower, 0)).tolist())
+        columns, rows = (np.maximum(upper, size) - np.minimum(lower, 0)).tolist()
+        if not columns * rows <= MAX_CELLS:
+            raise InputError(
+                f"the occupancy grid needs {columns:.15g} x {rows:.15g} cells of {self.resolution_m:g} m, more "
+                f"than {MAX_CELLS}; raise maps.grid_resolution_m"
+            )
         lower, upper = lower.astype(np.int64), upper.astype(np.int64)
         if (lower >= 0).all() and (upper <= size).all():
             return
         spare = (_GROWTH * np.maximum(size, upper - lower)).astype(np.int64)
         before = np.where(lower < 0, -lower + spare, 0)
         after = np.where(upper > size, upper - size + spare, 0)
-        columns, rows = (before + size + after).tolist()
-        if columns * rows > self.max_cells:
+        if np.prod(before + size + after) > MAX_CELLS:
             before, after = np.maximum(-lower, 0), np.maximum(upper - size, 0)
-            columns, rows = (before + size + after).tolist()
         self.origin_m = self.origin_m - before * self.resolution_m
-        self.log_odds = _enlarged(self.log_odds, rows, columns, before)
-        self.drawn = _enlarged(self.drawn, rows, columns, before)
-
-    def _check(self, columns: float, rows: float) -> None:
-        if not columns * rows <= self.max_cells:
-            raise InputError(
-                f"the occupancy grid needs {columns:.15g} x {rows:.15g} cells of {self.resolution_m:g} m, more "
-                f"than {self.max_cells}; raise maps.grid_resolution_m"
-            )
+        margins = [(int(near), int(far)) for near, far in zip(before[::-1], after[::-1], strict=True)]
+        self.log_odds, self.drawn = np.pad(self.log_odds, margins), np.pad(self.drawn, margins)
 
 
 def draw_grid(
@@ -150,11 +139,3 @@ def fitting_resolution(
     while np.prod(extent_m / resolution_m + 2 * _MARGIN + 2) > max_cells:
         resolution_m *= 2.0
     return resolution_m
-
-
-def _enlarged(cells: NDArray, rows: int, columns: int, before: NDArray[np.int64]) -> NDArray:
-    """The cells within a larger array of zeros, ``before`` (columns, rows) away from its corner."""
-    result = np.zeros((rows, columns), cells.dtype)
-    column, row = before.tolist()
-    result[row : row + cells.shape[0], column : column + cells.shape[1]] = cells
-    return result

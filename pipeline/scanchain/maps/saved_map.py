@@ -97,9 +97,9 @@ _EDGE_ARRAYS = Edges.__match_args__
 
 @dataclass(frozen=True, slots=True)
 class SavedPoints:
-    """The points of one keyframe of a saved map; ``rows`` (M, d) whole numbers lie on disk."""
+    """The points of one keyframe: ``rows`` (M, d) times ``step_m``; of a map that was opened, on disk."""
 
-    rows: NDArray[np.integer]
+    rows: NDArray[np.number]
     step_m: float
 
     def read(self) -> Points:
@@ -156,7 +156,7 @@ def write_saved_map(
     last_seen_ns : (K,) as in ``SavedMap``; the keyframes' own stamps where left out
     """
     folder.mkdir(parents=True)
-    steps_m, counts, wide = [], [], []
+    stored: list[tuple[int, float, bool]] = []
     with (folder / _POINTS).open("wb") as file:
         for keyframe in keyframes:
             points = keyframe.points
@@ -165,18 +165,16 @@ def write_saved_map(
             number = _WIDE if is_wide else _NUMBER
             step_m = max(reach_m / np.iinfo(number).max, _STEP_M)
             file.write(np.rint(points / step_m).astype(number).tobytes())
-            steps_m.append(step_m)
-            counts.append(len(points))
-            wide.append(is_wide)
-    count = np.array(counts, np.int64)
+            stored.append((len(points), step_m, is_wide))
+    rows = np.array(stored, [("count", np.int64), ("step_m", np.float64), ("is_wide", np.bool_)])
     stamps_ns = np.array([keyframe.stamp_ns for keyframe in keyframes], np.int64)
     np.savez(
         folder / _KEYFRAMES,
         poses=poses,
         session=session,
-        count=count,
-        step_m=np.array(steps_m),
-        is_wide=np.array(wide, np.bool_),
+        count=rows["count"],
+        step_m=rows["step_m"],
+        is_wide=rows["is_wide"],
         stamps_ns=stamps_ns,
         last_seen_ns=stamps_ns if last_seen_ns is None else last_seen_ns,
         scan_index=np.array([keyframe.scan_index for keyframe in keyframes], np.int64),
@@ -186,7 +184,7 @@ def write_saved_map(
     np.savez(folder / _EDGES, **{name: getattr(edges, name) for name in _EDGE_ARRAYS})
     crc32 = {name: _crc32(folder / name) for name in (_KEYFRAMES, _EDGES, _POINTS)}
     dimension: Literal[2, 3] = 2 if poses.shape[-1] == 3 else 3
-    index = _Index(VERSION, dimension, len(keyframes), int(count.sum()), tuple(sessions), crc32)
+    index = _Index(VERSION, dimension, len(keyframes), int(rows["count"].sum()), tuple(sessions), crc32)
     write_whole(folder / _INDEX, msgspec.json.format(msgspec.json.encode(index)))
 
 

@@ -138,7 +138,8 @@ def changes_between(
     before, after = (_cloud(part, size_m, config) for part in (earlier, later))
     labels_before = _labels(before, after, later, Label.VANISHED, size_m, config)
     labels_after = _labels(after, before, earlier, Label.APPEARED, size_m, config)
-    agreement = _agreement(labels_before, labels_after)
+    counts = np.bincount(np.concatenate([labels_before, labels_after]), minlength=len(Label))
+    agreement = float(counts[Label.SAME] / max(counts.sum() - counts[Label.UNKNOWN], 1))
     if agreement < _LEAST_AGREEMENT:
         raise InputError(
             f"{later.name}: only {100.0 * agreement:.0f} % of what both maps had in sight is the same as in "
@@ -157,8 +158,7 @@ def _cloud(part: Part, size_m: float, config: Config) -> Points:
     """One point a voxel of what stood still while the map was made."""
     dimension = part.poses.shape[-1] - 1
     scans = ((pose, keyframe.points) for pose, keyframe in zip(part.poses, part.keyframes, strict=True))
-    built = build_point_map(scans, dimension=dimension, voxel_size_m=size_m)
-    points = built.points()
+    points = build_point_map(scans, dimension=dimension, voxel_size_m=size_m).points()
     return points[~moved(points, size_m, _views(part, config))]
 
 
@@ -175,16 +175,7 @@ def _labels(
     distance_m = KDTree(others).query(points, distance_upper_bound=_SAME_VOXELS * size_m)[0]
     is_same = np.isfinite(distance_m)
     is_changed = clearly_through(seen, seen_through) & ~is_same
-    labels = np.full(len(points), Label.UNKNOWN, np.uint8)
-    labels[is_same | (seen > 0)] = Label.SAME
-    labels[is_changed] = changed
-    return labels
-
-
-def _agreement(*labels: NDArray[np.uint8]) -> float:
-    counts = np.bincount(np.concatenate(labels), minlength=len(Label))
-    sighted = int(counts.sum() - counts[Label.UNKNOWN])
-    return float(counts[Label.SAME] / sighted) if sighted else 0.0
+    return np.select([is_changed, is_same | (seen > 0)], [changed, Label.SAME], Label.UNKNOWN).astype(np.uint8)
 
 
 def _clusters(
@@ -192,10 +183,10 @@ def _clusters(
 ) -> tuple[NDArray[np.int64], list[Cluster]]:
     """Number of each point's cluster (N,), 0 for none, and the clusters, the largest first."""
     found: list[tuple[Cluster, NDArray[np.int64]]] = []
-    kinds: tuple[tuple[Kind, Label], ...] = (("vanished", Label.VANISHED), ("appeared", Label.APPEARED))
     rest = KDTree(points[(labels == Label.SAME) | (labels == Label.UNKNOWN)])
-    for kind, label in kinds:
-        for members in _groups(points, np.flatnonzero(labels == label), size_m):
+    kinds: tuple[Kind, ...] = ("vanished", "appeared")
+    for kind in kinds:
+        for members in _groups(points, np.flatnonzero(labels == Label[kind.upper()]), size_m):
             center, size, yaw_rad = _box(points[members], size_m)
             if size.max() >= min_size_m and not _is_grazed(points[members], rest, size_m):
                 found.append((Cluster(kind, 0, center, size, yaw_rad, len(members)), members))
@@ -274,19 +265,14 @@ def _paired(clusters: Sequence[Cluster], size_m: float) -> tuple[Cluster, ...]:
         return tuple(clusters)
     away_m = np.array([[np.linalg.norm(a.center - b.center) for b in come] for a in gone])
     away_m[[[not _alike(a, b, size_m) for b in come] for a in gone]] = np.inf
+    lengths_m = np.maximum.outer(*([cluster.size_m.max() for cluster in part] for part in (gone, come)))
     counterpart: dict[int, int] = {}
-    for row, column in zip(*np.nonzero(away_m < _MOVED_SIZES * _lengths(gone, come)), strict=True):
+    for row, column in zip(*np.nonzero(away_m < _MOVED_SIZES * lengths_m), strict=True):
         rivals = np.concatenate([np.delete(away_m[row], column), np.delete(away_m[:, column], row)])
         if away_m[row, column] < _UNRIVALED * float(rivals.min(initial=np.inf)):
             a, b = gone[row].number, come[column].number
             counterpart |= {a: b, b: a}
     return tuple(replace(each, counterpart=counterpart.get(each.number, 0)) for each in clusters)
-
-
-def _lengths(gone: Sequence[Cluster], come: Sequence[Cluster]) -> Matrix:
-    """Longest side of each pair of clusters, meters."""
-    longest = ([cluster.size_m.max() for cluster in part] for part in (gone, come))
-    return np.maximum.outer(*longest)
 
 
 def _alike(a: Cluster, b: Cluster, size_m: float) -> bool:

@@ -19,7 +19,7 @@ from scanchain.data import Keyframe, Matrix, Points, Scan
 from scanchain.errors import InputError
 from scanchain.kernels.raycast.free_space import nearest_ranges
 from scanchain.logs.formats.cloud_file import SUFFIXES, CloudFileError, read_cloud_file
-from scanchain.maps import MAP_FOLDER, Edges, Session, write_saved_map
+from scanchain.maps import MAP_FOLDER, Edges, SavedPoints, Session, write_saved_map
 from scanchain.maps.occupancy_grid import MAX_CELLS
 from scanchain.preprocess.resolution import Resolution
 from scanchain.runs.directory import RUN_FILE, RunDirectory
@@ -53,16 +53,6 @@ class Imported:
 
 
 @dataclass(frozen=True, slots=True)
-class _Seen:
-    """Points of a virtual keyframe."""
-
-    points: Points
-
-    def read(self) -> Points:
-        return self.points
-
-
-@dataclass(frozen=True, slots=True)
 class _Surfaces:
     """Points (N, d) of a map, and positions (P, d) that are free, where the file tells."""
 
@@ -91,7 +81,7 @@ def import_map(
     spacing_m = SPACING_M[dimension] if spacing_m is None else spacing_m
     config = load_settings(dimension).config
     with RunDirectory(out, force=force) as directory:
-        positions = _along_rows(_positions(surfaces, spacing_m, height_m), spacing_m)
+        positions = _positions(surfaces, spacing_m, height_m)
         say(f"{counted(len(surfaces.points), 'point')} seen from {counted(len(positions), 'position')}")
         keyframes = tuple(_keyframes(surfaces.points, positions, config))
         if not keyframes:
@@ -100,9 +90,10 @@ def import_map(
                 "cloud in meters with z up, or another --height"
             )
         poses = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
-        session = Session(file.name, 0, len(keyframes) - 1, len(keyframes))
+        session, k = Session(file.name, 0, len(keyframes) - 1, len(keyframes)), lie.twist_size(poses[0])
+        edges = Edges(np.empty((0, 2), np.int64), poses[:0], np.empty((0, k, k)), np.empty(0, bool), np.empty(0))
         numbers = np.zeros(len(keyframes), np.int64)
-        write_saved_map(directory.path / MAP_FOLDER, keyframes, poses, numbers, (session,), _no_edges(dimension))
+        write_saved_map(directory.path / MAP_FOLDER, keyframes, poses, numbers, (session,), edges)
         provenance = describe_start(sys.argv, [file], "")
         msgspec.structs.replace(provenance, complete=True).write(directory.path / RUN_FILE)
         directory.complete()
@@ -184,7 +175,7 @@ def _read_grid(file: Path) -> _Surfaces:
 
 
 def _positions(surfaces: _Surfaces, spacing_m: float, height_m: float) -> Points:
-    """Positions (P, d) on a grid, where a lidar could be."""
+    """Positions (P, d) on a grid, where a lidar could be, there and back along its rows: each beside the next."""
     points = surfaces.points
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     axes = [np.arange(a + 0.5 * min(spacing_m, b - a), b, spacing_m) for a, b in zip(low, high, strict=True)]
@@ -201,7 +192,10 @@ def _positions(surfaces: _Surfaces, spacing_m: float, height_m: float) -> Points
     clear = KDTree(points).query(grid)[0] > _CLEARANCE_M if len(grid) else np.zeros(0, bool)
     if clear.sum() > _MAX_POSITIONS:
         raise InputError(f"the map would be seen from {int(clear.sum()):,} positions; give a larger --spacing")
-    return grid[clear]
+    positions = grid[clear]
+    row = np.floor(positions[:, 1] / spacing_m)
+    along = np.where(row % 2 == 0, positions[:, 0], -positions[:, 0])
+    return positions[np.lexsort((along, row))]
 
 
 def _above_ground(points: Points, grid: Matrix, height_m: float) -> Points:
@@ -213,13 +207,6 @@ def _above_ground(points: Points, grid: Matrix, height_m: float) -> Points:
         if found
     ]
     return np.array(rows).reshape(-1, 3)
-
-
-def _along_rows(positions: Points, spacing_m: float) -> Points:
-    """The same positions, there and back along rows of the grid: neighbors in order are neighbors in space."""
-    row = np.floor(positions[:, 1] / spacing_m)
-    along = np.where(row % 2 == 0, positions[:, 0], -positions[:, 0])
-    return positions[np.lexsort((along, row))]
 
 
 def _keyframes(points: Points, positions: Points, config: Config) -> Iterator[Keyframe]:
@@ -236,7 +223,7 @@ def _keyframes(points: Points, positions: Points, config: Config) -> Iterator[Ke
         traveled_m += 0.0 if last is None else float(np.linalg.norm(position - last))
         last, pose = position, lie.identity(dimension)
         pose[:-1, -1] = position
-        yield Keyframe(index, index, index, _Seen(sweep.points), pose, traveled_m, resolution.scale)
+        yield Keyframe(index, index, index, SavedPoints(sweep.points, 1.0), pose, traveled_m, resolution.scale)
         index += 1
 
 
@@ -258,10 +245,3 @@ def _is_inside(seen: Points) -> bool:
     """True if points of the plane are on most sides."""
     sectors = np.floor((np.arctan2(seen[:, 1], seen[:, 0]) / (2.0 * np.pi) + 0.5) * _SECTORS).astype(int)
     return len(np.unique(np.minimum(sectors, _SECTORS - 1))) >= _LEAST_SECTORS * _SECTORS
-
-
-def _no_edges(dimension: int) -> Edges:
-    size, k = dimension + 1, 3 if dimension == 2 else 6
-    return Edges(
-        np.empty((0, 2), np.int64), np.empty((0, size, size)), np.empty((0, k, k)), np.empty(0, bool), np.empty(0)
-    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -27,6 +26,7 @@ from scanchain.runs.job import Job, Progress
 from scanchain.runs.metrics import GroundTruth, accuracy_lines
 from scanchain.runs.provenance import Hashing, describe_start
 from scanchain.runs.run import accuracy_of, opened, true_poses
+from scanchain.runs.step_table import pose_columns
 from scanchain.sessions.joining import MAX_REPEATED, repeated_paths
 from scanchain.sessions.localizer import Localization, Localizer, MapState
 from scanchain.settings import dump
@@ -136,39 +136,47 @@ def localize(
     Raises InputError for a log or a map that cannot be read.
     """
     started = working_s()
-    prior = _opened(map_path, job.out)
+    prior = open_saved_map(map_path)
+    if job.out.resolve() in (map_path.resolve(), prior.folder.resolve()):
+        raise InputError(f"{job.out}: is the map; choose another --out")
     log, settings, truth_file = opened(job)
-    _check(log, prior, settings.config)
+    config = settings.config
+    if not config.loops.enabled:
+        raise InputError("loops.enabled is false, but a place in a map is found by loop closures; leave it true")
+    if log.dimension != prior.dimension:
+        raise InputError(
+            f"{log.name}: has {log.dimension}D scans, the map {prior.name} is {prior.dimension}D; give a map of "
+            "the same kind"
+        )
     progress.say(f"{log.topic}: {counted(log.scan_count, 'scan')}; map {prior.name}")
     provenance = describe_start(job.command, job.logs, settings.source)
     with RunDirectory(job.out, force=job.force) as directory, Hashing(job.logs) as hashing:
         provenance.write(directory.path / RUN_FILE)
-        write_whole(directory.path / "config.toml", dump(settings.config).encode())
-        localizer = _followed(log, prior, settings.config, initial, directory.path / POINTS_FILE, progress)
+        write_whole(directory.path / "config.toml", dump(config).encode())
+        localizer = _followed(log, prior, config, initial, directory.path / POINTS_FILE, progress)
         progress.say("smoothing the path")
         found = localizer.finish()
-        count = counted(len(found.states), "scan")
-        stopped = (f"stopped by the user after {count}",) if progress.stopped else ()
-        warnings = (*stopped, *log.damage, *log.copies, *localizer.warnings)
-        metrics = measure(found, prior, settings.config, working_s() - started, warnings)
+        stopped = f"stopped by the user after {counted(len(found.states), 'scan')}" if progress.stopped else ""
+        warnings = (*filter(None, [stopped]), *log.damage, *log.copies, *localizer.warnings)
+        time_s, truth = working_s() - started, None
         progress.say("writing the results")
         with directory.results() as folder:
-            if metrics.placed:
+            if found.is_placed.any():
                 poses = partial(true_poses, log, truth_file, progress)
-                source = job.ground_truth or log.ground_truth_topic
+                source = str(job.ground_truth or log.ground_truth_topic)
                 placed = replace(found.result, trajectory=found.placed)
-                truth, note = accuracy_of(poses, str(source), job.max_gap_s, placed, folder)
-                metrics = structs.replace(metrics, ground_truth=truth, warnings=(*warnings, *note))
+                truth, note = accuracy_of(poses, source, job.max_gap_s, placed, folder)
+                warnings += note
+            metrics = measure(found, prior, config, time_s, warnings, truth)
             localized = LocalizedLog(directory.path, prior, found, metrics)
-            text = summary(localized, log)
+            text = _summary(localized, log)
             _write(folder, localized, text)
             draw(folder, localized)
         localizer.slam.points.close()
         (directory.path / POINTS_FILE).unlink(missing_ok=True)
-        made = structs.replace(
-            provenance.hashed(hashing), complete=True, stopped="".join(stopped), duration_s=working_s() - started
-        )
-        made.write(directory.path / RUN_FILE)
+        structs.replace(
+            provenance.hashed(hashing), complete=True, stopped=stopped, duration_s=working_s() - started
+        ).write(directory.path / RUN_FILE)
         directory.complete()
     return replace(localized, path=directory.path), text
 
@@ -191,36 +199,22 @@ def _followed(
     return localizer
 
 
-def _opened(path: Path, out: Path) -> SavedMap:
-    """The map. Raises InputError where it cannot be read, or the results would replace it."""
-    prior = open_saved_map(path)
-    if out.resolve() in (path.resolve(), prior.folder.resolve()):
-        raise InputError(f"{out}: is the map; choose another --out")
-    return prior
-
-
-def _check(log: Log, prior: SavedMap, config: Config) -> None:
-    if not config.loops.enabled:
-        raise InputError("loops.enabled is false, but a place in a map is found by loop closures; leave it true")
-    if log.dimension != prior.dimension:
-        raise InputError(
-            f"{log.name}: has {log.dimension}D scans, the map {prior.name} is {prior.dimension}D; give a map of "
-            "the same kind"
-        )
-
-
 def measure(
-    found: Localization, prior: SavedMap, config: Config, time_s: float, warnings: tuple[str, ...]
+    found: Localization,
+    prior: SavedMap,
+    config: Config,
+    time_s: float,
+    warnings: tuple[str, ...],
+    ground_truth: GroundTruth | None = None,
 ) -> LocalizeMetrics:
     """Figures and verdict of a localized log."""
-    first = found.found_at
+    first, graph = found.found_at, found.result.graph
     seconds = (found.trajectory.stamps_ns - found.trajectory.stamps_ns[0]) * 1e-9
-    with_map = [each for each in found.closures if each.verdict is ClosureVerdict.ACCEPTED]
-    graph = found.result.graph
+    overlaps = [each.overlap for each in found.closures if each.verdict is ClosureVerdict.ACCEPTED]
     in_map = graph.is_loop & (graph.edges[:, 0] < len(prior.keyframes))
-    rejected = int((graph.is_rejected & in_map).sum())
+    states = {state: int((found.states == state).sum()) for state in MapState}
     parts = tuple(_parts(found, seconds))
-    verdict, reason = _verdict(found, prior, parts, _doubt(found, prior, config))
+    verdict, reason = _verdict(found, prior, states, parts, _doubt(found, prior, config))
     return LocalizeMetrics(
         verdict=verdict,
         reason=reason,
@@ -229,19 +223,20 @@ def measure(
         map_keyframes=len(prior.keyframes),
         scans=len(found.states),
         placed=int(found.is_placed.sum()),
-        states={state: int((found.states == state).sum()) for state in MapState},
+        states={str(state): count for state, count in states.items()},
         found_scan=first,
         found_after_s=float(seconds[first]) if first >= 0 else np.nan,
         found_after_m=float(found.traveled_m[first]) if first >= 0 else np.nan,
         path_m=float(found.traveled_m[-1]),
-        matches=len(with_map),
-        rejected=rejected,
-        median_overlap=float(np.median([each.overlap for each in with_map])) if with_map else np.nan,
+        matches=len(overlaps),
+        rejected=int((graph.is_rejected & in_map).sum()),
+        median_overlap=_median(np.array(overlaps)),
         median_sigma_m=_median(found.sigma_m),
         median_final_sigma_m=_median(found.final_sigma_m),
         log_odds=found.result.map_log_odds,
         time_s=time_s,
         warnings=warnings,
+        ground_truth=ground_truth,
     )
 
 
@@ -277,55 +272,48 @@ def _parts(found: Localization, seconds: NDArray[np.float64]) -> Iterator[Part]:
 
 def _doubt(found: Localization, prior: SavedMap, config: Config) -> str:
     """Reason why a log may be of another place than where it was found; empty if there is none."""
-    result, of_map = found.result, len(prior.keyframes)
+    result, of_map, graph = found.result, len(prior.keyframes), found.result.graph
     chosen = [each for each in result.keyframes[of_map:] if found.is_placed[each.scan_index]]
     if not chosen or prior.dimension == 3 or found.found_at == 0:  # where it begins was given
         return ""
     placed = [replace(each, T_odom_lidar=found.trajectory.poses[each.scan_index]) for each in chosen]
-    graph = result.graph
-    sources = graph.edges[graph.is_loop & ~graph.is_rejected & (graph.edges[:, 0] < of_map), 1] - of_map
-    agreeing = np.flatnonzero(np.isin([each.index - of_map for each in chosen], sources))
+    sources = graph.edges[graph.is_loop & ~graph.is_rejected & (graph.edges[:, 0] < of_map), 1]
+    agreeing = np.flatnonzero(np.isin([each.index for each in chosen], sources))
     repeated, paths = repeated_paths(prior.keyframes, placed, agreeing, config, _PATHS)
-    return (
-        f"{repeated} of {paths} paths in it look like other places, too" if repeated > MAX_REPEATED * paths else ""
-    )
+    if repeated <= MAX_REPEATED * paths:
+        return ""
+    return f"{repeated} of {paths} paths in it look like other places, too"
 
 
-def _verdict(found: Localization, prior: SavedMap, parts: tuple[Part, ...], doubt: str) -> tuple[Verdict, str]:
-    scans, path_m = len(found.states), float(found.traveled_m[-1])
+def _verdict(
+    found: Localization, prior: SavedMap, states: dict[MapState, int], parts: tuple[Part, ...], doubt: str
+) -> tuple[Verdict, str]:
+    scans, path_m, log_odds = len(found.states), float(found.traveled_m[-1]), found.result.map_log_odds
     tried = f"{counted(scans, 'scan')} over {path_m:.1f} m"
     if not found.is_placed.any():
         if path_m < _SHORT_M[found.trajectory.dimension]:
-            return Verdict.NOT_TRUSTWORTHY, f"not found in {prior.name}: {tried} are too short a way to tell"
-        log_odds = found.result.map_log_odds
-        if np.isfinite(log_odds):
-            return Verdict.NOT_TRUSTWORTHY, (
+            reason = f"not found in {prior.name}: {tried} are too short a way to tell"
+        elif np.isfinite(log_odds):
+            reason = (
                 f"not certain: {tried} may be in {prior.name}, with log-odds of {log_odds:.1f}, which are too low"
             )
-        return Verdict.NOT_TRUSTWORTHY, f"not from this place: nothing in {tried} is in {prior.name}"
+        else:
+            reason = f"not from this place: nothing in {tried} is in {prior.name}"
+        return Verdict.NOT_TRUSTWORTHY, reason
     at = found.found_at
     where = f"found in {prior.name}" + (f" after {found.traveled_m[at]:.1f} m" if at >= 0 else " in the end")
-    doubtful = [part for part in parts if part.is_doubtful]
-    if not doubtful and not doubt:
-        return Verdict.TRUSTWORTHY, f"{where}, and followed: {tried}; {_evidence(found)}"
-    largest = sorted(doubtful, key=lambda part: part.length_m, reverse=True)[:_SHOWN]
-    more = len(doubtful) - len(largest)
-    listed = [
-        _evidence(found),
-        *filter(None, [doubt]),
-        *(part.text for part in largest),
-        *([f"and {more:,} more"] if more else []),
-    ]
-    return Verdict.CHECK, "; ".join([where, *listed])
-
-
-def _evidence(found: Localization) -> str:
-    """What speaks for the place: how much of what is in the map matches it, and the log-odds."""
-    unmatched, matched = (int((found.states == state).sum()) for state in (MapState.UNMATCHED, MapState.LOCALIZED))
-    outside = int((found.states == MapState.OUTSIDE).sum())
+    matched, unmatched, outside = (
+        states[state] for state in (MapState.LOCALIZED, MapState.UNMATCHED, MapState.OUTSIDE)
+    )
     share = f"{100.0 * matched / max(matched + unmatched, 1):.0f} % of the scans within the map matched"
-    away = f", {100.0 * outside / len(found.states):.0f} % outside of it" if outside else ""
-    return f"{share}{away}; log-odds {found.result.map_log_odds:.0f}"
+    away = f", {100.0 * outside / scans:.0f} % outside of it" if outside else ""
+    evidence = f"{share}{away}; log-odds {log_odds:.0f}"
+    doubtful = sorted((part for part in parts if part.is_doubtful), key=lambda part: -part.length_m)
+    if not doubtful and not doubt:
+        return Verdict.TRUSTWORTHY, f"{where}, and followed: {tried}; {evidence}"
+    more = f"and {len(doubtful) - _SHOWN:,} more" if len(doubtful) > _SHOWN else ""
+    reasons = [where, evidence, doubt, *(part.text for part in doubtful[:_SHOWN]), more]
+    return Verdict.CHECK, "; ".join(filter(None, reasons))
 
 
 def pose_near(x_m: float, y_m: float, yaw_deg: float) -> Initial:
@@ -361,11 +349,11 @@ def pose_in_file(path: Path) -> Initial:
     return pose
 
 
-def summary(localized: LocalizedLog, log: Log) -> str:
+def _summary(localized: LocalizedLog, log: Log) -> str:
     """Text of summary.txt."""
     m, prior = localized.metrics, localized.prior
     names = ", ".join(session.name for session in prior.sessions)
-    states = ", ".join(f"{count:,} {state}" for state, count in Counter(m.states).items() if count)
+    states = ", ".join(f"{count:,} {state}" for state, count in m.states.items() if count)
     lines = [
         ("verdict", m.sentence),
         ("log", f"{', '.join(map(str, log.paths))} {log.topic}: {counted(m.scans, 'scan')} over {m.path_m:.1f} m"),
@@ -379,37 +367,24 @@ def summary(localized: LocalizedLog, log: Log) -> str:
     if m.matches:
         left_out = f", {m.rejected:,} of them left out" if m.rejected else ""
         lines.append(("matches", f"{m.matches:,} with the map{left_out}; overlap {m.median_overlap:.2f} (median)"))
-        at_its_time, in_the_end = (
-            f"{m.median_sigma_m:.3f} m at its time",
-            f"{m.median_final_sigma_m:.3f} m in the end",
-        )
-        at_its_time, in_the_end = (
-            f"{m.median_sigma_m:.3f} m at its time",
-            f"{m.median_final_sigma_m:.3f} m in the end",
-        )
-        lines.append(("sigma", f"{at_its_time}, {in_the_end}: standard deviation of a position (median)"))
+        sigmas = f"{m.median_sigma_m:.3f} m at its time, {m.median_final_sigma_m:.3f} m in the end"
+        lines.append(("sigma", f"{sigmas}: standard deviation of a position (median)"))
     truth = [] if m.ground_truth is None else accuracy_lines(m.ground_truth)
     lines += [(line[:15].strip(), line[15:]) for line in truth]
     lines += [("stretch", part.text) for part in m.parts]
     lines += [("warning", warning) for warning in m.warnings]
-    rate = f"{m.scans / max(m.time_s, 1e-9):,.0f} scans/s"
-    lines.append(("time", f"{m.time_s:.1f} s, {rate}"))
+    lines.append(("time", f"{m.time_s:.1f} s, {m.scans / max(m.time_s, 1e-9):,.0f} scans/s"))
     return "".join(f"{name:<15}{text}\n" for name, text in lines)
 
 
 def _write(folder: Path, localized: LocalizedLog, text: str) -> None:
-    found, dimension = localized.localization, localized.prior.dimension
+    """Trajectories, summary, metrics and the table: a row a scan, poses null where unknown."""
+    found = localized.localization
     if found.is_placed.any():
         write_tum(folder / "trajectory.tum", found.placed)
     write_tum(folder / "odometry.tum", found.result.odometry)
-    _write_table(folder / LOCALIZATION_FILE, found, dimension)
     (folder / "summary.txt").write_text(text, encoding="utf-8")
-    (folder / "metrics.json").write_bytes(json.format(json.encode(localized.metrics), indent=2) + b"\n")
-
-
-def _write_table(path: Path, found: Localization, dimension: int) -> None:
-    """A row a scan: state and pose at its time, and the final pose, null where unknown."""
-    final = np.where(found.is_placed[:, None, None], found.trajectory.poses, np.nan)
+    (folder / "metrics.json").write_bytes(json.format(json.encode(localized.metrics)) + b"\n")
     columns: dict[str, pa.Array] = {
         "scan": pa.array(np.arange(len(found.states))),
         "stamp_ns": pa.array(found.trajectory.stamps_ns),
@@ -419,13 +394,11 @@ def _write_table(path: Path, found: Localization, dimension: int) -> None:
         "sigma_m": pa.array(found.sigma_m, from_pandas=True),
         "final_sigma_m": pa.array(found.final_sigma_m, from_pandas=True),
     }
-    for name, poses in (("live", found.live), ("final", final)):
-        spatial = lie.lift(poses)
-        known = np.isfinite(spatial[:, 0, 3])
-        quaternions = np.full((len(poses), 4), np.nan)
-        quaternions[known] = lie.to_quaternion(spatial[known, :3, :3])
-        values = np.column_stack([spatial[:, :3, 3], quaternions])
-        for column, part in enumerate(("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")):
-            columns[f"{name}_{part}"] = pa.array(values[:, column], from_pandas=True)
-    metadata = {"dimension": str(dimension)}
-    pq.write_table(pa.table(columns).replace_schema_metadata(metadata), path)
+    live, final = (found.live, np.isfinite(found.live[:, 0, 0])), (found.trajectory.poses, found.is_placed)
+    for name, (poses, known) in (("live", live), ("final", final)):
+        parts = pose_columns(np.where(known[:, None, None], poses, np.eye(poses.shape[-1])))
+        for part, values in parts.items():
+            unit = "_m" if part in "xyz" else ""
+            columns[f"{name}_{part}{unit}"] = pa.array(values, mask=~known)
+    table = pa.table(columns).replace_schema_metadata({"dimension": str(localized.prior.dimension)})
+    pq.write_table(table, folder / LOCALIZATION_FILE)

@@ -156,46 +156,36 @@ class Localizer:
         if self.initial is not None and len(self.states) == 0:
             self.slam.begin_at(self.initial, INITIAL_SIGMAS)
         placed = self._placed(step)
+        T, covariance = placed.T_map_lidar, placed.covariance
+        variances = [np.nan] if covariance is None else covariance.diagonal()[: self.slam.dimension].tolist()
         self.states.append(placed.state)
-        if placed.T_map_lidar is None or placed.covariance is None:
-            self.live.append(np.full(step.T_odom_lidar.shape, np.nan))
-            self.sigma_m.append(np.nan)
-        else:
-            self.live.append(placed.T_map_lidar)
-            self.sigma_m.append(math.sqrt(sum(placed.covariance.diagonal()[: self.slam.dimension].tolist())))
+        self.live.append(np.full(step.T_odom_lidar.shape, np.nan) if T is None else T)
+        self.sigma_m.append(math.sqrt(sum(variances)))
         self.traveled_m.append(self.slam.traveled_m - self.start_m)
         return placed
 
     def finish(self) -> Localization:
         """Match what is left and smooth the whole path; scans before the place was found are placed as well."""
-        result = self.slam.finish()
-        keyframe_of = np.searchsorted(
-            [keyframe.scan_index for keyframe in result.keyframes[self.slam.first :]],
-            np.arange(len(result.trajectory)),
-            side="right",
-        )
-        is_joined = result.components[self.slam.first :] == result.components[0]
-        is_placed = is_joined[keyframe_of - 1]
-        sigma_m = (
-            self._final_sigma_m(result)[keyframe_of - 1] if is_placed.any() else np.full(len(is_placed), np.nan)
-        )
+        result, first = self.slam.finish(), self.slam.first
+        scans = [keyframe.scan_index for keyframe in result.keyframes[first:]]
+        keyframe_of = np.searchsorted(scans, np.arange(len(result.trajectory)), side="right") - 1
+        is_placed = (result.components[first:] == result.components[0])[keyframe_of]
+        final_sigma_m = np.full(len(is_placed), np.nan)
+        if is_placed.any():
+            graph, own = with_map_errors(result.graph, result.map_errors, self.slam.config)  # the map is held
+            variances = np.diagonal((graph.covariances() + own)[first:], axis1=1, axis2=2)[:, : graph.dimension]
+            final_sigma_m[is_placed] = np.sqrt(variances.sum(axis=1))[keyframe_of[is_placed]]
         return Localization(
             states=np.array(self.states, np.str_),
             is_placed=is_placed,
             trajectory=result.trajectory,
             live=np.array(self.live),
             sigma_m=np.array(self.sigma_m),
-            final_sigma_m=np.where(is_placed, sigma_m, np.nan),
+            final_sigma_m=final_sigma_m,
             traveled_m=np.array(self.traveled_m),
-            closures=tuple(each for each in result.closures if each.target < self.slam.first),
+            closures=tuple(each for each in result.closures if each.target < first),
             result=result,
         )
-
-    def _final_sigma_m(self, result: SlamResult) -> NDArray[np.float64]:
-        """(K,) of the keyframes of the log: by all matches in force, the map held."""
-        graph, own = with_map_errors(result.graph, result.map_errors, self.slam.config)
-        covariances = (graph.covariances() + own)[self.slam.first :]
-        return np.sqrt(np.einsum("kii->k", covariances[:, : graph.dimension, : graph.dimension]))
 
     def _placed(self, step: Step) -> Placed:
         slam = self.slam

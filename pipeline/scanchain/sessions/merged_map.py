@@ -1,18 +1,24 @@
-"""The map of several sessions: final poses of their keyframes and scans, and the files of its directory."""
+"""The map of several sessions: final poses of their keyframes and scans, what is gone from them, and its files.
+
+An updated map follows its newest session: points of older keyframes that newer sessions saw through are removed.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import REJECTED_WEIGHT, Keyframe, Matrix, Trajectory
+from scanchain.data import REJECTED_WEIGHT, Keyframe, KeyframePoints, Matrix, Points, Trajectory
+from scanchain.errors import InputError
 from scanchain.graph.files.g2o_write import write_g2o
 from scanchain.loops import refined, spread
 from scanchain.maps import MAP_FOLDER, SavedMap, Session, write_map, write_ply, write_saved_map
@@ -20,9 +26,13 @@ from scanchain.point_store import PointStore
 from scanchain.runs.closures import FinalClosure, final_verdicts, write_closures
 from scanchain.runs.directory import directory_name
 from scanchain.runs.results import GRAPH_FILE, Cloud, grid_of
+from scanchain.sessions.changes import Label, Part, changes_between
 from scanchain.sessions.joining import Joined, graph_of
-from scanchain.sessions.updating import updated
 from scanchain.trajectory import read_tum, write_tum
+
+_SEEN_AGAIN = 0.3  # share of a keyframe's points near those of a later one, from which on it was seen again
+_CELL_VOXELS = 4.0  # edge of the cells, in voxels of the map, in which points are near each other
+_CELL_BITS = 21  # of each of their coordinates
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,10 +75,10 @@ def session_names(maps: Sequence[SavedMap], order: Sequence[int]) -> dict[tuple[
     for number in order:
         saved = maps[number]
         for index, session in enumerate(saved.sessions):
-            stem = directory_name(saved.name if len(saved.sessions) == 1 else session.name)
-            taken, count, name = set(names.values()), 2, stem
-            while name in taken:
-                name, count = f"{stem}-{count}", count + 1
+            stem = name = directory_name(saved.name if len(saved.sessions) == 1 else session.name)
+            numbers = count(2)
+            while name in names.values():
+                name = f"{stem}-{next(numbers)}"
             names[number, index] = name
     return names
 
@@ -107,9 +117,8 @@ def merged_map(
     removed, warnings = np.zeros(len(poses), np.int64), ()
     if update:
         new = updated(joined.keyframes, poses, session, sessions, config)
-        joined = replace(joined, keyframes=new.keyframes)
+        joined, removed, warnings = replace(joined, keyframes=new.keyframes), new.removed, new.warnings
         last_seen_ns = np.maximum(last_seen_ns, new.last_seen_ns)
-        removed, warnings = new.removed, new.warnings
     return MergedMap(joined, poses, tuple(sessions), session, tuple(trajectories), last_seen_ns, removed, warnings)
 
 
@@ -125,17 +134,10 @@ def write_merged(
     folder: Path, merged: MergedMap, cloud: Cloud, final: Sequence[FinalClosure], config: Config
 ) -> None:
     """Write map, trajectories, point cloud, grid, graph and closures into a directory."""
-    edges, poses = merged.joined.edges, merged.T_world_keyframes
+    edges, keyframes, poses = merged.joined.edges, merged.keyframes, merged.T_world_keyframes
     in_force = edges.where(edges.weight >= REJECTED_WEIGHT)
-    write_saved_map(
-        folder / MAP_FOLDER,
-        merged.keyframes,
-        poses,
-        merged.session,
-        merged.sessions,
-        in_force,
-        merged.last_seen_ns,
-    )
+    of_sessions = merged.session, merged.sessions
+    write_saved_map(folder / MAP_FOLDER, keyframes, poses, *of_sessions, in_force, merged.last_seen_ns)
     for session, trajectory in zip(merged.sessions, merged.trajectories, strict=True):
         write_tum(folder / f"{session.name}.tum", trajectory, force=True)
     write_ply(folder / "map.ply", cloud.points)
@@ -177,3 +179,91 @@ def _trajectory(saved: SavedMap, index: int, poses: Matrix) -> Trajectory:
                 scans.stamps_ns[begin:], known[begin:] if is_still else spread(poses, found, known[begin:])
             )
     return Trajectory(stamps_ns, poses)
+
+
+@dataclass(frozen=True, slots=True)
+class RemainingPoints:
+    """Points of a keyframe for which ``kept`` (M,) holds."""
+
+    stored: KeyframePoints
+    kept: NDArray[np.bool_]
+
+    def read(self) -> Points:
+        """(N, d) meters."""
+        return self.stored.read()[self.kept]
+
+
+@dataclass(frozen=True, slots=True)
+class Updated:
+    """Keyframes of an updated map.
+
+    Attributes
+    ----------
+    keyframes : without the points that newer sessions saw through
+    removed : (K,) number of these
+    last_seen_ns : (K,) stamp of the newest keyframe that saw the surroundings of each, its own at least
+    warnings : sessions that nothing was removed by, since they do not fit on those before
+    """
+
+    keyframes: tuple[Keyframe, ...]
+    removed: NDArray[np.int64]
+    last_seen_ns: NDArray[np.int64]
+    warnings: tuple[str, ...]
+
+
+def updated(
+    keyframes: Sequence[Keyframe],
+    poses: Matrix,
+    session: NDArray[np.int64],
+    sessions: Sequence[Session],
+    config: Config,
+) -> Updated:
+    """Keyframes at these poses (K, d+1, d+1) without what vanished from one session to the next.
+
+    session : (K,) number of each keyframe's session; the later session has the higher number
+    """
+    result, removed, warnings = list(keyframes), np.zeros(len(keyframes), np.int64), []
+    for number in range(1, len(sessions)):
+        older, newer = np.flatnonzero(session < number), np.flatnonzero(session == number)
+        earlier, later = (
+            Part("", [result[k] for k in chosen.tolist()], poses[chosen]) for chosen in (older, newer)
+        )
+        try:
+            changes = changes_between(earlier, later, config)
+        except InputError:
+            warnings.append(
+                f"{sessions[number].name}: too little in common with older sessions, nothing removed by it"
+            )
+            continue
+        if not (changes.labels == Label.VANISHED).any():
+            continue
+        label_of = KDTree(changes.points)
+        reach_m = np.sqrt(changes.dimension) * changes.voxel_size_m
+        is_vanished = np.append(changes.labels == Label.VANISHED, False)  # the last one: no point within reach
+        for k in older.tolist():
+            points = lie.transform(poses[k], result[k].points)
+            gone = is_vanished[label_of.query(points, distance_upper_bound=reach_m)[1]]
+            if gone.any():
+                removed[k] += gone.sum()
+                result[k] = replace(result[k], stored=RemainingPoints(result[k].stored, ~gone))
+    last_seen_ns = _last_seen(result, poses, _CELL_VOXELS * config.maps.voxel_size_m)
+    return Updated(tuple(result), removed, last_seen_ns, tuple(warnings))
+
+
+def _last_seen(keyframes: Sequence[Keyframe], poses: Matrix, cell_m: float) -> NDArray[np.int64]:
+    """(K,) stamp since which a share of each keyframe's points was seen, by any session; its own at least."""
+    stamps_ns = np.array([keyframe.stamp_ns for keyframe in keyframes], np.int64)
+    places = 1 << _CELL_BITS * np.arange(poses.shape[-1] - 1)  # of a cell's coordinates in one number
+    cells = []
+    for keyframe, pose in zip(keyframes, poses, strict=True):
+        coordinates = np.floor(lie.transform(pose, keyframe.points) / cell_m).astype(np.int64)
+        cells.append(np.unique((coordinates & ((1 << _CELL_BITS) - 1)) @ places))
+    number = np.unique(np.concatenate(cells), return_inverse=True)[1]
+    counts = np.array([len(each) for each in cells])
+    newest_ns = np.full(number.max(initial=-1) + 1, np.iinfo(np.int64).min)
+    np.maximum.at(newest_ns, number, np.repeat(stamps_ns, counts))
+    last_ns = stamps_ns.copy()
+    for k, seen in enumerate(np.split(newest_ns[number], np.cumsum(counts)[:-1])):
+        if len(seen):
+            last_ns[k] = np.sort(seen)[::-1][int(_SEEN_AGAIN * (len(seen) - 1))]
+    return last_ns

@@ -27,31 +27,6 @@ from scanchain.whole_file import write_whole
 from scanchain.words import counted
 
 
-@dataclass(frozen=True, slots=True)
-class MergeJob:
-    """Maps to merge.
-
-    Attributes
-    ----------
-    runs : run directories, or map folders; the first one's frame is that of the merged map
-    out : the directory to create
-    config_file : on top of the preset; overrides : on top of both
-    fixed : whether the keyframes of the first run stay where they are, to the bit
-    update : whether points that newer sessions saw through are removed from the keyframes of older ones
-    force : whether a directory of that name is replaced
-    command : the command line, for run.json
-    """
-
-    runs: tuple[Path, ...]
-    out: Path
-    config_file: Path | None = None
-    overrides: tuple[Override, ...] = ()
-    fixed: bool = False
-    update: bool = False
-    force: bool = False
-    command: tuple[str, ...] = ()
-
-
 class SessionMetrics(msgspec.Struct, frozen=True):
     """A session of the merged map.
 
@@ -115,29 +90,52 @@ class Merged:
     warnings: tuple[str, ...]
 
 
-def merge(job: MergeJob, progress: Progress, report: Callable[[Path], None]) -> Merged:
-    """Join the maps, write the directory, to which ``report`` adds page and recording in the end.
+def merge(
+    runs: Sequence[Path],
+    out: Path,
+    progress: Progress,
+    report: Callable[[Path], None],
+    *,
+    config_file: Path | None = None,
+    overrides: tuple[Override, ...] = (),
+    fixed: bool = False,
+    update: bool = False,
+    force: bool = False,
+    command: tuple[str, ...] = (),
+) -> Merged:
+    """Join the maps of runs, write the directory ``out``, to which ``report`` adds page and recording in the end.
 
+    runs : run directories, or map folders; the first one's frame is that of the merged map
+    config_file : on top of the preset; overrides : on top of both
+    fixed : whether the keyframes of the first run stay where they are, to the bit
+    update : whether points that newer sessions saw through are removed from the keyframes of older ones
+    force : whether a directory of that name is replaced
+    command : the command line, for run.json
     Raises InputError for bad input, and ScanchainError where no two maps belong together.
     """
     started, compiled_before_s = working_s(), compiled_s()
-    directory = RunDirectory(job.out, force=job.force)
-    maps = _opened(job)
-    settings = load_settings(maps[0].dimension, file=job.config_file, overrides=job.overrides)
-    config, held = settings.config, 0 if job.fixed else -1
+    directory = RunDirectory(out, force=force)
+    maps = _opened(runs, out)
+    if update:
+        _check_order([session for saved in maps for session in saved.sessions])
+    settings = load_settings(maps[0].dimension, file=config_file, overrides=overrides)
+    config, held, folders = settings.config, 0 if fixed else -1, [saved.folder for saved in maps]
     order = _canonical(maps, held)
     names = session_names(maps, order)
-    provenance = describe_start(job.command, [saved.folder for saved in maps], settings.source)
-    with directory, announcing_compilation(progress.say), Hashing([saved.folder for saved in maps]) as hashing:
+    provenance = describe_start(command, folders, settings.source)
+    with directory, announcing_compilation(progress.say), Hashing(folders) as hashing:
         firsts = [names[number, 0] for number in range(len(maps))]
         groups, uncertain = join_all(maps, order, firsts, config, held, progress.say)
-        joined = _chosen(groups, held, [saved.folder.parent for saved in maps], uncertain)
+        joined = _chosen(groups, held, maps, uncertain)
         progress.say(f"making the map of {counted(len(joined.keyframes), 'keyframe')}")
-        first = min(joined.maps)
-        merged = merged_map(joined, maps, names, config, first=first, held=held, update=job.update)
+        merged = merged_map(joined, maps, names, config, first=min(joined.maps), held=held, update=update)
         cloud, final = cloud_of(merged, config), final_closures(merged)
         write_merged(directory.path, merged, cloud, final, config)
-        apart = tuple(_names(group, maps, names) for group in groups if group is not joined)
+        apart = tuple(
+            tuple(names[number, k] for number in group.maps for k in range(len(maps[number].sessions)))
+            for group in groups
+            if group is not joined
+        )
         different = (_changed_text(names[number, 0], share) for number, share in changed(joined).items())
         warnings = (*(_apart_text(each, uncertain) for each in apart), *different, *merged.warnings)
         compile_s, run_s = compiled_s() - compiled_before_s, working_s() - started
@@ -147,11 +145,11 @@ def merge(job: MergeJob, progress: Progress, report: Callable[[Path], None]) -> 
             run_s=run_s,
             compile_s=compile_s,
             warnings=warnings,
-            updated=job.update,
+            updated=update,
             uncertain=tuple(uncertain),
         )
         write_whole(directory.path / "metrics.json", msgspec.json.format(msgspec.json.encode(metrics)) + b"\n")
-        text = _summary(metrics, names[first, 0], settings.source, fixed=job.fixed)
+        text = _summary(metrics, names[min(joined.maps), 0], settings.source, fixed=fixed)
         (directory.path / "summary.txt").write_text(text, encoding="utf-8")
         write_whole(directory.path / "config.toml", dump(config).encode())
         done = msgspec.structs.replace(provenance.hashed(hashing), complete=True, duration_s=run_s + compile_s)
@@ -162,30 +160,26 @@ def merge(job: MergeJob, progress: Progress, report: Callable[[Path], None]) -> 
     return Merged(directory.path, metrics, text, warnings)
 
 
-def _opened(job: MergeJob) -> list[SavedMap]:
-    """The maps of a job. Raises InputError where they cannot be merged."""
-    if len(job.runs) < 2:
+def _opened(runs: Sequence[Path], out: Path) -> list[SavedMap]:
+    """The maps of runs. Raises InputError where they cannot be merged."""
+    if len(runs) < 2:
         raise InputError("merge takes two run directories or more; name another one")
-    maps = [open_saved_map(run) for run in job.runs]
-    for run, saved in zip(job.runs, maps, strict=True):
+    maps = [open_saved_map(run) for run in runs]
+    holders: dict[tuple[int, int, int], Path] = {}
+    for run, saved in zip(runs, maps, strict=True):
         if saved.dimension != maps[0].dimension:
             raise InputError(
-                f"{run}: is a {saved.dimension}D map, {job.runs[0]} a {maps[0].dimension}D one; merge maps of one "
-                "kind"
+                f"{run}: is a {saved.dimension}D map, {runs[0]} a {maps[0].dimension}D one; merge maps of one kind"
             )
         if not saved.keyframes:
             raise InputError(f"{run}: its map has no keyframe; leave it out")
-        if job.out.resolve() in (run.resolve(), saved.folder.resolve()):
-            raise InputError(f"{job.out}: is one of the runs; choose another --out")
-    holders: dict[tuple[int, int, int], Path] = {}
-    for run, saved in zip(job.runs, maps, strict=True):
+        if out.resolve() in (run.resolve(), saved.folder.resolve()):
+            raise InputError(f"{out}: is one of the runs; choose another --out")
         for session in saved.sessions:
             key = (session.first_stamp_ns, session.last_stamp_ns, session.keyframes)
             if key in holders:
                 raise InputError(f"{run}: holds a session that {holders[key]} holds, too; leave one of them out")
             holders[key] = run
-    if job.update:
-        _check_order([session for saved in maps for session in saved.sessions])
     return maps
 
 
@@ -209,25 +203,20 @@ def _canonical(maps: Sequence[SavedMap], held: int) -> list[int]:
     return sorted(range(len(maps)), key=key)
 
 
-def _chosen(groups: Sequence[Joined], held: int, runs: Sequence[Path], uncertain: Sequence[Doubt]) -> Joined:
+def _chosen(groups: Sequence[Joined], held: int, maps: Sequence[SavedMap], uncertain: Sequence[Doubt]) -> Joined:
     """The group with the held map, else the one of most maps and, of equal ones, keyframes."""
+    chosen = max(groups, key=lambda group: (held in group.maps, len(group.maps), len(group.keyframes)))
+    if len(chosen.maps) > 1:
+        return chosen
+    what = "no two of the maps belong together"
     if held >= 0:
-        chosen = next(group for group in groups if held in group.maps)
-    else:
-        chosen = max(groups, key=lambda group: (len(group.maps), len(group.keyframes)))
-    if len(chosen.maps) < 2:
-        what = f"nothing belongs to {runs[held]}" if held >= 0 else "no two of the maps belong together"
-        if uncertain:
-            raise ScanchainError(f"{what} for certain: {'; '.join(each.text for each in uncertain)}")
-        raise ScanchainError(
-            f"{what}: too few closures between them agree; merge runs that saw the same place, or raise "
-            "--loops.max_radius_m where they have drifted far"
-        )
-    return chosen
-
-
-def _names(group: Joined, maps: Sequence[SavedMap], names: dict[tuple[int, int], str]) -> tuple[str, ...]:
-    return tuple(names[number, k] for number in group.maps for k in range(len(maps[number].sessions)))
+        what = f"nothing belongs to {maps[held].folder.parent}"
+    if uncertain:
+        raise ScanchainError(f"{what} for certain: {'; '.join(each.text for each in uncertain)}")
+    raise ScanchainError(
+        f"{what}: too few closures between them agree; merge runs that saw the same place, or raise "
+        "--loops.max_radius_m where they have drifted far"
+    )
 
 
 def _apart_text(names: Sequence[str], uncertain: Sequence[Doubt]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -38,6 +39,22 @@ _ALIKE = 1.4  # an interval shorter than the usual one by this factor is none: i
 
 _FEWEST, _BEFORE = 3, 10  # scans whose median overlap with the map is usual
 _LEAST_USUAL = 1e-3  # smallest usual share of points with a correspondence
+
+
+class Kind(StrEnum):
+    """Finding of a stretch."""
+
+    DEGENERATE = "degenerate"
+    LOST = "lost"
+    CONTRADICTED = "contradicted"
+    WHEELS = "wheels disagree"
+    SCANS_SLIP = "scans slip"
+    WHEELS_SLIP = "wheels slip"
+    ACCELERATION = "impossible acceleration"
+    LOOPS = "loop closures disagree"
+    DISCONNECTED = "disconnected"
+    OVERLAP = "overlap lost"
+    COPIES = "copies of one scan"
 
 
 class WheelCheck(NamedTuple):

@@ -1,10 +1,10 @@
-"""Stretches of a trajectory that a check contradicts or that no measurement constrains."""
+"""Stretches of a trajectory that a check contradicts or that no measurement constrains, and the worst of them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 from msgspec import Struct
@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from scanchain.data import LEAST_FIT, MOST_COPIES, Matrix
-from scanchain.verdict.checks import VELOCITY_LIMIT, WHEEL_LIMIT, Floats, WheelCheck
-from scanchain.verdict.loops import Closures, contradicting_groups
-from scanchain.verdict.slips import Slipped, which_slipped
+from scanchain.verdict.checks import VELOCITY_LIMIT, WHEEL_LIMIT, Floats, Kind, WheelCheck
+from scanchain.verdict.closures import Closures, contradicting_groups, which_slipped
 
 _LEAST_OVERLAP = 2.0 / 3.0  # smallest ``overlap`` that is no finding
 _GAP = 3.0  # intervals of usual length from which on the motion is not predicted
@@ -24,23 +23,8 @@ _PASSED_M = 1.0  # extent of a stretch of predicted or contradicted poses up to 
 _PASSED_BY_WHEELS_M = 4.0  # likewise where the wheels agree with the trajectory
 KNOWN = 0.5  # least share of scans that the wheels are compared at
 _RESTING_M = 0.05  # distance from copies to the next scan, within which the lidar rested
+_SHORT_M = 10.0  # largest path of a stretch that is shown by what lies before and behind it
 _MEDIAN_SCANS = 9  # scans over which the median of ``fit`` is taken: single ones are contradicted by people
-
-
-class Kind(StrEnum):
-    """Finding of a stretch."""
-
-    DEGENERATE = "degenerate"
-    LOST = "lost"
-    CONTRADICTED = "contradicted"
-    WHEELS = "wheels disagree"
-    SCANS_SLIP = "scans slip"
-    WHEELS_SLIP = "wheels slip"
-    ACCELERATION = "impossible acceleration"
-    LOOPS = "loop closures disagree"
-    DISCONNECTED = "disconnected"
-    OVERLAP = "overlap lost"
-    COPIES = "copies of one scan"
 
 
 class Stretch(Struct, frozen=True):
@@ -145,11 +129,12 @@ class Evidence:
 
 def find_stretches(evidence: Evidence) -> list[Stretch]:
     """Every stretch, by time, and those where the wheels slipped, which are none of the trajectory."""
+    has_left = (evidence.overlap < _LEAST_OVERLAP) & ~evidence.starts_segment
     measured = [
         *_of_states(evidence, Kind.LOST, evidence.is_lost),
         *_of_states(evidence, Kind.DEGENERATE, evidence.is_degenerate),
         *_of_states(evidence, Kind.CONTRADICTED, evidence.is_contradicted & _fits_badly(evidence)),
-        *_of_overlap(evidence),
+        *(_stretch(evidence, Kind.OVERLAP, part, has_left) for part in merged(has_left)),
         *_of_acceleration(evidence),
     ]
     found = [
@@ -173,7 +158,7 @@ def _of_states(evidence: Evidence, kind: Kind, is_marked: NDArray[np.bool_]) -> 
         runs = [slice(part.start + run.start, part.start + run.stop) for run in inner]
         if any(_extent_m(evidence, run, kind) > _passed_m(evidence, run) for run in runs):
             counted = evidence.is_contradicted if kind is Kind.CONTRADICTED else is_marked
-            yield _stretch(evidence, kind, part.start, part.stop - 1, int(counted[part].sum()))
+            yield _stretch(evidence, kind, part, counted)
 
 
 def _extent_m(evidence: Evidence, part: slice, kind: Kind) -> float:
@@ -206,17 +191,17 @@ def _of_wheels(evidence: Evidence, measured: Sequence[Stretch]) -> Iterator[Stre
     """
     is_marked = evidence.wheels.innovation > WHEEL_LIMIT
     odometry, parts = evidence.poses if evidence.odometry is None else evidence.odometry, merged(is_marked)
-    culprits = which_slipped(parts, odometry, evidence.wheels.poses, evidence.closures)
-    for part, (culprit, whole_m) in zip(parts, culprits, strict=True):
-        first, last = part.start, part.stop - 1
+    slipped = which_slipped(parts, odometry, evidence.wheels.poses, evidence.closures)
+    for part, (kind, whole_m) in zip(parts, slipped, strict=True):
         size_m, size_rad = (
             float(np.nanmax(each[part])) for each in (evidence.wheels.apart_m, evidence.wheels.apart_rad)
         )
-        kind = {Slipped.SCANS: Kind.SCANS_SLIP, Slipped.WHEELS: Kind.WHEELS_SLIP}.get(culprit, Kind.WHEELS)
-        if kind is Kind.WHEELS_SLIP and any(each.first <= last and first <= each.last for each in measured):
+        if kind is Kind.WHEELS_SLIP and any(
+            each.first < part.stop and part.start <= each.last for each in measured
+        ):
             kind = Kind.WHEELS
         size_m = size_m if kind is Kind.WHEELS else max(size_m, whole_m)
-        yield _stretch(evidence, kind, first, last, int(is_marked[part].sum()), size_m, size_rad)
+        yield _stretch(evidence, kind, part, is_marked, size_m, size_rad)
 
 
 def _of_acceleration(evidence: Evidence) -> Iterator[Stretch]:
@@ -226,13 +211,7 @@ def _of_acceleration(evidence: Evidence) -> Iterator[Stretch]:
     jumps_m[2:] = np.linalg.norm(np.diff(evidence.poses[:, :-1, -1], n=2, axis=0), axis=1)
     for part in merged(is_marked):
         size_m = float(jumps_m[part][is_marked[part]].max())
-        yield _stretch(evidence, Kind.ACCELERATION, part.start, part.stop - 1, int(is_marked[part].sum()), size_m)
-
-
-def _of_overlap(evidence: Evidence) -> Iterator[Stretch]:
-    is_marked = (evidence.overlap < _LEAST_OVERLAP) & ~evidence.starts_segment
-    for part in merged(is_marked):
-        yield _stretch(evidence, Kind.OVERLAP, part.start, part.stop - 1, int(is_marked[part].sum()))
+        yield _stretch(evidence, Kind.ACCELERATION, part, is_marked, size_m)
 
 
 def _of_copies(evidence: Evidence) -> Iterator[Stretch]:
@@ -246,12 +225,13 @@ def _of_copies(evidence: Evidence) -> Iterator[Stretch]:
             continue
         is_at_end = part.start == 1 or part.stop == len(evidence)
         if is_at_end or np.linalg.norm(positions[part.stop] - positions[part.stop - 1]) > _RESTING_M:
-            yield _stretch(evidence, Kind.COPIES, part.start, part.stop - 1, part.stop - part.start)
+            yield _stretch(evidence, Kind.COPIES, part, evidence.is_copy)
 
 
 def _of_loops(evidence: Evidence) -> Iterator[Stretch]:
     for group in contradicting_groups(evidence.closures, evidence.poses):
-        yield _stretch(evidence, Kind.LOOPS, group.first, group.last, group.closures, group.size_m)
+        seconds = evidence.seconds[[group.first, group.last]].tolist()
+        yield Stretch(Kind.LOOPS, group.first, group.last, group.closures, *seconds, group.size_m)
 
 
 def _of_segments(evidence: Evidence) -> Iterator[Stretch]:
@@ -263,8 +243,8 @@ def _of_segments(evidence: Evidence) -> Iterator[Stretch]:
     for low, high in np.sort(ends, axis=1).tolist():
         label[label == label[high]] = label[low]
     for number in np.flatnonzero(label != label[0]).tolist():
-        scans = np.flatnonzero(segment == number)
-        yield _stretch(evidence, Kind.DISCONNECTED, int(scans[0]), int(scans[-1]), len(scans))
+        (part,) = merged(segment == number)
+        yield _stretch(evidence, Kind.DISCONNECTED, part, segment == number)
 
 
 def merged(is_marked: NDArray[np.bool_], gap: int = _GAP_SCANS) -> list[slice]:
@@ -277,8 +257,52 @@ def merged(is_marked: NDArray[np.bool_], gap: int = _GAP_SCANS) -> list[slice]:
 
 
 def _stretch(
-    evidence: Evidence, kind: Kind, first: int, last: int, scans: int, size_m: float | None = None,
+    evidence: Evidence, kind: Kind, part: slice, is_marked: NDArray[np.bool_], size_m: float | None = None,
     size_rad: float | None = None,
 ) -> Stretch:  # fmt: skip
-    start_s, end_s = float(evidence.seconds[first]), float(evidence.seconds[last])
-    return Stretch(kind, first, last, scans, start_s, end_s, size_m, size_rad)
+    """The stretch of a part of the scans, some of which are marked (N,)."""
+    start_s, end_s = evidence.seconds[[part.start, part.stop - 1]].tolist()
+    count = int(is_marked[part].sum())
+    return Stretch(kind, part.start, part.stop - 1, count, start_s, end_s, size_m, size_rad)
+
+
+class WorstPlace(NamedTuple):
+    """The worst stretch, and two scans of the same place: before and after the contradiction, or of two passes."""
+
+    stretch: Stretch
+    before: int
+    after: int
+
+
+def worst_place(stretches: Sequence[Stretch], evidence: Evidence) -> WorstPlace | None:
+    """The stretch of the largest contradiction, of equal ones that of most scans; None without any.
+
+    Of a long one that no loop closures contradict, the scan that its check contradicts most, and the one before.
+    """
+    stretch = max(stretches, key=lambda each: (each.size_m or 0.0, each.scans), default=None)
+    if stretch is None:
+        return None
+    first, last = max(stretch.first - 1, 0), stretch.last
+    if stretch.kind is Kind.LOOPS:
+        return WorstPlace(stretch, stretch.first, stretch.last)
+    steps_m = np.linalg.norm(np.diff(evidence.poses[first : last + 1, :-1, -1], axis=0), axis=1)
+    if steps_m.sum() > _SHORT_M:
+        last = max(stretch.first + int(np.argmax(_contradiction(evidence, stretch))), 1)
+        first = last - 1
+    return WorstPlace(stretch, first, last)
+
+
+def _contradiction(evidence: Evidence, stretch: Stretch) -> Floats:
+    """Size of the contradiction at each scan of a stretch; the length of the step where no check measures it."""
+    part = slice(stretch.first, stretch.last + 1)
+    match stretch.kind:
+        case Kind.WHEELS:
+            return np.nan_to_num(evidence.wheels.innovation[part])
+        case Kind.ACCELERATION:
+            return np.nan_to_num(evidence.velocity[part])
+        case Kind.CONTRADICTED:
+            return 1.0 - np.nan_to_num(evidence.fit[part], nan=1.0)
+        case Kind.OVERLAP:
+            return 1.0 - np.nan_to_num(evidence.overlap[part], nan=1.0)
+    steps_m = np.linalg.norm(np.diff(evidence.poses[:, :-1, -1], axis=0), axis=1)
+    return np.concatenate([[0.0], steps_m])[part]

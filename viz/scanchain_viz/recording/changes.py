@@ -9,7 +9,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from scanchain.runs.directory import RECORDING_FILE
-from scanchain.sessions.change_files import COLORS, SUMMARY_FILE
+from scanchain.sessions.change_run import COLORS, SUMMARY_FILE
 from scanchain.sessions.changes import Changes, Label
 from scanchain_viz.recording import entities, shapes
 from scanchain_viz.recording.blueprint import scene

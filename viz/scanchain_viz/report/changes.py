@@ -10,7 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 from scanchain.data import Matrix
-from scanchain.sessions.change_files import COLORS, METRICS_FILE, TABLE_FILE
+from scanchain.sessions.change_run import COLORS, METRICS_FILE, TABLE_FILE
 from scanchain.sessions.changes import Changes, Cluster, Label
 from scanchain.words import counted
 from scanchain_viz.pictures.figure import INK

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from itertools import product
 
 import numpy as np
 
 from scanchain import lie
 from scanchain.data import LEAST_FIT, Matrix
-from scanchain.verdict.checks import WINDOW_M
-from scanchain.verdict.stretches import KNOWN, Evidence, Kind, Stretch, find_stretches
+from scanchain.verdict.checks import WINDOW_M, Kind
+from scanchain.verdict.stretches import KNOWN, Evidence, Stretch, find_stretches
 from scanchain.words import counted
 
 MOST_CONTRADICTED = 0.1  # largest share of contradicted scans; good real runs have up to 0.025
@@ -83,14 +84,12 @@ def judge(evidence: Evidence) -> Judged:
     rest = _Rest.of(evidence)
     notes = [*([rest.text] if rest.is_shown else []), *slips]
     error = evidence.error or (f"error below {rest.extent_m:.2g} m" if rest.is_shown else "error unknown")
-    verdict, reasons = Verdict.NOT_TRUSTWORTHY, list(_grave(evidence, stretches))
-    if not reasons:
-        verdict, reasons = Verdict.CHECK, list(_doubts(evidence, stretches, rest))
-    if not reasons:
-        verdict, reasons = (
-            Verdict.TRUSTWORTHY,
-            list(_nothing(evidence)),
-        )
+    if reasons := list(_grave(evidence, stretches)):
+        verdict = Verdict.NOT_TRUSTWORTHY
+    elif reasons := list(_doubts(evidence, stretches, rest)):
+        verdict = Verdict.CHECK
+    else:
+        verdict, reasons = Verdict.TRUSTWORTHY, list(_nothing(evidence))
     return Judged(verdict, "; ".join([*reasons, *notes]), stretches, error)
 
 
@@ -109,9 +108,10 @@ def _grave(evidence: Evidence, stretches: Sequence[Stretch]) -> Iterator[str]:
         cause = next((each for each in stretches if each.kind in _UNMEASURED and _overlap(each, slip)), None)
         if cause is not None:
             yield f"{slip.text}, at scans that are not well measured: {cause.kind}"
-    for loop in (each for each in stretches if each.kind is Kind.LOOPS):
-        slip = next((each for each in slips if _confirms(each, loop)), None)
-        if slip is not None:
+    loops = [each for each in stretches if each.kind is Kind.LOOPS]
+    for loop, slip in product(loops, slips):
+        is_explained = (slip.size_m or 0.0) > _EXPLAINED * (loop.size_m or 0.0)
+        if is_explained and _overlap(slip, loop):
             yield (
                 f"{slip.text}, and {counted(loop.scans, 'loop closure')} between scans {loop.first:,} and "
                 f"{loop.last:,} by {loop.size_m:.1f} m"
@@ -119,21 +119,8 @@ def _grave(evidence: Evidence, stretches: Sequence[Stretch]) -> Iterator[str]:
             return
 
 
-def _opposed(evidence: Evidence) -> Iterator[str]:
-    if evidence.wheels.turn_ratio < _OPPOSED:
-        yield (
-            "the lidar turns left where the wheels turn right: the scans are mirrored (a lidar upside down that "
-            "/tf_static does not state so), or the wheels are"
-        )
-
-
 def _overlap(a: Stretch, b: Stretch) -> bool:
     return a.first <= b.last and b.first <= a.last
-
-
-def _confirms(slip: Stretch, loop: Stretch) -> bool:
-    """True if the loops span the slip, and contradict the trajectory by no more than it explains."""
-    return _overlap(slip, loop) and (slip.size_m or 0.0) > _EXPLAINED * (loop.size_m or 0.0)
 
 
 def _many_contradicted(evidence: Evidence) -> Iterator[str]:
@@ -165,7 +152,11 @@ def _mostly_predicted(evidence: Evidence) -> Iterator[str]:
 
 
 def _doubts(evidence: Evidence, stretches: Sequence[Stretch], rest: _Rest) -> Iterator[str]:
-    yield from _opposed(evidence)
+    if evidence.wheels.turn_ratio < _OPPOSED:
+        yield (
+            "the lidar turns left where the wheels turn right: the scans are mirrored (a lidar upside down that "
+            "/tf_static does not state so), or the wheels are"
+        )
     if rest.is_there and not rest.is_shown:
         yield rest.text
     yield from _unlike_wheels(evidence)
