@@ -7,12 +7,13 @@ DEV := .venv/dev-installed
 BASELINES := .venv/baselines-installed
 DOCS := .venv/docs-installed
 
-.PHONY: help demo test lint docs clean
+.PHONY: help demo test lint count docs clean
 
 help:
 	@echo "make demo   simulate an office and a town, run both, compare the town with KISS-ICP and Open3D (within four minutes)"
 	@echo "make test   run the whole test suite"
 	@echo "make lint   format, lint, type and import checks"
+	@echo "make count  print how many files and lines each part has"
 	@echo "make docs   build the documentation into build/docs; warnings are errors"
 	@echo "make clean  remove the environment, logs and runs of the demo"
 
@@ -36,6 +37,14 @@ lint: $(DEV)
 	$(BIN)/ruff check .
 	$(BIN)/basedpyright
 	PYTHONPATH=pipeline:viz $(BIN)/lint-imports
+
+count:
+	@git ls-files '*.py' | xargs wc -l | awk '$$2 != "total" { \
+	  split($$2, part, "/"); room = part[2] == "scanchain" && part[4] ? part[1] "/" part[3] : part[1]; \
+	  kind = part[1] ~ /pipeline|viz/ ? "product" : part[1]; \
+	  lines[room] += $$1; files[room]++; if (kind == "product") { lines[kind] += $$1; files[kind]++ } } \
+	  END { for (room in lines) printf "%7d lines %4d files  %s\n", lines[room], files[room], room }' | sort -k5
+	@cat README.md CHANGELOG.md CONTRIBUTING.md docs/*.md | wc -c | awk '{ printf "%7.1f kB of documentation\n", $$1 / 1000 }'
 
 docs: $(DOCS)
 	$(BIN)/python -m sphinx -W --keep-going -q -d build/docs/.doctrees docs build/docs
