@@ -15,32 +15,32 @@ from scipy.sparse import coo_matrix, csc_matrix, csr_matrix
 from scipy.sparse.linalg import spsolve_triangular
 
 from scanchain.errors import MissingExtraError
-from scanchain.graph.solvers.cholesky import BlockPattern, analyze, front_rows
+from scanchain.graph.solvers.cholesky import BlockPattern, analyze
 from scanchain.kernels.graph import symbolic
-from scanchain.kernels.graph.fronts import Fronts, lay_out_fronts
 from scanchain.kernels.landmarks import normal_equations, sparse_qr
 from scanchain.landmarks.solvers.solution import LOST_DIGITS, Factor, Solution, Stopwatch, undetermined
 from scanchain.landmarks.system import LinearSystem, Pattern
 
 Ordering = Literal["natural", "colamd"]
+_REST = 4  # rows that wait for the dense factorization, over its columns
 _SPQR_ORDERINGS = {"natural": 0, "colamd": 2}  # SPQR_ORDERING_FIXED, SPQR_ORDERING_COLAMD
 
 
 @dataclass(frozen=True, slots=True)
 class _Analysis:
-    """Analysis of the pattern: requested order, position of each column, fronts, and their rows of A."""
+    """Order of the columns, position of each; rows of R, their tree, where R is full from on; order of A's rows."""
 
     order: NDArray[np.int64]
     place: NDArray[np.int64]
-    fronts: Fronts
     begin: NDArray[np.int64]
+    right: NDArray[np.int64]
+    parent: NDArray[np.int64]
+    dense: int
     rows: NDArray[np.int64]
-    height: NDArray[np.int64]
-    stack_size: int
 
 
 class QrSolver:
-    """Householder QR of the project's own; its analysis is reused while the pattern is the same."""
+    """QR by Givens rotations, full columns by LAPACK; its analysis is reused while the pattern is the same."""
 
     def __init__(self, ordering: Ordering) -> None:
         self._ordering: Ordering = ordering
@@ -49,43 +49,42 @@ class QrSolver:
     def solve(self, system: LinearSystem) -> Solution:
         """Solve in the least-squares sense; the factor is R."""
         watch = Stopwatch()
-        analysis = self._analysis(system.pattern)
-        build_s = watch.lap()
-        fronts, pattern, n = analysis.fronts, system.pattern, system.pattern.shape[1]
-        R, z = np.zeros(int(fronts.factor_start[-1])), np.zeros(n)
-        sparse_qr.factorize(
-            fronts, analysis.begin, analysis.rows, analysis.height, pattern.row_start, pattern.columns,
-            system.values, system.b, analysis.place, R, z, np.empty(analysis.stack_size),
-        )  # fmt: skip
-        matrix = front_rows(fronts, R)
-        factor_s = watch.lap()
-        lengths = np.zeros(n)
-        np.add.at(lengths, pattern.columns, system.values**2)
-        diagonal = matrix.diagonal()[analysis.place]
-        if not np.all(np.abs(diagonal) > LOST_DIGITS * np.sqrt(lengths)):
-            raise undetermined(system)
-        watch.lap()
-        sparse_qr.back_substitute(fronts, R, z)
-        x = z[analysis.place]
-        solve_s = watch.lap()
-        to_requested = analysis.place[analysis.order]
-        return Solution(
-            x, build_s, factor_s, solve_s,
-            lambda: Factor("R of A", matrix[to_requested][:, to_requested].tocsc(), analysis.order),
-        )  # fmt: skip
-
-    def _analysis(self, pattern: Pattern) -> _Analysis:
+        pattern, n = system.pattern, system.pattern.shape[1]
         if self._known is None or self._known[0] is not pattern:
             self._known = pattern, _analyze(pattern, self._ordering)
-        return self._known[1]
+        known = self._known[1]
+        build_s = watch.lap()
+        R, z = _factorize(system, known)
+        starts, k = known.begin + np.arange(n + 1), np.arange(n)
+        matrix = csr_matrix((R, np.insert(known.right, known.begin[:-1], k), starts), shape=(n, n))
+        factor_s = watch.lap()
+        lengths = np.bincount(pattern.columns, system.values**2, n)
+        if not np.all(np.abs(R[starts[:-1]]) > LOST_DIGITS * np.sqrt(lengths[known.order])):
+            raise undetermined(system)
+        watch.lap()
+        x = spsolve_triangular(matrix, z, lower=False)[known.place]
+        solve_s = watch.lap()
+        return Solution(x, build_s, factor_s, solve_s, lambda: Factor("R of A", matrix.tocsc(), known.order))
+
+
+def _factorize(system: LinearSystem, known: _Analysis) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Entries of R, row by row, and the head of Qᵀb."""
+    pattern, n = system.pattern, system.pattern.shape[1]
+    R, z, width = np.zeros(len(known.right) + n), np.zeros(n), n - known.dense
+    rest, tail, at = np.empty((_REST * width, width + 1)), np.zeros((width, width + 1)), 0
+    while at < len(known.rows):
+        at, filled = sparse_qr.rotate(
+            at, known.rows, pattern.row_start, pattern.columns, system.values, system.b,
+            known.place, known.begin, known.right, known.parent, known.dense, R, z, rest,
+        )  # fmt: skip
+        tail = np.linalg.qr(np.concatenate([tail, rest[:filled]]), mode="r")[:width]
+    R[known.begin[known.dense] + known.dense :] = tail[np.triu_indices(width)]
+    z[known.dense :] = tail[:, width]
+    return R, z
 
 
 def _analyze(pattern: Pattern, ordering: Ordering) -> _Analysis:
-    """Order the columns, those of "colamd" by minimum degree in AᵀA, and lay out the fronts.
-
-    Within that order the fronts follow a postorder of the elimination tree, which leaves every entry of R as
-    it is (Liu 1990), so that R can be given in the requested order.
-    """
+    """Order the columns, those of "colamd" by minimum degree in AᵀA, and find where R has entries."""
     n = pattern.shape[1]
     start, others, _ = normal_equations.product_structure(pattern.row_start, pattern.columns, *pattern.by_column())
     order = np.arange(n)
@@ -93,16 +92,23 @@ def _analyze(pattern: Pattern, ordering: Ordering) -> _Analysis:
         pairs = np.stack([np.repeat(order, np.diff(start)), others], axis=1)
         order = analyze(BlockPattern(np.ones(n, np.int64), pairs)).order
     start, neighbors = _neighbor_lists(start, others)
-    after = symbolic.postorder(symbolic.elimination_tree(start, neighbors, order))
-    eliminated = order[after]
-    parent = symbolic.elimination_tree(start, neighbors, eliminated)
-    begin, below = symbolic.column_structures(start, neighbors, eliminated, parent)
-    sizes = np.ones(n, np.int64)
-    fronts = lay_out_fronts(symbolic.group_columns(parent, begin, below, sizes), begin, below, sizes)
+    parent = symbolic.elimination_tree(start, neighbors, order)
+    begin, right = symbolic.column_structures(start, neighbors, order, parent)
+    sparse = np.flatnonzero(np.diff(begin) < n - 1 - np.arange(n))
     place = np.empty(n, np.int64)
-    place[eliminated] = np.arange(n)
-    found = sparse_qr.assign_rows(fronts, pattern.row_start, pattern.columns, place)
-    return _Analysis(order, place, fronts, *found)
+    place[order] = np.arange(n)
+    rows = np.flatnonzero(np.diff(pattern.row_start))
+    places = place[pattern.columns]
+    first, last = (ends.reduceat(places, pattern.row_start[rows]) for ends in (np.minimum, np.maximum))
+    return _Analysis(
+        order,
+        place,
+        begin,
+        right,
+        parent,
+        int(sparse[-1]) + 1 if len(sparse) else 0,
+        rows[np.lexsort((-last, first))],
+    )
 
 
 def _neighbor_lists(
