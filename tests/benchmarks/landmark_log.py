@@ -15,15 +15,12 @@ import gtsam
 import numpy as np
 
 from scanchain.graph.robust.losses import RobustLoss
-from scanchain.landmarks.accuracy import against_truth, truth_at
-from scanchain.landmarks.bearing_range import BearingRangeProblem, no_calibration
-from scanchain.landmarks.files.mrclam import read_mrclam
-from scanchain.landmarks.guess import from_odometry
-from scanchain.landmarks.minimize import minimize
-from scanchain.landmarks.problem import Values
-from scanchain.landmarks.ranges.dead_reckoning import OWN, OdometryNoise
-from scanchain.landmarks.ranges.slam import LogModel, solve_range_log
+from scanchain.landmarks.estimate import from_odometry, minimize
+from scanchain.landmarks.files import read_mrclam
+from scanchain.landmarks.problem import BearingRangeProblem, Values, no_calibration
+from scanchain.landmarks.ranges import OWN, LogModel, OdometryNoise, solve_range_log
 from scanchain.landmarks.solvers import create_solver
+from scanchain.landmarks.study import against_truth, truth_at
 
 ROOT = Path(__file__).resolve().parents[2]
 HUBER = 1.345

@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from scanchain.landmarks.compare import compare_linear
-from scanchain.landmarks.files.npz import read_landmark_data
+from scanchain.landmarks.files import read_landmark_data
+from scanchain.landmarks.problem import linear_system
 from scanchain.landmarks.solvers import METHODS
-from scanchain.landmarks.system import linear_system
 
 ROOT = Path(__file__).resolve().parents[2]
 OF_THE_REPORT = ("default", "pinv", "lu", "lu_colamd", "qr", "qr_colamd")

@@ -5,11 +5,10 @@ import pytest
 
 from scanchain.graph.robust.losses import RobustLoss
 from scanchain.kernels.landmarks import dead_reckoning, factors
-from scanchain.landmarks import guess as guesses
-from scanchain.landmarks.bearing_range import BearingRangeProblem, Measurements, no_calibration, world_referenced
-from scanchain.landmarks.files.npz import read_landmark_data
-from scanchain.landmarks.minimize import QUADRATIC, minimize
-from scanchain.landmarks.problem import Values
+from scanchain.landmarks import estimate as guesses
+from scanchain.landmarks.estimate import QUADRATIC, minimize
+from scanchain.landmarks.files import read_landmark_data
+from scanchain.landmarks.problem import BearingRangeProblem, Measurements, Values, no_calibration, world_referenced
 from scanchain.landmarks.solvers import METHODS, UndeterminedError, create_solver
 from tests.support import naive_landmarks
 from tests.support.naive_landmarks import numeric_jacobian

@@ -2,11 +2,8 @@ import numpy as np
 import pytest
 
 from scanchain.errors import InputError
-from scanchain.landmarks.files.mrclam import read_mrclam
-from scanchain.landmarks.files.npz import read_landmark_data
-from scanchain.landmarks.files.write import accuracy_lines
-from scanchain.landmarks.ranges.dead_reckoning import OdometryNoise
-from scanchain.landmarks.ranges.slam import solve_range_log
+from scanchain.landmarks.files import accuracy_lines, read_landmark_data, read_mrclam
+from scanchain.landmarks.ranges import OdometryNoise, solve_range_log
 from scanchain.landmarks.study import Options, study_file, study_log
 from tests.support.scenes import shared_data
 
@@ -233,7 +230,7 @@ def test_utias_6_robot_1_is_as_accurate_as_a_batch_in_gtsam_or_better():
 def test_the_estimate_of_the_noise_hardly_depends_on_where_it_begins(monkeypatch):
     log = read_mrclam(shared_data("landmarks/utias_mrclam6"), 1)
     first = solve_range_log(log, None)
-    monkeypatch.setattr("scanchain.landmarks.ranges.slam._SENSOR", np.square([0.02, 0.2]))
+    monkeypatch.setattr("scanchain.landmarks.ranges._SENSOR", np.square([0.02, 0.2]))
     second = solve_range_log(log, None)
     assert second.sigmas[3:] == pytest.approx(first.sigmas[3:], rel=0.1)
 

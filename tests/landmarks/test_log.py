@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 
 from scanchain.kernels.landmarks import dead_reckoning
-from scanchain.landmarks.files.mrclam import RangeLog
-from scanchain.landmarks.ranges.dead_reckoning import OWN, OdometryNoise, chain, reckon
-from scanchain.landmarks.ranges.noise_model import SightingPairs
-from scanchain.landmarks.ranges.slam import solve_range_log
+from scanchain.landmarks.files import RangeLog
+from scanchain.landmarks.ranges import OWN, OdometryNoise, SightingPairs, chain, reckon, solve_range_log
 
 OF_ITS_OWN = np.array([0.0, -0.05, 0.04, -0.03, 0.2])
 NOISE = OdometryNoise(0.02, 0.01, 0.03, 0.05)

@@ -14,8 +14,8 @@ from click.core import ParameterSource
 from scanchain.errors import InputError
 
 if TYPE_CHECKING:
-    from scanchain.landmarks.minimize import Optimizer
-    from scanchain.landmarks.ranges.dead_reckoning import OdometryNoise
+    from scanchain.landmarks.estimate import Optimizer
+    from scanchain.landmarks.ranges import OdometryNoise
     from scanchain.landmarks.study import Guess, Study
 
 
@@ -105,8 +105,7 @@ def landmarks(
     from scanchain.clock import announcing_compilation
     from scanchain.commands.options import check_output
     from scanchain.commands.terminal import Terminal
-    from scanchain.landmarks.files.npz import read_landmark_data
-    from scanchain.landmarks.files.write import text_of, tree_of
+    from scanchain.landmarks.files import read_landmark_data, text_of, tree_of
     from scanchain.landmarks.solvers import parse_methods
     from scanchain.landmarks.study import Options, study_file, study_log
     from scanchain.runs.directory import RunDirectory
@@ -157,7 +156,7 @@ def _check_options(ctx: click.Context, kinds: Collection[str]) -> None:
 
 def _noise(text: str | None) -> OdometryNoise | None:
     """Four positive numbers with commas; None is to be estimated."""
-    from scanchain.landmarks.ranges.dead_reckoning import OdometryNoise
+    from scanchain.landmarks.ranges import OdometryNoise
 
     if text is None:
         return None
@@ -172,7 +171,7 @@ def _noise(text: str | None) -> OdometryNoise | None:
 
 def _check_names(studies: Sequence[Study]) -> None:
     """Refuse problems whose files would overwrite each other."""
-    from scanchain.landmarks.files.write import file_stem
+    from scanchain.landmarks.files import file_stem
 
     stems = [file_stem(study.name) for study in studies]
     for study, stem in zip(studies, stems, strict=True):
@@ -184,7 +183,7 @@ def _write(directory: Path, data: Sequence[Path], studies: Sequence[Study], tree
     """Write the estimates and the figures of all solvers."""
     from msgspec.structs import replace
 
-    from scanchain.landmarks.files.write import write_estimate
+    from scanchain.landmarks.files import write_estimate
     from scanchain.runs.provenance import describe_start
 
     for study in studies:

@@ -8,11 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain.landmarks.bearing_range import BearingRangeProblem
-from scanchain.landmarks.minimize import Optimizer, minimize
-from scanchain.landmarks.problem import Values
+from scanchain.landmarks.estimate import Optimizer, minimize
+from scanchain.landmarks.problem import BearingRangeProblem, Layout, LinearSystem, Pattern, Values
 from scanchain.landmarks.solvers import Factor, LinearSolver, Solution, create_solver
-from scanchain.landmarks.system import Layout, LinearSystem, Pattern
 
 _SLOW_S = 1.0  # seconds of a solution above which it is not repeated
 

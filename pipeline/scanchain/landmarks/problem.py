@@ -1,14 +1,17 @@
-"""The landmark problems of a file: odometry, observations, their noise, and the truth."""
+"""Landmark problems in the plane: unknowns, measurements, pattern of A, linearization."""
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
 
 from scanchain.data import Matrix
+from scanchain.kernels.landmarks import factors
 
 Kind = Literal["linear", "bearing-range"]
 
@@ -64,3 +67,332 @@ class Values:
             self.landmarks + landmarks.reshape(self.landmarks.shape),
             self.calibration + calibration,
         )
+
+
+_FIRST_POSE = 100.0  # weight of the first pose over that of a step in a linear problem
+_COMPONENTS = ("x", "y", "heading")
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Columns of A: pose after pose, the robot's calibration, landmark after landmark.
+
+    Attributes
+    ----------
+    poses : how many
+    pose_size : unknowns of a pose, 2 (x, y) or 3 (x, y, heading)
+    landmarks : (L,) their names, as numbers
+    calibration : names of the unknowns that are the robot's own
+    """
+
+    poses: int
+    pose_size: int
+    landmarks: NDArray[np.int64]
+    calibration: tuple[str, ...] = ()
+
+    @property
+    def split(self) -> int:
+        """Columns of the poses; all others come after."""
+        return self.poses * self.pose_size
+
+    @property
+    def landmark_start(self) -> int:
+        """First column of the landmarks."""
+        return self.split + len(self.calibration)
+
+    @property
+    def columns(self) -> int:
+        """Unknowns in all."""
+        return self.landmark_start + 2 * len(self.landmarks)
+
+    def name(self, column: int) -> str:
+        """The unknown of a column, as "pose 3 heading" or "landmark 12 x"."""
+        if column < self.split:
+            pose, component = divmod(column, self.pose_size)
+            return f"pose {pose} {_COMPONENTS[component]}"
+        if column < self.landmark_start:
+            return self.calibration[column - self.split]
+        landmark, component = divmod(column - self.landmark_start, 2)
+        return f"landmark {self.landmarks[landmark]} {_COMPONENTS[component]}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pattern:
+    """Entries of A that may be nonzero, row by row: columns of row r are columns[row_start[r] : row_start[r + 1]].
+
+    One object is one pattern: solvers reuse their analysis of it as long as they are given the same one.
+    """
+
+    row_start: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    layout: Layout
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Number of rows and columns of A."""
+        return len(self.row_start) - 1, self.layout.columns
+
+    def by_column(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Start of each column's rows (n + 1,), and the rows."""
+        counts = csr_matrix(
+            (np.ones(len(self.columns), np.int8), self.columns, self.row_start), self.shape
+        ).tocsc()
+        return counts.indptr.astype(np.int64), counts.indices.astype(np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class LinearSystem:
+    """A x = b in the least-squares sense, every row divided by its standard deviation."""
+
+    pattern: Pattern
+    values: NDArray[np.float64]
+    b: NDArray[np.float64]
+
+    @property
+    def A(self) -> csr_matrix:
+        """The matrix in scipy's form."""
+        return csr_matrix((self.values, self.pattern.columns, self.pattern.row_start), self.pattern.shape)
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """Rows of A with equally many entries each: their columns and values, both (rows, entries)."""
+
+    columns: NDArray[np.int64]
+    values: Matrix
+
+
+def whitening(covariance: Matrix) -> Matrix:
+    """W with WᵀW = Σ⁻¹, upper triangular; covariance (..., k, k)."""
+    return np.swapaxes(np.linalg.cholesky(np.linalg.inv(covariance)), -1, -2).astype(np.float64, copy=False)
+
+
+def pattern_of(groups: list[NDArray[np.int64]], layout: Layout) -> Pattern:
+    """One group of rows, (rows, entries) columns each, under the other."""
+    lengths = np.concatenate([np.full(len(group), group.shape[1], np.int64) for group in groups])
+    row_start = np.concatenate([np.zeros(1, np.int64), np.cumsum(lengths)])
+    return Pattern(row_start, np.concatenate([group.reshape(-1) for group in groups]), layout)
+
+
+def pose_columns(layout: Layout, poses: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Columns of each pose, (N, pose size)."""
+    return poses[:, None] * layout.pose_size + np.arange(layout.pose_size)
+
+
+def landmark_columns(layout: Layout, landmarks: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Columns of each landmark, (N, 2)."""
+    return layout.landmark_start + 2 * landmarks[:, None] + np.arange(2)
+
+
+def difference_rows(W: Matrix, first: NDArray[np.int64], second: NDArray[np.int64]) -> Rows:
+    """Rows W (second − first) of many pairs of points with one and the same whitening.
+
+    first, second (N, 2) : columns of the points. Entries that are zero for all are left out.
+    """
+    if not np.any(W - np.diag(W.diagonal())):
+        columns = np.stack([first, second], axis=-1)
+        values = np.broadcast_to(np.stack([-W.diagonal(), W.diagonal()], axis=-1), columns.shape)
+    else:
+        columns = np.broadcast_to(np.concatenate([first, second], axis=1)[:, None], (len(first), 2, 4))
+        values = np.broadcast_to(np.concatenate([-W, W], axis=1), columns.shape)
+    width = columns.shape[-1]
+    return Rows(np.ascontiguousarray(columns).reshape(-1, width), values.reshape(-1, width))
+
+
+def linear_system(data: LandmarkData) -> LinearSystem:
+    """A x = b with A = Σ^(−1/2) H, b = Σ^(−1/2) z: a prior on the first pose, odometry, observations.
+
+    The prior puts the first pose at the origin. It can be met exactly, so that its weight, a hundredth of a step's
+    noise, matters to the covariance alone.
+    """
+    layout = Layout(len(data.odometry) + 1, 2, np.arange(len(data.true_landmarks)))
+    W_odometry, W_observation = whitening(data.odometry_covariance), whitening(data.observation_covariance)
+    poses = pose_columns(layout, np.arange(layout.poses))
+    seen_from, seen = data.observed.T
+    groups = [
+        Rows(poses[0][:, None], _FIRST_POSE * W_odometry.diagonal()[:, None]),
+        difference_rows(W_odometry, poses[:-1], poses[1:]),
+        difference_rows(W_observation, poses[seen_from], landmark_columns(layout, seen)),
+    ]
+    b = [np.zeros(2), (data.odometry @ W_odometry.T).ravel(), (data.measured @ W_observation.T).ravel()]
+    values = np.concatenate([group.values.ravel() for group in groups])
+    return LinearSystem(pattern_of([group.columns for group in groups], layout), values, np.concatenate(b))
+
+
+def state_of(data: LandmarkData, x: np.ndarray) -> Values:
+    """The unknowns as positions."""
+    split = 2 * (len(data.odometry) + 1)
+    return Values(x[:split].reshape(-1, 2), x[split:].reshape(-1, 2))
+
+
+_ANCHOR = 0.01  # noise of the first pose as a share of a step's
+
+
+@dataclass(frozen=True, slots=True)
+class Linearization:
+    """Whitened residuals r at a state and the values of A = ∂r/∂x there.
+
+    Attributes
+    ----------
+    prior, calibration, odometry, observations : residuals (p,), (C,), (K − 1, p), (N, 2); pure numbers
+    prior_rows, odometry_rows, observation_rows : of A: (p, p), (K − 1, p, 2 p + C), (N, 2, p + 2)
+    """
+
+    prior: NDArray[np.float64]
+    calibration: NDArray[np.float64]
+    odometry: Matrix
+    observations: Matrix
+    prior_rows: Matrix
+    odometry_rows: Matrix
+    observation_rows: Matrix
+
+    @property
+    def observation_chi2(self) -> NDArray[np.float64]:
+        """χ² of every observation, (N,)."""
+        return np.square(self.observations).sum(axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """Unknowns common to all motions of the robot.
+
+    Attributes
+    ----------
+    names : (C,) what they are called
+    value : (C,) at which the motions were worked out; slope (K − 1, p, C) by how much they change with them
+    mean, sigma : (C,) prior
+    """
+
+    names: tuple[str, ...]
+    value: NDArray[np.float64]
+    slope: Matrix
+    mean: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+
+
+def no_calibration(motion: Matrix) -> Calibration:
+    """Calibration without parameters, of motions (K − 1, p)."""
+    return Calibration((), np.zeros(0), np.zeros((*motion.shape, 0)), np.zeros(0), np.zeros(0))
+
+
+@dataclass(frozen=True, slots=True)
+class Measurements:
+    """Measurements of a bearing-range problem.
+
+    Attributes
+    ----------
+    first_pose, first_covariance : (p,), (p, p) prior of the first pose; p is 2 without headings, 3 with them
+    motion, motion_covariance : (K − 1, p), (K − 1, p, p) from each pose to the next: with headings in the frame
+        of the former, without in the world's
+    calibration : errors common to all motions
+    observed : (N, 2) pose, landmark
+    measured, measured_covariance : (N, 2), (2, 2) bearing in rad, range in m; of every one alike
+    landmarks : (L,) their names, as numbers
+    """
+
+    first_pose: NDArray[np.float64]
+    first_covariance: Matrix
+    motion: Matrix
+    motion_covariance: Matrix
+    calibration: Calibration
+    observed: NDArray[np.int64]
+    measured: Matrix
+    measured_covariance: Matrix
+    landmarks: NDArray[np.int64]
+
+    def motion_at(self, calibration: NDArray[np.float64]) -> Matrix:
+        """The motions with another calibration, to first order."""
+        return self.motion + self.calibration.slope @ (calibration - self.calibration.value)
+
+
+class BearingRangeProblem:
+    """Prior on the first pose, motion from pose to pose, bearings and ranges; its pattern is found once.
+
+    ``motion_columns`` (K − 1, 2 p + C) and ``observation_columns`` (N, p + 2) are the unknowns of each of them,
+    ``motion_whitening`` (K − 1, p, p) is W with WᵀW = Σ⁻¹.
+    """
+
+    def __init__(self, measurements: Measurements) -> None:
+        given = measurements
+        self.measurements = given
+        size = given.motion.shape[1]
+        layout = Layout(len(given.motion) + 1, size, given.landmarks, given.calibration.names)
+        self._first = whitening(given.first_covariance)
+        self._whiten()
+        poses = pose_columns(layout, np.arange(layout.poses))
+        own = np.arange(layout.split, layout.landmark_start)
+        seen_from, seen = given.observed.T
+        pairs = np.concatenate([poses[seen_from], landmark_columns(layout, seen)], axis=1)
+        moves = np.concatenate([poses[:-1], poses[1:], np.tile(own, (len(given.motion), 1))], axis=1)
+        groups = [
+            np.repeat(poses[:1], size, axis=0), own[:, None], np.repeat(moves, size, axis=0),
+            np.repeat(pairs, 2, axis=0),
+        ]  # fmt: skip
+        damping = np.arange(layout.columns)[:, None]
+        self.motion_columns, self.observation_columns = moves, pairs
+        self.pattern, self._damped = pattern_of(groups, layout), pattern_of([*groups, damping], layout)
+
+    def of(self, measurements: Measurements) -> BearingRangeProblem:
+        """The same pattern with other numbers."""
+        result = copy(self)
+        result.measurements = measurements
+        result._whiten()
+        return result
+
+    def _whiten(self) -> None:
+        given = self.measurements
+        self.motion_whitening = whitening(given.motion_covariance)
+        self._slope = -self.motion_whitening @ given.calibration.slope
+        self._observation = whitening(given.measured_covariance)
+
+    def linearize(self, state: Values) -> Linearization:
+        """Residuals and Jacobians at a state."""
+        given, p = self.measurements, state.poses.shape[1]
+        calibration = given.calibration
+        motion, J_motion = np.empty(given.motion.shape), np.empty((len(given.motion), p, 2 * p))
+        if p == 3:
+            factors.odometry(state.poses, given.motion, self.motion_whitening, motion, J_motion)
+        else:
+            W = self.motion_whitening
+            motion = (W @ (np.diff(state.poses, axis=0) - given.motion)[..., None])[..., 0]
+            J_motion = np.concatenate([-W, W], axis=-1)
+        motion += self._slope @ (state.calibration - calibration.value)
+        J_motion = np.concatenate([J_motion, self._slope], axis=-1)
+        seen = np.empty(given.measured.shape)
+        J_seen = np.empty((len(seen), 2, p + 2))
+        factors.bearing_range(
+            state.poses, state.landmarks, given.observed, given.measured, self._observation, seen, J_seen
+        )
+        off = state.poses[0] - given.first_pose
+        off[2:] = (off[2:] + np.pi) % (2.0 * np.pi) - np.pi
+        own = (state.calibration - calibration.mean) / calibration.sigma
+        return Linearization(self._first @ off, own, motion, seen, self._first, J_motion, J_seen)
+
+    def system(self, at: Linearization, weights: NDArray[np.float64]) -> LinearSystem:
+        """The step's system A x = −r, observations weighed by √w (N,)."""
+        root = np.sqrt(weights)[:, None]
+        seen = at.observation_rows * root[..., None]
+        own = 1.0 / self.measurements.calibration.sigma
+        values = np.concatenate([at.prior_rows.ravel(), own, at.odometry_rows.ravel(), seen.ravel()])
+        b = -np.concatenate([at.prior, at.calibration, at.odometry.ravel(), (at.observations * root).ravel()])
+        return LinearSystem(self.pattern, values, b)
+
+    def damped(self, system: LinearSystem, damping: NDArray[np.float64]) -> LinearSystem:
+        """The system with a row √d of its own for every unknown, so that AᵀA grows by diag(d); d (n,)."""
+        values, b = np.concatenate([system.values, np.sqrt(damping)]), np.append(system.b, np.zeros(len(damping)))
+        return LinearSystem(self._damped, values, b)
+
+
+def world_referenced(data: LandmarkData) -> Measurements:
+    """The problem of an npz file: headings are known, so that bearings are those of the world's axes."""
+    return Measurements(
+        first_pose=np.zeros(2),
+        first_covariance=_ANCHOR**2 * data.odometry_covariance,
+        motion=data.odometry,
+        motion_covariance=np.broadcast_to(data.odometry_covariance, (len(data.odometry), 2, 2)),
+        calibration=no_calibration(data.odometry),
+        observed=data.observed,
+        measured=data.measured,
+        measured_covariance=data.observation_covariance,
+        landmarks=np.arange(len(data.true_landmarks)),
+    )

@@ -1,7 +1,4 @@
-"""Studies of landmark problems by ``scanchain landmarks``: before and after, every method, accuracy.
-
-A problem is that of a file of the course, or the log of one robot of an MRCLAM folder.
-"""
+"""Studies of landmark problems by ``scanchain landmarks``: before and after, every method, accuracy."""
 
 from __future__ import annotations
 
@@ -15,27 +12,115 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.clock import working_s
 from scanchain.data import Matrix, Pose, Trajectory
-from scanchain.landmarks import guess as guesses
-from scanchain.landmarks.accuracy import (
-    Accuracy,
-    Truth,
-    against_truth,
-    nanoseconds,
-    of_positions,
-    pose_matrices,
-    truth_at,
-)
-from scanchain.landmarks.bearing_range import BearingRangeProblem, world_referenced
+from scanchain.evaluation import Alignment, absolute_error, pair
 from scanchain.landmarks.compare import MethodResult, compare_linear, compare_nonlinear
-from scanchain.landmarks.files.mrclam import RangeLog, read_mrclam
-from scanchain.landmarks.minimize import Optimizer, minimize
-from scanchain.landmarks.problem import LandmarkData, Values
-from scanchain.landmarks.ranges.dead_reckoning import OWN, OWN_UNITS, OdometryNoise
-from scanchain.landmarks.ranges.slam import RangeSolution, solve_range_log
+from scanchain.landmarks.estimate import Optimizer, disturbed, from_odometry, minimize, of_relative_positions
+from scanchain.landmarks.files import RangeLog, read_mrclam
+from scanchain.landmarks.problem import (
+    BearingRangeProblem,
+    LandmarkData,
+    LinearSystem,
+    Values,
+    landmark_columns,
+    linear_system,
+    pose_columns,
+    state_of,
+    world_referenced,
+)
+from scanchain.landmarks.ranges import OWN, OWN_UNITS, OdometryNoise, RangeSolution, solve_range_log
 from scanchain.landmarks.solvers import create_solver, methods_for
-from scanchain.landmarks.solvers.schur import Covariance
-from scanchain.landmarks.system import LinearSystem, landmark_columns, linear_system, pose_columns, state_of
+from scanchain.landmarks.solvers.elimination import Covariance
 from scanchain.words import FREEDOM, counted
+
+_WIDEST_GAP_S = 0.5  # between motion-capture poses that are interpolated
+
+
+@dataclass(frozen=True, slots=True)
+class Accuracy:
+    """Root mean squared distances from the truth; NaN without truth. ``definition`` defines them as text."""
+
+    poses_m: float
+    landmarks_m: float
+    definition: str
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """Motion capture at the times of an estimate.
+
+    Attributes
+    ----------
+    known : (K,) bool, poses of the estimate for which there is a truth
+    poses : (k, 3) x, y, heading of those
+    landmarks : (L, 2), NaN where a landmark was not surveyed
+    """
+
+    known: NDArray[np.bool_]
+    poses: Matrix
+    landmarks: Matrix
+
+
+def of_positions(state: Values, data: LandmarkData) -> Accuracy:
+    """Against the positions of an npz file, where it has them; both lie in one frame."""
+    known = len(data.true_poses) > 0
+    if not known and np.isnan(data.true_landmarks).all():
+        return Accuracy(np.nan, np.nan, "no true positions in the file")
+    return Accuracy(
+        _rms(state.poses - data.true_poses) if known else np.nan,
+        _rms(state.landmarks - data.true_landmarks),
+        "root mean squared distance from the true positions, nothing aligned",
+    )
+
+
+def truth_at(log: RangeLog, nodes_s: NDArray[np.float64], landmarks: NDArray[np.int64]) -> Truth:
+    """Motion capture interpolated to these times, surveyed positions of these landmarks."""
+    place = {
+        int(subject): position for subject, position in zip(log.true_subjects, log.true_landmarks, strict=True)
+    }
+    surveyed = np.array([place.get(int(subject), np.full(2, np.nan)) for subject in landmarks])
+    if len(log.true_s) < 2:
+        return Truth(np.zeros(len(nodes_s), np.bool_), np.empty((0, 3)), surveyed)
+    after = np.clip(np.searchsorted(log.true_s, nodes_s), 1, len(log.true_s) - 1)
+    inside = (nodes_s >= log.true_s[0]) & (nodes_s <= log.true_s[-1])
+    known = inside & (log.true_s[after] - log.true_s[after - 1] <= _WIDEST_GAP_S)
+    heading = np.unwrap(log.true_poses[:, 2])
+    columns = (log.true_poses[:, 0], log.true_poses[:, 1], heading)
+    poses = np.stack([np.interp(nodes_s[known], log.true_s, column) for column in columns], axis=-1)
+    return Truth(known, poses, surveyed)
+
+
+def against_truth(state: Values, nodes_s: NDArray[np.float64], truth: Truth) -> tuple[Accuracy, Pose]:
+    """ATE of the poses after rigid alignment, landmarks by the same alignment; and T_truth_estimate (3, 3)."""
+    stamps_ns = nanoseconds(nodes_s[truth.known])
+    estimate = Trajectory(stamps_ns, pose_matrices(state.poses[truth.known]))
+    error = absolute_error(pair(estimate, Trajectory(stamps_ns, pose_matrices(truth.poses))), Alignment.RIGID)
+    T_truth_estimate = lie.flatten(error.T_reference_estimate)
+    moved = lie.transform(T_truth_estimate, state.landmarks)
+    definition = f"{error.definition}, over {error.pairing}"
+    return Accuracy(error.translation_m.rmse, _rms(moved - truth.landmarks), definition), T_truth_estimate
+
+
+def nanoseconds(times_s: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Whole nanoseconds of times that were written with milliseconds."""
+    return np.round(times_s * 1e3).astype(np.int64) * 1_000_000
+
+
+def pose_matrices(poses: Matrix) -> Matrix:
+    """SE(2) matrices (K, 3, 3) of x, y, heading (K, 3)."""
+    result = np.zeros((len(poses), 3, 3))
+    result[:, 0, 0] = result[:, 1, 1] = np.cos(poses[:, 2])
+    result[:, 1, 0] = np.sin(poses[:, 2])
+    result[:, 0, 1] = -result[:, 1, 0]
+    result[:, :2, 2] = poses[:, :2]
+    result[:, 2, 2] = 1.0
+    return result
+
+
+def _rms(differences: Matrix) -> float:
+    """Root mean square over the rows that are known; NaN if none is."""
+    known = differences[np.isfinite(differences).all(axis=1)]
+    return float(np.sqrt(np.mean(np.sum(known**2, axis=1)))) if len(known) else float("nan")
+
 
 Guess = Literal["odometry", "disturbed", "origin"]
 
@@ -126,7 +211,7 @@ def _linear(data: LandmarkData, options: Options) -> Study:
         _chi2(chi2, len(system.b), system.pattern.shape[1]),
         *_left_out(left_out),
     )
-    before, after = guesses.of_relative_positions(data), state_of(data, methods[0].x)
+    before, after = of_relative_positions(data), state_of(data, methods[0].x)
     return _of_file(data, before, after, facts, system, build_s, methods)
 
 
@@ -169,9 +254,9 @@ def _chi2(chi2: float, rows: int, unknowns: int) -> Fact:
 
 
 def _guess(problem: BearingRangeProblem, guess: Guess) -> Values:
-    state = guesses.from_odometry(problem.measurements)
+    state = from_odometry(problem.measurements)
     if guess == "disturbed":
-        return guesses.disturbed(state, _SHIFT_M, _TURN_RAD)
+        return disturbed(state, _SHIFT_M, _TURN_RAD)
     if guess == "origin":
         return replace(state, landmarks=np.zeros_like(state.landmarks))
     return state

@@ -5,11 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from scanchain.errors import InputError
-from scanchain.landmarks.solvers.cholesky import CholeskySolver
+from scanchain.landmarks.solvers.direct import (
+    PINV_BELOW,
+    DefaultSolver,
+    Factor,
+    LinearSolver,
+    LuSolver,
+    PinvSolver,
+    Solution,
+    UndeterminedError,
+    check_pinv,
+)
+from scanchain.landmarks.solvers.elimination import CholeskySolver, SchurSolver
 from scanchain.landmarks.solvers.qr import QrSolver, SuiteSparseQrSolver
-from scanchain.landmarks.solvers.schur import SchurSolver
-from scanchain.landmarks.solvers.scipy_direct import PINV_BELOW, DefaultSolver, LuSolver, PinvSolver, check_pinv
-from scanchain.landmarks.solvers.solution import Factor, LinearSolver, Solution, UndeterminedError
 
 __all__ = [
     "ESTIMATOR", "METHODS", "Factor", "LinearSolver", "Solution", "UndeterminedError", "create_solver",

@@ -18,8 +18,8 @@ from scanchain.errors import MissingExtraError
 from scanchain.graph.solvers.cholesky import BlockPattern, analyze
 from scanchain.kernels.graph import symbolic
 from scanchain.kernels.landmarks import normal_equations, sparse_qr
-from scanchain.landmarks.solvers.solution import LOST_DIGITS, Factor, Solution, Stopwatch, undetermined
-from scanchain.landmarks.system import LinearSystem, Pattern
+from scanchain.landmarks.problem import LinearSystem, Pattern
+from scanchain.landmarks.solvers.direct import LOST_DIGITS, Factor, Solution, Stopwatch, undetermined
 
 Ordering = Literal["natural", "colamd"]
 _REST = 4  # rows that wait for the dense factorization, over its columns
@@ -28,7 +28,7 @@ _SPQR_ORDERINGS = {"natural": 0, "colamd": 2}  # SPQR_ORDERING_FIXED, SPQR_ORDER
 
 @dataclass(frozen=True, slots=True)
 class _Analysis:
-    """Order of the columns, position of each; rows of R, their tree, where R is full from on; order of A's rows."""
+    """Order of the columns, position of each; rows of R, their tree, first full column; order of A's rows."""
 
     order: NDArray[np.int64]
     place: NDArray[np.int64]
@@ -77,7 +77,7 @@ def _factorize(system: LinearSystem, known: _Analysis) -> tuple[NDArray[np.float
             at, known.rows, pattern.row_start, pattern.columns, system.values, system.b,
             known.place, known.begin, known.right, known.parent, known.dense, R, z, rest,
         )  # fmt: skip
-        tail = np.linalg.qr(np.concatenate([tail, rest[:filled]]), mode="r")[:width]
+        tail = np.asarray(np.linalg.qr(np.concatenate([tail, rest[:filled]]), mode="r"))[:width]
     R[known.begin[known.dense] + known.dense :] = tail[np.triu_indices(width)]
     z[known.dense :] = tail[:, width]
     return R, z

@@ -1,0 +1,220 @@
+"""Initial guesses of landmark problems, and their minimization by the step rules of pose graphs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain.data import Matrix
+from scanchain.graph.robust.losses import RobustLoss
+from scanchain.graph.solvers.cholesky import SingularMatrixError
+from scanchain.graph.solvers.descent import LocalModel, descend, step_rule
+from scanchain.kernels.landmarks import normal_equations
+from scanchain.landmarks.problem import (
+    BearingRangeProblem,
+    LandmarkData,
+    Linearization,
+    LinearSystem,
+    Measurements,
+    Values,
+)
+from scanchain.landmarks.solvers import LinearSolver, UndeterminedError
+
+_FIRST, _GROWTH = 16, 2  # number of poses of the first part, and growth factor of each further one
+_STEPS = 2
+_CONVEX = RobustLoss("huber", 1.345, 1.0)
+
+
+def from_odometry(measurements: Measurements) -> Values:
+    """Poses chained by the motions, every landmark by its first observation."""
+    if measurements.motion.shape[1] == 3:
+        poses = chain(measurements.first_pose, measurements.motion)
+    else:
+        poses = measurements.first_pose + np.cumsum(np.vstack([np.zeros(2), measurements.motion]), axis=0)
+    return Values(poses, _first_seen(measurements, poses)[0], measurements.calibration.value)
+
+
+def of_relative_positions(data: LandmarkData) -> Values:
+    """The same for a linear problem."""
+    poses = np.cumsum(np.vstack([np.zeros(2), data.odometry]), axis=0)
+    _, first = np.unique(data.observed[:, 1], return_index=True)
+    landmarks = np.full(data.true_landmarks.shape, np.nan)
+    landmarks[data.observed[first, 1]] = poses[data.observed[first, 0]] + data.measured[first]
+    return Values(poses, landmarks)
+
+
+def disturbed(state: Values, shift_m: float, turn_rad: float) -> Values:
+    """The poses but for the first moved by a shift along both axes and turned about the origin."""
+    c, s = np.cos(turn_rad), np.sin(turn_rad)
+    poses = state.poses.copy()
+    poses[1:, :2] = poses[1:, :2] @ np.array([[c, s], [-s, c]]) + shift_m
+    poses[1:, 2:] += turn_rad
+    return replace(state, poses=poses)
+
+
+def growing(measurements: Measurements, solver: LinearSolver) -> Values:
+    """Initialize part by part: extend the solution of the log so far, optimize, and so on to its end.
+
+    Dead reckoning over the whole log may be meters off, where a robust loss finds but a local minimum; over a
+    half of it, from poses and landmarks that are settled, it is not. The loss is convex in the residuals.
+    """
+    count = len(measurements.motion) + 1
+    poses, landmarks = measurements.first_pose[None], np.full((len(measurements.landmarks), 2), np.nan)
+    own, reach = measurements.calibration.mean, _FIRST
+    while True:
+        reach = min(reach, count)
+        motion = measurements.motion_at(own)
+        poses = np.vstack([poses, chain(poses[-1], motion[len(poses) - 1 : reach - 1])[1:]])
+        part, known = _beginning(measurements, reach)
+        guess, _ = _first_seen(part, poses)
+        settled = np.isfinite(landmarks[known, 0])
+        guess[settled] = landmarks[known[settled]]
+        state = minimize(
+            BearingRangeProblem(part), Values(poses, guess, own), solver, loss=_CONVEX, max_iterations=_STEPS
+        ).state
+        poses, landmarks[known], own = state.poses, state.landmarks, state.calibration
+        if reach == count:
+            return Values(poses, landmarks, own)
+        reach *= _GROWTH
+
+
+def _beginning(measurements: Measurements, poses: int) -> tuple[Measurements, NDArray[np.int64]]:
+    """The problem of the first so many poses, and the landmarks observed from them."""
+    kept = measurements.observed[:, 0] < poses
+    known, landmark = np.unique(measurements.observed[kept, 1], return_inverse=True)
+    part = replace(
+        measurements,
+        motion=measurements.motion[: poses - 1],
+        motion_covariance=measurements.motion_covariance[: poses - 1],
+        calibration=replace(measurements.calibration, slope=measurements.calibration.slope[: poses - 1]),
+        observed=np.stack([measurements.observed[kept, 0], landmark], axis=1),
+        measured=measurements.measured[kept],
+        landmarks=measurements.landmarks[known],
+    )
+    return part, known
+
+
+def _first_seen(measurements: Measurements, poses: Matrix) -> tuple[Matrix, NDArray[np.int64]]:
+    """Position (L, 2) of every landmark by its first observation, and the index of that observation, (L,)."""
+    _, first = np.unique(measurements.observed[:, 1], return_index=True)
+    pose = poses[measurements.observed[first, 0]]
+    bearing, reach = measurements.measured[first].T
+    direction = bearing + (pose[:, 2] if poses.shape[1] == 3 else 0.0)
+    return pose[:, :2] + reach[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1), first
+
+
+def chain(start: NDArray[np.float64], motion: Matrix) -> Matrix:
+    """Poses (K, 3) that follow each other by these motions (K − 1, 3), the first being ``start``."""
+    poses = np.tile(start, (len(motion) + 1, 1))
+    poses[1:, 2] += np.cumsum(motion[:, 2])
+    c, s = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
+    poses[1:, 0] += np.cumsum(c * motion[:, 0] - s * motion[:, 1])
+    poses[1:, 1] += np.cumsum(s * motion[:, 0] + c * motion[:, 1])
+    return poses
+
+
+Optimizer = Literal["gauss-newton", "levenberg-marquardt", "dogleg", "gradient-descent"]
+
+
+class Loss(Protocol):
+    """Robust loss of observations."""
+
+    def weight(self, chi2: NDArray[np.float64]) -> NDArray[np.float64]:
+        """dρ/dχ², (N,)."""
+        ...
+
+    def loss(self, chi2: NDArray[np.float64]) -> NDArray[np.float64]:
+        """ρ(χ²), (N,)."""
+        ...
+
+
+QUADRATIC = RobustLoss("none", 1.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Minimum:
+    """End of a minimization.
+
+    Attributes
+    ----------
+    state : the estimate; at : residuals and A there
+    weights : (N,) robust weight of every observation
+    cost : Σ r² of priors and odometry plus Σ ρ(χ²) of the observations
+    iterations : steps; converged, reason : whether and why it stopped
+    """
+
+    state: Values
+    at: Linearization
+    weights: NDArray[np.float64]
+    cost: float
+    iterations: int
+    converged: bool
+    reason: str
+
+
+def minimize(
+    problem: BearingRangeProblem,
+    guess: Values,
+    solver: LinearSolver,
+    *,
+    loss: Loss = QUADRATIC,
+    optimizer: Optimizer = "levenberg-marquardt",
+    max_iterations: int = 100,
+    tolerance: float = 1e-10,
+    first_damping: float = 1e-4,
+) -> Minimum:
+    """Follow the residuals downhill from the guess; a linearized step at a time, each solved by ``solver``.
+
+    It ends as ``descend`` does. The first damping is for a guess that may be poor; near the minimum 1e-10
+    serves better, since a long chain's weakest modes have 1e-9 of diag(AᵀA).
+    """
+    start = problem.linearize(guess)
+    here = Evaluation(guess, start, _cost(start, loss))
+
+    def moved(now: Evaluation, step: NDArray[np.float64]) -> Evaluation:
+        state = now.state.moved(step)
+        at = problem.linearize(state)
+        return Evaluation(state, at, _cost(at, loss))
+
+    def model_at(now: Evaluation) -> LocalModel:
+        return _model(problem, solver, problem.system(now.at, loss.weight(now.at.observation_chi2)))
+
+    descent = descend(model_at, moved, here, step_rule(optimizer, first_damping), max_iterations, tolerance)
+    end = descent.end
+    weights = loss.weight(end.at.observation_chi2)
+    return Minimum(end.state, end.at, weights, end.cost, descent.iterations, descent.converged, descent.reason)
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """A state with its residuals and the cost of them."""
+
+    state: Values
+    at: Linearization
+    cost: float
+
+
+def _model(problem: BearingRangeProblem, solver: LinearSolver, system: LinearSystem) -> LocalModel:
+    """H = AᵀA and g = −Aᵀb."""
+    pattern = system.pattern
+    downhill, diagonal = np.empty(pattern.shape[1]), np.empty(pattern.shape[1])
+    normal_equations.gradient(pattern.row_start, pattern.columns, system.values, system.b, downhill, diagonal)
+
+    def solve(damping: float) -> NDArray[np.float64]:
+        if not damping:
+            return solver.solve(system).x
+        try:
+            return solver.solve(problem.damped(system, damping * diagonal)).x
+        except UndeterminedError as error:
+            column = int(error.columns[0])
+            raise SingularMatrixError(column, column) from error
+
+    return LocalModel(-downhill, diagonal, solve, lambda step: system.A.T @ (system.A @ step))
+
+
+def _cost(at: Linearization, loss: Loss) -> float:
+    quadratic = sum(float(np.square(r).sum()) for r in (at.prior, at.calibration, at.odometry))
+    return quadratic + float(loss.loss(at.observation_chi2).sum())

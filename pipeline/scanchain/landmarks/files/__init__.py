@@ -1,1 +1,0 @@
-"""Landmark problems read from files, results written."""

@@ -1,0 +1,373 @@
+"""A log of wheel velocities, ranges and bearings to trajectory and landmarks, and to the noise of either."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain.clock import working_s
+from scanchain.data import Matrix
+from scanchain.errors import InputError
+from scanchain.kernels.landmarks import dead_reckoning
+from scanchain.landmarks.estimate import Minimum, from_odometry, growing, minimize
+from scanchain.landmarks.files import RangeLog
+from scanchain.landmarks.problem import (
+    BearingRangeProblem,
+    Calibration,
+    Measurements,
+    Values,
+    landmark_columns,
+    pose_columns,
+)
+from scanchain.landmarks.solvers import ESTIMATOR, LinearSolver, create_solver
+from scanchain.landmarks.solvers.elimination import Covariance
+
+_AT_REST = np.square([1e-3, 1e-3, 1e-3])  # m², m², rad² a second, whether or not the robot moves
+_LEAST_VARIANCE = 1e-12  # m², rad²; keeps the covariance of a motion that takes no time invertible
+
+OWN = ("forward scale", "forward lost in turning", "turn scale", "drift", "delay")
+OWN_UNITS = ("", " m/rad", "", " rad/m", " s")
+_MEAN = np.zeros(5)
+_SIGMA = np.array([0.1, 0.1, 0.1, 0.1, 0.3])  # typical of differential drives; the units as above
+_STEP = np.array([1e-3, 1e-3, 1e-3, 1e-3, 0.05])  # over which the slopes are taken
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryNoise:
+    """White noise of a robot's wheels: standard deviations of its motion after a meter, and after a radian turned.
+
+    It grows with the root of either. The values at hand are of a small differential drive on a smooth floor.
+    """
+
+    forward_m: float = 0.03
+    sideways_m: float = 0.01
+    drift_rad: float = 0.05
+    turn_rad: float = 0.1
+
+    @property
+    def densities(self) -> NDArray[np.float64]:
+        """Variances after a meter, a meter, a meter and a radian, (4,)."""
+        return np.square([self.forward_m, self.sideways_m, self.drift_rad, self.turn_rad])
+
+
+@dataclass(frozen=True, slots=True)
+class Reckoning:
+    """The log cut at its observations.
+
+    Attributes
+    ----------
+    motion : (K − 1, 3) from each node to the next, in the frame of the former
+    sources, rest : (K − 1, 4, 3, 3), (K − 1, 3, 3) its covariance by each noise of unit density, and by none
+    calibration : errors of the robot's velocities, and the motion's Jacobian
+    """
+
+    motion: Matrix
+    sources: Matrix
+    rest: Matrix
+    calibration: Calibration
+
+    def covariance(self, densities: NDArray[np.float64]) -> Matrix:
+        """Of every motion, (K − 1, 3, 3)."""
+        return np.einsum("c,kcab->kab", densities, self.sources) + self.rest
+
+
+def reckon(log: RangeLog, nodes_s: NDArray[np.float64], own: NDArray[np.float64]) -> Reckoning:
+    """Integrate the velocities from one node (K,) to the next, corrected by ``own`` (5,).
+
+    With (v, ω) as logged and c as ``own``, the robot drives, a delay c₄ later, at
+        (1 + c₀) v + c₁ |ω|   and   (1 + c₂) ω + c₃ v.
+    """
+    motion, sources = _integrated(log, nodes_s, own, sources=len(OdometryNoise().densities))
+    slope = np.empty((*motion.shape, len(own)))
+    for column, step in enumerate(np.diag(_STEP)):
+        ahead, _ = _integrated(log, nodes_s, own + step, sources=0)
+        slope[..., column] = (ahead - motion) / _STEP[column]
+    rest = np.diff(nodes_s)[:, None, None] * np.diag(_AT_REST) + _LEAST_VARIANCE * np.eye(3)
+    return Reckoning(motion, sources, rest, Calibration(OWN, own, slope, _MEAN, _SIGMA))
+
+
+def _integrated(
+    log: RangeLog, nodes_s: NDArray[np.float64], own: NDArray[np.float64], *, sources: int
+) -> tuple[Matrix, Matrix]:
+    """Motions (K − 1, 3) and their Jacobians by so many sources of noise (K − 1, sources, 3, 3)."""
+    v, turn_rate = log.velocities.T
+    driven = np.stack(
+        [(1.0 + own[0]) * v + own[1] * np.abs(turn_rate), (1.0 + own[2]) * turn_rate + own[3] * v], axis=1
+    )
+    steps = len(nodes_s) - 1
+    motion, spread = np.empty((steps, 3)), np.empty((steps, sources, 3, 3))
+    dead_reckoning.integrate(log.times_s + own[4], driven, nodes_s, motion, spread)
+    return motion, spread
+
+
+_FREEDOM = 4.0
+_SCALE2 = _FREEDOM + 2.0  # the weight (ν + 2) / (ν + χ²) is, but for a factor that σ takes up, s² / (s² + χ²)
+_LAGS_S = np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0])  # edges; farther apart errors count as independent
+_FEWEST = 30  # least number of pairs from which a correlation is estimated
+_STATED = np.array([10.0, 10.0, 10.0, 10.0, 2.0, 2.0])  # degrees of freedom that the stated noise counts as
+_LEAST_REDUNDANCY = 0.05  # least redundancy as a share of the sightings
+
+
+@dataclass(frozen=True, slots=True)
+class StudentLoss:
+    """ρ(χ²) of a bearing and a range together, ν = 4, times the share of the observation.
+
+    Attributes
+    ----------
+    share : (N,) of an independent observation, above 0 up to 1
+    """
+
+    share: NDArray[np.float64]
+
+    def weight(self, chi2: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Up to the share, (N,)."""
+        return self.share * _SCALE2 / (_SCALE2 + chi2)
+
+    def loss(self, chi2: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The share of χ² near zero, (N,)."""
+        return self.share * _SCALE2 * np.log1p(chi2 / _SCALE2)
+
+
+class SightingPairs:
+    """Pairs of sightings of one landmark within some seconds of each other, found once."""
+
+    def __init__(self, seen_s: NDArray[np.float64], landmarks: NDArray[np.int64]) -> None:
+        """Times and landmarks of the sightings, (N,) each."""
+        since = seen_s - seen_s.min(initial=np.inf)
+        key = since + landmarks * (since.max(initial=0.0) + 2.0 * _LAGS_S[-1])  # a landmark's time is its own
+        order = np.argsort(key, kind="stable")
+        places = np.arange(len(key))
+        after = np.searchsorted(key[order], key[order] + _LAGS_S[-1]) - places - 1
+        first = np.repeat(places, after)
+        second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(after) - after, after)
+        self._first, self._second = order[first], order[second]
+        self._lag = np.searchsorted(_LAGS_S, seen_s[self._second] - seen_s[self._first], side="right") - 1
+        self._count = len(seen_s)
+
+    def correlation(self, residuals: Matrix) -> NDArray[np.float64]:
+        """Correlation of residuals (N, 2) by lag, pooled over bearings and ranges; it never grows with the lag."""
+        bins = len(_LAGS_S) - 1
+        products = residuals[self._first] * residuals[self._second] / np.mean(residuals**2, axis=0)
+        sums = np.bincount(self._lag, products.mean(axis=1), bins)
+        found = sums / np.maximum(np.bincount(self._lag, minlength=bins), _FEWEST)
+        return np.minimum.accumulate(np.clip(found, 0.0, 1.0)).astype(np.float64)
+
+    def share(self, correlation: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Weight of each sighting as a share of an independent one, (N,): 1 / Σ of correlations (Kish 1965)."""
+        alike = correlation[self._lag]
+        sums = np.bincount(self._first, alike, self._count) + np.bincount(self._second, alike, self._count)
+        return (1.0 / (1.0 + sums)).astype(np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class Consistency:
+    """Consistency of an estimate's residuals with the noise it was found with.
+
+    Attributes
+    ----------
+    motion, sensor : χ² of the motions; of bearings and of ranges (2,), weighed
+    motion_freedom, redundancy : degrees of freedom of those, observations less what the state takes up
+    sightings : effective number of them
+    sources, sources_freedom : (4,) the parts of ``motion`` and of its freedom that are each source's
+    """
+
+    motion: float
+    motion_freedom: float
+    sources: NDArray[np.float64]
+    sources_freedom: NDArray[np.float64]
+    sensor: NDArray[np.float64]
+    redundancy: NDArray[np.float64]
+    sightings: float
+
+    @property
+    def sensor_freedom(self) -> NDArray[np.float64]:
+        """The redundancy, at least a small share of the sightings, (2,)."""
+        return np.maximum(self.redundancy, _LEAST_REDUNDANCY * self.sightings)
+
+    def growth(self, stated: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Factors by which the variances, those of odometry first, should grow, (6,); one where they are right.
+
+        stated : (6,) what they were thought to be beforehand, in units of what they are now
+        """
+        chi2 = np.concatenate([self.sources, self.sensor])
+        freedom = np.concatenate([self.sources_freedom, self.sensor_freedom])
+        return (chi2 + _STATED * stated) / (freedom + _STATED)
+
+
+def consistency(
+    problem: BearingRangeProblem,
+    minimum: Minimum,
+    covariance: Covariance,
+    sources: Matrix,
+    share: NDArray[np.float64],
+) -> Consistency:
+    """Compare residuals with their expectation under the noise model.
+
+    With r a whitened motion, W its whitening, H = J C Jᵀ its leverage and V = Σ Vₛ its covariance by sources, the
+    part of source s is rᵀ(W Vₛ Wᵀ)r, and tr(W Vₛ Wᵀ(I − H)) its expectation (Harville 1977). Of observations,
+    weighed by w, of which ``share`` (N,) is what an independent one would count, they are Σ w r² and
+    Σ share − w h (Lange et al. 1989).
+
+    sources : (K − 1, 4, 3, 3) covariance of every motion by sources
+    """
+    at, W = minimum.at, problem.motion_whitening
+    parts = W[:, None] @ sources @ np.swapaxes(W, 1, 2)[:, None]
+    leverage = at.odometry_rows @ covariance.of(problem.motion_columns) @ np.swapaxes(at.odometry_rows, 1, 2)
+    r = at.odometry
+    rows, weights = at.observation_rows, minimum.weights[:, None]
+    h = ((rows @ covariance.of(problem.observation_columns)) * rows).sum(axis=-1)
+    return Consistency(
+        motion=float(np.square(r).sum()),
+        motion_freedom=float(r.size - np.trace(leverage, axis1=1, axis2=2).sum()),
+        sources=((r[:, None, None, :] @ parts)[:, :, 0] * r[:, None]).sum(axis=(0, 2)),
+        sources_freedom=(parts * (np.eye(3) - leverage)[:, None]).sum(axis=(0, 2, 3)),
+        sensor=(weights * at.observations**2).sum(axis=0),
+        redundancy=(share[:, None] - weights * h).sum(axis=0),
+        sightings=float(share.sum()),
+    )
+
+
+_ANCHOR = 1e-8  # m², rad²: the first pose is where the world begins
+_SENSOR = np.square([0.03, 0.12])  # rad², m²; where the estimate of the sensor's noise begins
+_LEAST = np.square([1e-3, 1e-3, 1e-3, 1e-3, 3e-4, 3e-4])  # of the odometry's, as OdometryNoise has them; rad, m
+_LEAST_FREEDOM = 1e-3  # least redundancy of the observations
+_TURNS, _CHANGE = 20, 0.1  # estimates of the noise, and the relative change that ends them
+_RECKONED = 2  # of them begin with a new dead reckoning, by the robot as it is known then
+_MOST, _ROUGH, _FINE, _LITTLE = 50, 1e-2, 1e-5, 1e-10  # iterations; change of χ² that ends them; first damping
+
+
+class LogModel:
+    """The part of a log's problem independent of its noise: nodes, landmarks, observations."""
+
+    def __init__(self, log: RangeLog) -> None:
+        self._log = log
+        self.nodes_s, node = np.unique(log.seen_s, return_inverse=True)
+        self.landmarks, landmark = np.unique(log.subjects, return_inverse=True)
+        self.observed = np.stack([node, landmark], axis=1)
+        self.sighting_pairs = SightingPairs(log.seen_s, landmark)
+
+    def reckoned(self, own: NDArray[np.float64]) -> Reckoning:
+        """Dead reckoning from node to node by a robot with these errors of its own, (5,)."""
+        return reckon(self._log, self.nodes_s, own)
+
+    def measurements(self, reckoning: Reckoning, variances: NDArray[np.float64]) -> Measurements:
+        """The problem with these variances (6,), the odometry's first."""
+        return Measurements(
+            first_pose=np.zeros(3),
+            first_covariance=_ANCHOR * np.eye(3),
+            motion=reckoning.motion,
+            motion_covariance=reckoning.covariance(variances[:4]),
+            calibration=reckoning.calibration,
+            observed=self.observed,
+            measured=self._log.measured,
+            measured_covariance=np.diag(variances[4:]),
+            landmarks=self.landmarks,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class RangeSolution:
+    """A minimum, the noise it was found for, and their consistency.
+
+    Attributes
+    ----------
+    nodes_s : (K,) times of the poses, those of the observations
+    reckoned : by the velocities as they were logged, every landmark where it was first seen
+    problem, guess, minimum : with the noise as estimated; where the first minimization began; where the last
+        ended, the first pose at the origin
+    variances : (6,) of the odometry's sources as ``OdometryNoise`` has them, of bearing and range
+    loss : with which the observations were weighed; with the share of each
+    covariance, consistency : at the minimum
+    iterations, time_s : steps after the guess; of the whole, reading left out
+    """
+
+    nodes_s: NDArray[np.float64]
+    reckoned: Values
+    problem: BearingRangeProblem
+    guess: Values
+    minimum: Minimum
+    variances: NDArray[np.float64]
+    loss: StudentLoss
+    covariance: Covariance
+    consistency: Consistency
+    iterations: int
+    time_s: float
+
+    @property
+    def pose_covariance(self) -> Matrix:
+        """(K, 3, 3) relative to the first pose."""
+        return self.covariance.of(pose_columns(self.problem.pattern.layout, np.arange(len(self.nodes_s))))
+
+    @property
+    def landmark_covariance(self) -> Matrix:
+        """(L, 2, 2) relative to the first pose."""
+        layout = self.problem.pattern.layout
+        return self.covariance.of(landmark_columns(layout, np.arange(len(layout.landmarks))))
+
+    @property
+    def sigmas(self) -> list[float]:
+        """Standard deviations of the odometry's sources, of bearing in rad and range in m."""
+        return np.sqrt(self.variances).tolist()
+
+
+def solve_range_log(log: RangeLog, noise: OdometryNoise | None, method: str = ESTIMATOR) -> RangeSolution:
+    """Estimate poses, landmarks, the robot's own errors and the noise of odometry and sensor together.
+
+    noise : of the odometry; None for an estimate of it
+
+    Bearings and ranges follow Student's t (``StudentLoss``); the scales of it and the variances of the odometry
+    are found by restricted maximum likelihood (``consistency``). Errors of one landmark's sightings are alike for
+    a while, by what the residuals show (``SightingPairs``): each sighting counts as a share of an independent one.
+    Raises InputError where the observations are too few for that.
+    """
+    begin, model, solver = working_s(), LogModel(log), create_solver(method)
+    stated = np.concatenate([(noise or OdometryNoise()).densities, _SENSOR])
+    reckoning = model.reckoned(np.zeros(len(OWN)))
+    problem = BearingRangeProblem(model.measurements(reckoning, stated))
+    reckoned, guess = from_odometry(problem.measurements), growing(problem.measurements, solver)
+    variances, loss = stated, StudentLoss(np.ones(len(model.observed)))
+    minimum, covariance, found = _settled(problem, guess, loss, variances, reckoning, solver, _ROUGH)
+    if not np.all(found.redundancy > _LEAST_FREEDOM):
+        raise InputError("the landmarks were seen too seldom to estimate the sensor's noise; give a longer log")
+    iterations = minimum.iterations
+    for turn in range(_TURNS):
+        growth = found.growth(stated / variances)
+        if noise is not None:
+            growth[:4] = 1.0
+        is_last = turn == _TURNS - 1 or bool(np.abs(np.sqrt(growth) - 1.0).max() < _CHANGE)
+        variances = np.maximum(variances * growth, _LEAST)
+        residuals = np.sqrt(minimum.weights / loss.share)[:, None] * minimum.at.observations
+        loss = StudentLoss(model.sighting_pairs.share(model.sighting_pairs.correlation(residuals)))
+        state = minimum.state
+        if turn < _RECKONED:
+            reckoning = model.reckoned(state.calibration)
+        problem = problem.of(model.measurements(reckoning, variances))
+        tolerance = _FINE if is_last else _ROUGH
+        minimum, covariance, found = _settled(problem, state, loss, variances, reckoning, solver, tolerance)
+        iterations += minimum.iterations
+        if is_last:
+            break
+    return RangeSolution(
+        model.nodes_s, reckoned, problem, guess, minimum, variances, loss, covariance, found, iterations,
+        working_s() - begin,
+    )  # fmt: skip
+
+
+def _settled(
+    problem: BearingRangeProblem,
+    state: Values,
+    loss: StudentLoss,
+    variances: NDArray[np.float64],
+    reckoning: Reckoning,
+    solver: LinearSolver,
+    tolerance: float,
+) -> tuple[Minimum, Covariance, Consistency]:
+    """The minimum for a given noise, the covariance there, and the consistency of its residuals."""
+    minimum = minimize(
+        problem, state, solver, loss=loss, tolerance=tolerance, first_damping=_LITTLE, max_iterations=_MOST
+    )
+    covariance = Covariance(problem.system(minimum.at, minimum.weights))
+    sources = variances[:4, None, None] * reckoning.sources
+    return minimum, covariance, consistency(problem, minimum, covariance, sources, loss.share)

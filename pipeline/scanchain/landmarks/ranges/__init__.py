@@ -1,1 +1,0 @@
-"""Range and bearing logs (MRCLAM): noise and state estimated together."""
