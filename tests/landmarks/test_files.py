@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 
 from scanchain.errors import InputError
-from scanchain.landmarks.files import accuracy_lines, read_landmark_data, read_mrclam
+from scanchain.landmarks.files import read_landmark_data, read_mrclam
 from scanchain.landmarks.ranges import OdometryNoise, solve_range_log
+from scanchain.landmarks.results import accuracy_lines
 from scanchain.landmarks.study import Options, study_file, study_log
 from tests.support.scenes import shared_data
 

@@ -105,7 +105,8 @@ def landmarks(
     from scanchain.clock import announcing_compilation
     from scanchain.commands.options import check_output
     from scanchain.commands.terminal import Terminal
-    from scanchain.landmarks.files import read_landmark_data, text_of, tree_of
+    from scanchain.landmarks.files import read_landmark_data
+    from scanchain.landmarks.results import text_of, tree_of
     from scanchain.landmarks.solvers import parse_methods
     from scanchain.landmarks.study import Options, study_file, study_log
     from scanchain.runs.directory import RunDirectory
@@ -171,7 +172,7 @@ def _noise(text: str | None) -> OdometryNoise | None:
 
 def _check_names(studies: Sequence[Study]) -> None:
     """Refuse problems whose files would overwrite each other."""
-    from scanchain.landmarks.files import file_stem
+    from scanchain.landmarks.results import file_stem
 
     stems = [file_stem(study.name) for study in studies]
     for study, stem in zip(studies, stems, strict=True):
@@ -183,7 +184,7 @@ def _write(directory: Path, data: Sequence[Path], studies: Sequence[Study], tree
     """Write the estimates and the figures of all solvers."""
     from msgspec.structs import replace
 
-    from scanchain.landmarks.files import write_estimate
+    from scanchain.landmarks.results import write_estimate
     from scanchain.runs.provenance import describe_start
 
     for study in studies:

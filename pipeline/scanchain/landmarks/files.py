@@ -1,9 +1,7 @@
-"""Files of landmark problems: npz of the course and folders of MRCLAM in, results out."""
+"""Files of landmark problems: npz of the course and folders of MRCLAM in."""
 
 from __future__ import annotations
 
-import csv
-import math
 import re
 import zipfile
 from dataclasses import dataclass
@@ -14,10 +12,7 @@ from numpy.typing import NDArray
 
 from scanchain.data import Matrix
 from scanchain.errors import InputError
-from scanchain.landmarks.compare import MethodResult
 from scanchain.landmarks.problem import Kind, LandmarkData
-from scanchain.landmarks.study import Accuracy, Study
-from scanchain.trajectory import write_tum
 from scanchain.words import counted
 
 _SHAPES = {
@@ -282,147 +277,3 @@ def _subjects(barcodes: Matrix, seen: NDArray[np.float64]) -> NDArray[np.int64]:
     order = np.argsort(codes, kind="stable")
     at = np.minimum(np.searchsorted(codes[order], seen), len(codes) - 1)
     return np.where(codes[order][at] == seen, subjects[order][at], 0)
-
-
-_HEADINGS = (
-    "method",
-    "build ms",
-    "factor ms",
-    "solve ms",
-    "total ms",
-    "again ms",
-    "solves",
-    "nnz factor",
-    "differs by",
-)
-
-
-def file_stem(name: str) -> str:
-    """A name as the beginning of a file's name."""
-    return re.sub(r"[^A-Za-z0-9._-]+", "_", name).strip("._") or "problem"
-
-
-def table_of(study: Study) -> list[tuple[str, ...]]:
-    """Headings, then a row a method; a single one differs from none."""
-    rows = [_HEADINGS, *(_row(method) for method in study.methods)]
-    return rows if len(study.methods) > 1 else [row[:-1] for row in rows]
-
-
-def _row(method: MethodResult) -> tuple[str, ...]:
-    times = (method.build_s, method.factor_s, method.solve_s, method.total_s, method.again_s)
-    return (
-        method.method,
-        *(f"{1e3 * seconds:.2f}" for seconds in times),
-        str(method.iterations),
-        f"{method.factor.nnz:,}",
-        f"{method.difference:.1e}",
-    )
-
-
-def text_of(study: Study) -> str:
-    """The whole study for a terminal."""
-    lines = [study.name, *(f"  {fact.label:<15}{fact.value}" for fact in study.facts)]
-    lines += [f"  {label:<15}{value}" for label, value in accuracy_lines(study)]
-    lines.append(f"  {'A':<15}{size_of(study)}")
-    rows = table_of(study)
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        cells = (
-            f"{cell:<{width}}" if k == 0 else f"{cell:>{width}}"
-            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
-        )
-        lines.append("  " + "  ".join(cells))
-    return "\n".join(lines)
-
-
-def size_of(study: Study) -> str:
-    """Size of A as text."""
-    rows, columns = study.system.pattern.shape
-    entries = counted(len(study.system.values), "entry", "entries")
-    build = f"put together in {1e3 * study.build_s:.1f} ms"
-    return f"{counted(rows, 'row')}, {counted(columns, 'column')}, {entries}, {build}"
-
-
-def accuracy_lines(study: Study) -> list[tuple[str, str]]:
-    """Label and value of the accuracy before and after, and how it is defined."""
-    return [
-        ("before", _accuracy(study.before.accuracy)),
-        ("after", _accuracy(study.after.accuracy)),
-        ("accuracy", study.after.accuracy.definition),
-    ]
-
-
-def tree_of(study: Study) -> dict[str, object]:
-    """The figures for JSON."""
-    rows, columns = study.system.pattern.shape
-    return {
-        "name": study.name,
-        "facts": {fact.label: fact.value for fact in study.facts},
-        "converged": study.converged,
-        "before": _figures(study.before.accuracy),
-        "after": _figures(study.after.accuracy),
-        "A": {"rows": rows, "columns": columns, "entries": len(study.system.values), "build_s": study.build_s},
-        "methods": [
-            {
-                "method": method.method,
-                "build_s": method.build_s,
-                "factor_s": method.factor_s,
-                "solve_s": method.solve_s,
-                "again_s": method.again_s,
-                "iterations": method.iterations,
-                "factor": method.factor.name,
-                "factor_entries": method.factor.nnz,
-                "difference": method.difference,
-            }
-            for method in study.methods
-        ],
-    }
-
-
-def write_estimate(directory: Path, study: Study) -> None:
-    """Poses and landmarks with their covariances as CSV, and the poses as TUM where they have stamps."""
-    stem, state = file_stem(study.name), study.after.state
-    names = ["x_m", "y_m", "heading_rad"][: state.poses.shape[1]]
-    _write_csv(
-        directory / f"{stem}_poses.csv",
-        "pose",
-        np.arange(len(state.poses)),
-        names,
-        state.poses,
-        study.pose_covariance,
-    )
-    numbers = study.system.pattern.layout.landmarks
-    file = directory / f"{stem}_landmarks.csv"
-    _write_csv(file, "landmark", numbers, ["x_m", "y_m"], state.landmarks, study.landmark_covariance)
-    if study.trajectory is not None:
-        write_tum(directory / f"{stem}.tum", study.trajectory, force=True)
-
-
-def _write_csv(
-    path: Path, kind: str, numbers: np.ndarray, names: list[str], values: Matrix, covariance: Matrix
-) -> None:
-    """One line each: number, values, upper triangle of the covariance."""
-    rows, columns = np.triu_indices(len(names))
-    header = [kind, *names, *(f"cov_{names[i]}_{names[j]}" for i, j in zip(rows, columns, strict=True))]
-    table = np.concatenate([values, covariance[:, rows, columns]], axis=1)
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(header)
-        for number, row in zip(numbers.tolist(), table.tolist(), strict=True):
-            writer.writerow([number, *(f"{value:.9g}" for value in row)])
-
-
-def _accuracy(accuracy: Accuracy) -> str:
-    poses, landmarks = (
-        "unknown" if math.isnan(error_m) else f"{error_m:.4f} m off"
-        for error_m in (accuracy.poses_m, accuracy.landmarks_m)
-    )
-    return "unknown" if poses == landmarks == "unknown" else f"poses {poses}, landmarks {landmarks}"
-
-
-def _figures(accuracy: Accuracy) -> dict[str, float | str | None]:
-    return {
-        "poses_m": None if math.isnan(accuracy.poses_m) else accuracy.poses_m,
-        "landmarks_m": None if math.isnan(accuracy.landmarks_m) else accuracy.landmarks_m,
-        "definition": accuracy.definition,
-    }

@@ -10,7 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from scanchain import lie
-from scanchain.landmarks.files import file_stem
+from scanchain.landmarks.results import file_stem
 from scanchain.landmarks.study import Estimate, Study
 from scanchain_viz.pictures.landmarks import ellipses
 from scanchain_viz.recording import entities, shapes

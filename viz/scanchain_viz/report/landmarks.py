@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from scanchain.errors import InputError
-from scanchain.landmarks.files import accuracy_lines, file_stem, size_of, table_of
+from scanchain.landmarks.results import accuracy_lines, file_stem, size_of, table_of
 from scanchain.landmarks.study import Study
 from scanchain_viz.pictures.landmarks import (
     AFTER,

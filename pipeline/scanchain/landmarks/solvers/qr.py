@@ -64,7 +64,7 @@ class QrSolver:
         watch.lap()
         x = spsolve_triangular(matrix, z, lower=False)[known.place]
         solve_s = watch.lap()
-        return Solution(x, build_s, factor_s, solve_s, lambda: Factor("R of A", matrix.tocsc(), known.order))
+        return Solution(x, build_s, factor_s, solve_s, lambda: Factor("R of A", csc_matrix(matrix), known.order))
 
 
 def _factorize(system: LinearSystem, known: _Analysis) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
