@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from scanchain.kernels.landmarks import dead_reckoning
+from scanchain.landmarks.estimate import chain
 from scanchain.landmarks.files import RangeLog
-from scanchain.landmarks.ranges import OWN, OdometryNoise, SightingPairs, chain, reckon, solve_range_log
+from scanchain.landmarks.ranges import OWN, OdometryNoise, SightingPairs, reckon, solve_range_log
 
 OF_ITS_OWN = np.array([0.0, -0.05, 0.04, -0.03, 0.2])
 NOISE = OdometryNoise(0.02, 0.01, 0.03, 0.05)
