@@ -230,8 +230,8 @@ def _of_copies(evidence: Evidence) -> Iterator[Stretch]:
 
 def _of_loops(evidence: Evidence) -> Iterator[Stretch]:
     for group in contradicting_groups(evidence.closures, evidence.poses):
-        seconds = evidence.seconds[[group.first, group.last]].tolist()
-        yield Stretch(Kind.LOOPS, group.first, group.last, group.closures, *seconds, group.size_m)
+        start_s, end_s = evidence.seconds[[group.first, group.last]].tolist()
+        yield Stretch(Kind.LOOPS, group.first, group.last, group.closures, start_s, end_s, group.size_m)
 
 
 def _of_segments(evidence: Evidence) -> Iterator[Stretch]:
