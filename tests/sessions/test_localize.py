@@ -160,6 +160,9 @@ def test_a_map_that_is_damaged_or_of_another_kind_is_refused_in_one_line(office,
     index.write_text(index.read_text().replace('"version": 2', '"version": 1'))
     with pytest.raises(InputError, match=r"is of version 1, this scanchain reads 2 .*; make the map again"):
         open_saved_map(tmp_path / "newer")
+    index.write_text("{")
+    with pytest.raises(InputError, match=r"map.json: cannot be read"):
+        open_saved_map(tmp_path / "newer")
     for name in ("keyframes.npz", "edges.npz"):
         broken = copy(name.split(".")[0]) / name
         broken.write_bytes(broken.read_bytes()[:100])
@@ -185,16 +188,8 @@ def test_a_localized_log_never_replaces_its_map(office, call):
 
 
 def test_without_loop_closures_nothing_can_be_localized(office, tmp_path, call):
-    words = (
-        "localize",
-        office / "office.mcap",
-        "--map",
-        office / "map",
-        "--out",
-        tmp_path / "loc",
-        "--loops.enabled=false",
-    )
-    code, _, error = call(*words)
+    words = office / "office.mcap", "--map", office / "map", "--out", tmp_path / "loc", "--loops.enabled=false"
+    code, _, error = call("localize", *words)
     assert code == 2 and "a place in a map is found by loop closures; leave it true" in error
     assert not list(tmp_path.iterdir())
 
