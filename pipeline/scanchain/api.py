@@ -143,7 +143,7 @@ def localize(
 
     job = _job(log, out, config, ground_truth, recording=recording, force=force, overrides=overrides)
     draw = draw_localization if recording else lambda folder, localized: None
-    return localize_log(job, checks.path(prior, "prior"), Unwatched(), draw)[0]
+    return localize_log(job, checks.path(prior, "prior"), Unwatched(), draw)
 
 
 def _job(

@@ -14,10 +14,12 @@ from scanchain.errors import InputError
 from scanchain.logs.formats.cloud_file import read_ply
 from scanchain.maps import Edges, Session, open_saved_map, write_saved_map
 from scanchain.sessions.changes import Changes, Label, Part, changes_between
-from scanchain.sessions.merged_map import updated
+from scanchain.sessions.joining import Joined
+from scanchain.sessions.merged_map import MergedMap, updated
 from scanchain.settings import load_settings
 from scanchain.simulation.solids import Scenery, Solids
 
+NO_EDGES = Edges(np.empty((0, 2), int), *np.empty((2, 0, 3, 3)), np.empty(0, bool), np.empty(0))
 BOX, HIDDEN = (5.0, 3.0), (8.0, 6.5)  # the first stands free, the second behind a wall
 
 
@@ -82,9 +84,7 @@ def saved(folder: Path, *parts: Part) -> Path:
     poses = np.concatenate([each.poses for each in parts])
     numbers = np.repeat(np.arange(len(parts)), [len(each.keyframes) for each in parts])
     sessions = tuple(Session(each.name, 0, 9, len(each.keyframes)) for each in parts)
-    none = Edges(*(np.empty(shape) for shape in ((0, 3, 3), (0, 3, 3), (0, 3, 3), 0, 0)))
-    none = Edges(np.empty((0, 2), np.int64), none.measurements, none.information, np.empty(0, bool), none.weight)
-    write_saved_map(folder / "map", keyframes, poses, numbers, sessions, none)
+    write_saved_map(folder / "map", keyframes, poses, numbers, sessions, NO_EDGES)
     return folder
 
 
@@ -231,8 +231,10 @@ def updated_rooms(*parts: Part):
     ]
     numbers = np.repeat(np.arange(len(parts)), [len(each.keyframes) for each in parts])
     sessions = [Session(each.name, start, start + 9, 8) for start, each in zip((0, 100, 200), parts, strict=False)]
-    poses = np.concatenate([each.poses for each in parts])
-    return keyframes, updated(keyframes, poses, numbers, sessions, load_settings(2).config)
+    joined = Joined((0,), tuple(keyframes), np.zeros(len(keyframes), int), NO_EDGES)
+    none, poses = np.zeros(len(keyframes), np.int64), np.concatenate([each.poses for each in parts])
+    merged = MergedMap(joined, poses, tuple(sessions), numbers, (), none, none)
+    return keyframes, updated(merged, load_settings(2).config)
 
 
 def in_world(keyframe: Keyframe) -> np.ndarray:
