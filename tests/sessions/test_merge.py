@@ -17,7 +17,7 @@ from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.evidence import contradiction
 from scanchain.loops.planar_map_search import WholeSearch
 from scanchain.loops.verification import ScanVerifier
-from scanchain.maps import Edges, open_saved_map, read_ply
+from scanchain.maps import Edges, SavedPoints, open_saved_map, read_ply
 from scanchain.odometry.tracked import first_match
 from scanchain.runs.job import Unwatched
 from scanchain.sessions.joining import Joined, changed, doubt_about, graph_of
@@ -301,12 +301,7 @@ def _room(dimension, half_m):
     """A keyframe in the middle of a square room, or of a cube."""
     rays = np.random.default_rng(1).normal(size=(60_000, dimension))
     points = half_m * rays / np.abs(rays).max(axis=1, keepdims=True)
-
-    class Points:
-        def read(self):
-            return points
-
-    return Keyframe(0, 0, 0, Points(), lie.identity(dimension), 0.0)
+    return Keyframe(0, 0, 0, SavedPoints(points, 1.0), lie.identity(dimension), 0.0)
 
 
 def test_a_map_that_differs_from_those_it_joined_by_more_than_they_do_in_themselves_is_told():
@@ -379,12 +374,7 @@ def _corridor(x_m, index, depths_m):
     is_wall = (across < -1.0) | (across > depths_m[np.clip(along, 0.0, 59.9).astype(int)])
     seen = is_wall.any(axis=1)
     points = ranges_m[is_wall.argmax(axis=1)][seen, None] * directions[seen]
-
-    class Points:
-        def read(self):
-            return points
-
-    return Keyframe(index, index, index, Points(), lie.pose_2d(x_m, 0.0, 0.0), x_m)
+    return Keyframe(index, index, index, SavedPoints(points, 1.0), lie.pose_2d(x_m, 0.0, 0.0), x_m)
 
 
 def test_merging_searches_and_aligns_no_more_than_runs_do(runs, tmp_path, monkeypatch):
