@@ -143,7 +143,7 @@ def localize(
 
     job = _job(log, out, config, ground_truth, recording=recording, force=force, overrides=overrides)
     draw = draw_localization if recording else lambda folder, localized: None
-    return localize_log(job, checks.path(prior, "prior"), Unwatched(), draw)[0]
+    return localize_log(job, checks.path(prior, "prior"), Unwatched(), draw)
 
 
 def _job(
@@ -220,22 +220,15 @@ def changes(
     """
     from scanchain.sessions.change_run import compare_maps
 
-    first = checks.path(earlier, "earlier")
     return compare_maps(
-        [first] if later is None else [first, checks.path(later, "later")],
+        [checks.path(earlier, "earlier"), *([] if later is None else [checks.path(later, "later")])],
         checks.path(out, "out"),
         present_changes if recording else lambda directory, found: None,
-        T_earlier_later=None if T_earlier_later is None else _pose_in(first, T_earlier_later),
+        T_earlier_later=T_earlier_later,
         voxel_size_m=None if voxel_size_m is None else checks.positive(voxel_size_m, "voxel_size_m"),
         min_size_m=checks.positive(min_size_m, "min_size_m"),
         force=force,
     )
-
-
-def _pose_in(path: Path, T: Pose) -> Pose:
-    from scanchain.maps import open_saved_map
-
-    return checks.pose(T, "T_earlier_later", open_saved_map(path).dimension)
 
 
 def compare(

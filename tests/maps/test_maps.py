@@ -6,8 +6,6 @@ from dataclasses import replace
 import laspy
 import numpy as np
 import pytest
-from PIL import Image
-from ruamel.yaml import YAML
 
 from scanchain import lie
 from scanchain.baselines.open3d_pairs import Open3dPairs
@@ -158,18 +156,6 @@ def test_a_map_server_reads_walls_where_they_are_and_unknown_as_unknown(tmp_path
     assert set(np.unique(cells)) == {-1, 0, 100}
 
 
-def nav2_map(folder):
-    """A map as nav2's map_server loads it (map_io.cpp), by libraries for YAML and images; trinary mode alone."""
-    told = YAML(typ="safe").load((folder / "map.yaml").read_text())
-    assert (told["mode"], told["negate"]) == ("trinary", 0)
-    with Image.open(folder / told["image"]) as image:
-        occupancy = (255.0 - np.array(image.convert("L"), float)) / 255.0
-    cells = np.full(occupancy.shape, -1)
-    cells[occupancy < told["free_thresh"]] = 0
-    cells[occupancy > told["occupied_thresh"]] = 100
-    return cells[::-1], np.array(told["origin"]), told["resolution"]
-
-
 def room_scans(west, south, east, north):
     """A laser scanner that turns and moves about in an empty room between four walls; it measures exactly."""
     scenery = Scenery()
@@ -192,7 +178,7 @@ def room_scans(west, south, east, north):
 def test_nav2_reads_the_walls_of_a_known_room_to_one_cell(tmp_path):
     west, south, east, north = -3.33, 1.27, 4.12, 5.58
     write_map(tmp_path, draw_grid(room_scans(west, south, east, north), CONFIG))
-    cells, origin, resolution_m = nav2_map(tmp_path)
+    cells, origin, resolution_m = naive.served_map(tmp_path)
     assert resolution_m == RESOLUTION_M and origin[2] == 0.0
     assert np.abs(origin[:2] - [west, south]).max() <= RESOLUTION_M
     rows, columns = np.indices(cells.shape)
@@ -211,7 +197,7 @@ def test_nav2_reads_cell_0_0_at_the_origin_and_rows_upwards(tmp_path):
     for _ in range(5):
         grid.insert(lie.pose_2d(-4.95, 2.05, 0.0), np.array([[3.0, 0.0], [0.0, 2.0]]))
     write_map(tmp_path, grid.trimmed())
-    cells, origin, _ = nav2_map(tmp_path)
+    cells, origin, _ = naive.served_map(tmp_path)
     np.testing.assert_allclose(origin, [-5.0, 2.0, 0.0], atol=1e-9)
     assert cells.shape == (21, 31)
     assert (cells[0, 0], cells[0, 30], cells[20, 0], cells[20, 30]) == (0, 100, 100, -1)

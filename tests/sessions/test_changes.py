@@ -12,21 +12,19 @@ from scanchain.__main__ import main
 from scanchain.data import Keyframe
 from scanchain.errors import InputError
 from scanchain.logs.formats.cloud_file import read_ply
-from scanchain.maps import Edges, Session, open_saved_map, write_saved_map
+from scanchain.maps import Edges, SavedPoints, Session, open_saved_map, write_saved_map
 from scanchain.sessions.changes import Changes, Label, Part, changes_between
-from scanchain.sessions.merged_map import updated
+from scanchain.sessions.joining import Joined
+from scanchain.sessions.merged_map import MergedMap, updated
 from scanchain.settings import load_settings
 from scanchain.simulation.solids import Scenery, Solids
 
+NO_EDGES = Edges(np.empty((0, 2), int), *np.empty((2, 0, 3, 3)), np.empty(0, bool), np.empty(0))
 BOX, HIDDEN = (5.0, 3.0), (8.0, 6.5)  # the first stands free, the second behind a wall
 
 
-class Held:
-    def __init__(self, points):
-        self.points = points
-
-    def read(self):
-        return self.points
+def held(points: np.ndarray) -> SavedPoints:
+    return SavedPoints(points, 1.0)
 
 
 def room(*boxes: tuple[float, float], edge_m: float = 0.6) -> Solids:
@@ -62,14 +60,9 @@ def part(name: str, solids: Solids, T_map_room=None, count: int = 8) -> Part:
         lidar[:3, 3] = x, 1.5, 0.3
         ranges_m = solids.cast(lidar[None], np.zeros(720, np.int32), directions, 30.0)
         pose = T_map_room @ lie.pose_2d(float(x), 1.5, 0.0)
-        keyframes.append(Keyframe(k, k, k, Held(directions[:, :2] * ranges_m[:, None]), pose, 1.2 * k))
+        keyframes.append(Keyframe(k, k, k, held(directions[:, :2] * ranges_m[:, None]), pose, 1.2 * k))
         poses.append(pose)
     return Part(name, keyframes, np.array(poses))
-
-
-def _finite(keyframe: Keyframe) -> Keyframe:
-    points = keyframe.points
-    return replace(keyframe, stored=Held(points[np.isfinite(points).all(axis=1)]))
 
 
 def compared(before: Solids, after: Solids, **options) -> Changes:
@@ -82,9 +75,7 @@ def saved(folder: Path, *parts: Part) -> Path:
     poses = np.concatenate([each.poses for each in parts])
     numbers = np.repeat(np.arange(len(parts)), [len(each.keyframes) for each in parts])
     sessions = tuple(Session(each.name, 0, 9, len(each.keyframes)) for each in parts)
-    none = Edges(*(np.empty(shape) for shape in ((0, 3, 3), (0, 3, 3), (0, 3, 3), 0, 0)))
-    none = Edges(np.empty((0, 2), np.int64), none.measurements, none.information, np.empty(0, bool), none.weight)
-    write_saved_map(folder / "map", keyframes, poses, numbers, sessions, none)
+    write_saved_map(folder / "map", keyframes, poses, numbers, sessions, NO_EDGES)
     return folder
 
 
@@ -108,7 +99,7 @@ def test_nothing_is_named_where_nothing_changed():
 
 def test_what_the_other_map_did_not_see_is_unknown():
     before, after = part("a", room(BOX)), part("b", room(), count=3)
-    hidden = Keyframe(8, 8, 8, Held(np.random.default_rng(0).uniform(-0.3, 0.3, (200, 2))), before.poses[0], 20.0)
+    hidden = Keyframe(8, 8, 8, held(np.random.default_rng(0).uniform(-0.3, 0.3, (200, 2))), before.poses[0], 20.0)
     there = lie.pose_2d(*HIDDEN, 0.0)
     seen_once = Part("a", [*before.keyframes, hidden], np.concatenate([before.poses, there[None]]))
     found = changes_between(seen_once, after, load_settings(2).config)
@@ -231,8 +222,10 @@ def updated_rooms(*parts: Part):
     ]
     numbers = np.repeat(np.arange(len(parts)), [len(each.keyframes) for each in parts])
     sessions = [Session(each.name, start, start + 9, 8) for start, each in zip((0, 100, 200), parts, strict=False)]
-    poses = np.concatenate([each.poses for each in parts])
-    return keyframes, updated(keyframes, poses, numbers, sessions, load_settings(2).config)
+    joined = Joined((0,), tuple(keyframes), np.zeros(len(keyframes), int), NO_EDGES)
+    none, poses = np.zeros(len(keyframes), np.int64), np.concatenate([each.poses for each in parts])
+    merged = MergedMap(joined, poses, tuple(sessions), numbers, (), none, none)
+    return keyframes, updated(merged, load_settings(2).config)
 
 
 def in_world(keyframe: Keyframe) -> np.ndarray:
@@ -256,7 +249,7 @@ def test_what_newer_sessions_saw_through_is_removed_from_older_ones_and_nothing_
 def test_what_came_stays_and_what_no_newer_session_saw_stays():
     _, after = updated_rooms(part("monday", room((8.0, 3.0))), part("friday", room(BOX, (8.0, 3.0))))
     assert after.removed.sum() == 0
-    corner = Keyframe(0, 0, 5, Held(np.random.default_rng(0).uniform(-0.3, 0.3, (200, 2))), lie.identity(2), 0.0)
+    corner = Keyframe(0, 0, 5, held(np.random.default_rng(0).uniform(-0.3, 0.3, (200, 2))), lie.identity(2), 0.0)
     hidden = part("monday", room(BOX))
     there = Part("monday", [*hidden.keyframes, replace(corner, T_odom_lidar=lie.pose_2d(*HIDDEN, 0.0))],
                  np.concatenate([hidden.poses, lie.pose_2d(*HIDDEN, 0.0)[None]]))  # fmt: skip

@@ -5,7 +5,7 @@ import json
 import shutil
 import zipfile
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -25,7 +25,7 @@ from scanchain import (
 )
 from scanchain.config import LogConfig
 from scanchain.data import Keyframe
-from scanchain.maps import Edges, Session, open_saved_map, write_saved_map
+from scanchain.maps import Edges, SavedPoints, Session, open_saved_map, write_saved_map
 from scanchain.sessions.localize import measure, pose_near
 from scanchain.sessions.localizer import MapState
 from scanchain.settings import load_settings
@@ -160,6 +160,9 @@ def test_a_map_that_is_damaged_or_of_another_kind_is_refused_in_one_line(office,
     index.write_text(index.read_text().replace('"version": 2', '"version": 1'))
     with pytest.raises(InputError, match=r"is of version 1, this scanchain reads 2 .*; make the map again"):
         open_saved_map(tmp_path / "newer")
+    index.write_text("{")
+    with pytest.raises(InputError, match=r"map.json: cannot be read"):
+        open_saved_map(tmp_path / "newer")
     for name in ("keyframes.npz", "edges.npz"):
         broken = copy(name.split(".")[0]) / name
         broken.write_bytes(broken.read_bytes()[:100])
@@ -185,16 +188,8 @@ def test_a_localized_log_never_replaces_its_map(office, call):
 
 
 def test_without_loop_closures_nothing_can_be_localized(office, tmp_path, call):
-    words = (
-        "localize",
-        office / "office.mcap",
-        "--map",
-        office / "map",
-        "--out",
-        tmp_path / "loc",
-        "--loops.enabled=false",
-    )
-    code, _, error = call(*words)
+    words = office / "office.mcap", "--map", office / "map", "--out", tmp_path / "loc", "--loops.enabled=false"
+    code, _, error = call("localize", *words)
     assert code == 2 and "a place in a map is found by loop closures; leave it true" in error
     assert not list(tmp_path.iterdir())
 
@@ -280,7 +275,7 @@ def test_archives_that_no_reader_unpacks_are_refused_with_their_name(office, tmp
 def test_one_far_return_does_not_make_the_points_of_its_keyframe_coarse(tmp_path):
     near, far = np.array([[1.2345, -2.0], [0.0, 3.3333]]), np.array([[5e4, 0.0]])
     keyframes = [
-        Keyframe(k, k, k, _Points(points), np.eye(3), float(k), 1.0)
+        Keyframe(k, k, k, SavedPoints(points, 1.0), np.eye(3), float(k), 1.0)
         for k, points in enumerate((near, np.vstack([near, far]), near))
     ]
     none = Edges(np.empty((0, 2), int), np.empty((0, 3, 3)), np.empty((0, 3, 3)), np.empty(0, bool), np.empty(0))
@@ -288,14 +283,6 @@ def test_one_far_return_does_not_make_the_points_of_its_keyframe_coarse(tmp_path
     write_saved_map(tmp_path / "map", keyframes, np.tile(np.eye(3), (3, 1, 1)), np.zeros(3, int), (session,), none)
     for before, after in zip(keyframes, open_saved_map(tmp_path).keyframes, strict=True):
         np.testing.assert_allclose(after.points, before.points, atol=1e-3)
-
-
-@dataclass
-class _Points:
-    points: np.ndarray
-
-    def read(self):
-        return self.points
 
 
 def vars_of(edges: Edges):

@@ -4,6 +4,8 @@ import math
 from itertools import pairwise
 
 import numpy as np
+from PIL import Image
+from ruamel.yaml import YAML
 
 from tests.support.naive_loops import bin_of
 
@@ -47,25 +49,18 @@ def voxel_means(points, size):
 
 
 def served_map(folder):
-    """What a map server makes of map.yaml: cells of −1, 0 or 100, row 0 at the bottom, origin, resolution.
+    """Cells of −1, 0 or 100, row 0 at the bottom, origin and resolution of map.yaml, as map_server loads it.
 
-    Trinary mode: p = (255 − pixel) / 255, occupied above occupied_thresh, free below free_thresh.
+    By libraries for YAML and images; trinary mode alone (nav2's map_io.cpp): p = (255 − pixel) / 255.
     """
-    lines = (folder / "map.yaml").read_text().splitlines()
-    yaml = dict(line.split(": ", 1) for line in lines if line)
-    assert yaml["negate"] == "0"
-    assert yaml["mode"] == "trinary"
-    data = (folder / yaml["image"]).read_bytes()
-    magic, size, depth, pixels = data.split(b"\n", 3)
-    assert (magic, depth) == (b"P5", b"255")
-    columns, rows = map(int, size.split())
-    image = np.frombuffer(pixels, np.uint8).reshape(rows, columns)
-    p = (255.0 - image) / 255.0
-    cells = np.full(image.shape, -1)
-    cells[p > float(yaml["occupied_thresh"])] = 100
-    cells[p < float(yaml["free_thresh"])] = 0
-    origin = [float(value) for value in yaml["origin"].strip("[]").split(",")]
-    return cells[::-1], origin, float(yaml["resolution"])
+    told = YAML(typ="safe").load((folder / "map.yaml").read_text())
+    assert (told["mode"], told["negate"]) == ("trinary", 0)
+    with Image.open(folder / told["image"]) as image:
+        p = (255.0 - np.array(image.convert("L"), float)) / 255.0
+    cells = np.full(p.shape, -1)
+    cells[p < told["free_thresh"]] = 0
+    cells[p > told["occupied_thresh"]] = 100
+    return cells[::-1], np.array(told["origin"]), told["resolution"]
 
 
 def sight(point, ranges_m, limits):

@@ -56,6 +56,9 @@ def chained(motions, rng, noise_m=0.0):
     return np.array(poses)
 
 
+POSES = course()[0]
+
+
 def wheels_of(poses, seed=1, *, scale=1.0, drift_rad_m=0.0, share=0.02):
     """Wheel odometry with errors of scale and heading, and noise."""
     rng = np.random.default_rng(seed)
@@ -64,7 +67,7 @@ def wheels_of(poses, seed=1, *, scale=1.0, drift_rad_m=0.0, share=0.02):
     return chained(motions * rng.normal(1.0, share, motions.shape), rng)
 
 
-def evidence(poses, *, wheels=None, closures=(), **changes):
+def evidence(poses=POSES, *, wheels=None, closures=(), **changes):
     n = len(poses)
     seconds = changes.pop("seconds", INTERVAL_S * np.arange(n))
     stamps_ns = (1e9 * seconds).astype(np.int64)
@@ -106,9 +109,8 @@ def test_wheels_with_errors_of_scale_heading_and_noise_doubt_nothing(dimension, 
 
 
 def test_wheels_on_a_robot_whose_lidar_is_turned_doubt_nothing():
-    poses, _ = course()
     turned = lie.pose_2d(0.3, 0.0, 0.04)
-    assert judge(evidence(poses @ turned, wheels=wheels_of(poses))).verdict is Verdict.TRUSTWORTHY
+    assert judge(evidence(POSES @ turned, wheels=wheels_of(POSES))).verdict is Verdict.TRUSTWORTHY
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -123,11 +125,10 @@ def test_a_slip_along_a_corridor_is_named_though_every_scan_is_ok(dimension):
 
 
 def test_wheels_that_stall_and_catch_up_doubt_nothing():
-    poses, _ = course()
-    wheels = wheels_of(poses)
+    wheels = wheels_of(POSES)
     for first in (300, 700, 900):
         wheels[first : first + 4] = wheels[first]
-    assert judge(evidence(poses, wheels=wheels)).verdict is Verdict.TRUSTWORTHY
+    assert judge(evidence(wheels=wheels)).verdict is Verdict.TRUSTWORTHY
 
 
 def test_a_slip_where_scans_are_degenerate_is_not_trustworthy():
@@ -195,46 +196,41 @@ def test_closures_acquit_no_scans_that_are_badly_measured_and_none_that_they_do_
 
 @pytest.mark.parametrize("jump_m", [6.0, 1e6])
 def test_wheels_that_jump_are_wrong_without_closures(jump_m):
-    poses, _ = course()
-    wheels = wheels_of(poses)
+    wheels = wheels_of(POSES)
     wheels[600:, 0, 2] += jump_m
-    judged = judge(evidence(poses, wheels=wheels))
+    judged = judge(evidence(wheels=wheels))
     assert judged.verdict is Verdict.TRUSTWORTHY and f"s ({jump_m:,.0f}"[:4] in judged.reason
-    once = wheels_of(poses)
+    once = wheels_of(POSES)
     once[600, 0, 2] += jump_m
-    assert judge(evidence(poses, wheels=once)).verdict is Verdict.TRUSTWORTHY
+    assert judge(evidence(wheels=once)).verdict is Verdict.TRUSTWORTHY
 
 
 def test_a_verdict_counts_states_as_the_scans_have_them():
-    poses, _ = course()
     fit = np.where(np.arange(N) % 40 == 0, 0.4, 0.9)
-    judged = judge(evidence(poses, fit=fit, is_degenerate=marked(5, 8)))
+    judged = judge(evidence(fit=fit, is_degenerate=marked(5, 8)))
     assert judged.verdict is Verdict.TRUSTWORTHY and "contradiction" not in judged.sentence
     assert "nothing to check in 1,200 scans: 1,166 ok, 30 contradicted, 4 degenerate; checked by" in judged.reason
 
 
 def test_a_stretch_counts_every_contradicted_scan_within_it():
-    poses, _ = course()
     fit = np.where(marked(300, 340), 0.5, 0.9)
     fit[345] = 0.5  # alone
-    (stretch,) = judge(evidence(poses, fit=fit)).stretches
+    (stretch,) = judge(evidence(fit=fit)).stretches
     assert stretch.scans == int((fit[stretch.first : stretch.last + 1] < 0.6).sum())
 
 
 @pytest.mark.parametrize("share", [0.3, 0.09])
 def test_many_contradicted_scans_are_counted_as_in_the_summary_also_where_wheels_agree(share):
-    poses, _ = course()
     fit = np.where(np.arange(N) < share * N, 0.4, 0.9)
-    held = wheels_of(poses)
+    held = wheels_of(POSES)
     held[100:] = np.nan
-    judged = judge(evidence(poses, fit=fit, wheels=held))
+    judged = judge(evidence(fit=fit, wheels=held))
     counted = f"{int((fit < 0.6).sum()):,} of 1,200 scans are contradicted"
     assert (counted in judged.reason) is (share > 0.1)
 
 
 def test_a_verdict_names_the_error_that_it_vouches_for_where_it_vouches():
-    poses, _ = course()
-    right = replace(evidence(poses), error="ATE 0.010 to 0.020 m with 95 %")
+    right = replace(evidence(), error="ATE 0.010 to 0.020 m with 95 %")
     assert judge(right).sentence.startswith("trustworthy (ATE 0.010 to 0.020 m with 95 %): nothing to check")
     doubted = replace(right, fit=np.where(marked(300, 330), 0.5, 0.9))
     assert judge(doubted).sentence.startswith("check these stretches (otherwise ATE 0.010 to 0.020 m with 95 %): ")
@@ -247,17 +243,9 @@ def test_a_verdict_names_the_error_that_it_vouches_for_where_it_vouches():
 def test_the_error_of_another_tool_is_below_its_distance_to_an_independent_estimate(dimension, error_m):
     truth, _ = course(dimension)
     rng = np.random.default_rng(4)
-    estimate, other = (
-        truth
-        @ lie.exp(
-            np.cumsum(
-                rng.normal(0.0, error_m / 20.0, (N, 3 * dimension - 3))
-                * ([1.0] * 2 + [0.0] * (3 * dimension - 5)),
-                axis=0,
-            )
-        )
-        for _ in range(2)
-    )
+    level = np.arange(3 * dimension - 3) < 2
+    errors = (rng.normal(0.0, error_m / 20.0, (N, len(level))) * level for _ in range(2))
+    estimate, other = (truth @ lie.exp(np.cumsum(error, axis=0)) for error in errors)
     positions = [poses[:, :-1, -1] for poses in (estimate, other, truth)]
     bound_m, true_m = apart_m(positions[0], positions[1]), apart_m(positions[0], positions[2])
     assert 0.5 * true_m < bound_m < 4.0 * true_m
@@ -276,28 +264,25 @@ def test_the_error_of_another_tool_is_below_its_distance_to_an_independent_estim
 
 @pytest.mark.parametrize(("count", "verdict"), [(2, Verdict.TRUSTWORTHY), (3, Verdict.CHECK)])
 def test_rejected_closures_that_agree_with_each_other_are_a_finding_from_three_on(count, verdict):
-    poses, _ = course()
     wrong = lie.pose_2d(2.0, 0.0, 0.0)
     pairs = [(10 + 5 * k, 610 + 5 * k) for k in range(count)]
-    closures = [((i, j), lie.between(poses[i], poses[j] @ wrong)) for i, j in pairs]
-    judged = judge(evidence(poses, closures=closures))
+    closures = [((i, j), lie.between(POSES[i], POSES[j] @ wrong)) for i, j in pairs]
+    judged = judge(evidence(closures=closures))
     assert judged.verdict is verdict
     assert [each.kind for each in judged.stretches] == [Kind.LOOPS] * (count > 2)
     assert all(each.size_m == pytest.approx(2.0) for each in judged.stretches)
 
 
 def test_rejected_closures_that_disagree_with_each_other_are_noise():
-    poses, _ = course()
     closures = [
         ((10 + 5 * k, 610 + 5 * k), lie.pose_2d(*np.random.default_rng(k).uniform(-9.0, 9.0, 3))) for k in range(8)
     ]
-    assert judge(evidence(poses, closures=closures)).verdict is Verdict.TRUSTWORTHY
+    assert judge(evidence(closures=closures)).verdict is Verdict.TRUSTWORTHY
 
 
 def test_a_jump_is_an_impossible_acceleration():
-    poses, _ = course()
-    moved = poses.copy()
-    moved[400:] = lie.pose_2d(2.5, 0.0, 0.0) @ poses[400:]
+    moved = POSES.copy()
+    moved[400:] = lie.pose_2d(2.5, 0.0, 0.0) @ POSES[400:]
     judged = judge(evidence(moved))
     assert judged.verdict is Verdict.NOT_TRUSTWORTHY
     assert [each.kind for each in judged.stretches] == [Kind.ACCELERATION]
@@ -330,15 +315,14 @@ def test_a_single_scan_is_not_trustworthy():
 
 
 def test_a_driver_that_was_stuck_is_a_stretch_unless_the_lidar_rested_or_wheels_agree():
-    poses, _ = course()
-    stuck = poses.copy()
-    stuck[501:521] = poses[500]
+    stuck = POSES.copy()
+    stuck[501:521] = POSES[500]
     (stretch,) = judge(evidence(stuck, is_copy=marked(501, 520))).stretches[:1]
     assert (stretch.kind, stretch.first, stretch.last) == (Kind.COPIES, 501, 520)
     for at_an_end in (marked(N - 20, N - 1), marked(1, 20)):
-        assert Kind.COPIES in {each.kind for each in judge(evidence(poses, is_copy=at_an_end)).stretches}
-    rested = np.concatenate([poses[:500], np.repeat(poses[500:501], 21, axis=0), poses[501:]])[:N]
-    for calm, last, wheels in ((rested, 519, None), (poses, 505, None), (poses, 520, wheels_of(poses))):
+        assert Kind.COPIES in {each.kind for each in judge(evidence(is_copy=at_an_end)).stretches}
+    rested = np.concatenate([POSES[:500], np.repeat(POSES[500:501], 21, axis=0), POSES[501:]])[:N]
+    for calm, last, wheels in ((rested, 519, None), (POSES, 505, None), (POSES, 520, wheels_of(POSES))):
         judged = judge(evidence(calm, is_copy=marked(501, last), wheels=wheels))
         assert judged.verdict is Verdict.TRUSTWORTHY
 
@@ -372,15 +356,13 @@ def test_a_short_interval_after_a_gap_accelerates_nothing():
 
 @pytest.mark.parametrize("kind", [Kind.DEGENERATE, Kind.LOST, Kind.CONTRADICTED])
 def test_a_stretch_of_doubtful_scans_is_to_be_checked_and_most_of_a_run_is_not_trustworthy(kind):
-    poses, _ = course()
-
     def of(is_marked):
         changes = {
             Kind.DEGENERATE: {"is_degenerate": is_marked},
             Kind.LOST: {"is_lost": is_marked},
             Kind.CONTRADICTED: {"fit": np.where(is_marked, 0.4, 0.9)},
         }
-        return judge(evidence(poses, **changes[kind]))
+        return judge(evidence(**changes[kind]))
 
     assert of(marked(300, 303)).verdict is Verdict.TRUSTWORTHY  # 0.4 m
     judged = of(marked(300, 330))
@@ -390,11 +372,10 @@ def test_a_stretch_of_doubtful_scans_is_to_be_checked_and_most_of_a_run_is_not_t
 
 
 def test_a_corridor_that_the_wheels_hold_is_to_be_checked_and_not_wrong():
-    poses, _ = course()
-    wheels = wheels_of(poses)
-    judged = judge(evidence(poses, wheels=wheels, is_degenerate=marked(300, 1000)))
+    wheels = wheels_of(POSES)
+    judged = judge(evidence(wheels=wheels, is_degenerate=marked(300, 1000)))
     assert judged.verdict is Verdict.CHECK and judged.stretches[0].scans == 701
-    assert judge(evidence(poses, wheels=wheels, is_degenerate=marked(300, 330))).verdict is Verdict.TRUSTWORTHY
+    assert judge(evidence(wheels=wheels, is_degenerate=marked(300, 330))).verdict is Verdict.TRUSTWORTHY
 
 
 @pytest.mark.parametrize("open_scans", [8, 40])
@@ -433,19 +414,17 @@ def test_wheels_that_disagree_all_along_are_named_though_they_disagree_evenly(di
 
 
 def test_many_short_stretches_of_degenerate_scans_are_to_be_checked_though_wheels_hold_each():
-    poses, _ = course()
     often = np.arange(N) % 30 < 9
-    judged = judge(evidence(poses, wheels=wheels_of(poses), is_degenerate=often))
+    judged = judge(evidence(wheels=wheels_of(POSES), is_degenerate=often))
     assert judged.verdict is Verdict.CHECK and "360 of 1,200 scans are degenerate" in judged.reason
     seldom = np.arange(N) % 90 < 9
-    assert judge(evidence(poses, wheels=wheels_of(poses), is_degenerate=seldom)).verdict is Verdict.TRUSTWORTHY
+    assert judge(evidence(wheels=wheels_of(POSES), is_degenerate=seldom)).verdict is Verdict.TRUSTWORTHY
 
 
 @pytest.mark.parametrize(("tried", "verdict"), [(9, Verdict.TRUSTWORTHY), (10, Verdict.CHECK)])
 def test_revisited_places_that_do_not_look_as_mapped_are_to_be_checked(tried, verdict):
-    poses, _ = course()
-    pairs = [((10, 610), lie.between(poses[10], poses[610]))]
-    found = evidence(poses, closures=pairs)
+    pairs = [((10, 610), lie.between(POSES[10], POSES[610]))]
+    found = evidence(closures=pairs)
     closures = replace(found.closures, is_accepted=np.array([True]), tried=tried)
     judged = judge(replace(found, closures=closures))
     assert judged.verdict is verdict
@@ -453,13 +432,12 @@ def test_revisited_places_that_do_not_look_as_mapped_are_to_be_checked(tried, ve
 
 
 def test_segments_that_a_closure_joins_are_not_told():
-    poses, _ = course()
     starts = marked(600, 600)
-    parts = evidence(poses, starts_segment=starts)
+    parts = evidence(starts_segment=starts)
     (stretch,) = judge(parts).stretches
     assert (stretch.kind, stretch.first, stretch.last) == (Kind.DISCONNECTED, 600, N - 1)
-    closures = Closures(np.array([10]), np.array([610]), lie.between(poses[[10]], poses[[610]]), np.array([True]))
-    joined = evidence(poses, starts_segment=starts)
+    closures = Closures(np.array([10]), np.array([610]), lie.between(POSES[[10]], POSES[[610]]), np.array([True]))
+    joined = evidence(starts_segment=starts)
     object.__setattr__(joined, "closures", closures)
     assert judge(joined).verdict is Verdict.TRUSTWORTHY
 
@@ -493,17 +471,15 @@ def test_the_worst_place_of_a_slip_lies_between_the_scans_before_and_after_it():
 
 
 def test_the_worst_place_of_a_long_stretch_is_the_scan_that_is_contradicted_most():
-    poses, _ = course()
     fit = np.where(marked(300, 700), 0.5, 0.9)
     fit[444] = 0.1
-    found = evidence(poses, fit=fit)
+    found = evidence(fit=fit)
     worst = worst_place(judge(found).stretches, found)
     assert worst.stretch.kind is Kind.CONTRADICTED and (worst.before, worst.after) == (443, 444)
 
 
 def test_the_worst_place_of_disagreeing_loops_are_its_two_passes():
-    poses, _ = course()
-    found = evidence(poses)
+    found = evidence()
     loops = Stretch(Kind.LOOPS, 100, 700, 4, 20.0, 140.0, 2.0)
     slip = Stretch(Kind.WHEELS, 300, 310, 11, 60.0, 62.0, 1.0)
     assert worst_place((slip, loops), found)[1:] == (100, 700)
@@ -511,13 +487,12 @@ def test_the_worst_place_of_disagreeing_loops_are_its_two_passes():
 
 @pytest.mark.parametrize(("kind", "seen"), [(Kind.WHEELS, "one side"), (Kind.LOOPS, "around")])
 def test_an_overlay_holds_the_points_of_keyframes_near_the_worst_place(tmp_path, kind, seen):
-    poses, _ = course()
     numbers = np.arange(0, N, 5)
     beside = np.array([[0.0, 1.0]])
     result = SimpleNamespace(
-        trajectory=Trajectory(np.arange(N), poses),
+        trajectory=Trajectory(np.arange(N), POSES),
         keyframes=[SimpleNamespace(scan_index=int(k), points=beside) for k in numbers],
-        T_world_keyframes=poses[numbers],
+        T_world_keyframes=POSES[numbers],
     )
     stretch = Stretch(kind, 200, 205, 6, 40.0, 41.0, 1.0)
     write_overlay(tmp_path / "overlay.npz", WorstPlace(stretch, 199, 605), result)
@@ -526,16 +501,15 @@ def test_an_overlay_holds_the_points_of_keyframes_near_the_worst_place(tmp_path,
         numbers[(np.abs(STEP_M * (numbers - scan)) < 6.0) & ((side * (numbers - scan) >= 0) | (seen == "around"))]
         for scan, side in ((199, -1), (605, 1))
     )
-    assert overlay.text == stretch.text and np.allclose(overlay.place, poses[605, :2, 2])
+    assert overlay.text == stretch.text and np.allclose(overlay.place, POSES[605, :2, 2])
     assert abs(len(overlay.before) - len(before)) <= 2 and abs(len(overlay.after) - len(after)) <= 2
-    assert np.isclose(overlay.before, lie.transform(poses[before[3]], beside), atol=1e-4).all(axis=1).any()
+    assert np.isclose(overlay.before, lie.transform(POSES[before[3]], beside), atol=1e-4).all(axis=1).any()
 
 
 def test_without_a_keyframe_near_it_an_overlay_has_the_nearest(tmp_path):
-    poses, _ = course()
     keyframe = SimpleNamespace(scan_index=0, points=np.array([[1.0, 2.0]]))
     result = SimpleNamespace(
-        trajectory=Trajectory(np.arange(N), poses), keyframes=[keyframe], T_world_keyframes=poses[:1]
+        trajectory=Trajectory(np.arange(N), POSES), keyframes=[keyframe], T_world_keyframes=POSES[:1]
     )
     stretch = Stretch(Kind.LOST, 800, 820, 21, 160.0, 164.0)
     write_overlay(tmp_path / "overlay.npz", WorstPlace(stretch, 799, 820), result)
@@ -551,34 +525,30 @@ def test_the_usual_overlap_is_the_median_of_up_to_ten_scans_before(count):
 
 
 def test_a_lidar_that_was_carried_elsewhere_is_named_though_the_wheels_agree():
-    poses, _ = course()
     share = np.full(N, 0.98)
     share[600] = 0.4  # of the points have a correspondence; the next scans match the one that was inserted
-    judged = judge(evidence(poses, wheels=wheels_of(poses), overlap=check_overlap(share)))
+    judged = judge(evidence(wheels=wheels_of(POSES), overlap=check_overlap(share)))
     assert judged.verdict is Verdict.CHECK
     assert [(each.kind, each.first, each.last) for each in judged.stretches] == [(Kind.OVERLAP, 600, 600)]
 
 
 def test_overlap_that_shrinks_slowly_doubts_nothing():
-    poses, _ = course()
     share = np.linspace(1.0, 0.3, N)
-    assert judge(evidence(poses, overlap=check_overlap(share))).verdict is Verdict.TRUSTWORTHY
+    assert judge(evidence(overlap=check_overlap(share))).verdict is Verdict.TRUSTWORTHY
 
 
 def test_one_contradicted_scan_after_a_gap_is_to_be_checked_unless_wheels_agree():
-    poses, _ = course()
     kept = ~marked(300, 315)
     changes = {"fit": np.where(marked(316, 316), 0.4, 0.9)[kept], "seconds": INTERVAL_S * np.flatnonzero(kept)}
-    (stretch,) = judge(evidence(poses[kept], **changes)).stretches
+    (stretch,) = judge(evidence(POSES[kept], **changes)).stretches
     assert (stretch.kind, stretch.first, stretch.last) == (Kind.CONTRADICTED, 300, 300)
-    wheels = wheels_of(poses)[kept]
-    assert judge(evidence(poses[kept], wheels=wheels, **changes)).verdict is Verdict.TRUSTWORTHY
+    wheels = wheels_of(POSES)[kept]
+    assert judge(evidence(POSES[kept], wheels=wheels, **changes)).verdict is Verdict.TRUSTWORTHY
 
 
 def test_degenerate_scans_between_which_others_measure_the_pose_are_passed():
-    poses, _ = course()
     mostly = marked(300, 360) & (np.arange(N) % 8 != 0)  # 0.7 m at a time
-    assert judge(evidence(poses, is_degenerate=mostly)).verdict is Verdict.TRUSTWORTHY
+    assert judge(evidence(is_degenerate=mostly)).verdict is Verdict.TRUSTWORTHY
 
 
 def test_a_lidar_that_seems_to_stand_after_a_gap_at_speed_is_to_be_checked():

@@ -79,11 +79,11 @@ def localize(
     job = Job(logs=logs, out=out, overrides=overrides(ctx), command=tuple(sys.argv), **options)
     first = None if initial is None else _initial(initial)
     with Terminal("scans") as terminal:
-        localized, text = localize_log(job, prior, terminal, draw_localization, initial=first)
+        localized = localize_log(job, prior, terminal, draw_localization, initial=first)
     fails = localized.metrics.verdict.fails(strict=strict)
     if fails and not sys.stdout.isatty():
         click.echo(f"error: {out}: {localized.metrics.sentence}", err=True)
-    click.echo((out / "metrics.json").read_text() if as_json else text, nl=False)
+    click.echo((out / "metrics.json").read_text() if as_json else localized.summary, nl=False)
     if not as_json:
         click.echo(f"{'written':<15}{out}")
     if fails:

@@ -56,9 +56,10 @@ def write_ply(
     comment: str = _PLY_COMMENT,
 ) -> None:
     """Write points (N, d) as binary little-endian PLY of float32, with further columns (N,) of u1 or i4."""
-    coordinates = dict(zip("xyz", _in_space(points).T, strict=True))
-    named = coordinates if columns is None else coordinates | columns
-    rows = np.rec.fromarrays(list(named.values()), names=list(named))
+    named = dict(zip("xyz", _in_space(points).T, strict=True)) | dict(columns or {})
+    rows = np.empty(len(points), [(name, values.dtype) for name, values in named.items()])
+    for name, values in named.items():
+        rows[name] = values
     Path(path).write_bytes(_ply_header(len(rows), rows.dtype, comment).encode("ascii") + rows.tobytes())
 
 

@@ -61,8 +61,16 @@ class OccupancyGrid:
                 config.slice_min_z_m, config.slice_max_z_m, starts[part], ends[part],
             )  # fmt: skip
             kept[k + 1] = kept[k] + count
-        if beams := int(kept[-1]):
-            self._draw(starts[:beams], ends[:beams], kept)
+        starts, ends = starts[: kept[-1]], ends[: kept[-1]]
+        if len(starts):
+            extent = np.array([np.inf, np.inf, -np.inf, -np.inf])
+            grid.bounds(starts, extent)
+            grid.bounds(ends, extent)
+            self._cover(extent)
+            grid.draw_beams(
+                starts, ends, kept, self.origin_m, self.resolution_m, self.scans + 1, np.float32(_HIT),
+                np.float32(_MISS), np.float32(_LOW), np.float32(_HIGH), self.log_odds, self.drawn,
+            )  # fmt: skip
         self.scans += len(poses)
 
     def probability(self) -> NDArray[np.float32]:
@@ -80,16 +88,6 @@ class OccupancyGrid:
             result.origin_m = self.origin_m + self.resolution_m * np.array([columns[0], rows[0]])
             result.log_odds, result.drawn = self.log_odds[box].copy(), self.drawn[box].copy()
         return result
-
-    def _draw(self, starts: Matrix, ends: Matrix, offsets: NDArray[np.int64]) -> None:
-        extent = np.array([np.inf, np.inf, -np.inf, -np.inf])
-        grid.bounds(starts, extent)
-        grid.bounds(ends, extent)
-        self._cover(extent)
-        grid.draw_beams(
-            starts, ends, offsets, self.origin_m, self.resolution_m, self.scans + 1,
-            np.float32(_HIT), np.float32(_MISS), np.float32(_LOW), np.float32(_HIGH), self.log_odds, self.drawn,
-        )  # fmt: skip
 
     def _cover(self, extent: NDArray[np.float64]) -> None:
         """Grow the grid, by whole cells, so that it holds the extent (min x, min y, max x, max y) and a margin."""

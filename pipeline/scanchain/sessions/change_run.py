@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from scanchain import lie
+from scanchain import checks, lie
 from scanchain.config import Config
 from scanchain.data import Pose
 from scanchain.errors import InputError
@@ -107,6 +107,7 @@ def _in_one_frame(
         alignment = align_maps(first, second, config)
         poses, text = alignment.poses, f"by {counted(alignment.loops, 'loop closure')}"
     else:
+        T = checks.pose(T, "T_earlier_later", first.dimension)
         is_same = np.allclose(T, lie.identity(first.dimension))
         poses, text = T @ second.poses, "as given" + (", one frame" if is_same else "")
     return Part(names[0], first.keyframes, first.poses), Part(names[1], second.keyframes, poses), text

@@ -108,13 +108,14 @@ class LocalizeMetrics(Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class LocalizedLog:
-    """A localized log for report and recording: its directory, the map, its poses in it, the metrics."""
+    """A localized log: its directory, the map, its poses in it, metrics and summary."""
 
     __repr__ = brief
     path: Path
     prior: SavedMap
     localization: Localization
     metrics: LocalizeMetrics
+    summary: str
 
 
 Draw = Callable[[Path, LocalizedLog], None]
@@ -128,8 +129,8 @@ def localize(
     draw: Draw = lambda folder, localized: None,
     *,
     initial: Initial | None = None,
-) -> tuple[LocalizedLog, str]:
-    """Localize a log; returns what is in the directory, and the summary.
+) -> LocalizedLog:
+    """Localize a log; returns what is in the directory.
 
     map_path : run directory, or folder, of the map; draw : adds report and recording to the folder
     initial : T_map_lidar of the first scan, where known, by the stamp of that scan and the map
@@ -168,9 +169,8 @@ def localize(
                 truth, note = accuracy_of(poses, source, job.max_gap_s, placed, folder)
                 warnings += note
             metrics = measure(found, prior, config, time_s, warnings, truth)
-            localized = LocalizedLog(directory.path, prior, found, metrics)
-            text = _summary(localized, log)
-            _write(folder, localized, text)
+            localized = LocalizedLog(directory.path, prior, found, metrics, _summary(metrics, prior, log))
+            _write(folder, localized)
             draw(folder, localized)
         localizer.slam.points.close()
         (directory.path / POINTS_FILE).unlink(missing_ok=True)
@@ -178,7 +178,7 @@ def localize(
             provenance.hashed(hashing), complete=True, stopped=stopped, duration_s=working_s() - started
         ).write(directory.path / RUN_FILE)
         directory.complete()
-    return replace(localized, path=directory.path), text
+    return replace(localized, path=directory.path)
 
 
 def _followed(
@@ -349,9 +349,8 @@ def pose_in_file(path: Path) -> Initial:
     return pose
 
 
-def _summary(localized: LocalizedLog, log: Log) -> str:
+def _summary(m: LocalizeMetrics, prior: SavedMap, log: Log) -> str:
     """Text of summary.txt."""
-    m, prior = localized.metrics, localized.prior
     names = ", ".join(session.name for session in prior.sessions)
     states = ", ".join(f"{count:,} {state}" for state, count in m.states.items() if count)
     lines = [
@@ -377,13 +376,13 @@ def _summary(localized: LocalizedLog, log: Log) -> str:
     return "".join(f"{name:<15}{text}\n" for name, text in lines)
 
 
-def _write(folder: Path, localized: LocalizedLog, text: str) -> None:
+def _write(folder: Path, localized: LocalizedLog) -> None:
     """Trajectories, summary, metrics and the table: a row a scan, poses null where unknown."""
     found = localized.localization
     if found.is_placed.any():
         write_tum(folder / "trajectory.tum", found.placed)
     write_tum(folder / "odometry.tum", found.result.odometry)
-    (folder / "summary.txt").write_text(text, encoding="utf-8")
+    (folder / "summary.txt").write_text(localized.summary, encoding="utf-8")
     (folder / "metrics.json").write_bytes(json.format(json.encode(localized.metrics)) + b"\n")
     columns: dict[str, pa.Array] = {
         "scan": pa.array(np.arange(len(found.states))),

@@ -114,12 +114,9 @@ def merged_map(
         sessions.append(msgspec.structs.replace(maps[number].sessions[index], name=names[number, index]))
         trajectories.append(_trajectory(maps[number], index, poses[of_session]))
     last_seen_ns = np.concatenate([maps[number].last_seen_ns for number in joined.maps])
-    removed, warnings = np.zeros(len(poses), np.int64), ()
-    if update:
-        new = updated(joined.keyframes, poses, session, sessions, config)
-        joined, removed, warnings = replace(joined, keyframes=new.keyframes), new.removed, new.warnings
-        last_seen_ns = np.maximum(last_seen_ns, new.last_seen_ns)
-    return MergedMap(joined, poses, tuple(sessions), session, tuple(trajectories), last_seen_ns, removed, warnings)
+    removed = np.zeros(len(poses), np.int64)
+    merged = MergedMap(joined, poses, tuple(sessions), session, tuple(trajectories), last_seen_ns, removed)
+    return updated(merged, config) if update else merged
 
 
 def final_closures(merged: MergedMap) -> tuple[FinalClosure, ...]:
@@ -193,37 +190,11 @@ class RemainingPoints:
         return self.stored.read()[self.kept]
 
 
-@dataclass(frozen=True, slots=True)
-class Updated:
-    """Keyframes of an updated map.
-
-    Attributes
-    ----------
-    keyframes : without the points that newer sessions saw through
-    removed : (K,) number of these
-    last_seen_ns : (K,) stamp of the newest keyframe that saw the surroundings of each, its own at least
-    warnings : sessions that nothing was removed by, since they do not fit on those before
-    """
-
-    keyframes: tuple[Keyframe, ...]
-    removed: NDArray[np.int64]
-    last_seen_ns: NDArray[np.int64]
-    warnings: tuple[str, ...]
-
-
-def updated(
-    keyframes: Sequence[Keyframe],
-    poses: Matrix,
-    session: NDArray[np.int64],
-    sessions: Sequence[Session],
-    config: Config,
-) -> Updated:
-    """Keyframes at these poses (K, d+1, d+1) without what vanished from one session to the next.
-
-    session : (K,) number of each keyframe's session; the later session has the higher number
-    """
-    result, removed, warnings = list(keyframes), np.zeros(len(keyframes), np.int64), []
-    for number in range(1, len(sessions)):
+def updated(merged: MergedMap, config: Config) -> MergedMap:
+    """The map without what vanished from one session to the next; warns of sessions that fit on none before."""
+    session, poses = merged.session, merged.T_world_keyframes
+    result, removed, warnings = list(merged.keyframes), merged.removed.copy(), list(merged.warnings)
+    for number, newest in enumerate(merged.sessions[1:], 1):
         older, newer = np.flatnonzero(session < number), np.flatnonzero(session == number)
         earlier, later = (
             Part("", [result[k] for k in chosen.tolist()], poses[chosen]) for chosen in (older, newer)
@@ -231,9 +202,7 @@ def updated(
         try:
             changes = changes_between(earlier, later, config)
         except InputError:
-            warnings.append(
-                f"{sessions[number].name}: too little in common with older sessions, nothing removed by it"
-            )
+            warnings.append(f"{newest.name}: too little in common with older sessions, nothing removed by it")
             continue
         if not (changes.labels == Label.VANISHED).any():
             continue
@@ -247,7 +216,13 @@ def updated(
                 removed[k] += gone.sum()
                 result[k] = replace(result[k], stored=RemainingPoints(result[k].stored, ~gone))
     last_seen_ns = _last_seen(result, poses, _CELL_VOXELS * config.maps.voxel_size_m)
-    return Updated(tuple(result), removed, last_seen_ns, tuple(warnings))
+    return replace(
+        merged,
+        joined=replace(merged.joined, keyframes=tuple(result)),
+        last_seen_ns=np.maximum(merged.last_seen_ns, last_seen_ns),
+        removed=removed,
+        warnings=tuple(warnings),
+    )
 
 
 def _last_seen(keyframes: Sequence[Keyframe], poses: Matrix, cell_m: float) -> NDArray[np.int64]:

@@ -4,6 +4,7 @@ from scanchain.verdict.checks import (
     VELOCITY_LIMIT,
     WHEEL_LIMIT,
     Kind,
+    Stretch,
     apart_m,
     check_overlap,
     check_velocity,
@@ -13,7 +14,7 @@ from scanchain.verdict.checks import (
 )
 from scanchain.verdict.closures import Closures
 from scanchain.verdict.judging import MOST_CONTRADICTED, Judged, Verdict, judge
-from scanchain.verdict.stretches import KNOWN, Evidence, Stretch, WorstPlace, worst_place
+from scanchain.verdict.stretches import KNOWN, Evidence, WorstPlace, worst_place
 
 __all__ = [
     "KNOWN", "MOST_CONTRADICTED", "VELOCITY_LIMIT", "WHEEL_LIMIT", "Closures", "Evidence", "Judged", "Kind",

@@ -1,4 +1,7 @@
-"""Independent checks of a trajectory: normalized innovations against wheel odometry and constant velocity."""
+"""Independent checks of a trajectory: normalized innovations against wheel odometry and constant velocity.
+
+What they and the other evidence find are stretches of scans.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
+from msgspec import Struct
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
@@ -37,6 +41,7 @@ _ACCELERATION_M_S2, _ACCELERATION_RAD_S2 = 4.0, 12.0  # σ: a fifth to a third o
 _MOTION_M, _MOTION_RAD = 0.05, 0.01  # σ of a motion between scans by matching
 _ALIKE = 1.4  # an interval shorter than the usual one by this factor is none: its stamps jitter
 
+_SMALL_RAD = 0.1  # difference of headings that is not worth a word
 _FEWEST, _BEFORE = 3, 10  # scans whose median overlap with the map is usual
 _LEAST_USUAL = 1e-3  # smallest usual share of points with a correspondence
 
@@ -55,6 +60,42 @@ class Kind(StrEnum):
     DISCONNECTED = "disconnected"
     OVERLAP = "overlap lost"
     COPIES = "copies of one scan"
+
+
+class Stretch(Struct, frozen=True):
+    """Consecutive suspicious scans.
+
+    Attributes
+    ----------
+    first, last : scans, from 0; start_s, end_s : since the first scan of the run
+    scans : of this kind among them
+    size_m, size_rad : the contradiction; null where it is not measured
+    """
+
+    kind: Kind
+    first: int
+    last: int
+    scans: int
+    start_s: float
+    end_s: float
+    size_m: float | None = None
+    size_rad: float | None = None
+
+    @property
+    def text(self) -> str:
+        """The stretch in words."""
+        size = "" if self.size_m is None else f" by {self.size_m:,.1f} m"
+        turn_rad = self.size_rad or 0.0
+        if turn_rad > _SMALL_RAD:
+            size += f" and {np.degrees(turn_rad):.0f} deg"
+        place = f"scan {self.first:,}" if self.first == self.last else f"scans {self.first:,} to {self.last:,}"
+        return f"{place} ({self.times}): {self.kind}{size}"
+
+    @property
+    def times(self) -> str:
+        """Its seconds as text, one where both ends are the same to a digit."""
+        start, end = f"{self.start_s:.1f}", f"{self.end_s:.1f}"
+        return f"{start if start == end else f'{start} to {end}'} s"
 
 
 class WheelCheck(NamedTuple):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +13,9 @@ from scipy.spatial import KDTree
 from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.graph.robust.groups import FEWEST, carried, connected
-from scanchain.verdict.checks import Floats, Kind
+from scanchain.verdict.checks import Floats, Kind, Stretch
 
-LEAST_M = 0.5  # smallest contradiction of a closure that is checked
+_LEAST_M = 0.5  # smallest contradiction of a closure that is checked
 _NEAR_M = 10.0  # largest path between the ends of two closures of a group
 _AGREE_M, _AGREE_SHARE = 0.2, 0.02  # largest difference of two that agree: meters, and share of the path between
 _FINDABLE = 3000  # largest number of contradicting closures that are grouped; of more every n-th
@@ -47,26 +46,18 @@ class Closures:
     tried: int = 0
 
 
-class Group(NamedTuple):
-    """Closures that agree with each other: scans that all of them span, their number, and contradiction in meters.
+def contradicting_groups(closures: Closures, poses: Matrix, seconds: Floats) -> list[Stretch]:
+    """Scans that groups of closures span, at least three which agree, each far off the final poses (N, d+1, d+1).
 
-    The motion from the first scan to the last is wrong by that much, or the two places are alike.
+    The motion from the first scan to the last is wrong by about as much, or the two places are alike.
+    seconds : (N,) of the scans
     """
-
-    first: int
-    last: int
-    closures: int
-    size_m: float
-
-
-def contradicting_groups(closures: Closures, poses: Matrix) -> list[Group]:
-    """Groups of at least three closures, each more than ``LEAST_M`` off the final poses (N, d+1, d+1)."""
     if not len(closures.target):
         return []
     expected = lie.between(poses[closures.target], poses[closures.source])
     off = lie.between(expected, closures.T_target_source)[:, :-1, -1]
     size_m = np.linalg.norm(off, axis=1)
-    chosen = np.flatnonzero(size_m > LEAST_M)
+    chosen = np.flatnonzero(size_m > _LEAST_M)
     chosen = chosen[:: max(1, -(-len(chosen) // _FINDABLE))]
     if len(chosen) < FEWEST:
         return []
@@ -85,7 +76,9 @@ def contradicting_groups(closures: Closures, poses: Matrix) -> list[Group]:
         first, last = int(low.max()), int(high.min())
         if first >= last:
             first, last = int(low.min()), int(high.max())
-        groups.append(Group(first, last, len(members), float(np.median(size_m[chosen][members]))))
+        start_s, end_s = seconds[[first, last]].tolist()
+        wrong_m = float(np.median(size_m[chosen][members]))
+        groups.append(Stretch(Kind.LOOPS, first, last, len(members), start_s, end_s, wrong_m))
     return groups
 
 

@@ -7,60 +7,22 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from msgspec import Struct
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from scanchain.data import LEAST_FIT, MOST_COPIES, Matrix
-from scanchain.verdict.checks import VELOCITY_LIMIT, WHEEL_LIMIT, Floats, Kind, WheelCheck
+from scanchain.verdict.checks import VELOCITY_LIMIT, WHEEL_LIMIT, Floats, Kind, Stretch, WheelCheck
 from scanchain.verdict.closures import Closures, contradicting_groups, which_slipped
 
 _LEAST_OVERLAP = 2.0 / 3.0  # smallest ``overlap`` that is no finding
 _GAP = 3.0  # intervals of usual length from which on the motion is not predicted
 _GAP_SCANS = 10  # longest gap within a stretch
-_SMALL_RAD = 0.1  # difference of headings that is not worth a word
 _PASSED_M = 1.0  # extent of a stretch of predicted or contradicted poses up to which it is passed without harm
 _PASSED_BY_WHEELS_M = 4.0  # likewise where the wheels agree with the trajectory
 KNOWN = 0.5  # least share of scans that the wheels are compared at
 _RESTING_M = 0.05  # distance from copies to the next scan, within which the lidar rested
 _SHORT_M = 10.0  # largest path of a stretch that is shown by what lies before and behind it
 _MEDIAN_SCANS = 9  # scans over which the median of ``fit`` is taken: single ones are contradicted by people
-
-
-class Stretch(Struct, frozen=True):
-    """Consecutive suspicious scans.
-
-    Attributes
-    ----------
-    first, last : scans, from 0; start_s, end_s : since the first scan of the run
-    scans : of this kind among them
-    size_m, size_rad : the contradiction; null where it is not measured
-    """
-
-    kind: Kind
-    first: int
-    last: int
-    scans: int
-    start_s: float
-    end_s: float
-    size_m: float | None = None
-    size_rad: float | None = None
-
-    @property
-    def text(self) -> str:
-        """The stretch in words."""
-        size = "" if self.size_m is None else f" by {self.size_m:,.1f} m"
-        turn_rad = self.size_rad or 0.0
-        if turn_rad > _SMALL_RAD:
-            size += f" and {np.degrees(turn_rad):.0f} deg"
-        place = f"scan {self.first:,}" if self.first == self.last else f"scans {self.first:,} to {self.last:,}"
-        return f"{place} ({self.times}): {self.kind}{size}"
-
-    @property
-    def times(self) -> str:
-        """Its seconds as text, one where both ends are the same to a digit."""
-        start, end = f"{self.start_s:.1f}", f"{self.end_s:.1f}"
-        return f"{start if start == end else f'{start} to {end}'} s"
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +103,7 @@ def find_stretches(evidence: Evidence) -> list[Stretch]:
         *measured,
         *_of_wheels(evidence, measured),
         *_of_copies(evidence),
-        *_of_loops(evidence),
+        *contradicting_groups(evidence.closures, evidence.poses, evidence.seconds),
         *_of_segments(evidence),
     ]
     return sorted(found, key=lambda stretch: (stretch.first, stretch.last))
@@ -226,12 +188,6 @@ def _of_copies(evidence: Evidence) -> Iterator[Stretch]:
         is_at_end = part.start == 1 or part.stop == len(evidence)
         if is_at_end or np.linalg.norm(positions[part.stop] - positions[part.stop - 1]) > _RESTING_M:
             yield _stretch(evidence, Kind.COPIES, part, evidence.is_copy)
-
-
-def _of_loops(evidence: Evidence) -> Iterator[Stretch]:
-    for group in contradicting_groups(evidence.closures, evidence.poses):
-        seconds = evidence.seconds[[group.first, group.last]].tolist()
-        yield Stretch(Kind.LOOPS, group.first, group.last, group.closures, *seconds, group.size_m)
 
 
 def _of_segments(evidence: Evidence) -> Iterator[Stretch]:
