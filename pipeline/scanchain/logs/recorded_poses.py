@@ -1,10 +1,9 @@
-"""Poses recorded beside the scans: of the wheels, of the ground truth, and of the lidar on the robot."""
+"""Poses recorded beside the scans: of the wheels and of the ground truth."""
 
 from __future__ import annotations
 
 from bisect import bisect_left, insort
 from collections import Counter
-from typing import NamedTuple
 
 import numpy as np
 
@@ -13,29 +12,19 @@ from scanchain.data import Pose, Trajectory
 from scanchain.logs.mcap.stream import Decoded
 from scanchain.logs.messages.poses import StampedPose
 from scanchain.logs.messages.returns import Returns
-from scanchain.logs.mounting import Mounting, edge
 from scanchain.words import counted
 
 _REMEMBERED = 512  # largest number of readings in memory
 _NEAREST_NS = 500_000_000
 
 
-class PosesAtScan(NamedTuple):
-    """T_odom_base (d+1, d+1) and T_base_lidar (4, 4) at a scan's stamp; None where no reading is near."""
-
-    T_odom_base: Pose | None
-    T_base_lidar: Pose | None
-
-
 class RecordedPoses:
     """Pose messages by topic, looked up at the stamp of a scan; malformed ones are counted."""
 
-    def __init__(self, odometry_topic: str, ground_truth_topic: str, mounting: Mounting | None = None) -> None:
+    def __init__(self, odometry_topic: str, ground_truth_topic: str) -> None:
         self.odometry_topic = odometry_topic
         self.ground_truth_topic = ground_truth_topic
         self.wheels = PoseTrack()
-        self.mounting = mounting
-        self.joints = {joint: PoseTrack() for joint in (() if mounting is None else mounting.joints)}
         self.truth: list[StampedPose] = []
         self.malformed: Counter[str] = Counter()
         self.reasons: dict[str, str] = {}
@@ -43,9 +32,6 @@ class RecordedPoses:
     def take(self, message: Decoded) -> None:
         """Sort one message in."""
         topic, pose = message.channel.topic, message.value
-        if isinstance(pose, list):
-            self._take_joints(pose)
-            return
         if not isinstance(pose, StampedPose):
             self.malformed[topic] += 1
             self.reasons.setdefault(topic, str(pose))
@@ -56,27 +42,12 @@ class RecordedPoses:
             self.truth.append(pose)
 
     def covers(self, stamp_ns: int) -> bool:
-        """True if all poses that a scan at the instant needs have been read."""
-        needed = [self.wheels] if self.odometry_topic else []
-        return all(track.covers(stamp_ns) for track in (*needed, *self.joints.values()))
+        """True if the wheels' pose that a scan at the instant needs has been read."""
+        return not self.odometry_topic or self.wheels.covers(stamp_ns)
 
-    def at_scan(self, scan: Decoded) -> PosesAtScan:
-        """The poses at the scan's stamp."""
-        if not isinstance(scan.value, Returns):
-            return PosesAtScan(None, None)
-        stamp_ns = scan.value.stamp_ns
-        return PosesAtScan(self.wheels.at(stamp_ns), self._mounting_at(stamp_ns))
-
-    def _take_joints(self, transforms: list[StampedPose]) -> None:
-        for each in transforms:
-            track = self.joints.get(edge(each))
-            if track is not None:
-                track.add(each.stamp_ns, each.T_parent_child)
-
-    def _mounting_at(self, stamp_ns: int) -> Pose | None:
-        poses = [(joint, track.at(stamp_ns)) for joint, track in self.joints.items()]
-        known = [StampedPose(stamp_ns, *joint, pose) for joint, pose in poses if pose is not None]
-        return self.mounting.at(known) if self.mounting is not None and known else None
+    def at_scan(self, scan: Decoded) -> Pose | None:
+        """T_odom_base at the scan's stamp, None where no reading is near."""
+        return self.wheels.at(scan.value.stamp_ns) if isinstance(scan.value, Returns) else None
 
     def ground_truth(self) -> Trajectory | None:
         """The true poses so far, in the order in which they were logged; None where there are none."""
