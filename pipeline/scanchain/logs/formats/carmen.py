@@ -38,7 +38,7 @@ _HALF_TURN = math.pi
 
 _MOST_BYTES = 2 << 30  # largest size of the text in bytes
 _MOST_RATIO, _LEAST_BYTES = 1000, 1 << 24  # largest ratio of packing, beyond so many bytes of text
-_AT_ONCE, _CLOSELY = 1 << 12, 64  # bytes of text that are unpacked at once, and of a damaged file
+_AT_ONCE = 256  # bytes of text that are unpacked at once, of which damage loses all
 
 
 def claims_carmen(_: Path, head: bytes) -> bool:
@@ -256,19 +256,13 @@ def read_text(path: Path) -> tuple[bytes, str]:
 
     Raises InputError where it cannot be read or unpacks to more than any log does.
     """
-    text, damage = _unpacked(path, _AT_ONCE)
-    return _unpacked(path, _CLOSELY) if damage else (text, damage)
-
-
-def _unpacked(path: Path, at_once: int) -> tuple[bytes, str]:
-    """As ``read_text``, so many bytes of text at once; damage among them loses all of these."""
     text = bytearray()
     try:
         with path.open("rb") as file:
             head, most = file.read(3), min(_MOST_BYTES, _LEAST_BYTES + _MOST_RATIO * path.stat().st_size)
         opened = bz2.open if head == b"BZh" else gzip.open if head[:2] == b"\x1f\x8b" else Path.open
         with opened(path, "rb") as file:
-            while block := file.read1(at_once):
+            while block := file.read1(_AT_ONCE):
                 text += block
                 if len(text) > most:
                     raise InputError(f"{path}: unpacks to more than {most:,} bytes; is it a CARMEN log?")
