@@ -263,7 +263,9 @@ class Log:
         if self._truth is None and self.ground_truth_topic:
             poses = RecordedPoses("", self.ground_truth_topic)
             decoder = self.pose_decoders[self.ground_truth_topic]
-            for message in self._messages({self.ground_truth_topic: decoder}, []):
+            for message in decoded_messages(
+                self.indexes, {self.ground_truth_topic: decoder}, self.span, damage=[]
+            ):
                 poses.take(message)
             self._truth = poses.ground_truth()
         return self._truth
@@ -272,7 +274,7 @@ class Log:
         """Lidar messages with the wheels' pose at their stamp; they wait a little for the readings behind them."""
         decoders = {self.topic: self.decoder(times).decode, **self.pose_decoders}
         waiting: deque[Decoded] = deque()
-        for message in self._messages(decoders, self._damage):
+        for message in decoded_messages(self.indexes, decoders, self.span, damage=self._damage):
             if message.channel.topic == self.topic:
                 waiting.append(message)
             else:
@@ -307,6 +309,3 @@ class Log:
         if not isinstance(first, Returns) or len(waiting) > _HOLD_SCANS:
             return True
         return poses.covers(first.stamp_ns) or now_ns - waiting[0].log_time_ns > _HOLD_NS
-
-    def _messages(self, decoders: Decoders, damage: list[str]) -> Iterator[Decoded]:
-        return decoded_messages(self.indexes, decoders, self.span, damage=damage)
