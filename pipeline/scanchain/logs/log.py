@@ -183,7 +183,20 @@ class Log:
                     counts.skip(complaint)
                     check_count(counts.bad, self.scan_count, self.config, complaint)
                     continue
-                scan = self._scan(index, message, T_odom_base, counts, waited_s=working_s() - requested_s)
+                returns = message.value
+                assert isinstance(returns, Returns)
+                points = returns.points
+                scan = Scan(
+                    index=index,
+                    stamp_ns=returns.stamp_ns,
+                    log_time_ns=message.log_time_ns,
+                    points=points * np.array([1.0, -1.0], np.float32) if self.is_mirrored else points,
+                    times_s=returns.times_s,
+                    dropped=returns.dropped,
+                    T_odom_base=T_odom_base,
+                    waited_s=working_s() - requested_s,
+                    is_copy=counts.repeats(points),
+                )
                 counts.take(scan)
                 self.scans_with_wheels += scan.T_odom_base is not None
                 yield scan
@@ -200,23 +213,6 @@ class Log:
         if is_damaged:
             scans = counted(count - counts.bad, "scan")
             self._damage.append(f"{scans} of {self.topic} {'was' if scans == '1 scan' else 'were'} recovered")
-
-    def _scan(
-        self, index: int, message: Decoded, T_odom_base: Pose | None, counts: ScanCounts, *, waited_s: float
-    ) -> Scan:
-        returns = message.value
-        assert isinstance(returns, Returns)
-        return Scan(
-            index=index,
-            stamp_ns=returns.stamp_ns,
-            log_time_ns=message.log_time_ns,
-            points=returns.points * np.array([1.0, -1.0], np.float32) if self.is_mirrored else returns.points,
-            times_s=returns.times_s,
-            dropped=returns.dropped,
-            T_odom_base=T_odom_base,
-            waited_s=waited_s,
-            is_copy=counts.repeats(returns.points),
-        )
 
     def _mounting_notes(self) -> list[str]:
         """Assumptions about the mounting. Raises InputError where a planar lidar moves out of its plane."""
@@ -274,12 +270,19 @@ class Log:
         """Lidar messages with the wheels' pose at their stamp; they wait a little for the readings behind them."""
         decoders = {self.topic: self.decoder(times).decode, **self.pose_decoders}
         waiting: deque[Decoded] = deque()
+
+        def may_go(now_ns: int) -> bool:
+            first = waiting[0].value
+            if not isinstance(first, Returns) or len(waiting) > _HOLD_SCANS:
+                return True
+            return poses.covers(first.stamp_ns) or now_ns - waiting[0].log_time_ns > _HOLD_NS
+
         for message in decoded_messages(self.indexes, decoders, self.span, damage=self._damage):
             if message.channel.topic == self.topic:
                 waiting.append(message)
             else:
                 poses.take(message)
-            while waiting and self._may_go(waiting, message.log_time_ns, poses):
+            while waiting and may_go(message.log_time_ns):
                 yield waiting[0], poses.at_scan(waiting.popleft())
         while waiting:
             yield waiting[0], poses.at_scan(waiting.popleft())
@@ -303,9 +306,3 @@ class Log:
                 f"the clouds of {self.topic} are planar (z = {height_m:.3g} m everywhere): read as a 2D log"
             )
         return height_m
-
-    def _may_go(self, waiting: deque[Decoded], now_ns: int, poses: RecordedPoses) -> bool:
-        first = waiting[0].value
-        if not isinstance(first, Returns) or len(waiting) > _HOLD_SCANS:
-            return True
-        return poses.covers(first.stamp_ns) or now_ns - waiting[0].log_time_ns > _HOLD_NS
