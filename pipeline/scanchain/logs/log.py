@@ -271,21 +271,24 @@ class Log:
         decoders = {self.topic: self.decoder(times).decode, **self.pose_decoders}
         waiting: deque[Decoded] = deque()
 
-        def may_go(now_ns: int) -> bool:
-            first = waiting[0].value
-            if not isinstance(first, Returns) or len(waiting) > _HOLD_SCANS:
-                return True
-            return poses.covers(first.stamp_ns) or now_ns - waiting[0].log_time_ns > _HOLD_NS
+        def next_scan() -> tuple[Decoded, Pose | None]:
+            scan = waiting.popleft()
+            return scan, poses.at(scan.value.stamp_ns) if isinstance(scan.value, Returns) else None
 
         for message in decoded_messages(self.indexes, decoders, self.span, damage=self._damage):
             if message.channel.topic == self.topic:
                 waiting.append(message)
             else:
                 poses.take(message)
-            while waiting and may_go(message.log_time_ns):
-                yield waiting[0], poses.at_scan(waiting.popleft())
+            while waiting and (
+                len(waiting) > _HOLD_SCANS
+                or message.log_time_ns - waiting[0].log_time_ns > _HOLD_NS
+                or not isinstance(first := waiting[0].value, Returns)
+                or poses.covers(first.stamp_ns)
+            ):
+                yield next_scan()
         while waiting:
-            yield waiting[0], poses.at_scan(waiting.popleft())
+            yield next_scan()
 
     def decoder(self, times: PointTimes) -> LaserScanDecoder | PointCloudDecoder:
         """Decoder of the lidar's messages to points; ``times`` collects its assumptions about theirs."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 from scanchain.config import LogConfig
 from scanchain.errors import InputError
@@ -31,7 +31,8 @@ from scanchain.logs.topics import is_lidar
 from scanchain.source import Source
 
 
-class LogFormat(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class LogFormat:
     """A log format.
 
     Attributes

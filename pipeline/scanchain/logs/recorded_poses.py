@@ -11,7 +11,6 @@ from scanchain import lie
 from scanchain.data import Pose, Trajectory
 from scanchain.logs.mcap.stream import Decoded
 from scanchain.logs.messages.poses import StampedPose
-from scanchain.logs.messages.returns import Returns
 from scanchain.words import counted
 
 _REMEMBERED = 512  # largest number of readings in memory
@@ -19,12 +18,13 @@ _NEAREST_NS = 500_000_000
 
 
 class RecordedPoses:
-    """Pose messages by topic, looked up at the stamp of a scan; malformed ones are counted."""
+    """Pose messages by topic, the wheels' looked up at the stamp of a scan; malformed ones are counted."""
 
     def __init__(self, odometry_topic: str, ground_truth_topic: str) -> None:
         self.odometry_topic = odometry_topic
         self.ground_truth_topic = ground_truth_topic
-        self.wheels = PoseTrack()
+        self.stamps_ns: list[int] = []  # of the latest readings of the wheels, in order
+        self.wheels: dict[int, Pose] = {}
         self.truth: list[StampedPose] = []
         self.malformed: Counter[str] = Counter()
         self.reasons: dict[str, str] = {}
@@ -36,18 +36,29 @@ class RecordedPoses:
             self.malformed[topic] += 1
             self.reasons.setdefault(topic, str(pose))
             return
-        if topic == self.odometry_topic:
-            self.wheels.add(pose.stamp_ns, pose.T_parent_child)
         if topic == self.ground_truth_topic:
             self.truth.append(pose)
+        if topic == self.odometry_topic:
+            if pose.stamp_ns not in self.wheels:
+                insort(self.stamps_ns, pose.stamp_ns)
+            self.wheels[pose.stamp_ns] = pose.T_parent_child
+            if len(self.stamps_ns) > _REMEMBERED:
+                del self.wheels[self.stamps_ns.pop(0)]
 
     def covers(self, stamp_ns: int) -> bool:
-        """True if the wheels' pose that a scan at the instant needs has been read."""
-        return not self.odometry_topic or self.wheels.covers(stamp_ns)
+        """True if there is no reading of the wheels to wait for, at the instant or after it."""
+        return not self.odometry_topic or bool(self.stamps_ns and self.stamps_ns[-1] >= stamp_ns)
 
-    def at_scan(self, scan: Decoded) -> Pose | None:
-        """T_odom_base at the scan's stamp, None where no reading is near."""
-        return self.wheels.at(scan.value.stamp_ns) if isinstance(scan.value, Returns) else None
+    def at(self, stamp_ns: int) -> Pose | None:
+        """T_odom_base at the instant, or between its neighbors, or the nearest within half a second; else None."""
+        if stamp_ns in self.wheels:
+            return self.wheels[stamp_ns]
+        after = bisect_left(self.stamps_ns, stamp_ns)
+        near = [s for s in self.stamps_ns[max(after - 1, 0) : after + 1] if abs(s - stamp_ns) <= _NEAREST_NS]
+        if len(near) == 2:
+            share = (stamp_ns - near[0]) / (near[1] - near[0])
+            return lie.interpolate(self.wheels[near[0]], self.wheels[near[1]], share)
+        return self.wheels[near[0]] if near else None
 
     def ground_truth(self) -> Trajectory | None:
         """The true poses so far, in the order in which they were logged; None where there are none."""
@@ -62,34 +73,3 @@ class RecordedPoses:
             f"{counted(count, 'malformed message')} of {topic} left out (the first: {self.reasons[topic]})"
             for topic, count in self.malformed.items()
         ]
-
-
-class PoseTrack:
-    """The latest poses of a moving frame, by stamp, interpolated between them."""
-
-    def __init__(self) -> None:
-        self.stamps_ns: list[int] = []
-        self.poses: dict[int, Pose] = {}
-
-    def add(self, stamp_ns: int, T_odom_base: Pose) -> None:
-        """Add a reading; the oldest are dropped."""
-        if stamp_ns not in self.poses:
-            insort(self.stamps_ns, stamp_ns)
-        self.poses[stamp_ns] = T_odom_base
-        if len(self.stamps_ns) > _REMEMBERED:
-            del self.poses[self.stamps_ns.pop(0)]
-
-    def covers(self, stamp_ns: int) -> bool:
-        """True if there is a reading at the instant, or one after it."""
-        return stamp_ns in self.poses or bool(self.stamps_ns and self.stamps_ns[-1] >= stamp_ns)
-
-    def at(self, stamp_ns: int) -> Pose | None:
-        """The reading at the instant, or between its neighbors, or the nearest within half a second."""
-        if stamp_ns in self.poses:
-            return self.poses[stamp_ns]
-        after = bisect_left(self.stamps_ns, stamp_ns)
-        near = [s for s in self.stamps_ns[max(after - 1, 0) : after + 1] if abs(s - stamp_ns) <= _NEAREST_NS]
-        if len(near) == 2:
-            share = (stamp_ns - near[0]) / (near[1] - near[0])
-            return lie.interpolate(self.poses[near[0]], self.poses[near[1]], share)
-        return self.poses[near[0]] if near else None

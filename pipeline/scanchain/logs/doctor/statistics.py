@@ -145,7 +145,7 @@ def _facts(returns: Returns) -> ScanFacts:
         time_span_s=float(np.ptp(times_s)) if len(times_s) else float("nan"),
         turn=turn,
         start_rad=start_rad,
-        digest=zlib.crc32(np.ascontiguousarray(points)),
+        digest=zlib.crc32(points.tobytes()),
     )
 
 

@@ -67,7 +67,7 @@ def index_scans(path: Path, number: int, name: str, source: Source | None = None
 def _write(destination: Path, path: Path, name: str) -> int:
     """Write the scans that the class reads of a path; returns their number."""
     make = load_format(name)
-    dimension, end = 0, object()
+    written, dimension, end = 0, 0, object()
     with LogWriter(destination) as log:
         with _blaming(f"{path}: {name}"):
             scans = iter(make(path).scans())
