@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from scanchain.data import Matrix
-from scanchain.errors import InputError
 from scanchain.simulation.motion import Motion, Vehicle
 from scanchain.simulation.routes import Pivot, begun_at, laps, pivots
 from scanchain.simulation.solids import Solids
@@ -72,10 +71,3 @@ WORLDS: dict[str, World] = {
     "turns": World(outdoor.yard, outdoor.YARD_STEPS, outdoor.YARD_ROBOT, "os1-32", 40.0),
     "gap": World(outdoor.town, outdoor.TOWN_ROUTE, outdoor.TOWN_CAR, "hdl-64", 30.0, dropouts=_GAPS),
 }
-
-
-def find_world(name: str) -> World:
-    """The world of that name."""
-    if name not in WORLDS:
-        raise InputError(f"world {name!r} does not exist; choose one of {', '.join(WORLDS)}")
-    return WORLDS[name]
