@@ -37,7 +37,7 @@ from scanchain.sessions.localizer import Localizer, MapState
 from scanchain.settings import load_settings
 from scanchain.simulation.drive import plan
 from scanchain.simulation.log import record
-from scanchain.simulation.worlds import town
+from scanchain.simulation.worlds import outdoor
 from scanchain.simulation.worlds.registry import WORLDS, World
 from tests.benchmarks.odometry3d_set import simulator_version
 
@@ -51,7 +51,7 @@ def city(km: float) -> World:
     """A town whose streets that run east, a kilometer each, are so many kilometers together."""
     x_m = np.arange(0.0, min(STREET_M, 1e3 * km) + 1.0, BLOCK_M[0])
     y_m = np.arange(max(round(1e3 * km / STREET_M), 2)) * BLOCK_M[1]
-    build = partial(town.town, streets_x_m=x_m.tolist(), streets_y_m=y_m.tolist())
+    build = partial(outdoor.town, streets_x_m=x_m.tolist(), streets_y_m=y_m.tolist())
     return replace(WORLDS["town"], build=build, route=_serpentine(x_m[0], x_m[-1], y_m))
 
 

@@ -129,30 +129,6 @@ def test_a_gap_is_found_where_it_is(tmp_path):
     assert (later.found, later.remedy) == (finding.found, finding.remedy)  # the flag counts from the same moment
 
 
-def test_missing_scans_are_counted_though_the_stamps_jitter(tmp_path):
-    rng = np.random.default_rng(0)
-    shifts = rng.normal(0.0, 0.0002, 100) * SECOND
-    missing = {20, 41, 42, 70, 90, 91, 92}
-    said = drive(100, stamp=lambda k: int(shifts[k]))
-    found = diagnose(saved(tmp_path, [each for k, each in enumerate(said, start=-1) if k not in missing]))
-    assert found["gaps"].severity == "note" and found["gaps"].found.endswith("; 7 scans missing in all")
-    single = diagnose(saved(tmp_path, [each for k, each in enumerate(drive(40), start=-1) if k != 20]))["gaps"]
-    assert single.severity == "note" and single.found == "none longer than 2.5 periods; 1 scan missing in all"
-
-
-def test_returns_below_range_min_are_told(tmp_path):
-    def near(k):
-        values = room(k)
-        values[:38] = 0.2
-        return values
-
-    finding = diagnose(saved(tmp_path, drive(ranges=near, low=0.45)))["returns"]
-    assert finding.severity == "note" and "38 % below range_min (0.45 m)" in finding.found
-    assert "below range_min is not used" in finding.effect
-    raised = diagnose(saved(tmp_path, sweeps()), min_range_m=3.0)["returns"]
-    assert "below range_min (3 m)" in raised.found
-
-
 def test_stamps_that_step_back_or_repeat_are_counted(tmp_path):
     finding = diagnose(saved(tmp_path, drive(stamp=lambda k: {5: -2, 9: -2, 20: -1}.get(k, 0) * STEP_NS)))
     assert finding["stamp order"].severity == "warning"
@@ -170,11 +146,6 @@ def test_another_clock_is_told_and_wheels_that_miss_for_it_are_counted(tmp_path)
     assert found["clock"].severity == "warning" and "logged 37 s after" in found["clock"].found
     assert "40 of 40 scans without one" in found["wheels"].found
     assert found["wheels"].remedy == found["clock"].remedy == ""  # without a reading nothing is taken from them
-
-
-def test_scans_that_were_logged_late_are_noted(tmp_path):
-    finding = diagnose(saved(tmp_path, drive(log=lambda k: 3 * STEP_NS if k == 30 else 0)))["clock"]
-    assert finding.severity == "note" and "from 0 to 0.3 s" in finding.found
 
 
 def test_a_range_that_stands_for_no_return_is_found_and_mended_by_its_flag(tmp_path):
@@ -198,7 +169,7 @@ def test_nan_and_zero_shares_are_measured(tmp_path):
         return values
 
     finding = diagnose(saved(tmp_path, drive(ranges=ranges)))["returns"]
-    assert finding.found == "30 % NaN or infinite, 50 % zero, 20 valid a scan (median)"
+    assert finding.found == "80 % of the beams without a valid return, 20 valid a scan (median)"
     assert finding.severity == "warning" and "40 scans with fewer than 50 returns" in finding.effect
 
 
@@ -236,12 +207,6 @@ def test_wheels_without_a_mounting_are_told(tmp_path):
     finding = diagnose(saved(tmp_path, drive(wheels=True, mounted=False)))["wheels"]
     assert finding.severity == "warning" and "no static transform from base_link to laser" in finding.found
     assert finding.remedy == "--odometry.prior constant-velocity"
-
-
-def test_scans_of_several_frames_on_one_topic_are_a_problem(tmp_path):
-    said = [*drive(20, frame="left"), *drive(20, frame="right", mounted=False)]
-    finding = diagnose(saved(tmp_path, said))["frames"]
-    assert finding.severity == "problem" and "left, right" in finding.found
 
 
 # Clouds
@@ -389,7 +354,7 @@ def test_truth_and_wheels_are_named_though_the_lidar_is_not_chosen(tmp_path, cap
 def test_the_intel_log_is_known_for_its_stamps():
     found = diagnose(shared_data("2d/intel.mcap"))
     assert found["stamp order"].found == "631 steps back in the header stamps, 0 repeated"
-    assert "81.83 m" in found["no return"].found and found["no return"].severity == "ok"
+    assert found["no return"].severity == "ok"
     assert found["duplicates"].severity == "ok" and "0 of 13,631" in found["wheels"].found
 
 

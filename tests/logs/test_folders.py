@@ -106,11 +106,11 @@ def test_a_part_of_a_kitti_sequence_opens_only_its_own_files(tmp_path, monkeypat
 
     opened = []
 
-    def noted(path, whole=kitti.read_xyzi):
+    def noted(path, point, whole=kitti.read_raw):
         opened.append(path.name)
-        return whole(path)
+        return whole(path, point)
 
-    monkeypatch.setattr(kitti, "read_xyzi", noted)
+    monkeypatch.setattr(kitti, "read_raw", noted)
     said = recorders.clouds(9)
     sequence = kitti_odometry(tmp_path, said, poses=False)
     log, scans = read(sequence, start_s=0.2, end_s=0.5)

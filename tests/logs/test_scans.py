@@ -591,7 +591,7 @@ def test_a_tilting_planar_lidar_is_refused_with_its_frames_and_its_range(tmp_pat
     with pytest.raises(InputError) as caught:
         open_log(path)
     for part in (
-        f"{parent} → laser in /tf turns from -40 to 40 deg about its x axis",
+        f"{parent} → laser in /tf turns by up to 40 deg",
         "--topic",
         "/scan",
         "--end",
@@ -610,15 +610,6 @@ def test_the_part_of_a_log_in_which_a_planar_lidar_rests_is_read(tmp_path):
     assert len(scans) == 10 and log.mounting.motion is None
     with pytest.raises(InputError, match="does not stay in one plane"):
         open_log(path)
-
-
-def test_a_planar_lidar_that_leaves_its_plane_where_nobody_looked_before_is_refused_there(tmp_path):
-    said = swinging(lambda at: 0.5 if 1.05 < at < 1.25 else 0.0, seconds=40.0)
-    path = write(tmp_path / "a.mcap", said, chunk_size=300)
-    log = open_log(path)
-    assert log.mounting.motion is None
-    with pytest.raises(InputError, match="laser has turned by 29 deg in /tf at scan 11"):
-        list(log.scans())
 
 
 @pytest.mark.parametrize("seconds", [2.0, 40.0])
@@ -656,17 +647,14 @@ def test_the_frame_above_a_lidar_that_travels_is_no_base(tmp_path):
     assert log.mounting.motion is None and log.mounting.base == ""
 
 
-def test_wheels_are_carried_over_to_a_lidar_that_pans_by_tf_at_the_stamp(tmp_path):
-    yaw = {0.0: 0.0, 0.1: 0.2, 0.2: 0.4}
-    said = []
-    for at, turn in yaw.items():
-        said += [joined(at, ("base_link", "laser", 0.2, 0.0, turn, 0.0)), *wheels((at, at, 10.0 * at))]
-    said += [one_scan(0.21, 0.0), one_scan(0.22, 0.05), one_scan(0.23, 0.1)]
+def test_wheels_are_no_prior_for_a_lidar_that_pans_by_tf(tmp_path):
+    said = [joined(at, ("base_link", "laser", 0.2, 0.0, 2.0 * at, 0.0)) for at in (0.0, 0.1, 0.2)]
+    said += [*wheels((0.0, 0.0, 0.0), (0.1, 0.1, 1.0)), one_scan(0.21, 0.0), one_scan(0.22, 0.05)]
     log, scans = read(write(tmp_path / "a.mcap", said))
-    assert "base_link → laser in /tf turns from 0 to 23 deg about its z axis" in log.notes[0]
-    for scan, at in zip(scans, (0.0, 0.05, 0.1), strict=True):
-        expected = lie.pose_2d(10.0 * at, 0.0, 0.0) @ lie.pose_2d(0.2, 0.0, 2.0 * at)
-        np.testing.assert_allclose(scan.T_odom_base @ log.T_base_lidar, expected, atol=1e-9)
+    assert "base_link → laser in /tf turns by up to 23 deg)" in log.notes[0]
+    assert "the wheels (/odom) are no prior for it" in log.notes[0]
+    assert [scan.T_odom_base for scan in scans] == [None, None] and not log.has_odometry
+    np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(0.2, 0.0, 0.0), atol=1e-12)
 
 
 def test_a_cloud_lidar_may_move_out_of_any_plane(tmp_path):
@@ -675,11 +663,9 @@ def test_a_cloud_lidar_may_move_out_of_any_plane(tmp_path):
     for k in range(20):
         time_ns = STAMP_NS + k * SECOND // 10
         said += [joined(k / 10, ("base_link", "lidar", 0.0, 0.0, 0.0, tilt(k / 10)))]
-        said += [*wheels((k / 10, k / 10, 0.0)), cloud_said(time_ns, point_cloud(time_ns, rows))]
+        said += [cloud_said(time_ns, point_cloud(time_ns, rows))]
     log, scans = read(write(tmp_path / "a.mcap", said))
-    assert log.mounting.motion.leaves_plane and "poses are the lidar's" in log.notes[0]
-    turned = [lie.apart(log.T_base_lidar, scan.T_odom_base @ log.T_base_lidar)[1] for scan in scans]
-    np.testing.assert_allclose(turned, np.abs([tilt(k / 10) for k in range(20)]), atol=1e-9)
+    assert len(scans) == 20 and log.mounting.leaves_plane and "poses are the lidar's" in log.notes[0]
 
 
 # real logs

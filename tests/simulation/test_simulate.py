@@ -20,7 +20,7 @@ from scanchain.simulation import NO_SLIP, SENSORS, WORLDS, Slip, plan, simulate
 from scanchain.simulation.motion import wheel_odometry
 from scanchain.simulation.sensors import take_sweep
 from scanchain.simulation.solids import Solids
-from scanchain.simulation.worlds.corridor import LENGTH_M, SIGHT_M, STRUCTURE_M
+from scanchain.simulation.worlds.indoor import CORRIDOR_M, CORRIDOR_SIGHT_M, CORRIDOR_STRUCTURE_M
 from tests.support import naive_raycast
 from tests.support.scan_information import information, spectrum, surface_normals, undetermined
 
@@ -409,11 +409,11 @@ def test_the_middle_of_the_corridor_leaves_the_way_along_it_undetermined(sensor)
     for scan in range(0, 400, 40):
         pose, shares, twists = informed(drive, scan)
         x = pose[0, 3]
-        if STRUCTURE_M + SIGHT_M < x < LENGTH_M - STRUCTURE_M - SIGHT_M:
+        if CORRIDOR_STRUCTURE_M + CORRIDOR_SIGHT_M < x < CORRIDOR_M - CORRIDOR_STRUCTURE_M - CORRIDOR_SIGHT_M:
             assert shares[0] < 1e-12 and shares[1] > 1e-3 and len(twists) == 1
             assert np.allclose(np.abs(twists[0]), [1.0, 0, 0, 0, 0, 0], atol=1e-6)
             seen.add("middle")
-        elif x > LENGTH_M - 12.0:
+        elif x > CORRIDOR_M - 12.0:
             assert shares[0] > 3e-3 and len(twists) == 0
             seen.add("end")
     assert seen == {"middle", "end"}

@@ -8,7 +8,7 @@ from scanchain import lie
 from scanchain.data import Matrix, Points, Pose
 from scanchain.preprocess.sweep import first_per_voxel
 from scanchain.simulation.drive import plan
-from scanchain.simulation.worlds.town import town
+from scanchain.simulation.worlds.outdoor import town
 
 PLACE_SEED = 3
 

@@ -123,54 +123,51 @@ class ScanCounts:
             self.log_times_ns.append(scan.log_time_ns)
             self.spans_s += [float(np.ptp(scan.times_s))] if len(scan.times_s) else []
 
+    def _share(self, count: int) -> str:
+        return f"{count} of {counted(self.scans, 'scan')} of {self.topic}"
+
+    @property
+    def _has_no_stamps(self) -> bool:
+        return self.repeated > _MOST_REPEATED * self.scans
+
     def losses(self) -> list[str]:
         """Lines on scans left out, stamps that most scans do not have, and odd point times; none as a rule."""
         lines = []
         if self.bad:
             were = "was" if self.bad == 1 else "were"
-            share = f"{self.bad} of {counted(self.scans, 'scan')} of {self.topic} {were}"
-            lines.append(f"{share} left out (the first: {self.first_complaint})")
+            lines.append(f"{self._share(self.bad)} {were} left out (the first: {self.first_complaint})")
         if self._has_no_stamps and self.last_stamp_ns is not None:
-            share = f"{self.repeated} of {counted(self.scans, 'scan')} of {self.topic}"
             lines.append(
-                f"{share} have the header stamp of the one before (the last {1e-9 * self.last_stamp_ns:.3f} s): "
-                "the times in the results do not tell scans apart; record with stamps"
+                f"{self._share(self.repeated)} have the header stamp of the one before (the last "
+                f"{1e-9 * self.last_stamp_ns:.3f} s): the times in the results do not tell scans apart; record "
+                "with stamps"
             )
-        return [*lines, *self._odd_times()]
+        span_s = float(np.median(self.spans_s)) if self.spans_s else 0.0
+        period_s = 1e-9 * float(np.median(np.diff(self.log_times_ns))) if len(self.log_times_ns) > 1 else 0.0
+        if self.spans_s and period_s > 0.0 and not _SHORTEST_PART < span_s / period_s < _LONGEST_PART:
+            lines.append(
+                f"by their point times scans of {self.topic} last {1e3 * span_s:.3g} ms, {span_s / period_s:.2g} "
+                "of the period: of another unit? scanchain doctor names the flag, --preprocess.deskew false "
+                "ignores them"
+            )
+        return lines
 
     def copied(self) -> list[str]:
         """A line where more than a few scans are copies."""
         if self.copies <= max(MOST_COPIES, _COPIES_SHARE * self.scans):
             return []
         return [
-            f"{self.copies} of {counted(self.scans, 'scan')} of {self.topic} are the one before once more, to the "
-            "last bit: where the driver was stuck, the poses stand still though the lidar may have moved "
-            "(scanchain doctor)"
+            f"{self._share(self.copies)} are the one before once more, to the last bit: where the driver was "
+            "stuck, the poses stand still though the lidar may have moved (scanchain doctor)"
         ]
-
-    def _odd_times(self) -> list[str]:
-        """A line where the point times of the first scans span next to nothing, or more than two periods."""
-        if not self.spans_s or len(self.log_times_ns) < 2:
-            return []
-        span_s, period_s = float(np.median(self.spans_s)), 1e-9 * float(np.median(np.diff(self.log_times_ns)))
-        if period_s <= 0.0 or _SHORTEST_PART < span_s / period_s < _LONGEST_PART:
-            return []
-        return [
-            f"by their point times scans of {self.topic} last {1e3 * span_s:.3g} ms, {span_s / period_s:.2g} of "
-            "the period: of another unit? scanchain doctor names the flag, --preprocess.deskew false ignores them"
-        ]
-
-    @property
-    def _has_no_stamps(self) -> bool:
-        return self.repeated > _MOST_REPEATED * self.scans
 
     def notes(self) -> list[str]:
-        """Lines on stamps out of order and missing wheel odometry."""
+        """Lines on a few copies, stamps out of order and missing wheel odometry."""
         lines = []
         if self.copies and not self.copied():
-            share = f"{self.copies} of {counted(self.scans, 'scan')} of {self.topic}"
             lines.append(
-                f"{share} logged twice, to the last bit: such a copy has the pose of the first, and no other use"
+                f"{self._share(self.copies)} logged twice, to the last bit: such a copy has the pose of the "
+                "first, and no other use"
             )
         if self.backwards:
             steps = counted(self.backwards, "step")

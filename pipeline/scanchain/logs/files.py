@@ -50,8 +50,17 @@ class RemoteFile:
 
     @cached_property
     def has_ranges(self) -> bool:
-        """True if parts of it can be requested."""
-        return self._may_have_ranges and self._tries_range()
+        """True if parts of it can be requested: its last byte comes alone."""
+
+        def ask() -> bool:
+            try:
+                with self._system.open(self._path, "rb", cache_type="none") as file:
+                    file.seek(self.size - 1)
+                    return len(file.read(1)) == 1
+            except ValueError:  # a web server without range requests would send everything
+                return False
+
+        return self._may_have_ranges and _patient(ask, str(self.address))
 
     def read(self, offset: int, size: int) -> bytes:
         """So many bytes from the offset on. Raises InputError where they do not come after several requests."""
@@ -63,19 +72,6 @@ class RemoteFile:
             return data
 
         return _patient(ask, f"{self.address}: byte {offset}") if size else b""
-
-    def _tries_range(self) -> bool:
-        """True if the last byte comes alone; a web server without range requests would send everything."""
-
-        def ask() -> bool:
-            try:
-                with self._system.open(self._path, "rb", cache_type="none") as file:
-                    file.seek(self.size - 1)
-                    return len(file.read(1)) == 1
-            except ValueError:
-                return False
-
-        return _patient(ask, str(self.address))
 
 
 def matching(pattern: Address) -> list[Address]:
@@ -93,7 +89,14 @@ def _system_of(address: Address) -> tuple[Any, str]:
         raise MissingExtraError("fsspec", "remote") from None
     options = {}
     if address.url.lower().startswith(("http://", "https://")):
-        options = {"client_kwargs": {"timeout": _web_timeout()}}
+        try:
+            from aiohttp import ClientTimeout
+        except ImportError:
+            raise MissingExtraError("aiohttp", "remote") from None
+        silence = ClientTimeout(
+            total=None, sock_connect=_CONNECT_S, sock_read=_SILENCE_S
+        )  # a large file takes long
+        options = {"client_kwargs": {"timeout": silence}}
     try:
         return url_to_fs(address.url, **options)
     except ImportError as error:
@@ -102,23 +105,18 @@ def _system_of(address: Address) -> tuple[Any, str]:
         raise InputError(f"{address}: {error}; give a path, s3:// or https://") from None
 
 
-def _web_timeout() -> Any:
-    """Timeout on silence, not on the whole response, which may be large."""
-    try:
-        from aiohttp import ClientTimeout
-    except ImportError:
-        raise MissingExtraError("aiohttp", "remote") from None
-    return ClientTimeout(total=None, sock_connect=_CONNECT_S, sock_read=_SILENCE_S)
-
-
 def _patient(ask: Callable[[], T], what: str) -> T:
     """Result of a request, repeated after errors that may pass."""
     for attempt in range(1, _ATTEMPTS + 1):
         try:
             return ask()
         except Exception as error:  # each file system raises what the libraries below it raise
-            reason = _reason(error)
-            if hopeless := _hopeless(error):
+            cause = error.__cause__ or error
+            status = int(getattr(cause, "status", 0) or 0)  # of HTTP
+            text = f"{status} {getattr(cause, 'message', '')}" if status else str(cause)
+            is_absent = isinstance(cause, FileNotFoundError)  # its text would be the address, keys and all
+            reason = "not found" if is_absent else " ".join(text.split()) or type(cause).__name__
+            if hopeless := _hopeless(error, status):
                 raise InputError(f"{what}: {hopeless} ({reason})") from error
             if attempt == _ATTEMPTS:
                 raise InputError(f"{what}: cannot be read ({reason}); requested {_ATTEMPTS} times") from error
@@ -126,9 +124,8 @@ def _patient(ask: Callable[[], T], what: str) -> T:
     raise AssertionError
 
 
-def _hopeless(error: Exception) -> str:
+def _hopeless(error: Exception, status: int) -> str:
     """Remedy for an error that repeating does not mend, empty for one that may pass."""
-    status = _status(error)
     if status in _ABSENT or (isinstance(error, FileNotFoundError) and error.__cause__ is None):
         return "no such file; check the address"
     if status in _REFUSED or isinstance(error, PermissionError) or type(error).__name__ == "NoCredentialsError":
@@ -139,39 +136,21 @@ def _hopeless(error: Exception) -> str:
     return "the server refuses it; check the address" if 400 <= status < 500 and status not in _PASSING else ""
 
 
-def _status(error: Exception) -> int:
-    """The HTTP status of an error, 0 without one."""
-    return int(getattr(error.__cause__ or error, "status", 0) or 0)
-
-
-def _reason(error: Exception) -> str:
-    cause, status = error.__cause__ or error, _status(error)
-    if isinstance(cause, FileNotFoundError):
-        return "not found"  # its text would be the address, keys and all
-    text = f"{status} {getattr(cause, 'message', '')}" if status else str(cause)
-    return " ".join(text.split()) or type(cause).__name__
-
-
 def fetch_whole(file: RemoteFile) -> Path:
     """The path of the copy. Raises InputError where it does not come or finds no room."""
     folder = Path(mkdtemp(prefix="scanchain-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     copy = folder / (file.address.name or "log")
     try:
-        if file.has_ranges:
-            _copy(file, copy)
-        else:
+        if not file.has_ranges:
             fetch(file.address.url, copy)
+            return copy
+        with copy.open("wb") as written:  # block by block: a broken connection costs one block only
+            for offset in range(0, file.size, _BLOCK_BYTES):
+                written.write(file.read(offset, min(_BLOCK_BYTES, file.size - offset)))
     except OSError as error:
         raise InputError(f"{copy}: {file.address} cannot be kept there ({error.strerror}); set TMPDIR") from error
     return copy
-
-
-def _copy(file: RemoteFile, destination: Path) -> None:
-    """Copy block by block, so that a broken connection costs one block only."""
-    with destination.open("wb") as copy:
-        for offset in range(0, file.size, _BLOCK_BYTES):
-            copy.write(file.read(offset, min(_BLOCK_BYTES, file.size - offset)))
 
 
 def files_of(path: Path) -> list[Path]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from scanchain.config import LogConfig
 from scanchain.errors import InputError
@@ -47,18 +47,18 @@ class LogInfo:
     start_ns: int
     duration_s: float
     topics: tuple[TopicInfo, ...]
-    lidar: str
-    dimension: int
-    scans: int
-    odometry: str
-    sensors: tuple[OtherSensor, ...]
-    point_times: str
-    T_base_lidar: tuple[tuple[float, ...], ...]
-    base_frame: str
-    mount_motion: str
-    notes: tuple[str, ...]
-    damage: tuple[str, ...]
-    problem: str
+    lidar: str = ""
+    dimension: int = 0
+    scans: int = 0
+    odometry: str = ""
+    sensors: tuple[OtherSensor, ...] = ()
+    point_times: str = ""
+    T_base_lidar: tuple[tuple[float, ...], ...] = ()
+    base_frame: str = ""
+    mount_motion: str = ""
+    notes: tuple[str, ...] = ()
+    damage: tuple[str, ...] = ()
+    problem: str = ""
 
 
 def describe(sources: Sequence[Source], config: LogConfig | None = None) -> LogInfo:
@@ -66,34 +66,33 @@ def describe(sources: Sequence[Source], config: LogConfig | None = None) -> LogI
     config = config or LogConfig()
     indexes = index_files(sources, config)
     whole = whole_span(indexes)
-    log, problem = _open(indexes, config)
     wheels, truth, notes = _pose_topics(indexes, config)
-    return LogInfo(
+    found = LogInfo(
         files=tuple(str(source) for source in sources),
         size_bytes=sum(size_of(source) for source in sources),
         start_ns=whole.begin_ns,
         duration_s=whole.duration_s,
         topics=_topics(indexes, whole.duration_s),
-        lidar="" if log is None else log.topic,
-        dimension=0 if log is None else log.dimension,
-        scans=0 if log is None else log.scan_count,
         odometry=wheels,
         sensors=tuple(other_sensors(indexes, wheels=wheels, truth=truth)),
-        point_times="" if log is None else log.assumed_point_times(),
-        T_base_lidar=() if log is None else tuple(tuple(row) for row in log.T_base_lidar.tolist()),
-        base_frame="" if log is None else log.mounting.base,
-        mount_motion="" if log is None or log.mounting.motion is None else str(log.mounting.motion),
-        notes=tuple(notes if log is None else log.notes),
+        notes=tuple(notes),
         damage=tuple(grouped(line for index in indexes for line in index.damage)),
-        problem=problem,
     )
-
-
-def _open(indexes: Sequence[FileIndex], config: LogConfig) -> tuple[Log | None, str]:
     try:
-        return Log(indexes, config), ""
+        log = Log(indexes, config)
     except InputError as error:
-        return None, error.text
+        return replace(found, problem=error.text)
+    return replace(
+        found,
+        lidar=log.topic,
+        dimension=log.dimension,
+        scans=log.scan_count,
+        point_times=log.assumed_point_times(),
+        T_base_lidar=tuple(tuple(row) for row in log.T_base_lidar.tolist()),
+        base_frame=log.mounting.base,
+        mount_motion=log.mounting.motion or "",
+        notes=tuple(log.notes),
+    )
 
 
 def _pose_topics(indexes: Sequence[FileIndex], config: LogConfig) -> tuple[str, str, list[str]]:

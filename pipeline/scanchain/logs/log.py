@@ -9,7 +9,6 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from scanchain import lie
 from scanchain.checks import instance
 from scanchain.clock import working_s
 from scanchain.config import LogConfig, PreprocessConfig
@@ -32,16 +31,9 @@ from scanchain.logs.messages.point_times import PointTimes
 from scanchain.logs.messages.poses import StampedPose
 from scanchain.logs.messages.readers import is_scan, pose_reader, reader
 from scanchain.logs.messages.returns import RangeLimits, Returns
-from scanchain.logs.mounting import (
-    find_mounting,
-    in_plane,
-    is_moved,
-    is_upside_down,
-    joint_topics,
-    leaves_plane,
-)
+from scanchain.logs.mounting import find_mounting, in_plane, is_upside_down
 from scanchain.logs.opening import index_files
-from scanchain.logs.recorded_poses import PosesAtScan, RecordedPoses
+from scanchain.logs.recorded_poses import RecordedPoses
 from scanchain.logs.topics import files_with_scans, find_ground_truth, find_lidar, find_odometry
 from scanchain.settings import load_settings, overrides_of
 from scanchain.source import Source, source_of
@@ -125,6 +117,8 @@ class Log:
         self.scan_count = count_scans(indexes, self.topic, whole, config)
         self.mounting = find_mounting(indexes, lidar, wheels, self.span)
         self.notes += [*notes_on(indexes, config), *self._mounting_notes()]
+        if self.mounting.motion is not None:
+            wheels, self.odometry_topic = None, ""
         T_base_lidar = self.mounting.T_base_lidar
         self.is_mirrored = self.dimension == 2 and is_upside_down(T_base_lidar)
         self.T_base_lidar: Pose = in_plane(T_base_lidar) if self.dimension == 2 else T_base_lidar
@@ -134,8 +128,6 @@ class Log:
             for channel in (wheels, truth)
             if channel is not None
         }
-        if self.mounting.joints:
-            self.pose_decoders |= {topic: reader(channel) for topic, channel in joint_topics(indexes).items()}
         self.scans_with_wheels = 0
         self.copies: list[str] = []
         self._opening_notes = tuple(self.notes)
@@ -174,13 +166,13 @@ class Log:
         """
         self._damage = [line for index in self.indexes for line in index.damage]
         self.notes = list(self._opening_notes)
-        poses = RecordedPoses(self.odometry_topic, self.ground_truth_topic, self.mounting)
+        poses = RecordedPoses(self.odometry_topic, self.ground_truth_topic)
         counts = ScanCounts(self.topic, self.odometry_topic)
         times = PointTimes(self.config)
         self.scans_with_wheels = 0
         count, index, requested_s = 0, 0, working_s()
         try:
-            for message, recorded in self._with_poses(poses, times):
+            for message, T_odom_base in self._with_poses(poses, times):
                 count += 1
                 if (count - 1) % self.config.every:
                     continue
@@ -191,7 +183,20 @@ class Log:
                     counts.skip(complaint)
                     check_count(counts.bad, self.scan_count, self.config, complaint)
                     continue
-                scan = self._scan(index, message, recorded, counts, waited_s=working_s() - requested_s)
+                returns = message.value
+                assert isinstance(returns, Returns)
+                points = returns.points
+                scan = Scan(
+                    index=index,
+                    stamp_ns=returns.stamp_ns,
+                    log_time_ns=message.log_time_ns,
+                    points=points * np.array([1.0, -1.0], np.float32) if self.is_mirrored else points,
+                    times_s=returns.times_s,
+                    dropped=returns.dropped,
+                    T_odom_base=T_odom_base,
+                    waited_s=working_s() - requested_s,
+                    is_copy=counts.repeats(points),
+                )
                 counts.take(scan)
                 self.scans_with_wheels += scan.T_odom_base is not None
                 yield scan
@@ -209,58 +214,23 @@ class Log:
             scans = counted(count - counts.bad, "scan")
             self._damage.append(f"{scans} of {self.topic} {'was' if scans == '1 scan' else 'were'} recovered")
 
-    def _scan(
-        self, index: int, message: Decoded, poses: PosesAtScan, counts: ScanCounts, *, waited_s: float
-    ) -> Scan:
-        returns = message.value
-        assert isinstance(returns, Returns)
-        return Scan(
-            index=index,
-            stamp_ns=returns.stamp_ns,
-            log_time_ns=message.log_time_ns,
-            points=returns.points * np.array([1.0, -1.0], np.float32) if self.is_mirrored else returns.points,
-            times_s=returns.times_s,
-            dropped=returns.dropped,
-            T_odom_base=self._wheels(index, poses),
-            waited_s=waited_s,
-            is_copy=counts.repeats(returns.points),
-        )
-
     def _mounting_notes(self) -> list[str]:
         """Assumptions about the mounting. Raises InputError where a planar lidar moves out of its plane."""
         mounting = self.mounting
         notes = [mounting.note] if mounting.note else []
         if mounting.motion is not None:
-            if self.dimension == 2 and mounting.motion.leaves_plane:
-                raise self._out_of_plane(str(mounting.motion))
-            moves = (
-                f"the lidar moves on the robot ({mounting.motion}): poses are the lidar's, this motion included"
+            if self.dimension == 2 and mounting.leaves_plane:
+                raise InputError(
+                    f"{self.name}: the planar lidar of {self.topic} does not stay in one plane: "
+                    f"{mounting.motion}; choose another --topic, a part in which it rests (--start, --end), or "
+                    "join its scans to 3D clouds first (laser_assembler)"
+                )
+            wheels = f"; the wheels ({self.odometry_topic}) are no prior for it" if self.has_odometry else ""
+            notes.append(
+                f"the lidar moves on the robot ({mounting.motion}): poses are the lidar's, this motion "
+                f"included{wheels}"
             )
-            wheels = (
-                "; wheels are carried over to it by /tf at the stamp of each scan" if self.has_odometry else ""
-            )
-            notes.append(moves + wheels)
         return [*notes, *(mounting.out_of_plane if self.dimension == 2 else [])]
-
-    def _out_of_plane(self, motion: str) -> InputError:
-        return InputError(
-            f"{self.name}: the planar lidar of {self.topic} does not stay in one plane: {motion}; choose "
-            "another --topic, a part in which it rests (--start, --end), or join its scans to 3D clouds first "
-            "(laser_assembler)"
-        )
-
-    def _wheels(self, index: int, poses: PosesAtScan) -> Pose | None:
-        """T_odom_base of a scan; where the lidar moves on the base, that of a base which is fixed to the lidar."""
-        mounting, T_base_lidar = self.mounting, poses.T_base_lidar
-        if T_base_lidar is None or not is_moved(mounting.T_base_lidar, T_base_lidar):
-            return poses.T_odom_base
-        if self.dimension == 2 and leaves_plane(mounting.T_base_lidar, T_base_lidar):
-            turn_deg = np.degrees(lie.apart(mounting.T_base_lidar, T_base_lidar)[1])
-            raise self._out_of_plane(f"{mounting.lidar} has turned by {turn_deg:.0f} deg in /tf at scan {index}")
-        if poses.T_odom_base is None:
-            return None
-        now = in_plane(T_base_lidar) if self.dimension == 2 else T_base_lidar
-        return poses.T_odom_base @ now @ lie.inverse(self.T_base_lidar)
 
     def assumed_point_times(self) -> str:
         """Assumption of a run about per-point times, by the first scan that has returns; empty for laser scans."""
@@ -289,24 +259,36 @@ class Log:
         if self._truth is None and self.ground_truth_topic:
             poses = RecordedPoses("", self.ground_truth_topic)
             decoder = self.pose_decoders[self.ground_truth_topic]
-            for message in self._messages({self.ground_truth_topic: decoder}, []):
+            for message in decoded_messages(
+                self.indexes, {self.ground_truth_topic: decoder}, self.span, damage=[]
+            ):
                 poses.take(message)
             self._truth = poses.ground_truth()
         return self._truth
 
-    def _with_poses(self, poses: RecordedPoses, times: PointTimes) -> Iterator[tuple[Decoded, PosesAtScan]]:
-        """Lidar messages with the poses at their stamp; they wait a little for the readings behind them."""
+    def _with_poses(self, poses: RecordedPoses, times: PointTimes) -> Iterator[tuple[Decoded, Pose | None]]:
+        """Lidar messages with the wheels' pose at their stamp; they wait a little for the readings behind them."""
         decoders = {self.topic: self.decoder(times).decode, **self.pose_decoders}
         waiting: deque[Decoded] = deque()
-        for message in self._messages(decoders, self._damage):
+
+        def next_scan() -> tuple[Decoded, Pose | None]:
+            scan = waiting.popleft()
+            return scan, poses.at(scan.value.stamp_ns) if isinstance(scan.value, Returns) else None
+
+        for message in decoded_messages(self.indexes, decoders, self.span, damage=self._damage):
             if message.channel.topic == self.topic:
                 waiting.append(message)
             else:
                 poses.take(message)
-            while waiting and self._may_go(waiting, message.log_time_ns, poses):
-                yield waiting[0], poses.at_scan(waiting.popleft())
+            while waiting and (
+                len(waiting) > _HOLD_SCANS
+                or message.log_time_ns - waiting[0].log_time_ns > _HOLD_NS
+                or not isinstance(first := waiting[0].value, Returns)
+                or poses.covers(first.stamp_ns)
+            ):
+                yield next_scan()
         while waiting:
-            yield waiting[0], poses.at_scan(waiting.popleft())
+            yield next_scan()
 
     def decoder(self, times: PointTimes) -> LaserScanDecoder | PointCloudDecoder:
         """Decoder of the lidar's messages to points; ``times`` collects its assumptions about theirs."""
@@ -327,12 +309,3 @@ class Log:
                 f"the clouds of {self.topic} are planar (z = {height_m:.3g} m everywhere): read as a 2D log"
             )
         return height_m
-
-    def _may_go(self, waiting: deque[Decoded], now_ns: int, poses: RecordedPoses) -> bool:
-        first = waiting[0].value
-        if not isinstance(first, Returns) or len(waiting) > _HOLD_SCANS:
-            return True
-        return poses.covers(first.stamp_ns) or now_ns - waiting[0].log_time_ns > _HOLD_NS
-
-    def _messages(self, decoders: Decoders, damage: list[str]) -> Iterator[Decoded]:
-        return decoded_messages(self.indexes, decoders, self.span, damage=damage)

@@ -1,20 +1,19 @@
-"""Mounting of the lidar on the robot, by static transforms or by those of /tf, which may change."""
+"""Mounting of the lidar on the robot, by static transforms or by the first ones of /tf."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from scanchain import lie
-from scanchain.data import Matrix, Pose
+from scanchain.data import Pose
 from scanchain.logs.mcap.records import Channel, FileIndex
 from scanchain.logs.mcap.selection import Span
 from scanchain.logs.mcap.stream import first_messages, spread_messages
-from scanchain.logs.messages.poses import StampedPose, chain, frames_between
+from scanchain.logs.messages.poses import StampedPose, chain
 from scanchain.logs.messages.readers import (
     has_transforms,
     is_odometry,
@@ -27,30 +26,11 @@ _BASE_FRAMES = ("base_link", "base_footprint", "base")
 _WORLD_WORDS = {"map", "odom", "world", "earth", "global", "origin", "init"}  # in names of frames that stand still
 _TURN_RAD, _SHIFT_M = np.radians(0.2), 0.005  # least turn and shift of a mount that moves
 _TILT_RAD, _LIFT_M = np.radians(1.0), 0.1  # least tilt and lift of a planar lidar that leaves its plane
-TILTED_RAD = np.radians(10.0)  # tilt of a planar lidar's plane from which on it is no floor plan
+_TILTED_RAD = np.radians(10.0)  # tilt of a planar lidar's plane from which on it is no floor plan
 _TURNED_DEG = 0.5  # least turn of a lidar on its robot that is worth a word
-_FULL_TURN_DEG = 360.0
 _MOUNT_M = 1.0  # largest motion of a sensor on a robot; a frame that moves by more is no part of it
 
 Edge = tuple[str, str]  # parent and child
-
-
-class Motion(NamedTuple):
-    """Extent of a lidar's motion on its mount since its first pose: the joint, and the lidar's axis of turn."""
-
-    joint: Edge
-    least_rad: float
-    most_rad: float
-    axis: str
-    shift_m: float
-    leaves_plane: bool
-
-    def __str__(self) -> str:
-        low, high = np.degrees((self.least_rad, self.most_rad))
-        angles = f"from {low:.0f} to {high:.0f} deg" if high - low < _FULL_TURN_DEG else "round and round"
-        turn = f"turns {angles} about its {self.axis} axis"
-        shift = f" and shifts by {self.shift_m:.2f} m" if self.shift_m > _SHIFT_M else ""
-        return f"{self.joint[0]} → {self.joint[1]} in /tf {turn}{shift}"
 
 
 class Mounting(NamedTuple):
@@ -58,19 +38,20 @@ class Mounting(NamedTuple):
 
     Attributes
     ----------
-    base, lidar : frames; the base's is empty where the log does not state it
+    base, lidar : the frames; the base's is empty where the log does not state it
     T_base_lidar : (4, 4), the first one seen where it moves; the identity where the log does not state it
-    fixed : the static transforms; joints : those of /tf between base and lidar, none where all are static
-    motion : None where the lidar stays where it is
+    source : of the pose, as text
+    motion : the joint that moves the lidar and how far, as text; None where it stays where it is
+    leaves_plane : whether it tilts or rises then
     note : what was assumed, empty where nothing was
     """
 
     base: str
     lidar: str
     T_base_lidar: Pose
-    fixed: tuple[StampedPose, ...] = ()
-    joints: tuple[Edge, ...] = ()
-    motion: Motion | None = None
+    source: str = "by static transforms"
+    motion: str | None = None
+    leaves_plane: bool = False
     note: str = ""
 
     @property
@@ -79,17 +60,10 @@ class Mounting(NamedTuple):
         return "the base" if not self.base or self.base in _BASE_FRAMES else self.base
 
     @property
-    def source(self) -> str:
-        """Source of the mounting as text."""
-        if self.motion is not None:
-            return "by transforms of /tf that change"
-        return "by transforms of /tf, which do not change" if self.joints else "by static transforms"
-
-    @property
     def out_of_plane(self) -> list[str]:
         """Notes on a planar lidar whose plane is not that of the base as seen from above."""
-        tilted_rad = tilt_rad(self.T_base_lidar)
-        if tilted_rad > TILTED_RAD:
+        tilted_rad = float(np.arccos(np.clip(abs(self.T_base_lidar[2, 2]), 0.0, 1.0)))
+        if tilted_rad > _TILTED_RAD:
             return [
                 f"the plane of the scans is tilted by {np.degrees(tilted_rad):.0f} deg on {self.base_name} "
                 f"{self.source}: a floor plan takes a level one; correct the transforms, or choose another --topic"
@@ -97,11 +71,6 @@ class Mounting(NamedTuple):
         if is_upside_down(self.T_base_lidar):
             return [f"the lidar hangs upside down {self.source}: its scans are mirrored"]
         return []
-
-    def at(self, joints: Sequence[StampedPose]) -> Pose:
-        """T_base_lidar (4, 4) with these transforms of its joints."""
-        T_base_lidar = chain([*self.fixed, *joints], self.base, self.lidar)
-        return self.T_base_lidar if T_base_lidar is None else T_base_lidar
 
 
 class MovingFrame(NamedTuple):
@@ -113,8 +82,12 @@ class MovingFrame(NamedTuple):
 
 def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel | None, span: Span) -> Mounting:
     """The mounting of a lidar as the chosen part of a log shows it."""
-    fixed = static_transforms(indexes)
-    topics = joint_topics(indexes)
+    fixed = _static_transforms(indexes)
+    topics = {
+        name: channel
+        for name, channel in topics_of(indexes).items()
+        if has_transforms(channel) and not name.endswith("tf_static")
+    }
     if not fixed and not topics and wheels is None:
         return Mounting("", "", np.eye(4))
     frame = _frame_of(indexes, lidar)
@@ -126,10 +99,10 @@ def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel 
         T_base_lidar = chain(fixed, base, frame)
         if T_base_lidar is not None:
             return Mounting(base, frame, T_base_lidar)
+    moving = _moving_transforms(indexes, topics, span)
     worlds = {"" if stated is None else stated.parent.lstrip("/")}
-    seen = _moving_transforms(indexes, topics, span)
-    worlds |= {name for each in (*seen, *map(edge, fixed)) for name in each if _is_of_the_world(name)}
-    moving = {joint: poses for joint, poses in seen.items() if not worlds & set(joint)}
+    worlds |= {name for each in (*moving, *map(_edge, fixed)) for name in each if _is_of_the_world(name)}
+    moving = {joint: poses for joint, poses in moving.items() if not worlds & set(joint)}
     tree = [*fixed, *(poses[0] for poses in moving.values())]
     base = next((base for base in bases if chain(tree, base, frame) is not None), "")
     root = base or _top(fixed, moving, frame, worlds)
@@ -138,7 +111,38 @@ def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel 
         note = "" if not fixed and wheels is None else f"{why}: the lidar is taken to sit at the robot's origin"
         return Mounting("", frame, np.eye(4), note=note)
     note = "" if base else f"the log has no transform from {bases[0]} to {frame}: {root} is taken as the base"
-    return _seen(root, frame, fixed, moving, note)
+    return _on_joints(Mounting(root, frame, np.eye(4), note=note), fixed, moving)
+
+
+def _on_joints(
+    mounting: Mounting, fixed: Sequence[StampedPose], moving: dict[Edge, list[StampedPose]]
+) -> Mounting:
+    """A mounting with the first pose that its transforms show, and the largest motion of one of them."""
+    base, frame = mounting.base, mounting.lidar
+    first = {joint: poses[0] for joint, poses in moving.items()}
+    T_first = chain([*fixed, *first.values()], base, frame)
+    assert T_first is not None
+    mounting = mounting._replace(T_base_lidar=T_first)
+    most_rad = -1.0
+    for joint, poses in moving.items():
+        others = [*fixed, *(pose for other, pose in first.items() if other != joint)]
+        if chain(others, base, frame) is not None:  # the lidar does not hang on it
+            continue
+        if mounting.motion is None:
+            mounting = mounting._replace(source="by transforms of /tf, which do not change")
+        seen = [T for pose in poses if (T := chain([*others, pose], base, frame)) is not None]
+        turn_rad = max(lie.apart(T_first, T)[1] for T in seen)
+        shift_m = max(lie.apart(T_first, T)[0] for T in seen)
+        if (turn_rad > _TURN_RAD or shift_m > _SHIFT_M) and turn_rad > most_rad:
+            most_rad = turn_rad
+            turn = f"turns by up to {np.degrees(turn_rad):.0f} deg"
+            shift = f" and shifts by {shift_m:.2f} m" if shift_m > _SHIFT_M else ""
+            mounting = mounting._replace(
+                source="by transforms of /tf that change",
+                motion=f"{joint[0]} → {joint[1]} in /tf {turn}{shift}",
+                leaves_plane=mounting.leaves_plane or any(_leaves_plane(T_first, T) for T in seen),
+            )
+    return mounting
 
 
 def moving_frame(
@@ -149,23 +153,13 @@ def moving_frame(
     Transforms of /tf that join it to the base and do not change are as good as fixed ones.
     """
     frame = _frame_of(indexes, lidar) or "lidar"
-    transforms = static_transforms(indexes)
-    if mounting.joints and mounting.motion is None:
+    transforms = _static_transforms(indexes)
+    if mounting.base and mounting.motion is None and chain(transforms, mounting.base, frame) is None:
         transforms.append(StampedPose(0, mounting.base, frame, mounting.T_base_lidar))
-    root = root_frame(transforms, frame)
+    root = _root({child: parent for parent, child in map(_edge, transforms)}, frame)
     T_root_lidar = chain(transforms, root, frame)
     T_root_lidar = np.eye(4) if T_root_lidar is None else T_root_lidar
     return MovingFrame(root, lie.inverse(in_plane(T_root_lidar) if dimension == 2 else T_root_lidar))
-
-
-def joint_topics(indexes: Sequence[FileIndex]) -> dict[str, Channel]:
-    """The topics of transforms that may change, by name."""
-    topics = topics_of(indexes)
-    return {
-        name: channel
-        for name, channel in topics.items()
-        if has_transforms(channel) and not name.endswith("tf_static")
-    }
 
 
 def _moving_transforms(
@@ -176,7 +170,7 @@ def _moving_transforms(
     for topic, channel in topics.items():
         for transforms in spread_messages(indexes, topic, reader(channel), span):
             for each in transforms:
-                found.setdefault(edge(each), []).append(each)
+                found.setdefault(_edge(each), []).append(each)
     return found
 
 
@@ -187,89 +181,35 @@ def _is_of_the_world(frame: str) -> bool:
 
 def _top(fixed: Sequence[StampedPose], moving: dict[Edge, list[StampedPose]], frame: str, worlds: set[str]) -> str:
     """The topmost frame above the lidar that is a part of the robot."""
-    parents = {child: parent for parent, child in [edge(each) for each in fixed]}
+    parents = {child: parent for parent, child in map(_edge, fixed)}
     for (parent, child), poses in moving.items():
         if np.ptp([pose.T_parent_child[:3, 3] for pose in poses], axis=0).max() < _MOUNT_M:
             parents.setdefault(child, parent)
-    seen: list[str] = []
-    while frame in parents and parents[frame] not in worlds and frame not in seen:
-        seen.append(frame)
+    return _root({child: parent for child, parent in parents.items() if parent not in worlds}, frame)
+
+
+def _root(parents: dict[str, str], frame: str) -> str:
+    """The topmost frame above one, by the parent of each; the frame itself where it has none."""
+    seen: set[str] = set()
+    while frame in parents and frame not in seen:
+        seen.add(frame)
         frame = parents[frame]
     return frame
 
 
-def _seen(
-    base: str,
-    frame: str,
-    fixed: Sequence[StampedPose],
-    moving: dict[Edge, list[StampedPose]],
-    note: str,
-) -> Mounting:
-    """The mounting between two frames that are joined, with the motion that its joints show."""
-    first = {joint: poses[0] for joint, poses in moving.items()}
-    on_path = frames_between([*fixed, *first.values()], base, frame)
-    pairs = {frozenset(pair) for pair in pairwise(on_path)}
-    static = {frozenset(edge(each)) for each in fixed}
-    joints = tuple(joint for joint in first if frozenset(joint) in pairs - static)
-    rest = Mounting(base, frame, np.eye(4), tuple(fixed), joints, note=note)
-    rest = rest._replace(T_base_lidar=rest.at([first[joint] for joint in joints]))
-    motions = []
-    for joint in joints:
-        others = [first[other] for other in joints if other != joint]
-        motions.append((joint, np.array([rest.at([*others, pose]) for pose in moving[joint]])))
-    moved = [motion for joint, poses in motions if (motion := _motion(joint, poses)) is not None]
-    return rest._replace(motion=max(moved, key=lambda motion: motion.most_rad - motion.least_rad, default=None))
-
-
-def _motion(joint: Edge, T_base_lidar: Matrix) -> Motion | None:
-    """Motion of a lidar whose poses (N, 4, 4) one joint changes; None where it does not move."""
-    turns = lie.log(lie.between(np.broadcast_to(T_base_lidar[0], T_base_lidar.shape), T_base_lidar))[:, 3:]
-    axis = np.linalg.svd(turns)[2][0] if len(turns) > 1 else np.eye(3)[2]
-    axis = axis * np.sign(axis[np.argmax(np.abs(axis))])
-    angles_rad = np.unwrap(turns @ axis)
-    shift_m = float(np.ptp(T_base_lidar[:, :3, 3], axis=0).max())
-    if not any(is_moved(T_base_lidar[0], T) for T in T_base_lidar):
-        return None
-    name = "xyz"[int(np.argmax(np.abs(axis)))]
-    leaves = any(leaves_plane(T_base_lidar[0], T) for T in T_base_lidar)
-    return Motion(joint, float(angles_rad.min()), float(angles_rad.max()), name, shift_m, leaves)
-
-
-def edge(transform: StampedPose) -> Edge:
-    """The frames that a transform joins."""
+def _edge(transform: StampedPose) -> Edge:
     return transform.parent.lstrip("/"), transform.child.lstrip("/")
 
 
-def is_moved(T_base_first: Pose, T_base_lidar: Pose) -> bool:
-    """True if a lidar's pose on the robot has changed."""
-    shift_m, turn_rad = lie.apart(T_base_first, T_base_lidar)
-    return turn_rad > _TURN_RAD or shift_m > _SHIFT_M
-
-
-def leaves_plane(T_base_first: Pose, T_base_lidar: Pose) -> bool:
+def _leaves_plane(T_base_first: Pose, T_base_lidar: Pose) -> bool:
     """True if a planar lidar that was in a plane has tilted or risen out of it."""
     cosine = float(T_base_first[:3, 2] @ T_base_lidar[:3, 2])
     return cosine < np.cos(_TILT_RAD) or abs(T_base_first[2, 3] - T_base_lidar[2, 3]) > _LIFT_M
 
 
-def root_frame(transforms: Sequence[StampedPose], frame: str) -> str:
-    """The topmost frame to which fixed transforms join a frame; the frame itself where there are none."""
-    parents = {each.child.lstrip("/"): each.parent.lstrip("/") for each in transforms}
-    seen: list[str] = []
-    while frame in parents and frame not in seen:
-        seen.append(frame)
-        frame = parents[frame]
-    return frame
-
-
 def is_upside_down(T_base_lidar: Pose) -> bool:
     """True if the lidar's z axis points downwards."""
     return bool(T_base_lidar[2, 2] < 0.0)
-
-
-def tilt_rad(T_base_lidar: Pose) -> float:
-    """Angle between a planar lidar's plane and that of the base, rad, 0 of one that hangs upside down."""
-    return float(np.arccos(np.clip(abs(T_base_lidar[2, 2]), 0.0, 1.0)))
 
 
 def turned_by(T_base_lidar: Pose) -> str:
@@ -292,7 +232,7 @@ def in_plane(T_base_lidar: Pose) -> Pose:
     return lie.flatten(T_base_lidar)
 
 
-def static_transforms(indexes: Sequence[FileIndex]) -> list[StampedPose]:
+def _static_transforms(indexes: Sequence[FileIndex]) -> list[StampedPose]:
     """Every transform of the topics of fixed ones."""
     found: list[StampedPose] = []
     for topic, channel in topics_of(indexes).items():

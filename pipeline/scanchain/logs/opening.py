@@ -40,13 +40,11 @@ class LogFormat:
     description : as errors list it
     claims : whether a path is of this format, by its first bytes (none of a folder) or what lies in it
     index : index of a path as the n-th file of a log, see ``FileIndex``; it may raise UnknownFormatError
-    takes_rate : whether ``index`` has an argument ``rate_hz``, for scans without stamps
     """
 
     description: str
     claims: Callable[[Path, bytes], bool]
     index: Callable[..., FileIndex]
-    takes_rate: bool = False
 
 
 FORMATS: dict[str, LogFormat] = {  # the first that claims a path reads it
@@ -56,7 +54,7 @@ FORMATS: dict[str, LogFormat] = {  # the first that claims a path reads it
     "carmen": LogFormat("a CARMEN .log or .clf (also .bz2, .gz)", claims_carmen, index_carmen),
     "kitti-raw": LogFormat("a KITTI raw drive", claims_kitti_raw, index_kitti_raw),
     "kitti-odometry": LogFormat("a KITTI odometry sequence", claims_kitti_odometry, index_kitti_odometry),
-    "clouds": LogFormat("a folder of PCD, PLY, .npy or .bin files", claims_clouds, index_clouds, takes_rate=True),
+    "clouds": LogFormat("a folder of PCD, PLY, .npy or .bin files", claims_clouds, index_clouds),
 }
 AUTO = "auto"  # value of log.format: the format that claims the path
 
@@ -123,21 +121,18 @@ def _is_one_log(files: Sequence[Path]) -> bool:
 
 
 def _index(source: Source, number: int, config: LogConfig) -> FileIndex:
+    """Index of a file; of a remote one without an index of its own that of a copy."""
     if isinstance(source, Path):
         return _index_path(source, number, config)
     file = RemoteFile(source)
-    index = index_by_summary(file, number) if file.has_ranges and config.format in (AUTO, "mcap") else None
-    return index or _index_copy(file, number, config)
-
-
-def _index_copy(file: RemoteFile, number: int, config: LogConfig) -> FileIndex:
-    """Index of a copy of a remote file which has no index of its own."""
+    if file.has_ranges and config.format in (AUTO, "mcap"):
+        index = index_by_summary(file, number)
+        if index is not None:
+            return index
     copy = fetch_whole(file)
-    index = _index_path(copy, number, config, file.address)
+    index = _index_path(copy, number, config, source)
     why = "has no index to read it by" if file.has_ranges else "lies on a server that sends no parts of files"
-    index.notes.insert(
-        0, f"{file.address}: {why}, so all {copy.stat().st_size / 1e6:.1f} MB of it were downloaded"
-    )
+    index.notes.insert(0, f"{source}: {why}, so all {copy.stat().st_size / 1e6:.1f} MB of it were downloaded")
     return index
 
 
@@ -145,13 +140,18 @@ def _index_path(path: Path, number: int, config: LogConfig, address: Source | No
     """Index of a path, which may be the copy of a remote file."""
     if config.format != AUTO and config.format not in FORMATS:
         return index_scans(path, number, config.format, address)
-    head = _head(path) if path.is_file() else b""
-    form = _claiming(path, head) if config.format == AUTO else FORMATS[config.format]
-    index = form.index
-    if form.takes_rate:
+    try:
+        head = b""
+        if path.is_file():
+            with path.open("rb") as file:
+                head = file.read(_HEAD_BYTES)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
+    index = (_claiming(path, head) if config.format == AUTO else FORMATS[config.format]).index
+    if index is index_clouds:
         index = partial(index, rate_hz=config.rate_hz)
     elif index is index_file:
-        index = partial(index_file, source=address)
+        index = partial(index, source=address)
     try:
         return index(path, number)
     except UnknownFormatError as error:
@@ -201,11 +201,3 @@ def _other_parts(source: Source) -> list[str]:
     if not isinstance(source, Path) or source in parts or (source / "metadata.yaml").is_file():
         return []
     return left_out(source, Path(parts[0].name).suffix, (*_PART_SUFFIXES, *SUFFIXES))
-
-
-def _head(path: Path) -> bytes:
-    try:
-        with path.open("rb") as file:
-            return file.read(_HEAD_BYTES)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error

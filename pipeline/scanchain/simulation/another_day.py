@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,24 +18,14 @@ _REMOVED, _MOVED, _ADDED = 0.12, 0.15, 0.08  # shares of the objects that go, mo
 _APART_M = (0.5, 4.0)  # distance of the move
 _TURN_RAD = 0.15  # standard deviation of the turn, beside quarter turns
 _TRIES = 20
-_ROOM_M, _SPARE_M = (
-    0.05,
-    0.25,
-)  # distance kept from other solids, and from the path besides half the vehicle's width
+_ROOM_M = 0.05  # distance kept from other solids
+_SPARE_M = 0.25  # distance kept from the path, besides half the vehicle's width
 _SAMPLE_M = 0.1  # spacing of the points of a footprint
 _NEAR_M = 8.0  # solids so far from an object can be in its way
 _BELOW_M = 2.0  # solids that begin higher are in nobody's way
 _COLUMNS = (
-    "kind",
-    "x_before",
-    "y_before",
-    "z_before",
-    "x_after",
-    "y_after",
-    "z_after",
-    "length",
-    "width",
-    "height",
+    *("kind", "x_before", "y_before", "z_before", "x_after", "y_after", "z_after"),
+    *("length", "width", "height"),
 )
 
 
@@ -57,11 +47,12 @@ class Change:
     owner: int
 
 
-class _Object:
+class _Object(NamedTuple):
     """The solids of one movable object; rows as in ``Solids``."""
 
-    def __init__(self, boxes: Matrix, cylinders: Matrix, ellipsoids: Matrix) -> None:
-        self.boxes, self.cylinders, self.ellipsoids = boxes, cylinders, ellipsoids
+    boxes: Matrix
+    cylinders: Matrix
+    ellipsoids: Matrix
 
     def box(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Corners (3,) of its bounding box along x, y and z."""
@@ -69,17 +60,17 @@ class _Object:
         half = np.column_stack(
             [c * self.boxes[:, 2] + s * self.boxes[:, 3], s * self.boxes[:, 2] + c * self.boxes[:, 3]]
         )
-        round_half = np.repeat(self.cylinders[:, 2:3], 2, axis=1)
-        low = [
-            np.column_stack([self.boxes[:, :2] - half, self.boxes[:, 4]]),
-            np.column_stack([self.cylinders[:, :2] - round_half, self.cylinders[:, 3]]),
-            self.ellipsoids[:, :3] - self.ellipsoids[:, 3:],
-        ]
-        high = [
-            np.column_stack([self.boxes[:, :2] + half, self.boxes[:, 5]]),
-            np.column_stack([self.cylinders[:, :2] + round_half, self.cylinders[:, 4]]),
-            self.ellipsoids[:, :3] + self.ellipsoids[:, 3:],
-        ]
+        parts = (
+            (self.boxes[:, :2], half, self.boxes[:, 4:6]),
+            (self.cylinders[:, :2], self.cylinders[:, [2, 2]], self.cylinders[:, 3:5]),
+            (
+                self.ellipsoids[:, :2],
+                self.ellipsoids[:, 3:5],
+                self.ellipsoids[:, 2:3] + self.ellipsoids[:, 5:6] * [-1.0, 1.0],
+            ),
+        )
+        low = [np.column_stack([xy - half, z[:, 0]]) for xy, half, z in parts]
+        high = [np.column_stack([xy + half, z[:, 1]]) for xy, half, z in parts]
         return np.vstack(low).min(axis=0), np.vstack(high).max(axis=0)
 
     def middle(self) -> NDArray[np.float64]:
@@ -99,14 +90,14 @@ class _Object:
         middle = self.middle()[:2]
         c, s = np.cos(turn_rad), np.sin(turn_rad)
         turn = np.array([[c, -s], [s, c]])
-        boxes, cylinders, ellipsoids = self.boxes.copy(), self.cylinders.copy(), self.ellipsoids.copy()
-        for rows in (boxes, cylinders, ellipsoids):
+        boxes, cylinders, ellipsoids = thing = _Object(*(rows.copy() for rows in self))
+        for rows in thing:
             rows[:, :2] = (rows[:, :2] - middle) @ turn.T + middle + shift[:2]
         boxes[:, 6:8] = boxes[:, 6:8] @ turn.T
         boxes[:, 4:6] += shift[2]
         cylinders[:, 3:5] += shift[2]
         ellipsoids[:, 2] += shift[2]
-        return _Object(boxes, cylinders, ellipsoids)
+        return thing
 
 
 def another_day(
@@ -134,7 +125,7 @@ def another_day(
         elif elsewhere is not None and world.is_free(elsewhere):
             number = world.put(elsewhere)
             changes.append(Change("added", gone, elsewhere.middle(), high - low, number))
-    return world.solids, tuple(changes)
+    return world.solids(), tuple(changes)
 
 
 def write_changes(path: Path, changes: Sequence[Change]) -> None:
@@ -151,33 +142,33 @@ class _World:
     """Solids whose movable objects are taken out and put down again."""
 
     def __init__(self, solids: Solids, path: Matrix, free_m: float) -> None:
-        self.solids = solids
+        self._ground = solids.ground
+        self._rows = _Object(solids.boxes, solids.cylinders, solids.ellipsoids)
+        ends = np.cumsum([len(rows) for rows in self._rows])
+        self._owners = np.split(solids.owner, ends[:-1])  # of boxes, cylinders, ellipsoids
         self._path = path
         self._free_m = free_m
         self._objects = int(solids.owner.max(initial=FIXED)) + 1
 
+    def solids(self) -> Solids:
+        """All that stands in it now."""
+        return Solids(*self._rows, ground=self._ground, owner=np.concatenate(self._owners))
+
     def taken(self, owner: int) -> _Object:
         """Take an object out."""
-        parts = [self._split(rows, self._owner_of(k) == owner) for k, rows in enumerate(self._rows())]
-        keep = self.solids.owner != owner
-        rest = [rest for _, rest in parts]
-        self.solids = replace(
-            self.solids, boxes=rest[0], cylinders=rest[1], ellipsoids=rest[2], owner=self.solids.owner[keep]
-        )
-        return _Object(*(taken for taken, _ in parts))
+        parts = list(zip(self._rows, self._owners, strict=True))
+        self._rows = _Object(*(rows[owners != owner] for rows, owners in parts))
+        self._owners = [owners[owners != owner] for owners in self._owners]
+        return _Object(*(rows[owners == owner] for rows, owners in parts))
 
     def put(self, thing: _Object, owner: int | None = None) -> int:
         """Put an object down, as one that was there or, without a number, as a new one; returns its number."""
         if owner is None:
             owner, self._objects = self._objects, self._objects + 1
-        added = (thing.boxes, thing.cylinders, thing.ellipsoids)
-        owners = [np.append(self._owner_of(k), np.full(len(rows), owner)) for k, rows in enumerate(added)]
-        boxes, cylinders, ellipsoids = (
-            np.vstack([rows, more]) for rows, more in zip(self._rows(), added, strict=True)
-        )
-        self.solids = replace(
-            self.solids, boxes=boxes, cylinders=cylinders, ellipsoids=ellipsoids, owner=np.concatenate(owners)
-        )
+        self._rows = _Object(*(np.vstack(both) for both in zip(self._rows, thing, strict=True)))
+        self._owners = [
+            np.append(owners, np.full(len(rows), owner)) for owners, rows in zip(self._owners, thing, strict=True)
+        ]
         return owner
 
     def place_for(self, thing: _Object, rng: np.random.Generator) -> _Object | None:
@@ -187,7 +178,7 @@ class _World:
             away_m, direction = rng.uniform(*_APART_M), rng.uniform(0.0, 2.0 * np.pi)
             xy = away_m * np.array([np.cos(direction), np.sin(direction)])
             turn_rad = 0.5 * np.pi * rng.integers(4) + rng.normal(0.0, _TURN_RAD)
-            rise = np.diff(self.solids.ground_height(np.array([here[:2], here[:2] + xy])))
+            rise = np.diff(self.solids().ground_height(np.array([here[:2], here[:2] + xy])))
             moved = thing.moved(np.append(xy, rise), turn_rad)
             line = here[:2] + np.linspace(0.0, 1.0, int(away_m / _SAMPLE_M) + 2)[:, None] * xy
             if self.is_free(moved) and self._clearance_m(line, only_fixed=True) > _ROOM_M:
@@ -206,25 +197,13 @@ class _World:
 
     def _clearance_m(self, xy: Matrix, *, only_fixed: bool = False) -> float:
         """Least distance of positions (N, 2) from the solids around, inf where none is near."""
+        boxes, cylinders, ellipsoids = self._rows
+        reaches_m = boxes[:, 2:4].max(axis=1), cylinders[:, 2], ellipsoids[:, 3:5].max(axis=1)
         chosen = []
-        for k, rows in enumerate(self._rows()):
-            reach_m = rows[:, 2:4].max(axis=1) if k == 0 else rows[:, 2] if k == 1 else rows[:, 3:5].max(axis=1)
+        for rows, owners, reach_m in zip(self._rows, self._owners, reaches_m, strict=True):
             near = np.linalg.norm(rows[:, :2] - xy.mean(axis=0), axis=1) < _NEAR_M + 1.5 * reach_m
-            chosen.append(rows[near & (self._owner_of(k) == FIXED) if only_fixed else near])
-        around = Solids(*chosen, ground=self.solids.ground)
-        return float(around.clearance_m(xy, _BELOW_M).min())
-
-    def _rows(self) -> tuple[Matrix, Matrix, Matrix]:
-        return self.solids.boxes, self.solids.cylinders, self.solids.ellipsoids
-
-    def _owner_of(self, kind: int) -> NDArray[np.int64]:
-        """Owners of the boxes (0), cylinders (1) or ellipsoids (2)."""
-        ends = np.cumsum([0, *(len(rows) for rows in self._rows())])
-        return self.solids.owner[ends[kind] : ends[kind + 1]]
-
-    @staticmethod
-    def _split(rows: Matrix, chosen: NDArray[np.bool_]) -> tuple[Matrix, Matrix]:
-        return rows[chosen], rows[~chosen]
+            chosen.append(rows[near & (owners == FIXED) if only_fixed else near])
+        return float(Solids(*chosen, ground=self._ground).clearance_m(xy, _BELOW_M).min())
 
 
 def _rectangle(box: NDArray[np.float64]) -> Matrix:

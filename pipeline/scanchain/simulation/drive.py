@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from scanchain.simulation.another_day import Change, another_day
 from scanchain.simulation.motion import Motion
 from scanchain.simulation.sensors import SENSORS, Sensor
 from scanchain.simulation.solids import Solids
-from scanchain.simulation.worlds.registry import World, find_world
+from scanchain.simulation.worlds.registry import WORLDS, World
 
 EPOCH_NS = 1_700_000_000_000_000_000  # stamp of the first scan
 PLACE, DEVIATION, WHEELS, RANGES = range(4)  # every purpose draws its own random numbers
@@ -70,7 +70,9 @@ def plan(
     start_m: float = 0.0,
 ) -> Drive:
     """The drive that ``simulate`` records for the same arguments."""
-    place = find_world(world)
+    if world not in WORLDS:
+        raise InputError(f"world {world!r} does not exist; choose one of {', '.join(WORLDS)}")
+    place = WORLDS[world]
     lidar = _sensor(sensor or place.sensor, noise_m, dropout, place.sight_m)
     length_s = place.duration_s if duration_s is None else duration_s
     check_range("duration_s", length_s, lidar.period_ns * 1e-9, _LONGEST_S)
@@ -112,27 +114,18 @@ def check_range(name: str, value: float, low: float, high: float) -> None:
 
 def _recorded(world: World, motion: Motion, sensor: Sensor, count: int) -> NDArray[np.int64]:
     """All scans outside the dropouts: one second each, centered on the first moment nearest to its location."""
-    scans = np.arange(count)
-    lacking = round(_DROPOUT_S * 1e9 / sensor.period_ns)
     kept = np.ones(count, dtype=bool)
-    for first in _passed(world.dropouts, motion, scans * (sensor.period_ns * 1e-9)):
-        kept[max(first - lacking // 2, 0) :][:lacking] = False
-    return scans[kept]
-
-
-def _passed(places: Sequence[tuple[float, float]], motion: Motion, times_s: NDArray[np.floating]) -> list[int]:
-    """Index of the instant at which each location is first passed, for those that are."""
-    if not places:
-        return []
-    path = motion.base(times_s)[:, :2, 3]
-    passed = []
-    for place in places:
+    lacking = round(_DROPOUT_S * 1e9 / sensor.period_ns)
+    times_s = np.arange(count) * (sensor.period_ns * 1e-9)
+    path = motion.base(times_s)[:, :2, 3] if world.dropouts else np.empty((count, 2))
+    for place in world.dropouts:
         distance_m = np.linalg.norm(path - place, axis=1)
         near = np.flatnonzero(distance_m < 6.0)
         visit = near[: np.argmax(np.append(np.diff(near) > 1, True)) + 1]
-        if len(visit) and visit[-1] + 1 < len(times_s):
-            passed.append(int(visit[np.argmin(distance_m[visit])]))
-    return passed
+        if len(visit) and visit[-1] + 1 < count:
+            first = int(visit[np.argmin(distance_m[visit])])
+            kept[max(first - lacking // 2, 0) :][:lacking] = False
+    return np.flatnonzero(kept)
 
 
 def _sensor(name: str, noise_m: float | None, dropout: float | None, sight_m: float) -> Sensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,28 +43,25 @@ def simulate(
     destination: str | Path,
     *,
     seed: int = 0,
-    duration_s: float | None = None,
-    sensor: str | None = None,
+    changed: int | None = None,
     drift: float = 1.0,
     wheels_slip: Slip = NO_SLIP,
-    noise_m: float | None = None,
-    dropout: float | None = None,
-    changed: int | None = None,
-    reverse: bool = False,
-    start_m: float = 0.0,
     force: bool = False,
     progress: Callable[[int, int], None] | None = None,
+    **options: Any,
 ) -> Trajectory:
     """Write a log of a drive to ``destination`` and the truth beside it as .tum; the same seed, the same bytes.
 
     A scan's stamp is the instant of its first ray, point times count from there, and it is recorded at its end.
     The log holds /scan or /points, /odom (50 Hz, T_odom_base, drifts), /ground_truth (T_world_lidar at the stamp
-    of every scan, exact) and /tf_static (T_base_lidar); in the dropouts of a world, /odom alone goes on. ``drift``
-    multiplies the errors of the wheel odometry, which slips once by ``wheels_slip``; ``noise_m`` and ``dropout``
-    replace the sensor's own; with ``changed``, a seed, it is another day: furniture or parked cars came, went and
-    moved, as .changes.csv beside the log lists, and the drive is repeated with other deviations and noise;
-    ``reverse`` drives the other way round, from ``start_m`` along that route;
-    ``progress`` is called with the scans done and in all.
+    of every scan, exact) and /tf_static (T_base_lidar); in the dropouts of a world, /odom alone goes on.
+
+    changed : a seed; it is another day: furniture or parked cars came, went and moved, as .changes.csv beside the
+        log lists, and the drive is repeated with other deviations and noise
+    drift : multiplies the errors of the wheel odometry, which slips once by ``wheels_slip``
+    progress : called with the scans done and in all
+    options : ``duration_s``; ``sensor``, by name; ``noise_m`` and ``dropout`` in place of the sensor's own;
+        ``reverse`` to drive the other way round, from ``start_m`` along that route
 
     Returns the truth, SE(2) for a laser scanner and SE(3) for a lidar.
     """
@@ -75,23 +72,11 @@ def simulate(
             f"wheels_slip from {start_s:g} to {end_s:g} s by {size_m:g} m: begin at 0 s or later, end later"
         )
     destination = checks.path(destination, "destination")
-    truth_file = destination.with_suffix(".tum")
-    if truth_file.exists() and not force:
-        raise InputError(f"{truth_file}: exists; choose another name or pass --force to replace it")
     changes_file = destination.with_suffix(".changes.csv")
-    if changed is not None and changes_file.exists() and not force:
-        raise InputError(f"{changes_file}: exists; choose another name or pass --force to replace it")
-    drive = plan(
-        world,
-        seed=seed,
-        duration_s=duration_s,
-        sensor=sensor,
-        noise_m=noise_m,
-        dropout=dropout,
-        changed=changed,
-        reverse=reverse,
-        start_m=start_m,
-    )
+    for file in (destination.with_suffix(".tum"), *(() if changed is None else (changes_file,))):
+        if file.exists() and not force:
+            raise InputError(f"{file}: exists; choose another name or pass --force to replace it")
+    drive = plan(world, seed=seed, changed=changed, **options)
     truth = record(
         drive, destination, seed=seed, changed=changed, drift=drift, wheels_slip=wheels_slip, force=force,
         progress=progress,

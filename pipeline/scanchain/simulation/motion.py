@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,23 +59,55 @@ def mount(x_m: float, z_m: float) -> Matrix:
     return np.array([[1.0, 0, 0, x_m], [0, 1, 0, 0], [0, 0, 1, z_m], [0, 0, 0, 1]])
 
 
-class Motion(Protocol):
-    """A motion whose pose is known at any instant."""
+class Course(NamedTuple):
+    """Positions (N, 2) on the ground or (N, 3) at heights of their own, unit vectors (N, 2) ahead, speeds (N,)."""
+
+    place: Matrix
+    forward: Matrix
+    speed_m_s: NDArray[np.float64]
+
+
+class Motion:
+    """A vehicle's motion along a course, whose pose is known at any instant.
+
+    ``course`` at (N,) instants; ``phases`` (5,) of the body's sway.
+    """
+
+    def __init__(
+        self,
+        course: Callable[[NDArray[np.floating]], Course],
+        vehicle: Vehicle,
+        solids: Solids,
+        phases: NDArray[np.float64],
+    ) -> None:
+        self._course = course
+        self._vehicle = vehicle
+        self._solids = solids
+        self._phases = phases
 
     def speed_m_s(self, times_s: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Speed along the path at (N,) instants."""
-        ...
+        """Speed along the path at (N,) instants; 0 while it turns on the spot."""
+        return self._course(times_s).speed_m_s
 
     def base(self, times_s: NDArray[np.floating]) -> Matrix:
-        """T_world_base at (N,) instants, (N, 4, 4)."""
-        ...
+        """T_world_base at (N,) instants, (N, 4, 4): x along the path, z normal to the ground."""
+        place, forward, speed_m_s = self._course(times_s)
+        if place.shape[1] == 2:
+            height_m, slope = self._solids.ground_height(place), self._solids.ground_slope(place)
+        else:
+            height_m, slope = place[:, 2], np.zeros_like(forward)
+        poses = _stand(place[:, :2], height_m, slope, forward)
+        if self._vehicle.sway_rad > 0.0 or self._vehicle.heave_m > 0.0:
+            share = speed_m_s / self._vehicle.speed_m_s
+            poses = poses @ lie.exp(_sway(self._vehicle, self._phases, times_s, share))
+        return poses
 
     def lidar(self, times_s: NDArray[np.floating]) -> Matrix:
         """T_world_lidar at (N,) instants, (N, 4, 4)."""
-        ...
+        return self.base(times_s) @ self._vehicle.T_base_lidar
 
 
-def sway(
+def _sway(
     vehicle: Vehicle, phases: NDArray[np.float64], times_s: NDArray[np.floating], share: NDArray[np.float64]
 ) -> Matrix:
     """Twists (N, 6) of a body on its springs or legs, as large as the ``share`` (N,) of the full speed.
@@ -89,7 +122,7 @@ def sway(
     return twist
 
 
-def stand(xy: Matrix, height_m: NDArray[np.float64], slope: Matrix, forward: Matrix) -> Matrix:
+def _stand(xy: Matrix, height_m: NDArray[np.float64], slope: Matrix, forward: Matrix) -> Matrix:
     """Poses (N, 4, 4) at that height that look along ``forward`` (N, 2), z normal to a ``slope`` (N, 2)."""
     ahead = np.column_stack([forward, np.sum(slope * forward, axis=1)])
     up = np.column_stack([-slope, np.ones(len(xy))])
@@ -101,11 +134,6 @@ def stand(xy: Matrix, height_m: NDArray[np.float64], slope: Matrix, forward: Mat
     poses[:, 2, 3] = height_m
     poses[:, 3, 3] = 1.0
     return poses
-
-
-def stand_on_ground(xy: Matrix, forward: Matrix, solids: Solids) -> Matrix:
-    """Poses (N, 4, 4) that stand on the ground and look along ``forward`` (N, 2)."""
-    return stand(xy, solids.ground_height(xy), solids.ground_slope(xy), forward)
 
 
 def wheel_odometry(

@@ -10,9 +10,8 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import BSpline, make_interp_spline
 from scipy.ndimage import gaussian_filter1d
 
-from scanchain import lie
 from scanchain.data import Matrix
-from scanchain.simulation.motion import Vehicle, stand, stand_on_ground, sway
+from scanchain.simulation.motion import Course, Motion, Vehicle
 from scanchain.simulation.solids import Solids
 
 _HOLD_S = 1.0  # before it sets off, as long as the easing reaches
@@ -28,77 +27,66 @@ _PAUSE_S = 0.4  # between a turn and a move, as long as the easing reaches on bo
 _FIRST_PAUSE_S = 1.0  # standstill at the beginning
 
 
-class Laps:
+class Lap:
+    """A closed route (W, d) by the distance along it; ``corners_m`` (W + 1,) are those of its corners."""
+
+    def __init__(self, route: Matrix) -> None:
+        self._corners = np.vstack([route, route[:1]])
+        self.corners_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self._corners, axis=0), axis=1))])
+        self.length_m = float(self.corners_m[-1])
+
+    def at(self, along_m: NDArray[np.float64] | float) -> Matrix:
+        """Positions (..., d), on whichever lap."""
+        place_m = along_m % self.length_m
+        return np.stack([np.interp(place_m, self.corners_m, column) for column in self._corners.T], axis=-1)
+
+    def yaw_rad(self, along_m: float) -> float:
+        """Direction of a route on the ground, over one meter."""
+        ahead = self.at(along_m + 0.5) - self.at(along_m - 0.5)
+        return float(np.arctan2(ahead[1], ahead[0]))
+
+    def beside(self, along_m: float, left_m: float) -> tuple[float, float]:
+        """The position so far along a route on the ground and to its left."""
+        yaw_rad = self.yaw_rad(along_m)
+        x, y = self.at(along_m) + left_m * np.array([-np.sin(yaw_rad), np.cos(yaw_rad)])
+        return float(x), float(y)
+
+
+def laps(
+    route: Matrix, vehicle: Vehicle, solids: Solids, *, duration_s: float, rng: np.random.Generator
+) -> Motion:
     """A drive round a closed ``route``: (W, 2) along the ground, (W, 3) walked upright at the heights it gives."""
+    phases = rng.uniform(0.0, 2.0 * np.pi, 3)
+    reach_m = vehicle.speed_m_s * duration_s + 10.0 * vehicle.corner_m + 2.0 * _MARGIN_S * vehicle.start_m_s
+    line = _deviate(Lap(route).at(np.arange(0.0, reach_m, 0.02 * vehicle.corner_m)), vehicle, rng)
+    phases = np.concatenate([phases, rng.uniform(0.0, 2.0 * np.pi, 2)])
+    smooth = gaussian_filter1d(line, 50.0, axis=0, mode="nearest")
+    arc_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(smooth, axis=0), axis=1))])
+    position = make_interp_spline(arc_m, smooth, k=3)
+    driven_m = _drive(position, arc_m, vehicle, duration_s)
 
-    def __init__(
-        self,
-        route: Matrix,
-        vehicle: Vehicle,
-        solids: Solids,
-        *,
-        duration_s: float,
-        rng: np.random.Generator,
-    ) -> None:
-        self._vehicle = vehicle
-        self._solids = solids
-        phases = rng.uniform(0.0, 2.0 * np.pi, 3)
-        reach_m = vehicle.speed_m_s * duration_s + 10.0 * vehicle.corner_m + 2.0 * _MARGIN_S * vehicle.start_m_s
-        line = _deviate(_densify(route, reach_m, 0.02 * vehicle.corner_m), vehicle, rng)
-        self._phases = np.concatenate([phases, rng.uniform(0.0, 2.0 * np.pi, 2)])
-        smooth = gaussian_filter1d(line, 50.0, axis=0, mode="nearest")
-        arc_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(smooth, axis=0), axis=1))])
-        self._position = make_interp_spline(arc_m, smooth, k=3)
-        self._arc = _drive(self._position, arc_m, vehicle, duration_s)
-
-    def speed_m_s(self, times_s: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Speed along the path at (N,) instants."""
-        return self._arc(times_s, 1)
-
-    def base(self, times_s: NDArray[np.floating]) -> Matrix:
-        """T_world_base at (N,) instants, (N, 4, 4): x along the path, z normal to the ground."""
-        arc_m = self._arc(times_s)
-        place = self._position(arc_m)
-        forward = self._position(arc_m, 1)[:, :2]
+    def course(times_s: NDArray[np.floating]) -> Course:
+        along_m = driven_m(times_s)
+        forward = position(along_m, 1)[:, :2]
         forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-        if place.shape[1] == 2:
-            poses = stand_on_ground(place, forward, self._solids)
-        else:
-            poses = stand(place[:, :2], place[:, 2], np.zeros_like(forward), forward)
-        if self._vehicle.sway_rad > 0.0 or self._vehicle.heave_m > 0.0:
-            share = self.speed_m_s(times_s) / self._vehicle.speed_m_s
-            poses = poses @ lie.exp(sway(self._vehicle, self._phases, times_s, share))
-        return poses
+        return Course(position(along_m), forward, driven_m(times_s, 1))
 
-    def lidar(self, times_s: NDArray[np.floating]) -> Matrix:
-        """T_world_lidar at (N,) instants, (N, 4, 4)."""
-        return self.base(times_s) @ self._vehicle.T_base_lidar
+    return Motion(course, vehicle, solids, phases)
 
 
 def begun_at(route: Matrix, start_m: float) -> Matrix:
     """The closed route (W, d) from a point on, so many meters along it."""
     if start_m == 0.0:
         return route
-    lap = np.vstack([route, route[:1]])
-    corners_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(lap, axis=0), axis=1))])
-    along_m = start_m % corners_m[-1]
-    first = np.stack([np.interp(along_m, corners_m, column) for column in lap.T])
-    ahead = int(np.searchsorted(corners_m[:-1], along_m, side="right"))
-    return np.vstack([first, route[ahead:], route[:ahead]])
+    lap = Lap(route)
+    ahead = int(np.searchsorted(lap.corners_m[:-1], start_m % lap.length_m, side="right"))
+    return np.vstack([lap.at(start_m), route[ahead:], route[:ahead]])
 
 
 def sampled(route: Matrix, step_m: float) -> Matrix:
     """Points along the straight segments of the closed route, both corners of each and one about every step."""
     segments = zip(route, np.roll(route, -1, axis=0), strict=True)
     return np.vstack([np.linspace(a, b, max(int(np.linalg.norm(b - a) / step_m), 2)) for a, b in segments])
-
-
-def _densify(route: Matrix, reach_m: float, step_m: float) -> Matrix:
-    """Points every ``step_m`` along as many laps of the closed route as ``reach_m`` takes."""
-    lap = np.vstack([route, route[:1]])
-    corners_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(lap, axis=0), axis=1))])
-    along_m = np.arange(0.0, reach_m, step_m) % corners_m[-1]
-    return np.stack([np.interp(along_m, corners_m, column) for column in lap.T], axis=1)
 
 
 def _deviate(line: Matrix, vehicle: Vehicle, rng: np.random.Generator) -> Matrix:
@@ -136,48 +124,28 @@ class Pivot(NamedTuple):
     ahead_m: float
 
 
-class Pivots:
+def pivots(
+    steps: tuple[Pivot, ...], vehicle: Vehicle, solids: Solids, *, duration_s: float, rng: np.random.Generator
+) -> Motion:
     """Turns and short moves from the origin, heading along x: ``steps`` that end as they began, repeated."""
+    phases = rng.uniform(0.0, 2.0 * np.pi, 5)
+    lap = np.vstack([_rates(step, vehicle) for step in steps])
+    rounds = int((duration_s + 2.0) / (len(lap) * _PIVOT_STEP_S)) + 1
+    rates = np.vstack([np.zeros((round(_FIRST_PAUSE_S / _PIVOT_STEP_S), 2)), *[lap] * rounds])
+    eased = np.asarray(gaussian_filter1d(rates, _PIVOT_EASE_S / _PIVOT_STEP_S, axis=0))
+    turning, moving = eased[:, 0], eased[:, 1]
+    instants_s = np.arange(len(rates)) * _PIVOT_STEP_S
+    turned = cumulative_trapezoid(turning, dx=_PIVOT_STEP_S, initial=0.0)
+    velocity = moving[:, np.newaxis] * np.column_stack([np.cos(turned), np.sin(turned)])
+    moved = cumulative_trapezoid(velocity, dx=_PIVOT_STEP_S, axis=0, initial=0.0)
+    heading, place = (make_interp_spline(instants_s, values, k=3) for values in (turned, moved))
 
-    def __init__(
-        self,
-        steps: tuple[Pivot, ...],
-        vehicle: Vehicle,
-        solids: Solids,
-        *,
-        duration_s: float,
-        rng: np.random.Generator,
-    ) -> None:
-        self._vehicle = vehicle
-        self._solids = solids
-        self._phases = rng.uniform(0.0, 2.0 * np.pi, 5)
-        lap = np.vstack([_rates(step, vehicle) for step in steps])
-        laps = int((duration_s + 2.0) / (len(lap) * _PIVOT_STEP_S)) + 1
-        rates = np.vstack([np.zeros((round(_FIRST_PAUSE_S / _PIVOT_STEP_S), 2)), *[lap] * laps])
-        eased = np.asarray(gaussian_filter1d(rates, _PIVOT_EASE_S / _PIVOT_STEP_S, axis=0))
-        turning, moving = eased[:, 0], eased[:, 1]
-        times_s = np.arange(len(rates)) * _PIVOT_STEP_S
-        heading = cumulative_trapezoid(turning, dx=_PIVOT_STEP_S, initial=0.0)
-        velocity = moving[:, np.newaxis] * np.column_stack([np.cos(heading), np.sin(heading)])
-        place = cumulative_trapezoid(velocity, dx=_PIVOT_STEP_S, axis=0, initial=0.0)
-        self._heading = make_interp_spline(times_s, heading, k=3)
-        self._place = make_interp_spline(times_s, place, k=3)
+    def course(times_s: NDArray[np.floating]) -> Course:
+        yaw = heading(times_s)
+        forward = np.column_stack([np.cos(yaw), np.sin(yaw)])
+        return Course(place(times_s), forward, np.linalg.norm(place(times_s, 1), axis=1))
 
-    def speed_m_s(self, times_s: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Speed along the path at (N,) instants; 0 while it turns."""
-        return np.linalg.norm(self._place(times_s, 1), axis=1)
-
-    def base(self, times_s: NDArray[np.floating]) -> Matrix:
-        """T_world_base at (N,) instants, (N, 4, 4): z normal to the ground."""
-        heading = self._heading(times_s)
-        forward = np.column_stack([np.cos(heading), np.sin(heading)])
-        poses = stand_on_ground(self._place(times_s), forward, self._solids)
-        share = self.speed_m_s(times_s) / self._vehicle.speed_m_s
-        return poses @ lie.exp(sway(self._vehicle, self._phases, times_s, share))
-
-    def lidar(self, times_s: NDArray[np.floating]) -> Matrix:
-        """T_world_lidar at (N,) instants, (N, 4, 4)."""
-        return self.base(times_s) @ self._vehicle.T_base_lidar
+    return Motion(course, vehicle, solids, phases)
 
 
 def _rates(step: Pivot, vehicle: Vehicle) -> Matrix:

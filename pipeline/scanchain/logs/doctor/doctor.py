@@ -23,20 +23,15 @@ from scanchain.source import Source
 from scanchain.words import counted
 
 _GAP_PERIODS = 2.5
-_MOST_MISSING = 10  # largest number of scans missing in a row at which they are counted
-_JITTER = 0.1  # jitter, as a share of the period, from which on scans come as they please
 _LONG_GAP_S, _LONG_GAP_ON_WHEELS_S = 0.5, 10.0
 _OTHER_CLOCK_S = 1.0
-_LATE_S = 0.2
 _PART_OF_SCAN, _MORE_THAN_SCAN = 0.3, 1.2  # shares of the period outside which a unit of time is implausible
 _SPINS_AT_S = (0.04, 0.25)
 _SURE = 0.9  # least share of the scans that turn alike, and least agreement of their starts
 _FASTEST_M_S = 100.0  # speed by the wheels above which their unit is another
 _LEAST_STEP_M = 1e-3  # length of a step between two readings from which on the wheels turn
 _NEAR_NS = 500_000_000  # largest distance from a scan's stamp of a wheel reading that a run uses
-_MANY_LOST = 0.5
 _MANY_UNUSED = 0.3  # share of unused returns, from which on a wider range is recommended
-_SOME_BELOW = 0.05  # share of beams below range_min that is reported
 _STUCK_SHARE = 0.01  # share of beams at one farthest range that is reported
 _FEW_POINTS = 50
 
@@ -107,7 +102,6 @@ def _check(seen: Survey, config: Config) -> Iterator[Finding]:
     if not is_scan(seen.log.lidar):
         yield _point_times(seen)
     yield _damage(seen, config.preprocess)
-    yield from _frames(seen)
     yield _returns(seen)
     yield _no_return(seen)
     yield _ranges(seen, config.preprocess)
@@ -117,18 +111,13 @@ def _check(seen: Survey, config: Config) -> Iterator[Finding]:
 def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:
     steps_s = np.diff(seen.log_ns) * 1e-9
     gaps = np.flatnonzero(steps_s > _GAP_PERIODS * seen.period_s) if seen.period_s else np.empty(0, np.int64)
-    missing = _missing(seen)
-    absent = f"; {counted(missing, 'scan')} missing in all" if missing else ""
     if not len(gaps):
-        found = f"none longer than {_GAP_PERIODS:g} periods{absent}"
-        if not missing:
-            return Finding("gaps", Severity.OK, found)
-        return Finding("gaps", Severity.NOTE, found, "after a missing scan the prediction is off by one motion")
+        return Finding("gaps", Severity.OK, f"none longer than {_GAP_PERIODS:g} periods")
     longest = gaps[np.argmax(steps_s[gaps])]
     at_s = seen.into_log_s(int(seen.log_ns[longest]))
     found = (
         f"{len(gaps):,} longer than {_GAP_PERIODS:g} periods, the longest {steps_s[longest]:.3g} s, "
-        f"{at_s:.1f} s into the log{absent}"
+        f"{at_s:.1f} s into the log"
     )
     predicted = f"the motion over a gap is predicted {'by the wheels' if is_on_wheels else 'at constant velocity'}"
     if steps_s[longest] < (_LONG_GAP_ON_WHEELS_S if is_on_wheels else _LONG_GAP_S):
@@ -139,18 +128,6 @@ def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:
         f"the rest, --start {again_s:g}, apart"
     )
     return Finding("gaps", Severity.WARNING, found, effect, f"--end {until_s:g}")
-
-
-def _missing(seen: Survey) -> int:
-    """Number of missing scans, by the periods between stamps; 0 of scans that come as they please.
-
-    Stamps that step back, repeat or jump are left out.
-    """
-    steps_s = np.diff(seen.stamps_ns) * 1e-9
-    steps_s = steps_s[(steps_s > 0.0) & (steps_s < (_MOST_MISSING + 1.5) * seen.period_s)]
-    periods = np.maximum(np.rint(steps_s / seen.period_s), 1.0) if len(steps_s) else steps_s
-    is_even = len(steps_s) > 0 and float(np.std(steps_s - periods * seen.period_s)) < _JITTER * seen.period_s
-    return int((periods - 1).sum()) if is_even else 0
 
 
 def _order(seen: Survey) -> Finding:
@@ -177,9 +154,6 @@ def _clock(seen: Survey) -> Finding:
         )
         effect += "header stamps, and wheels or ground truth of the recorder's clock do not meet the scans"
         return Finding("clock", Severity.WARNING, found, effect)
-    if most - least > _LATE_S:
-        effect = "some scans were recorded late; results hold at header stamps and do not suffer"
-        return Finding("clock", Severity.NOTE, found, effect)
     return Finding("clock", Severity.OK, found)
 
 
@@ -290,31 +264,16 @@ def _damage(seen: Survey, preprocess: PreprocessConfig) -> Finding:
     return Finding("damage", Severity.WARNING, "; ".join(lines), effect)
 
 
-def _frames(seen: Survey) -> Iterator[Finding]:
-    frames = sorted({scan.frame for scan in seen.scans})
-    if len(frames) > 1:
-        effect = "only the first frame's mounting is used; scans of the others are taken to sit there, too"
-        yield Finding("frames", Severity.PROBLEM, f"scans in several frames: {', '.join(frames)}", effect)
-
-
 def _returns(seen: Survey) -> Finding:
-    undefined, zero = seen.share(lambda scan: scan.undefined), seen.share(lambda scan: scan.zero)
-    below = seen.share(lambda scan: scan.below)
-    kept = np.array([scan.kept for scan in seen.scans])
-    found = f"{100 * undefined:.2g} % NaN or infinite, {100 * zero:.2g} % zero, "
-    if below:
-        least_m = np.median([scan.limits_m[0] for scan in seen.scans])
-        found += f"{100 * below:.2g} % below range_min ({least_m:.3g} m), "
-    found += f"{int(np.median(kept)):,} valid a scan (median)"
+    kept, dropped = np.array([(scan.kept, scan.dropped) for scan in seen.scans]).T
+    lost = float(dropped.sum() / max((kept + dropped).sum(), 1))
+    found = (
+        f"{100 * lost:.2g} % of the beams without a valid return, {int(np.median(kept)):,} valid a scan (median)"
+    )
     poor = kept < _FEW_POINTS
     if few := int(np.count_nonzero(poor)):
         effect = f"{counted(few, 'scan')} with fewer than {_FEW_POINTS} returns: matches are weak there, or lost"
         return Finding("returns", Severity.WARNING, found, effect, _without_ends(seen, poor))
-    if undefined + zero + below > _MANY_LOST:
-        return Finding("returns", Severity.NOTE, found, "they are left out; what is left may determine too little")
-    if below > _SOME_BELOW:
-        effect = "what lies below range_min is not used: the sensor's own limit"
-        return Finding("returns", Severity.NOTE, found, effect)
     return Finding("returns", Severity.OK, found)
 
 
@@ -330,19 +289,15 @@ def _without_ends(seen: Survey, poor: NDArray[np.bool_]) -> str:
 
 def _no_return(seen: Survey) -> Finding:
     """Finding on beams that all have one farthest range, as of scanners that write a number for no return."""
-    values = Counter(scan.farthest_m for scan in seen.scans if np.isfinite(scan.farthest_m))
+    values = Counter(scan.farthest_m for scan in seen.scans if scan.kept)
     farthest_m = max(values, default=0.0)
-    below_m = np.floor(1e3 * farthest_m) / 1e3  # the flag must lie below the stated range, to the last bit
     stuck = sum(scan.at_farthest for scan in seen.scans if scan.farthest_m == farthest_m)
-    share = stuck / max(sum(scan.beams for scan in seen.scans), 1)
-    stated_m = min((scan.limits_m[1] for scan in seen.scans), default=float("inf"))
-    limit_m = min(stated_m, seen.log.config.max_range_m)
+    share = stuck / max(sum(scan.kept + scan.dropped for scan in seen.scans), 1)
     if share < _STUCK_SHARE:
         return Finding("no return", Severity.OK, "no range is so frequent that it must mean no return")
     found = f"{100 * share:.2g} % of the beams have exactly {farthest_m:.6g} m, the farthest there is"
-    if farthest_m >= limit_m:
-        return Finding("no return", Severity.OK, f"{found}; range limits take it out")
     effect = "if it stands for no return, it is taken for a wall that moves along"
+    below_m = math.floor(1e3 * farthest_m - 0.5) / 1e3  # below the range, to the last bit
     return Finding("no return", Severity.WARNING, found, effect, f"--log.max_range_m {below_m:g}")
 
 

@@ -15,9 +15,6 @@ from scanchain.errors import InputError
 from scanchain.logs.log import Log
 from scanchain.logs.mcap.selection import whole_span
 from scanchain.logs.mcap.stream import decoded_messages
-from scanchain.logs.messages.cdr import MalformedMessageError
-from scanchain.logs.messages.laser_scan import LaserScanDecoder, LaserScanMessage
-from scanchain.logs.messages.point_cloud import PointCloudDecoder, PointCloudMessage, column
 from scanchain.logs.messages.point_times import PointTimes
 from scanchain.logs.messages.poses import StampedPose
 from scanchain.logs.messages.readers import is_scan
@@ -25,6 +22,7 @@ from scanchain.logs.messages.returns import Returns
 from scanchain.words import grouped
 
 _PERCENT = np.arange(101)
+_SAME_M = 1e-4  # largest difference of ranges that are one number: rounding of float32
 _NEXT_RAD = 0.2  # largest angle from one point to the next, usually, where their order is that of firing
 _ONE_TURN_RAD = (1.5 * np.pi, 2.5 * np.pi)  # one revolution; clouds stored ring by ring turn many times
 
@@ -65,15 +63,12 @@ class Survey:
         """Seconds after the log's first message, as ``--start`` and ``--end`` count."""
         return (log_time_ns - whole_span(self.log.indexes).begin_ns) * 1e-9
 
-    def share(self, part: Callable[[ScanFacts], int]) -> float:
-        """A count of beams over all beams of all scans."""
-        return sum(part(scan) for scan in self.scans) / max(sum(scan.beams for scan in self.scans), 1)
-
 
 def survey(log: Log, progress: Callable[[int, int], None] | None = None) -> Survey:
     """Statistics of every scan of the chosen part. Raises InputError where none is readable."""
     times = PointTimes(log.config)
-    decoders = {log.topic: facts_of(log.decoder(times)), **log.pose_decoders}
+    decode = log.decoder(times).decode
+    decoders = {log.topic: lambda data: _facts(decode(data)), **log.pose_decoders}
     damage = [line for index in log.indexes for line in index.damage]
     scans: list[ScanFacts] = []
     log_ns: list[int] = []
@@ -92,7 +87,7 @@ def survey(log: Log, progress: Callable[[int, int], None] | None = None) -> Surv
                     progress(len(scans), log.scan_count)
             case StampedPose() as pose if message.channel.topic == log.odometry_topic:
                 wheels.append(pose)
-            case MalformedMessageError() as error if message.channel.topic == log.topic:
+            case Exception() as error if message.channel.topic == log.topic:
                 malformed.append(str(error))
     if not scans:
         reasons = "; ".join([*malformed[:1], *grouped(damage)]) or "the chosen part is empty"
@@ -110,30 +105,22 @@ def survey(log: Log, progress: Callable[[int, int], None] | None = None) -> Surv
 
 
 class ScanFacts(NamedTuple):
-    """Statistics of one scan.
+    """Statistics of the returns that a run would get of one scan.
 
     Attributes
     ----------
-    beams : measurements in the message; ``undefined`` are NaN or infinite, ``zero`` are at no distance at all
-    below : closer than ``limits_m``, though not at no distance
-    kept : what a run would use
-    limits_m : the least and the largest valid range of the message, 0 and inf where it states none
-    farthest_m, at_farthest : the largest finite range and the number of beams with just that one
-    ranges_m : (101,) percentiles of the ranges that are kept, NaN where none is
+    kept, dropped : number of valid returns, and of the others
+    farthest_m, at_farthest : the largest range and the number of returns with just that one; NaN without any
+    ranges_m : (101,) percentiles of the ranges, NaN without any
     time_span_s : of the per-point times, NaN where there are none
     turn : 1 if the points, in their order, go around once counter-clockwise, −1 if clockwise, else 0
     start_rad : azimuth of the first point
-    digest : of the measurements, equal for equal ones
+    digest : of the points, equal for equal ones
     """
 
     stamp_ns: int
-    frame: str
-    beams: int
-    undefined: int
-    zero: int
-    below: int
     kept: int
-    limits_m: tuple[float, float]
+    dropped: int
     farthest_m: float
     at_farthest: int
     ranges_m: NDArray[np.float32]
@@ -143,52 +130,22 @@ class ScanFacts(NamedTuple):
     digest: int
 
 
-def facts_of(decoder: LaserScanDecoder | PointCloudDecoder) -> Callable[[memoryview], ScanFacts]:
-    """Function from a message to its statistics, by a run's decoder."""
-    if isinstance(decoder, LaserScanDecoder):
-        return lambda data: _of_scan(decoder, decoder.read(data))
-    return lambda data: _of_cloud(decoder, decoder.read(data))
-
-
-def _of_scan(decoder: LaserScanDecoder, message: LaserScanMessage) -> ScanFacts:
-    limits_m = message.range_min_m, message.range_max_m if message.range_max_m > 0.0 else float("inf")
-    digest = zlib.crc32(message.ranges_m.tobytes())
-    return _facts(decoder.returns(message), message.frame, message.ranges_m, limits_m, digest)
-
-
-def _of_cloud(decoder: PointCloudDecoder, message: PointCloudMessage) -> ScanFacts:
-    x, y, z = (np.asarray(column(message, name), np.float32) for name in "xyz")
-    with np.errstate(over="ignore", invalid="ignore"):
-        ranges_m = np.sqrt(x * x + y * y + z * z)
-    limits_m = (decoder.limits.min_m, float("inf"))
-    return _facts(decoder.returns(message), message.frame, ranges_m, limits_m, zlib.crc32(message.data))
-
-
-def _facts(
-    returns: Returns, frame: str, ranges_m: NDArray[np.float32], limits_m: tuple[float, float], digest: int
-) -> ScanFacts:
-    finite = ranges_m[np.isfinite(ranges_m)]
-    farthest_m = float(finite.max()) if len(finite) else float("nan")
-    kept_m = np.sqrt(np.sum(np.square(returns.points), axis=1))
-    kept_m = np.percentile(kept_m, _PERCENT) if len(kept_m) else np.full(len(_PERCENT), np.nan)
-    times_s = returns.times_s
-    turn, start_rad = _turning(returns.points)
+def _facts(returns: Returns) -> ScanFacts:
+    points, times_s = returns.points, returns.times_s
+    ranges_m = np.sqrt(np.sum(np.square(points), axis=1))
+    farthest_m = float(ranges_m.max()) if len(points) else float("nan")
+    turn, start_rad = _turning(points)
     return ScanFacts(
         stamp_ns=returns.stamp_ns,
-        frame=frame,
-        beams=len(ranges_m),
-        undefined=len(ranges_m) - len(finite),
-        zero=int(np.count_nonzero(finite == 0.0)),
-        below=int(np.count_nonzero((finite > 0.0) & (finite < limits_m[0]))),
-        kept=len(returns.points),
-        limits_m=limits_m,
-        farthest_m=farthest_m,
-        at_farthest=int(np.count_nonzero(finite == np.float32(farthest_m))),
-        ranges_m=kept_m.astype(np.float32),
-        time_span_s=float(times_s.max() - times_s.min()) if len(times_s) else float("nan"),
+        kept=len(points),
+        dropped=returns.dropped,
+        farthest_m=round(farthest_m, 4),
+        at_farthest=int(np.count_nonzero(ranges_m > farthest_m - _SAME_M)),
+        ranges_m=np.percentile(ranges_m if len(points) else np.nan, _PERCENT).astype(np.float32),
+        time_span_s=float(np.ptp(times_s)) if len(times_s) else float("nan"),
         turn=turn,
         start_rad=start_rad,
-        digest=digest,
+        digest=zlib.crc32(points.tobytes()),
     )
 
 

@@ -14,6 +14,7 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -38,7 +39,7 @@ _HALF_TURN = math.pi
 
 _MOST_BYTES = 2 << 30  # largest size of the text in bytes
 _MOST_RATIO, _LEAST_BYTES = 1000, 1 << 24  # largest ratio of packing, beyond so many bytes of text
-_AT_ONCE, _CLOSELY = 1 << 12, 64  # bytes of text that are unpacked at once, and of a damaged file
+_AT_ONCE = 256  # bytes of text that are unpacked at once, of which damage loses all
 
 
 def claims_carmen(_: Path, head: bytes) -> bool:
@@ -59,6 +60,17 @@ def index_carmen(path: Path, number: int) -> FileIndex:
     return index
 
 
+class Line(NamedTuple):
+    """Offset of a line in the text, its kind, and its log time."""
+
+    kind: bytes
+    begin: int
+    end: int
+    number: int
+    stamp_ns: int
+    log_time_ns: int
+
+
 class _Carmen:
     """The text of a log, its lines and its channels."""
 
@@ -75,10 +87,24 @@ class _Carmen:
         self.mounting = add_channel(index, "/tf_static", "tf2_msgs/msg/TFMessage")
         self.truth = add_channel(index, "/ground_truth", "nav_msgs/msg/Odometry")
         for begin in range(0, len(self.lines), _LINES_A_BLOCK):
-            self._block(begin)
+            lines = self.lines[begin : begin + _LINES_A_BLOCK]
+            kinds = Counter(line.kind for line in lines)
+            scans = sum(kinds[kind] for kind in SCANS)
+            counts = {
+                self.mounting: int(0 <= self.first_scan - begin < len(lines)),
+                self.odometry: scans + kinds[b"ODOM"],
+                self.scan: scans,
+                self.truth: kinds[b"TRUEPOS"],
+            }
+            size = lines[-1].end - lines[0].begin
+            add_block(index, begin, size, [line.log_time_ns for line in lines], counts)
         index.channels = {number: c for number, c in index.channels.items() if index.counts.get(number)}
         index.make = self.make
-        self._summarize()
+        if self.malformed:
+            index.note_damage(_complaint(index.path, self.malformed))
+        if self.others:
+            listed = ", ".join(f"{count} {kind.decode('ascii', 'replace')}" for kind, count in self.others.items())
+            index.notes.append(f"{index.path}: lines of kinds that are not read: {listed}")
 
     def make(self, block: Block, wanted: AbstractSet[int] | None) -> Contents:
         """The messages of a block of lines."""
@@ -86,30 +112,27 @@ class _Carmen:
         malformed: list[int] = []
         for place, line in enumerate(self.lines[block.offset : block.offset + _LINES_A_BLOCK]):
             try:
-                messages += self._messages(line, is_first=block.offset + place == self.first_scan)
+                said = self._messages(line, is_first=block.offset + place == self.first_scan)
+                messages += [Message(channel, line.log_time_ns, memoryview(data)) for channel, data in said]
             except (ValueError, IndexError):
                 malformed.append(line.number)
         if wanted is not None:
             messages = [message for message in messages if message.channel.key[1] in wanted]
         return Contents(messages, _complaint(self.index.path, malformed))
 
-    def _messages(self, line: Line, *, is_first: bool) -> Iterator[Message]:
+    def _messages(self, line: Line, *, is_first: bool) -> Iterator[tuple[Channel, bytes]]:
         words = self.text[line.begin : line.end].split()
         if line.kind in SCANS:
             offset_m, reach_m = (self.parameters.get(name, 0.0) for name in _PARAMETERS)
             stated = read_scan(words, line.stamp_ns, reach_m, offset_m)
             if is_first:
-                data = pack_transforms(line.stamp_ns, Link("base_link", "laser", stated.mounting))
-                yield self._message(self.mounting, line, data)
-            yield self._message(self.odometry, line, stated.odometry)
-            yield self._message(self.scan, line, stated.scan)
-        elif line.kind == b"ODOM":
-            yield self._message(self.odometry, line, read_pose(words, line.stamp_ns, "odom"))
+                yield self.mounting, pack_transforms(line.stamp_ns, Link("base_link", "laser", stated.mounting))
+            yield self.odometry, stated.odometry
+            yield self.scan, stated.scan
         else:
-            yield self._message(self.truth, line, read_pose(words, line.stamp_ns, "world"))
-
-    def _message(self, channel: Channel, line: Line, data: bytes) -> Message:
-        return Message(channel, line.log_time_ns, memoryview(data))
+            channel, frame = (self.odometry, "odom") if line.kind == b"ODOM" else (self.truth, "world")
+            pose = planar(*_numbers(words[1:], 3))
+            yield channel, pack_odometry(line.stamp_ns, frame, "base_link", pose)
 
     def _find(self) -> Iterator[Line]:
         """Every line of a known kind, in the order of the file."""
@@ -118,46 +141,25 @@ class _Carmen:
             kind = raw[:16].split(maxsplit=1)[0] if raw[:16].strip() else b"#"
             end = begin + len(raw)
             if kind in KINDS:
-                try:
-                    stamp_ns = stamp_of(raw.rsplit(maxsplit=3))
+                try:  # the stamp is the third word from behind, a double like in CARMEN
+                    stamp_ns = int(float(raw.rsplit(maxsplit=3)[-3]) * 1e9)
+                except (ValueError, IndexError, OverflowError):
+                    stamp_ns = -1
+                if not 0 <= stamp_ns < LATEST_NS:
+                    self.malformed.append(number)
+                else:
                     line_ns = max(stamp_ns, log_ns)
                     if kind in SCANS:
                         line_ns = log_ns = max(stamp_ns, log_ns + _LEAST_STEP_NS)
                     yield Line(kind, begin, end, number, stamp_ns, line_ns)
-                except (ValueError, IndexError, OverflowError):
-                    self.malformed.append(number)
             elif kind == b"PARAM":
-                self._parameter(raw.split())
+                words = raw.split()
+                if len(words) > 2 and words[1] in _PARAMETERS:
+                    with suppress(ValueError):
+                        self.parameters[words[1]] = float(words[2])
             elif not kind.startswith(b"#"):
                 self.others[kind] += 1
             begin = end
-
-    def _parameter(self, words: list[bytes]) -> None:
-        if len(words) > 2 and words[1] in _PARAMETERS:
-            try:
-                self.parameters[words[1]] = float(words[2])
-            except ValueError:
-                self.others[b"PARAM"] += 1
-
-    def _block(self, begin: int) -> None:
-        lines = self.lines[begin : begin + _LINES_A_BLOCK]
-        kinds = Counter(line.kind for line in lines)
-        scans = sum(kinds[kind] for kind in SCANS)
-        counts = {
-            self.mounting: int(0 <= self.first_scan - begin < len(lines)),
-            self.odometry: scans + kinds[b"ODOM"],
-            self.scan: scans,
-            self.truth: kinds[b"TRUEPOS"],
-        }
-        size = lines[-1].end - lines[0].begin
-        add_block(self.index, begin, size, [line.log_time_ns for line in lines], counts)
-
-    def _summarize(self) -> None:
-        if self.malformed:
-            self.index.note_damage(_complaint(self.index.path, self.malformed))
-        if self.others:
-            listed = ", ".join(f"{count} {kind.decode('ascii', 'replace')}" for kind, count in self.others.items())
-            self.index.notes.append(f"{self.index.path}: lines of kinds that are not read: {listed}")
 
 
 def _complaint(path: Source, malformed: list[int]) -> str:
@@ -166,34 +168,12 @@ def _complaint(path: Source, malformed: list[int]) -> str:
     return f"{path}: {counted(len(malformed), 'malformed line')} left out (the first: line {malformed[0]})"
 
 
-class Line(NamedTuple):
-    """Offset of a line in the text, its kind, and its log time."""
-
-    kind: bytes
-    begin: int
-    end: int
-    number: int
-    stamp_ns: int
-    log_time_ns: int
-
-
 class CarmenScan(NamedTuple):
     """A laser line: the scan and the robot's pose, each as a message; ``mounting`` is the laser on the robot."""
 
     scan: bytes
     odometry: bytes
     mounting: Place
-
-
-def stamp_of(words: list[bytes]) -> int:
-    """Nanoseconds of a line's own stamp, the third word from behind, as a double like in CARMEN.
-
-    Raises ValueError or IndexError where that is none.
-    """
-    stamp_ns = int(float(words[-3]) * 1e9)
-    if not 0 <= stamp_ns < LATEST_NS:
-        raise ValueError(f"{stamp_ns} ns is no stamp")
-    return stamp_ns
 
 
 def read_scan(words: list[bytes], stamp_ns: int, max_range_m: float, offset_m: float) -> CarmenScan:
@@ -228,11 +208,6 @@ def read_scan(words: list[bytes], stamp_ns: int, max_range_m: float, offset_m: f
     return CarmenScan(scan, pack_odometry(stamp_ns, "odom", "base_link", planar(*robot)), mounting)
 
 
-def read_pose(words: list[bytes], stamp_ns: int, frame: str) -> bytes:
-    """The first three numbers of an ODOM or TRUEPOS line. Raises ValueError where they are none."""
-    return pack_odometry(stamp_ns, frame, "base_link", planar(*_numbers(words[1:], 3)))
-
-
 def planar(x_m: float, y_m: float, yaw_rad: float) -> Place:
     """A pose in the plane."""
     return Place(x_m, y_m, 0.0, 0.0, 0.0, math.sin(0.5 * yaw_rad), math.cos(0.5 * yaw_rad))
@@ -256,19 +231,13 @@ def read_text(path: Path) -> tuple[bytes, str]:
 
     Raises InputError where it cannot be read or unpacks to more than any log does.
     """
-    text, damage = _unpacked(path, _AT_ONCE)
-    return _unpacked(path, _CLOSELY) if damage else (text, damage)
-
-
-def _unpacked(path: Path, at_once: int) -> tuple[bytes, str]:
-    """As ``read_text``, so many bytes of text at once; damage among them loses all of these."""
     text = bytearray()
     try:
         with path.open("rb") as file:
             head, most = file.read(3), min(_MOST_BYTES, _LEAST_BYTES + _MOST_RATIO * path.stat().st_size)
         opened = bz2.open if head == b"BZh" else gzip.open if head[:2] == b"\x1f\x8b" else Path.open
         with opened(path, "rb") as file:
-            while block := file.read1(at_once):
+            while block := file.read1(_AT_ONCE):
                 text += block
                 if len(text) > most:
                     raise InputError(f"{path}: unpacks to more than {most:,} bytes; is it a CARMEN log?")

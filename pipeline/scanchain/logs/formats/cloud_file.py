@@ -77,11 +77,6 @@ def read_cloud_file(path: Path, raw: np.dtype[np.void] = XYZI) -> NDArray[np.voi
     return rows[numbers].astype(point, copy=False)
 
 
-def read_xyzi(path: Path) -> NDArray[np.void]:
-    """The points of a file of float32 x, y, z, intensity, as KITTI and others write them."""
-    return read_raw(path, XYZI)
-
-
 def read_raw(path: Path, point: np.dtype[np.void]) -> NDArray[np.void]:
     """The points of a file without a header."""
     size = path.stat().st_size

@@ -135,9 +135,8 @@ def raw_point(files: Sequence[Path]) -> np.dtype[np.void]:
     """Layout of a point in .bin files, without a header: float32 or float64, x y z and up to three columns more.
 
     A few files vote, since some may be damaged; a layout must divide the size of most. Of several the one whose
-    columns differ most from each other in mean and spread is taken: numbers that are cut into wrong rows mix them,
-    so that all columns are equal. x, y, z, intensity where no other is more likely. Raises CloudFileError
-    where none fits.
+    columns differ most in mean and spread is taken: numbers that are cut into wrong rows mix them, so that all
+    columns are equal. x, y, z, intensity where no other is more likely. Raises CloudFileError where none fits.
     """
     sizes = [file.stat().st_size for file in files]
     filled = [file for file, size in zip(files, sizes, strict=True) if size]
@@ -155,48 +154,40 @@ def _likely_layout(sample: NDArray[np.uint8], sizes: Sequence[int]) -> np.dtype[
     """Likely layout of the points of one file, None where no layout fits."""
     for kind in (np.dtype("<f4"), np.dtype("<f8")):
         values = sample[: len(sample) - len(sample) % kind.itemsize].view(kind)
-        if not _are_plausible(values):
-            continue
-        contrasts = {
-            columns: _contrast(values, columns)
+        with np.errstate(invalid="ignore"):  # a damaged number may be a signaling NaN
+            values = values.astype(np.float64)
+        magnitude = np.abs(values)
+        are_small = (magnitude == 0.0) | np.isnan(magnitude) | ((magnitude > _SMALLEST) & (magnitude < _LARGEST))
+        fitting = [
+            columns
             for columns in _LIKELY_COLUMNS
             if 2 * sum(size % (columns * kind.itemsize) == 0 for size in sizes) > len(sizes)  # some may be broken
-        }
-        if contrasts:
+        ]
+        if fitting and are_small.mean() > _MOSTLY:  # random bits would not
+            contrasts = {columns: _contrast(_finite_rows(values, columns)) for columns in fitting}
             best = max(contrasts, key=lambda columns: contrasts[columns])
             if contrasts[best] < _NOTHING:
-                best = next(iter(contrasts))
-            if best == 6 and 3 in contrasts and _repeats(values):
-                best = 3
-            return point_of_columns(kind, best)
+                best = fitting[0]
+            is_repeated = best == 6 and 3 in fitting and _repeats(_finite_rows(values, 6))
+            return point_of_columns(kind, 3 if is_repeated else best)
     return None
 
 
-def _are_plausible(values: NDArray[np.floating]) -> bool:
-    """True if bytes read as such numbers look like meters and the like: random bits would not."""
-    with np.errstate(invalid="ignore"):
-        size = np.abs(values.astype(np.float64))
-    return bool(np.mean((size == 0.0) | np.isnan(size) | ((size > _SMALLEST) & (size < _LARGEST))) > _MOSTLY)
+def _finite_rows(values: NDArray[np.float64], columns: int) -> NDArray[np.float64]:
+    rows = values[: len(values) - len(values) % columns].reshape(-1, columns)
+    return rows[np.isfinite(rows).all(axis=1)]
 
 
-def _contrast(values: NDArray[np.floating], columns: int) -> float:
+def _contrast(rows: NDArray[np.float64]) -> float:
     """Difference of columns in mean and spread, in spreads of all numbers."""
-    rows = _finite_rows(values, columns)
     if len(rows) < _FEWEST_ROWS:
         return 0.0
     spread = float(rows.std()) or 1.0
     return float(np.ptp(rows.mean(axis=0)) + np.ptp(rows.std(axis=0))) / spread
 
 
-def _repeats(values: NDArray[np.floating]) -> bool:
+def _repeats(rows: NDArray[np.float64]) -> bool:
     """True if rows of six numbers are two of three: the fourth to sixth columns are as the first to third."""
-    rows = _finite_rows(values, 6)
     mean, spread = rows.mean(axis=0).reshape(2, 3), rows.std(axis=0).reshape(2, 3)
     near = _ALIKE * spread.max(axis=0) + _HARDLY * rows.std()
     return bool(((np.ptp(mean, axis=0) <= near) & (np.ptp(spread, axis=0) <= near)).all())
-
-
-def _finite_rows(values: NDArray[np.floating], columns: int) -> NDArray[np.float64]:
-    with np.errstate(invalid="ignore"):  # a damaged number may be a signaling NaN
-        rows = values[: len(values) - len(values) % columns].astype(np.float64).reshape(-1, columns)
-    return rows[np.isfinite(rows).all(axis=1)]

@@ -16,9 +16,9 @@ from numpy.linalg import LinAlgError
 from scanchain import lie
 from scanchain.data import Matrix, Pose
 from scanchain.errors import InputError
-from scanchain.logs.formats.cloud_file import CloudFileError, read_xyzi
+from scanchain.logs.formats.cloud_file import XYZI, CloudFileError, read_raw
 from scanchain.logs.formats.on_demand import add_block, add_channel, natural_order, on_demand_index
-from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
+from scanchain.logs.mcap.records import Block, Contents, FileIndex, Message
 from scanchain.logs.writing.pack import LATEST_NS, pack_cloud, pack_odometry, place
 from scanchain.words import counted
 
@@ -123,32 +123,33 @@ def _index(index: FileIndex, files: Sequence[Path], times_ns: Sequence[int], tru
         if wanted is not None and channel.key[1] not in wanted:
             return Contents([], "")
         if block.offset == _TRUTH:
-            return _truth_messages(channel, truth)
-        return _sweep(channel, files[block.offset], block.start_ns)
+            said = [(each, pack_odometry(each, "world", "velodyne", place(T))) for each, T in truth]
+            return Contents([Message(channel, each, memoryview(data)) for each, data in said], "")
+        file, stamp_ns = files[block.offset], block.start_ns
+        try:
+            data = pack_cloud(stamp_ns, "velodyne", read_raw(file, XYZI))
+        except (CloudFileError, OSError) as error:
+            return Contents([], f"{file}: {error}; it was left out")
+        return Contents([Message(channel, stamp_ns, memoryview(data))], "")
 
     index.make = make
     return index
 
 
-def _sweep(channel: Channel, file: Path, stamp_ns: int) -> Contents:
-    try:
-        data = pack_cloud(stamp_ns, "velodyne", read_xyzi(file))
-    except (CloudFileError, OSError) as error:
-        return Contents([], f"{file}: {error}; it was left out")
-    return Contents([Message(channel, stamp_ns, memoryview(data))], "")
-
-
-def _truth_messages(channel: Channel, truth: Truth) -> Contents:
-    messages = []
-    for stamp_ns, T_world_lidar in truth:
-        data = pack_odometry(stamp_ns, "world", "velodyne", place(T_world_lidar))
-        messages.append(Message(channel, stamp_ns, memoryview(data)))
-    return Contents(messages, "")
-
-
 def read_times(file: Path) -> list[int]:
     """Nanoseconds of each line ``2011-09-26 13:02:25.594360375``, which is taken as UTC."""
-    return [_parsed(file, number, line) for number, line in enumerate(_lines(file), start=1)]
+    times_ns = []
+    for number, line in enumerate(map(str.strip, _lines(file)), start=1):
+        try:
+            whole, _, fraction = line.partition(".")
+            moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
+            stamp_ns = int(moment.timestamp()) * _NS + int(fraction.ljust(9, "0")[:9])
+            if not 0 <= stamp_ns < LATEST_NS:
+                raise ValueError("before 1970 or after 2038")
+        except ValueError as error:
+            raise InputError(f"{file}: line {number} is no time ({line!r}); download it again") from error
+        times_ns.append(stamp_ns)
+    return times_ns
 
 
 def read_seconds(file: Path) -> list[int]:
@@ -161,16 +162,19 @@ def read_seconds(file: Path) -> list[int]:
 
 def read_calibration(file: Path) -> Pose:
     """The (4, 4) transform of a ``calib_*_to_*.txt`` with its lines ``R:`` and ``T:``."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = _entry(file, "R", (3, 3)), _entry(file, "T", (3,))
+    return T
+
+
+def _entry(file: Path, name: str, shape: tuple[int, ...]) -> Matrix:
+    """The numbers of the line ``name: numbers``."""
     entries = dict(line.split(":", 1) for line in _lines(file) if ":" in line)
     try:
-        T = np.eye(4)
-        T[:3, :3] = np.array(entries["R"].split(), np.float64).reshape(3, 3)
-        T[:3, 3] = np.array(entries["T"].split(), np.float64)
+        return np.array(entries[name].split(), np.float64).reshape(shape)
     except (KeyError, ValueError) as error:
-        raise InputError(
-            f"{file}: has no lines R: and T: of 9 and 3 numbers ({error}); download it again"
-        ) from error
-    return T
+        count = int(np.prod(shape))
+        raise InputError(f"{file}: has no line {name}: of {count} numbers ({error}); download it again") from error
 
 
 def read_oxts(folder: Path, T_lidar_imu: Pose) -> Matrix:
@@ -200,13 +204,7 @@ def read_camera_poses(file: Path, calibration: Path) -> Matrix:
     rows = _table(file, 12)
     T_world_camera = np.tile(np.eye(4), (len(rows), 1, 1))
     T_world_camera[:, :3] = rows.reshape(-1, 3, 4)
-    entries = dict(line.split(":", 1) for line in _lines(calibration) if ":" in line)
-    try:
-        T_camera_lidar = np.vstack(
-            [np.array(entries["Tr"].split(), np.float64).reshape(3, 4), [0.0, 0.0, 0.0, 1.0]]
-        )
-    except (KeyError, ValueError) as error:
-        raise InputError(f"{calibration}: has no line Tr: of 12 numbers ({error}); download it again") from error
+    T_camera_lidar = np.vstack([_entry(calibration, "Tr", (3, 4)), [0.0, 0.0, 0.0, 1.0]])
     T_world_lidar = T_world_camera @ T_camera_lidar
     return np.linalg.inv(T_world_lidar[0]) @ T_world_lidar
 
@@ -219,18 +217,6 @@ def _turn(angles_rad: Matrix, axis: int) -> Matrix:
     R[:, b, a] = np.sin(angles_rad)
     R[:, a, b] = -R[:, b, a]
     return R
-
-
-def _parsed(file: Path, number: int, line: str) -> int:
-    whole, _, fraction = line.strip().partition(".")
-    try:
-        moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
-        stamp_ns = int(moment.timestamp()) * _NS + int(fraction.ljust(9, "0")[:9])
-        if not 0 <= stamp_ns < LATEST_NS:
-            raise ValueError("before 1970 or after 2038")
-        return stamp_ns
-    except ValueError as error:
-        raise InputError(f"{file}: line {number} is no time ({line.strip()!r}); download it again") from error
 
 
 def _table(file: Path, columns: int) -> Matrix:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple, Protocol, TypeVar
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,10 +23,7 @@ from scanchain.logs.writing.writer import LogWriter
 from scanchain.source import Source
 from scanchain.words import counted
 
-T = TypeVar("T")
-
 _TOPIC, _FRAME = "/points", "lidar"
-_TUPLE = "a tuple (stamp_s, points, times_s or None)"
 
 
 class ScanFormat(Protocol):
@@ -68,58 +66,48 @@ def index_scans(path: Path, number: int, name: str, source: Source | None = None
 
 def _write(destination: Path, path: Path, name: str) -> int:
     """Write the scans that the class reads of a path; returns their number."""
-    written, dimension = 0, 0
+    make = load_format(name)
+    written, dimension, end = 0, 0, object()
     with LogWriter(destination) as log:
-        for scan in _scans(path, name):
+        with _blaming(f"{path}: {name}"):
+            scans = iter(make(path).scans())
+        for written in count():
             where = f"{path}: scan {written} of {name}"
-            checked = _checked(scan, where)
-            d = checked.points.shape[1]
+            with _blaming(where):
+                scan = next(scans, end)
+            if scan is end:
+                break
+            stamp_ns, points, times_s = _checked(scan, where)
+            d = points.shape[1]
             dimension = dimension or d
             if d != dimension:
                 raise InputError(
                     f"{where} has points (N, {d}), the scans before it (N, {dimension}); yield one kind"
                 )
-            points = np.pad(checked.points, ((0, 0), (0, 3 - d)))  # in the plane z = 0, by which it is known as 2D
-            log.point_cloud(_TOPIC, checked.stamp_ns, _FRAME, points, times_s=checked.times_s, time_field="time")
-            written += 1
+            points = np.pad(points, ((0, 0), (0, 3 - d)))  # in the plane z = 0, by which it is known as 2D
+            log.point_cloud(_TOPIC, stamp_ns, _FRAME, points, times_s=times_s, time_field="time")
     if not written:
         raise InputError(f"{path}: {name} yields no scan of it; check the path and the format")
     return written
 
 
-def _scans(path: Path, name: str) -> Iterator[object]:
-    """Scans of the class; whatever goes wrong in it is an InputError that says where."""
-    make = load_format(name)
-    scans = _guarded(lambda: iter(make(path).scans()), f"{path}: {name}")
-    end = object()
-    for place in count():
-        scan = _guarded(lambda: next(scans, end), f"{path}: scan {place} of {name}")
-        if scan is end:
-            return
-        yield scan
-
-
-def _guarded(call: Callable[[], T], where: str) -> T:
+@contextmanager
+def _blaming(where: str) -> Iterator[None]:
+    """Make an InputError that says where of whatever goes wrong in the user's own code."""
     try:
-        return call()
+        yield
     except InputError:
         raise
-    except Exception as error:  # of the user's own code
+    except Exception as error:
         last = traceback.extract_tb(error.__traceback__)[-1]
-        reason = one_line(error)
         line = f"{Path(last.filename).name}, line {last.lineno}"
-        raise InputError(f"{where} failed with {type(error).__name__}: {reason} ({line})") from error
+        raise InputError(f"{where} failed with {type(error).__name__}: {one_line(error)} ({line})") from error
 
 
-class _Checked(NamedTuple):
-    stamp_ns: int
-    points: NDArray[np.float32]
-    times_s: NDArray[np.float32] | None
-
-
-def _checked(scan: object, where: str) -> _Checked:
+def _checked(scan: object, where: str) -> tuple[int, NDArray[np.float32], NDArray[np.float32] | None]:
+    """Stamp in nanoseconds, points (N, d) and their times of what the class yielded. Raises InputError."""
     if not isinstance(scan, tuple) or len(scan) != 3:
-        raise InputError(f"{where} is {shown(scan)}; wanted {_TUPLE}")
+        raise InputError(f"{where} is {shown(scan)}; wanted a tuple (stamp_s, points, times_s or None)")
     stamp_s, points, times_s = scan
     try:
         stamp_ns = round(float(stamp_s) * 1e9)
@@ -136,4 +124,4 @@ def _checked(scan: object, where: str) -> _Checked:
     if array.shape[1:] not in ((2,), (3,)):
         raise InputError(f"{where} has the points {shown(points)}; wanted (N, 2) or (N, 3) numbers in meters")
     times = point_times(times_s, f"{where}: times_s", len(array))
-    return _Checked(stamp_ns, array, times if len(times) else None)
+    return stamp_ns, array, times if len(times) else None

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from scanchain.data import Matrix
-from scanchain.errors import InputError
 from scanchain.simulation.motion import Motion, Vehicle
-from scanchain.simulation.routes import Laps, Pivot, Pivots, begun_at
+from scanchain.simulation.routes import Pivot, begun_at, laps, pivots
 from scanchain.simulation.solids import Solids
-from scanchain.simulation.worlds import corridor, forest, highway, identical, office, sparse, staircase, town
+from scanchain.simulation.worlds import indoor, outdoor
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,31 +48,26 @@ class World:
         reverse : drive the route the other way round; start_m : begin so far along it
         """
         if isinstance(self.route, tuple):
-            return Pivots(self.route, self.vehicle, solids, duration_s=duration_s, rng=rng)
+            return pivots(self.route, self.vehicle, solids, duration_s=duration_s, rng=rng)
         route = begun_at(self.route[::-1] if reverse else self.route, start_m)
-        return Laps(route, self.vehicle, solids, duration_s=duration_s, rng=rng)
+        return laps(route, self.vehicle, solids, duration_s=duration_s, rng=rng)
 
 
 _GAPS = ((0.0, 40.0), (25.0, 0.0))  # a crossing that is turned at, the middle of a street
 
 WORLDS: dict[str, World] = {
-    "office": World(office.office, office.ROUTE, office.ROBOT, "lms-270", 240.0),
-    "town": World(town.town, town.ROUTE, town.CAR, "hdl-64", 60.0),
-    "rounds": World(town.rounds, town.ROUNDS_ROUTE, town.ROUNDS_CAR, "hdl-64", 160.0),
-    "identical": World(identical.identical, identical.ROUTE, office.ROBOT, "lms-270", 300.0),
-    "highway": World(highway.highway, highway.ROUTE, highway.CAR, "hdl-64", 30.0),
-    "corridor": World(corridor.corridor, corridor.ROUTE, corridor.ROBOT, "os1-32", 40.0, corridor.SIGHT_M),
-    "field": World(sparse.field, sparse.FIELD_ROUTE, sparse.TRACTOR, "hdl-64", 40.0, sparse.FIELD_SIGHT_M),
-    "forest": World(forest.forest, forest.ROUTE, forest.MULE, "os1-32", 30.0),
-    "staircase": World(staircase.staircase, staircase.ROUTE, staircase.WALKER, "os1-32", 40.0),
-    "hall": World(sparse.hall, sparse.HALL_ROUTE, sparse.TRUCK, "vlp-16", 25.0),
-    "turns": World(sparse.yard, sparse.YARD_STEPS, sparse.YARD_ROBOT, "os1-32", 40.0),
-    "gap": World(town.town, town.ROUTE, town.CAR, "hdl-64", 30.0, dropouts=_GAPS),
+    "office": World(indoor.office, indoor.OFFICE_ROUTE, indoor.OFFICE_ROBOT, "lms-270", 240.0),
+    "town": World(outdoor.town, outdoor.TOWN_ROUTE, outdoor.TOWN_CAR, "hdl-64", 60.0),
+    "rounds": World(outdoor.rounds, outdoor.ROUNDS_ROUTE, outdoor.ROUNDS_CAR, "hdl-64", 160.0),
+    "identical": World(indoor.identical, indoor.IDENTICAL_ROUTE, indoor.OFFICE_ROBOT, "lms-270", 300.0),
+    "highway": World(outdoor.highway, outdoor.HIGHWAY_ROUTE, outdoor.HIGHWAY_CAR, "hdl-64", 30.0),
+    "corridor": World(
+        indoor.corridor, indoor.CORRIDOR_ROUTE, indoor.CORRIDOR_ROBOT, "os1-32", 40.0, indoor.CORRIDOR_SIGHT_M
+    ),
+    "field": World(outdoor.field, outdoor.FIELD_ROUTE, outdoor.TRACTOR, "hdl-64", 40.0, outdoor.FIELD_SIGHT_M),
+    "forest": World(outdoor.forest, outdoor.FOREST_ROUTE, outdoor.MULE, "os1-32", 30.0),
+    "staircase": World(indoor.staircase, indoor.STAIRCASE_ROUTE, indoor.WALKER, "os1-32", 40.0),
+    "hall": World(indoor.hall, indoor.HALL_ROUTE, indoor.TRUCK, "vlp-16", 25.0),
+    "turns": World(outdoor.yard, outdoor.YARD_STEPS, outdoor.YARD_ROBOT, "os1-32", 40.0),
+    "gap": World(outdoor.town, outdoor.TOWN_ROUTE, outdoor.TOWN_CAR, "hdl-64", 30.0, dropouts=_GAPS),
 }
-
-
-def find_world(name: str) -> World:
-    """The world of that name."""
-    if name not in WORLDS:
-        raise InputError(f"world {name!r} does not exist; choose one of {', '.join(WORLDS)}")
-    return WORLDS[name]

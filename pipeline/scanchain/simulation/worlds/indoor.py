@@ -1,0 +1,386 @@
+"""Worlds inside of buildings: an office, an identical floor, a corridor, a hall, a stairwell.
+
+The office has rooms along a corridor that runs in a ring around a core; the identical floor three corridors of
+identical rooms, which scans do not tell apart. The corridor is 80 m long with bare walls between two lobbies: in
+its middle the motion along it is unobservable. The hall is large, with few pillars; the stairwell has four storys
+and is walked up and down with the lidar in the hand.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from scanchain.data import Matrix
+from scanchain.simulation.motion import Vehicle, mount
+from scanchain.simulation.routes import sampled
+from scanchain.simulation.solids import Scenery, Solids
+from scanchain.simulation.worlds.interior import CEILING_M, Furnisher, Room, Wall, build_wall
+
+# the office
+
+_OFFICE_WIDTH_M, _OFFICE_DEPTH_M = 26.0, 18.0
+OFFICE_ROBOT = Vehicle(
+    speed_m_s=1.0,
+    acceleration_m_s2=0.5,
+    lateral_acceleration_m_s2=0.5,
+    corner_m=0.6,
+    deviation_m=0.05,
+    sway_rad=0.0,
+    heave_m=0.0,
+    radius_m=0.25,
+    T_base_lidar=mount(0.15, 0.25),
+)
+
+# Round the ring by two rooms; then again, across the core, and by two more rooms.
+OFFICE_ROUTE = np.array([
+    [5.0, 5.0], [8.0, 5.0], [8.0, 2.0], [13.0, 2.0], [13.0, 5.0], [21.0, 5.0], [21.0, 13.0], [5.0, 13.0],
+    [5.0, 5.0], [21.0, 5.0], [21.0, 13.0], [12.7, 13.0], [12.7, 5.0], [21.0, 5.0], [21.0, 13.0], [17.0, 13.0],
+    [17.0, 16.0], [9.0, 16.0], [9.0, 13.0], [5.0, 13.0],
+])  # fmt: skip
+
+
+_WALLS = (
+    Wall(0, 0, 26, 0), Wall(26, 0, 26, 18), Wall(26, 18, 0, 18), Wall(0, 18, 0, 0),
+    Wall(0, 4, 26, 4, (4.5, 8.0, 13.0, 18.2, 21.6), -1), Wall(0, 14, 26, 14, (4.4, 9.0, 17.0, 21.4), 1),
+    Wall(4, 4, 4, 14, (2.2, 7.6), 1), Wall(22, 4, 22, 14, (3.0, 6.4), -1),
+    Wall(5.6, 0, 5.6, 4), Wall(10.3, 0, 10.3, 4, (2.0,)), Wall(15.9, 0, 15.9, 4), Wall(20.4, 0, 20.4, 4),
+    Wall(5.2, 14, 5.2, 18), Wall(12.6, 14, 12.6, 18, (2.0,)), Wall(20.2, 14, 20.2, 18),
+    Wall(0, 8.7, 4, 8.7), Wall(22, 9.4, 26, 9.4),
+    Wall(6, 6, 20, 6, (6.7, 12.4), 1), Wall(6, 12, 20, 12, (6.7,), -1),
+    Wall(6, 6, 6, 12), Wall(20, 6, 20, 12, (1.6,)), Wall(10.5, 6, 10.5, 12), Wall(15.2, 6, 15.2, 12),
+)  # fmt: skip
+
+_ROOMS = (
+    Room(0, 0, 5.6, 4), Room(5.6, 0, 10.3, 4), Room(10.3, 0, 15.9, 4), Room(15.9, 0, 20.4, 4),
+    Room(20.4, 0, 26, 4), Room(0, 14, 5.2, 18), Room(5.2, 14, 12.6, 18), Room(12.6, 14, 20.2, 18),
+    Room(20.2, 14, 26, 18), Room(0, 4, 4, 8.7), Room(0, 8.7, 4, 14), Room(22, 4, 26, 9.4), Room(22, 9.4, 26, 14),
+    Room(10.5, 6, 15.2, 12), Room(15.2, 6, 20, 12),
+)  # fmt: skip
+
+
+def office(rng: np.random.Generator) -> Solids:
+    """The floor; walls and doorways stand where they stand, furniture and door leaves are drawn from ``rng``."""
+    scenery = Scenery()
+    scenery.box(
+        (0.5 * _OFFICE_WIDTH_M, 0.5 * _OFFICE_DEPTH_M),
+        (_OFFICE_WIDTH_M + 1.0, _OFFICE_DEPTH_M + 1.0),
+        (CEILING_M, CEILING_M + 0.2),
+    )
+    for wall in _WALLS:
+        build_wall(scenery, wall, rng)
+    scenery.box((8.25, 9.0), (2.4, 5.88), (0.0, CEILING_M))  # lift shaft in the closed part of the core
+    _line_corridor(scenery, rng)
+    doors = np.array([wall.at(place) for wall in _WALLS for place in wall.doors])
+    furnisher = Furnisher(scenery, sampled(OFFICE_ROUTE, 0.05), doors, rng)
+    for room in _ROOMS:
+        furnisher.furnish(room)
+    return scenery.finish()
+
+
+def _line_corridor(scenery: Scenery, rng: np.random.Generator) -> None:
+    """Pillars at the corners of the core, cupboards, a copier and plants along the corridor's walls."""
+    for x, y in ((6.0, 6.0), (20.0, 6.0), (6.0, 12.0), (20.0, 12.0)):
+        scenery.box((x, y), (0.4, 0.4), (0.0, CEILING_M))
+    for x, y, size_x, size_y in (
+        (10.6, 4.26, 1.2, 0.4), (16.0, 5.74, 1.6, 0.4), (11.2, 12.26, 0.9, 0.4), (18.9, 12.28, 0.7, 0.45),
+        (4.26, 10.2, 0.4, 1.0), (21.74, 9.0, 0.4, 1.6), (7.2, 13.76, 1.5, 0.36), (5.76, 8.4, 0.36, 1.2),
+    ):  # fmt: skip
+        scenery.box((x, y), (size_x, size_y), (0.0, rng.uniform(0.8, 1.9)))
+    for place in ((14.6, 4.28), (4.3, 4.3), (21.7, 13.7), (14.9, 13.72), (5.72, 10.8), (20.26, 7.0)):
+        scenery.cylinder(place, rng.uniform(0.12, 0.2), (0.0, 0.9))
+
+
+# the identical floor
+
+_ROOMS_A_SIDE, _ROOM_M, _ROOM_DEPTH_M = 8, 5.0, 6.0  # on each side of a corridor, along it and across it
+_FLOOR_M = _ROOMS_A_SIDE * _ROOM_M
+_AISLE_HALF_M = 1.0  # of a corridor's width
+_CORRIDORS_Y_M = (0.0, 14.0, 28.0)  # their middles; rooms lie back to back between them
+_WEST_M, _EAST_M = -_AISLE_HALF_M, _FLOOR_M + _AISLE_HALF_M  # middles of the two corridors that join them
+
+# Along each corridor and through rooms of each, back through the first one, and round by two rooms to the start.
+IDENTICAL_ROUTE = np.array([
+    [7.5, 0.0], [27.5, 0.0], [27.5, -4.0], [32.5, -4.0], [32.5, 0.0], [_EAST_M, 0.0], [_EAST_M, 14.0],
+    [22.5, 14.0], [22.5, 10.0], [17.5, 10.0], [17.5, 14.0], [_WEST_M, 14.0], [_WEST_M, 28.0], [7.5, 28.0],
+    [7.5, 32.0], [12.5, 32.0], [12.5, 28.0], [_EAST_M, 28.0], [_EAST_M, 0.0], [32.5, 0.0], [32.5, -4.0],
+    [27.5, -4.0], [27.5, 0.0], [12.5, 0.0], [12.5, 4.0], [7.5, 4.0],
+])  # fmt: skip
+
+# In every room: middle of a piece of furniture, from the room's, and how long, wide and high it is.
+_FURNITURE_M = np.array([
+    [1.7, 2.4, 1.4, 0.8, 0.74], [1.5, 1.6, 0.45, 0.45, 0.9], [-1.75, 2.65, 1.2, 0.4, 1.9],
+    [-2.15, -1.8, 0.4, 1.2, 1.2], [2.15, -2.0, 0.5, 0.6, 2.0],
+])  # fmt: skip
+
+
+def identical(rng: np.random.Generator) -> Solids:
+    """The floor; what ``rng`` draws is the same in all rooms."""
+    furniture = _FURNITURE_M + rng.uniform(-0.1, 0.1, _FURNITURE_M.shape)
+    scenery = Scenery()
+    middle = (0.5 * _FLOOR_M, _CORRIDORS_Y_M[1])
+    scenery.box(middle, (_FLOOR_M + 6.0, 46.0), (CEILING_M, CEILING_M + 0.2))
+    for wall in _identical_walls():
+        build_wall(scenery, wall, rng)
+    for y in _CORRIDORS_Y_M:
+        for side in (-1.0, 1.0):
+            for room in range(_ROOMS_A_SIDE):
+                _furnish_alike(
+                    scenery,
+                    (room + 0.5) * _ROOM_M,
+                    y + side * (_AISLE_HALF_M + 0.5 * _ROOM_DEPTH_M),
+                    side,
+                    furniture,
+                )
+    return scenery.finish()
+
+
+def _identical_walls() -> list[Wall]:
+    """Every corridor's two sides, the walls between its rooms and behind them, and the two ends of the floor."""
+    doors = tuple((room + 0.5) * _ROOM_M for room in range(_ROOMS_A_SIDE))
+    walls: list[Wall] = []
+    for y in _CORRIDORS_Y_M:
+        for side in (-1.0, 1.0):
+            near, far = y + side * _AISLE_HALF_M, y + side * (_AISLE_HALF_M + _ROOM_DEPTH_M)
+            walls.append(Wall(0.0, near, _FLOOR_M, near, doors))
+            walls.append(Wall(0.0, far, _FLOOR_M, far))
+            for room in range(_ROOMS_A_SIDE + 1):
+                x = room * _ROOM_M
+                walls.append(Wall(x, near, x, far, (0.5 * _ROOM_DEPTH_M,) if 0 < room < _ROOMS_A_SIDE else ()))
+    south, north = _CORRIDORS_Y_M[0] - _AISLE_HALF_M, _CORRIDORS_Y_M[-1] + _AISLE_HALF_M
+    for inner, outer in ((0.0, 2.0 * _WEST_M), (_FLOOR_M, _FLOOR_M + 2.0 * _AISLE_HALF_M)):
+        walls.append(Wall(outer, south, outer, north))
+        walls += [Wall(min(inner, outer), y, max(inner, outer), y) for y in (south, north)]
+    return walls
+
+
+def _furnish_alike(scenery: Scenery, x: float, y: float, side: float, furniture: Matrix) -> None:
+    """The same furniture in the room around (x, y); rooms on the two sides of a corridor are turned by 180°."""
+    yaw_rad = 0.0 if side > 0.0 else np.pi
+    for u, v, length, width, height in furniture:
+        with scenery.movable():
+            scenery.box((x + side * u, y + side * v), (length, width), (0.0, height), yaw_rad)
+
+
+# the corridor
+
+CORRIDOR_M = 80.0
+CORRIDOR_SIGHT_M = 20.0  # range limit by dust in the air: neither end can be seen from the middle
+CORRIDOR_STRUCTURE_M = 5.0  # of the corridor at either end that is not bare
+_CORRIDOR_HALF_M, _CORRIDOR_HEIGHT_M, _CORRIDOR_WALL_M = 1.5, 2.7, 0.3
+_LOBBY_M, _LOBBY_HALF_M = 9.0, 4.5
+
+CORRIDOR_ROBOT = Vehicle(
+    speed_m_s=2.5,
+    acceleration_m_s2=0.8,
+    lateral_acceleration_m_s2=0.8,
+    corner_m=0.7,
+    deviation_m=0.08,
+    sway_rad=0.004,
+    heave_m=0.004,
+    radius_m=0.35,
+    T_base_lidar=mount(0.1, 0.9),
+)
+
+# To the other lobby on the right, round in it, and back.
+CORRIDOR_ROUTE = np.array([
+    [-3.0, -0.4], [83.0, -0.4], [84.5, -2.2], [86.5, -2.0], [86.5, 2.0], [84.5, 2.2], [83.0, 0.4],
+    [-3.0, 0.4], [-4.5, 2.2], [-6.5, 2.0], [-6.5, -2.0], [-4.5, -2.2],
+])  # fmt: skip
+
+
+def corridor(rng: np.random.Generator) -> Solids:
+    """The corridor along x from 0 to 80 m; what stands in the lobbies and at the ends is drawn from ``rng``."""
+    scenery = Scenery()
+    middle, span = 0.5 * CORRIDOR_M, CORRIDOR_M + 2.0 * _LOBBY_M + 2.0
+    scenery.box((middle, 0.0), (span, 2.0 * _LOBBY_HALF_M + 2.0), (_CORRIDOR_HEIGHT_M, _CORRIDOR_HEIGHT_M + 0.3))
+    for side in (-1.0, 1.0):
+        y = side * (_CORRIDOR_HALF_M + 0.5 * _CORRIDOR_WALL_M)
+        scenery.box((middle, y), (CORRIDOR_M, _CORRIDOR_WALL_M), (0.0, _CORRIDOR_HEIGHT_M))
+    for end, outwards in ((0.0, -1.0), (CORRIDOR_M, 1.0)):
+        _lobby(scenery, end, outwards)
+        _furnish_lobby(scenery, end, outwards, rng)
+        for place in rng.uniform([0.5, 2.0, 3.5], [1.5, 3.0, CORRIDOR_STRUCTURE_M - 0.2]):
+            size = (rng.uniform(0.1, 0.3), rng.uniform(0.05, 0.2))
+            for side in (-1.0, 1.0):
+                center = (float(end - outwards * place), side * (_CORRIDOR_HALF_M - 0.5 * size[1]))
+                scenery.box(center, size, (0.0, _CORRIDOR_HEIGHT_M))
+    return scenery.finish()
+
+
+def _lobby(scenery: Scenery, end: float, outwards: float) -> None:
+    """The walls of a lobby; the corridor opens in the middle of the one at x = ``end``."""
+    far = end + outwards * (_LOBBY_M + 0.5 * _CORRIDOR_WALL_M)
+    scenery.box(
+        (far, 0.0), (_CORRIDOR_WALL_M, 2.0 * _LOBBY_HALF_M + 2.0 * _CORRIDOR_WALL_M), (0.0, _CORRIDOR_HEIGHT_M)
+    )
+    for side in (-1.0, 1.0):
+        y = side * (_LOBBY_HALF_M + 0.5 * _CORRIDOR_WALL_M)
+        scenery.box((end + outwards * 0.5 * _LOBBY_M, y), (_LOBBY_M, _CORRIDOR_WALL_M), (0.0, _CORRIDOR_HEIGHT_M))
+        width = _LOBBY_HALF_M - _CORRIDOR_HALF_M
+        center = (end - outwards * 0.5 * _CORRIDOR_WALL_M, side * (_CORRIDOR_HALF_M + 0.5 * width))
+        scenery.box(center, (_CORRIDOR_WALL_M, width), (0.0, _CORRIDOR_HEIGHT_M))
+
+
+def _furnish_lobby(scenery: Scenery, end: float, outwards: float, rng: np.random.Generator) -> None:
+    """Cupboards and benches along the lobby's walls, a plant in two corners."""
+    for depth in (1.2, 3.5, 5.8):
+        for side in (-1.0, 1.0):
+            size = (rng.uniform(0.6, 1.8), rng.uniform(0.3, 0.7))
+            x = end + outwards * (depth + rng.uniform(-0.2, 0.2))
+            scenery.box((x, side * (_LOBBY_HALF_M - 0.5 * size[1])), size, (0.0, rng.uniform(0.45, 2.1)))
+    for y in (-2.5, rng.uniform(-0.5, 0.5), 2.5):
+        size = (rng.uniform(0.3, 0.8), rng.uniform(0.5, 1.6))
+        x = end + outwards * (_LOBBY_M - 0.5 * size[0])
+        scenery.box((x, y + rng.uniform(-0.3, 0.3)), size, (0.0, rng.uniform(0.5, 2.2)))
+    for side in (-1.0, 1.0):
+        corner = (end + outwards * (_LOBBY_M - 0.4), side * (_LOBBY_HALF_M - 0.4))
+        scenery.cylinder(corner, rng.uniform(0.15, 0.25), (0.0, rng.uniform(0.4, 1.8)))
+
+
+# the hall
+
+_HALL_LENGTH_M, _HALL_WIDTH_M, _HALL_HEIGHT_M, _HALL_WALL_M = 60.0, 40.0, 9.0, 0.4
+_PILLARS = ((15.0, 20.0), (30.0, 20.0), (45.0, 20.0))
+
+TRUCK = Vehicle(
+    speed_m_s=5.0,
+    acceleration_m_s2=5.0,
+    lateral_acceleration_m_s2=4.0,
+    corner_m=6.5,
+    deviation_m=0.3,
+    sway_rad=0.0,
+    heave_m=0.0,
+    radius_m=0.7,
+    T_base_lidar=mount(0.4, 1.3),
+    standstill_s=2.0,
+)
+
+HALL_ROUTE = np.array([[12.0, 9.0], [51.0, 9.0], [51.0, 31.0], [9.0, 31.0], [9.0, 9.0]])
+
+
+def hall(rng: np.random.Generator) -> Solids:
+    """Walls, ceiling, three pillars in a row and four stacks of pallets drawn from ``rng``."""
+    scenery = Scenery()
+    middle = (0.5 * _HALL_LENGTH_M, 0.5 * _HALL_WIDTH_M)
+    scenery.box(middle, (_HALL_LENGTH_M + 2.0, _HALL_WIDTH_M + 2.0), (_HALL_HEIGHT_M, _HALL_HEIGHT_M + 0.3))
+    for side in (0.0, 1.0):
+        outside = (2.0 * side - 1.0) * 0.5 * _HALL_WALL_M
+        scenery.box(
+            (middle[0], side * _HALL_WIDTH_M + outside),
+            (_HALL_LENGTH_M + 2.0 * _HALL_WALL_M, _HALL_WALL_M),
+            (0.0, _HALL_HEIGHT_M),
+        )
+        scenery.box(
+            (side * _HALL_LENGTH_M + outside, middle[1]), (_HALL_WALL_M, _HALL_WIDTH_M), (0.0, _HALL_HEIGHT_M)
+        )
+    for x, y in _PILLARS:
+        scenery.box((x, y), (0.6, 0.6), (0.0, _HALL_HEIGHT_M))
+    for x in rng.uniform([3.0, 22.0, 36.0, 54.0], [6.0, 27.0, 40.0, 57.0]):
+        y = float(rng.choice([1.0, _HALL_WIDTH_M - 1.0]))
+        scenery.box((float(x), y), (rng.uniform(1.2, 3.6), 1.2), (0.0, rng.uniform(0.6, 2.2)))
+    return scenery.finish()
+
+
+# the stairwell
+
+_FLIGHTS, _STEPS_A_FLIGHT = 8, 10
+_TREAD_M, _RISE_M = 0.29, 0.17
+_RUN_M, _FLIGHT_M = _STEPS_A_FLIGHT * _TREAD_M, _STEPS_A_FLIGHT * _RISE_M
+_LANE_M, _STAIR_HALF_M, _LANDING_M = (
+    0.8,
+    1.6,
+    1.7,
+)  # middle of a flight from the axis, half width, depth of a landing
+_TOP_M = _FLIGHTS * _FLIGHT_M
+_ROOF_M = _TOP_M + 2.8
+
+WALKER = Vehicle(
+    speed_m_s=0.8,
+    acceleration_m_s2=0.8,
+    lateral_acceleration_m_s2=0.5,
+    corner_m=0.3,
+    deviation_m=0.05,
+    sway_rad=0.05,
+    heave_m=0.03,
+    radius_m=0.3,
+    T_base_lidar=mount(0.3, 1.4),
+    swing_rad=0.08,
+    swing_m=0.03,
+)
+
+
+def _staircase_route() -> Matrix:
+    """Up all flights, round on the top landing, down again, and round on the ground; heights of the feet."""
+    up = []
+    for flight in range(_FLIGHTS):
+        y = -_LANE_M if flight % 2 == 0 else _LANE_M
+        first, last = (0.0, _RUN_M) if flight % 2 == 0 else (_RUN_M, 0.0)
+        outside = 0.75 if flight % 2 == 0 else -0.75
+        low, high = flight * _FLIGHT_M, (flight + 1) * _FLIGHT_M
+        up += [[first, y, low], [last, y, high], [last + outside, y, high], [last + outside, -y, high]]
+    up = up[:-2]  # the last landing is turned round on
+    top = [[-0.8, 0.7, _TOP_M], [-0.9, -0.5, _TOP_M], [-0.4, -0.5, _TOP_M], [-0.3, 0.2, _TOP_M]]
+    ground = [[-0.8, -0.7, 0.0], [-0.9, 0.5, 0.0], [-0.4, 0.5, 0.0], [-0.3, -0.2, 0.0]]
+    return np.array([*ground[1:], *up, *top, *up[::-1], ground[0]])
+
+
+STAIRCASE_ROUTE = _staircase_route()
+
+
+def staircase(rng: np.random.Generator) -> Solids:
+    """The stairwell: flights along x, landings at either end; doors, radiators and pipes drawn from ``rng``."""
+    scenery = Scenery()
+    _shaft(scenery)
+    for flight in range(_FLIGHTS):
+        _flight(scenery, flight)
+        _landing(scenery, flight, rng)
+    _furnish_landing(scenery, 0.0, -_LANDING_M, -1.0, rng)
+    for y in (-_STAIR_HALF_M + 0.1, _STAIR_HALF_M - 0.1):
+        scenery.cylinder((-_LANDING_M + 0.1, y), rng.uniform(0.03, 0.08), (0.0, _ROOF_M))
+    return scenery.finish()
+
+
+def _shaft(scenery: Scenery) -> None:
+    """Four walls and a roof."""
+    middle, length = 0.5 * _RUN_M, _RUN_M + 2.0 * _LANDING_M
+    scenery.box((middle, 0.0), (length + 1.0, 2.0 * _STAIR_HALF_M + 1.0), (_ROOF_M, _ROOF_M + 0.2))
+    for side in (-1.0, 1.0):
+        scenery.box((middle, side * (_STAIR_HALF_M + 0.1)), (length + 0.4, 0.2), (0.0, _ROOF_M))
+        scenery.box((middle + side * (0.5 * length + 0.1), 0.0), (0.2, 2.0 * _STAIR_HALF_M), (0.0, _ROOF_M))
+
+
+def _flight(scenery: Scenery, flight: int) -> None:
+    """Steps as slabs one above the other, a railing along the well in the middle."""
+    side = -1.0 if flight % 2 == 0 else 1.0
+    low, width = flight * _FLIGHT_M, _STAIR_HALF_M - 0.1
+    for step in range(_STEPS_A_FLIGHT):
+        along = (step + 0.5) * _TREAD_M
+        x, top = (along if side < 0.0 else _RUN_M - along), low + (step + 1) * _RISE_M
+        scenery.box((x, side * (0.1 + 0.5 * width)), (_TREAD_M, width), (top - _RISE_M - 0.12, top))
+        scenery.cylinder((x, side * 0.13), 0.015, (top, top + 0.85))
+        scenery.box((x, side * 0.13), (_TREAD_M, 0.05), (top + 0.85, top + 0.9))
+
+
+def _landing(scenery: Scenery, flight: int, rng: np.random.Generator) -> None:
+    """The slab at the upper end of a flight and what stands at its wall."""
+    far, outwards = (_RUN_M, 1.0) if flight % 2 == 0 else (0.0, -1.0)
+    level = (flight + 1) * _FLIGHT_M
+    scenery.box((far + outwards * 0.5 * _LANDING_M, 0.0), (_LANDING_M, 2.0 * _STAIR_HALF_M), (level - 0.2, level))
+    _furnish_landing(scenery, level, far + outwards * _LANDING_M, outwards, rng)
+
+
+def _furnish_landing(
+    scenery: Scenery, level: float, wall: float, outwards: float, rng: np.random.Generator
+) -> None:
+    """A door's frame on a floor, a radiator and a window sill half way; sometimes an extinguisher."""
+    y = rng.uniform(-0.5, 0.5)
+    if outwards < 0.0:
+        for side in (-0.5, 0.5):
+            scenery.box((wall - outwards * 0.04, y + side), (0.08, 0.1), (level, level + 2.1))
+        scenery.box((wall - outwards * 0.04, y), (0.08, 1.1), (level + 2.1, level + 2.2))
+    else:
+        scenery.box((wall - outwards * 0.06, y), (0.12, rng.uniform(0.6, 1.2)), (level + 0.12, level + 0.7))
+        scenery.box((wall - outwards * 0.1, y), (0.2, 1.4), (level + 0.95, level + 1.0))
+    if rng.random() < 0.6:
+        corner = (wall - outwards * 0.12, float(rng.choice([-1.0, 1.0])) * (_STAIR_HALF_M - 0.3))
+        scenery.cylinder(corner, 0.09, (level + 0.5, level + 1.0))
