@@ -15,6 +15,7 @@ import zstandard
 from scanchain.errors import one_line
 from scanchain.logs.mcap.records import (
     CHANNEL,
+    MALFORMED,
     MESSAGE,
     MESSAGE_HEAD,
     SCHEMA,
@@ -22,6 +23,7 @@ from scanchain.logs.mcap.records import (
     Contents,
     FileIndex,
     Message,
+    read_definition,
     records_of,
 )
 from scanchain.words import counted
@@ -43,10 +45,8 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
     met = undefined = 0
     try:
         for opcode, begin, end in records_of(payload):
-            if opcode == SCHEMA:
-                index.add_schema(payload, begin)
-            elif opcode == CHANNEL:
-                index.add_channel(payload, begin)
+            if opcode in (SCHEMA, CHANNEL):
+                index.define(read_definition(opcode, bytes(payload[begin:end])))
             elif opcode == MESSAGE:
                 number, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(payload, begin)
                 met += 1
@@ -56,7 +56,7 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
                     messages.append(Message(channel, log_time_ns, payload[begin + MESSAGE_HEAD.size : end]))
             else:
                 raise struct.error("record of no kind that a chunk may hold")
-    except (struct.error, UnicodeDecodeError):
+    except MALFORMED:
         damage = "a record in it is malformed; what follows was left out"
         return Contents(messages, "" if block.is_cut else f"{_name(index, block)}: {damage}")
     stated = sum(entry.messages for entry in block.entries)

@@ -8,22 +8,23 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
-from typing import NamedTuple, TypeAlias
+from io import BytesIO
+from typing import NamedTuple
+
+import mcap.records
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
 
 from scanchain.source import Source
 from scanchain.words import counted
 
 MAGIC = b"\x89MCAP0\r\n"
-FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = 2, 3, 4, 5, 6, 7, 8
-STATISTICS, DATA_END = 0x0B, 0x0F
+SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = 3, 4, 5, 6, 7
 RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-
-_CRC = struct.Struct("<I")
-_CRC_AT = RECORD.size + 24  # of a chunk record
-_LONGEST_STRING = 1 << 24  # longest name or definition in bytes; a longer one is damage
-
-Bytes: TypeAlias = memoryview | mmap.mmap | bytes
+CHUNK_HEAD = struct.Struct("<BQQQQII")  # record, start, end, uncompressed size, CRC-32, length of a name
+MALFORMED = (McapError, struct.error, UnicodeDecodeError)  # raised on reading a record that is none
+_MOST_BEHIND = 256  # bytes behind a definition; a longer rest is that of another record with a damaged opcode
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +95,7 @@ class Block:
     @property
     def chunk_offset(self) -> int:
         """Offset of a chunk's record, its head included."""
-        return self.offset - (_CRC_AT + 16 + len(self.compression) if self.is_chunk else 0)
+        return self.offset - (CHUNK_HEAD.size + len(self.compression) + 8 if self.is_chunk else 0)
 
     @property
     def may_be_empty(self) -> bool:
@@ -138,7 +139,7 @@ class FileIndex:
             return self.bytes_at(block.offset, block.size), block.crc
         head = block.offset - block.chunk_offset
         record = self.bytes_at(block.chunk_offset, head + block.size)
-        return record[head:], _CRC.unpack_from(record, _CRC_AT)[0]
+        return record[head:], CHUNK_HEAD.unpack_from(record)[5]
 
     def bytes_at(self, offset: int, size: int) -> memoryview:
         """A part of an MCAP file, wherever it lies."""
@@ -146,20 +147,16 @@ class FileIndex:
             return memoryview(self.fetch(offset, size))
         return memoryview(self.data)[offset : offset + size]
 
-    def add_schema(self, body: Bytes, offset: int) -> None:
-        """Take in the schema record whose body starts at the offset."""
-        (number,) = struct.unpack_from("<H", body, offset)
-        (name, encoding, definition), _ = read_strings(body, offset + 2, 3)
-        self.schemas[number] = (name.decode(), encoding.decode(), definition)
-
-    def add_channel(self, body: Bytes, offset: int) -> None:
-        """Take in the channel record whose body starts at the offset; one that is fully known stays."""
-        number, schema = struct.unpack_from("<HH", body, offset)
-        if not self.knows(number):
-            (topic, encoding), _ = read_strings(body, offset + 4, 2)
-            known = self.schemas.get(schema, ("", "", b""))
-            key = (self.number, number)
-            self.channels[number] = Channel(key, topic.decode(), encoding.decode(), schema, *known)
+    def define(self, record: mcap.records.Schema | mcap.records.Channel) -> None:
+        """Take in a schema, or a channel; a channel that is fully known stays."""
+        if isinstance(record, mcap.records.Schema):
+            self.schemas[record.id] = (record.name, record.encoding, record.data)
+        elif not self.knows(record.id):
+            schema = self.schemas.get(record.schema_id, ("", "", b""))
+            key = (self.number, record.id)
+            self.channels[record.id] = Channel(
+                key, record.topic, record.message_encoding, record.schema_id, *schema
+            )
 
     def numbers_of(self, topic: str) -> list[int]:
         """Ids of the channels of a topic."""
@@ -200,16 +197,13 @@ def records_of(data: memoryview | bytes) -> Iterator[tuple[int, int, int]]:
         yield opcode, begin, offset
 
 
-def read_strings(data: Bytes, offset: int, count: int) -> tuple[list[bytes], int]:
-    """Strings with their lengths before them, and the byte behind the last."""
-    strings = []
-    for _ in range(count):
-        begin = offset + 4
-        offset = begin + struct.unpack_from("<I", data, offset)[0]
-        if offset > min(len(data), begin + _LONGEST_STRING):
-            raise struct.error("string beyond the end")
-        strings.append(bytes(data[begin:offset]))
-    return strings, offset
+def read_definition(opcode: int, body: bytes) -> mcap.records.Schema | mcap.records.Channel:
+    """The schema or channel that a record defines. Raises one of MALFORMED."""
+    stream = ReadDataStream(BytesIO(body))
+    record = (mcap.records.Schema if opcode == SCHEMA else mcap.records.Channel).read(stream)
+    if stream.count + _MOST_BEHIND < len(body):
+        raise struct.error("definition of another length than its record")
+    return record
 
 
 def name_of(indexes: Sequence[FileIndex]) -> str:
