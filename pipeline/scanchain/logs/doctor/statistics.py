@@ -15,13 +15,13 @@ from scanchain.errors import InputError
 from scanchain.logs.log import Log
 from scanchain.logs.mcap.selection import whole_span
 from scanchain.logs.mcap.stream import decoded_messages
-from scanchain.logs.messages.cdr import MalformedMessageError
 from scanchain.logs.messages.laser_scan import LaserScanDecoder, LaserScanMessage
 from scanchain.logs.messages.point_cloud import PointCloudDecoder, PointCloudMessage, column
 from scanchain.logs.messages.point_times import PointTimes
 from scanchain.logs.messages.poses import StampedPose
 from scanchain.logs.messages.readers import is_scan
 from scanchain.logs.messages.returns import Returns
+from scanchain.logs.messages.ros import MalformedMessageError
 from scanchain.words import grouped
 
 _PERCENT = np.arange(101)

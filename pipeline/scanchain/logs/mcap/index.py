@@ -89,16 +89,20 @@ def walked(index: FileIndex) -> FileIndex:
     data, walk = index.data, _Walk(index)
     index.is_consistent = False
     sought: tuple[int, ...] = ()
+    chunk = 0  # the last one; records behind it may be none, met by a length that is wrong
     offset, end = len(MAGIC), _record_end(index, len(MAGIC))
     while not _is_end(data, offset):
         following = _record_end(index, end) if end else 0
         if end and (following or _is_end(data, end)):
             walk.take(offset, end)
+            chunk = offset if data[offset] == CHUNK else chunk
             offset, end = end, following
             continue
         sought = sought or _sought(index)
-        resumed = _next_record(index, offset + 1, sought) or max(data.rfind(_DATA_END, offset + 1), 0)
-        if end and (_chunk_at(index, offset) or not 0 < resumed < end):
+        is_chunk = _chunk_at(index, offset) is not None
+        searched = 1 + (chunk if sought == (CHUNK,) and not is_chunk else offset)
+        resumed = _next_record(index, searched, sought) or max(data.rfind(_DATA_END, offset + 1), 0)
+        if end and (is_chunk or not 0 < resumed < end):
             walk.take(offset, end)
             offset = end
         if not resumed:
@@ -109,7 +113,8 @@ def walked(index: FileIndex) -> FileIndex:
             f"{index.path}: the record at byte {where} is damaged; reading went on at byte {resumed}"
         )
         walk.close(where, complete=False)
-        offset, end = resumed, _record_end(index, resumed)
+        chunk = offset = resumed
+        end = _record_end(index, offset)
     else:
         walk.close(offset, complete=True)
         _take_uncertain(index, offset)

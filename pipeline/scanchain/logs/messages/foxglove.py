@@ -16,10 +16,10 @@ from msgspec import Struct, field
 
 from scanchain.data import Pose
 from scanchain.logs.mcap.records import Channel
-from scanchain.logs.messages.cdr import MalformedMessageError
 from scanchain.logs.messages.laser_scan import LaserScanMessage
 from scanchain.logs.messages.point_cloud import PointCloudMessage, PointField
-from scanchain.logs.messages.poses import StampedPose, pose_matrix
+from scanchain.logs.messages.poses import StampedPose, pose_of
+from scanchain.logs.messages.ros import MalformedMessageError
 
 _POINT_FIELD = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}  # foxglove.NumericType to sensor_msgs/PointField
 
@@ -136,7 +136,9 @@ def point_cloud(message: JsonPointCloud) -> PointCloudMessage:
     if not message.point_stride:
         raise MalformedMessageError("point_stride is zero")
     count = len(message.data) // message.point_stride
-    fields = [PointField(field.name, field.offset, _POINT_FIELD.get(field.type, 0), 1) for field in message.fields]
+    fields = tuple(
+        PointField(field.name, field.offset, _POINT_FIELD.get(field.type, 0), 1) for field in message.fields
+    )
     return PointCloudMessage(
         stamp_ns=_stamp_ns(message.timestamp),
         frame=message.frame_id,
@@ -147,7 +149,6 @@ def point_cloud(message: JsonPointCloud) -> PointCloudMessage:
         point_step=message.point_stride,
         row_step=count * message.point_stride,
         data=memoryview(message.data),
-        described=repr((message.point_stride, fields)).encode(),
         T_frame_cloud=_unless_identity(message.pose),
     )
 
@@ -180,9 +181,8 @@ def _unless_identity(pose: JsonPose) -> Pose | None:
 
 def _pose(position: JsonVector, orientation: JsonQuaternion, dimension: int) -> Pose:
     """A pose; a quaternion that was left out, zero, turns nothing."""
-    quaternion = (orientation.x, orientation.y, orientation.z, orientation.w)
-    quaternion = quaternion if any(quaternion) else (0.0, 0.0, 0.0, 1.0)
-    return pose_matrix((position.x, position.y, position.z, *quaternion), dimension)
+    is_given = any((orientation.x, orientation.y, orientation.z, orientation.w))
+    return pose_of(position, orientation if is_given else JsonQuaternion(w=1.0), dimension)
 
 
 def parse_json(data: memoryview, kind: type[T]) -> T:
