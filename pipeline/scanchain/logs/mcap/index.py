@@ -91,15 +91,15 @@ def walked(index: FileIndex) -> FileIndex:
     sought: tuple[int, ...] = ()
     chunk = 0  # the last one; records behind it may be none, met by a length that is wrong
     offset, end = len(MAGIC), _record_end(index, len(MAGIC))
-    while not _is_end(data, offset):
+    while end or not _is_whole_summary(index, offset):
         following = _record_end(index, end) if end else 0
         if end and (following or _is_end(data, end)):
             walk.take(offset, end)
             chunk = offset if data[offset] == CHUNK else chunk
             offset, end = end, following
             continue
-        sought = sought or _sought(index)
         is_chunk = _chunk_at(index, offset) is not None
+        sought = sought or _sought(index)
         searched = 1 + (chunk if sought == (CHUNK,) and not is_chunk else offset)
         resumed = _next_record(index, searched, sought) or max(data.rfind(_DATA_END, offset + 1), 0)
         if end and (is_chunk or not 0 < resumed < end):
@@ -115,9 +115,7 @@ def walked(index: FileIndex) -> FileIndex:
         walk.close(where, complete=False)
         chunk = offset = resumed
         end = _record_end(index, offset)
-    else:
-        walk.close(offset, complete=True)
-        _take_uncertain(index, offset)
+    walk.close(offset, complete=True)
     if walk.private:
         index.damage.append(
             f"{index.path}: passed over {counted(len(walk.private), 'record')} of unknown kinds, "
@@ -195,15 +193,18 @@ def _indexed(chunk: ChunkIndex, file: int) -> Block:
     )
 
 
-def _take_uncertain(index: FileIndex, offset: int) -> None:
-    """Take in the channels of a summary that was not accepted, the last resort; note where it is damaged."""
+def _is_whole_summary(index: FileIndex, offset: int) -> bool:
+    """True if the data end here and a summary ends the file; its channels are taken in as a last resort."""
+    if not _is_end(index.data, offset):
+        return False
     uncertain = FileIndex(index.path, index.number, b"", channels=index.uncertain_channels)
     try:
         for record in _records(index.data[offset:]):
             if isinstance(record, Schema | Channel):
                 uncertain.define(record)
     except MALFORMED:
-        index.damage.append(f"{index.path}: its summary, from byte {offset} on, is damaged or cut off")
+        return False
+    return True
 
 
 def _map(path: Path) -> mmap.mmap:
@@ -258,10 +259,14 @@ class _Walk:
 
     def cut_off(self, offset: int) -> None:
         """End the walk at the record that is not all there; of a chunk the beginning is retained."""
-        index, size = self.index, len(self.index.data)
-        self.close(offset, complete=False)
+        index, size, is_end = self.index, len(self.index.data), _is_end(self.index.data, offset)
+        self.close(offset, complete=is_end)
         where = f", inside the record at byte {offset}" if offset + RECORD.size <= size else ""
-        index.damage.append(f"{index.path}: cut off at byte {size}{where}, without the closing magic")
+        index.damage.append(
+            f"{index.path}: the summary at byte {offset} is damaged or cut off"
+            if is_end
+            else f"{index.path}: cut off at byte {size}{where}, without the closing magic"
+        )
         chunk = _chunk_at(index, offset)
         if chunk is not None:
             self._take_chunk(chunk, offset)
