@@ -11,7 +11,7 @@ from __future__ import annotations
 import mmap
 import struct
 import zlib
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import lru_cache
@@ -93,7 +93,7 @@ def walked(index: FileIndex) -> FileIndex:
     offset, end = len(MAGIC), _record_end(index, len(MAGIC))
     while end or not _is_whole_summary(index, offset):
         following = _record_end(index, end) if end else 0
-        if end and (following or _is_end(data, end)):
+        if end and (following or _is_end(data, end)) and not walk.is_shortened(offset, end):
             walk.take(offset, end)
             chunk = offset if data[offset] == CHUNK else chunk
             offset, end = end, following
@@ -234,6 +234,7 @@ class _Walk:
         self.loose_from = -1
         self.loose_times: list[int] = []
         self.loose_counts: Counter[int] = Counter()
+        self.loose_sizes: deque[int] = deque(maxlen=8)  # of the records met last
 
     def take(self, offset: int, end: int) -> None:
         """Sort in the record of these bytes."""
@@ -256,6 +257,13 @@ class _Walk:
         else:
             self.close(offset, complete=True)
             self.private += [offset] if opcode >= _PRIVATE else []
+
+    def is_shortened(self, offset: int, end: int) -> bool:
+        """True if a loose message ends in a whole one of a size met lately: so many bytes of it are missing."""
+        data, sizes = self.index.data, [size for size in self.loose_sizes if size < end - offset]
+        return data[offset] == MESSAGE and any(
+            RECORD.unpack_from(data, end - size) == (MESSAGE, size - RECORD.size) for size in sizes
+        )
 
     def cut_off(self, offset: int) -> None:
         """End the walk at the record that is not all there; of a chunk the beginning is retained."""
@@ -292,6 +300,8 @@ class _Walk:
         channel, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(self.index.data, offset + RECORD.size)
         if self.loose_from < 0:
             self.loose_from = offset
+        if end - offset not in self.loose_sizes:
+            self.loose_sizes.append(end - offset)
         self.loose_times.append(log_time_ns)
         self.loose_counts[channel] += 1
         if end - self.loose_from > _LOOSE_BYTES:
