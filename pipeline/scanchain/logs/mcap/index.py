@@ -12,14 +12,14 @@ import mmap
 import struct
 import zlib
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
-from mcap.records import Channel, ChunkIndex, McapRecord, Schema, Statistics
+from mcap.records import Channel, ChunkIndex, Schema, Statistics
 from mcap.stream_reader import StreamReader
 
 from scanchain.errors import InputError
@@ -140,15 +140,8 @@ def _summary(read: Callable[[int, int], bytes], size: int, *, needs_crc: bool) -
 
 def _take_summary(index: FileIndex, summary: bytes, size: int) -> bool:
     """Fill the index by the summary of a file of this size; False where that does not give every message."""
-    statistics = None
     try:
-        for record in _records(summary):
-            if isinstance(record, Schema | Channel):
-                index.define(record)
-            elif isinstance(record, ChunkIndex):
-                index.blocks.append(_indexed(record, index.number))
-            elif isinstance(record, Statistics):
-                statistics = record
+        statistics = _fill(index, summary)
     except MALFORMED:
         return False
     if statistics is None or statistics.chunk_count != len(index.blocks):
@@ -164,9 +157,17 @@ def _take_summary(index: FileIndex, summary: bytes, size: int) -> bool:
     )
 
 
-def _records(summary: bytes) -> Iterator[McapRecord]:
-    """The records up to the closing magic. Raises one of MALFORMED."""
-    return StreamReader(BytesIO(summary), skip_magic=True, emit_chunks=True).records
+def _fill(index: FileIndex, summary: bytes) -> Statistics | None:
+    """Take in the records up to the closing magic; the statistics among them. Raises one of MALFORMED."""
+    statistics = None
+    for record in StreamReader(BytesIO(summary), skip_magic=True, emit_chunks=True).records:
+        if isinstance(record, Schema | Channel):
+            index.define(record)
+        elif isinstance(record, ChunkIndex):
+            index.blocks.append(_indexed(record, index.number))
+        elif isinstance(record, Statistics):
+            statistics = record
+    return statistics
 
 
 def _indexed(chunk: ChunkIndex, file: int) -> Block:
@@ -199,9 +200,7 @@ def _is_whole_summary(index: FileIndex, offset: int) -> bool:
         return False
     uncertain = FileIndex(index.path, index.number, b"", channels=index.uncertain_channels)
     try:
-        for record in _records(index.data[offset:]):
-            if isinstance(record, Schema | Channel):
-                uncertain.define(record)
+        _fill(uncertain, index.data[offset:])
     except MALFORMED:
         return False
     return True

@@ -11,8 +11,16 @@ from numpy.typing import NDArray
 
 from scanchain.config import LogConfig
 from scanchain.errors import InputError
-from scanchain.logs.mcap.blocks import DamagedBlockError, read_block
-from scanchain.logs.mcap.records import Block, Channel, FileIndex, Message, damage_of, name_of
+from scanchain.logs.mcap.records import (
+    Block,
+    Channel,
+    DamagedBlockError,
+    FileIndex,
+    Message,
+    damage_of,
+    name_of,
+    read_block,
+)
 from scanchain.words import duration
 
 

@@ -34,15 +34,7 @@ class JsonStamp(Struct, frozen=True):
 
 
 class JsonVector(Struct, frozen=True):
-    """Meters."""
-
-    x: float = 0.0
-    y: float = 0.0
-    z: float = 0.0
-
-
-class JsonQuaternion(Struct, frozen=True):
-    """All zero where it was left out."""
+    """Meters, or with w a quaternion, all zero where it was left out."""
 
     x: float = 0.0
     y: float = 0.0
@@ -54,7 +46,7 @@ class JsonPose(Struct, frozen=True):
     """Position and orientation."""
 
     position: JsonVector = JsonVector()
-    orientation: JsonQuaternion = JsonQuaternion()
+    orientation: JsonVector = JsonVector()
 
 
 class JsonLaserScan(Struct, frozen=True):
@@ -101,7 +93,7 @@ class JsonFrameTransform(Struct, frozen=True):
     parent_frame_id: str
     child_frame_id: str
     translation: JsonVector = JsonVector()
-    rotation: JsonQuaternion = JsonQuaternion()
+    rotation: JsonVector = JsonVector()
     timestamp: JsonStamp = JsonStamp()
 
 
@@ -179,10 +171,10 @@ def _unless_identity(pose: JsonPose) -> Pose | None:
     return None if np.array_equal(T, np.eye(4)) else T
 
 
-def _pose(position: JsonVector, orientation: JsonQuaternion, dimension: int) -> Pose:
+def _pose(position: JsonVector, orientation: JsonVector, dimension: int) -> Pose:
     """A pose; a quaternion that was left out, zero, turns nothing."""
     is_given = any((orientation.x, orientation.y, orientation.z, orientation.w))
-    return pose_of(position, orientation if is_given else JsonQuaternion(w=1.0), dimension)
+    return pose_of(position, orientation if is_given else JsonVector(w=1.0), dimension)
 
 
 def parse_json(data: memoryview, kind: type[T]) -> T:

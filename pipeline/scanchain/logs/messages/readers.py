@@ -107,7 +107,7 @@ def reader(channel: Channel) -> Read:
     _, read, json_type = _TYPES[name]
     if read is read_livox:
         return partial(read_livox, encoding=encoding)
-    if encoding in _ROS:
+    if json_type is None:
         package, _, type_name = name.partition("/")
         ros_name = "tf2_msgs/msg/TFMessage" if package == "tf" else f"{package}/msg/{type_name}"
         parse = partial(unpacked, type_name=ros_name, encoding=encoding)
