@@ -181,17 +181,8 @@ def _indexed(chunk: ChunkIndex, file: int) -> Block:
         for (_, channel), begin, end in zip(stated, begins, ends, strict=False)
         if end - begin >= 16
     )
-    return Block(
-        file,
-        end - chunk.compressed_size,
-        chunk.compressed_size,
-        chunk.compression,
-        chunk.uncompressed_size,
-        None,
-        chunk.message_start_time,
-        chunk.message_end_time,
-        entries,
-    )
+    size, times_ns = chunk.compressed_size, (chunk.message_start_time, chunk.message_end_time)
+    return Block(file, end - size, size, chunk.compression, chunk.uncompressed_size, None, *times_ns, entries)
 
 
 def _is_whole_summary(index: FileIndex, offset: int) -> bool:
@@ -209,14 +200,13 @@ def _is_whole_summary(index: FileIndex, offset: int) -> bool:
 def _map(path: Path) -> mmap.mmap:
     try:
         with path.open("rb") as file:
-            if path.stat().st_size == 0:
-                raise InputError(f"{path}: is empty (0 bytes); record or copy it again")
             data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file; check the path") from error
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise InputError(f"{path}: cannot be read ({reason}); check its permissions") from error
+    except ValueError as error:
+        raise InputError(f"{path}: is empty (0 bytes); record or copy it again") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
     if data[: len(MAGIC)] != MAGIC:
         raise InputError(f"{path}: is not an MCAP file (starts with {data[:8]!r}); see scanchain convert --help")
     return data
@@ -356,7 +346,7 @@ def _chunk_at(index: FileIndex, offset: int) -> Block | None:
     head = index.data[offset : offset + CHUNK_HEAD.size + _LONGEST_NAME + 8]
     if len(head) < CHUNK_HEAD.size + 8:
         return None
-    _, length, start_ns, end_ns, uncompressed, crc, name = CHUNK_HEAD.unpack_from(head)
+    _, length, *times_ns, uncompressed, crc, name = CHUNK_HEAD.unpack_from(head)
     begin = CHUNK_HEAD.size + name + 8
     if begin > len(head):
         return None
@@ -365,17 +355,8 @@ def _chunk_at(index: FileIndex, offset: int) -> Block | None:
         return None
     compression = head[CHUNK_HEAD.size : begin - 8].decode("utf-8", "replace")
     there = len(index.data) - offset - begin
-    return Block(
-        index.number,
-        offset + begin,
-        min(size, there),
-        compression,
-        uncompressed,
-        crc,
-        start_ns,
-        end_ns,
-        is_cut=size > there,
-    )
+    where = index.number, offset + begin, min(size, there)
+    return Block(*where, compression, uncompressed, crc, *times_ns, is_cut=size > there)
 
 
 def _sought(index: FileIndex) -> tuple[int, ...]:
@@ -396,11 +377,7 @@ def _next_record(index: FileIndex, offset: int, sought: tuple[int, ...]) -> int:
         likely = np.isin(window[:-8], sought) & ((window[6:-2] | window[7:-1] | window[8:]) == 0)
         for candidate in (begin + np.flatnonzero(likely)).tolist():
             end = _record_end(index, candidate)
-            is_index = end and data[candidate] == MESSAGE_INDEX
-            if (
-                is_index
-                or _chunk_at(index, candidate)
-                or (end and (_record_end(index, end) or _is_end(data, end)))
-            ):
+            is_sure = data[candidate] == MESSAGE_INDEX or _is_end(data, end)
+            if _chunk_at(index, candidate) or (end and (is_sure or _record_end(index, end))):
                 return candidate
     return 0

@@ -45,20 +45,20 @@ class _Type(NamedTuple):
 _TYPES = {
     "sensor_msgs/LaserScan": _Type(Role.SCAN, read_laser_scan),
     "sensor_msgs/MultiEchoLaserScan": _Type(Role.SCAN, read_multi_echo_scan),
-    "foxglove.LaserScan": _Type(Role.SCAN, foxglove.laser_scan, foxglove.JsonLaserScan),
+    "foxglove.LaserScan": _Type(Role.SCAN, *foxglove.LASER_SCAN),
     "sensor_msgs/PointCloud2": _Type(Role.CLOUD, read_point_cloud),
     "livox_ros_driver2/CustomMsg": _Type(Role.CLOUD, read_livox),
     "livox_ros_driver/CustomMsg": _Type(Role.CLOUD, read_livox),
     "livox_interfaces/CustomMsg": _Type(Role.CLOUD, read_livox),
-    "foxglove.PointCloud": _Type(Role.CLOUD, foxglove.point_cloud, foxglove.JsonPointCloud),
+    "foxglove.PointCloud": _Type(Role.CLOUD, *foxglove.POINT_CLOUD),
     "nav_msgs/Odometry": _Type(Role.ODOMETRY, read_odometry),
     "geometry_msgs/PoseStamped": _Type(Role.POSE, read_pose),
     "geometry_msgs/PoseWithCovarianceStamped": _Type(Role.POSE, read_pose),
-    "foxglove.PoseInFrame": _Type(Role.POSE, foxglove.pose_in_frame, foxglove.JsonPoseInFrame),
+    "foxglove.PoseInFrame": _Type(Role.POSE, *foxglove.POSE_IN_FRAME),
     "tf2_msgs/TFMessage": _Type(Role.TRANSFORMS, read_transforms),
     "tf/tfMessage": _Type(Role.TRANSFORMS, read_transforms),
-    "foxglove.FrameTransform": _Type(Role.TRANSFORMS, foxglove.frame_transform, foxglove.JsonFrameTransform),
-    "foxglove.FrameTransforms": _Type(Role.TRANSFORMS, foxglove.frame_transforms, foxglove.JsonFrameTransforms),
+    "foxglove.FrameTransform": _Type(Role.TRANSFORMS, *foxglove.FRAME_TRANSFORM),
+    "foxglove.FrameTransforms": _Type(Role.TRANSFORMS, *foxglove.FRAME_TRANSFORMS),
 }
 LIDAR_TYPES = tuple(sorted(name for name, each in _TYPES.items() if each.role in (Role.SCAN, Role.CLOUD)))
 
