@@ -418,6 +418,7 @@ def test_a_real_cloud_log_cut_off_gives_the_sweeps_before_the_cut(tmp_path):
     path.write_bytes(whole[:10_000_000])
     scans, damage = recover(path)
     assert 6 <= len(scans) <= 9
+    assert "cut off at byte 10000000" in damage[0] and not any("is damaged" in line for line in damage)
     assert any(f"{len(scans)} scan" in line for line in damage)
 
 

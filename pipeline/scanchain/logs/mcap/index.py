@@ -108,11 +108,12 @@ def walked(index: FileIndex) -> FileIndex:
         if not resumed:
             walk.cut_off(offset)
             break
-        where = min(offset, resumed)
-        index.damage.append(
-            f"{index.path}: the record at byte {where} is damaged; reading went on at byte {resumed}"
-        )
-        walk.close(where, complete=False)
+        if resumed != offset:  # which is that of a chunk that is cut off
+            where = min(offset, resumed)
+            index.damage.append(
+                f"{index.path}: the record at byte {where} is damaged; reading went on at byte {resumed}"
+            )
+            walk.close(where, complete=False)
         chunk = offset = resumed
         end = _record_end(index, offset)
     walk.close(offset, complete=True)
