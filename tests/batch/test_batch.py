@@ -18,6 +18,7 @@ import pytest
 from scanchain.__main__ import main
 from scanchain.batch.batch import collect
 from scanchain.errors import InputError
+from scanchain.logs.writing.pack import ORIGIN, pack_laser_scan, pack_odometry
 from scanchain.logs.writing.writer import LogWriter
 from scanchain.processes import resident_mib
 from scanchain.runs.directory import directory_name
@@ -324,10 +325,12 @@ def test_a_robot_that_stands_still_has_a_result_that_is_found_again(tmp_path, ca
     ranges = 4.0 / np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles)))  # a square room
     with LogWriter(log) as writer:
         for stamp_ns in range(0, 2_000_000_000, 100_000_000):
-            writer.odometry("/ground_truth", stamp_ns, "world", "lidar", np.eye(4))
-            writer.laser_scan(
-                "/scan", stamp_ns, "lidar", 0.0, np.radians(1.0), 0.0, ranges, range_min_m=0.1, range_max_m=20.0
+            pose = pack_odometry(stamp_ns, "world", "lidar", ORIGIN)
+            writer.append("/ground_truth", "nav_msgs/msg/Odometry", pose, stamp_ns)
+            scan = pack_laser_scan(
+                stamp_ns, "lidar", 0.0, np.radians(1.0), ranges, range_min_m=0.1, range_max_m=20.0
             )
+            writer.append("/scan", "sensor_msgs/msg/LaserScan", scan, stamp_ns)
     assert main(["batch", str(log), "--out", str(out)]) == 0
     assert main(["batch", str(log), "--out", str(out)]) == 0
     (row,) = table(out).values()
@@ -379,11 +382,11 @@ def two_lidars(tmp_path):
         with LogWriter(log) as writer:
             for stamp_ns in range(0, 2_000_000_000, 100_000_000):
                 ranges = exact + 1e-3 * random.standard_normal(len(exact))
+                scan = pack_laser_scan(
+                    stamp_ns, "lidar", angles[0], np.radians(0.5), ranges, range_min_m=0.1, range_max_m=20.0
+                )
                 for topic in ("/front", "/rear"):
-                    writer.laser_scan(
-                        topic, stamp_ns, "lidar", angles[0], np.radians(0.5), 0.0, ranges,
-                        range_min_m=0.1, range_max_m=20.0,
-                    )  # fmt: skip
+                    writer.append(topic, "sensor_msgs/msg/LaserScan", scan, stamp_ns)
     return logs
 
 

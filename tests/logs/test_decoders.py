@@ -353,7 +353,8 @@ def test_what_was_assumed_of_the_times_is_told(tmp_path):
 @pytest.mark.parametrize("kind", ["PoseStamped", "PoseWithCovarianceStamped"])
 def test_stamped_poses_lead_where_they_are_asked_for(tmp_path, kind):
     """Of the robot's base: the static transform from base_link says where the lidar is."""
-    pose = bytes(Cdr("<").header(STAMP_NS, "map").pose(3.0, 4.0, 0.5, 6.0).put("d", *[0.0] * 36))
+    covariance = [0.0] * 36 * (kind == "PoseWithCovarianceStamped")
+    pose = bytes(Cdr("<").header(STAMP_NS, "map").pose(3.0, 4.0, 0.5, 6.0).put("d", *covariance))
     said = [
         transforms_said(STAMP_NS, transforms(("base_link", "lidar", 1.0, 2.0, 0.3, 0.1))),
         Said("/gps", f"geometry_msgs/msg/{kind}", STAMP_NS, pose),

@@ -7,7 +7,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from scanchain import lie
 from scanchain.errors import InputError
-from scanchain.logs.writing.pack import schema_text
+from scanchain.logs.writing.pack import Link, pack_laser_scan, pack_odometry, pack_transforms, place, schema_text
 from scanchain.logs.writing.writer import LogWriter
 
 STAMP_NS = 1_700_000_000_123_456_789
@@ -18,6 +18,11 @@ def read_back(path):
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         assert reader.get_header().profile == "ros2"
         return list(reader.iter_decoded_messages())
+
+
+def append_mounting(log, T):
+    data = pack_transforms(STAMP_NS, Link("base_link", "lidar", place(T)))
+    log.append("/tf_static", "tf2_msgs/msg/TFMessage", data, STAMP_NS)
 
 
 def nanoseconds(message):
@@ -38,9 +43,11 @@ def columns(cloud):
 def test_a_laser_scan_survives_any_length_of_frame_name(tmp_path, frame):
     ranges = np.array([1.5, np.inf, 29.75], dtype=np.float32)
     with LogWriter(tmp_path / "a.mcap") as log:
-        log.laser_scan(
-            "/scan", STAMP_NS, frame, -0.5, 0.5, 1e-3, ranges, range_min_m=0.1, range_max_m=30.0, scan_time_s=0.1
-        )
+        data = pack_laser_scan(
+            STAMP_NS, frame, -0.5, 0.5, ranges, range_min_m=0.1, range_max_m=30.0, time_increment_s=1e-3,
+            scan_time_s=0.1,
+        )  # fmt: skip
+        log.append("/scan", "sensor_msgs/msg/LaserScan", data, STAMP_NS)
     ((schema, channel, message, scan),) = read_back(tmp_path / "a.mcap")
     assert (schema.name, schema.encoding) == ("sensor_msgs/msg/LaserScan", "ros2msg")
     assert (channel.topic, channel.message_encoding) == ("/scan", "cdr")
@@ -94,8 +101,9 @@ def test_poses_of_either_dimension_survive_as_odometry_and_static_transform(tmp_
     solid = lie.exp(np.array([1.0, 2.0, 3.0, 0.3, -0.8, 1.9]))
     covariance = np.arange(36.0).reshape(6, 6)
     with LogWriter(tmp_path / "a.mcap") as log:
-        log.static_transform(STAMP_NS, "base_link", "lidar", flat)
-        log.odometry("/odom", STAMP_NS, "odom", "base_link", solid, covariance)
+        append_mounting(log, flat)
+        data = pack_odometry(STAMP_NS, "odom", "base_link", place(solid), covariance)
+        log.append("/odom", "nav_msgs/msg/Odometry", data, STAMP_NS)
     static, odometry = (decoded for *_, decoded in read_back(tmp_path / "a.mcap"))
 
     (transform,) = static.transforms
@@ -125,7 +133,7 @@ def test_every_definition_brings_the_types_it_uses():
 
 def test_a_failure_leaves_no_file_that_looks_complete(tmp_path):
     with pytest.raises(ZeroDivisionError), LogWriter(tmp_path / "a.mcap") as log:
-        log.static_transform(STAMP_NS, "base_link", "lidar", np.eye(4))
+        append_mounting(log, np.eye(4))
         assert not (tmp_path / "a.mcap").exists()
         _ = 1 / 0
     assert list(tmp_path.iterdir()) == []
@@ -138,7 +146,7 @@ def test_an_existing_file_is_replaced_only_on_demand(tmp_path):
         LogWriter(path)
     assert path.read_bytes() == b"precious"
     with LogWriter(path, force=True) as log:
-        log.static_transform(STAMP_NS, "base_link", "lidar", np.eye(4))
+        append_mounting(log, np.eye(4))
     assert len(read_back(path)) == 1
 
 

@@ -18,7 +18,6 @@ from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.logs import open_log
 from scanchain.logs.mcap.records import Channel
-from scanchain.logs.messages.cdr import MalformedMessageError
 from scanchain.logs.messages.laser_scan import LaserScanDecoder
 from scanchain.logs.messages.point_cloud import PointCloudDecoder
 from scanchain.logs.messages.point_times import PointTimes
@@ -31,6 +30,7 @@ from scanchain.logs.messages.readers import (
     reader,
 )
 from scanchain.logs.messages.returns import RangeLimits
+from scanchain.logs.messages.ros import MalformedMessageError
 from tests.support import recorders
 from tests.support.mutations import CHUNK, Seed, cut_and_flipped, cut_at, mutant, mutated_message
 from tests.support.naive_logs import STAMP_NS, cloud_said, odometry, odometry_said, office, point_cloud, write

@@ -22,6 +22,7 @@ from rerun.chunk import RrdReader
 from scanchain.__main__ import main
 from scanchain.comparison.figures import COLUMNS
 from scanchain.comparison.table import read_table
+from scanchain.logs.writing.pack import ORIGIN, pack_laser_scan, pack_odometry
 from scanchain.logs.writing.writer import LogWriter
 from scanchain.maps import read_ply
 from scanchain.runs.metrics import Metrics
@@ -420,10 +421,10 @@ def test_a_lidar_that_stands_still_without_loops_has_a_report_too(tmp_path):
     with LogWriter(tmp_path / "still.mcap") as log:
         for k in range(8):
             stamp_ns = 10**18 + k * 10**8
-            log.laser_scan(
-                "/scan", stamp_ns, "lidar", -1.57, 0.01745, 0.0, ranges_m, range_min_m=0.1, range_max_m=30.0
-            )
-            log.odometry("/ground_truth", stamp_ns, "world", "lidar", np.eye(3))
+            scan = pack_laser_scan(stamp_ns, "lidar", -1.57, 0.01745, ranges_m, range_min_m=0.1, range_max_m=30.0)
+            log.append("/scan", "sensor_msgs/msg/LaserScan", scan, stamp_ns)
+            pose = pack_odometry(stamp_ns, "world", "lidar", ORIGIN)
+            log.append("/ground_truth", "nav_msgs/msg/Odometry", pose, stamp_ns)
     arguments = [
         "run",
         str(tmp_path / "still.mcap"),

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import checks
-from scanchain.data import Matrix, Trajectory
+from scanchain.data import Trajectory
 from scanchain.errors import InputError
+from scanchain.logs.writing.pack import Link, pack_laser_scan, pack_odometry, pack_transforms, place
 from scanchain.logs.writing.writer import LogWriter
 from scanchain.simulation.another_day import write_changes
 from scanchain.simulation.drive import EPOCH_NS, RANGES, WHEELS, Drive, check_range, plan, random_numbers
@@ -101,13 +102,15 @@ def record(
     truth = drive.truth()
     period_ns = drive.sensor.period_ns
     with LogWriter(destination, force=force) as log:
-        log.static_transform(EPOCH_NS, "base_link", "lidar", drive.T_base_lidar)
+        mounting = pack_transforms(EPOCH_NS, Link("base_link", "lidar", place(drive.T_base_lidar)))
+        log.append("/tf_static", "tf2_msgs/msg/TFMessage", mounting, EPOCH_NS)
         end_ns = int(truth.stamps_ns[-1]) - EPOCH_NS + period_ns
         wheels = _Wheels(log, drive.motion, end_ns, drift, wheels_slip, random_numbers(seed, WHEELS, changed))
         for done, sweep in enumerate(_sweeps(drive, random_numbers(seed, RANGES, changed))):
             stamp_ns = int(truth.stamps_ns[done])
             wheels.write_until(stamp_ns - 1)  # in a dropout
-            log.odometry("/ground_truth", stamp_ns, "world", "lidar", truth.poses[done])
+            pose = pack_odometry(stamp_ns, "world", "lidar", place(truth.poses[done]))
+            log.append("/ground_truth", "nav_msgs/msg/Odometry", pose, stamp_ns)
             wheels.write_until(stamp_ns + period_ns)
             _write_sweep(log, sweep, drive.sensor, stamp_ns)
             if progress is not None:
@@ -149,8 +152,9 @@ class _Wheels:
     def write_until(self, time_ns: int) -> None:
         while self._next < len(self._stamps_ns) and self._stamps_ns[self._next] <= time_ns:
             stamp_ns = int(self._stamps_ns[self._next])
-            pose: Matrix = self._poses[self._next]
-            self._log.odometry("/odom", stamp_ns, "odom", "base_link", pose, self._covariance)
+            pose = place(self._poses[self._next])
+            data = pack_odometry(stamp_ns, "odom", "base_link", pose, self._covariance)
+            self._log.append("/odom", "nav_msgs/msg/Odometry", data, stamp_ns)
             self._next += 1
 
 
@@ -164,16 +168,15 @@ def _write_sweep(log: LogWriter, sweep: Sweep, sensor: Sensor, stamp_ns: int) ->
         return
     first, second = sweep.rays.directions[:2]
     angle_min = float(np.arctan2(first[1], first[0]))
-    log.laser_scan(
-        "/scan",
+    data = pack_laser_scan(
         stamp_ns,
         "lidar",
         angle_min,
         float(np.arctan2(second[1], second[0])) - angle_min,
-        float(sweep.rays.instants_ns[-1]) * 1e-9 / (len(sweep.ranges_m) - 1),
         sweep.ranges_m,
         range_min_m=sensor.min_range_m,
         range_max_m=sensor.max_range_m,
+        time_increment_s=float(sweep.rays.instants_ns[-1]) * 1e-9 / (len(sweep.ranges_m) - 1),
         scan_time_s=sensor.period_ns * 1e-9,
-        log_time_ns=end_ns,
     )
+    log.append("/scan", "sensor_msgs/msg/LaserScan", data, stamp_ns, end_ns)

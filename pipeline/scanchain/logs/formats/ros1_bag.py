@@ -20,9 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.errors import InputError
-from scanchain.logs.mcap.blocks import unpack
 from scanchain.logs.mcap.index import is_plausible_size
-from scanchain.logs.mcap.records import Block, Channel, Contents, Entry, FileIndex, Message
+from scanchain.logs.mcap.records import Block, Channel, Contents, Entry, FileIndex, Message, unpack
 from scanchain.logs.mcap.selection import messages_of
 from scanchain.words import counted
 

@@ -1,8 +1,8 @@
 """Index of an MCAP file: its blocks of messages, channels and damage, by its summary or by walking its records.
 
 A summary that agrees with its CRC and its statistics gives the position of every message; a damaged chunk shows
-when it is unpacked. Files that were cut off, never finished or damaged there are walked: nine bytes a record and
-a chunk's header are read, never its contents, and behind damage it goes on at the next record that is one.
+when it is unpacked. Files that were cut off, never finished or damaged there are walked record by record, chunks
+by their heads alone; behind damage the walk resumes at the next record that is one.
 Format: https://mcap.dev/spec
 """
 
@@ -11,58 +11,51 @@ from __future__ import annotations
 import mmap
 import struct
 import zlib
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
-from collections.abc import Set as AbstractSet
 from dataclasses import replace
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
-from mcap.records import ChunkIndex, Statistics
+import numpy as np
+from mcap.records import Channel, ChunkIndex, Schema, Statistics
+from mcap.stream_reader import StreamReader
 
 from scanchain.errors import InputError
 from scanchain.logs.files import RemoteFile
 from scanchain.logs.mcap.records import (
     CHANNEL,
     CHUNK,
-    CHUNK_INDEX,
-    DATA_END,
-    FOOTER,
+    CHUNK_HEAD,
     MAGIC,
+    MALFORMED,
     MESSAGE,
     MESSAGE_HEAD,
     MESSAGE_INDEX,
     RECORD,
     SCHEMA,
-    STATISTICS,
     Block,
     Entry,
     FileIndex,
-    read_strings,
-    records_of,
-)
-from scanchain.logs.mcap.resync import (
-    CHUNK_HEAD,
-    PRIVATE,
-    is_end,
-    next_record,
-    record_end,
-    sought_behind,
-    states_length_twice,
+    read_definition,
 )
 from scanchain.source import Source
 from scanchain.words import counted
 
+HEADER, FOOTER, ATTACHMENT, METADATA, DATA_END = 1, 2, 9, 12, 15
+_PRIVATE = 0x80  # opcodes from here on are those of applications
+_LEAST_BYTES = {HEADER: 8, MESSAGE: MESSAGE_HEAD.size, ATTACHMENT: 36, METADATA: 8}  # of a record's body
+_DATA_END = RECORD.pack(DATA_END, 4)
 _FOOTER_BYTES = RECORD.size + 20 + len(MAGIC)  # the closing magic included
-_TAIL_BYTES = 65_536  # number of bytes of a remote file read at first; most summaries lie in it
+_TAIL_BYTES = 65_536  # number of bytes of a file read at first; most summaries lie in it
 _REPEATED = 4  # number of ranges of a remote file retained: the first blocks are read more than once
+_LONGEST_NAME = 16  # bytes; no name of a compression is longer
 _LARGEST_CHUNK = 1 << 30  # largest size of a chunk in bytes; one beyond is damage
 _MODEST_CHUNK = 1 << 25  # size in bytes up to which a chunk's stated size is accepted at any ratio
 _MOST_TIMES = 20  # largest ratio of the unpacked to the stored size of a larger chunk
 _LOOSE_BYTES = 1 << 20  # messages outside chunks are read in blocks of about this size
+_WINDOW = 1 << 20  # bytes searched at once
 
 
 def claims_mcap(path: Path, head: bytes) -> bool:
@@ -95,27 +88,40 @@ def walked(index: FileIndex) -> FileIndex:
     """The index, filled by walking the records of its file."""
     data, walk = index.data, _Walk(index)
     index.is_consistent = False
-    sought: AbstractSet[int] = frozenset()
-    offset, end = len(MAGIC), record_end(data, len(MAGIC))
-    while not is_end(data, offset):
-        following = record_end(data, end) if end else 0
-        if end and (following or is_end(data, end)):
+    sought: tuple[int, ...] = ()
+    chunk = 0  # the last one; records behind it may be none, met by a length that is wrong
+    offset, end = len(MAGIC), _record_end(index, len(MAGIC))
+    while end or not _is_whole_summary(index, offset):
+        following = _record_end(index, end) if end else 0
+        if end and (following or _is_end(data, end)) and not walk.is_shortened(offset, end):
             walk.take(offset, end)
+            chunk = offset if data[offset] == CHUNK else chunk
             offset, end = end, following
             continue
-        sought = sought or sought_behind(data, offset)
-        resumed = next_record(data, offset + 1, sought)
-        if end and (states_length_twice(data, offset) or not 0 < resumed < end):
+        is_chunk = _chunk_at(index, offset) is not None
+        sought = sought or _sought(index)
+        searched = 1 + (chunk if sought == (CHUNK,) and not is_chunk else offset)
+        resumed = _next_record(index, searched, sought) or max(data.rfind(_DATA_END, offset + 1), 0)
+        if end and (is_chunk or not 0 < resumed < end):
             walk.take(offset, end)
-            offset = resumed if 0 < resumed < end else end
+            offset = end
         if not resumed:
+            walk.cut_off(offset)
             break
+        if resumed != offset:  # which is that of a chunk that is cut off
+            where = min(offset, resumed)
+            index.damage.append(
+                f"{index.path}: the record at byte {where} is damaged; reading went on at byte {resumed}"
+            )
+            walk.close(where, complete=False)
+        chunk = offset = resumed
+        end = _record_end(index, offset)
+    walk.close(offset, complete=True)
+    if walk.private:
         index.damage.append(
-            f"{index.path}: the record at byte {offset} is damaged; reading went on at byte {resumed}"
+            f"{index.path}: passed over {counted(len(walk.private), 'record')} of unknown kinds, "
+            f"the first at byte {walk.private[0]}"
         )
-        walk.close(offset, complete=False)
-        offset, end = resumed, record_end(data, resumed)
-    walk.finish(offset)
     return index
 
 
@@ -135,19 +141,9 @@ def _summary(read: Callable[[int, int], bytes], size: int, *, needs_crc: bool) -
 
 def _take_summary(index: FileIndex, summary: bytes, size: int) -> bool:
     """Fill the index by the summary of a file of this size; False where that does not give every message."""
-    statistics = None
     try:
-        for opcode, begin, end in records_of(summary[: -len(MAGIC)]):
-            body = ReadDataStream(BytesIO(summary[begin:end]))
-            if opcode == SCHEMA:
-                index.add_schema(summary, begin)
-            elif opcode == CHANNEL:
-                index.add_channel(summary, begin)
-            elif opcode == CHUNK_INDEX:
-                index.blocks.append(_indexed(ChunkIndex.read(body), index.number))
-            elif opcode == STATISTICS:
-                statistics = Statistics.read(body)
-    except (McapError, struct.error, UnicodeDecodeError):
+        statistics = _fill(index, summary)
+    except MALFORMED:
         return False
     if statistics is None or statistics.chunk_count != len(index.blocks):
         return False
@@ -162,6 +158,19 @@ def _take_summary(index: FileIndex, summary: bytes, size: int) -> bool:
     )
 
 
+def _fill(index: FileIndex, summary: bytes) -> Statistics | None:
+    """Take in the records up to the closing magic; the statistics among them. Raises one of MALFORMED."""
+    statistics = None
+    for record in StreamReader(BytesIO(summary), skip_magic=True, emit_chunks=True).records:
+        if isinstance(record, Schema | Channel):
+            index.define(record)
+        elif isinstance(record, ChunkIndex):
+            index.blocks.append(_indexed(record, index.number))
+        elif isinstance(record, Statistics):
+            statistics = record
+    return statistics
+
+
 def _indexed(chunk: ChunkIndex, file: int) -> Block:
     """A chunk by its index; where the next message index begins gives the number of a channel's messages."""
     end = chunk.chunk_start_offset + chunk.chunk_length
@@ -173,30 +182,32 @@ def _indexed(chunk: ChunkIndex, file: int) -> Block:
         for (_, channel), begin, end in zip(stated, begins, ends, strict=False)
         if end - begin >= 16
     )
-    return Block(
-        file,
-        end - chunk.compressed_size,
-        chunk.compressed_size,
-        chunk.compression,
-        chunk.uncompressed_size,
-        None,
-        chunk.message_start_time,
-        chunk.message_end_time,
-        entries,
-    )
+    size, times_ns = chunk.compressed_size, (chunk.message_start_time, chunk.message_end_time)
+    return Block(file, end - size, size, chunk.compression, chunk.uncompressed_size, None, *times_ns, entries)
+
+
+def _is_whole_summary(index: FileIndex, offset: int) -> bool:
+    """True if the data end here and a summary ends the file; its channels are taken in as a last resort."""
+    if not _is_end(index.data, offset):
+        return False
+    uncertain = FileIndex(index.path, index.number, b"", channels=index.uncertain_channels)
+    try:
+        _fill(uncertain, index.data[offset:])
+    except MALFORMED:
+        return False
+    return True
 
 
 def _map(path: Path) -> mmap.mmap:
     try:
         with path.open("rb") as file:
-            if path.stat().st_size == 0:
-                raise InputError(f"{path}: is empty (0 bytes); record or copy it again")
             data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such file; check the path") from error
-    except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise InputError(f"{path}: cannot be read ({reason}); check its permissions") from error
+    except ValueError as error:
+        raise InputError(f"{path}: is empty (0 bytes); record or copy it again") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
     if data[: len(MAGIC)] != MAGIC:
         raise InputError(f"{path}: is not an MCAP file (starts with {data[:8]!r}); see scanchain convert --help")
     return data
@@ -207,42 +218,57 @@ class _Walk:
 
     def __init__(self, index: FileIndex) -> None:
         self.index = index
-        self.data = index.data
-        self.defining = index  # what schemas and channels are defined in
-        self.private: list[int] = []  # offsets of records of some application
         self.chunk: Block | None = None
         self.entries: list[Entry] = []
+        self.private: list[int] = []  # offsets of records of some application, or of damaged messages
         self.loose_from = -1
         self.loose_times: list[int] = []
         self.loose_counts: Counter[int] = Counter()
+        self.loose_sizes: deque[int] = deque(maxlen=8)  # of the records met last
 
     def take(self, offset: int, end: int) -> None:
         """Sort in the record of these bytes."""
-        try:
-            self._sort(self.data[offset], offset + RECORD.size, end)
-        except (struct.error, UnicodeDecodeError):
-            self.index.damage.append(
-                f"{self.index.path}: the record at byte {offset} is malformed and was left out"
+        data, opcode, body = self.index.data, self.index.data[offset], offset + RECORD.size
+        chunk = _chunk_at(self.index, offset)
+        if chunk is not None:
+            self.close(offset, complete=True)
+            self._take_chunk(chunk, offset)
+        elif opcode == MESSAGE:
+            self._take_message(offset, end)
+        elif opcode == MESSAGE_INDEX and self.chunk is None:
+            self.index.note_damage(
+                f"{self.index.path}: the chunk before the message index at byte {offset} is missing"
             )
+        elif opcode == MESSAGE_INDEX and end - body > 6:
+            (channel,) = struct.unpack_from("<H", data, body)
+            self.entries.append(Entry(channel, body + 6, (end - body - 6) // 16))
+        elif opcode in (SCHEMA, CHANNEL):
+            self.index.define(read_definition(opcode, data[body:end]))
+        else:
+            self.close(offset, complete=True)
+            self.private += [offset] if opcode >= _PRIVATE else []
 
-    def finish(self, offset: int) -> None:
-        """End the walk at this byte; of a chunk that is cut off there the beginning is retained."""
-        index, size = self.index, len(self.data)
-        is_whole = is_end(self.data, offset)
-        self.close(offset, complete=is_whole)
-        if not is_whole:
-            where = f", inside the record at byte {offset}" if offset + RECORD.size <= size else ""
-            index.damage.append(f"{index.path}: cut off at byte {size}{where}, without the closing magic")
-            if where and self.data[offset] == CHUNK:
-                self.take(offset, size)
-                if self.chunk is not None:
-                    self.chunk = replace(self.chunk, is_cut=True, crc=0)
-                    self.close(offset, complete=False)
-        if self.private:  # one of them may have been a chunk
-            index.damage.append(
-                f"{index.path}: passed over {counted(len(self.private), 'record')} of unknown kinds, "
-                f"the first at byte {self.private[0]}"
-            )
+    def is_shortened(self, offset: int, end: int) -> bool:
+        """True if a loose message ends in a whole one of a size met lately: so many bytes of it are missing."""
+        data, sizes = self.index.data, [size for size in self.loose_sizes if size < end - offset]
+        return data[offset] == MESSAGE and any(
+            RECORD.unpack_from(data, end - size) == (MESSAGE, size - RECORD.size) for size in sizes
+        )
+
+    def cut_off(self, offset: int) -> None:
+        """End the walk at the record that is not all there; of a chunk the beginning is retained."""
+        index, size, is_end = self.index, len(self.index.data), _is_end(self.index.data, offset)
+        self.close(offset, complete=is_end)
+        where = f", inside the record at byte {offset}" if offset + RECORD.size <= size else ""
+        index.damage.append(
+            f"{index.path}: the summary at byte {offset} is damaged or cut off"
+            if is_end
+            else f"{index.path}: cut off at byte {size}{where}, without the closing magic"
+        )
+        chunk = _chunk_at(index, offset)
+        if chunk is not None:
+            self._take_chunk(chunk, offset)
+            self.close(size, complete=False)
 
     def close(self, offset: int, *, complete: bool) -> None:
         """End the chunk or the run of loose messages at this byte; incomplete entries are discarded."""
@@ -258,63 +284,101 @@ class _Walk:
         self.chunk, self.entries = None, []
         self.loose_from, self.loose_times, self.loose_counts = -1, [], Counter()
 
-    def _sort(self, opcode: int, body: int, end: int) -> None:
-        if opcode == MESSAGE:
-            self._message(body, end)
-        elif opcode == MESSAGE_INDEX:
-            self._entry(body, end)
-        elif opcode == SCHEMA:
-            self.defining.add_schema(self.data, body)
-        elif opcode == CHANNEL:
-            self.defining.add_channel(self.data, body)
-        else:
-            self.close(body - RECORD.size, complete=True)
-            if opcode == CHUNK:
-                self._chunk(body, end)
-            elif opcode >= PRIVATE:
-                self.private.append(body - RECORD.size)
-            elif opcode == DATA_END:  # the summary behind it, damaged or unchecked, is the last resort
-                uncertain = self.index.uncertain_channels
-                self.defining = FileIndex(self.index.path, self.index.number, b"", channels=uncertain)
-
-    def _message(self, body: int, end: int) -> None:
-        offset = body - RECORD.size
+    def _take_message(self, offset: int, end: int) -> None:
         if self.chunk is not None:
             self.close(offset, complete=True)
-        channel, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(self.data, body)
+        channel, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(self.index.data, offset + RECORD.size)
         if self.loose_from < 0:
             self.loose_from = offset
+        if end - offset not in self.loose_sizes:
+            self.loose_sizes.append(end - offset)
         self.loose_times.append(log_time_ns)
         self.loose_counts[channel] += 1
         if end - self.loose_from > _LOOSE_BYTES:
             self.close(end, complete=True)
 
-    def _entry(self, body: int, end: int) -> None:
-        channel, size = struct.unpack_from("<HI", self.data, body)
-        if size > end - body - 6:
-            raise struct.error("message index beyond its record")
-        if self.chunk is None:
-            self.index.note_damage(
-                f"{self.index.path}: the chunk before the message index at byte {body} is missing"
-            )
-        elif size:
-            self.entries.append(Entry(channel, body + 6, size // 16))
-
-    def _chunk(self, body: int, end: int) -> None:
-        start_ns, end_ns, uncompressed, crc = CHUNK_HEAD.unpack_from(self.data, body)
-        (name,), records = read_strings(self.data, body + CHUNK_HEAD.size, 1)
-        compression = name.decode()
-        size = end - records - 8
-        if is_plausible_size(size, uncompressed):
-            number = self.index.number
-            self.chunk = Block(number, records + 8, size, compression, uncompressed, crc, start_ns, end_ns)
+    def _take_chunk(self, chunk: Block, offset: int) -> None:
+        name = f"{self.index.path}: the chunk at byte {offset}"
+        if self.index.data[offset] != CHUNK:
+            self.index.damage.append(f"{name} is marked as another record; it was read all the same")
+        if is_plausible_size(chunk.size, chunk.uncompressed_size):
+            self.chunk = chunk
             return
         self.index.damage.append(
-            f"{self.index.path}: the chunk at byte {body - RECORD.size} claims to unpack from {size} to "
-            f"{uncompressed} bytes, more than is accepted, and was left out"
+            f"{name} claims to unpack from {chunk.size} to {chunk.uncompressed_size} bytes, more than is "
+            "accepted, and was left out"
         )
 
 
 def is_plausible_size(size: int, uncompressed: int) -> bool:
     """True if a chunk of so many bytes may unpack to the size that its record states."""
     return uncompressed <= min(max(_MODEST_CHUNK, _MOST_TIMES * size), _LARGEST_CHUNK)
+
+
+def _is_end(data: mmap.mmap | bytes, offset: int) -> bool:
+    """True if the data end here; behind is at most a summary."""
+    return data[offset : offset + len(_DATA_END)] == _DATA_END
+
+
+def _record_end(index: FileIndex, offset: int) -> int:
+    """The byte behind the record at ``offset``; 0 where there is none of the data section, or not all of one."""
+    data, body = index.data, offset + RECORD.size
+    if body > len(data):
+        return 0
+    opcode, length = RECORD.unpack_from(data, offset)
+    end = body + length
+    if end > len(data):
+        return 0
+    if _chunk_at(index, offset):
+        return end
+    if opcode == MESSAGE_INDEX:
+        return end if length >= 6 and struct.unpack_from("<I", data, body + 2)[0] == length - 6 else 0
+    if opcode in (SCHEMA, CHANNEL):
+        try:
+            read_definition(opcode, data[body:end])
+        except MALFORMED:
+            return 0
+        return end
+    return end if opcode >= _PRIVATE or length >= _LEAST_BYTES.get(opcode, len(data)) else 0
+
+
+def _chunk_at(index: FileIndex, offset: int) -> Block | None:
+    """The chunk whose record begins here, whatever its opcode; None where its length is not stated twice alike."""
+    head = index.data[offset : offset + CHUNK_HEAD.size + _LONGEST_NAME + 8]
+    if len(head) < CHUNK_HEAD.size + 8:
+        return None
+    _, length, *times_ns, uncompressed, crc, name = CHUNK_HEAD.unpack_from(head)
+    begin = CHUNK_HEAD.size + name + 8
+    if begin > len(head):
+        return None
+    (size,) = struct.unpack_from("<Q", head, begin - 8)
+    if size != length + RECORD.size - begin:
+        return None
+    compression = head[CHUNK_HEAD.size : begin - 8].decode("utf-8", "replace")
+    there = len(index.data) - offset - begin
+    where = index.number, offset + begin, min(size, there)
+    return Block(*where, compression, uncompressed, crc, *times_ns, is_cut=size > there)
+
+
+def _sought(index: FileIndex) -> tuple[int, ...]:
+    """Opcodes of the records that are searched behind damage.
+
+    No message is searched outside of the chunks of a file that has them: what is left of a damaged chunk,
+    unchecked, is not taken for messages.
+    """
+    is_chunked = index.blocks or _next_record(index, len(MAGIC), (CHUNK, MESSAGE_INDEX))
+    return (CHUNK,) if is_chunked else (SCHEMA, CHANNEL, MESSAGE)
+
+
+def _next_record(index: FileIndex, offset: int, sought: tuple[int, ...]) -> int:
+    """The first byte from ``offset`` on at which such a record begins, a chunk even if cut off; 0 for none."""
+    data = index.data
+    for begin in range(offset, len(data) - RECORD.size, _WINDOW):
+        window = np.frombuffer(data, np.uint8, min(_WINDOW + 8, len(data) - begin), begin)
+        likely = np.isin(window[:-8], sought) & ((window[6:-2] | window[7:-1] | window[8:]) == 0)
+        for candidate in (begin + np.flatnonzero(likely)).tolist():
+            end = _record_end(index, candidate)
+            is_sure = data[candidate] == MESSAGE_INDEX or _is_end(data, end)
+            if _chunk_at(index, candidate) or (end and (is_sure or _record_end(index, end))):
+                return candidate
+    return 0

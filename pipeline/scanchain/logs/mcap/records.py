@@ -1,29 +1,35 @@
-"""Index of an MCAP file: channels, blocks of messages, damage."""
+"""Index of an MCAP file: channels, blocks of messages, damage; and the messages of a block."""
 
 from __future__ import annotations
 
+import bz2
 import mmap
 import struct
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
-from typing import NamedTuple, TypeAlias
+from io import BytesIO
+from typing import NamedTuple
 
+import lz4.frame
+import mcap.records
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+
+from scanchain.errors import one_line
 from scanchain.source import Source
 from scanchain.words import counted
 
 MAGIC = b"\x89MCAP0\r\n"
-FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = 2, 3, 4, 5, 6, 7, 8
-STATISTICS, DATA_END = 0x0B, 0x0F
+SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = 3, 4, 5, 6, 7
 RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-
-_CRC = struct.Struct("<I")
-_CRC_AT = RECORD.size + 24  # of a chunk record
-_LONGEST_STRING = 1 << 24  # longest name or definition in bytes; a longer one is damage
-
-Bytes: TypeAlias = memoryview | mmap.mmap | bytes
+CHUNK_HEAD = struct.Struct("<BQQQQII")  # record, start, end, uncompressed size, CRC-32, length of a name
+MALFORMED = (McapError, struct.error, UnicodeDecodeError)  # raised on reading a record that is none
+_MOST_BEHIND = 256  # bytes behind a definition; a longer rest is that of another record with a damaged opcode
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +100,7 @@ class Block:
     @property
     def chunk_offset(self) -> int:
         """Offset of a chunk's record, its head included."""
-        return self.offset - (_CRC_AT + 16 + len(self.compression) if self.is_chunk else 0)
+        return self.offset - (CHUNK_HEAD.size + len(self.compression) + 8 if self.is_chunk else 0)
 
     @property
     def may_be_empty(self) -> bool:
@@ -138,7 +144,7 @@ class FileIndex:
             return self.bytes_at(block.offset, block.size), block.crc
         head = block.offset - block.chunk_offset
         record = self.bytes_at(block.chunk_offset, head + block.size)
-        return record[head:], _CRC.unpack_from(record, _CRC_AT)[0]
+        return record[head:], CHUNK_HEAD.unpack_from(record)[5]
 
     def bytes_at(self, offset: int, size: int) -> memoryview:
         """A part of an MCAP file, wherever it lies."""
@@ -146,20 +152,16 @@ class FileIndex:
             return memoryview(self.fetch(offset, size))
         return memoryview(self.data)[offset : offset + size]
 
-    def add_schema(self, body: Bytes, offset: int) -> None:
-        """Take in the schema record whose body starts at the offset."""
-        (number,) = struct.unpack_from("<H", body, offset)
-        (name, encoding, definition), _ = read_strings(body, offset + 2, 3)
-        self.schemas[number] = (name.decode(), encoding.decode(), definition)
-
-    def add_channel(self, body: Bytes, offset: int) -> None:
-        """Take in the channel record whose body starts at the offset; one that is fully known stays."""
-        number, schema = struct.unpack_from("<HH", body, offset)
-        if not self.knows(number):
-            (topic, encoding), _ = read_strings(body, offset + 4, 2)
-            known = self.schemas.get(schema, ("", "", b""))
-            key = (self.number, number)
-            self.channels[number] = Channel(key, topic.decode(), encoding.decode(), schema, *known)
+    def define(self, record: mcap.records.Schema | mcap.records.Channel) -> None:
+        """Take in a schema, or a channel; a channel that is fully known stays."""
+        if isinstance(record, mcap.records.Schema):
+            self.schemas[record.id] = (record.name, record.encoding, record.data)
+        elif not self.knows(record.id):
+            schema = self.schemas.get(record.schema_id, ("", "", b""))
+            key = (self.number, record.id)
+            self.channels[record.id] = Channel(
+                key, record.topic, record.message_encoding, record.schema_id, *schema
+            )
 
     def numbers_of(self, topic: str) -> list[int]:
         """Ids of the channels of a topic."""
@@ -200,16 +202,98 @@ def records_of(data: memoryview | bytes) -> Iterator[tuple[int, int, int]]:
         yield opcode, begin, offset
 
 
-def read_strings(data: Bytes, offset: int, count: int) -> tuple[list[bytes], int]:
-    """Strings with their lengths before them, and the byte behind the last."""
-    strings = []
-    for _ in range(count):
-        begin = offset + 4
-        offset = begin + struct.unpack_from("<I", data, offset)[0]
-        if offset > min(len(data), begin + _LONGEST_STRING):
-            raise struct.error("string beyond the end")
-        strings.append(bytes(data[begin:offset]))
-    return strings, offset
+def read_definition(opcode: int, body: bytes) -> mcap.records.Schema | mcap.records.Channel:
+    """The schema or channel that a record defines. Raises one of MALFORMED."""
+    stream = ReadDataStream(BytesIO(body))
+    record = (mcap.records.Schema if opcode == SCHEMA else mcap.records.Channel).read(stream)
+    if stream.count + _MOST_BEHIND < len(body):
+        raise struct.error("definition of another length than its record")
+    return record
+
+
+class DamagedBlockError(Exception):
+    """A block whose contents cannot be trusted; the message says which and why."""
+
+
+def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None = None) -> Contents:
+    """The messages of a block, of all channels or of those wanted; channels found there join the index.
+
+    Raises DamagedBlockError where a whole block does not unpack to what its header says.
+    """
+    if index.make is not None:
+        return index.make(block, wanted)
+    payload = unpack(index, block)
+    messages: list[Message] = []
+    met = undefined = 0
+    try:
+        for opcode, begin, end in records_of(payload):
+            if opcode in (SCHEMA, CHANNEL):
+                index.define(read_definition(opcode, bytes(payload[begin:end])))
+            elif opcode == MESSAGE:
+                number, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(payload, begin)
+                met += 1
+                channel = index.channels.get(number)
+                undefined += channel is None
+                if channel is not None and (wanted is None or number in wanted):
+                    messages.append(Message(channel, log_time_ns, payload[begin + MESSAGE_HEAD.size : end]))
+            else:
+                raise struct.error("record of no kind that a chunk may hold")
+    except MALFORMED:
+        damage = "a record in it is malformed; what follows was left out"
+        return Contents(messages, "" if block.is_cut else f"{_name(index, block)}: {damage}")
+    stated = sum(entry.messages for entry in block.entries)
+    damage = f"holds {met} of the {stated} indexed messages" if met < stated else ""
+    if undefined:
+        damage = f"{counted(undefined, 'message')} of a channel that nothing defines"
+    return Contents(messages, damage and f"{_name(index, block)}: {damage}")
+
+
+def unpack(index: FileIndex, block: Block) -> memoryview:
+    """The records of a block; of one that is cut off those that are there, unchecked. Raises DamagedBlockError."""
+    stored, crc = index.stored(block)
+    size = block.uncompressed_size
+    try:
+        payload = _decompressed(stored, block.compression, size, is_cut=block.is_cut)
+    except (zstandard.ZstdError, RuntimeError, MemoryError, EOFError, OSError, ValueError) as error:
+        if block.is_cut:
+            return memoryview(b"")
+        raise DamagedBlockError(
+            f"{_name(index, block)}: does not unpack ({one_line(error) or type(error).__name__})"
+        ) from error
+    if not block.is_cut and len(payload) != size:
+        raise DamagedBlockError(f"{_name(index, block)}: unpacks to {len(payload)} bytes instead of {size}")
+    if not block.is_cut and crc and zlib.crc32(payload) != crc:
+        raise DamagedBlockError(f"{_name(index, block)}: its CRC is wrong")
+    return memoryview(payload)
+
+
+def release(index: FileIndex, block: Block) -> None:
+    """Release a block's bytes of the file, so that memory does not grow with what has been read."""
+    if isinstance(index.data, mmap.mmap) and hasattr(index.data, "madvise"):
+        begin = block.offset - block.offset % mmap.PAGESIZE
+        index.data.madvise(mmap.MADV_DONTNEED, begin, block.offset + block.size - begin)
+
+
+def _decompressed(stored: memoryview, compression: str, size: int, *, is_cut: bool) -> bytes | memoryview:
+    """At most so many bytes; of what is cut off as many as there are."""
+    if not size or compression == "":
+        return stored if size else b""
+    if compression == "zstd" and is_cut:
+        with zstandard.ZstdDecompressor().stream_reader(BytesIO(stored)) as reader:
+            return reader.read(size)
+    if compression == "zstd":
+        if zstandard.frame_content_size(stored) not in (-1, size):
+            raise ValueError("it lies about the size it unpacks to")
+        return zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
+    if compression == "lz4":
+        return lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=size)
+    if compression == "bz2":
+        return bz2.BZ2Decompressor().decompress(stored, max_length=size)
+    raise ValueError(f"compression {compression!r} is not known; none, lz4 and zstd are")
+
+
+def _name(index: FileIndex, block: Block) -> str:
+    return f"{index.path}: the {'chunk' if block.is_chunk else 'run of messages'} at byte {block.offset}"
 
 
 def name_of(indexes: Sequence[FileIndex]) -> str:

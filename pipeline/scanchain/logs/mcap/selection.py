@@ -11,8 +11,16 @@ from numpy.typing import NDArray
 
 from scanchain.config import LogConfig
 from scanchain.errors import InputError
-from scanchain.logs.mcap.blocks import DamagedBlockError, read_block
-from scanchain.logs.mcap.records import Block, Channel, FileIndex, Message, damage_of, name_of
+from scanchain.logs.mcap.records import (
+    Block,
+    Channel,
+    DamagedBlockError,
+    FileIndex,
+    Message,
+    damage_of,
+    name_of,
+    read_block,
+)
 from scanchain.words import duration
 
 
@@ -174,9 +182,10 @@ def complete(index: FileIndex) -> None:
     """Add the channels and counts that a file without a full summary has inside its chunks."""
     counts = index.indexed_counts()
     unknown = {number for number in {*index.counts, *counts} if not index.knows(number)}
-    for block in index.blocks:
-        held = {entry.channel for entry in block.entries}
-        if unknown & held or (not held and (unknown or not index.is_counted)):
+    for block in sorted(
+        index.blocks, key=lambda each: unknown.isdisjoint(entry.channel for entry in each.entries)
+    ):
+        if unknown or not (block.entries or index.is_counted):
             messages = messages_of(index, block)
             counts.update(message.channel.key[1] for message in messages if not block.entries)
             unknown = {number for number in unknown if not index.knows(number)}

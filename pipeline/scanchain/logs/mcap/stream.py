@@ -12,10 +12,9 @@ from heapq import heappop, heappush
 from itertools import pairwise
 from typing import NamedTuple, TypeVar
 
-from scanchain.logs.mcap.blocks import DamagedBlockError, read_block, release
-from scanchain.logs.mcap.records import Block, Channel, FileIndex, Message
+from scanchain.logs.mcap.records import Block, Channel, DamagedBlockError, FileIndex, Message, read_block, release
 from scanchain.logs.mcap.selection import EVERYTHING, Span, messages_of
-from scanchain.logs.messages.cdr import MalformedMessageError
+from scanchain.logs.messages.ros import MalformedMessageError
 from scanchain.threads import threads
 
 Decoders = Mapping[str, Callable[[memoryview], object]]

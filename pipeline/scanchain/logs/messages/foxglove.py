@@ -16,33 +16,23 @@ from msgspec import Struct, field
 
 from scanchain.data import Pose
 from scanchain.logs.mcap.records import Channel
-from scanchain.logs.messages.cdr import MalformedMessageError
 from scanchain.logs.messages.laser_scan import LaserScanMessage
 from scanchain.logs.messages.point_cloud import PointCloudMessage, PointField
-from scanchain.logs.messages.poses import StampedPose, pose_matrix
+from scanchain.logs.messages.poses import StampedPose, pose_of
+from scanchain.logs.messages.ros import MalformedMessageError
 
 _POINT_FIELD = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}  # foxglove.NumericType to sensor_msgs/PointField
 
 T = TypeVar("T")
 
 
-class JsonStamp(Struct, frozen=True):
-    """Seconds and nanoseconds since the epoch."""
-
+class _Stamp(Struct, frozen=True):
     seconds: int = field(name="sec", default=0)
     nanos: int = field(name="nsec", default=0)
 
 
-class JsonVector(Struct, frozen=True):
-    """Meters."""
-
-    x: float = 0.0
-    y: float = 0.0
-    z: float = 0.0
-
-
-class JsonQuaternion(Struct, frozen=True):
-    """All zero where it was left out."""
+class _Vector(Struct, frozen=True):
+    """Meters, or with w a quaternion, all zero where it was left out."""
 
     x: float = 0.0
     y: float = 0.0
@@ -50,68 +40,58 @@ class JsonQuaternion(Struct, frozen=True):
     w: float = 0.0
 
 
-class JsonPose(Struct, frozen=True):
-    """Position and orientation."""
-
-    position: JsonVector = JsonVector()
-    orientation: JsonQuaternion = JsonQuaternion()
+class _Pose(Struct, frozen=True):
+    position: _Vector = _Vector()
+    orientation: _Vector = _Vector()
 
 
-class JsonLaserScan(Struct, frozen=True):
+class _LaserScan(Struct, frozen=True):
     """A foxglove.LaserScan; a range that is null is no number."""
 
     ranges: list[float | None]
     start_angle: float
     end_angle: float
-    timestamp: JsonStamp = JsonStamp()
+    timestamp: _Stamp = _Stamp()
     frame_id: str = ""
-    pose: JsonPose = JsonPose()
+    pose: _Pose = _Pose()
 
 
-class JsonPackedField(Struct, frozen=True):
-    """A foxglove.PackedElementField."""
-
+class _PackedField(Struct, frozen=True):
     name: str
     offset: int
     type: int
 
 
-class JsonPointCloud(Struct, frozen=True):
+class _PointCloud(Struct, frozen=True):
     """A foxglove.PointCloud; ``data`` comes in base64."""
 
     point_stride: int
-    fields: list[JsonPackedField]
+    fields: list[_PackedField]
     data: bytes
-    timestamp: JsonStamp = JsonStamp()
+    timestamp: _Stamp = _Stamp()
     frame_id: str = ""
-    pose: JsonPose = JsonPose()
+    pose: _Pose = _Pose()
 
 
-class JsonPoseInFrame(Struct, frozen=True):
-    """A foxglove.PoseInFrame."""
-
-    pose: JsonPose
-    timestamp: JsonStamp = JsonStamp()
+class _PoseInFrame(Struct, frozen=True):
+    pose: _Pose
+    timestamp: _Stamp = _Stamp()
     frame_id: str = ""
 
 
-class JsonFrameTransform(Struct, frozen=True):
-    """A foxglove.FrameTransform."""
-
+class _FrameTransform(Struct, frozen=True):
     parent_frame_id: str
     child_frame_id: str
-    translation: JsonVector = JsonVector()
-    rotation: JsonQuaternion = JsonQuaternion()
-    timestamp: JsonStamp = JsonStamp()
+    translation: _Vector = _Vector()
+    rotation: _Vector = _Vector()
+    timestamp: _Stamp = _Stamp()
 
 
-class JsonFrameTransforms(Struct, frozen=True):
-    """A foxglove.FrameTransforms."""
-
-    transforms: list[JsonFrameTransform]
+class _FrameTransforms(Struct, frozen=True):
+    transforms: list[_FrameTransform]
 
 
-def laser_scan(message: JsonLaserScan) -> LaserScanMessage:
+def laser_scan(message: _LaserScan) -> LaserScanMessage:
     """The scan, without range limits and times, which Foxglove lacks."""
     with np.errstate(over="ignore"):
         ranges_m = np.array(message.ranges, np.float64).astype(np.float32)
@@ -131,12 +111,14 @@ def laser_scan(message: JsonLaserScan) -> LaserScanMessage:
     )
 
 
-def point_cloud(message: JsonPointCloud) -> PointCloudMessage:
+def point_cloud(message: _PointCloud) -> PointCloudMessage:
     """The cloud, its number types in the codes of sensor_msgs/PointField; little endian."""
     if not message.point_stride:
         raise MalformedMessageError("point_stride is zero")
     count = len(message.data) // message.point_stride
-    fields = [PointField(field.name, field.offset, _POINT_FIELD.get(field.type, 0), 1) for field in message.fields]
+    fields = tuple(
+        PointField(field.name, field.offset, _POINT_FIELD.get(field.type, 0), 1) for field in message.fields
+    )
     return PointCloudMessage(
         stamp_ns=_stamp_ns(message.timestamp),
         frame=message.frame_id,
@@ -147,42 +129,47 @@ def point_cloud(message: JsonPointCloud) -> PointCloudMessage:
         point_step=message.point_stride,
         row_step=count * message.point_stride,
         data=memoryview(message.data),
-        described=repr((message.point_stride, fields)).encode(),
         T_frame_cloud=_unless_identity(message.pose),
     )
 
 
-def pose_in_frame(message: JsonPoseInFrame, dimension: int) -> StampedPose:
+def pose_in_frame(message: _PoseInFrame, dimension: int) -> StampedPose:
     """A foxglove.PoseInFrame, flattened for dimension 2."""
     pose = _pose(message.pose.position, message.pose.orientation, dimension)
     return StampedPose(_stamp_ns(message.timestamp), message.frame_id, "", pose)
 
 
-def frame_transform(message: JsonFrameTransform) -> list[StampedPose]:
+def frame_transform(message: _FrameTransform) -> list[StampedPose]:
     """A foxglove.FrameTransform."""
     pose = _pose(message.translation, message.rotation, 3)
     return [StampedPose(_stamp_ns(message.timestamp), message.parent_frame_id, message.child_frame_id, pose)]
 
 
-def frame_transforms(message: JsonFrameTransforms) -> list[StampedPose]:
+def frame_transforms(message: _FrameTransforms) -> list[StampedPose]:
     """All transforms of a foxglove.FrameTransforms."""
     return [transform for each in message.transforms for transform in frame_transform(each)]
 
 
-def _stamp_ns(stamp: JsonStamp) -> int:
+def _stamp_ns(stamp: _Stamp) -> int:
     return stamp.seconds * 1_000_000_000 + stamp.nanos
 
 
-def _unless_identity(pose: JsonPose) -> Pose | None:
+def _unless_identity(pose: _Pose) -> Pose | None:
     T = _pose(pose.position, pose.orientation, 3)
     return None if np.array_equal(T, np.eye(4)) else T
 
 
-def _pose(position: JsonVector, orientation: JsonQuaternion, dimension: int) -> Pose:
+def _pose(position: _Vector, orientation: _Vector, dimension: int) -> Pose:
     """A pose; a quaternion that was left out, zero, turns nothing."""
-    quaternion = (orientation.x, orientation.y, orientation.z, orientation.w)
-    quaternion = quaternion if any(quaternion) else (0.0, 0.0, 0.0, 1.0)
-    return pose_matrix((position.x, position.y, position.z, *quaternion), dimension)
+    is_given = any((orientation.x, orientation.y, orientation.z, orientation.w))
+    return pose_of(position, orientation if is_given else _Vector(w=1.0), dimension)
+
+
+LASER_SCAN = laser_scan, _LaserScan  # readers, and what JSON is parsed to for them
+POINT_CLOUD = point_cloud, _PointCloud
+POSE_IN_FRAME = pose_in_frame, _PoseInFrame
+FRAME_TRANSFORM = frame_transform, _FrameTransform
+FRAME_TRANSFORMS = frame_transforms, _FrameTransforms
 
 
 def parse_json(data: memoryview, kind: type[T]) -> T:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import isfinite
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.data import Pose
-from scanchain.logs.messages.cdr import CdrReader, MalformedMessageError
 from scanchain.logs.messages.returns import NO_TIMES, RangeLimits, Returns, moved
+from scanchain.logs.messages.ros import MalformedMessageError, stamp_ns
 
 _MOST_GEOMETRIES = 16
 _MOST_TURNS = 2.0  # largest number of turns that the beams of a scan cover; in degrees they seem to cover more
@@ -38,30 +38,26 @@ class LaserScanMessage(NamedTuple):
     T_frame_scan: Pose | None = None
 
 
-def read_laser_scan(data: memoryview, form: type[CdrReader] = CdrReader) -> LaserScanMessage:
-    """Take a message apart; the ranges are a view of it."""
-    reader = form(data)
-    stamp_ns, frame = reader.header()
-    first_rad, last_rad, step_rad, beam_s, scan_s, range_min_m, range_max_m = reader.numbers("f", 7)
-    ranges_m = reader.floats()
+def read_laser_scan(message: Any) -> LaserScanMessage:
+    """A sensor_msgs/LaserScan."""
     return LaserScanMessage(
-        stamp_ns, frame, first_rad, last_rad, step_rad, beam_s, scan_s, range_min_m, range_max_m, ranges_m
+        stamp_ns=stamp_ns(message),
+        frame=message.header.frame_id,
+        first_rad=message.angle_min,
+        last_rad=message.angle_max,
+        step_rad=message.angle_increment,
+        beam_s=message.time_increment,
+        scan_s=message.scan_time,
+        range_min_m=message.range_min,
+        range_max_m=message.range_max,
+        ranges_m=message.ranges,
     )
 
 
-def read_multi_echo_scan(data: memoryview, form: type[CdrReader] = CdrReader) -> LaserScanMessage:
+def read_multi_echo_scan(message: Any) -> LaserScanMessage:
     """A sensor_msgs/MultiEchoLaserScan as the scan of each beam's first echo, inf where there is none."""
-    reader = form(data)
-    stamp_ns, frame = reader.header()
-    first_rad, last_rad, step_rad, beam_s, scan_s, range_min_m, range_max_m = reader.numbers("f", 7)
-    ranges_m = np.full(_checked_count(reader.integer(), len(data)), np.inf, np.float32)
-    for beam in range(len(ranges_m)):
-        echoes_m = reader.floats()
-        if len(echoes_m):
-            ranges_m[beam] = echoes_m[0]
-    return LaserScanMessage(
-        stamp_ns, frame, first_rad, last_rad, step_rad, beam_s, scan_s, range_min_m, range_max_m, ranges_m
-    )
+    firsts_m = [beam.echoes[0] if len(beam.echoes) else np.inf for beam in message.ranges]
+    return read_laser_scan(message)._replace(ranges_m=np.array(firsts_m, np.float32))
 
 
 ReadLaserScan = Callable[[memoryview], LaserScanMessage]
@@ -77,7 +73,7 @@ class Geometry(NamedTuple):
 class LaserScanDecoder:
     """Decodes scans; directions are computed once for each geometry and shared, also between threads."""
 
-    def __init__(self, limits: RangeLimits, read: ReadLaserScan = read_laser_scan) -> None:
+    def __init__(self, limits: RangeLimits, read: ReadLaserScan) -> None:
         self.limits = limits
         self.read = read
         self.geometries: dict[tuple[float, float, float, int], Geometry] = {}
@@ -120,12 +116,6 @@ class LaserScanDecoder:
                 self.geometries = {}
             geometry = self.geometries[key] = _geometry(*key)
         return geometry
-
-
-def _checked_count(beams: int, size: int) -> int:
-    if 4 * beams > size:
-        raise MalformedMessageError(f"it claims {beams} beams, more than its {size} bytes can hold")
-    return beams
 
 
 def _geometry(first_rad: float, step_rad: float, beam_s: float, count: int) -> Geometry:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.data import Pose
+from scanchain.errors import one_line
 from scanchain.kernels.cloud_fields import keep_valid
-from scanchain.logs.messages.cdr import CdrReader, MalformedMessageError
 from scanchain.logs.messages.point_times import NAMES, PointTimes
 from scanchain.logs.messages.returns import NO_TIMES, RangeLimits, Returns, moved
+from scanchain.logs.messages.ros import MalformedMessageError, stamp_ns
 
 _FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
 _MOST_LAYOUTS = 64
@@ -22,7 +24,6 @@ _FEWEST_POINTS, _ENOUGH_POINTS = 3, 1000  # least number of points of a cloud, a
 _SQUARE_OF_FARTHEST = float(np.finfo(np.float32).max)
 
 _LIVOX_POINT_BYTES = 19  # offset_time, x, y, z, reflectivity, tag, line
-_LIVOX_DESCRIBED = b"livox CustomMsg, little endian", b"livox CustomMsg, big endian"
 
 
 class PointField(NamedTuple):
@@ -34,8 +35,16 @@ class PointField(NamedTuple):
     repeats: int
 
 
+_LIVOX_FIELDS = (
+    PointField("offset_time", 0, 6, 1),
+    PointField("x", 4, 7, 1),
+    PointField("y", 8, 7, 1),
+    PointField("z", 12, 7, 1),
+)
+
+
 class PointCloudMessage(NamedTuple):
-    """A sensor_msgs/PointCloud2 as it is; ``described`` are the bytes of the layout of a point.
+    """A sensor_msgs/PointCloud2 as it is.
 
     ``T_frame_cloud`` (4, 4) is where the cloud lies in its frame, None where that is its origin.
     """
@@ -44,41 +53,57 @@ class PointCloudMessage(NamedTuple):
     frame: str
     height: int
     width: int
-    fields: list[PointField]
+    fields: tuple[PointField, ...]
     is_bigendian: bool
     point_step: int
     row_step: int
     data: memoryview
-    described: bytes
     T_frame_cloud: Pose | None = None
 
 
-_LIVOX_FIELDS = [
-    PointField("offset_time", 0, 6, 1),
-    PointField("x", 4, 7, 1),
-    PointField("y", 8, 7, 1),
-    PointField("z", 12, 7, 1),
-]
-
-
-def read_point_cloud(data: memoryview, form: type[CdrReader] = CdrReader) -> PointCloudMessage:
-    """Take a message apart; the points are a view of it."""
-    reader = form(data)
-    stamp_ns, frame = reader.header()
-    height, width = reader.integer(), reader.integer()
-    begin = reader.offset
-    count = reader.integer()
-    if count > _MOST_FIELDS:
-        raise MalformedMessageError(f"it claims {count} fields; at most {_MOST_FIELDS} are accepted")
-    fields = [
-        PointField(reader.string(), reader.integer(), reader.integer("B"), reader.integer()) for _ in range(count)
-    ]
-    is_bigendian = bool(reader.integer("B"))
-    point_step = reader.integer()
-    described = bytes(data[begin : reader.offset])
-    row_step = reader.integer()
+def read_point_cloud(message: Any) -> PointCloudMessage:
+    """A sensor_msgs/PointCloud2."""
+    if len(message.fields) > _MOST_FIELDS:
+        raise MalformedMessageError(f"it has {len(message.fields)} fields; at most {_MOST_FIELDS} are accepted")
+    fields = tuple(PointField(each.name, each.offset, each.datatype, each.count) for each in message.fields)
     return PointCloudMessage(
-        stamp_ns, frame, height, width, fields, is_bigendian, point_step, row_step, reader.octets(), described
+        stamp_ns=stamp_ns(message),
+        frame=message.header.frame_id,
+        height=message.height,
+        width=message.width,
+        fields=fields,
+        is_bigendian=message.is_bigendian,
+        point_step=message.point_step,
+        row_step=message.row_step,
+        data=memoryview(message.data),
+    )
+
+
+def read_livox(data: memoryview, encoding: str) -> PointCloudMessage:
+    """A Livox driver's CustomMsg, the points a view of it, each a row of its own as CDR aligns them."""
+    is_ros1 = encoding == "ros1"
+    order = "<" if is_ros1 or data[1:2] == b"\1" else ">"
+    try:
+        seconds, nanoseconds, length = struct.unpack_from(f"{order}iII", data, 4)
+        frame = str(data[16 : 16 + length], "utf-8", "replace").rstrip("\0")
+        begin = 16 + length  # behind it the time of the first point by the lidar's clock, aligned to 8 bytes
+        begin += 0 if is_ros1 else (4 - begin) % 8
+        (count,) = struct.unpack_from(f"{order}I", data, begin + 16)
+    except struct.error as error:
+        raise MalformedMessageError(one_line(error)) from error
+    stride = _LIVOX_POINT_BYTES if is_ros1 else _LIVOX_POINT_BYTES + 1
+    if (count - 1) * stride + _LIVOX_POINT_BYTES > len(data) - begin - 20:
+        raise MalformedMessageError(f"it has {len(data)} bytes, too few for {count} points of {stride} bytes")
+    return PointCloudMessage(
+        stamp_ns=seconds * 1_000_000_000 + nanoseconds,
+        frame=frame,
+        height=count,
+        width=1,
+        fields=_LIVOX_FIELDS,
+        is_bigendian=order == ">",
+        point_step=_LIVOX_POINT_BYTES,
+        row_step=stride,
+        data=data[begin + 20 :],
     )
 
 
@@ -112,11 +137,11 @@ class Layout(NamedTuple):
 class PointCloudDecoder:
     """Decodes clouds; the offsets of the fields are computed once for each layout."""
 
-    def __init__(self, limits: RangeLimits, times: PointTimes, read: ReadPointCloud = read_point_cloud) -> None:
+    def __init__(self, limits: RangeLimits, times: PointTimes, read: ReadPointCloud) -> None:
         self.read = read
         self.limits = limits
         self.times = times
-        self.layouts: dict[bytes, Layout] = {}
+        self.layouts: dict[tuple[tuple[PointField, ...], bool, int], Layout] = {}
 
     def decode(self, data: memoryview) -> Returns:
         """Valid returns of a message's points."""
@@ -127,11 +152,12 @@ class PointCloudDecoder:
 
         Rows may be padded, bytes in either order, x y z of any number type; other fields are passed over.
         """
-        layout = self.layouts.get(message.described)
+        described = (message.fields, message.is_bigendian, message.point_step)
+        layout = self.layouts.get(described)
         if layout is None:
             if len(self.layouts) >= _MOST_LAYOUTS:
                 self.layouts = {}
-            layout = self.layouts[message.described] = _layout(message, self.times)
+            layout = self.layouts[described] = _layout(message, self.times)
         return self._filter(message, layout, _rows(message, layout.point))
 
     def _filter(self, message: PointCloudMessage, layout: Layout, cloud: NDArray[np.void]) -> Returns:
@@ -251,24 +277,3 @@ def _why_none(x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.floa
     zero = int(np.count_nonzero((x == 0.0) & (y == 0.0) & (z == 0.0)))
     outside = count - undefined - zero
     return f"of {count} points {undefined} are NaN or infinite, {zero} are (0, 0, 0), {outside} are out of range"
-
-
-def read_livox(data: memoryview, form: type[CdrReader] = CdrReader) -> PointCloudMessage:
-    """Take a message apart; the points are a view of it, each a row of its own as CDR aligns them."""
-    reader = form(data)
-    stamp_ns, frame = reader.header()
-    reader.numbers("Q")  # time of the first point, by the lidar's clock
-    reader.integer()  # the number of points, stated once more by their array
-    reader.numbers("B", 4)  # lidar and reserved
-    count = reader.integer()
-    before = reader.offset
-    reader.offset += _LIVOX_POINT_BYTES
-    reader.align(4)
-    stride = reader.offset - before
-    if (count - 1) * stride + _LIVOX_POINT_BYTES > len(data) - before:
-        raise MalformedMessageError(f"it has {len(data)} bytes, too few for {count} points of {stride} bytes")
-    is_bigendian = reader.order == ">"
-    body, described = data[before:], _LIVOX_DESCRIBED[is_bigendian]
-    return PointCloudMessage(
-        stamp_ns, frame, count, 1, _LIVOX_FIELDS, is_bigendian, _LIVOX_POINT_BYTES, stride, body, described
-    )

@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from math import isfinite, sqrt
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from scanchain import lie
 from scanchain.data import Pose
-from scanchain.logs.messages.cdr import CdrReader, MalformedMessageError
-
-_MOST_TRANSFORMS = 65536
+from scanchain.logs.messages.ros import MalformedMessageError, stamp_ns
 
 
 class StampedPose(NamedTuple):
@@ -25,33 +23,29 @@ class StampedPose(NamedTuple):
     T_parent_child: Pose
 
 
-def decode_odometry(data: memoryview, dimension: int = 3, form: type[CdrReader] = CdrReader) -> StampedPose:
-    """The pose of a nav_msgs/Odometry, flattened for dimension 2; twist and covariances are passed over."""
-    reader = form(data)
-    stamp_ns, parent = reader.header()
-    child = reader.string()
-    return StampedPose(stamp_ns, parent, child, _pose(reader, dimension))
+def read_odometry(message: Any, dimension: int = 3) -> StampedPose:
+    """The pose of a nav_msgs/Odometry, flattened for dimension 2."""
+    return read_pose(message, dimension)._replace(child=message.child_frame_id)
 
 
-def decode_pose(data: memoryview, dimension: int = 3, form: type[CdrReader] = CdrReader) -> StampedPose:
+def read_pose(message: Any, dimension: int = 3) -> StampedPose:
     """A geometry_msgs/PoseStamped or PoseWithCovarianceStamped, flattened for dimension 2."""
-    reader = form(data)
-    stamp_ns, parent = reader.header()
-    return StampedPose(stamp_ns, parent, "", _pose(reader, dimension))
+    pose = getattr(message.pose, "pose", message.pose)
+    T = pose_of(pose.position, pose.orientation, dimension)
+    return StampedPose(stamp_ns(message), message.header.frame_id, "", T)
 
 
-def decode_transforms(data: memoryview, form: type[CdrReader] = CdrReader) -> list[StampedPose]:
+def read_transforms(message: Any) -> list[StampedPose]:
     """All transforms of a tf2_msgs/TFMessage."""
-    reader = form(data)
-    transforms = []
-    count = reader.integer()
-    if count > _MOST_TRANSFORMS:
-        raise MalformedMessageError(f"it claims {count} transforms; at most {_MOST_TRANSFORMS} are accepted")
-    for _ in range(count):
-        stamp_ns, parent = reader.header()
-        child = reader.string()
-        transforms.append(StampedPose(stamp_ns, parent, child, _pose(reader, 3)))
-    return transforms
+    return [
+        StampedPose(
+            stamp_ns(each),
+            each.header.frame_id,
+            each.child_frame_id,
+            pose_of(each.transform.translation, each.transform.rotation),
+        )
+        for each in message.transforms
+    ]
 
 
 def chain(transforms: Sequence[StampedPose], target: str, source: str) -> Pose | None:
@@ -88,16 +82,13 @@ def _reached(transforms: Sequence[StampedPose], source: str) -> dict[str, tuple[
     return reached
 
 
-def _pose(reader: CdrReader, dimension: int) -> Pose:
-    return pose_matrix(reader.numbers("d", 7), dimension)
-
-
-def pose_matrix(numbers: Sequence[float], dimension: int) -> Pose:
-    """A pose of position and quaternion xyzw, of any length but zero; flattened for dimension 2."""
-    x_m, y_m, z_m, x, y, z, w = numbers
+def pose_of(position: Any, orientation: Any, dimension: int = 3) -> Pose:
+    """A pose of position and quaternion, of any length but zero; flattened for dimension 2."""
+    x_m, y_m, z_m = position.x, position.y, position.z
+    x, y, z, w = orientation.x, orientation.y, orientation.z, orientation.w
     square = x * x + y * y + z * z + w * w
-    if not (isfinite(x_m + y_m + z_m) and isfinite(square) and square > 1e-12):
-        raise MalformedMessageError("its pose is not finite, or the quaternion is zero")
+    if not (isfinite(x_m + y_m + z_m) and 1e-12 < square < 1e12):
+        raise MalformedMessageError("its pose is not finite, or the quaternion is zero or without bound")
     if dimension == 2:
         cosine, sine = w * w + x * x - y * y - z * z, 2.0 * (x * y + z * w)
         norm = sqrt(cosine * cosine + sine * sine) or 1.0

@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 
 from scanchain.logs.mcap.records import Channel
 from scanchain.logs.messages import foxglove
-from scanchain.logs.messages.cdr import CdrReader, Ros1Reader
 from scanchain.logs.messages.laser_scan import read_laser_scan, read_multi_echo_scan
 from scanchain.logs.messages.point_cloud import read_livox, read_point_cloud
-from scanchain.logs.messages.poses import StampedPose, decode_odometry, decode_pose, decode_transforms
+from scanchain.logs.messages.poses import StampedPose, read_odometry, read_pose, read_transforms
+from scanchain.logs.messages.ros import unpacked
 
 Read = Callable[..., Any]
-_FORMS: dict[str, type[CdrReader]] = {"cdr": CdrReader, "ros1": Ros1Reader}
+_ROS = ("cdr", "ros1")
 _SCHEMA_LANGUAGES = {
     "cdr": ("ros2msg", "ros2idl"),
     "ros1": ("ros1msg",),
@@ -35,7 +35,7 @@ class Role(StrEnum):
 
 
 class _Type(NamedTuple):
-    """A message type: its reader, which of Foxglove's types takes the record that ``json_type`` describes."""
+    """A message type: its reader takes what the message is parsed to, of Foxglove's types like ``json_type``."""
 
     role: Role
     read: Read
@@ -45,20 +45,20 @@ class _Type(NamedTuple):
 _TYPES = {
     "sensor_msgs/LaserScan": _Type(Role.SCAN, read_laser_scan),
     "sensor_msgs/MultiEchoLaserScan": _Type(Role.SCAN, read_multi_echo_scan),
-    "foxglove.LaserScan": _Type(Role.SCAN, foxglove.laser_scan, foxglove.JsonLaserScan),
+    "foxglove.LaserScan": _Type(Role.SCAN, *foxglove.LASER_SCAN),
     "sensor_msgs/PointCloud2": _Type(Role.CLOUD, read_point_cloud),
     "livox_ros_driver2/CustomMsg": _Type(Role.CLOUD, read_livox),
     "livox_ros_driver/CustomMsg": _Type(Role.CLOUD, read_livox),
     "livox_interfaces/CustomMsg": _Type(Role.CLOUD, read_livox),
-    "foxglove.PointCloud": _Type(Role.CLOUD, foxglove.point_cloud, foxglove.JsonPointCloud),
-    "nav_msgs/Odometry": _Type(Role.ODOMETRY, decode_odometry),
-    "geometry_msgs/PoseStamped": _Type(Role.POSE, decode_pose),
-    "geometry_msgs/PoseWithCovarianceStamped": _Type(Role.POSE, decode_pose),
-    "foxglove.PoseInFrame": _Type(Role.POSE, foxglove.pose_in_frame, foxglove.JsonPoseInFrame),
-    "tf2_msgs/TFMessage": _Type(Role.TRANSFORMS, decode_transforms),
-    "tf/tfMessage": _Type(Role.TRANSFORMS, decode_transforms),
-    "foxglove.FrameTransform": _Type(Role.TRANSFORMS, foxglove.frame_transform, foxglove.JsonFrameTransform),
-    "foxglove.FrameTransforms": _Type(Role.TRANSFORMS, foxglove.frame_transforms, foxglove.JsonFrameTransforms),
+    "foxglove.PointCloud": _Type(Role.CLOUD, *foxglove.POINT_CLOUD),
+    "nav_msgs/Odometry": _Type(Role.ODOMETRY, read_odometry),
+    "geometry_msgs/PoseStamped": _Type(Role.POSE, read_pose),
+    "geometry_msgs/PoseWithCovarianceStamped": _Type(Role.POSE, read_pose),
+    "foxglove.PoseInFrame": _Type(Role.POSE, *foxglove.POSE_IN_FRAME),
+    "tf2_msgs/TFMessage": _Type(Role.TRANSFORMS, read_transforms),
+    "tf/tfMessage": _Type(Role.TRANSFORMS, read_transforms),
+    "foxglove.FrameTransform": _Type(Role.TRANSFORMS, *foxglove.FRAME_TRANSFORM),
+    "foxglove.FrameTransforms": _Type(Role.TRANSFORMS, *foxglove.FRAME_TRANSFORMS),
 }
 LIDAR_TYPES = tuple(sorted(name for name, each in _TYPES.items() if each.role in (Role.SCAN, Role.CLOUD)))
 
@@ -73,7 +73,7 @@ def role(channel: Channel) -> Role | None:
     known = _TYPES.get(kind(channel))
     if known is None or channel.schema_encoding not in _SCHEMA_LANGUAGES.get(channel.encoding, ()):
         return None
-    return known.role if (channel.encoding in _FORMS) == (known.json_type is None) else None
+    return known.role if (channel.encoding in _ROS) == (known.json_type is None) else None
 
 
 def is_scan(channel: Channel) -> bool:
@@ -103,11 +103,18 @@ def has_transforms(channel: Channel) -> bool:
 
 def reader(channel: Channel) -> Read:
     """Reader of the messages of a channel that has a role; that of poses takes their ``dimension``, too."""
-    _, read, json_type = _TYPES[kind(channel)]
+    name, encoding = kind(channel), channel.encoding
+    _, read, json_type = _TYPES[name]
+    if read is read_livox:
+        return partial(read_livox, encoding=encoding)
     if json_type is None:
-        return partial(read, form=_FORMS[channel.encoding])
-    is_json = channel.encoding == "json"
-    parse = partial(foxglove.parse_json, kind=json_type) if is_json else foxglove.protobuf_parser(channel)
+        package, _, type_name = name.partition("/")
+        ros_name = "tf2_msgs/msg/TFMessage" if package == "tf" else f"{package}/msg/{type_name}"
+        parse = partial(unpacked, type_name=ros_name, encoding=encoding)
+    elif encoding == "json":
+        parse = partial(foxglove.parse_json, kind=json_type)
+    else:
+        parse = foxglove.protobuf_parser(channel)
     return lambda data, **options: read(parse(data), **options)
 
 

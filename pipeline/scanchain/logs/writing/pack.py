@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Sequence
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.data import Matrix, Pose
+from scanchain.logs.messages.ros import new, packed, typestore
 
 LATEST_NS = (1 << 31) * 1_000_000_000  # largest stamp of ROS
 _FIELD_TYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}  # sensor_msgs/PointField
@@ -52,45 +52,41 @@ def pack_laser_scan(
 ) -> bytes:
     """A sensor_msgs/LaserScan; (N,) ranges, inf where nothing came back, stamp = first beam."""
     angle_max_rad = angle_min_rad + (len(ranges_m) - 1) * angle_increment_rad
-    cdr = _Cdr()
-    cdr.header(stamp_ns, frame)
-    cdr.numbers("f", angle_min_rad, angle_max_rad, angle_increment_rad, time_increment_s, scan_time_s)
-    cdr.numbers("f", range_min_m, range_max_m)
-    cdr.numbers("I", len(ranges_m))
-    cdr.data += np.ascontiguousarray(ranges_m, dtype="<f4").tobytes()
-    cdr.numbers("I", 0)  # intensities
-    return bytes(cdr.data)
+    angles_rad = angle_min_rad, angle_max_rad, angle_increment_rad
+    limits_m = range_min_m, range_max_m
+    ranges = np.ascontiguousarray(ranges_m, np.float32)
+    return packed(
+        "sensor_msgs/msg/LaserScan",
+        _header(stamp_ns, frame), *angles_rad, time_increment_s, scan_time_s, *limits_m, ranges, ranges[:0],
+    )  # fmt: skip
 
 
 def pack_cloud(stamp_ns: int, frame: str, rows: NDArray[np.void]) -> bytes:
     """A sensor_msgs/PointCloud2 of one row: the fields of a structured array (N,), little endian."""
-    fields = rows.dtype.fields or {}
-    cdr = _Cdr()
-    cdr.header(stamp_ns, frame)
-    cdr.numbers("I", 1, len(rows), len(fields))
-    for name, field in fields.items():
-        cdr.string(name)
-        cdr.numbers("I", field[1])
-        cdr.numbers("B", _FIELD_TYPES[field[0].str[1:]])
-        cdr.numbers("I", 1)
-    cdr.numbers("B", 0)  # little endian
-    cdr.numbers("I", rows.itemsize, rows.nbytes, rows.nbytes)
-    cdr.data += rows.tobytes()
-    cdr.numbers("B", 1)  # dense
-    return bytes(cdr.data)
+    fields = [
+        new("sensor_msgs/msg/PointField", name, offset, _FIELD_TYPES[number.str[1:]], 1)
+        for name, (number, offset, *_) in (rows.dtype.fields or {}).items()
+    ]
+    data = np.frombuffer(rows.tobytes(), np.uint8)
+    return packed(
+        "sensor_msgs/msg/PointCloud2",
+        _header(stamp_ns, frame), 1, len(rows), fields, False, rows.itemsize, rows.nbytes, data, True,
+    )  # fmt: skip
 
 
 def pack_odometry(
     stamp_ns: int, frame: str, child_frame: str, pose: Place, covariance: Matrix | None = None
 ) -> bytes:
     """A nav_msgs/Odometry: pose of ``child_frame`` in ``frame``, (6, 6) covariance; no twist."""
-    cdr = _Cdr()
-    cdr.header(stamp_ns, frame)
-    cdr.string(child_frame)
-    cdr.numbers("d", *pose)
-    cdr.data += (np.zeros((6, 6)) if covariance is None else covariance.astype("<f8")).tobytes()
-    cdr.numbers("d", *([0.0] * 42))
-    return bytes(cdr.data)
+    covariances = np.zeros(36) if covariance is None else covariance.astype(np.float64).ravel(), np.zeros(36)
+    still = new("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
+    return packed(
+        "nav_msgs/msg/Odometry",
+        _header(stamp_ns, frame),
+        child_frame,
+        new("geometry_msgs/msg/PoseWithCovariance", _pose(pose), covariances[0]),
+        new("geometry_msgs/msg/TwistWithCovariance", new("geometry_msgs/msg/Twist", still, still), covariances[1]),
+    )
 
 
 class Link(NamedTuple):
@@ -103,66 +99,46 @@ class Link(NamedTuple):
 
 def pack_transforms(stamp_ns: int, *links: Link) -> bytes:
     """A tf2_msgs/TFMessage."""
-    cdr = _Cdr()
-    cdr.numbers("I", len(links))
-    for link in links:
-        cdr.header(stamp_ns, link.parent)
-        cdr.string(link.child)
-        cdr.numbers("d", *link.pose)
-    return bytes(cdr.data)
+    transforms = [
+        new(
+            "geometry_msgs/msg/TransformStamped",
+            _header(stamp_ns, link.parent),
+            link.child,
+            new("geometry_msgs/msg/Transform", *_parts(link.pose, "Vector3")),
+        )
+        for link in links
+    ]
+    return packed("tf2_msgs/msg/TFMessage", transforms)
 
 
 def pack_path(stamp_ns: int, frame: str, stamps_ns: Sequence[int], poses: Sequence[Place]) -> bytes:
     """A nav_msgs/Path: poses in ``frame``, each with its own stamp."""
-    cdr = _Cdr()
-    cdr.header(stamp_ns, frame)
-    cdr.numbers("I", len(poses))
-    for each_ns, pose in zip(stamps_ns, poses, strict=True):
-        cdr.header(each_ns, frame)
-        cdr.numbers("d", *pose)
-    return bytes(cdr.data)
+    stamped = [
+        new("geometry_msgs/msg/PoseStamped", _header(each_ns, frame), _pose(pose))
+        for each_ns, pose in zip(stamps_ns, poses, strict=True)
+    ]
+    return packed("nav_msgs/msg/Path", _header(stamp_ns, frame), stamped)
 
 
 def pack_grid(stamp_ns: int, frame: str, cells: NDArray[np.int8], resolution_m: float, origin: Place) -> bytes:
     """A nav_msgs/OccupancyGrid: (rows, columns) cells 0 free to 100 occupied, −1 unknown, row 0 at the origin."""
     rows, columns = cells.shape
-    cdr = _Cdr()
-    cdr.header(stamp_ns, frame)
-    cdr.stamp(stamp_ns)
-    cdr.numbers("f", resolution_m)
-    cdr.numbers("I", columns, rows)
-    cdr.numbers("d", *origin)
-    cdr.numbers("I", cells.size)
-    cdr.data += np.ascontiguousarray(cells, np.int8).tobytes()
-    return bytes(cdr.data)
+    header = _header(stamp_ns, frame)
+    about = new("nav_msgs/msg/MapMetaData", header.stamp, resolution_m, columns, rows, _pose(origin))
+    return packed("nav_msgs/msg/OccupancyGrid", header, about, np.ascontiguousarray(cells, np.int8).ravel())
 
 
-class _Cdr:
-    """A message in ROS 2's CDR, little endian: numbers lie at multiples of their size, counted from byte 4."""
+def _header(stamp_ns: int, frame: str) -> Any:
+    return new("std_msgs/msg/Header", new("builtin_interfaces/msg/Time", *divmod(stamp_ns, 1_000_000_000)), frame)
 
-    __slots__ = ("data",)
 
-    def __init__(self) -> None:
-        self.data = bytearray(b"\x00\x01\x00\x00")
+def _pose(pose: Place) -> Any:
+    return new("geometry_msgs/msg/Pose", *_parts(pose, "Point"))
 
-    def numbers(self, code: str, *values: float) -> None:
-        size = struct.calcsize(f"<{code}")
-        self.data += bytes(-(len(self.data) - 4) % size)
-        self.data += struct.pack(f"<{len(values)}{code}", *values)
 
-    def string(self, text: str) -> None:
-        encoded = text.encode() + b"\x00"
-        self.numbers("I", len(encoded))
-        self.data += encoded
-
-    def header(self, stamp_ns: int, frame: str) -> None:
-        self.stamp(stamp_ns)
-        self.string(frame)
-
-    def stamp(self, stamp_ns: int) -> None:
-        seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
-        self.numbers("i", seconds)
-        self.numbers("I", nanoseconds)
+def _parts(pose: Place, kind: str) -> tuple[Any, Any]:
+    """Position, of a type of geometry_msgs, and orientation."""
+    return new(f"geometry_msgs/msg/{kind}", *pose[:3]), new("geometry_msgs/msg/Quaternion", *pose[3:])
 
 
 @cache
@@ -171,9 +147,9 @@ def schema_text(name: str) -> bytes:
 
     Empty for a type that ROS 2 does not bring.
     """
-    from rosbags.typesys import Stores, TypesysError, get_typestore  # a tenth of a second
+    from rosbags.typesys import TypesysError
 
     try:
-        return get_typestore(Stores.ROS2_HUMBLE).generate_msgdef(name, ros_version=2)[0].encode()
+        return typestore().generate_msgdef(name, ros_version=2)[0].encode()
     except TypesysError:
         return b""

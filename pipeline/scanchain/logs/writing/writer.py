@@ -11,18 +11,9 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
-from scanchain.data import Matrix, Pose
 from scanchain.errors import InputError
 from scanchain.logs.mcap.records import Channel
-from scanchain.logs.writing.pack import (
-    Link,
-    pack_cloud,
-    pack_laser_scan,
-    pack_odometry,
-    pack_transforms,
-    place,
-    schema_text,
-)
+from scanchain.logs.writing.pack import pack_cloud, schema_text
 
 CHUNK_BYTES = 4 * 1024 * 1024
 
@@ -30,7 +21,7 @@ CHUNK_BYTES = 4 * 1024 * 1024
 class LogWriter:
     """A new log; a context manager. It takes its name only when complete, an exception leaves nothing behind.
 
-    Messages are recorded at ``log_time_ns``, by default their own stamp. Poses may be SE(2) or SE(3).
+    Messages are recorded at ``log_time_ns``, by default their own stamp.
     """
 
     def __init__(self, destination: Path, *, force: bool = False, profile: str = "ros2") -> None:
@@ -72,35 +63,6 @@ class LogWriter:
                 self._stream.close()
             self._partial.unlink(missing_ok=True)
 
-    def laser_scan(
-        self,
-        topic: str,
-        stamp_ns: int,
-        frame: str,
-        angle_min_rad: float,
-        angle_increment_rad: float,
-        time_increment_s: float,
-        ranges_m: NDArray[np.floating],
-        *,
-        range_min_m: float,
-        range_max_m: float,
-        scan_time_s: float = 0.0,
-        log_time_ns: int | None = None,
-    ) -> None:
-        """Append a sensor_msgs/LaserScan; (N,) ranges, inf where nothing came back, stamp = first beam."""
-        data = pack_laser_scan(
-            stamp_ns,
-            frame,
-            angle_min_rad,
-            angle_increment_rad,
-            ranges_m,
-            range_min_m=range_min_m,
-            range_max_m=range_max_m,
-            time_increment_s=time_increment_s,
-            scan_time_s=scan_time_s,
-        )
-        self.append(topic, "sensor_msgs/msg/LaserScan", data, stamp_ns, log_time_ns)
-
     def point_cloud(
         self,
         topic: str,
@@ -133,28 +95,6 @@ class LogWriter:
         for name, (_, values) in columns.items():
             rows[name] = values
         self.append(topic, "sensor_msgs/msg/PointCloud2", pack_cloud(stamp_ns, frame, rows), stamp_ns, log_time_ns)
-
-    def odometry(
-        self,
-        topic: str,
-        stamp_ns: int,
-        frame: str,
-        child_frame: str,
-        T: Pose,
-        covariance: Matrix | None = None,
-        *,
-        log_time_ns: int | None = None,
-    ) -> None:
-        """Append a nav_msgs/Odometry: pose of ``child_frame`` in ``frame``, (6, 6) covariance; no twist."""
-        data = pack_odometry(stamp_ns, frame, child_frame, place(T), covariance)
-        self.append(topic, "nav_msgs/msg/Odometry", data, stamp_ns, log_time_ns)
-
-    def static_transform(
-        self, stamp_ns: int, parent: str, child: str, T: Pose, *, log_time_ns: int | None = None
-    ) -> None:
-        """Append a tf2_msgs/TFMessage to /tf_static: pose of ``child`` in ``parent``."""
-        data = pack_transforms(stamp_ns, Link(parent, child, place(T)))
-        self.append("/tf_static", "tf2_msgs/msg/TFMessage", data, stamp_ns, log_time_ns)
 
     def copy(self, channel: Channel, log_time_ns: int, data: bytes) -> None:
         """Append a message of another log as it is, with its topic, type, encoding and definition."""
