@@ -309,7 +309,7 @@ def write_report(directory: Path) -> None:
 def draw_localization(folder: Path, localized: LocalizedLog) -> None:
     """Add report.html and a recording to the directory of a localized log."""
     from scanchain.runs.directory import RECORDING_FILE
-    from scanchain_viz.recording.localization import record_localization
+    from scanchain_viz.recording.maps import record_localization
     from scanchain_viz.report.localization import write_localization_report
 
     write_localization_report(folder, localized)
@@ -318,7 +318,7 @@ def draw_localization(folder: Path, localized: LocalizedLog) -> None:
 
 def present_merge(directory: Path) -> None:
     """Add report.html and a recording to the directory of a merge."""
-    from scanchain_viz.recording.merge import record_merge
+    from scanchain_viz.recording.maps import record_merge
     from scanchain_viz.report.merge import write_merge_report
 
     write_merge_report(directory)
@@ -336,7 +336,7 @@ def present_comparison(directory: Path) -> None:
 
 def present_changes(directory: Path, found: Changes) -> None:
     """Add report.html and a recording to the directory of changes."""
-    from scanchain_viz.recording.changes import record_changes
+    from scanchain_viz.recording.maps import record_changes
     from scanchain_viz.report.changes import write_changes_report
 
     write_changes_report(directory, found)

@@ -23,10 +23,10 @@ from scanchain.errors import InputError
 from scanchain.runs.closures import final_verdicts
 from scanchain.runs.step_table import StepTable
 from scanchain.verdict import Judged, Kind, Stretch, Verdict
-from scanchain_viz.recording import entities, shapes, viewer
+from scanchain_viz.recording import drawing, entities, viewer
 from scanchain_viz.recording import recording as module
 from scanchain_viz.recording.blueprint import blueprint
-from scanchain_viz.recording.messages import Message
+from scanchain_viz.recording.drawing import Message
 from scanchain_viz.recording.recording import Recording
 from scanchain_viz.recording.sinks import file_sink, open_stream, write_recording
 from tests.support.killing import same_recording
@@ -195,7 +195,7 @@ def test_a_position_that_one_direction_leaves_open_is_drawn_long_in_that_directi
     information[2, 2] = 1e8
     columns = {
         str(c.component_descriptor()): c.as_arrow_array().to_pylist()
-        for c in shapes.ellipsoids(information[None], 1.0)
+        for c in drawing.ellipsoids(information[None], 1.0)
     }
     sizes = next(value for key, value in columns.items() if "half_sizes" in key)[0][0]
     quat = next(value for key, value in columns.items() if "quaternion" in key)[0][0]
@@ -207,7 +207,7 @@ def test_a_position_that_one_direction_leaves_open_is_drawn_long_in_that_directi
 
 def test_a_match_without_any_information_is_drawn_at_the_cap_and_breaks_nothing():
     for information in (np.zeros((6, 6)), np.full((6, 6), np.nan)):
-        columns = list(shapes.ellipsoids(information[None], 1.0))
+        columns = list(drawing.ellipsoids(information[None], 1.0))
         np.testing.assert_allclose(columns[0].as_arrow_array().to_pylist()[0][0], [0.2] * 3, rtol=1e-5)
 
 
@@ -278,7 +278,7 @@ from tests.support.recordings import drive, free_port
 from scanchain.config import RecordingConfig
 from scanchain_viz.recording import sinks, viewer
 from scanchain_viz.recording.blueprint import blueprint
-from scanchain_viz.recording.messages import Message
+from scanchain_viz.recording.drawing import Message
 from scanchain_viz.recording.recording import Recording
 from scanchain_viz.recording.sinks import open_stream, write_recording
 sinks._VIEWER_PATIENCE_S = 1.0
@@ -364,7 +364,7 @@ from uuid import uuid4
 from tests.support.recordings import drive
 from scanchain.config import RecordingConfig
 from scanchain_viz.recording.blueprint import blueprint
-from scanchain_viz.recording.messages import Message
+from scanchain_viz.recording.drawing import Message
 from scanchain_viz.recording.recording import Recording
 from scanchain_viz.recording.sinks import open_stream, write_recording
 recording = Recording(Path(sys.argv[1]), dimension=2, name="t", sinks=frozenset({"save"}),

@@ -169,7 +169,7 @@ class Outputs:
             with _written(self.picture):
                 draw_graph(report.change, self.picture)
         if self.recording is not None:
-            from scanchain_viz.recording.graph import record_graph
+            from scanchain_viz.recording.problems import record_graph
 
             with _written(self.recording):
                 record_graph(report.change, self.recording)

@@ -16,7 +16,7 @@ from scanchain.words import counted
 from scanchain_viz.pictures.map_figures import surroundings
 from scanchain_viz.pictures.merge import DrawnMerge, picture, read_merge
 from scanchain_viz.pictures.trajectory_figures import PathLine
-from scanchain_viz.recording.shapes import in_space
+from scanchain_viz.recording.drawing import in_space
 from scanchain_viz.report import page
 from scanchain_viz.report.sections import provenance_sections
 from scanchain_viz.report.trajectory_map import SCRIPT, interactive_map
