@@ -82,24 +82,6 @@ def mark_ends(figure: SvgFigure, path: Floats, ends: Sequence[tuple[int, str]] =
         figure.marks(x, y, shape, INK, 7.0, line=1.0)
 
 
-def layers_picture(
-    layers: Sequence[tuple[Points, str]],
-    outlines: Sequence[tuple[Floats, str]],
-    low: Floats,
-    high: Floats,
-    *,
-    is_wide: bool = False,
-) -> Markup:
-    """Points (M, 3) in a color each, seen from above, the last ones on top, and closed outlines (N, 2)."""
-    figure = SvgFigure.of_plan(low, high, is_wide=is_wide)
-    for points, color in layers:
-        draw_points(figure, points, low, high, color)
-    for outline, color in outlines:
-        x, y = np.vstack([outline, outline[:1]])[:, :2].T
-        figure.line(x, y, color, 0.8)
-    return figure.svg()
-
-
 BEFORE, AFTER = "#1aa179", "#a55bd6"  # colors of two passes
 _MARGIN_M = 1.0  # around their points
 _VIEW_M = {2: 12.0, 3: 30.0}  # half width of a picture of two passes

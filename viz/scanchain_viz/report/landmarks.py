@@ -79,4 +79,4 @@ def _grid(study: Study) -> page.Grid:
     split = [heading.partition(" ms") for heading in headings]
     heads = tuple(page.Head(name, unit.strip()) for name, unit, _ in split)
     notes = (_TIMES, *((_DIFFERS, _PINV) if len(rows) > 1 else ("--methods all compares the linear solvers.",)))
-    return page.Grid(heads, tuple(page.Row(name, tuple(map(page.Cell, cells))) for name, *cells in rows), notes)
+    return page.Grid(heads, tuple(page.Row(name, tuple(cells)) for name, *cells in rows), notes)

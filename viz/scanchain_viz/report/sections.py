@@ -15,7 +15,7 @@ from scanchain.runs.provenance import Provenance
 from scanchain_viz.pictures import trajectory_figures as figures
 from scanchain_viz.pictures.map_figures import loops_picture
 from scanchain_viz.pictures.trajectory_figures import CLOSURES, TRUTH, DrawnTrajectory, Floats
-from scanchain_viz.report.page import Cell, Chip, Collapsible, Drawing, Grid, Head, Row, Section
+from scanchain_viz.report.page import Cell, Chip, Collapsible, Drawing, Grid, Head, Row, Section, figure
 
 _TRUTH_CHIP = Chip("ground truth", TRUTH, is_dashed=True)
 _WITHOUT_CAUSES = "This run is older than the column cause; reasons are in loops.parquet, a sentence a closure."
@@ -183,20 +183,15 @@ def _verdict_grid(closures: pa.Table) -> Grid:
         Row(
             verdict,
             (
-                Cell(f"{len(places):,}"),
-                Cell(f"{100.0 * np.median(overlap[places]):.0f}"),
-                Cell(_millimeters(float(np.median(residual_m[places])))),
+                f"{len(places):,}",
+                f"{100.0 * np.median(overlap[places]):.0f}",
+                figure(float(np.median(residual_m[places])), 1e3, 0),
                 *((Cell(cause, is_wide=True),) if has_causes else ()),
             ),
         )
         for (verdict, cause), places in sorted(groups.items(), key=lambda group: -len(group[1]))
     )
     return Grid(heads, rows, () if has_causes else (_WITHOUT_CAUSES,))
-
-
-def _millimeters(value_m: float) -> str:
-    """Millimeters as text, – without a value."""
-    return f"{1e3 * value_m:.0f}" if np.isfinite(value_m) else "–"
 
 
 def _of_neighbors(what: str, trajectories: Sequence[DrawnTrajectory], key: str) -> str:
