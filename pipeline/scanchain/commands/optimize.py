@@ -164,7 +164,7 @@ class Outputs:
             with _written(self.table):
                 write_covariances(self.table, file.ids[chosen], file.graph.covariances()[chosen])
         if self.picture is not None:
-            from scanchain_viz.pictures.graph import draw_graph
+            from scanchain_viz.pictures.problems import draw_graph
 
             with _written(self.picture):
                 draw_graph(report.change, self.picture)

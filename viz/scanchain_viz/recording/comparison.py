@@ -15,6 +15,7 @@ from scanchain.comparison.results import MAP_FILE, SCANS_FILE, TRUTH_FILE, metho
 from scanchain.comparison.table import Table, read_table
 from scanchain.maps import read_ply
 from scanchain.trajectory import read_tum
+from scanchain_viz.colors import rgb
 from scanchain_viz.pictures.compared_trajectories import read_trajectories
 from scanchain_viz.pictures.trajectory_figures import DrawnTrajectory
 from scanchain_viz.recording import drawing, entities
@@ -50,7 +51,7 @@ def _messages(directory: Path, trajectories: Sequence[DrawnTrajectory], stamps_n
 def _of(trajectory: DrawnTrajectory, map_file: Path, stamps_ns: np.ndarray) -> list[Message]:
     """The trajectory in segments, the lidar on it, the map, and the plots."""
     name = rr.escape_entity_path_part(trajectory.name)
-    color, positions = drawing.rgb(trajectory.color), trajectory.positions.astype(np.float32)
+    color, positions = rgb(trajectory.color), trajectory.positions.astype(np.float32)
     times = Times(np.arange(len(positions)), stamps_ns[: len(positions)])
     before = np.concatenate([positions[:1], positions[:-1]])
     strips = rr.LineStrips3D.columns(strips=drawing.segments(before, positions))

@@ -71,12 +71,6 @@ class Message:
         return [part.partition([len(part.as_arrow_array())]) for part in parts]
 
 
-def rgb(color: str) -> Color:
-    """The parts of #rrggbb."""
-    red, green, blue = bytes.fromhex(color.removeprefix("#"))
-    return red, green, blue
-
-
 def pixels(radius: float | None) -> float | None:
     """A radius in points of the screen, which rerun takes as a negative number."""
     return None if radius is None else -radius

@@ -16,8 +16,8 @@ from scanchain.sessions.change_files import COLORS, SUMMARY_FILE
 from scanchain.sessions.changes import Changes, Label
 from scanchain.sessions.localize import LocalizedLog
 from scanchain.sessions.localizer import MapState
-from scanchain_viz.pictures.map_figures import map_points
-from scanchain_viz.pictures.merge import DrawnMerge, read_merge
+from scanchain_viz.colors import rgb
+from scanchain_viz.pictures.map_figures import DrawnMerge, map_points, read_merge
 from scanchain_viz.recording import drawing, entities
 from scanchain_viz.recording.blueprint import scene, time_panel, whole_log
 from scanchain_viz.recording.drawing import Message, Times
@@ -55,7 +55,7 @@ def _merge(directory: Path, drawn: DrawnMerge) -> Iterator[Message]:
     yield Message(entities.MAP, drawing.dots(points, entities.GRAY, 0.75))
     yield Message(entities.ACCEPTED, drawing.lines(drawn.closures.astype(np.float32), entities.GREEN, 0.75))
     for session in drawn.sessions:
-        color, name = drawing.rgb(session.color), rr.escape_entity_path_part(session.name)
+        color, name = rgb(session.color), rr.escape_entity_path_part(session.name)
         path = session.positions.astype(np.float32)
         yield Message(f"world/sessions/{name}/trajectory", drawing.lines([path], color, 1.5))
         yield Message(f"world/sessions/{name}/keyframes", drawing.dots(path, color, 2.5))

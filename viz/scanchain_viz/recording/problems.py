@@ -14,7 +14,7 @@ from scanchain.data import GraphState
 from scanchain.graph.optimization import GraphChange
 from scanchain.landmarks.files.write import file_stem
 from scanchain.landmarks.study import Estimate, Study
-from scanchain_viz.pictures.landmarks import ellipses
+from scanchain_viz.pictures.problems import ellipses
 from scanchain_viz.recording import drawing, entities
 from scanchain_viz.recording.drawing import Message, Times
 from scanchain_viz.recording.sinks import write_recording

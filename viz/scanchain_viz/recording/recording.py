@@ -23,12 +23,12 @@ from scanchain.runs.closures import FinalClosure
 from scanchain.runs.job import SinkName
 from scanchain.runs.step_table import StepRow
 from scanchain.verdict import Judged, Kind, Stretch
+from scanchain_viz.colors import STRETCH_COLORS, rgb
 from scanchain_viz.recording import drawing, entities, viewer
 from scanchain_viz.recording.batching import WARNING, Batcher, events
 from scanchain_viz.recording.blueprint import blueprint
 from scanchain_viz.recording.drawing import Message, Times
 from scanchain_viz.recording.sinks import Sink, file_sink, open_stream, viewer_sink
-from scanchain_viz.stretch_colors import STRETCH_COLORS
 
 _LISTED = 50  # largest number of stretches in the text of a verdict
 _RADIUS = 3.5  # of a stretch, in points of the screen
@@ -287,7 +287,7 @@ def _verdict(judged: Judged, trajectory: Trajectory) -> list[Message]:
         path = drawing.positions(trajectory.poses)
         lines = rr.LineStrips3D(
             [_stretch_line(path, each) for each in judged.stretches],
-            colors=[drawing.rgb(STRETCH_COLORS[each.kind]) for each in judged.stretches],
+            colors=[rgb(STRETCH_COLORS[each.kind]) for each in judged.stretches],
             radii=drawing.pixels(_RADIUS),
             labels=[str(each.kind) for each in judged.stretches],
             show_labels=False,

@@ -18,7 +18,7 @@ from scanchain.source import source_of, without_keys
 from scanchain.trajectory import read_tum
 from scanchain.verdict import MOST_CONTRADICTED
 from scanchain.words import counted
-from scanchain_viz.pictures.figure import SvgFigure
+from scanchain_viz.pictures.figure import Plot
 from scanchain_viz.pictures.trajectory_figures import color_of
 from scanchain_viz.report import page
 
@@ -151,7 +151,7 @@ def _values(done: Sequence[Row], figure: Callable[[Row, Metrics], float | None])
 
 
 def _sorted_values(name: str, unit: str, values: Sequence[float]) -> Markup:
-    figure, ordered = SvgFigure(), np.array(values)
+    figure, ordered = Plot(), np.array(values)
     share = 100.0 * (np.arange(len(values)) + 1) / len(values)
     figure.steps(ordered, share, color_of(0))
     figure.marks(ordered, share, "o", color_of(0), 3.5)
@@ -179,7 +179,7 @@ def _trajectory(trajectory: Path) -> Markup:
     rows = np.linspace(0, len(positions) - 1, min(len(positions), _MAX_POINTS)).astype(int)
     middle, size = 0.5 * (positions.min(axis=0) + positions.max(axis=0)), np.ptp(positions, axis=0)
     half = _BEYOND * 0.5 * (max(size / _BOX) or 1.0) * _BOX
-    figure = SvgFigure.of_plan(middle - half, middle + half)
+    figure = Plot.of_plan(middle - half, middle + half)
     x, y = positions[rows].T
     figure.line(x, y, color_of(0))
     figure.marks(x[:1], y[:1], "o", color_of(0), 5.0)

@@ -22,9 +22,18 @@ from scanchain.sessions.localizer import MapState
 from scanchain.sessions.merging import MergeMetrics
 from scanchain.verdict import Judged
 from scanchain.words import counted
-from scanchain_viz.pictures.figure import INK, SvgFigure
-from scanchain_viz.pictures.map_figures import draw_points, extent, map_points, path_over_map, surroundings
-from scanchain_viz.pictures.merge import DrawnMerge, picture, read_merge
+from scanchain_viz.colors import hex_of
+from scanchain_viz.pictures.figure import INK, Plot
+from scanchain_viz.pictures.map_figures import (
+    DrawnMerge,
+    draw_points,
+    extent,
+    map_points,
+    merge_picture,
+    path_over_map,
+    read_merge,
+    surroundings,
+)
 from scanchain_viz.pictures.trajectory_figures import PathLine
 from scanchain_viz.recording.drawing import in_space
 from scanchain_viz.report import page
@@ -49,7 +58,7 @@ _PLACED_LATER = "#0f9bb5"
 _ROWS, _CLOSE_UPS = 200, 12
 _AROUND_M = 3.0  # around a cluster in a close-up
 _ORDER = (Label.SAME, Label.UNKNOWN, Label.VANISHED, Label.APPEARED)
-_HEX = {label: "#" + bytes(COLORS[label]).hex() for label in Label}
+_HEX = {label: hex_of(COLORS[label]) for label in Label}
 _HOW_TOLD = (
     "A change is named where the scans of the other map looked through the place. Unknown is what the other map "
     "did not see, or what is too small."
@@ -99,7 +108,7 @@ def _merged_map(directory: Path, drawn: DrawnMerge, metrics: MergeMetrics) -> pa
         page.Drawing(
             "Sessions over the map",
             "Seen from above; thin lines: closures in force between sessions.",
-            picture(drawn, points, low, high),
+            merge_picture(drawn, points, low, high),
         ),
         interactive_map(points, lines, low, high, grain_m=drawn.grain_m, is_flat=is_flat),
     )
@@ -203,7 +212,7 @@ def _path_picture(localized: LocalizedLog) -> page.Drawing:
 def _states_picture(localized: LocalizedLog) -> page.Drawing:
     """Standard deviation of the position and state, over the path."""
     found = localized.localization
-    figure, runs = SvgFigure(2.0, is_wide=True), np.flatnonzero(found.states[1:] != found.states[:-1]) + 1
+    figure, runs = Plot(2.0, is_wide=True), np.flatnonzero(found.states[1:] != found.states[:-1]) + 1
     top = float(np.nanmax(found.sigma_m, initial=0.01)) if np.isfinite(found.sigma_m).any() else 1.0
     for run in np.split(np.arange(len(found.states)), runs):
         first_m, last_m = found.traveled_m[[run[0], min(run[-1] + 1, len(found.states) - 1)]].tolist()
@@ -257,9 +266,9 @@ def _changes_picture(
     points: Matrix, changes: Changes, low: Matrix, high: Matrix, *, is_wide: bool = False
 ) -> Markup:
     """Points (M, 3) in the colors of their labels, seen from above, and boxes of clusters."""
-    figure = SvgFigure.of_plan(low, high, is_wide=is_wide)
+    figure = Plot.of_plan(low, high, is_wide=is_wide)
     for label in _ORDER:
-        draw_points(figure, points[changes.labels == label], low, high, _HEX[label])
+        draw_points(figure, points[changes.labels == label], low, high, (_HEX[label],))
     for cluster in changes.clusters:
         x, y = _outline(cluster)[[0, 1, 2, 3, 0]].T
         figure.line(x, y, INK, 0.8)

@@ -91,7 +91,7 @@ class Grid:
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
-    """A picture with its caption; ``svg`` comes from an ``SvgFigure`` or is a scene, all else is escaped.
+    """A picture with its caption; ``svg`` comes from an ``Plot`` or is a scene, all else is escaped.
 
     ``is_wide`` : over the whole width of the page
     """
