@@ -124,18 +124,33 @@ class Plot:
         drawn = {"color": _on_white(color), "linewidth": width, "alpha": opacity, "label": name or None}
         self._on_axes.append(lambda axes: axes.plot(x, y, linestyle=(0, (*dashes,)) if dashes else "-", **drawn))
 
+    def path(
+        self,
+        positions: NDArray[np.floating],
+        color: str,
+        width: float = 1.2,
+        dashes: Sequence[float] = (),
+        opacity: float = 1.0,
+        *,
+        name: str = "",
+    ) -> None:
+        """Draw a line through positions (N, 2) or, from above, (N, 3)."""
+        x, y = positions[:, :2].T.astype(np.float64)
+        self.line(x, y, color, width, dashes, opacity, name=name)
+
     def steps(self, x: Floats, y: Floats, color: str) -> None:
         """Draw a line that rises or falls at positions only."""
         self.line(np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1], color)
 
     def marks(
-        self, x: Floats, y: Floats, shape: str, color: str, size: float, *, line: float = 0.0, name: str = ""
+        self, positions: Floats, shape: str, color: str, size: float, *, line: float = 0.0, name: str = ""
     ) -> None:
-        """Draw a mark of so many points at each position: a disk "o", a square "s" or a cross "+".
+        """Draw a mark of so many points at each position (N, 2): a disk "o", a square "s" or a cross "+".
 
         line : width of the line that it is drawn with; 0 fills it
         name : as of a line
         """
+        x, y = positions.T
         self._include(x, y)
         style = f"fill: {color}" if not line else f"stroke: {color}; stroke-width: {line:g}"
         self._within.append(lambda: _marks(self._at(x, y), shape, 0.5 * size, style))

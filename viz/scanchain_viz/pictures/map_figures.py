@@ -74,16 +74,14 @@ def path_over_map(
     draw_points(figure, points, low, high)
     mark_ends(figure, path)
     for line in lines:
-        x, y = line.positions[:, :2].T
-        figure.line(x, y, line.color, line.width, (3.0, 3.0) if line.is_dashed else ())
+        figure.path(line.positions, line.color, line.width, (3.0, 3.0) if line.is_dashed else ())
     return figure.svg()
 
 
 def mark_ends(figure: Plot, path: Floats, ends: Sequence[tuple[int, str]] = ((0, "o"), (-1, "s"))) -> None:
     """Outlines around begin and end of a path (N, 3), however short it is: it is drawn over them."""
     for place, shape in ends:
-        x, y = path[place, :2, None]
-        figure.marks(x, y, shape, INK, 7.0, line=1.0)
+        figure.marks(path[place, None, :2], shape, INK, 7.0, line=1.0)
 
 
 BEFORE, AFTER = "#1aa179", "#a55bd6"  # colors of two passes
@@ -102,7 +100,7 @@ def overlay_picture(overlay: Overlay) -> Markup:
     figure = Plot.of_plan(low, high)
     for points, path, color in ((before, overlay.path_before, BEFORE), (after, overlay.path_after, AFTER)):
         draw_points(figure, points, low, high, (color,))
-        figure.line(path[:, 0], path[:, 1], color, 1.4)
+        figure.path(path, color, 1.4)
     return figure.svg()
 
 
@@ -156,9 +154,9 @@ def loops_picture(
     """The trajectory (gray) and its closures (E, 2, 3) in the colors of ``CLOSURES``, over the whole page."""
     figure = Plot.of_plan(low, high, is_wide=True)
     mark_ends(figure, trajectory.positions, ((0, "o"),))
-    figure.line(trajectory.positions[:, 0], trajectory.positions[:, 1], _POINTS, 0.7)
+    figure.path(trajectory.positions, _POINTS, 0.7)
     for by, (_, color) in CLOSURES.items():
-        figure.line(*broken(edges[rejected_by == by][:, :, :2]).T, color, 0.9)
+        figure.path(broken(edges[rejected_by == by]), color, 0.9)
     return figure.svg()
 
 
@@ -203,8 +201,7 @@ def merge_picture(drawn: DrawnMerge, points: Points, low: Floats, high: Floats) 
     """Paths and closures over the map (M, 3), seen from above, within corners."""
     figure = Plot.of_plan(low, high)
     draw_points(figure, points, low, high)
-    figure.line(*broken(drawn.closures[:, :, :2]).T, CLOSURES[""][1], 0.5)
+    figure.path(broken(drawn.closures), CLOSURES[""][1], 0.5)
     for session in drawn.sessions:
-        x, y = session.positions[:, :2].T
-        figure.line(x, y, session.color)
+        figure.path(session.positions, session.color)
     return figure.svg()

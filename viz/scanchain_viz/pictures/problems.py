@@ -55,7 +55,7 @@ def _graph(state: GraphState) -> Plot:
         (state.is_rejected, _REJECTED, width, "rejected"),
     ):
         if chosen.any():
-            figure.line(*broken(seen[state.edges[chosen]]).T, color, thickness, name=name)
+            figure.path(broken(seen[state.edges[chosen]]), color, thickness, name=name)
     return figure
 
 
@@ -82,7 +82,7 @@ def plot_after(study: Study) -> Plot:
     along = axes_m[:, None] * np.stack([np.cos(around), np.sin(around)], axis=-1)
     c, s = np.cos(angles_rad), np.sin(angles_rad)
     outlines = along @ np.stack([c, s, -s, c], axis=-1).reshape(-1, 2, 2) + _in_truth(study.after)[1][:, None]
-    figure.line(*broken(outlines).T, AFTER, 0.6, opacity=0.5, name="95 % ellipse of a landmark")
+    figure.path(broken(outlines), AFTER, 0.6, opacity=0.5, name="95 % ellipse of a landmark")
     return figure
 
 
@@ -91,11 +91,11 @@ def _plot(study: Study, estimate: Estimate, color: str, when: str) -> Plot:
     figure = Plot.of_plan(*_with_margin(np.concatenate(points)))
     poses, landmarks = _in_truth(estimate)
     if len(study.true_poses):
-        figure.line(*study.true_poses.T, INK, 1.1, (4.0, 2.0), name="true trajectory")
-    figure.line(*poses.T, color, opacity=0.85, name=f"trajectory {when}")
+        figure.path(study.true_poses, INK, 1.1, (4.0, 2.0), name="true trajectory")
+    figure.path(poses, color, opacity=0.85, name=f"trajectory {when}")
     if np.isfinite(study.true_landmarks).any():
-        figure.marks(*study.true_landmarks.T, "+", INK, 7.0, line=0.9, name="true landmarks")
-    figure.marks(*landmarks.T, "o", color, 4.0, line=0.9, name=f"landmarks {when}")
+        figure.marks(study.true_landmarks, "+", INK, 7.0, line=0.9, name="true landmarks")
+    figure.marks(landmarks, "o", color, 4.0, line=0.9, name=f"landmarks {when}")
     return figure
 
 

@@ -69,7 +69,7 @@ def draw_map(
     if grid is not None:
         _draw_grid(figure, grid, low, high)
     if points is not None and len(points):
-        space = np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
+        space = np.pad(points, ((0, 0), (0, 3 - points.shape[1]))).astype(np.float64)
         draw_points(figure, space, low, high, _SHADES)
     _draw_path(figure, odometry, "odometry", _ODOMETRY, 1.0)
     _draw_path(figure, optimized, "optimized", _OPTIMIZED, 1.8)
@@ -78,12 +78,11 @@ def draw_map(
         _draw_path(figure, poses, name, color_of(number), 1.4)
     for each in stretches:
         if each.kind is not Kind.LOOPS:
-            x, y = optimized[max(each.first - 1, 0) : each.last + 1, :2, -1].T
-            figure.line(x, y, STRETCH_COLORS[each.kind], 3.0, name=str(each.kind))
+            part = optimized[max(each.first - 1, 0) : each.last + 1, :2, -1]
+            figure.path(part, STRETCH_COLORS[each.kind], 3.0, name=str(each.kind))
     for place, shape, name in ((0, "o", "start"), (-1, "s", "end")):
         if len(optimized):
-            x, y = optimized[place, :2, -1, None]
-            figure.marks(x, y, shape, _OPTIMIZED, 7.0, line=1.0, name=name)
+            figure.marks(optimized[place, None, :2, -1], shape, _OPTIMIZED, 7.0, line=1.0, name=name)
     write_png(path, [(title, figure)], width_inches=_WIDTH_INCHES)
 
 
@@ -121,7 +120,7 @@ def _draw_path(
     """Draw one line, its length in the legend."""
     if poses is not None and len(poses):
         length_m = float(np.linalg.norm(np.diff(poses[:, :-1, -1], axis=0), axis=1).sum())
-        figure.line(*poses[:, :2, -1].T, color, width, dashes, name=f"{name} ({length_m:.0f} m)")
+        figure.path(poses[:, :2, -1], color, width, dashes, name=f"{name} ({length_m:.0f} m)")
 
 
 def draw_evaluated(picture: Path, evaluated: Mapping[str, tuple[Matrix, Matrix]]) -> None:

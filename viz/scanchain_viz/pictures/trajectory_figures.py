@@ -101,11 +101,9 @@ def plan(
     """Seen from above, within corners."""
     figure = Plot.of_plan(low, high, is_wide=is_wide)
     for trajectory in _known(trajectories, "positions"):
-        x, y = _decimated(trajectory.positions)[:, :2].T
-        figure.line(x, y, trajectory.color, dashes=trajectory.dashes)
+        figure.path(_decimated(trajectory.positions), trajectory.color, dashes=trajectory.dashes)
     if truth is not None:
-        x, y = _decimated(truth)[:, :2].T
-        figure.line(x, y, TRUTH, _TRUTH_WIDTH, _TRUTH_DASHES)
+        figure.path(_decimated(truth), TRUTH, _TRUTH_WIDTH, _TRUTH_DASHES)
     figure.has_grid = True
     return figure.svg()
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from numpy.typing import NDArray
 
 from scanchain_viz.recording import entities
 from scanchain_viz.recording.drawing import Floats
@@ -82,7 +83,7 @@ def time_panel(scans: int) -> rrb.TimePanel:
 
 
 def scene(
-    name: str, dimension: int, seen: Floats | None, overrides: Mapping[Any, Any] | None = None
+    name: str, dimension: int, seen: NDArray[np.floating] | None, overrides: Mapping[Any, Any] | None = None
 ) -> rrb.Spatial3DView:
     """The world, dark whatever the viewer is; seen : (N, 3) points, or corners, that the view should hold."""
     return rrb.Spatial3DView(
@@ -95,7 +96,7 @@ def scene(
     )
 
 
-def _eye(dimension: int, seen: Floats | None) -> rrb.EyeControls3D:
+def _eye(dimension: int, seen: NDArray[np.floating] | None) -> rrb.EyeControls3D:
     """From above for a 2D log, obliquely for a 3D one; far enough to see the whole trajectory."""
     known = np.array([[-20.0] * 3, [20.0] * 3]) if seen is None or not len(seen) else seen
     low, high = known.min(axis=0), known.max(axis=0)

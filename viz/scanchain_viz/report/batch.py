@@ -154,7 +154,7 @@ def _sorted_values(name: str, unit: str, values: Sequence[float]) -> Markup:
     figure, ordered = Plot(), np.array(values)
     share = 100.0 * (np.arange(len(values)) + 1) / len(values)
     figure.steps(ordered, share, color_of(0))
-    figure.marks(ordered, share, "o", color_of(0), 3.5)
+    figure.marks(np.stack([ordered, share], axis=1), "o", color_of(0), 3.5)
     figure.x.limit(0.0, _BEYOND * max(values) or 1.0)
     figure.y.limit(0.0, 105.0)
     figure.x.label, figure.y.label, figure.has_grid = f"{name} [{unit}]", "logs below [%]", True
@@ -180,8 +180,7 @@ def _trajectory(trajectory: Path) -> Markup:
     middle, size = 0.5 * (positions.min(axis=0) + positions.max(axis=0)), np.ptp(positions, axis=0)
     half = _BEYOND * 0.5 * (max(size / _BOX) or 1.0) * _BOX
     figure = Plot.of_plan(middle - half, middle + half)
-    x, y = positions[rows].T
-    figure.line(x, y, color_of(0))
-    figure.marks(x[:1], y[:1], "o", color_of(0), 5.0)
+    figure.path(positions[rows], color_of(0))
+    figure.marks(positions[:1], "o", color_of(0), 5.0)
     figure.has_grid = True
     return figure.svg()

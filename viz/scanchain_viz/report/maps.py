@@ -270,8 +270,7 @@ def _changes_picture(
     for label in _ORDER:
         draw_points(figure, points[changes.labels == label], low, high, (_HEX[label],))
     for cluster in changes.clusters:
-        x, y = _outline(cluster)[[0, 1, 2, 3, 0]].T
-        figure.line(x, y, INK, 0.8)
+        figure.path(_outline(cluster)[[0, 1, 2, 3, 0]], INK, 0.8)
     return figure.svg()
 
 
