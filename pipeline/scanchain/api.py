@@ -300,8 +300,8 @@ def write_report(directory: Path) -> None:
 def draw_localization(folder: Path, localized: LocalizedLog) -> None:
     """Add report.html and a recording to the directory of a localized log."""
     from scanchain.runs.directory import RECORDING_FILE
-    from scanchain_viz.recording.localization import record_localization
-    from scanchain_viz.report.localization import write_localization_report
+    from scanchain_viz.recording.maps import record_localization
+    from scanchain_viz.report.maps import write_localization_report
 
     write_localization_report(folder, localized)
     record_localization(folder / RECORDING_FILE, localized)
@@ -309,8 +309,8 @@ def draw_localization(folder: Path, localized: LocalizedLog) -> None:
 
 def present_merge(directory: Path) -> None:
     """Add report.html and a recording to the directory of a merge."""
-    from scanchain_viz.recording.merge import record_merge
-    from scanchain_viz.report.merge import write_merge_report
+    from scanchain_viz.recording.maps import record_merge
+    from scanchain_viz.report.maps import write_merge_report
 
     write_merge_report(directory)
     record_merge(directory)
@@ -327,8 +327,8 @@ def present_comparison(directory: Path) -> None:
 
 def present_changes(directory: Path, found: Changes) -> None:
     """Add report.html and a recording to the directory of changes."""
-    from scanchain_viz.recording.changes import record_changes
-    from scanchain_viz.report.changes import write_changes_report
+    from scanchain_viz.recording.maps import record_changes
+    from scanchain_viz.report.maps import write_changes_report
 
     write_changes_report(directory, found)
     record_changes(directory, found)

@@ -85,10 +85,15 @@ def graph_of(steps, last_keyframe):
     )
 
 
-def record(path, steps, dimension, sinks=("save",), config=None, final=None, **ports):
-    """The recording after its end, with results of every kind; the last graph of the steps is the final one."""
+def opened(path, dimension=2, sinks=("save",), config=None, **ports):
+    """A recording before it begins."""
     config = config or RecordingConfig()
-    recording = Recording(path, dimension=dimension, name="test", sinks=frozenset(sinks), config=config, **ports)
+    return Recording(path, dimension=dimension, name="test", sinks=frozenset(sinks), config=config, **ports)
+
+
+def record(path, steps, dimension, final=None, **options):
+    """The recording after its end, with results of every kind; the last graph of the steps is the final one."""
+    recording = opened(path, dimension, **options)
     with recording:
         for step in steps:
             recording.log(step)
@@ -114,12 +119,13 @@ def rows_of(path):
     return rows, timelines
 
 
-def column(path, entity, name):
+def column(path, entity, name, *, is_static=False):
     """All values of one component of an entity, or of a timeline, row by row."""
     values = []
     for chunk in RrdReader(str(path)).stream():
         batch = chunk.to_record_batch()
-        if chunk.entity_path.lstrip("/") == entity and not chunk.is_static and name in batch.schema.names:
+        is_of_it = chunk.entity_path.lstrip("/") == entity and chunk.is_static == is_static
+        if is_of_it and name in batch.schema.names:
             values.extend(batch.column(name).to_pylist())
     return values
 

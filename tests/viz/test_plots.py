@@ -8,7 +8,7 @@ import pytest
 from scanchain import lie
 from scanchain.verdict import Kind, Stretch
 from scanchain_viz.pictures.axis import Axis, width_of
-from scanchain_viz.pictures.figure import SvgFigure, palette_of
+from scanchain_viz.pictures.figure import Plot, palette_of
 from scanchain_viz.pictures.map_figures import draw_points
 from scanchain_viz.pictures.run import GridPicture, draw_map
 
@@ -139,7 +139,7 @@ def test_a_logarithmic_axis_has_decades_and_where_they_are_few_more(ends, shown)
 @pytest.mark.parametrize("name", ["", "x", "y"])
 def test_what_is_known_of_a_line_is_within_its_axes_and_breaks_where_it_is_not(name):
     x, y = np.array([1.0, 2.0, np.nan, 4.0, 5.0]), np.array([1.0, 10.0, 10.0, 100.0, 3.0])
-    figure = SvgFigure(logarithmic=name)
+    figure = Plot(logarithmic=name)
     figure.line(x, y, "red")
     drawn = re.search(r'<path d="([^"]*)" style="stroke: red', figure.svg())[1]
     assert re.sub(r"[\d. -]", "", drawn) == "MLML"
@@ -153,7 +153,7 @@ def test_what_is_known_of_a_line_is_within_its_axes_and_breaks_where_it_is_not(n
 
 def test_a_line_of_many_points_is_as_long_as_it_looks_and_ends_where_it_ends():
     angle = np.linspace(0.0, 1.9 * np.pi, 100_000)
-    figure = SvgFigure.of_plan(np.full(2, -1.1), np.full(2, 1.1))
+    figure = Plot.of_plan(np.full(2, -1.1), np.full(2, 1.1))
     figure.line(np.cos(angle), np.sin(angle), "red")
     end = np.array([np.cos(angle[-1]), np.sin(angle[-1])])
     svg = figure.svg()
@@ -167,7 +167,7 @@ def test_a_line_of_many_points_is_as_long_as_it_looks_and_ends_where_it_ends():
 def test_the_pixels_of_a_map_are_square_and_begin_at_its_corner():
     low, high = np.zeros(3), np.array([13.7, 6.95, 0.0])
     points = np.random.default_rng(0).uniform(low, high, (1000, 3))
-    figure = SvgFigure.of_plan(low, high)
+    figure = Plot.of_plan(low, high)
     draw_points(figure, points, low, high)
     x, y, width, height = map(
         float, re.search(r'<image x="(.*?)" y="(.*?)" width="(.*?)" height="(.*?)"', figure.svg()).groups()
@@ -182,7 +182,7 @@ def test_an_image_of_a_figure_has_its_colors_and_its_first_row_at_the_lower_corn
     palette = palette_of(("ff0000", "00ff00", "0000ff"), 8)
     palette[:, 3] = np.arange(8) * 36
     for is_downward in (False, True):
-        figure = SvgFigure.of_plan(np.zeros(2), np.array([7.0, 5.0]))
+        figure = Plot.of_plan(np.zeros(2), np.array([7.0, 5.0]))
         if is_downward:
             figure.y.limit(5.0, 0.0)
         figure.image(pixels, palette, np.zeros(2), np.array([7.0, 5.0]))

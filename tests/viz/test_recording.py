@@ -23,10 +23,10 @@ from scanchain.errors import InputError
 from scanchain.runs.closures import final_verdicts
 from scanchain.runs.step_table import StepTable
 from scanchain.verdict import Judged, Kind, Stretch, Verdict
-from scanchain_viz.recording import entities, shapes, viewer
+from scanchain_viz.recording import drawing, entities, viewer
 from scanchain_viz.recording import recording as module
 from scanchain_viz.recording.blueprint import blueprint
-from scanchain_viz.recording.messages import Message
+from scanchain_viz.recording.drawing import Message
 from scanchain_viz.recording.recording import Recording
 from scanchain_viz.recording.sinks import file_sink, open_stream, write_recording
 from tests.support.killing import same_recording
@@ -37,6 +37,7 @@ from tests.support.recordings import (
     column,
     drive,
     free_port,
+    opened,
     record,
     rows_of,
     static_entities,
@@ -81,8 +82,8 @@ def test_a_preview_is_shown_by_a_viewer_until_its_step_is_recorded_and_is_in_no_
     steps, before, after = drive(20, 2), tmp_path / "before.rrd", tmp_path / "after.rrd"
     monkeypatch.setattr(Recording, "_viewer_address", lambda self: "a viewer")
     monkeypatch.setattr(module, "viewer_sink", lambda address, stream, layout: file_sink(after, stream, layout))
-    sinks, measured = frozenset({"save", "connect"}), replace(steps[0].scan, points=2.0 * steps[0].scan.points)
-    with Recording(tmp_path / "a.rrd", dimension=2, name="a", sinks=sinks, config=RecordingConfig()) as recording:
+    measured = replace(steps[0].scan, points=2.0 * steps[0].scan.points)
+    with opened(tmp_path / "a.rrd", sinks=("save", "connect")) as recording:
         recording.preview(measured)
         assert all(sink.settle() for sink in recording.sinks)
         before.write_bytes(after.read_bytes())
@@ -101,18 +102,9 @@ def test_a_preview_is_shown_by_a_viewer_until_its_step_is_recorded_and_is_in_no_
 def test_stamps_that_step_back_are_recorded_as_they_are(tmp_path):
     steps = drive(60, 2)
     record(tmp_path / "a.rrd", steps, 2)
-    stamps = [value.value for value in column_scalars(tmp_path / "a.rrd", entities.SCAN, "sensor_time")]
+    stamps = [stamp.value for stamp in column(tmp_path / "a.rrd", entities.SCAN, "sensor_time")]
     assert stamps == [step.scan.stamp_ns for step in steps]
     assert min(np.diff(stamps)) < 0
-
-
-def column_scalars(path, entity, name):
-    values = []
-    for chunk in RrdReader(str(path)).stream():
-        batch = chunk.to_record_batch()
-        if chunk.entity_path.lstrip("/") == entity and not chunk.is_static:
-            values.extend(batch.column(name))
-    return values
 
 
 def test_states_are_recorded_where_they_change_and_say_why(tmp_path):
@@ -195,7 +187,7 @@ def test_a_position_that_one_direction_leaves_open_is_drawn_long_in_that_directi
     information[2, 2] = 1e8
     columns = {
         str(c.component_descriptor()): c.as_arrow_array().to_pylist()
-        for c in shapes.ellipsoids(information[None], 1.0)
+        for c in drawing.ellipsoids(information[None], 1.0)
     }
     sizes = next(value for key, value in columns.items() if "half_sizes" in key)[0][0]
     quat = next(value for key, value in columns.items() if "quaternion" in key)[0][0]
@@ -207,7 +199,7 @@ def test_a_position_that_one_direction_leaves_open_is_drawn_long_in_that_directi
 
 def test_a_match_without_any_information_is_drawn_at_the_cap_and_breaks_nothing():
     for information in (np.zeros((6, 6)), np.full((6, 6), np.nan)):
-        columns = list(shapes.ellipsoids(information[None], 1.0))
+        columns = list(drawing.ellipsoids(information[None], 1.0))
         np.testing.assert_allclose(columns[0].as_arrow_array().to_pylist()[0][0], [0.2] * 3, rtol=1e-5)
 
 
@@ -230,10 +222,7 @@ def test_spawn_without_a_display_is_a_warning(tmp_path, monkeypatch):
 
 def test_the_web_viewer_listens_on_this_machine_only_and_ends_with_the_recording(tmp_path):
     port, web_port = free_port(), free_port()
-    recording = Recording(
-        tmp_path / "a.rrd", dimension=2, name="test", sinks=frozenset({"save", "web"}), config=RecordingConfig(),
-        port=port, web_port=web_port,
-    )  # fmt: skip
+    recording = opened(tmp_path / "a.rrd", sinks=("save", "web"), port=port, web_port=web_port)
     with recording:
         assert recording.warnings == []
         assert recording.web_address.startswith(f"http://127.0.0.1:{web_port}/?url=")
@@ -255,10 +244,7 @@ def test_a_viewer_that_dies_ends_with_a_warning_and_the_file_is_whole(tmp_path):
     port, web_port = free_port(), free_port()
     server = viewer.start_web(port, web_port)
     steps = drive(600, 2)
-    recording = Recording(
-        tmp_path / "a.rrd", dimension=2, name="test", sinks=frozenset({"save", "connect"}),
-        config=RecordingConfig(), port=port,
-    )  # fmt: skip
+    recording = opened(tmp_path / "a.rrd", sinks=("save", "connect"), port=port)
     with recording:
         for step in steps:
             if step.scan.index == 300:
@@ -273,22 +259,15 @@ def test_a_viewer_that_stops_reading_does_not_stop_the_run(tmp_path):
     script = """
 import sys, time, os, signal
 from pathlib import Path
-from uuid import uuid4
-from tests.support.recordings import drive, free_port
-from scanchain.config import RecordingConfig
+from tests.support.recordings import drive, free_port, opened
 from scanchain_viz.recording import sinks, viewer
-from scanchain_viz.recording.blueprint import blueprint
-from scanchain_viz.recording.messages import Message
-from scanchain_viz.recording.recording import Recording
-from scanchain_viz.recording.sinks import open_stream, write_recording
 sinks._VIEWER_PATIENCE_S = 1.0
 port = free_port()
 server = viewer.start_web(port, free_port())
 os.killpg(server.pid, signal.SIGSTOP)
 try:
     steps = drive(400, 3, points=8000)
-    recording = Recording(Path(sys.argv[1]), dimension=3, name="t", sinks=frozenset({"save", "connect"}),
-                          config=RecordingConfig(), port=port)
+    recording = opened(Path(sys.argv[1]), 3, sinks=("save", "connect"), port=port)
     with recording:
         started = time.perf_counter()
         for step in steps:
@@ -360,15 +339,8 @@ def test_a_killed_run_leaves_a_file_that_reads_up_to_the_last_batch(tmp_path):
     script = """
 import os, signal, sys, time
 from pathlib import Path
-from uuid import uuid4
-from tests.support.recordings import drive
-from scanchain.config import RecordingConfig
-from scanchain_viz.recording.blueprint import blueprint
-from scanchain_viz.recording.messages import Message
-from scanchain_viz.recording.recording import Recording
-from scanchain_viz.recording.sinks import open_stream, write_recording
-recording = Recording(Path(sys.argv[1]), dimension=2, name="t", sinks=frozenset({"save"}),
-                      config=RecordingConfig())
+from tests.support.recordings import drive, opened
+recording = opened(Path(sys.argv[1]))
 recording.__enter__()
 for step in drive(600, 2):
     recording.log(step)
@@ -425,10 +397,7 @@ def test_what_is_recorded_at_once_is_written_whole_or_not_at_all(tmp_path, monke
 def test_a_step_that_cannot_be_drawn_is_told_and_does_not_raise(tmp_path):
     steps = drive(60, 2)
     steps[30] = replace(steps[30], T_world_lidar=np.eye(7))
-    recording = Recording(
-        tmp_path / "a.rrd", dimension=2, name="t", sinks=frozenset({"save"}), config=RecordingConfig()
-    )
-    with recording:
+    with opened(tmp_path / "a.rrd") as recording:
         for step in steps:
             recording.log(step)
     assert recording.warnings and "the recording lacks something" in recording.warnings[0]
@@ -438,7 +407,7 @@ def test_a_step_that_cannot_be_drawn_is_told_and_does_not_raise(tmp_path):
 def test_a_recording_goes_on_in_file_and_viewer_from_what_was_secured_of_it(tmp_path, dimension):
     steps, port = drive(300, dimension), free_port()
     whole, begun, again = (tmp_path / name for name in ("whole.rrd", "begun.rrd", "again.rrd"))
-    options = {"dimension": dimension, "name": "test", "config": RecordingConfig(local_map_every=2)}
+    config = RecordingConfig(local_map_every=2)
     closures = [closure for step in steps for closure in step.closures]
     last = next(step for step in reversed(steps[:200]) if step.graph is not None)
     rows = rows_of_steps(steps[: last.scan.index + 1])
@@ -449,9 +418,9 @@ def test_a_recording_goes_on_in_file_and_viewer_from_what_was_secured_of_it(tmp_
         recording.log_closures(final_verdicts(closures, steps[280].graph), steps[280].graph)
         recording.log_map(np.concatenate([step.points for step in steps]))
 
-    with Recording(whole, sinks=frozenset({"save"}), **options) as recording:
+    with opened(whole, dimension, config=config) as recording:
         finish(recording, steps)
-    with Recording(begun, sinks=frozenset({"save"}), **options) as recording:
+    with opened(begun, dimension, config=config) as recording:
         for step in steps[: len(rows)]:
             recording.log(step)
         secured = recording.secure()
@@ -459,7 +428,7 @@ def test_a_recording_goes_on_in_file_and_viewer_from_what_was_secured_of_it(tmp_
     os.truncate(begun, secured)
     server = viewer.start_web(port, free_port())
     try:
-        with Recording(again, sinks=frozenset({"save", "connect"}), port=port, **options) as recording:
+        with opened(again, dimension, ("save", "connect"), config, port=port) as recording:
             known = [closure for step in steps[: len(rows)] for closure in step.closures]
             recording.resume(begun, rows, known, last.graph)
             finish(recording, steps[len(rows) :])
@@ -476,11 +445,10 @@ def rows_of_steps(steps):
 
 
 def test_what_lacks_something_is_not_secured(tmp_path):
-    without = Recording(None, dimension=2, name="t", sinks=frozenset(), config=RecordingConfig())
-    with without as recording:
+    with opened(None, sinks=()) as recording:
         assert recording.secure() == 0
-    steps, saved = drive(21, 2), frozenset({"save"})
-    with Recording(tmp_path / "a.rrd", dimension=2, name="t", sinks=saved, config=RecordingConfig()) as recording:
+    steps = drive(21, 2)
+    with opened(tmp_path / "a.rrd") as recording:
         recording.log(steps[0])
         assert recording.secure() == (tmp_path / "a.rrd").stat().st_size > 0
         (tmp_path / "b.rrd").write_bytes(b"no recording")
@@ -497,8 +465,7 @@ def test_a_path_that_cannot_be_written_is_refused_at_the_start(tmp_path):
 
 
 def test_without_sinks_nothing_is_kept_and_nothing_written(tmp_path):
-    recording = Recording(None, dimension=2, name="t", sinks=frozenset(), config=RecordingConfig())
-    with recording:
+    with opened(None, sinks=()) as recording:
         for step in drive(60, 2):
             recording.log(step)
     assert recording.batcher.steps == [] and recording.warnings == []
@@ -536,9 +503,7 @@ def test_the_verdict_is_recorded_as_text_with_its_stretches_as_lines_and_events(
         Stretch(Kind.WHEELS, 20, 30, 9, 2.0, 3.0, 1.5),
     )
     judged = Judged(Verdict.CHECK, "; ".join(each.text for each in stretches), stretches, "ATE below 1 m")
-    with Recording(
-        tmp_path / "a.rrd", dimension=2, name="a", sinks=frozenset({"save"}), config=RecordingConfig()
-    ) as r:
+    with opened(tmp_path / "a.rrd") as r:
         for step in steps:
             r.log(step)
         r.log_verdict(judged, path)
@@ -547,23 +512,14 @@ def test_the_verdict_is_recorded_as_text_with_its_stretches_as_lines_and_events(
     assert [text for text in texts if "stretch" in text] == [
         f"stretch to check: {each.text}" for each in stretches
     ]
-    statics = {
-        chunk.entity_path.lstrip("/"): chunk.to_record_batch()
-        for chunk in RrdReader(str(tmp_path / "a.rrd")).stream()
-        if chunk.is_static
-    }
-    (strips,) = statics[entities.STRETCHES].column("LineStrips3D:strips").to_pylist()
+    (strips,) = column(tmp_path / "a.rrd", entities.STRETCHES, "LineStrips3D:strips", is_static=True)
     assert [len(strip) for strip in strips] == [2, 12]
-    (document,) = statics[entities.VERDICT].column("TextDocument:text").to_pylist()
+    document = column(tmp_path / "a.rrd", entities.VERDICT, "TextDocument:text", is_static=True)[-1]
     assert document[0].startswith("## check these stretches\n\notherwise ATE below 1 m\n")
     assert stretches[0].text in document[0]
 
 
 def test_the_legend_has_no_table_whose_lines_the_viewer_would_cut_off(tmp_path):
     record(tmp_path / "a.rrd", drive(60, 2), 2)
-    texts = [
-        chunk.to_record_batch().column("TextDocument:text")[0].as_py()[0]
-        for chunk in RrdReader(str(tmp_path / "a.rrd")).stream()
-        if chunk.entity_path == f"/{entities.LEGEND}"
-    ]
-    assert len(texts) == 1 and "red edges" in texts[0] and "|" not in texts[0]
+    ((text,),) = column(tmp_path / "a.rrd", entities.LEGEND, "TextDocument:text", is_static=True)
+    assert "red edges" in text and "|" not in text

@@ -40,6 +40,7 @@ from tests.support.scenes import ROOT
 
 EVIL = "<script>alert(1)</script>"
 SUPPORT = ROOT / "tests" / "support"
+BOTH = pytest.mark.parametrize("which", ["comparison", "one_run"])
 SIZES = [(1200, False), (1200, True), (390, False), (390, True)]
 
 
@@ -96,7 +97,7 @@ def one_run(evil, tmp_path_factory):
 
 
 @pytest.mark.parametrize(("width", "dark"), SIZES)
-@pytest.mark.parametrize("which", ["comparison", "one_run"])
+@BOTH
 def test_nothing_is_cut_and_nothing_overlaps(which, width, dark, request, tmp_path):
     seen = look(request.getfixturevalue(which) / "report.html", tmp_path, width=width, dark=dark)
     assert seen["wide"] <= seen["width"] and seen["outside"] == []
@@ -147,12 +148,12 @@ def test_closures_are_counted_by_cause_and_an_older_table_has_a_row_a_verdict_an
     trajectory, file = course(np.random.default_rng(0).normal(size=(9, 3))), tmp_path / "loops.parquet"
     pq.write_table(closures, file)
     (section,) = loop_section(trajectory, file, "Loop closures", 30.0)
-    assert [tuple(cell.text for cell in row.cells) for row in section.grid.rows] == [
+    assert [tuple(getattr(cell, "text", cell) for cell in row.cells) for row in section.grid.rows] == [
         ("2", "30", "30", "small overlap"), ("1", "90", "10", "verified"), ("1", "80", "30", "few points"),
     ]  # fmt: skip
     pq.write_table(closures.drop_columns(["cause"]), file)
     (section,) = loop_section(trajectory, file, "Loop closures", 30.0)
-    assert [tuple(cell.text for cell in row.cells) for row in section.grid.rows] == [
+    assert [tuple(getattr(cell, "text", cell) for cell in row.cells) for row in section.grid.rows] == [
         ("3", "40", "30"), ("1", "90", "10"),
     ]  # fmt: skip
     assert "older than the column cause" in section.grid.notes[0]
@@ -160,20 +161,12 @@ def test_closures_are_counted_by_cause_and_an_older_table_has_a_row_a_verdict_an
 
 def test_a_run_shows_its_way_its_map_its_loops_and_its_versions(one_run, tmp_path):
     seen = look(one_run / "report.html", tmp_path, width=1200)
-    for title in (
-        "Trajectory and map",
-        "Error",
-        "Time per scan",
-        "Observability",
-        "Loop closures",
-        "Versions",
-        "ATE",
-    ):
-        assert title in seen["text"], title
+    titles = {"Trajectory and map", "Error", "Time per scan", "Observability", "Loop closures", "Versions", "ATE"}
+    assert all(title in seen["text"] for title in titles)
     assert len(seen["svgs"]) >= 8
 
 
-@pytest.mark.parametrize("which", ["comparison", "one_run"])
+@BOTH
 def test_text_is_as_large_in_figures_over_the_whole_page_as_in_others_and_a_lone_figure_is_one(which, request):
     page = (request.getfixturevalue(which) / "report.html").read_text(encoding="utf-8")
     wide, others = (
@@ -280,14 +273,19 @@ def test_the_map_of_a_run_is_drawn_in_the_page_under_its_own_security_policy(one
     page = (one_run / "report.html").read_text(encoding="utf-8")
     digest = b64encode(sha256(SCRIPT.encode()).digest()).decode()
     assert f"script-src 'sha256-{digest}'" in html.unescape(page) and page.count("<script") == 1
-    command = [
-        find_browser(), "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path}",
-        "--virtual-time-budget=2000", "--dump-dom", f"file://{one_run / 'report.html'}",
-    ]  # fmt: skip
-    answer = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    drawn = re.search(r'data-drawn="(\d+)"', answer.stdout)
+    shown = dumped(one_run / "report.html", tmp_path)
+    drawn = re.search(r'data-drawn="(\d+)"', shown)
     assert drawn and int(drawn[1]) == len(read_ply(one_run / "map.ply"))
-    assert answer.stdout.count("<button") == 3  # "from above" is left out of a flat map
+    assert shown.count("<button") == 3  # "from above" is left out of a flat map
+
+
+def dumped(page, profile):
+    """The elements of a page after five seconds in a browser."""
+    command = [
+        find_browser(), "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={profile}",
+        "--window-size=1000,900", "--virtual-time-budget=5000", "--dump-dom", f"file://{page}",
+    ]  # fmt: skip
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False).stdout
 
 
 _HANDLED = """
@@ -332,12 +330,9 @@ def test_the_map_is_turned_moved_and_zoomed_and_the_page_scrolls_unless_it_was_c
     text = re.sub('<meta http-equiv="Content-Security-Policy"[^>]*>', "", (tmp_path / "a.html").read_text())
     frames = "<script>window.requestAnimationFrame = act => setTimeout(act, 10);</script>"  # none without a window
     (tmp_path / "b.html").write_text(text.replace("<body>", f"<body>{frames}").replace("</body>", _HANDLED))
-    command = [
-        find_browser(), "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}",
-        "--window-size=1000,900", "--virtual-time-budget=5000", "--dump-dom", f"file://{tmp_path / 'b.html'}",
-    ]  # fmt: skip
-    answer = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    same = json.loads(html.unescape(re.search("<title>PROBE(.*?)</title>", answer.stdout)[1]))
+    same = json.loads(
+        html.unescape(re.search("<title>PROBE(.*?)</title>", dumped(tmp_path / "b.html", tmp_path / "profile"))[1])
+    )
     assert same == {name: name for name in same} | {"scrolled": "first", "reset": "first"}
     assert len(same) == 8
 
@@ -425,21 +420,13 @@ def test_a_lidar_that_stands_still_without_loops_has_a_report_too(tmp_path):
             log.append("/scan", "sensor_msgs/msg/LaserScan", scan, stamp_ns)
             pose = pack_odometry(stamp_ns, "world", "lidar", ORIGIN)
             log.append("/ground_truth", "nav_msgs/msg/Odometry", pose, stamp_ns)
-    arguments = [
-        "run",
-        str(tmp_path / "still.mcap"),
-        "--out",
-        str(tmp_path / "out"),
-        "--rerun",
-        "off",
-        "--no-loops",
-    ]
-    assert main(arguments) == 0
+    files = [str(tmp_path / "still.mcap"), "--out", str(tmp_path / "out")]
+    assert main(["run", *files, "--rerun", "off", "--no-loops"]) == 0
     text = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "Accuracy" in text and "<td>–</td>" in text and "Loop closures" not in text
 
 
-@pytest.mark.parametrize("which", ["comparison", "one_run"])
+@BOTH
 def test_a_topic_that_is_a_script_is_shown_as_text_and_not_run(which, request, tmp_path):
     page = request.getfixturevalue(which) / "report.html"
     seen = look(page, tmp_path, width=1200)
@@ -450,7 +437,7 @@ def test_a_topic_that_is_a_script_is_shown_as_text_and_not_run(which, request, t
     assert text.count("<script") == ours and html.escape(EVIL) in text
 
 
-@pytest.mark.parametrize("which", ["comparison", "one_run"])
+@BOTH
 def test_a_page_needs_nothing_but_itself(which, request):
     text = (request.getfixturevalue(which) / "report.html").read_text(encoding="utf-8")
     assert "default-src 'none'" in text

@@ -128,7 +128,7 @@ def landmarks(
         _write(directory.path, data, studies, tree)
         write_report(directory.path, studies)
         if recording is not None:
-            from scanchain_viz.recording.landmarks import record_landmarks
+            from scanchain_viz.recording.problems import record_landmarks
 
             record_landmarks(studies, recording)
         directory.complete()

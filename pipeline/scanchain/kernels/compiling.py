@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
+from numba import config
 from numba.core.caching import FunctionCache
 
 try:
@@ -33,8 +34,8 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """``numba.njit`` of a kernel, whose machine code is kept for later processes."""
 
     def compiled(function: Callable[..., Any]) -> Any:
-        kernel = numba.njit(**options)(function)
-        if not numba.config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
+        kernel: Any = numba.njit(**options)(function)
+        if not config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
             kernel._cache = _SharedCache(function)
         return kernel
 

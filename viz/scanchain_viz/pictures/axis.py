@@ -38,11 +38,11 @@ class Axis:
         self.label = ""
         self._least, self._greatest = np.inf, -np.inf
         self._limits: tuple[float, float] | None = None
-        self._ticks: Sequence[float] = ()
+        self.only_ticks: Sequence[float] | None = None
 
-    def limit(self, low: float, high: float, ticks: Sequence[float] = ()) -> None:
+    def limit(self, low: float, high: float, ticks: Sequence[float] | None = None) -> None:
         """Set the range, downward or to the left where ``low`` is the greater, and, if given, the only ticks."""
-        self._limits, self._ticks = (float(low), float(high)), ticks
+        self._limits, self.only_ticks = (float(low), float(high)), ticks
 
     def include(self, values: NDArray[np.float64]) -> None:
         """Widen the range by values, unless it is set; NaN have no place."""
@@ -74,8 +74,11 @@ class Axis:
     def ticks(self, length: float, *, is_upright: bool) -> list[tuple[float, str]]:
         """Fraction and number of each tick on an axis so many points long."""
         low, high = min(self.ends), max(self.ends)
-        values = list(self._ticks) or self._decades(low, high) or _round_steps(low, high, length, is_upright)
-        texts = map(plain, values) if self._ticks or self.is_logarithmic else _fixed(values)
+        if self.only_ticks is not None:
+            values = list(self.only_ticks)
+        else:
+            values = self._decades(low, high) or _round_steps(low, high, length, is_upright)
+        texts = _fixed(values) if self.only_ticks is None and not self.is_logarithmic else map(plain, values)
         places = self.fractions(np.array(values, np.float64)).tolist()
         return [(place, text.replace("-", "−")) for place, text in zip(places, texts, strict=True)]
 

@@ -1,4 +1,4 @@
-"""Figures: an SVG inside a page that takes its colors, light or dark; by matplotlib, a PNG file.
+"""Figures: an SVG inside a page that takes its colors, light or dark, or by matplotlib a PNG file.
 
 The SVG of a report is written here: matplotlib takes half a second to load, and as long for a dozen figures.
 """
@@ -10,18 +10,20 @@ import zlib
 from base64 import b64encode
 from collections.abc import Callable, Sequence
 from io import BytesIO
+from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
 from scanchain.whole_file import write_whole
+from scanchain_viz.colors import rgb
 from scanchain_viz.pictures.axis import FONT, Axis, width_of
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+    from matplotlib.axes import Axes
 
 Floats = NDArray[np.float64]
 
@@ -37,14 +39,19 @@ _BAR, _BAR_AWAY = 9.0, 6.0  # width of a color bar, and its distance to the axes
 _SAME = 0.1  # points; successive positions of a line that are nearer are one
 _FAR = 1e5  # points beyond which nothing is drawn
 _LEVEL = 3  # of compression: more is as long again and saves a tenth
+_FRAME = "#cccccc"  # of axes on white
+_PANEL_INCHES = (2.0, 12.0)  # least and greatest height of a figure in a PNG
+_TITLE_INCHES = 0.07  # room for its title and labels, times the height of text in points
 _STYLE = (
     f"font: {FONT:g}px 'DejaVu Sans', Verdana, Arial, sans-serif; fill: none; stroke-linejoin: round; "
     "stroke-linecap: butt"
 )
 
 
-class SvgFigure:
-    """One figure with one pair of axes: draw in their units, then ask for the ``svg``.
+class Plot:
+    """One figure with one pair of axes: draw in their units, then ask for the ``svg``, or ``write_png``.
+
+    Only lines, marks and images are drawn in a PNG as well.
 
     height_inches : of the whole figure
     logarithmic : the axis whose decades are equally long, "x" or "y"
@@ -65,10 +72,11 @@ class SvgFigure:
         self.is_wide, self.spare, self.proportions = is_wide, spare_inches, (0.0, 0.0)  # of a plan
         self._lay_out(height_inches, is_wide=is_wide)
         self._within: list[Callable[[], str]] = []
+        self._on_axes: list[Callable[[Axes], object]] = []
         self._beside: list[Callable[[], str]] = []
 
     @classmethod
-    def of_plan(cls, low: Floats, high: Floats, spare_inches: float = 0.0, *, is_wide: bool = False) -> SvgFigure:
+    def of_plan(cls, low: Floats, high: Floats, spare_inches: float = 0.0, *, is_wide: bool = False) -> Plot:
         """A figure in the proportions of the box between two corners."""
         figure = cls(spare_inches=spare_inches, is_wide=is_wide)
         figure.x.limit(low[0], high[0])
@@ -102,25 +110,53 @@ class SvgFigure:
         width: float = 1.2,
         dashes: Sequence[float] = (),
         opacity: float = 1.0,
+        *,
+        name: str = "",
     ) -> None:
-        """Draw a line through positions, broken where they are NaN; lengths of dashes and gaps are in widths."""
+        """Draw a line through positions, broken where they are NaN; lengths of dashes and gaps are in widths.
+
+        name : in the legend of a PNG, once for all lines of this name
+        """
         self._include(x, y)
         dashed = f"; stroke-dasharray: {' '.join(f'{width * each:.4g}' for each in dashes)}" if dashes else ""
         style = f"stroke: {color}; stroke-width: {width:g}{dashed}{_opacity(opacity)}"
         self._within.append(lambda: f'<path d="{_path(self._at(x, y))}" style="{style}"/>')
+        drawn = {"color": _on_white(color), "linewidth": width, "alpha": opacity, "label": name or None}
+        self._on_axes.append(lambda axes: axes.plot(x, y, linestyle=(0, (*dashes,)) if dashes else "-", **drawn))
+
+    def path(
+        self,
+        positions: NDArray[np.floating],
+        color: str,
+        width: float = 1.2,
+        dashes: Sequence[float] = (),
+        opacity: float = 1.0,
+        *,
+        name: str = "",
+    ) -> None:
+        """Draw a line through positions (N, 2) or, from above, (N, 3)."""
+        x, y = positions[:, :2].T.astype(np.float64)
+        self.line(x, y, color, width, dashes, opacity, name=name)
 
     def steps(self, x: Floats, y: Floats, color: str) -> None:
         """Draw a line that rises or falls at positions only."""
         self.line(np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1], color)
 
-    def marks(self, x: Floats, y: Floats, shape: str, color: str, size: float, *, line: float = 0.0) -> None:
-        """Draw a mark of so many points at each position: a disk "o", a square "s" or a cross "+".
+    def marks(
+        self, positions: Floats, shape: str, color: str, size: float, *, line: float = 0.0, name: str = ""
+    ) -> None:
+        """Draw a mark of so many points at each position (N, 2): a disk "o", a square "s" or a cross "+".
 
         line : width of the line that it is drawn with; 0 fills it
+        name : as of a line
         """
+        x, y = positions.T
         self._include(x, y)
         style = f"fill: {color}" if not line else f"stroke: {color}; stroke-width: {line:g}"
         self._within.append(lambda: _marks(self._at(x, y), shape, 0.5 * size, style))
+        drawn = {"markersize": size, "color": _on_white(color), "label": name or None}
+        drawn |= {"markerfacecolor": "none", "markeredgewidth": line} if line else {}
+        self._on_axes.append(lambda axes: axes.plot(x, y, linestyle="none", marker=shape, **drawn))
 
     def dots(self, x: Floats, y: Floats, colors: Sequence[str], size: float) -> None:
         """Draw a disk in a color of its own at each position, the last ones on top."""
@@ -131,23 +167,6 @@ class SvgFigure:
                 for (u, v), color in zip(self._at(x, y).tolist(), colors, strict=True)
             )
         )
-
-    def ellipses(
-        self, x: Floats, y: Floats, axes: Floats, angles_rad: Floats, color: str, width: float, opacity: float
-    ) -> None:
-        """Draw ellipses with half axes (N, 2), the first at an angle to x; in a plan."""
-        style = f"stroke: {color}; stroke-width: {width:g}{_opacity(opacity)}"
-
-        def drawn() -> str:
-            low, high = self.x.ends
-            each = zip(self._at(x, y), axes * self.extent[0] / (high - low), np.degrees(angles_rad), strict=True)
-            return "".join(
-                f'<ellipse rx="{a:.2f}" ry="{b:.2f}" transform="translate({u:.2f} {v:.2f}) rotate({-angle:.1f})" '
-                f'style="{style}"/>'
-                for (u, v), (a, b), angle in each
-            )
-
-        self._within.append(drawn)
 
     def image(
         self,
@@ -171,6 +190,10 @@ class SvgFigure:
             return _image(rows, palette, box, rendering)
 
         self._within.append(drawn)
+        extent = (low[0], high[0], low[1], high[1])
+        self._on_axes.append(
+            lambda axes: axes.imshow(palette[pixels], origin="lower", extent=extent, interpolation="antialiased")
+        )
 
     def span(self, first: float, last: float, color: str, opacity: float) -> None:
         """Shade what lies between two values of x."""
@@ -218,6 +241,22 @@ class SvgFigure:
         narrow = self._drawn("narrow")
         self._lay_out(height_inches, is_wide=True)
         return Markup(wide + narrow)
+
+    def draw_on(self, axes: Axes, title: str, font: float) -> None:
+        """Draw on axes of matplotlib, on white."""
+        for draw in self._on_axes:
+            draw(axes)
+        axes.set(xlim=self.x.ends, ylim=self.y.ends, aspect="equal" if self.proportions[0] else "auto")
+        axes.set_xlabel(self.x.label, fontsize=font - 2.0)
+        axes.set_ylabel(self.y.label, fontsize=font - 2.0)
+        axes.set_title(title, loc="left", fontsize=font)
+        axes.tick_params(labelsize=font - 2.0, color=_FRAME)
+        if self.x.only_ticks is not None:
+            axes.set_xticks(self.x.only_ticks)
+        if self.y.only_ticks is not None:
+            axes.set_yticks(self.y.only_ticks)
+        for spine in axes.spines.values():
+            spine.set_color(_FRAME)
 
     def _drawn(self, name: str = "") -> str:
         (left, top), (width, height) = self.corner, self.extent
@@ -324,15 +363,54 @@ def _png(rows: NDArray[np.uint8], palette: NDArray[np.uint8]) -> bytes:
 
 
 def palette_of(colors: Sequence[str], count: int = 256) -> NDArray[np.uint8]:
-    """(K, 4) opaque colors between some that are equally far from each other, "rrggbb"."""
-    anchors = np.array([list(bytes.fromhex(color)) for color in colors], np.float64)
+    """(K, 4) opaque colors between some that are equally far from each other, #rrggbb."""
+    anchors = np.array(list(map(rgb, colors)), np.float64)
     places = np.linspace(0.0, len(anchors) - 1.0, count)
     mixed = np.stack([np.interp(places, np.arange(len(anchors)), channel) for channel in anchors.T], axis=1)
     return np.pad(np.rint(mixed).astype(np.uint8), ((0, 0), (0, 1)), constant_values=255)
 
 
-def write_figure(path: Path, figure: Figure, **options: Any) -> None:
-    """Write a figure by matplotlib on white; ``options`` are those of savefig. Raises OSError."""
+def broken(segments: NDArray[np.floating]) -> Floats:
+    """Segments (E, 2, d) as one line (3 E, d) that is broken between them."""
+    gaps = np.full((len(segments), 1, segments.shape[-1]), np.nan)
+    return np.concatenate([segments, gaps], axis=1).reshape(-1, segments.shape[-1])
+
+
+def write_png(
+    path: Path,
+    panels: Sequence[tuple[str, Plot | None]],
+    *,
+    width_inches: float,
+    columns: int = 1,
+    font: float = 11.0,
+) -> None:
+    """Write figures beside and below each other, each under its title, over one legend; None leaves a place free.
+
+    width_inches : of each; the highest sets the height of all
+    Raises OSError.
+    """
+    from matplotlib.figure import Figure
+
+    shapes = [plot.proportions for _, plot in panels if plot is not None]
+    height_inches = np.clip(width_inches * max(height / width for width, height in shapes), *_PANEL_INCHES)
+    height_inches += _TITLE_INCHES * font
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(columns * width_inches, rows * float(height_inches)), layout="constrained")
+    named = {}
+    for axes, panel in zip_longest(figure.subplots(rows, columns, squeeze=False).ravel(), panels):
+        title, plot = panel or ("", None)
+        if plot is None:
+            axes.set_axis_off()
+        else:
+            plot.draw_on(axes, title, font)
+            named |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+    if named:
+        figure.legend([*named.values()], [*named], loc="outside lower center", ncols=5, frameon=False, fontsize=9)
     picture = BytesIO()
-    figure.savefig(picture, facecolor="white", format="png", **options)
+    figure.savefig(picture, facecolor="white", format="png", dpi=150, bbox_inches="tight")
     write_whole(path, picture.getvalue())
+
+
+def _on_white(color: str) -> str:
+    """A color of the page as one on white."""
+    return "#1a1a1a" if color == INK else color

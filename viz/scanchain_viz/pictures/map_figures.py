@@ -1,21 +1,25 @@
-"""Maps as small pictures, and loop closures on them."""
+"""Maps as small pictures: trajectories, loop closures and the sessions of a merge on them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
 from scanchain import lie
+from scanchain.config import Config
 from scanchain.data import Points
-from scanchain.maps import SavedMap
+from scanchain.maps import SavedMap, open_saved_map
 from scanchain.runs.overlay import Overlay
-from scanchain_viz.pictures.figure import INK, Floats, SvgFigure, palette_of
-from scanchain_viz.pictures.trajectory_figures import CLOSURES, DrawnTrajectory, PathLine
+from scanchain_viz.pictures.figure import INK, Floats, Plot, broken, palette_of
+from scanchain_viz.pictures.trajectory_figures import CLOSURES, DrawnTrajectory, PathLine, color_of
 
 _POINTS = "#808893"
+_GRAY = (_POINTS,)
 _MAX_POINTS = 120_000
 _SAMPLE = 200_000  # points taken of a map's keyframes
 _PIXELS_A_POINT, _WIDTHS = 2.0, (200.0, 700.0)  # of a map's picture: per root of the points; pixels
@@ -57,8 +61,8 @@ def map_points(prior: SavedMap, limit: int = _SAMPLE) -> Points:
 
 def map_picture(points: Points, low: Floats, high: Floats) -> Markup:
     """Points (M, 3) seen from above, within corners; the color is the height, where there is any."""
-    figure = SvgFigure.of_plan(low, high)
-    draw_points(figure, points, low, high, by_height=True)
+    figure = Plot.of_plan(low, high)
+    draw_points(figure, points, low, high, _VIRIDIS)
     return figure.svg()
 
 
@@ -66,38 +70,18 @@ def path_over_map(
     points: Points, path: Floats, lines: Sequence[PathLine], low: Floats, high: Floats, *, is_wide: bool = False
 ) -> Markup:
     """Lines over the map (gray), seen from above, within corners; ring and square begin and end the path."""
-    figure = SvgFigure.of_plan(low, high, is_wide=is_wide)
+    figure = Plot.of_plan(low, high, is_wide=is_wide)
     draw_points(figure, points, low, high)
     mark_ends(figure, path)
     for line in lines:
-        x, y = line.positions[:, :2].T
-        figure.line(x, y, line.color, line.width, (3.0, 3.0) if line.is_dashed else ())
+        figure.path(line.positions, line.color, line.width, (3.0, 3.0) if line.is_dashed else ())
     return figure.svg()
 
 
-def mark_ends(figure: SvgFigure, path: Floats, ends: Sequence[tuple[int, str]] = ((0, "o"), (-1, "s"))) -> None:
+def mark_ends(figure: Plot, path: Floats, ends: Sequence[tuple[int, str]] = ((0, "o"), (-1, "s"))) -> None:
     """Outlines around begin and end of a path (N, 3), however short it is: it is drawn over them."""
     for place, shape in ends:
-        x, y = path[place, :2, None]
-        figure.marks(x, y, shape, INK, 7.0, line=1.0)
-
-
-def layers_picture(
-    layers: Sequence[tuple[Points, str]],
-    outlines: Sequence[tuple[Floats, str]],
-    low: Floats,
-    high: Floats,
-    *,
-    is_wide: bool = False,
-) -> Markup:
-    """Points (M, 3) in a color each, seen from above, the last ones on top, and closed outlines (N, 2)."""
-    figure = SvgFigure.of_plan(low, high, is_wide=is_wide)
-    for points, color in layers:
-        draw_points(figure, points, low, high, color)
-    for outline, color in outlines:
-        x, y = np.vstack([outline, outline[:1]])[:, :2].T
-        figure.line(x, y, color, 0.8)
-    return figure.svg()
+        figure.marks(path[place, None, :2], shape, INK, 7.0, line=1.0)
 
 
 BEFORE, AFTER = "#1aa179", "#a55bd6"  # colors of two passes
@@ -113,10 +97,10 @@ def overlay_picture(overlay: Overlay) -> Markup:
     drawn = np.concatenate([before, after])[:, :2] if len(before) + len(after) else overlay.place[None, :2]
     low = np.maximum(overlay.place[:2] - half_m, np.minimum(drawn.min(axis=0), overlay.place[:2]) - _MARGIN_M)
     high = np.minimum(overlay.place[:2] + half_m, np.maximum(drawn.max(axis=0), overlay.place[:2]) + _MARGIN_M)
-    figure = SvgFigure.of_plan(low, high)
+    figure = Plot.of_plan(low, high)
     for points, path, color in ((before, overlay.path_before, BEFORE), (after, overlay.path_after, AFTER)):
-        draw_points(figure, points, low, high, color)
-        figure.line(path[:, 0], path[:, 1], color, 1.4)
+        draw_points(figure, points, low, high, (color,))
+        figure.path(path, color, 1.4)
     return figure.svg()
 
 
@@ -127,13 +111,18 @@ def _above_ground(points: Points) -> Points:
 
 
 def draw_points(
-    figure: SvgFigure, points: Points, low: Floats, high: Floats, color: str = _POINTS, *, by_height: bool = False
+    figure: Plot,
+    points: Points,
+    low: Floats,
+    high: Floats,
+    colors: Sequence[str] = (_POINTS,),
+    detail: float = 1.0,
 ) -> None:
-    """Draw points (M, 3) as seen from above, within corners, in one color or by their height."""
+    """Draw points (M, 3) as seen from above, within corners, in one color, or in several by height, if any."""
     shown = points[:: max(1, -(-len(points) // _MAX_POINTS))]
     inside = ((shown[:, :2] > low[:2]) & (shown[:, :2] < high[:2])).all(axis=1)
     if inside.any():
-        colors = _VIRIDIS if by_height and np.ptp(shown[inside, 2]) else (color.removeprefix("#"),)
+        colors = colors if len(colors) == 1 or np.ptp(shown[inside, 2]) else _GRAY
         pixels, palette, edge_m = _image(shown[inside], low, high, colors)
         figure.image(pixels, palette, low, low[:2] + edge_m * np.array(pixels.shape[::-1]))
 
@@ -163,12 +152,56 @@ def loops_picture(
     trajectory: DrawnTrajectory, edges: Floats, rejected_by: NDArray[np.str_], low: Floats, high: Floats
 ) -> Markup:
     """The trajectory (gray) and its closures (E, 2, 3) in the colors of ``CLOSURES``, over the whole page."""
-    figure = SvgFigure.of_plan(low, high, is_wide=True)
+    figure = Plot.of_plan(low, high, is_wide=True)
     mark_ends(figure, trajectory.positions, ((0, "o"),))
-    figure.line(trajectory.positions[:, 0], trajectory.positions[:, 1], _POINTS, 0.7)
+    figure.path(trajectory.positions, _POINTS, 0.7)
     for by, (_, color) in CLOSURES.items():
-        chosen = edges[rejected_by == by][:, :, :2]
-        gaps = np.full((len(chosen), 1, 2), np.nan)
-        x, y = np.concatenate([chosen, gaps], axis=1).reshape(-1, 2).T
-        figure.line(x, y, color, 0.9)
+        figure.path(broken(edges[rejected_by == by]), color, 0.9)
+    return figure.svg()
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnSession:
+    """A session: its name, color, and the positions (K, 3) of its keyframes."""
+
+    name: str
+    color: str
+    positions: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnMerge:
+    """Sessions of a merged map, ends (E, 2, 3) of the closures between them, and the spacing of its points."""
+
+    sessions: tuple[DrawnSession, ...]
+    closures: Floats
+    dimension: int
+    grain_m: float
+
+    @property
+    def positions(self) -> Floats:
+        """(K, 3) of all keyframes."""
+        return np.concatenate([session.positions for session in self.sessions])
+
+
+def read_merge(directory: Path) -> DrawnMerge:
+    """The sessions of a merge's directory."""
+    saved = open_saved_map(directory)
+    positions = lie.lift(saved.poses)[:, :3, 3]
+    sessions = tuple(
+        DrawnSession(each.name, color_of(number), positions[saved.session == number])
+        for number, each in enumerate(saved.sessions)
+    )
+    ends: NDArray[np.int64] = saved.session[saved.edges.pairs]
+    between = saved.edges.pairs[ends[:, 0] != ends[:, 1]]
+    return DrawnMerge(sessions, positions[between], saved.dimension, Config().maps.voxel_size_m)
+
+
+def merge_picture(drawn: DrawnMerge, points: Points, low: Floats, high: Floats) -> Markup:
+    """Paths and closures over the map (M, 3), seen from above, within corners."""
+    figure = Plot.of_plan(low, high)
+    draw_points(figure, points, low, high)
+    figure.path(broken(drawn.closures), CLOSURES[""][1], 0.5)
+    for session in drawn.sessions:
+        figure.path(session.positions, session.color)
     return figure.svg()

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -19,21 +19,16 @@ from scanchain.maps import open_saved_map, read_map, read_ply
 from scanchain.runs.directory import TRUTH_FILE
 from scanchain.trajectory import read_tum
 from scanchain.verdict import Kind, Stretch
-from scanchain_viz.pictures.figure import write_figure
-from scanchain_viz.pictures.map_figures import extent, map_points
+from scanchain_viz.colors import STRETCH_COLORS
+from scanchain_viz.pictures.figure import Floats, Plot, palette_of, write_png
+from scanchain_viz.pictures.map_figures import draw_points, extent, map_points
 from scanchain_viz.pictures.trajectory_figures import TRUTH, color_of
-from scanchain_viz.stretch_colors import STRETCH_COLORS
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 _WIDTH_INCHES = 8.0
-_MAX_POINTS = 400_000
 _ODOMETRY, _OPTIMIZED = "#e07b00", "#1f5fd0"
-_POINTS = "#8a8f98"
+_SHADES = ("#a9b1bd", "#747c88", "#14171b")  # of points in space, by height
 _FREE, _OCCUPIED = 35, 65  # per cent of occupancy below which a cell is drawn white, and above which dark
-_UNKNOWN = 0.90
+_UNKNOWN = "#e6e6e6"
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,29 +65,30 @@ def draw_map(
     drawn = (optimized, odometry, ground_truth, *(poses for _, poses in sessions))
     paths = [path for path in drawn if path is not None and len(path)]
     low, high = _frame(paths, points, grid)
-    figure, axes = _figure(low, high)
+    figure = Plot.of_plan(low, high)
     if grid is not None:
-        _draw_grid(axes, grid)
+        _draw_grid(figure, grid, low, high)
     if points is not None and len(points):
-        _draw_points(axes, points)
-    _draw_path(axes, odometry, "odometry", _ODOMETRY, "-", 1.0)
-    _draw_path(axes, optimized, "optimized", _OPTIMIZED, "-", 1.8)
-    _draw_path(axes, ground_truth, "ground truth", TRUTH, (0, (4, 3)), 1.2)
+        space = np.pad(points, ((0, 0), (0, 3 - points.shape[1]))).astype(np.float64)
+        draw_points(figure, space, low, high, _SHADES)
+    _draw_path(figure, odometry, "odometry", _ODOMETRY, 1.0)
+    _draw_path(figure, optimized, "optimized", _OPTIMIZED, 1.8)
+    _draw_path(figure, ground_truth, "ground truth", TRUTH, 1.2, (4.0, 3.0))
     for number, (name, poses) in enumerate(sessions):
-        _draw_path(axes, poses, name, color_of(number), "-", 1.4)
-    _mark_stretches(axes, optimized, stretches)
-    _mark_ends(axes, optimized)
-    axes.set_xlim(low[0], high[0])
-    axes.set_ylim(low[1], high[1])
-    axes.set_title(title, loc="left", fontsize=11)
-    if len(paths):
-        axes.figure.legend(loc="outside lower center", ncols=5, frameon=False, fontsize=9)
-    write_figure(path, figure, dpi=150)
+        _draw_path(figure, poses, name, color_of(number), 1.4)
+    for each in stretches:
+        if each.kind is not Kind.LOOPS:
+            part = optimized[max(each.first - 1, 0) : each.last + 1, :2, -1]
+            figure.path(part, STRETCH_COLORS[each.kind], 3.0, name=str(each.kind))
+    for place, shape, name in ((0, "o", "start"), (-1, "s", "end")):
+        if len(optimized):
+            figure.marks(optimized[place, None, :2, -1], shape, _OPTIMIZED, 7.0, line=1.0, name=name)
+    write_png(path, [(title, figure)], width_inches=_WIDTH_INCHES)
 
 
 def _frame(
     paths: list[Matrix], points: NDArray[np.floating] | None, grid: GridPicture | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Floats, Floats]:
     """Corners of the required view: every trajectory, the map without outliers, and a margin."""
     corners: list[NDArray[np.floating]] = [path[:, :2, -1] for path in paths]
     if points is not None and len(points):
@@ -108,76 +104,23 @@ def _frame(
     return low - margin, high + margin
 
 
-def _figure(low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[Figure, Axes]:
-    """A figure in the proportions of the map."""
-    from matplotlib.figure import Figure
-
-    width, height = high - low
-    figure = Figure(
-        figsize=(_WIDTH_INCHES, float(np.clip(_WIDTH_INCHES * height / width, 3.0, 12.0))), layout="constrained"
-    )
-    axes = figure.add_subplot()
-    axes.set_aspect("equal")
-    axes.set_xlabel("x [m]")
-    axes.set_ylabel("y [m]")
-    axes.tick_params(labelsize=9, color="#999999")
-    for spine in axes.spines.values():
-        spine.set_color("#cccccc")
-    return figure, axes
-
-
-def _draw_grid(axes: Axes, grid: GridPicture) -> None:
+def _draw_grid(figure: Plot, grid: GridPicture, low: Floats, high: Floats) -> None:
     """Free white, occupied dark, unknown a light gray, like the paper around the grid."""
+    palette = np.vstack([palette_of(("#ffffff", "#262626"), 255), palette_of((_UNKNOWN,), 1)])
+    figure.image(np.full((1, 1), 255, np.uint8), palette, low, high)
     share = np.clip((grid.cells - float(_FREE)) / (_OCCUPIED - _FREE), 0.0, 1.0)
-    shade = np.where(grid.cells < 0, _UNKNOWN, 1.0 - 0.85 * share)
-    axes.set_facecolor((_UNKNOWN, _UNKNOWN, _UNKNOWN))
-    rows, columns = grid.cells.shape
-    (x, y), size_m = grid.origin_m, grid.resolution_m
-    extent = (x, x + size_m * columns, y, y + size_m * rows)
-    axes.imshow(shade, cmap="gray", vmin=0.0, vmax=1.0, origin="lower", extent=extent, interpolation="antialiased")
-
-
-def _draw_points(axes: Axes, points: NDArray[np.floating]) -> None:
-    shown = points[:: max(1, -(-len(points) // _MAX_POINTS))]
-    size = float(np.clip(60_000.0 / len(shown), 0.15, 2.0))
-    if points.shape[1] == 2:
-        axes.scatter(shown[:, 0], shown[:, 1], s=size, c=_POINTS, linewidths=0, rasterized=True)
-        return
-    low, high = np.percentile(shown[:, 2], (2.0, 98.0))
-    order = np.argsort(shown[:, 2])
-    axes.scatter(
-        shown[order, 0], shown[order, 1], s=size, c=shown[order, 2], cmap="bone_r",
-        vmin=low - 0.6 * (high - low), vmax=high, linewidths=0, rasterized=True,
-    )  # fmt: skip
+    shades = np.where(grid.cells < 0, 255.0, np.rint(254.0 * share)).astype(np.uint8)
+    first = np.array(grid.origin_m)
+    figure.image(shades, palette, first, first + grid.resolution_m * np.array(shades.shape[::-1]))
 
 
 def _draw_path(
-    axes: Axes, poses: Matrix | None, name: str, color: str, style: str | tuple[int, tuple[int, int]], width: float
+    figure: Plot, poses: Matrix | None, name: str, color: str, width: float, dashes: Sequence[float] = ()
 ) -> None:
     """Draw one line, its length in the legend."""
-    if poses is None or not len(poses):
-        return
-    x, y = poses[:, 0, -1], poses[:, 1, -1]
-    length_m = float(np.linalg.norm(np.diff(poses[:, :-1, -1], axis=0), axis=1).sum())
-    axes.plot(x, y, color=color, linestyle=style, linewidth=width, label=f"{name} ({length_m:.0f} m)")
-
-
-def _mark_stretches(axes: Axes, poses: Matrix, stretches: Sequence[Stretch]) -> None:
-    """Draw stretches over their trajectory, each kind once in the legend."""
-    for kind, color in STRETCH_COLORS.items():
-        chosen = [each for each in stretches if each.kind is kind and each.kind is not Kind.LOOPS]
-        parts = [poses[max(each.first - 1, 0) : each.last + 1, :2, -1] for each in chosen]
-        for place, part in enumerate(parts):
-            label = str(kind) if place == 0 else None
-            axes.plot(*part.T, color=color, linewidth=3.0, solid_capstyle="round", label=label)
-
-
-def _mark_ends(axes: Axes, poses: Matrix) -> None:
-    if not len(poses):
-        return
-    marks = {"color": _OPTIMIZED, "linestyle": "none", "markersize": 7, "markerfacecolor": "none"}
-    axes.plot(*poses[0, :2, -1], marker="o", label="start", **marks)
-    axes.plot(*poses[-1, :2, -1], marker="s", label="end", **marks)
+    if poses is not None and len(poses):
+        length_m = float(np.linalg.norm(np.diff(poses[:, :-1, -1], axis=0), axis=1).sum())
+        figure.path(poses[:, :2, -1], color, width, dashes, name=f"{name} ({length_m:.0f} m)")
 
 
 def draw_evaluated(picture: Path, evaluated: Mapping[str, tuple[Matrix, Matrix]]) -> None:

@@ -10,8 +10,9 @@ from markupsafe import Markup
 from scipy.special import gammaincinv
 
 from scanchain.runs.closures import BACK_END, VERIFICATION
+from scanchain_viz.colors import hex_of
 from scanchain_viz.pictures.axis import Axis
-from scanchain_viz.pictures.figure import INK, Floats, SvgFigure, palette_of
+from scanchain_viz.pictures.figure import INK, Floats, Plot, palette_of
 
 # Distinguishable on white and on black, also for most color-blind readers.
 _COLORS = (
@@ -84,14 +85,8 @@ _THIN, _DOTS = 0.8, (1.0, 1.5)  # width and dashes of a dotted line
 _TRUTH_WIDTH, _TRUTH_DASHES = 0.9, (3.0, 3.0)
 _LOWEST, _HIGHEST = 0.01, 1000.0  # range to which observability is clipped
 _BAR_INCHES = 0.65  # of a color bar and its numbers
-_WORST_TO_BEST = (
-    "7a0177",
-    "dd1c77",
-    "f2a03d",
-    "9fb8ad",
-    "41a6c4",
-    "1f6fd0",
-)  # a decade each, degenerate up to orange
+# a decade each, degenerate up to orange
+_WORST_TO_BEST = ("#7a0177", "#dd1c77", "#f2a03d", "#9fb8ad", "#41a6c4", "#1f6fd0")
 _MAX_DOTS = 3000
 
 
@@ -104,20 +99,18 @@ def plan(
     is_wide: bool = False,
 ) -> Markup:
     """Seen from above, within corners."""
-    figure = SvgFigure.of_plan(low, high, is_wide=is_wide)
+    figure = Plot.of_plan(low, high, is_wide=is_wide)
     for trajectory in _known(trajectories, "positions"):
-        x, y = _decimated(trajectory.positions)[:, :2].T
-        figure.line(x, y, trajectory.color, dashes=trajectory.dashes)
+        figure.path(_decimated(trajectory.positions), trajectory.color, dashes=trajectory.dashes)
     if truth is not None:
-        x, y = _decimated(truth)[:, :2].T
-        figure.line(x, y, TRUTH, _TRUTH_WIDTH, _TRUTH_DASHES)
+        figure.path(_decimated(truth), TRUTH, _TRUTH_WIDTH, _TRUTH_DASHES)
     figure.has_grid = True
     return figure.svg()
 
 
 def height(trajectories: Sequence[DrawnTrajectory], truth: Floats | None, low: Floats, high: Floats) -> Markup:
     """Height over the distance traveled, within corners."""
-    figure = SvgFigure()
+    figure = Plot()
     for trajectory in _known(trajectories, "positions"):
         z = _decimated(trajectory.positions)[:, 2]
         figure.line(_decimated(trajectory.distance_m), z, trajectory.color, dashes=trajectory.dashes)
@@ -134,7 +127,7 @@ def height(trajectories: Sequence[DrawnTrajectory], truth: Floats | None, low: F
 
 def error_over_distance(trajectories: Sequence[DrawnTrajectory]) -> Markup:
     """Position error over the distance, after alignment."""
-    figure = SvgFigure(logarithmic="y")
+    figure = Plot(logarithmic="y")
     for trajectory in _known(trajectories, "error_m"):
         known = np.isfinite(trajectory.error_m)
         x, y = _windowed(trajectory.distance_m[known], trajectory.error_m[known])
@@ -146,7 +139,7 @@ def distribution(
     trajectories: Sequence[DrawnTrajectory], key: str, unit_scale: float, label: str, *, is_wide: bool = False
 ) -> Markup:
     """Cumulative distribution, shown up to the 99.5th percentile of the worst trajectory."""
-    figure, ends = SvgFigure(logarithmic="x", is_wide=is_wide), []
+    figure, ends = Plot(logarithmic="x", is_wide=is_wide), []
     for trajectory in _known(trajectories, key):
         values = getattr(trajectory, key)
         values = np.maximum(np.sort(unit_scale * values[np.isfinite(values)]), 1e-6)
@@ -159,7 +152,7 @@ def distribution(
 
 def time_per_scan(trajectories: Sequence[DrawnTrajectory]) -> Markup:
     """Milliseconds along the log."""
-    figure = SvgFigure(logarithmic="y")
+    figure = Plot(logarithmic="y")
     for trajectory in _known(trajectories, "seconds"):
         x, y = _windowed(np.arange(len(trajectory.seconds), dtype=np.float64), 1e3 * trajectory.seconds)
         figure.line(x, y, trajectory.color, 0.9, trajectory.dashes)
@@ -168,7 +161,7 @@ def time_per_scan(trajectories: Sequence[DrawnTrajectory]) -> Markup:
 
 def consistency(trajectories: Sequence[DrawnTrajectory], degrees_of_freedom: int) -> Markup:
     """Distribution of the NEES beside the one that exact covariances would give (dotted)."""
-    figure = SvgFigure(logarithmic="x")
+    figure = Plot(logarithmic="x")
     for trajectory in _known(trajectories, "nees"):
         values = np.sort(trajectory.nees[np.isfinite(trajectory.nees)])
         _cumulative(figure, trajectory, np.maximum(values, 1e-4))
@@ -181,7 +174,7 @@ def consistency(trajectories: Sequence[DrawnTrajectory], degrees_of_freedom: int
 
 def observability(trajectories: Sequence[DrawnTrajectory], *, is_wide: bool) -> Markup:
     """Observability scan by scan; below 1 (dotted) a scan is degenerate."""
-    figure = SvgFigure(logarithmic="y", is_wide=is_wide)
+    figure = Plot(logarithmic="y", is_wide=is_wide)
     for trajectory in _known(trajectories, "observability"):
         x = np.arange(len(trajectory.observability), dtype=np.float64)
         known = np.clip(trajectory.observability, _LOWEST, _HIGHEST)
@@ -194,7 +187,7 @@ def innovations(
     curves: Mapping[str, tuple[Floats, str]], stretches: Sequence[tuple[int, int, str]], *, is_wide: bool
 ) -> Markup:
     """Innovations (N,) over their limits scan by scan, 1 (dotted) is a finding; stretches are shaded."""
-    figure = SvgFigure(is_wide=is_wide)
+    figure = Plot(is_wide=is_wide)
     for first, last, color in stretches:
         figure.span(first - 0.5, last + 0.5, color, 0.2)
     for values, color in curves.values():
@@ -207,7 +200,7 @@ def innovations(
 
 def observability_plan(trajectory: DrawnTrajectory) -> Markup:
     """Observability on the trajectory from above, the worst scans on top; of many the worst of successive ones."""
-    figure = SvgFigure.of_plan(*frame([trajectory], None), spare_inches=_BAR_INCHES)
+    figure = Plot.of_plan(*frame([trajectory], None), spare_inches=_BAR_INCHES)
     values = np.nan_to_num(trajectory.observability, nan=_HIGHEST)
     groups = np.array_split(np.arange(len(values)), min(len(values), _MAX_DOTS))
     worst = np.array([group[np.argmin(values[group])] for group in groups])
@@ -219,7 +212,7 @@ def observability_plan(trajectory: DrawnTrajectory) -> Markup:
     colors = palette[np.rint(255.0 * axis.fractions(shown)).astype(int), :3]
     size = float(np.sqrt(np.clip(3000.0 / len(values), 4.0, 30.0)))
     x, y = trajectory.positions[order, :2].T
-    figure.dots(x, y, [f"#{bytes(color).hex()}" for color in colors], size)
+    figure.dots(x, y, list(map(hex_of, colors)), size)
     figure.color_bar(palette, axis)
     figure.has_grid = True
     return figure.svg()
@@ -240,14 +233,14 @@ def _known(trajectories: Sequence[DrawnTrajectory], key: str) -> list[DrawnTraje
     return [trajectory for trajectory in reversed(trajectories) if np.isfinite(getattr(trajectory, key)).any()]
 
 
-def _cumulative(figure: SvgFigure, trajectory: DrawnTrajectory, ordered: Floats) -> None:
+def _cumulative(figure: Plot, trajectory: DrawnTrajectory, ordered: Floats) -> None:
     """Per cent of the values below each."""
     rows = np.unique(np.linspace(0, len(ordered) - 1, min(len(ordered), _MAX_POINTS)).astype(int))
     shares = np.linspace(0.0, 100.0, len(ordered))[rows]
     figure.line(ordered[rows], shares, trajectory.color, dashes=trajectory.dashes)
 
 
-def _labeled(figure: SvgFigure, x: str, y: str) -> Markup:
+def _labeled(figure: Plot, x: str, y: str) -> Markup:
     """The figure with a grid and names of its axes."""
     figure.x.label, figure.y.label, figure.has_grid = x, y, True
     return figure.svg()

@@ -1,38 +1,135 @@
-"""Steps gathered into batches: one call a column instead of one a scan, which is what makes recording cheap."""
+"""Steps gathered into batches, one call a column instead of one a scan, and the keyframe graph as it grows."""
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from time import perf_counter
 
+import msgspec
 import numpy as np
 import rerun as rr
 
 from scanchain import lie
-from scanchain.data import Match, Matrix, State, Step
+from scanchain.data import Closure, ClosureVerdict, GraphState, Match, Matrix, State, Step
+from scanchain.runs.closures import FinalClosure, final_verdicts
 from scanchain.runs.step_table import StepRow
-from scanchain_viz.recording import entities, shapes
-from scanchain_viz.recording.keyframe_graph import Verdicts
-from scanchain_viz.recording.messages import Message, Times
+from scanchain_viz.recording import drawing, entities
+from scanchain_viz.recording.drawing import Floats, Message, Times
 
 _MAX_SCANS = 256
 _MAX_BYTES = 4_000_000
 _MAX_WAIT_S = 0.25
 _LEAST_DRAWN = 1e-3  # least observability that is drawn
 WARNING, _INFORMATION = "WARN", "INFO"  # rerun's words
+_GROWTH = 1.05  # factor of growth between two drawings: the recording stays linear in the length of the log
+_DOWNWEIGHTED = 0.5  # robust weight below which an accepted closure is drawn amber
+
+
+class Verdicts(msgspec.Struct, frozen=True):
+    """Events of a step, one per closure with a new verdict, and the numbers accepted and rejected since."""
+
+    events: Sequence[str]
+    accepted: int
+    rejected: int
+
+
+class KeyframeGraph:
+    """Takes in every step; returns the verdicts on closures, and draws the graph when it has grown enough."""
+
+    def __init__(self) -> None:
+        self.positions: list[Floats] = []
+        self.closures: list[FinalClosure] = []
+        self.graph: GraphState | None = None
+        self.counts = (0, 0)
+        self.drawn = 0
+        self.is_current = True
+
+    def add(self, step: Step) -> Verdicts:
+        """Take in a step; the verdicts on its closures are those of the matcher, then of the back end for all."""
+        if step.keyframe >= 0:
+            self.positions.append(drawing.positions(step.T_world_lidar[None])[0])
+            self.is_current = False
+        events: list[str] = []
+        if step.closures:
+            found = [FinalClosure(c, c.verdict, c.cause, c.reason, 1.0, math.nan) for c in step.closures]
+            events += self._update([*self.closures, *found])  # verdicts of the matcher alone
+        if step.graph is not None:
+            self.graph = step.graph
+            events += self._update(final_verdicts([item.closure for item in self.closures], step.graph))
+        return Verdicts(events, *self.counts)
+
+    def settle(self, closures: Sequence[FinalClosure], graph: GraphState) -> Verdicts:
+        """Take in the final graph with every closure tried."""
+        self.graph = graph
+        self.is_current = False
+        return Verdicts(self._update(closures), *self.counts)
+
+    def restore(self, rows: Sequence[StepRow], closures: Sequence[Closure], graph: GraphState) -> Verdicts:
+        """Restore the state after the steps of ``rows`` from the closures and the graph at that time."""
+        self.graph = graph
+        self._update(final_verdicts(closures, graph))
+        for row in rows:
+            if row.keyframe >= 0:
+                self.positions.append(drawing.positions(row.T_world_lidar[None])[0])
+                self.drawn = len(self.positions) if self.has_grown else self.drawn
+        self.is_current = self.drawn == len(self.positions)
+        return Verdicts((), *self.counts)
+
+    @property
+    def has_grown(self) -> bool:
+        """True if it is time to draw it."""
+        return len(self.positions) > _GROWTH * self.drawn
+
+    def draw(self, times: Times) -> list[Message]:
+        """Messages of the present graph, unless it is drawn already."""
+        if self.is_current or not self.positions:
+            return []
+        self.drawn, self.is_current = len(self.positions), True
+        nodes = np.array(self.positions)
+        if self.graph is not None:
+            nodes[: len(self.graph.poses)] = drawing.positions(self.graph.poses)
+        accepted = [item for item in self.closures if item.verdict is ClosureVerdict.ACCEPTED]
+        rejected = [item for item in self.closures if item.verdict is ClosureVerdict.REJECTED]
+        colors = [entities.ORANGE if item.weight < _DOWNWEIGHTED else entities.GREEN for item in accepted]
+        return [
+            Message(entities.KEYFRAMES, drawing.dots(nodes), times),
+            Message(entities.ODOMETRY_EDGES, drawing.lines([nodes]), times),
+            Message(entities.ACCEPTED, drawing.lines(_edges(nodes, accepted), colors or None), times),
+            Message(entities.REJECTED, drawing.lines(_edges(nodes, rejected)), times),
+        ]
+
+    def _update(self, closures: Sequence[FinalClosure]) -> list[str]:
+        """Store the verdicts; a line for each new one, the number being the closure's row in loops.parquet."""
+        before = [item.verdict for item in self.closures]
+        self.closures = list(closures)
+        counts = Counter(item.verdict for item in closures)
+        self.counts = (counts[ClosureVerdict.ACCEPTED], counts[ClosureVerdict.REJECTED])
+        return [
+            f"closure {number} ({item.closure.target} to {item.closure.source}) {item.verdict}: {item.reason}"
+            for number, item in enumerate(closures)
+            if number >= len(before) or item.verdict is not before[number]
+        ]
+
+
+def _edges(nodes: Floats, closures: list[FinalClosure]) -> Floats:
+    """Line strips (E, 2, 3) between the keyframes of closures."""
+    pairs = np.array([(item.closure.target, item.closure.source) for item in closures], np.int64).reshape(-1, 2)
+    return nodes[pairs]
 
 
 class Batcher:
     """Holds the steps since the last batch; every batch turns them into messages."""
 
     def __init__(self, dimension: int) -> None:
+        self.graph = KeyframeGraph()
         self.steps: list[Step] = []
         self.verdicts: list[Verdicts] = []  # of each step
         self.bytes = 0
         self.scans = 0
         self.points = 0
-        self.box: shapes.Floats | None = None
+        self.box: Floats | None = None
         self.started_s = perf_counter()
         self.T_odom_before: Matrix | None = None
         self.T_world_odom: Matrix = lie.identity(dimension)
@@ -40,17 +137,18 @@ class Batcher:
         self.state: State | None = None
         self.closures: tuple[int, int] | None = None
 
-    def restore(self, rows: Sequence[StepRow], verdicts: Verdicts) -> None:
-        """Restore the state after the steps of ``rows`` from the verdicts at that time."""
-        last = rows[-1]
+    def restore(self, rows: Sequence[StepRow], closures: Sequence[Closure], graph: GraphState) -> None:
+        """Restore the state after the steps of ``rows`` from the closures and the graph at that time."""
+        last, verdicts = rows[-1], self.graph.restore(rows, closures, graph)
         self.scans, self.points = len(rows), sum(row.match.points for row in rows)
-        self._frame(shapes.positions(np.array([row.T_world_lidar for row in rows])))
+        self._frame(drawing.positions(np.array([row.T_world_lidar for row in rows])))
         self.T_odom_before = last.T_odom_lidar
         self.has_odom, self.T_world_odom = True, last.T_world_lidar @ lie.inverse(last.T_odom_lidar)
         self.state, self.closures = last.state, (verdicts.accepted, verdicts.rejected)
 
-    def add(self, step: Step, verdicts: Verdicts) -> None:
-        """Take in one step with the verdicts of that moment."""
+    def add(self, step: Step) -> None:
+        """Take in one step, and the verdicts of that moment."""
+        verdicts = self.graph.add(step)
         if not self.steps:
             self.started_s = perf_counter()
         self.steps.append(step)
@@ -80,9 +178,9 @@ class Batcher:
         )
         odom = np.array([step.T_odom_lidar for step in steps])
         world = np.array([step.T_world_lidar for step in steps])
-        self._frame(shapes.positions(world))
+        self._frame(drawing.positions(world))
         return [
-            Message(entities.LIDAR, shapes.transforms(world), times),
+            Message(entities.LIDAR, drawing.transforms(world), times),
             Message(entities.SCAN, _scans(steps), times),
             *self._trails(times, odom, world),
             *_matches([step.match for step in steps], times),
@@ -90,15 +188,13 @@ class Batcher:
             *self._states(steps, verdicts, times),
         ]
 
-    def settled(self, verdicts: Verdicts, times: Times) -> list[Message]:
-        """The verdicts after the last step, at its ``times``; their numbers in any case."""
-        self.closures = None
-        return [
-            *events([[(_INFORMATION, text) for text in verdicts.events]], times),
-            *self._counts([verdicts], times),
-        ]
+    def settled(self, closures: Sequence[FinalClosure], graph: GraphState, times: Times) -> list[Message]:
+        """All that is left, and the final verdicts at ``times``, of the last step; their numbers in any case."""
+        messages, verdicts, self.closures = self.messages(), self.graph.settle(closures, graph), None
+        told = events([[(_INFORMATION, text) for text in verdicts.events]], times)
+        return [*messages, *told, *self._counts([verdicts], times), *self.graph.draw(times)]
 
-    def _frame(self, positions: shapes.Floats) -> None:
+    def _frame(self, positions: Floats) -> None:
         """Widen the box around everything that was passed, (2, 3)."""
         known = positions if self.box is None else np.concatenate([self.box, positions])
         self.box = np.stack([known.min(axis=0), known.max(axis=0)])
@@ -117,14 +213,14 @@ class Batcher:
         changed = steps > 1e-6
         changed[0] |= not self.has_odom
         self.has_odom, self.T_world_odom = True, corrections[-1]
-        odometry = shapes.segments(shapes.positions(before), shapes.positions(odom))
-        trajectory = shapes.segments(shapes.positions(corrections @ before), shapes.positions(world))
+        odometry = drawing.segments(drawing.positions(before), drawing.positions(odom))
+        trajectory = drawing.segments(drawing.positions(corrections @ before), drawing.positions(world))
         messages = [
             Message(entities.ODOMETRY, rr.LineStrips3D.columns(strips=odometry), times),
             Message(entities.TRAJECTORY, rr.LineStrips3D.columns(strips=trajectory), times),
         ]
         if changed.any():
-            messages.append(Message(entities.ODOM, shapes.transforms(corrections[changed]), times[changed]))
+            messages.append(Message(entities.ODOM, drawing.transforms(corrections[changed]), times[changed]))
         return messages
 
     def _states(self, steps: list[Step], verdicts: list[Verdicts], times: Times) -> list[Message]:
@@ -165,7 +261,7 @@ def events(events: Sequence[Sequence[tuple[str, str]]], times: Times) -> list[Me
 
 
 def _scans(steps: list[Step]) -> rr.ComponentColumnList:
-    points = shapes.in_space(np.concatenate([step.points for step in steps]))
+    points = drawing.in_space(np.concatenate([step.points for step in steps]))
     return rr.Points3D.columns(positions=points).partition([len(step.points) for step in steps])
 
 
@@ -194,7 +290,7 @@ def _matches(matches: list[Match], times: Times) -> list[Message]:
             Message(entity, rr.Scalars.columns(scalars=np.ascontiguousarray(column)), times)
             for entity, column in zip(series, numbers.T, strict=True)
         ),
-        Message(entities.COVARIANCE, shapes.ellipsoids(informations, entities.COVARIANCE_SCALE), times),
+        Message(entities.COVARIANCE, drawing.ellipsoids(informations, entities.COVARIANCE_SCALE), times),
     ]
 
 

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from numpy.typing import NDArray
 
 from scanchain_viz.recording import entities
-from scanchain_viz.recording.shapes import Floats
+from scanchain_viz.recording.drawing import Floats
 
 _BACKGROUND = (13, 16, 17)  # of scenes, also where the viewer is light: lines of ground truth are white
 _PLAY_S = 30.0
@@ -82,22 +83,23 @@ def time_panel(scans: int) -> rrb.TimePanel:
 
 
 def scene(
-    name: str, dimension: int, box: Floats | None, overrides: Mapping[Any, Any] | None = None
+    name: str, dimension: int, seen: NDArray[np.floating] | None, overrides: Mapping[Any, Any] | None = None
 ) -> rrb.Spatial3DView:
-    """The world, dark whatever the viewer is; box : (2, 3) corners of what is to be seen."""
+    """The world, dark whatever the viewer is; seen : (N, 3) points, or corners, that the view should hold."""
     return rrb.Spatial3DView(
         origin=entities.WORLD,
         name=name,
         overrides=overrides,
         background=_BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=False),
-        eye_controls=_eye(dimension, box),
+        eye_controls=_eye(dimension, seen),
     )
 
 
-def _eye(dimension: int, box: Floats | None) -> rrb.EyeControls3D:
+def _eye(dimension: int, seen: NDArray[np.floating] | None) -> rrb.EyeControls3D:
     """From above for a 2D log, obliquely for a 3D one; far enough to see the whole trajectory."""
-    low, high = (np.full(3, -20.0), np.full(3, 20.0)) if box is None else box
+    known = np.array([[-20.0] * 3, [20.0] * 3]) if seen is None or not len(seen) else seen
+    low, high = known.min(axis=0), known.max(axis=0)
     center = 0.5 * (low + high)
     size_m = max(float(np.linalg.norm(high - low)), 20.0 if dimension == 2 else 60.0)
     away = (0.0, 0.0, 1.3) if dimension == 2 else (-0.35, -0.7, 0.7)

@@ -15,11 +15,12 @@ from scanchain.comparison.results import MAP_FILE, SCANS_FILE, TRUTH_FILE, metho
 from scanchain.comparison.table import Table, read_table
 from scanchain.maps import read_ply
 from scanchain.trajectory import read_tum
+from scanchain_viz.colors import rgb
 from scanchain_viz.pictures.compared_trajectories import read_trajectories
 from scanchain_viz.pictures.trajectory_figures import DrawnTrajectory
-from scanchain_viz.recording import entities, shapes
+from scanchain_viz.recording import drawing, entities
 from scanchain_viz.recording.blueprint import scene, time_panel, up_to_now, whole_log
-from scanchain_viz.recording.messages import Message, Times
+from scanchain_viz.recording.drawing import Message, Times
 from scanchain_viz.recording.sinks import write_recording
 
 RECORDING_FILE = "compare.rrd"
@@ -37,11 +38,11 @@ def record_comparison(directory: Path) -> None:
 
 
 def _messages(directory: Path, trajectories: Sequence[DrawnTrajectory], stamps_ns: np.ndarray) -> list[Message]:
-    messages = [entities.UP]
+    messages: list[Message] = []
     truth_file = directory / TRUTH_FILE
     if truth_file.exists():
-        path = shapes.positions(read_tum(truth_file).poses)
-        messages.append(Message(entities.GROUND_TRUTH, entities.lines(entities.WHITE, 0.75, [path])))
+        path = drawing.positions(read_tum(truth_file).poses)
+        messages.append(Message(entities.GROUND_TRUTH, drawing.lines([path], entities.WHITE, 0.75)))
     for trajectory in trajectories:
         messages += _of(trajectory, method_folder(directory, trajectory.name) / MAP_FILE, stamps_ns)
     return messages
@@ -50,22 +51,22 @@ def _messages(directory: Path, trajectories: Sequence[DrawnTrajectory], stamps_n
 def _of(trajectory: DrawnTrajectory, map_file: Path, stamps_ns: np.ndarray) -> list[Message]:
     """The trajectory in segments, the lidar on it, the map, and the plots."""
     name = rr.escape_entity_path_part(trajectory.name)
-    color, positions = entities.rgb(trajectory.color), trajectory.positions.astype(np.float32)
+    color, positions = rgb(trajectory.color), trajectory.positions.astype(np.float32)
     times = Times(np.arange(len(positions)), stamps_ns[: len(positions)])
     before = np.concatenate([positions[:1], positions[:-1]])
-    strips = rr.LineStrips3D.columns(strips=shapes.segments(before, positions))
+    strips = rr.LineStrips3D.columns(strips=drawing.segments(before, positions))
     messages = [
-        Message(f"world/{name}/trajectory", entities.lines(color, 1.5)),
+        Message(f"world/{name}/trajectory", drawing.lines(color=color, radius=1.5)),
         Message(f"world/{name}/trajectory", strips, times),
-        Message(f"world/{name}/lidar", entities.dots(color, 5.0)),
+        Message(f"world/{name}/lidar", drawing.dots(color=color, radius=5.0)),
         Message(
             f"world/{name}/lidar", rr.Points3D.columns(positions=positions).partition([1] * len(positions)), times
         ),
     ]
     if map_file.exists():
-        points = shapes.in_space(shapes.at_most(read_ply(map_file), _MAP_POINTS))
+        points = drawing.at_most(read_ply(map_file), _MAP_POINTS)
         red, green, blue = ((value + shade) // 2 for value, shade in zip(color, entities.GRAY, strict=True))
-        messages.append(Message(f"world/{name}/map", entities.dots((red, green, blue), 0.5, points)))
+        messages.append(Message(f"world/{name}/map", drawing.dots(points, (red, green, blue), 0.5)))
     for plot, values in _series(trajectory).items():
         known = np.isfinite(values)
         if known.any():
@@ -86,9 +87,8 @@ def _blueprint(trajectories: Sequence[DrawnTrajectory], table: Table) -> rrb.Blu
     names = [rr.escape_entity_path_part(trajectory.name) for trajectory in trajectories]
     overrides: dict[Any, Any] = {f"world/{name}/trajectory": [up_to_now()] for name in names}
     overrides |= {f"world/{name}/map": [rrb.EntityBehavior(visible=False)] for name in names[1:]}
-    ends = [trajectory.positions for trajectory in trajectories[:1]]
-    box = np.array([ends[0].min(axis=0), ends[0].max(axis=0)]) if ends else None
-    world = scene("trajectories and maps", table.dimension, box, overrides)
+    seen = trajectories[0].positions if trajectories else None
+    world = scene("trajectories and maps", table.dimension, seen, overrides)
     return rrb.Blueprint(
         rrb.Vertical(world, rrb.Horizontal(*_plots(trajectories)), row_shares=[2, 1]),
         time_panel(table.scans),

@@ -6,14 +6,12 @@ correction that loop closures make. A 2D log is drawn in the plane z = 0.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
 from scanchain.data import State
-from scanchain_viz.recording.messages import Message
+from scanchain_viz.recording.drawing import Color, Floats, Message, dots, lines, pixels
 
 WORLD = "world"
 ODOM = "world/odom"
@@ -48,7 +46,6 @@ VERDICT = "verdict"
 STAGES = ("read", "preprocess", "match", "map", "loops")
 COVARIANCE_SCALE = 100.0  # a standard deviation of 1 mm is drawn 10 cm long
 
-Color = tuple[int, int, int]
 YELLOW, GRAY, WHITE = (255, 205, 60), (110, 120, 135), (235, 235, 235)
 BLUE, GREEN, RED, ORANGE, VIOLET = (70, 150, 255), (60, 200, 90), (235, 70, 60), (255, 140, 40), (190, 120, 255)
 CYAN = (70, 210, 210)
@@ -82,7 +79,7 @@ back.
 UP = Message(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
 
 
-def height_colors(points: NDArray[np.float32]) -> NDArray[np.uint8]:
+def height_colors(points: Floats) -> NDArray[np.uint8]:
     """Colors (N, 3) of points (N, 3) by height, from the 2nd to the 98th percentile."""
     low, high = np.percentile(points[:, 2], (2.0, 98.0))
     share = np.clip((points[:, 2] - low) / max(float(high - low), 1e-3), 0.0, 1.0)
@@ -97,15 +94,15 @@ def constants(dimension: int) -> list[Message]:
     return [
         UP,
         Message(LIDAR, rr.TransformAxes3D(axis_length=size_m)),
-        Message(SCAN, dots(YELLOW, 2.0)),
-        Message(LOCAL_MAP, dots(GRAY, 1.2)),
-        Message(COVARIANCE, rr.Ellipsoids3D.from_fields(colors=[VIOLET], line_radii=[pixels(1.0)])),
-        Message(ODOMETRY, lines(ORANGE, 1.0)),
-        Message(TRAJECTORY, lines(BLUE, 1.5)),
-        Message(KEYFRAMES, dots(VIOLET, 2.0)),
-        Message(ODOMETRY_EDGES, lines(GRAY, 0.75)),
-        Message(ACCEPTED, rr.LineStrips3D.from_fields(radii=[pixels(1.5)])),
-        Message(REJECTED, lines(RED, 0.75)),
+        Message(SCAN, dots(color=YELLOW, radius=2.0)),
+        Message(LOCAL_MAP, dots(color=GRAY, radius=1.2)),
+        Message(COVARIANCE, rr.Ellipsoids3D.from_fields(colors=[VIOLET], line_radii=pixels(1.0))),
+        Message(ODOMETRY, lines(color=ORANGE, radius=1.0)),
+        Message(TRAJECTORY, lines(color=BLUE, radius=1.5)),
+        Message(KEYFRAMES, dots(color=VIOLET, radius=2.0)),
+        Message(ODOMETRY_EDGES, lines(color=GRAY, radius=0.75)),
+        Message(ACCEPTED, lines(radius=1.5)),
+        Message(REJECTED, lines(color=RED, radius=0.75)),
         Message(LEGEND, rr.TextDocument(_LEGEND, media_type=rr.MediaType.MARKDOWN)),
         Message(VERDICT, rr.TextDocument("The verdict comes with the end of the run.")),
         *_series(),
@@ -134,26 +131,3 @@ def _series() -> list[Message]:
 def _steps(names: list[str], colors: list[Color]) -> rr.SeriesLines:
     """Series that hold their value until the next."""
     return rr.SeriesLines(names=names, colors=colors, interpolation_mode=rr.components.InterpolationMode.StepAfter)
-
-
-def pixels(radius: float) -> float:
-    """A radius in points of the screen, which rerun takes as a negative number."""
-    return -radius
-
-
-def dots(color: Color, radius: float, positions: NDArray[np.float32] | None = None) -> rr.Points3D:
-    """Points (N, 3) of one color and radius on the screen; without positions the style of those to come."""
-    return rr.Points3D.from_fields(positions=positions, colors=[color], radii=[pixels(radius)])
-
-
-def lines(color: Color, radius: float, strips: Iterable[NDArray[np.float32]] | None = None) -> rr.LineStrips3D:
-    """Line strips, (N, 3) each, of one color and radius; without strips the style of those to come."""
-    return rr.LineStrips3D.from_fields(
-        strips=None if strips is None else [*strips], colors=[color], radii=[pixels(radius)]
-    )
-
-
-def rgb(color: str) -> Color:
-    """The parts of #rrggbb."""
-    red, green, blue = bytes.fromhex(color.removeprefix("#"))
-    return red, green, blue

@@ -22,14 +22,16 @@ from scanchain.errors import InputError
 from scanchain.runs.closures import FinalClosure
 from scanchain.runs.job import SinkName
 from scanchain.runs.step_table import StepRow
-from scanchain.verdict import Judged
-from scanchain_viz.recording import entities, shapes, viewer
-from scanchain_viz.recording.batching import Batcher
+from scanchain.verdict import Judged, Kind, Stretch
+from scanchain_viz.colors import STRETCH_COLORS, rgb
+from scanchain_viz.recording import drawing, entities, viewer
+from scanchain_viz.recording.batching import WARNING, Batcher, events
 from scanchain_viz.recording.blueprint import blueprint
-from scanchain_viz.recording.keyframe_graph import KeyframeGraph
-from scanchain_viz.recording.messages import Message, Times
+from scanchain_viz.recording.drawing import Message, Times
 from scanchain_viz.recording.sinks import Sink, file_sink, open_stream, viewer_sink
-from scanchain_viz.recording.verdict import verdict_messages
+
+_LISTED = 50  # largest number of stretches in the text of a verdict
+_RADIUS = 3.5  # of a stretch, in points of the screen
 
 
 class Recording:
@@ -66,7 +68,6 @@ class Recording:
         self.file: Sink | None = None
         self.server: subprocess.Popen[bytes] | None = None
         self.batcher = Batcher(dimension)
-        self.graph = KeyframeGraph()
         self.last = (0, 0)  # scan and stamp of the last step
         self.problems: list[str] = []
 
@@ -101,7 +102,7 @@ class Recording:
         before : the recording up to there, which is copied; without one, the recording begins here
         """
         self.last = rows[-1].index, rows[-1].stamp_ns
-        self._guard(lambda: self.batcher.restore(rows, self.graph.restore(rows, closures, graph)))
+        self._guard(lambda: self.batcher.restore(rows, closures, graph))
         if before is not None:
             for sink in self.sinks:
                 sink.send(before)
@@ -126,10 +127,10 @@ class Recording:
             return
         self.last = step.scan.index, step.scan.stamp_ns
         try:
-            self.batcher.add(step, self.graph.add(step))
+            self.batcher.add(step)
         except Exception as error:
             self._note(error)
-        has_news = self.graph.has_grown or self._draws_map_of(step)
+        has_news = self.batcher.graph.has_grown or self._draws_map_of(step)
         if has_news or self.batcher.is_due:
             self._send(lambda: self._step(step))
 
@@ -141,15 +142,15 @@ class Recording:
 
     def log_closures(self, closures: Sequence[FinalClosure], graph: GraphState) -> None:
         """Record the final graph and the final verdict on every closure, at the last scan."""
-        self._send(lambda: self._settled(closures, graph))
+        self._send(lambda: self.batcher.settled(closures, graph, self.now))
 
     def log_verdict(self, judged: Judged, trajectory: Trajectory) -> None:
         """Record the verdict, and its stretches on the optimized trajectory."""
-        self._send(lambda: verdict_messages(judged, trajectory))
+        self._send(lambda: _verdict(judged, trajectory))
 
     def log_ground_truth(self, poses: Matrix) -> None:
         """Record true poses (N, 4, 4), aligned to the optimized trajectory."""
-        line = entities.lines(entities.WHITE, 0.75, [shapes.positions(poses)])
+        line = drawing.lines([drawing.positions(poses)], entities.WHITE, 0.75)
         self._send(lambda: [Message(entities.GROUND_TRUTH, line)])
 
     def log_map(self, points: NDArray[np.floating]) -> None:
@@ -168,7 +169,7 @@ class Recording:
 
     def close(self) -> None:
         """Write the last batch, frame the view, and close file and viewer; may be called twice."""
-        self._send(lambda: [*self.batcher.messages(), *self.graph.draw(self.now)])
+        self._send(lambda: [*self.batcher.messages(), *self.batcher.graph.draw(self.now)])
         layout = blueprint(self.dimension, self.batcher.box, self.batcher.scans)
         for sink in self.sinks:
             sink.send(layout)
@@ -215,36 +216,29 @@ class Recording:
 
     def _step(self, step: Step) -> list[Message]:
         """Messages that are due after a step."""
-        messages = self.graph.draw(self.now) if self.graph.has_grown else []
+        messages = self.batcher.graph.draw(self.now) if self.batcher.graph.has_grown else []
         if self._draws_map_of(step):
-            points = shapes.in_space(shapes.at_most(step.local_map, self.config.max_map_points))
-            columns = rr.Points3D.columns(positions=points).partition([len(points)])
-            messages.append(Message(entities.LOCAL_MAP, columns, self.now))
+            points = drawing.at_most(step.local_map, self.config.max_map_points)
+            messages.append(Message(entities.LOCAL_MAP, drawing.dots(points), self.now))
         return [*messages, *self.batcher.messages()] if self.batcher.is_due else messages
 
     def _previewed(self, scan: Scan) -> list[Message]:
-        points = shapes.in_space(shapes.at_most(scan.points, self.config.max_map_points))
-        columns = rr.Points3D.columns(positions=points).partition([len(points)])
-        return [Message(entities.SCAN, columns, Times.at(scan.index, scan.stamp_ns))]
-
-    def _settled(self, closures: Sequence[FinalClosure], graph: GraphState) -> list[Message]:
-        verdicts = self.graph.settle(closures, graph)
-        messages = [*self.batcher.messages(), *self.batcher.settled(verdicts, self.now)]
-        return [*messages, *self.graph.draw(self.now)]
+        points = drawing.at_most(scan.points, self.config.max_map_points)
+        return [Message(entities.SCAN, drawing.dots(points), Times.at(scan.index, scan.stamp_ns))]
 
     def _trajectory(self, times: Times, poses: Matrix) -> list[Message]:
         return [
-            Message(entities.OPTIMIZED, entities.lines(entities.CYAN, 0.75, [shapes.positions(poses)])),
-            Message(entities.OPTIMIZED_LIDAR, shapes.transforms(poses), times),
+            Message(entities.OPTIMIZED, drawing.lines([drawing.positions(poses)], entities.CYAN, 0.75)),
+            Message(entities.OPTIMIZED_LIDAR, drawing.transforms(poses), times),
         ]
 
     def _map(self, points: NDArray[np.floating]) -> list[Message]:
         limit = max(self.config.max_map_points, self.batcher.points // 3)
-        drawn = shapes.in_space(shapes.at_most(points, limit))
+        drawn = drawing.at_most(points, limit)
         if not len(drawn):
             return []
-        colors = entities.height_colors(drawn) if self.dimension == 3 else [entities.WHITE]
-        return [Message(entities.MAP, rr.Points3D(drawn, colors=colors, radii=[entities.pixels(1.0)]))]
+        color = entities.height_colors(drawn) if self.dimension == 3 else entities.WHITE
+        return [Message(entities.MAP, drawing.dots(drawn, color, 1.0))]
 
     def _grid(
         self, cells: NDArray[np.int8] | NDArray[np.uint8], resolution_m: float, origin_m: tuple[float, float]
@@ -283,3 +277,37 @@ class Recording:
         problem = f"the recording lacks something: {type(error).__name__}: {error}"
         if problem not in self.problems:
             self.problems.append(problem)
+
+
+def _verdict(judged: Judged, trajectory: Trajectory) -> list[Message]:
+    """Text, lines and events; the indices of the trajectory's scans are those of the log."""
+    document = rr.TextDocument(_document(judged), media_type=rr.MediaType.MARKDOWN)
+    messages = [Message(entities.VERDICT, document)]
+    if judged.stretches:
+        path = drawing.positions(trajectory.poses)
+        lines = rr.LineStrips3D(
+            [_stretch_line(path, each) for each in judged.stretches],
+            colors=[rgb(STRETCH_COLORS[each.kind]) for each in judged.stretches],
+            radii=drawing.pixels(_RADIUS),
+            labels=[str(each.kind) for each in judged.stretches],
+            show_labels=False,
+        )
+        messages.append(Message(entities.STRETCHES, lines))
+        first = np.array([each.first for each in judged.stretches], np.int64)
+        texts = [[(WARNING, f"stretch to check: {each.text}")] for each in judged.stretches]
+        messages += events(texts, Times(first, trajectory.stamps_ns[first]))
+    return messages
+
+
+def _document(judged: Judged) -> str:
+    listed = "".join(f"- {each.text}\n" for each in judged.unnamed[:_LISTED])
+    more = len(judged.unnamed) - _LISTED
+    head = f"## {judged.verdict}\n\n{judged.vouched}\n\n{judged.reason}\n\n"
+    return head + listed + (f"- and {more:,} more\n" if more > 0 else "")
+
+
+def _stretch_line(path: drawing.Floats, stretch: Stretch) -> drawing.Floats:
+    """The part of the path that leads through a stretch; of disagreeing loops the line between their ends."""
+    if stretch.kind is Kind.LOOPS:
+        return path[[stretch.first, stretch.last]]
+    return path[max(stretch.first - 1, 0) : stretch.last + 1]

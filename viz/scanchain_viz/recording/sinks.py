@@ -25,7 +25,8 @@ from rerun.error_utils import RerunWarning
 from scanchain.errors import InputError
 from scanchain.whole_file import write_whole
 from scanchain.words import counted
-from scanchain_viz.recording.messages import Message
+from scanchain_viz.recording.drawing import Message
+from scanchain_viz.recording.entities import UP
 
 _QUEUED_BATCHES = 16
 _COPIED_CHUNKS = 64  # largest number of chunks in memory when a recording is copied
@@ -178,11 +179,14 @@ def file_sink(path: Path, stream: rr.RecordingStream, blueprint: rrb.Blueprint) 
 def write_recording(
     path: Path, name: str, dimension: int, blueprint: rrb.Blueprint, messages: Iterable[Message], *, kind: str = ""
 ) -> None:
-    """Write a .rrd file of complete data, whole or not at all. Raises OSError."""
-    stream = open_stream(name, dimension, uuid4(), kind)
+    """Write a .rrd file of complete data, whole or not at all; z is up in it. Raises OSError.
+
+    name : of what is in it; that of a directory that has its final name only later is cut to this one
+    """
+    stream = open_stream(name.partition(".partial-")[0], dimension, uuid4(), kind)
     memory = stream.memory_recording()
     stream.send_blueprint(blueprint, make_active=False)
-    for message in messages:
+    for message in (UP, *messages):
         message.send(stream)
     write_whole(path, memory.drain_as_bytes())
 

@@ -18,10 +18,9 @@ from scanchain.source import source_of, without_keys
 from scanchain.trajectory import read_tum
 from scanchain.verdict import MOST_CONTRADICTED
 from scanchain.words import counted
-from scanchain_viz.pictures.figure import SvgFigure
+from scanchain_viz.pictures.figure import Plot
 from scanchain_viz.pictures.trajectory_figures import color_of
 from scanchain_viz.report import page
-from scanchain_viz.report.checks import verdict_cell
 
 _MAX_TRAJECTORIES = 60
 _MAX_POINTS = 1500  # largest number of points of a line
@@ -97,21 +96,21 @@ def _row(directory: Path, row: Row, name: str) -> page.Row:
     truth = None if m.ground_truth is None else m.ground_truth.optimized
     is_far_off = m.ground_truth is not None and bool(m.ground_truth.complaint)
     cells = (
-        verdict_cell(m.verdict),
-        page.Cell(f"{m.scans:,}"),
+        page.verdict_cell(m.verdict),
+        f"{m.scans:,}",
         page.Cell(f"{m.contradicted:,}", is_bad=m.contradicted > MOST_CONTRADICTED * m.scans),
         page.Cell(f"{m.degenerate:,}", is_bad=m.degenerate > _MANY_DEGENERATE * m.scans),
         page.Cell(f"{m.lost:,}", is_bad=m.lost > _MANY_LOST * m.scans),
         page.Cell(f"{row.warnings:,}", is_bad=row.warnings > 0),
-        page.Cell(f"{m.traveled_m:,.1f}"),
-        page.Cell(f"{m.closures_accepted:,}"),
-        page.Cell(_figure(None if truth is None else truth.ate_rmse_m, 1.0, 4), is_bad=is_far_off),
-        page.Cell(_figure(None if truth is None else truth.kitti_translation_share, 100.0, 3)),
-        page.Cell(f"{100.0 * m.median_inlier_share:.0f}"),
-        page.Cell(_figure(m.median_residual_m, 1e3, 1)),
-        page.Cell(f"{m.times_real_time:.1f}"),
-        page.Cell(f"{row.duration_s:.1f}"),
-        page.Cell(f"{row.peak_mib:,.0f}"),
+        f"{m.traveled_m:,.1f}",
+        f"{m.closures_accepted:,}",
+        page.Cell(page.figure(None if truth is None else truth.ate_rmse_m, 1.0, 4), is_bad=is_far_off),
+        page.figure(None if truth is None else truth.kitti_translation_share, 100.0, 3),
+        f"{100.0 * m.median_inlier_share:.0f}",
+        page.figure(m.median_residual_m, 1e3, 1),
+        f"{m.times_real_time:.1f}",
+        f"{row.duration_s:.1f}",
+        f"{row.peak_mib:,.0f}",
     )
     return page.Row(name, cells, link=link)
 
@@ -122,10 +121,6 @@ def _link(directory: Path, row: Row) -> str:
         if path is not None and (directory / path).is_file():
             return quote(path.as_posix())
     return ""
-
-
-def _figure(value: float | None, scale: float, digits: int) -> str:
-    return "–" if value is None else f"{scale * value:.{digits}f}"
 
 
 def _paths(row: Row) -> str:
@@ -156,10 +151,10 @@ def _values(done: Sequence[Row], figure: Callable[[Row, Metrics], float | None])
 
 
 def _sorted_values(name: str, unit: str, values: Sequence[float]) -> Markup:
-    figure, ordered = SvgFigure(), np.array(values)
+    figure, ordered = Plot(), np.array(values)
     share = 100.0 * (np.arange(len(values)) + 1) / len(values)
     figure.steps(ordered, share, color_of(0))
-    figure.marks(ordered, share, "o", color_of(0), 3.5)
+    figure.marks(np.stack([ordered, share], axis=1), "o", color_of(0), 3.5)
     figure.x.limit(0.0, _BEYOND * max(values) or 1.0)
     figure.y.limit(0.0, 105.0)
     figure.x.label, figure.y.label, figure.has_grid = f"{name} [{unit}]", "logs below [%]", True
@@ -184,9 +179,8 @@ def _trajectory(trajectory: Path) -> Markup:
     rows = np.linspace(0, len(positions) - 1, min(len(positions), _MAX_POINTS)).astype(int)
     middle, size = 0.5 * (positions.min(axis=0) + positions.max(axis=0)), np.ptp(positions, axis=0)
     half = _BEYOND * 0.5 * (max(size / _BOX) or 1.0) * _BOX
-    figure = SvgFigure.of_plan(middle - half, middle + half)
-    x, y = positions[rows].T
-    figure.line(x, y, color_of(0))
-    figure.marks(x[:1], y[:1], "o", color_of(0), 5.0)
+    figure = Plot.of_plan(middle - half, middle + half)
+    figure.path(positions[rows], color_of(0))
+    figure.marks(positions[:1], "o", color_of(0), 5.0)
     figure.has_grid = True
     return figure.svg()

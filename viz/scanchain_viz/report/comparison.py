@@ -19,18 +19,7 @@ from scanchain_viz.pictures import trajectory_figures as figures
 from scanchain_viz.pictures.compared_trajectories import read_trajectories
 from scanchain_viz.pictures.map_figures import map_picture, surroundings
 from scanchain_viz.pictures.trajectory_figures import DrawnTrajectory, Floats
-from scanchain_viz.report import page
-from scanchain_viz.report.checks import verdict_cell
-from scanchain_viz.report.sections import (
-    chip,
-    error_section,
-    loop_section,
-    provenance_sections,
-    relation_section,
-    time_section,
-    trajectories_section,
-    uncertainty_section,
-)
+from scanchain_viz.report import page, sections
 
 _VERDICT = page.Head(
     "verdict", "", "of other tools by wheels and constant velocity alone, with the error that it vouches for", True
@@ -106,13 +95,13 @@ def _grid(
     has_verdicts: bool = False,
 ) -> page.Grid:
     """A row a method; the end of a failed one in place of its figures."""
-    chips = {trajectory.name: chip(trajectory) for trajectory in trajectories}
+    chips = {trajectory.name: sections.chip(trajectory) for trajectory in trajectories}
     shown = [dict(zip((row.name for row in table.rows), c.cells(table.figures), strict=True)) for c in columns]
     lines = []
     for row in rows:
         cells = tuple(page.Cell(each[row.name].text, each[row.name].is_best) for each in shown)
         if has_verdicts:
-            cells += (verdict_cell(row.verdict, row.vouched),)
+            cells += (page.verdict_cell(row.verdict, row.vouched),)
         if row.status is not Status.OK:
             cells = (page.Cell(f"{row.status}: {row.reason}", is_wide=True),)
         lines.append(page.Row(row.name, cells, chips.get(row.name)))
@@ -142,15 +131,15 @@ def _sections(
             whole = {trajectory.name for trajectory in framing}
             astray = ", ".join(trajectory.name for trajectory in drawn if trajectory.name not in whole)
             text += f" The axes frame the sharper maps; {astray} may leave them."
-        yield trajectories_section(drawn, framing, truth, is_planar=is_planar, text=text)
-        yield from error_section(drawn, table.truth)
-        yield from relation_section(drawn)
-        yield from time_section(drawn)
-        yield from uncertainty_section(drawn, is_planar=is_planar)
+        yield sections.trajectories_section(drawn, framing, truth, is_planar=is_planar, text=text)
+        yield from sections.error_section(drawn, table.truth)
+        yield from sections.relation_section(drawn)
+        yield from sections.time_section(drawn)
+        yield from sections.uncertainty_section(drawn, is_planar=is_planar)
         yield from _map_section(directory, drawn, framing, figures.frame(framing, truth), table.dimension)
     settings = {row.name: row.settings for row in table.rows}
     for trajectory in trajectories:
-        yield from loop_section(
+        yield from sections.loop_section(
             trajectory,
             method_folder(directory, trajectory.name) / CLOSURES_FILE,
             f"Loop closures of {trajectory.name}",
@@ -182,7 +171,7 @@ def _map_section(
     whole = {trajectory.name for trajectory in framing}
     corners = surroundings(*box, [points for trajectory, points in maps if trajectory.name in whole])
     drawings = tuple(
-        page.Drawing(trajectory.name, "", map_picture(points, *corners), chip(trajectory))
+        page.Drawing(trajectory.name, "", map_picture(points, *corners), sections.chip(trajectory))
         for trajectory, points in maps
     )
     text = "The same points of the same scans, placed by the poses of each method."
@@ -193,7 +182,7 @@ def _map_section(
 def _disagreement(table: Table) -> page.Section:
     names = [row.name for row in table.rows]
     rows = [
-        page.Row(name, tuple(page.Cell("–" if value is None else f"{1e3 * value:.1f}") for value in values))
+        page.Row(name, tuple(page.figure(value, 1e3, 1) for value in values))
         for name, values in zip(names, table.disagreement_m, strict=True)
     ]
     return page.Section(
@@ -205,7 +194,7 @@ def _disagreement(table: Table) -> page.Section:
 
 
 def _collapsibles(directory: Path, table: Table) -> Iterator[page.Collapsible]:
-    yield from provenance_sections(table.provenance, table.baselines)
+    yield from sections.provenance_sections(table.provenance, table.baselines)
     yield page.Collapsible(
         "Methods", "\n".join(f"{row.name}: {row.description or row.reason}" for row in table.rows)
     )

@@ -10,15 +10,15 @@ import numpy as np
 from scanchain.errors import InputError
 from scanchain.landmarks.results import accuracy_lines, file_stem, size_of, table_of
 from scanchain.landmarks.study import Study
-from scanchain_viz.pictures.landmarks import (
+from scanchain_viz.pictures.problems import (
     AFTER,
     BEFORE,
     draw_estimate,
     draw_factors,
-    svg_after,
-    svg_before,
-    svg_factor,
-)
+    plot_after,
+    plot_before,
+    plot_factor,
+)  # fmt: skip
 from scanchain_viz.report import page
 
 _TIMES = (
@@ -63,12 +63,13 @@ def _sections(study: Study) -> Iterator[page.Section]:
     chips = (page.Chip("before", BEFORE), page.Chip("after", AFTER), *truth)
     marks = "Circles: landmarks" + ("; crosses: true ones" if is_known else "")
     drawings = (
-        page.Drawing("Before optimization", f"{marks}.", svg_before(study)),
-        page.Drawing("After optimization", f"{marks}; ellipses: 95 %.", svg_after(study)),
+        page.Drawing("Before optimization", f"{marks}.", plot_before(study).svg()),
+        page.Drawing("After optimization", f"{marks}; ellipses: 95 %.", plot_after(study).svg()),
     )
     yield page.Section(study.name, facts=facts, chips=chips, drawings=drawings)
     factors = tuple(
-        page.Drawing(f"{method.method}: {method.factor.name}", "", svg_factor(method)) for method in study.methods
+        page.Drawing(f"{method.method}: {method.factor.name}", "", plot_factor(method).svg())
+        for method in study.methods
     )
     text = f"The Jacobian A has {size_of(study)}. Drawn is where the factor of every method is not zero."
     yield page.Section(f"Linear solvers on {study.name}", text, grid=_grid(study), drawings=factors, is_small=True)
@@ -79,4 +80,4 @@ def _grid(study: Study) -> page.Grid:
     split = [heading.partition(" ms") for heading in headings]
     heads = tuple(page.Head(name, unit.strip()) for name, unit, _ in split)
     notes = (_TIMES, *((_DIFFERS, _PINV) if len(rows) > 1 else ("--methods all compares the linear solvers.",)))
-    return page.Grid(heads, tuple(page.Row(name, tuple(map(page.Cell, cells))) for name, *cells in rows), notes)
+    return page.Grid(heads, tuple(page.Row(name, tuple(cells)) for name, *cells in rows), notes)

@@ -5,12 +5,14 @@ from __future__ import annotations
 from base64 import b64encode
 from dataclasses import dataclass
 from hashlib import sha256
+from math import isfinite
 from pathlib import Path
 
+import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from scanchain.verdict import Judged
+from scanchain.verdict import Judged, Verdict
 from scanchain.whole_file import write_whole
 
 REPORT_FILE = "report.html"
@@ -28,7 +30,7 @@ class Chip:
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """A table's cell; ``is_wide`` stretches it to the end of its row.
+    """A table's cell that is more than its text; ``is_wide`` stretches it to the end of its row.
 
     ``is_bad`` marks a problem, ``is_doubted`` what may be one.
     """
@@ -40,6 +42,21 @@ class Cell:
     is_doubted: bool = False
 
 
+def figure(value: float | None, scale: float, digits: int) -> str:
+    """A figure in a table in its unit, – without a value."""
+    return "–" if value is None or not isfinite(value) else f"{scale * value:.{digits}f}"
+
+
+def date(stamp_ns: int) -> str:
+    """A stamp as date and time, UTC."""
+    return str(np.datetime64(stamp_ns, "ns").astype("datetime64[s]")).replace("T", " ")
+
+
+def verdict_cell(verdict: str, text: str = "") -> Cell:
+    """A verdict in a table, in other words if there are any, in the color of its severity; empty for none."""
+    return Cell(text or verdict, is_bad=verdict == Verdict.NOT_TRUSTWORTHY, is_doubted=verdict == Verdict.CHECK)
+
+
 @dataclass(frozen=True, slots=True)
 class Row:
     """A table's row: its subject, with its line in the drawings if it has one, and its cells.
@@ -48,7 +65,7 @@ class Row:
     """
 
     name: str
-    cells: tuple[Cell, ...]
+    cells: tuple[Cell | str, ...]
     chip: Chip | None = None
     link: str = ""
 
@@ -74,7 +91,7 @@ class Grid:
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
-    """A picture with its caption; ``svg`` comes from an ``SvgFigure`` or is a scene, all else is escaped.
+    """A picture with its caption; ``svg`` comes from an ``Plot`` or is a scene, all else is escaped.
 
     ``is_wide`` : over the whole width of the page
     """

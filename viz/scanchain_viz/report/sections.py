@@ -15,7 +15,7 @@ from scanchain.runs.provenance import Provenance
 from scanchain_viz.pictures import trajectory_figures as figures
 from scanchain_viz.pictures.map_figures import loops_picture
 from scanchain_viz.pictures.trajectory_figures import CLOSURES, TRUTH, DrawnTrajectory, Floats
-from scanchain_viz.report.page import Cell, Chip, Collapsible, Drawing, Grid, Head, Row, Section
+from scanchain_viz.report.page import Cell, Chip, Collapsible, Drawing, Grid, Head, Row, Section, figure
 
 _TRUTH_CHIP = Chip("ground truth", TRUTH, is_dashed=True)
 _WITHOUT_CAUSES = "This run is older than the column cause; reasons are in loops.parquet, a sentence a closure."
@@ -63,25 +63,24 @@ def error_section(trajectories: Sequence[DrawnTrajectory], truth_name: str) -> I
             Drawing(
                 "Over the distance", _of_neighbors("Medians", known, "error_m"), figures.error_over_distance(known)
             ),
-            Drawing(
-                "Distribution",
-                "Share of the scans with a smaller error.",
-                figures.distribution(known, "error_m", 1.0, "position error [m]"),
-            ),
+            _distribution(known, "error_m", 1.0, "position error [m]", "scans with a smaller error"),
         ),
     )
+
+
+def _distribution(
+    known: Sequence[DrawnTrajectory], key: str, scale: float, label: str, those: str, *, is_wide: bool = False
+) -> Drawing:
+    svg = figures.distribution(known, key, scale, label, is_wide=is_wide)
+    return Drawing("Distribution", f"Share of the {those}.", svg, is_wide=is_wide)
 
 
 def relation_section(trajectories: Sequence[DrawnTrajectory]) -> Iterator[Section]:
     """Errors over manually verified relations."""
     known = _with(trajectories, "relation_error_m")
     if known:
-        drawing = Drawing(
-            "Distribution",
-            "Share of the relations with a smaller error.",
-            figures.distribution(known, "relation_error_m", 1.0, "error of a relation [m]", is_wide=True),
-            is_wide=True,
-        )
+        label, those = "error of a relation [m]", "relations with a smaller error"
+        drawing = _distribution(known, "relation_error_m", 1.0, label, those, is_wide=True)
         text = "Distance between the motion of a relation and that of the trajectory."
         yield Section("Error over relations", text, _legend(known), (drawing,))
 
@@ -97,11 +96,7 @@ def time_section(trajectories: Sequence[DrawnTrajectory], stages: Grid | None = 
             _legend(known),
             (
                 Drawing("Along the log", _of_neighbors("Medians", known, "seconds"), along),
-                Drawing(
-                    "Distribution",
-                    "Share of the scans that took less.",
-                    figures.distribution(known, "seconds", 1e3, "time of a scan [ms]"),
-                ),
+                _distribution(known, "seconds", 1e3, "time of a scan [ms]", "scans that took less"),
             ),
             stages,
         )
@@ -112,33 +107,35 @@ def uncertainty_section(trajectories: Sequence[DrawnTrajectory], *, is_planar: b
     reported = _with(trajectories, "observability")
     if not reported:
         return
-    consistency = tuple(_consistency(trajectories, is_planar=is_planar))
+    estimated = _with(trajectories, "nees")
     least = _of_neighbors(" Least values", reported, "observability")
-    along = Drawing(
-        "Observability",
-        "Information along the least constrained direction over the minimum required; below 1 (dotted) a scan is "
-        f"degenerate.{least}",
-        figures.observability(reported, is_wide=bool(consistency)),
-        is_wide=bool(consistency),
-    )
-    whose = f" of {reported[0].name}" if len(trajectories) > 1 else ""
-    where = Drawing(
-        f"Observability{whose} on the trajectory",
-        "Seen from above, the least observable scans on top.",
-        figures.observability_plan(reported[0]),
-    )
-    yield Section("Uncertainty", "", _legend(reported), (along, *consistency, where))
-
-
-def _consistency(trajectories: Sequence[DrawnTrajectory], *, is_planar: bool) -> Iterator[Drawing]:
-    with_covariances = _with(trajectories, "nees")
-    if with_covariances:
-        yield Drawing(
-            "Covariance consistency",
-            "Squared error of each motion over its covariance. Dotted: exact covariances; to the left of it "
-            "they are too large, to the right too small.",
-            figures.consistency(with_covariances, 3 if is_planar else 6),
+    drawings = [
+        Drawing(
+            "Observability",
+            "Information along the least constrained direction over the minimum required; below 1 (dotted) a scan "
+            f"is degenerate.{least}",
+            figures.observability(reported, is_wide=bool(estimated)),
+            is_wide=bool(estimated),
         )
+    ]
+    if estimated:
+        drawings.append(
+            Drawing(
+                "Covariance consistency",
+                "Squared error of each motion over its covariance. Dotted: exact covariances; to the left of it "
+                "they are too large, to the right too small.",
+                figures.consistency(estimated, 3 if is_planar else 6),
+            )
+        )
+    whose = f" of {reported[0].name}" if len(trajectories) > 1 else ""
+    drawings.append(
+        Drawing(
+            f"Observability{whose} on the trajectory",
+            "Seen from above, the least observable scans on top.",
+            figures.observability_plan(reported[0]),
+        )
+    )
+    yield Section("Uncertainty", "", _legend(reported), tuple(drawings))
 
 
 def loop_section(trajectory: DrawnTrajectory, path: Path, title: str, min_travel_m: float) -> Iterator[Section]:
@@ -183,20 +180,15 @@ def _verdict_grid(closures: pa.Table) -> Grid:
         Row(
             verdict,
             (
-                Cell(f"{len(places):,}"),
-                Cell(f"{100.0 * np.median(overlap[places]):.0f}"),
-                Cell(_millimeters(float(np.median(residual_m[places])))),
+                f"{len(places):,}",
+                f"{100.0 * np.median(overlap[places]):.0f}",
+                figure(float(np.median(residual_m[places])), 1e3, 0),
                 *((Cell(cause, is_wide=True),) if has_causes else ()),
             ),
         )
         for (verdict, cause), places in sorted(groups.items(), key=lambda group: -len(group[1]))
     )
     return Grid(heads, rows, () if has_causes else (_WITHOUT_CAUSES,))
-
-
-def _millimeters(value_m: float) -> str:
-    """Millimeters as text, – without a value."""
-    return f"{1e3 * value_m:.0f}" if np.isfinite(value_m) else "–"
 
 
 def _of_neighbors(what: str, trajectories: Sequence[DrawnTrajectory], key: str) -> str:

@@ -18,11 +18,12 @@ from scanchain.data import Points, State
 from scanchain.runs.closures import BACK_END
 from scanchain.verdict import Kind, Stretch
 from scanchain.words import counted
+from scanchain_viz.colors import STRETCH_COLORS
 from scanchain_viz.pictures import trajectory_figures as figures
+from scanchain_viz.pictures.figure import broken
 from scanchain_viz.pictures.map_figures import map_picture, path_over_map, surroundings
 from scanchain_viz.pictures.trajectory_figures import CLOSURES, TRUTH, DrawnTrajectory, Floats, PathLine
 from scanchain_viz.report.page import Chip, Drawing, Section
-from scanchain_viz.stretch_colors import STRETCH_COLORS
 
 _DISPUTED = "at closures rejected by the back end"
 _OVER_ALL = (
@@ -100,9 +101,7 @@ def _closure_lines(path: Floats, closures: pa.Table | None) -> Iterator[tuple[Pa
         count = int(chosen.sum())
         if count:
             pairs = path[ends[chosen][:: max(1, -(-count // _MAX_CLOSURES))]]
-            gaps = np.full((len(pairs), 1, 3), np.nan)
-            line = np.concatenate([pairs, gaps], axis=1).reshape(-1, 3)
-            yield PathLine(line, color, 0.9), Chip(f"closures {name}: {count:,}", color)
+            yield PathLine(broken(pairs), color, 0.9), Chip(f"closures {name}: {count:,}", color)
 
 
 def _is_marked(tables: Tables, mark: Kind | str) -> NDArray[np.bool_]:

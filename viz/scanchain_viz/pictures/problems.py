@@ -1,0 +1,155 @@
+"""Pictures of pose graphs and landmark problems, before and after optimization, and the sparsity of factors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain import lie
+from scanchain.data import GraphState, Matrix
+from scanchain.graph.optimization import GraphChange, fit
+from scanchain.landmarks.compare import MethodResult
+from scanchain.landmarks.study import Estimate, Study
+from scanchain_viz.pictures.figure import INK, Plot, broken, palette_of, write_png
+
+_CHAIN, _LOOP, _REJECTED = "#1f5fd0", "#8a8f98", "#d03030"
+_SEEN_FROM = np.array([[0.80, 0.60, 0.0], [-0.30, 0.40, 0.866]])  # rows: right and up of an oblique view, in 3D
+BEFORE, AFTER = "#e07b00", "#1f5fd0"
+_ACROSS = 4  # panels of factors in a row
+_PIXELS = 500  # largest width in pixels of a picture of a factor
+_ELLIPSE = 2.4477  # standard deviations that hold 95 % of a Gaussian in the plane
+_ELLIPSE_POINTS = 37
+_BLUES = ("f7fbff", "deebf7", "c6dbef", "9dcae1", "6aaed6", "4191c6", "2070b4", "08509b", "08306b")
+
+
+def draw_graph(change: GraphChange, path: Path) -> None:
+    """Draw a graph to a PNG: from above in 2D, obliquely in 3D; before and after each in its own frame and scale.
+
+    Raises OSError.
+    """
+    states = (("before", change.before), ("after", change.after))
+    panels = [(f"{change.name} {when}\n{fit(state)}", _graph(state)) for when, state in states]
+    write_png(path, panels, width_inches=6.0, columns=2)
+
+
+def _graph(state: GraphState) -> Plot:
+    positions = state.poses[:, :-1, -1]
+    is_flat = positions.shape[1] == 2
+    seen = positions if is_flat else positions @ _SEEN_FROM.T
+    low, high = _with_margin(seen)
+    center, half = 0.5 * (low + high), 0.5 * (high - low).max()
+    low, high = center - half, center + half  # a square, since the panels stand side by side
+    figure = Plot.of_plan(low, high)
+    if not is_flat:
+        figure.x.limit(low[0], high[0], ticks=())
+        figure.y.limit(low[1], high[1], ticks=())
+        figure.x.label, figure.y.label = "seen obliquely from above", ""
+    skips = np.abs(state.edges[:, 0] - state.edges[:, 1]) != 1
+    width = float(np.clip(2000.0 / max(len(state.edges), 1), 0.25, 1.0))
+    for chosen, color, thickness, name in (
+        (skips & ~state.is_rejected, _LOOP, width, "between poses that do not follow each other"),
+        (~skips & ~state.is_rejected, _CHAIN, 1.5 * width, "between successive poses"),
+        (state.is_rejected, _REJECTED, width, "rejected"),
+    ):
+        if chosen.any():
+            figure.path(broken(seen[state.edges[chosen]]), color, thickness, name=name)
+    return figure
+
+
+def draw_estimate(path: Path, study: Study) -> None:
+    """Draw both estimates of a landmark problem side by side, over the truth, to a PNG. Raises OSError."""
+    panels = []
+    for when, plot in (("before", plot_before(study)), ("after", plot_after(study))):
+        off_m = (study.before if when == "before" else study.after).accuracy.poses_m
+        error = f": poses {off_m:.3g} m off" if np.isfinite(off_m) else ""
+        panels.append((f"{study.name}, {when}{error}", plot))
+    write_png(path, panels, width_inches=5.5, columns=2)
+
+
+def plot_before(study: Study) -> Plot:
+    """Trajectory and landmarks before optimization, over the truth, in its frame where there is one."""
+    return _plot(study, study.before, BEFORE, "before")
+
+
+def plot_after(study: Study) -> Plot:
+    """The same after it, landmarks with their 95 % ellipses."""
+    figure = _plot(study, study.after, AFTER, "after")
+    axes_m, angles_rad = ellipses(study)
+    around = np.linspace(0.0, 2.0 * np.pi, _ELLIPSE_POINTS)
+    along = axes_m[:, None] * np.stack([np.cos(around), np.sin(around)], axis=-1)
+    c, s = np.cos(angles_rad), np.sin(angles_rad)
+    outlines = along @ np.stack([c, s, -s, c], axis=-1).reshape(-1, 2, 2) + _in_truth(study.after)[1][:, None]
+    figure.path(broken(outlines), AFTER, 0.6, opacity=0.5, name="95 % ellipse of a landmark")
+    return figure
+
+
+def _plot(study: Study, estimate: Estimate, color: str, when: str) -> Plot:
+    points = [study.true_poses, study.true_landmarks, *_in_truth(study.before), *_in_truth(study.after)]
+    figure = Plot.of_plan(*_with_margin(np.concatenate(points)))
+    poses, landmarks = _in_truth(estimate)
+    if len(study.true_poses):
+        figure.path(study.true_poses, INK, 1.1, (4.0, 2.0), name="true trajectory")
+    figure.path(poses, color, opacity=0.85, name=f"trajectory {when}")
+    if np.isfinite(study.true_landmarks).any():
+        figure.marks(study.true_landmarks, "+", INK, 7.0, line=0.9, name="true landmarks")
+    figure.marks(landmarks, "o", color, 4.0, line=0.9, name=f"landmarks {when}")
+    return figure
+
+
+def _with_margin(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Corners (2,) of a view of points (N, 2) that are known."""
+    known = points[np.isfinite(points).all(axis=1)]
+    low, high = known.min(axis=0), known.max(axis=0)
+    margin = max(0.05 * float((high - low).max()), 1e-3)
+    return low - margin, high + margin
+
+
+def _in_truth(estimate: Estimate) -> tuple[Matrix, Matrix]:
+    """Positions of poses and landmarks in the truth's frame."""
+    state, T = estimate.state, estimate.T_truth_estimate
+    return lie.transform(T, state.poses[:, :2]), lie.transform(T, state.landmarks)
+
+
+def ellipses(study: Study) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The 95 % ellipse of every landmark: half axes (N, 2) in meters, the longer first, and angle to x (N,)."""
+    turn = study.after.T_truth_estimate[:2, :2]
+    values, vectors = np.linalg.eigh(turn @ study.landmark_covariance @ turn.T)
+    axes_m = _ELLIPSE * np.sqrt(np.maximum(values[:, ::-1], 0.0))
+    return axes_m, np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
+
+
+def plot_factor(method: MethodResult) -> Plot:
+    """Nonzero entries of a method's factor, dark; a pixel of many entries is as dark as they are dense."""
+    matrix, size = method.factor.matrix.tocoo(), len(method.factor.order)
+    there, pixels = matrix.data != 0.0, min(size, _PIXELS)
+    count, _, _ = np.histogram2d(
+        matrix.row[there], matrix.col[there], bins=pixels, range=[[-0.5, size - 0.5], [-0.5, size - 0.5]]
+    )
+    share = count / (size / pixels) ** 2
+    shades = np.where(count > 0, 0.30 + 0.70 * np.sqrt(np.minimum(share, 1.0)), 0.0)
+    low, high = np.zeros(2), np.full(2, float(size))
+    figure = Plot.of_plan(low, high)
+    figure.x.limit(0.0, size, ticks=(0, size))
+    figure.y.limit(size, 0.0, ticks=(0, size))
+    figure.x.label, figure.y.label = f"{method.factor.nnz:,} nonzero", ""
+    figure.image(np.rint(255.0 * shades).astype(np.uint8), palette_of(_BLUES), low, high, rendering="auto")
+    return figure
+
+
+def draw_factors(path: Path, studies: Sequence[Study]) -> None:
+    """Draw every method's factor to a PNG; several problems stand side by side. Raises OSError.
+
+    The place of a method that a problem was not solved by stays empty.
+    """
+    solved = [{method.method: method for method in study.methods} for study in studies]
+    panels = []
+    for name in dict.fromkeys(name for methods in solved for name in methods):
+        for study, methods in zip(studies, solved, strict=True):
+            problem, method = f"{study.name}\n" if len(studies) > 1 else "", methods.get(name)
+            title = "" if method is None else f"{problem}{name}: {method.factor.name}"
+            panels.append((title, None if method is None else plot_factor(method)))
+    columns = len(studies) * max(1, min(_ACROSS, len(panels)) // len(studies))
+    write_png(path, panels, width_inches=2.9, columns=columns, font=9.0)
