@@ -21,7 +21,7 @@ from scanchain.verdict import Judged
 
 if TYPE_CHECKING:
     from scanchain.runs.closures import FinalClosure
-    from scanchain.runs.step_table import StepRow
+    from scanchain.runs.step_table import StepTable
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,9 +121,9 @@ class Recorder(Protocol):
     ) -> None: ...
 
     def resume(
-        self, before: Path | None, rows: Sequence[StepRow], closures: Sequence[Closure], graph: GraphState
+        self, before: Path | None, steps: StepTable, closures: Sequence[Closure], graph: GraphState
     ) -> None:
-        """Resume after the steps of ``rows``, with all closures tried by then and the graph as it was.
+        """Resume after these steps, with all closures tried by then and the graph as it was.
 
         before : the recording up to there, which is copied; without one, the recording begins here
         """

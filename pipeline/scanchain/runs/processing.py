@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from time import perf_counter
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.clock import compiled_s
 from scanchain.config import Config
-from scanchain.data import Scan, Step, Trajectory
+from scanchain.data import Scan, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import ExpectedErrors, on_the_estimate
 from scanchain.logs import Log
@@ -27,17 +24,14 @@ from scanchain.runs.directory import POINTS_FILE, RECORDING_FILE, RunDirectory
 from scanchain.runs.job import Job, OpenRecorder, Progress, Recorder
 from scanchain.runs.overlay import OVERLAY_FILE, write_overlay
 from scanchain.runs.results import Cloud, record_results, results_of, write_results
-from scanchain.runs.resume.checkpoint import Checkpoints
-from scanchain.runs.resume.journal import JOURNAL_FILE, Journal
-from scanchain.runs.resume.resuming import Left, after, resume_recording, set_aside
+from scanchain.runs.resume import Checkpoint, Checkpoints, after, resume_recording, set_aside
 from scanchain.runs.step_table import StepTable
 from scanchain.runs.vouching import evidence_of_run
 from scanchain.slam import Slam, SlamResult
 from scanchain.threads import threads
 from scanchain.verdict import Judged, judge, worst_place
 
-_TOGETHER = 16  # largest number of scans that are read, and of steps that are entered, together
-_WAIT_S = 0.05  # longest time for which steps are gathered
+_TOGETHER = 16  # largest number of scans that are read together
 
 TruePoses = Callable[[NDArray[np.int64]], Trajectory | None]  # of scans with these stamps; may raise InputError
 
@@ -63,13 +57,12 @@ def process(
     record: OpenRecorder,
     progress: Progress,
     steps: StepTable,
-    left: Left | None,
+    left: Checkpoint | None,
     true_poses: TruePoses,
 ) -> Processed:
     """Process every scan, from the first on or from the checkpoint, and write the results."""
     compiled_before_s = compiled_s()
     slam, scans, checkpoints = _begin(job, log, config, directory.path, left)
-    journal = Journal(directory.path / JOURNAL_FILE, after_bytes=0 if left is None else left.journal_bytes)
     with (
         record(
             directory.path / RECORDING_FILE,
@@ -78,20 +71,19 @@ def process(
             sinks=job.sinks,
             config=config.recording,
         ) as recording,
-        journal,
         closing(scans),  # what it left out is counted then, also if the run was stopped
     ):
         if recording.web_address:
             progress.announce(f"viewer: {recording.web_address}")
         notes = () if left is None else (resume_recording(directory.path, left, recording, checkpoints),)
         read = _previewed(scans, compiled_before_s, recording) if left is None else scans
-        with _Taking(recording, journal, steps) as taking:
-            for scan in _ahead(progress.track(read, log.scan_count - len(steps)), slam):
-                taking.take(slam.place(slam.front_end.locate(scan)))
-                if checkpoints.are_due():
-                    taking.enter()
-                    checkpoints.write(slam, recording.secure())
-        checkpoints.write(slam, recording.secure())  # an interruption from here on loses no scan
+        for scan in _ahead(progress.track(read, log.scan_count - len(steps)), slam):
+            step = slam.place(slam.front_end.locate(scan))
+            steps.append(step)
+            recording.log(step)
+            if checkpoints.are_due():
+                checkpoints.write(slam, steps, recording.secure())
+        checkpoints.write(slam, steps, recording.secure())  # an interruption from here on loses no scan
         result = slam.finish(progress.say)
         final = final_verdicts(result.closures, result.state)
         progress.say("building the maps and writing the results")
@@ -121,53 +113,17 @@ def process(
     )
 
 
-class _Taking:
-    """Records steps and enters them into table and journal, a few at once: that is quicker. A context."""
-
-    def __init__(self, recording: Recorder, journal: Journal, steps: StepTable) -> None:
-        self.recording = recording
-        self.journal = journal
-        self.steps = steps
-        self.waiting: deque[Step] = deque()
-        self.since_s = perf_counter()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.enter()
-
-    def take(self, step: Step) -> None:
-        """Take a step, to be entered by now or soon."""
-        self.waiting.append(step)
-        if len(self.waiting) >= _TOGETHER or perf_counter() - self.since_s >= _WAIT_S:
-            self.enter()
-
-    def enter(self) -> None:
-        """Enter the steps that wait, and write the journal. Raises OSError where the disk is full."""
-        while self.waiting:
-            step = self.waiting.popleft()
-            self.journal.append(self.steps.append(step))
-            self.recording.log(step)
-        self.journal.flush()
-        self.since_s = perf_counter()
-
-
 def _begin(
-    job: Job, log: Log, config: Config, folder: Path, left: Left | None
+    job: Job, log: Log, config: Config, folder: Path, left: Checkpoint | None
 ) -> tuple[Slam, Generator[Scan, None, None], Checkpoints]:
     """SLAM, new or as of the checkpoint, the scans that follow, and the writer of checkpoints."""
     if left is None:
         slam = Slam(config, log.T_base_lidar, folder / POINTS_FILE)
         return slam, log.scans(config.preprocess), Checkpoints(folder, job.checkpoint_s)
-    checkpoint = left.checkpoint
-    checkpoint.slam.points.reopen(folder / POINTS_FILE)
-    scans = after(tuple(left.steps.rows), log.scans(config.preprocess), left.folder)
-    set_aside(folder, checkpoint)
-    checkpoints = Checkpoints(folder, job.checkpoint_s, run_s=checkpoint.run_s, process=checkpoint.process + 1)
-    return checkpoint.slam, scans, checkpoints
+    left.slam.points.reopen(folder / POINTS_FILE)
+    scans = after(left, log.scans(config.preprocess))
+    set_aside(folder, left)
+    return left.slam, scans, Checkpoints(folder, job.checkpoint_s, run_s=left.run_s, process=left.process + 1)
 
 
 def _previewed(scans: Iterator[Scan], compiled_before_s: float, recording: Recorder) -> Iterator[Scan]:

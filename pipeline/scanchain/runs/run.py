@@ -40,9 +40,7 @@ from scanchain.runs.metrics import (
 )
 from scanchain.runs.processing import TruePoses, process
 from scanchain.runs.provenance import Hashing, Provenance, describe_start
-from scanchain.runs.resume.journal import JOURNAL_FILE
-from scanchain.runs.resume.rescue import rescued
-from scanchain.runs.resume.resuming import Left, find_left
+from scanchain.runs.resume import Checkpoint, find_left, rescued
 from scanchain.runs.step_table import StepTable
 from scanchain.runs.warm_up import beside
 from scanchain.settings import Settings, dump, load_settings, named
@@ -53,7 +51,7 @@ from scanchain.whole_file import write_whole
 from scanchain.words import counted
 
 _FEW_SCANS = 2  # scans whose trajectory shows at most one motion
-_FOR_RESUMING = (JOURNAL_FILE, CHECKPOINT_FILE, POINTS_FILE)
+_FOR_RESUMING = (CHECKPOINT_FILE, POINTS_FILE)
 
 
 def _no_report(folder: Path) -> None:
@@ -105,7 +103,7 @@ def _run(
         progress.announce(f"warning: {gap}")
     provenance = describe_start(job.command, job.logs, settings.source)
     steps = StepTable() if left is None else left.steps
-    started -= 0.0 if left is None else left.checkpoint.run_s
+    started -= 0.0 if left is None else left.run_s
     _tell_beginning(job, left, progress)
     compiling = announcing_compilation(progress.say, beside(log.dimension, threads()))
     with directory, compiling:
@@ -153,7 +151,7 @@ def opened(job: Job) -> tuple[Log, Settings, TruthFile | None]:
     return log, settings, truth_file
 
 
-def _tell_beginning(job: Job, left: Left | None, progress: Progress) -> None:
+def _tell_beginning(job: Job, left: Checkpoint | None, progress: Progress) -> None:
     """Announce that an earlier run is resumed, or that one exists and is not."""
     if left is not None:
         progress.announce(f"resuming after {counted(len(left.steps), 'scan')} of {left.folder.name}")

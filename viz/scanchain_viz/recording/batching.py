@@ -11,7 +11,7 @@ import rerun as rr
 
 from scanchain import lie
 from scanchain.data import Match, Matrix, State, Step
-from scanchain.runs.step_table import StepRow
+from scanchain.runs.step_table import StepTable
 from scanchain_viz.recording import entities, shapes
 from scanchain_viz.recording.keyframe_graph import Verdicts
 from scanchain_viz.recording.messages import Message, Times
@@ -40,14 +40,14 @@ class Batcher:
         self.state: State | None = None
         self.closures: tuple[int, int] | None = None
 
-    def restore(self, rows: Sequence[StepRow], verdicts: Verdicts) -> None:
-        """Restore the state after the steps of ``rows`` from the verdicts at that time."""
-        last = rows[-1]
-        self.scans, self.points = len(rows), sum(row.match.points for row in rows)
-        self._frame(shapes.positions(np.array([row.T_world_lidar for row in rows])))
-        self.T_odom_before = last.T_odom_lidar
-        self.has_odom, self.T_world_odom = True, last.T_world_lidar @ lie.inverse(last.T_odom_lidar)
-        self.state, self.closures = last.state, (verdicts.accepted, verdicts.rejected)
+    def restore(self, steps: StepTable, verdicts: Verdicts) -> None:
+        """Restore the state after these steps from the verdicts at that time."""
+        odom, world = steps.columns["T_odom_lidar"], steps.columns["T_world_lidar"]
+        self.scans, self.points = len(steps), int(steps.columns["points"].sum())
+        self._frame(shapes.positions(world))
+        self.T_odom_before = odom[-1]
+        self.has_odom, self.T_world_odom = True, world[-1] @ lie.inverse(odom[-1])
+        self.state, self.closures = steps.last_state, (verdicts.accepted, verdicts.rejected)
 
     def add(self, step: Step, verdicts: Verdicts) -> None:
         """Take in one step with the verdicts of that moment."""

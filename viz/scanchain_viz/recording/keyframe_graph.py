@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from scanchain.data import Closure, ClosureVerdict, GraphState, Step
 from scanchain.runs.closures import FinalClosure, final_verdicts
-from scanchain.runs.step_table import StepRow
+from scanchain.runs.step_table import StepTable
 from scanchain_viz.recording import entities, shapes
 from scanchain_viz.recording.messages import Message, Times
 
@@ -58,9 +58,9 @@ class KeyframeGraph:
         self.is_current = False
         return Verdicts(self._update(closures), *self.counts)
 
-    def restore(self, rows: Sequence[StepRow], closures: Sequence[Closure], graph: GraphState) -> Verdicts:
-        """Restore the state after the steps of ``rows`` from the closures and the graph at that time."""
-        poses = np.array([row.T_world_lidar for row in rows if row.keyframe >= 0])
+    def restore(self, steps: StepTable, closures: Sequence[Closure], graph: GraphState) -> Verdicts:
+        """Restore the state after these steps from the closures and the graph at that time."""
+        poses = steps.columns["T_world_lidar"][steps.columns["keyframe"] >= 0]
         self.positions = list(shapes.positions(poses))
         self.graph = graph
         self._update(final_verdicts(closures, graph))
