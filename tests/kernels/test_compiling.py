@@ -31,7 +31,7 @@ from scanchain.kernels.registration.residuals import gradient_spread
 from scanchain.kernels.registration.weights import weigh
 from scanchain.registration import VoxelMap
 from scanchain.runs import processing, results, warm_up
-from scanchain.runs.job import Job, Unwatched
+from scanchain.runs.job import Job, Progress
 from scanchain.runs.run import run
 from scanchain.settings import load_settings
 from scanchain.simulation import simulate
@@ -39,7 +39,7 @@ from scanchain.slam import Slam
 from scanchain_viz.recording.recording import Recording
 
 
-class Told(Unwatched):
+class Told(Progress):
     def __init__(self):
         self.lines = []
 
@@ -130,7 +130,7 @@ def test_a_run_uses_the_types_that_were_compiled_ahead(office, tmp_path, dimensi
     warm_up.graph(dimension)
     kernels = *(each.inner for each in (align, fit_at, gradient_spread, agreement, signal_along)), factorize
     ahead = [list(kernel.signatures) for kernel in kernels]  # tests before may have used other types
-    run(Job(logs=(log,), out=tmp_path / "run", sinks=frozenset()), open_recorder, Unwatched())
+    run(Job(logs=(log,), out=tmp_path / "run", sinks=frozenset()), open_recorder, Progress())
     assert all(ahead) and [list(kernel.signatures) for kernel in kernels] == ahead
 
 
@@ -219,7 +219,7 @@ def office(tmp_path_factory):
 
 def test_a_run_tells_compilation_apart_from_work(office, tmp_path, monkeypatch):
     def finished(name):
-        done = run(Job(logs=(office,), out=tmp_path / name, sinks=frozenset()), open_recorder, Unwatched())
+        done = run(Job(logs=(office,), out=tmp_path / name, sinks=frozenset()), open_recorder, Progress())
         return done, json.loads((done.path / "metrics.json").read_text())
 
     finished("to compile what the cache on disk lacks")
@@ -250,7 +250,7 @@ def test_the_first_scan_is_shown_ahead_where_kernels_are_compiled(office, tmp_pa
     monkeypatch.setattr(processing, "compiled_s", lambda: next(seconds) if compiles else 0.0)
     monkeypatch.setattr(Recording, "preview", lambda self, scan: shown.append(scan))
     monkeypatch.setattr(Recording, "log", lambda self, step: steps.append(step))
-    run(Job(logs=(office,), out=tmp_path / "run", sinks=frozenset()), open_recorder, Unwatched())
+    run(Job(logs=(office,), out=tmp_path / "run", sinks=frozenset()), open_recorder, Progress())
     assert [scan.index for scan in shown] == [steps[0].scan.index] * compiles
     np.testing.assert_array_equal(steps[0].T_world_lidar, np.eye(3))  # as the viewer draws a scan without a pose
 

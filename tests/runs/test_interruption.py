@@ -20,8 +20,8 @@ from scanchain.graph.pose_graph import PoseGraph
 from scanchain.logs import open_log
 from scanchain.preprocess import Resolution
 from scanchain.runs.directory import POINTS_FILE, RECORDING_FILE
-from scanchain.runs.processing import few_at_once
 from scanchain.runs.resume import Checkpoints, read_checkpoint
+from scanchain.runs.run import few_at_once
 from scanchain.runs.step_table import StepTable
 from scanchain.simulation import simulate
 from scanchain.slam import Slam

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from glob import glob
 from pathlib import Path
 from threading import Event
-from typing import Protocol
 
 from scanchain.batch.table import write_table
 from scanchain.batch.task import ROWS_FOLDER, Row, State, Task, attempt, finished_row, key_of, unfinished_row
@@ -17,6 +16,7 @@ from scanchain.logs.files import matching, misspelled, spelled
 from scanchain.logs.opening import AUTO, logs_in
 from scanchain.processes import available_mib
 from scanchain.runs.directory import check_outside_runs
+from scanchain.runs.job import Progress
 from scanchain.runs.provenance import identity_of
 from scanchain.settings import Override
 from scanchain.source import Source, source_of
@@ -26,18 +26,6 @@ from scanchain.words import counted
 _SHARE = 0.75  # of the memory that is free, for all workers together
 
 Work = Callable[[Sequence[Task]], Iterator[Row]]
-
-
-class BatchProgress(Protocol):
-    """Progress of a batch."""
-
-    def say(self, line: str) -> None:
-        """Show a line."""
-        ...
-
-    def count(self, done: int, total: int) -> None:
-        """Show that so many logs of all are done."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +77,7 @@ class Batched:
         return f"{count:,} of {len(self.rows):,} logs have stretches to check" if count else ""
 
 
-def run_batch(batch: Batch, progress: BatchProgress, work: Work | None = None) -> Batched:
+def run_batch(batch: Batch, progress: Progress, work: Work | None = None) -> Batched:
     """Run the logs without a result and write the table.
 
     work : where the tasks are run; None for processes on this machine
