@@ -70,8 +70,9 @@ def partial(out):
 
 def steps_on_disk(out):
     """Scans of the last checkpoint."""
+    folder = partial(out) or out
     try:
-        return len(read_checkpoint(partial(out) or out, config_of(partial(out) or out)).steps)
+        return len(read_checkpoint(folder, config_of(folder)).steps)
     except (FileNotFoundError, InputError):  # not there yet, or just taking another name
         return 0
 
