@@ -30,6 +30,7 @@ from scanchain.runs.directory import (
     RUN_FILE,
     RunDirectory,
     left_behind,
+    writer_of,
 )
 from scanchain.runs.job import Recorder
 from scanchain.runs.provenance import Provenance, package_version
@@ -197,11 +198,13 @@ def _is_of_slam(module: str) -> bool:
 def find_left(out: Path, config: Config) -> Checkpoint | None:
     """State of an earlier run into ``out``, None if it had no checkpoint.
 
-    config : that of now. Raises InputError where that run's, or its version, was another.
+    config : that of now. Raises InputError where that run's, or its version, was another, or it still runs.
     """
     folder = left_behind(out)
     if folder is None:
         return None
+    if writer := writer_of(folder):
+        raise InputError(f"{folder}: is being written by process {writer}; wait for its end or stop it")
     if (folder / "config.toml").read_text(encoding="utf-8") != dump(config):
         raise InputError(f"{folder}: was run with another configuration; repeat its flags, or {_REMEDY}")
     return read_checkpoint(folder, config)

@@ -30,8 +30,9 @@ from scanchain.runs.directory import (
     RUN_FILE,
     TRUTH_FILE,
     RunDirectory,
-    left_without_checkpoint,
-    resumable,
+    left_behind,
+    partial_runs,
+    writer_of,
 )
 from scanchain.runs.job import Job, OpenRecorder, Progress, Recorder
 from scanchain.runs.metrics import (
@@ -133,13 +134,14 @@ class _Run:
             self.steps = self.left.steps
             self.began_s -= self.left.run_s
             progress.announce(f"resuming after {counted(len(self.steps), 'scan')} of {self.left.folder.name}")
-        elif (idle := resumable(job.out)) is not None:
+        elif (idle := left_behind(job.out)) is not None and not writer_of(idle):
             progress.announce(
                 f"{idle.name} is of a run that was stopped; --resume would continue it, this run starts over and "
                 "removes it once complete"
             )
-        elif job.resume and (partial_names := left_without_checkpoint(job.out)):
-            progress.announce(f"{', '.join(partial_names)}: no checkpoint to resume from, this run starts over")
+        elif job.resume and (begun := partial_runs(job.out)):
+            names = ", ".join(path.name for path in begun)
+            progress.announce(f"{names}: no checkpoint to resume from, this run starts over")
 
     def begin(self) -> tuple[Slam, Generator[Scan, None, None], Checkpoints]:
         """SLAM, new or as of the checkpoint, the scans that follow, and the writer of checkpoints."""
