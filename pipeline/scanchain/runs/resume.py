@@ -22,7 +22,7 @@ from scanchain.config import Config
 from scanchain.data import Scan
 from scanchain.errors import InputError, ScanchainError, remedy_of
 from scanchain.point_store import PointStore
-from scanchain.registration.matcher import CheckedMatcher, create_matcher
+from scanchain.registration.matcher import CheckedMatcher, Matcher, create_matcher
 from scanchain.runs.directory import (
     CHECKPOINT_FILE,
     POINTS_FILE,
@@ -183,7 +183,7 @@ class _Unpickler(pickle.Unpickler):
             self.left_out[pid] = self._made(*pid)
         return self.left_out[pid]
 
-    def _made(self, what: str, dimension: int = 0, rows: int = 0) -> PointStore | CheckedMatcher | None:
+    def _made(self, what: str, dimension: int = 0, rows: int = 0) -> PointStore | Matcher | None:
         if what == "points":
             store = PointStore(dimension)
             store.rows = rows  # of the file that it is to reopen

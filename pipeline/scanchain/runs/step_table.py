@@ -56,7 +56,7 @@ class StepTable:
             "timing": [getattr(timing, f"{stage}_s") for stage in STAGES],
             **{name: getattr(match, _FIELDS.get(name, name)) for name in _OF_MATCH},
         }
-        self._steps.append(tuple(row[name] for name in self.columns.dtype.names))
+        self._steps.append(tuple(row[name] for name in self._steps.rows.dtype.names or ()))
 
     @property
     def columns(self) -> NDArray[np.void]:
