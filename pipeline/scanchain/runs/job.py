@@ -15,7 +15,7 @@ from scanchain.settings import Override
 from scanchain.source import Source
 
 SinkName = Literal["save", "spawn", "connect", "web"]
-Recorder = Any  # scanchain_viz.recording.recording.Recording, which is above a run and makes no difference to it
+Recorder = Any  # a Recording of scanchain_viz, which stands above runs: its type cannot be named here
 OpenRecorder = Callable[..., AbstractContextManager[Recorder]]
 
 

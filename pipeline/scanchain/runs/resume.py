@@ -10,6 +10,7 @@ import traceback
 import zlib
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from threading import Thread
 from time import perf_counter
@@ -73,6 +74,7 @@ class Checkpoints:
     def __init__(self, folder: Path, every_s: float, *, run_s: float = 0.0, process: int = 0) -> None:
         """run_s : seconds that the ``process`` earlier processes took up to the checkpoint."""
         self.path = folder / CHECKPOINT_FILE
+        self.version = _version()
         self.process = process
         self.every_s = every_s
         self.began_s = working_s() - run_s
@@ -94,7 +96,7 @@ class Checkpoints:
         try:
             with new.open("wb") as file:
                 summed = _Summed(file)
-                summed.write(_version())
+                summed.write(self.version)
                 _Pickler(summed, slam.config).dump(state)
                 file.write(summed.crc.to_bytes(_CRC_BYTES, "little"))
             new.replace(self.path)
@@ -126,8 +128,9 @@ def read_checkpoint(folder: Path, config: Config) -> Checkpoint:
     return checkpoint
 
 
+@cache
 def _version() -> bytes:
-    """Version of the package and checksum of its code: other code would not give the same bits."""
+    """Version of the package and checksum of its code, as it began: other code would not give the same bits."""
     package = Path(__file__).parents[1]
     code = b"".join(path.read_bytes() for path in sorted(package.rglob("*.py")))
     return f"scanchain {package_version('scanchain')} (code {zlib.crc32(code):08x})\n".encode()
