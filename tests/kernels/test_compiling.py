@@ -30,7 +30,7 @@ from scanchain.kernels.registration.observability import agreement, signal_along
 from scanchain.kernels.registration.residuals import gradient_spread
 from scanchain.kernels.registration.weights import weigh
 from scanchain.registration import VoxelMap
-from scanchain.runs import processing, results, warm_up
+from scanchain.runs import results, warm_up
 from scanchain.runs.job import Job, Progress
 from scanchain.runs.run import run
 from scanchain.settings import load_settings
@@ -247,7 +247,7 @@ def test_a_run_tells_compilation_apart_from_work(office, tmp_path, monkeypatch):
 @pytest.mark.parametrize("compiles", [True, False])
 def test_the_first_scan_is_shown_ahead_where_kernels_are_compiled(office, tmp_path, monkeypatch, compiles):
     seconds, shown, steps = count(), [], []
-    monkeypatch.setattr(processing, "compiled_s", lambda: next(seconds) if compiles else 0.0)
+    monkeypatch.setattr("scanchain.runs.run.compiled_s", lambda: next(seconds) if compiles else 0.0)
     monkeypatch.setattr(Recording, "preview", lambda self, scan: shown.append(scan))
     monkeypatch.setattr(Recording, "log", lambda self, step: steps.append(step))
     run(Job(logs=(office,), out=tmp_path / "run", sinks=frozenset()), open_recorder, Progress())
