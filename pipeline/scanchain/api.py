@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from scanchain import checks
 from scanchain import slam as core
@@ -16,7 +16,7 @@ from scanchain.graph.pose_graph import PoseGraph
 from scanchain.logs import sources_of
 from scanchain.preprocess import downsample as first_per_voxel
 from scanchain.runs.closures import closures_table, final_verdicts
-from scanchain.runs.job import Job, Unwatched
+from scanchain.runs.job import Job, Progress
 from scanchain.runs.results import cloud_of, expected_of
 from scanchain.runs.run import Finished
 from scanchain.runs.run import run as run_job
@@ -29,13 +29,12 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from scanchain.comparison.compare import Compared
-    from scanchain.config import RecordingConfig
     from scanchain.graph.optimization import Optimization
     from scanchain.odometry import Located
-    from scanchain.runs.job import Recorder, SinkName
     from scanchain.sessions.changes import Changes
     from scanchain.sessions.localize import LocalizedLog
     from scanchain.sessions.merging import Merged
+    from scanchain_viz.recording.recording import Recording
 
 Logs = str | Path | Sequence[str | Path]
 
@@ -119,7 +118,7 @@ def run(
     Raises InputError for bad input.
     """
     job = _job(log, out, config, ground_truth, recording=recording, force=force, overrides=overrides)
-    return run_job(job, open_recorder, Unwatched(), write_report)
+    return run_job(job, open_recorder, Progress(), write_report)
 
 
 def localize(
@@ -143,7 +142,7 @@ def localize(
 
     job = _job(log, out, config, ground_truth, recording=recording, force=force, overrides=overrides)
     draw = draw_localization if recording else lambda folder, localized: None
-    return localize_log(job, checks.path(prior, "prior"), Unwatched(), draw)
+    return localize_log(job, checks.path(prior, "prior"), Progress(), draw)
 
 
 def _job(
@@ -189,7 +188,7 @@ def merge(
     return merge_maps(
         [checks.path(run, "runs") for run in runs],
         checks.path(out, "out"),
-        Unwatched(),
+        Progress(),
         present_merge,
         config_file=None if config is None else checks.path(config, "config"),
         overrides=overrides_of(overrides),
@@ -259,7 +258,7 @@ def compare(
         repeat=repeat,
         force=force,
     )
-    return run_comparison(comparison, present_comparison, Unwatched())
+    return run_comparison(comparison, present_comparison, Progress())
 
 
 def optimize(graph: PoseGraph, **overrides: object) -> Optimization:
@@ -281,13 +280,11 @@ def downsample(points: AnyPoints, voxel_size_m: float) -> Points:
     return first_per_voxel(valid, checks.positive(voxel_size_m, "voxel_size_m"))
 
 
-def open_recorder(
-    path: Path | None, *, dimension: int, name: str, sinks: frozenset[SinkName], config: RecordingConfig
-) -> Recorder:
+def open_recorder(path: Path | None, **options: Any) -> Recording:
     """A rerun recording, which takes half a second to import."""
     from scanchain_viz.recording.recording import Recording
 
-    return Recording(path, dimension=dimension, name=name, sinks=sinks, config=config)
+    return Recording(path, **options)
 
 
 def write_report(directory: Path) -> None:

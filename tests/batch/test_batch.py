@@ -256,7 +256,7 @@ def test_what_a_killed_batch_started_ends_with_it(tmp_path):
         str(tmp_path / "out"),
     ]
     child = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    wait_until(lambda: list((tmp_path / "out").glob("*.partial-*/steps.journal")))
+    wait_until(lambda: list((tmp_path / "out").glob("*.partial-*/points.store")))
     assert processes_about(tmp_path)
     child.kill()
     child.wait()

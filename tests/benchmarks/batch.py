@@ -17,19 +17,10 @@ from tempfile import TemporaryDirectory
 from time import perf_counter
 
 from scanchain.batch.batch import Batch, run_batch
+from scanchain.runs.job import Progress
 from scanchain.simulation import simulate
 
 ROUNDS = 3
-
-
-class Silence:
-    """Progress that shows nothing."""
-
-    def say(self, line: str) -> None:
-        pass
-
-    def count(self, done: int, total: int) -> None:
-        pass
 
 
 def timed(logs: Sequence[Path], out: Path, workers: int, *, on_ray: bool) -> float:
@@ -37,14 +28,14 @@ def timed(logs: Sequence[Path], out: Path, workers: int, *, on_ray: bool) -> flo
     arguments = ("--rerun", "off")
     if not on_ray:
         began = perf_counter()
-        batched = run_batch(Batch(logs, out, arguments=arguments, workers=workers), Silence())
+        batched = run_batch(Batch(logs, out, arguments=arguments, workers=workers), Progress())
     else:
         from scanchain.batch.cluster import on_cluster
 
         with nodes(workers) as address:
             work = on_cluster(address)
             began = perf_counter()
-            batched = run_batch(Batch(logs, out, arguments=arguments), Silence(), work)
+            batched = run_batch(Batch(logs, out, arguments=arguments), Progress(), work)
     assert batched.failures == "", batched.summary
     return perf_counter() - began
 

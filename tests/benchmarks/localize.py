@@ -35,7 +35,7 @@ from scanchain.data import ClosureVerdict, Matrix, Scan
 from scanchain.logs import open_log
 from scanchain.maps import SavedMap, open_saved_map
 from scanchain.odometry import Odometry
-from scanchain.runs.job import Job, Unwatched
+from scanchain.runs.job import Job, Progress
 from scanchain.runs.run import run
 from scanchain.settings import load_settings, overrides_of
 from scanchain.simulation import plan, record
@@ -81,7 +81,7 @@ def map_of(log: Path, out: Path, **options: object) -> Path:
         run(
             Job((log,), out, overrides=overrides_of(options), sinks=frozenset(), force=True),
             open_recorder,
-            Unwatched(),
+            Progress(),
         )
     return out
 

@@ -47,7 +47,7 @@ from scanchain.api import open_recorder
 from scanchain.data import Matrix, Trajectory
 from scanchain.evaluation import absolute_error, pair, read_relations, relation_error
 from scanchain.evaluation.pairing import nearest
-from scanchain.runs.job import Job, Unwatched
+from scanchain.runs.job import Job, Progress
 from scanchain.runs.run import run
 from scanchain.runs.vouching import evidence_of
 from scanchain.settings import overrides_of
@@ -114,7 +114,7 @@ def _process(case: Case, cache: Path, out: Path) -> None:
         (file,), out, overrides=overrides_of(options), sinks=frozenset(), force=True,
         ground_truth=reference if is_tum else None,
     )  # fmt: skip
-    run(job, open_recorder, Unwatched())
+    run(job, open_recorder, Progress())
     for path in out.iterdir():
         if path.name not in KEPT:
             shutil.rmtree(path) if path.is_dir() else path.unlink()

@@ -113,8 +113,7 @@ def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]
     from scanchain.graph.pose_graph import PoseGraph
     from scanchain.loops import LoopCloser
     from scanchain.point_store import PointStore
-    from scanchain.runs import processing, results, run
-    from scanchain.runs.resume.journal import Journal
+    from scanchain.runs import results, run
     from scanchain.runs.step_table import StepTable
 
     watch = Stopwatch()
@@ -124,13 +123,13 @@ def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]
     watch.over("loops", LoopCloser, "close", "finish")
     watch.over("optimizing", PoseGraph, "optimize")
     watch.over("points kept", PointStore, "add", "read")
-    watch.over("journal", Journal, "append")
+    watch.over("table of steps", StepTable, "append")
     watch.over("map", results, "build_point_map", "write_ply", "draw_grid", "write_map")
     watch.over("what moved", results, "moved")
-    watch.over("other results", processing, "write_results", "record_results")
+    watch.over("other results", run, "write_results", "record_results")
     watch.over("other results", StepTable, "write")
     watch.over("other results", run, "accuracy_of", "measure")
-    watch.over("report", run, "_report")
+    watch.over("report", run._Run, "complete")
     open_recording = api.open_recorder
 
     def record(*arguments: Any, **options: Any) -> Any:

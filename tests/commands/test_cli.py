@@ -226,7 +226,7 @@ def test_a_disk_that_fills_up_during_a_run_is_told_once_with_what_to_do(call, mo
     def fail(*_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("scanchain.runs.processing.write_results", fail)
+    monkeypatch.setattr("scanchain.runs.run.write_results", fail)
     code, _, errors = call("run", office, "--out", tmp_path / "a", "--rerun", "off")
     assert code == 1 and "Errno" not in errors and errors.count("full") == 1
     assert errors.startswith(f"error: {tmp_path / 'a'}: {FULL}; ")

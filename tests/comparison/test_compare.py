@@ -29,7 +29,7 @@ from scanchain.evaluation import absolute_error, disagreement, motion_nees, pair
 from scanchain.logs import open_log
 from scanchain.odometry import Odometry
 from scanchain.processes import Limits
-from scanchain.runs.job import Unwatched
+from scanchain.runs.job import Progress
 from scanchain.runs.provenance import Provenance
 from scanchain.settings import Override, load_settings
 from scanchain.simulation import simulate
@@ -63,7 +63,7 @@ def toml(path, text_):
 def run(office, folder, *methods, **changes):
     """The table of a comparison without report and recording."""
     comparison = Comparison(logs=(office,), out=folder / "out", methods=methods, **changes)
-    return compare(comparison, lambda _: None, Unwatched()).table
+    return compare(comparison, lambda _: None, Progress()).table
 
 
 def row(table, name):
@@ -262,7 +262,7 @@ def test_a_run_that_compiled_kernels_is_run_anew(monkeypatch, tmp_path):
 
     monkeypatch.setattr("scanchain.comparison.processes._run", fake)
     methods = resolve(("plicp",), 2, file=None)
-    outcomes = run_all(methods, None, tmp_path, repeat=2, limits=Limits(1.0, 1.0), progress=Unwatched())
+    outcomes = run_all(methods, None, tmp_path, repeat=2, limits=Limits(1.0, 1.0), progress=Progress())
     assert len(ran) == len(set(ran)) == 3
     assert [outcome.seconds[0] for outcome in outcomes["plicp"]] == [2.0, 3.0]
 
@@ -308,7 +308,7 @@ def test_every_method_is_a_line_on_a_pipe_as_it_ends(office, tmp_path, capfd):
     assert [line.split(" in ")[0] for line in lines if " in " in line] == ["plicp: 20 scans", "svd: 20 scans"]
 
 
-class StopsAtOnce(Unwatched):
+class StopsAtOnce(Progress):
     stopped = True
 
     def track(self, scans, count):

@@ -19,8 +19,8 @@ from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.kernels import compiling
 from scanchain.kernels.registration import residuals
 from scanchain.registration import VoxelMap
-from scanchain.runs import processing, results, warm_up
-from scanchain.runs.job import Job, Unwatched
+from scanchain.runs import results, warm_up
+from scanchain.runs.job import Job, Progress
 from scanchain.runs.run import run
 from scanchain.settings import load_settings
 from scanchain.simulation import simulate
@@ -28,7 +28,7 @@ from scanchain.slam import Slam
 from scanchain_viz.recording.recording import Recording
 
 
-class Told(Unwatched):
+class Told(Progress):
     def __init__(self):
         self.lines = []
 
@@ -170,7 +170,7 @@ def office(tmp_path_factory):
 
 def test_a_run_tells_compilation_apart_from_work(office, tmp_path, monkeypatch):
     def finished(name):
-        done = run(Job(logs=(office,), out=tmp_path / name, sinks=frozenset()), open_recorder, Unwatched())
+        done = run(Job(logs=(office,), out=tmp_path / name, sinks=frozenset()), open_recorder, Progress())
         return done, json.loads((done.path / "metrics.json").read_text())
 
     finished("to compile what the cache on disk lacks")
@@ -198,10 +198,10 @@ def test_a_run_tells_compilation_apart_from_work(office, tmp_path, monkeypatch):
 @pytest.mark.parametrize("compiles", [True, False])
 def test_the_first_scan_is_shown_ahead_where_kernels_are_compiled(office, tmp_path, monkeypatch, compiles):
     seconds, shown, steps = count(), [], []
-    monkeypatch.setattr(processing, "compiled_s", lambda: next(seconds) if compiles else 0.0)
+    monkeypatch.setattr("scanchain.runs.run.compiled_s", lambda: next(seconds) if compiles else 0.0)
     monkeypatch.setattr(Recording, "preview", lambda self, scan: shown.append(scan))
     monkeypatch.setattr(Recording, "log", lambda self, step: steps.append(step))
-    run(Job(logs=(office,), out=tmp_path / "run", sinks=frozenset()), open_recorder, Unwatched())
+    run(Job(logs=(office,), out=tmp_path / "run", sinks=frozenset()), open_recorder, Progress())
     assert [scan.index for scan in shown] == [steps[0].scan.index] * compiles
     np.testing.assert_array_equal(steps[0].T_world_lidar, np.eye(3))  # as the viewer draws a scan without a pose
 

@@ -19,9 +19,9 @@ from rerun.chunk import RrdReader
 from scanchain.api import open_recorder
 from scanchain.errors import InputError
 from scanchain.runs.directory import RunDirectory
-from scanchain.runs.job import Job, Unwatched
+from scanchain.runs.job import Job, Progress
 from scanchain.runs.metrics import summary
-from scanchain.runs.resume.rescue import PartialRunError
+from scanchain.runs.resume import PartialRunError
 from scanchain.runs.run import run
 from scanchain.settings import Override
 from scanchain.simulation import simulate
@@ -166,7 +166,7 @@ def test_a_run_is_not_written_into_another(tmp_path):
 # whole runs
 
 
-class Watcher(Unwatched):
+class Watcher(Progress):
     """Ends a run after so many scans: by a wish, or by an error."""
 
     def __init__(self, after, error=None):
@@ -185,7 +185,7 @@ class Watcher(Unwatched):
 _NO_PROCESS = 999_999_999
 
 
-class Telling(Unwatched):
+class Telling(Progress):
     """Remembers every line."""
 
     def __init__(self):
@@ -206,7 +206,7 @@ def job(log, out, **options):
 
 
 def test_a_run_says_that_it_is_complete_and_what_it_read(tmp_path, office):
-    finished = run(job(office, tmp_path / "a", command=("scanchain", "run")), open_recorder, Unwatched())
+    finished = run(job(office, tmp_path / "a", command=("scanchain", "run")), open_recorder, Progress())
     assert finished.path == tmp_path / "a" and names(tmp_path) == ["a"]
     said = run_file(finished.path)
     assert (said["complete"], said["stopped"], said["command"]) == (True, "", ["scanchain", "run"])
@@ -302,7 +302,7 @@ def test_a_bad_scan_in_the_middle_is_bad_input_and_what_was_before_it_is_kept(tm
     path = write(tmp_path / "log.mcap", [*good, bad])
     none_bad = Override("log.max_bad_scans_percent", "0", "--log.max_bad_scans_percent")
     with pytest.raises(InputError, match=r"scan 5 of /scan has no valid point .*; 5 scans until then are in"):
-        run(job(path, tmp_path / "a", overrides=(none_bad,)), open_recorder, Unwatched())
+        run(job(path, tmp_path / "a", overrides=(none_bad,)), open_recorder, Progress())
     assert not (tmp_path / "a").exists()
     assert len(np.loadtxt(partial_in(tmp_path) / "odometry.tum")) == 5
 
@@ -312,12 +312,12 @@ def test_a_forced_run_that_crashes_leaves_the_old_run_whole(tmp_path, office):
     with pytest.raises(PartialRunError):
         run(job(office, old, force=True), open_recorder, Watcher(20, RuntimeError("boom")))
     assert names(old) == ["old.txt", "run.json"]
-    run(job(office, old, force=True), open_recorder, Unwatched())
+    run(job(office, old, force=True), open_recorder, Progress())
     assert "old.txt" not in names(old) and run_file(old)["complete"]
 
 
 def test_of_two_runs_into_one_directory_the_second_keeps_its_results_beside(tmp_path, office):
-    class Slow(Unwatched):
+    class Slow(Progress):
         def track(self, scans, count):
             yield from scans
             an_old_run(tmp_path / "a")
@@ -327,7 +327,7 @@ def test_of_two_runs_into_one_directory_the_second_keeps_its_results_beside(tmp_
     assert names(tmp_path / "a") == ["old.txt", "run.json"]
     folder = partial_in(tmp_path)
     assert not run_file(folder)["complete"]
-    usual = run(job(office, tmp_path / "b"), open_recorder, Unwatched()).path
+    usual = run(job(office, tmp_path / "b"), open_recorder, Progress()).path
     tables = [pq.read_table(path / "steps.parquet").select(["x", "y", "qz"]) for path in (folder, usual)]
     assert tables[0].equals(tables[1])
 
@@ -343,7 +343,7 @@ def test_what_a_stopped_run_left_is_named_with_resume_where_its_name_or_that_of_
         InputError, match=rf"a: exists; .*; {left.name} is of a run .*: force=True --resume continues"
     ):
         RunDirectory(tmp_path / "a", force=False)
-    resumed = run(job(office, tmp_path / "a", force=True, resume=True), open_recorder, Unwatched())
+    resumed = run(job(office, tmp_path / "a", force=True, resume=True), open_recorder, Progress())
     assert resumed.path == tmp_path / "a" and names(tmp_path) == ["a"]
 
 
@@ -358,7 +358,7 @@ def test_a_complete_run_removes_what_earlier_ones_left_but_not_what_another_proc
 
 
 def test_interrupted_while_it_optimizes_a_run_can_be_resumed(tmp_path, office):
-    class Interrupted(Unwatched):
+    class Interrupted(Progress):
         def say(self, line):
             if line.startswith("optimizing"):
                 raise KeyboardInterrupt
@@ -373,7 +373,7 @@ def test_interrupted_while_it_optimizes_a_run_can_be_resumed(tmp_path, office):
 def test_a_trajectory_of_a_few_scans_is_warned_of(tmp_path, office):
     for scans, words in ((1, "trajectory of 1 scan says"), (2, "trajectory of 2 scans says"), (3, "")):
         few = (Override("log.every", str(60 // scans), "--every"),)
-        finished = run(job(office, tmp_path / str(scans), overrides=few), open_recorder, Unwatched())
+        finished = run(job(office, tmp_path / str(scans), overrides=few), open_recorder, Progress())
         warnings = " ".join(finished.warnings)
         assert words in warnings and ("nothing about the log" in warnings) == (scans < 3)
 
@@ -398,7 +398,7 @@ def test_one_keyframe_is_not_called_keyframes(tmp_path, office):
 def test_a_file_named_twice_is_refused(tmp_path, office):
     twice = dataclasses.replace(job(office, tmp_path / "a"), logs=(office, office))
     with pytest.raises(InputError, match=r"office.mcap: is named 2 times"):
-        run(twice, open_recorder, Unwatched())
+        run(twice, open_recorder, Progress())
     assert names(tmp_path) == []
 
 

@@ -19,7 +19,7 @@ from scanchain.loops.planar_map_search import WholeSearch
 from scanchain.loops.verification import ScanVerifier
 from scanchain.maps import Edges, SavedPoints, open_saved_map, read_ply
 from scanchain.odometry.tracked import first_match
-from scanchain.runs.job import Unwatched
+from scanchain.runs.job import Progress
 from scanchain.sessions.joining import Joined, changed, doubt_about, graph_of
 from scanchain.sessions.merging import merge
 from scanchain.trajectory import read_tum
@@ -49,7 +49,7 @@ def merged(runs, tmp_path_factory):
 
 
 def quietly(*runs, out, **options):
-    return merge(runs, out, Unwatched(), lambda folder: None, **options)
+    return merge(runs, out, Progress(), lambda folder: None, **options)
 
 
 def ate_m(out, truth, names):
@@ -161,7 +161,7 @@ def test_a_merge_that_is_killed_leaves_the_runs_as_they_were_and_nothing_else(ru
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        merge([folder / "morning", folder / "noon"], tmp_path / "out", Unwatched(), interrupted)
+        merge([folder / "morning", folder / "noon"], tmp_path / "out", Progress(), interrupted)
     assert not list(tmp_path.iterdir())
     assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 

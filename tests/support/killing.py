@@ -16,11 +16,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from rerun.chunk import RrdReader
 
+from scanchain.errors import InputError
 from scanchain.graph.files.g2o import read_g2o
 from scanchain.maps import MAP_FOLDER, open_saved_map, read_map, read_ply
 from scanchain.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RECORDING_FILE
-from scanchain.runs.resume.checkpoint import read_checkpoint
-from scanchain.runs.resume.journal import JOURNAL_FILE, read_journal
+from scanchain.runs.resume import read_checkpoint
 from scanchain.settings import load_settings
 from scanchain.trajectory import read_kitti, read_tum
 from scanchain_viz.recording import entities
@@ -69,15 +69,17 @@ def partial(out):
 
 
 def steps_on_disk(out):
+    """Scans of the last checkpoint."""
+    folder = partial(out) or out
     try:
-        return len(read_journal(partial(out) or out)[0])
-    except FileNotFoundError:  # not there yet, or just taking another name
+        return len(read_checkpoint(folder, config_of(folder)).steps)
+    except (FileNotFoundError, InputError):  # not there yet, or just taking another name
         return 0
 
 
-def wait_for_steps(child, out, steps, *, checkpoint=True):
-    """Return once a run has so many steps on disk, and a checkpoint."""
-    while steps_on_disk(out) < steps or (checkpoint and not (partial(out) / CHECKPOINT_FILE).exists()):
+def wait_for_steps(child, out, steps):
+    """Return once a run has so many steps in its checkpoint."""
+    while steps_on_disk(out) < steps:
         assert child.poll() is None, "the run ended before"
         time.sleep(0.02)
 
@@ -182,8 +184,7 @@ def config_of(folder):
 
 
 def _read_checkpoint(path):
-    steps = read_checkpoint(path.parent, config_of(path.parent)).scans
-    assert steps <= len(read_journal(path.parent)[0]), "the checkpoint is ahead of the journal"
+    return len(read_checkpoint(path.parent, config_of(path.parent)).steps)
 
 
 def _read_html(path):
@@ -199,7 +200,6 @@ def _read_text(path):
 
 
 _READ = {
-    JOURNAL_FILE: lambda path: len(read_journal(path.parent)[0]),
     CHECKPOINT_FILE: _read_checkpoint,
     MAP_FOLDER: open_saved_map,
     POINTS_FILE: lambda path: np.fromfile(path, np.float32),
@@ -219,5 +219,5 @@ _READ = {
 }
 _REACHED = {
     "report.html": "completing", "metrics.json": "writing its report", "trajectory.tum": "writing results",
-    CHECKPOINT_FILE: "after a checkpoint", JOURNAL_FILE: "before the first checkpoint", "run.json": "opening",
+    CHECKPOINT_FILE: "after a checkpoint", POINTS_FILE: "before the first checkpoint", "run.json": "opening",
 }  # fmt: skip

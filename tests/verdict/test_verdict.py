@@ -4,7 +4,6 @@ import re
 from dataclasses import replace
 from types import SimpleNamespace
 
-import msgspec
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -446,20 +445,24 @@ def test_a_scan_that_starts_a_segment_is_known_from_its_column_whatever_its_reas
     table = StepTable()
     for step in drive(20, 3):
         table.append(replace(step, starts_segment=step.scan.index == 7, reason="a new map begins"))
-    poses = np.array([row.T_world_lidar for row in table.rows])
-    table.write(tmp_path / "steps.parquet", Trajectory(table.odometry.stamps_ns, poses))
+    table.write(tmp_path / "steps.parquet", table.best_known)
     found = evidence_of(pq.ParquetFile(tmp_path / "steps.parquet").read(), None)
     assert np.flatnonzero(found.starts_segment).tolist() == [7]
 
 
-def test_a_table_gives_back_the_rows_that_were_added(monkeypatch):
-    monkeypatch.setattr("scanchain.runs.step_table._PART", 8)
+def test_a_table_holds_the_figures_of_the_steps():
     table = StepTable()
     steps = [replace(step, reason=f"reason {step.scan.index % 3}") for step in drive(20, 2)]
-    steps[9] = replace(steps[9], scan=replace(steps[9].scan, T_odom_base=lie.pose_2d(1.0, 2.0, 0.3)))
-    added = [table.append(step) for step in steps]
-    kept = [msgspec.msgpack.encode(list(rows), enc_hook=np.ndarray.tolist) for rows in (added, table.rows)]
-    assert kept[0] == kept[1] and len(table) == 20
+    T_odom_base = lie.pose_2d(1.0, 2.0, 0.3)
+    steps[9] = replace(steps[9], scan=replace(steps[9].scan, T_odom_base=T_odom_base))
+    for step in steps:
+        table.append(step)
+    columns = table.columns
+    assert len(table) == 20 and columns["has_wheels"].tolist() == [k == 9 for k in range(20)]
+    assert table.texts(columns["reason"]).to_pylist() == [step.reason for step in steps]
+    np.testing.assert_array_equal(columns["T_odom_base"][9], T_odom_base)
+    np.testing.assert_array_equal(columns["information"], [step.match.information for step in steps])
+    np.testing.assert_array_equal(columns["timing"][:, 2], [step.timing.match_s for step in steps])
 
 
 def test_the_worst_place_of_a_slip_lies_between_the_scans_before_and_after_it():

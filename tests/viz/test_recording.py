@@ -410,7 +410,7 @@ def test_a_recording_goes_on_in_file_and_viewer_from_what_was_secured_of_it(tmp_
     config = RecordingConfig(local_map_every=2)
     closures = [closure for step in steps for closure in step.closures]
     last = next(step for step in reversed(steps[:200]) if step.graph is not None)
-    rows = rows_of_steps(steps[: last.scan.index + 1])
+    table = table_of(steps[: last.scan.index + 1])
 
     def finish(recording, rest):
         for step in rest:
@@ -421,17 +421,17 @@ def test_a_recording_goes_on_in_file_and_viewer_from_what_was_secured_of_it(tmp_
     with opened(whole, dimension, config=config) as recording:
         finish(recording, steps)
     with opened(begun, dimension, config=config) as recording:
-        for step in steps[: len(rows)]:
+        for step in steps[: len(table)]:
             recording.log(step)
         secured = recording.secure()
-        finish(recording, steps[len(rows) : 250])  # what a process records that is killed after its checkpoint
+        finish(recording, steps[len(table) : 250])  # what a process records that is killed after its checkpoint
     os.truncate(begun, secured)
     server = viewer.start_web(port, free_port())
     try:
         with opened(again, dimension, ("save", "connect"), config, port=port) as recording:
-            known = [closure for step in steps[: len(rows)] for closure in step.closures]
-            recording.resume(begun, rows, known, last.graph)
-            finish(recording, steps[len(rows) :])
+            known = [closure for step in steps[: len(table)] for closure in step.closures]
+            recording.resume(begun, table, known, last.graph)
+            finish(recording, steps[len(table) :])
     finally:
         viewer.stop(server)
     late = [warning for warning in recording.warnings if "the viewer" in warning]  # on a busy machine
@@ -439,9 +439,11 @@ def test_a_recording_goes_on_in_file_and_viewer_from_what_was_secured_of_it(tmp_
     same_recording(again, whole)
 
 
-def rows_of_steps(steps):
+def table_of(steps):
     table = StepTable()
-    return [table.append(step) for step in steps]
+    for step in steps:
+        table.append(step)
+    return table
 
 
 def test_what_lacks_something_is_not_secured(tmp_path):
@@ -452,7 +454,7 @@ def test_what_lacks_something_is_not_secured(tmp_path):
         recording.log(steps[0])
         assert recording.secure() == (tmp_path / "a.rrd").stat().st_size > 0
         (tmp_path / "b.rrd").write_bytes(b"no recording")
-        recording.resume(tmp_path / "b.rrd", rows_of_steps(steps), [], steps[20].graph)
+        recording.resume(tmp_path / "b.rrd", table_of(steps), [], steps[20].graph)
         assert recording.secure() == 0
     assert "a.rrd is incomplete, the run goes on without it" in recording.warnings[0]
 

@@ -3,41 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from glob import glob
 from pathlib import Path
 from threading import Event
-from typing import Protocol
+
+import msgspec
 
 from scanchain.batch.table import write_table
-from scanchain.batch.task import ROWS_FOLDER, Row, State, Task, attempt, finished_row, key_of, unfinished_row
+from scanchain.batch.task import ROWS_FOLDER, Row, State, Task, attempt, finished_row, key_of
 from scanchain.errors import InputError
 from scanchain.logs.files import matching, misspelled, spelled
 from scanchain.logs.opening import AUTO, logs_in
 from scanchain.processes import available_mib
 from scanchain.runs.directory import check_outside_runs
+from scanchain.runs.job import Progress
 from scanchain.runs.provenance import identity_of
 from scanchain.settings import Override
 from scanchain.source import Source, source_of
 from scanchain.verdict import Verdict
+from scanchain.whole_file import write_whole
 from scanchain.words import counted
 
 _SHARE = 0.75  # of the memory that is free, for all workers together
 
 Work = Callable[[Sequence[Task]], Iterator[Row]]
-
-
-class BatchProgress(Protocol):
-    """Progress of a batch."""
-
-    def say(self, line: str) -> None:
-        """Show a line."""
-        ...
-
-    def count(self, done: int, total: int) -> None:
-        """Show that so many logs of all are done."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +80,7 @@ class Batched:
         return f"{count:,} of {len(self.rows):,} logs have stretches to check" if count else ""
 
 
-def run_batch(batch: Batch, progress: BatchProgress, work: Work | None = None) -> Batched:
+def run_batch(batch: Batch, progress: Progress, work: Work | None = None) -> Batched:
     """Run the logs without a result and write the table.
 
     work : where the tasks are run; None for processes on this machine
@@ -111,13 +102,14 @@ def run_batch(batch: Batch, progress: BatchProgress, work: Work | None = None) -
         progress.say(f"{kept:,} of {len(tasks):,} logs are done already")
     try:
         for done, row in enumerate((work or _local(batch.workers))(readable), start=1):
-            row.write(missing[row.key].row_file)
+            write_whole(missing[row.key].row_file, msgspec.json.encode(row))
             rows[row.key] = row
-            progress.say(f"{row.log}: {row.state}{row.why and f': {row.why}'}{_damage(row)}")
+            warnings = f", {counted(row.warnings, 'warning')}" if row.warnings else ""
+            progress.say(f"{row.log}: {row.state}{row.why and f': {row.why}'}{warnings}")
             progress.count(kept + done, len(tasks))
     except KeyboardInterrupt:
         progress.say("stopped")
-    table = tuple(rows.get(task.key) or _unread(task) for task in tasks)
+    table = tuple(rows.get(task.key) or _not_run(task) for task in tasks)
     return Batched(table, kept, write_table(batch.out, table))
 
 
@@ -132,10 +124,6 @@ def _check_out(batch: Batch) -> None:
         raise InputError(
             f"{batch.out}: is not empty and not a batch ({ROWS_FOLDER} is missing); choose another --out"
         )
-
-
-def _damage(row: Row) -> str:
-    return f", {counted(row.warnings, 'warning')}" if row.warnings else ""
 
 
 def _tasks(batch: Batch) -> list[Task]:
@@ -153,15 +141,14 @@ def _tasks(batch: Batch) -> list[Task]:
     return tasks
 
 
-def _unread(task: Task) -> Row:
+def _not_run(task: Task) -> Row:
     """The row of a log that was not run, with the reason."""
-    source = source_of(task.log)
+    source, state, reason = source_of(task.log), State.FAILED, "no such file; check the path"
     if task.identity:
-        return unfinished_row(task, State.NOT_RUN, "stopped by the user")
-    reason = misspelled(source) or f"cannot be read; scanchain info {task.name} shows the reason"
-    if isinstance(source, Path) and not source.exists():
-        reason = "no such file; check the path"
-    return unfinished_row(task, State.FAILED, reason)
+        state, reason = State.NOT_RUN, "stopped by the user"
+    elif not isinstance(source, Path) or source.exists():
+        reason = misspelled(source) or f"cannot be read; scanchain info {task.name} shows the reason"
+    return Row(task.name, "", task.key, "", state, reason, 0, 0.0, 0.0, None)
 
 
 def _local(workers: int) -> Work:
@@ -170,10 +157,9 @@ def _local(workers: int) -> Work:
     def work(tasks: Sequence[Task]) -> Iterator[Row]:
         stop = Event()
         with ThreadPoolExecutor(workers, "batch") as pool:
-            futures: list[Future[Row]] = [pool.submit(attempt, task, stop) for task in tasks]
+            futures = [pool.submit(attempt, task, stop) for task in tasks]
             try:
-                for future in as_completed(futures):
-                    yield future.result()
+                yield from (future.result() for future in as_completed(futures))
             finally:
                 stop.set()
                 pool.shutdown(wait=True, cancel_futures=True)

@@ -61,7 +61,10 @@ def summary(rows: Sequence[Row]) -> str:
         for row in rows
         if row.metrics is not None and row.metrics.verdict is Verdict.CHECK
     ]
-    lines += [f"{'warned':<14} {row.log}: {_first_warning(row)}" for row in rows if row.warnings]
+    for row in rows:
+        if row.metrics is not None and row.warnings:
+            more = f" (and {row.warnings - 1:,} more)" if row.warnings > 1 else ""
+            lines.append(f"{'warned':<14} {row.log}: {row.metrics.warnings[0].replace(f'{row.log}: ', '')}{more}")
     return "\n".join(lines) + "\n"
 
 
@@ -75,16 +78,12 @@ def totals(rows: Sequence[Row]) -> list[tuple[str, str]]:
     return [("logs", f"{len(rows):,}: {ended}"), *warnings, *(_amounts(results) if results else ())]
 
 
-def _first_warning(row: Row) -> str:
-    first = "" if row.metrics is None else row.metrics.warnings[0].replace(f"{row.log}: ", "")
-    return first + (f" (and {row.warnings - 1:,} more)" if row.warnings > 1 else "")
-
-
 def _amounts(results: Sequence[Metrics]) -> Iterator[tuple[str, str]]:
     scans, contradicted, degenerate, lost = (
         sum(getattr(each, name) for each in results) for name in ("scans", "contradicted", "degenerate", "lost")
     )
-    path = _distance(sum(each.traveled_m for each in results))
+    traveled_m = sum(each.traveled_m for each in results)
+    path = f"{traveled_m:.1f} m" if traveled_m < 1000.0 else f"{1e-3 * traveled_m:.2f} km"
     time = duration(sum(each.log_span_s for each in results))
     speed = np.array([each.times_real_time for each in results])
     yield (
@@ -100,10 +99,6 @@ def _amounts(results: Sequence[Metrics]) -> Iterator[tuple[str, str]]:
             f"rmse {np.median(errors_m):.4f} m (median), {max(errors_m):.4f} m at the most, "
             f"{counted(len(errors_m), 'log')} with ground truth",
         )
-
-
-def _distance(length_m: float) -> str:
-    return f"{length_m:.1f} m" if length_m < 1000.0 else f"{1e-3 * length_m:.2f} km"
 
 
 def _cells(row: Row) -> dict[str, object]:

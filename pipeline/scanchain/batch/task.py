@@ -15,13 +15,12 @@ from msgspec import Struct
 from scanchain.logs.files import spelled
 from scanchain.processes import Ending, KilledFor, Limits, run_within
 from scanchain.runs.directory import RUN_FILE, directory_name
-from scanchain.runs.metrics import Metrics
+from scanchain.runs.metrics import METRICS_FILE, Metrics
 from scanchain.runs.provenance import Provenance, package_version
 from scanchain.settings import Override, dump, load_settings
 from scanchain.source import source_of
 from scanchain.threads import VARIABLE
 from scanchain.verdict import Verdict
-from scanchain.whole_file import write_whole
 
 ROWS_FOLDER = "rows"  # folder of a batch's directory with the result of each log
 
@@ -105,11 +104,6 @@ class Row(Struct, frozen=True):
         """The reason without the name of the log, behind which it stands."""
         return self.reason.removeprefix(f"{self.log}: ")
 
-    def write(self, path: Path) -> None:
-        """Write as JSON, whole or not at all."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, msgspec.json.encode(self))
-
 
 def output_file(out: Path, key: str) -> Path:
     """File with the output of the last try of a log."""
@@ -122,13 +116,8 @@ def finished_row(task: Task) -> Row | None:
         row = msgspec.json.decode(task.row_file.read_bytes(), type=Row)
     except (OSError, msgspec.DecodeError):
         return None
-    is_done = row.state.has_result and (Path(task.out) / row.run / "metrics.json").is_file()
+    is_done = row.state.has_result and (Path(task.out) / row.run / METRICS_FILE).is_file()
     return msgspec.structs.replace(row, log=task.name) if is_done else None
-
-
-def unfinished_row(task: Task, state: State, reason: str) -> Row:
-    """Row of a task that was not run."""
-    return Row(task.name, "", task.key, "", state, reason, 0, 0.0, 0.0, None)
 
 
 def key_of(identity: str, config_file: Path | None, overrides: Sequence[Override]) -> str:
@@ -153,35 +142,32 @@ def attempt(task: Task, stop: Event | None = None) -> Row:
 
 
 def _tried(task: Task, stop: Event | None) -> Row:
-    words = ["run", "--out", str(task.run), "--force", *task.arguments, "--", task.log]
     output = output_file(Path(task.out), task.key)
     output.parent.mkdir(parents=True, exist_ok=True)
     ending = run_within(
         Limits(task.time_s, task.memory_mib),
         "scanchain.processes",
-        ["scanchain", *words],
+        ["scanchain", "run", "--out", str(task.run), "--force", *task.arguments, "--", task.log],
         os.environ | dict.fromkeys(_THREADS, "1"),  # a process a core: threads would only get in each other's way
         output=output,
         interval_s=_LOOK_S,
         stop=stop,
     )
-    state, reason = _verdict(task, ending)
-    metrics = _metrics(task) if state.has_result else None
-    run = task.run.name if metrics is not None else ""
-    sha256 = _sha256(task) if run else ""
+    state, reason = _state(task, ending, output)
+    run, sha256, metrics = "", "", None
+    if state.has_result:
+        run, metrics = task.run.name, _metrics(task)
+        made = msgspec.json.decode((task.run / RUN_FILE).read_bytes(), type=Provenance)
+        sha256 = made.logs[0].sha256
     return Row(task.name, sha256, task.key, run, state, reason, 1, ending.duration_s, ending.peak_mib, metrics)
 
 
-def _sha256(task: Task) -> str:
-    return msgspec.json.decode((task.run / RUN_FILE).read_bytes(), type=Provenance).logs[0].sha256
-
-
 def _metrics(task: Task) -> Metrics:
-    return msgspec.json.decode((task.run / "metrics.json").read_bytes(), type=Metrics)
+    return msgspec.json.decode((task.run / METRICS_FILE).read_bytes(), type=Metrics)
 
 
-def _verdict(task: Task, ending: Ending) -> tuple[State, str]:
-    """End state, and the reason if it failed."""
+def _state(task: Task, ending: Ending, output: Path) -> tuple[State, str]:
+    """End state, and the reason if it failed, from what ended the process, its exit code and its output."""
     match ending.killed_for:
         case KilledFor.MEMORY:
             gib = task.memory_mib / 1024.0
@@ -190,17 +176,11 @@ def _verdict(task: Task, ending: Ending) -> tuple[State, str]:
             return State.TIMED_OUT, f"took longer than --time-limit ({task.time_s:.3g} s)"
         case KilledFor.STOP:
             return State.NOT_RUN, "stopped by the user"
-        case KilledFor.NOTHING:
-            return _own_ending(ending, task)
-
-
-def _own_ending(ending: Ending, task: Task) -> tuple[State, str]:
-    """End state and reason, from exit code and output."""
     if ending.code == 0:
         return State.DONE, ""
-    output = output_file(Path(task.out), task.key).read_text(encoding="utf-8", errors="replace").splitlines()
-    error = next((line for line in reversed(output) if line.startswith("error: ")), "")
-    if ending.code == 1 and (task.run / "metrics.json").is_file():
+    lines = output.read_text(encoding="utf-8", errors="replace").splitlines()
+    error = next((line for line in reversed(lines) if line.startswith("error: ")), "")
+    if ending.code == 1 and (task.run / METRICS_FILE).is_file():
         metrics = _metrics(task)
         if metrics.verdict is Verdict.NOT_TRUSTWORTHY and error.endswith(metrics.sentence):
             return State.NOT_TRUSTWORTHY, metrics.verdict_reason
@@ -208,5 +188,5 @@ def _own_ending(ending: Ending, task: Task) -> tuple[State, str]:
         return State.FAILED, error.removeprefix("error: ")
     if ending.code == _SYSTEM_KILL:
         return State.OUT_OF_MEMORY, "killed, as the system does when memory runs out"
-    last = " ".join(" ".join(output).split())[-_LAST_CHARACTERS:]
+    last = " ".join(" ".join(lines).split())[-_LAST_CHARACTERS:]
     return State.CRASHED, f"ended by {ending.how}" + (f": {last}" if last else "")

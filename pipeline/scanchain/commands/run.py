@@ -95,7 +95,7 @@ def run(
     from scanchain.api import open_recorder, write_report
     from scanchain.commands.terminal import Terminal
     from scanchain.runs.job import Job
-    from scanchain.runs.resume.rescue import how_to_resume
+    from scanchain.runs.resume import how_to_resume
     from scanchain.runs.run import run as run_log
 
     command = tuple(sys.argv)

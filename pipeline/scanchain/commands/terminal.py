@@ -10,6 +10,8 @@ from time import monotonic
 from types import FrameType, TracebackType
 from typing import TYPE_CHECKING, Self
 
+from scanchain.runs.job import Progress
+
 if TYPE_CHECKING:
     from scanchain.data import Scan
 
@@ -17,7 +19,7 @@ _REDRAW_S = 0.2
 _SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 
-class Terminal:
+class Terminal(Progress):
     """Progress of a job; a context manager.
 
     On the first Ctrl-C (or SIGTERM, or a closed terminal) while scans are tracked no more of them come, and the

@@ -36,7 +36,7 @@ from scanchain.comparison.scan_store import StoredScans, open_store
 from scanchain.data import Pose, Scan, Trajectory
 from scanchain.errors import MissingExtraError, ScanchainError, shown
 from scanchain.processes import die_first, die_with_parent, peak_mib
-from scanchain.runs.job import Unwatched
+from scanchain.runs.job import Progress
 
 
 class Runner(Protocol):
@@ -144,7 +144,7 @@ def main() -> None:
     (folder / REPORT_FILE).write_bytes(msgspec.json.encode(report))
 
 
-class _Compiler(Unwatched):
+class _Compiler(Progress):
     """Notices compilation."""
 
     has_compiled = False

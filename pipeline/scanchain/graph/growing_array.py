@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 
 class GrowingArray:
     """Rows of one shape and type; the room doubles when it is full."""
 
-    def __init__(self, row_shape: tuple[int, ...], dtype: type) -> None:
+    def __init__(self, row_shape: tuple[int, ...], dtype: DTypeLike) -> None:
         self._room = np.empty((16, *row_shape), dtype)
         self._count = 0
 

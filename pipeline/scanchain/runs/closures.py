@@ -84,39 +84,35 @@ def closures_table(final: Sequence[FinalClosure], keyframes: Sequence[Keyframe],
     """Every closure tried, with its final verdict and the robust weight that the optimizer left to it."""
     import pyarrow as pa
 
+    def of(items: Sequence[object], kind: pa.DataType, *names: str, null_nan: bool = False) -> dict[str, pa.Array]:
+        return {
+            name: pa.array([getattr(each, name) for each in items], kind, from_pandas=null_nan) for name in names
+        }
+
     k = 3 if dimension == 2 else 6
+    whole, number, text = pa.int64(), pa.float64(), pa.string()
     closures = [item.closure for item in final]
     matches = [closure.match for closure in closures]
-    relative = np.array([match.T_target_source for match in matches])
-    columns: dict[str, object] = {
-        "target": pa.array([closure.target for closure in closures], pa.int64()),
-        "source": pa.array([closure.source for closure in closures], pa.int64()),
-        "target_scan": pa.array([keyframes[closure.target].scan_index for closure in closures], pa.int64()),
-        "source_scan": pa.array([keyframes[closure.source].scan_index for closure in closures], pa.int64()),
-        "target_stamp_ns": pa.array([keyframes[closure.target].stamp_ns for closure in closures], pa.int64()),
-        "source_stamp_ns": pa.array([keyframes[closure.source].stamp_ns for closure in closures], pa.int64()),
-        "proposed_by": pa.array([str(closure.proposed_by) for closure in closures], pa.string()),
-        "verdict": pa.array([str(item.verdict) for item in final], pa.string()),
-        "rejected_by": pa.array([item.rejected_by for item in final], pa.string()),
-        "cause": pa.array([item.cause for item in final], pa.string()),
-        "reason": pa.array([item.reason for item in final], pa.string()),
-        "weight": pa.array([item.weight for item in final], pa.float64()),
-        "chi2_before": pa.array([closure.chi2_before for closure in closures], pa.float64(), from_pandas=True),
-        "chi2_after": pa.array([item.chi2_after for item in final], pa.float64(), from_pandas=True),
-        **{
-            name: pa.array(values, pa.float64())
-            for name, values in pose_columns(relative.reshape(-1, dimension + 1, dimension + 1)).items()
-        },
+    ends = {name: [keyframes[getattr(closure, name)] for closure in closures] for name in ("target", "source")}
+    poses = np.array([match.T_target_source for match in matches]).reshape(-1, dimension + 1, dimension + 1)
+    columns = {
+        **of(closures, whole, "target", "source"),
+        **{f"{end}_scan": pa.array([each.scan_index for each in ends[end]], whole) for end in ends},
+        **{f"{end}_stamp_ns": pa.array([each.stamp_ns for each in ends[end]], whole) for end in ends},
+        **of(closures, text, "proposed_by"),
+        **of(final, text, "verdict", "rejected_by", "cause", "reason"),
+        **of(final, number, "weight"),
+        **of(closures, number, "chi2_before", null_nan=True),
+        **of(final, number, "chi2_after", null_nan=True),
+        **{name: pa.array(values, number) for name, values in pose_columns(poses).items()},
         "information": pa.array(
-            [match.information.ravel().tolist() for match in matches], pa.list_(pa.float64(), k * k)
+            [match.information.ravel().tolist() for match in matches], pa.list_(number, k * k)
         ),
-        "overlap": pa.array([closure.overlap for closure in closures], pa.float64()),
-        "points": pa.array([match.points for match in matches], pa.int64()),
-        "inliers": pa.array([match.inliers for match in matches], pa.int64()),
-        "iterations": pa.array([match.iterations for match in matches], pa.int64()),
-        "residual_m": pa.array([match.residual_m for match in matches], pa.float64()),
-        "converged": pa.array([match.converged for match in matches], pa.bool_()),
-        "degeneracy_eigenvalue": pa.array([match.degeneracy_eigenvalue for match in matches], pa.float64()),
+        **of(closures, number, "overlap"),
+        **of(matches, whole, "points", "inliers", "iterations"),
+        **of(matches, number, "residual_m"),
+        **of(matches, pa.bool_(), "converged"),
+        **of(matches, number, "degeneracy_eigenvalue"),
     }
     notes = {
         "x y z qx qy qz qw": "pose of keyframe source in the frame of keyframe target",

@@ -108,63 +108,40 @@ class RunDirectory:
             self.destination.rename(self.destination.with_name(f"{self.destination.name}.replaced-{os.getpid()}"))
         self.path.rename(self.destination)
         self.path = self.destination
-        left = [path for path in _partial(self.destination) if not _writer(path)]
+        left = [path for path in partial_runs(self.destination) if not writer_of(path)]
         for old in (*left, *self.destination.parent.glob(f"{escape(self.destination.name)}.replaced-*")):
             shutil.rmtree(old, ignore_errors=True)  # also what a killed process left
 
 
-def left_behind(destination: Path) -> Path | None:
-    """The latest directory marked partial that holds a checkpoint; None where there is none.
-
-    Raises InputError where the process that writes it still runs.
-    """
-    latest = _latest_left(destination)
-    if latest is not None and (writer := _writer(latest)):
-        raise InputError(f"{latest}: is being written by process {writer}; wait for its end or stop it")
-    return latest
-
-
-def resumable(destination: Path) -> Path | None:
-    """Directory of a stopped run into ``destination`` that can be resumed; None if there is none."""
-    latest = _latest_left(destination)
-    return latest if latest is None or not _writer(latest) else None
-
-
-def left_without_checkpoint(destination: Path) -> list[str]:
-    """Names of the directories that runs into ``destination`` left before their first checkpoint."""
-    return sorted(path.name for path in _partial(destination) if not (path / CHECKPOINT_FILE).is_file())
-
-
-def _partial(destination: Path) -> Iterator[Path]:
-    """Directories that runs into ``destination`` left, or write now."""
+def partial_runs(destination: Path) -> list[Path]:
+    """Directories that runs into ``destination`` left, or write now, by name."""
     destination = destination.resolve()
-    return destination.parent.glob(f"{escape(destination.name)}.partial-*")
+    return sorted(destination.parent.glob(f"{escape(destination.name)}.partial-*"))
 
 
-def _latest_left(destination: Path) -> Path | None:
-    left = [
-        path
-        for path in _partial(destination)
-        if (path / CHECKPOINT_FILE).is_file() and (path / RUN_FILE).is_file()
-    ]
-    return max(left, key=lambda path: (path / CHECKPOINT_FILE).stat().st_mtime_ns, default=None)
+def left_behind(destination: Path) -> Path | None:
+    """That of them with the latest checkpoint, None where no run came that far."""
+    files = [path / CHECKPOINT_FILE for path in partial_runs(destination) if (path / RUN_FILE).is_file()]
+    checkpoints = [file for file in files if file.is_file()]
+    return max(checkpoints, key=lambda file: file.stat().st_mtime_ns).parent if checkpoints else None
 
 
-def _writer(partial: Path) -> int:
-    """Number of another process that still writes there, 0 if none does."""
+def writer_of(partial: Path) -> int:
+    """Number of another process that still writes to a directory marked partial, 0 if none does.
+
+    One that began after the file was written has its number by chance.
+    """
     number = partial.name.rpartition("-")[2]
-    is_other = number.isdigit() and int(number) != os.getpid()
-    return int(number) if is_other and _is_written_by(int(number), partial / RUN_FILE) else 0
-
-
-def _is_written_by(pid: int, run_file: Path) -> bool:
-    """True if that process existed when the file was written; a later one has its number by chance."""
+    if not number.isdigit() or int(number) == os.getpid():
+        return 0
+    run_file = partial / RUN_FILE
     try:
-        process = psutil.Process(pid)
-        folder_or_file = run_file if run_file.exists() else run_file.parent  # which has just been made
-        return process.status() != psutil.STATUS_ZOMBIE and process.create_time() < folder_or_file.stat().st_mtime
+        process = psutil.Process(int(number))
+        is_alive = process.status() != psutil.STATUS_ZOMBIE
+        written_s = (run_file if run_file.exists() else partial).stat().st_mtime  # or it has just been made
+        return int(number) if is_alive and process.create_time() < written_s else 0
     except (psutil.Error, FileNotFoundError):
-        return False
+        return 0
 
 
 def check_outside_runs(destination: Path) -> None:
@@ -183,19 +160,15 @@ def _check(destination: Path, force: bool) -> None:
     if not destination.is_dir():
         raise InputError(f"{destination}: is a file; choose another --out")
     if not force:
-        resume = _how_to_resume(destination)
+        resume = ""
+        whole, mark, _ = destination.name.rpartition(".partial-")
+        if mark and (destination / CHECKPOINT_FILE).is_file():
+            resume = f"; it is what a stopped run left: --out {destination.with_name(whole)} --resume continues it"
+        elif (left := left_behind(destination)) is not None and not writer_of(left):
+            resume = f"; {left.name} is of a run that was stopped: --force --resume continues it"
         raise InputError(f"{destination}: exists; choose another --out or pass --force to replace it{resume}")
     if any(destination.iterdir()) and not (destination / RUN_FILE).is_file():
         raise InputError(
             f"{destination}: is not a run ({RUN_FILE} is missing), so --force does not replace it; "
             "choose another --out"
         )
-
-
-def _how_to_resume(destination: Path) -> str:
-    """Hint to resume if the existing name is, or belongs to, a run that was stopped."""
-    whole, mark, _ = destination.name.rpartition(".partial-")
-    if mark and (destination / CHECKPOINT_FILE).is_file():
-        return f"; it is what a stopped run left: --out {destination.with_name(whole)} --resume continues it"
-    left = resumable(destination)
-    return "" if left is None else f"; {left.name} is of a run that was stopped: --force --resume continues it"

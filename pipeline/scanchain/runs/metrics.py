@@ -15,15 +15,14 @@ from scanchain.data import State, Trajectory, fit_text
 from scanchain.errors import InputError
 from scanchain.evaluation import (
     ExpectedError,
-    ExpectedErrors,
     Pairs,
     absolute_error_of_any_path,
     kitti_error_of_any_path,
     pair,
 )
 from scanchain.evaluation.absolute import far_off, path_length
-from scanchain.runs.closures import BACK_END, VERIFICATION, FinalClosure
-from scanchain.runs.results import Cloud
+from scanchain.runs.closures import BACK_END, VERIFICATION
+from scanchain.runs.results import Results
 from scanchain.runs.step_table import STAGES, StepTable, inlier_shares
 from scanchain.slam import SlamResult
 from scanchain.verdict import Judged, Stretch, Verdict
@@ -191,11 +190,8 @@ class Metrics(Struct, frozen=True):
 
 def measure(
     steps: StepTable,
-    result: SlamResult,
-    cloud: Cloud,
-    final: Sequence[FinalClosure],
+    results: Results,
     judged: Judged,
-    expected: ExpectedErrors | None,
     *,
     run_s: float,
     compile_s: float,
@@ -204,6 +200,7 @@ def measure(
     stopped: str = "",
 ) -> Metrics:
     """Metrics of a finished run."""
+    result, cloud, final = results.result, results.cloud, results.final
     columns, states = steps.columns, steps.states()
     residuals_m = columns["residual_m"][np.isfinite(columns["residual_m"])]
     stage_s = columns["timing"]
@@ -245,7 +242,7 @@ def measure(
         verdict_reason=judged.reason,
         stretches=judged.stretches,
         verdict_error=judged.error,
-        expected_ate_m=None if expected is None else expected.ate,
+        expected_ate_m=results.expected and results.expected.ate,
         stopped=stopped,
         warnings=tuple(warnings),
         compile_s=compile_s,

@@ -37,8 +37,7 @@ def write_results_mcap(path: Path, log: Log, steps: StepTable, result: SlamResul
     in a frame of its own.
     """
     moving = moving_frame(log.indexes, log.lidar, log.mounting, dimension=log.dimension)
-    first = next(steps.rows)
-    first_ns, first_log_ns = first.stamp_ns, first.log_time_ns
+    first_ns, first_log_ns = (int(steps.columns[name][0]) for name in ("stamp_ns", "log_time_ns"))
     with LogWriter(path) as writer:
         trajectory = result.trajectory
         places = [place(T @ moving.T_lidar_frame) for T in trajectory.poses]
@@ -73,16 +72,17 @@ def ros_covariance(covariance: Matrix | None, T: Pose) -> NDArray[np.float64]:
 def _write_motion(writer: LogWriter, moving: MovingFrame, steps: StepTable, poses: Matrix) -> None:
     T_lidar_frame = moving.T_lidar_frame
     adjoint = lie.adjoint(lie.inverse(T_lidar_frame))
-    for row, T_world_lidar, covariance in zip(steps.rows, poses, steps.covariances(), strict=True):
-        T_odom_frame = row.T_odom_lidar @ T_lidar_frame
-        T_world_odom = T_world_lidar @ lie.inverse(row.T_odom_lidar)
+    for step, T_world_lidar, covariance in zip(steps.columns, poses, steps.covariances(), strict=True):
+        stamp_ns, log_time_ns, T_odom_lidar = int(step["stamp_ns"]), int(step["log_time_ns"]), step["T_odom_lidar"]
+        T_odom_frame = T_odom_lidar @ T_lidar_frame
+        T_world_odom = T_world_lidar @ lie.inverse(T_odom_lidar)
         here = place(T_odom_frame)
         links = Link(_WORLD, _ODOM, place(T_world_odom)), Link(_ODOM, moving.name, here)
-        data = pack_transforms(row.stamp_ns, *links)
-        writer.append("/tf", "tf2_msgs/msg/TFMessage", data, row.stamp_ns, row.log_time_ns)
+        data = pack_transforms(stamp_ns, *links)
+        writer.append("/tf", "tf2_msgs/msg/TFMessage", data, stamp_ns, log_time_ns)
         in_ros = None if covariance is None else adjoint @ covariance @ adjoint.T
-        data = pack_odometry(row.stamp_ns, _ODOM, moving.name, here, ros_covariance(in_ros, T_odom_frame))
-        writer.append("/odometry", "nav_msgs/msg/Odometry", data, row.stamp_ns, row.log_time_ns)
+        data = pack_odometry(stamp_ns, _ODOM, moving.name, here, ros_covariance(in_ros, T_odom_frame))
+        writer.append("/odometry", "nav_msgs/msg/Odometry", data, stamp_ns, log_time_ns)
 
 
 def _rows(points: Points) -> NDArray[np.void]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import AbstractContextManager, closing, suppress
 from dataclasses import dataclass
-from functools import partial
+from itertools import islice
 from pathlib import Path
+from time import perf_counter
 
 import msgspec
 import numpy as np
@@ -13,22 +15,26 @@ from numpy.typing import NDArray
 
 from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.config import NO_TRUTH, Config
-from scanchain.data import Trajectory, brief
+from scanchain.data import Scan, Trajectory, brief
 from scanchain.errors import InputError
-from scanchain.evaluation import TruthFile, check_overlap, during, read_truth
+from scanchain.evaluation import TruthFile, check_overlap, during, on_the_estimate, read_truth
 from scanchain.logs import Log, open_log
 from scanchain.logs.mounting import turned_by
 from scanchain.logs.topics import other_sensors
+from scanchain.preprocess import Prepared, Resolution, prepare, prepare_ahead
+from scanchain.runs.closures import final_verdicts
 from scanchain.runs.directory import (
     CHECKPOINT_FILE,
     POINTS_FILE,
+    RECORDING_FILE,
     RUN_FILE,
     TRUTH_FILE,
     RunDirectory,
-    left_without_checkpoint,
-    resumable,
+    left_behind,
+    partial_runs,
+    writer_of,
 )
-from scanchain.runs.job import Job, OpenRecorder, Progress
+from scanchain.runs.job import Job, OpenRecorder, Progress, Recorder
 from scanchain.runs.metrics import (
     METRICS_FILE,
     Accuracy,
@@ -38,24 +44,24 @@ from scanchain.runs.metrics import (
     measure,
     summary,
 )
-from scanchain.runs.processing import TruePoses, process
-from scanchain.runs.provenance import Hashing, Provenance, describe_start
-from scanchain.runs.resume.journal import JOURNAL_FILE
-from scanchain.runs.resume.rescue import rescued
-from scanchain.runs.resume.resuming import Left, find_left
+from scanchain.runs.overlay import OVERLAY_FILE, write_overlay
+from scanchain.runs.provenance import Hashing, describe_start
+from scanchain.runs.results import Results, record_results, results_of, write_results
+from scanchain.runs.resume import Checkpoints, after, find_left, rescued, resume_recording, set_aside
 from scanchain.runs.step_table import StepTable
+from scanchain.runs.vouching import evidence_of_run
 from scanchain.settings import Settings, dump, load_settings, named
-from scanchain.slam import SlamResult
+from scanchain.slam import Slam, SlamResult
+from scanchain.threads import threads
 from scanchain.trajectory import write_tum
+from scanchain.verdict import Judged, judge, worst_place
 from scanchain.whole_file import write_whole
 from scanchain.words import counted
 
 _FEW_SCANS = 2  # scans whose trajectory shows at most one motion
-_FOR_RESUMING = (JOURNAL_FILE, CHECKPOINT_FILE, POINTS_FILE)
-
-
-def _no_report(folder: Path) -> None:
-    """No report, for scripts."""
+_TOGETHER = 16  # largest number of scans that are read together
+TruePoses = Callable[[NDArray[np.int64]], Trajectory | None]  # of scans with these stamps; may raise InputError
+_FOR_RESUMING = (CHECKPOINT_FILE, POINTS_FILE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +85,7 @@ class Finished:
 
 
 def run(
-    job: Job, record: OpenRecorder, progress: Progress, report: Callable[[Path], None] = _no_report
+    job: Job, record: OpenRecorder, progress: Progress, report: Callable[[Path], None] = lambda folder: None
 ) -> Finished:
     """Open the log, process it, write the run directory, to which ``report`` adds its page in the end.
 
@@ -87,57 +93,210 @@ def run(
     """
     job.check_logs()
     with Hashing(job.logs) as hashing:  # from the beginning on: while the log is opened a core is idle
-        return _run(job, record, progress, report, hashing)
+        this = _Run(job, progress)
+        with (
+            this.directory,
+            announcing_compilation(progress.say, ("scanchain.runs.warm_up", str(this.log.dimension))),
+        ):
+            this.provenance.write(this.directory.path / RUN_FILE)
+            write_whole(this.directory.path / "config.toml", dump(this.config).encode())
+            try:
+                slam, scans, checkpoints = this.begin()
+                with this.recording(record) as recording:
+                    result = this.process(slam, scans, checkpoints, recording)
+                    results, judged = this.write(result, recording)
+                    slam.points.close()
+                    held_s = this.hold(recording)
+                metrics, text = this.judge(results, judged, recording.warnings, held_s)
+                return this.complete(metrics, text, hashing, report)
+            except (Exception, KeyboardInterrupt) as error:
+                raise rescued(error, this.directory, this.steps, this.provenance) from error
 
 
-def _run(
-    job: Job, record: OpenRecorder, progress: Progress, report: Callable[[Path], None], hashing: Hashing
-) -> Finished:
-    started, compiled_before_s = working_s(), compiled_s()
-    log, settings, truth_file = opened(job)
-    left = find_left(job.out, settings.config) if job.resume else None
-    directory = RunDirectory(job.out, force=job.force, left=left and left.folder)
-    _check_prior(log, settings.config)
-    progress.say(f"{log.topic}: {log.dimension}D, {counted(log.scan_count, 'scan')}; {settings.source}")
-    for gap in log.gaps:
-        progress.announce(f"warning: {gap}")
-    provenance = describe_start(job.command, job.logs, settings.source)
-    steps = StepTable() if left is None else left.steps
-    started -= 0.0 if left is None else left.checkpoint.run_s
-    _tell_beginning(job, left, progress)
-    compiling = announcing_compilation(progress.say, ("scanchain.runs.warm_up", str(log.dimension)))
-    with directory, compiling:
-        provenance.write(directory.path / RUN_FILE)
-        write_whole(directory.path / "config.toml", dump(settings.config).encode())
-        try:
-            poses = partial(true_poses, log, truth_file, progress)
-            done = process(job, log, settings.config, directory, record, progress, steps, left, poses)
-            run_s = working_s() - started - done.held_s
-            compile_s = compiled_s() - compiled_before_s
-            stopped = f"stopped by the user after {counted(len(steps), 'scan')}" if progress.stopped else ""
-            with directory.results() as folder:
-                source = str(job.ground_truth or log.ground_truth_topic)
-                truth, note = accuracy_of(poses, source, job.max_gap_s, done.result, folder)
-                few = _few_scans(len(steps))
-                warnings = (*log.damage, *log.copies, *done.warnings, *few, *note)
-                metrics = measure(
-                    steps, done.result, done.cloud, done.final, done.judged, done.expected,
-                    run_s=run_s, compile_s=compile_s, ground_truth=truth, warnings=warnings, stopped=stopped,
-                )  # fmt: skip
-                text = summary(
-                    metrics,
-                    _heading(log, settings.config, stopped),
-                    settings.source,
-                    [*log.notes, *_idle_sensors(log)],
-                )
-                metrics.write(folder / METRICS_FILE)
-                (folder / "summary.txt").write_text(text, encoding="utf-8")
-            warnings += _complete(
-                directory, provenance, hashing, stopped, run_s + compile_s, partial(_draw, progress, report)
+class _Run:
+    """A log on its way into a run directory: begun or resumed, processed scan by scan, written, judged."""
+
+    def __init__(self, job: Job, progress: Progress) -> None:
+        """Open the log, and what a stopped run left. Raises InputError where either does not fit the job."""
+        self.began_s, self.compiled_before_s = working_s(), compiled_s()
+        self.job, self.progress = job, progress
+        self.log, settings, self.truth_file = opened(job)
+        self.config, self.source = settings.config, settings.source
+        self.left = find_left(job.out, self.config) if job.resume else None
+        self.directory = RunDirectory(job.out, force=job.force, left=self.left and self.left.folder)
+        log = self.log
+        _check_prior(log, self.config)
+        progress.say(f"{log.topic}: {log.dimension}D, {counted(log.scan_count, 'scan')}; {self.source}")
+        for gap in log.gaps:
+            progress.announce(f"warning: {gap}")
+        self.provenance = describe_start(job.command, job.logs, self.source)
+        self.notes: list[str] = []
+        self.steps = StepTable()
+        if self.left is not None:
+            self.steps = self.left.steps
+            self.began_s -= self.left.run_s
+            progress.announce(f"resuming after {counted(len(self.steps), 'scan')} of {self.left.folder.name}")
+        elif (idle := left_behind(job.out)) is not None and not writer_of(idle):
+            progress.announce(
+                f"{idle.name} is of a run that was stopped; --resume would continue it, this run starts over and "
+                "removes it once complete"
             )
-        except (Exception, KeyboardInterrupt) as error:
-            raise rescued(error, directory, steps, provenance) from error
-    return Finished(directory.path, metrics, text, warnings, stopped)
+        elif job.resume and (begun := partial_runs(job.out)):
+            names = ", ".join(path.name for path in begun)
+            progress.announce(f"{names}: no checkpoint to resume from, this run starts over")
+
+    def begin(self) -> tuple[Slam, Generator[Scan, None, None], Checkpoints]:
+        """SLAM, new or as of the checkpoint, the scans that follow, and the writer of checkpoints."""
+        folder, every_s, left = self.directory.path, self.job.checkpoint_s, self.left
+        scans = self.log.scans(self.config.preprocess)
+        if left is None:
+            return (
+                Slam(self.config, self.log.T_base_lidar, folder / POINTS_FILE),
+                scans,
+                Checkpoints(folder, every_s),
+            )
+        left.slam.points.reopen(folder / POINTS_FILE)
+        scans = after(left, scans)
+        set_aside(folder, left)
+        return left.slam, scans, Checkpoints(folder, every_s, run_s=left.run_s, process=left.process + 1)
+
+    def recording(self, record: OpenRecorder) -> AbstractContextManager[Recorder]:
+        """The recording, to be entered before the first scan."""
+        return record(
+            self.directory.path / RECORDING_FILE,
+            dimension=self.log.dimension,
+            name=self.job.out.resolve().name,
+            sinks=self.job.sinks,
+            config=self.config.recording,
+        )
+
+    def process(
+        self, slam: Slam, scans: Generator[Scan, None, None], checkpoints: Checkpoints, recording: Recorder
+    ) -> SlamResult:
+        """Place every scan, from the first on or from the checkpoint."""
+        if recording.web_address:
+            self.progress.announce(f"viewer: {recording.web_address}")
+        if self.left is not None:
+            self.notes.append(resume_recording(self.directory.path, self.left, recording, checkpoints))
+        with closing(scans):  # what it left out is counted then, also if the run was stopped
+            tracked = self.progress.track(self._previewed(scans, recording), self.log.scan_count - len(self.steps))
+            for scan in _ahead(tracked, slam):
+                step = slam.place(slam.front_end.locate(scan))
+                self.steps.append(step)
+                recording.log(step)
+                if checkpoints.are_due():
+                    checkpoints.write(slam, self.steps, recording.secure())
+        checkpoints.write(slam, self.steps, recording.secure())  # an interruption from here on loses no scan
+        return slam.finish(self.progress.say)
+
+    def _previewed(self, scans: Iterator[Scan], recording: Recorder) -> Iterator[Scan]:
+        """The scans; the first one is shown as measured where its step waits for kernels that are compiled."""
+        for number, scan in enumerate(scans):
+            if not number and self.left is None and compiled_s() > self.compiled_before_s:
+                recording.preview(scan)
+            yield scan
+
+    def write(self, result: SlamResult, recording: Recorder) -> tuple[Results, Judged]:
+        """Write the results to the directory, and the verdict on them and on the truth to the recording."""
+        self.progress.say("building the maps and writing the results")
+        with self.directory.results() as folder:
+            final = final_verdicts(result.closures, result.state)
+            results = results_of(self.log, self.config, self.steps, result, final)
+            write_results(folder, results)
+            evidence = evidence_of_run(folder, results.expected and results.expected.ate)
+            judged = judge(evidence)
+            worst = worst_place(judged.stretches, evidence)
+            if worst is not None:
+                write_overlay(folder / OVERLAY_FILE, worst, result)
+            record_results(recording, results)
+            recording.log_verdict(judged, result.trajectory)
+            with suppress(InputError):  # which is reported with the accuracy
+                reference = self._true_poses(result.trajectory.stamps_ns)
+                if reference is not None:
+                    moved = on_the_estimate(result.trajectory, reference, gap_s=self.job.max_gap_s)
+                    recording.log_ground_truth(moved.poses)
+        return results, judged
+
+    def hold(self, recording: Recorder) -> float:
+        """Keep the web viewer open, which lives as long as the recording; seconds until the user ended this."""
+        began_s = perf_counter()
+        if recording.web_address:
+            self.progress.announce(f"done; the viewer at {recording.web_address} stays until Ctrl-C")
+            recording.hold()
+        if self.job.sinks:
+            self.progress.say("writing the rest of the recording")
+        return perf_counter() - began_s if recording.web_address else 0.0
+
+    def judge(
+        self, results: Results, judged: Judged, of_recording: Sequence[str], held_s: float
+    ) -> tuple[Metrics, str]:
+        """Measure the run, and write the figures; these and the summary."""
+        log, result = self.log, results.result
+        run_s, compile_s = working_s() - self.began_s - held_s, compiled_s() - self.compiled_before_s
+        stopped = f"stopped by the user after {counted(len(self.steps), 'scan')}" if self.progress.stopped else ""
+        with self.directory.results() as folder:
+            source = str(self.job.ground_truth or log.ground_truth_topic)
+            truth, note = accuracy_of(self._true_poses, source, self.job.max_gap_s, result, folder)
+            lost = (*log.damage, *log.copies, *self.notes, *result.warnings, *results.warnings, *of_recording)
+            metrics = measure(
+                self.steps, results, judged, run_s=run_s, compile_s=compile_s, ground_truth=truth,
+                warnings=(*lost, *_few_scans(len(self.steps)), *note), stopped=stopped,
+            )  # fmt: skip
+            text = summary(
+                metrics, _heading(log, self.config, stopped), self.source, [*log.notes, *_idle_sensors(log)]
+            )
+            metrics.write(folder / METRICS_FILE)
+            (folder / "summary.txt").write_text(text, encoding="utf-8")
+        return metrics, text
+
+    def complete(self, metrics: Metrics, text: str, hashing: Hashing, report: Callable[[Path], None]) -> Finished:
+        """Add the report and give a complete run its name; a stopped one stays marked partial."""
+        directory, stopped, warnings = self.directory, metrics.stopped, metrics.warnings
+        if stopped:
+            directory.worth_keeping()
+        made = self.provenance if stopped else self.provenance.hashed(hashing)
+        made = msgspec.structs.replace(
+            made, complete=not stopped, stopped=stopped, duration_s=metrics.run_s + metrics.compile_s
+        )
+        made.write(directory.path / RUN_FILE)
+        self.progress.say("drawing the report")
+        try:
+            report(directory.path)
+        except Exception as error:  # a report that fails must not fail the run
+            warnings += (f"no report.html: {type(error).__name__}: {error}",)
+        if not stopped:
+            directory.complete()
+            for file in _FOR_RESUMING:  # only now: until then a kill leaves what --resume needs
+                (directory.path / file).unlink(missing_ok=True)
+        return Finished(directory.path, metrics, text, warnings, stopped)
+
+    def _true_poses(self, stamps_ns: NDArray[np.int64]) -> Trajectory | None:
+        return true_poses(self.log, self.truth_file, self.progress, stamps_ns)
+
+
+def _ahead(scans: Iterator[Scan], slam: Slam) -> Iterator[Scan | Prepared]:
+    """The scans, clouds prepared in a thread beside; laser scans a few at once, which is quicker than either."""
+    resolution = slam.front_end.odometry.resolution
+    if slam.dimension == 3 and threads() > 1:
+        yield from prepare_ahead(scans, resolution)
+    elif resolution.is_fixed:
+        yield from few_at_once(scans, resolution)
+    else:
+        yield from scans
+
+
+def few_at_once(scans: Iterator[Scan], resolution: Resolution) -> Iterator[Prepared]:
+    """Scans, a few read and prepared together; those before an error come before this."""
+    while True:
+        some: list[Prepared] = []
+        try:
+            some.extend(prepare(scan, resolution) for scan in islice(scans, _TOGETHER))
+        except BaseException:  # of the log, or the user's wish to end
+            yield from some
+            raise
+        if not some:
+            return
+        yield from some
 
 
 def opened(job: Job) -> tuple[Log, Settings, TruthFile | None]:
@@ -149,24 +308,6 @@ def opened(job: Job) -> tuple[Log, Settings, TruthFile | None]:
     settings = load_settings(log.dimension, file=job.config_file, overrides=job.overrides)
     _check_truth(job, log, truth_file)
     return log, settings, truth_file
-
-
-def _tell_beginning(job: Job, left: Left | None, progress: Progress) -> None:
-    """Announce that an earlier run is resumed, or that one exists and is not."""
-    if left is not None:
-        progress.announce(f"resuming after {counted(len(left.steps), 'scan')} of {left.folder.name}")
-    elif (idle := resumable(job.out)) is not None:
-        progress.announce(
-            f"{idle.name} is of a run that was stopped; --resume would continue it, this run starts over and "
-            "removes it once complete"
-        )
-    elif job.resume and (partial_names := left_without_checkpoint(job.out)):
-        progress.announce(f"{', '.join(partial_names)}: no checkpoint to resume from, this run starts over")
-
-
-def _draw(progress: Progress, report: Callable[[Path], None], folder: Path) -> None:
-    progress.say("drawing the report")
-    report(folder)
 
 
 def _check_prior(log: Log, config: Config) -> None:
@@ -250,35 +391,3 @@ def _wheels(log: Log, config: Config) -> str:
     elif not log.scans_with_wheels:
         unused = ", not used: no reading is near the stamp of a scan"
     return f"wheel odometry {log.odometry_topic}{unused}"
-
-
-def _complete(
-    directory: RunDirectory,
-    provenance: Provenance,
-    hashing: Hashing,
-    stopped: str,
-    duration_s: float,
-    report: Callable[[Path], None],
-) -> tuple[str, ...]:
-    """Give a complete run its name; a stopped one stays marked partial. Returns problems with the report."""
-    if stopped:
-        directory.worth_keeping()
-        replaced = msgspec.structs.replace(provenance, stopped=stopped, duration_s=duration_s)
-        replaced.write(directory.path / RUN_FILE)
-        return _report(directory.path, report)
-    replaced = msgspec.structs.replace(provenance.hashed(hashing), complete=True, duration_s=duration_s)
-    replaced.write(directory.path / RUN_FILE)
-    warnings = _report(directory.path, report)
-    directory.complete()
-    for file in _FOR_RESUMING:  # only now: until then a kill leaves what --resume needs
-        (directory.path / file).unlink(missing_ok=True)
-    return warnings
-
-
-def _report(folder: Path, report: Callable[[Path], None]) -> tuple[str, ...]:
-    """A report that fails must not fail the run."""
-    try:
-        report(folder)
-    except Exception as error:
-        return (f"no report.html: {type(error).__name__}: {error}",)
-    return ()

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.data import Match, Matrix, Pose, State, Step, Timing, Trajectory
+from scanchain.data import Matrix, Pose, State, Step, Trajectory
 from scanchain.evaluation import motion_nees, pair
+from scanchain.graph.growing_array import GrowingArray
 from scanchain.verdict import check_overlap, check_velocity, check_wheels
 
 if TYPE_CHECKING:
@@ -23,82 +22,51 @@ if TYPE_CHECKING:
 _SINGULAR = 1e-12  # smallest over largest eigenvalue of an information matrix below which it is not inverted
 
 
-class StepRow(msgspec.Struct, frozen=True):
-    """A step without its points."""
-
-    index: int
-    stamp_ns: int
-    log_time_ns: int
-    points: int
-    dropped: int
-    T_odom_lidar: Pose
-    T_world_lidar: Pose
-    match: Match
-    state: State
-    reason: str
-    keyframe: int
-    timing: Timing
-    T_odom_base: Pose | None = None
-    starts_segment: bool = False
-    is_copy: bool = False
-
-
 class StepTable:
-    """Rows of all steps, in columns: a row takes microseconds, and a quarter of the memory of its objects."""
+    """Figures of all steps in columns, without their points: a step takes microseconds, and under a kilobyte."""
 
     def __init__(self) -> None:
-        self._recent: list[StepRow] = []
-        self._parts: list[NDArray[np.void]] = []
+        self._steps: GrowingArray | None = None
         self._texts: dict[str, int] = {}
 
     def __len__(self) -> int:
-        return _PART * len(self._parts) + len(self._recent)
+        return 0 if self._steps is None else len(self._steps)
 
-    def append(self, step: Step) -> StepRow:
-        """Keep one step; what is kept of it."""
-        scan = step.scan
-        row = StepRow(
-            scan.index,
-            scan.stamp_ns,
-            scan.log_time_ns,
-            len(scan.points),
-            scan.dropped,
-            step.T_odom_lidar,
-            step.T_world_lidar,
-            step.match,
-            step.state,
-            step.reason,
-            step.keyframe,
-            step.timing,
-            scan.T_odom_base,
-            step.starts_segment,
-            scan.is_copy,
-        )
-        self.add(row)
-        return row
-
-    def add(self, row: StepRow) -> None:
-        """Keep a row."""
-        self._recent.append(row)
-        if len(self._recent) == _PART:
-            self._parts.append(self._packed(self._recent))
-            self._recent = []
-
-    @property
-    def rows(self) -> Iterator[StepRow]:
-        """The rows, unpacked from the columns one by one."""
-        texts = list(self._texts)
-        for part in self._parts:
-            for packed in part:
-                yield _row(packed, texts)
-        yield from self._recent
+    def append(self, step: Step) -> None:
+        """Keep one step."""
+        scan, match, timing = step.scan, step.match, step.timing
+        if self._steps is None:
+            self._steps = GrowingArray((), _layout(len(step.T_odom_lidar), len(match.information)))
+        row = {
+            "index": scan.index,
+            "stamp_ns": scan.stamp_ns,
+            "log_time_ns": scan.log_time_ns,
+            "scan_points": len(scan.points),
+            "dropped": scan.dropped,
+            "keyframe": step.keyframe,
+            "state": self._code(str(step.state)),
+            "reason": self._code(step.reason),
+            "match_reason": self._code(match.reason),
+            "has_wheels": scan.T_odom_base is not None,
+            "starts_segment": step.starts_segment,
+            "is_copy": scan.is_copy,
+            "T_odom_lidar": step.T_odom_lidar,
+            "T_world_lidar": step.T_world_lidar,
+            "T_odom_base": np.nan if scan.T_odom_base is None else scan.T_odom_base,
+            "timing": [getattr(timing, f"{stage}_s") for stage in STAGES],
+            **{name: getattr(match, _FIELDS.get(name, name)) for name in _OF_MATCH},
+        }
+        self._steps.append(tuple(row[name] for name in self._steps.rows.dtype.names or ()))
 
     @property
     def columns(self) -> NDArray[np.void]:
         """(N,) the steps as a structured array; ``texts`` has what state and reasons refer to."""
-        recent = [self._packed(self._recent)] if self._recent else []
-        parts = [*self._parts, *recent]
-        return np.concatenate(parts) if parts else np.empty(0, _layout(3, 3))
+        return np.empty(0, _layout(3, 3)) if self._steps is None else self._steps.rows
+
+    @property
+    def last_state(self) -> State:
+        """State of the last step."""
+        return State(list(self._texts)[self.columns["state"][-1]])
 
     def texts(self, codes: NDArray[np.int64]) -> pa.DictionaryArray:
         """Texts (N,) of these codes."""
@@ -177,32 +145,6 @@ class StepTable:
         }
         return pa.table(arrays).replace_schema_metadata(_NOTES)
 
-    def _packed(self, rows: Sequence[StepRow]) -> NDArray[np.void]:
-        first = rows[0]
-        result = np.empty(len(rows), _layout(len(first.T_odom_lidar), len(first.match.information)))
-        for name, values in {
-            "index": [row.index for row in rows],
-            "stamp_ns": [row.stamp_ns for row in rows],
-            "log_time_ns": [row.log_time_ns for row in rows],
-            "scan_points": [row.points for row in rows],
-            "dropped": [row.dropped for row in rows],
-            "T_odom_lidar": [row.T_odom_lidar for row in rows],
-            "T_world_lidar": [row.T_world_lidar for row in rows],
-            "state": [self._code(str(row.state)) for row in rows],
-            "reason": [self._code(row.reason) for row in rows],
-            "keyframe": [row.keyframe for row in rows],
-            "timing": [[getattr(row.timing, f"{stage}_s") for stage in STAGES] for row in rows],
-            "has_wheels": [row.T_odom_base is not None for row in rows],
-            "starts_segment": [row.starts_segment for row in rows],
-            "is_copy": [row.is_copy for row in rows],
-            "match_reason": [self._code(row.match.reason) for row in rows],
-            **{name: [getattr(row.match, _FIELDS.get(name, name)) for row in rows] for name in _OF_MATCH},
-        }.items():
-            result[name] = values
-        unknown = np.full(first.T_odom_lidar.shape, np.nan)
-        result["T_odom_base"] = [unknown if row.T_odom_base is None else row.T_odom_base for row in rows]
-        return result
-
     def _code(self, text: str) -> int:
         return self._texts.setdefault(text, len(self._texts))
 
@@ -234,7 +176,6 @@ def inlier_shares(steps: NDArray[np.void]) -> NDArray[np.float64]:
     return steps["inliers"] / np.maximum(steps["points"], 1)
 
 
-_PART = 1024  # rows that are put into columns together
 _OF_MATCH = (  # as columns; all of a match but its reason
     "points", "inliers", "iterations", "residual_m", "fit", "cost_m2", "converged", "at_minimum",
     "degeneracy_eigenvalue", "observability", "degeneracy_direction", "information", "T_target_source",
@@ -275,32 +216,6 @@ def _layout(size: int, k: int) -> np.dtype[np.void]:
         "timing": (np.float64, (len(STAGES),)),
     }
     return np.dtype(list((whole | counts | codes | flags | numbers | arrays).items()))
-
-
-def _row(packed: np.void, texts: Sequence[str]) -> StepRow:
-    """The row that was packed."""
-    of_match = {_FIELDS.get(name, name): _value(packed[name]) for name in _OF_MATCH}
-    return StepRow(
-        index=int(packed["index"]),
-        stamp_ns=int(packed["stamp_ns"]),
-        log_time_ns=int(packed["log_time_ns"]),
-        points=int(packed["scan_points"]),
-        dropped=int(packed["dropped"]),
-        T_odom_lidar=packed["T_odom_lidar"],
-        T_world_lidar=packed["T_world_lidar"],
-        match=Match(**of_match, reason=texts[int(packed["match_reason"])]),
-        state=State(texts[int(packed["state"])]),
-        reason=texts[int(packed["reason"])],
-        keyframe=int(packed["keyframe"]),
-        timing=Timing(*packed["timing"].tolist()),
-        T_odom_base=packed["T_odom_base"] if packed["has_wheels"] else None,
-        starts_segment=bool(packed["starts_segment"]),
-        is_copy=bool(packed["is_copy"]),
-    )
-
-
-def _value(field: Any) -> Any:
-    return field if isinstance(field, np.ndarray) else field.item()
 
 
 def _lists(rows: Matrix, is_null: NDArray[np.bool_] | None = None) -> pa.FixedSizeListArray:

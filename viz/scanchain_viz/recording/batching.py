@@ -14,7 +14,7 @@ import rerun as rr
 from scanchain import lie
 from scanchain.data import Closure, ClosureVerdict, GraphState, Match, Matrix, State, Step
 from scanchain.runs.closures import FinalClosure, final_verdicts
-from scanchain.runs.step_table import StepRow
+from scanchain.runs.step_table import StepTable
 from scanchain_viz.recording import drawing, entities
 from scanchain_viz.recording.drawing import Floats, Message, Times
 
@@ -66,14 +66,13 @@ class KeyframeGraph:
         self.is_current = False
         return Verdicts(self._update(closures), *self.counts)
 
-    def restore(self, rows: Sequence[StepRow], closures: Sequence[Closure], graph: GraphState) -> Verdicts:
-        """Restore the state after the steps of ``rows`` from the closures and the graph at that time."""
+    def restore(self, steps: StepTable, closures: Sequence[Closure], graph: GraphState) -> Verdicts:
+        """Restore the state after these steps from the closures and the graph at that time."""
         self.graph = graph
         self._update(final_verdicts(closures, graph))
-        for row in rows:
-            if row.keyframe >= 0:
-                self.positions.append(drawing.positions(row.T_world_lidar[None])[0])
-                self.drawn = len(self.positions) if self.has_grown else self.drawn
+        for position in drawing.positions(steps.columns["T_world_lidar"][steps.columns["keyframe"] >= 0]):
+            self.positions.append(position)
+            self.drawn = len(self.positions) if self.has_grown else self.drawn
         self.is_current = self.drawn == len(self.positions)
         return Verdicts((), *self.counts)
 
@@ -137,14 +136,15 @@ class Batcher:
         self.state: State | None = None
         self.closures: tuple[int, int] | None = None
 
-    def restore(self, rows: Sequence[StepRow], closures: Sequence[Closure], graph: GraphState) -> None:
-        """Restore the state after the steps of ``rows`` from the closures and the graph at that time."""
-        last, verdicts = rows[-1], self.graph.restore(rows, closures, graph)
-        self.scans, self.points = len(rows), sum(row.match.points for row in rows)
-        self._frame(drawing.positions(np.array([row.T_world_lidar for row in rows])))
-        self.T_odom_before = last.T_odom_lidar
-        self.has_odom, self.T_world_odom = True, last.T_world_lidar @ lie.inverse(last.T_odom_lidar)
-        self.state, self.closures = last.state, (verdicts.accepted, verdicts.rejected)
+    def restore(self, steps: StepTable, closures: Sequence[Closure], graph: GraphState) -> None:
+        """Restore the state after these steps from the closures and the graph at that time."""
+        verdicts = self.graph.restore(steps, closures, graph)
+        odom, world = steps.columns["T_odom_lidar"], steps.columns["T_world_lidar"]
+        self.scans, self.points = len(steps), int(steps.columns["points"].sum())
+        self._frame(drawing.positions(world))
+        self.T_odom_before = odom[-1]
+        self.has_odom, self.T_world_odom = True, world[-1] @ lie.inverse(odom[-1])
+        self.state, self.closures = steps.last_state, (verdicts.accepted, verdicts.rejected)
 
     def add(self, step: Step) -> None:
         """Take in one step, and the verdicts of that moment."""

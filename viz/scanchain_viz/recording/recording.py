@@ -21,7 +21,7 @@ from scanchain.data import Closure, GraphState, Matrix, Scan, Step, Trajectory
 from scanchain.errors import InputError
 from scanchain.runs.closures import FinalClosure
 from scanchain.runs.job import SinkName
-from scanchain.runs.step_table import StepRow
+from scanchain.runs.step_table import StepTable
 from scanchain.verdict import Judged, Kind, Stretch
 from scanchain_viz.colors import STRETCH_COLORS, rgb
 from scanchain_viz.recording import drawing, entities, viewer
@@ -95,14 +95,14 @@ class Recording:
         return [*self.problems, *(warning for sink in self.sinks for warning in sink.warnings)]
 
     def resume(
-        self, before: Path | None, rows: Sequence[StepRow], closures: Sequence[Closure], graph: GraphState
+        self, before: Path | None, steps: StepTable, closures: Sequence[Closure], graph: GraphState
     ) -> None:
-        """Resume after the steps of ``rows``, with all closures tried by then and the graph as it was.
+        """Resume after these steps, with all closures tried by then and the graph as it was.
 
         before : the recording up to there, which is copied; without one, the recording begins here
         """
-        self.last = rows[-1].index, rows[-1].stamp_ns
-        self._guard(lambda: self.batcher.restore(rows, closures, graph))
+        self.last = int(steps.columns["index"][-1]), int(steps.columns["stamp_ns"][-1])
+        self._guard(lambda: self.batcher.restore(steps, closures, graph))
         if before is not None:
             for sink in self.sinks:
                 sink.send(before)

@@ -1,0 +1,316 @@
+"""Resuming a run that was stopped: its checkpoints, the files that it leaves, and the error that names them."""
+
+from __future__ import annotations
+
+import io
+import os
+import pickle
+import shlex
+import traceback
+import zlib
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from threading import Thread
+from time import perf_counter
+from typing import Any, BinaryIO
+
+import msgspec
+
+from scanchain.clock import working_s
+from scanchain.config import Config
+from scanchain.data import Scan
+from scanchain.errors import InputError, ScanchainError, remedy_of
+from scanchain.point_store import PointStore
+from scanchain.registration.matcher import CheckedMatcher, Matcher, create_matcher
+from scanchain.runs.directory import (
+    CHECKPOINT_FILE,
+    POINTS_FILE,
+    RECORDING_FILE,
+    RUN_FILE,
+    RunDirectory,
+    left_behind,
+    writer_of,
+)
+from scanchain.runs.job import Recorder
+from scanchain.runs.provenance import Provenance, package_version
+from scanchain.runs.step_table import StepTable
+from scanchain.settings import dump, flatten
+from scanchain.slam import Slam
+from scanchain.source import without_keys
+from scanchain.trajectory import write_tum
+from scanchain.words import counted
+
+_LEISURE = 20.0  # least time between two checkpoints over the time that one takes to write
+_REMEDY = "run without --resume"
+_NEEDED = (RUN_FILE, "config.toml", CHECKPOINT_FILE, POINTS_FILE)
+_CRC_BYTES = 4
+
+
+class PartialRunError(ScanchainError):
+    """A run that failed after some scans; its results so far are in a directory marked partial."""
+
+
+@dataclass(frozen=True, slots=True)
+class Checkpoint:
+    """A run after some scans, which took ``run_s`` seconds of work, in the directory that it left.
+
+    The first ``recorded_bytes`` of the recording hold these scans, none where it was not kept whole; ``process``
+    numbers the processes that wrote to the run directory, from 0.
+    """
+
+    folder: Path
+    run_s: float
+    process: int
+    recorded_bytes: int
+    slam: Slam
+    steps: StepTable
+
+
+class Checkpoints:
+    """Writer of checkpoints, at an interval at which they take at most 5 % of the time."""
+
+    def __init__(self, folder: Path, every_s: float, *, run_s: float = 0.0, process: int = 0) -> None:
+        """run_s : seconds that the ``process`` earlier processes took up to the checkpoint."""
+        self.path = folder / CHECKPOINT_FILE
+        self.version = _version()
+        self.process = process
+        self.every_s = every_s
+        self.began_s = working_s() - run_s
+        self.next_s = perf_counter() + every_s
+
+    def are_due(self) -> bool:
+        """True when it is time for the next."""
+        return perf_counter() >= self.next_s
+
+    def write(self, slam: Slam, steps: StepTable, recorded_bytes: int = 0) -> None:
+        """Write one, whole or not at all: a line on the version, a pickle, the CRC-32 of both.
+
+        Raises OSError on a full disk; the last checkpoint stays.
+        """
+        started = perf_counter()
+        slam.points.flush()
+        state = working_s() - self.began_s, self.process, recorded_bytes, slam, steps
+        new = self.path.with_name(f"{self.path.name}.new")
+        try:
+            with new.open("wb") as file:
+                summed = _Summed(file)
+                summed.write(self.version)
+                _Pickler(summed, slam.config).dump(state)
+                file.write(summed.crc.to_bytes(_CRC_BYTES, "little"))
+            new.replace(self.path)
+        except BaseException:
+            new.unlink(missing_ok=True)
+            raise
+        now = perf_counter()
+        self.next_s = now + max(self.every_s, _LEISURE * (now - started))
+
+
+def read_checkpoint(folder: Path, config: Config) -> Checkpoint:
+    """The last checkpoint of a run. Raises InputError for one that is damaged or that other code made.
+
+    config : of the resuming user, with which it must have been made
+    """
+    path = folder / CHECKPOINT_FILE
+    data = path.read_bytes()
+    body = memoryview(data)[:-_CRC_BYTES]
+    if zlib.crc32(body) != int.from_bytes(data[-_CRC_BYTES:], "little"):
+        raise InputError(f"{path}: is not whole; {_REMEDY}")
+    file = io.BytesIO(body)
+    version = file.readline()
+    if version != _version():
+        made, this = (line.decode(errors="replace").rstrip() for line in (version, _version()))
+        raise InputError(f"{path}: was made by {made}, this is {this}; {_REMEDY}")
+    checkpoint = Checkpoint(folder, *_Unpickler(file, config).load())
+    if checkpoint.slam.config != config:
+        raise InputError(f"{path}: has another configuration; {_REMEDY}")
+    return checkpoint
+
+
+@cache
+def _version() -> bytes:
+    """Version of the package and checksum of its code, as it began: other code would not give the same bits."""
+    package = Path(__file__).parents[1]
+    code = b"".join(path.read_bytes() for path in sorted(package.rglob("*.py")))
+    return f"scanchain {package_version('scanchain')} (code {zlib.crc32(code):08x})\n".encode()
+
+
+class _Summed:
+    """A file, and the CRC-32 of what was written to it."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self.file, self.crc = file, 0
+
+    def write(self, data: bytes) -> int:
+        self.crc = zlib.crc32(data, self.crc)
+        return self.file.write(data)
+
+
+class _Pickler(pickle.Pickler):
+    """Leaves out what lies in a file beside it, what runs in a thread, and objects of the user's own classes."""
+
+    def __init__(self, file: _Summed, config: Config) -> None:
+        super().__init__(file, protocol=5)
+        self.own = set(flatten(config).values())  # among them any MODULE:CLASS
+
+    def persistent_id(self, value: Any) -> tuple[Any, ...] | None:
+        if isinstance(value, PointStore):
+            return "points", value.dimension, value.rows
+        if isinstance(value, CheckedMatcher):
+            return ("matcher",)
+        kind = type(value)
+        if isinstance(value, Thread) or f"{kind.__module__}:{kind.__qualname__}" in self.own:
+            return ("nothing",)  # which begins anew where it is missed
+        return None
+
+
+class _Unpickler(pickle.Unpickler):
+    """Makes objects of the classes that SLAM consists of, and nothing else."""
+
+    def __init__(self, file: BinaryIO, config: Config) -> None:
+        super().__init__(file)
+        self.config = config
+        self.left_out: dict[tuple[Any, ...], Any] = {}
+
+    def find_class(self, module: str, name: str) -> Any:
+        if _is_of_slam(module):
+            found = super().find_class(module, name)
+            home = getattr(found, "__module__", "")
+            if _is_of_slam(home) and (isinstance(found, type) or home.startswith("numpy._core.")):
+                return found
+        raise InputError(f"the checkpoint names {module}.{name}, which does not belong there; {_REMEDY}")
+
+    def persistent_load(self, pid: tuple[Any, ...]) -> Any:
+        if pid not in self.left_out:
+            self.left_out[pid] = self._made(*pid)
+        return self.left_out[pid]
+
+    def _made(self, what: str, dimension: int = 0, rows: int = 0) -> PointStore | Matcher | None:
+        if what == "points":
+            store = PointStore(dimension)
+            store.rows = rows  # of the file that it is to reopen
+            return store
+        return create_matcher(self.config.matching) if what == "matcher" else None
+
+
+def _is_of_slam(module: str) -> bool:
+    return module.split(".")[0] in ("scanchain", "numpy", "collections") or module.startswith("scipy.spatial.")
+
+
+def find_left(out: Path, config: Config) -> Checkpoint | None:
+    """State of an earlier run into ``out``, None if it had no checkpoint.
+
+    config : that of now. Raises InputError where that run's, or its version, was another, or it still runs.
+    """
+    folder = left_behind(out)
+    if folder is None:
+        return None
+    if writer := writer_of(folder):
+        raise InputError(f"{folder}: is being written by process {writer}; wait for its end or stop it")
+    if (folder / "config.toml").read_text(encoding="utf-8") != dump(config):
+        raise InputError(f"{folder}: was run with another configuration; repeat its flags, or {_REMEDY}")
+    return read_checkpoint(folder, config)
+
+
+def after(left: Checkpoint, scans: Generator[Scan, None, None]) -> Generator[Scan, None, None]:
+    """The scans that follow those already done. Raises InputError where these were not the same."""
+    for index, *known in left.steps.columns[
+        ["index", "stamp_ns", "log_time_ns", "scan_points", "dropped"]
+    ].tolist():
+        scan = next(scans, None)
+        if scan is None or [scan.stamp_ns, scan.log_time_ns, len(scan.points), scan.dropped] != known:
+            raise InputError(f"{left.folder}: scan {index} of the log is not the one that was run; {_REMEDY}")
+    return scans
+
+
+def set_aside(folder: Path, left: Checkpoint) -> None:
+    """Remove files that will be written again, except the recording, which is renamed.
+
+    Its name holds the number of its process: one killed before its own first checkpoint leaves it to the next.
+    """
+    before, recording = _recorded_by(left.process, folder), folder / RECORDING_FILE
+    if recording.is_file() and not before.exists():
+        recording.rename(before)
+    if left.recorded_bytes:  # of what the process before recorded, too
+        _recorded_by(left.process - 1, folder).unlink(missing_ok=True)
+    for path in folder.iterdir():
+        if path.name not in _NEEDED and not path.match("recording.part_*.rrd") and not path.is_dir():
+            path.unlink()
+
+
+def resume_recording(folder: Path, left: Checkpoint, recording: Recorder, checkpoints: Checkpoints) -> str:
+    """Resume the recording where the last checkpoint left it; returns a note about it."""
+    before = _recorded_by(left.process, folder)
+    is_whole = 0 < left.recorded_bytes <= (before.stat().st_size if before.exists() else 0)
+    if is_whole:
+        os.truncate(before, left.recorded_bytes)
+    recording.resume(before if is_whole else None, left.steps, left.slam.closures, left.slam.graph.state())
+    recorded_bytes = recording.secure()
+    checkpoints.write(left.slam, left.steps, recorded_bytes)
+    note = f"resumed after {counted(len(left.steps), 'scan')}"
+    if recorded_bytes and is_whole:
+        before.unlink()
+    elif before.exists():
+        note += f"; the recording up to there is {before.name}{'' if is_whole else ', incomplete'}"
+    elif recorded_bytes:
+        note += "; the recording begins there"
+    return note
+
+
+def _recorded_by(process: int, folder: Path) -> Path:
+    return folder / f"recording.part_{process}.rrd"
+
+
+def how_to_resume(command: Sequence[str]) -> str:
+    """Command that resumes the run which this command line started; scripts have none."""
+    words = [*without_keys(command[1:]), *([] if "--resume" in command else ["--resume"])]
+    again = f"scanchain {shlex.join(words)}" if len(command) > 1 else "the same with --resume"
+    return f"to resume: {again}"
+
+
+def rescued(
+    error: BaseException, directory: RunDirectory, steps: StepTable, provenance: Provenance
+) -> BaseException:
+    """The error to raise; the results so far are written, and the error names their directory."""
+    is_bug = not isinstance(error, ScanchainError | KeyboardInterrupt | OSError)
+    if not len(steps) and not is_bug:
+        return error
+    directory.worth_keeping()
+    if isinstance(error, OSError) and error.filename is None:
+        error.filename = str(directory.destination)
+    known = "interrupted" if isinstance(error, KeyboardInterrupt) else ""
+    known = remedy_of(error) if isinstance(error, OSError) else known
+    reason = known or str(error) or type(error).__name__
+    until = f"{counted(len(steps), 'scan')} until then"
+    is_or_are = "is" if len(steps) == 1 and not is_bug else "are"
+    where = f"{'traceback.txt and the ' if is_bug else ''}{until} {is_or_are} in {directory.path}"
+    try:
+        _keep(
+            error if is_bug else None, directory.path, steps, msgspec.structs.replace(provenance, stopped=reason)
+        )
+    except OSError as failure:
+        why = "" if isinstance(error, OSError) else f" ({remedy_of(failure) or failure.strerror})"
+        where = f"{until} could not be written to {directory.path}{why}"
+    if isinstance(error, KeyboardInterrupt | OSError) and (directory.path / CHECKPOINT_FILE).is_file():
+        where += f"; {how_to_resume(provenance.command)}"
+    if isinstance(error, InputError):
+        return InputError(f"{error.text}; {where}")
+    kind = f"{type(error).__name__}: " if is_bug else ""
+    return PartialRunError(f"{kind}{reason}; {where}")
+
+
+def _keep(bug: BaseException | None, folder: Path, steps: StepTable, provenance: Provenance) -> None:
+    """Write the results so far. Raises OSError on a full disk, after which nothing half-written is left."""
+    written = [folder / name for name in ("odometry.tum", "steps.parquet", "traceback.txt")]
+    try:
+        provenance.write(folder / RUN_FILE)
+        if bug is not None:
+            written[2].write_text("".join(traceback.format_exception(bug)), encoding="utf-8")
+        if len(steps) and not (folder / "metrics.json").exists():  # else the results are better
+            write_tum(written[0], steps.odometry, force=True)
+            steps.write(written[1], steps.best_known)
+    except OSError:
+        for path in written:
+            path.unlink(missing_ok=True)
+        raise

@@ -1,1 +1,0 @@
-"""Checkpoints of a run, and resuming it after it was stopped."""
