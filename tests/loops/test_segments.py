@@ -17,8 +17,9 @@ from scanchain.loops.evidence import PlaceTest
 from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.odometry import Odometry
 from scanchain.odometry.tracked import first_match
+from scanchain.placement import edge_information
 from scanchain.runs.closures import final_verdicts
-from scanchain.slam import Slam, edge_information
+from scanchain.slam import Slam
 from tests.support.scenes import configured, shared_data, stored
 
 

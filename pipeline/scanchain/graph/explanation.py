@@ -149,14 +149,14 @@ class Explainer:
         self._measured, self._information = measured, information
         self._rejection: Graduated = rejection
         is_large = len(is_loop) - int(is_loop.sum()) >= _LARGE
-        self._trial: Graduated = "edges" if is_large and rejection == "refined" else rejection
+        self._trial: Graduated = "judge" if is_large and rejection == "refined" else rejection
         self._jumps = jumps
         self._nominal = rejection_limit(config.robust_scale, measured.shape[-1] * (measured.shape[-1] - 1) // 2)
 
     def solve(self, explanation: Explanation, poses: Matrix, initialize: Initialization) -> Explained:
         """The minimum, from these poses and this explanation."""
         best = first = self._solved(explanation, poses, initialize, self._rejection)
-        explains = self._rejection != "gnc" and not len(best.problem.sightings)
+        explains = not len(best.problem.sightings)
         for _ in range(_MAX_STEPS):
             better = next(self._better(best), None) if explains and best.solved.minimum.price else None
             if better is None:

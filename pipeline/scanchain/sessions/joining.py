@@ -21,8 +21,8 @@ from scanchain.loops.evidence import PlaceTest, compared, contradiction
 from scanchain.loops.map_search import MapSearch
 from scanchain.loops.planar_map_search import PlanarMapSearch
 from scanchain.maps import Edges, SavedMap
+from scanchain.placement import loop_information
 from scanchain.sessions.alignment import align
-from scanchain.slam import loop_information
 from scanchain.words import counted
 
 _APART_M = 200.0  # path between the last keyframe of a map and the first of the next: no submap holds both

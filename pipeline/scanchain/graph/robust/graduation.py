@@ -17,8 +17,8 @@ from scanchain.graph.robust.inliers import InlierSet, fair_price
 from scanchain.graph.robust.losses import Graduation, RobustLoss, rejection_limit
 from scanchain.graph.solvers.minimizer import Evaluation, Limits, Minimizer, Minimum
 
-Graduated = Literal["gnc", "edges", "refined"]
-OutlierRejection = Literal[Graduated, "retained", "recent", "explained"]
+Graduated = Literal["judge", "refined"]
+Rejection = Literal["update", Graduated]
 
 _MAX_ROUNDS = 50  # largest number of rounds of refining the inlier set
 _MAX_FAILED = 4  # largest number of groups tried in a row without success
@@ -28,18 +28,18 @@ _FEWER, _FEWEST = 0.3, 1e-3  # share of the changes tried after a round that doe
 def minimize(minimizer: Minimizer, poses: Matrix, loss: RobustLoss, rejection: Graduated) -> Minimum:
     """Minimize from these poses; a kernel that is not convex is graduated first (Yang et al. 2020).
 
-    rejection : of truncated edges: as GNC leaves it, or refined by how much each edge contradicts the others, and
-        groups of edges that agree
+    rejection : of truncated edges, by how much each contradicts the others, and if "refined" also by groups of
+        edges that agree
     """
     now, used = minimizer.evaluate(poses, loss), 0
     graduation = loss.graduation(now.chi2[minimizer.loops])
     if graduation is not None and len(minimizer.loops):
         now, loss, used = _graduate(minimizer, now, graduation)
-    if rejection != "gnc" and loss.kernel == "truncated" and len(minimizer.loops):
+    if loss.kernel == "truncated" and len(minimizer.loops):
         minimum = _refine(minimizer, now, loss, rejection)
     else:
         minimum = minimizer.descend(now, loss)
-        if loss.kernel not in ("none", "truncated"):
+        if loss.kernel != "none":
             minimum = _settle_without_outliers(minimizer, minimum, loss)
     return replace(minimum, iterations=used + minimum.iterations)
 

@@ -12,12 +12,12 @@ from scanchain import data
 from scanchain.clock import working_s
 from scanchain.config import Config
 from scanchain.errors import InputError
-from scanchain.graph.background import BackgroundOptimization
 from scanchain.graph.explanation import Explanation
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.robust.loosened import Loosened
 from scanchain.graph.robust.update import Since
+from scanchain.graph.schedule import BackgroundOptimization, Plan, Schedule
 from scanchain.kernels.voxels.voxel_shapes import Voxels
 from scanchain.loops.closer import LoopCloser, ProximityCloser
 from scanchain.loops.closure_table import ClosureTable
@@ -37,6 +37,7 @@ from scanchain.odometry.prediction import ErrorStatistics, MotionFilter, Predict
 from scanchain.odometry.recovery import Recovery
 from scanchain.odometry.standstill import AgreeingMatches, Standstill
 from scanchain.odometry.tracked import Tracked
+from scanchain.placement import Placement
 from scanchain.point_store import PointStore, StoredPoints
 from scanchain.preprocess import Resolution, Sweep
 from scanchain.registration import PointToShapeMatcher, VoxelMap, create_matcher
@@ -45,6 +46,7 @@ from scanchain.runs.provenance import package_version
 from scanchain.runs.resume.snapshot import Classes, read_snapshot, write_snapshot
 from scanchain.settings import flatten
 from scanchain.slam import Slam
+from scanchain.trail import Trail
 
 _LEISURE = 20.0  # least time between two checkpoints over the time that one takes to write
 
@@ -73,13 +75,14 @@ class Checkpoint:
 
 _CLASSES = Classes(
     [
-        Checkpoint, Slam, FrontEnd, Motion, Odometry, LiveStamps, Predictor, MotionFilter, Intervals,
+        Checkpoint, Slam, Trail, Placement, FrontEnd,
+        Motion, Odometry, LiveStamps, Predictor, MotionFilter, Intervals,
         ErrorStatistics, Recovery, Standstill, AgreeingMatches, Tracked, ElevationCalibration, MapKeeper,
         Resolution, Sweep, VoxelMap,
         Voxels, PointToShapeMatcher, LoopCloser, ProximityCloser, PlaceCloser, Relocalizer, Find, PlanarSearch,
         VoxelSubmaps, ScanVerifier, SubmapVerifier, Segments, Drift, PoseGraph, Explanation, Loosened,
         GrowingArray, Since, data.KeyframeErrors, KeyframeErrorTracker,
-        ClosureTable, PlaceTest, BackgroundOptimization, PointStore, StoredPoints,
+        ClosureTable, PlaceTest, BackgroundOptimization, Schedule, Plan, PointStore, StoredPoints,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.ClosureVerdict, data.Proposal, data.Prior,
         data.State,
         Config, *(type(getattr(Config(), section)) for section in Config.__struct_fields__),
@@ -122,7 +125,7 @@ class Checkpoints:
         started = perf_counter()
         run_s = working_s() - self.began_s
         slam.points.flush()
-        checkpoint = Checkpoint(len(slam.stamps_ns), run_s, self.process, recorded_bytes, slam)
+        checkpoint = Checkpoint(len(slam.trail.stamps_ns), run_s, self.process, recorded_bytes, slam)
         write_snapshot(self.path, checkpoint, _CLASSES)
         now = perf_counter()
         self.next_s = now + max(self.every_s, _LEISURE * (now - started))
