@@ -11,7 +11,7 @@ from scanchain.graph.schedule import BackgroundOptimization, Plan, Schedule
 from tests.support.scenes import shared_data
 
 SIGMA = np.array([0.01, 0.01, 0.005])
-LAP = 30  # poses
+LAP = 60  # poses
 
 
 class Laps:
@@ -19,14 +19,14 @@ class Laps:
 
     def __init__(self, wrong_at=-1):
         self.graph = PoseGraph(2)
-        self.schedule = Schedule(self.graph, GraphConfig(), 0.05)
-        self.wrong_at = wrong_at
+        self.schedule = Schedule(self.graph, GraphConfig(), 0.5)
+        self.wrong_at, self.rng = wrong_at, np.random.default_rng(1)
         self.optimized = []  # number of poses and the first that moved, each time
 
     def grow(self, count, *, closes=True, is_live=False):
         for index in range(len(self.graph), count):
-            Z = lie.pose_2d(1.0, 0.0, 2 * np.pi / LAP)
-            moved = Z @ lie.pose_2d(0.0, 3.0 * (index == self.wrong_at), 0.0)
+            Z = lie.pose_2d(1.0, 0.0, 2 * np.pi / LAP) @ self.noise()
+            moved = Z @ lie.pose_2d(-2.0, 1.0, 0.1) if index == self.wrong_at else Z
             if index:
                 self.graph.add_pose(self.graph.poses[-1] @ moved, index)
                 self.graph.add_edge(index - 1, index, moved, np.diag(SIGMA**-2))
@@ -38,10 +38,14 @@ class Laps:
             if first < len(self.graph):
                 self.optimized.append((len(self.graph), first))
 
+    def noise(self):
+        return lie.exp(0.3 * SIGMA * self.rng.normal(size=3))
+
     def close(self, target, source, off_m=0.0, **options):
         T_old, T_new = self.graph.poses[[target, source]]
-        error = lie.log(lie.between(lie.pose_2d(off_m, 0.0, 0.0), lie.between(T_old, T_new)))
-        self.graph.add_edge(target, source, lie.pose_2d(off_m, 0.0, 0.0), np.diag(SIGMA**-2), is_loop=True)
+        Z = lie.pose_2d(off_m, 0.0, 0.0) @ self.noise()
+        error = lie.log(lie.between(Z, lie.between(T_old, T_new)))
+        self.graph.add_edge(target, source, Z, np.diag(SIGMA**-2), is_loop=True)
         chi2 = float((error**2 / SIGMA**2).sum())
         self.schedule.note(source, float(np.linalg.norm(error[:2])), chi2, **options)
 
@@ -64,10 +68,10 @@ def test_a_closure_that_moves_the_map_is_optimized_in_soon_and_one_that_joins_a_
     laps = Laps()
     laps.grow(398)
     before = laps.schedule.optimized_at
-    laps.close(LAP, 397, 0.2)
+    laps.close(LAP, 397, 1.0)
     laps.grow(max(before + 10, 400), closes=False)
     assert before < laps.optimized[-1][0] == max(before + 10, 399)
-    laps.close(LAP, len(laps.graph) - 1, 0.2, joins=True)
+    laps.close(LAP, len(laps.graph) - 1, 1.0, joins=True)
     laps.grow(len(laps.graph) + 1, closes=False)
     assert laps.optimized[-1] == (len(laps.graph), 0)
 
@@ -76,12 +80,11 @@ def test_a_jump_of_a_large_graph_is_found_in_the_poses_since_the_last_closure_th
     monkeypatch.setattr(schedule, "_LARGE", 200)
     monkeypatch.setattr(schedule, "LAG", 50)
     laps = Laps(wrong_at=600)
-    laps.grow(660)
-    assert laps.graph.jumps == (599,) or [slip.first <= 599 < slip.first + slip.count for slip in laps.graph.slips]
-    assert not laps.graph.is_rejected.any() and laps.schedule.excess == 0
-    assert all(first >= 540 for count, first in laps.optimized if count > 600 and first)
-    lap = laps.graph.poses[-LAP:, :2, 2]
-    assert np.abs(lap - laps.graph.poses[-2 * LAP : -LAP, :2, 2]).max() < 0.05
+    laps.grow(659)
+    assert laps.graph.corrections(np.arange(659))
+    assert all(first >= 500 for count, first in laps.optimized if count > 601 and first)
+    lap = laps.graph.poses[-10:, :2, 2]
+    assert np.abs(lap - laps.graph.poses[-LAP - 10 : -LAP, :2, 2]).max() < 0.1
 
 
 def test_all_poses_are_updated_where_that_is_little_work_and_else_the_last_ones(monkeypatch):
@@ -113,7 +116,7 @@ def test_an_optimization_beside_takes_the_graph_as_it_was_and_moves_what_was_add
     graph.add_edge(last, graph.add_pose(before @ T_last_new, 1), T_last_new, information)
     graph.add_edge(0, last, lie.pose_2d(90.0, 0.0, 0.0), information, is_loop=True)
     graph.take_over(beside.result())
-    optimized = whole.optimize(GraphConfig(), initialize="given", rejection="judge").state.poses
+    optimized = whole.optimize(GraphConfig(), initialize="given").state.poses
     assert np.array_equal(graph.poses[:-1], optimized) and not np.allclose(optimized[-1], before)
     assert np.allclose(lie.between(graph.poses[last], graph.poses[-1]), T_last_new, atol=1e-9)
     assert np.array_equal(graph.weight, [*whole.weight, 1.0, 1.0])

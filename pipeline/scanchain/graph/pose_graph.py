@@ -32,7 +32,7 @@ from scanchain.graph.observability import (
 )
 from scanchain.graph.optimization import Optimization, Solved, solve
 from scanchain.graph.robust.drift import corrected
-from scanchain.graph.robust.graduation import Graduated, Rejection
+from scanchain.graph.robust.graduation import Rejection
 from scanchain.graph.robust.loosened import Slip
 from scanchain.graph.robust.update import Since
 from scanchain.graph.solvers.cholesky import SingularMatrixError
@@ -273,13 +273,12 @@ class PoseGraph:
         self._measurements.replace(measurements)
 
     def optimize(
-        self, config: GraphConfig, *, initialize: Initialization = "auto", rejection: Rejection = "refined"
+        self, config: GraphConfig, *, initialize: Initialization = "auto", rejection: Rejection = "judge"
     ) -> Optimization:
         """Move the poses to the minimum of χ², starting from the chosen guess.
 
-        rejection : of loop edges under the truncated loss: "refined" judges all of them anew, "judge" without
-            groups of wrong ones that agree, and "update", the cheapest, begins with the verdicts at hand and
-            judges new edges by these
+        rejection : of loop edges under the truncated loss: "judge" all of them anew, or "update", which is cheap:
+            it begins with the verdicts at hand and judges new edges by these
         """
         checks.instance(config, GraphConfig, "config", "load_settings(dimension).config.graph")
         checks.one_of(initialize, get_args(Initialization), "initialize")
@@ -332,7 +331,7 @@ class PoseGraph:
         if rejection == "update":
             return solve(end.problem_of(none), poses, end.is_loop, config, "given", Since(0, 0))
         arrays = end.measured, end.information, end.is_loop
-        explained = Explainer(end.problem_of, *arrays, config, rejection, jumps=True).solve(none, poses, "given")
+        explained = Explainer(end.problem_of, *arrays, config, jumps=True).solve(none, poses, "given")
         before = int((~self.is_loop).sum() - (~end.is_loop).sum())
         self._explanation = self._explanation.with_later(explained.explanation, before)
         return explained.solved
@@ -451,8 +450,7 @@ class PoseGraph:
             solved = solve(problem, self.poses, self.is_loop, config, initialize, self.since)
             return Explained(problem, solved, self._explanation)
         measured, information = self._measurements.rows, self._information.rows
-        graduated: Graduated = "judge" if rejection == "update" else rejection
-        explainer = Explainer(self._problem_of, measured, information, self.is_loop, config, graduated)
+        explainer = Explainer(self._problem_of, measured, information, self.is_loop, config)
         return explainer.solve(self._explanation, self.poses, initialize)
 
     def _prepared(self) -> BetweenProblem:

@@ -236,7 +236,7 @@ def graph_of(joined: Joined, held: int = -1) -> PoseGraph:
 def optimized(joined: Joined, config: Config, held: int = -1) -> Joined:
     """All edges at the minimum of χ²; the keyframes of the held map stay where they are, or else the first one."""
     graph, body = graph_of(joined, held), _body(joined, held)
-    graph.optimize(config.graph, initialize="given", rejection="refined")
+    graph.optimize(config.graph, initialize="given")
     weight = np.ones(len(joined.edges.pairs))
     weight[~(joined.edges.pairs < body).all(axis=1)] = graph.weight
     poses = joined.poses
