@@ -13,8 +13,7 @@ from scanchain.graph.between import WASTE
 from scanchain.graph.edge_checks import is_connected
 from scanchain.graph.robust.consistency import Consistency
 from scanchain.graph.robust.groups import agreeing_groups
-from scanchain.graph.robust.inliers import InlierSet, fair_price
-from scanchain.graph.robust.losses import Graduation, RobustLoss, rejection_limit
+from scanchain.graph.robust.losses import Graduation, InlierSet, RobustLoss, fair_price, rejection_limit
 from scanchain.graph.solvers.minimizer import Evaluation, Limits, Minimizer, Minimum
 
 Rejection = Literal["update", "judge"]
