@@ -159,7 +159,7 @@ def localized(case: Case, scans: Sequence[Scan], start: int, poses: Matrix) -> O
         T_last = step.T_odom_lidar
         if np.isfinite(found_m):
             errors.append(lie.apart(poses[scan.index], step.T_world_lidar))
-        is_found = any(c.verdict is ClosureVerdict.ACCEPTED and c.target < slam.first for c in step.closures)
+        is_found = any(c.verdict is ClosureVerdict.ACCEPTED and c.target < slam.trail.first for c in step.closures)
         if is_found and np.isinf(found_m):
             found_m = traveled_m
         if traveled_m > min(found_m + AFTER_M, GIVE_UP_M):

@@ -71,7 +71,7 @@ def score(path: Path, error_per_m: NDArray[np.float64], false_share: float) -> S
     loops_s = sum(step.timing.loops_s for step in map(slam.process, log.scans()))
     seconds = perf_counter() - started
     wrong = false_closures(slam, false_share) if false_share else ()
-    slam._take(wrong)
+    slam.placement.take(wrong)
     result = slam.finish()
     everything = final_verdicts(result.closures, result.state)
     judged = [item for item in everything if item.closure.reason != MADE_UP]

@@ -8,7 +8,6 @@ from scanchain.config import GraphConfig
 from scanchain.data import Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import absolute_error, expected_ate, pair
-from scanchain.graph.background import BackgroundOptimization
 from scanchain.graph.explanation import Explanation
 from scanchain.graph.files.g2o import read_g2o
 from scanchain.graph.pose_graph import PoseGraph
@@ -216,35 +215,12 @@ def test_the_same_optimization_twice_is_equal_to_the_bit():
     assert answers[0].chi2_after == answers[1].chi2_after
 
 
-def test_an_optimization_beside_takes_the_graph_as_it_was_and_moves_what_was_added_since():
-    whole, graph = read("intel"), read("intel")
-    before, last = graph.poses[-1].copy(), len(graph) - 1
-    beside = BackgroundOptimization(graph, GraphConfig(), "gnc", len(graph) + 1)
-    T_last_new, information = lie.pose_2d(1.0, 0.2, 0.3), np.eye(3)
-    graph.add_edge(last, graph.add_pose(before @ T_last_new, 1), T_last_new, information)
-    graph.add_edge(0, last, lie.pose_2d(90.0, 0.0, 0.0), information, is_loop=True)
-    graph.take_over(beside.result())
-    optimized = whole.optimize(GraphConfig(), initialize="given", rejection="gnc").state.poses
-    assert np.array_equal(graph.poses[:-1], optimized) and not np.allclose(optimized[-1], before)
-    assert np.allclose(lie.between(graph.poses[last], graph.poses[-1]), T_last_new, atol=1e-9)
-    assert np.array_equal(graph.weight, [*whole.weight, 1.0, 1.0])
-
-
 @pytest.mark.parametrize("first", [0, 12, 18, 40, 60])
 def test_edges_added_are_corrected_as_among_all_others(first):
     graph, _ = ring(2, count=60, noise=0.03)
     graph._explanation = Explanation(np.array([0.02, 0.001]), (Loosened(10, 4, False), Loosened(20, 1, True)))
     for added, every in zip(graph.added_since(first), (graph.measurements, graph.information), strict=True):
         assert np.allclose(added, every[first:], rtol=1e-12, atol=1e-12)
-
-
-def test_an_error_of_an_optimization_beside_is_raised_where_its_result_is_taken():
-    graph = PoseGraph(2)
-    for index in range(2):
-        graph.add_pose(lie.identity(2), index)
-    beside = BackgroundOptimization(graph, GraphConfig(), "gnc", 2)
-    with pytest.raises(InputError, match="not joined to a fixed one"):
-        beside.result()
 
 
 def test_every_reason_to_stop_is_reported():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scanchain import Slam, lie
+from scanchain import lie
 from scanchain.data import ClosureVerdict
 from scanchain.evaluation import absolute_error, pair
 from scanchain.graph.pose_graph import PoseGraph
@@ -103,25 +103,3 @@ def test_a_revisit_stays_with_the_pass_that_was_matched_last_and_in_the_plane_wi
     near.target = target
     assert near._next(T_world, 90, np.ones(91, bool))[0] == closest
     assert near._next(T_world[1:], 89, np.ones(90, bool))[0] == 74
-
-
-@pytest.mark.parametrize(
-    ("judged_at", "updated_at", "explained_at", "work", "disagreeing", "expected"),
-    [
-        (0, 0, 0, 0.0, 2, "gnc"),
-        (0, 0, 0, 0.0, 8, "edges"),
-        (2000, 2800, 2000, 1e8, 2, "retained"),
-        (2000, 2900, 2000, 1e8, 2, "recent"),  # too early
-        (2000, 2800, 2000, 3e8, 2, "recent"),  # too much work
-        (2000, 2800, 2000, 1e8, 8, "explained"),
-        (2000, 2800, 2900, 1e8, 8, "retained"),  # only just explained
-    ],
-)
-def test_of_a_large_graph_the_end_is_optimized_and_all_where_that_is_little_work(
-    judged_at, updated_at, explained_at, work, disagreeing, expected
-):
-    slam = Slam(configured(2), dimension=2)
-    slam.keyframes, slam.graph.work = 3000 * [None], work
-    slam.judged_at, slam.updated_at, slam.explained_at = judged_at, updated_at, explained_at
-    slam.waiting_closures, slam.contradicting_closures = 10, disagreeing
-    assert slam._rejection_of_large(3000) == expected

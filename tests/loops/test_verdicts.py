@@ -48,7 +48,7 @@ def undisturbed(log):
 @pytest.fixture(scope="module")
 def disturbed(log):
     slam = driven(log)
-    slam._take(false_closures(slam, 0.3))
+    slam.placement.take(false_closures(slam, 0.3))
     return slam.finish()
 
 
@@ -109,7 +109,7 @@ def forced(log, tmp_path_factory):
     finish = Slam.finish
 
     def finish_forced(slam, progress):
-        slam._take(false_closures(slam, 0.3))
+        slam.placement.take(false_closures(slam, 0.3))
         return finish(slam, progress)
 
     out = tmp_path_factory.mktemp("forced") / "run"

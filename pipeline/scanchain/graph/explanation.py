@@ -14,7 +14,6 @@ from scanchain.graph.between import BetweenProblem
 from scanchain.graph.initialize import Initialization
 from scanchain.graph.optimization import Solved, solve
 from scanchain.graph.robust.drift import FEWEST, corrected, drift_step, penalty, rescaled, size
-from scanchain.graph.robust.graduation import Graduated
 from scanchain.graph.robust.groups import apart
 from scanchain.graph.robust.left_out import LeftOut
 from scanchain.graph.robust.loosened import Loosened, Slip, cost_of, loosened, next_loosened
@@ -137,7 +136,6 @@ class Explainer:
         information: Matrix,
         is_loop: NDArray[np.bool_],
         config: GraphConfig,
-        rejection: Graduated,
         *,
         jumps: bool = False,
     ) -> None:
@@ -147,30 +145,28 @@ class Explainer:
         """
         self._problem_of, self._is_loop, self._config = problem_of, is_loop, config
         self._measured, self._information = measured, information
-        self._rejection: Graduated = rejection
-        is_large = len(is_loop) - int(is_loop.sum()) >= _LARGE
-        self._trial: Graduated = "edges" if is_large and rejection == "refined" else rejection
+        self._is_large = len(is_loop) - int(is_loop.sum()) >= _LARGE
         self._jumps = jumps
         self._nominal = rejection_limit(config.robust_scale, measured.shape[-1] * (measured.shape[-1] - 1) // 2)
 
     def solve(self, explanation: Explanation, poses: Matrix, initialize: Initialization) -> Explained:
         """The minimum, from these poses and this explanation."""
-        best = first = self._solved(explanation, poses, initialize, self._rejection)
-        explains = self._rejection != "gnc" and not len(best.problem.sightings)
+        best = first = self._solved(explanation, poses, initialize, groups=True)
+        explains = not len(best.problem.sightings)
         for _ in range(_MAX_STEPS):
             better = next(self._better(best), None) if explains and best.solved.minimum.price else None
             if better is None:
                 break
             best = better
-        if best is not first and self._trial != self._rejection:
-            best = self._solved(best.explanation, best.solved.poses, "given", self._rejection)
+        if best is not first and self._is_large:
+            best = self._solved(best.explanation, best.solved.poses, "given", groups=True)
         return best
 
     def _better(self, best: Explained) -> Iterator[Explained]:
         """Explanations under which the cost is lower, those that promise most first."""
         price = best.solved.minimum.price
         for explanation, poses in self._candidates(best):
-            trial = self._solved(explanation, poses, "given", self._trial)
+            trial = self._solved(explanation, poses, "given", groups=not self._is_large)
             if self._cost(trial, price) < self._cost(best, price) - _SETTLED * price:
                 yield trial
 
@@ -206,10 +202,10 @@ class Explainer:
         return [(explanation, start) for gain, explanation, start in found if gain > _SETTLED * price]
 
     def _solved(
-        self, explanation: Explanation, poses: Matrix, initialize: Initialization, rejection: Graduated
+        self, explanation: Explanation, poses: Matrix, initialize: Initialization, *, groups: bool
     ) -> Explained:
         problem = self._problem_of(explanation)
-        solved = solve(problem, poses, self._is_loop, self._config, initialize, rejection)
+        solved = solve(problem, poses, self._is_loop, self._config, initialize, groups=groups)
         return Explained(problem, solved, explanation)
 
     def _cost(self, explained: Explained, price: float) -> float:

@@ -12,7 +12,7 @@ from scanchain.data import GraphState, Matrix, brief, fit_text
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.edge_checks import has_loop
 from scanchain.graph.initialize import Initialization, first_guess
-from scanchain.graph.robust.graduation import Graduated, minimize
+from scanchain.graph.robust.graduation import minimize
 from scanchain.graph.robust.losses import robust_loss
 from scanchain.graph.robust.update import LIMITS, Since, update
 from scanchain.graph.solvers.minimizer import Limits, Minimizer, Minimum
@@ -87,11 +87,13 @@ def solve(
     is_loop: NDArray[np.bool_],
     config: GraphConfig,
     initialize: Initialization,
-    rejection: Graduated | Since,
+    since: Since | None = None,
+    *,
+    groups: bool = True,
 ) -> Solved:
     """Minimize from the chosen guess; fixed poses stay to the bit. Loop edges (E,) bool get the robust loss.
 
-    rejection : ``Since`` for an update, under the truncated loss
+    since : for an update, under the truncated loss; groups : otherwise, as for ``minimize``
     Raises SingularMatrixError where the edges leave a pose free, and the optimizer minds.
     """
     outlier_free = config.robust == "none" or not is_loop.any()
@@ -99,11 +101,11 @@ def solve(
     shift = guess[:, :-1, -1].mean(axis=0)  # left twists turn about the origin: bring it into the middle
     guess[:, :-1, -1] -= shift
     loss = robust_loss(config.robust, config.robust_scale, problem.freedom)
-    if isinstance(rejection, Since):
-        minimum = update(Minimizer(problem, is_loop, config.optimizer, LIMITS), guess, loss, rejection)
+    if since is not None:
+        minimum = update(Minimizer(problem, is_loop, config.optimizer, LIMITS), guess, loss, since)
     else:
         limits = Limits(config.max_iterations, config.tolerance)
-        minimum = minimize(Minimizer(problem, is_loop, config.optimizer, limits), guess, loss, rejection)
+        minimum = minimize(Minimizer(problem, is_loop, config.optimizer, limits), guess, loss, groups=groups)
     found = _orthonormal(minimum.estimate.poses)
     found[:, :-1, -1] += shift
     fixed = problem.variable < 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import get_args
 
 import numpy as np
@@ -32,14 +32,11 @@ from scanchain.graph.observability import (
 )
 from scanchain.graph.optimization import Optimization, Solved, solve
 from scanchain.graph.robust.drift import corrected
-from scanchain.graph.robust.graduation import Graduated, OutlierRejection
+from scanchain.graph.robust.graduation import Rejection
 from scanchain.graph.robust.loosened import Slip
 from scanchain.graph.robust.update import Since
 from scanchain.graph.solvers.cholesky import SingularMatrixError
-from scanchain.graph.solvers.minimizer import Evaluation
 from scanchain.words import counted
-
-_LAST, _MOST_LAST = 0.1, 2000  # share of the poses that are the last ones, and their largest number
 
 
 class PoseGraph:
@@ -276,29 +273,31 @@ class PoseGraph:
         self._measurements.replace(measurements)
 
     def optimize(
-        self, config: GraphConfig, *, initialize: Initialization = "auto", rejection: OutlierRejection = "refined"
+        self, config: GraphConfig, *, initialize: Initialization = "auto", rejection: Rejection = "judge"
     ) -> Optimization:
         """Move the poses to the minimum of χ², starting from the chosen guess.
 
-        rejection : of loop edges under the truncated loss; "gnc" is cheaper, for all but the last optimization;
-            "retained" is cheapest: it begins with the inliers at hand and judges new edges by these; "recent"
-            does so with the last poses alone, all others held, and "explained" refines the inliers there and looks
-            for errors of odometry that explain why loop edges disagree
+        rejection : of loop edges under the truncated loss: "judge" all of them anew, or "update", which is cheap:
+            it begins with the verdicts at hand and judges new edges by these
         """
         checks.instance(config, GraphConfig, "config", "load_settings(dimension).config.graph")
         checks.one_of(initialize, get_args(Initialization), "initialize")
-        checks.one_of(rejection, get_args(OutlierRejection), "rejection")
+        checks.one_of(rejection, get_args(Rejection), "rejection")
         begin = working_s()
         problem = self._prepared()
         chi2_before = self._in_force(problem.chi2(problem.errors(self.poses)))
         try:
-            if rejection in ("recent", "explained"):
-                solved = self._optimize_last(config, explains=rejection == "explained")
-            else:
-                solved = self._optimize_all(problem, config, initialize, rejection)
+            explained = self._explained(problem, config, initialize, rejection)
         except SingularMatrixError as error:
-            raise self._singular(error, problem) from error
-        minimum = solved.minimum
+            raise self._singular(error, problem.free) from error
+        self._problem, self._explanation = explained.problem, explained.explanation
+        solved, minimum = explained.solved, explained.solved.minimum
+        self._poses.replace(solved.poses)
+        self._weight.replace(minimum.weights)
+        self._factor_is_now = False
+        edges = len(self.edges)
+        self.since = Since(self.since.judged if rejection == "update" else edges, edges)
+        self.work = self._problem.cholesky.work * minimum.iterations
         return Optimization(
             state=self.state(),
             chi2_before=chi2_before,
@@ -311,60 +310,31 @@ class PoseGraph:
             time_s=working_s() - begin,
         )
 
-    def follow(self, config: GraphConfig, first: int) -> None:
-        """Move the poses from this one on to the minimum near them, all others held (fixed-lag smoothing).
+    def optimize_end(self, config: GraphConfig, first: int, rejection: Rejection) -> None:
+        """Move the poses from this one on, all others held.
 
-        Of the loop edges to them those are in force whose χ² is small there, until all are optimized again.
+        rejection : as in ``optimize``; what is judged is also explained by jumps of odometry there
         """
         end = _End.of(self, first)
-        solved = solve(
-            end.problem_of(Explanation.none(self.freedom)),
-            self.poses[end.poses],
-            end.is_loop,
-            config,
-            "given",
-            Since(len(end.edges), len(end.edges)),
-        )
-        self._move_end(end, solved)
-
-    def _optimize_all(
-        self, problem: BetweenProblem, config: GraphConfig, initialize: Initialization, rejection: OutlierRejection
-    ) -> Solved:
-        explained = self._explained(problem, config, initialize, rejection)
-        solved = explained.solved
-        self._problem, self._explanation = explained.problem, explained.explanation
-        self._poses.replace(solved.poses)
-        self._weight.replace(solved.minimum.weights)
-        self._factor_is_now = False
-        edges = len(self.edges)
-        self.since = Since(self.since.judged if rejection == "retained" else edges, edges)
-        self.work = self._problem.cholesky.work * solved.minimum.iterations
-        return solved
-
-    def _optimize_last(self, config: GraphConfig, *, explains: bool) -> Solved:
-        """Optimize the last poses, all others held; ``explains`` as "explained" does."""
-        end = _End.of(self, len(self) - min(int(_LAST * len(self)), _MOST_LAST))
-        none, poses = Explanation.none(self.freedom), self.poses[end.poses]
-        if not explains:
-            solved = solve(end.problem_of(none), poses, end.is_loop, config, "given", Since(0, 0))
-        else:
-            arrays = end.measured, end.information, end.is_loop
-            explained = Explainer(end.problem_of, *arrays, config, "edges", jumps=True).solve(none, poses, "given")
-            before = int((~self.is_loop).sum() - (~end.is_loop).sum())
-            self._explanation = self._explanation.with_later(explained.explanation, before)
-            solved = explained.solved
-        self._move_end(end, solved)
-        problem = self._prepared()
-        errors = problem.errors(self.poses)
-        estimate = Evaluation(self.poses, errors, problem.chi2(errors), solved.minimum.estimate.cost)
-        return replace(solved, minimum=replace(solved.minimum, estimate=estimate))
-
-    def _move_end(self, end: _End, solved: Solved) -> None:
+        try:
+            solved = self._solved(end, config, rejection)
+        except SingularMatrixError as error:
+            raise self._singular(error, end.poses[~end.is_held]) from error
         moved, weight = self.poses.copy(), self.weight.copy()
         moved[end.poses], weight[end.chosen] = solved.poses, solved.minimum.weights
         self._poses.replace(moved)
         self._weight.replace(weight)
         self._changed()
+
+    def _solved(self, end: _End, config: GraphConfig, rejection: Rejection) -> Solved:
+        none, poses = Explanation.none(self.freedom), self.poses[end.poses]
+        if rejection == "update":
+            return solve(end.problem_of(none), poses, end.is_loop, config, "given", Since(0, 0))
+        arrays = end.measured, end.information, end.is_loop
+        explained = Explainer(end.problem_of, *arrays, config, jumps=True).solve(none, poses, "given")
+        before = int((~self.is_loop).sum() - (~end.is_loop).sum())
+        self._explanation = self._explanation.with_later(explained.explanation, before)
+        return explained.solved
 
     def copy(self) -> PoseGraph:
         """The graph as it is, independent of what becomes of this one."""
@@ -442,7 +412,7 @@ class PoseGraph:
             information = self._weight_in_force[:, None, None] * self.information
             problem.cholesky.factorize(own_equations(problem, self.poses, information))
         except SingularMatrixError as error:
-            raise self._singular(error, problem) from error
+            raise self._singular(error, problem.free) from error
         return own_covariances(problem)
 
     def pose_errors(self, count: int, seed: int = 0) -> NDArray[np.float64]:
@@ -468,20 +438,19 @@ class PoseGraph:
             try:
                 problem.cholesky.factorize(equations.values)
             except SingularMatrixError as error:
-                raise self._singular(error, problem) from error
+                raise self._singular(error, problem.free) from error
             self._factor_is_now = True
         return problem
 
     def _explained(
-        self, problem: BetweenProblem, config: GraphConfig, initialize: Initialization, rejection: OutlierRejection
+        self, problem: BetweenProblem, config: GraphConfig, initialize: Initialization, rejection: Rejection
     ) -> Explained:
         """The minimum, with the errors of odometry that explain loop edges; those at hand for an update."""
-        if rejection == "retained" and config.robust == "truncated":
+        if rejection == "update" and config.robust == "truncated":
             solved = solve(problem, self.poses, self.is_loop, config, initialize, self.since)
             return Explained(problem, solved, self._explanation)
         measured, information = self._measurements.rows, self._information.rows
-        graduated: Graduated = "refined" if rejection == "refined" else "edges" if rejection == "edges" else "gnc"
-        explainer = Explainer(self._problem_of, measured, information, self.is_loop, config, graduated)
+        explainer = Explainer(self._problem_of, measured, information, self.is_loop, config)
         return explainer.solve(self._explanation, self.poses, initialize)
 
     def _prepared(self) -> BetweenProblem:
@@ -508,9 +477,9 @@ class PoseGraph:
         free = () if len(names) else self.free_poses()
         return lost_text(names) if len(names) else free_text(free) if free else ""
 
-    def _singular(self, error: SingularMatrixError, problem: BetweenProblem) -> InputError:
-        """The error for poses that their edges leave free, or as good as free."""
-        name = int(self.names[problem.free[error.variable]])
+    def _singular(self, error: SingularMatrixError, free: NDArray[np.int64]) -> InputError:
+        """The error for poses that their edges leave free, or as good as free, of the free ones (n,)."""
+        name = int(self.names[free[error.variable]])
         return _refused(self._undetermined() or free_text([FreePose(name, ("next to no information",))]))
 
     @property

@@ -116,7 +116,7 @@ def _walked(
     for n, number in enumerate(order):
         slam.place(_located(keyframes[number], information[n], first_points, config))
         if n == 0 and T_target_first is not None:
-            slam.begin_at(T_target_first, _FOUND)
+            slam.placement.begin_at(T_target_first, _FOUND)
     result, old = slam.finish(), len(target.keyframes)
     i, j = result.state.edges[result.state.is_loop & ~result.state.is_rejected].T
     loops = int(((i < old) & (j >= old)).sum())

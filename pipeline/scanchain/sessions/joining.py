@@ -21,8 +21,8 @@ from scanchain.loops.evidence import PlaceTest, compared, contradiction
 from scanchain.loops.map_search import MapSearch
 from scanchain.loops.planar_map_search import PlanarMapSearch
 from scanchain.maps import Edges, SavedMap
+from scanchain.placement import loop_information
 from scanchain.sessions.alignment import align
-from scanchain.slam import loop_information
 from scanchain.words import counted
 
 _APART_M = 200.0  # path between the last keyframe of a map and the first of the next: no submap holds both
@@ -236,7 +236,7 @@ def graph_of(joined: Joined, held: int = -1) -> PoseGraph:
 def optimized(joined: Joined, config: Config, held: int = -1) -> Joined:
     """All edges at the minimum of χ²; the keyframes of the held map stay where they are, or else the first one."""
     graph, body = graph_of(joined, held), _body(joined, held)
-    graph.optimize(config.graph, initialize="given", rejection="refined")
+    graph.optimize(config.graph, initialize="given")
     weight = np.ones(len(joined.edges.pairs))
     weight[~(joined.edges.pairs < body).all(axis=1)] = graph.weight
     poses = joined.poses

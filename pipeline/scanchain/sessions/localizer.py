@@ -16,8 +16,9 @@ from scanchain.data import AnyPoints, Closure, Keyframe, Matrix, Pose, Scan, Sta
 from scanchain.evaluation.expected import edge_errors, with_map_errors
 from scanchain.loops.evidence import are_in_sight
 from scanchain.maps import SavedMap, open_saved_map
+from scanchain.placement import loop_information
 from scanchain.preprocess import Prepared
-from scanchain.slam import Slam, SlamResult, loop_information
+from scanchain.slam import Slam, SlamResult
 
 _RECENT_KEYFRAMES = 3  # since the last match with the map, up to which a scan counts as localized
 INITIAL_SIGMAS = (2.0, 0.35)  # m and rad, standard deviations of a pose that the user gives
@@ -126,7 +127,7 @@ class Localizer:
         self.live: list[Pose] = []
         self.sigma_m: list[float] = []
         self.traveled_m: list[float] = []
-        self.start_m = self.slam.traveled_m
+        self.start_m = self.slam.trail.traveled_m
         self.is_in_map = False
         self.state = MapState.SEARCHING  # of the newest keyframe
         self.covariance = np.empty((0, 0))  # of its pose, but for its own error, once it is in the map
@@ -154,19 +155,19 @@ class Localizer:
         """Place one scan of a log."""
         step = self.slam.process(scan)
         if self.initial is not None and len(self.states) == 0:
-            self.slam.begin_at(self.initial, INITIAL_SIGMAS)
+            self.slam.placement.begin_at(self.initial, INITIAL_SIGMAS)
         placed = self._placed(step)
         T, covariance = placed.T_map_lidar, placed.covariance
         variances = [np.nan] if covariance is None else covariance.diagonal()[: self.slam.dimension].tolist()
         self.states.append(placed.state)
         self.live.append(np.full(step.T_odom_lidar.shape, np.nan) if T is None else T)
         self.sigma_m.append(math.sqrt(sum(variances)))
-        self.traveled_m.append(self.slam.traveled_m - self.start_m)
+        self.traveled_m.append(self.slam.trail.traveled_m - self.start_m)
         return placed
 
     def finish(self) -> Localization:
         """Match what is left and smooth the whole path; scans before the place was found are placed as well."""
-        result, first = self.slam.finish(), self.slam.first
+        result, first = self.slam.finish(), self.slam.trail.first
         scans = [keyframe.scan_index for keyframe in result.keyframes[first:]]
         keyframe_of = np.searchsorted(scans, np.arange(len(result.trajectory)), side="right") - 1
         is_placed = (result.components[first:] == result.components[0])[keyframe_of]
@@ -190,19 +191,19 @@ class Localizer:
     def _placed(self, step: Step) -> Placed:
         slam = self.slam
         if step.closures or step.graph is not None or step.starts_segment or not self.states:
-            self.is_in_map = slam.is_in_map
+            self.is_in_map = slam.placement.is_in_map
         if not self.is_in_map:
             self.covariance = np.empty((0, 0))
             return Placed(MapState.SEARCHING, None, None, step)
         if step.keyframe >= 0 or not len(self.covariance):
             self._follow()
-        T_map_lidar = slam.T_world_odom @ step.T_odom_lidar
+        T_map_lidar = slam.placement.T_world_odom @ step.T_odom_lidar
         covariance = _moved(self.covariance, slam.keyframes[-1], step.T_odom_lidar) + self.own
         return Placed(MapState.LOST if step.state is State.LOST else self.state, T_map_lidar, covariance, step)
 
     def _follow(self) -> None:
         """State and covariance of the newest keyframe: by its match with the map, or by the motion to it."""
-        slam, by_map, newest = self.slam, self.slam.by_map, self.slam.keyframes[-1]
+        slam, by_map, newest = self.slam, self.slam.placement.by_map, self.slam.keyframes[-1]
         of_newest = (slam.graph.edges[:, 1] == newest.index) & ~slam.graph.is_loop
         information = slam.graph.added_since(int(np.flatnonzero(of_newest)[-1]))[1][:1]
         motion, own = self._errors(information, newest.index, is_loop=False)
@@ -219,12 +220,12 @@ class Localizer:
             self.state = MapState.LOCALIZED
         else:
             placed = replace(newest, T_odom_lidar=slam.graph.poses[-1])
-            is_known = are_in_sight([placed], slam.keyframes[: slam.first])[0]
+            is_known = are_in_sight([placed], slam.keyframes[: slam.trail.first])[0]
             self.state = MapState.UNMATCHED if is_known else MapState.OUTSIDE
 
     def _errors(self, information: Matrix, keyframe: int, *, is_loop: bool) -> tuple[Matrix, Matrix]:
         """Covariances (k, k) of an edge to a keyframe, and of the pose of that by itself."""
-        errors = self.slam.map_errors[keyframe : keyframe + 1]
+        errors = self.slam.trail.map_errors[keyframe : keyframe + 1]
         edge, own = edge_errors(information, np.array([is_loop]), errors, self.slam.config)
         return edge[0], own[0]
 

@@ -238,7 +238,7 @@ def _measured(
 ) -> MergeMetrics:
     """The metrics of a map but for what joined it."""
     graph = graph_of(merged.joined, held)
-    state = graph.optimize(config.graph, initialize="given", rejection="refined").state
+    state = graph.optimize(config.graph, initialize="given").state
     certificate = graph.certify()
     edges = merged.joined.edges
     between = edges.where(merged.joined.is_between & (edges.weight >= REJECTED_WEIGHT))

@@ -13,33 +13,30 @@ from scanchain.graph.between import WASTE
 from scanchain.graph.edge_checks import is_connected
 from scanchain.graph.robust.consistency import Consistency
 from scanchain.graph.robust.groups import agreeing_groups
-from scanchain.graph.robust.inliers import InlierSet, fair_price
-from scanchain.graph.robust.losses import Graduation, RobustLoss, rejection_limit
+from scanchain.graph.robust.losses import Graduation, InlierSet, RobustLoss, fair_price, rejection_limit
 from scanchain.graph.solvers.minimizer import Evaluation, Limits, Minimizer, Minimum
 
-Graduated = Literal["gnc", "edges", "refined"]
-OutlierRejection = Literal[Graduated, "retained", "recent", "explained"]
+Rejection = Literal["update", "judge"]
 
 _MAX_ROUNDS = 50  # largest number of rounds of refining the inlier set
 _MAX_FAILED = 4  # largest number of groups tried in a row without success
 _FEWER, _FEWEST = 0.3, 1e-3  # share of the changes tried after a round that does not help: at first, at least
 
 
-def minimize(minimizer: Minimizer, poses: Matrix, loss: RobustLoss, rejection: Graduated) -> Minimum:
+def minimize(minimizer: Minimizer, poses: Matrix, loss: RobustLoss, *, groups: bool) -> Minimum:
     """Minimize from these poses; a kernel that is not convex is graduated first (Yang et al. 2020).
 
-    rejection : of truncated edges: as GNC leaves it, or refined by how much each edge contradicts the others, and
-        groups of edges that agree
+    Truncated edges are judged by how much each contradicts the others, with ``groups`` also by groups that agree.
     """
     now, used = minimizer.evaluate(poses, loss), 0
     graduation = loss.graduation(now.chi2[minimizer.loops])
     if graduation is not None and len(minimizer.loops):
         now, loss, used = _graduate(minimizer, now, graduation)
-    if rejection != "gnc" and loss.kernel == "truncated" and len(minimizer.loops):
-        minimum = _refine(minimizer, now, loss, rejection)
+    if loss.kernel == "truncated" and len(minimizer.loops):
+        minimum = _refine(minimizer, now, loss, groups=groups)
     else:
         minimum = minimizer.descend(now, loss)
-        if loss.kernel not in ("none", "truncated"):
+        if loss.kernel != "none":
             minimum = _settle_without_outliers(minimizer, minimum, loss)
     return replace(minimum, iterations=used + minimum.iterations)
 
@@ -105,7 +102,7 @@ class Focus:
         return self._chosen
 
 
-def _refine(minimizer: Minimizer, now: Evaluation, loss: RobustLoss, rejection: Graduated) -> Minimum:
+def _refine(minimizer: Minimizer, now: Evaluation, loss: RobustLoss, *, groups: bool) -> Minimum:
     """The minimum with the present inliers, and then with those that the other edges do not contradict."""
     kept, nominal = loss.weight(now.chi2[minimizer.loops]) > 0.5, loss.scale**2
     minimum = settle(minimizer, now, InlierSet(kept, nominal))
@@ -116,7 +113,7 @@ def _refine(minimizer: Minimizer, now: Evaluation, loss: RobustLoss, rejection: 
     price = fair_price(against[kept], nominal, problem.freedom)
     minimum = replace(minimum, estimate=minimizer.reweighed(minimum.estimate, InlierSet(kept, price)))
     minimum = _refine_edges(minimizer, minimum, against, price)
-    if rejection == "refined":
+    if groups:
         minimum = _refine_groups(minimizer, minimum, price, nominal)
     return replace(minimum, price=price)
 

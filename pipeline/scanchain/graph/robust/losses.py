@@ -1,4 +1,4 @@
-"""Robust losses of loop edges, functions of the whitened residual χ alone, and their graduation.
+"""Robust losses of loop edges, functions of the whitened residual χ alone, their graduation, and sets of inliers.
 
 A further one is a class and a line in ``LOSSES`` (``scanchain.config``), or a user's own, ``module:Class``.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,8 @@ _SHARP = 1e4  # control above which truncated least squares is as good as its li
 _FLAT, _LONG_FACTOR = 1e-2, 4.0  # control below which truncated least squares is all but convex; its step there
 _ONE, _SLOPE = 0.99, 1e-3  # least weight at χ² = 0, and largest error of the slope, of a class of the user's
 _FACTOR = 1.4  # step of the graduation (Yang et al. 2020, remark 5)
+_MARGIN = 6.0  # factor over the share of a pessimistic noise model: residuals have long tails
+_FEWEST = 10  # least number of inlier edges from which a noise model is estimated
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,3 +255,38 @@ def _check(loss: RobustLoss) -> None:
         raise InputError(f"{loss.kernel}: weight returned {weight.tolist()}; wanted (N,) in [0, 1], 1 at χ² = 0")
     if slope.shape != chi2.shape or not np.allclose(slope, weight, rtol=0.0, atol=_SLOPE):
         raise InputError(f"{loss.kernel}: the slope of loss over χ² is not weight; both belong to one function")
+
+
+@dataclass(frozen=True, slots=True)
+class InlierSet:
+    """Loop edges kept or not, as a loss: a kept edge costs its χ², another its price.
+
+    Attributes
+    ----------
+    kept : (L,) bool, of the loop edges
+    price : what leaving an edge out costs, in χ²
+    """
+
+    kept: NDArray[np.bool_]
+    price: float
+    kernel: Literal["truncated"] = "truncated"
+
+    def weight(self, chi2: NDArray[np.float64]) -> NDArray[np.float64]:
+        """1 or 0, whatever the residuals."""
+        return self.kept.astype(np.float64)
+
+    def loss(self, chi2: NDArray[np.float64]) -> NDArray[np.float64]:
+        """χ² or the price."""
+        return np.where(self.kept, chi2, self.price)
+
+
+def fair_price(against: NDArray[np.float64], nominal: float, degrees: int) -> float:
+    """The price, lowered where the contradictions of kept edges (L,) show that the noise model is pessimistic.
+
+    Information matrices that are far too small would let in any edge. The median of the contradictions, against
+    that of χ² with so many degrees of freedom, is the factor.
+    """
+    if len(against) < _FEWEST:
+        return nominal
+    expected = 2.0 * float(gammaincinv(0.5 * degrees, 0.5))
+    return nominal * min(1.0, _MARGIN * float(np.median(against)) / expected)

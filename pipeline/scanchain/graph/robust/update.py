@@ -12,8 +12,7 @@ from scanchain.graph.edge_checks import is_connected
 from scanchain.graph.robust.consistency import Consistency
 from scanchain.graph.robust.graduation import Focus, settle
 from scanchain.graph.robust.groups import agreeing_groups
-from scanchain.graph.robust.inliers import InlierSet
-from scanchain.graph.robust.losses import RobustLoss
+from scanchain.graph.robust.losses import InlierSet, RobustLoss
 from scanchain.graph.solvers.minimizer import Evaluation, Limits, Minimizer, Minimum
 
 # a few steps with one set of edges, until the poses have settled roughly; the next update goes on

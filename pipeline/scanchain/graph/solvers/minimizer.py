@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem, NormalEquations
-from scanchain.graph.robust.inliers import InlierSet
-from scanchain.graph.robust.losses import RobustLoss
+from scanchain.graph.robust.losses import InlierSet, RobustLoss
 from scanchain.graph.solvers.descent import LocalModel, Optimizer, Vector, descend, step_rule
 
 _STEP = 1e-6  # step, m or rad, of the central differences

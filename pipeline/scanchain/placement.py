@@ -1,0 +1,217 @@
+"""Where the segments of a log lie: joined to each other, and to a prior map if they were recorded in it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from scanchain import lie
+from scanchain.config import LoopsConfig
+from scanchain.data import Closure, ClosureVerdict, GraphState, Keyframe, Matrix, Pose, Problem
+from scanchain.graph.schedule import LAG, Schedule
+from scanchain.loops import ClosureTable, LoopCloser, PlaceTest
+
+LARGEST_SIGMAS = (300.0, 30.0)  # m and rad, of an edge: a pose that hangs on less information is lost to rounding
+
+
+class Placement:
+    """Takes closures into the graph, and with them finds where the newest segment of the log lies.
+
+    The first closure to an older segment moves it there. In a prior map, whose keyframes come first and are fixed,
+    closures wait until they are evidence enough, and those that later scans contradict are withdrawn.
+    """
+
+    def __init__(
+        self, config: LoopsConfig, closer: LoopCloser, schedule: Schedule, keyframes: Sequence[Keyframe]
+    ) -> None:
+        """Begin before the first scan; ``keyframes`` are those of the graph, which the caller adds to."""
+        self.config, self.closer, self.schedule, self.keyframes = config, closer, schedule, keyframes
+        self.graph = schedule.graph
+        self.closures = ClosureTable()
+        self.T_world_odom = lie.identity(self.graph.dimension)
+        self.first = 0  # number of the first keyframe of the log, after those of the map
+        self.evidence = PlaceTest(closer.segments, 0)
+        self.by_map: Closure | None = None  # with the map, of the newest keyframe that has one
+        self.joined_start = 0  # first keyframe of the last segment that a loop joined to older ones
+
+    def begin_in(self, count: int) -> None:
+        """Begin in a map: so many keyframes, the first ones, stay where they are."""
+        self.first = self.evidence.of_map = count
+
+    @property
+    def is_in_map(self) -> bool:
+        """True if closures in force join the newest keyframe to the map."""
+        components = self.closer.segments.components(self.graph)
+        return self.first > 0 and not self.evidence.is_gathering and bool(components[-1] == components[0])
+
+    def begin_at(self, T_world_lidar: Pose, sigmas: tuple[float, float]) -> None:
+        """Join the first scan of the log to the nearest keyframe of the map: it is at this pose, to m and rad."""
+        positions = self.graph.poses[: self.first, :-1, -1]
+        nearest = int(np.argmin(np.linalg.norm(positions - T_world_lidar[:-1, -1], axis=1)))
+        T_nearest_lidar = lie.between(self.graph.poses[nearest], T_world_lidar)
+        information = np.diag(lie.by_component(self.graph.freedom, *sigmas) ** -2.0)
+        self._move(self.first, T_world_lidar @ lie.inverse(self.graph.poses[self.first]))
+        self.graph.add_edge(nearest, self.first, T_nearest_lidar, information, is_loop=True)
+        self.evidence.give()
+        self.schedule.optimize()
+        self.follow_graph()
+
+    def close(self, *, is_keyframe: bool) -> tuple[Closure, ...]:
+        """Closures by what the scan completes, and of the newest keyframe if the scan is one."""
+        if self.evidence.is_in_vain:
+            self.give_up()
+        closures = self.take(self.closer.advance(self.keyframes, self.graph))
+        if is_keyframe:
+            closures += self.take(self.closer.close(self.keyframes, self.graph))
+        for closure in closures if self.first else ():
+            is_by_map = closure.verdict is ClosureVerdict.ACCEPTED and closure.target < self.first
+            if is_by_map and (self.by_map is None or closure.source >= self.by_map.source):
+                self.by_map = closure
+                T_world_source = self.keyframes[closure.target].T_odom_lidar @ closure.match.T_target_source
+                T_source_odom = lie.inverse(self.keyframes[closure.source].T_odom_lidar)
+                self.T_world_odom = lie.normalize(T_world_source @ T_source_odom)
+        return closures
+
+    def take(self, closures: tuple[Closure, ...]) -> tuple[Closure, ...]:
+        """Keep closures; those accepted become edges of the graph."""
+        if not closures:
+            return ()
+        closures = self._tested(closures) if self.first else closures
+        taken = tuple(
+            self._add(closure) if closure.verdict is ClosureVerdict.ACCEPTED else closure for closure in closures
+        )
+        self.closures.extend(taken)
+        return taken
+
+    def optimize(self, *, is_live: bool) -> GraphState | None:
+        """Optimize the graph if it is time; the graph as it is then, where more than its end moved."""
+        if self.evidence.is_gathering:
+            return None
+        moved = len(self.graph) - self.schedule.advance(is_live=is_live)
+        if moved:
+            self.follow_graph()
+        return self.graph.state() if moved > LAG or moved == len(self.graph) else None
+
+    def predict(self, T_odom_last: Pose, T_odom_next: Pose) -> Pose:
+        """T_world of the next keyframe by the last one, its odometry corrected by the drift that loops show."""
+        if self.graph.drift.any():
+            T_last_next = self.graph.predicted(lie.between(T_odom_last, T_odom_next))
+            self.T_world_odom = lie.normalize(self.graph.poses[-1] @ T_last_next @ lie.inverse(T_odom_next))
+        return self.T_world_odom @ T_odom_next
+
+    def start_segment(self, keyframe: int) -> None:
+        """Start a segment: the motion to this keyframe, the newest, is not known."""
+        self.give_up()
+        self.closer.start_segment(keyframe)
+
+    def finish(self) -> None:
+        """Take the last closures; what is being tested then has too little evidence."""
+        self.take(self.closer.finish(self.keyframes, self.graph))
+        self.give_up()
+
+    def give_up(self) -> None:
+        """The pose in the map that is being tested, if any, is wrong: search the newest segment again."""
+        if self.evidence.is_gathering:
+            self.evidence.drop(self.closer.segments.starts[-1])
+            self.closer.search_again()
+
+    def set_apart(self) -> None:
+        """Take segments of the log for apart from the map that too little joins to it in the end."""
+        segments, graph = self.closer.segments, self.graph
+        chosen = graph.is_loop & ~graph.is_rejected & (graph.edges[:, 0] < self.first)
+        in_force = graph.edges[chosen & (graph.edges[:, 1] >= self.first), 1]
+        for number, start in enumerate(segments.starts[1:], 1):
+            end = segments.span(start, len(graph))[1]
+            if not ((in_force >= start) & (in_force < end)).any():
+                continue
+            placed = [replace(self.keyframes[k], T_odom_lidar=graph.poses[k]) for k in range(start, end)]
+            if not self.evidence.holds(placed, self.keyframes):
+                segments.apart.add(number)
+
+    def follow_graph(self) -> None:
+        """Put the odometry frame where the graph has the newest keyframe."""
+        T_lidar_odom = lie.inverse(self.keyframes[-1].T_odom_lidar)
+        self.T_world_odom = lie.normalize(self.graph.poses[-1] @ T_lidar_odom)
+
+    def _tested(self, closures: tuple[Closure, ...]) -> tuple[Closure, ...]:
+        """Closures; those that would join the newest segment to the map are rejected until they are enough."""
+        start = self.closer.segments.starts[-1]
+        with_map = [each for each in closures if each.target < self.first and each.source >= start]
+        self.evidence.note(with_map)
+        if self.is_in_map:
+            return closures if self.evidence.follow(with_map, self.keyframes) else self._withdrawn(closures)
+        others = [each for each in closures if each.target >= self.first or each.source < start]
+        was_gathering = self.evidence.is_gathering
+        joining = self.evidence.collect(with_map, self.keyframes)
+        if self.evidence.is_gathering and not was_gathering:
+            self._move_to(self.evidence.waiting[0])
+            self.follow_graph()
+        too_few = Problem.plain("too few keyframes agree on the place in the map")
+        alone = [each.rejected(too_few) if each.verdict is ClosureVerdict.ACCEPTED else each for each in with_map]
+        return (*others, *(joining or alone))
+
+    def _withdrawn(self, closures: tuple[Closure, ...]) -> tuple[Closure, ...]:
+        """The newest segment is not where it was joined to the map: take back all that joins it; search again."""
+        start = self.closer.segments.starts[-1]
+        problem = Problem.plain("withdrawn: what was seen since contradicts the place in the map")
+
+        def is_wrong(closure: Closure) -> bool:
+            is_accepted = closure.verdict is ClosureVerdict.ACCEPTED
+            return is_accepted and closure.target < self.first and closure.source >= start
+
+        edges = self.graph.edges
+        self.graph.remove_loops(self.graph.is_loop & (edges[:, 0] < self.first) & (edges[:, 1] >= start))
+        self.closures.reject(is_wrong, problem)
+        self.evidence.drop(start)
+        self.closer.search_again()
+        self.schedule.stop()
+        self.by_map, self.joined_start = None, 0
+        return tuple(each.rejected(problem) if is_wrong(each) else each for each in closures)
+
+    def _add(self, closure: Closure) -> Closure:
+        """Make an edge of a closure; returns the closure with its innovation in the graph before."""
+        information = loop_information(closure, self.config)
+        Z_ij, start = closure.match.T_target_source, self.closer.segments.starts[-1]
+        expected = lie.between(self.graph.poses[closure.target], self.graph.poses[closure.source])
+        error = lie.log(lie.between(Z_ij, expected))
+        chi2_before = float(error @ information @ error)
+        joins = self.joined_start < start and closure.target < start <= closure.source
+        self.schedule.note(closure.source, lie.apart(expected, Z_ij)[0], chi2_before, joins=joins)
+        self.graph.add_edge(closure.target, closure.source, Z_ij, information, is_loop=True)
+        if joins:
+            self.joined_start = start
+            self._move_to(closure)
+        return replace(closure, chi2_before=chi2_before)
+
+    def _move_to(self, closure: Closure) -> None:
+        """Put the newest segment where its first closure says: from far off, robust losses reject all of them."""
+        self.schedule.stop()  # it would put the segment back
+        T_world_source = self.graph.poses[closure.target] @ closure.match.T_target_source
+        start, T_old = self.closer.segments.starts[-1], self.graph.poses[closure.source]
+        self._move(start, T_world_source @ lie.inverse(T_old))
+
+    def _move(self, start: int, T_new_old: Pose) -> None:
+        self.graph.move(start, lie.normalize(T_new_old))
+        if start == self.first:
+            self.graph.remeasure(0)  # the edge that the log hangs on: where it began in the map was not known
+
+
+def loop_information(closure: Closure, config: LoopsConfig) -> Matrix:
+    """Information (k, k) of the pose-graph edge of a closure."""
+    return edge_information(closure.match.information, config.edge_sigma_m, config.edge_sigma_rad)
+
+
+def edge_information(information: Matrix, sigma_m: float, sigma_rad: float) -> Matrix:
+    """Information (k, k) of a pose-graph edge: that of the motion (k, k), with a floor under its variances.
+
+    Residuals share the map's errors and are far from independent, so that H alone is overconfident.
+    """
+    k = len(information)
+    largest = lie.by_component(k, *LARGEST_SIGMAS) ** 2
+    floor = np.minimum(lie.by_component(k, sigma_m, sigma_rad) ** 2, largest)
+    least = np.maximum(1e-6 / floor, 1.0 / largest)
+    covariance = np.linalg.inv(information + np.diag(least)) + np.diag(floor)
+    result = np.linalg.inv(covariance)
+    return 0.5 * (result + result.T)
