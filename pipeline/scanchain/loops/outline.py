@@ -17,7 +17,7 @@ from scanchain.data import Keyframe, Matrix, Pose
 from scanchain.errors import InputError
 from scanchain.loops.descriptor import level_frame, upright_frame
 from scanchain.maps.saved_map import read_arrays
-from scanchain.registration import upright_columns
+from scanchain.registration.search import upright_columns
 from scanchain.whole_file import write_whole
 
 PLACES_FILE = "places.npz"
@@ -53,19 +53,19 @@ def outline_of(folder: Path, keyframes: Sequence[Keyframe], config: LocalMapConf
         return stored
     size_m = config.voxel_size_m * float(np.median([keyframe.scale for keyframe in keyframes]))
     T_map_level = level_of(keyframes, [keyframe.T_odom_lidar for keyframe in keyframes], config)
-    outline = Outline(T_map_level, _columns(keyframes, lie.inverse(T_map_level), size_m), size_m)
+    columns = _columns(keyframes, lie.inverse(T_map_level), size_m).astype(np.float32)  # as it is stored
     data = io.BytesIO()
     np.savez(
         data,
         version=VERSION,
         keyframes=len(keyframes),
-        T_map_level=outline.T_map_level,
-        columns=outline.columns.astype(np.float32),
+        T_map_level=T_map_level,
+        columns=columns,
         size_m=size_m,
     )
     with suppress(OSError):  # a map that cannot be written to is searched all the same
         write_whole(path, data.getvalue())
-    return outline
+    return Outline(T_map_level, columns.astype(np.float64), size_m)
 
 
 def _stored(path: Path, count: int) -> Outline | None:

@@ -8,34 +8,22 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import MapsConfig
 from scanchain.data import Keyframe, Matrix, Points, Pose
-from scanchain.kernels.search.branch_and_bound import fill_pyramid
-from scanchain.kernels.search.whole_map import (
-    SURFACE,
-    best_poses,
-    climb,
-    find_room,
-    interleave,
-    score_cells,
-    score_windows,
-    turned,
-)
+from scanchain.kernels.search.branch_and_bound import FREE, NEAR, UNKNOWN
 from scanchain.maps.occupancy_grid import OccupancyGrid, fitting_resolution
 from scanchain.preprocess import downsample
+from scanchain.registration import SearchGrid, Wanted
+from scanchain.registration.search import Search, draw_surfaces
 
-_TOP = 2  # levels of the pyramid above the grid itself; windows start with 2² cells: larger ones rule out nothing
-_ADDITIONS = 400_000_000  # of scores in one slice of a search, 20 to 40 ms
 _MAX_CELLS = 16_000_000  # of the grid: a hundred megabytes with its pyramid; larger maps get larger cells
 _CERTAIN = 0.6  # log-odds of occupancy, from which on a cell is a surface, and below minus which it is free
 _POINTS, _MORE_POINTS = 120, 800  # number of points that poses are searched with and compared with
 _APART_M, _APART_RAD = 1.0, 0.2  # least distance of two distinct poses
 _ANSWERS = 12  # largest number of poses that are compared
 _RIVAL = 0.75  # share of the best score, from which on other poses are compared with it
-_MIN_RANGE_M = 1.0  # least median range that sets the step of the headings
 LEAST_SHARE = 0.35  # of the highest score: wrong poses of long paths come up to it
 _CHANCE = 2.0  # what a search over all poses finds by chance: that much over the root of the number of points more
 _AMBIGUOUS = 0.8  # share of the best score, from which on a pose elsewhere makes it ambiguous
@@ -82,15 +70,11 @@ class PlanarMapSearch:
         grid = OccupancyGrid(config, max_range_m=math.inf)
         grid.insert_batch(T_map_lidar, np.vstack(clouds), np.append(0, np.cumsum([len(each) for each in clouds])))
         grid = grid.trimmed()
-        before, after = 2**_TOP, 2  # windows begin before the first cell; the border is unknown
-        log_odds = np.pad(grid.log_odds, (before, after))
-        self.origin_m = grid.origin_m - before * self.resolution_m
-        self.pyramid = np.zeros((_TOP + 1, *log_odds.shape), np.int8)
-        score_cells(log_odds, _CERTAIN, self.pyramid[0])
-        fill_pyramid(self.pyramid)
-        self.blocks = interleave(self.pyramid[_TOP], _TOP)
-        self.spans = np.empty((self.blocks.shape[2], 2), np.int64)
-        self.has_room = find_room(self.pyramid[0], _TOP, self.spans)
+        log_odds = np.pad(grid.log_odds, 1)
+        cells = np.where(log_odds < -_CERTAIN, FREE, UNKNOWN).astype(np.int8)
+        draw_surfaces(cells, *np.nonzero(log_odds > _CERTAIN))
+        room = (cells == FREE) | (cells == NEAR)
+        self.grid = SearchGrid(cells, grid.origin_m - self.resolution_m, self.resolution_m, room)
 
     def best(self, points: Points, least: float) -> Hypothesis | None:
         """The pose that the points (N, 2), lidar frame, fit best; None where none has the least share."""
@@ -106,66 +90,40 @@ class PlanarMapSearch:
         best = self.best(points, LEAST_SHARE)
         return best if best is not None and best.is_likely else None
 
-    def climbed(self, points: Points, pose: NDArray[np.float64], step_rad: float) -> float:
-        """Share of the points at a pose (3,), which moves to the best one near by."""
-        score = climb(self.pyramid[0], points, self.origin_m, self.resolution_m, pose, step_rad)
-        return float(score) / SURFACE
-
 
 class WholeSearch:
-    """Search of a whole map for points, in slices of equal work, so that no scan of a live stream waits long."""
+    """Search of a whole map for points, in slices of equal work; what it finds is compared with more points."""
 
     def __init__(self, target: PlanarMapSearch, points: Points, least: float) -> None:
         """Begin to search for points (N, 2), lidar frame; least : share of the highest score that counts."""
         points = np.random.default_rng(0).permutation(downsample(points, target.resolution_m))
-        self.target = target
         self.count = len(points)
         self.points = points[:_MORE_POINTS].copy()
-        few = points[:_POINTS].copy()
-        range_m = max(float(np.median(np.hypot(few[:, 0], few[:, 1]))), _MIN_RANGE_M) if len(few) else 0.0
-        self.cells = turned(few, target.resolution_m, math.ceil(2.0 * math.pi * range_m / target.resolution_m))
-        self.least = least * SURFACE * len(few)
-        additions = max(int(np.maximum(np.diff(target.spans), 0).sum()) * len(few), 1)
-        self.headings = max(_ADDITIONS // additions, 1)
-        self.turn = 0
-        self.windows: list[NDArray[np.int64]] = []
+        self.search = Search(points[:_POINTS], target.grid, None, Wanted(_APART_M, _RIVAL, _ANSWERS, least))
 
     @property
     def is_done(self) -> bool:
-        """True once all headings were searched."""
-        return self.turn >= len(self.cells)
+        """True once all poses were searched."""
+        return self.search.is_done
 
     def advance(self) -> None:
-        """Search the next headings."""
-        target, cells = self.target, self.cells[self.turn : self.turn + self.headings]
-        self.windows.append(
-            score_windows(target.blocks, _TOP, target.has_room, target.spans, cells, self.turn, self.least)
-        )
-        self.turn += len(cells)
+        """Search on."""
+        self.search.advance()
 
     def best(self) -> Hypothesis | None:
         """The pose that the points fit best; None where none has the least share."""
-        target, turns = self.target, len(self.cells)
-        if not self.count:
+        step_rad = 0.5 * self.search.turn_rad
+        found = [
+            self.search.grid.climbed(self.points, each.T_target_source, step_rad) for each in self.search.poses()
+        ]
+        if not found:
             return None
-        found = best_poses(
-            target.pyramid, self.cells, np.vstack(self.windows), target.resolution_m, self.least, _RIVAL, _APART_M,
-            _ANSWERS,
-        )  # fmt: skip
-        if not len(found):
-            return None
-        poses = np.empty((len(found), 3))
-        poses[:, :2] = target.origin_m + (found[:, :2] + 0.5) * target.resolution_m
-        poses[:, 2] = 2.0 * math.pi / turns * found[:, 2]
-        shares = np.array([target.climbed(self.points, pose, math.pi / turns) for pose in poses])
-        best = int(np.argmax(shares))
-        rival = float(shares[_is_apart(poses, poses[best])].max(initial=0.0))
-        x_m, y_m, yaw_rad = poses[best].tolist()
-        return Hypothesis(lie.pose_2d(x_m, y_m, yaw_rad), float(shares[best]), rival, self.count)
+        best = max(found, key=lambda each: each.share)
+        apart = (each.share for each in found if _are_apart(each.T_target_source, best.T_target_source))
+        return Hypothesis(best.T_target_source, best.share, max(apart, default=0.0), self.count)
 
 
-def _is_apart(poses: NDArray[np.float64], pose: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """True for poses (A, 3) that are not the given one."""
-    away_m = np.abs(poses[:, :2] - pose[:2]).max(axis=1)
-    away_rad = np.abs(np.angle(np.exp(1j * (poses[:, 2] - pose[2]))))
-    return (away_m >= _APART_M) | (away_rad >= _APART_RAD)
+def _are_apart(T: Pose, T_other: Pose) -> bool:
+    """True for two poses that are not the same."""
+    away_m = np.abs(T[:2, 2] - T_other[:2, 2]).max()
+    return bool(away_m >= _APART_M or lie.apart(T, T_other)[1] >= _APART_RAD)

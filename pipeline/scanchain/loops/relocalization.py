@@ -15,7 +15,8 @@ from scanchain.loops.connectivity import Segments
 from scanchain.loops.planar_map_search import LEAST_SHARE, PlanarMapSearch, WholeSearch
 from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.loops.verification import ScanVerifier
-from scanchain.registration import CorrelativeMap, Seed, VoxelMap
+from scanchain.registration import SearchGrid, Wanted, Window, find, thinned
+from scanchain.registration.search import Found
 
 _BASIN_M = 0.5  # largest uncertainty that matching corrects without a search
 _INTERVAL = 0.2  # share of the uncertainty that is traveled between two searches: wide windows cost most
@@ -23,7 +24,7 @@ _RADIANS_A_METER = 0.2  # half width of the window in heading for each meter of 
 _MIN_RAD = 0.1  # least half width of the window in heading
 _SPACING_M = 4.0  # least distance between the anchors of submaps that are searched
 _MAX_SUBMAPS = 6  # largest number of submaps searched near the expected pose
-_MIN_SHARE = 0.55  # least share of the highest possible score at which something was found near it
+_WANTED = Wanted(apart_m=1.0, rival=0.8, answers=2, least=0.55)  # near it, in each submap
 _SAME_POSE_M = 2.0  # distance within which the results of two submaps are the same pose
 _AMBIGUOUS = 0.9  # share of the best score, from which on a result elsewhere makes it ambiguous
 
@@ -41,7 +42,7 @@ _NEAR_M = 8.0  # largest distance of such a submap's anchor
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class Nearby:
     """The anchor of the submap that the newest keyframe fits best, and its pose there, to within a voxel."""
 
     anchor: int
@@ -65,7 +66,7 @@ class PlanarSearch:
         T_world: Matrix,
         near: NDArray[np.int64],
         uncertainty_m: NDArray[np.float64],
-    ) -> Found | None:
+    ) -> Nearby | None:
         """The best fit of the newest keyframe; None where there is none, an ambiguous one, or none is needed.
 
         near : older keyframes within reach; uncertainty_m : of the position of each of the older keyframes
@@ -77,17 +78,13 @@ class PlanarSearch:
         anchors = self._anchors(near, T_world)
         points = self._points(keyframes, self.submaps.half_width)
         T_first = lie.between(T_world[anchors], T_world[-1])
-        seeds = [
-            _seed(
-                points,
-                self.submaps.around(anchor, keyframes, len(uncertainty_m) - 1),
-                T,
-                radius_m,
-                _MIN_RAD + _RADIANS_A_METER * radius_m,
-            )
-            for anchor, T, radius_m in zip(anchors, T_first, uncertainty_m[anchors].tolist(), strict=True)
-        ]
-        return _best(anchors, seeds, T_world)
+        found: list[tuple[Found, int]] = []
+        for anchor, T, radius_m in zip(anchors, T_first, uncertainty_m[anchors].tolist(), strict=True):
+            grid = SearchGrid.of_voxels(self.submaps.around(anchor, keyframes, len(uncertainty_m) - 1), T)
+            window = Window(T, radius_m, _MIN_RAD + _RADIANS_A_METER * radius_m)
+            some = find(thinned(points, grid.resolution_m), grid, window, _WANTED)
+            found += [(each, anchor) for each in some]
+        return _best(found, T_world)
 
     def _anchors(self, near: NDArray[np.int64], T_world: Matrix) -> list[int]:
         """Anchors among the keyframes within reach, the nearest to the newest first, none close to another."""
@@ -278,22 +275,21 @@ class Find:
         return self.T_world_source @ lie.between(odom, keyframes[keyframe].T_odom_lidar)
 
 
-def _seed(points: Points, submap: VoxelMap, T_first: Pose, half_width_m: float, half_width_rad: float) -> Seed:
-    return CorrelativeMap(submap, lie.identity(2)).best(
-        points, T_first, half_width_m=half_width_m, half_width_rad=half_width_rad, least=_MIN_SHARE
-    )
+def _best(found: Sequence[tuple[Found, int]], T_world: Matrix) -> Nearby | None:
+    """The best of the poses in submaps of anchors; None where there is none, or another one is as good.
 
-
-def _best(anchors: Sequence[int], seeds: Sequence[Seed], T_world: Matrix) -> Found | None:
-    """The best of all seeds; None where there is none, or another one elsewhere is as good."""
-    shares = np.array([seed.share for seed in seeds])
-    best = int(np.argmax(shares))
-    T_found = np.array([T_world[a] @ seed.T_target_source for a, seed in zip(anchors, seeds, strict=True)])
-    elsewhere = np.linalg.norm((T_found - T_found[best])[:, :2, 2], axis=1) > _SAME_POSE_M
-    rival = max(seeds[best].rival, float(shares[elsewhere].max(initial=0.0)))
-    if rival >= _AMBIGUOUS * shares[best]:
+    Two of the same submap are distinct.
+    """
+    if not found:
         return None
-    return Found(anchors[best], seeds[best].T_target_source)
+    best, anchor = max(found, key=lambda each: each[0].share)
+    position = (T_world[anchor] @ best.T_target_source)[:2, 2]
+    for each, other in found:
+        away_m = np.linalg.norm((T_world[other] @ each.T_target_source)[:2, 2] - position)
+        is_distinct = each is not best if other == anchor else away_m > _SAME_POSE_M
+        if is_distinct and each.share >= _AMBIGUOUS * best.share:
+            return None
+    return Nearby(anchor, best.T_target_source)
 
 
 def _path_begin(keyframes: Sequence[Keyframe], start: int) -> int:

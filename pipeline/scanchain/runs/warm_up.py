@@ -23,8 +23,8 @@ from scanchain.kernels.registration.residuals import gradient_spread
 from scanchain.odometry import Located
 from scanchain.odometry.tracked import Tracked, first_match
 from scanchain.registration import VoxelMap
-from scanchain.registration.correlative import CorrelativeMap, Window
 from scanchain.registration.plicp import settings_of
+from scanchain.registration.search import SearchGrid, Wanted, Window, find
 from scanchain.settings import load_settings
 
 _SCANS = 3
@@ -43,8 +43,8 @@ def judge(dimension: int) -> None:
     problem, T = _problem(dimension)
     k = lie.twist_size(T)
     if dimension == 2:
-        grid = CorrelativeMap(VoxelMap(2, load_settings(2).config.local_map), T)
-        grid.search(np.ones((1, 2)), T, Window(0.0, 0.0, 1.0, 1.0, answers=1))
+        grid = SearchGrid.of_voxels(VoxelMap(2, load_settings(2).config.local_map), T)
+        find(np.ones((1, 2)), grid, Window(T, 0.0, 0.0), Wanted(1.0, 1.0, answers=1))
     correspondences = problem.correspondence, problem.weight
     gradient_spread.compile_inner(problem.voxels, problem.points, T, problem.origin, *correspondences, 1.0)
     agreement.compile_inner(np.eye(k), np.eye(k), 1.0)
