@@ -178,6 +178,7 @@ class Search:
             self.turn += len(cells)
             if self.turn == len(self.cells):
                 scored = np.vstack(self.scored)
+                scored = scored[-scored[:, 0] >= max(self.least, wanted.rival * self.reached[0])]
                 self.scored = [scored[np.argsort(scored[:, 0], kind="stable")]]
             return
         apart = wanted.apart_m / grid.resolution_m
