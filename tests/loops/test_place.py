@@ -18,7 +18,7 @@ from scanchain.loops.descriptor import compare, describe, level_frame
 from scanchain.loops.descriptor_recognizer import DescriptorDatabase
 from scanchain.loops.outline import PLACES_FILE
 from scanchain.loops.submaps import VoxelSubmaps, submap_around
-from scanchain.loops.verification import SubmapVerifier, free_space_agreement
+from scanchain.loops.verification import Verifier, free_space_agreement
 from scanchain.registration import VoxelMap
 from scanchain.simulation import plan
 from scanchain.simulation.sensors import take_sweep
@@ -180,11 +180,11 @@ def test_submaps_of_one_place_agree_and_those_of_two_do_not():
     here, _ = place_in_the_middle()
     again, _ = place_in_the_middle(4.0, True)
     truth = lie.inverse(here.anchor.T_odom_lidar) @ again.anchor.T_odom_lidar
-    true = SubmapVerifier(configured(3)).verify(again, here, truth @ pose(1.0, -0.8, yaw=0.06))
+    true = Verifier(configured(3)).submap(again, here, truth @ pose(1.0, -0.8, yaw=0.06))
     error = lie.inverse(truth) @ true.match.T_target_source
     assert true.match.converged and true.overlap > 0.6 and true.agreement > 0.9
     assert np.linalg.norm(error[:3, 3]) < 0.1 and lie.rotation_angle(error) < 0.005
-    false = SubmapVerifier(configured(3)).verify(again, here, truth @ pose(0.0, 9.0))
+    false = Verifier(configured(3)).submap(again, here, truth @ pose(0.0, 9.0))
     assert false.agreement < 0.87
 
 

@@ -19,7 +19,7 @@ from scanchain.loops.map_search import MapSearch
 from scanchain.loops.place_closer import PlaceCloser
 from scanchain.loops.relocalization import PlanarSearch, Relocalizer
 from scanchain.loops.submaps import VoxelSubmaps
-from scanchain.loops.verification import ScanVerifier
+from scanchain.loops.verification import Verifier
 
 _KEPT_M = 10.0  # largest distance from the anchor of a map's submap, up to which it is matched on, at full scale
 _LARGE = 2000  # keyframes from which on those of one pass go before the nearest one
@@ -42,12 +42,12 @@ class LoopCloser:
         self.is_live = is_live
         self.segments = Segments()
         submaps = VoxelSubmaps(dimension, _SUBMAP_KEYFRAMES, config.local_map, self.segments)
-        verifier = ScanVerifier(config, submaps)
+        verifier = Verifier(config)
         search = PlanarSearch(submaps) if dimension == 2 else None
         self.near = ProximityCloser(config.loops, submaps, verifier, search)
         self.map_search: MapSearch | None = None
         self.relocalizer = None if search is None else Relocalizer(submaps, verifier, self.segments)
-        self.places = PlaceCloser(config, dimension, self.segments, verifier)
+        self.places = PlaceCloser(config, dimension, submaps, verifier)
 
     def begin_in(
         self, keyframes: Sequence[Keyframe], folder: Path | None = None, *, is_final: bool = True
@@ -123,7 +123,7 @@ class ProximityCloser:
     """Aligns each new keyframe to the nearest older one; in the plane, searches within the drift if that fails."""
 
     def __init__(
-        self, config: LoopsConfig, submaps: VoxelSubmaps, verifier: ScanVerifier, search: PlanarSearch | None
+        self, config: LoopsConfig, submaps: VoxelSubmaps, verifier: Verifier, search: PlanarSearch | None
     ) -> None:
         self.config = config
         self.submaps = submaps
@@ -159,9 +159,8 @@ class ProximityCloser:
                 target = kept
             self.target_in_map = target
         T_first = lie.between(T_world[target], T_world[-1])
-        verified = self.verifier.verify(
-            keyframes, newest, target, T_first, newest=old - 1, in_map=target < self.of_map
-        )
+        submap = self.submaps.around(target, keyframes, old - 1)
+        verified = self.verifier.scan(keyframes[newest], submap, T_first, in_map=target < self.of_map)
         closure = verified.closure(target, newest)
         self.target = target if closure.verdict is ClosureVerdict.ACCEPTED else -1
         if closure.verdict is ClosureVerdict.ACCEPTED or self.search is None:
@@ -173,7 +172,8 @@ class ProximityCloser:
         found = self.search.find(keyframes, T_world, near, uncertainty_m)
         if found is None:
             return (closure,)
-        searched = self.verifier.verify(keyframes, newest, found.anchor, found.T_anchor_source, newest=old - 1)
+        submap = self.submaps.around(found.anchor, keyframes, old - 1)
+        searched = self.verifier.scan(keyframes[newest], submap, found.T_anchor_source)
         return closure, searched.closure(found.anchor, newest, Proposal.PLACE)
 
     def _near(

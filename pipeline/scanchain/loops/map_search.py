@@ -18,7 +18,7 @@ from scanchain.loops.descriptor import level_frame, upright_frame
 from scanchain.loops.evidence import pose_in_map
 from scanchain.loops.outline import outline_of
 from scanchain.loops.submaps import Submap
-from scanchain.loops.verification import SubmapVerifier
+from scanchain.loops.verification import Verifier
 from scanchain.registration import SearchGrid, Wanted, Window, find
 from scanchain.registration.search import Found, Search, evenly, upright_columns
 
@@ -59,7 +59,7 @@ class MapSearch:
         """Take the keyframes of a map; the outline is kept in its folder."""
         self.config = config
         self.segments = segments
-        self.verifier = SubmapVerifier(config, min_agreement=_MIN_AGREEMENT)
+        self.verifier = Verifier(config)
         self.of_map = len(keyframes)
         self.radius_m = config.loops.place_radius_m * float(np.median([each.scale for each in keyframes]))
         outline = outline_of(folder, keyframes, config.local_map)
@@ -188,7 +188,9 @@ class MapSearch:
                     T_newest_level
                 )
                 T_first = lie.inverse(self.T_level_keyframes[target]) @ T_level_source
-                verified = self.verifier.verify(source, self._submap(target, keyframes), T_first)
+                verified = self.verifier.submap(
+                    source, self._submap(target, keyframes), T_first, min_agreement=_MIN_AGREEMENT
+                )
                 tried.append(verified.closure(target, newest.index, Proposal.PLACE))
         accepted = [each for each in tried if each.verdict is ClosureVerdict.ACCEPTED]
         if not accepted:

@@ -12,10 +12,9 @@ from scanchain.config import Config
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Pose, Problem, Proposal
 from scanchain.errors import InputError, shown
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.loops.connectivity import Segments
 from scanchain.loops.recognizer import Candidate, Query, Recognizer, create_recognizer
-from scanchain.loops.submaps import RADII_AHEAD, RADII_BEHIND, Submap, submap_around
-from scanchain.loops.verification import ScanVerifier, SubmapVerifier, Verification
+from scanchain.loops.submaps import RADII_AHEAD, RADII_BEHIND, Submap, VoxelSubmaps, submap_around
+from scanchain.loops.verification import Verification, Verifier
 
 _PLACE_DRIFT = 0.1  # largest distance from the prediction as a share of the path between
 _PLACE_SIGMAS = 3.0  # the same in standard deviations of the prediction by the graph, where these allow more
@@ -28,13 +27,13 @@ class PlaceCloser:
     A submap is complete once the lidar has gone on by its radius.
     """
 
-    def __init__(self, config: Config, dimension: int, segments: Segments, verifier: ScanVerifier) -> None:
-        """Verifier : of candidates in the plane; in 3D submaps are aligned."""
+    def __init__(self, config: Config, dimension: int, submaps: VoxelSubmaps, verifier: Verifier) -> None:
+        """Submaps : that scans are aligned to in the plane; in 3D two submaps are aligned."""
         self.config = config
         self.dimension = dimension
-        self.segments = segments
-        self.scan_verifier = verifier
-        self.submap_verifier = SubmapVerifier(config)
+        self.submaps = submaps
+        self.segments = submaps.segments
+        self.verifier = verifier
         self.recognizer = create_recognizer(config, dimension)
         self.added: list[int] = []
         self.examined = 0
@@ -174,12 +173,10 @@ class PlaceCloser:
     def _verify(self, source: Submap, candidate: Candidate, keyframes: Sequence[Keyframe]) -> Verification:
         T_first = candidate.T_target_source
         if self.dimension == 2:
-            newest, index = len(keyframes) - 1, source.anchor.index
-            return self.scan_verifier.verify(
-                keyframes, index, candidate.target, T_first, newest=newest, alone=True
-            )
+            voxels = self.submaps.around(candidate.target, keyframes, len(keyframes) - 1)
+            return self.verifier.scan(source.anchor, voxels, T_first, alone=True)
         target = submap_around(keyframes, candidate.target, source.radius_m, self.segments)
-        return self.submap_verifier.verify(source, target, T_first)
+        return self.verifier.submap(source, target, T_first)
 
     def _problem(
         self, candidate: Candidate, verified: Verification, query: Query, graph: PoseGraph | None

@@ -14,7 +14,7 @@ from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
 from scanchain.loops.planar_map_search import LEAST_SHARE, PlanarMapSearch, WholeSearch
 from scanchain.loops.submaps import VoxelSubmaps
-from scanchain.loops.verification import ScanVerifier
+from scanchain.loops.verification import Verifier
 from scanchain.registration import SearchGrid, Wanted, Window, find, thinned
 from scanchain.registration.search import Found
 
@@ -113,7 +113,7 @@ class Relocalizer:
     one, and scans align there. A search in a large map goes on over several scans.
     """
 
-    def __init__(self, submaps: VoxelSubmaps, verifier: ScanVerifier, segments: Segments) -> None:
+    def __init__(self, submaps: VoxelSubmaps, verifier: Verifier, segments: Segments) -> None:
         self.submaps = submaps
         self.verifier = verifier
         self.segments = segments
@@ -235,7 +235,8 @@ class Relocalizer:
         best: Closure | None = None
         for anchor in near.tolist():
             T_first = lie.between(T_world[anchor], T_world_source)
-            verified = self.verifier.verify(keyframes, source, anchor, T_first, newest=len(keyframes) - 1)
+            submap = self.submaps.around(anchor, keyframes, len(keyframes) - 1)
+            verified = self.verifier.scan(keyframes[source], submap, T_first)
             off_m, off_rad = lie.apart(T_first, verified.match.T_target_source)
             is_off = off_m > _AGREE_M or off_rad > _AGREE_RAD
             far = Problem("far from where the path was found", f"{off_m:.1f} m from where the path was found")

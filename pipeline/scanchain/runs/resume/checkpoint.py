@@ -26,7 +26,7 @@ from scanchain.loops.evidence import PlaceTest
 from scanchain.loops.place_closer import PlaceCloser
 from scanchain.loops.relocalization import Find, PlanarSearch, Relocalizer
 from scanchain.loops.submaps import VoxelSubmaps
-from scanchain.loops.verification import ScanVerifier, SubmapVerifier
+from scanchain.loops.verification import Verifier
 from scanchain.odometry import FrontEnd, LiveStamps, Odometry
 from scanchain.odometry.elevation import ElevationCalibration
 from scanchain.odometry.front_end import Motion
@@ -77,7 +77,7 @@ _CLASSES = Classes(
         ErrorStatistics, Recovery, Standstill, AgreeingMatches, Tracked, ElevationCalibration, MapKeeper,
         Resolution, Sweep, VoxelMap,
         Voxels, PointToShapeMatcher, LoopCloser, ProximityCloser, PlaceCloser, Relocalizer, Find, PlanarSearch,
-        VoxelSubmaps, ScanVerifier, SubmapVerifier, Segments, Drift, PoseGraph, Explanation, Loosened,
+        VoxelSubmaps, Verifier, Segments, Drift, PoseGraph, Explanation, Loosened,
         GrowingArray, Since, data.KeyframeErrors, KeyframeErrorTracker,
         ClosureTable, PlaceTest, BackgroundOptimization, PointStore, StoredPoints,
         data.Scan, data.Keyframe, data.Closure, data.Match, data.ClosureVerdict, data.Proposal, data.Prior,
