@@ -125,23 +125,19 @@ class Search:
         size_m = grid.resolution_m
         ranges_m = np.hypot(points[:, 0], points[:, 1])
         range_m = max(float(np.median(ranges_m)) if len(points) else 0.0, _MIN_RANGE * size_m)
-        around = math.ceil(2.0 * math.pi * range_m / size_m)
         if region is None:
             self.room = grid.room
             self.begin = np.append(grid.origin_m + 0.5 * size_m, 0.0)
+            turns = math.ceil(2.0 * math.pi * range_m / size_m)
+            self.turn_rad = 2.0 * math.pi / turns
         else:
             shifts = math.ceil(region.half_width_m / size_m)
             self.room = np.ones((2 * shifts + 1, 2 * shifts + 1), np.bool_)
-            self.begin = np.append(
-                region.T_target_source[:2, 2] - shifts * size_m, lie.yaw(region.T_target_source)
-            )
-        if region is None or region.half_width_rad >= math.pi:
-            self.turn_rad, turns = 2.0 * math.pi / around, around
-        else:
             self.turn_rad = size_m / range_m
-            half = math.ceil(region.half_width_rad / self.turn_rad)
-            self.begin[2] -= half * self.turn_rad
+            half = math.ceil(min(region.half_width_rad, math.pi) / self.turn_rad)
             turns = 2 * half + 1
+            T = region.T_target_source
+            self.begin = np.append(T[:2, 2] - shifts * size_m, lie.yaw(T) - half * self.turn_rad)
         self.grid, self.wanted = grid, wanted
         mixed = np.random.default_rng(0).permutation(points)  # so that poor poses are given up after a few points
         self.cells = self._turned(mixed, turns)
