@@ -11,13 +11,11 @@ from scanchain import lie
 from scanchain.data import ClosureVerdict, Keyframe, Proposal
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.kernels.raycast.free_space import FAR, compare_ranges, nearest_ranges
-from scanchain.kernels.search.descriptor import count_heights, mark_heights
 from scanchain.loops import LoopCloser, outline_of
 from scanchain.loops.connectivity import Segments
-from scanchain.loops.descriptor import compare, describe, level_frame
-from scanchain.loops.descriptor_recognizer import DescriptorDatabase
-from scanchain.loops.outline import PLACES_FILE
-from scanchain.loops.submaps import VoxelSubmaps, submap_around
+from scanchain.loops.descriptor import SIZE, DescriptorDatabase, compare, describe, heights_of
+from scanchain.loops.map_search import PLACES_FILE
+from scanchain.loops.submaps import VoxelSubmaps, level_frame, submap_around
 from scanchain.loops.verification import Verifier, free_space_agreement
 from scanchain.registration import VoxelMap
 from scanchain.simulation import plan
@@ -87,14 +85,11 @@ def place_in_the_middle(offset_m=0.0, backwards=False):
 @pytest.mark.parametrize("seed", range(3))
 def test_the_view_from_above_equals_the_naive_one(seed):
     rng = np.random.default_rng(seed)
-    points = rng.normal(0.0, 6.0, (3000, 3)) * [1.0, 1.0, 3.0]
-    T = pose(1.0, -2.0, 0.5, yaw=0.7, pitch=0.1)
-    masks, counts = np.zeros((32, 32), np.uint64), np.empty((32, 32), np.uint8)
-    mark_heights(points, T, 0.5, masks)
-    count_heights(masks, counts)
-    expected = naive_loops.heights(points, T, 0.5, 32)
+    points = rng.normal(0.0, 24.0, (20_000, 3)) * [1.0, 1.0, 2.0]
+    points[:10_000, :2] *= 0.2
+    expected = naive_loops.heights(points, np.eye(4), 0.5, SIZE)
     assert expected.max() > 5
-    np.testing.assert_array_equal(counts, expected)
+    np.testing.assert_array_equal(heights_of(points, 0.5), expected)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -263,7 +258,7 @@ def test_a_street_driven_the_other_way_is_recognized_wherever_odometry_has_it(lo
 
 @pytest.mark.parametrize(("sigma_rad", "are_refused"), [(0.002, True), (0.2, False)])
 def test_a_place_is_refused_that_odometry_cannot_have_missed_by_so_much(monkeypatch, sigma_rad, are_refused):
-    monkeypatch.setattr("scanchain.loops.place_closer._PLACE_DRIFT", 0.001)
+    monkeypatch.setattr("scanchain.loops.recognizer._PLACE_DRIFT", 0.001)
     keyframes, _ = there_and_back(8.0)
     closures = LoopCloser(configured(3), 3).places.close(
         keyframes, graph_of(keyframes, sigma_rad), np.ones(len(keyframes), bool), finish=True

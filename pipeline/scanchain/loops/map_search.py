@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Generator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.config import Config
+from scanchain.config import Config, LocalMapConfig
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Points, Pose, Problem, Proposal
+from scanchain.errors import InputError
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
-from scanchain.loops.descriptor import level_frame, upright_frame
 from scanchain.loops.evidence import pose_in_map
-from scanchain.loops.outline import outline_of
-from scanchain.loops.submaps import Submap
+from scanchain.loops.submaps import Submap, level_frame, upright_frame
 from scanchain.loops.verification import Verifier
+from scanchain.maps.saved_map import read_arrays
 from scanchain.registration import SearchGrid, Wanted, Window, find
 from scanchain.registration.search import Found, Search, evenly, upright_columns
+from scanchain.whole_file import write_whole
 
 _MEMBERS = 10  # number of the newest keyframes that are sought together
 _RADIUS = 1.5  # radii of a submap, up to which structure around the lidar is sought
@@ -45,7 +49,27 @@ _AGREE_M, _AGREE_RAD = 1.0, 0.05  # largest difference between the poses that tw
 _MATCH_M = 3.5  # path between two matches with the map, at full scale
 _TRACKED_M = 20.0  # path since the last match with the map, up to which it is not searched
 _DRIFT = 0.1  # largest distance from the prediction, as a share of the path since the last match
+PLACES_FILE = "places.npz"
+VERSION = 1
+_TOGETHER = 10  # number of keyframes whose points are seen together; drift between more would raise the ground
+_MAX_LEVELED = 16  # number of keyframes, evenly spread, whose ground says where the map's vertical is
 _ALIKE = Problem.plain("another place of the map is as similar")
+
+
+@dataclass(frozen=True, slots=True)
+class Outline:
+    """Upright structure of a map.
+
+    Attributes
+    ----------
+    T_map_level : (4, 4) rotation to the frame whose z axis is normal to the ground, on average
+    columns : (M, 2) where it is upright, level frame
+    size_m : edge length of the cells that the map was seen in
+    """
+
+    T_map_level: Pose
+    columns: Matrix
+    size_m: float
 
 
 class MapSearch:
@@ -275,6 +299,66 @@ class MapSearch:
             return None
         limit = f"from the prediction, more than {100.0 * _DRIFT:g} % of the path between"
         return Problem(f"far {limit}", f"{moved_m:.1f} m {limit}")
+
+
+def outline_of(folder: Path, keyframes: Sequence[Keyframe], config: LocalMapConfig) -> Outline:
+    """The outline of a map in this folder, which holds it from the first time on where it can be written to.
+
+    keyframes : of the map; their ``T_odom_lidar`` is T_map_lidar
+    """
+    path = folder / PLACES_FILE
+    stored = _stored(path, len(keyframes))
+    if stored is not None:
+        return stored
+    size_m = config.voxel_size_m * float(np.median([keyframe.scale for keyframe in keyframes]))
+    T_map_level = level_of(keyframes, [keyframe.T_odom_lidar for keyframe in keyframes], config)
+    columns = _columns(keyframes, lie.inverse(T_map_level), size_m).astype(np.float32)  # as it is stored
+    data = io.BytesIO()
+    np.savez(
+        data,
+        version=VERSION,
+        keyframes=len(keyframes),
+        T_map_level=T_map_level,
+        columns=columns,
+        size_m=size_m,
+    )
+    with suppress(OSError):  # a map that cannot be written to is searched all the same
+        write_whole(path, data.getvalue())
+    return Outline(T_map_level, columns.astype(np.float64), size_m)
+
+
+def _stored(path: Path, count: int) -> Outline | None:
+    """The outline on disk; None where there is none of this version and number of keyframes."""
+    try:
+        file = read_arrays(path)
+        if (int(file["version"]), int(file["keyframes"])) != (VERSION, count):
+            return None
+        return Outline(file["T_map_level"], file["columns"].astype(np.float64), float(file["size_m"]))
+    except (InputError, ValueError, KeyError, TypeError):
+        return None
+
+
+def level_of(keyframes: Sequence[Keyframe], poses: Sequence[Pose] | Matrix, config: LocalMapConfig) -> Pose:
+    """T_map_level by the ground around some of the keyframes, whose poses in the map these are."""
+    step = max(-(-len(keyframes) // _MAX_LEVELED), 1)
+    chosen = zip(keyframes[::step], poses[::step], strict=True)
+    up = sum((T[:3, :3] @ level_frame(k, config)[:3, 2] for k, T in chosen), np.zeros(3))
+    return upright_frame(up / np.linalg.norm(up))
+
+
+def _columns(keyframes: Sequence[Keyframe], T_level_map: Pose, size_m: float) -> Matrix:
+    """Upright columns (M, 2), one a cell."""
+    seen: list[NDArray[np.float64]] = []
+    for first in range(0, len(keyframes), _TOGETHER):
+        members = keyframes[first : first + _TOGETHER]
+        seen.append(
+            upright_columns(
+                np.vstack([lie.transform(T_level_map @ each.T_odom_lidar, each.points) for each in members]),
+                size_m,
+            )
+        )
+    columns = np.vstack(seen)
+    return columns[np.unique(np.floor(columns / size_m), axis=0, return_index=True)[1]]
 
 
 def _together(members: Sequence[Keyframe], T_level_newest: Pose) -> Points:

@@ -19,12 +19,12 @@ from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.robust.loosened import Loosened
 from scanchain.graph.robust.update import Since
 from scanchain.kernels.voxels.voxel_shapes import Voxels
-from scanchain.loops.closer import LoopCloser, ProximityCloser
+from scanchain.loops.closer import LoopCloser, PlanarSearch, ProximityCloser
 from scanchain.loops.closure_table import ClosureTable
 from scanchain.loops.connectivity import Drift, Segments
 from scanchain.loops.evidence import PlaceTest
-from scanchain.loops.place_closer import PlaceCloser
-from scanchain.loops.relocalization import Find, PlanarSearch, Relocalizer
+from scanchain.loops.planar_map_search import Find, Relocalizer
+from scanchain.loops.recognizer import PlaceCloser
 from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.loops.verification import Verifier
 from scanchain.odometry import FrontEnd, LiveStamps, Odometry
