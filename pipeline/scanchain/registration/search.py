@@ -97,7 +97,7 @@ class SearchGrid:
         draw_surfaces(cells, rows, columns)
         columns, rows = _cells(positions, origin_m, resolution_m).T
         away[rows, columns] = False
-        room = distance_transform_edt(away) * resolution_m <= reach_m if len(positions) else None
+        room = np.asarray(distance_transform_edt(away)) * resolution_m <= reach_m if len(positions) else None
         return cls(cells, origin_m, resolution_m, room)
 
     @classmethod
@@ -142,7 +142,7 @@ class Search:
         mixed = np.random.default_rng(0).permutation(points)  # so that poor poses are given up after a few points
         self.cells = self._turned(mixed, turns)
         blocks = _in_blocks(self.room)
-        self.has_room = blocks.any(axis=(1, 3))
+        self.has_room = np.asarray(blocks.any(axis=(1, 3)))
         self.spans = _spans(self.has_room)
         self.full = SURFACE * len(points)
         self.least = max(wanted.least * self.full, 1.0)

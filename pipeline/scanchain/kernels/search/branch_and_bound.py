@@ -35,7 +35,7 @@ def score_windows(blocks, pyramid, room, has_room, spans, cells, first: int, lea
     windows = [(0, 0, 0, 0, 0) for _ in range(0)]
     for turn in range(cells.shape[0]):
         _score_heading(blocks, level, has_room, spans, cells[turn], scores)
-        row, column = divmod(scores.argmax(), scores.shape[1])
+        row, column = divmod(scores.argmax(), has_room.shape[1])
         if scores[row, column] > reached[0]:
             reached[0] = max(
                 reached[0], _best_of_window(pyramid[0], room, cells[turn], row * size, column * size, size)
