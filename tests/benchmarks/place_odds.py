@@ -51,16 +51,14 @@ class Shown:
         if lie.apart(saved.poses[near], T_map_lidar)[0] > NEAR_M:
             return None
         target = self.closer.near.submaps.anchor_of(near)
-        keyframes = [*saved.keyframes, replace(keyframe, index=len(saved.keyframes))]
-        verified = self.closer.near.verifier.verify(
-            keyframes, len(saved.keyframes), target, lie.between(saved.poses[target], T_map_lidar),
-            newest=len(saved.keyframes) - 1, in_map=True,
-        )  # fmt: skip
+        submap = self.closer.near.submaps.around(target, saved.keyframes, len(saved.keyframes) - 1)
+        T_first = lie.between(saved.poses[target], T_map_lidar)
+        verified = self.closer.near.verifier.scan(keyframe, submap, T_first, in_map=True)
         T = saved.poses[target] @ verified.match.T_target_source
         placed, beside = replace(keyframe, T_odom_lidar=T), saved.keyframes[self._nearest(T)]
         counts = evidence.compared([placed], [beside]) + evidence.compared([beside], [placed])
         points = len(keyframe.points) + len(beside.points)
-        return evidence.features(verified.closure(target, keyframes[-1].index), *counts.tolist(), points)
+        return evidence.features(verified.closure(target, len(saved.keyframes)), *counts.tolist(), points)
 
     def _nearest(self, T: Pose) -> int:
         return int(np.linalg.norm(self.saved.poses[:, :2, 2] - T[:2, 2], axis=1).argmin())

@@ -5,20 +5,8 @@ import pytest
 
 from scanchain import lie
 from scanchain.data import Keyframe
-from scanchain.kernels.search.branch_and_bound import fill_pyramid
-from scanchain.kernels.search.whole_map import (
-    FREE,
-    NEAR,
-    SURFACE,
-    best_poses,
-    find_room,
-    interleave,
-    score_cells,
-    score_windows,
-    turned,
-)
-from scanchain.loops import planar_map_search
 from scanchain.loops.planar_map_search import PlanarMapSearch, WholeSearch
+from scanchain.registration import search
 from tests.support.scenes import stored
 
 CENTERS = (lie.pose_2d(0.0, 0.0, 0.0), lie.pose_2d(30.0, 0.0, 0.0))
@@ -67,16 +55,18 @@ def test_two_identical_rooms_rival_each_other():
 
 def test_a_search_in_slices_finds_what_one_at_once_does(monkeypatch):
     target, points = rooms([True, False]), seen(with_pillar=True)
-    at_once = WholeSearch(target, points, 0.3)
-    at_once.advance()
-    assert at_once.is_done
-    monkeypatch.setattr(planar_map_search, "_ADDITIONS", 20_000_000)
-    sliced = WholeSearch(target, points, 0.3)
-    sliced.advance()
-    assert not sliced.is_done
-    while not sliced.is_done:
-        sliced.advance()
-    one, other = at_once.best(), sliced.best()
+    slices, found = [], []
+    for additions, steps in ((10**12, 10**9), (20_000_000, 100)):
+        monkeypatch.setattr(search, "_ADDITIONS", additions)
+        monkeypatch.setattr(search, "_STEPS", steps)
+        sliced = WholeSearch(target, points, 0.3)
+        slices.append(0)
+        while not sliced.is_done:
+            sliced.advance()
+            slices[-1] += 1
+        found.append(sliced.best())
+    assert slices[0] == 2 and slices[1] > 3
+    one, other = found
     assert (one.T_map_lidar == other.T_map_lidar).all()
     assert (one.share, one.rival, one.points) == (other.share, other.rival, other.points)
 
@@ -84,31 +74,3 @@ def test_a_search_in_slices_finds_what_one_at_once_does(monkeypatch):
 def test_a_room_of_another_shape_is_nowhere():
     circle = np.stack([np.cos(a := np.linspace(-np.pi, np.pi, 720)), np.sin(a)], axis=1)
     assert rooms([True, False]).best(1.7 * circle, 0.3) is None
-
-
-def test_the_search_finds_the_best_of_all_poses_with_the_lidar_in_free_space():
-    rng = np.random.default_rng(3)
-    log_odds = np.zeros((60, 50))
-    log_odds[20:55, 10:45] = rng.choice([-1.0, 0.0, 1.0], (35, 35), p=[0.7, 0.2, 0.1])
-    cells = np.zeros(log_odds.shape, np.int8)
-    score_cells(log_odds, 0.5, cells)
-    pyramid = np.zeros((4, *cells.shape), np.int8)
-    pyramid[0] = cells
-    fill_pyramid(pyramid)
-    points, turns = rng.uniform(-1.0, 1.0, (40, 2)), 12
-    spans = np.empty((15, 2), np.int64)
-    has_room = find_room(cells, 2, spans)
-    of_points, blocks = turned(points, 0.1, turns), interleave(pyramid[2], 2)
-    windows = [score_windows(blocks, 2, has_room, spans, of_points[k : k + 5], k, 0.0) for k in range(0, turns, 5)]
-    found = best_poses(pyramid, of_points, np.vstack(windows), 0.1, 0.0, 0.9, 0.5, 1)
-    scores = {}
-    for turn in range(turns):
-        c, s = np.cos(2.0 * np.pi * turn / turns), np.sin(2.0 * np.pi * turn / turns)
-        shifts = np.floor(points @ np.array([[c, s], [-s, c]]) / 0.1 + 0.5).astype(int)
-        for row, column in np.argwhere((cells == FREE) | (cells == NEAR)).tolist():
-            x, y = shifts[:, 0] + column, shifts[:, 1] + row
-            inside = (x >= 0) & (y >= 0) & (x < 50) & (y < 60)
-            scores[column, row, turn] = int(cells[y[inside], x[inside]].sum(dtype=int))
-    best = max(scores.values())
-    assert 0 < best < SURFACE * len(points)
-    assert found[0, 3] == best == scores[tuple(found[0, :3].astype(int))]

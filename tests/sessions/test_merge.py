@@ -16,7 +16,7 @@ from scanchain.evaluation import absolute_error, pair
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.evidence import contradiction
 from scanchain.loops.planar_map_search import WholeSearch
-from scanchain.loops.verification import ScanVerifier
+from scanchain.loops.verification import Verifier
 from scanchain.maps import Edges, SavedPoints, open_saved_map, read_ply
 from scanchain.odometry.tracked import first_match
 from scanchain.runs.job import Progress
@@ -386,12 +386,12 @@ def test_merging_searches_and_aligns_no_more_than_runs_do(runs, tmp_path, monkey
         span = {"log__start_s": k * quarter_s, "log__end_s": (k + 1) * quarter_s}
         sc.run(tmp_path / "office.mcap", part, recording=False, **span)
     work: Counter[str] = Counter()
-    for owner, name in ((WholeSearch, "__init__"), (ScanVerifier, "verify"), (PoseGraph, "optimize")):
+    for owner, name in ((WholeSearch, "__init__"), (Verifier, "scan"), (PoseGraph, "optimize")):
         monkeypatch.setattr(owner, name, _counted(getattr(owner, name), owner.__name__, work))
     merged = quietly(*parts, folder / "stranger", out=tmp_path / "out")
     assert merged.metrics.apart == (("stranger",),)
     assert work["WholeSearch"] < merged.metrics.keyframes / 4
-    assert work["ScanVerifier"] < merged.metrics.keyframes
+    assert work["Verifier"] < merged.metrics.keyframes
     assert work["PoseGraph"] < merged.metrics.keyframes / 5
 
 

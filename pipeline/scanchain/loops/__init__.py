@@ -3,7 +3,7 @@
 from scanchain.loops.closer import LoopCloser
 from scanchain.loops.closure_table import ClosureTable
 from scanchain.loops.evidence import PlaceTest
-from scanchain.loops.outline import level_of, outline_of
+from scanchain.loops.map_search import level_of, outline_of
 from scanchain.loops.refinement import refined, spread
 
 __all__ = ["ClosureTable", "LoopCloser", "PlaceTest", "level_of", "outline_of", "refined", "spread"]

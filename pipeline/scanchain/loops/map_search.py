@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Generator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.config import Config
+from scanchain.config import Config, LocalMapConfig
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Points, Pose, Problem, Proposal
+from scanchain.errors import InputError
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
-from scanchain.loops.descriptor import level_frame, upright_frame
 from scanchain.loops.evidence import pose_in_map
-from scanchain.loops.outline import outline_of
-from scanchain.loops.submaps import Submap
-from scanchain.loops.verification import SubmapVerifier
-from scanchain.registration import PlaceGrid, PlaceSearch, ScoreGrid, Window, evenly, upright_columns
+from scanchain.loops.submaps import Submap, level_frame, upright_frame
+from scanchain.loops.verification import Verifier
+from scanchain.maps.saved_map import read_arrays
+from scanchain.registration import SearchGrid, Wanted, Window, find
+from scanchain.registration.search import Found, Search, evenly, upright_columns
+from scanchain.whole_file import write_whole
 
 _MEMBERS = 10  # number of the newest keyframes that are sought together
 _RADIUS = 1.5  # radii of a submap, up to which structure around the lidar is sought
@@ -28,8 +33,7 @@ _COARSE, _COARSE_COLUMNS, _COARSE_SEEDS = 2.0, 100, 12  # cells, in fine ones, a
 _REFINED_RAD = 0.15  # half width of the window in heading around what it found
 _MIN_COLUMNS = 30  # number of columns, below which there is too little to see
 _MAX_CELLS = 1 << 21  # of the coarse grid of a map; a larger one has coarser cells
-_STEPS = 150_000  # windows of the coarse search that are split in one scan
-_VERIFIED = 50_000  # windows that are split in the time in which one pose is verified
+_VERIFIED = 3  # number of poses that are verified in one scan
 _MIN_SHARE = 0.55  # least share of the columns that lie on the map's
 _RIVAL = 0.85  # share of the best score, from which on another pose is verified, too
 _SEEDS = 4  # largest number of poses that are verified
@@ -45,7 +49,27 @@ _AGREE_M, _AGREE_RAD = 1.0, 0.05  # largest difference between the poses that tw
 _MATCH_M = 3.5  # path between two matches with the map, at full scale
 _TRACKED_M = 20.0  # path since the last match with the map, up to which it is not searched
 _DRIFT = 0.1  # largest distance from the prediction, as a share of the path since the last match
+PLACES_FILE = "places.npz"
+VERSION = 1
+_TOGETHER = 10  # number of keyframes whose points are seen together; drift between more would raise the ground
+_MAX_LEVELED = 16  # number of keyframes, evenly spread, whose ground says where the map's vertical is
 _ALIKE = Problem.plain("another place of the map is as similar")
+
+
+@dataclass(frozen=True, slots=True)
+class Outline:
+    """Upright structure of a map.
+
+    Attributes
+    ----------
+    T_map_level : (4, 4) rotation to the frame whose z axis is normal to the ground, on average
+    columns : (M, 2) where it is upright, level frame
+    size_m : edge length of the cells that the map was seen in
+    """
+
+    T_map_level: Pose
+    columns: Matrix
+    size_m: float
 
 
 class MapSearch:
@@ -59,14 +83,14 @@ class MapSearch:
         """Take the keyframes of a map; the outline is kept in its folder."""
         self.config = config
         self.segments = segments
-        self.verifier = SubmapVerifier(config, min_agreement=_MIN_AGREEMENT)
+        self.verifier = Verifier(config)
         self.of_map = len(keyframes)
         self.radius_m = config.loops.place_radius_m * float(np.median([each.scale for each in keyframes]))
         outline = outline_of(folder, keyframes, config.local_map)
         poses = np.array([each.T_odom_lidar for each in keyframes])
         self.T_level_keyframes = lie.inverse(outline.T_map_level) @ poses
         self.size_m, self.columns = outline.size_m, outline.columns
-        self.grid: PlaceGrid | None = None  # drawn when first searched
+        self.grid: SearchGrid | None = None  # drawn when first searched
         self.search: Generator[None, None, Closure | None] | None = None  # the one that is under way
         self.has_advanced = False  # in the present scan
         self.next_m = 0.0
@@ -177,20 +201,20 @@ class MapSearch:
         """
         newest = members[-1]
         T_newest_level = level_frame(newest, self.config.local_map)
-        seeds, spent = yield from self._seeds(_together(members, lie.inverse(T_newest_level)))
+        seeds = yield from self._seeds(_together(members, lie.inverse(T_newest_level)))
         source = Submap(newest, members, self.radius_m)
         tried: list[Closure] = []
-        for x_m, y_m, yaw_rad, _ in seeds.tolist():
-            for target in self._stories(np.array([x_m, y_m])):
-                if spent + _VERIFIED > _STEPS:
+        for seed in seeds:
+            for target in self._stories(seed.T_target_source[:2, 2]):
+                if len(tried) % _VERIFIED == 0:
                     yield
-                    spent = 0
-                spent += _VERIFIED
-                T_level_source = self._on_ground(keyframes[target], x_m, y_m, yaw_rad) @ lie.inverse(
+                T_level_source = self._on_ground(keyframes[target], seed.T_target_source) @ lie.inverse(
                     T_newest_level
                 )
                 T_first = lie.inverse(self.T_level_keyframes[target]) @ T_level_source
-                verified = self.verifier.verify(source, self._submap(target, keyframes), T_first)
+                verified = self.verifier.submap(
+                    source, self._submap(target, keyframes), T_first, min_agreement=_MIN_AGREEMENT
+                )
                 tried.append(verified.closure(target, newest.index, Proposal.PLACE))
         accepted = [each for each in tried if each.verdict is ClosureVerdict.ACCEPTED]
         if not accepted:
@@ -200,42 +224,42 @@ class MapSearch:
             return best
         return best.rejected(_ALIKE)
 
-    def _seeds(self, points: Points) -> Generator[None, None, tuple[Matrix, int]]:
-        """The best poses in the map's level frame (A, 4): x, y, yaw and share; sought coarsely, then refined.
-
-        And what that took of the work of the present scan.
-        """
+    def _seeds(self, points: Points) -> Generator[None, None, Sequence[Found]]:
+        """The best poses (3, 3) in the map's level frame, sought coarsely, then refined."""
         near = points[np.abs(points[:, :2]).max(axis=1, initial=0.0) < _RADIUS * self.radius_m]
         columns = evenly(upright_columns(near, self.size_m), _COLUMNS)
         if len(columns) < _MIN_COLUMNS or not len(self.columns):
-            return np.empty((0, 4)), 0
+            return ()
         if self.grid is None:
             self.grid = self._drawn()
-        coarse_m = self.grid.surfaces.resolution_m
-        anywhere = Window(math.inf, math.pi, _APART * coarse_m, _RIVAL, _COARSE_SEEDS, _MIN_SHARE)
-        search = PlaceSearch(self.grid, evenly(columns, _COARSE_COLUMNS), anywhere)
-        spent = search.go_on(_STEPS)
+        coarse_m = self.grid.resolution_m
+        wanted = Wanted(_APART * coarse_m, _RIVAL, _COARSE_SEEDS, _MIN_SHARE)
+        search = Search(evenly(columns, _COARSE_COLUMNS), self.grid, None, wanted)
+        search.advance()
         while not search.is_done:
             yield
-            spent = search.go_on(_STEPS)
-        around = Window(coarse_m, _REFINED_RAD, _APART * coarse_m, 1.0, 1, _MIN_SHARE)
+            search.advance()
         reach_m = 2.0 * _RADIUS * self.radius_m + coarse_m
-        seeds = np.empty((0, 4))
-        for x_m, y_m, yaw_rad, _ in search.poses().tolist():
-            surfaces = self.columns[np.abs(self.columns - (x_m, y_m)).max(axis=1) < reach_m]
-            found = ScoreGrid(surfaces, self.size_m).search(columns, lie.pose_2d(x_m, y_m, yaw_rad), around)
-            seeds = np.vstack([seeds, found])
-        best_first = seeds[np.argsort(-seeds[:, 3], kind="stable")][:_SEEDS]
-        return best_first[best_first[:, 3] >= _RIVAL * best_first[:1, 3]], spent
+        seeds: list[Found] = []
+        for coarse in search.poses():
+            surfaces = self.columns[np.abs(self.columns - coarse.T_target_source[:2, 2]).max(axis=1) < reach_m]
+            around = Window(coarse.T_target_source, coarse_m, _REFINED_RAD)
+            seeds += find(columns, SearchGrid.of_points(surfaces, self.size_m), around, wanted._replace(answers=1))
+        best_first = sorted(seeds, key=lambda each: -each.share)[:_SEEDS]
+        return [each for each in best_first if each.share >= _RIVAL * best_first[0].share]
 
-    def _drawn(self) -> PlaceGrid:
+    def _drawn(self) -> SearchGrid:
         """The coarse grid of the map; poses that it finds may be a cell farther off than those verified."""
-        positions = np.ascontiguousarray(self.T_level_keyframes[:, :2, 3])
+        positions = self.T_level_keyframes[:, :2, 3]
         reach_m = _REACH * self.radius_m + _COARSE * self.size_m
-        range_m = math.sqrt(2.0) * _RADIUS * self.radius_m
-        extent_m = np.ptp(np.vstack([self.columns, positions]), axis=0) + 2.0 * (reach_m + range_m)
-        cells_m = max(_COARSE * self.size_m, math.sqrt(float(extent_m.prod()) / _MAX_CELLS))
-        return PlaceGrid(self.columns, positions, cells_m, reach_m=reach_m, range_m=range_m)
+        extent = np.vstack([self.columns, positions - reach_m, positions + reach_m])
+        area_m2 = float(np.ptp(extent, axis=0).prod())
+        return SearchGrid.of_points(
+            self.columns,
+            max(_COARSE * self.size_m, math.sqrt(area_m2 / _MAX_CELLS)),
+            near=positions,
+            reach_m=reach_m,
+        )
 
     def _stories(self, place: NDArray[np.float64]) -> list[int]:
         """Keyframes of the map nearest to a place (2,), one on each story."""
@@ -249,13 +273,14 @@ class MapSearch:
                 chosen.append(index)
         return chosen
 
-    def _on_ground(self, target: Keyframe, x_m: float, y_m: float, yaw_rad: float) -> Pose:
+    def _on_ground(self, target: Keyframe, T_plane_source: Pose) -> Pose:
         """T_level_source of a level source at a place, on the plane of the ground around the target."""
         T_level_target = self.T_level_keyframes[target.index]
         up = T_level_target[:3, :3] @ level_frame(target, self.config.local_map)[:3, 2]
-        T = upright_frame(up, np.array([math.cos(yaw_rad), math.sin(yaw_rad), 0.0]))
-        aside = np.array([x_m, y_m]) - T_level_target[:2, 3]
-        T[:3, 3] = x_m, y_m, T_level_target[2, 3] - float(aside @ up[:2]) / float(up[2])
+        T = upright_frame(up, np.append(T_plane_source[:2, 0], 0.0))
+        aside = T_plane_source[:2, 2] - T_level_target[:2, 3]
+        T[:2, 3] = T_plane_source[:2, 2]
+        T[2, 3] = T_level_target[2, 3] - float(aside @ up[:2]) / float(up[2])
         return T
 
     def _submap(self, target: int, keyframes: Sequence[Keyframe]) -> Submap:
@@ -274,6 +299,66 @@ class MapSearch:
             return None
         limit = f"from the prediction, more than {100.0 * _DRIFT:g} % of the path between"
         return Problem(f"far {limit}", f"{moved_m:.1f} m {limit}")
+
+
+def outline_of(folder: Path, keyframes: Sequence[Keyframe], config: LocalMapConfig) -> Outline:
+    """The outline of a map in this folder, which holds it from the first time on where it can be written to.
+
+    keyframes : of the map; their ``T_odom_lidar`` is T_map_lidar
+    """
+    path = folder / PLACES_FILE
+    stored = _stored(path, len(keyframes))
+    if stored is not None:
+        return stored
+    size_m = config.voxel_size_m * float(np.median([keyframe.scale for keyframe in keyframes]))
+    T_map_level = level_of(keyframes, [keyframe.T_odom_lidar for keyframe in keyframes], config)
+    columns = _columns(keyframes, lie.inverse(T_map_level), size_m).astype(np.float32)  # as it is stored
+    data = io.BytesIO()
+    np.savez(
+        data,
+        version=VERSION,
+        keyframes=len(keyframes),
+        T_map_level=T_map_level,
+        columns=columns,
+        size_m=size_m,
+    )
+    with suppress(OSError):  # a map that cannot be written to is searched all the same
+        write_whole(path, data.getvalue())
+    return Outline(T_map_level, columns.astype(np.float64), size_m)
+
+
+def _stored(path: Path, count: int) -> Outline | None:
+    """The outline on disk; None where there is none of this version and number of keyframes."""
+    try:
+        file = read_arrays(path)
+        if (int(file["version"]), int(file["keyframes"])) != (VERSION, count):
+            return None
+        return Outline(file["T_map_level"], file["columns"].astype(np.float64), float(file["size_m"]))
+    except (InputError, ValueError, KeyError, TypeError):
+        return None
+
+
+def level_of(keyframes: Sequence[Keyframe], poses: Sequence[Pose] | Matrix, config: LocalMapConfig) -> Pose:
+    """T_map_level by the ground around some of the keyframes, whose poses in the map these are."""
+    step = max(-(-len(keyframes) // _MAX_LEVELED), 1)
+    chosen = zip(keyframes[::step], poses[::step], strict=True)
+    up = sum((T[:3, :3] @ level_frame(k, config)[:3, 2] for k, T in chosen), np.zeros(3))
+    return upright_frame(up / np.linalg.norm(up))
+
+
+def _columns(keyframes: Sequence[Keyframe], T_level_map: Pose, size_m: float) -> Matrix:
+    """Upright columns (M, 2), one a cell."""
+    seen: list[NDArray[np.float64]] = []
+    for first in range(0, len(keyframes), _TOGETHER):
+        members = keyframes[first : first + _TOGETHER]
+        seen.append(
+            upright_columns(
+                np.vstack([lie.transform(T_level_map @ each.T_odom_lidar, each.points) for each in members]),
+                size_m,
+            )
+        )
+    columns = np.vstack(seen)
+    return columns[np.unique(np.floor(columns / size_m), axis=0, return_index=True)[1]]
 
 
 def _together(members: Sequence[Keyframe], T_level_newest: Pose) -> Points:

@@ -1,20 +1,28 @@
-"""The interface of place recognition: query and candidate, the protocol of recognizers, and the built-in ones."""
+"""Place recognition: the protocol of recognizers, and loop closures of what they propose, once verified."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from scanchain import plugins
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain import lie, plugins
 from scanchain.config import Config
-from scanchain.data import Keyframe, Matrix, Pose, Proposal
-from scanchain.errors import InputError
-from scanchain.loops.submaps import Submap
+from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Pose, Problem, Proposal
+from scanchain.errors import InputError, shown
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.loops.submaps import RADII_AHEAD, RADII_BEHIND, Submap, VoxelSubmaps, submap_around
+from scanchain.loops.verification import Verification, Verifier
 
 RECOGNIZERS = {
-    "descriptor": "scanchain.loops.descriptor_recognizer:DescriptorRecognizer",
+    "descriptor": "scanchain.loops.descriptor:DescriptorRecognizer",
 }
+_PLACE_DRIFT = 0.1  # largest distance from the prediction as a share of the path between
+_PLACE_SIGMAS = 3.0  # the same in standard deviations of the prediction by the graph, where these allow more
+_SPACING = 1.0 / 3.0  # radii of a submap between the anchors of two submaps along the path
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,3 +101,190 @@ def create_recognizer(config: Config, dimension: int) -> Recognizer | None:
         known = ", ".join(("auto", "none", *RECOGNIZERS))
         raise InputError(f"loops.recognizer is {name!r}; it must be one of {known}, or module:Class for your own")
     return plugins.load(RECOGNIZERS.get(name, name), "add", "query")(config, dimension)
+
+
+class PlaceCloser:
+    """Loop closures by the recognizer, queried for one keyframe of every few.
+
+    A submap is complete once the lidar has gone on by its radius.
+    """
+
+    def __init__(self, config: Config, dimension: int, submaps: VoxelSubmaps, verifier: Verifier) -> None:
+        """Submaps : that scans are aligned to in the plane; in 3D two submaps are aligned."""
+        self.config = config
+        self.dimension = dimension
+        self.submaps = submaps
+        self.segments = submaps.segments
+        self.verifier = verifier
+        self.recognizer = create_recognizer(config, dimension)
+        self.added: list[int] = []
+        self.examined = 0
+        self.next_m = 0.0
+        self.last: Closure | None = None
+
+    def begin_in(self, keyframes: Sequence[Keyframe], *, are_added: bool = True) -> float:
+        """Begin behind the keyframes of a map; the path, in meters, from which on all of them are candidates.
+
+        are_added : whether places of the map are recognized here
+        """
+        if self.recognizer is not None and are_added:
+            for anchor in self._anchors(keyframes, finish=True):
+                self.recognizer.add(self._submap(anchor, keyframes))
+                self.added.append(anchor.index)
+        self.examined = len(keyframes)
+        last, limits = keyframes[-1], self.config.loops
+        apart_m = max((RADII_BEHIND + RADII_AHEAD) * self._radius_m(last), limits.min_travel_m)
+        self.next_m = last.traveled_m + 2.0 * apart_m
+        return self.next_m
+
+    def skip(self, keyframes: Sequence[Keyframe]) -> None:
+        """Make no submaps around the keyframes so far."""
+        self.examined = len(keyframes)
+
+    def close(
+        self,
+        keyframes: Sequence[Keyframe],
+        graph: PoseGraph,
+        connected: NDArray[np.bool_],
+        *,
+        finish: bool = False,
+    ) -> tuple[Closure, ...]:
+        """Closures of the submaps that are complete by now, accepted or not; with ``finish``, of all others, too.
+
+        keyframes : all so far; graph : their best known poses, and how sure they are
+        connected : (K,) keyframes in the component of the newest
+        """
+        recognizer = self._recognizer(keyframes)
+        if recognizer is None:
+            return ()
+        closures: list[Closure] = []
+        for anchor in self._anchors(keyframes, finish):
+            closures += self._closures(recognizer, anchor, keyframes, graph, connected)
+        return tuple(closures)
+
+    def _recognizer(self, keyframes: Sequence[Keyframe]) -> Recognizer | None:
+        """The recognizer; after a checkpoint, which does not hold it, a new one with the same submaps."""
+        if self.recognizer is None:
+            self.recognizer = create_recognizer(self.config, self.dimension)
+            if self.recognizer is not None:
+                for index in self.added:
+                    self.recognizer.add(self._submap(keyframes[index], keyframes))
+        return self.recognizer
+
+    def _anchors(self, keyframes: Sequence[Keyframe], finish: bool) -> Iterator[Keyframe]:
+        """Keyframes that submaps are made around, each once."""
+        while self.examined < len(keyframes):
+            keyframe = keyframes[self.examined]
+            radius_m = self._radius_m(keyframe)
+            if keyframes[-1].traveled_m < keyframe.traveled_m + RADII_AHEAD * radius_m and not finish:
+                return
+            self.examined += 1
+            if keyframe.traveled_m >= self.next_m:
+                self.next_m = keyframe.traveled_m + _SPACING * radius_m
+                yield keyframe
+
+    def _closures(
+        self,
+        recognizer: Recognizer,
+        anchor: Keyframe,
+        keyframes: Sequence[Keyframe],
+        graph: PoseGraph,
+        connected: NDArray[np.bool_],
+    ) -> Iterator[Closure]:
+        """The first that is accepted, after those that are not."""
+        submap, T_world = self._submap(anchor, keyframes), graph.poses
+        recognizer.add(submap)
+        self.added.append(anchor.index)
+        apart_m = max((RADII_BEHIND + RADII_AHEAD) * submap.radius_m, self.config.loops.min_travel_m)
+        T_expected = self._expected(anchor, keyframes, T_world)
+        query = Query(submap, anchor.traveled_m - apart_m, T_expected, keyframes, T_world)
+        candidates = recognizer.query(query)
+        if not isinstance(candidates, Iterable):
+            raise InputError(f"{self._named}: query returned {shown(candidates)}; wanted a list of candidates")
+        for candidate in candidates:
+            self._check(candidate, query)
+            is_connected = bool(connected[candidate.target] == connected[anchor.index])
+            if not is_connected and candidate.proposed_by is Proposal.POSITION:
+                continue
+            verified = self._verify(submap, candidate, keyframes)
+            problem = self._problem(candidate, verified, query, graph if is_connected else None)
+            closure = verified.closure(candidate.target, anchor.index, candidate.proposed_by, problem=problem)
+            yield closure
+            if closure.verdict is ClosureVerdict.ACCEPTED:
+                self.last = closure
+                return
+
+    def _submap(self, anchor: Keyframe, keyframes: Sequence[Keyframe]) -> Submap:
+        return submap_around(keyframes, anchor.index, self._radius_m(anchor), self.segments)
+
+    def _radius_m(self, anchor: Keyframe) -> float:
+        return self.config.loops.place_radius_m * anchor.scale
+
+    def _expected(self, anchor: Keyframe, keyframes: Sequence[Keyframe], T_world: Matrix) -> Pose:
+        """T_world_anchor by odometry since the last closure; that one may not have moved the map yet."""
+        if self.last is None:
+            return T_world[anchor.index]
+        T_last_anchor = lie.between(keyframes[self.last.source].T_odom_lidar, anchor.T_odom_lidar)
+        return T_world[self.last.target] @ self.last.match.T_target_source @ T_last_anchor
+
+    @property
+    def _named(self) -> str:
+        return f"loops.recognizer {self.config.loops.recognizer}"
+
+    def _check(self, candidate: Candidate, query: Query) -> None:
+        """Refuse what is no candidate, and a candidate that is out of range."""
+        if not isinstance(candidate, Candidate):
+            raise InputError(
+                f"{self._named}: query returned {shown(candidate)} among its candidates; wanted "
+                "scanchain.loops.recognizer.Candidate"
+            )
+        target = candidate.target
+        is_old = 0 <= target < len(query.keyframes) and query.keyframes[target].traveled_m <= query.max_traveled_m
+        if not is_old:
+            raise InputError(
+                f"{self._named}: candidate {target} for keyframe {query.submap.anchor.index} is not "
+                "older; wanted one whose traveled_m is at most query.max_traveled_m"
+            )
+        T, size = np.asarray(candidate.T_target_source), self.dimension + 1
+        if T.shape != (size, size) or not np.isfinite(T).all():
+            raise InputError(
+                f"{self._named}: T_target_source of candidate {target} has the shape {T.shape}; wanted "
+                f"a finite pose ({size}, {size})"
+            )
+
+    def _verify(self, source: Submap, candidate: Candidate, keyframes: Sequence[Keyframe]) -> Verification:
+        T_first = candidate.T_target_source
+        if self.dimension == 2:
+            voxels = self.submaps.around(candidate.target, keyframes, len(keyframes) - 1)
+            return self.verifier.scan(source.anchor, voxels, T_first, alone=True)
+        target = submap_around(keyframes, candidate.target, source.radius_m, self.segments)
+        return self.verifier.submap(source, target, T_first)
+
+    def _problem(
+        self, candidate: Candidate, verified: Verification, query: Query, graph: PoseGraph | None
+    ) -> Problem | None:
+        """Why an aligned candidate is no closure, None if it is one.
+
+        graph : None between unconnected keyframes, where the distance that odometry has them apart means nothing
+        """
+        limits, anchor = self.config.loops, query.submap.anchor
+        if candidate.rival >= 0:
+            return Problem("another keyframe is as similar", f"keyframe {candidate.rival} is as similar")
+        if graph is None or verified.problem:
+            return None
+        T_world_i, T_world_j = query.T_world[candidate.target], query.T_world[anchor.index]
+        moved = lie.inverse(T_world_j) @ T_world_i @ verified.match.T_target_source
+        moved_m = float(np.linalg.norm(moved[:-1, -1]))
+        traveled_m = anchor.traveled_m - query.keyframes[candidate.target].traveled_m
+        if moved_m <= max(_PLACE_DRIFT * traveled_m, limits.min_radius_m):
+            return None
+        d = self.dimension
+        covariance = graph.relative_covariance(candidate.target, anchor.index)[:d, :d]
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+        if moved_m <= _PLACE_SIGMAS * sigma_m:
+            return None
+        return Problem(
+            "far from the prediction",
+            f"{moved_m:.1f} m from the prediction, more than {100.0 * _PLACE_DRIFT:g} % of the path between and "
+            f"than {_PLACE_SIGMAS:g} of its standard deviations ({sigma_m:.1f} m)",
+        )

@@ -1,4 +1,4 @@
-"""Submaps: the scans around a keyframe in its frame, as points or as voxels."""
+"""Submaps: the scans around a keyframe in its frame, as points or as voxels, and where up is in it."""
 
 from __future__ import annotations
 
@@ -8,11 +8,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from scanchain import lie
 from scanchain.config import LocalMapConfig
 from scanchain.data import Keyframe, Points, Pose
+from scanchain.kernels.voxels.voxel_shapes import DIRECTION, PLANE, SHAPE
 from scanchain.loops.connectivity import Segments
 from scanchain.registration import VoxelMap
 
@@ -21,6 +23,8 @@ RADII_BEHIND = 2.0  # radii of the trajectory before it: a lidar that looks ahea
 _MAX_POINTS = 80_000  # largest number of points of a submap, of keyframes evenly spread over it
 _OF_MAP = 2  # times as many keyframes in a submap of a map, which was seen from several sides
 _MAX_CACHED = 64  # largest number of voxel submaps in memory; the least recently used one is dropped first
+_CONES = (0.85, 0.97)  # cosines: normals nearer to the axis than this are the ground's, roughly and finally
+_MIN_GROUND_VOXELS = 10  # least number of voxels with such a normal; with fewer the lidar is assumed upright
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,3 +124,36 @@ class VoxelSubmaps:
         points = [lie.transform(T_anchor_odom @ each.T_odom_lidar, each.points) for each in members[::_OF_MAP]]
         submap.insert(np.vstack(points), lie.identity(self.dimension))
         return submap
+
+
+def level_frame(keyframe: Keyframe, config: LocalMapConfig) -> Pose:
+    """T_keyframe_level (4, 4), the frame with the same origin whose z axis is normal to the ground.
+
+    The ground is what is planar and lies at less than 32° to the lidar's own horizon; where there is too little
+    of it, the lidar is assumed upright. The x axis is as near to the lidar's as it can be.
+    """
+    voxels = VoxelMap(3, config, keyframe.scale)
+    voxels.insert(keyframe.points, lie.identity(3))
+    cells = voxels.voxels.cells[: len(voxels)]
+    normals = cells[cells[:, SHAPE] == PLANE, DIRECTION : DIRECTION + 3]
+    up = np.array([0.0, 0.0, 1.0])
+    for cosine in _CONES:
+        along = normals @ up
+        chosen = np.abs(along) > cosine
+        if chosen.sum() < _MIN_GROUND_VOXELS:
+            break
+        up = _unit((normals[chosen] * np.sign(along[chosen])[:, None]).sum(axis=0))
+    return upright_frame(up)
+
+
+def upright_frame(up: NDArray[np.float64], ahead: NDArray[np.float64] | None = None) -> Pose:
+    """The frame (4, 4) at the origin with its z axis along the unit vector ``up``, x near ``ahead``, or x."""
+    T = lie.identity(3)
+    ahead = np.array([1.0, 0.0, 0.0]) if ahead is None else ahead
+    forward = _unit(ahead - (ahead @ up) * up)
+    T[:3, 0], T[:3, 1], T[:3, 2] = forward, np.cross(up, forward), up
+    return T
+
+
+def _unit(v: NDArray[np.float64]) -> NDArray[np.float64]:
+    return v / np.linalg.norm(v)

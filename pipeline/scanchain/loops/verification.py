@@ -5,7 +5,6 @@ A scan is aligned to a voxel submap or, in 3D, a submap to a submap, which are t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +14,7 @@ from scanchain.config import Config
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Match, Points, Pose, Problem, Proposal
 from scanchain.kernels.raycast.free_space import compare_ranges, nearest_ranges
 from scanchain.kernels.registration.association import associate
-from scanchain.loops.submaps import Submap, VoxelSubmaps
+from scanchain.loops.submaps import Submap
 from scanchain.preprocess import downsample
 from scanchain.registration import PointToShapeMatcher, VoxelMap
 from scanchain.words import below
@@ -63,70 +62,42 @@ class Verification:
         return Closure(target, source, self.match, self.overlap, verdict, reason, proposed_by, cause=cause)
 
 
-class ScanVerifier:
-    """Aligns a keyframe's scan to a voxel submap."""
+class Verifier:
+    """Aligns a scan to a voxel submap or, in 3D, a submap to a submap, and judges the result."""
 
-    def __init__(self, config: Config, submaps: VoxelSubmaps) -> None:
-        self.config = config.loops
-        self.match_voxel_m = config.preprocess.match_voxel_m
+    def __init__(self, config: Config) -> None:
+        self.config = config
         self.matcher = PointToShapeMatcher(config.matching)
-        self.submaps = submaps
 
-    def verify(
-        self,
-        keyframes: Sequence[Keyframe],
-        source: int,
-        target: int,
-        T_first: Pose,
-        *,
-        newest: int,
-        alone: bool = False,
-        in_map: bool = False,
+    def scan(
+        self, source: Keyframe, target: VoxelMap, T_first: Pose, *, alone: bool = False, in_map: bool = False
     ) -> Verification:
-        """The source's scan in the submap of an anchor, from an initial pose.
+        """A keyframe's scan in a submap, from an initial pose.
 
-        newest : keyframe that may be in the submap
         alone : whether nothing but the match supports the closure, which must overlap more then
         in_map : whether the source is followed in a map, where it needs no more information than a scan does
         """
-        submap = self.submaps.around(target, keyframes, newest)
-        points = downsample(keyframes[source].points, submap.scale * self.match_voxel_m)
-        match = self.matcher.align(points, submap, T_first, wide=True)
-        overlap = overlap_of(points, match.T_target_source, submap)
-        moved_m = lie.apart(T_first, match.T_target_source)[0]
-        min_overlap = _MIN_OVERLAP_ALONE if alone else self.config.min_overlap
-        min_information = 0.0 if in_map and match.observability >= 1.0 else self.config.min_information
-        return Verification(match, overlap, self._problem(match, overlap, moved_m, min_overlap, min_information))
+        limits = self.config.loops
+        points = downsample(source.points, target.scale * self.config.preprocess.match_voxel_m)
+        match = self.matcher.align(points, target, T_first, wide=True)
+        overlap = overlap_of(points, match.T_target_source, target)
+        min_overlap = _MIN_OVERLAP_ALONE if alone else limits.min_overlap
+        min_information = 0.0 if in_map and match.observability >= 1.0 else limits.min_information
+        problem = (
+            _unfit(match)
+            or _below("overlap", below(overlap), overlap, min_overlap, "loops.min_overlap")
+            or _too_uncertain(match, min_information, "loops.min_information")
+            or self._too_far(lie.apart(T_first, match.T_target_source)[0])
+        )
+        return Verification(match, overlap, problem)
 
-    def _problem(
-        self, match: Match, overlap: float, moved_m: float, min_overlap: float, min_information: float
-    ) -> Problem | None:
-        limits, information = self.config, match.degeneracy_eigenvalue
-        if not match.is_fit:
-            return Problem(match.cause, match.reason)
-        if overlap < min_overlap:
-            text = f"overlap {below(overlap)} < loops.min_overlap ({min_overlap:g})"
-            return Problem("overlap < loops.min_overlap", text)
-        if information < min_information:
-            text = f"information {information:.1e} < loops.min_information ({min_information:g})"
-            return Problem("information < loops.min_information", text)
-        if moved_m > limits.max_radius_m:
-            text = f"{moved_m:.1f} m from the prediction > loops.max_radius_m ({limits.max_radius_m:g})"
-            return Problem("distance from the prediction > loops.max_radius_m", text)
-        return None
+    def submap(
+        self, source: Submap, target: Submap, T_first: Pose, *, min_agreement: float = _MIN_AGREEMENT
+    ) -> Verification:
+        """A submap in another, from an initial pose: aligned from coarse to fine, free space compared.
 
-
-class SubmapVerifier:
-    """Aligns 3D submaps from coarse to fine and compares their free space."""
-
-    def __init__(self, config: Config, *, min_agreement: float = _MIN_AGREEMENT) -> None:
-        """min_agreement : least agreement about free space; less where the place may have changed."""
-        self.config = config
-        self.min_agreement = min_agreement
-        self.matcher = PointToShapeMatcher(config.matching)
-
-    def verify(self, source: Submap, target: Submap, T_first: Pose) -> Verification:
-        """The source in the target, from an initial pose."""
+        min_agreement : least agreement about free space; less where the place may have changed
+        """
         scale = source.anchor.scale
         fine_m = scale * self.config.preprocess.match_voxel_m
         surfaces, dense = target.points(), source.points()
@@ -145,30 +116,41 @@ class SubmapVerifier:
             free_space_agreement(target, others, lie.identity(3), margin_m),
         )
         overlap, agreement = overlap_of(points, T, voxels), both_ways / max(with_itself, 1e-9)
-        return Verification(match, overlap, self._problem(match, overlap, agreement), agreement)
+        problem = (
+            _unfit(match)
+            or _below("overlap", below(overlap), overlap, _MIN_PLACE_OVERLAP)
+            or _too_uncertain(match, _MIN_PLACE_INFORMATION)
+            or _below("free-space agreement", below(agreement), agreement, min_agreement)
+        )
+        return Verification(match, overlap, problem, agreement)
 
     def _voxels(self, points: Points, scale: float) -> VoxelMap:
         result = VoxelMap(3, self.config.local_map, scale)
         result.insert(points, lie.identity(3))
         return result
 
-    def _problem(self, match: Match, overlap: float, agreement: float) -> Problem | None:
-        information = match.degeneracy_eigenvalue
-        if not match.is_fit:
-            return Problem(match.cause, match.reason)
-        if overlap < _MIN_PLACE_OVERLAP:
-            return _less("overlap", below(overlap), _MIN_PLACE_OVERLAP)
-        if information < _MIN_PLACE_INFORMATION:
-            return _less("information", f"{information:.1e}", _MIN_PLACE_INFORMATION)
-        if agreement < self.min_agreement:
-            return _less("free-space agreement", below(agreement), self.min_agreement)
+    def _too_far(self, moved_m: float) -> Problem | None:
+        most_m, cause = self.config.loops.max_radius_m, "distance from the prediction > loops.max_radius_m"
+        if moved_m <= most_m:
+            return None
+        return Problem(cause, f"{moved_m:.1f} m from the prediction > loops.max_radius_m ({most_m:g})")
+
+
+def _unfit(match: Match) -> Problem | None:
+    return None if match.is_fit else Problem(match.cause, match.reason)
+
+
+def _too_uncertain(match: Match, least: float, key: str = "") -> Problem | None:
+    information = match.degeneracy_eigenvalue
+    return _below("information", f"{information:.1e}", information, least, key)
+
+
+def _below(name: str, figure: str, value: float, least: float, key: str = "") -> Problem | None:
+    """A figure below the limit of this key, or of a recognized place; None where it is not."""
+    if value >= least:
         return None
-
-
-def _less(name: str, figure: str, least: float) -> Problem:
-    """A figure below the least of a recognized place."""
-    limit = f"< the least of a recognized place ({least:g})"
-    return Problem(f"{name} {limit}", f"{name} {figure} {limit}")
+    limit = f"{key or 'the least of a recognized place'} ({least:g})"
+    return Problem(f"{name} < {key or limit}", f"{name} {figure} < {limit}")
 
 
 def free_space_agreement(submap: Submap, points: Points, T_target_source: Pose, margin_m: float) -> float:

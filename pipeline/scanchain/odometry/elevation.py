@@ -15,7 +15,7 @@ from scanchain.data import Matrix, Points, Pose, Scan
 from scanchain.kernels.registration.plane_adjustment import lift, plane_equations, planes
 from scanchain.preprocess import Sweep
 from scanchain.preprocess.sweep import sweep_of
-from scanchain.registration.correlative import evenly
+from scanchain.registration.search import evenly
 
 _FIRST, _LATER = (14, 0.6), (16, 0.9)  # scans adjusted together, and distance of two in cells: soon, then well
 _CELL_M, _POINT_M = 1.0, 0.3  # edge of a cell, and of the voxels to which scans are downsampled

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,8 @@ from scanchain.config import MatchingConfig
 from scanchain.data import LEAST_FIT, Match, Points, Pose, State
 from scanchain.odometry.prediction import Prediction
 from scanchain.preprocess import Sweep
-from scanchain.registration import AMBIGUOUS, BirdsEye, CorrelativeMap, Matcher, VoxelMap, Window
+from scanchain.registration import AMBIGUOUS, Matcher, SearchGrid, VoxelMap, Wanted, Window, find, thinned
+from scanchain.registration.search import evenly, upright_columns
 
 _WIDE_SCANS = 3  # number of scans searched wide at the start and after a loss, while no velocity is known
 _PATIENCE = 5  # number of scans lost in a row, from which on the map is extended at the predicted pose
@@ -24,10 +25,12 @@ _ROUGH = 0.05  # share of the cost of a point without a correspondence, below wh
 _UNUSUAL = 1.5  # cost per point over its running mean, from which on a contradicted pose in space is searched
 CLEARLY = 0.8  # share of the cost of the present pose, below which another one replaces it
 _SAME_RAD = 0.05  # largest angle between two poses of one minimum, which lie within a voxel
-_SEEDS = 3  # number of poses from the bird's-eye search that are aligned
+_SEEDS = 3  # number of poses by upright structure that are aligned
+_COLUMNS = 300  # of upright structure that are scored, evenly spread
+_COLUMNS_APART, _COLUMNS_SHARE = 3.0, 0.6  # of these poses: least distance in voxels, share of the best score
 _LONG_S = 1.0  # shortest gap after which a robot may have turned around
 _SEEDS_APART_M, _SEEDS_SHARE = 1.0, 0.8  # of those of the search in the plane: distance, share of the best score
-_NEAR_PERCENT = 95.0  # share of the points within the radius of the bird's-eye image
+_NEAR_PERCENT = 95.0  # share of the points within the radius of the map that is searched in space
 _MEMORY = 0.9  # weight of the running mean of the cost per point against the next one
 
 
@@ -129,10 +132,8 @@ class Recovery:
         best = tried[0]
         for half_width_m, half_width_rad in prediction.windows_in_space():
             radius_m = float(np.percentile(np.abs(structure[:, :2]), _NEAR_PERCENT)) + half_width_m
-            seeds = BirdsEye(surfaces, prediction.T_odom_lidar, radius_m).seeds(
-                structure, half_width_m=half_width_m, half_width_rad=half_width_rad, answers=_SEEDS
-            )
-            for seed in seeds:
+            window = Window(lie.identity(2), half_width_m, half_width_rad)
+            for seed in from_above(structure, surfaces, prediction.T_odom_lidar, window, radius_m):
                 if not any(_is_near(seed, match.T_target_source, surfaces.voxels.size_m) for match in tried):
                     tried.append(matcher.align(points, surfaces, seed, wide=True))
             found = min(tried, key=lambda match: self._cost(match, prediction))
@@ -176,6 +177,22 @@ def _away(match: Match, prediction: Prediction) -> float:
     return float(away @ away)
 
 
+def from_above(
+    structure: Points, surfaces: VoxelMap, T_predicted: Pose, window: Window, radius_m: float
+) -> Iterator[Pose]:
+    """Initial poses in space, the best first: upright structure of scan and map as seen along the lidar's z axis.
+
+    window : of the motion in its xy plane; radius_m : half the side of the square of the map that is seen
+    """
+    size_m = surfaces.voxels.size_m
+    means = lie.transform(lie.inverse(T_predicted), surfaces.points())
+    near = means[np.abs(means[:, :2]).max(axis=1, initial=0.0) <= radius_m]
+    grid = SearchGrid.of_points(upright_columns(near, size_m), size_m)
+    columns = evenly(upright_columns(structure, size_m), _COLUMNS)
+    for found in find(columns, grid, window, Wanted(_COLUMNS_APART * size_m, _COLUMNS_SHARE, _SEEDS)):
+        yield T_predicted @ lie.lift(found.T_target_source)
+
+
 def is_sound(match: Match) -> bool:
     """True if the correspondences determine the pose and agree with it."""
     return match.fit >= LEAST_FIT and match.observability >= 1.0
@@ -195,7 +212,8 @@ def _guesses(points: Points, surfaces: VoxelMap, prediction: Prediction) -> tupl
     half_width_m, half_width_rad = prediction.window()
     reach_m = float(np.abs(points).max()) * math.sqrt(2.0) + half_width_m
     T_predicted = prediction.T_odom_lidar
-    window = Window(half_width_m, half_width_rad, _SEEDS_APART_M, _SEEDS_SHARE, answers=2)
-    seeds = CorrelativeMap(surfaces, T_predicted, reach_m).search(points, T_predicted, window)
-    seeds = seeds[: 2 if _is_free(prediction) else 1]
-    return (*alternatives, *(lie.pose_2d(x_m, y_m, yaw_rad) for x_m, y_m, yaw_rad, _ in seeds.tolist()))
+    grid = SearchGrid.of_voxels(surfaces, T_predicted, reach_m)
+    wanted = Wanted(_SEEDS_APART_M, _SEEDS_SHARE, answers=2 if _is_free(prediction) else 1)
+    window = Window(T_predicted, half_width_m, half_width_rad)
+    seeds = find(thinned(points, grid.resolution_m), grid, window, wanted)
+    return (*alternatives, *(seed.T_target_source for seed in seeds))

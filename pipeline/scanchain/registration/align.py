@@ -14,8 +14,8 @@ from scanchain.config import Config, PreprocessConfig
 from scanchain.data import AnyPoints, Match, Points, Pose
 from scanchain.errors import InputError
 from scanchain.preprocess import downsample
-from scanchain.registration.correlative import CorrelativeMap, Window
 from scanchain.registration.matcher import create_matcher
+from scanchain.registration.search import SearchGrid, Wanted, Window, find, thinned
 from scanchain.registration.voxel_map import VoxelMap
 from scanchain.settings import Override, load_settings
 
@@ -100,10 +100,11 @@ def _matched(
     match = matcher.align(sparse, local_map, T_first, wide=True)
     if local_map.dimension == 3:
         return match
-    window = Window(_WINDOW * range_m, _WINDOW_RAD, _SEEDS_APART_M, _RIVAL, _SEEDS)
-    T_begin, turned = T_first @ lie.inverse(T_pivot_source), lie.transform(T_pivot_source, sparse)
-    seeds = CorrelativeMap(local_map, T_first).search(turned, T_begin, window)
-    found = (lie.pose_2d(x_m, y_m, yaw_rad) @ T_pivot_source for x_m, y_m, yaw_rad, _ in seeds.tolist())
+    grid = SearchGrid.of_voxels(local_map, T_first)
+    turned = thinned(lie.transform(T_pivot_source, sparse), grid.resolution_m)
+    window = Window(T_first @ lie.inverse(T_pivot_source), _WINDOW * range_m, _WINDOW_RAD)
+    seeds = find(turned, grid, window, Wanted(_SEEDS_APART_M, _RIVAL, _SEEDS))
+    found = (seed.T_target_source @ T_pivot_source for seed in seeds)
     return _unambiguous([match, *(matcher.align(sparse, local_map, T_seed) for T_seed in found)])
 
 

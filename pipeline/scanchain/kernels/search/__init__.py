@@ -1,1 +1,1 @@
-"""Branch and bound over poses, and place descriptors; compiled."""
+"""Branch and bound over poses; compiled."""

@@ -1,4 +1,9 @@
-"""Correlative scan matching in the plane, exact over a wide window, by branch and bound (Hess et al. 2016)."""
+"""Best poses of points of the plane in a grid of scores, by branch and bound (Hess et al. 2016).
+
+A window is 2ʰ × 2ʰ shifts of the points under one heading: (−bound, level h, turn, column, row). It scores at most
+what its points find in level h of the grid's pyramid, so the window with the highest bound is split until one of a
+single shift comes first: nothing that is left can beat it.
+"""
 
 import heapq
 import math
@@ -7,151 +12,201 @@ import numpy as np
 
 from scanchain.kernels.compiling import njit
 
-HIT, NEAR = 2, 1  # score of a point in a cell with a surface, and in one beside it
+SURFACE, NEAR, UNKNOWN, FREE = 2, 1, 0, -2  # score of a point in a cell
 APART_RAD = 0.1  # least angle between two distinct poses
+_EARLY = 32  # points between two tests whether the rest can still reach the least score
 
 
 @njit(nogil=True)
-def draw_hits(means, origin, resolution_m: float, grid):
-    """Score HIT where a surface point lies, NEAR in the eight cells around it.
+def score_windows(blocks, pyramid, room, has_room, spans, cells, first: int, least: float, rival: float, reached):
+    """The largest windows whose bound is worth it, under some headings: (K, 5).
 
-    means : (V, ≥ 2) meters; origin : (2,) corner of cell (0, 0); grid : (rows, columns) uint8, row along y
-    Every mean lies within the grid, a cell or more from its border.
+    blocks : (2ˡ, 2ˡ, rows, columns) of the pyramid's last level l, by their place in its 2ˡ × 2ˡ blocks: points of
+        one scan in neighboring windows lie side by side, and many windows are scored at once
+    pyramid, room, least, rival : as in ``split_best``
+    has_room : (rows, columns) of windows, those that hold a shift which is searched
+    spans : (rows, 2) first of these in each row, and past the last
+    cells : (turns, N, 2) column and row of the points without a shift, under the headings from ``first`` on
+    reached : (1,) best score of a pose so far, of those in the best window of each heading; raised
     """
-    for v in range(means.shape[0]):
-        column = int((means[v, 0] - origin[0]) / resolution_m)
-        row = int((means[v, 1] - origin[1]) / resolution_m)
-        for dr in range(-1, 2):
-            for dc in range(-1, 2):
-                grid[row + dr, column + dc] = max(grid[row + dr, column + dc], NEAR)
-        grid[row, column] = HIT
+    level = pyramid.shape[0] - 1
+    size = 1 << level
+    scores = np.empty(has_room.shape, np.int16)
+    windows = [(0, 0, 0, 0, 0) for _ in range(0)]
+    for turn in range(cells.shape[0]):
+        _score_heading(blocks, level, has_room, spans, cells[turn], scores)
+        row, column = divmod(scores.argmax(), has_room.shape[1])
+        if scores[row, column] > reached[0]:
+            reached[0] = max(
+                reached[0], _best_of_window(pyramid[0], room, cells[turn], row * size, column * size, size)
+            )
+        limit = max(least, rival * reached[0])
+        for row in range(scores.shape[0]):
+            for column in range(spans[row, 0], spans[row, 1]):
+                if scores[row, column] >= limit:
+                    windows.append((-int(scores[row, column]), level, first + turn, column * size, row * size))
+    return _array_of(windows)
 
 
 @njit(nogil=True)
-def fill_pyramid(pyramid):
-    """Fill level h of (levels, rows, columns) with the best score in the 2ʰ × 2ʰ cells that start at each cell."""
-    levels, rows, columns = pyramid.shape
-    for h in range(1, levels):
-        half = 1 << (h - 1)
-        for row in range(rows):
-            far_row = row + half
-            for column in range(columns):
-                best = pyramid[h - 1, row, column]
-                far_column = column + half
-                if far_column < columns:
-                    best = max(best, pyramid[h - 1, row, far_column])
-                if far_row < rows:
-                    best = max(best, pyramid[h - 1, far_row, column])
-                    if far_column < columns:
-                        best = max(best, pyramid[h - 1, far_row, far_column])
-                pyramid[h, row, column] = best
+def _score_heading(blocks, level: int, has_room, spans, cells, scores):
+    """Score of the points in every window, under one heading: cells (N, 2). The innermost loop is vectorized."""
+    size, rows, columns = 1 << level, blocks.shape[2], blocks.shape[3]
+    scores[:] = 0
+    for i in range(cells.shape[0]):
+        x, y = cells[i, 0] >> level, cells[i, 1] >> level
+        layer = blocks[cells[i, 1] & (size - 1), cells[i, 0] & (size - 1)]
+        for row in range(max(0, -y), min(scores.shape[0], rows - y)):
+            left = max(spans[row, 0], -x)
+            count = max(min(spans[row, 1], columns - x) - left, 0)
+            of_row, added = scores[row, left : left + count], layer[row + y, left + x : left + x + count]
+            for column in range(count):
+                of_row[column] += added[column]
+    for row in range(scores.shape[0]):
+        for column in range(scores.shape[1]):
+            if not has_room[row, column]:
+                scores[row, column] = -1
 
 
 @njit(nogil=True)
-def search(
-    pyramid, origin, resolution_m: float, points, T, shifts: int, turns: int, turn_rad: float, least: float,
-    apart_m: float, rival: float, answers: int,
-):  # fmt: skip
-    """The best-scoring poses around T, within so many shifts of a cell and turns, each apart from the others.
-
-    A window of 2ʰ × 2ʰ shifts scores at most what its points find in level h, so the window with the highest
-    bound is split until one of a single shift comes first: nothing that is left can beat it. The search goes on
-    to the best pose elsewhere, ``apart_m`` or APART_RAD away from those found, with at least the share ``rival``
-    of the best score.
-
-    pyramid : of ``fill_pyramid``; its first 2ᵗᵒᵖ − 1 rows and columns are empty
-    points : (N, 2) meters, lidar frame; T : (3, 3)
-    least : share of the highest score possible, below which nothing counts
-    Returns (A ≤ answers, 4), the best first: x, y (m), yaw, share of the highest score possible.
-    """
-    full = HIT * points.shape[0]
-    cells = turned_cells(points, T, origin, resolution_m, turns, turn_rad)
-    heap = _roots(pyramid, cells, shifts, least * full)
-    found, count = np.empty((answers, 4)), 0
-    taken = np.empty((answers, 3), np.int64)
+def _best_of_window(layer, room, cells, first_row: int, first_column: int, size: int) -> int:
+    """Best score of the shifts of a window, 0 where there is none."""
     best = 0
-    while len(heap) and count < answers:
-        negative, level, turn, dx, dy = heapq.heappop(heap)
-        if -negative < rival * best:
+    for y in range(first_row, min(first_row + size, room.shape[0])):
+        for x in range(first_column, min(first_column + size, room.shape[1])):
+            if room[y, x]:
+                best = max(best, _score(layer, cells, x, y, best))
+    return best
+
+
+@njit(nogil=True)
+def split_best(
+    pyramid, room, cells, sorted_windows, split, windows, found, turn_rad: float, least: float, rival: float,
+    apart: float, steps: int,
+):  # fmt: skip
+    """Split the most promising windows, at most so many; the split ones of which may still hold a pose (K, 5).
+
+    The search is over once none is left of these or of the sorted ones.
+
+    pyramid : (levels, rows, columns), level h the best score in the 2ʰ × 2ʰ cells that start at each cell
+    room : (rows, columns) of shifts that are searched
+    cells : (turns, N, 2) as in ``score_windows``, points in random order: poor windows are given up after a few
+    sorted_windows : (K, 5) of ``score_windows``, the best first; split : (2,) how many were taken, and the
+        number of poses found; changed
+    windows : (K, 5) of the last call, a heap
+    found : (A, 4) column, row, turn and score of the poses found, each so many cells or APART_RAD away from those
+        before it, the best first; filled
+    least : score below which nothing counts; rival : share of the best score, likewise
+    """
+    heap = [(w[0], w[1], w[2], w[3], w[4]) for w in windows]
+    size = len(sorted_windows)
+    for _ in range(steps):
+        best = found[0, 3] if split[1] else 0.0
+        limit = max(least, rival * best)
+        if split[0] < size and (not len(heap) or sorted_windows[split[0], 0] < heap[0][0]):
+            w = sorted_windows[split[0]]
+            window = (w[0], w[1], w[2], w[3], w[4])
+            split[0] += 1
+        elif len(heap):
+            window = heapq.heappop(heap)
+        else:
             break
-        if is_taken(taken[:count], level, turn, dx, dy, resolution_m, turn_rad, apart_m):
+        negative, level, turn, x, y = window
+        if -negative < limit or split[1] == found.shape[0]:
+            split[0] = size
+            heap.clear()
+            break
+        if _is_taken(found[: split[1]], level, turn, x, y, turn_rad, apart):
             continue
         if level > 0:
-            _split(heap, pyramid[level - 1], cells[turn], level - 1, turn, dx, dy, shifts, least * full)
+            _split(heap, pyramid, room, cells[turn], level - 1, turn, x, y, limit)
             continue
-        best = max(best, -negative)
-        taken[count, 0], taken[count, 1], taken[count, 2] = turn, dx, dy
-        found[count, 0], found[count, 1] = T[0, 2] + dx * resolution_m, T[1, 2] + dy * resolution_m
-        found[count, 2] = math.atan2(T[1, 0], T[0, 0]) + (turn - turns) * turn_rad
-        found[count, 3] = -negative / full
-        count += 1
-    return found[:count]
+        found[split[1], 0], found[split[1], 1] = x, y
+        found[split[1], 2], found[split[1], 3] = turn, -negative
+        split[1] += 1
+    return _array_of(heap)
+
+
+@njit(nogil=True)
+def _split(heap, pyramid, room, cells, level: int, turn: int, x: int, y: int, least: float):
+    """Push those of the four windows of the next level that make up one which reach the least score."""
+    half = 1 << level
+    for far_y in (y, y + half):
+        for far_x in (x, x + half):
+            if far_y >= room.shape[0] or far_x >= room.shape[1] or (level == 0 and not room[far_y, far_x]):
+                continue
+            bound = _score(pyramid[level], cells, far_x, far_y, least)
+            if bound >= least:
+                heapq.heappush(heap, (-bound, level, turn, far_x, far_y))
+
+
+@njit(nogil=True)
+def _array_of(windows):
+    result = np.empty((len(windows), 5), np.int64)
+    for k, window in enumerate(windows):
+        for part, value in enumerate(window):
+            result[k, part] = value
+    return result
 
 
 @njit(inline="always")
-def is_taken(
-    taken, level: int, turn: int, dx: int, dy: int, resolution_m: float, turn_rad: float, apart_m: float
-) -> bool:
-    """True if a window lies near one of the (A, 3) turns and shifts that were found."""
+def _is_taken(found, level: int, turn: int, x: int, y: int, turn_rad: float, apart: float) -> bool:
+    """True if a window lies near one of the (A, 4) poses that were found."""
     size = (1 << level) - 1
-    for a in range(taken.shape[0]):
-        x, y = taken[a, 1], taken[a, 2]
-        away = max(abs(dx - x), abs(dx + size - x), abs(dy - y), abs(dy + size - y))
-        if abs(turn - taken[a, 0]) * turn_rad < APART_RAD and away * resolution_m < apart_m:
+    for a in range(found.shape[0]):
+        fx, fy = found[a, 0], found[a, 1]
+        away = max(abs(x - fx), abs(x + size - fx), abs(y - fy), abs(y + size - fy))
+        turned_rad = abs(turn - found[a, 2]) * turn_rad
+        if min(turned_rad, 2.0 * math.pi - turned_rad) < APART_RAD and away < apart:
             return True
     return False
 
 
-@njit(nogil=True)
-def turned_cells(points, T, origin, resolution_m: float, turns: int, turn_rad: float):
-    """Column and row (2·turns + 1, N, 2) of every point under every turn of T."""
-    yaw = math.atan2(T[1, 0], T[0, 0])
-    cells = np.empty((2 * turns + 1, points.shape[0], 2), np.int32)
-    for turn in range(2 * turns + 1):
-        angle = yaw + (turn - turns) * turn_rad
-        c, s = math.cos(angle), math.sin(angle)
-        for i in range(points.shape[0]):
-            x = c * points[i, 0] - s * points[i, 1] + T[0, 2] - origin[0]
-            y = s * points[i, 0] + c * points[i, 1] + T[1, 2] - origin[1]
-            cells[turn, i, 0] = math.floor(x / resolution_m)
-            cells[turn, i, 1] = math.floor(y / resolution_m)
-    return cells
-
-
-@njit(nogil=True)
-def _roots(pyramid, cells, shifts: int, least: float):
-    """Heap of the largest windows: (−bound, level, turn, first shift along x, along y)."""
-    top = pyramid.shape[0] - 1
-    heap = [(0, 0, 0, 0, 0) for _ in range(0)]
-    for turn in range(cells.shape[0]):
-        for dx in range(-shifts, shifts + 1, 1 << top):
-            for dy in range(-shifts, shifts + 1, 1 << top):
-                bound = score(pyramid[top], cells[turn], dx, dy)
-                if bound >= least:
-                    heap.append((-bound, top, turn, dx, dy))
-    heapq.heapify(heap)
-    return heap
-
-
-@njit(nogil=True)
-def _split(heap, layer, cells, level: int, turn: int, dx: int, dy: int, shifts: int, least: float):
-    """Push the four windows of the next level that make up one."""
-    half = 1 << level
-    for x in (dx, dx + half):
-        for y in (dy, dy + half):
-            if x > shifts or y > shifts:
-                continue
-            bound = score(layer, cells, x, y)
-            if bound >= least:
-                heapq.heappush(heap, (-bound, level, turn, x, y))
-
-
 @njit(inline="always")
-def score(layer, cells, dx: int, dy: int) -> int:
-    """Score of the points, shifted by so many cells, in a layer; 0 for cells outside."""
+def _score(layer, cells, x: int, y: int, least: float) -> int:
+    """Score of the points, shifted by so many cells, in a layer; given up once the rest cannot reach the least."""
+    count = cells.shape[0]
     total = 0
-    for i in range(cells.shape[0]):
-        column, row = cells[i, 0] + dx, cells[i, 1] + dy
+    for i in range(count):
+        column, row = cells[i, 0] + x, cells[i, 1] + y
         if 0 <= row < layer.shape[0] and 0 <= column < layer.shape[1]:
             total += layer[row, column]
+        if i % _EARLY == _EARLY - 1 and total + SURFACE * (count - 1 - i) < least:
+            return SURFACE * -count - 1
     return total
+
+
+@njit(nogil=True)
+def climb(cells, points, origin, resolution_m: float, pose, step_rad: float):
+    """Move a pose (x, y, yaw), in place, uphill on the score of its points; returns their mean score.
+
+    Steps are half a cell and ``step_rad``, then half as large.
+    """
+    best = _mean_score(cells, points, origin, resolution_m, pose[0], pose[1], pose[2])
+    for halving in range(2):
+        step_m, turn_rad = 0.5 * resolution_m / (1 << halving), step_rad / (1 << halving)
+        for _ in range(8):
+            x, y, yaw, before = pose[0], pose[1], pose[2], best
+            for a in range(-1, 2):
+                for b in range(-1, 2):
+                    for c in range(-1, 2):
+                        moved = x + a * step_m, y + b * step_m, yaw + c * turn_rad
+                        score = _mean_score(cells, points, origin, resolution_m, moved[0], moved[1], moved[2])
+                        if score > best:
+                            best, pose[0], pose[1], pose[2] = score, moved[0], moved[1], moved[2]
+            if best <= before:
+                break
+    return best
+
+
+@njit(nogil=True)
+def _mean_score(cells, points, origin, resolution_m: float, x: float, y: float, yaw: float) -> float:
+    c, s = math.cos(yaw) / resolution_m, math.sin(yaw) / resolution_m
+    left, low = (x - origin[0]) / resolution_m, (y - origin[1]) / resolution_m
+    total = 0
+    for i in range(points.shape[0]):
+        column = math.floor(c * points[i, 0] - s * points[i, 1] + left)
+        row = math.floor(s * points[i, 0] + c * points[i, 1] + low)
+        if 0 <= row < cells.shape[0] and 0 <= column < cells.shape[1]:
+            total += cells[row, column]
+    return total / points.shape[0]
