@@ -17,9 +17,9 @@ import numpy as np
 from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import Keyframe, KeyframeErrors, Matrix, Points, Pose, Prior, Scan, State
-from scanchain.kernels.registration.icp import Fit, Problem, align, fit_at
+from scanchain.kernels.registration.icp import Fit, align, fit_at
 from scanchain.kernels.registration.observability import agreement, signal_along
-from scanchain.kernels.registration.residuals import gradient_spread
+from scanchain.kernels.registration.residuals import Problem, gradient_spread
 from scanchain.odometry import Located
 from scanchain.odometry.tracked import Tracked, first_match
 from scanchain.registration import VoxelMap
@@ -45,8 +45,7 @@ def judge(dimension: int) -> None:
     if dimension == 2:
         grid = CorrelativeMap(VoxelMap(2, load_settings(2).config.local_map), T)
         grid.search(np.ones((1, 2)), T, Window(0.0, 0.0, 1.0, 1.0, answers=1))
-    correspondences = problem.correspondence, problem.weight
-    gradient_spread.compile_inner(problem.voxels, problem.points, T, problem.origin, *correspondences, 1.0)
+    gradient_spread.compile_inner(problem, T, 1.0)
     agreement.compile_inner(np.eye(k), np.eye(k), 1.0)
     signal_along.compile_inner(problem, T, np.zeros(k))
     fit_at.compile_inner(problem, T, Fit(np.eye(k), np.eye(k), 0.0, 0.0, 0.0, 0, 0, 0))

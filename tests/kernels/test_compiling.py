@@ -18,13 +18,11 @@ from numba.core.codegen import CPUCodeLibrary
 from numba.core.compiler import Flags
 from numba.core.types.functions import BaseFunction
 
-from scanchain import lie
 from scanchain.__main__ import main
 from scanchain.api import open_recorder
 from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.kernels import compiler_shortcuts, compiling
 from scanchain.kernels.graph.cholesky import factorize
-from scanchain.kernels.registration import residuals
 from scanchain.kernels.registration.icp import align, fit_at
 from scanchain.kernels.registration.observability import agreement, signal_along
 from scanchain.kernels.registration.residuals import gradient_spread
@@ -253,19 +251,6 @@ def test_the_first_scan_is_shown_ahead_where_kernels_are_compiled(office, tmp_pa
     run(Job(logs=(office,), out=tmp_path / "run", sinks=frozenset()), open_recorder, Unwatched())
     assert [scan.index for scan in shown] == [steps[0].scan.index] * compiles
     np.testing.assert_array_equal(steps[0].T_world_lidar, np.eye(3))  # as the viewer draws a scan without a pose
-
-
-@pytest.mark.parametrize(("d", "kernel"), [(2, residuals._in_plane), (3, residuals._in_space)])
-def test_normal_equations_count_no_references_from_point_to_point(d, kernel, tmp_path, monkeypatch):
-    """A row of an array, handed on, was counted up and down for every point: two thirds of the time."""
-    voxels = VoxelMap(d, load_settings(d).config.local_map).voxels
-    k = lie.twist_size(lie.identity(d))
-    none = np.empty(0, np.int32), np.empty(0)
-    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
-    compiled = compiling.njit()(kernel.py_func)
-    compiled(voxels, np.empty((0, d)), lie.identity(d), np.zeros(3), *none, 1.0, np.zeros((k, k)), np.zeros(k))
-    blocks = re.split(r"^[^\s:]+:.*$", body(compiled), flags=re.MULTILINE)
-    assert sum("NRT_incref(" in block for block in blocks) <= 2  # at the begin, and of H in the end
 
 
 def body(kernel):

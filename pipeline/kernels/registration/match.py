@@ -166,15 +166,7 @@ def _spread(problem, T, fit):
     """
     if fit.H.shape[0] == 3:
         return np.zeros((0, 0))
-    spread = gradient_spread(
-        problem.voxels,
-        problem.points,
-        T,
-        problem.origin,
-        problem.correspondence,
-        problem.weight,
-        problem.settings.scale_m,
-    )
+    spread = gradient_spread(problem, T, problem.settings.scale_m)
     variance = _variance(problem, fit)
     for i in range(6):
         for j in range(6):
