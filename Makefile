@@ -7,12 +7,13 @@ DEV := .venv/dev-installed
 BASELINES := .venv/baselines-installed
 DOCS := .venv/docs-installed
 
-.PHONY: help demo test lint docs clean
+.PHONY: help demo test lint count docs clean
 
 help:
 	@echo "make demo   simulate an office and a town, run both, compare the town with KISS-ICP and Open3D (within four minutes)"
 	@echo "make test   run the whole test suite"
 	@echo "make lint   format, lint, type and import checks"
+	@echo "make count  print how many files and lines each part has"
 	@echo "make docs   build the documentation into build/docs; warnings are errors"
 	@echo "make clean  remove the environment, logs and runs of the demo"
 
@@ -34,29 +35,36 @@ test: $(DEV)
 lint: $(DEV)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	rm -rf build/lint && mkdir -p build/lint && cp -R pipeline build/lint/scanchain && cp -R viz build/lint/scanchain/viz
-	$(BIN)/basedpyright | sed 's|[^ ]*build/lint/scanchain/viz|viz|; s|[^ ]*build/lint/scanchain|pipeline|'
-	cd build/lint && ../../$(BIN)/lint-imports --config ../../pyproject.toml
+	$(BIN)/basedpyright
+	PYTHONPATH=pipeline:viz $(BIN)/lint-imports
+
+count:
+	@git ls-files '*.py' | xargs wc -l | awk '$$2 != "total" { \
+	  split($$2, part, "/"); room = part[2] == "scanchain" && part[4] ? part[1] "/" part[3] : part[1]; \
+	  kind = part[1] ~ /pipeline|viz/ ? "product" : part[1]; \
+	  lines[room] += $$1; files[room]++; if (kind == "product") { lines[kind] += $$1; files[kind]++ } } \
+	  END { for (room in lines) printf "%7d lines %4d files  %s\n", lines[room], files[room], room }' | sort -k5
+	@cat README.md CHANGELOG.md CONTRIBUTING.md docs/*.md | wc -c | awk '{ printf "%7.1f kB of documentation\n", $$1 / 1000 }'
 
 docs: $(DOCS)
 	$(BIN)/python -m sphinx -W --keep-going -q -d build/docs/.doctrees docs build/docs
 	@echo "Open build/docs/index.html"
 
-$(RUNTIME): pyproject.toml setup.py
+$(RUNTIME): pyproject.toml
 	@$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11) and 'Python 3.11 or newer is needed: make PYTHON=python3.12')"
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
 	touch $@
 
-$(BASELINES): pyproject.toml setup.py $(RUNTIME)
+$(BASELINES): pyproject.toml $(RUNTIME)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[baselines]'
 	touch $@
 
-$(DEV): pyproject.toml setup.py $(RUNTIME)
+$(DEV): pyproject.toml $(RUNTIME)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[baselines,cluster,remote,dev]'
 	touch $@
 
-$(DOCS): pyproject.toml setup.py $(RUNTIME)
+$(DOCS): pyproject.toml $(RUNTIME)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
 	touch $@
 

@@ -9,7 +9,7 @@ from msgspec.structs import fields
 
 from scanchain.config import Config
 from scanchain.errors import InputError
-from scanchain.settings import Override, config_keys, dump, flatten, load_settings, preset_path, read_layer
+from scanchain.settings import Override, config_keys, dump, flatten, load_settings, read_layer, shipped
 from tests.support.messages import says
 from tests.support.scenes import ROOT, configured
 
@@ -55,8 +55,8 @@ def test_the_two_presets_differ():
 
 @pytest.mark.parametrize("name", ["lidar2d", "lidar3d"])
 def test_a_preset_holds_only_what_differs_from_the_defaults(name):
-    layer = read_layer(preset_path(name))
-    assert preset_path(name) == ROOT / "configs" / f"{name}.toml"
+    layer = read_layer(shipped("configs") / f"{name}.toml")
+    assert shipped("configs") == ROOT / "configs"
     assert {key for key, value in layer.items() if value == config_keys()[key].default} == set()
 
 

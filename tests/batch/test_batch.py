@@ -23,7 +23,7 @@ from scanchain.processes import resident_mib
 from scanchain.runs.directory import directory_name
 from scanchain.simulation import simulate
 from scanchain.source import Address
-from scanchain.viz.report.batch import names_of
+from scanchain_viz.report.batch import names_of
 from tests.support.browser import look
 from tests.support.killing import processes_about, wait_until
 from tests.support.scenes import ROOT

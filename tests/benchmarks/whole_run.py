@@ -136,7 +136,7 @@ def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]
     def record(*arguments: Any, **options: Any) -> Any:
         recording = open_recording(*arguments, **options)
         watch.over("recording", type(recording), "__enter__", "close", "log", "log_trajectory", "log_map")
-        watch.over("recording", sys.modules["scanchain.viz.recording.messages"].Message, "send")
+        watch.over("recording", sys.modules["scanchain_viz.recording.messages"].Message, "send")
         return recording
 
     api.open_recorder = watch.timed("recording", record)

@@ -1019,13 +1019,13 @@ def test_what_config_dump_prints_can_be_given_back(call, tmp_path, dimension):
     assert call("config", "dump", "--config", tmp_path / "mine.toml")[1] == output
 
 
-def test_sequence_list_knows_every_folder_of_the_catalog(call):
-    folders = sorted(path.parent.name for path in (ROOT / "sequences").glob("*/sequence.toml"))
+def test_sequence_list_knows_every_file_of_the_catalog(call):
+    known = sorted(path.stem for path in (ROOT / "sequences").glob("*.toml"))
     code, output, errors = call("sequence", "list")
     assert (code, errors) == (0, "")
-    assert [line.split()[0] for line in output.splitlines()] == folders
+    assert [line.split()[0] for line in output.splitlines()] == known
     tree = json.loads(call("sequence", "list", "--json")[1])
-    assert list(tree) == folders and tree["demo-office"]["source"]["world"] == "office"
+    assert list(tree) == known and tree["demo-office"]["source"]["world"] == "office"
 
 
 def test_sequence_get_does_not_make_again_what_is_there(call, tmp_path):

@@ -26,7 +26,7 @@ from scanchain.runs.resume.snapshot import Classes, read_snapshot, write_snapsho
 from scanchain.simulation import simulate
 from scanchain.slam import Slam
 from scanchain.trajectory import read_tum
-from scanchain.viz.recording import entities
+from scanchain_viz.recording import entities
 from tests.support.killing import (
     assert_readable,
     config_of,
@@ -111,7 +111,7 @@ def test_killed_at_any_moment_a_run_leaves_files_that_open_and_goes_on_to_the_sa
 @pytest.mark.parametrize(
     "module, kind, method",
     [
-        ("scanchain.viz.recording.recording", "Recording", "resume"),
+        ("scanchain_viz.recording.recording", "Recording", "resume"),
         ("scanchain.runs.resume.checkpoint", "Checkpoints", "write"),
     ],
 )

@@ -14,7 +14,7 @@ from scanchain.errors import InputError
 from scanchain.logs.formats.cloud_file import read_ply
 from scanchain.maps import Edges, Session, open_saved_map, write_saved_map
 from scanchain.sessions.changes import Changes, Label, Part, changes_between
-from scanchain.sessions.updating import updated
+from scanchain.sessions.merged_map import updated
 from scanchain.settings import load_settings
 from scanchain.simulation.solids import Scenery, Solids
 

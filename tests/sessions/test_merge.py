@@ -21,9 +21,9 @@ from scanchain.maps import Edges, open_saved_map, read_ply
 from scanchain.odometry.tracked import first_match
 from scanchain.runs.job import Unwatched
 from scanchain.sessions.joining import Joined, changed, doubt_about, graph_of
-from scanchain.sessions.merging import MergeJob, merge
+from scanchain.sessions.merging import merge
 from scanchain.trajectory import read_tum
-from scanchain.viz.pictures.run import draw_run
+from scanchain_viz.pictures.run import draw_run
 
 PARTS = {"morning": (0.0, 18.0), "noon": (6.0, 24.0), "evening": (14.0, 34.0)}
 FILES = ("map/points.i16", "map/edges.npz", "map/keyframes.npz", "map.ply", "map.pgm", "evening.tum", "graph.g2o")
@@ -49,7 +49,7 @@ def merged(runs, tmp_path_factory):
 
 
 def quietly(*runs, out, **options):
-    return merge(MergeJob(tuple(runs), out, **options), Unwatched(), lambda folder: None)
+    return merge(runs, out, Unwatched(), lambda folder: None, **options)
 
 
 def ate_m(out, truth, names):
@@ -175,9 +175,8 @@ def test_a_merge_that_is_killed_leaves_the_runs_as_they_were_and_nothing_else(ru
     def interrupted(directory):
         raise KeyboardInterrupt
 
-    job = MergeJob((folder / "morning", folder / "noon"), tmp_path / "out")
     with pytest.raises(KeyboardInterrupt):
-        merge(job, Unwatched(), interrupted)
+        merge([folder / "morning", folder / "noon"], tmp_path / "out", Unwatched(), interrupted)
     assert not list(tmp_path.iterdir())
     assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 

@@ -15,6 +15,7 @@ import scanchain
 from scanchain import catalog, lie
 from scanchain.__main__ import main
 from scanchain.errors import InputError
+from scanchain.settings import shipped
 from scanchain.simulation import NO_SLIP, SENSORS, WORLDS, Slip, plan, simulate
 from scanchain.simulation.motion import wheel_odometry
 from scanchain.simulation.sensors import take_sweep
@@ -687,10 +688,10 @@ def test_an_unknown_sequence_names_the_known_ones():
 
 
 def test_a_misspelt_key_is_refused(tmp_path):
-    text = (catalog._folder() / "office" / "sequence.toml").read_text()
-    (tmp_path / "sequence.toml").write_text(text.replace("drift", "drfit").replace("seed", "sede"))
+    text = (shipped("sequences") / "office.toml").read_text()
+    (tmp_path / "office.toml").write_text(text.replace("drift", "drfit").replace("seed", "sede"))
     with pytest.raises(InputError, match="sede"):
-        catalog.read(tmp_path / "sequence.toml")
+        catalog.read(tmp_path / "office.toml")
 
 
 def test_another_day_changes_movable_objects_alone_and_keeps_the_path_free():

@@ -23,7 +23,7 @@ from scanchain.runs.resume.checkpoint import read_checkpoint
 from scanchain.runs.resume.journal import JOURNAL_FILE, read_journal
 from scanchain.settings import load_settings
 from scanchain.trajectory import read_kitti, read_tum
-from scanchain.viz.recording import entities
+from scanchain_viz.recording import entities
 from tests.support.scenes import ROOT
 
 _KILLS_A_RUN = 3  # then it may go on to its end

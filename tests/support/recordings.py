@@ -9,8 +9,8 @@ from scanchain import lie
 from scanchain.config import RecordingConfig
 from scanchain.data import Closure, ClosureVerdict, GraphState, Match, Scan, State, Step, Timing
 from scanchain.runs.closures import final_verdicts
-from scanchain.viz.recording import entities
-from scanchain.viz.recording.recording import Recording
+from scanchain_viz.recording import entities
+from scanchain_viz.recording.recording import Recording
 
 START_NS = 976_052_857_000_000_000
 EVERY_SCAN = (

@@ -30,7 +30,7 @@ from scanchain.verdict import (
     wheel_bound_m,
     worst_place,
 )
-from scanchain.viz.stretch_colors import STRETCH_COLORS
+from scanchain_viz.stretch_colors import STRETCH_COLORS
 from tests.support.recordings import drive
 
 N, STEP_M, INTERVAL_S = 1200, 0.1, 0.2

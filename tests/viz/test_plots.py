@@ -7,10 +7,10 @@ import pytest
 
 from scanchain import lie
 from scanchain.verdict import Kind, Stretch
-from scanchain.viz.pictures.axis import Axis, width_of
-from scanchain.viz.pictures.figure import SvgFigure, palette_of
-from scanchain.viz.pictures.map_figures import draw_points
-from scanchain.viz.pictures.run import GridPicture, draw_map
+from scanchain_viz.pictures.axis import Axis, width_of
+from scanchain_viz.pictures.figure import SvgFigure, palette_of
+from scanchain_viz.pictures.map_figures import draw_points
+from scanchain_viz.pictures.run import GridPicture, draw_map
 
 image = pytest.importorskip("matplotlib.image")
 

@@ -23,12 +23,12 @@ from scanchain.errors import InputError
 from scanchain.runs.closures import final_verdicts
 from scanchain.runs.step_table import StepTable
 from scanchain.verdict import Judged, Kind, Stretch, Verdict
-from scanchain.viz.recording import entities, shapes, viewer
-from scanchain.viz.recording import recording as module
-from scanchain.viz.recording.blueprint import blueprint
-from scanchain.viz.recording.messages import Message
-from scanchain.viz.recording.recording import Recording
-from scanchain.viz.recording.sinks import file_sink, open_stream, write_recording
+from scanchain_viz.recording import entities, shapes, viewer
+from scanchain_viz.recording import recording as module
+from scanchain_viz.recording.blueprint import blueprint
+from scanchain_viz.recording.messages import Message
+from scanchain_viz.recording.recording import Recording
+from scanchain_viz.recording.sinks import file_sink, open_stream, write_recording
 from tests.support.killing import same_recording
 from tests.support.recordings import (
     EVERY_SCAN,
@@ -276,11 +276,11 @@ from pathlib import Path
 from uuid import uuid4
 from tests.support.recordings import drive, free_port
 from scanchain.config import RecordingConfig
-from scanchain.viz.recording import sinks, viewer
-from scanchain.viz.recording.blueprint import blueprint
-from scanchain.viz.recording.messages import Message
-from scanchain.viz.recording.recording import Recording
-from scanchain.viz.recording.sinks import open_stream, write_recording
+from scanchain_viz.recording import sinks, viewer
+from scanchain_viz.recording.blueprint import blueprint
+from scanchain_viz.recording.messages import Message
+from scanchain_viz.recording.recording import Recording
+from scanchain_viz.recording.sinks import open_stream, write_recording
 sinks._VIEWER_PATIENCE_S = 1.0
 port = free_port()
 server = viewer.start_web(port, free_port())
@@ -313,7 +313,7 @@ def test_view_web_prints_one_address_and_takes_its_server_along(tmp_path, number
     script = f"""
 import sys
 from scanchain.__main__ import main
-from scanchain.viz.recording import viewer
+from scanchain_viz.recording import viewer
 viewer.PORT, viewer.WEB_PORT = {port}, {web_port}
 sys.exit(main(["view", "--web", sys.argv[1]]))
 """
@@ -363,10 +363,10 @@ from pathlib import Path
 from uuid import uuid4
 from tests.support.recordings import drive
 from scanchain.config import RecordingConfig
-from scanchain.viz.recording.blueprint import blueprint
-from scanchain.viz.recording.messages import Message
-from scanchain.viz.recording.recording import Recording
-from scanchain.viz.recording.sinks import open_stream, write_recording
+from scanchain_viz.recording.blueprint import blueprint
+from scanchain_viz.recording.messages import Message
+from scanchain_viz.recording.recording import Recording
+from scanchain_viz.recording.sinks import open_stream, write_recording
 recording = Recording(Path(sys.argv[1]), dimension=2, name="t", sinks=frozenset({"save"}),
                       config=RecordingConfig())
 recording.__enter__()
@@ -390,7 +390,7 @@ import resource, signal, sys
 from pathlib import Path
 from uuid import uuid4
 from tests.support.recordings import drive, record
-from scanchain.viz.recording import sinks
+from scanchain_viz.recording import sinks
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 sinks._FILE_PATIENCE_S = 1.0
 resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, resource.RLIM_INFINITY))

@@ -28,12 +28,12 @@ from scanchain.runs.metrics import Metrics
 from scanchain.runs.overlay import OVERLAY_FILE
 from scanchain.simulation import simulate
 from scanchain.verdict import Judged, Kind, Stretch, Verdict
-from scanchain.viz.pictures.map_figures import AFTER, BEFORE, path_over_map, surroundings
-from scanchain.viz.pictures.trajectory_figures import DrawnTrajectory, PathLine, plan
-from scanchain.viz.report.page import Chip, Collapsible, Drawing, Grid, Head, Page, Row, Section, write_page
-from scanchain.viz.report.run import write_run_report
-from scanchain.viz.report.sections import loop_section
-from scanchain.viz.report.trajectory_map import SCRIPT, Tables, map_scene, trajectory_section
+from scanchain_viz.pictures.map_figures import AFTER, BEFORE, path_over_map, surroundings
+from scanchain_viz.pictures.trajectory_figures import DrawnTrajectory, PathLine, plan
+from scanchain_viz.report.page import Chip, Collapsible, Drawing, Grid, Head, Page, Row, Section, write_page
+from scanchain_viz.report.run import write_run_report
+from scanchain_viz.report.sections import loop_section
+from scanchain_viz.report.trajectory_map import SCRIPT, Tables, map_scene, trajectory_section
 from tests.support.browser import find_browser, look
 from tests.support.scenes import ROOT
 
@@ -459,7 +459,7 @@ def test_a_page_needs_nothing_but_itself(which, request):
 
 
 def test_the_same_directory_gives_the_same_page(comparison, tmp_path):
-    from scanchain.viz.report.comparison import write_compare_report
+    from scanchain_viz.report.comparison import write_compare_report
 
     before = (comparison / "report.html").read_bytes()
     write_compare_report(comparison)

@@ -1,0 +1,341 @@
+"""The commands as functions, and SLAM of scans from anywhere with the map and the verdict that a run has."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from scanchain import checks
+from scanchain import slam as core
+from scanchain.config import Config
+from scanchain.data import AnyPoints, Points, Pose, Step, brief
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.logs import sources_of
+from scanchain.preprocess import downsample as first_per_voxel
+from scanchain.runs.closures import closures_table, final_verdicts
+from scanchain.runs.job import Job, Unwatched
+from scanchain.runs.results import cloud_of, expected_of
+from scanchain.runs.run import Finished
+from scanchain.runs.run import run as run_job
+from scanchain.runs.step_table import StepTable
+from scanchain.runs.vouching import evidence_of
+from scanchain.settings import load_settings, overrides_of
+from scanchain.verdict import Judged, judge
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from scanchain.comparison.compare import Compared
+    from scanchain.config import RecordingConfig
+    from scanchain.graph.optimization import Optimization
+    from scanchain.odometry import Located
+    from scanchain.runs.job import Recorder, SinkName
+    from scanchain.sessions.changes import Changes
+    from scanchain.sessions.localize import LocalizedLog
+    from scanchain.sessions.merging import Merged
+
+Logs = str | Path | Sequence[str | Path]
+
+
+@dataclass(frozen=True, slots=True)
+class SlamResult(core.SlamResult):
+    """The result of a log, with the map and the verdict that a run has.
+
+    Attributes
+    ----------
+    trajectory, odometry : T_world_lidar of every scan, after and before optimization
+    keyframes : the scans that stand in the graph; T_world_keyframes (K, d+1, d+1) are their final poses
+    closures : every loop closure tried
+    graph, state : the pose graph, and how it was left
+    components : (K,) numbers the pieces that the keyframes belong to, which no loop joins; one as a rule
+    elevation_offset_rad, calibrated_from : what vertical angles were corrected by, from which scan on; 0 as a rule
+    map_errors : of the keyframes, against the map that they were aligned to
+    config, steps : what it was made with, and the columns of steps.parquet
+    """
+
+    __repr__ = brief
+    config: Config = field(kw_only=True)
+    steps: pa.Table = field(kw_only=True)
+
+    def cloud(self) -> Points:
+        """(M, d) points of the map, moving objects removed, as in the map.ply of a run."""
+        return cloud_of(self, self.config).points
+
+    def verdict(self) -> Judged:
+        """The verdict on the trajectory, with reasons and stretches, as a run is judged."""
+        final, expected = final_verdicts(self.closures, self.state), expected_of(self, self.config)
+        table = closures_table(final, self.keyframes, self.trajectory.dimension)
+        return judge(evidence_of(self.steps, table, expected and expected.ate))
+
+
+class Slam(core.Slam):
+    """Odometry, loop closing and pose graph: a step for every scan, the result at the end."""
+
+    def place(self, located: Located) -> Step:
+        """Place one scan that ``front_end`` located."""
+        step = super().place(located)
+        self.steps.append(step)
+        return step
+
+    @cached_property
+    def steps(self) -> StepTable:
+        """Figures of the scans so far, without their points."""
+        return StepTable()
+
+    def finish(self, progress: Callable[[str], None] = lambda stage: None) -> SlamResult:
+        """Close what is left, optimize once more, spread the corrections over all scans and refine these.
+
+        progress : called with the name of each stage when it begins
+        Raises InputError without a scan, and when called again.
+        """
+        result = super().finish(progress)
+        steps = self.steps.table(result.trajectory, self.T_base_lidar)
+        parts = {each.name: getattr(result, each.name) for each in fields(result)}
+        return SlamResult(**parts, config=self.config, steps=steps)
+
+
+def run(
+    log: Logs,
+    out: str | Path,
+    *,
+    config: str | Path | None = None,
+    ground_truth: str | Path | None = None,
+    recording: bool = True,
+    force: bool = False,
+    **overrides: object,
+) -> Finished:
+    """Process a log into a run directory, as ``scanchain run`` does; nothing is printed.
+
+    log : a file, a folder, an address, or the files of one log
+    out : the directory to create; with ``force`` an earlier run there is replaced
+    config : a TOML file on top of the preset
+    ground_truth : a TUM or KITTI file of true poses
+    recording : whether a rerun recording is written
+    overrides : keys of the configuration, two underscores for the dot: ``loops__drift=0.02``
+    Returns path, metrics, summary and warnings; ``metrics.verdict`` says whether to rely on it.
+    Raises InputError for bad input.
+    """
+    job = _job(log, out, config, ground_truth, recording=recording, force=force, overrides=overrides)
+    return run_job(job, open_recorder, Unwatched(), write_report)
+
+
+def localize(
+    log: Logs,
+    prior: str | Path,
+    out: str | Path,
+    *,
+    config: str | Path | None = None,
+    ground_truth: str | Path | None = None,
+    recording: bool = True,
+    force: bool = False,
+    **overrides: object,
+) -> LocalizedLog:
+    """Place a log in the map of an earlier run, as ``scanchain localize`` does; nothing is printed.
+
+    prior : the run directory that holds the map
+    Other arguments as in ``run``; without ``recording`` there is no report either.
+    Returns path, metrics and poses. Raises InputError for bad input.
+    """
+    from scanchain.sessions.localize import localize as localize_log
+
+    job = _job(log, out, config, ground_truth, recording=recording, force=force, overrides=overrides)
+    draw = draw_localization if recording else lambda folder, localized: None
+    return localize_log(job, checks.path(prior, "prior"), Unwatched(), draw)[0]
+
+
+def _job(
+    log: Logs,
+    out: str | Path,
+    config: str | Path | None,
+    ground_truth: str | Path | None,
+    *,
+    recording: bool,
+    force: bool,
+    overrides: dict[str, object],
+) -> Job:
+    return Job(
+        logs=sources_of(log),
+        out=checks.path(out, "out"),
+        config_file=None if config is None else checks.path(config, "config"),
+        overrides=overrides_of(overrides),
+        sinks=frozenset({"save"}) if recording else frozenset(),
+        ground_truth=None if ground_truth is None else checks.path(ground_truth, "ground_truth"),
+        force=force,
+    )
+
+
+def merge(
+    runs: Sequence[str | Path],
+    out: str | Path,
+    *,
+    config: str | Path | None = None,
+    fixed: bool = False,
+    update: bool = False,
+    force: bool = False,
+    **overrides: object,
+) -> Merged:
+    """Merge the maps of run directories into one, as ``scanchain merge`` does; nothing is printed.
+
+    runs : two or more; the map is in the frame of the first, whose poses stay as they are if ``fixed``
+    update : whether points that newer sessions saw through are removed from the keyframes of older ones
+    Other arguments as in ``run``. Returns path, metrics, summary and warnings: runs that do not belong to the map
+    are named there. Raises InputError for bad input, ScanchainError where no two runs belong together.
+    """
+    from scanchain.sessions.merging import merge as merge_maps
+
+    return merge_maps(
+        [checks.path(run, "runs") for run in runs],
+        checks.path(out, "out"),
+        Unwatched(),
+        present_merge,
+        config_file=None if config is None else checks.path(config, "config"),
+        overrides=overrides_of(overrides),
+        fixed=checks.truth(fixed, "fixed"),
+        update=checks.truth(update, "update"),
+        force=force,
+    )
+
+
+def changes(
+    earlier: str | Path,
+    later: str | Path | None,
+    out: str | Path,
+    *,
+    T_earlier_later: Pose | None = None,
+    voxel_size_m: float | None = None,
+    min_size_m: float = 0.2,
+    recording: bool = True,
+    force: bool = False,
+) -> Changes:
+    """Compare two maps of one place, as ``scanchain changes`` does; nothing is printed.
+
+    earlier, later : run directories; None compares the newest session of a merged map with all before it
+    T_earlier_later : (d+1, d+1) where it is known; found by loop closures where left out
+    voxel_size_m : resolution; that of maps where left out. min_size_m : least length of a change
+    recording : whether report and recording are written
+    Returns points, labels and clusters. Raises InputError for bad input, and for maps that are not of one place.
+    """
+    from scanchain.sessions.change_run import compare_maps
+
+    first = checks.path(earlier, "earlier")
+    return compare_maps(
+        [first] if later is None else [first, checks.path(later, "later")],
+        checks.path(out, "out"),
+        present_changes if recording else lambda directory, found: None,
+        T_earlier_later=None if T_earlier_later is None else _pose_in(first, T_earlier_later),
+        voxel_size_m=None if voxel_size_m is None else checks.positive(voxel_size_m, "voxel_size_m"),
+        min_size_m=checks.positive(min_size_m, "min_size_m"),
+        force=force,
+    )
+
+
+def _pose_in(path: Path, T: Pose) -> Pose:
+    from scanchain.maps import open_saved_map
+
+    return checks.pose(T, "T_earlier_later", open_saved_map(path).dimension)
+
+
+def compare(
+    log: Logs,
+    out: str | Path,
+    methods: Sequence[str] = (),
+    *,
+    ground_truth: str | Path | None = None,
+    repeat: int = 1,
+    force: bool = False,
+    **overrides: object,
+) -> Compared:
+    """Run several methods over the same scans, as ``scanchain compare`` does; nothing is printed.
+
+    methods : names such as "plicp", "kiss-icp" or "module:Class"; by default all that apply to the log
+    repeat : runs of each method, interleaved
+    Other arguments as in ``run``. Returns path and table. Raises InputError for bad input.
+    """
+    from scanchain.comparison.compare import Comparison
+    from scanchain.comparison.compare import compare as run_comparison
+
+    comparison = Comparison(
+        logs=sources_of(log),
+        out=checks.path(out, "out"),
+        methods=(methods,) if isinstance(methods, str) else tuple(methods),
+        overrides=overrides_of(overrides),
+        ground_truth=None if ground_truth is None else checks.path(ground_truth, "ground_truth"),
+        repeat=repeat,
+        force=force,
+    )
+    return run_comparison(comparison, present_comparison, Unwatched())
+
+
+def optimize(graph: PoseGraph, **overrides: object) -> Optimization:
+    """Move the poses of a graph to the minimum of χ², as ``scanchain optimize`` does.
+
+    overrides : keys of ``[graph]``, such as robust="truncated" where loops may be wrong; by default none is
+    Returns state, χ² before and after, iterations, ``converged`` and ``reason``.
+    Raises InputError if the graph is disconnected.
+    """
+    checks.instance(graph, PoseGraph, "graph", "read_g2o(path).graph")
+    given = {name.removeprefix("graph__"): value for name, value in overrides.items()}
+    changes = overrides_of({"robust": "none"} | given, "graph")
+    return graph.optimize(load_settings(graph.dimension, overrides=changes).config.graph)
+
+
+def downsample(points: AnyPoints, voxel_size_m: float) -> Points:
+    """The first finite point of every voxel, (M, d), in the order of the points (N, d). Raises InputError."""
+    valid, _ = checks.valid_points(points, "points")
+    return first_per_voxel(valid, checks.positive(voxel_size_m, "voxel_size_m"))
+
+
+def open_recorder(
+    path: Path | None, *, dimension: int, name: str, sinks: frozenset[SinkName], config: RecordingConfig
+) -> Recorder:
+    """A rerun recording, which takes half a second to import."""
+    from scanchain_viz.recording.recording import Recording
+
+    return Recording(path, dimension=dimension, name=name, sinks=sinks, config=config)
+
+
+def write_report(directory: Path) -> None:
+    """Add report.html to a run directory."""
+    from scanchain_viz.report.run import write_run_report
+
+    write_run_report(directory)
+
+
+def draw_localization(folder: Path, localized: LocalizedLog) -> None:
+    """Add report.html and a recording to the directory of a localized log."""
+    from scanchain.runs.directory import RECORDING_FILE
+    from scanchain_viz.recording.localization import record_localization
+    from scanchain_viz.report.localization import write_localization_report
+
+    write_localization_report(folder, localized)
+    record_localization(folder / RECORDING_FILE, localized)
+
+
+def present_merge(directory: Path) -> None:
+    """Add report.html and a recording to the directory of a merge."""
+    from scanchain_viz.recording.merge import record_merge
+    from scanchain_viz.report.merge import write_merge_report
+
+    write_merge_report(directory)
+    record_merge(directory)
+
+
+def present_comparison(directory: Path) -> None:
+    """Add report.html and a recording to the directory of a comparison."""
+    from scanchain_viz.recording.comparison import record_comparison
+    from scanchain_viz.report.comparison import write_compare_report
+
+    write_compare_report(directory)
+    record_comparison(directory)
+
+
+def present_changes(directory: Path, found: Changes) -> None:
+    """Add report.html and a recording to the directory of changes."""
+    from scanchain_viz.recording.changes import record_changes
+    from scanchain_viz.report.changes import write_changes_report
+
+    write_changes_report(directory, found)
+    record_changes(directory, found)

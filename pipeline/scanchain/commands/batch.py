@@ -1,0 +1,134 @@
+"""``scanchain batch``: many logs."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from scanchain.commands.options import (
+    LOG,
+    OverrideCommand,
+    config_option,
+    ground_truth_option,
+    limit_options,
+    matcher_option,
+    no_loops_option,
+    overrides,
+    part_options,
+)
+from scanchain.errors import InputError, ScanchainError
+from scanchain.settings import Override, load_settings
+from scanchain.source import Source
+from scanchain.words import counted
+
+_PATH = click.Path(path_type=Path)
+_DAY_S = 86_400.0
+
+
+@click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
+@click.argument("logs", metavar="LOG...", nargs=-1, type=LOG)
+@click.option("--out", required=True, metavar="DIR", type=_PATH, help="Directory to create, or to resume.")
+@click.option(
+    "--manifest", "manifests", multiple=True, metavar="FILE", type=_PATH, help="Text file with one log per line."
+)
+@config_option
+@part_options("each log")
+@matcher_option
+@no_loops_option
+@ground_truth_option("TOPIC|none", "Ground truth in every log; none to ignore it. [default: /ground_truth]")
+@click.option(
+    "--workers", type=click.IntRange(1), metavar="N", help="Logs run in parallel. [default: one per core]"
+)
+@click.option("--ray", metavar="auto|ADDRESS", help="Run on a Ray cluster that sees the same files.")
+@limit_options("a log", time_default="a day", memory_default="an equal share of three quarters of the free memory")
+@click.option(
+    "--retries",
+    type=click.IntRange(0),
+    default=1,
+    show_default=True,
+    help="Retries of a log whose process crashed.",
+)
+@click.option(
+    "--rerun",
+    type=click.Choice(["save", "off"]),
+    default="save",
+    show_default=True,
+    help="Whether runs write a recording, some ten megabytes each.",
+)
+@click.option("--strict", is_flag=True, help="Exit with 1 unless every verdict is trustworthy.")
+@click.pass_context
+def batch(
+    ctx: click.Context,
+    logs: tuple[Source, ...],
+    out: Path,
+    manifests: tuple[Path, ...],
+    config_file: Path | None,
+    workers: int | None,
+    ray: str | None,
+    rerun: str,
+    ground_truth: Path | None,
+    strict: bool,
+    time_s: float | None,
+    **limits: Any,
+) -> None:
+    """Run many logs, each in its own process.
+
+    LOG is a file, folder or address that scanchain run takes, a folder of such logs, or a quoted glob pattern.
+    Files of a folder that follow one another within a minute are the parts of one log. A log whose process
+    crashes, hangs or runs out of memory becomes a row with the reason; the others finish, and the exit code is 1.
+    Called again, batch runs only the logs that have no result yet. A result belongs to the path, size and last
+    change of the log (of a remote one: its address, size and version) and the effective configuration. DIR gets a
+    run directory per log, batch.parquet with a row per log, report.html and summary.txt. Logs with different lidar
+    topics need separate calls, each with its --topic.
+
+    \b
+    Examples:
+      scanchain batch logs/ --out runs/all
+      scanchain batch 'logs/**/*.mcap' --out runs/all --workers 8 --time-limit 600 --memory-limit 4
+      scanchain batch --manifest logs.txt --out runs/svd --matching.matcher svd
+      scanchain batch *.bag --out runs/front --topic /lidar_front/points --end 60
+      scanchain batch --manifest logs.txt --out /shared/all --ray auto
+      scanchain batch 's3://bucket/drives/*.mcap' --out runs/drives
+    """
+    from scanchain.batch.batch import Batch, collect, run_batch
+    from scanchain.batch.cluster import on_cluster
+    from scanchain.commands.terminal import Terminal
+
+    if ray is not None and workers is not None:
+        raise InputError("--workers is for this machine alone; on a cluster every core takes a log")
+    if ground_truth is not None:
+        raise InputError(
+            f"--gt {ground_truth}: a batch has no file of true poses for all its logs; name a topic, or use run"
+        )
+    changes = overrides(ctx)
+    job = Batch(
+        logs=collect(logs, manifests, load_settings(file=config_file, overrides=changes).config.log.format),
+        out=out.resolve(),
+        config_file=config_file,
+        overrides=changes,
+        arguments=("--rerun", rerun, *_arguments(config_file, changes)),
+        workers=workers or os.cpu_count() or 1,
+        time_s=time_s or _DAY_S,
+        **limits,
+    )
+    from scanchain_viz.report.batch import write_batch_report
+
+    with Terminal("logs") as terminal:
+        batched = run_batch(job, terminal, None if ray is None else on_cluster(ray))
+    click.echo(batched.summary, nl=False)
+    write_batch_report(job.out, batched.rows, sys.argv)
+    files = "batch.parquet, report.html, summary.txt"
+    click.echo(f"written        {out}: {files}; {counted(batched.kept, 'result')} from before")
+    failures = ", ".join(filter(None, (batched.failures, batched.doubts if strict else "")))
+    if failures:
+        raise ScanchainError(f"{failures}; {out}/summary.txt has the reason")
+
+
+def _arguments(config: Path | None, changes: tuple[Override, ...]) -> tuple[str, ...]:
+    """The same configuration for scanchain run."""
+    file = () if config is None else ("--config", str(config.resolve()))
+    return (*file, *(f"--{change.key}={change.text}" for change in changes))

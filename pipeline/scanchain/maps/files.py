@@ -1,0 +1,147 @@
+"""Files of maps: point clouds as PLY, PCD and LAZ, occupancy grids as the map.pgm and map.yaml of map_server.
+
+PLY: Turk 1994. PCD: https://pointclouds.org/documentation/tutorials/pcd_file_format.html. LAZ by laspy.
+Points of the plane lie at z = 0.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain import lie
+from scanchain.data import Points
+from scanchain.errors import InputError
+from scanchain.maps.occupancy_grid import FREE_PROBABILITY, OCCUPIED_PROBABILITY, OccupancyGrid
+
+_PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
+_PLY_COMMENT = "scanchain, meters, world frame"
+_PCD = """# .PCD v0.7 - Point Cloud Data file format
+VERSION 0.7
+FIELDS x y z
+SIZE 4 4 4
+TYPE F F F
+COUNT 1 1 1
+WIDTH {count}
+HEIGHT 1
+VIEWPOINT 0 0 0 1 0 0 0
+POINTS {count}
+DATA binary
+"""
+_SCALE_M = 0.001  # LAZ holds whole multiples of it
+
+_PGM = re.compile(rb"P5\n(\d+) (\d+)\n255\n(.*)", re.DOTALL)
+_OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205  # pixels of ROS's map_saver
+# Thresholds that sort exactly these three pixels, p = (255 − pixel) / 255, as nav2's own saver writes them: with
+# the common free_thresh 0.25 the unknown pixel, p = 0.196, would be read as free.
+_YAML = """image: map.pgm
+mode: trinary
+resolution: {resolution_m!r}
+origin: [{x_m:.9g}, {y_m:.9g}, 0]
+negate: 0
+occupied_thresh: 0.65
+free_thresh: 0.196
+"""
+_YAML_NUMBERS = re.compile(r"resolution: (\S+)\norigin: \[(\S+), (\S+), 0\]")
+
+
+def write_ply(
+    path: Path | str,
+    points: Points,
+    columns: Mapping[str, NDArray] | None = None,
+    comment: str = _PLY_COMMENT,
+) -> None:
+    """Write points (N, d) as binary little-endian PLY of float32, with further columns (N,) of u1 or i4."""
+    coordinates = dict(zip("xyz", _in_space(points).T, strict=True))
+    named = coordinates if columns is None else coordinates | columns
+    rows = np.rec.fromarrays(list(named.values()), names=list(named))
+    Path(path).write_bytes(_ply_header(len(rows), rows.dtype, comment).encode("ascii") + rows.tobytes())
+
+
+def read_ply(path: Path | str) -> Points:
+    """Points (N, 3) of a file that ``write_ply`` wrote. Raises InputError for one that is not."""
+    try:
+        header, found, body = Path(path).read_bytes().partition(b"end_header\n")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); scanchain run writes it") from error
+    dtype = np.dtype([(axis, "<f4") for axis in "xyz"])
+    count, rest = divmod(len(body), dtype.itemsize)
+    if not found or rest or (header + found).decode("latin-1") != _ply_header(count, dtype, _PLY_COMMENT):
+        raise InputError(f"{path}: is not a PLY file as scanchain writes it; run it again")
+    return np.frombuffer(body, "<f4").reshape(-1, 3).astype(np.float64)
+
+
+def write_pcd(path: Path | str, points: Points) -> None:
+    """Write points (N, d) as binary PCD of float32."""
+    Path(path).write_bytes(_PCD.format(count=len(points)).encode("ascii") + _in_space(points).tobytes())
+
+
+def write_laz(path: Path | str, points: Points) -> None:
+    """Write points (N, d) as LAZ 1.4, to the millimeter."""
+    import laspy
+
+    rows = lie.lift_points(points)
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.generating_software = "scanchain"
+    header.scales = np.full(3, _SCALE_M)
+    header.offsets = np.floor(rows.min(axis=0)) if len(rows) else np.zeros(3)
+    cloud = laspy.LasData(header)
+    cloud.x, cloud.y, cloud.z = rows.T
+    cloud.write(str(path))
+
+
+def write_map(folder: Path | str, grid: OccupancyGrid) -> None:
+    """Write ``map.pgm`` and ``map.yaml`` as nav2's map_server and ROS 1's read them.
+
+    ``origin`` is the pose (x, y, yaw) of the outer corner of the image's lower left pixel. Black pixels are
+    occupied, white ones free, gray ones unknown; an empty grid becomes a single unknown pixel.
+    """
+    probability = grid.probability() if grid.log_odds.size else np.full((1, 1), 0.5)
+    image = np.full(probability.shape, _UNKNOWN, np.uint8)
+    image[probability > OCCUPIED_PROBABILITY] = _OCCUPIED
+    image[probability < FREE_PROBABILITY] = _FREE
+    rows, columns = image.shape
+    (Path(folder) / "map.pgm").write_bytes(f"P5\n{columns} {rows}\n255\n".encode() + image[::-1].tobytes())
+    x_m, y_m = grid.origin_m.tolist()
+    text = _YAML.format(resolution_m=float(grid.resolution_m), x_m=x_m, y_m=y_m)
+    (Path(folder) / "map.yaml").write_text(text, encoding="utf-8", newline="\n")
+
+
+def read_map(folder: Path | str) -> tuple[NDArray[np.int8], float, tuple[float, float]]:
+    """Cells (rows, columns) of a map that ``write_map`` wrote, the resolution in meters and the origin's x, y.
+
+    Cells are 0 free, 100 occupied, −1 unknown; row 0 has the lowest y. Raises InputError where a file is missing
+    or of another make.
+    """
+    folder = Path(folder)
+    try:
+        image = _PGM.fullmatch((folder / "map.pgm").read_bytes())
+        header = _YAML_NUMBERS.search((folder / "map.yaml").read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(
+            f"{error.filename}: cannot be read ({error.strerror}); scanchain run writes it"
+        ) from error
+    if image is None or header is None:
+        raise InputError(f"{folder}: map.pgm or map.yaml is not as scanchain writes them; run it again")
+    columns, rows = int(image[1]), int(image[2])
+    pixels = np.frombuffer(image[3], np.uint8)
+    if len(pixels) != rows * columns:
+        raise InputError(f"{folder / 'map.pgm'}: has {len(pixels)} pixels instead of {rows} × {columns}")
+    cells = np.select([pixels == _FREE, pixels == _OCCUPIED], [0, 100], -1).astype(np.int8).reshape(rows, columns)
+    resolution_m, x_m, y_m = (float(number) for number in header.groups())
+    return np.ascontiguousarray(cells[::-1]), resolution_m, (x_m, y_m)
+
+
+def _ply_header(count: int, dtype: np.dtype, comment: str) -> str:
+    properties = "".join(f"property {_PLY_TYPES[dtype[name].str[1:]]} {name}\n" for name in dtype.names or ())
+    comments = "".join(f"comment {line}\n" for line in comment.split("\n"))
+    return f"ply\nformat binary_little_endian 1.0\n{comments}element vertex {count}\n{properties}end_header\n"
+
+
+def _in_space(points: Points) -> NDArray[np.float32]:
+    """Points (N, d) as (N, 3) little-endian float32."""
+    return lie.lift_points(points).astype("<f4")

@@ -1,0 +1,301 @@
+"""A map to localize in and to merge: keyframes with their final poses, and the edges between them, in a folder.
+
+    map.json       version, dimension, number of keyframes and points, the sessions it was made of, and the CRC-32
+                   of each of the other files
+    keyframes.npz  poses (K, d+1, d+1) T_map_lidar; stamps_ns, scan_index, session, traveled_m, scale, count,
+                   step_m, is_wide and last_seen_ns (K,)
+    edges.npz      pairs (E, 2), measurements (E, d+1, d+1), information (E, k, k), is_loop, weight (E,)
+    points.i16     of one keyframe after the other the coordinates (count, d) as int16, where it is_wide as int32,
+                   little-endian, times its step_m
+
+Points stay on disk and are read keyframe by keyframe. Maps of version 1 had no checksums and are refused.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain.data import Keyframe, Matrix, Points
+from scanchain.errors import InputError, one_line, shown
+from scanchain.whole_file import write_whole
+from scanchain.words import counted
+
+MAP_FOLDER = "map"
+VERSION = 2
+_INDEX, _KEYFRAMES, _EDGES, _POINTS = "map.json", "keyframes.npz", "edges.npz", "points.i16"
+_NUMBER, _WIDE = np.dtype("<i2"), np.dtype("<i4")
+_STEP_M = 0.001  # of coordinates on disk, more where the keyframe reaches farther than 33 m
+_WIDE_FROM_M = 0.01  # step from which on they take 32 bits: one far return must not make all points coarse
+_BLOCK = 1 << 20
+_Shapes = dict[str, tuple[str, tuple[int, ...]]]  # by name the kinds of numbers and the shape of an array
+
+
+class Session(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A log that a map was made of: its name, when it began and ended, and its number of keyframes."""
+
+    name: str
+    first_stamp_ns: int
+    last_stamp_ns: int
+    keyframes: int
+
+
+class _Index(msgspec.Struct, frozen=True):
+    """Contents of map.json."""
+
+    version: int
+    dimension: Literal[2, 3]
+    keyframes: int
+    points: int
+    sessions: tuple[Session, ...]
+    crc32: dict[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Edges:
+    """Edges of a pose graph.
+
+    Attributes
+    ----------
+    pairs : (E, 2) int64 keyframes (i, j)
+    measurements : (E, d+1, d+1) T_ij; information : (E, k, k) of a right twist on it
+    is_loop : (E,) bool; weight : (E,) robust weight
+    """
+
+    pairs: NDArray[np.int64]
+    measurements: Matrix
+    information: Matrix
+    is_loop: NDArray[np.bool_]
+    weight: NDArray[np.float64]
+
+    def among(self, chosen: NDArray[np.int64]) -> Edges:
+        """Those between chosen keyframes, renumbered in this order."""
+        number = np.full(max(int(self.pairs.max(initial=-1)), int(chosen.max(initial=-1))) + 1, -1)
+        number[chosen] = np.arange(len(chosen))
+        pairs = number[self.pairs]
+        return replace(self, pairs=pairs).where((pairs[:, 0] >= 0) & (pairs[:, 1] >= 0))
+
+    @classmethod
+    def chained(cls, *parts: Edges) -> Edges:
+        """Those of several, one after the other."""
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in _EDGE_ARRAYS))
+
+    def where(self, kept: NDArray[np.bool_]) -> Edges:
+        """Those for which ``kept`` (E,) holds."""
+        return Edges(*(getattr(self, name)[kept] for name in _EDGE_ARRAYS))
+
+
+_EDGE_ARRAYS = Edges.__match_args__
+
+
+@dataclass(frozen=True, slots=True)
+class SavedPoints:
+    """The points of one keyframe: ``rows`` (M, d) times ``step_m``; of a map that was opened, on disk."""
+
+    rows: NDArray[np.number]
+    step_m: float
+
+    def read(self) -> Points:
+        """(M, d) meters."""
+        return self.rows.astype(np.float64) * self.step_m
+
+
+@dataclass(frozen=True, slots=True)
+class SavedMap:
+    """A map on disk.
+
+    Attributes
+    ----------
+    folder : where it lies
+    dimension : 2 or 3
+    keyframes : their ``T_odom_lidar`` is the final pose, T_map_lidar
+    session : (K,) number of the session that each keyframe comes from
+    sessions : in the order they joined
+    edges : in force between the keyframes
+    last_seen_ns : (K,) stamp of the newest keyframe known to have seen the surroundings of each, its own at least
+    """
+
+    folder: Path
+    dimension: int
+    keyframes: tuple[Keyframe, ...]
+    session: NDArray[np.int64]
+    sessions: tuple[Session, ...]
+    edges: Edges
+    last_seen_ns: NDArray[np.int64]
+
+    @property
+    def poses(self) -> Matrix:
+        """(K, d+1, d+1) T_map_lidar of the keyframes."""
+        return np.array([keyframe.T_odom_lidar for keyframe in self.keyframes])
+
+    @property
+    def name(self) -> str:
+        """Name of the run it belongs to."""
+        return self.folder.parent.name if self.folder.name == MAP_FOLDER else self.folder.name
+
+
+def write_saved_map(
+    folder: Path,
+    keyframes: Sequence[Keyframe],
+    poses: Matrix,
+    session: NDArray[np.int64],
+    sessions: Sequence[Session],
+    edges: Edges,
+    last_seen_ns: NDArray[np.int64] | None = None,
+) -> None:
+    """Write a map of keyframes at these poses (K, d+1, d+1) into a new folder; map.json comes last.
+
+    session : (K,) number of each keyframe's session
+    last_seen_ns : (K,) as in ``SavedMap``; the keyframes' own stamps where left out
+    """
+    folder.mkdir(parents=True)
+    stored: list[tuple[int, float, bool]] = []
+    with (folder / _POINTS).open("wb") as file:
+        for keyframe in keyframes:
+            points = keyframe.points
+            reach_m = float(np.abs(points).max(initial=0.0))
+            is_wide = reach_m > _WIDE_FROM_M * np.iinfo(_NUMBER).max
+            number = _WIDE if is_wide else _NUMBER
+            step_m = max(reach_m / np.iinfo(number).max, _STEP_M)
+            file.write(np.rint(points / step_m).astype(number).tobytes())
+            stored.append((len(points), step_m, is_wide))
+    rows = np.array(stored, [("count", np.int64), ("step_m", np.float64), ("is_wide", np.bool_)])
+    stamps_ns = np.array([keyframe.stamp_ns for keyframe in keyframes], np.int64)
+    np.savez(
+        folder / _KEYFRAMES,
+        poses=poses,
+        session=session,
+        count=rows["count"],
+        step_m=rows["step_m"],
+        is_wide=rows["is_wide"],
+        stamps_ns=stamps_ns,
+        last_seen_ns=stamps_ns if last_seen_ns is None else last_seen_ns,
+        scan_index=np.array([keyframe.scan_index for keyframe in keyframes], np.int64),
+        traveled_m=np.array([keyframe.traveled_m for keyframe in keyframes]),
+        scale=np.array([keyframe.scale for keyframe in keyframes]),
+    )
+    np.savez(folder / _EDGES, **{name: getattr(edges, name) for name in _EDGE_ARRAYS})
+    crc32 = {name: _crc32(folder / name) for name in (_KEYFRAMES, _EDGES, _POINTS)}
+    dimension: Literal[2, 3] = 2 if poses.shape[-1] == 3 else 3
+    index = _Index(VERSION, dimension, len(keyframes), int(rows["count"].sum()), tuple(sessions), crc32)
+    write_whole(folder / _INDEX, msgspec.json.format(msgspec.json.encode(index)))
+
+
+def open_saved_map(path: Path) -> SavedMap:
+    """The map of a run directory, or in a folder itself. Raises InputError where there is none that is whole."""
+    folder = path / MAP_FOLDER if (path / MAP_FOLDER).is_dir() else path
+    if not (folder / _INDEX).is_file():
+        raise InputError(f"{path}: holds no map ({MAP_FOLDER}/{_INDEX}); give the directory of a finished run")
+    index = _index(folder / _INDEX)
+    for name in (_KEYFRAMES, _EDGES, _POINTS):
+        try:
+            found = _crc32(folder / name)
+        except OSError as error:
+            raise _damaged(folder / name, f"cannot be read: {error.strerror}") from error
+        if found != index.crc32.get(name):
+            raise _damaged(folder / name, f"is damaged or cut off: its checksum is not that in {_INDEX}")
+    K, d = index.keyframes, index.dimension
+    whole, numbers = ("i", (K,)), ("f", (K,))
+    rows = _arrays(
+        folder / _KEYFRAMES,
+        {"poses": ("f", (K, d + 1, d + 1)), "is_wide": ("b", (K,))}
+        | dict.fromkeys(("stamps_ns", "scan_index", "session", "count", "last_seen_ns"), whole)
+        | dict.fromkeys(("traveled_m", "scale", "step_m"), numbers),
+    )
+    if not ((rows["count"] >= 0) & (rows["step_m"] > 0.0) & (rows["scale"] > 0.0)).all():
+        raise _damaged(folder / _KEYFRAMES, "holds a count, step or scale below 0")
+    if rows["count"].sum() != index.points:
+        raise _damaged(folder / _KEYFRAMES, f"counts other than the {index.points:,} points of {_INDEX}")
+    if not np.isin(rows["session"], np.arange(len(index.sessions))).all():
+        raise _damaged(folder / _KEYFRAMES, f"names sessions that {_INDEX} does not list")
+    k = 3 if d == 2 else 6
+    shapes = (("i", (-1, 2)), ("f", (-1, d + 1, d + 1)), ("f", (-1, k, k)), ("b", (-1,)), ("f", (-1,)))
+    edges = _arrays(folder / _EDGES, dict(zip(_EDGE_ARRAYS, shapes, strict=True)))
+    if (
+        len({len(array) for array in edges.values()}) > 1
+        or not ((edges["pairs"] >= 0) & (edges["pairs"] < K)).all()
+    ):
+        raise _damaged(folder / _EDGES, "holds edges of keyframes that are not there, or of different numbers")
+    keyframes = _keyframes(rows, folder / _POINTS, d)
+    return SavedMap(folder, d, keyframes, rows["session"], index.sessions, Edges(**edges), rows["last_seen_ns"])
+
+
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of an .npz file. Raises InputError where it cannot be read."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return dict(file)
+    except Exception as error:  # whatever a damaged file makes NumPy, its parser and the decoders raise
+        raise _damaged(path, f"cannot be read ({type(error).__name__}: {one_line(error)})") from error
+
+
+def _arrays(path: Path, wanted: _Shapes) -> dict[str, NDArray[Any]]:
+    """Its arrays of these names, kinds and shapes, all finite; −1 stands for any number."""
+    arrays = read_arrays(path)
+    for name, (kind, shape) in wanted.items():
+        array = arrays.get(name)
+        if array is None or array.dtype.kind != kind or len(array.shape) != len(shape):
+            raise _damaged(path, f"lacks {name} as {shape} of kind {kind!r}")
+        if any(there != asked >= 0 for there, asked in zip(array.shape, shape, strict=True)):
+            raise _damaged(path, f"holds {name} of the shape {array.shape}; wanted {shape}")
+        if not np.isfinite(array).all():
+            raise _damaged(path, f"holds {name} that are NaN or infinite")
+    return {name: arrays[name] for name in wanted}
+
+
+def _keyframes(rows: dict[str, Any], path: Path, d: int) -> tuple[Keyframe, ...]:
+    """The keyframes, whose points stay in a file that is mapped into memory."""
+    sizes = rows["count"] * d * np.where(rows["is_wide"], 2, 1)
+    ends = np.cumsum(sizes)
+    if path.stat().st_size != int(sizes.sum()) * _NUMBER.itemsize:
+        raise _damaged(path, f"has {counted(path.stat().st_size, 'byte')}, other than {_KEYFRAMES} says")
+    points = np.memmap(path, _NUMBER, "r") if sizes.any() else np.empty(0, _NUMBER)
+    return tuple(
+        Keyframe(
+            index=k,
+            scan_index=int(rows["scan_index"][k]),
+            stamp_ns=int(rows["stamps_ns"][k]),
+            stored=SavedPoints(
+                points[end - size : end].view(_WIDE if rows["is_wide"][k] else _NUMBER).reshape(-1, d),
+                float(rows["step_m"][k]),
+            ),
+            T_odom_lidar=rows["poses"][k],
+            traveled_m=float(rows["traveled_m"][k]),
+            scale=float(rows["scale"][k]),
+        )
+        for k, (end, size) in enumerate(zip(ends.tolist(), sizes.tolist(), strict=True))
+    )
+
+
+def _index(path: Path) -> _Index:
+    try:
+        data = path.read_bytes()
+        version = msgspec.json.decode(data)["version"]
+        if version != VERSION:
+            raise InputError(
+                f"{path}: is of version {shown(version)}, this scanchain reads {VERSION} (version 1 had no "
+                "checksums); make the map again"
+            )
+        return msgspec.json.decode(data, type=_Index)
+    except (msgspec.MsgspecError, KeyError, TypeError, OSError, UnicodeDecodeError) as error:
+        raise _damaged(path, f"cannot be read ({type(error).__name__}: {one_line(error)})") from error
+
+
+def _crc32(path: Path) -> int:
+    """CRC-32 of a file, which sees any few flipped bits."""
+    crc = 0
+    with path.open("rb") as file:
+        while block := file.read(_BLOCK):
+            crc = zlib.crc32(block, crc)
+    return crc
+
+
+def _damaged(path: Path, how: str) -> InputError:
+    return InputError(f"{path}: {how}; make the map again")

@@ -1,0 +1,247 @@
+"""Maps from elsewhere: point clouds and occupancy grids as maps to localize in, as a lidar would see them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from scanchain import lie
+from scanchain.config import Config
+from scanchain.data import Keyframe, Matrix, Points, Scan
+from scanchain.errors import InputError
+from scanchain.kernels.raycast.free_space import nearest_ranges
+from scanchain.logs.formats.cloud_file import SUFFIXES, CloudFileError, read_cloud_file
+from scanchain.maps import MAP_FOLDER, Edges, SavedPoints, Session, write_saved_map
+from scanchain.maps.occupancy_grid import MAX_CELLS
+from scanchain.preprocess.resolution import Resolution
+from scanchain.runs.directory import RUN_FILE, RunDirectory
+from scanchain.runs.provenance import describe_start
+from scanchain.settings import load_settings
+from scanchain.words import counted
+
+LAS_SUFFIXES, GRID_SUFFIXES = (".laz", ".las"), (".yaml", ".yml")
+SPACING_M = {2: 1.5, 3: 6.0}  # between the positions that a map is seen from
+VIEW_M = {2: 30.0, 3: 50.0}  # how far it is seen
+_HEIGHT_M = 1.6  # of a lidar above the ground
+_CLEARANCE_M = 0.4  # least distance of a position from any point
+_GROUND_RADIUS_M, _GROUND_PERCENTILE = 2.0, 5.0  # around a position, and which of the heights there is the ground
+_BINS = {2: (1, 720), 3: (180, 360)}  # of elevation and azimuth, in which nearer points hide others
+_HIDDEN_M = 0.5  # farther than the nearest point of its bin, from which on a point is hidden
+_SECTORS, _LEAST_SECTORS = 36, 0.6  # of azimuth, and share of them with points that a position in the plane needs
+_LEAST_POINTS = 100  # in view
+_FLAT_M = 1e-6  # extent in height of points in the plane
+_MAX_POSITIONS = 20_000
+_LEAST_CELL_M, _LARGEST_CELL_M = 1e-3, 1e2  # of a grid
+
+
+@dataclass(frozen=True, slots=True)
+class Imported:
+    """An imported map: dimension, numbers of points read and of keyframes made, spacing of these in meters."""
+
+    dimension: int
+    points: int
+    keyframes: int
+    spacing_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Surfaces:
+    """Points (N, d) of a map, and positions (P, d) that are free, where the file tells."""
+
+    points: Points
+    free: Points | None = None
+
+
+def import_map(
+    file: Path,
+    out: Path,
+    *,
+    spacing_m: float | None = None,
+    height_m: float = _HEIGHT_M,
+    force: bool = False,
+    say: Callable[[str], None] = lambda stage: None,
+) -> Imported:
+    """A cloud (PLY, PCD, LAZ, LAS, .npy) or an occupancy grid (.yaml of nav2's or ROS 1's map_server) as a map.
+
+    spacing_m : between the virtual keyframes; SPACING_M where left out
+    height_m : of the lidar above the ground, in space
+    Raises InputError for a file that cannot be read, or in which no lidar could have been anywhere.
+    """
+    say(f"reading {file.name}")
+    surfaces = _read(file)
+    dimension = surfaces.points.shape[1]
+    spacing_m = SPACING_M[dimension] if spacing_m is None else spacing_m
+    config = load_settings(dimension).config
+    with RunDirectory(out, force=force) as directory:
+        positions = _positions(surfaces, spacing_m, height_m)
+        say(f"{counted(len(surfaces.points), 'point')} seen from {counted(len(positions), 'position')}")
+        keyframes = tuple(_keyframes(surfaces.points, positions, config))
+        if not keyframes:
+            raise InputError(
+                f"{file}: a lidar {height_m:g} m above the ground sees {_LEAST_POINTS} points nowhere; give a "
+                "cloud in meters with z up, or another --height"
+            )
+        poses = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
+        session, k = Session(file.name, 0, len(keyframes) - 1, len(keyframes)), lie.twist_size(poses[0])
+        edges = Edges(np.empty((0, 2), np.int64), poses[:0], np.empty((0, k, k)), np.empty(0, bool), np.empty(0))
+        numbers = np.zeros(len(keyframes), np.int64)
+        write_saved_map(directory.path / MAP_FOLDER, keyframes, poses, numbers, (session,), edges)
+        provenance = describe_start(sys.argv, [file], "")
+        msgspec.structs.replace(provenance, complete=True).write(directory.path / RUN_FILE)
+        directory.complete()
+    return Imported(dimension, len(surfaces.points), len(keyframes), spacing_m)
+
+
+def _read(file: Path) -> _Surfaces:
+    suffix = file.suffix.lower()
+    if suffix in GRID_SUFFIXES:
+        return _read_grid(file)
+    try:
+        if suffix in LAS_SUFFIXES:
+            points = _read_las(file)
+        elif suffix in SUFFIXES:
+            rows = read_cloud_file(file)
+            points = np.column_stack([rows[name] for name in "xyz"]).astype(np.float64)
+        else:
+            known = ", ".join((*SUFFIXES, *LAS_SUFFIXES, *GRID_SUFFIXES))
+            raise InputError(f"{file}: is no map that can be read; give one of {known}")
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read ({error.strerror or error})") from error
+    except CloudFileError as error:
+        raise InputError(f"{file}: {error}") from error
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        raise InputError(f"{file}: has no points")
+    return _Surfaces(points[:, :2] if np.ptp(points[:, 2]) < _FLAT_M else points)
+
+
+def _read_las(file: Path) -> Points:
+    import laspy
+
+    try:
+        return np.asarray(laspy.read(file).xyz, np.float64)
+    except OSError:
+        raise
+    except Exception as error:  # whatever a damaged file makes laspy and its decoder raise
+        raise InputError(f"{file}: is no LAS or LAZ file ({type(error).__name__}: {error})") from error
+
+
+def _read_grid(file: Path) -> _Surfaces:
+    """Occupied and free cells of a map of map_server, at their centers; thresholds as it reads them."""
+    from PIL import Image
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        stated: dict[str, Any] = YAML(typ="safe").load(file)
+        with Image.open(file.parent / stated["image"]) as picture:
+            if picture.width * picture.height > MAX_CELLS:
+                raise ValueError(f"its image has {picture.width} x {picture.height} cells, over {MAX_CELLS:,}")
+            image = np.asarray(picture.convert("L"))[::-1]
+        resolution_m, (x, y, yaw_rad) = float(stated["resolution"]), map(float, stated["origin"])
+        occupied_from, free_to = float(stated["occupied_thresh"]), float(stated["free_thresh"])
+        is_negated = bool(int(stated.get("negate", 0)))
+        if not (_LEAST_CELL_M <= resolution_m <= _LARGEST_CELL_M and np.isfinite([x, y, yaw_rad]).all()):
+            raise ValueError(f"resolution {resolution_m:g} m, origin {x:g}, {y:g}, {yaw_rad:g}")
+    except OSError as error:
+        raise InputError(f"{error.filename or file}: cannot be read ({error.strerror or error})") from error
+    except (
+        YAMLError, KeyError, TypeError, ValueError, AttributeError, RecursionError, Image.DecompressionBombError
+    ) as error:  # fmt: skip
+        raise InputError(
+            f"{file}: is no map of map_server ({type(error).__name__}: {error}); wanted image, resolution, "
+            "origin, occupied_thresh, free_thresh"
+        ) from error
+    levels = np.arange(256) / 255.0
+    probability = levels if is_negated else 1.0 - levels
+    T_map_image = lie.pose_2d(x, y, yaw_rad)
+
+    def centers(cells: NDArray[np.bool_]) -> Points:
+        rows, columns = np.nonzero(cells)
+        return lie.transform(T_map_image, (np.column_stack([columns, rows]) + 0.5) * resolution_m)
+
+    points = centers((probability > occupied_from)[image])
+    if not len(points):
+        raise InputError(f"{file}: has no occupied cells; look at occupied_thresh and negate")
+    return _Surfaces(points, centers((probability < free_to)[image]))
+
+
+def _positions(surfaces: _Surfaces, spacing_m: float, height_m: float) -> Points:
+    """Positions (P, d) on a grid, where a lidar could be, there and back along its rows: each beside the next."""
+    points = surfaces.points
+    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    axes = [np.arange(a + 0.5 * min(spacing_m, b - a), b, spacing_m) for a, b in zip(low, high, strict=True)]
+    if len(axes[0]) * len(axes[1]) > 100 * _MAX_POSITIONS:
+        raise InputError(
+            f"the map is {high[0] - low[0]:,.0f} x {high[1] - low[1]:,.0f} m large; give a larger --spacing, or a "
+            "part of it"
+        )
+    grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    if points.shape[1] == 3:
+        grid = _above_ground(points, grid, height_m)
+    elif surfaces.free is not None and len(surfaces.free):
+        grid = grid[KDTree(surfaces.free).query(grid)[0] < 0.5 * _CLEARANCE_M]
+    clear = KDTree(points).query(grid)[0] > _CLEARANCE_M if len(grid) else np.zeros(0, bool)
+    if clear.sum() > _MAX_POSITIONS:
+        raise InputError(f"the map would be seen from {int(clear.sum()):,} positions; give a larger --spacing")
+    positions = grid[clear]
+    row = np.floor(positions[:, 1] / spacing_m)
+    along = np.where(row % 2 == 0, positions[:, 0], -positions[:, 0])
+    return positions[np.lexsort((along, row))]
+
+
+def _above_ground(points: Points, grid: Matrix, height_m: float) -> Points:
+    """Positions (P, 3) above the ground around positions in the plane, where there is any."""
+    around = KDTree(points[:, :2]).query_ball_point(grid, _GROUND_RADIUS_M)
+    rows = [
+        (x, y, float(np.percentile(points[found, 2], _GROUND_PERCENTILE)) + height_m)
+        for (x, y), found in zip(grid.tolist(), around, strict=True)
+        if found
+    ]
+    return np.array(rows).reshape(-1, 3)
+
+
+def _keyframes(points: Points, positions: Points, config: Config) -> Iterator[Keyframe]:
+    """Virtual keyframes with the points in view of them, downsampled as scans are."""
+    dimension = points.shape[1]
+    tree, resolution = KDTree(points), Resolution(config.preprocess, config.local_map.voxel_size_m)
+    index, traveled_m, last = 0, 0.0, None
+    for position in positions:
+        near = tree.query_ball_point(position, VIEW_M[dimension])
+        seen = _in_view(points[near] - position)
+        if len(seen) < _LEAST_POINTS or (dimension == 2 and not _is_inside(seen)):
+            continue
+        sweep, _ = resolution.downsampled(Scan.of(seen.astype(np.float32), 1e-9 * index, index=index))
+        traveled_m += 0.0 if last is None else float(np.linalg.norm(position - last))
+        last, pose = position, lie.identity(dimension)
+        pose[:-1, -1] = position
+        yield Keyframe(index, index, index, SavedPoints(sweep.points, 1.0), pose, traveled_m, resolution.scale)
+        index += 1
+
+
+def _in_view(points: Points) -> Points:
+    """Points (M, d) around a lidar that no nearer ones hide."""
+    rows, columns = _BINS[points.shape[1]]
+    ranges_m = np.empty((rows, columns))
+    in_space = lie.lift_points(points)
+    nearest_ranges(in_space, ranges_m)
+    range_m = np.linalg.norm(in_space, axis=1)
+    elevation = np.arcsin(in_space[:, 2] / np.maximum(range_m, 1e-9)) / np.pi + 0.5
+    azimuth = np.arctan2(in_space[:, 1], in_space[:, 0]) / (2.0 * np.pi) + 0.5
+    row = np.minimum((elevation * rows).astype(int), rows - 1)
+    column = np.minimum((azimuth * columns).astype(int), columns - 1)
+    return points[range_m < ranges_m[row, column] + _HIDDEN_M]
+
+
+def _is_inside(seen: Points) -> bool:
+    """True if points of the plane are on most sides."""
+    sectors = np.floor((np.arctan2(seen[:, 1], seen[:, 0]) / (2.0 * np.pi) + 0.5) * _SECTORS).astype(int)
+    return len(np.unique(np.minimum(sectors, _SECTORS - 1))) >= _LEAST_SECTORS * _SECTORS

@@ -1,0 +1,404 @@
+"""``scanchain localize``: a log and a map in, a directory with poses in the map's frame out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from msgspec import Struct, json, structs
+from numpy.typing import NDArray
+
+from scanchain import lie
+from scanchain.clock import working_s
+from scanchain.config import Config
+from scanchain.data import ClosureVerdict, Pose, brief
+from scanchain.errors import InputError
+from scanchain.logs import Log
+from scanchain.maps import SavedMap, open_saved_map
+from scanchain.runs.directory import POINTS_FILE, RUN_FILE, RunDirectory
+from scanchain.runs.job import Job, Progress
+from scanchain.runs.metrics import GroundTruth, accuracy_lines
+from scanchain.runs.provenance import Hashing, describe_start
+from scanchain.runs.run import accuracy_of, opened, true_poses
+from scanchain.runs.step_table import pose_columns
+from scanchain.sessions.joining import MAX_REPEATED, repeated_paths
+from scanchain.sessions.localizer import Localization, Localizer, MapState
+from scanchain.settings import dump
+from scanchain.trajectory import read_tum, write_tum
+from scanchain.verdict import Verdict
+from scanchain.whole_file import write_whole
+from scanchain.words import counted
+
+LOCALIZATION_FILE = "localization.parquet"
+_SHORT_M = {2: 5.0, 3: 20.0}  # path below which a place that is not found says nothing
+_WITHOUT_MAP_M = {2: 2.0, 3: 10.0}  # shortest path without the map that is told as a stretch
+_MOVED_M, _MOVED_SIGMAS = 0.3, 5.0  # between a pose as known at its time and in the end, that is told
+_PATHS = 12  # largest number of paths that are compared with the map in the end
+_APART_S = 1.0  # largest difference between the first scan and the nearest pose of a file
+_SHOWN = 3  # stretches that the verdict lists
+
+
+class Part(Struct, frozen=True):
+    """Consecutive scans whose place is less certain, or not known: first and last, seconds, meters of path."""
+
+    kind: str
+    first: int
+    last: int
+    start_s: float
+    end_s: float
+    length_m: float
+
+    @property
+    def is_doubtful(self) -> bool:
+        """False where the log was followed all along, if by odometry alone."""
+        return self.kind not in (MapState.UNMATCHED, MapState.OUTSIDE)
+
+    @property
+    def text(self) -> str:
+        """The part in words."""
+        return (
+            f"scans {self.first:,} to {self.last:,} ({self.start_s:.1f} to {self.end_s:.1f} s, "
+            f"{self.length_m:.1f} m): {self.kind}"
+        )
+
+
+class LocalizeMetrics(Struct, frozen=True):
+    """Contents of metrics.json of a localized log.
+
+    ``found_*`` say where the place of the log was first known; −1 and NaN where it never was. ``matches`` are
+    closures of keyframes with the map, ``rejected`` those that the graph left out in the end. ``log_odds`` are
+    those that the log is where it was placed, or, where they do not suffice, might have been; NaN for nothing
+    found. Standard deviations are medians, of positions as known at their time and in the end. ``ground_truth`` is
+    the accuracy of the scans that are placed.
+    """
+
+    verdict: Verdict
+    reason: str
+    parts: tuple[Part, ...]
+    map: str
+    map_keyframes: int
+    scans: int
+    placed: int
+    states: dict[str, int]
+    found_scan: int
+    found_after_s: float
+    found_after_m: float
+    path_m: float
+    matches: int
+    rejected: int
+    median_overlap: float
+    median_sigma_m: float
+    median_final_sigma_m: float
+    log_odds: float
+    time_s: float
+    warnings: tuple[str, ...]
+    ground_truth: GroundTruth | None = None
+
+    @property
+    def sentence(self) -> str:
+        """Verdict and reason."""
+        return f"{self.verdict}: {self.reason}"
+
+
+@dataclass(frozen=True, slots=True)
+class LocalizedLog:
+    """A localized log for report and recording: its directory, the map, its poses in it, the metrics."""
+
+    __repr__ = brief
+    path: Path
+    prior: SavedMap
+    localization: Localization
+    metrics: LocalizeMetrics
+
+
+Draw = Callable[[Path, LocalizedLog], None]
+Initial = Callable[[int, SavedMap], Pose]
+
+
+def localize(
+    job: Job,
+    map_path: Path,
+    progress: Progress,
+    draw: Draw = lambda folder, localized: None,
+    *,
+    initial: Initial | None = None,
+) -> tuple[LocalizedLog, str]:
+    """Localize a log; returns what is in the directory, and the summary.
+
+    map_path : run directory, or folder, of the map; draw : adds report and recording to the folder
+    initial : T_map_lidar of the first scan, where known, by the stamp of that scan and the map
+    Raises InputError for a log or a map that cannot be read.
+    """
+    started = working_s()
+    prior = open_saved_map(map_path)
+    if job.out.resolve() in (map_path.resolve(), prior.folder.resolve()):
+        raise InputError(f"{job.out}: is the map; choose another --out")
+    log, settings, truth_file = opened(job)
+    config = settings.config
+    if not config.loops.enabled:
+        raise InputError("loops.enabled is false, but a place in a map is found by loop closures; leave it true")
+    if log.dimension != prior.dimension:
+        raise InputError(
+            f"{log.name}: has {log.dimension}D scans, the map {prior.name} is {prior.dimension}D; give a map of "
+            "the same kind"
+        )
+    progress.say(f"{log.topic}: {counted(log.scan_count, 'scan')}; map {prior.name}")
+    provenance = describe_start(job.command, job.logs, settings.source)
+    with RunDirectory(job.out, force=job.force) as directory, Hashing(job.logs) as hashing:
+        provenance.write(directory.path / RUN_FILE)
+        write_whole(directory.path / "config.toml", dump(config).encode())
+        localizer = _followed(log, prior, config, initial, directory.path / POINTS_FILE, progress)
+        progress.say("smoothing the path")
+        found = localizer.finish()
+        stopped = f"stopped by the user after {counted(len(found.states), 'scan')}" if progress.stopped else ""
+        warnings = (*filter(None, [stopped]), *log.damage, *log.copies, *localizer.warnings)
+        time_s, truth = working_s() - started, None
+        progress.say("writing the results")
+        with directory.results() as folder:
+            if found.is_placed.any():
+                poses = partial(true_poses, log, truth_file, progress)
+                source = str(job.ground_truth or log.ground_truth_topic)
+                placed = replace(found.result, trajectory=found.placed)
+                truth, note = accuracy_of(poses, source, job.max_gap_s, placed, folder)
+                warnings += note
+            metrics = measure(found, prior, config, time_s, warnings, truth)
+            localized = LocalizedLog(directory.path, prior, found, metrics)
+            text = _summary(localized, log)
+            _write(folder, localized, text)
+            draw(folder, localized)
+        localizer.slam.points.close()
+        (directory.path / POINTS_FILE).unlink(missing_ok=True)
+        structs.replace(
+            provenance.hashed(hashing), complete=True, stopped=stopped, duration_s=working_s() - started
+        ).write(directory.path / RUN_FILE)
+        directory.complete()
+    return replace(localized, path=directory.path), text
+
+
+def _followed(
+    log: Log, prior: SavedMap, config: Config, initial: Initial | None, points_file: Path, progress: Progress
+) -> Localizer:
+    """The localizer after the scans of the log. Raises InputError where there is none."""
+    localizer: Localizer | None = None
+    with closing(log.scans(config.preprocess)) as scans:
+        for scan in progress.track(scans, log.scan_count):
+            if localizer is None:
+                T = None if initial is None else initial(scan.stamp_ns, prior)
+                localizer = Localizer(
+                    prior, config, log.T_base_lidar, initial=T, points_file=points_file, is_live=False
+                )
+            localizer.process(scan)
+    if localizer is None:
+        raise InputError(f"{log.name}: has no scan to localize; scanchain doctor says why")
+    return localizer
+
+
+def measure(
+    found: Localization,
+    prior: SavedMap,
+    config: Config,
+    time_s: float,
+    warnings: tuple[str, ...],
+    ground_truth: GroundTruth | None = None,
+) -> LocalizeMetrics:
+    """Figures and verdict of a localized log."""
+    first, graph = found.found_at, found.result.graph
+    seconds = (found.trajectory.stamps_ns - found.trajectory.stamps_ns[0]) * 1e-9
+    overlaps = [each.overlap for each in found.closures if each.verdict is ClosureVerdict.ACCEPTED]
+    in_map = graph.is_loop & (graph.edges[:, 0] < len(prior.keyframes))
+    states = {state: int((found.states == state).sum()) for state in MapState}
+    parts = tuple(_parts(found, seconds))
+    verdict, reason = _verdict(found, prior, states, parts, _doubt(found, prior, config))
+    return LocalizeMetrics(
+        verdict=verdict,
+        reason=reason,
+        parts=parts,
+        map=str(prior.folder.resolve()),
+        map_keyframes=len(prior.keyframes),
+        scans=len(found.states),
+        placed=int(found.is_placed.sum()),
+        states={str(state): count for state, count in states.items()},
+        found_scan=first,
+        found_after_s=float(seconds[first]) if first >= 0 else np.nan,
+        found_after_m=float(found.traveled_m[first]) if first >= 0 else np.nan,
+        path_m=float(found.traveled_m[-1]),
+        matches=len(overlaps),
+        rejected=int((graph.is_rejected & in_map).sum()),
+        median_overlap=_median(np.array(overlaps)),
+        median_sigma_m=_median(found.sigma_m),
+        median_final_sigma_m=_median(found.final_sigma_m),
+        log_odds=found.result.map_log_odds,
+        time_s=time_s,
+        warnings=warnings,
+        ground_truth=ground_truth,
+    )
+
+
+def _median(values: NDArray[np.float64]) -> float:
+    """Median of the finite ones, NaN if there are none."""
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else np.nan
+
+
+def _parts(found: Localization, seconds: NDArray[np.float64]) -> Iterator[Part]:
+    """Parts of a log that is in the map whose place is uncertain, unknown, or was other than it was said."""
+    if found.found_at < 0:
+        return
+    dimension = found.trajectory.dimension
+    after = np.arange(len(found.states)) >= found.found_at
+    away_m = np.linalg.norm((found.live - found.trajectory.poses)[:, :-1, -1], axis=1)
+    wrong = found.is_placed & (away_m > np.maximum(_MOVED_M, _MOVED_SIGMAS * found.sigma_m))
+    kinds = (
+        ("not joined to the map", ~found.is_placed, 0.0),
+        ("lost", after & found.is_placed & (found.states == MapState.LOST), 0.0),
+        ("place unknown at the time", after & found.is_placed & (found.states == MapState.SEARCHING), 0.0),
+        (MapState.UNMATCHED.value, found.is_placed & (found.states == MapState.UNMATCHED), 1.0),
+        (MapState.OUTSIDE.value, found.is_placed & (found.states == MapState.OUTSIDE), 1.0),
+        ("place corrected later", wrong, 0.0),
+    )
+    for kind, chosen, shortest in kinds:
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]])))
+        for begin, end in edges.reshape(-1, 2).tolist():
+            length_m = float(found.traveled_m[end - 1] - found.traveled_m[begin])
+            if length_m >= shortest * _WITHOUT_MAP_M[dimension]:
+                yield Part(kind, begin, end - 1, float(seconds[begin]), float(seconds[end - 1]), length_m)
+
+
+def _doubt(found: Localization, prior: SavedMap, config: Config) -> str:
+    """Reason why a log may be of another place than where it was found; empty if there is none."""
+    result, of_map, graph = found.result, len(prior.keyframes), found.result.graph
+    chosen = [each for each in result.keyframes[of_map:] if found.is_placed[each.scan_index]]
+    if not chosen or prior.dimension == 3 or found.found_at == 0:  # where it begins was given
+        return ""
+    placed = [replace(each, T_odom_lidar=found.trajectory.poses[each.scan_index]) for each in chosen]
+    sources = graph.edges[graph.is_loop & ~graph.is_rejected & (graph.edges[:, 0] < of_map), 1]
+    agreeing = np.flatnonzero(np.isin([each.index for each in chosen], sources))
+    repeated, paths = repeated_paths(prior.keyframes, placed, agreeing, config, _PATHS)
+    if repeated <= MAX_REPEATED * paths:
+        return ""
+    return f"{repeated} of {paths} paths in it look like other places, too"
+
+
+def _verdict(
+    found: Localization, prior: SavedMap, states: dict[MapState, int], parts: tuple[Part, ...], doubt: str
+) -> tuple[Verdict, str]:
+    scans, path_m, log_odds = len(found.states), float(found.traveled_m[-1]), found.result.map_log_odds
+    tried = f"{counted(scans, 'scan')} over {path_m:.1f} m"
+    if not found.is_placed.any():
+        if path_m < _SHORT_M[found.trajectory.dimension]:
+            reason = f"not found in {prior.name}: {tried} are too short a way to tell"
+        elif np.isfinite(log_odds):
+            reason = (
+                f"not certain: {tried} may be in {prior.name}, with log-odds of {log_odds:.1f}, which are too low"
+            )
+        else:
+            reason = f"not from this place: nothing in {tried} is in {prior.name}"
+        return Verdict.NOT_TRUSTWORTHY, reason
+    at = found.found_at
+    where = f"found in {prior.name}" + (f" after {found.traveled_m[at]:.1f} m" if at >= 0 else " in the end")
+    matched, unmatched, outside = (
+        states[state] for state in (MapState.LOCALIZED, MapState.UNMATCHED, MapState.OUTSIDE)
+    )
+    share = f"{100.0 * matched / max(matched + unmatched, 1):.0f} % of the scans within the map matched"
+    away = f", {100.0 * outside / scans:.0f} % outside of it" if outside else ""
+    evidence = f"{share}{away}; log-odds {log_odds:.0f}"
+    doubtful = sorted((part for part in parts if part.is_doubtful), key=lambda part: -part.length_m)
+    if not doubtful and not doubt:
+        return Verdict.TRUSTWORTHY, f"{where}, and followed: {tried}; {evidence}"
+    more = f"and {len(doubtful) - _SHOWN:,} more" if len(doubtful) > _SHOWN else ""
+    reasons = [where, evidence, doubt, *(part.text for part in doubtful[:_SHOWN]), more]
+    return Verdict.CHECK, "; ".join(filter(None, reasons))
+
+
+def pose_near(x_m: float, y_m: float, yaw_deg: float) -> Initial:
+    """T_map_lidar at a position and heading; in space height and tilt are those of the nearest keyframe."""
+
+    def pose(stamp_ns: int, prior: SavedMap) -> Pose:
+        planar = lie.pose_2d(x_m, y_m, np.radians(yaw_deg))
+        if prior.dimension == 2:
+            return planar
+        poses = prior.poses
+        nearest = poses[np.argmin(np.hypot(poses[:, 0, 3] - x_m, poses[:, 1, 3] - y_m))]
+        T = lie.lift(planar)
+        turn = float(lie.yaw(lie.flatten(nearest)))
+        T[:3, :3] = T[:3, :3] @ lie.lift(lie.pose_2d(0.0, 0.0, -turn))[:3, :3] @ nearest[:3, :3]
+        T[2, 3] = nearest[2, 3]
+        return T
+
+    return pose
+
+
+def pose_in_file(path: Path) -> Initial:
+    """T_map_lidar of the first scan by a TUM file."""
+    trajectory = read_tum(path)
+
+    def pose(stamp_ns: int, prior: SavedMap) -> Pose:
+        nearest = int(np.argmin(np.abs(trajectory.stamps_ns - stamp_ns)))
+        away_s = abs(int(trajectory.stamps_ns[nearest]) - stamp_ns) * 1e-9
+        if away_s > _APART_S:
+            raise InputError(f"{path}: has no pose within {_APART_S:g} s of the first scan ({away_s:.1f} s away)")
+        T = trajectory.poses[nearest]
+        return lie.flatten(T) if prior.dimension == 2 else T
+
+    return pose
+
+
+def _summary(localized: LocalizedLog, log: Log) -> str:
+    """Text of summary.txt."""
+    m, prior = localized.metrics, localized.prior
+    names = ", ".join(session.name for session in prior.sessions)
+    states = ", ".join(f"{count:,} {state}" for state, count in m.states.items() if count)
+    lines = [
+        ("verdict", m.sentence),
+        ("log", f"{', '.join(map(str, log.paths))} {log.topic}: {counted(m.scans, 'scan')} over {m.path_m:.1f} m"),
+        ("map", f"{prior.folder}: {counted(m.map_keyframes, 'keyframe')} of {names}"),
+        ("states", f"{states}; {m.placed:,} placed in the end"),
+    ]
+    if m.found_scan >= 0:
+        lines.append(
+            ("found", f"at scan {m.found_scan:,}, after {m.found_after_s:.1f} s and {m.found_after_m:.1f} m")
+        )
+    if m.matches:
+        left_out = f", {m.rejected:,} of them left out" if m.rejected else ""
+        lines.append(("matches", f"{m.matches:,} with the map{left_out}; overlap {m.median_overlap:.2f} (median)"))
+        sigmas = f"{m.median_sigma_m:.3f} m at its time, {m.median_final_sigma_m:.3f} m in the end"
+        lines.append(("sigma", f"{sigmas}: standard deviation of a position (median)"))
+    truth = [] if m.ground_truth is None else accuracy_lines(m.ground_truth)
+    lines += [(line[:15].strip(), line[15:]) for line in truth]
+    lines += [("stretch", part.text) for part in m.parts]
+    lines += [("warning", warning) for warning in m.warnings]
+    lines.append(("time", f"{m.time_s:.1f} s, {m.scans / max(m.time_s, 1e-9):,.0f} scans/s"))
+    return "".join(f"{name:<15}{text}\n" for name, text in lines)
+
+
+def _write(folder: Path, localized: LocalizedLog, text: str) -> None:
+    """Trajectories, summary, metrics and the table: a row a scan, poses null where unknown."""
+    found = localized.localization
+    if found.is_placed.any():
+        write_tum(folder / "trajectory.tum", found.placed)
+    write_tum(folder / "odometry.tum", found.result.odometry)
+    (folder / "summary.txt").write_text(text, encoding="utf-8")
+    (folder / "metrics.json").write_bytes(json.format(json.encode(localized.metrics)) + b"\n")
+    columns: dict[str, pa.Array] = {
+        "scan": pa.array(np.arange(len(found.states))),
+        "stamp_ns": pa.array(found.trajectory.stamps_ns),
+        "state": pa.array(found.states.tolist()),
+        "placed": pa.array(found.is_placed),
+        "traveled_m": pa.array(found.traveled_m),
+        "sigma_m": pa.array(found.sigma_m, from_pandas=True),
+        "final_sigma_m": pa.array(found.final_sigma_m, from_pandas=True),
+    }
+    live, final = (found.live, np.isfinite(found.live[:, 0, 0])), (found.trajectory.poses, found.is_placed)
+    for name, (poses, known) in (("live", live), ("final", final)):
+        parts = pose_columns(np.where(known[:, None, None], poses, np.eye(poses.shape[-1])))
+        for part, values in parts.items():
+            unit = "_m" if part in "xyz" else ""
+            columns[f"{name}_{part}{unit}"] = pa.array(values, mask=~known)
+    table = pa.table(columns).replace_schema_metadata({"dimension": str(localized.prior.dimension)})
+    pq.write_table(table, folder / LOCALIZATION_FILE)

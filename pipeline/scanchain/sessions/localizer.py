@@ -1,0 +1,235 @@
+"""Localization in a map from nowhere: odometry, joined to the map by loop closures once its place is known."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain import checks, lie
+from scanchain.config import Config
+from scanchain.data import AnyPoints, Closure, Keyframe, Matrix, Pose, Scan, State, Step, Trajectory, brief
+from scanchain.evaluation.expected import edge_errors, with_map_errors
+from scanchain.loops.evidence import are_in_sight
+from scanchain.maps import SavedMap, open_saved_map
+from scanchain.preprocess import Prepared
+from scanchain.slam import Slam, SlamResult, loop_information
+
+_RECENT_KEYFRAMES = 3  # since the last match with the map, up to which a scan counts as localized
+INITIAL_SIGMAS = (2.0, 0.35)  # m and rad, standard deviations of a pose that the user gives
+
+
+class MapState(StrEnum):
+    """Knowledge of where a scan is in the map."""
+
+    SEARCHING = "searching"
+    LOCALIZED = "localized"
+    UNMATCHED = "not matched to the map"
+    OUTSIDE = "outside of the map"
+    LOST = "lost"
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """A scan in the map, as known at its time.
+
+    Attributes
+    ----------
+    state : how it is known; of one that is ``LOST`` the pose is predicted
+    T_map_lidar : pose in the map's frame, None while ``SEARCHING``
+    covariance : (k, k) of a twist in the lidar's own frame, None while ``SEARCHING``
+    step : its odometry and what was compared with the map
+    """
+
+    __repr__ = brief
+    state: MapState
+    T_map_lidar: Pose | None
+    covariance: Matrix | None
+    step: Step
+
+
+@dataclass(frozen=True, slots=True)
+class Localization:
+    """A log in a map, after its last scan.
+
+    Attributes
+    ----------
+    states : (N,) of every scan, as known at its time
+    is_placed : (N,) bool, scans that are joined to the map in the end, those before they were found too
+    trajectory : every scan, T_map_lidar; without meaning where not ``is_placed``
+    live : (N, d+1, d+1) poses as known at the time, NaN while searching
+    sigma_m : (N,) standard deviation of the position at the time, NaN while searching
+    final_sigma_m : (N,) of the position in the end, NaN where not placed
+    traveled_m : (N,) length of the path up to each scan, by odometry
+    closures : with keyframes of the map, or tried
+    result : of the whole chain, keyframes of the map first
+    """
+
+    __repr__ = brief
+    states: NDArray[np.str_]
+    is_placed: NDArray[np.bool_]
+    trajectory: Trajectory
+    live: Matrix
+    sigma_m: NDArray[np.float64]
+    final_sigma_m: NDArray[np.float64]
+    traveled_m: NDArray[np.float64]
+    closures: tuple[Closure, ...]
+    result: SlamResult
+
+    @property
+    def placed(self) -> Trajectory:
+        """Those of its scans that are placed."""
+        return Trajectory(self.trajectory.stamps_ns[self.is_placed], self.trajectory.poses[self.is_placed])
+
+    @property
+    def found_at(self) -> int:
+        """The first scan whose place was known at its time, −1 if there is none."""
+        known = np.flatnonzero(self.states != MapState.SEARCHING)
+        return int(known[0]) if len(known) and self.is_placed.any() else -1
+
+
+class Localizer:
+    """Places the scans of a log in a map, which stays as it is.
+
+    Until its place is found the log is followed by odometry alone. Then every keyframe is matched to the map
+    around it, and every scan to those before; matches with the map that contradict the others are left out.
+    """
+
+    def __init__(
+        self,
+        prior: SavedMap | Path | str,
+        config: Config | None = None,
+        T_base_lidar: Pose | None = None,
+        *,
+        initial: Pose | None = None,
+        points_file: Path | None = None,
+        is_live: bool = True,
+    ) -> None:
+        """Begin in a map.
+
+        prior : the map, or the run directory that holds it
+        config, T_base_lidar, points_file : as in ``Slam``
+        is_live : whether a search of a large map goes on over several scans, so that none of them waits for it;
+            else it is completed at once, which finds the log after a shorter path
+        initial : T_map_lidar of the first scan where it is known, to a few meters and 20°
+        Raises InputError for a map that cannot be read.
+        """
+        self.map = prior if isinstance(prior, SavedMap) else open_saved_map(checks.path(prior, "prior"))
+        dimension = self.map.dimension
+        self.slam = Slam(config, T_base_lidar, points_file, dimension=dimension, prior=self.map, is_live=is_live)
+        self.initial = None if initial is None else checks.pose(initial, "initial", dimension)
+        self.states: list[MapState] = []
+        self.live: list[Pose] = []
+        self.sigma_m: list[float] = []
+        self.traveled_m: list[float] = []
+        self.start_m = self.slam.traveled_m
+        self.is_in_map = False
+        self.state = MapState.SEARCHING  # of the newest keyframe
+        self.covariance = np.empty((0, 0))  # of its pose, but for its own error, once it is in the map
+        self.own = self.covariance  # covariance of its own error
+        self.by_map: Closure | None = None  # its match, or the last one before
+
+    def track(
+        self,
+        points: AnyPoints,
+        stamp_s: float,
+        times_s: NDArray[np.floating] | None = None,
+        *,
+        T_odom_base: Pose | None = None,
+    ) -> Placed:
+        """Place a scan as a driver gives it; arguments as in ``Odometry.track``."""
+        scan = Scan.of(points, stamp_s, times_s, index=len(self.states), T_odom_base=T_odom_base)
+        return self.slam.live_stamps.passed(scan, self.process)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Lines on wheels that were left out."""
+        return self.slam.front_end.odometry.predictor.warnings()
+
+    def process(self, scan: Scan | Prepared) -> Placed:
+        """Place one scan of a log."""
+        step = self.slam.process(scan)
+        if self.initial is not None and len(self.states) == 0:
+            self.slam.begin_at(self.initial, INITIAL_SIGMAS)
+        placed = self._placed(step)
+        T, covariance = placed.T_map_lidar, placed.covariance
+        variances = [np.nan] if covariance is None else covariance.diagonal()[: self.slam.dimension].tolist()
+        self.states.append(placed.state)
+        self.live.append(np.full(step.T_odom_lidar.shape, np.nan) if T is None else T)
+        self.sigma_m.append(math.sqrt(sum(variances)))
+        self.traveled_m.append(self.slam.traveled_m - self.start_m)
+        return placed
+
+    def finish(self) -> Localization:
+        """Match what is left and smooth the whole path; scans before the place was found are placed as well."""
+        result, first = self.slam.finish(), self.slam.first
+        scans = [keyframe.scan_index for keyframe in result.keyframes[first:]]
+        keyframe_of = np.searchsorted(scans, np.arange(len(result.trajectory)), side="right") - 1
+        is_placed = (result.components[first:] == result.components[0])[keyframe_of]
+        final_sigma_m = np.full(len(is_placed), np.nan)
+        if is_placed.any():
+            graph, own = with_map_errors(result.graph, result.map_errors, self.slam.config)  # the map is held
+            variances = np.diagonal((graph.covariances() + own)[first:], axis1=1, axis2=2)[:, : graph.dimension]
+            final_sigma_m[is_placed] = np.sqrt(variances.sum(axis=1))[keyframe_of[is_placed]]
+        return Localization(
+            states=np.array(self.states, np.str_),
+            is_placed=is_placed,
+            trajectory=result.trajectory,
+            live=np.array(self.live),
+            sigma_m=np.array(self.sigma_m),
+            final_sigma_m=final_sigma_m,
+            traveled_m=np.array(self.traveled_m),
+            closures=tuple(each for each in result.closures if each.target < first),
+            result=result,
+        )
+
+    def _placed(self, step: Step) -> Placed:
+        slam = self.slam
+        if step.closures or step.graph is not None or step.starts_segment or not self.states:
+            self.is_in_map = slam.is_in_map
+        if not self.is_in_map:
+            self.covariance = np.empty((0, 0))
+            return Placed(MapState.SEARCHING, None, None, step)
+        if step.keyframe >= 0 or not len(self.covariance):
+            self._follow()
+        T_map_lidar = slam.T_world_odom @ step.T_odom_lidar
+        covariance = _moved(self.covariance, slam.keyframes[-1], step.T_odom_lidar) + self.own
+        return Placed(MapState.LOST if step.state is State.LOST else self.state, T_map_lidar, covariance, step)
+
+    def _follow(self) -> None:
+        """State and covariance of the newest keyframe: by its match with the map, or by the motion to it."""
+        slam, by_map, newest = self.slam, self.slam.by_map, self.slam.keyframes[-1]
+        of_newest = (slam.graph.edges[:, 1] == newest.index) & ~slam.graph.is_loop
+        information = slam.graph.added_since(int(np.flatnonzero(of_newest)[-1]))[1][:1]
+        motion, own = self._errors(information, newest.index, is_loop=False)
+        if by_map is not None and (by_map is not self.by_map or not len(self.covariance)):
+            loop = loop_information(by_map, slam.config.loops)[None]
+            matched = self._errors(loop, by_map.source, is_loop=True)[0]
+            self.covariance = _moved(matched, slam.keyframes[by_map.source], newest.T_odom_lidar)
+        elif by_map is None and not len(self.covariance):
+            self.covariance = np.diag(lie.by_component(slam.graph.freedom, *INITIAL_SIGMAS) ** 2)
+        else:
+            self.covariance = _moved(self.covariance, slam.keyframes[-2], newest.T_odom_lidar) + motion
+        self.by_map, self.own = by_map, own
+        if by_map is not None and newest.index - by_map.source <= _RECENT_KEYFRAMES:
+            self.state = MapState.LOCALIZED
+        else:
+            placed = replace(newest, T_odom_lidar=slam.graph.poses[-1])
+            is_known = are_in_sight([placed], slam.keyframes[: slam.first])[0]
+            self.state = MapState.UNMATCHED if is_known else MapState.OUTSIDE
+
+    def _errors(self, information: Matrix, keyframe: int, *, is_loop: bool) -> tuple[Matrix, Matrix]:
+        """Covariances (k, k) of an edge to a keyframe, and of the pose of that by itself."""
+        errors = self.slam.map_errors[keyframe : keyframe + 1]
+        edge, own = edge_errors(information, np.array([is_loop]), errors, self.slam.config)
+        return edge[0], own[0]
+
+
+def _moved(covariance: Matrix, keyframe: Keyframe, T_odom_lidar: Pose) -> Matrix:
+    """Covariance of the pose of a keyframe as that of another pose, whose motion from it is known."""
+    Ad = lie.adjoint(lie.between(T_odom_lidar, keyframe.T_odom_lidar))
+    return Ad @ covariance @ Ad.T

@@ -1,0 +1,269 @@
+"""The map of several sessions: final poses of their keyframes and scans, what is gone from them, and its files.
+
+An updated map follows its newest session: points of older keyframes that newer sessions saw through are removed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import count
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from scanchain import lie
+from scanchain.config import Config
+from scanchain.data import REJECTED_WEIGHT, Keyframe, KeyframePoints, Matrix, Points, Trajectory
+from scanchain.errors import InputError
+from scanchain.graph.files.g2o_write import write_g2o
+from scanchain.loops import refined, spread
+from scanchain.maps import MAP_FOLDER, SavedMap, Session, write_map, write_ply, write_saved_map
+from scanchain.point_store import PointStore
+from scanchain.runs.closures import FinalClosure, final_verdicts, write_closures
+from scanchain.runs.directory import directory_name
+from scanchain.runs.results import GRAPH_FILE, Cloud, grid_of
+from scanchain.sessions.changes import Label, Part, changes_between
+from scanchain.sessions.joining import Joined, graph_of
+from scanchain.trajectory import read_tum, write_tum
+
+_SEEN_AGAIN = 0.3  # share of a keyframe's points near those of a later one, from which on it was seen again
+_CELL_VOXELS = 4.0  # edge of the cells, in voxels of the map, in which points are near each other
+_CELL_BITS = 21  # of each of their coordinates
+
+
+@dataclass(frozen=True, slots=True)
+class MergedMap:
+    """Maps in one frame, with their sessions.
+
+    Attributes
+    ----------
+    joined : the graph
+    T_world_keyframes : (K, d+1, d+1) final poses; in the plane finer than those of the graph
+    sessions : of all maps, with names that differ, in the order of time
+    session : (K,) number of each keyframe's session
+    trajectories : of the sessions; of all scans where a run has them, else of the keyframes
+    last_seen_ns : (K,) stamp of the newest keyframe known to have seen the surroundings of each
+    removed : (K,) number of each keyframe's points that newer sessions saw through, where the map was updated
+    warnings : of the update
+    """
+
+    joined: Joined
+    T_world_keyframes: Matrix
+    sessions: tuple[Session, ...]
+    session: NDArray[np.int64]
+    trajectories: tuple[Trajectory, ...]
+    last_seen_ns: NDArray[np.int64]
+    removed: NDArray[np.int64]
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def keyframes(self) -> tuple[Keyframe, ...]:
+        """Keyframes of all sessions."""
+        return self.joined.keyframes
+
+
+def session_names(maps: Sequence[SavedMap], order: Sequence[int]) -> dict[tuple[int, int], str]:
+    """Name of every session by the numbers of its map and of itself there.
+
+    A run of one log is called by its directory; of equal names the later ones, in this order, get a number.
+    """
+    names: dict[tuple[int, int], str] = {}
+    for number in order:
+        saved = maps[number]
+        for index, session in enumerate(saved.sessions):
+            stem = name = directory_name(saved.name if len(saved.sessions) == 1 else session.name)
+            numbers = count(2)
+            while name in names.values():
+                name = f"{stem}-{next(numbers)}"
+            names[number, index] = name
+    return names
+
+
+def merged_map(
+    joined: Joined,
+    maps: Sequence[SavedMap],
+    names: dict[tuple[int, int], str],
+    config: Config,
+    *,
+    first: int,
+    held: int,
+    update: bool = False,
+) -> MergedMap:
+    """The map of joined maps, in the frame of the map ``first``: its first keyframe stays where it was.
+
+    names : of the sessions, by map and number; held : map whose poses stay as they are, or −1
+    update : whether points that newer sessions saw through are removed
+    """
+    poses = _refined(joined, config, held)
+    if held < 0:
+        at = int(np.flatnonzero(joined.of_map == first)[0])
+        T_first_world = maps[first].keyframes[0].T_odom_lidar @ lie.inverse(poses[at])
+        poses = T_first_world @ poses
+        joined = joined.placed(T_first_world @ joined.poses)
+    chosen = [(number, index) for number in joined.maps for index in range(len(maps[number].sessions))]
+    chosen.sort(key=lambda each: maps[each[0]].sessions[each[1]].first_stamp_ns)
+    session = np.empty(len(poses), np.int64)
+    sessions, trajectories = [], []
+    for new, (number, index) in enumerate(chosen):
+        of_session = np.flatnonzero(joined.of_map == number)[maps[number].session == index]
+        session[of_session] = new
+        sessions.append(msgspec.structs.replace(maps[number].sessions[index], name=names[number, index]))
+        trajectories.append(_trajectory(maps[number], index, poses[of_session]))
+    last_seen_ns = np.concatenate([maps[number].last_seen_ns for number in joined.maps])
+    removed, warnings = np.zeros(len(poses), np.int64), ()
+    if update:
+        new = updated(joined.keyframes, poses, session, sessions, config)
+        joined, removed, warnings = replace(joined, keyframes=new.keyframes), new.removed, new.warnings
+        last_seen_ns = np.maximum(last_seen_ns, new.last_seen_ns)
+    return MergedMap(joined, poses, tuple(sessions), session, tuple(trajectories), last_seen_ns, removed, warnings)
+
+
+def final_closures(merged: MergedMap) -> tuple[FinalClosure, ...]:
+    """Every closure tried between maps with its final verdict."""
+    state, edges = graph_of(merged.joined).state(), merged.joined.edges
+    order = np.argsort(edges.is_loop, kind="stable")  # of the state: odometry first
+    between = merged.joined.is_between[order]
+    return final_verdicts(merged.joined.closures, replace(state, is_loop=between, weight=edges.weight[order]))
+
+
+def write_merged(
+    folder: Path, merged: MergedMap, cloud: Cloud, final: Sequence[FinalClosure], config: Config
+) -> None:
+    """Write map, trajectories, point cloud, grid, graph and closures into a directory."""
+    edges, keyframes, poses = merged.joined.edges, merged.keyframes, merged.T_world_keyframes
+    in_force = edges.where(edges.weight >= REJECTED_WEIGHT)
+    of_sessions = merged.session, merged.sessions
+    write_saved_map(folder / MAP_FOLDER, keyframes, poses, *of_sessions, in_force, merged.last_seen_ns)
+    for session, trajectory in zip(merged.sessions, merged.trajectories, strict=True):
+        write_tum(folder / f"{session.name}.tum", trajectory, force=True)
+    write_ply(folder / "map.ply", cloud.points)
+    if merged.joined.dimension == 2:
+        write_map(folder, grid_of(merged, config.maps))
+    write_g2o(folder / GRAPH_FILE, graph_of(replace(merged.joined, edges=in_force)))
+    write_closures(folder / "loops.parquet", final, merged.keyframes, merged.joined.dimension)
+
+
+def _refined(joined: Joined, config: Config, held: int) -> Matrix:
+    """Final poses (K, d+1, d+1): in the plane, each keyframe aligned once more to the map of all of them."""
+    poses = joined.poses
+    if joined.dimension == 3 or not config.loops.refine:
+        return poses
+    store = PointStore(2)
+    stored = [store.add(keyframe.points) for keyframe in joined.keyframes]
+    spans = np.array([(each.first, each.count) for each in stored], np.int64)
+    free = joined.of_map != held
+    poses[free] = refined(poses[free], spans[free], store, joined.keyframes, joined.poses, config)
+    return poses
+
+
+def _trajectory(saved: SavedMap, index: int, poses: Matrix) -> Trajectory:
+    """Poses of a session's scans, from its first keyframe on, moved along with its keyframes (K, d+1, d+1)."""
+    keyframes = [saved.keyframes[k] for k in np.flatnonzero(saved.session == index).tolist()]
+    stamps_ns = np.array([keyframe.stamp_ns for keyframe in keyframes], np.int64)
+    before = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
+    file = saved.folder.parent / (
+        "trajectory.tum" if len(saved.sessions) == 1 else f"{saved.sessions[index].name}.tum"
+    )
+    scans = read_tum(file) if file.exists() else Trajectory(stamps_ns[:0], before[:0])
+    known = lie.flatten(scans.poses) if saved.dimension == 2 and len(scans) else scans.poses
+    rows = np.array([keyframe.scan_index for keyframe in keyframes], np.int64)
+    for first in (0, int(rows[0])):  # a merged map's file begins at the first keyframe
+        begin, found = int(rows[0]) - first, rows - rows[0]
+        if rows[-1] - first < len(scans) and np.array_equal(scans.stamps_ns[rows - first], stamps_ns):
+            is_still = np.array_equal(poses, before)
+            return Trajectory(
+                scans.stamps_ns[begin:], known[begin:] if is_still else spread(poses, found, known[begin:])
+            )
+    return Trajectory(stamps_ns, poses)
+
+
+@dataclass(frozen=True, slots=True)
+class RemainingPoints:
+    """Points of a keyframe for which ``kept`` (M,) holds."""
+
+    stored: KeyframePoints
+    kept: NDArray[np.bool_]
+
+    def read(self) -> Points:
+        """(N, d) meters."""
+        return self.stored.read()[self.kept]
+
+
+@dataclass(frozen=True, slots=True)
+class Updated:
+    """Keyframes of an updated map.
+
+    Attributes
+    ----------
+    keyframes : without the points that newer sessions saw through
+    removed : (K,) number of these
+    last_seen_ns : (K,) stamp of the newest keyframe that saw the surroundings of each, its own at least
+    warnings : sessions that nothing was removed by, since they do not fit on those before
+    """
+
+    keyframes: tuple[Keyframe, ...]
+    removed: NDArray[np.int64]
+    last_seen_ns: NDArray[np.int64]
+    warnings: tuple[str, ...]
+
+
+def updated(
+    keyframes: Sequence[Keyframe],
+    poses: Matrix,
+    session: NDArray[np.int64],
+    sessions: Sequence[Session],
+    config: Config,
+) -> Updated:
+    """Keyframes at these poses (K, d+1, d+1) without what vanished from one session to the next.
+
+    session : (K,) number of each keyframe's session; the later session has the higher number
+    """
+    result, removed, warnings = list(keyframes), np.zeros(len(keyframes), np.int64), []
+    for number in range(1, len(sessions)):
+        older, newer = np.flatnonzero(session < number), np.flatnonzero(session == number)
+        earlier, later = (
+            Part("", [result[k] for k in chosen.tolist()], poses[chosen]) for chosen in (older, newer)
+        )
+        try:
+            changes = changes_between(earlier, later, config)
+        except InputError:
+            warnings.append(
+                f"{sessions[number].name}: too little in common with older sessions, nothing removed by it"
+            )
+            continue
+        if not (changes.labels == Label.VANISHED).any():
+            continue
+        label_of = KDTree(changes.points)
+        reach_m = np.sqrt(changes.dimension) * changes.voxel_size_m
+        is_vanished = np.append(changes.labels == Label.VANISHED, False)  # the last one: no point within reach
+        for k in older.tolist():
+            points = lie.transform(poses[k], result[k].points)
+            gone = is_vanished[label_of.query(points, distance_upper_bound=reach_m)[1]]
+            if gone.any():
+                removed[k] += gone.sum()
+                result[k] = replace(result[k], stored=RemainingPoints(result[k].stored, ~gone))
+    last_seen_ns = _last_seen(result, poses, _CELL_VOXELS * config.maps.voxel_size_m)
+    return Updated(tuple(result), removed, last_seen_ns, tuple(warnings))
+
+
+def _last_seen(keyframes: Sequence[Keyframe], poses: Matrix, cell_m: float) -> NDArray[np.int64]:
+    """(K,) stamp since which a share of each keyframe's points was seen, by any session; its own at least."""
+    stamps_ns = np.array([keyframe.stamp_ns for keyframe in keyframes], np.int64)
+    places = 1 << _CELL_BITS * np.arange(poses.shape[-1] - 1)  # of a cell's coordinates in one number
+    cells = []
+    for keyframe, pose in zip(keyframes, poses, strict=True):
+        coordinates = np.floor(lie.transform(pose, keyframe.points) / cell_m).astype(np.int64)
+        cells.append(np.unique((coordinates & ((1 << _CELL_BITS) - 1)) @ places))
+    number = np.unique(np.concatenate(cells), return_inverse=True)[1]
+    counts = np.array([len(each) for each in cells])
+    newest_ns = np.full(number.max(initial=-1) + 1, np.iinfo(np.int64).min)
+    np.maximum.at(newest_ns, number, np.repeat(stamps_ns, counts))
+    last_ns = stamps_ns.copy()
+    for k, seen in enumerate(np.split(newest_ns[number], np.cumsum(counts)[:-1])):
+        if len(seen):
+            last_ns[k] = np.sort(seen)[::-1][int(_SEEN_AGAIN * (len(seen) - 1))]
+    return last_ns

@@ -1,0 +1,294 @@
+"""Merging: run directories of one place in, one map out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import msgspec
+
+from scanchain.clock import announcing_compilation, compiled_s, working_s
+from scanchain.config import Config
+from scanchain.data import REJECTED_WEIGHT, ClosureVerdict, brief
+from scanchain.errors import InputError, ScanchainError
+from scanchain.graph.optimization import fit
+from scanchain.maps import SavedMap, Session, open_saved_map
+from scanchain.runs.closures import FinalClosure
+from scanchain.runs.directory import RUN_FILE, RunDirectory
+from scanchain.runs.job import Progress
+from scanchain.runs.provenance import Hashing, describe_start
+from scanchain.runs.results import Cloud, cloud_of
+from scanchain.sessions.joining import Doubt, Joined, changed, graph_of, join_all
+from scanchain.sessions.merged_map import MergedMap, final_closures, merged_map, session_names, write_merged
+from scanchain.settings import Override, dump, load_settings
+from scanchain.whole_file import write_whole
+from scanchain.words import counted
+
+
+class SessionMetrics(msgspec.Struct, frozen=True):
+    """A session of the merged map.
+
+    Attributes
+    ----------
+    closures : in force between it and other maps
+    removed_points : of its keyframes, that newer sessions saw through; 0 where the map was not updated
+    """
+
+    name: str
+    first_stamp_ns: int
+    last_stamp_ns: int
+    keyframes: int
+    closures: int
+    removed_points: int = 0
+
+
+class MergeMetrics(msgspec.Struct, frozen=True):
+    """Contents of metrics.json of a merge.
+
+    Attributes
+    ----------
+    sessions : those in the map, in the order of time
+    apart : those that are not, each with the other sessions of its own place, if any
+    closures_tried, closures_in_force : between maps
+    chi2, degrees_of_freedom, certified, certificate : of the pose graph
+    map_points, moving_points_removed : of map.ply
+    updated : whether the map follows its newest session
+    uncertain : joins without enough evidence
+    run_s : wall time, without compilation
+    """
+
+    dimension: int
+    sessions: tuple[SessionMetrics, ...]
+    keyframes: int
+    closures_tried: int
+    closures_in_force: int
+    chi2: float
+    degrees_of_freedom: int
+    fit: str
+    certified: bool
+    certificate: str
+    map_points: int
+    moving_points_removed: int
+    apart: tuple[tuple[str, ...], ...] = ()
+    uncertain: tuple[Doubt, ...] = ()
+    warnings: tuple[str, ...] = ()
+    updated: bool = False
+    run_s: float = 0.0
+    compile_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Merged:
+    """A finished merge: its directory, metrics, summary and warnings."""
+
+    __repr__ = brief
+    path: Path
+    metrics: MergeMetrics
+    summary: str
+    warnings: tuple[str, ...]
+
+
+def merge(
+    runs: Sequence[Path],
+    out: Path,
+    progress: Progress,
+    report: Callable[[Path], None],
+    *,
+    config_file: Path | None = None,
+    overrides: tuple[Override, ...] = (),
+    fixed: bool = False,
+    update: bool = False,
+    force: bool = False,
+    command: tuple[str, ...] = (),
+) -> Merged:
+    """Join the maps of runs, write the directory ``out``, to which ``report`` adds page and recording in the end.
+
+    runs : run directories, or map folders; the first one's frame is that of the merged map
+    config_file : on top of the preset; overrides : on top of both
+    fixed : whether the keyframes of the first run stay where they are, to the bit
+    update : whether points that newer sessions saw through are removed from the keyframes of older ones
+    force : whether a directory of that name is replaced
+    command : the command line, for run.json
+    Raises InputError for bad input, and ScanchainError where no two maps belong together.
+    """
+    started, compiled_before_s = working_s(), compiled_s()
+    directory = RunDirectory(out, force=force)
+    maps = _opened(runs, out)
+    if update:
+        _check_order([session for saved in maps for session in saved.sessions])
+    settings = load_settings(maps[0].dimension, file=config_file, overrides=overrides)
+    config, held, folders = settings.config, 0 if fixed else -1, [saved.folder for saved in maps]
+    order = _canonical(maps, held)
+    names = session_names(maps, order)
+    provenance = describe_start(command, folders, settings.source)
+    with directory, announcing_compilation(progress.say), Hashing(folders) as hashing:
+        firsts = [names[number, 0] for number in range(len(maps))]
+        groups, uncertain = join_all(maps, order, firsts, config, held, progress.say)
+        joined = _chosen(groups, held, maps, uncertain)
+        progress.say(f"making the map of {counted(len(joined.keyframes), 'keyframe')}")
+        merged = merged_map(joined, maps, names, config, first=min(joined.maps), held=held, update=update)
+        cloud, final = cloud_of(merged, config), final_closures(merged)
+        write_merged(directory.path, merged, cloud, final, config)
+        apart = tuple(
+            tuple(names[number, k] for number in group.maps for k in range(len(maps[number].sessions)))
+            for group in groups
+            if group is not joined
+        )
+        different = (_changed_text(names[number, 0], share) for number, share in changed(joined).items())
+        warnings = (*(_apart_text(each, uncertain) for each in apart), *different, *merged.warnings)
+        compile_s, run_s = compiled_s() - compiled_before_s, working_s() - started
+        metrics = msgspec.structs.replace(
+            _measured(merged, cloud, final, config, held),
+            apart=apart,
+            run_s=run_s,
+            compile_s=compile_s,
+            warnings=warnings,
+            updated=update,
+            uncertain=tuple(uncertain),
+        )
+        write_whole(directory.path / "metrics.json", msgspec.json.format(msgspec.json.encode(metrics)) + b"\n")
+        text = _summary(metrics, names[min(joined.maps), 0], settings.source, fixed=fixed)
+        (directory.path / "summary.txt").write_text(text, encoding="utf-8")
+        write_whole(directory.path / "config.toml", dump(config).encode())
+        done = msgspec.structs.replace(provenance.hashed(hashing), complete=True, duration_s=run_s + compile_s)
+        done.write(directory.path / RUN_FILE)
+        progress.say("drawing the report")
+        report(directory.path)
+        directory.complete()
+    return Merged(directory.path, metrics, text, warnings)
+
+
+def _opened(runs: Sequence[Path], out: Path) -> list[SavedMap]:
+    """The maps of runs. Raises InputError where they cannot be merged."""
+    if len(runs) < 2:
+        raise InputError("merge takes two run directories or more; name another one")
+    maps = [open_saved_map(run) for run in runs]
+    holders: dict[tuple[int, int, int], Path] = {}
+    for run, saved in zip(runs, maps, strict=True):
+        if saved.dimension != maps[0].dimension:
+            raise InputError(
+                f"{run}: is a {saved.dimension}D map, {runs[0]} a {maps[0].dimension}D one; merge maps of one kind"
+            )
+        if not saved.keyframes:
+            raise InputError(f"{run}: its map has no keyframe; leave it out")
+        if out.resolve() in (run.resolve(), saved.folder.resolve()):
+            raise InputError(f"{out}: is one of the runs; choose another --out")
+        for session in saved.sessions:
+            key = (session.first_stamp_ns, session.last_stamp_ns, session.keyframes)
+            if key in holders:
+                raise InputError(f"{run}: holds a session that {holders[key]} holds, too; leave one of them out")
+            holders[key] = run
+    return maps
+
+
+def _check_order(sessions: Sequence[Session]) -> None:
+    """Raise InputError where it is not known which of two sessions is the newer one."""
+    for before, after in pairwise(sorted(sessions, key=lambda session: session.first_stamp_ns)):
+        if before.first_stamp_ns == after.first_stamp_ns:
+            raise InputError(
+                f"{before.name}, {after.name}: begin at the same time, none is newer; leave out --update"
+            )
+
+
+def _canonical(maps: Sequence[SavedMap], held: int) -> list[int]:
+    """Numbers of the maps, the held one first, then the largest, whatever order they were named in."""
+
+    def key(number: int) -> tuple[object, ...]:
+        saved = maps[number]
+        stamps = [(session.first_stamp_ns, session.last_stamp_ns) for session in saved.sessions]
+        return (number != held, -len(saved.keyframes), saved.name, stamps)
+
+    return sorted(range(len(maps)), key=key)
+
+
+def _chosen(groups: Sequence[Joined], held: int, maps: Sequence[SavedMap], uncertain: Sequence[Doubt]) -> Joined:
+    """The group with the held map, else the one of most maps and, of equal ones, keyframes."""
+    chosen = max(groups, key=lambda group: (held in group.maps, len(group.maps), len(group.keyframes)))
+    if len(chosen.maps) > 1:
+        return chosen
+    what = "no two of the maps belong together"
+    if held >= 0:
+        what = f"nothing belongs to {maps[held].folder.parent}"
+    if uncertain:
+        raise ScanchainError(f"{what} for certain: {'; '.join(each.text for each in uncertain)}")
+    raise ScanchainError(
+        f"{what}: too few closures between them agree; merge runs that saw the same place, or raise "
+        "--loops.max_radius_m where they have drifted far"
+    )
+
+
+def _apart_text(names: Sequence[str], uncertain: Sequence[Doubt]) -> str:
+    together = "; they belong together: merge them on their own" if len(names) > 1 else ""
+    doubts = [each.text for each in uncertain if {each.session, each.frame} & set(names)]
+    reason = "; ".join(doubts) if doubts else "too few closures agree"
+    return f"{', '.join(names)}: not in this map; {reason}{together}"
+
+
+def _changed_text(name: str, share: float) -> str:
+    return (
+        f"{name}: {100.0 * share:.1f} % of what it and the others had in sight differs; much has changed, or "
+        "it is of another floor of the same plan; then leave it out"
+    )
+
+
+def _measured(
+    merged: MergedMap, cloud: Cloud, final: Sequence[FinalClosure], config: Config, held: int
+) -> MergeMetrics:
+    """The metrics of a map but for what joined it."""
+    graph = graph_of(merged.joined, held)
+    state = graph.optimize(config.graph, initialize="given", rejection="refined").state
+    certificate = graph.certify()
+    edges = merged.joined.edges
+    between = edges.where(merged.joined.is_between & (edges.weight >= REJECTED_WEIGHT))
+    ends = merged.session[between.pairs]
+    return MergeMetrics(
+        dimension=merged.joined.dimension,
+        sessions=tuple(
+            SessionMetrics(
+                each.name,
+                each.first_stamp_ns,
+                each.last_stamp_ns,
+                int((merged.session == number).sum()),
+                int((ends == number).any(axis=1).sum()),
+                int(merged.removed[merged.session == number].sum()),
+            )
+            for number, each in enumerate(merged.sessions)
+        ),
+        keyframes=len(merged.keyframes),
+        closures_tried=len(final),
+        closures_in_force=sum(item.verdict is ClosureVerdict.ACCEPTED for item in final),
+        chi2=state.chi2,
+        degrees_of_freedom=state.degrees_of_freedom,
+        fit=fit(state),
+        certified=certificate.certified,
+        certificate=certificate.verdict,
+        map_points=len(cloud.points),
+        moving_points_removed=cloud.removed,
+    )
+
+
+def _summary(m: MergeMetrics, first: str, configuration: str, *, fixed: bool) -> str:
+    """The metrics as text."""
+    width = max(len(each.name) for each in m.sessions)
+    lines = [
+        f"merged         {counted(len(m.sessions), 'session')} in the frame of {first}"
+        + (", whose poses are fixed" if fixed else ""),
+        *(
+            f"session        {each.name:<{width}}  {counted(each.keyframes, 'keyframe')}, "
+            f"{counted(each.closures, 'closure')} to other sessions"
+            + (f", {counted(each.removed_points, 'point')} removed as gone" if m.updated else "")
+            for each in m.sessions
+        ),
+        *(f"apart          {warning}" for warning in m.warnings[: len(m.apart)]),
+        *(f"warning        {warning}" for warning in m.warnings[len(m.apart) :]),
+        f"configuration  {configuration}",
+        f"closures       {m.closures_tried:,} tried between maps, {m.closures_in_force:,} in force",
+        f"pose graph     {m.fit}",
+        f"certificate    {m.certificate}",
+        f"map            {counted(m.map_points, 'point')}; {m.moving_points_removed:,} more removed as moving",
+        f"time           {m.run_s:.1f} s"
+        + (f" (and {m.compile_s:.0f} s compiling)" if m.compile_s >= 1.0 else ""),
+    ]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,22 @@
+"""Independent checks of a trajectory, and the verdict on it."""
+
+from scanchain.verdict.checks import (
+    VELOCITY_LIMIT,
+    WHEEL_LIMIT,
+    Kind,
+    apart_m,
+    check_overlap,
+    check_velocity,
+    check_wheels,
+    smallest_jump_m,
+    wheel_bound_m,
+)
+from scanchain.verdict.closures import Closures
+from scanchain.verdict.judging import MOST_CONTRADICTED, Judged, Verdict, judge
+from scanchain.verdict.stretches import KNOWN, Evidence, Stretch, WorstPlace, worst_place
+
+__all__ = [
+    "KNOWN", "MOST_CONTRADICTED", "VELOCITY_LIMIT", "WHEEL_LIMIT", "Closures", "Evidence", "Judged", "Kind",
+    "Stretch", "Verdict", "WorstPlace", "apart_m", "check_overlap", "check_velocity", "check_wheels", "judge",
+    "smallest_jump_m", "wheel_bound_m", "worst_place",
+]  # fmt: skip

@@ -1,0 +1,242 @@
+"""Independent checks of a trajectory: normalized innovations against wheel odometry and constant velocity."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from scanchain import lie
+from scanchain.data import Matrix
+from scanchain.registration.svd_icp import DegeneratePairsError, rigid_transform
+
+Floats = NDArray[np.float64]
+
+WHEEL_LIMIT, VELOCITY_LIMIT = 8.0, 4.0  # largest innovations that are no finding, standard deviations
+WINDOW_M = 4.0  # path over which wheels and trajectory are compared
+_SHORTEST_M = 0.5  # shortest path of a window that is checked
+_LARGEST_CORRECTION = 0.1  # m/m and rad/m: a larger one is no calibration of the wheels
+_RIDGE = 1e-3  # of the calibration's normal equations, against directions in which the wheels never moved
+_ROUNDS = 10  # of the robust regression
+_TURN_M_RAD = 0.5  # path of a turn on the spot
+_LEAST_M, _LEAST_RAD = 0.05, 0.03  # smallest σ of wheels
+_LEAST_SHARE, _MOST_SHARE = 0.02, 0.05  # m/m and rad/m: limits of the learned σ; worse wheels check nothing finer
+_TAIL, _TAIL_SIGMAS = 90.0, 1.645  # percentile of the residuals from which σ is learned, and where a normal has it
+
+_LEAST_TURN_RAD = 1.0  # turns of the wheels over a log, below which their sense is not compared
+_GRID_M, _MEDIAN = 0.1, 21  # of the medians along the path: spacing and number of values
+
+_SPUN_M = 0.5  # of path that wheels alone make in a scan, at most: of more they slip, or a reading is wrong
+_WILD = 2.0  # m/m and rad/m by which wheels are wrong in a window, above which it calibrates nothing
+
+_ACCELERATION_M_S2, _ACCELERATION_RAD_S2 = 4.0, 12.0  # σ: a fifth to a third of what vehicles and hands can do
+_MOTION_M, _MOTION_RAD = 0.05, 0.01  # σ of a motion between scans by matching
+_ALIKE = 1.4  # an interval shorter than the usual one by this factor is none: its stamps jitter
+
+_FEWEST, _BEFORE = 3, 10  # scans whose median overlap with the map is usual
+_LEAST_USUAL = 1e-3  # smallest usual share of points with a correspondence
+
+
+class Kind(StrEnum):
+    """Finding of a stretch."""
+
+    DEGENERATE = "degenerate"
+    LOST = "lost"
+    CONTRADICTED = "contradicted"
+    WHEELS = "wheels disagree"
+    SCANS_SLIP = "scans slip"
+    WHEELS_SLIP = "wheels slip"
+    ACCELERATION = "impossible acceleration"
+    LOOPS = "loop closures disagree"
+    DISCONNECTED = "disconnected"
+    OVERLAP = "overlap lost"
+    COPIES = "copies of one scan"
+
+
+class WheelCheck(NamedTuple):
+    """Trajectory against wheels around each scan, NaN where there is nothing to compare.
+
+    Attributes
+    ----------
+    innovation : (N,) standard deviations
+    apart_m, apart_rad : (N,) difference of the motions over ``WINDOW_M`` after calibration
+    poses : (N, d+1, d+1) of the lidar by the wheels, NaN where unknown
+    turn_ratio : turns of the trajectory over those of the wheels; NaN where these turn too little to say
+    known_share : share of the scans whose motion the wheels know, at rest too
+    """
+
+    innovation: Floats
+    apart_m: Floats
+    apart_rad: Floats
+    poses: Matrix
+    turn_ratio: float = np.nan
+    known_share: float = 0.0
+
+
+def check_wheels(poses: Matrix, wheel_poses: Matrix) -> WheelCheck:
+    """Motions of a trajectory (N, d+1, d+1) against those by the wheels, NaN where unknown.
+
+    The differences of the motions are summed up in the lidar's frame, so that neither drift of heading nor slopes
+    matter, and compared before and after each scan, as medians along the path, so that readings that are late or
+    out of time do not matter either. Scale errors, drift and a turned or displaced lidar are calibrated by robust
+    regression over the log; the standard deviations of what is left are learned from the log.
+    """
+    d, n = poses.shape[-1] - 1, len(poses)
+    known = np.isfinite(wheel_poses[:, 0, 0])
+    nothing = np.full(n, np.nan)
+    check = WheelCheck(nothing, nothing.copy(), nothing.copy(), wheel_poses, known_share=float(known.mean()))
+    ends = np.flatnonzero(known & np.concatenate([[False], known[:-1]]))
+    matched, wheels = np.zeros((2, n, lie.twist_size(poses[0])))
+    matched[ends] = lie.log(lie.between(poses[ends - 1], poses[ends]))
+    wheels[ends] = lie.log(lie.between(wheel_poses[ends - 1], wheel_poses[ends]))
+    single_m = np.maximum(_lengths(matched[:, :d]), np.minimum(_lengths(wheels[:, :d]), _SPUN_M))
+    single_m += _TURN_M_RAD * np.maximum(_lengths(matched[:, d:]), _lengths(wheels[:, d:]))
+    path_m = np.cumsum(single_m)
+    first = np.searchsorted(path_m, path_m - 0.5 * WINDOW_M, side="left")
+    last = np.searchsorted(path_m, path_m + 0.5 * WINDOW_M, side="right") - 1
+    each = np.arange(n)  # with the motions to and from it, however long
+    first, last = np.maximum(np.minimum(first, each - 1), 0), np.minimum(np.maximum(last, each + 1), n - 1)
+    length_m, unknown = path_m[last] - path_m[first], np.cumsum(~known)
+    checked = np.flatnonzero((length_m >= _SHORTEST_M) & (unknown[last] == unknown[first]) & known)
+    if not len(checked):
+        return check
+    first, last, length_m = first[checked], last[checked], length_m[checked]
+    check = check._replace(turn_ratio=_turn_ratio(matched[:, d:], wheels[:, d:], first, last))
+    inputs, outputs = np.column_stack([wheels, single_m]), matched - wheels
+    innovation = np.zeros(len(checked))
+    for part, apart, least in (
+        (slice(0, d), check.apart_m, _LEAST_M),
+        (slice(d, None), check.apart_rad, _LEAST_RAD),
+    ):
+        calibration = _calibration(_over(inputs, first, last), _over(outputs[:, part], first, last), length_m)
+        difference = outputs[:, part] - _limited(inputs @ calibration, single_m)
+        drift = _smoothed(np.cumsum(difference, axis=0), path_m)
+        apart[checked] = _lengths(drift[last] - drift[first])
+        share = np.percentile(apart[checked] / length_m, _TAIL) / _TAIL_SIGMAS
+        sigma = np.hypot(least, np.clip(share, _LEAST_SHARE, _MOST_SHARE) * length_m)
+        innovation = np.maximum(innovation, apart[checked] / sigma)
+    check.innovation[checked] = innovation
+    return check
+
+
+def check_velocity(stamps_ns: NDArray[np.int64], log_times_ns: NDArray[np.int64], poses: Matrix) -> Floats:
+    """(N,) change of the motion to each scan against what an acceleration can be, in standard deviations.
+
+    The motion before is stretched by the time that passed, by the stamps, by the log or as usual, whichever agrees
+    best: stamps that jitter accelerate nothing. NaN for the first two scans, and where neither clock goes on.
+    """
+    n, d = len(poses), poses.shape[-1] - 1
+    innovation = np.full(n, np.nan)
+    if n < 3:
+        return innovation
+    motions = lie.log(lie.between(poses[:-1], poses[1:]))
+    clocks = [np.diff(clock) * 1e-9 for clock in (stamps_ns, log_times_ns)]
+    usual_s = next((usual_s for clock in clocks if (usual_s := float(np.median(clock))) > 0.0), 0.0)
+    if not usual_s:
+        return innovation
+    clocks.append(np.full(n - 1, usual_s))
+    best = np.full(n - 2, np.inf)
+    for interval_s in clocks:
+        plausible_s = np.maximum(interval_s, usual_s / _ALIKE)
+        before, after = plausible_s[:-1], plausible_s[1:]
+        change = motions[1:] - (after / before)[:, None] * motions[:-1]
+        span_s2 = 0.5 * after * (before + after)
+        sigma_m = _sigma_m(span_s2)
+        sigma_rad = np.hypot(_ACCELERATION_RAD_S2 * span_s2, _MOTION_RAD)
+        best = np.minimum(best, np.maximum(_lengths(change[:, :d]) / sigma_m, _lengths(change[:, d:]) / sigma_rad))
+    innovation[2:] = best
+    return innovation
+
+
+def smallest_jump_m(seconds: Floats) -> float:
+    """Smallest jump of a position that ``check_velocity`` finds at the usual interval of times (N,)."""
+    return VELOCITY_LIMIT * float(_sigma_m(np.median(np.diff(seconds)) ** 2)) if len(seconds) > 1 else np.inf
+
+
+def _sigma_m(span_s2: Floats | float) -> Floats:
+    return np.hypot(_ACCELERATION_M_S2 * span_s2, _MOTION_M)
+
+
+def check_overlap(inlier_share: Floats) -> Floats:
+    """(N,) share of the points with a correspondence over its median in the scans before, NaN for the first.
+
+    What the lidar saw before it sees again, from nearby: where much of it is gone at once, the lidar is elsewhere
+    than the map says, or something stands close before it.
+    """
+    n = len(inlier_share)
+    usual = np.full(n, np.nan)
+    for scan in range(_FEWEST, min(_BEFORE, n)):
+        usual[scan] = np.median(inlier_share[:scan])
+    if n > _BEFORE:
+        usual[_BEFORE:] = np.median(sliding_window_view(inlier_share[:-1], _BEFORE), axis=1)
+    return inlier_share / np.maximum(usual, _LEAST_USUAL)
+
+
+def apart_m(positions: Floats, others: Floats) -> float:
+    """Root mean squared distance of positions (N, d) after rigid alignment, as of an ATE."""
+    weights = np.ones(len(positions))
+    try:
+        moved = lie.transform(rigid_transform(positions, others, weights), positions)
+    except DegeneratePairsError:  # on a line, about which a rotation is free
+        moved = positions - positions.mean(axis=0) + others.mean(axis=0)
+    return float(np.sqrt(((moved - others) ** 2).sum(axis=1).mean()))
+
+
+def wheel_bound_m(poses: Matrix, wheels: Matrix) -> float:
+    """Difference of a trajectory (N, d+1, d+1) from the wheels, NaN where unknown, seen from above.
+
+    Two estimates whose errors are independent differ by more than either errs, so that this bounds its error.
+    """
+    known = np.flatnonzero(np.isfinite(wheels[:, 0, 0]))
+    level = wheels[known[0]] @ lie.between(poses[known[0]], poses[known])  # in the frame of the wheels
+    return apart_m(level[:, :2, -1], wheels[known, :2, -1])
+
+
+def _turn_ratio(matched: Matrix, wheels: Matrix, first: NDArray[np.intp], last: NDArray[np.intp]) -> float:
+    """Turns (N, k) of the trajectory along those of the wheels, over these; NaN where the wheels turn little."""
+    if _lengths(wheels).sum() < _LEAST_TURN_RAD:
+        return np.nan
+    matched, wheels = _over(matched, first, last), _over(wheels, first, last)
+    turned_rad = np.maximum(_lengths(wheels), 1e-12)
+    return float(((matched * wheels).sum(axis=1) / turned_rad).sum() / turned_rad.sum())
+
+
+def _over(motions: Matrix, first: NDArray[np.intp], last: NDArray[np.intp]) -> Matrix:
+    """Sums of motions (N, k) after each first to each last scan."""
+    total = np.cumsum(motions, axis=0)
+    return total[last] - total[first]
+
+
+def _smoothed(values: Matrix, path_m: Floats) -> Matrix:
+    """Medians of values (N, d) along the path."""
+    grid_m = np.arange(0.0, path_m[-1] + _GRID_M, _GRID_M)
+    sampled = [np.interp(grid_m, path_m, each) for each in values.T]
+    smooth = [median_filter(each, _MEDIAN, mode="nearest") for each in sampled]
+    return np.stack([np.interp(path_m, grid_m, each) for each in smooth], axis=1)
+
+
+def _calibration(inputs: Matrix, outputs: Matrix, length_m: Floats) -> Matrix:
+    """Linear map from inputs (M, a) to outputs (M, b), by reweighted least squares (Cauchy) per length."""
+    A, B = inputs / length_m[:, None], outputs / length_m[:, None]
+    weight = (_lengths(B) < _WILD).astype(np.float64)
+    correction: Matrix = np.zeros((A.shape[1], B.shape[1]))
+    for _ in range(_ROUNDS):
+        H = (A * weight[:, None]).T @ A + _RIDGE * len(A) * np.eye(A.shape[1])
+        correction = np.linalg.solve(H, (A * weight[:, None]).T @ B).astype(np.float64, copy=False)
+        error = _lengths(B - A @ correction)
+        weight = 1.0 / (1.0 + (error / max(1.5 * float(np.median(error)), 1e-3)) ** 2) * (weight > 0.0)
+    return correction
+
+
+def _limited(corrections: Matrix, length_m: Floats) -> Matrix:
+    """Corrections (N, b) of at most a share of the path."""
+    size = np.maximum(_lengths(corrections), 1e-12)
+    return corrections * np.minimum(1.0, _LARGEST_CORRECTION * length_m / size)[:, None]
+
+
+def _lengths(vectors: Matrix) -> Floats:
+    return np.linalg.norm(vectors, axis=1)

@@ -1,0 +1,261 @@
+"""The verdict of a run: whether its trajectory can be relied on, with reasons."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from itertools import product
+
+import numpy as np
+
+from scanchain import lie
+from scanchain.data import LEAST_FIT, Matrix
+from scanchain.verdict.checks import WINDOW_M, Kind
+from scanchain.verdict.stretches import KNOWN, Evidence, Stretch, find_stretches
+from scanchain.words import counted
+
+MOST_CONTRADICTED = 0.1  # largest share of contradicted scans; good real runs have up to 0.025
+_MOST_PREDICTED = 0.5  # largest share of scans whose pose is predicted and confirmed by nothing
+_LARGE_M = 1.0  # impossible change of the motion above which the trajectory is wrong
+_EXPLAINED = 0.5  # share of a contradiction by loops that the wheels must confirm
+_FEW_POINTS = 100  # number of points below which a scan is sparse; those of planar lidars have more
+_UNMEASURED = (Kind.DEGENERATE, Kind.LOST, Kind.CONTRADICTED, Kind.OVERLAP)
+_MOST_OPEN = 0.2  # largest share of degenerate scans of a trajectory that is trustworthy
+_MEDIAN_LIMIT = 2.0  # largest median innovation of the wheels; about 1 where their calibration and σ are right
+_REST_M, _REST_RAD, _REST_M_S = 1.0, 0.5, 0.1  # extent and speed of a trajectory, up to which it is one of rest
+_MOST_OPEN_AT_REST = 0.05  # largest share of scans that leave a direction open, of those that show a rest
+_FEWEST_TRIED, _LEAST_ACCEPTED = 10, 0.2  # loop closures that must be tried, and share of them that must fit
+_OPPOSED = -0.5  # turns of the trajectory over those of the wheels, below which one of the two is mirrored
+_SHOWN = 3  # stretches that the sentence lists
+
+
+class Verdict(StrEnum):
+    """Reliability of a trajectory as a whole."""
+
+    TRUSTWORTHY = "trustworthy"
+    CHECK = "check these stretches"
+    NOT_TRUSTWORTHY = "not trustworthy"
+
+    def fails(self, *, strict: bool) -> bool:
+        """True if a command exits with 1: not trustworthy or, if strict, anything but trustworthy."""
+        return self is Verdict.NOT_TRUSTWORTHY or (strict and self is not Verdict.TRUSTWORTHY)
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A verdict, its reasons in words, the suspicious stretches, and the error that it vouches for in words."""
+
+    verdict: Verdict
+    reason: str
+    stretches: tuple[Stretch, ...] = ()
+    error: str = ""
+
+    @property
+    def vouched(self) -> str:
+        """The error as far as it is vouched for: elsewhere than in the stretches to check, or not at all."""
+        words = {Verdict.TRUSTWORTHY: "", Verdict.CHECK: "otherwise "}
+        return f"{words[self.verdict]}{self.error}" if self.error and self.verdict in words else ""
+
+    @property
+    def sentence(self) -> str:
+        """Verdict, error and reasons."""
+        return f"{self.verdict}{f' ({self.vouched})' if self.vouched else ''}: {self.reason}"
+
+    @property
+    def unnamed(self) -> tuple[Stretch, ...]:
+        """Stretches that the reason does not name."""
+        return tuple(each for each in self.stretches if each.text not in self.reason)
+
+
+def judge(evidence: Evidence) -> Judged:
+    """The verdict on a trajectory.
+
+    Not trustworthy is one most of which is predicted, many of whose scans are contradicted, that accelerates
+    impossibly, that the wheels contradict where it is not well measured, or that loop closures and wheels
+    contradict at the same place by about the same distance. To be checked is any with a suspicious stretch, and
+    one that is suspicious as a whole: nothing shows whether it moves, wheels disagree all along, many scans are
+    degenerate, or revisited places do not look as mapped. Wheels that slipped, as scans and closures or the wheels
+    themselves show, are named and count for nothing.
+    """
+    found = find_stretches(evidence)
+    stretches = tuple(each for each in found if each.kind is not Kind.WHEELS_SLIP)
+    slips = [f"{each.kind} at {each.times} ({each.size_m:,.1f} m)" for each in found if each not in stretches]
+    rest = _Rest.of(evidence)
+    notes = [*([rest.text] if rest.is_shown else []), *slips]
+    error = evidence.error or (f"error below {rest.extent_m:.2g} m" if rest.is_shown else "error unknown")
+    if reasons := list(_grave(evidence, stretches)):
+        verdict = Verdict.NOT_TRUSTWORTHY
+    elif reasons := list(_doubts(evidence, stretches, rest)):
+        verdict = Verdict.CHECK
+    else:
+        verdict, reasons = Verdict.TRUSTWORTHY, list(_nothing(evidence))
+    return Judged(verdict, "; ".join([*reasons, *notes]), stretches, error)
+
+
+def _grave(evidence: Evidence, stretches: Sequence[Stretch]) -> Iterator[str]:
+    if len(evidence) == 1:
+        yield "one scan has no motion that could be checked"
+    yield from _many_contradicted(evidence)
+    yield from _mostly_predicted(evidence)
+    jumps = [each for each in stretches if each.kind is Kind.ACCELERATION and (each.size_m or 0.0) > _LARGE_M]
+    if jumps:
+        yield _listed(jumps)
+    for slip in (each for each in stretches if each.kind is Kind.SCANS_SLIP):
+        yield f"{slip.kind} at {slip.times} ({slip.size_m:,.1f} m): wheels and loop closures agree with each other"
+    slips = [each for each in stretches if each.kind is Kind.WHEELS]
+    for slip in slips:
+        cause = next((each for each in stretches if each.kind in _UNMEASURED and _overlap(each, slip)), None)
+        if cause is not None:
+            yield f"{slip.text}, at scans that are not well measured: {cause.kind}"
+    loops = [each for each in stretches if each.kind is Kind.LOOPS]
+    for loop, slip in product(loops, slips):
+        is_explained = (slip.size_m or 0.0) > _EXPLAINED * (loop.size_m or 0.0)
+        if is_explained and _overlap(slip, loop):
+            yield (
+                f"{slip.text}, and {counted(loop.scans, 'loop closure')} between scans {loop.first:,} and "
+                f"{loop.last:,} by {loop.size_m:.1f} m"
+            )
+            return
+
+
+def _overlap(a: Stretch, b: Stretch) -> bool:
+    return a.first <= b.last and b.first <= a.last
+
+
+def _many_contradicted(evidence: Evidence) -> Iterator[str]:
+    total = int(evidence.is_contradicted.sum())
+    count = int((evidence.is_contradicted & ~evidence.is_held_by_wheels).sum())
+    if count > MOST_CONTRADICTED * len(evidence):
+        held = f", {total - count:,} of them where the wheels agree" if count < total else ""
+        yield (
+            f"{total:,} of {len(evidence):,} scans are contradicted by the map where they were placed (fit below "
+            f"{LEAST_FIT:g}{held}): the motion between scans may be larger than the search, or the log is "
+            "at fault (scanchain doctor)"
+        )
+
+
+def _mostly_predicted(evidence: Evidence) -> Iterator[str]:
+    is_open = evidence.is_degenerate & ~evidence.is_held_by_wheels
+    if (is_open | evidence.is_lost).sum() <= _MOST_PREDICTED * len(evidence):
+        return
+    line = (
+        f"{int(evidence.is_degenerate.sum()):,} of {len(evidence):,} scans are degenerate and "
+        f"{int(evidence.is_lost.sum()):,} lost: most poses are predicted, not measured, in at least one direction"
+    )
+    points = float(np.median(evidence.points))
+    if points < _FEW_POINTS:
+        few = f"scans have {points:.0f} valid points (median)"
+        yield f"{line}; {few}, as a radar's have: choose a lidar with --topic"
+    else:
+        yield f"{line}: the surroundings do not constrain it there, or the log is faulty (scanchain doctor)"
+
+
+def _doubts(evidence: Evidence, stretches: Sequence[Stretch], rest: _Rest) -> Iterator[str]:
+    if evidence.wheels.turn_ratio < _OPPOSED:
+        yield (
+            "the lidar turns left where the wheels turn right: the scans are mirrored (a lidar upside down that "
+            "/tf_static does not state so), or the wheels are"
+        )
+    if rest.is_there and not rest.is_shown:
+        yield rest.text
+    yield from _unlike_wheels(evidence)
+    yield from _degenerate(evidence)
+    yield from _unlike_map(evidence)
+    if stretches:
+        yield _listed(stretches)
+
+
+@dataclass(frozen=True, slots=True)
+class _Rest:
+    """Rest of a trajectory that stays where it began, and whether that of the lidar is shown.
+
+    Scans that constrain every direction show it, as do wheels. Along a direction that they leave open, a lidar in
+    motion sees the same as one at rest.
+    """
+
+    is_there: bool
+    is_shown: bool
+    extent_m: float
+    text: str
+
+    @classmethod
+    def of(cls, evidence: Evidence) -> _Rest:
+        motion = np.abs(lie.log(lie.between(evidence.poses[:1], evidence.poses)))
+        d = evidence.poses.shape[-1] - 1
+        seconds, has_wheels = float(evidence.seconds[-1]), evidence.wheels.known_share >= KNOWN
+        extent_m, limit_m = _extent_m(evidence.poses), min(_REST_M, _REST_M_S * seconds)
+        is_there = bool(extent_m < limit_m and motion[:, d:].max() < _REST_RAD)
+        is_there &= not has_wheels or _extent_m(evidence.wheels.poses) < limit_m
+        is_open = evidence.is_degenerate | evidence.is_lost | evidence.is_contradicted
+        is_observed = bool(np.isfinite(evidence.fit).any() and is_open.mean() <= _MOST_OPEN_AT_REST)
+        is_shown = is_there and (is_observed or has_wheels)
+        text = f"does not move (stays within {extent_m:.3f} m for {seconds:.1f} s)"
+        if not is_shown:
+            text = (
+                f"stays within {extent_m:.2f} m for {seconds:.1f} s: at rest, or in motion along a direction in "
+                "which everything looks the same; nothing in the log tells which"
+            )
+        return cls(is_there, is_shown, extent_m, text)
+
+
+def _extent_m(poses: Matrix) -> float:
+    """Largest distance of poses (N, d+1, d+1) from the first that is known."""
+    positions = poses[np.isfinite(poses[:, 0, 0]), :-1, -1]
+    return float(np.linalg.norm(positions - positions[0], axis=1).max())
+
+
+def _unlike_wheels(evidence: Evidence) -> Iterator[str]:
+    """Wheels that disagree all along, which is why their standard deviations were learned to be large."""
+    wheels = evidence.wheels
+    known = np.isfinite(wheels.innovation)
+    if not known.any() or np.median(wheels.innovation[known]) <= _MEDIAN_LIMIT:
+        return
+    apart_m, apart_deg = np.median(wheels.apart_m[known]), np.degrees(np.median(wheels.apart_rad[known]))
+    yield (
+        f"the wheels disagree with the trajectory all along, by {apart_m:.1f} m and {apart_deg:.0f} deg over "
+        f"{WINDOW_M:g} m (medians): their scale or the mounting is wrong, or the lidar follows what moves along"
+    )
+
+
+def _degenerate(evidence: Evidence) -> Iterator[str]:
+    """Directions in which nothing but wheels or prediction says where the lidar is, in many scans."""
+    count = int(evidence.is_degenerate.sum())
+    if count > _MOST_OPEN * len(evidence):
+        source = "the wheels' alone" if evidence.wheels.known_share >= KNOWN else "predicted"
+        yield (
+            f"{count:,} of {len(evidence):,} scans are degenerate: along at least one direction poses are {source}"
+        )
+
+
+def _unlike_map(evidence: Evidence) -> Iterator[str]:
+    """Revisits where next to nothing looks as it was mapped."""
+    closures = evidence.closures
+    accepted = int(closures.is_accepted.sum())
+    if closures.tried >= _FEWEST_TRIED and accepted < _LEAST_ACCEPTED * closures.tried:
+        yield (
+            f"of {closures.tried:,} loop closures tried {accepted:,} were accepted: where the trajectory returns, "
+            "the place does not look as mapped"
+        )
+
+
+def _listed(stretches: Sequence[Stretch]) -> str:
+    """The largest stretches in words, and how many more there are."""
+    largest = sorted(stretches, key=lambda each: (each.size_m or 0.0, each.scans), reverse=True)[:_SHOWN]
+    more = len(stretches) - len(largest)
+    return "; ".join(each.text for each in largest) + (f"; and {more:,} more" if more else "")
+
+
+def _nothing(evidence: Evidence) -> Iterator[str]:
+    """That no check found anything, with the states of the scans and the checks that were made."""
+    states = f": {evidence.states}" if evidence.states else ""
+    yield f"nothing to check in {counted(len(evidence), 'scan')}{states}"
+    checks = {
+        "fit": evidence.fit,
+        "overlap": evidence.overlap,
+        "constant velocity": evidence.velocity,
+        "wheels": evidence.wheels.innovation,
+        "loop closures": evidence.closures.target,
+    }
+    if made := [name for name, values in checks.items() if np.isfinite(values).any()]:
+        yield f"checked by {', '.join(made)}"

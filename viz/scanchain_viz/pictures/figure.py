@@ -1,0 +1,338 @@
+"""Figures: an SVG inside a page that takes its colors, light or dark; by matplotlib, a PNG file.
+
+The SVG of a report is written here: matplotlib takes half a second to load, and as long for a dozen figures.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from base64 import b64encode
+from collections.abc import Callable, Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
+
+from scanchain.whole_file import write_whole
+from scanchain_viz.pictures.axis import FONT, Axis, width_of
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Floats = NDArray[np.float64]
+
+INK, LINE = "var(--ink)", "var(--line)"  # the page's own colors
+_INCH = 72.0  # points, the unit of the drawing
+_WIDTH, _WHOLE = 4.6, 9.6  # inches: of a figure beside another, and of one over the whole page, of equal text
+_LEFT, _RIGHT, _BOTTOM, _TOP = 0.8, 0.2, 0.45, 0.12  # inches around the axes: room for numbers and labels
+_LOWEST, _HIGHEST, _HIGHEST_WHOLE = 1.5, 5.2, 6.5  # least and greatest heights of a plan in inches
+_TICK = 3.5  # length of a tick, and its distance to the number
+_ABOVE, _BELOW = 0.76 * FONT, 0.24 * FONT  # of text, over and under its baseline
+_LABEL = 4.0  # distance of a label to the numbers
+_BAR, _BAR_AWAY = 9.0, 6.0  # width of a color bar, and its distance to the axes
+_SAME = 0.1  # points; successive positions of a line that are nearer are one
+_FAR = 1e5  # points beyond which nothing is drawn
+_LEVEL = 3  # of compression: more is as long again and saves a tenth
+_STYLE = (
+    f"font: {FONT:g}px 'DejaVu Sans', Verdana, Arial, sans-serif; fill: none; stroke-linejoin: round; "
+    "stroke-linecap: butt"
+)
+
+
+class SvgFigure:
+    """One figure with one pair of axes: draw in their units, then ask for the ``svg``.
+
+    height_inches : of the whole figure
+    logarithmic : the axis whose decades are equally long, "x" or "y"
+    spare_inches : left free beside the axes
+    is_wide : over the whole width of the page
+    """
+
+    def __init__(
+        self,
+        height_inches: float = 2.7,
+        *,
+        logarithmic: str = "",
+        spare_inches: float = 0.0,
+        is_wide: bool = False,
+    ) -> None:
+        self.x, self.y = (Axis(is_logarithmic=name == logarithmic) for name in "xy")
+        self.has_grid = False
+        self.is_wide, self.spare, self.proportions = is_wide, spare_inches, (0.0, 0.0)  # of a plan
+        self._lay_out(height_inches, is_wide=is_wide)
+        self._within: list[Callable[[], str]] = []
+        self._beside: list[Callable[[], str]] = []
+
+    @classmethod
+    def of_plan(cls, low: Floats, high: Floats, spare_inches: float = 0.0, *, is_wide: bool = False) -> SvgFigure:
+        """A figure in the proportions of the box between two corners."""
+        figure = cls(spare_inches=spare_inches, is_wide=is_wide)
+        figure.x.limit(low[0], high[0])
+        figure.y.limit(low[1], high[1])
+        figure.x.label, figure.y.label = "x [m]", "y [m]"
+        figure.proportions = (float(high[0] - low[0]), float(high[1] - low[1]))
+        figure._lay_out(0.0, is_wide=is_wide)
+        return figure
+
+    def _lay_out(self, height_inches: float, *, is_wide: bool) -> None:
+        """Size of the figure, and corner and extent of its axes; of a plan so that a meter is equal along both."""
+        whole, (width, height) = _WHOLE if is_wide else _WIDTH, self.proportions
+        across = whole - _LEFT - _RIGHT - self.spare
+        if width:
+            needed = across * height / width + _BOTTOM + _TOP
+            height_inches = float(np.clip(needed, _LOWEST, _HIGHEST_WHOLE if is_wide else _HIGHEST))
+        down = height_inches - _TOP - _BOTTOM
+        self.size, fitting = (whole * _INCH, height_inches * _INCH), (across, down)
+        if width:
+            scale = min(across / width, down / height)
+            fitting = (scale * width, scale * height)
+        self.extent = (fitting[0] * _INCH, fitting[1] * _INCH)
+        left, top = _LEFT + 0.5 * (across - fitting[0]), _TOP + 0.5 * (down - fitting[1])
+        self.corner = (left * _INCH, top * _INCH)  # of the axes, on the left and above
+
+    def line(
+        self,
+        x: Floats,
+        y: Floats,
+        color: str,
+        width: float = 1.2,
+        dashes: Sequence[float] = (),
+        opacity: float = 1.0,
+    ) -> None:
+        """Draw a line through positions, broken where they are NaN; lengths of dashes and gaps are in widths."""
+        self._include(x, y)
+        dashed = f"; stroke-dasharray: {' '.join(f'{width * each:.4g}' for each in dashes)}" if dashes else ""
+        style = f"stroke: {color}; stroke-width: {width:g}{dashed}{_opacity(opacity)}"
+        self._within.append(lambda: f'<path d="{_path(self._at(x, y))}" style="{style}"/>')
+
+    def steps(self, x: Floats, y: Floats, color: str) -> None:
+        """Draw a line that rises or falls at positions only."""
+        self.line(np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1], color)
+
+    def marks(self, x: Floats, y: Floats, shape: str, color: str, size: float, *, line: float = 0.0) -> None:
+        """Draw a mark of so many points at each position: a disk "o", a square "s" or a cross "+".
+
+        line : width of the line that it is drawn with; 0 fills it
+        """
+        self._include(x, y)
+        style = f"fill: {color}" if not line else f"stroke: {color}; stroke-width: {line:g}"
+        self._within.append(lambda: _marks(self._at(x, y), shape, 0.5 * size, style))
+
+    def dots(self, x: Floats, y: Floats, colors: Sequence[str], size: float) -> None:
+        """Draw a disk in a color of its own at each position, the last ones on top."""
+        self._include(x, y)
+        self._within.append(
+            lambda: "".join(
+                f'<circle cx="{u:.1f}" cy="{v:.1f}" r="{0.5 * size:.2f}" style="fill: {color}"/>'
+                for (u, v), color in zip(self._at(x, y).tolist(), colors, strict=True)
+            )
+        )
+
+    def ellipses(
+        self, x: Floats, y: Floats, axes: Floats, angles_rad: Floats, color: str, width: float, opacity: float
+    ) -> None:
+        """Draw ellipses with half axes (N, 2), the first at an angle to x; in a plan."""
+        style = f"stroke: {color}; stroke-width: {width:g}{_opacity(opacity)}"
+
+        def drawn() -> str:
+            low, high = self.x.ends
+            each = zip(self._at(x, y), axes * self.extent[0] / (high - low), np.degrees(angles_rad), strict=True)
+            return "".join(
+                f'<ellipse rx="{a:.2f}" ry="{b:.2f}" transform="translate({u:.2f} {v:.2f}) rotate({-angle:.1f})" '
+                f'style="{style}"/>'
+                for (u, v), (a, b), angle in each
+            )
+
+        self._within.append(drawn)
+
+    def image(
+        self,
+        pixels: NDArray[np.uint8],
+        palette: NDArray[np.uint8],
+        low: Floats,
+        high: Floats,
+        *,
+        rendering: str = "pixelated",
+    ) -> None:
+        """Draw an image (H, W) of numbers of colors between two corners, its first row at ``low``.
+
+        palette : (K, 4) red, green, blue, opacity
+        rendering : "pixelated" to keep pixels apart, "auto" to blend them
+        """
+
+        def drawn() -> str:
+            (left, right), (bottom, top) = self._at(np.array([low[0], high[0]]), np.array([low[1], high[1]])).T
+            rows = pixels[::-1] if top < bottom else pixels
+            box = (left, min(bottom, top), right - left, abs(top - bottom))
+            return _image(rows, palette, box, rendering)
+
+        self._within.append(drawn)
+
+    def span(self, first: float, last: float, color: str, opacity: float) -> None:
+        """Shade what lies between two values of x."""
+        self.x.include(np.array([first, last]))
+
+        def drawn() -> str:
+            left, right = self.extent[0] * self.x.fractions(np.array([first, last]))
+            box = f'x="{left:.2f}" width="{right - left:.2f}" height="{self.extent[1]:.2f}"'
+            return f'<rect {box} style="fill: {color}{_opacity(opacity)}"/>'
+
+        self._within.append(drawn)
+
+    def level(self, value: float, width: float, dashes: Sequence[float]) -> None:
+        """Draw a line at a value of y, from end to end."""
+        self.y.include(np.array([value]))
+        style = f"stroke: {INK}; stroke-width: {width:g}; stroke-dasharray: {' '.join(map(str, dashes))}"
+
+        def drawn() -> str:
+            (place,) = self.extent[1] * (1.0 - self.y.fractions(np.array([value])))
+            return f'<path d="M0 {place:.2f}H{self.extent[0]:.2f}" style="{style}"/>'
+
+        self._within.append(drawn)
+
+    def color_bar(self, palette: NDArray[np.uint8], axis: Axis) -> None:
+        """Draw the colors beside the axes, with the values of an axis that they stand for from end to end."""
+
+        def drawn() -> str:
+            left, (top, height) = self.corner[0] + self.extent[0] + _BAR_AWAY, (self.corner[1], self.extent[1])
+            rows = np.arange(len(palette), dtype=np.uint8)[::-1, None]
+            numbers = "".join(
+                _text(left + _BAR + 2.0 * _TICK, top + (1.0 - place) * height + 0.5 * _ABOVE, text, "start")
+                + _rule(left + _BAR, top + (1.0 - place) * height, f"h{_TICK}", 0.8)
+                for place, text in axis.ticks(height, is_upright=True)
+            )
+            return _image(rows, palette, (left, top, _BAR, height), "auto") + numbers
+
+        self._beside.append(drawn)
+
+    def svg(self) -> Markup:
+        """The figure as SVG for a page, a wide one once more for a narrow page; no text of a log is ever drawn."""
+        if not self.is_wide:
+            return Markup(self._drawn())
+        wide, height_inches = self._drawn("wide"), self.size[1] / _INCH
+        self._lay_out(height_inches, is_wide=False)
+        narrow = self._drawn("narrow")
+        self._lay_out(height_inches, is_wide=True)
+        return Markup(wide + narrow)
+
+    def _drawn(self, name: str = "") -> str:
+        (left, top), (width, height) = self.corner, self.extent
+        across = [(left + place * width, text) for place, text in self.x.ticks(width, is_upright=False)]
+        up = [(top + (1.0 - place) * height, text) for place, text in self.y.ticks(height, is_upright=True)]
+        bottom = top + height
+        parts = [f'<svg class="{name}" viewBox="0 0 {self.size[0]:g} {self.size[1]:g}" style="{_STYLE}">']
+        if self.has_grid:
+            parts += [_rule(x, bottom, f"v{-height:.2f}", 0.5) for x, _ in across]
+            parts += [_rule(left, y, f"h{width:.2f}", 0.5) for y, _ in up]
+        parts.append(f'<svg x="{left:.2f}" y="{top:.2f}" width="{width:.2f}" height="{height:.2f}">')  # clips
+        parts += [drawn() for drawn in self._within]
+        parts.append(f"</svg>{_rule(left, top, f'v{height:.2f}h{width:.2f}', 0.8)}")
+        for x, text in across:
+            parts += [_rule(x, bottom, f"v{_TICK}", 0.8), _text(x, bottom + 2.0 * _TICK + _ABOVE, text)]
+        for y, text in up:
+            parts.append(_rule(left, y, f"h{-_TICK}", 0.8))
+            parts.append(_text(left - 2.0 * _TICK, y + 0.5 * _ABOVE, text, "end"))
+        below = bottom + 2.0 * _TICK + FONT + _LABEL + _ABOVE
+        beside = left - 2.0 * _TICK - max((width_of(text) for _, text in up), default=0.0) - _LABEL - _BELOW
+        if self.x.label:
+            parts.append(_text(left + 0.5 * width, below, self.x.label))
+        if self.y.label:
+            parts.append(_text(beside, top + 0.5 * height, self.y.label, is_upright=True))
+        parts += [drawn() for drawn in self._beside]
+        return "".join([*parts, "</svg>"])
+
+    def _include(self, x: Floats, y: Floats) -> None:
+        self.x.include(x)
+        self.y.include(y)
+
+    def _at(self, x: Floats, y: Floats) -> Floats:
+        """Positions (N, 2) in points from the upper left corner of the axes."""
+        places = np.stack([self.x.fractions(x), 1.0 - self.y.fractions(y)], axis=1) * self.extent
+        return np.clip(places, -_FAR, _FAR)
+
+
+def _opacity(opacity: float) -> str:
+    return f"; opacity: {opacity:g}" if opacity < 1.0 else ""
+
+
+def _rule(x: float, y: float, steps: str, width: float) -> str:
+    return f'<path d="M{x:.2f} {y:.2f}{steps}" style="stroke: {LINE}; stroke-width: {width:g}"/>'
+
+
+def _text(x: float, y: float, text: str, anchor: str = "middle", *, is_upright: bool = False) -> str:
+    turned = f' transform="rotate(-90 {x:.2f} {y:.2f})"' if is_upright else ""
+    style = f"fill: {INK}; text-anchor: {anchor}"
+    return f'<text x="{x:.2f}" y="{y:.2f}"{turned} style="{style}">{Markup.escape(text)}</text>'
+
+
+def _path(points: Floats) -> str:
+    """Line through points (N, 2), broken where they are NaN."""
+    known, cells = np.isfinite(points[:, 0] + points[:, 1]), np.rint(points / _SAME)
+    begins, moves = known.copy(), np.ones(len(points), bool)
+    begins[1:] &= ~known[:-1]
+    moves[1:] = (cells[1:] != cells[:-1]).any(axis=1)
+    kept = known & (begins | moves)
+    return "".join(
+        f"{'M' if is_first else 'L'}{x:.2f} {y:.2f}"
+        for is_first, (x, y) in zip(begins[kept].tolist(), points[kept].tolist(), strict=True)
+    )
+
+
+def _marks(points: Floats, shape: str, half: float, style: str) -> str:
+    """One path of marks at points (N, 2) that are known."""
+    outline = {
+        "o": f"m{-half:g} 0a{half:g} {half:g} 0 1 0 {2 * half:g} 0a{half:g} {half:g} 0 1 0 {-2 * half:g} 0z",
+        "s": f"m{-half:g} {-half:g}h{2 * half:g}v{2 * half:g}h{-2 * half:g}z",
+        "+": f"m{-half:g} 0h{2 * half:g}m{-half:g} {-half:g}v{2 * half:g}",
+    }[shape]
+    known = points[np.isfinite(points[:, 0] + points[:, 1])]
+    return f'<path d="{"".join(f"M{x:.2f} {y:.2f}{outline}" for x, y in known.tolist())}" style="{style}"/>'
+
+
+def _image(
+    rows: NDArray[np.uint8], palette: NDArray[np.uint8], box: tuple[float, float, float, float], rendering: str
+) -> str:
+    """Pixels (H, W), each the number of a color, in a box: left, top, width, height."""
+    data = b64encode(_png(rows, palette)).decode("ascii")
+    where = " ".join(
+        f'{name}="{value:.2f}"' for name, value in zip(("x", "y", "width", "height"), box, strict=True)
+    )
+    return (
+        f'<image {where} preserveAspectRatio="none" style="image-rendering: {rendering}" '
+        f'href="data:image/png;base64,{data}"/>'
+    )
+
+
+def _png(rows: NDArray[np.uint8], palette: NDArray[np.uint8]) -> bytes:
+    """A PNG file of pixels (H, W), the numbers of the colors of a palette (K, 4) (ISO/IEC 15948)."""
+    height, width = rows.shape
+    chunks = (
+        (b"IHDR", struct.pack(">2I5B", width, height, 8, 3, 0, 0, 0)),
+        (b"PLTE", palette[:, :3].tobytes()),
+        (b"tRNS", palette[:, 3].tobytes()),
+        (b"IDAT", zlib.compress(np.pad(rows, ((0, 0), (1, 0))).tobytes(), _LEVEL)),
+        (b"IEND", b""),
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in chunks
+    )
+
+
+def palette_of(colors: Sequence[str], count: int = 256) -> NDArray[np.uint8]:
+    """(K, 4) opaque colors between some that are equally far from each other, "rrggbb"."""
+    anchors = np.array([list(bytes.fromhex(color)) for color in colors], np.float64)
+    places = np.linspace(0.0, len(anchors) - 1.0, count)
+    mixed = np.stack([np.interp(places, np.arange(len(anchors)), channel) for channel in anchors.T], axis=1)
+    return np.pad(np.rint(mixed).astype(np.uint8), ((0, 0), (0, 1)), constant_values=255)
+
+
+def write_figure(path: Path, figure: Figure, **options: Any) -> None:
+    """Write a figure by matplotlib on white; ``options`` are those of savefig. Raises OSError."""
+    picture = BytesIO()
+    figure.savefig(picture, facecolor="white", format="png", **options)
+    write_whole(path, picture.getvalue())

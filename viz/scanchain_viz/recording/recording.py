@@ -1,0 +1,285 @@
+"""The rerun recording of a run, to a file, to a viewer, or to both.
+
+Nothing that goes wrong here after the start ends a run; it is collected in ``Recording.warnings``.
+"""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from uuid import uuid4
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+from rerun.error_utils import catch_and_log_exceptions
+
+from scanchain.config import RecordingConfig
+from scanchain.data import Closure, GraphState, Matrix, Scan, Step, Trajectory
+from scanchain.errors import InputError
+from scanchain.runs.closures import FinalClosure
+from scanchain.runs.job import SinkName
+from scanchain.runs.step_table import StepRow
+from scanchain.verdict import Judged
+from scanchain_viz.recording import entities, shapes, viewer
+from scanchain_viz.recording.batching import Batcher
+from scanchain_viz.recording.blueprint import blueprint
+from scanchain_viz.recording.keyframe_graph import KeyframeGraph
+from scanchain_viz.recording.messages import Message, Times
+from scanchain_viz.recording.sinks import Sink, file_sink, open_stream, viewer_sink
+from scanchain_viz.recording.verdict import verdict_messages
+
+
+class Recording:
+    """Takes in steps and results; a context that is entered before the first and left after the last.
+
+    path : the .rrd file; needed for the sink "save", ignored otherwise
+    name : what the viewer calls the recording
+    sinks : "save" to the file, "spawn" a viewer, "connect" to an open one, serve a "web" viewer on this machine;
+        none at all is a recording that goes nowhere
+    """
+
+    def __init__(
+        self,
+        path: Path | None,
+        *,
+        dimension: int,
+        name: str,
+        sinks: frozenset[SinkName],
+        config: RecordingConfig,
+        port: int = viewer.PORT,
+        web_port: int = viewer.WEB_PORT,
+    ) -> None:
+        if "save" in sinks and path is None:
+            raise InputError("no path for the recording: give --out, or leave save out of --rerun")
+        self.path = path
+        self.dimension = dimension
+        self.name = name
+        self.wanted = sinks
+        self.config = config
+        self.port = port
+        self.web_port = web_port
+        self.web_address = ""
+        self.sinks: list[Sink] = []
+        self.file: Sink | None = None
+        self.server: subprocess.Popen[bytes] | None = None
+        self.batcher = Batcher(dimension)
+        self.graph = KeyframeGraph()
+        self.last = (0, 0)  # scan and stamp of the last step
+        self.problems: list[str] = []
+
+    def __enter__(self) -> Recording:
+        recording_id = uuid4()
+        if "save" in self.wanted and self.path is not None:
+            stream = open_stream(self.name, self.dimension, recording_id)
+            self.file = file_sink(self.path, stream, blueprint(self.dimension))
+            self.sinks.append(self.file)
+        address = self._viewer_address() if self.wanted & {"spawn", "connect", "web"} else ""
+        if address:
+            stream = open_stream(self.name, self.dimension, recording_id)
+            self.sinks.append(viewer_sink(address, stream, blueprint(self.dimension)))
+        self._send(lambda: entities.constants(self.dimension))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def warnings(self) -> list[str]:
+        """Problems so far, a line each."""
+        return [*self.problems, *(warning for sink in self.sinks for warning in sink.warnings)]
+
+    def resume(
+        self, before: Path | None, rows: Sequence[StepRow], closures: Sequence[Closure], graph: GraphState
+    ) -> None:
+        """Resume after the steps of ``rows``, with all closures tried by then and the graph as it was.
+
+        before : the recording up to there, which is copied; without one, the recording begins here
+        """
+        self.last = rows[-1].index, rows[-1].stamp_ns
+        self._guard(lambda: self.batcher.restore(rows, self.graph.restore(rows, closures, graph)))
+        if before is not None:
+            for sink in self.sinks:
+                sink.send(before)
+        for sink in self.sinks:
+            sink.settle()
+
+    def secure(self) -> int:
+        """Size of the file in bytes, once it holds all that was recorded; 0 where there is no whole one."""
+        self._send(self.batcher.messages)
+        if self.path is None or self.file is None or not self.file.settle():
+            return 0
+        return self.path.stat().st_size
+
+    def preview(self, scan: Scan) -> None:
+        """Show a viewer, but no file, every n-th point of the first scan until its step is recorded."""
+        viewers = [sink for sink in self.sinks if sink is not self.file]
+        self._send(lambda: self._previewed(scan), viewers)
+
+    def log(self, step: Step) -> None:
+        """Record one step; most of it is gathered and written in batches."""
+        if not self.sinks:
+            return
+        self.last = step.scan.index, step.scan.stamp_ns
+        try:
+            self.batcher.add(step, self.graph.add(step))
+        except Exception as error:
+            self._note(error)
+        has_news = self.graph.has_grown or self._draws_map_of(step)
+        if has_news or self.batcher.is_due:
+            self._send(lambda: self._step(step))
+
+    def log_trajectory(
+        self, stamps_ns: NDArray[np.int64], poses_optimized: Matrix, indices: NDArray[np.int64]
+    ) -> None:
+        """Record the optimized trajectory: poses (N, d+1, d+1) of the scans ``indices``."""
+        self._send(lambda: self._trajectory(Times(indices, stamps_ns), poses_optimized))
+
+    def log_closures(self, closures: Sequence[FinalClosure], graph: GraphState) -> None:
+        """Record the final graph and the final verdict on every closure, at the last scan."""
+        self._send(lambda: self._settled(closures, graph))
+
+    def log_verdict(self, judged: Judged, trajectory: Trajectory) -> None:
+        """Record the verdict, and its stretches on the optimized trajectory."""
+        self._send(lambda: verdict_messages(judged, trajectory))
+
+    def log_ground_truth(self, poses: Matrix) -> None:
+        """Record true poses (N, 4, 4), aligned to the optimized trajectory."""
+        line = entities.lines(entities.WHITE, 0.75, [shapes.positions(poses)])
+        self._send(lambda: [Message(entities.GROUND_TRUTH, line)])
+
+    def log_map(self, points: NDArray[np.floating]) -> None:
+        """Record the finished map (N, d), downsampled to a third of the points of the scans."""
+        self._send(lambda: self._map(points))
+
+    def log_grid(
+        self, cells: NDArray[np.int8] | NDArray[np.uint8], *, resolution_m: float, origin_m: tuple[float, float]
+    ) -> None:
+        """Record the finished occupancy grid of a 2D log.
+
+        cells : (H, W), as ROS counts: 0 free to 100 occupied, −1 (255) unknown; row 0 at the lowest y
+        origin_m : x, y of the outer corner of cells[0, 0]
+        """
+        self._send(lambda: self._grid(cells, resolution_m, origin_m))
+
+    def close(self) -> None:
+        """Write the last batch, frame the view, and close file and viewer; may be called twice."""
+        self._send(lambda: [*self.batcher.messages(), *self.graph.draw(self.now)])
+        layout = blueprint(self.dimension, self.batcher.box, self.batcher.scans)
+        for sink in self.sinks:
+            sink.send(layout)
+            sink.close()
+        self.problems, self.sinks = self.warnings, []
+        if self.server is not None:
+            viewer.stop(self.server)
+            self.server = None
+
+    def hold(self) -> None:
+        """Keep the web viewer served until it ends or the user interrupts."""
+        self._send(self.batcher.messages)
+        if self.server is not None:
+            try:
+                self.server.wait()
+            except KeyboardInterrupt:
+                return
+
+    def _viewer_address(self) -> str:
+        """Address of a viewer; empty, with a warning, if there is none."""
+        try:
+            if "web" in self.wanted:
+                self.server = viewer.start_web(self.port, self.web_port)
+                self.web_address = viewer.web_address(self.port, self.web_port)
+            elif "spawn" in self.wanted:
+                viewer.start_window(self.port)
+            elif not viewer.is_listening(self.port):
+                raise viewer.ViewerError(
+                    f"no viewer at {viewer.HOST}:{self.port}, the run goes on without it; open one with: rerun"
+                )
+        except (viewer.ViewerError, OSError) as error:
+            self.problems.append(str(error))
+            return ""
+        return viewer.grpc_address(self.port)
+
+    @property
+    def now(self) -> Times:
+        """The instant of the last step."""
+        return Times.at(*self.last)
+
+    def _draws_map_of(self, step: Step) -> bool:
+        """True for every so many keyframes."""
+        return step.keyframe >= 0 and step.keyframe % self.config.local_map_every == 0 and len(step.local_map) > 0
+
+    def _step(self, step: Step) -> list[Message]:
+        """Messages that are due after a step."""
+        messages = self.graph.draw(self.now) if self.graph.has_grown else []
+        if self._draws_map_of(step):
+            points = shapes.in_space(shapes.at_most(step.local_map, self.config.max_map_points))
+            columns = rr.Points3D.columns(positions=points).partition([len(points)])
+            messages.append(Message(entities.LOCAL_MAP, columns, self.now))
+        return [*messages, *self.batcher.messages()] if self.batcher.is_due else messages
+
+    def _previewed(self, scan: Scan) -> list[Message]:
+        points = shapes.in_space(shapes.at_most(scan.points, self.config.max_map_points))
+        columns = rr.Points3D.columns(positions=points).partition([len(points)])
+        return [Message(entities.SCAN, columns, Times.at(scan.index, scan.stamp_ns))]
+
+    def _settled(self, closures: Sequence[FinalClosure], graph: GraphState) -> list[Message]:
+        verdicts = self.graph.settle(closures, graph)
+        messages = [*self.batcher.messages(), *self.batcher.settled(verdicts, self.now)]
+        return [*messages, *self.graph.draw(self.now)]
+
+    def _trajectory(self, times: Times, poses: Matrix) -> list[Message]:
+        return [
+            Message(entities.OPTIMIZED, entities.lines(entities.CYAN, 0.75, [shapes.positions(poses)])),
+            Message(entities.OPTIMIZED_LIDAR, shapes.transforms(poses), times),
+        ]
+
+    def _map(self, points: NDArray[np.floating]) -> list[Message]:
+        limit = max(self.config.max_map_points, self.batcher.points // 3)
+        drawn = shapes.in_space(shapes.at_most(points, limit))
+        if not len(drawn):
+            return []
+        colors = entities.height_colors(drawn) if self.dimension == 3 else [entities.WHITE]
+        return [Message(entities.MAP, rr.Points3D(drawn, colors=colors, radii=[entities.pixels(1.0)]))]
+
+    def _grid(
+        self, cells: NDArray[np.int8] | NDArray[np.uint8], resolution_m: float, origin_m: tuple[float, float]
+    ) -> list[Message]:
+        """Rerun's first row is the top one, at the highest y."""
+        height, width = cells.shape
+        pixels = np.ascontiguousarray(cells[::-1]).view(np.uint8)
+        grid = rr.GridMap(
+            data=pixels.tobytes(),
+            format=rr.components.ImageFormat(width=width, height=height, color_model="L", channel_datatype="U8"),
+            cell_size=resolution_m,
+            translation=[*origin_m, -0.05],
+            colormap=rr.components.Colormap.RvizMap,
+        )
+        return [Message(entities.GRID, grid)]
+
+    def _send(self, say: Callable[[], list[Message]], sinks: Sequence[Sink] | None = None) -> None:
+        """Send the messages that ``say`` returns to these sinks, or to every one."""
+        sinks = self.sinks if sinks is None else sinks
+        if not sinks:
+            return
+        messages: list[Message] = []
+        self._guard(lambda: messages.extend(say()))
+        for sink in sinks if messages else ():
+            sink.send(messages)
+
+    def _guard(self, act: Callable[[], object]) -> None:
+        """Turn an exception into a warning, once per kind: a recording that fails must not fail the run."""
+        try:
+            with catch_and_log_exceptions(strict=True):  # else rerun turns errors into warnings on stderr
+                act()
+        except Exception as error:
+            self._note(error)
+
+    def _note(self, error: Exception) -> None:
+        problem = f"the recording lacks something: {type(error).__name__}: {error}"
+        if problem not in self.problems:
+            self.problems.append(problem)

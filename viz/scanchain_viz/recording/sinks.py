@@ -1,0 +1,196 @@
+"""Destinations of a recording: a file, a live viewer, or both; each is a stream served by its own thread.
+
+rerun can tee one stream to both, but it waits without a limit for a viewer that stops reading (a suspended laptop,
+a broken tunnel) and for a file on a full disk, and the run would wait with it. Here the run waits for a queue, and
+for that only so long.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import queue
+import threading
+import warnings
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from time import perf_counter
+from uuid import UUID, uuid4
+
+import rerun as rr
+import rerun.blueprint as rrb
+from rerun.chunk import RrdReader
+from rerun.error_utils import RerunWarning
+
+from scanchain.errors import InputError
+from scanchain.whole_file import write_whole
+from scanchain.words import counted
+from scanchain_viz.recording.messages import Message
+
+_QUEUED_BATCHES = 16
+_COPIED_CHUNKS = 64  # largest number of chunks in memory when a recording is copied
+_LOOK_EVERY_S = 0.1
+_FILE_PATIENCE_S = 10.0
+_VIEWER_PATIENCE_S = 5.0
+
+
+class Sink:
+    """Passes batches on to one stream.
+
+    name : what warnings call it
+    connect : run first, in the thread
+    patience_s : how long it may take nothing before it is given up
+    is_lossless : whether the run waits for it when it falls behind; else what it is too slow for is dropped
+    """
+
+    def __init__(
+        self,
+        name: str,
+        stream: rr.RecordingStream,
+        connect: Callable[[], None],
+        *,
+        patience_s: float,
+        is_lossless: bool,
+    ) -> None:
+        self.name = name
+        self.stream = stream
+        self.connect = connect
+        self.patience_s = patience_s
+        self.is_lossless = is_lossless
+        self.warnings: list[str] = []
+        self.dropped = 0
+        self.flushes = 0
+        self.lock = threading.Lock()
+        self.waiting: queue.Queue[list[Message] | rrb.Blueprint | Path | threading.Event | None] = queue.Queue(
+            _QUEUED_BATCHES
+        )
+        self.thread = threading.Thread(target=self._serve, name=f"recording to {name}", daemon=True)
+        self.thread.start()
+
+    def send(self, item: list[Message] | rrb.Blueprint | Path) -> None:
+        """Hand over a batch, a blueprint to replace the one before, or a recording whose rows are to be copied.
+
+        What goes wrong ends up in ``warnings``.
+        """
+        if self.warnings:
+            return
+        try:
+            self.waiting.put(item, timeout=self.patience_s if self.is_lossless else 0.0)
+        except queue.Full:
+            self.dropped += 1
+            if self.is_lossless:
+                self._give_up("it takes no more data")
+
+    def settle(self) -> bool:
+        """Wait until everything is written; True if it is."""
+        settled = threading.Event()
+        if not self.warnings:
+            with contextlib.suppress(queue.Full):
+                self.waiting.put(settled, timeout=self.patience_s)
+            flushes, since_s = self.flushes, perf_counter()
+            while not settled.wait(_LOOK_EVERY_S) and not self.warnings:
+                if flushes != self.flushes:
+                    flushes, since_s = self.flushes, perf_counter()
+                elif perf_counter() - since_s > self.patience_s:
+                    self._give_up("it takes no more data")
+        return not self.warnings
+
+    def close(self) -> None:
+        """Give it time to take the rest, then go on without it."""
+        if not self.warnings:
+            with contextlib.suppress(queue.Full):
+                self.waiting.put(None, timeout=self.patience_s)
+            self.thread.join(self.patience_s + 1.0)
+            if self.thread.is_alive():
+                self._give_up("it takes no more data")
+        if self.dropped and not self.warnings:
+            self.warnings.append(f"{self.name} was too slow: it lacks {counted(self.dropped, 'batch', 'batches')}")
+
+    def _serve(self) -> None:
+        try:
+            self.connect()
+            while (item := self.waiting.get()) is not None:
+                match item:
+                    case threading.Event():
+                        item.set()
+                        continue
+                    case Path():
+                        self._copy(item)
+                    case list():
+                        for message in item:
+                            message.send(self.stream)
+                    case _:
+                        self.stream.send_blueprint(item)
+                self._flush()
+            self.stream.disconnect()
+        except Exception as error:
+            self._give_up(str(error))
+
+    def _copy(self, path: Path) -> None:
+        """Pass on a recording except its static messages, which are sent again."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RerunWarning)  # what a killed process wrote lacks rerun's index
+            chunks = RrdReader(path).stream().filter(is_static=False)
+        for number, chunk in enumerate(chunks, start=1):
+            rr.send_chunks(chunk, recording=self.stream)
+            if number % _COPIED_CHUNKS == 0:
+                self._flush()
+
+    def _flush(self) -> None:
+        self.stream.flush(timeout_sec=self.patience_s)
+        self.flushes += 1
+
+    def _give_up(self, why: str) -> None:
+        """Warn, and never free the stream: freeing it, like rerun's exit handler, may wait without a limit."""
+        with self.lock:
+            if self.warnings:
+                return
+            self.warnings.append(f"{self.name} is incomplete, the run goes on without it: {why}")
+            ctypes.pythonapi.Py_IncRef(ctypes.py_object(self.stream))
+            rr.unregister_shutdown()
+
+
+def open_stream(name: str, dimension: int, recording_id: UUID, kind: str = "") -> rr.RecordingStream:
+    """A stream that knows its recording's name and adds no timeline of its own; each ``kind`` has its layout."""
+    stream = rr.RecordingStream(f"scanchain {kind}{dimension}D", recording_id=recording_id)
+    stream.set_log_time_enabled(False)
+    stream.send_recording_name(name)
+    return stream
+
+
+def file_sink(path: Path, stream: rr.RecordingStream, blueprint: rrb.Blueprint) -> Sink:
+    """A .rrd file; it can be read up to the last batch even if the run is killed.
+
+    It has its name only once it can be read: rerun writes the head in parts.
+    """
+    unnamed = path.with_name(f"{path.name}.new")
+    try:
+        stream.set_sinks(rr.FileSink(unnamed), default_blueprint=blueprint)
+        stream.flush(timeout_sec=_FILE_PATIENCE_S)
+        unnamed.replace(path)
+    except (RuntimeError, OSError) as error:
+        raise InputError(
+            f"{path}: cannot write the recording: {error}; use another --out or --rerun off"
+        ) from error
+    return Sink(f"{path}", stream, lambda: None, patience_s=_FILE_PATIENCE_S, is_lossless=True)
+
+
+def write_recording(
+    path: Path, name: str, dimension: int, blueprint: rrb.Blueprint, messages: Iterable[Message], *, kind: str = ""
+) -> None:
+    """Write a .rrd file of complete data, whole or not at all. Raises OSError."""
+    stream = open_stream(name, dimension, uuid4(), kind)
+    memory = stream.memory_recording()
+    stream.send_blueprint(blueprint, make_active=False)
+    for message in messages:
+        message.send(stream)
+    write_whole(path, memory.drain_as_bytes())
+
+
+def viewer_sink(address: str, stream: rr.RecordingStream, blueprint: rrb.Blueprint) -> Sink:
+    """A viewer at ``address``."""
+
+    def connect() -> None:
+        stream.set_sinks(rr.GrpcSink(address), default_blueprint=blueprint)
+
+    return Sink(f"the viewer at {address}", stream, connect, patience_s=_VIEWER_PATIENCE_S, is_lossless=False)

@@ -1,0 +1,219 @@
+"""report.html of a comparison, made of the files in its directory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+
+from scanchain.comparison.figures import Column, columns_of
+from scanchain.comparison.outcome import CLOSURES_FILE, Status
+from scanchain.comparison.results import MAP_FILE, SETTINGS_FILE, TRUTH_FILE, method_folder
+from scanchain.comparison.table import Row as TableRow
+from scanchain.comparison.table import Table, read_table
+from scanchain.maps import read_ply
+from scanchain.trajectory import read_tum
+from scanchain_viz.pictures import trajectory_figures as figures
+from scanchain_viz.pictures.compared_trajectories import read_trajectories
+from scanchain_viz.pictures.map_figures import map_picture, surroundings
+from scanchain_viz.pictures.trajectory_figures import DrawnTrajectory, Floats
+from scanchain_viz.report import page
+from scanchain_viz.report.checks import verdict_cell
+from scanchain_viz.report.sections import (
+    chip,
+    error_section,
+    loop_section,
+    provenance_sections,
+    relation_section,
+    time_section,
+    trajectories_section,
+    uncertainty_section,
+)
+
+_VERDICT = page.Head(
+    "verdict", "", "of other tools by wheels and constant velocity alone, with the error that it vouches for", True
+)
+_WIDEST = 10  # largest number of columns of a table beside the summary
+_NEARLY = 1.25  # thickness of a map over that of the sharpest, up to which it frames the pictures
+
+
+def write_compare_report(directory: Path) -> None:
+    """Draw and write the page."""
+    table, trajectories = read_table(directory), read_trajectories(directory)
+    truth_file = directory / TRUTH_FILE
+    truth = read_tum(truth_file).poses[:, :3, 3] if truth_file.exists() else None
+    whole = page.Page(
+        title=f"Comparison on {Path(table.log.split(', ')[0]).name}",
+        subtitle=_subtitle(table),
+        facts=_facts(table),
+        warnings=tuple(_warnings(table)),
+        notes=tuple(table.notes),
+        sections=tuple(_sections(directory, table, trajectories, truth)),
+        collapsibles=tuple(_collapsibles(directory, table)),
+    )
+    page.write_page(directory / page.REPORT_FILE, whole)
+
+
+def _subtitle(table: Table) -> str:
+    how = "through every method, each in its own process"
+    return f"The same {table.scans:,} decoded scans {how}. {table.against}"
+
+
+def _facts(table: Table) -> tuple[tuple[str, str], ...]:
+    made = table.provenance
+    return (
+        ("log", table.log),
+        ("topic", table.topic),
+        ("scans", f"{table.scans:,} of {table.points_per_scan:,.0f} points, {table.dimension}D"),
+        ("runs of a method", str(table.repeats)),
+        ("machine", f"{made.platform}, {made.cores} cores"),
+        ("made", f"{datetime.fromisoformat(made.started):%Y-%m-%d %H:%M} UTC, in {made.duration_s:.0f} s"),
+    )
+
+
+def _warnings(table: Table) -> Iterator[str]:
+    if table.provenance.stopped:
+        yield table.provenance.stopped
+    for row in table.rows:
+        if row.status.is_failure:
+            yield f"{row.name} {row.status}: {row.reason}"
+        if row.is_doubted:
+            yield f"{row.name}: {row.sentence}"
+
+
+def _figures(table: Table, trajectories: Sequence[DrawnTrajectory]) -> Iterator[page.Section]:
+    """The summary, and all else in one table more, or in two where that would be too wide."""
+    summary = columns_of(table.figures, "summary")
+    yield page.Section("Summary", grid=_grid(table, table.rows, trajectories, summary, has_verdicts=True))
+    ended = [row for row in table.rows if row.status is Status.OK]
+    accuracy, time = columns_of(table.figures, "accuracy"), columns_of(table.figures, "time")
+    parts = {"More on accuracy": accuracy, "More on time": time}
+    if len(accuracy) + len(time) <= _WIDEST:
+        parts = {"More figures": [*accuracy, *time]}
+    for title, columns in parts.items():
+        if columns:
+            yield page.Section(title, grid=_grid(table, ended, trajectories, columns))
+
+
+def _grid(
+    table: Table,
+    rows: Sequence[TableRow],
+    trajectories: Sequence[DrawnTrajectory],
+    columns: Sequence[Column],
+    *,
+    has_verdicts: bool = False,
+) -> page.Grid:
+    """A row a method; the end of a failed one in place of its figures."""
+    chips = {trajectory.name: chip(trajectory) for trajectory in trajectories}
+    shown = [dict(zip((row.name for row in table.rows), c.cells(table.figures), strict=True)) for c in columns]
+    lines = []
+    for row in rows:
+        cells = tuple(page.Cell(each[row.name].text, each[row.name].is_best) for each in shown)
+        if has_verdicts:
+            cells += (verdict_cell(row.verdict, row.vouched),)
+        if row.status is not Status.OK:
+            cells = (page.Cell(f"{row.status}: {row.reason}", is_wide=True),)
+        lines.append(page.Row(row.name, cells, chips.get(row.name)))
+    heads = (
+        page.Head("method"),
+        *(page.Head(column.head, column.unit, column.definition) for column in columns),
+        *((_VERDICT,) if has_verdicts else ()),
+    )
+    notes = tuple(f"{column.heading}: {column.definition}" for column in columns)
+    return page.Grid(heads, tuple(lines), notes)
+
+
+def _sections(
+    directory: Path, table: Table, trajectories: Sequence[DrawnTrajectory], truth: Floats | None
+) -> Iterator[page.Section]:
+    yield from _figures(table, trajectories)
+    is_planar = table.dimension == 2
+    drawn = [trajectory for trajectory in trajectories if len(trajectory.positions)]
+    if drawn:
+        framing = _sharpest(table, drawn)
+        text = "All start at the same pose."
+        if truth is not None:
+            text = (
+                "Each is aligned to the ground truth as for the ATE; one that did not finish, by its first pose."
+            )
+        if truth is None and len(framing) < len(drawn):
+            whole = {trajectory.name for trajectory in framing}
+            astray = ", ".join(trajectory.name for trajectory in drawn if trajectory.name not in whole)
+            text += f" The axes frame the sharper maps; {astray} may leave them."
+        yield trajectories_section(drawn, framing, truth, is_planar=is_planar, text=text)
+        yield from error_section(drawn, table.truth)
+        yield from relation_section(drawn)
+        yield from time_section(drawn)
+        yield from uncertainty_section(drawn, is_planar=is_planar)
+        yield from _map_section(directory, drawn, framing, figures.frame(framing, truth), table.dimension)
+    settings = {row.name: row.settings for row in table.rows}
+    for trajectory in trajectories:
+        yield from loop_section(
+            trajectory,
+            method_folder(directory, trajectory.name) / CLOSURES_FILE,
+            f"Loop closures of {trajectory.name}",
+            float(settings[trajectory.name].get("loops", {}).get("min_travel_m", 0.0)),
+        )
+    if len(table.rows) > 1:
+        yield _disagreement(table)
+
+
+def _sharpest(table: Table, trajectories: Sequence[DrawnTrajectory]) -> list[DrawnTrajectory]:
+    """Trajectories whose maps are nearly as sharp as the best, which frame the pictures; all without maps."""
+    thickness_m = {row.name: row.figures.thickness_m or np.inf for row in table.rows}
+    limit_m = _NEARLY * min(thickness_m[trajectory.name] for trajectory in trajectories)
+    return [trajectory for trajectory in trajectories if thickness_m[trajectory.name] <= limit_m]
+
+
+def _map_section(
+    directory: Path,
+    trajectories: Sequence[DrawnTrajectory],
+    framing: Sequence[DrawnTrajectory],
+    box: tuple[Floats, Floats],
+    dimension: int,
+) -> Iterator[page.Section]:
+    """Maps, all within the same corners; those of ``framing`` must be seen whole."""
+    files = [(trajectory, method_folder(directory, trajectory.name) / MAP_FILE) for trajectory in trajectories]
+    maps = [(trajectory, read_ply(file)) for trajectory, file in files if file.exists()]
+    if not maps:
+        return
+    whole = {trajectory.name for trajectory in framing}
+    corners = surroundings(*box, [points for trajectory, points in maps if trajectory.name in whole])
+    drawings = tuple(
+        page.Drawing(trajectory.name, "", map_picture(points, *corners), chip(trajectory))
+        for trajectory, points in maps
+    )
+    text = "The same points of the same scans, placed by the poses of each method."
+    text += " Dark is low, bright is high." if dimension == 3 else ""
+    yield page.Section("Maps", text, drawings=drawings, is_small=True)
+
+
+def _disagreement(table: Table) -> page.Section:
+    names = [row.name for row in table.rows]
+    rows = [
+        page.Row(name, tuple(page.Cell("–" if value is None else f"{1e3 * value:.1f}") for value in values))
+        for name, values in zip(names, table.disagreement_m, strict=True)
+    ]
+    return page.Section(
+        "Disagreement",
+        "Median distance between the motions that two methods find for a scan, in millimeters. "
+        "Not a measure of accuracy: two methods with the same error agree.",
+        grid=page.Grid((page.Head("mm"), *(page.Head(name) for name in names)), tuple(rows)),
+    )
+
+
+def _collapsibles(directory: Path, table: Table) -> Iterator[page.Collapsible]:
+    yield from provenance_sections(table.provenance, table.baselines)
+    yield page.Collapsible(
+        "Methods", "\n".join(f"{row.name}: {row.description or row.reason}" for row in table.rows)
+    )
+    definitions = dict.fromkeys(definition for row in table.rows for definition in row.definitions)
+    if definitions:
+        yield page.Collapsible("Definitions of the errors", "\n\n".join(definitions))
+    yield page.Collapsible(
+        "Settings, in the form of --config",
+        (directory / SETTINGS_FILE).read_text(encoding="utf-8"),
+        is_long=True,
+    )
