@@ -1,14 +1,11 @@
 import numpy as np
 import pytest
-from scipy.sparse.csgraph import csgraph_from_dense, dijkstra
 
 from scanchain import lie
+from scanchain.checks import largest_magnitude
 from scanchain.config import LocalMapConfig, MatchingConfig
 from scanchain.kernels.geometry import eigen
-from scanchain.kernels.geometry.twist import orthonormalize, perturb
-from scanchain.kernels.geometry.validity import largest_magnitude
-from scanchain.kernels.graph.nearest import nearest_position, on_first_pass
-from scanchain.kernels.graph.shortest_paths import shortest_paths
+from scanchain.kernels.geometry.se import orthonormalize, perturb
 from scanchain.kernels.registration import icp, optimizers, residuals
 from scanchain.kernels.registration.association import associate
 from scanchain.kernels.registration.residuals import normal_equations
@@ -349,48 +346,6 @@ def test_deskewing_moves_each_point_along_the_motion(twist, deskew):
     expected = naive.deskew(points, shares, np.array(twist))
     deskew(points, shares, np.array(twist))
     np.testing.assert_allclose(points, expected, atol=1e-12)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_shortest_paths_equal_those_of_scipy(seed):
-    rng = np.random.default_rng(seed)
-    edges = np.concatenate([np.stack([np.arange(39), np.arange(1, 40)], axis=1), rng.integers(0, 45, (20, 2))])
-    lengths = rng.uniform(0.1, 2.0, len(edges))
-    dense = np.full((45, 45), np.inf)
-    for (i, j), length in zip(edges, lengths, strict=True):
-        dense[i, j] = dense[j, i] = min(dense[i, j], length)
-    expected = dijkstra(csgraph_from_dense(dense, null_value=np.inf), directed=False, indices=3, limit=5.0)
-    assert shortest_paths(edges, lengths, 45, 3, 5.0) == pytest.approx(expected)
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_the_nearest_position_is_that_of_a_search_through_all_that_are_chosen(dimension):
-    rng = np.random.default_rng(4)
-    poses = np.tile(np.eye(dimension + 1), (50, 1, 1))
-    poses[:, :-1, -1] = rng.normal(size=(50, dimension))
-    for count in (50, 5, 0):
-        chosen = np.isin(np.arange(50), rng.permutation(50)[:count])
-        distances_m = np.where(chosen, np.linalg.norm(poses[:, :-1, -1] - poses[7, :-1, -1], axis=1), np.inf)
-        nearest, distance_m = nearest_position(poses, poses[7], chosen)
-        assert distance_m == distances_m.min()
-        assert nearest == (np.argmin(distances_m) if count else -1)
-
-
-@pytest.mark.parametrize(
-    ("turned", "chosen", "expected"), [(0.3, 0, 4), (0.6, 0, -1), (0.3, 7, 14), (0.3, 20, -1)]
-)
-def test_the_first_pass_near_a_pose_is_found_where_it_is_nearest(turned, chosen, expected):
-    """Two passes of ten poses, 1 m apart each."""
-    poses = np.array([lie.pose_2d(k % 10, 0.1 * (k // 10), 0.0) for k in range(20)])
-    pose = lie.pose_2d(4.2, 0.0, turned)
-    found, distance_m = on_first_pass(poses, pose, np.arange(20) >= chosen, 2.0, 0.5)
-    away_m = np.linalg.norm(poses[expected, :2, 2] - pose[:2, 2]) if expected >= 0 else np.inf
-    assert (found, distance_m) == (expected, pytest.approx(away_m))
-
-
-def test_an_edge_of_infinite_length_leads_nowhere():
-    edges = np.array([[0, 1], [1, 2]])
-    assert shortest_paths(edges, np.array([1.0, np.inf]), 3, 0, 9.0).tolist() == [0.0, 1.0, np.inf]
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import msgspec
@@ -14,7 +13,6 @@ from scanchain.clock import working_s
 from scanchain.config import Config
 from scanchain.data import LEAST_FIT, AnyPoints, Match, Points, Pose, Scan, State
 from scanchain.errors import InputError, shown
-from scanchain.kernels.geometry.validity import largest_magnitude
 from scanchain.odometry.elevation import ElevationCalibration
 from scanchain.odometry.intervals import LiveStamps
 from scanchain.odometry.map_keeper import MapKeeper
@@ -256,7 +254,7 @@ class Odometry:
     def _judge(self, match: Match) -> State:
         if match.inlier_share < self.config.matching.min_inlier_share:
             return State.LOST
-        if not math.isfinite(largest_magnitude(match.T_target_source)):
+        if not np.isfinite(match.T_target_source).all():
             return State.LOST
         return State.DEGENERATE if match.observability < 1.0 else State.OK
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.geometry.twist import orthonormalize, perturb
+from scanchain.kernels.geometry.se import orthonormalize, perturb
 from scanchain.kernels.registration.association import associate
 from scanchain.kernels.registration.optimizers import (
     LEVENBERG_MARQUARDT,

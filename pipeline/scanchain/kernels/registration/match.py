@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.geometry.pose_log import twist_3d
-from scanchain.kernels.geometry.poses import adjoint, between, centered, inverse, twist_2d
+from scanchain.kernels.geometry.se import adjoint, between, centered, inverse, twist_2d, twist_3d
 from scanchain.kernels.registration.icp import (
     NO_CORRESPONDENCES,
     align,
