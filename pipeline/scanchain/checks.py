@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from scanchain.errors import InputError, one_line, shown
-from scanchain.kernels.geometry.se import rigidity_error
+from scanchain.kernels.geometry.validity import largest_magnitude, rigidity_error
 from scanchain.kernels.voxels.hashing import REACH
 
 _RIGID = 1e-3  # largest entry of RᵀR − I; poses printed with four digits stay below it
@@ -65,12 +65,6 @@ def points(value: object, name: str, d: int, *, dtype: DTypeLike = np.float64) -
             f"{name}: {bad:,} of {len(array):,} points are NaN or infinite; leave them out, with their times"
         )
     return array
-
-
-def largest_magnitude(array: NDArray[np.floating]) -> float:
-    """Largest |entry| of an array; infinite where one is NaN or infinite, 0 without entries."""
-    largest = float(max(array.max(initial=0.0), -array.min(initial=0.0)))
-    return largest if math.isfinite(largest) else math.inf
 
 
 def valid_points(

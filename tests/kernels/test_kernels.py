@@ -2,14 +2,13 @@ import numpy as np
 import pytest
 
 from scanchain import lie
-from scanchain.checks import largest_magnitude
 from scanchain.config import LocalMapConfig, MatchingConfig
 from scanchain.kernels.geometry import eigen
 from scanchain.kernels.geometry.se import orthonormalize, perturb
+from scanchain.kernels.geometry.validity import largest_magnitude
 from scanchain.kernels.registration import icp, optimizers, residuals
-from scanchain.kernels.registration.association import associate
+from scanchain.kernels.registration.association import associate, weigh
 from scanchain.kernels.registration.residuals import normal_equations
-from scanchain.kernels.registration.weights import weigh
 from scanchain.kernels.voxels import downsample, hashing
 from scanchain.kernels.voxels.voxel_shapes import DIRECTION, SHAPE, insert
 from scanchain.registration import VoxelMap

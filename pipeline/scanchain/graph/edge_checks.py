@@ -7,9 +7,10 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from scanchain.checks import LARGEST, largest_magnitude
+from scanchain.checks import LARGEST
 from scanchain.data import Matrix
 from scanchain.errors import InputError
+from scanchain.kernels.geometry.validity import largest_magnitude
 
 _NO_INFORMATION = 1e-9  # eigenvalue of a matrix of unit diagonal up to which a direction is not measured
 _ROUNDING = 1e-6  # share of the largest entry that a negative eigenvalue may have, from printed digits
@@ -18,7 +19,7 @@ _ROUNDING = 1e-6  # share of the largest entry that a negative eigenvalue may ha
 def check_edges(edges: NDArray[np.int64], measurements: Matrix, information: Matrix, pose_count: int) -> None:
     """Refuse edges to unknown poses, from a pose to itself, or with impossible numbers."""
     is_sound = positive_semidefinite(information)
-    largest = max(largest_magnitude(each) for each in (measurements, information))
+    largest = max(largest_magnitude(each.reshape(-1, each.shape[-1])) for each in (measurements, information))
     is_known = edges.min(initial=0) >= 0 and edges.max(initial=-1) < pose_count
     if is_known and is_sound.all() and largest <= LARGEST and (edges[:, 0] != edges[:, 1]).all():
         return

@@ -6,10 +6,11 @@ import math
 
 import numpy as np
 
-from scanchain.checks import LONGEST_SWEEP_S, largest_magnitude
+from scanchain.checks import LONGEST_SWEEP_S
 from scanchain.config import LogConfig, PreprocessConfig
 from scanchain.data import MOST_COPIES, RawPoints, Scan
 from scanchain.errors import InputError
+from scanchain.kernels.geometry.validity import largest_magnitude
 from scanchain.logs.mcap.stream import Decoded
 from scanchain.logs.messages.returns import Returns
 from scanchain.words import counted

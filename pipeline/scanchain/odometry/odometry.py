@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import msgspec
@@ -13,9 +14,9 @@ from scanchain.clock import working_s
 from scanchain.config import Config
 from scanchain.data import LEAST_FIT, AnyPoints, Match, Points, Pose, Scan, State
 from scanchain.errors import InputError, shown
+from scanchain.kernels.geometry.validity import largest_magnitude
 from scanchain.odometry.elevation import ElevationCalibration
 from scanchain.odometry.intervals import LiveStamps
-from scanchain.odometry.map_keeper import MapKeeper
 from scanchain.odometry.prediction import Prediction, Predictor
 from scanchain.odometry.recovery import CLEARLY, Recovery, is_sound
 from scanchain.odometry.standstill import Standstill
@@ -31,7 +32,7 @@ from scanchain.odometry.tracked import (
     spread,
 )
 from scanchain.preprocess import Prepared, Resolution, Sweep, prepare
-from scanchain.registration import VoxelMap, create_matcher
+from scanchain.registration import MapKeeper, VoxelMap, create_matcher
 from scanchain.settings import check_dimension, check_order, load_settings
 
 _SAMPLE = 1000  # number of points of two scans, evenly spread, which are compared
@@ -191,7 +192,7 @@ class Odometry:
             self._check_range(scan, sparse)
         points = sparse.from_middle(prediction.velocity)
         if not len(points):
-            match = nothing_to_match(prediction, self.config.preprocess)
+            match = nothing_to_match(prediction, self.config)
             return _Registered(points, match, State.LOST, prediction)
         if is_first:
             match = first_match(prediction.T_odom_last, points, self.config.matching)
@@ -254,7 +255,7 @@ class Odometry:
     def _judge(self, match: Match) -> State:
         if match.inlier_share < self.config.matching.min_inlier_share:
             return State.LOST
-        if not np.isfinite(match.T_target_source).all():
+        if not math.isfinite(largest_magnitude(match.T_target_source)):
             return State.LOST
         return State.DEGENERATE if match.observability < 1.0 else State.OK
 

@@ -12,6 +12,7 @@ from scanchain import lie
 from scanchain.config import OdometryConfig
 from scanchain.data import Match, Matrix, Pose, Prior, Scan, State
 from scanchain.errors import InputError
+from scanchain.kernels.geometry.validity import largest_magnitude
 from scanchain.kernels.registration.observability import WEAK, definite_inverse
 from scanchain.odometry.intervals import Intervals
 from scanchain.words import counted
@@ -294,7 +295,7 @@ class Predictor:
 
     def _jump_m(self, wheel: Pose, interval_s: float) -> float:
         scans = max(interval_s / self.intervals.usual_s, 1.0) if self.intervals.usual_s else 1.0
-        if np.abs(wheel - self.filter.motion).max() <= _JUMP * scans:
+        if largest_magnitude(wheel - self.filter.motion) <= _JUMP * scans:
             return 0.0
         return float(np.linalg.norm(wheel[:-1, -1] - scans * self.filter.motion[:-1, -1]))
 

@@ -19,4 +19,5 @@ from scanchain.registration.plicp import PointToShapeMatcher as PointToShapeMatc
 from scanchain.registration.svd_icp import DegeneratePairsError as DegeneratePairsError
 from scanchain.registration.svd_icp import SvdMatcher as SvdMatcher
 from scanchain.registration.svd_icp import rigid_transform as rigid_transform
+from scanchain.registration.voxel_map import MapKeeper as MapKeeper
 from scanchain.registration.voxel_map import VoxelMap as VoxelMap

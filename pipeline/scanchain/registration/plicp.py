@@ -9,6 +9,7 @@ import numpy as np
 from scanchain import checks, lie
 from scanchain.config import MatchingConfig
 from scanchain.data import LEAST_FIT, AnyPoints, Match, Points, Pose, Prior, Problem
+from scanchain.kernels.geometry.validity import largest_magnitude
 from scanchain.kernels.registration import icp
 from scanchain.kernels.registration.match import Result, match
 from scanchain.kernels.registration.optimizers import GAUSS_NEWTON, GRADIENT_DESCENT, LEVENBERG_MARQUARDT, NEWTON
@@ -128,7 +129,7 @@ def _problem(
     result: Result, points: int, target: VoxelMap, observability: float, config: MatchingConfig
 ) -> Problem | None:
     """Why a result did not converge, None if it did."""
-    if not np.isfinite(result.T).all():
+    if not math.isfinite(largest_magnitude(result.T)):
         return Problem.plain("the pose is not finite")
     if result.ending == icp.NO_CORRESPONDENCES:
         return Problem.plain(_ENDINGS[result.ending])

@@ -255,33 +255,3 @@ def orthonormalize(T):
         scale = 1.0 / math.sqrt(square)
         for column in range(d):
             T[row, column] *= scale
-
-
-@njit()
-def rigidity_error(T) -> float:
-    """Largest |entry| of RᵀR − I and of the last row less (0, …, 0, 1) of T (d+1, d+1).
-
-    At least 2 where det R < 0, as a reflection has it; infinite where an entry is not finite.
-    """
-    d = T.shape[0] - 1
-    error = 0.0
-    for i in range(d + 1):
-        for j in range(d + 1):
-            if not math.isfinite(T[i, j]):
-                return np.inf
-    for i in range(d):
-        error = max(error, abs(T[d, i]))
-        for j in range(d):
-            product = -1.0 if i == j else 0.0
-            for m in range(d):
-                product += T[m, i] * T[m, j]
-            error = max(error, abs(product))
-    if d == 2:
-        determinant = T[0, 0] * T[1, 1] - T[0, 1] * T[1, 0]
-    else:
-        determinant = (
-            T[0, 0] * (T[1, 1] * T[2, 2] - T[1, 2] * T[2, 1])
-            - T[0, 1] * (T[1, 0] * T[2, 2] - T[1, 2] * T[2, 0])
-            + T[0, 2] * (T[1, 0] * T[2, 1] - T[1, 1] * T[2, 0])
-        )
-    return max(error, abs(T[d, d] - 1.0), 2.0 if determinant < 0.0 else 0.0)

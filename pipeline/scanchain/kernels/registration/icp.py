@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from scanchain.kernels.compiling import njit
 from scanchain.kernels.geometry.se import orthonormalize, perturb
-from scanchain.kernels.registration.association import associate
+from scanchain.kernels.registration.association import associate, weigh
 from scanchain.kernels.registration.optimizers import (
     LEVENBERG_MARQUARDT,
     NEWTON,
@@ -22,7 +22,6 @@ from scanchain.kernels.registration.residuals import (
     normal_equations,
     robust_sums,
 )
-from scanchain.kernels.registration.weights import weigh
 from scanchain.kernels.voxels.voxel_shapes import POINT, SHAPE
 
 CONVERGED, OUT_OF_ITERATIONS, NO_CORRESPONDENCES, SINGULAR = 0, 1, 2, 3

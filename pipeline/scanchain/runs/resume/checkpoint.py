@@ -29,17 +29,15 @@ from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.loops.verification import ScanVerifier, SubmapVerifier
 from scanchain.odometry import FrontEnd, LiveStamps, Odometry
 from scanchain.odometry.elevation import ElevationCalibration
-from scanchain.odometry.front_end import Motion
+from scanchain.odometry.front_end import KeyframeErrorTracker
 from scanchain.odometry.intervals import Intervals
-from scanchain.odometry.keyframe_errors import KeyframeErrorTracker
-from scanchain.odometry.map_keeper import MapKeeper
 from scanchain.odometry.prediction import ErrorStatistics, MotionFilter, Predictor
 from scanchain.odometry.recovery import Recovery
 from scanchain.odometry.standstill import AgreeingMatches, Standstill
 from scanchain.odometry.tracked import Tracked
 from scanchain.point_store import PointStore, StoredPoints
 from scanchain.preprocess import Resolution, Sweep
-from scanchain.registration import PointToShapeMatcher, VoxelMap, create_matcher
+from scanchain.registration import MapKeeper, PointToShapeMatcher, VoxelMap, create_matcher
 from scanchain.runs.directory import CHECKPOINT_FILE
 from scanchain.runs.provenance import package_version
 from scanchain.runs.resume.snapshot import Classes, read_snapshot, write_snapshot
@@ -73,7 +71,7 @@ class Checkpoint:
 
 _CLASSES = Classes(
     [
-        Checkpoint, Slam, FrontEnd, Motion, Odometry, LiveStamps, Predictor, MotionFilter, Intervals,
+        Checkpoint, Slam, FrontEnd, Odometry, LiveStamps, Predictor, MotionFilter, Intervals,
         ErrorStatistics, Recovery, Standstill, AgreeingMatches, Tracked, ElevationCalibration, MapKeeper,
         Resolution, Sweep, VoxelMap,
         Voxels, PointToShapeMatcher, LoopCloser, ProximityCloser, PlaceCloser, Relocalizer, Find, PlanarSearch,
