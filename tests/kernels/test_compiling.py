@@ -216,7 +216,7 @@ def test_normal_equations_count_no_references_from_point_to_point(d, tmp_path, m
     problem = icp.problem_of(voxel_map.voxels, np.empty((0, d)), T, np.zeros((k, k)), search)
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
     compiled = compiling.njit()(residuals._sum_up.py_func)
-    compiled(problem, T, 1.0, (0.0,) * (k * (k + 1) // 2), (0.0,) * k)
+    compiled(*residuals._arrays(problem, T), 1.0, (0.0,) * (k * (k + 1) // 2), (0.0,) * k)
     blocks = re.split(r"^[^\s:]+:.*$", body(compiled), flags=re.MULTILINE)
     assert sum("NRT_incref(" in block for block in blocks) <= 2  # at the begin, and of H in the end
 

@@ -81,29 +81,29 @@ def normal_equations(problem, T, scale_m: float, curvature: float, H, b):
     H = Σ w JᵀJ, b = Σ w Jᵀr. Returns the cost Σ ½ s²r²/(s²+r²) in m², Σ w, and Σ w r² in m².
     """
     if H.shape[0] == 6:
-        sums, upper, gradient = _sum_up(problem, T, scale_m, (0.0,) * 21, (0.0,) * 6)
+        sums, upper, gradient = _sum_up(*_arrays(problem, T), scale_m, (0.0,) * 21, (0.0,) * 6)
         _unfold(upper, gradient, H, b)
     else:
-        sums, upper, gradient = _sum_up(problem, T, scale_m, (0.0,) * 6, (0.0,) * 3)
+        sums, upper, gradient = _sum_up(*_arrays(problem, T), scale_m, (0.0,) * 6, (0.0,) * 3)
         _unfold(upper, gradient, H, b)
     if curvature > 0.0:
-        _add_curvature(problem, T, scale_m, curvature, H)
+        _add_curvature(*_arrays(problem, T), scale_m, curvature, H)
     return sums
 
 
 @njit(nogil=True)
 def robust_sums(problem, T, scale_m: float):
     """The cost Σ ½ s²r²/(s²+r²) in m², Σ w, and Σ w r² in m², as ``normal_equations`` returns them."""
-    return _sum_up(problem, T, scale_m, (), ())[0]
+    return _sum_up(*_arrays(problem, T), scale_m, (), ())[0]
 
 
 @njit(nogil=True)
 def gradients_by_group(problem, T, scale_m: float, group, gradients):
     """Add b of ``normal_equations`` to the gradients (G, k), each point's to that of its group (N,)."""
     if gradients.shape[1] == 6:
-        _sum_by_group(problem, T, scale_m, (0.0,) * 21, (0.0,) * 6, group, gradients)
+        _sum_by_group(*_arrays(problem, T), scale_m, (0.0,) * 21, (0.0,) * 6, group, gradients)
     else:
-        _sum_by_group(problem, T, scale_m, (0.0,) * 6, (0.0,) * 3, group, gradients)
+        _sum_by_group(*_arrays(problem, T), scale_m, (0.0,) * 6, (0.0,) * 3, group, gradients)
 
 
 @njit(nogil=True)
@@ -135,8 +135,14 @@ def gradient_spread(problem, T, scale_m: float):
     return spread
 
 
+@njit(inline="always")
+def _arrays(problem, T):
+    """What loops over the points take: of arrays in a tuple, references are counted at every point."""
+    return problem.voxels.cells, problem.points, T, problem.origin, problem.correspondence, problem.weight
+
+
 @njit(nogil=True)
-def _sum_up(problem, T, scale_m: float, upper, gradient):
+def _sum_up(cells, points, T, origin, correspondence, weight, scale_m: float, upper, gradient):
     """Cost, Σ w and Σ w r², then the sums over all residuals: the upper triangle of H, by rows, and b.
 
     upper, gradient : zeros, 21 and 6 in space, 6 and 3 in the plane, none to leave the two out. Tuples are kept in
@@ -144,13 +150,16 @@ def _sum_up(problem, T, scale_m: float, upper, gradient):
     """
     cost = total_weight = squares = 0.0
     s2 = scale_m * scale_m
-    for i in range(problem.points.shape[0]):
-        if problem.correspondence[i] < 0:
+    for i in range(points.shape[0]):
+        if correspondence[i] < 0:
             continue
-        shape, moved, normal, residual, along, r2 = _at_point(problem, T, i)
-        r2 *= problem.weight[i]
+        x, y, z = move(T, points, i)
+        shape, q, normal = shape_of(cells, correspondence[i])
+        residual, along, r2 = _residual(shape, q, normal, x, y, z)
+        moved = x - origin[0], y - origin[1], z - origin[2]
+        r2 *= weight[i]
         ratio = s2 / (s2 + r2)
-        w = problem.weight[i] * ratio * ratio
+        w = weight[i] * ratio * ratio
         cost += 0.5 * r2 * ratio
         total_weight += w
         squares += ratio * ratio * r2
@@ -159,33 +168,41 @@ def _sum_up(problem, T, scale_m: float, upper, gradient):
 
 
 @njit(nogil=True)
-def _sum_by_group(problem, T, scale_m: float, no_upper, none, group, gradients):
+def _sum_by_group(
+    cells, points, T, origin, correspondence, weight, scale_m: float, no_upper, none, group, gradients
+):
     s2 = scale_m * scale_m
-    for i in range(problem.points.shape[0]):
-        if problem.correspondence[i] < 0 or problem.weight[i] == 0.0:
+    for i in range(points.shape[0]):
+        if correspondence[i] < 0 or weight[i] == 0.0:
             continue
-        shape, moved, normal, residual, along, r2 = _at_point(problem, T, i)
-        ratio = s2 / (s2 + r2 * problem.weight[i])
-        w = problem.weight[i] * ratio * ratio
+        x, y, z = move(T, points, i)
+        shape, q, normal = shape_of(cells, correspondence[i])
+        residual, along, r2 = _residual(shape, q, normal, x, y, z)
+        moved = x - origin[0], y - origin[1], z - origin[2]
+        ratio = s2 / (s2 + r2 * weight[i])
+        w = weight[i] * ratio * ratio
         _, b = _plus(no_upper, none, w, shape, normal, moved, residual, along)
         for m in range(gradients.shape[1]):
             gradients[group[i], m] += b[m]
 
 
 @njit(nogil=True)
-def _add_curvature(problem, T, scale_m: float, curvature: float, H):
+def _add_curvature(cells, points, T, origin, correspondence, weight, scale_m: float, curvature: float, H):
     """Add the second derivatives of eᵀ exp(ξ) p at ξ = 0 to H (k, k), e the residual of each correspondence.
 
     exp(ξ) p = p + φ × p + ρ + ½ φ × (φ × p) + ½ φ × ρ + …, so that the blocks are
         ½(e pᵀ + p eᵀ) − (eᵀp) I for (φ, φ), in 2D −eᵀp, and ½ φᵀ(ρ × e) for (ρ, φ).
     """
     s2 = scale_m * scale_m
-    for i in range(problem.points.shape[0]):
-        if problem.correspondence[i] < 0:
+    for i in range(points.shape[0]):
+        if correspondence[i] < 0:
             continue
-        _, (px, py, pz), _, (ex, ey, ez), _, r2 = _at_point(problem, T, i)
-        ratio = s2 / (s2 + r2 * problem.weight[i])
-        w = curvature * problem.weight[i] * ratio * ratio
+        x, y, z = move(T, points, i)
+        shape, q, normal = shape_of(cells, correspondence[i])
+        (ex, ey, ez), _, r2 = _residual(shape, q, normal, x, y, z)
+        px, py, pz = x - origin[0], y - origin[1], z - origin[2]
+        ratio = s2 / (s2 + r2 * weight[i])
+        w = curvature * weight[i] * ratio * ratio
         dot = ex * px + ey * py + ez * pz
         half = 0.5 * w
         if H.shape[0] == 3:
@@ -208,16 +225,6 @@ def _add_curvature(problem, T, scale_m: float, curvature: float, H):
     for row in range(1, H.shape[0]):
         for column in range(row):
             H[row, column] = H[column, row]
-
-
-@njit(forceinline=True)
-def _at_point(problem, T, i: int):
-    """Shape at point i, the point from the origin, normal, residual, its offset along that, its squared length."""
-    x, y, z = move(T, problem.points, i)
-    shape, q, normal = shape_of(problem.voxels.cells, problem.correspondence[i])
-    residual, along, r2 = _residual(shape, q, normal, x, y, z)
-    moved = x - problem.origin[0], y - problem.origin[1], z - problem.origin[2]
-    return shape, moved, normal, residual, along, r2
 
 
 @njit(forceinline=True)
