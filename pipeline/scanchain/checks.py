@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from scanchain.errors import InputError, one_line, shown
-from scanchain.kernels.geometry.validity import largest_magnitude, largest_moved, rigidity_error
+from scanchain.kernels.geometry.validity import largest_magnitude, rigidity_error
 from scanchain.kernels.voxels.hashing import REACH
 
 _RIGID = 1e-3  # largest entry of RᵀR − I; poses printed with four digits stay below it
@@ -114,7 +114,7 @@ def within_map(points: NDArray[np.floating], T: NDArray[np.float64], voxel_m: fl
     at_most_m = math.sqrt(points.shape[1]) * largest_magnitude(points) + math.hypot(*T[:-1, -1].tolist())
     if at_most_m < REACH * voxel_m:  # without moving them
         return
-    farthest_m = largest_moved(points, T)
+    farthest_m = largest_magnitude(points @ T[:-1, :-1].T + T[:-1, -1])
     if not farthest_m < REACH * voxel_m:
         raise InputError(
             f"{name} reach {farthest_m:.3g} m from the origin; a map of {voxel_m:g} m voxels holds "

@@ -4,7 +4,7 @@ import pytest
 from scanchain import lie
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.robust.losses import RobustLoss, robust_loss
-from scanchain.kernels.graph import between_se2
+from scanchain.kernels.graph import between
 from tests.support import naive_graph
 
 ANGLES = [0.0, 1e-9, 1e-5, 1e-3, 0.05, 0.1, 1.0, 2.5, np.pi - 1e-3, np.pi - 1e-5]
@@ -56,11 +56,11 @@ def test_the_blocks_in_coordinates_equal_finite_differences(angle):
     def residual(values):
         r = np.empty(3)
         T_i, T_j = (lie.pose_2d(*row) for row in values)
-        between_se2.chart_blocks(T_i, T_j, Z, r, np.empty((3, 3)), np.empty((3, 3)))
+        between.chart_blocks(T_i, T_j, Z, r, np.empty((3, 3)), np.empty((3, 3)))
         return r
 
     A, B = np.empty((3, 3)), np.empty((3, 3))
-    between_se2.chart_blocks(*poses, Z, np.empty(3), A, B)
+    between.chart_blocks(*poses, Z, np.empty(3), A, B)
     for end, block in ((0, A), (1, B)):
         for a in range(3):
             shift = np.zeros((2, 3))
@@ -75,7 +75,7 @@ def test_the_blocks_in_coordinates_are_those_of_the_textbook():
     R_i, R_z, theta = T_i[:2, :2], Z[:2, :2], lie.yaw(T_i)
     slope = np.array([[-np.sin(theta), np.cos(theta)], [-np.cos(theta), -np.sin(theta)]])  # ∂R_iᵀ/∂θ_i
     A, B, r = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
-    between_se2.chart_blocks(T_i, T_j, Z, r, A, B)
+    between.chart_blocks(T_i, T_j, Z, r, A, B)
     assert np.allclose(A[:2, :2], -R_z.T @ R_i.T)
     assert np.allclose(A[:2, 2], R_z.T @ slope @ (T_j[:2, 2] - T_i[:2, 2]))
     assert np.allclose(B[:2, :2], R_z.T @ R_i.T)

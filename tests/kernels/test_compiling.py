@@ -17,8 +17,9 @@ from scanchain.__main__ import main
 from scanchain.api import open_recorder
 from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.kernels import compiling
-from scanchain.kernels.registration import residuals
+from scanchain.kernels.registration import icp, residuals
 from scanchain.registration import VoxelMap
+from scanchain.registration.plicp import settings_of
 from scanchain.runs import results, warm_up
 from scanchain.runs.job import Job, Progress
 from scanchain.runs.run import run
@@ -206,15 +207,16 @@ def test_the_first_scan_is_shown_ahead_where_kernels_are_compiled(office, tmp_pa
     np.testing.assert_array_equal(steps[0].T_world_lidar, np.eye(3))  # as the viewer draws a scan without a pose
 
 
-@pytest.mark.parametrize(("d", "kernel"), [(2, residuals._in_plane), (3, residuals._in_space)])
-def test_normal_equations_count_no_references_from_point_to_point(d, kernel, tmp_path, monkeypatch):
+@pytest.mark.parametrize("d", [2, 3])
+def test_normal_equations_count_no_references_from_point_to_point(d, tmp_path, monkeypatch):
     """A row of an array, handed on, was counted up and down for every point: two thirds of the time."""
-    voxels = VoxelMap(d, load_settings(d).config.local_map).voxels
-    k = lie.twist_size(lie.identity(d))
-    none = np.empty(0, np.int32), np.empty(0)
+    settings, T = load_settings(d).config, lie.identity(d)
+    voxel_map, k = VoxelMap(d, settings.local_map), lie.twist_size(T)
+    search = settings_of(settings.matching, voxel_map, wide=False)
+    problem = icp.problem_of(voxel_map.voxels, np.empty((0, d)), T, np.zeros((k, k)), search)
     monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
-    compiled = compiling.njit()(kernel.py_func)
-    compiled(voxels, np.empty((0, d)), lie.identity(d), np.zeros(3), *none, 1.0, np.zeros((k, k)), np.zeros(k))
+    compiled = compiling.njit()(residuals._sum_up.py_func)
+    compiled(*residuals._arrays(problem, T), 1.0, (0.0,) * (k * (k + 1) // 2), (0.0,) * k)
     blocks = re.split(r"^[^\s:]+:.*$", body(compiled), flags=re.MULTILINE)
     assert sum("NRT_incref(" in block for block in blocks) <= 2  # at the begin, and of H in the end
 

@@ -7,7 +7,7 @@ import pytest
 
 from scanchain import lie
 from scanchain.config import LocalMapConfig, MatchingConfig
-from scanchain.kernels.geometry import poses
+from scanchain.kernels.geometry import se
 from scanchain.kernels.geometry.eigen import eigensystem
 from scanchain.kernels.registration import observability
 from scanchain.kernels.registration.icp import root_mean_square_range
@@ -107,7 +107,7 @@ def test_how_far_apart_two_poses_are(k, angle_rad):
     turn[-1] = angle_rad
     b = a @ lie.exp(turn)
     b[:-1, -1] += 0.5
-    meters, radians = poses.apart(a, b)
+    meters, radians = se.apart(a, b)
     assert meters == pytest.approx(0.5 * math.sqrt(len(a) - 1))
     assert radians == pytest.approx(angle_rad, abs=1e-7)
     assert math.isclose(radians, float(lie.rotation_angle(lie.between(a, b))), abs_tol=1e-7)

@@ -1,21 +1,18 @@
 import numpy as np
 import pytest
-from scipy.sparse.csgraph import csgraph_from_dense, dijkstra
 
 from scanchain import lie
-from scanchain.config import LocalMapConfig
+from scanchain.config import LocalMapConfig, MatchingConfig
 from scanchain.kernels.geometry import eigen
-from scanchain.kernels.geometry.twist import orthonormalize, perturb
+from scanchain.kernels.geometry.se import orthonormalize, perturb
 from scanchain.kernels.geometry.validity import largest_magnitude
-from scanchain.kernels.graph.nearest import nearest_position, on_first_pass
-from scanchain.kernels.graph.shortest_paths import shortest_paths
-from scanchain.kernels.registration import optimizers
-from scanchain.kernels.registration.association import associate
+from scanchain.kernels.registration import icp, optimizers, residuals
+from scanchain.kernels.registration.association import associate, weigh
 from scanchain.kernels.registration.residuals import normal_equations
-from scanchain.kernels.registration.weights import weigh
 from scanchain.kernels.voxels import downsample, hashing
 from scanchain.kernels.voxels.voxel_shapes import DIRECTION, SHAPE, insert
 from scanchain.registration import VoxelMap
+from scanchain.registration.plicp import settings_of
 from tests.support import naive
 
 SHAPES = {0.0: "point", 1.0: "line", 2.0: "plane"}
@@ -213,6 +210,16 @@ def test_a_pole_counts_and_a_ring_on_a_rail_does_not():
     assert weight_of(pole) > 0.5 > 0.01 > weight_of(rail)
 
 
+def associated(voxel_map, points, T):
+    """The problem of points at T, every correspondence with the weight one; twists about zero."""
+    k = lie.twist_size(T)
+    settings = settings_of(MatchingConfig(), voxel_map, wide=False)
+    problem = icp.problem_of(voxel_map.voxels, points, T, np.zeros((k, k)), settings)
+    associate(voxel_map.voxels, points, T, 1, 1.0, problem.correspondence)
+    problem.weight.fill(1.0)
+    return problem._replace(origin=np.zeros(3))
+
+
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_normal_equations_are_the_gradient_and_hessian_of_the_cost(dimension):
     points = some_points(dimension)
@@ -220,13 +227,12 @@ def test_normal_equations_are_the_gradient_and_hessian_of_the_cost(dimension):
     k = 3 if dimension == 2 else 6
     T = lie.exp(np.linspace(0.05, -0.08, k))
     origin = np.array([0.7, -0.4, 0.3]) * ([1, 1, 0] if dimension == 2 else 1)
-    correspondence = np.empty(len(points), np.int32)
-    associate(voxel_map.voxels, points, T, 1, 1.0, correspondence)
-    pairs = paired(voxel_map, correspondence)
+    scale, weight = 0.2, np.random.default_rng(3).uniform(0.1, 1.0, len(points))
+    problem = associated(voxel_map, points, T)._replace(origin=origin, weight=weight)
+    pairs = paired(voxel_map, problem.correspondence)
     assert {kind for _, _, kind, _ in pairs} >= ({"plane", "point"} if dimension == 2 else set(SHAPES.values()))
     H, b = np.empty((k, k)), np.empty(k)
-    scale, weight = 0.2, np.random.default_rng(3).uniform(0.1, 1.0, len(points))
-    total, _, _ = normal_equations(voxel_map.voxels, points, T, origin, correspondence, weight, scale, False, H, b)
+    total, _, _ = normal_equations(problem, T, scale, 0.0, H, b)
     assert total == pytest.approx(naive.cost(points, pairs, T, scale, weight), rel=1e-12)
     np.testing.assert_allclose(
         H, naive.gauss_newton_hessian(points, pairs, T, origin[:dimension], scale, weight), rtol=1e-6, atol=1e-5
@@ -246,19 +252,15 @@ def test_second_order_hessian_is_the_curvature_of_the_squared_residuals(dimensio
     voxel_map = map_of(points)
     k = 3 if dimension == 2 else 6
     T = lie.exp(np.linspace(0.05, -0.08, k))
-    origin, correspondence = np.zeros(3), np.empty(len(points), np.int32)
-    associate(voxel_map.voxels, points, T, 1, 1.0, correspondence)
-    huge, full = 1e4, np.ones(len(points))  # every weight is one, the cost plain least squares
+    problem, origin = associated(voxel_map, points, T), np.zeros(3)
     H, b = np.empty((k, k)), np.empty(k)
-    normal_equations(voxel_map.voxels, points, T, origin, correspondence, full, huge, True, H, b)
+    normal_equations(problem, T, residuals.WITHOUT_KERNEL_M, 1.0, H, b)  # the cost is plain least squares
     h, moved, gradients = 1e-5, np.empty_like(T), []
     for axis in range(k):
         ends = []
         for sign in (h, -h):
             perturb(sign * np.eye(k)[axis], T.copy(), origin, moved)
-            normal_equations(
-                voxel_map.voxels, points, moved, origin, correspondence, full, huge, False, np.empty((k, k)), b
-            )
+            normal_equations(problem, moved, residuals.WITHOUT_KERNEL_M, 0.0, np.empty((k, k)), b)
             ends.append(b.copy())
         gradients.append((ends[0] - ends[1]) / (2 * h))
     numeric = np.array(gradients)
@@ -343,48 +345,6 @@ def test_deskewing_moves_each_point_along_the_motion(twist, deskew):
     expected = naive.deskew(points, shares, np.array(twist))
     deskew(points, shares, np.array(twist))
     np.testing.assert_allclose(points, expected, atol=1e-12)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_shortest_paths_equal_those_of_scipy(seed):
-    rng = np.random.default_rng(seed)
-    edges = np.concatenate([np.stack([np.arange(39), np.arange(1, 40)], axis=1), rng.integers(0, 45, (20, 2))])
-    lengths = rng.uniform(0.1, 2.0, len(edges))
-    dense = np.full((45, 45), np.inf)
-    for (i, j), length in zip(edges, lengths, strict=True):
-        dense[i, j] = dense[j, i] = min(dense[i, j], length)
-    expected = dijkstra(csgraph_from_dense(dense, null_value=np.inf), directed=False, indices=3, limit=5.0)
-    assert shortest_paths(edges, lengths, 45, 3, 5.0) == pytest.approx(expected)
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_the_nearest_position_is_that_of_a_search_through_all_that_are_chosen(dimension):
-    rng = np.random.default_rng(4)
-    poses = np.tile(np.eye(dimension + 1), (50, 1, 1))
-    poses[:, :-1, -1] = rng.normal(size=(50, dimension))
-    for count in (50, 5, 0):
-        chosen = np.isin(np.arange(50), rng.permutation(50)[:count])
-        distances_m = np.where(chosen, np.linalg.norm(poses[:, :-1, -1] - poses[7, :-1, -1], axis=1), np.inf)
-        nearest, distance_m = nearest_position(poses, poses[7], chosen)
-        assert distance_m == distances_m.min()
-        assert nearest == (np.argmin(distances_m) if count else -1)
-
-
-@pytest.mark.parametrize(
-    ("turned", "chosen", "expected"), [(0.3, 0, 4), (0.6, 0, -1), (0.3, 7, 14), (0.3, 20, -1)]
-)
-def test_the_first_pass_near_a_pose_is_found_where_it_is_nearest(turned, chosen, expected):
-    """Two passes of ten poses, 1 m apart each."""
-    poses = np.array([lie.pose_2d(k % 10, 0.1 * (k // 10), 0.0) for k in range(20)])
-    pose = lie.pose_2d(4.2, 0.0, turned)
-    found, distance_m = on_first_pass(poses, pose, np.arange(20) >= chosen, 2.0, 0.5)
-    away_m = np.linalg.norm(poses[expected, :2, 2] - pose[:2, 2]) if expected >= 0 else np.inf
-    assert (found, distance_m) == (expected, pytest.approx(away_m))
-
-
-def test_an_edge_of_infinite_length_leads_nowhere():
-    edges = np.array([[0, 1], [1, 2]])
-    assert shortest_paths(edges, np.array([1.0, np.inf]), 3, 0, 9.0).tolist() == [0.0, 1.0, np.inf]
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -109,12 +109,11 @@ def test_gradients_of_the_sectors_are_those_of_their_points(d):
     T = lie.exp(np.array([0.02, -0.01, 0.03] if d == 2 else [0.02, -0.01, 0.03, 0.001, 0.002, -0.003]))
     problem = icp.problem_of(voxel_map.voxels, points, T, np.zeros((k, k)), settings)
     icp.align(problem, T, np.zeros(k), settings.first_scale_m)
-    map_side = problem.voxels, problem.points, T, problem.origin
     found, far = problem.gradients, np.linalg.norm(points, axis=1) > problem.range_m
     number = (points[:, 0] > 0.0) + 2 * (points[:, 1] > 0.0) + 4 * far
     for sector in range(8):
         H, b = np.zeros((k, k)), np.zeros(k)
         others = np.where(number == sector, problem.correspondence, -1).astype(np.int32)
-        normal_equations(*map_side, others, problem.weight, settings.scale_m, 0.0, H, b)
+        normal_equations(problem._replace(correspondence=others), T, settings.scale_m, 0.0, H, b)
         np.testing.assert_allclose(found[sector], b, atol=1e-9)
     assert np.abs(found).max(axis=1).all()

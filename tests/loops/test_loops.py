@@ -46,6 +46,23 @@ def test_an_edge_counts_by_its_own_uncertainty_where_odometry_was_lost():
     assert Drift(0.1).between(graph, 3, 5.0) == pytest.approx([1.2, 1.1, 1.0, 0.0])
 
 
+def test_of_edges_between_the_same_two_the_shortest_counts_once():
+    graph = chain(4)
+    for meters in (3.0, 0.5):
+        graph.add_edge(1, 3, lie.pose_2d(meters, 0.0, 0.0), 1e6 * np.eye(3))
+    assert Drift(0.1).between(graph, 0, 5.0) == pytest.approx([0.0, 0.1, 0.2, 0.15])
+
+
+@pytest.mark.parametrize(
+    ("turned", "chosen", "expected"), [(0.3, 0, 4), (0.6, 0, -1), (0.3, 7, 14), (0.3, 20, -1)]
+)
+def test_the_first_pass_near_a_pose_is_found_where_it_is_nearest(turned, chosen, expected):
+    """Two passes of ten poses, 1 m apart each."""
+    poses = [lie.pose_2d(k % 10, 0.1 * (k // 10), 0.0) for k in range(20)]
+    poses = np.array([*poses, lie.pose_2d(4.2, 0.0, turned)])
+    assert closer.on_first_pass(poses, np.arange(20) >= chosen, 2.0) == expected
+
+
 def test_uncertainty_follows_a_graph_that_grows():
     graph, drift = chain(10), Drift(0.1)
     drift.between(graph, 9, 5.0)

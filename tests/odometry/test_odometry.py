@@ -270,7 +270,7 @@ def test_where_scans_see_nothing_along_uncertainty_grows_over_those_without_a_wh
             tracked = Tracked(None, NOTHING, NOTHING, T, match, State.DEGENERATE, "", prior, 0.0, 0.0, 0.0)
             front_end.odometry.place = lambda scan, tracked=tracked: tracked
             front_end.locate(None)
-            told.append(front_end.sum_up())
+            told.append(front_end.information)
         return np.sqrt(np.linalg.inv(np.array(told) + 1e-9 * np.eye(3))[:, 0, 0])
 
     read = np.arange(24) > 0
@@ -290,7 +290,7 @@ def test_a_motion_over_a_scan_that_correspondences_contradict_is_known_as_predic
         tracked = Tracked(None, nothing, nothing, T, match, State.OK, "", prior, 0.0, 0.0, 0.0)
         front_end.odometry.place = lambda scan, tracked=tracked: tracked
         front_end.locate(None)
-        told.append(np.linalg.inv(front_end.sum_up()))
+        told.append(np.linalg.inv(front_end.information))
     sigmas = np.sqrt(np.diagonal(told, axis1=1, axis2=2))
     assert np.all(sigmas[:2] <= 1e-3 * (1.0 + 1e-9))
     assert np.allclose(sigmas[2:], np.hypot(np.abs(off), 0.01), atol=0.02) and sigmas[3, 0] > 0.009

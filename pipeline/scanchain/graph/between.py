@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.graph.solvers.cholesky import BlockPattern, Packing, SparseCholesky, analyze
-from scanchain.kernels.graph import between_se2, between_se3, scatter
+from scanchain.kernels.graph import between, scatter
 
 WASTE = 0.1  # share of edges without weight that is worth a new analysis
 _FEW = 0.03  # the same where H⁻¹ is wanted too, which fill-in slows down more
@@ -150,8 +150,8 @@ class BetweenProblem:
 
     def _errors(self, poses: Matrix, edges: NDArray[np.int64]) -> Matrix:
         errors = np.empty((len(edges), self.freedom))
-        kernel = between_se2 if self.freedom == 3 else between_se3
-        kernel.residuals(_kept(poses), _kept(edges), self.measurements, errors)
+        residuals = between.residuals_2d if self.freedom == 3 else between.residuals_3d
+        residuals(_kept(poses), _kept(edges), self.measurements, errors)
         if len(self.sightings):
             d, Z = poses.shape[-1] - 1, self.measurements[self.sightings]
             T_i, T_j = poses[edges[self.sightings].T]
@@ -163,9 +163,9 @@ class BetweenProblem:
     def _jacobians(self, poses: Matrix, edges: NDArray[np.int64], errors: Matrix) -> Matrix:
         jacobian = np.empty((len(edges), self.freedom, self.freedom))
         if self.freedom == 3:
-            between_se2.jacobians(_kept(poses), _kept(edges), self.measurements, jacobian)
+            between.jacobians_2d(_kept(poses), _kept(edges), self.measurements, jacobian)
         else:
-            between_se3.jacobians(_kept(poses), _kept(edges), errors, jacobian)
+            between.jacobians_3d(_kept(poses), _kept(edges), errors, jacobian)
         if len(self.sightings):
             d = poses.shape[-1] - 1
             T_i, T_j = poses[edges[self.sightings].T]

@@ -14,7 +14,6 @@ from scanchain import lie
 from scanchain.config import Config, LoopsConfig
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Points, Pose, Proposal
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.kernels.graph.nearest import nearest_position, on_first_pass
 from scanchain.loops.connectivity import Drift, Segments
 from scanchain.loops.map_search import MapSearch
 from scanchain.loops.planar_map_search import Relocalizer
@@ -206,17 +205,17 @@ class ProximityCloser:
         odometry in a corridor, keyframes would be closed to each other.
         """
         if old >= _LARGE and self.submaps.dimension == 2:
-            reach_m = self.config.min_radius_m
-            first, distance_m = on_first_pass(T_world[:old], T_world[-1], connected[:old], reach_m, _ALIKE_RAD)
+            first = on_first_pass(T_world, connected[:old], self.config.min_radius_m)
             if first >= 0:
-                return first, distance_m
+                return first, float(_distances_m(T_world, first))
         if old >= _LARGE and self.target >= self.of_map and self.submaps.dimension == 3:
             begin, end = max(self.target - _ALONG, 0), min(self.target + _ALONG + 1, old)
             distances_m = np.where(connected[begin:end], _distances_m(T_world, slice(begin, end)), np.inf)
             along = int(np.argmin(distances_m))
             if distances_m[along] <= self.config.min_radius_m:
                 return begin + along, float(distances_m[along])
-        return nearest_position(T_world[:old], T_world[-1], connected[:old])
+        distances_m = np.where(connected[:old], _distances_m(T_world, slice(old)), np.inf)
+        return (int(np.argmin(distances_m)), float(distances_m.min())) if connected[:old].any() else (-1, np.inf)
 
     def _old(self, keyframes: Sequence[Keyframe]) -> int:
         """Number of the first keyframes that lie far enough back along the path to count as revisited."""
@@ -289,6 +288,20 @@ class PlanarSearch:
         T_source_odom = lie.inverse(keyframes[-1].T_odom_lidar)
         members = keyframes[-count:]
         return np.vstack([lie.transform(T_source_odom @ member.T_odom_lidar, member.points) for member in members])
+
+
+def on_first_pass(T_world: Matrix, chosen: NDArray[np.bool_], reach_m: float) -> int:
+    """Where the first pass by the newest keyframe (K, 3, 3) was nearest, of those chosen (n,); −1 if none was.
+
+    A pass is of keyframes one after the other within reach and of about the same heading.
+    """
+    distances_m = _distances_m(T_world, slice(len(chosen)))
+    cosines = (T_world[: len(chosen), :2, 0] * T_world[-1, :2, 0]).sum(axis=1)
+    near = np.flatnonzero(chosen & (distances_m <= reach_m) & (cosines >= np.cos(_ALIKE_RAD)))
+    if not len(near):
+        return -1
+    goes_on = (np.diff(near) == 1) & (np.diff(distances_m[near]) <= 0.0)
+    return int(near[np.argmin(np.append(goes_on, False))])
 
 
 def _distances_m(T_world: Matrix, keyframes: NDArray[np.int64] | slice | int) -> NDArray[np.float64]:

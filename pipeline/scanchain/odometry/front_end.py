@@ -2,31 +2,17 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import msgspec
 import numpy as np
 
 from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import LEAST_FIT, KeyframeErrors, Matrix, Points, Pose, Scan, State
-from scanchain.odometry.keyframe_errors import KeyframeErrorTracker
 from scanchain.odometry.odometry import Odometry
 from scanchain.odometry.tracked import Tracked
 from scanchain.preprocess import Prepared
 
-_MOST_MOTIONS = 64  # largest number of scans whose motions are gathered before they are summed up
-
-
-class Motion(NamedTuple):
-    """The pose of a scan and what is known of its motion: prior and match; ``doubt`` (k, k), None in the plane."""
-
-    T_odom_lidar: Pose
-    covariance: Matrix
-    is_measured: bool
-    information: Matrix
-    is_lost: bool
-    doubt: Matrix | None
+_LATEST = 0.1  # weight of the last scan in the mean of the systematic errors
 
 
 class Located(msgspec.Struct, frozen=True):
@@ -57,17 +43,16 @@ class FrontEnd:
         self.odometry = Odometry(config, T_base_lidar)
         self.T_odom_keyframe = lie.identity(self.odometry.dimension)
         self.T_odom_last = lie.identity(self.odometry.dimension)
-        self.at_keyframe = np.zeros((lie.twist_size(T_base_lidar),) * 2)
-        self.covariance: Matrix | None = self.at_keyframe  # of the motion since the keyframe, None where unknown
-        self.doubt = self.at_keyframe  # of the motion, by scans that their correspondences contradict
-        self.error_tracker = KeyframeErrorTracker(len(self.at_keyframe))
-        self.errors = KeyframeErrors(1.0, self.at_keyframe, 0.0)  # of the last keyframe
+        self.nothing = np.zeros((lie.twist_size(T_base_lidar),) * 2)
+        self.covariance: Matrix | None = self.nothing  # of the motion since the keyframe, None where unknown
+        self.doubt = self.nothing  # of the motion, by scans that their correspondences contradict
+        self.error_tracker = KeyframeErrorTracker(len(self.nothing))
+        self.errors = KeyframeErrors(1.0, self.nothing, 0.0)  # of the last keyframe
         self.has_wheels = False
         self.since_keyframe = 0
         self.scans = 0
         self.no_points = np.empty((0, self.odometry.dimension))
-        self.motions: list[Motion] = []  # of the last scans, not summed up yet
-        self.since = self.at_keyframe  # information of the motion since the keyframe, but for those
+        self.information = self.nothing  # of the motion since the keyframe
 
     def locate(self, scan: Scan | Prepared) -> Located:
         """Place one scan by odometry; it becomes a keyframe where it moved far enough from the last one."""
@@ -75,69 +60,53 @@ class FrontEnd:
         is_keyframe = not self.scans or tracked.elsewhere_m > 0.0 or self._moved_enough(tracked)
         self.scans += 1
         if not tracked.is_repeated:
-            self._take(tracked)
+            self.information = self._since(tracked)
             self.error_tracker.take(tracked)
-        information = self.sum_up() if is_keyframe else self.at_keyframe
         if is_keyframe:
             self.errors = self.error_tracker.at_keyframe(tracked, self.T_odom_keyframe)
             self.T_odom_keyframe = tracked.T_odom_lidar
-            self.covariance, self.since_keyframe = self.at_keyframe, 0
-            self.doubt = self.at_keyframe
+            self.covariance, self.since_keyframe = self.nothing, 0
+            self.doubt = self.nothing
         local_map = self.odometry.local_map
         return Located(
             tracked=tracked,
             is_keyframe=is_keyframe,
             scale=self.odometry.resolution.octave,
             local_map=local_map.points() if is_keyframe else self.no_points,
-            information=information,
+            information=self.information if is_keyframe else self.nothing,
             errors=self.errors,
             first_points=self.odometry.first_points,
         )
 
-    def sum_up(self) -> Matrix:
-        """Sum up the motions gathered; information (k, k) of that of the last scan since the last keyframe."""
-        for motion in self.motions:
-            self.since = self._since(motion)
-        self.motions = []
-        return self.since
-
-    def _take(self, tracked: Tracked) -> None:
-        """Gather a motion: the sum is for keyframes alone, and quicker at once than one scan at a time."""
-        is_lost, prior, information = tracked.state is State.LOST, tracked.prior, tracked.match.information
-        doubt = _doubt_of(tracked) if self.odometry.dimension == 3 else None
-        self.motions.append(
-            Motion(tracked.T_odom_lidar, prior.covariance, prior.is_measured, information, is_lost, doubt)
-        )
-        if len(self.motions) >= _MOST_MOTIONS:
-            self.sum_up()
-
-    def _since(self, motion: Motion) -> Matrix:
-        """Information of a motion since the last keyframe: of the match, and of all predictions since.
+    def _since(self, tracked: Tracked) -> Matrix:
+        """Information (k, k) of the motion since the last keyframe: of the match, and of all predictions since.
 
         The wheels' errors go on from scan to scan, so that their standard deviations add up, not the variances; so
         do those of scans between that have no reading. Without wheels the match is all there is.
         """
+        prior, of_match = tracked.prior, tracked.match.information
         self.since_keyframe += 1
-        self.has_wheels |= motion.is_measured
+        self.has_wheels |= prior.is_measured
         if not self.has_wheels:
             self.covariance = None
-        T_last, self.T_odom_last = self.T_odom_last, motion.T_odom_lidar
-        if self.covariance is None and motion.doubt is None:
-            return motion.information
+        T_last, self.T_odom_last = self.T_odom_last, tracked.T_odom_lidar
+        is_planar = self.odometry.dimension == 2
+        if self.covariance is None and is_planar:
+            return of_match
         n = self.since_keyframe
-        Ad = lie.adjoint(lie.inverse(lie.between(T_last, motion.T_odom_lidar)))
-        if motion.doubt is not None:
-            self.doubt = Ad @ self.doubt @ Ad.T + motion.doubt
+        Ad = lie.adjoint(lie.inverse(lie.between(T_last, tracked.T_odom_lidar)))
+        if not is_planar:
+            self.doubt = Ad @ self.doubt @ Ad.T + _doubt_of(tracked)
         if self.covariance is None:
-            return self._doubted(motion.information)
-        predicted = n * motion.covariance
+            return self._doubted(of_match)
+        predicted = n * prior.covariance
         if n > 1:
             predicted = predicted + (n / (n - 1) * Ad).dot(self.covariance).dot(Ad.T)
         information = np.asarray(np.linalg.inv(predicted), np.float64)
-        if not motion.is_lost:
-            information += motion.information
+        if tracked.state is not State.LOST:
+            information += of_match
         self.covariance = np.asarray(np.linalg.inv(information), np.float64)
-        return information if motion.doubt is None else self._doubted(information)
+        return information if is_planar else self._doubted(information)
 
     def _doubted(self, information: Matrix) -> Matrix:
         """Information with the doubt added to the covariance."""
@@ -165,3 +134,38 @@ def _doubt_of(tracked: Tracked) -> Matrix:
         return np.zeros_like(prior.covariance)
     innovation = lie.log(lie.between(prior.T_target_source, match.T_target_source))
     return prior.covariance + np.outer(innovation, innovation)
+
+
+class KeyframeErrorTracker:
+    """Mean systematic error of the scans, and what the map was renewed by since the last keyframe."""
+
+    def __init__(self, freedom: int) -> None:
+        self.systematic = np.zeros((freedom, freedom))
+        self.scans = 0  # that the mean is of
+        self.is_open = False  # since the last keyframe: poses that no correspondences determined
+
+    def take(self, tracked: Tracked) -> None:
+        """Take a scan. Of those whose pose is open or contradicted the sectors say nothing."""
+        match = tracked.match
+        if match.observability < 1.0 or tracked.state is State.LOST:
+            self.is_open = True
+        elif match.fit >= LEAST_FIT and match.systematic.size:
+            self.scans += 1
+            self.systematic = self.systematic + max(_LATEST, 1.0 / self.scans) * (
+                match.systematic - self.systematic
+            )
+
+    def at_keyframe(self, tracked: Tracked, T_odom_keyframe: Pose) -> KeyframeErrors:
+        """Errors at a new keyframe after that of another pose.
+
+        A map as wide as the scans is renewed by the distance over their root mean square range, and, where they do
+        not look around, by turning.
+        """
+        distance_m, angle_rad = lie.apart(T_odom_keyframe, tracked.T_odom_lidar)
+        points = tracked.matched
+        range_m = float(np.sqrt(np.einsum("ij,ij->", points, points) / max(len(points), 1)))
+        renewal = distance_m / max(range_m, 1e-6) + angle_rad / np.pi
+        renewal = 1.0 if self.is_open else min(renewal, 1.0)
+        self.is_open = False
+        factor = 1.0 if tracked.state is State.LOST else tracked.match.variance_factor
+        return KeyframeErrors(factor, self.systematic, renewal)

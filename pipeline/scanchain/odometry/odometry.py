@@ -17,7 +17,6 @@ from scanchain.errors import InputError, shown
 from scanchain.kernels.geometry.validity import largest_magnitude
 from scanchain.odometry.elevation import ElevationCalibration
 from scanchain.odometry.intervals import LiveStamps
-from scanchain.odometry.map_keeper import MapKeeper
 from scanchain.odometry.prediction import Prediction, Predictor
 from scanchain.odometry.recovery import CLEARLY, Recovery, is_sound
 from scanchain.odometry.standstill import Standstill
@@ -33,7 +32,7 @@ from scanchain.odometry.tracked import (
     spread,
 )
 from scanchain.preprocess import Prepared, Resolution, Sweep, prepare
-from scanchain.registration import VoxelMap, create_matcher
+from scanchain.registration import MapKeeper, VoxelMap, create_matcher
 from scanchain.settings import check_dimension, check_order, load_settings
 
 _SAMPLE = 1000  # number of points of two scans, evenly spread, which are compared
@@ -193,7 +192,7 @@ class Odometry:
             self._check_range(scan, sparse)
         points = sparse.from_middle(prediction.velocity)
         if not len(points):
-            match = nothing_to_match(prediction, self.config.preprocess)
+            match = nothing_to_match(prediction, self.config)
             return _Registered(points, match, State.LOST, prediction)
         if is_first:
             match = first_match(prediction.T_odom_last, points, self.config.matching)

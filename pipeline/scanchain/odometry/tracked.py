@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.config import MatchingConfig, PreprocessConfig
+from scanchain.config import Config, MatchingConfig
 from scanchain.data import Match, Points, Pose, Prior, Scan, State, brief
 from scanchain.odometry.prediction import Prediction
 from scanchain.registration import as_ambiguous, with_source_frame
@@ -77,26 +77,19 @@ def first_match(T_odom_lidar: Pose, points: Points, config: MatchingConfig) -> M
     )
 
 
-def nothing_to_match(prediction: Prediction, config: PreprocessConfig) -> Match:
+def nothing_to_match(prediction: Prediction, config: Config) -> Match:
     """Match of a scan without a point left: the prediction."""
-    return Match(
-        T_target_source=prediction.T_odom_lidar,
+    limits = config.preprocess
+    return replace(
+        first_match(prediction.T_odom_lidar, np.empty((0, 0)), config.matching),
         information=prediction.prior.information,
-        cost=0.0,
-        inliers=0,
-        points=0,
-        iterations=0,
-        residual_m=0.0,
         fit=0.0,
         at_minimum=False,
         converged=False,
-        reason=(
-            f"no point lies between preprocess.min_range_m ({config.min_range_m:g}) and "
-            f"preprocess.max_range_m ({config.max_range_m:g})"
-        ),
+        reason=f"no point lies between preprocess.min_range_m ({limits.min_range_m:g}) and "
+        f"preprocess.max_range_m ({limits.max_range_m:g})",
         degeneracy_eigenvalue=0.0,
         observability=0.0,
-        degeneracy_direction=np.eye(len(prediction.prior.information))[0],
     )
 
 

@@ -15,4 +15,5 @@ from scanchain.registration.search import thinned as thinned
 from scanchain.registration.svd_icp import DegeneratePairsError as DegeneratePairsError
 from scanchain.registration.svd_icp import SvdMatcher as SvdMatcher
 from scanchain.registration.svd_icp import rigid_transform as rigid_transform
+from scanchain.registration.voxel_map import MapKeeper as MapKeeper
 from scanchain.registration.voxel_map import VoxelMap as VoxelMap

@@ -15,9 +15,8 @@ from scanchain.data import Match, Matrix, Pose, Scan, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import pair
 from scanchain.logs import Log, open_log
-from scanchain.odometry.map_keeper import MapKeeper
 from scanchain.preprocess import Resolution
-from scanchain.registration import create_matcher
+from scanchain.registration import MapKeeper, create_matcher
 from scanchain.runs.vouching import evidence_of_trajectory
 from scanchain.settings import Override, load_settings
 from scanchain.source import Source

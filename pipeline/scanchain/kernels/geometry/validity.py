@@ -5,7 +5,6 @@ import math
 import numpy as np
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.voxels.voxel_shapes import move
 
 _BLOCK = 512  # entries that are compared at once with the largest before
 
@@ -25,16 +24,6 @@ def largest_magnitude(array) -> float:
                 if not math.isfinite(value):
                     return np.inf
                 largest = float(value)
-    return largest
-
-
-@njit(nogil=True)
-def largest_moved(points, T) -> float:
-    """Largest |coordinate| of finite points (N, d) moved by the pose T (d+1, d+1); 0 without points."""
-    largest = 0.0
-    for i in range(points.shape[0]):
-        x, y, z = move(T, points, i)
-        largest = max(largest, abs(x), abs(y), abs(z))
     return largest
 
 

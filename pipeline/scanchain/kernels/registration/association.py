@@ -1,10 +1,26 @@
-"""Correspondences: the nearest voxel mean of every point, and the weighted pairs of the closed form."""
+"""Correspondences: the nearest voxel mean of every point, their weights, and the pairs of the closed form."""
 
 import numpy as np
 
 from scanchain.kernels.compiling import njit
 from scanchain.kernels.voxels.hashing import find_row, pack
-from scanchain.kernels.voxels.voxel_shapes import move
+from scanchain.kernels.voxels.voxel_shapes import (
+    ACROSS,
+    DIRECTION,
+    LINE,
+    MEAN_TERM,
+    PLANE,
+    SHAPE,
+    SLOPE_ACROSS,
+    SLOPE_ALONG,
+    THICKNESS,
+    move,
+)
+
+_GRAZING_SINE = 0.05  # of the angle between ray and plane at which the weight is halved
+_RING_WIDTHS = 2.0  # widths of a plane that a ray may spend within its thickness before the weight is halved
+_NOISE_WIDTHS = 3.0  # times σ, the width of a plane at which half of its normal is noise
+_UPRIGHT_COSINE = 0.5  # between a line and the lidar's vertical, at which the weight is halved
 
 
 @njit(nogil=True)
@@ -52,6 +68,47 @@ def associate(voxels, points, T, reach: int, max_distance_m: float, corresponden
 
 
 @njit(nogil=True)
+def weigh(voxels, points, T, correspondence, variance: float, weight):
+    """Weights (N,) of all correspondences at the pose T: σ²/(variance of the residual) ≤ 1, 0 without one.
+
+    On a plane of thickness τ, fitted to n points with eigenvalues λ along and λ' across it, the residual at
+    (a, c) from the mean has the variance max(τ², σ²)·(1 + 1/n + a²/(nλ) + c²/(nλ'))    (after Yuan et al. 2022).
+    The points of one ring lie in a plane of their own, seen edge-on, that moves along with the lidar. A plane
+    therefore has little weight where the ray grazes it, where the ray would stay within τ for longer than √λ',
+    and where √λ' is no more than noise. In 2D every correspondence with a line has the weight 1.
+    A line has the weight of its thickness where it is upright, so that several rings measured it: poles, trunks.
+    Other lines are rings, mostly; like voxels without a shape, their mean represents a surface to within s/2 of a
+    voxel of size s.
+
+    points : (N, d) meters, source frame; correspondence : (N,) rows of the map's voxels, −1 for none
+    T : (d+1, d+1); the lidar's z axis is that of its rings
+    variance : σ² of the sensor, m²
+    """
+    planar = points.shape[1] == 2
+    without_shape = variance / (variance + 0.25 * voxels.size_m * voxels.size_m)
+    for i in range(points.shape[0]):
+        if correspondence[i] < 0:
+            weight[i] = 0.0
+            continue
+        cell = voxels.cells[correspondence[i]]
+        if planar:
+            weight[i] = 1.0 if cell[SHAPE] == PLANE else without_shape
+            continue
+        x, y, z = move(T, points, i)
+        ex, ey, ez = x - cell[0], y - cell[1], z - cell[2]
+        x, y, z = x - T[0, 3], y - T[1, 3], z - T[2, 3]
+        if cell[SHAPE] == PLANE:
+            surface = _surface_weight(cell, x, y, z, variance) / (1.0 + _plane_variance(cell, ex, ey, ez))
+            weight[i] = surface * variance / max(cell[THICKNESS], variance)
+        elif cell[SHAPE] == LINE:
+            weight[i] = max(
+                _upright_weight(cell, T, x, y, z) * variance / max(cell[THICKNESS], variance), without_shape
+            )
+        else:
+            weight[i] = without_shape
+
+
+@njit(nogil=True)
 def weighted_pairs(voxels, points, T, correspondence, scale_m: float, source, target, weight):
     """Number of pairs; the moved point, voxel mean and Geman–McClure weight (s²/(s²+r²))² of each, one row a pair.
 
@@ -74,3 +131,33 @@ def weighted_pairs(voxels, points, T, correspondence, scale_m: float, source, ta
         weight[pairs] = ratio * ratio
         pairs += 1
     return pairs
+
+
+@njit(inline="always")
+def _plane_variance(cell, ex, ey, ez) -> float:
+    """Variance of the fitted plane at (ex, ey, ez) from the mean, over that of a point on it."""
+    out = cell[DIRECTION] * ex + cell[DIRECTION + 1] * ey + cell[DIRECTION + 2] * ez
+    across = cell[ACROSS] * ex + cell[ACROSS + 1] * ey + cell[ACROSS + 2] * ez
+    along2 = max(ex * ex + ey * ey + ez * ez - out * out - across * across, 0.0)
+    return cell[MEAN_TERM] + cell[SLOPE_ACROSS] * across * across + cell[SLOPE_ALONG] * along2
+
+
+@njit(inline="always")
+def _surface_weight(cell, x, y, z, variance: float) -> float:
+    """Weight of a plane that the ray (x, y, z) hits, as a surface rather than the points of one ring, 0 to 1."""
+    out = cell[DIRECTION] * x + cell[DIRECTION + 1] * y + cell[DIRECTION + 2] * z
+    sine2 = out * out / max(x * x + y * y + z * z, 1e-300)
+    width2 = cell[MEAN_TERM] / cell[SLOPE_ACROSS]
+    edge = _GRAZING_SINE * _GRAZING_SINE + _RING_WIDTHS * _RING_WIDTHS * cell[THICKNESS] / width2
+    return sine2 / (sine2 + edge) * width2 / (width2 + _NOISE_WIDTHS * _NOISE_WIDTHS * variance)
+
+
+@njit(inline="always")
+def _upright_weight(cell, T, x, y, z) -> float:
+    """Weight of a line by how far it runs across the rings, along the growing elevation of the ray, 0 to 1."""
+    zx, zy, zz = T[0, 2], T[1, 2], T[2, 2]
+    height = (x * zx + y * zy + z * zz) / max(x * x + y * y + z * z, 1e-300)
+    ux, uy, uz = zx - height * x, zy - height * y, zz - height * z
+    cosine = cell[DIRECTION] * ux + cell[DIRECTION + 1] * uy + cell[DIRECTION + 2] * uz
+    cosine2 = cosine * cosine / max(ux * ux + uy * uy + uz * uz, 1e-300)
+    return cosine2 / (cosine2 + _UPRIGHT_COSINE * _UPRIGHT_COSINE)

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.geometry.twist import orthonormalize, perturb
-from scanchain.kernels.registration.association import associate
+from scanchain.kernels.geometry.se import orthonormalize, perturb
+from scanchain.kernels.registration.association import associate, weigh
 from scanchain.kernels.registration.optimizers import (
     LEVENBERG_MARQUARDT,
     NEWTON,
@@ -15,9 +15,14 @@ from scanchain.kernels.registration.optimizers import (
     relax,
     step,
 )
-from scanchain.kernels.registration.residuals import information, normal_equations, robust_sums
-from scanchain.kernels.registration.weights import weigh
-from scanchain.kernels.voxels.voxel_shapes import POINT, SHAPE, Voxels
+from scanchain.kernels.registration.residuals import (
+    WITHOUT_KERNEL_M,
+    Problem,
+    gradients_by_group,
+    normal_equations,
+    robust_sums,
+)
+from scanchain.kernels.voxels.voxel_shapes import POINT, SHAPE
 
 CONVERGED, OUT_OF_ITERATIONS, NO_CORRESPONDENCES, SINGULAR = 0, 1, 2, 3
 
@@ -25,59 +30,8 @@ SHRINK = 0.6  # ratio of the kernel's scale from one iteration to the next
 SLACK = 0.02  # voxels that points may move before they are associated again
 PATIENCE = 20  # steps at the last scale, after which correspondences are fixed
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e8
-_SECTORS = 8  # of a scan, in ``information``
+_SECTORS = 8  # of a scan, in ``shape_information``
 _COST, _WEIGHT, _SQUARES, _DAMPING = 0, 1, 2, 3  # entries of ``Iterate.sums``
-
-
-class Settings(NamedTuple):
-    """Settings of a registration.
-
-    reach, max_distance_m : of the search for correspondences while the pose moves
-    last_reach, last_distance_m : of the correspondences that the result is judged by
-    first_scale_m, widest_scale_m, scale_m : of the robust kernel, at first where the prediction is certain, at
-        most where it is not, and at last
-    variance : of a range, σ² in m²
-    min_information, min_signal : eigenvalue of the information per weight, and its signal-to-noise ratio, below
-        which a direction is degenerate
-    insertions : into the map so far
-    tolerance_m, tolerance_rad : of a step at a minimum
-    """
-
-    optimizer: int
-    max_iterations: int
-    reach: int
-    max_distance_m: float
-    last_reach: int
-    last_distance_m: float
-    first_scale_m: float
-    widest_scale_m: float
-    scale_m: float
-    variance: float
-    min_information: float
-    min_signal: float
-    insertions: int
-    tolerance_m: float
-    tolerance_rad: float
-
-
-class Problem(NamedTuple):
-    """Points (N, d) to be aligned to a map.
-
-    origin : (3,), map frame, that twists rotate about
-    prior : (k, k) information of the predicted pose times the variance of a residual, along the map's axes
-    correspondence, weight : (N,) of the last association; gradients (8, k) of sectors of the points at a ``Fit``
-    range_m : root mean square of the points' ranges
-    """
-
-    voxels: Voxels
-    points: NDArray[np.float64]
-    origin: NDArray[np.float64]
-    prior: NDArray[np.float64]
-    correspondence: NDArray[np.int32]
-    weight: NDArray[np.float64]
-    gradients: NDArray[np.float64]
-    range_m: float
-    settings: Settings
 
 
 class Iterate(NamedTuple):
@@ -176,9 +130,7 @@ def fit_at(problem, T, fit):
     """``Fit`` at the pose T itself, by correspondences within the last distance; cost and ending of ``fit``."""
     settings = problem.settings
     pairs = correspond(problem, T, settings.last_reach, settings.last_distance_m)
-    _, total_weight, squares = robust_sums(
-        problem.voxels, problem.points, T, problem.correspondence, problem.weight, settings.scale_m
-    )
+    _, total_weight, squares = robust_sums(problem, T, settings.scale_m)
     H, unweighted = shape_information(problem, T)
     return Fit(H, unweighted, fit.cost, total_weight, squares, pairs, fit.iterations, fit.ending)
 
@@ -198,27 +150,23 @@ def correspond(problem, T, reach: int, max_distance_m: float):
 def shape_information(problem, T):
     """Information (k, k) of planes and lines at the pose T, with and without robust weights.
 
-    Correspondences with a voxel that has no shape lose their weight.
+    Correspondences with a voxel that has no shape lose their weight. Filled as well are the gradients of sectors,
+    ahead or behind, left or right, nearer or farther than the problem's range: calibration, motion within the
+    scan and surfaces that repeat shift the points of a sector together.
     """
-    k = 3 if problem.points.shape[1] == 2 else 6
-    for i in range(problem.correspondence.shape[0]):
-        voxel = problem.correspondence[i]
+    k, points, sector = problem.prior.shape[0], problem.points, np.empty(problem.points.shape[0], np.int32)
+    for i in range(points.shape[0]):
+        voxel, squared = problem.correspondence[i], 0.0
         if voxel >= 0 and problem.voxels.cells[voxel, SHAPE] == POINT:
             problem.weight[i] = 0.0
-    H, unweighted = np.empty((k, k)), np.empty((k, k))
-    information(
-        problem.voxels,
-        problem.points,
-        T,
-        problem.origin,
-        problem.correspondence,
-        problem.weight,
-        problem.settings.scale_m,
-        problem.range_m,
-        H,
-        unweighted,
-        problem.gradients,
-    )
+        for axis in range(points.shape[1]):
+            squared += points[i, axis] * points[i, axis]
+        sector[i] = (points[i, 0] > 0.0) + 2 * (points[i, 1] > 0.0) + 4 * (squared > problem.range_m**2)
+    H, unweighted, b = np.empty((k, k)), np.empty((k, k)), np.empty(k)
+    normal_equations(problem, T, problem.settings.scale_m, 0.0, H, b)
+    normal_equations(problem, T, WITHOUT_KERNEL_M, 0.0, unweighted, b)
+    problem.gradients.fill(0.0)
+    gradients_by_group(problem, T, problem.settings.scale_m, sector, problem.gradients)
     return H, unweighted
 
 
@@ -288,19 +236,8 @@ def _descend(problem, scale_m: float, slack_m: float, now, trial, x, factor) -> 
 @njit(nogil=True)
 def _linearize(problem, scale_m: float, iterate):
     """Fill the iterate's normal equations and sums at its pose, the prior included."""
-    settings = problem.settings
-    cost, total_weight, squares = normal_equations(
-        problem.voxels,
-        problem.points,
-        iterate.T,
-        problem.origin,
-        problem.correspondence,
-        problem.weight,
-        scale_m,
-        1.0 if settings.optimizer == NEWTON else 0.0,
-        iterate.H,
-        iterate.b,
-    )
+    curvature = 1.0 if problem.settings.optimizer == NEWTON else 0.0
+    cost, total_weight, squares = normal_equations(problem, iterate.T, scale_m, curvature, iterate.H, iterate.b)
     for i in range(iterate.b.shape[0]):
         gradient = 0.0
         for j in range(iterate.b.shape[0]):
@@ -314,9 +251,7 @@ def _linearize(problem, scale_m: float, iterate):
 @njit(nogil=True)
 def _evaluate(problem, scale_m: float, iterate):
     """Fill the iterate's sums at its pose, and leave its normal equations as they are."""
-    cost, total_weight, squares = robust_sums(
-        problem.voxels, problem.points, iterate.T, problem.correspondence, problem.weight, scale_m
-    )
+    cost, total_weight, squares = robust_sums(problem, iterate.T, scale_m)
     cost += _prior_cost(problem.prior, iterate.offset)
     iterate.sums[_COST], iterate.sums[_WEIGHT], iterate.sums[_SQUARES] = cost, total_weight, squares
 
@@ -324,15 +259,11 @@ def _evaluate(problem, scale_m: float, iterate):
 @njit(nogil=True)
 def _accept(now, trial):
     """Copy the trial to the present iterate."""
-    for i in range(now.T.shape[0]):
-        for j in range(now.T.shape[0]):
-            now.T[i, j] = trial.T[i, j]
-    for i in range(now.b.shape[0]):
-        now.offset[i], now.b[i] = trial.offset[i], trial.b[i]
-        for j in range(now.b.shape[0]):
-            now.H[i, j] = trial.H[i, j]
-    for i in range(now.sums.shape[0]):
-        now.sums[i] = trial.sums[i]
+    now.T[:] = trial.T
+    now.offset[:] = trial.offset
+    now.H[:] = trial.H
+    now.b[:] = trial.b
+    now.sums[:] = trial.sums
 
 
 @njit(nogil=True)

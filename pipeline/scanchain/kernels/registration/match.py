@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.geometry.pose_log import twist_3d
-from scanchain.kernels.geometry.poses import adjoint, between, centered, inverse, twist_2d
+from scanchain.kernels.geometry.se import adjoint, between, centered, inverse, twist_2d, twist_3d
 from scanchain.kernels.registration.icp import (
     NO_CORRESPONDENCES,
     align,
@@ -166,15 +165,7 @@ def _spread(problem, T, fit):
     """
     if fit.H.shape[0] == 3:
         return np.zeros((0, 0))
-    spread = gradient_spread(
-        problem.voxels,
-        problem.points,
-        T,
-        problem.origin,
-        problem.correspondence,
-        problem.weight,
-        problem.settings.scale_m,
-    )
+    spread = gradient_spread(problem, T, problem.settings.scale_m)
     variance = _variance(problem, fit)
     for i in range(6):
         for j in range(6):

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from scanchain.kernels.compiling import njit
 from scanchain.kernels.geometry.eigen import eigensystem
-from scanchain.kernels.geometry.poses import adjoint, centered
+from scanchain.kernels.geometry.se import adjoint, centered
 from scanchain.kernels.registration.optimizers import factorize, substitute
 from scanchain.kernels.voxels.hashing import unpack
 from scanchain.kernels.voxels.voxel_shapes import (

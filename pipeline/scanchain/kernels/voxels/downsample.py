@@ -5,8 +5,7 @@ import math
 import numpy as np
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.geometry.twist import perturb
-from scanchain.kernels.geometry.validity import largest_magnitude
+from scanchain.kernels.geometry.se import perturb
 from scanchain.kernels.voxels.hashing import EMPTY, find, first_slot, pack
 
 _MOST_STEPS = 100.0  # of 1 rad in a sweep; no lidar turns faster
@@ -116,7 +115,8 @@ def deskew_in_space(points, shares, twist):
     """
     flat, x, y, z = points.reshape(-1), twist[3], twist[4], twist[5]
     square = x * x + y * y + z * z
-    steps = int(np.ceil(min(max(np.sqrt(square) * largest_magnitude(shares), 1.0), _MOST_STEPS)))
+    longest = np.abs(shares).max() if shares.size else 0.0
+    steps = int(np.ceil(min(max(np.sqrt(square) * longest, 1.0), _MOST_STEPS)))
     ru, rv, rw = twist[0], twist[1], twist[2]
     for _ in range(steps):
         for i in range(shares.shape[0]):
