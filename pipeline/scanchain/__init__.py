@@ -29,8 +29,8 @@ if TYPE_CHECKING:  # "as" says that the name is public here
     from scanchain.errors import InputError as InputError
     from scanchain.errors import ScanchainError as ScanchainError
     from scanchain.evaluation.metrics import evaluate as evaluate
-    from scanchain.graph.files.g2o import read_g2o as read_g2o
-    from scanchain.graph.files.g2o_write import write_g2o as write_g2o
+    from scanchain.graph.g2o import read_g2o as read_g2o
+    from scanchain.graph.g2o import write_g2o as write_g2o
     from scanchain.graph.pose_graph import PoseGraph as PoseGraph
     from scanchain.logs import open_log as open_log
     from scanchain.odometry import Odometry as Odometry
@@ -52,8 +52,7 @@ _MODULES = {
     "data": "Match Scan State Step Trajectory",
     "errors": "InputError ScanchainError",
     "evaluation.metrics": "evaluate",
-    "graph.files.g2o": "read_g2o",
-    "graph.files.g2o_write": "write_g2o",
+    "graph.g2o": "read_g2o write_g2o",
     "graph.pose_graph": "PoseGraph",
     "logs": "open_log",
     "odometry": "Odometry",

@@ -28,12 +28,12 @@ MATCHERS = {
 }
 Matcher = Annotated[str, Meta(extra={"choices": tuple(MATCHERS)})]  # or a user's own, MODULE:CLASS
 LOSSES = {  # of loop edges
-    "none": "scanchain.graph.robust.losses:Quadratic",
-    "huber": "scanchain.graph.robust.losses:Huber",
-    "cauchy": "scanchain.graph.robust.losses:Cauchy",
-    "geman-mcclure": "scanchain.graph.robust.losses:GemanMcClure",
-    "tukey": "scanchain.graph.robust.losses:Tukey",
-    "truncated": "scanchain.graph.robust.losses:Truncated",
+    "none": "scanchain.graph.graduation.losses:Quadratic",
+    "huber": "scanchain.graph.graduation.losses:Huber",
+    "cauchy": "scanchain.graph.graduation.losses:Cauchy",
+    "geman-mcclure": "scanchain.graph.graduation.losses:GemanMcClure",
+    "tukey": "scanchain.graph.graduation.losses:Tukey",
+    "truncated": "scanchain.graph.graduation.losses:Truncated",
 }
 Loss = Annotated[str, Meta(extra={"choices": tuple(LOSSES)})]  # likewise
 Optimizer = Literal["levenberg-marquardt", "gauss-newton", "newton", "gradient-descent"]

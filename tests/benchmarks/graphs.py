@@ -17,8 +17,7 @@ import numpy as np
 from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.graph.between import BetweenProblem
-from scanchain.graph.files.g2o import read_g2o
-from scanchain.graph.files.g2o_write import write_g2o
+from scanchain.graph.g2o import read_g2o, write_g2o
 
 ROOT = Path(__file__).resolve().parents[2]
 SHORT = (("LM", "levenberg-marquardt"), ("GN", "gauss-newton"))

@@ -14,7 +14,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from scanchain.graph.robust.losses import RobustLoss
+from scanchain.graph.losses import RobustLoss
 from scanchain.landmarks.estimate import from_odometry, minimize
 from scanchain.landmarks.files import read_mrclam
 from scanchain.landmarks.problem import BearingRangeProblem, Values, no_calibration

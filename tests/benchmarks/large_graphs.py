@@ -17,8 +17,7 @@ from scipy.spatial import cKDTree
 
 from scanchain import lie
 from scanchain.config import GraphConfig
-from scanchain.graph.files.g2o import read_g2o
-from scanchain.graph.files.g2o_write import write_g2o
+from scanchain.graph.g2o import read_g2o, write_g2o
 from scanchain.graph.pose_graph import PoseGraph
 from tests.benchmarks.graphs import certify, compare, report
 

@@ -17,7 +17,7 @@ from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.data import Trajectory
 from scanchain.evaluation import Alignment, absolute_error, pair
-from scanchain.graph.files.g2o import read_g2o
+from scanchain.graph.g2o import read_g2o
 
 ROOT = Path(__file__).resolve().parents[2]
 KINDS = {"anywhere": 1, "nearby": 1, "groups": 5, "groups of 10": 10}  # how many agree with each other

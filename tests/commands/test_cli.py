@@ -20,7 +20,7 @@ from scanchain import lie
 from scanchain.__main__ import scanchain
 from scanchain.data import Trajectory
 from scanchain.evaluation.metrics import evaluate as scanchain_evaluate
-from scanchain.graph.files.g2o import read_g2o
+from scanchain.graph.g2o import read_g2o
 from scanchain.logs.writing.writer import LogWriter
 from scanchain.settings import flatten
 from scanchain.simulation import simulate

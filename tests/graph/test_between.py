@@ -3,7 +3,7 @@ import pytest
 
 from scanchain import lie
 from scanchain.graph.between import BetweenProblem
-from scanchain.graph.robust.losses import RobustLoss, robust_loss
+from scanchain.graph.losses import RobustLoss, robust_loss
 from scanchain.kernels.graph import between
 from tests.support import naive_graph
 

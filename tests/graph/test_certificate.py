@@ -7,9 +7,9 @@ from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.certificate import Minorants, minorize
-from scanchain.graph.files.g2o import read_g2o
+from scanchain.graph.cholesky import BlockPattern
+from scanchain.graph.g2o import read_g2o
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.graph.solvers.cholesky import BlockPattern
 from scanchain.kernels.graph.dual import scatter_dual
 from tests.support import naive_graph
 from tests.support.scenes import shared_data

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scanchain.graph.solvers.cholesky import BlockPattern, SingularMatrixError, SparseCholesky, analyze
+from scanchain.graph.cholesky import BlockPattern, SingularMatrixError, SparseCholesky, analyze
 from tests.support import naive_graph
 
 

@@ -6,8 +6,7 @@ from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.errors import InputError
 from scanchain.graph.edge_checks import check_connected, nearest_semidefinite
-from scanchain.graph.files.g2o import read_g2o
-from scanchain.graph.files.g2o_write import write_g2o
+from scanchain.graph.g2o import read_g2o, write_g2o
 from scanchain.graph.pose_graph import PoseGraph
 from tests.support.scenes import shared_data
 

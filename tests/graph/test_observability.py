@@ -7,8 +7,7 @@ from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.errors import InputError
 from scanchain.graph.between import BetweenProblem
-from scanchain.graph.edge_checks import ranks
-from scanchain.graph.observability import free_poses
+from scanchain.graph.edge_checks import free_poses, ranks
 from scanchain.graph.pose_graph import PoseGraph
 from tests.support import naive_graph
 

@@ -9,10 +9,10 @@ from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.errors import InputError
 from scanchain.graph.between import BetweenProblem
-from scanchain.graph.files.g2o import read_g2o
+from scanchain.graph.consistency import Consistency
+from scanchain.graph.g2o import read_g2o
+from scanchain.graph.odometry_errors import corrected
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.graph.robust.consistency import Consistency
-from scanchain.graph.robust.drift import corrected
 from tests.benchmarks.wrong_edges import try_wrong_loops
 from tests.support.scenes import shared_data
 

@@ -5,7 +5,7 @@ from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.errors import InputError
 from scanchain.graph import schedule
-from scanchain.graph.files.g2o import read_g2o
+from scanchain.graph.g2o import read_g2o
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.schedule import BackgroundOptimization, Plan, Schedule
 from tests.support.scenes import shared_data

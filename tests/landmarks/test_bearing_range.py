@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scanchain.graph.robust.losses import RobustLoss
+from scanchain.graph.losses import RobustLoss
 from scanchain.kernels.landmarks import dead_reckoning, factors
 from scanchain.landmarks import estimate as guesses
 from scanchain.landmarks.estimate import QUADRATIC, minimize

@@ -13,7 +13,7 @@ from scanchain.__main__ import main
 from scanchain.config import GraphConfig, LogConfig
 from scanchain.data import ClosureVerdict, Proposal
 from scanchain.evaluation import absolute_error, pair
-from scanchain.graph.files.g2o import read_g2o
+from scanchain.graph.g2o import read_g2o
 from scanchain.logs import open_log
 from scanchain.runs.closures import final_verdicts, write_closures
 from scanchain.runs.metrics import Metrics

@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 from rerun.chunk import RrdReader
 
 from scanchain.errors import InputError
-from scanchain.graph.files.g2o import read_g2o
+from scanchain.graph.g2o import read_g2o
 from scanchain.maps import MAP_FOLDER, open_saved_map, read_map, read_ply
 from scanchain.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RECORDING_FILE
 from scanchain.runs.resume import read_checkpoint

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from scanchain.graph.certificate import Certificate
-    from scanchain.graph.files.g2o import G2oFile
-    from scanchain.graph.observability import FreePose
+    from scanchain.graph.edge_checks import FreePose
+    from scanchain.graph.g2o import G2oFile
     from scanchain.graph.optimization import GraphChange, Optimization
 
 _POOR_FIT = 10.0  # χ² per degree of freedom, above which no noise model that is a little off explains it
@@ -86,7 +86,7 @@ class GraphReport:
 
     @property
     def _free(self) -> list[str]:
-        from scanchain.graph.observability import free_text, weak_text
+        from scanchain.graph.edge_checks import free_text, weak_text
 
         lines = [f"free           {free_text(self.free)}"] if self.free else []
         return [*lines, f"weakly joined  {weak_text(self.weak)}"] if len(self.weak) else lines

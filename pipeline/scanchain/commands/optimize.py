@@ -18,7 +18,7 @@ from scanchain.settings import Override, load_settings
 
 if TYPE_CHECKING:
     from scanchain.config import GraphConfig
-    from scanchain.graph.files.g2o import G2oFile, Indefinite
+    from scanchain.graph.g2o import G2oFile, Indefinite
     from scanchain.graph.initialize import Initialization
 
 _PATH = click.Path(path_type=Path)
@@ -129,7 +129,7 @@ class Outputs:
     @property
     def rejected(self) -> Path | None:
         """File of the rejected edges, written if there are any."""
-        from scanchain.graph.files.g2o_write import rejected_path
+        from scanchain.graph.g2o import rejected_path
 
         return rejected_path(self.graph) if self.graph else None
 
@@ -137,7 +137,7 @@ class Outputs:
         """Refuse, before the work, files that could not be written after it."""
         if self.marginals is not None and self.graph is None:
             raise InputError("--marginals writes a table beside the graph; give --out FILE")
-        from scanchain.graph.files.g2o_write import GRAPH_SUFFIXES
+        from scanchain.graph.g2o import GRAPH_SUFFIXES
 
         endings = {self.graph: GRAPH_SUFFIXES, self.picture: (".png",), self.recording: (".rrd",)}
         for path in (*self.paths, *filter(None, [self.rejected])):
@@ -146,7 +146,7 @@ class Outputs:
     def write(self, report: GraphReport) -> list[Path]:
         """Write them all and return their paths."""
         from scanchain.graph.covariance import chosen_poses, write_covariances
-        from scanchain.graph.files.g2o_write import write_g2o
+        from scanchain.graph.g2o import write_g2o
 
         file = report.file
         chosen = chosen_poses(self.marginals, file.ids) if self.marginals is not None else file.ids[:0]
@@ -197,7 +197,7 @@ def _config(settings: Sequence[Override]) -> GraphConfig:
 
 def _read(source: Path, indefinite: Indefinite, is_robust: bool) -> G2oFile:
     """The graph, with a warning where matrices were projected."""
-    from scanchain.graph.files.g2o import read_g2o
+    from scanchain.graph.g2o import read_g2o
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

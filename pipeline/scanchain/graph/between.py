@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.data import Matrix
-from scanchain.graph.solvers.cholesky import BlockPattern, Packing, SparseCholesky, analyze
+from scanchain.graph.cholesky import BlockPattern, Packing, SparseCholesky, analyze
 from scanchain.kernels.graph import between, scatter
 
 WASTE = 0.1  # share of edges without weight that is worth a new analysis

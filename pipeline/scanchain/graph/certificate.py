@@ -11,8 +11,8 @@ from scanchain import lie
 from scanchain.clock import working_s
 from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem
+from scanchain.graph.cholesky import BlockPattern, Packing, SingularMatrixError, SparseCholesky
 from scanchain.graph.edge_checks import is_connected
-from scanchain.graph.solvers.cholesky import BlockPattern, Packing, SingularMatrixError, SparseCholesky
 from scanchain.kernels.graph.dual import scatter_dual
 from scanchain.words import counted
 

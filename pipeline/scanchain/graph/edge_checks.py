@@ -1,16 +1,175 @@
-"""Checks of a pose graph's edges: numbers, positive semidefiniteness, rank, connectivity."""
+"""Checks of edges that users give: numbers, and poses that they leave free."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from scanchain import lie
 from scanchain.checks import LARGEST
 from scanchain.data import Matrix
 from scanchain.errors import InputError
+from scanchain.graph.between import BetweenProblem
+from scanchain.graph.cholesky import SingularMatrixError
 from scanchain.kernels.geometry.validity import largest_magnitude
+from scanchain.words import counted
+
+_AXES = {3: ("x", "y", "yaw"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
+_MOST = 100  # largest number of directions of the null space that are computed
+_MOVES = 1e-6  # share of the largest component of a null vector below which a pose stays where it is
+_NAMED = 1e-2  # component of a direction from which its axis is named
+_NOTHING = 1e-20  # share of the largest entry up to which a diagonal entry is rounding noise
+_FREE = 1e-11  # share of the information of a pose alone up to which what is left of it beside the others is none
+WEAK = 1e-6  # share of the median information up to which an edge is a weak one
+LOST = 1e-10  # share up to which too few digits of an edge are left beside the others to determine a pose
+
+
+@dataclass(frozen=True, slots=True)
+class FreePose:
+    """A pose that moves without any change of χ².
+
+    Attributes
+    ----------
+    name : what the pose is called: its vertex id, or its index
+    axes : the axes of its own frame, as "x" or "yaw", along which or about which it may move
+    followers : the other poses that move with it as one rigid body
+    """
+
+    name: int
+    axes: tuple[str, ...]
+    followers: tuple[int, ...] = ()
+
+    def __str__(self) -> str:
+        names = listed(np.array([self.name, *self.followers]))
+        return f"{names} ({', '.join(self.axes)}){' as one body' if self.followers else ''}"
+
+
+def free_text(free: Sequence[FreePose]) -> str:
+    """Number of free poses, and the directions of the first, as one line of text."""
+    shown = ", ".join(map(str, free[:8])) + (", ..." if len(free) > 8 else "")
+    count = sum(1 + len(pose.followers) for pose in free)
+    return f"the edges leave {counted(count, 'pose')} free: {shown}"
+
+
+def free_poses(
+    problem: BetweenProblem,
+    poses: Matrix,
+    weights: NDArray[np.float64],
+    ranks: NDArray[np.int64],
+    names: NDArray[np.int64],
+) -> tuple[FreePose, ...]:
+    """Poses with directions of their own frames that no edge constrains, at these poses and weights (E,).
+
+    ranks (E,) are those of the information matrices. Where edges of full rank, weak along no axis, join every pose
+    to a fixed one, nothing is free. Else those that move together in the null space of H, without the axes along
+    which an edge says next to nothing.
+    """
+    fixed, axes = problem.variable < 0, _AXES[problem.freedom]
+    kept, shares = weights > 0.0, _shares(problem.information)
+    is_strong = kept & (ranks == problem.freedom) & (shares.min(axis=1) > WEAK)
+    if is_connected(problem.edges[is_strong], fixed):
+        return ()
+    apart = loose(problem.edges[kept & (ranks > 0)], fixed)
+    found = [FreePose(int(names[i]), axes[: 2 if problem.is_point[i] else None]) for i in apart.tolist()]
+    measured = np.where(shares > LOST, np.sqrt(weights * kept)[:, None], 0.0)
+    information = measured[:, :, None] * problem.information * measured[:, None, :]
+    null = _null_space(problem, poses, information, problem.variable[apart])
+    for body in _bodies(problem, poses, null):
+        first, *followers = problem.free[body].tolist()
+        reach = np.abs(null[body[0]]).max(axis=1)
+        along = tuple(axis for axis, size in zip(axes, reach, strict=True) if size > _NAMED * reach.max())
+        found.append(FreePose(int(names[first]), along, tuple(names[followers].tolist())))
+    place = {name: index for index, name in enumerate(names.tolist())}
+    return tuple(sorted(found, key=lambda pose: place[pose.name]))
+
+
+def _bodies(problem: BetweenProblem, poses: Matrix, null: Matrix) -> list[NDArray[np.int64]]:
+    """Variables that move in the null space (n, k, m), those together that have the same twists in the world."""
+    moving = np.flatnonzero((np.abs(null) > _MOVES).any(axis=(1, 2)))
+    of_moving = problem.free[moving]
+    centered = poses[of_moving]
+    centered[:, :-1, -1] -= poses[problem.free, :-1, -1].mean(axis=0)
+    twists = (lie.adjoint(centered) @ null[moving]).reshape(len(moving), null.shape[1] * null.shape[2])
+    _, body = np.unique(np.round(twists / np.abs(twists).max(initial=1e-300), 6), axis=0, return_inverse=True)
+    body = np.where(problem.is_point[of_moving], len(moving) + np.arange(len(moving)), body.reshape(-1))
+    return [moving[body == one] for one in np.unique(body)]
+
+
+def _null_space(problem: BetweenProblem, poses: Matrix, information: Matrix, apart: NDArray[np.int64]) -> Matrix:
+    """Own-frame twists (n, k, m), at most 1, of all variables that change no edge; those ``apart`` are fixed.
+
+    Every pivot of H that vanishes gets a prior: with H' = H + Σ h e eᵀ over these, the null space of H is spanned
+    by the columns of H'⁻¹ e, each of which moves one of these scalars alone.
+    """
+    pattern = problem.pattern
+    values = own_equations(problem, poses, information)
+    diagonal = values[pattern.diagonal]
+    largest = diagonal.max(initial=0.0)
+    diagonal[diagonal <= _NOTHING * largest] = 0.0
+    prior = np.where(diagonal > 0.0, diagonal, max(largest, 1.0))
+    held = np.where(np.repeat(np.isin(np.arange(len(problem.free)), apart), pattern.sizes), prior, 0.0)
+    vanished = list[int]()
+    while len(vanished) <= _MOST:
+        values[pattern.diagonal] = diagonal + held
+        try:
+            problem.cholesky.factorize(values, _FREE)
+            break
+        except SingularMatrixError as error:
+            vanished.append(error.scalar)
+        which = vanished[-1] if len(vanished) < _MOST else slice(None)
+        held[which] = prior[which]
+    ends = np.zeros((pattern.scalars, len(vanished)))
+    ends[vanished, np.arange(len(vanished))] = 1.0
+    null = problem.packing.spread_rows(problem.cholesky.solve(ends))
+    return null / np.abs(null).max(axis=(0, 1), initial=0.0)
+
+
+def hanging(
+    edges: NDArray[np.int64], information: Matrix, fixed: NDArray[np.bool_], share: float
+) -> NDArray[np.int64]:
+    """Poses joined to a fixed one only by edges of at most this share of the median information."""
+    return loose(edges[_shares(information).max(axis=1, initial=0.0) > share], fixed)
+
+
+def weak_text(names: NDArray[np.int64]) -> str:
+    """Poses that hang on weak edges as one line of text."""
+    return f"{_group(names)} by edges of less than a millionth of the usual information"
+
+
+def lost_text(names: NDArray[np.int64]) -> str:
+    """Poses that hang on edges of too little information as one line of text."""
+    hang = "hangs" if len(names) == 1 else "hang"
+    return f"{_group(names)} {hang} on edges of next to no information, {LOST:.0e} of the usual or less"
+
+
+def _group(names: NDArray[np.int64]) -> str:
+    return f"pose {names[0]}" if len(names) == 1 else f"poses {listed(names)} ({len(names):,})"
+
+
+def _shares(information: Matrix) -> Matrix:
+    """Diagonals of information matrices (E, k), over the medians for positions and rotations."""
+    d = 2 if information.shape[-1] == 3 else 3
+    result = np.einsum("eaa->ea", information).copy()
+    for part in (result[:, :d], result[:, d:]):
+        known = part[part > 0.0]
+        part /= np.median(known) if len(known) else 1.0
+    return result
+
+
+def own_equations(problem: BetweenProblem, poses: Matrix, information: Matrix) -> NDArray[np.float64]:
+    """Block values of H = Σ JᵀΩJ, with Ω (E, k, k), over twists of every pose in its own frame, T exp(ξ)."""
+    jacobian, adjoint = problem.jacobians(poses, problem.errors(poses)), lie.adjoint(poses)
+    i, j = problem.edges.T
+    J_i, J_j = -jacobian @ adjoint[i], jacobian @ adjoint[j]
+    J_i_t, J_j_t = np.swapaxes(J_i, 1, 2), np.swapaxes(J_j, 1, 2)
+    blocks = problem.scattered(J_i_t @ information @ J_i, J_j_t @ information @ J_j, J_i_t @ information @ J_j)
+    return problem.packing.values(blocks)
+
 
 _NO_INFORMATION = 1e-9  # eigenvalue of a matrix of unit diagonal up to which a direction is not measured
 _ROUNDING = 1e-6  # share of the largest entry that a negative eigenvalue may have, from printed digits

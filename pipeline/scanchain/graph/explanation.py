@@ -1,4 +1,4 @@
-"""Errors of odometry that explain loop edges which contradict it: a systematic drift, slips and jumps."""
+"""Errors of odometry that would explain closures left out: the search for the best, one after the other."""
 
 from __future__ import annotations
 
@@ -11,13 +11,24 @@ from numpy.typing import NDArray
 from scanchain.config import GraphConfig
 from scanchain.data import REJECTED_WEIGHT, Matrix
 from scanchain.graph.between import BetweenProblem
+from scanchain.graph.consistency import apart
 from scanchain.graph.initialize import Initialization
+from scanchain.graph.left_out import LeftOut
+from scanchain.graph.losses import rejection_limit
+from scanchain.graph.odometry_errors import (
+    FEWEST,
+    Loosened,
+    Slip,
+    corrected,
+    cost_of,
+    drift_step,
+    loosened,
+    next_loosened,
+    penalty,
+    rescaled,
+    size,
+)
 from scanchain.graph.optimization import Solved, solve
-from scanchain.graph.robust.drift import FEWEST, corrected, drift_step, penalty, rescaled, size
-from scanchain.graph.robust.groups import apart
-from scanchain.graph.robust.left_out import LeftOut
-from scanchain.graph.robust.loosened import Loosened, Slip, cost_of, loosened, next_loosened
-from scanchain.graph.robust.losses import rejection_limit
 
 _LARGE = 2000  # edges of odometry from which on groups of loop edges are judged once, under the last explanation
 _FEWEST = 2  # least number of loop edges left out, none near another, that are to be explained

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem
-from scanchain.graph.solvers.cholesky import BlockPattern, SingularMatrixError, SparseCholesky
+from scanchain.graph.cholesky import BlockPattern, SingularMatrixError, SparseCholesky
 
 Initialization = Literal["auto", "given", "odometry", "spanning-tree", "chordal"]
 

@@ -11,11 +11,10 @@ from scanchain.config import GraphConfig
 from scanchain.data import GraphState, Matrix, brief, fit_text
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.edge_checks import has_loop
+from scanchain.graph.graduation import LIMITS, Since, minimize, update
 from scanchain.graph.initialize import Initialization, first_guess
-from scanchain.graph.robust.graduation import minimize
-from scanchain.graph.robust.losses import robust_loss
-from scanchain.graph.robust.update import LIMITS, Since, update
-from scanchain.graph.solvers.minimizer import Limits, Minimizer, Minimum
+from scanchain.graph.losses import robust_loss
+from scanchain.graph.minimizer import Limits, Minimizer, Minimum
 from scanchain.words import counted
 
 

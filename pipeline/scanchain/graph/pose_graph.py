@@ -15,27 +15,27 @@ from scanchain.data import REJECTED_WEIGHT, GraphState, Matrix, Pose
 from scanchain.errors import InputError
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.certificate import Certificate, certify
+from scanchain.graph.cholesky import SingularMatrixError
 from scanchain.graph.covariance import own_covariances, pose_errors, relative_covariance
-from scanchain.graph.edge_checks import check_connected, check_edges, ranks
-from scanchain.graph.explanation import Explained, Explainer, Explanation, corrections, odometry_of
-from scanchain.graph.growing_array import GrowingArray
-from scanchain.graph.initialize import Initialization
-from scanchain.graph.observability import (
+from scanchain.graph.edge_checks import (
     LOST,
     WEAK,
     FreePose,
+    check_connected,
+    check_edges,
     free_poses,
     free_text,
     hanging,
     lost_text,
     own_equations,
+    ranks,
 )
+from scanchain.graph.explanation import Explained, Explainer, Explanation, corrections, odometry_of
+from scanchain.graph.graduation import Rejection, Since
+from scanchain.graph.growing_array import GrowingArray
+from scanchain.graph.initialize import Initialization
+from scanchain.graph.odometry_errors import Slip, corrected
 from scanchain.graph.optimization import Optimization, Solved, solve
-from scanchain.graph.robust.drift import corrected
-from scanchain.graph.robust.graduation import Rejection
-from scanchain.graph.robust.loosened import Slip
-from scanchain.graph.robust.update import Since
-from scanchain.graph.solvers.cholesky import SingularMatrixError
 from scanchain.words import counted
 
 

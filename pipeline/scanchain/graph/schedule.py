@@ -8,8 +8,8 @@ from typing import Literal
 
 from scanchain.config import GraphConfig
 from scanchain.data import GraphState
+from scanchain.graph.losses import rejection_limit
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.graph.robust.losses import rejection_limit
 from scanchain.processes import return_freed_memory
 
 _LEAST = 10  # number of keyframes between two optimizations

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.data import Matrix
-from scanchain.graph.robust.losses import RobustLoss
-from scanchain.graph.solvers.cholesky import SingularMatrixError
-from scanchain.graph.solvers.descent import LocalModel, descend, step_rule
+from scanchain.graph.cholesky import SingularMatrixError
+from scanchain.graph.losses import RobustLoss
+from scanchain.graph.minimizer import LocalModel, descend, step_rule
 from scanchain.kernels.landmarks import normal_equations
 from scanchain.landmarks.problem import (
     BearingRangeProblem,

@@ -18,7 +18,7 @@ from scanchain.config import Config, MapsConfig
 from scanchain.data import Keyframe, Matrix, Points, Pose, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import ExpectedErrors, expected_errors
-from scanchain.graph.files.g2o_write import rejected_path, write_g2o
+from scanchain.graph.g2o import rejected_path, write_g2o
 from scanchain.logs import Log
 from scanchain.loops import level_of, outline_of
 from scanchain.maps import (

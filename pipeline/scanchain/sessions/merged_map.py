@@ -19,7 +19,7 @@ from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import REJECTED_WEIGHT, Keyframe, KeyframePoints, Matrix, Points, Trajectory
 from scanchain.errors import InputError
-from scanchain.graph.files.g2o_write import write_g2o
+from scanchain.graph.g2o import write_g2o
 from scanchain.loops import refined, spread
 from scanchain.maps import MAP_FOLDER, SavedMap, Session, write_map, write_ply, write_saved_map
 from scanchain.point_store import PointStore

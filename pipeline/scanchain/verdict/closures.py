@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 
 from scanchain import lie
 from scanchain.data import Matrix
-from scanchain.graph.robust.groups import FEWEST, carried, connected
+from scanchain.graph.consistency import FEWEST, carried, connected
 from scanchain.verdict.checks import Floats, Kind, Stretch
 
 _LEAST_M = 0.5  # smallest contradiction of a closure that is checked

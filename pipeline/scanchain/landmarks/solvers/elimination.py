@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 
 from scanchain.data import Matrix
-from scanchain.graph.solvers.cholesky import (
+from scanchain.graph.cholesky import (
     BlockPattern,
     SingularMatrixError,
     SparseCholesky,

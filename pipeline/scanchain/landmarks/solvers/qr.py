@@ -15,7 +15,7 @@ from scipy.sparse import coo_matrix, csc_matrix, csr_matrix
 from scipy.sparse.linalg import spsolve_triangular
 
 from scanchain.errors import MissingExtraError
-from scanchain.graph.solvers.cholesky import BlockPattern, analyze
+from scanchain.graph.cholesky import BlockPattern, analyze
 from scanchain.kernels.graph import symbolic
 from scanchain.kernels.landmarks import normal_equations, sparse_qr
 from scanchain.landmarks.problem import LinearSystem, Pattern

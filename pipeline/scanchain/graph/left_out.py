@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from scanchain.data import Matrix
 from scanchain.graph.between import BetweenProblem
+from scanchain.graph.consistency import apart
 from scanchain.graph.covariance import difference_covariance, edge_covariances, inverse_blocks, responses
-from scanchain.graph.robust.groups import apart
 
 _MOST = 30  # largest number of loop edges that are looked at
 _MOST_ENTRIES = 4_000_000  # largest number of covariances between these and odometry, 32 MB

@@ -1,7 +1,4 @@
-"""Robust losses of loop edges, functions of the whitened residual χ alone, their graduation, and sets of inliers.
-
-A further one is a class and a line in ``LOSSES`` (``scanchain.config``), or a user's own, ``module:Class``.
-"""
+"""Robust losses of loop edges, and their graduation."""
 
 from __future__ import annotations
 

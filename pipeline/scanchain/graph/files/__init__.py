@@ -1,1 +1,0 @@
-"""Pose graphs as text: g2o and TORO."""

@@ -1,0 +1,516 @@
+"""Pose graphs in g2o and TORO files: read and written."""
+
+from __future__ import annotations
+
+import warnings
+from collections import Counter, defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation as Turn
+
+from scanchain import checks, lie
+from scanchain.checks import LARGEST
+from scanchain.data import Matrix, brief
+from scanchain.errors import InputError, shown
+from scanchain.graph.edge_checks import nearest_semidefinite, positive_semidefinite
+from scanchain.graph.initialize import follow_odometry
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.whole_file import write_whole
+from scanchain.words import counted
+
+Rotation = Literal["vector", "quaternion"]  # of which Ω is in 3D
+ROTATION_COMMENT: dict[Rotation, str] = {
+    "vector": "# information of EDGE_SE3:QUAT is of (translation, rotation vector in radians)",
+    "quaternion": "# information of EDGE_SE3:QUAT is of (translation, vector part of unit quaternion), as g2o",
+}
+_LARGEST_ID = 2**63 - 1  # int64
+_WHOLE_TURN = 2.0 * np.pi + 1e-3  # rad, above which an angle is a turn too many, or degrees
+
+
+@dataclass(frozen=True, slots=True)
+class Tag:
+    """Kind of a line.
+
+    Attributes
+    ----------
+    dimension : 2 or 3
+    ids : number of vertex ids that it begins with: 1 of a vertex, 2 of an edge
+    columns : which numbers of a whole line follow: a pose (x y θ, or x y z qx qy qz qw), and of an edge the upper
+        triangle of Ω, row by row. TORO has roll, pitch and yaw for the quaternion
+    is_point : whether it is a point, or an edge to one
+    """
+
+    dimension: int
+    ids: int
+    columns: tuple[int, ...]
+    is_point: bool = False
+    is_toro: bool = False
+
+
+TAGS = {
+    "VERTEX_SE2": Tag(2, 1, (0, 1, 2)),
+    "EDGE_SE2": Tag(2, 2, tuple(range(9))),
+    "VERTEX_XY": Tag(2, 1, (0, 1), is_point=True),
+    "EDGE_SE2_XY": Tag(2, 2, (0, 1, 3, 4, 6), is_point=True),
+    "VERTEX_SE3:QUAT": Tag(3, 1, tuple(range(7))),
+    "EDGE_SE3:QUAT": Tag(3, 2, tuple(range(28))),
+    "VERTEX2": Tag(2, 1, (0, 1, 2), is_toro=True),
+    "EDGE2": Tag(2, 2, (0, 1, 2, 3, 4, 6, 8, 5, 7), is_toro=True),  # Ω as xx xy yy θθ xθ yθ
+    "VERTEX3": Tag(3, 1, tuple(range(6)), is_toro=True),
+    "EDGE3": Tag(3, 2, tuple(range(27)), is_toro=True),
+}
+
+
+def write_lines(
+    dimension: int, ids: NDArray[np.int64], numbers: Matrix, is_point: NDArray[np.bool_], *, is_toro: bool
+) -> list[str]:
+    """Lines of vertices, ids (n, 1), or edges (n, 2), of whole lines as g2o has them (n, m).
+
+    Every number is the shortest that reads back as the same.
+    """
+    if is_toro and dimension == 3:
+        numbers = np.hstack([numbers[:, :3], to_angles(numbers[:, 3:7]), numbers[:, 7:]])
+    tags = {
+        tag.is_point: (name, tag.columns)
+        for name, tag in TAGS.items()
+        if (tag.dimension, tag.ids, tag.is_toro) == (dimension, ids.shape[1], is_toro)
+    }
+    lines = []
+    for names, row, point in zip(ids.tolist(), numbers.tolist(), is_point.tolist(), strict=True):
+        name, columns = tags[point]
+        lines.append(" ".join([name, *map(repr, names), *(repr(row[column]) for column in columns)]))
+    return lines
+
+
+def from_angles(angles: Matrix) -> Matrix:
+    """Quaternions xyzw (n, 4) of roll, pitch and yaw (n, 3), Rz(yaw) Ry(pitch) Rx(roll)."""
+    return Turn.from_euler("ZYX", angles[:, ::-1]).as_quat()
+
+
+def to_angles(quat_xyzw: Matrix) -> Matrix:
+    """Roll, pitch and yaw (n, 3); exact at a pitch of ±π/2 too, where yaw is free and taken as zero."""
+    R = lie.from_quaternion(quat_xyzw)
+    yaw = np.where(np.hypot(R[:, 0, 0], R[:, 1, 0]) > 1e-9, np.arctan2(R[:, 1, 0], R[:, 0, 0]), 0.0)
+    c, s = np.cos(yaw), np.sin(yaw)
+    pitch = np.arctan2(-R[:, 2, 0], c * R[:, 0, 0] + s * R[:, 1, 0])
+    roll = np.arctan2(s * R[:, 0, 2] - c * R[:, 1, 2], c * R[:, 1, 1] - s * R[:, 0, 1])
+    return np.stack([roll, pitch, yaw], axis=1)
+
+
+class Rows(NamedTuple):
+    """Vertices or edges, those of poses before those of points, each in the order of the file.
+
+    Attributes
+    ----------
+    lines : (n,) where they stand
+    ids : (n, 1) or (n, 2) vertex ids
+    numbers : (n, m) whole lines as g2o has them, zero where a tag has no number
+    is_point : (n,) bool, points or edges to points
+    """
+
+    lines: NDArray[np.int64]
+    ids: NDArray[np.int64]
+    numbers: Matrix
+    is_point: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class G2oLines:
+    """Content of a file.
+
+    Attributes
+    ----------
+    dimension : 2 or 3
+    fixed : line and vertex id of every pose that is held
+    others : lines of other tags
+    rotation : of which the information is, by the comment that ``write_g2o`` writes
+    turns : line and size of angles beyond a turn, which may be degrees
+    """
+
+    dimension: int
+    vertices: Rows
+    edges: Rows
+    fixed: list[tuple[int, int]]
+    others: list[str]
+    rotation: Rotation
+    turns: list[tuple[int, float]]
+
+
+def sort_lines(path: Path) -> G2oLines:
+    """Read the file; a line that cannot be understood is an error that names it."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "not text"
+        raise InputError(
+            f"{path}: cannot be read as g2o: {reason}; give a text file of vertices and edges"
+        ) from error
+    dimension = 0
+    rotation: Rotation = "vector"
+    others, fixed, turns = list[str](), list[tuple[int, int]](), list[tuple[int, float]]()
+    by_tag = defaultdict[str, list[tuple[int, list[int], list[float]]]](list)
+    comments: dict[str, Rotation] = {comment: name for name, comment in ROTATION_COMMENT.items()}
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split()
+        if not words:
+            continue
+        tag = TAGS.get(words[0])
+        if words[0] == "FIX":
+            fixed += [(number, _vertex_id(f"{path}:{number}: FIX", word)) for word in words[1:]]
+        elif line in comments:
+            rotation = comments[line]
+        elif tag is None:
+            others.append(line)
+        elif dimension not in (0, tag.dimension):
+            raise InputError(
+                f"{path}:{number}: {words[0]} in an SE({dimension}) graph; keep to one dimension a file"
+            )
+        else:
+            dimension = tag.dimension
+            by_tag[words[0]].append((number, *_parsed(f"{path}:{number}: {words[0]}", tag, words)))
+    rows = {name: _rows(path, name, lines, turns) for name, lines in by_tag.items()}
+    vertices, edges = (_joined([rows[name] for name in rows if TAGS[name].ids == ids], ids) for ids in (1, 2))
+    if not len(edges.ids):
+        raise InputError(f"{path}: holds no EDGE_SE2 and no EDGE_SE3:QUAT line; is it a g2o pose graph?")
+    return G2oLines(dimension, vertices, edges, fixed, others, rotation, turns)
+
+
+def _joined(parts: list[Rows], ids: int) -> Rows:
+    """Rows of several tags, or none."""
+    if not parts:
+        return Rows(np.empty(0, np.int64), np.empty((0, ids), np.int64), np.empty((0, 0)), np.empty(0, np.bool_))
+    lines, is_point = (
+        np.concatenate([part.lines for part in parts]),
+        np.concatenate([part.is_point for part in parts]),
+    )
+    names, numbers = np.concatenate([part.ids for part in parts]), np.concatenate([part.numbers for part in parts])
+    order = np.lexsort((lines, is_point))
+    return Rows(lines[order], names[order], numbers[order], is_point[order])
+
+
+def _parsed(place: str, tag: Tag, words: list[str]) -> tuple[list[int], list[float]]:
+    """Vertex ids and numbers of a line; ``place`` is for messages."""
+    if len(words) != 1 + tag.ids + len(tag.columns):
+        count, wanted = counted(len(words) - 1, "value"), tag.ids + len(tag.columns)
+        raise InputError(f"{place} has {count}, needs {wanted}")
+    ids = [_vertex_id(place, word) for word in words[1 : 1 + tag.ids]]
+    try:
+        return ids, list(map(float, words[1 + tag.ids :]))
+    except ValueError as error:
+        raise InputError(f"{place}: {error}") from error
+
+
+def _rows(
+    path: Path, name: str, lines: list[tuple[int, list[int], list[float]]], turns: list[tuple[int, float]]
+) -> Rows:
+    """Lines of one tag as arrays, checked; angles beyond a turn are added to ``turns``."""
+    tag = TAGS[name]
+    places, ids, numbers = (np.array(column) for column in zip(*lines, strict=True))
+    for row in np.flatnonzero(~np.isfinite(numbers).all(axis=1))[:1]:
+        raise InputError(f"{path}:{places[row]}: {name} has a value that is not finite; remove or mend the line")
+    for row, column in np.argwhere(np.abs(numbers) > LARGEST)[:1]:
+        start = " ".join([name, *map(str, ids[row].tolist())])
+        raise InputError(
+            f"{path}:{places[row]}: {start} has the value {numbers[row, column]:g}, over {LARGEST:g}; "
+            "write meters and radians, and an inverse covariance of these"
+        )
+    if not tag.is_point and (tag.dimension == 2 or tag.is_toro):
+        largest = np.abs(numbers[:, 3:6] if tag.dimension == 3 else numbers[:, 2:3]).max(axis=1)
+        beyond = largest > _WHOLE_TURN
+        turns += zip(places[beyond].tolist(), largest[beyond].tolist(), strict=True)
+    whole = numbers
+    if tag.dimension == 2:
+        whole = np.zeros((len(numbers), 3 if tag.ids == 1 else 9))
+        whole[:, tag.columns] = numbers
+    elif tag.is_toro:
+        whole = np.hstack([numbers[:, :3], from_angles(numbers[:, 3:6]), numbers[:, 6:]])
+    return Rows(places, ids, whole, np.full(len(numbers), tag.is_point))
+
+
+def _vertex_id(place: str, word: str) -> int:
+    try:
+        value = int(word)
+    except ValueError:
+        raise InputError(f"{place}: vertex id {shown(word)} is not a whole number; write 0, 1, 2, ...") from None
+    if abs(value) > _LARGEST_ID:
+        raise InputError(f"{place}: vertex id {shown(word)} is too large; the limit is {_LARGEST_ID}")
+    return value
+
+
+TORO_SUFFIXES = (".graph", ".toro")
+GRAPH_SUFFIXES = (".g2o", *TORO_SUFFIXES)
+
+Chosen = Literal["in force", "rejected"]
+
+
+def rejected_path(path: Path) -> Path:
+    """The file beside a graph that holds its rejected edges: graph_rejected.g2o beside graph.g2o."""
+    return path.with_name(f"{path.stem}_rejected{path.suffix}")
+
+
+def write_g2o(
+    path: Path | str,
+    graph: PoseGraph,
+    *,
+    ids: NDArray[np.int64] | None = None,
+    other_lines: Iterable[str] = (),
+    edges: Chosen = "in force",
+    rotation: Rotation = "vector",
+    force: bool = False,
+) -> None:
+    """Write poses, points and edges with full information matrices; to .graph or .toro as TORO has them.
+
+    ids : (K,) the vertex ids, by default 0, 1, …; FIX is written for poses that were held by name
+    edges : those "in force" with their robust weight in Ω, so that the poses are the minimum of the file's own χ²
+    rotation : of what Ω is in 3D, which the first line of the file says: "vector" for a rotation vector, as this
+        package, GTSAM and published graphs have it, or "quaternion" for the vector part of the unit quaternion,
+        half as long, as g2o itself has it
+    force : whether a file that is there is replaced; else InputError, as for a graph with points in TORO
+    """
+    checks.instance(graph, PoseGraph, "graph", "read_g2o(path).graph")
+    checks.one_of(rotation, get_args(Rotation), "rotation")
+    path, d = checks.path(path, "path"), graph.dimension
+    is_toro = path.suffix in TORO_SUFFIXES
+    if is_toro and graph.is_point.any():
+        raise InputError(f"{path}: TORO has no points, and the graph has {graph.is_point.sum()}; write .g2o")
+    names = np.arange(len(graph)) if ids is None else ids
+    has_quaternions = d == 3 and not is_toro
+    chosen = graph.is_rejected if edges == "rejected" else ~graph.is_rejected
+    pairs = graph.edges[chosen]
+    units = lie.by_component(graph.freedom, 1.0, 2.0 if has_quaternions and rotation == "quaternion" else 1.0)
+    weight = np.ones(len(pairs)) if edges == "rejected" else graph.weight[chosen]
+    information = weight[:, None, None] * (graph.information[chosen] * np.outer(units, units))
+    triangles = information[:, *np.triu_indices(graph.freedom)]
+    of_edges = np.hstack([_numbers(graph.measurements[chosen]), triangles])
+    lines = [ROTATION_COMMENT[rotation]] if has_quaternions else []
+    lines += write_lines(d, names[:, None], _numbers(graph.poses), graph.is_point, is_toro=is_toro)
+    lines += [f"FIX {names[index]}" for index in graph.held]
+    lines += write_lines(d, names[pairs], of_edges, graph.is_point[pairs[:, 1]], is_toro=is_toro)
+    with checks.writing(path, force=force):
+        write_whole(path, "\n".join([*lines, *other_lines, ""]).encode())
+
+
+def _numbers(poses: Matrix) -> Matrix:
+    """Poses as rows x y θ, or x y z qx qy qz qw."""
+    d = poses.shape[-1] - 1
+    if d == 2:
+        return np.column_stack([poses[:, :2, 2], lie.yaw(poses)])
+    return np.hstack([poses[:, :3, 3], lie.to_quaternion(poses[:, :3, :3])])
+
+
+Indefinite = Literal["project", "refuse"]
+
+
+@dataclass(frozen=True, slots=True)
+class Projection:
+    """Edges of a file with an indefinite information matrix, and the change by projecting it.
+
+    Attributes
+    ----------
+    edges, of : how many edges, of how many
+    median, most : ‖Ω − Ω₊‖ / ‖Ω‖ of these, Frobenius
+    first : the first of them, by its vertices and its line
+    """
+
+    edges: int
+    of: int
+    median: float
+    most: float
+    first: str
+
+    @property
+    def text(self) -> str:
+        """The projection as one line of text."""
+        return (
+            f"{self.edges:,} of {self.of:,} edges have an indefinite information matrix, which is no inverse "
+            "covariance; each was projected to the nearest positive semidefinite one, which changed it by "
+            f"{100.0 * self.median:.3g} % of its norm (median), {100.0 * self.most:.3g} % at most; "
+            f"first {self.first}"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class G2oFile:
+    """A pose graph as read.
+
+    Attributes
+    ----------
+    graph : the poses in the order of their ids, then the points in that of theirs; the stamp of each is its id
+    ids : (K,) the file's vertex ids
+    other_lines : lines about neither poses nor edges, retained to be written again
+    has_guess : whether the file holds vertices; else the graph's poses follow its odometry
+    projection : of the indefinite information matrices; None without any
+    note : warning that angles may be degrees; empty where they are radians
+    """
+
+    __repr__ = brief
+    graph: PoseGraph
+    ids: NDArray[np.int64]
+    other_lines: tuple[str, ...]
+    has_guess: bool
+    projection: Projection | None
+    note: str = ""
+
+    @property
+    def other_tags(self) -> tuple[tuple[str, int], ...]:
+        """Tags that are not supported, with the number of lines of each."""
+        return tuple(Counter(line.split(maxsplit=1)[0] for line in self.other_lines).items())
+
+
+def read_g2o(
+    path: Path | str,
+    *,
+    loops: Literal["quadratic", "robust"] = "quadratic",
+    indefinite: Indefinite = "project",
+    rotation: Rotation | None = None,
+) -> G2oFile:
+    """Read a graph.
+
+    loops : "robust" marks edges between poses that do not follow each other for the robust loss
+    indefinite : what to do about indefinite information matrices: "project" each to the nearest positive
+        semidefinite one and warn, or "refuse" the file
+    rotation : of what the information is in 3D, as in ``write_g2o``; as the file says, else "vector"
+    """
+    path = checks.path(path, "path")
+    lines = sort_lines(path)
+    edges, dimension = lines.edges, lines.dimension
+    ids, is_point, poses = _vertices(path, lines)
+    pairs = _indices(path, edges.lines, edges.ids, ids)
+    sees_none = np.stack([is_point[pairs[:, 0]], is_point[pairs[:, 1]] != edges.is_point], axis=1)
+    _refuse_unknown(path, edges.lines, edges.ids, sees_none)
+    for bad in np.flatnonzero(pairs[:, 0] == pairs[:, 1])[:1]:
+        i, j = edges.ids[bad]
+        raise InputError(f"{path}:{edges.lines[bad]}: edge {i}-{j} joins a vertex to itself; remove it")
+    held = np.array(lines.fixed, np.int64).reshape(-1, 2)
+    fixed = _indices(path, held[:, 0], held[:, 1:], ids)[:, 0]
+    measurements, information = _poses(path, edges, dimension), _information(edges, dimension)
+    if dimension == 3 and (rotation or lines.rotation) == "quaternion":
+        units = lie.by_component(6, 1.0, 0.5)
+        information *= np.outer(units, units)
+    projection = _project(path, edges, information, indefinite)
+    has_guess = bool(len(lines.vertices.ids))
+    if not has_guess:
+        chain, to_points = ~edges.is_point, edges.is_point
+        is_held = np.isin(np.arange(len(ids)), fixed if len(fixed) else 0)
+        poses = follow_odometry(poses, is_held, pairs[chain], measurements[chain])
+        i, j = pairs[to_points].T
+        poses[j, :-1, -1] = (poses[i] @ measurements[to_points])[:, :-1, -1]
+    graph = PoseGraph(dimension, ids)
+    for pose, point, stamp in zip(poses, is_point.tolist(), ids.tolist(), strict=True):
+        graph.add_point(pose[:-1, -1], stamp) if point else graph.add_pose(pose, stamp)
+    is_robust = (loops == "robust") & (np.abs(pairs[:, 0] - pairs[:, 1]) != 1) & ~edges.is_point
+    graph.add_edges(pairs, measurements, information, is_robust)
+    for index in fixed.tolist():
+        graph.fix(index)
+    note = _degrees_note(lines.turns)
+    if note:
+        warnings.warn(f"{path}: {note}", stacklevel=2)
+    return G2oFile(graph, ids, tuple(lines.others), has_guess, projection, note)
+
+
+def _degrees_note(turns: list[tuple[int, float]]) -> str:
+    """That angles lie beyond a whole turn, by the largest; empty where none does."""
+    if not turns:
+        return ""
+    line, largest = max(turns, key=lambda turn: turn[1])
+    return (
+        f"{counted(len(turns), 'line has', 'lines have')} an angle beyond a whole turn, up to {largest:.6g} in "
+        f"line {line}; degrees? they are taken as radians"
+    )
+
+
+def _project(path: Path, edges: Rows, information: Matrix, indefinite: Indefinite) -> Projection | None:
+    """Replace indefinite matrices (E, k, k) by the nearest semidefinite ones, and warn of the change."""
+    bad = np.flatnonzero(~positive_semidefinite(information))
+    if not len(bad):
+        return None
+    (i, j), line = edges.ids[bad[0]], edges.lines[bad[0]]
+    if indefinite == "refuse":
+        raise InputError(
+            f"{path}:{line}: information matrix of edge {i}-{j} is not positive semidefinite, the first of "
+            f"{len(bad):,}; give the upper triangle of an inverse covariance, or have it projected"
+        )
+    before, nearest = information[bad], nearest_semidefinite(information[bad])
+    information[bad] = nearest
+    off = np.linalg.norm(nearest - before, axis=(1, 2)) / np.linalg.norm(before, axis=(1, 2))
+    first = f"{i}-{j} in line {line}"
+    projection = Projection(len(bad), len(edges.ids), float(np.median(off)), float(off.max()), first)
+    warnings.warn(projection.text, stacklevel=3)
+    return projection
+
+
+def _vertices(path: Path, lines: G2oLines) -> tuple[NDArray[np.int64], NDArray[np.bool_], Matrix]:
+    """Ids (K,), those of poses and then those of points, ascending, which are points, and poses (K, d+1, d+1).
+
+    Without vertex lines those of the edges, at the identity.
+    """
+    vertices, edges = lines.vertices, lines.edges
+    if not len(vertices.ids):
+        seen = edges.ids[edges.is_point]
+        of_poses, of_points = np.unique(np.append(edges.ids[~edges.is_point], seen[:, 0])), np.unique(seen[:, 1])
+        ids, is_point = np.append(of_poses, of_points), np.arange(len(of_poses) + len(of_points)) >= len(of_poses)
+        poses = np.tile(lie.identity(lines.dimension), (len(ids), 1, 1))
+    else:
+        order = np.lexsort((vertices.ids[:, 0], vertices.is_point))
+        ids, is_point, poses = (
+            vertices.ids[order, 0],
+            vertices.is_point[order],
+            _poses(path, vertices, lines.dimension)[order],
+        )
+        again = order[1:][(ids[1:] == ids[:-1]) & (is_point[1:] == is_point[:-1])]
+        for row in np.sort(again)[:1]:
+            raise InputError(
+                f"{path}:{vertices.lines[row]}: vertex {vertices.ids[row, 0]} stands in the file twice; remove one"
+            )
+    for name in np.intersect1d(ids[is_point], ids[~is_point])[:1]:
+        raise InputError(f"{path}: vertex {name} is a pose and a point; give each an id of its own")
+    return ids, is_point, poses
+
+
+def _indices(
+    path: Path, lines: NDArray[np.int64], names: NDArray[np.int64], ids: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Indices (n, w) of vertices by their names among ``ids`` (K,), of lines (n,) that name them."""
+    order = np.argsort(ids)
+    indices = order[np.minimum(np.searchsorted(ids, names, sorter=order), len(ids) - 1)]
+    _refuse_unknown(path, lines, names, ids[indices] != names)
+    return indices
+
+
+def _refuse_unknown(
+    path: Path, lines: NDArray[np.int64], names: NDArray[np.int64], unknown: NDArray[np.bool_]
+) -> None:
+    for row, column in np.argwhere(unknown)[:1]:
+        raise InputError(
+            f"{path}:{lines[row]}: vertex {names[row, column]} is not in the file; add its VERTEX line"
+        )
+
+
+def _information(edges: Rows, dimension: int) -> Matrix:
+    """Information matrices (E, k, k) of the upper triangles that the rows end with."""
+    k = 3 if dimension == 2 else 6
+    information = np.zeros((len(edges.ids), k, k))
+    a, b = np.triu_indices(k)
+    information[:, a, b] = information[:, b, a] = edges.numbers[:, -len(a) :]
+    return information
+
+
+def _poses(path: Path, rows: Rows, d: int) -> Matrix:
+    """Poses (n, d+1, d+1) that rows x y θ, or x y z qx qy qz qw, begin with; quaternions are normalized."""
+    numbers = rows.numbers
+    result = np.tile(lie.identity(d), (len(numbers), 1, 1))
+    result[:, :d, d] = numbers[:, :d]
+    if d == 2:
+        result[:, 0, 0] = result[:, 1, 1] = np.cos(numbers[:, 2])
+        result[:, 1, 0] = np.sin(numbers[:, 2])
+        result[:, 0, 1] = -result[:, 1, 0]
+        return result
+    for bad in np.flatnonzero(np.linalg.norm(numbers[:, 3:7], axis=1) < 1e-6)[:1]:
+        raise InputError(f"{path}:{rows.lines[bad]}: quaternion of length 0; write qx qy qz qw, 0 0 0 1 for none")
+    result[:, :3, :3] = lie.from_quaternion(numbers[:, 3:7])
+    return result

@@ -1,1 +1,0 @@
-"""Robust losses of loop edges, graduated non-convexity, the set of inliers."""
