@@ -13,10 +13,9 @@ import tomli_w
 from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.comparison.assessment import Assessed, assess, observability, representative
+from scanchain.comparison.figures import Assessed, assess, observability, representative
 from scanchain.comparison.methods import Method
-from scanchain.comparison.outcome import CLOSURES_FILE, STEPS_FILE, Outcome
-from scanchain.comparison.scan_store import StoredScans
+from scanchain.comparison.processes import CLOSURES_FILE, STEPS_FILE, Outcome, StoredScans
 from scanchain.data import Matrix, Points, Trajectory
 from scanchain.evaluation import Relations, during
 from scanchain.evaluation.absolute import path_length

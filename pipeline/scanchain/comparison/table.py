@@ -13,12 +13,10 @@ import numpy as np
 from msgspec import Struct
 
 from scanchain.baselines import BASELINES
-from scanchain.comparison.assessment import judged, representative
-from scanchain.comparison.figures import COLUMNS, Figures, columns_of
+from scanchain.comparison.figures import COLUMNS, Figures, columns_of, judged, representative
 from scanchain.comparison.methods import Method
-from scanchain.comparison.outcome import EndReport, Outcome, Status
+from scanchain.comparison.processes import EndReport, Outcome, Status, StoredScans
 from scanchain.comparison.results import Results
-from scanchain.comparison.scan_store import StoredScans
 from scanchain.data import Points
 from scanchain.evaluation import Sharpness, disagreement, sampled_map, sampling_step, sharpness
 from scanchain.logs import Log
@@ -35,6 +33,7 @@ class Row(Struct, frozen=True):
     Attributes
     ----------
     status, reason : of the first run that did not end well, else ok
+    figures : by key of COLUMNS, None where unknown
     settings : whole, as a TOML file for --config would hold them
     definitions : of its errors, as text
     verdict, verdict_reason : on its trajectory, of other tools by wheels and constant velocity; empty if it failed
@@ -47,7 +46,7 @@ class Row(Struct, frozen=True):
     reason: str
     description: str
     settings: dict[str, Any]
-    figures: Figures
+    figures: dict[str, float | None]
     definitions: list[str]
     verdict: str = ""
     verdict_reason: str = ""
@@ -110,7 +109,7 @@ class Table(Struct, frozen=True):
     @property
     def figures(self) -> list[Figures]:
         """Figures of the rows, empty for a row that failed."""
-        return [row.figures if row.status is Status.OK else Figures() for row in self.rows]
+        return [row.figures if row.status is Status.OK else {} for row in self.rows]
 
 
 def write_table(folder: Path, table: Table) -> None:
@@ -180,7 +179,7 @@ def _csv(table: Table) -> str:
     writer.writerow(["method", "status", "verdict", "verdict_error", *keys])
     for row in table.rows:
         writer.writerow(
-            [row.name, row.status, row.verdict, row.verdict_error, *(getattr(row.figures, key) for key in keys)]
+            [row.name, row.status, row.verdict, row.verdict_error, *(row.figures.get(key) for key in keys)]
         )
     return buffer.getvalue()
 
@@ -222,12 +221,11 @@ def _row(
     outcomes, assessed = results.outcomes[method.name], results.assessed[method.name]
     end = _end([outcome.report for outcome in outcomes])
     known = apart_m[np.isfinite(apart_m)]
-    figures: Figures = msgspec.structs.replace(
-        assessed.figures,
-        thickness_m=sharp.thickness_m if sharp else None,
-        entropy=sharp.mean_map_entropy if sharp else None,
-        disagreement_m=float(np.median(known)) if len(known) else None,
-    )
+    figures = {column.key: assessed.figures.get(column.key) for column in COLUMNS}
+    if sharp is not None:
+        figures |= {"thickness_m": sharp.thickness_m, "entropy": sharp.mean_map_entropy}
+    if len(known):
+        figures["disagreement_m"] = float(np.median(known))
     return Row(
         name=method.name,
         base=method.base,
