@@ -270,6 +270,13 @@ def _import_small_gicp() -> ModuleType:
 
 Residual = Literal["point-to-plane", "point-to-point", "plane-to-plane"]
 
+# Open3D's registration function for a residual, and its estimation object.
+_REGISTRATIONS: dict[Residual, tuple[str, str]] = {
+    "point-to-plane": ("registration_icp", "TransformationEstimationPointToPlane"),
+    "point-to-point": ("registration_icp", "TransformationEstimationPointToPoint"),
+    "plane-to-plane": ("registration_generalized_icp", "TransformationEstimationForGeneralizedICP"),
+}
+
 
 class Open3dSettings(Struct, frozen=True, forbid_unknown_fields=True):
     """Voxels for downsampling, largest distance of correspondences, and neighborhood of normals."""
@@ -294,7 +301,8 @@ class Open3dPairs(_Pairs):
         self.residual = residual
         self.settings = settings
         registration = self.open3d.pipelines.registration
-        self.register, self.estimation = _registration(registration, residual)
+        register, estimation = _REGISTRATIONS[residual]
+        self.register, self.estimation = getattr(registration, register), getattr(registration, estimation)()
         self.criteria: Any = registration.ICPConvergenceCriteria(max_iteration=settings.max_iterations)
 
     @property
@@ -327,18 +335,6 @@ class Open3dPairs(_Pairs):
                 )
             )
         return cloud
-
-
-def _registration(registration: Any, residual: Residual) -> tuple[Callable[..., Any], Any]:
-    """Open3D's registration function for a residual, and its estimation object."""
-    if residual == "plane-to-plane":
-        return (
-            registration.registration_generalized_icp,
-            registration.TransformationEstimationForGeneralizedICP(),
-        )
-    if residual == "point-to-plane":
-        return registration.registration_icp, registration.TransformationEstimationPointToPlane()
-    return registration.registration_icp, registration.TransformationEstimationPointToPoint()
 
 
 def _import_open3d() -> ModuleType:

@@ -139,8 +139,6 @@ def key_of(identity: str, config_file: Path | None, overrides: Sequence[Override
 
 
 _LOOK_S = 0.1
-_SYSTEM_KILL = -9
-_LAST_CHARACTERS = 300  # of the output of a process that crashed
 _THREADS = (VARIABLE, *(f"{name}_NUM_THREADS" for name in ("NUMBA", "OMP", "OPENBLAS", "MKL", "RAYON")))
 
 
@@ -182,23 +180,21 @@ def _metrics(task: Task) -> Metrics:
 
 def _verdict(task: Task, ending: Ending) -> tuple[State, str]:
     """End state, and the reason if it failed."""
-    match ending.killed_for:
-        case KilledFor.MEMORY:
-            gib = task.memory_mib / 1024.0
-            return State.OUT_OF_MEMORY, f"took more than --memory-limit ({gib:.3g} GiB)"
-        case KilledFor.TIME:
-            return State.TIMED_OUT, f"took longer than --time-limit ({task.time_s:.3g} s)"
-        case KilledFor.STOP:
-            return State.NOT_RUN, "stopped by the user"
-        case KilledFor.NOTHING:
-            return _own_ending(ending, task)
+    output = output_file(Path(task.out), task.key).read_text(encoding="utf-8", errors="replace")
+    if ending.killed_for is KilledFor.STOP:
+        return State.NOT_RUN, "stopped by the user"
+    if ending.killed_for is KilledFor.NOTHING and (own := _own_ending(ending, task, output.splitlines())):
+        return own
+    state = State.OUT_OF_MEMORY if ending.ran_out_of_memory else State.CRASHED
+    if ending.killed_for is KilledFor.TIME:
+        state = State.TIMED_OUT
+    return state, ending.reason(Limits(task.time_s, task.memory_mib), output)
 
 
-def _own_ending(ending: Ending, task: Task) -> tuple[State, str]:
-    """End state and reason, from exit code and output."""
+def _own_ending(ending: Ending, task: Task, output: list[str]) -> tuple[State, str] | None:
+    """End state and reason by exit code and output; None of a process that crashed."""
     if ending.code == 0:
         return State.DONE, ""
-    output = output_file(Path(task.out), task.key).read_text(encoding="utf-8", errors="replace").splitlines()
     error = next((line for line in reversed(output) if line.startswith("error: ")), "")
     if ending.code == 1 and (task.run / "metrics.json").is_file():
         metrics = _metrics(task)
@@ -206,7 +202,4 @@ def _own_ending(ending: Ending, task: Task) -> tuple[State, str]:
             return State.NOT_TRUSTWORTHY, metrics.verdict_reason
     if ending.code in (1, 2) and error:
         return State.FAILED, error.removeprefix("error: ")
-    if ending.code == _SYSTEM_KILL:
-        return State.OUT_OF_MEMORY, "killed, as the system does when memory runs out"
-    last = " ".join(" ".join(output).split())[-_LAST_CHARACTERS:]
-    return State.CRASHED, f"ended by {ending.how}" + (f": {last}" if last else "")
+    return None

@@ -11,7 +11,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import BinaryIO
 
 import msgspec
 import numpy as np
@@ -20,11 +19,18 @@ from numpy.typing import NDArray
 
 from scanchain.comparison.methods import Method
 from scanchain.data import Matrix, Pose, Scan, Trajectory
-from scanchain.processes import Ending, KilledFor, Limits, available_mib, run_within
+from scanchain.processes import KilledFor, Limits, available_mib, run_within
 from scanchain.runs.job import Progress
 from scanchain.words import counted
 
-_POINTS, _TIMES, _TABLE = "points.f32", "times.f32", "scans.npz"
+_ARRAYS, _TABLE = "points_and_times.npy", "scans.npz"
+POSES_FILE, SECONDS_FILE, CPU_FILE = "poses.npy", "seconds.npy", "cpu_seconds.npy"
+METHOD_FILE, TRAJECTORY_FILE, REPORT_FILE = "method.msgpack", "trajectory.npy", "end.json"
+STEPS_FILE, CLOSURES_FILE = "steps.parquet", "loops.parquet"
+
+_LEAST_S, _SCAN_S = 300.0, 1.0  # default time limit, seconds: at least, and for each scan
+_SHARE = 0.75  # share of the free memory that is the default limit
+_INTERVAL_S = 0.02  # between two readings of a process's memory
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +40,7 @@ class StoredScans:
     Attributes
     ----------
     folder : where their points and times lie
-    points, times : (N,) numbers of points and of times of each scan, which lie one after the other
+    points : (N,) numbers of points of each scan
     stamps_ns, log_times_ns, dropped : (N,) as in ``Scan``
     wheels : (N, d+1, d+1) T_odom_base, NaN where the log has none
     T_base_lidar : (d+1, d+1)
@@ -42,7 +48,6 @@ class StoredScans:
 
     folder: Path
     points: NDArray[np.int64]
-    times: NDArray[np.int64]
     stamps_ns: NDArray[np.int64]
     log_times_ns: NDArray[np.int64]
     dropped: NDArray[np.int64]
@@ -59,15 +64,14 @@ class StoredScans:
 
     def scans(self) -> Iterator[Scan]:
         """The scans as they were decoded."""
-        with (self.folder / _POINTS).open("rb") as points, (self.folder / _TIMES).open("rb") as times:
-            for index in range(len(self)):
-                wheels = self.wheels[index]
+        with (self.folder / _ARRAYS).open("rb") as arrays:
+            for index, wheels in enumerate(self.wheels):
                 yield Scan(
                     index=index,
                     stamp_ns=int(self.stamps_ns[index]),
                     log_time_ns=int(self.log_times_ns[index]),
-                    points=_read(points, self.points[index] * self.dimension).reshape(-1, self.dimension),
-                    times_s=_read(times, self.times[index]),
+                    points=np.load(arrays),
+                    times_s=np.load(arrays),
                     dropped=int(self.dropped[index]),
                     T_odom_base=wheels if np.isfinite(wheels).all() else None,
                 )
@@ -78,12 +82,12 @@ def store(scans: Iterable[Scan], T_base_lidar: Pose, folder: Path) -> StoredScan
     rows: list[tuple[int, ...]] = []
     wheels: list[Pose] = []
     unknown = np.full(T_base_lidar.shape, np.nan)
-    with (folder / _POINTS).open("wb") as points, (folder / _TIMES).open("wb") as times:
+    with (folder / _ARRAYS).open("wb") as arrays:
         for scan in scans:
-            rows.append((len(scan.points), len(scan.times_s), scan.stamp_ns, scan.log_time_ns, scan.dropped))
+            rows.append((len(scan.points), scan.stamp_ns, scan.log_time_ns, scan.dropped))
             wheels.append(unknown if scan.T_odom_base is None else scan.T_odom_base)
-            points.write(np.ascontiguousarray(scan.points, np.float32).data)
-            times.write(np.ascontiguousarray(scan.times_s, np.float32).data)
+            np.save(arrays, np.ascontiguousarray(scan.points, np.float32))
+            np.save(arrays, np.ascontiguousarray(scan.times_s, np.float32))
     np.savez(folder / _TABLE, rows=np.array(rows, np.int64), wheels=np.array(wheels), T_base_lidar=T_base_lidar)
     return open_store(folder)
 
@@ -91,20 +95,9 @@ def store(scans: Iterable[Scan], T_base_lidar: Pose, folder: Path) -> StoredScan
 def open_store(folder: Path) -> StoredScans:
     """The scans that ``store`` wrote."""
     with np.load(folder / _TABLE) as table:
-        points, times, stamps_ns, log_times_ns, dropped = table["rows"].T.copy()
+        points, stamps_ns, log_times_ns, dropped = table["rows"].T.copy()
         wheels, T_base_lidar = table["wheels"], table["T_base_lidar"]
-    return StoredScans(folder, points, times, stamps_ns, log_times_ns, dropped, wheels, T_base_lidar)
-
-
-def _read(file: BinaryIO, count: int) -> NDArray[np.float32]:
-    """The next floats (count,)."""
-    return np.fromfile(file, np.float32, int(count))
-
-
-POSES_FILE, SECONDS_FILE, CPU_FILE = "poses.npy", "seconds.npy", "cpu_seconds.npy"
-METHOD_FILE = "method.msgpack"
-TRAJECTORY_FILE, REPORT_FILE = "trajectory.npy", "end.json"
-STEPS_FILE, CLOSURES_FILE = "steps.parquet", "loops.parquet"
+    return StoredScans(folder, points, stamps_ns, log_times_ns, dropped, wheels, T_base_lidar)
 
 
 class Status(StrEnum):
@@ -183,10 +176,6 @@ def read_outcome(folder: Path, report: EndReport, stamps_ns: NDArray[np.int64], 
     return Outcome(report, odometry, Trajectory(stamps_ns[: len(poses)], poses), seconds, cpu_seconds, folder)
 
 
-_LEAST_S, _SCAN_S = 300.0, 1.0  # default time limit, seconds: at least, and for each scan
-_SHARE = 0.75  # share of the free memory that is the default limit
-
-
 def limits_for(scans: int, time_s: float | None, memory_mib: float | None) -> Limits:
     """The requested limits, else 300 s and one more a scan, and three quarters of the memory that is free."""
     return Limits(
@@ -227,11 +216,6 @@ def _progress_line(name: str, turn: int, repeat: int, outcome: Outcome) -> str:
     return f"{name}{which}: {outcome.report.status}: {outcome.report.reason}"
 
 
-_INTERVAL_S = 0.02
-_LAST_CHARACTERS = 300  # last characters of the output of a process that crashed, which are reported
-_KILLED = -9
-
-
 def run_watched(method: Method, scans: Path, folder: Path, limits: Limits) -> EndReport:
     """Run a method over stored scans; its own folder takes what it writes and prints."""
     (folder / METHOD_FILE).write_bytes(msgspec.msgpack.encode(method))
@@ -245,17 +229,13 @@ def run_watched(method: Method, scans: Path, folder: Path, limits: Limits) -> En
         output=folder / "output.txt",
         interval_s=_INTERVAL_S,
     )
-    if ending.killed_for is KilledFor.TIME:
-        return _ended(Status.TIMED_OUT, f"took longer than --time-limit ({limits.time_s:.3g} s)", ending, folder)
-    if ending.killed_for is KilledFor.MEMORY:
-        limit_gib = limits.memory_mib / 1024.0
-        return _ended(Status.OUT_OF_MEMORY, f"took more than --memory-limit ({limit_gib:.3g} GiB)", ending, folder)
-    if (folder / REPORT_FILE).exists():
+    if ending.killed_for is KilledFor.NOTHING and (folder / REPORT_FILE).exists():
         return _own_report(folder)
-    if ending.code == _KILLED:
-        return _ended(Status.OUT_OF_MEMORY, "killed, as the system does when memory runs out", ending, folder)
-    output = " ".join((folder / "output.txt").read_text(errors="replace").split())[-_LAST_CHARACTERS:]
-    return _ended(Status.CRASHED, f"ended by {ending.how}" + (f": {output}" if output else ""), ending, folder)
+    status = Status.OUT_OF_MEMORY if ending.ran_out_of_memory else Status.CRASHED
+    if ending.killed_for is KilledFor.TIME:
+        status = Status.TIMED_OUT
+    reason = ending.reason(limits, (folder / "output.txt").read_text(errors="replace"))
+    return EndReport(status, f"{_where(folder)}: {reason}", peak_mib=ending.peak_mib)
 
 
 def _own_report(folder: Path) -> EndReport:
@@ -264,11 +244,6 @@ def _own_report(folder: Path) -> EndReport:
     if not report.status.is_failure:
         return report
     return msgspec.structs.replace(report, reason=f"{_where(folder)}: {report.reason}")
-
-
-def _ended(status: Status, reason: str, ending: Ending, folder: Path) -> EndReport:
-    """Report of a process that left none."""
-    return EndReport(status, f"{_where(folder)}: {reason}", peak_mib=ending.peak_mib)
 
 
 def _where(folder: Path) -> str:

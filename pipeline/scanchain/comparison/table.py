@@ -186,7 +186,8 @@ def _csv(table: Table) -> str:
 
 def summarize(results: Results, log: Log, limits: Limits, provenance: Provenance) -> Table:
     """Every method's row, with figures that depend on all of them: sharpness and disagreement."""
-    scans, sharp = results.scans, sharpness_of(results.maps)
+    scans, maps = results.scans, results.maps
+    sharp = dict(zip(maps, sharpness(list(maps.values())), strict=True)) if maps else {}
     chosen = {method.name: representative(results.outcomes[method.name]) for method in results.methods}
     apart_m, judgments = disagreement([each.trajectory.poses for each in chosen.values()]), judged(chosen, scans)
     rows = [
@@ -260,9 +261,3 @@ def maps_of(scans: StoredScans, outcomes: Mapping[str, list[Outcome]]) -> dict[s
         for name, outcome in whole.items()
         if outcome.is_whole
     }
-
-
-def sharpness_of(maps: Mapping[str, Points]) -> dict[str, Sharpness]:
-    """Sharpness of each map that has one."""
-    results = sharpness(list(maps.values())) if maps else []
-    return {name: result for name, result in zip(maps, results, strict=True) if result is not None}

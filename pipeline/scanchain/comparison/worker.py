@@ -20,28 +20,28 @@ import numpy as np
 from numpy.lib.format import open_memmap
 
 from scanchain import plugins
-from scanchain.baselines import BASELINES, Baseline, InPlane
+from scanchain.baselines import BASELINES, InPlane
 from scanchain.clock import announcing_compilation
 from scanchain.comparison.methods import Method
 from scanchain.comparison.processes import (
-    CLOSURES_FILE,
     CPU_FILE,
     METHOD_FILE,
     POSES_FILE,
     REPORT_FILE,
     SECONDS_FILE,
-    STEPS_FILE,
     TRAJECTORY_FILE,
     EndReport,
     Status,
     StoredScans,
     open_store,
 )
-from scanchain.config import Config
 from scanchain.data import Pose, Scan, Trajectory
 from scanchain.errors import MissingExtraError, ScanchainError, shown
 from scanchain.processes import die_first, die_with_parent, peak_mib
 from scanchain.runs.job import Unwatched
+
+_WARM_UP_SCANS = 4
+_MAX_CHARACTERS = 300  # largest length of the message of an error raised by other code
 
 
 class Runner(Protocol):
@@ -63,70 +63,22 @@ class Runner(Protocol):
 
 def start(method: Method, T_base_lidar: Pose) -> Runner:
     """The method before its first scan. Raises MissingExtraError where its package is not installed."""
-    return _Ours(method, T_base_lidar) if method.is_ours else _Others(method, len(T_base_lidar) - 1)
+    if not method.is_ours:
+        return _Others(method, len(T_base_lidar) - 1)
+    from scanchain.comparison.ours import Ours  # much code, which is not to count as memory of the others
 
-
-def can_start_again(method: Method) -> bool:
-    """True if instances are independent, so that one may be discarded after warming up."""
-    return method.base not in BASELINES or BASELINES[method.base].forgets
-
-
-class _Ours:
-    """Odometry, with loop closures and pose graph where the method closes loops.
-
-    Imports here what is much code, and is not to count as memory of the others.
-    """
-
-    def __init__(self, method: Method, T_base_lidar: Pose) -> None:
-        from scanchain.runs.step_table import StepTable
-        from scanchain.slam import Slam
-
-        self.config = config = msgspec.convert(method.settings, Config)
-        self.has_loops = config.loops.enabled
-        closing = "; loops closed, pose graph optimized at the end" if self.has_loops else ""
-        self.description = f"{_description(config)}{closing}"
-        self.slam = Slam(config, T_base_lidar)
-        self.T_base_lidar = T_base_lidar
-        self.steps = StepTable()
-
-    def track(self, scan: Scan) -> Pose:
-        """T_odom_lidar (d+1, d+1)."""
-        step = self.slam.process(scan)
-        self.steps.append(step)
-        return step.T_odom_lidar
-
-    def finish(self, odometry: Trajectory, folder: Path) -> Trajectory:
-        """The final poses; tables and the expected ATE go into the folder."""
-        from scanchain.runs.closures import final_verdicts, write_closures
-        from scanchain.runs.metrics import METRICS_FILE
-        from scanchain.runs.results import expected_of
-
-        result = self.slam.finish()
-        trajectory = result.trajectory if self.has_loops else odometry
-        self.steps.write(folder / STEPS_FILE, trajectory, self.T_base_lidar)
-        expected = expected_of(result, self.config)
-        known = {"expected_ate_m": expected and expected.ate}
-        (folder / METRICS_FILE).write_bytes(msgspec.json.encode(known))
-        if self.has_loops:
-            final = final_verdicts(result.closures, result.state)
-            write_closures(folder / CLOSURES_FILE, final, result.keyframes, odometry.dimension)
-        return trajectory
-
-
-def _description(config: Config) -> str:
-    wheels = "wheels where the log has them" if config.odometry.prior != "constant-velocity" else "no wheels"
-    deskewing = "deskewing where the log has times" if config.preprocess.deskew else "no deskewing"
-    steps = f" by {config.matching.optimizer}" if config.matching.matcher == "plicp" else ""
-    size_m = np.format_float_positional(config.local_map.voxel_size_m, trim="-")
-    return (
-        f"ours, {config.matching.matcher}{steps}, scan to map, voxels of {size_m} m, "
-        f"one thread, {wheels}, {deskewing}"
-    )
+    return Ours(method, T_base_lidar)
 
 
 class _Others:
     def __init__(self, method: Method, dimension: int) -> None:
-        self.baseline = _baseline(method, dimension)
+        if method.base in BASELINES:
+            entry = BASELINES[method.base]
+            self.baseline = entry.make(msgspec.convert(method.settings, type(entry.settings)))
+            if dimension == 2:
+                self.baseline = InPlane(self.baseline, is_raised=entry.is_raised)
+        else:
+            self.baseline = plugins.load(method.base, "track")(**method.settings)
         self.description = str(getattr(self.baseline, "description", "")) or method.base
 
     def track(self, scan: Scan) -> Pose:
@@ -134,18 +86,6 @@ class _Others:
 
     def finish(self, odometry: Trajectory, folder: Path) -> Trajectory:
         return odometry
-
-
-def _baseline(method: Method, dimension: int) -> Baseline:
-    if method.base not in BASELINES:
-        return plugins.load(method.base, "track")(**method.settings)
-    entry = BASELINES[method.base]
-    baseline = entry.make(msgspec.convert(method.settings, type(entry.settings)))
-    return baseline if dimension == 3 else InPlane(baseline, is_raised=entry.is_raised)
-
-
-_WARM_UP_SCANS = 4
-_MAX_CHARACTERS = 300  # largest length of the message of an error raised by other code
 
 
 def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
@@ -176,7 +116,7 @@ def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
 
 def warm_up(scans: Iterable[Scan], method: Method, T_base_lidar: Pose) -> None:
     """Import and compile with an instance that is thrown away; what goes wrong will go wrong again."""
-    if not can_start_again(method):
+    if method.base in BASELINES and not BASELINES[method.base].forgets:
         return
     runner = start(method, T_base_lidar)
     with suppress(Exception):

@@ -15,7 +15,6 @@ from scanchain.evaluation.pairing import Pairs, pair
 from scanchain.registration.svd_icp import DegeneratePairsError, rigid_transform
 
 _PLANAR = 1e-9  # meters of height and radians of tilt below which poses count as planar
-
 _FAR_OFF_SHARE, _FAR_OFF_M = 0.02, 0.1  # ATE above both of which odometry failed: share of the path, meters
 _SHORTEST_PATH_M = 1.0  # shortest path of which an error is given as a share
 

@@ -65,7 +65,7 @@ def relative_error_over_distance(pairs: Pairs, distance_m: float) -> RelativeErr
     if not distance_m > 0.0:
         raise InputError(f"RPE over {distance_m:g} m is not defined; take more than 0")
     traveled_m = path_length(pairs.reference)
-    end = _of_that_size(traveled_m, first_after(traveled_m, distance_m), distance_m)
+    end = _of_that_size(traveled_m, np.searchsorted(traveled_m, traveled_m + distance_m, side="left"), distance_m)
     return _relative_error(pairs, end, f"{distance_m:g} m along the reference")
 
 
@@ -81,11 +81,6 @@ def relative_error_over_time(pairs: Pairs, duration_s: float) -> RelativeError:
     return _relative_error(pairs, end, f"{duration_s:g} s")
 
 
-def first_after(traveled_m: NDArray[np.float64], distance_m: float) -> NDArray[np.int64]:
-    """(N,) index of the first pose at least ``distance_m`` further along, N where there is none."""
-    return np.searchsorted(traveled_m, traveled_m + distance_m, side="left")
-
-
 def _of_that_size(
     along: NDArray[np.float64] | NDArray[np.int64], end: NDArray[np.int64], size: float
 ) -> NDArray[np.int64]:
@@ -94,12 +89,17 @@ def _of_that_size(
     return np.where(reached - along <= _LARGEST * size, end, len(along))
 
 
-def motion_errors(pairs: Pairs, stretches: NDArray[np.int64]) -> Matrix:
-    """E (M, 4, 4) = (R_i⁻¹ R_j)⁻¹ (P_i⁻¹ P_j) of each stretch (i, j)."""
+def _motion_errors(pairs: Pairs, stretches: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Translation (M,) and angle (M,) of E = (R_i⁻¹ R_j)⁻¹ (P_i⁻¹ P_j) of each stretch (i, j)."""
     i, j = stretches[:, 0], stretches[:, 1]
     reference = lie.between(pairs.reference[i], pairs.reference[j])
     estimate = lie.between(pairs.estimate[i], pairs.estimate[j])
-    return lie.between(reference, estimate)
+    return _sizes(lie.between(reference, estimate))
+
+
+def _sizes(error: Matrix) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Translation (M,) and angle (M,) of motions (M, 4, 4)."""
+    return np.linalg.norm(error[:, :3, 3], axis=1), lie.rotation_angle(error)
 
 
 def _relative_error(pairs: Pairs, end: NDArray[np.int64], size: str) -> RelativeError:
@@ -109,8 +109,7 @@ def _relative_error(pairs: Pairs, end: NDArray[np.int64], size: str) -> Relative
             f"RPE over {size}: no stretch of that length fits into {counted(len(pairs), 'paired pose')}"
         )
     stretches = np.stack([start, end[start]], axis=1)
-    error = motion_errors(pairs, stretches)
-    errors_m, errors_rad = np.linalg.norm(error[:, :3, 3], axis=1), lie.rotation_angle(error)
+    errors_m, errors_rad = _motion_errors(pairs, stretches)
     return RelativeError(
         size=size,
         definition=(
@@ -239,8 +238,8 @@ def _drift(
     start = np.arange(0, len(pairs), every)
     end = np.searchsorted(traveled_m, traveled_m[start] + length_m, side="right")
     fits = end < len(pairs)
-    error = motion_errors(pairs, np.stack([start[fits], end[fits]], axis=1))
-    return np.linalg.norm(error[:, :3, 3], axis=1) / length_m, lie.rotation_angle(error) / length_m
+    errors_m, errors_rad = _motion_errors(pairs, np.stack([start[fits], end[fits]], axis=1))
+    return errors_m / length_m, errors_rad / length_m
 
 
 def _mean(values: NDArray[np.float64]) -> float | None:
@@ -314,8 +313,7 @@ def relation_error(
     first, second = index.reshape(-1, 2)[used].T
     poses = lie.lift(trajectory.poses)
     estimated = lie.between(poses[first], poses[second])
-    error = lie.between(relations.T_first_second[used], estimated)
-    errors_m, errors_rad = np.linalg.norm(error[:, :3, 3], axis=1), lie.rotation_angle(error)
+    errors_m, errors_rad = _sizes(lie.between(relations.T_first_second[used], estimated))
     return RelationError(
         definition=(
             f"relations (Kümmerle et al. 2009): ‖trans‖ and |rot| of δ*⁻¹ δ, δ = T_first⁻¹ T_second at the poses "

@@ -1,0 +1,61 @@
+"""Our own methods in a comparison, with the tables that only they write."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from scanchain.comparison.methods import Method
+from scanchain.comparison.processes import CLOSURES_FILE, STEPS_FILE
+from scanchain.config import Config
+from scanchain.data import Pose, Scan, Trajectory
+from scanchain.runs.closures import final_verdicts, write_closures
+from scanchain.runs.metrics import METRICS_FILE
+from scanchain.runs.results import expected_of
+from scanchain.runs.step_table import StepTable
+from scanchain.slam import Slam
+
+
+class Ours:
+    """Odometry, with loop closures and pose graph where the method closes loops."""
+
+    def __init__(self, method: Method, T_base_lidar: Pose) -> None:
+        self.config = config = msgspec.convert(method.settings, Config)
+        self.has_loops = config.loops.enabled
+        closing = "; loops closed, pose graph optimized at the end" if self.has_loops else ""
+        self.description = f"{_description(config)}{closing}"
+        self.slam = Slam(config, T_base_lidar)
+        self.T_base_lidar = T_base_lidar
+        self.steps = StepTable()
+
+    def track(self, scan: Scan) -> Pose:
+        """T_odom_lidar (d+1, d+1)."""
+        step = self.slam.process(scan)
+        self.steps.append(step)
+        return step.T_odom_lidar
+
+    def finish(self, odometry: Trajectory, folder: Path) -> Trajectory:
+        """The final poses; tables and the expected ATE go into the folder."""
+        result = self.slam.finish()
+        trajectory = result.trajectory if self.has_loops else odometry
+        self.steps.write(folder / STEPS_FILE, trajectory, self.T_base_lidar)
+        expected = expected_of(result, self.config)
+        known = {"expected_ate_m": expected and expected.ate}
+        (folder / METRICS_FILE).write_bytes(msgspec.json.encode(known))
+        if self.has_loops:
+            final = final_verdicts(result.closures, result.state)
+            write_closures(folder / CLOSURES_FILE, final, result.keyframes, odometry.dimension)
+        return trajectory
+
+
+def _description(config: Config) -> str:
+    wheels = "wheels where the log has them" if config.odometry.prior != "constant-velocity" else "no wheels"
+    deskewing = "deskewing where the log has times" if config.preprocess.deskew else "no deskewing"
+    steps = f" by {config.matching.optimizer}" if config.matching.matcher == "plicp" else ""
+    size_m = np.format_float_positional(config.local_map.voxel_size_m, trim="-")
+    return (
+        f"ours, {config.matching.matcher}{steps}, scan to map, voxels of {size_m} m, "
+        f"one thread, {wheels}, {deskewing}"
+    )
