@@ -15,7 +15,7 @@ from msgspec import Struct
 from scanchain.baselines import BASELINES
 from scanchain.comparison.figures import COLUMNS, Figures, columns_of, judged, representative
 from scanchain.comparison.methods import Method
-from scanchain.comparison.processes import EndReport, Outcome, Status, StoredScans
+from scanchain.comparison.processes import Outcome, Status, StoredScans
 from scanchain.comparison.results import Results
 from scanchain.data import Points
 from scanchain.evaluation import Sharpness, disagreement, sampled_map, sampling_step, sharpness
@@ -212,7 +212,9 @@ def summarize(results: Results, log: Log, limits: Limits, provenance: Provenance
             *log.damage,
         ],
         provenance=provenance,
-        baselines={name: _installed(name) for name in packages},
+        baselines={  # a package may be installed as its variant without CUDA
+            name: package_version(name) or package_version(f"{name}-cpu") for name in packages
+        },
     )
 
 
@@ -220,7 +222,8 @@ def _row(
     results: Results, method: Method, sharp: Sharpness | None, apart_m: np.ndarray, judgment: Judged | None
 ) -> Row:
     outcomes, assessed = results.outcomes[method.name], results.assessed[method.name]
-    end = _end([outcome.report for outcome in outcomes])
+    ended = [outcome.report for outcome in outcomes]
+    end = next((report for report in ended if report.status is not Status.OK), ended[0])
     known = apart_m[np.isfinite(apart_m)]
     figures = {column.key: assessed.figures.get(column.key) for column in COLUMNS}
     if sharp is not None:
@@ -242,22 +245,12 @@ def _row(
     )
 
 
-def _end(reports: list[EndReport]) -> EndReport:
-    """End report: that of the first run that failed, else of the first."""
-    return next((report for report in reports if report.status is not Status.OK), reports[0])
-
-
-def _installed(package: str) -> str:
-    """Version of a package, which may be installed as its variant without CUDA."""
-    return package_version(package) or package_version(f"{package}-cpu")
-
-
 def maps_of(scans: StoredScans, outcomes: Mapping[str, list[Outcome]]) -> dict[str, Points]:
     """Sampled maps (M, d) of the methods that came to their end."""
     step = sampling_step(int(scans.points.sum()))
-    whole = {name: representative(runs) for name, runs in outcomes.items()}
+    chosen = {name: representative(runs) for name, runs in outcomes.items()}
     return {
         name: sampled_map(scans.scans(), outcome.trajectory, step)
-        for name, outcome in whole.items()
+        for name, outcome in chosen.items()
         if outcome.is_whole
     }
