@@ -21,6 +21,8 @@ from time import monotonic
 import psutil
 
 _MIB = 1024.0**2
+_SYSTEM_KILL = -9  # code of a process that the system killed, as it does when memory runs out
+_LAST_CHARACTERS = 300  # of the output of a process that crashed, which are reported
 _HAS_GROUPS = sys.platform != "win32"
 _KILL = signal.SIGKILL if sys.platform != "win32" else signal.SIGTERM
 
@@ -114,6 +116,23 @@ class Ending:
     def how(self) -> str:
         """Signal or exit code as text, if it was not killed here."""
         return signal.Signals(-self.code).name if self.code < 0 else f"exit code {self.code}"
+
+    @property
+    def ran_out_of_memory(self) -> bool:
+        """True if it was killed for its memory, here or by the system."""
+        by_system = self.killed_for is KilledFor.NOTHING and self.code == _SYSTEM_KILL
+        return by_system or self.killed_for is KilledFor.MEMORY
+
+    def reason(self, limits: Limits, output: str) -> str:
+        """The limit that it was killed for, else signal or exit code with the last of its output."""
+        if self.killed_for is KilledFor.TIME:
+            return f"took longer than --time-limit ({limits.time_s:.3g} s)"
+        if self.killed_for is KilledFor.MEMORY:
+            return f"took more than --memory-limit ({limits.memory_mib / 1024.0:.3g} GiB)"
+        if self.ran_out_of_memory:
+            return "killed, as the system does when memory runs out"
+        last = " ".join(output.split())[-_LAST_CHARACTERS:]
+        return f"ended by {self.how}" + (f": {last}" if last else "")
 
 
 def die_with_parent(leftover: Path | None = None) -> None:

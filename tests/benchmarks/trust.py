@@ -42,7 +42,7 @@ from scanchain.evaluation import (
     read_relations,
 )
 from scanchain.evaluation.absolute import path_length
-from scanchain.evaluation.expected import with_map_errors
+from scanchain.evaluation.consistency import with_map_errors
 from scanchain.evaluation.pairing import nearest
 from scanchain.logs import open_log
 from scanchain.settings import Override, load_settings

@@ -144,7 +144,7 @@ def test_real_kitti_sweeps_are_the_same_out_of_a_folder(tmp_path):
 
 
 def open3d():
-    from scanchain.baselines.open3d_pairs import Open3dPairs
+    from scanchain.baselines.wrapped import Open3dPairs
 
     return Open3dPairs("point-to-point").open3d
 

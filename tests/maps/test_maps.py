@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from scanchain import lie
-from scanchain.baselines.open3d_pairs import Open3dPairs
+from scanchain.baselines.wrapped import Open3dPairs
 from scanchain.config import MapsConfig
 from scanchain.errors import InputError
 from scanchain.logs import open_log

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from scanchain.comparison.methods import resolve
-from scanchain.comparison.outcome import Status
+from scanchain.comparison.processes import Status
 from scanchain.comparison.table import read_table
 from scanchain.config import LocalMapConfig, MatchingConfig
 from scanchain.errors import InputError
@@ -112,7 +112,7 @@ def test_it_is_a_row_of_a_comparison_and_its_settings_can_be_given_back(office, 
     assert child.returncode == 0, errors
     svd, own = read_table(folder / "a").rows
     assert own.status is Status.OK and NAME in own.description
-    assert own.figures.ate_m < 0.1 and own.figures.ate_m != svd.figures.ate_m
+    assert own.figures["ate_m"] < 0.1 and own.figures["ate_m"] != svd.figures["ate_m"]
     monkeypatch.chdir(folder)
     monkeypatch.setattr(sys, "path", [*sys.path])
     given = resolve(names, 2, file=None, matcher=NAME)

@@ -76,7 +76,7 @@ def comparison(evil, tmp_path_factory):
         f'["{EVIL}"]\nmethod = "bad_odometries:Shifted"\n[raises]\nmethod = "bad_odometries:Raises"\n'
     )
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", f"{SUPPORT}:{ROOT}")
+        patch.setenv("PYTHONPATH", f"{SUPPORT}:{ROOT}", prepend=":")
         code = main(
             [
                 "compare", str(evil), "--out", str(folder / "out"), "--settings", str(folder / "a.toml"),

@@ -128,8 +128,6 @@ def key_of(identity: str, config_file: Path | None, overrides: Sequence[Override
 
 
 _LOOK_S = 0.1
-_SYSTEM_KILL = -9
-_LAST_CHARACTERS = 300  # of the output of a process that crashed
 _THREADS = (VARIABLE, *(f"{name}_NUM_THREADS" for name in ("NUMBA", "OMP", "OPENBLAS", "MKL", "RAYON")))
 
 
@@ -153,7 +151,7 @@ def _tried(task: Task, stop: Event | None) -> Row:
         interval_s=_LOOK_S,
         stop=stop,
     )
-    state, reason = _state(task, ending, output)
+    state, reason = _verdict(task, ending)
     run, sha256, metrics = "", "", None
     if state.has_result:
         run, metrics = task.run.name, _metrics(task)
@@ -166,27 +164,28 @@ def _metrics(task: Task) -> Metrics:
     return msgspec.json.decode((task.run / METRICS_FILE).read_bytes(), type=Metrics)
 
 
-def _state(task: Task, ending: Ending, output: Path) -> tuple[State, str]:
-    """End state, and the reason if it failed, from what ended the process, its exit code and its output."""
-    match ending.killed_for:
-        case KilledFor.MEMORY:
-            gib = task.memory_mib / 1024.0
-            return State.OUT_OF_MEMORY, f"took more than --memory-limit ({gib:.3g} GiB)"
-        case KilledFor.TIME:
-            return State.TIMED_OUT, f"took longer than --time-limit ({task.time_s:.3g} s)"
-        case KilledFor.STOP:
-            return State.NOT_RUN, "stopped by the user"
+def _verdict(task: Task, ending: Ending) -> tuple[State, str]:
+    """End state, and the reason if it failed."""
+    output = output_file(Path(task.out), task.key).read_text(encoding="utf-8", errors="replace")
+    if ending.killed_for is KilledFor.STOP:
+        return State.NOT_RUN, "stopped by the user"
+    if ending.killed_for is KilledFor.NOTHING and (own := _own_ending(ending, task, output.splitlines())):
+        return own
+    state = State.OUT_OF_MEMORY if ending.ran_out_of_memory else State.CRASHED
+    if ending.killed_for is KilledFor.TIME:
+        state = State.TIMED_OUT
+    return state, ending.reason(Limits(task.time_s, task.memory_mib), output)
+
+
+def _own_ending(ending: Ending, task: Task, output: list[str]) -> tuple[State, str] | None:
+    """End state and reason by exit code and output; None of a process that crashed."""
     if ending.code == 0:
         return State.DONE, ""
-    lines = output.read_text(encoding="utf-8", errors="replace").splitlines()
-    error = next((line for line in reversed(lines) if line.startswith("error: ")), "")
+    error = next((line for line in reversed(output) if line.startswith("error: ")), "")
     if ending.code == 1 and (task.run / METRICS_FILE).is_file():
         metrics = _metrics(task)
         if metrics.verdict is Verdict.NOT_TRUSTWORTHY and error.endswith(metrics.sentence):
             return State.NOT_TRUSTWORTHY, metrics.verdict_reason
     if ending.code in (1, 2) and error:
         return State.FAILED, error.removeprefix("error: ")
-    if ending.code == _SYSTEM_KILL:
-        return State.OUT_OF_MEMORY, "killed, as the system does when memory runs out"
-    last = " ".join(" ".join(lines).split())[-_LAST_CHARACTERS:]
-    return State.CRASHED, f"ended by {ending.how}" + (f": {last}" if last else "")
+    return None

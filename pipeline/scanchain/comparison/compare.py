@@ -12,11 +12,10 @@ import msgspec
 import numpy as np
 
 from scanchain import lie
-from scanchain.comparison.assessment import assess
+from scanchain.comparison.figures import assess
 from scanchain.comparison.methods import default_names, resolve, shared_settings
-from scanchain.comparison.processes import limits_for, run_all
+from scanchain.comparison.processes import StoredScans, limits_for, run_all, store
 from scanchain.comparison.results import Reference, Results, write_results
-from scanchain.comparison.scan_store import StoredScans, store
 from scanchain.comparison.table import Table, maps_of, summarize, write_table
 from scanchain.config import NO_TRUTH
 from scanchain.data import Trajectory, brief

@@ -1,45 +1,35 @@
-"""Figures of a method, and their columns in tables: heads, units, digits, best value."""
+"""Figures of methods: against ground truth and relations, and times; their columns in tables."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+import pyarrow.parquet as pq
 from msgspec import Struct
+from numpy.typing import NDArray
 
+from scanchain.comparison.processes import STEPS_FILE, Outcome, StoredScans
+from scanchain.data import Matrix, Pose, Trajectory
+from scanchain.errors import InputError
+from scanchain.evaluation import (
+    KittiError,
+    RelationError,
+    Relations,
+    absolute_error_of_any_path,
+    pair,
+    relation_error,
+    relative_errors,
+)
+from scanchain.runs.step_table import COLUMNS as STEP_COLUMNS
+from scanchain.runs.step_table import nees_of_steps
+from scanchain.runs.vouching import evidence_of_trajectory, expected_of_run, judge_run
+from scanchain.verdict import Judged, Verdict, apart_m, judge
 
-class Figures(Struct, frozen=True):
-    """A row of the table; errors are None without ground truth or relations, or after a failure."""
-
-    ate_m: float | None = None
-    ate_share: float | None = None
-    ate_rotation_rad: float | None = None
-    rpe_1_s_m: float | None = None
-    rpe_10_m_m: float | None = None
-    rpe_100_m_m: float | None = None
-    kitti_share: float | None = None
-    kitti_rad_per_m: float | None = None
-    paired_share: float | None = None
-    relations_m: float | None = None
-    relations_rad: float | None = None
-    nees: float | None = None
-    thickness_m: float | None = None
-    entropy: float | None = None
-    disagreement_m: float | None = None
-    median_s: float | None = None
-    p95_s: float | None = None
-    cpu_s: float | None = None
-    first_s: float | None = None
-    scans_per_s: float | None = None
-    preprocess_s: float | None = None
-    match_s: float | None = None
-    map_s: float | None = None
-    loops_s: float | None = None
-    start_s: float | None = None
-    finish_s: float | None = None
-    peak_mib: float | None = None
-    repeats_apart_m: float | None = None
+Figures = Mapping[str, float | None]  # by key of COLUMNS; unknown without a reference, or after a failure
 
 
 class Shown(Struct, frozen=True):
@@ -54,9 +44,9 @@ class Column(Struct, frozen=True):
 
     Attributes
     ----------
-    key : the field of ``Figures``
+    key : of the figure
     head, unit : what stands above it
-    scale : from the field's unit to the shown one
+    scale : from the figure's unit to the shown one
     digits : after the point, at most
     better : which values are marked as the best; none of a figure that is not about accuracy or cost, as the NEES
         of a bad method may be near 1
@@ -80,7 +70,7 @@ class Column(Struct, frozen=True):
 
     def of(self, figures: Figures) -> float | None:
         """The shown value of a row."""
-        value: float | None = getattr(figures, self.key)
+        value = figures.get(self.key)
         return None if value is None else self.scale * value
 
     def cells(self, rows: Sequence[Figures]) -> list[Shown]:
@@ -156,3 +146,172 @@ def columns_of(rows: Sequence[Figures], table: str) -> list[Column]:
     return [
         column for column in COLUMNS if column.table == table and any(column.of(row) is not None for row in rows)
     ]
+
+
+@dataclass(frozen=True, slots=True)
+class Assessed:
+    """Figures of a method against the ground truth, scan by scan.
+
+    Attributes
+    ----------
+    figures : over all scans
+    T_reference_estimate : (4, 4) the alignment of the ATE; the true first pose of one that did not come to its
+        end; the identity without truth
+    errors_m, errors_rad, nees : (N,) NaN where a scan has no true pose beside it
+    relations : the error over relations; None without any, or after a failure
+    definitions : of the figures, as text
+    """
+
+    figures: Figures
+    T_reference_estimate: Pose
+    errors_m: NDArray[np.float64]
+    errors_rad: NDArray[np.float64]
+    nees: NDArray[np.float64]
+    relations: RelationError | None
+    definitions: tuple[str, ...]
+
+
+def assess(
+    outcomes: Sequence[Outcome],
+    stamps_ns: NDArray[np.int64],
+    truth: Trajectory | None,
+    relations: Relations | None,
+) -> Assessed:
+    """Figures of a method's runs over scans of these stamps: errors of the first whole one, times of all."""
+    outcome = representative(outcomes)
+    figures = _speed(outcomes)
+    blank = np.full(len(outcome.seconds), np.nan)
+    if not outcome.is_whole:
+        return Assessed(figures, _start(stamps_ns, truth), blank, blank, blank, None, ())
+    figures["repeats_apart_m"] = _apart(outcomes)
+    error = None if relations is None else relation_error(outcome.trajectory, relations)
+    if error is not None:
+        figures |= {"relations_m": error.translation_m.mean, "relations_rad": error.rotation_rad.mean}
+    definitions = () if error is None else (error.definition,)
+    assessed = Assessed(figures, np.eye(4), blank, blank, blank, error, definitions)
+    return assessed if truth is None else _against(truth, outcome, assessed)
+
+
+def representative(outcomes: Sequence[Outcome]) -> Outcome:
+    """The first whole run, else the first."""
+    return next((outcome for outcome in outcomes if outcome.is_whole), outcomes[0])
+
+
+def observability(outcome: Outcome) -> NDArray[np.float64]:
+    """(N,) as in ``Match``; empty if the method does not report it."""
+    path = outcome.folder / STEPS_FILE
+    if not path.exists():
+        return np.empty(0)
+    return pq.read_table(path, columns=["observability"])["observability"].to_numpy()
+
+
+def judged(outcomes: Mapping[str, Outcome], scans: StoredScans) -> dict[str, Judged]:
+    """The verdict on each whole run: on ours by all that is known, on others by wheels and constant velocity.
+
+    The error of others is bounded by the wheels, and by each of ours that is trustworthy.
+    """
+    whole = {name: outcome for name, outcome in outcomes.items() if outcome.is_whole}
+    found = {name: judge_run(each.folder) for name, each in whole.items() if (each.folder / STEPS_FILE).exists()}
+    expected = {name: expected_of_run(whole[name].folder) for name in found}
+    positions = {name: each.trajectory.poses[:, :-1, -1] for name, each in whole.items()}
+    wheels = scans.wheels @ scans.T_base_lidar
+    for name in [name for name in whole if name not in found]:
+        bounds_m = {
+            ours: apart_m(positions[name], positions[ours]) + error.high
+            for ours, error in expected.items()
+            if error is not None and found[ours].verdict is Verdict.TRUSTWORTHY
+        }
+        trajectory = whole[name].trajectory
+        found[name] = judge(evidence_of_trajectory(trajectory, scans.log_times_ns, wheels, scans.points, bounds_m))
+    return found
+
+
+def _start(stamps_ns: NDArray[np.int64], truth: Trajectory | None) -> Pose:
+    """True first pose of a method that begins with the identity."""
+    if truth is None:
+        return np.eye(4)
+    try:
+        return pair(Trajectory(stamps_ns[:1], np.eye(4)[None]), truth).reference[0]
+    except InputError:  # the truth begins later
+        return np.eye(4)
+
+
+def _against(truth: Trajectory, outcome: Outcome, assessed: Assessed) -> Assessed:
+    pairs = pair(outcome.trajectory, truth)
+    if len(pairs) < 2:  # of a method that failed early
+        return assessed
+    ate = absolute_error_of_any_path(pairs)
+    others = relative_errors(pairs, ((1.0, "s"), (10.0, "m"), (100.0, "m")))[0]
+    nees = _nees(outcome, truth)
+    errors_m, errors_rad = assessed.errors_m.copy(), assessed.errors_rad.copy()
+    errors_m[pairs.places], errors_rad[pairs.places] = ate.errors_m, ate.errors_rad
+    figures = {
+        **assessed.figures,
+        "ate_m": ate.translation_m.rmse,
+        "ate_share": ate.share_of_path,
+        "ate_rotation_rad": ate.rotation_rad.rmse,
+        "paired_share": pairs.share,
+        "nees": float(np.nanmean(nees)) if np.isfinite(nees).any() else None,
+    }
+    for name, error in others.items():
+        if isinstance(error, KittiError):
+            figures |= {"kitti_share": error.translation_share, "kitti_rad_per_m": error.rotation_rad_per_m}
+        else:
+            figures[f"{name}_m"] = error.translation_m.rmse
+    found = (each.definition for each in (ate, *others.values()))
+    definitions = (*assessed.definitions, *found, f"Paired: {pairs.description}")
+    return Assessed(figures, ate.T_reference_estimate, errors_m, errors_rad, nees, assessed.relations, definitions)
+
+
+def _nees(outcome: Outcome, truth: Trajectory) -> NDArray[np.float64]:
+    """(N,) of the motion up to each scan; NaN if the method does not report covariances."""
+    path = outcome.folder / STEPS_FILE
+    if not path.exists():
+        return np.full(len(outcome.seconds), np.nan)
+    odometry = Trajectory(outcome.trajectory.stamps_ns, outcome.odometry)
+    return nees_of_steps(pq.read_table(path, columns=list(STEP_COLUMNS)), odometry, truth)
+
+
+def _speed(outcomes: Sequence[Outcome]) -> dict[str, float | None]:
+    """From all runs that came to their end; the first scan of each stands apart."""
+    whole = [outcome for outcome in outcomes if outcome.is_whole]
+    if not whole:
+        peak = max(outcome.report.peak_mib for outcome in outcomes)
+        return {"peak_mib": peak} if outcomes[0].report.status.is_failure and peak else {}
+    first = min(1, len(whole[0].seconds) - 1)
+    rest = np.concatenate([outcome.seconds[first:] for outcome in whole])
+    cpu = np.concatenate([outcome.cpu_seconds[first:] for outcome in whole])
+    return {
+        "median_s": float(np.median(rest)),
+        "p95_s": float(np.percentile(rest, 95.0)),
+        "cpu_s": float(np.median(cpu)),
+        "first_s": float(np.median([outcome.seconds[0] for outcome in whole])),
+        "scans_per_s": float(len(rest) / rest.sum()),
+        **_stages(whole[0]),
+        "start_s": float(np.median([outcome.report.start_s for outcome in whole])),
+        "finish_s": float(np.median([outcome.report.finish_s for outcome in whole])),
+        "peak_mib": max(outcome.report.peak_mib for outcome in whole),
+    }
+
+
+def _stages(outcome: Outcome) -> dict[str, float]:
+    """Seconds by stage of a method that reports them; the mean for loops, most scans of which take nothing."""
+    path = outcome.folder / STEPS_FILE
+    if not path.exists():
+        return {}
+    table = pq.read_table(path, columns=["preprocess_s", "match_s", "map_s", "loops_s"])
+    seconds = {name: table[name].to_numpy()[1:] for name in table.column_names}
+    loops = seconds.pop("loops_s")
+    if not len(loops):
+        return {}
+    medians = {name: float(np.median(each)) for name, each in seconds.items()}
+    return medians | ({"loops_s": float(loops.mean())} if loops.any() else {})
+
+
+def _apart(outcomes: Sequence[Outcome]) -> float | None:
+    """Largest distance between the positions of a scan in two runs."""
+    whole: list[Matrix] = [outcome.trajectory.poses for outcome in outcomes if outcome.is_whole]
+    if len(whole) < 2:
+        return None
+    first = whole[0][:, :-1, -1]
+    return max(float(np.linalg.norm(poses[:, :-1, -1] - first, axis=1).max()) for poses in whole[1:])

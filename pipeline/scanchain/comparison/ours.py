@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from scanchain.comparison.methods import Method
-from scanchain.comparison.outcome import CLOSURES_FILE, STEPS_FILE
+from scanchain.comparison.processes import CLOSURES_FILE, STEPS_FILE
 from scanchain.config import Config
 from scanchain.data import Pose, Scan, Trajectory
 from scanchain.runs.closures import final_verdicts, write_closures

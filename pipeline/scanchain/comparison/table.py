@@ -13,12 +13,10 @@ import numpy as np
 from msgspec import Struct
 
 from scanchain.baselines import BASELINES
-from scanchain.comparison.assessment import judged, representative
-from scanchain.comparison.figures import COLUMNS, Figures, columns_of
+from scanchain.comparison.figures import COLUMNS, Figures, columns_of, judged, representative
 from scanchain.comparison.methods import Method
-from scanchain.comparison.outcome import EndReport, Outcome, Status
+from scanchain.comparison.processes import Outcome, Status, StoredScans
 from scanchain.comparison.results import Results
-from scanchain.comparison.scan_store import StoredScans
 from scanchain.data import Points
 from scanchain.evaluation import Sharpness, disagreement, sampled_map, sampling_step, sharpness
 from scanchain.logs import Log
@@ -35,6 +33,7 @@ class Row(Struct, frozen=True):
     Attributes
     ----------
     status, reason : of the first run that did not end well, else ok
+    figures : by key of COLUMNS, None where unknown
     settings : whole, as a TOML file for --config would hold them
     definitions : of its errors, as text
     verdict, verdict_reason : on its trajectory, of other tools by wheels and constant velocity; empty if it failed
@@ -47,7 +46,7 @@ class Row(Struct, frozen=True):
     reason: str
     description: str
     settings: dict[str, Any]
-    figures: Figures
+    figures: dict[str, float | None]
     definitions: list[str]
     verdict: str = ""
     verdict_reason: str = ""
@@ -110,7 +109,7 @@ class Table(Struct, frozen=True):
     @property
     def figures(self) -> list[Figures]:
         """Figures of the rows, empty for a row that failed."""
-        return [row.figures if row.status is Status.OK else Figures() for row in self.rows]
+        return [row.figures if row.status is Status.OK else {} for row in self.rows]
 
 
 def write_table(folder: Path, table: Table) -> None:
@@ -180,14 +179,15 @@ def _csv(table: Table) -> str:
     writer.writerow(["method", "status", "verdict", "verdict_error", *keys])
     for row in table.rows:
         writer.writerow(
-            [row.name, row.status, row.verdict, row.verdict_error, *(getattr(row.figures, key) for key in keys)]
+            [row.name, row.status, row.verdict, row.verdict_error, *(row.figures.get(key) for key in keys)]
         )
     return buffer.getvalue()
 
 
 def summarize(results: Results, log: Log, limits: Limits, provenance: Provenance) -> Table:
     """Every method's row, with figures that depend on all of them: sharpness and disagreement."""
-    scans, sharp = results.scans, sharpness_of(results.maps)
+    scans, maps = results.scans, results.maps
+    sharp = dict(zip(maps, sharpness(list(maps.values())), strict=True)) if maps else {}
     chosen = {method.name: representative(results.outcomes[method.name]) for method in results.methods}
     apart_m, judgments = disagreement([each.trajectory.poses for each in chosen.values()]), judged(chosen, scans)
     rows = [
@@ -212,7 +212,9 @@ def summarize(results: Results, log: Log, limits: Limits, provenance: Provenance
             *log.damage,
         ],
         provenance=provenance,
-        baselines={name: _installed(name) for name in packages},
+        baselines={  # a package may be installed as its variant without CUDA
+            name: package_version(name) or package_version(f"{name}-cpu") for name in packages
+        },
     )
 
 
@@ -220,14 +222,14 @@ def _row(
     results: Results, method: Method, sharp: Sharpness | None, apart_m: np.ndarray, judgment: Judged | None
 ) -> Row:
     outcomes, assessed = results.outcomes[method.name], results.assessed[method.name]
-    end = _end([outcome.report for outcome in outcomes])
+    ended = [outcome.report for outcome in outcomes]
+    end = next((report for report in ended if report.status is not Status.OK), ended[0])
     known = apart_m[np.isfinite(apart_m)]
-    figures: Figures = msgspec.structs.replace(
-        assessed.figures,
-        thickness_m=sharp.thickness_m if sharp else None,
-        entropy=sharp.mean_map_entropy if sharp else None,
-        disagreement_m=float(np.median(known)) if len(known) else None,
-    )
+    figures = {column.key: assessed.figures.get(column.key) for column in COLUMNS}
+    if sharp is not None:
+        figures |= {"thickness_m": sharp.thickness_m, "entropy": sharp.mean_map_entropy}
+    if len(known):
+        figures["disagreement_m"] = float(np.median(known))
     return Row(
         name=method.name,
         base=method.base,
@@ -243,28 +245,12 @@ def _row(
     )
 
 
-def _end(reports: list[EndReport]) -> EndReport:
-    """End report: that of the first run that failed, else of the first."""
-    return next((report for report in reports if report.status is not Status.OK), reports[0])
-
-
-def _installed(package: str) -> str:
-    """Version of a package, which may be installed as its variant without CUDA."""
-    return package_version(package) or package_version(f"{package}-cpu")
-
-
 def maps_of(scans: StoredScans, outcomes: Mapping[str, list[Outcome]]) -> dict[str, Points]:
     """Sampled maps (M, d) of the methods that came to their end."""
     step = sampling_step(int(scans.points.sum()))
-    whole = {name: representative(runs) for name, runs in outcomes.items()}
+    chosen = {name: representative(runs) for name, runs in outcomes.items()}
     return {
         name: sampled_map(scans.scans(), outcome.trajectory, step)
-        for name, outcome in whole.items()
+        for name, outcome in chosen.items()
         if outcome.is_whole
     }
-
-
-def sharpness_of(maps: Mapping[str, Points]) -> dict[str, Sharpness]:
-    """Sharpness of each map that has one."""
-    results = sharpness(list(maps.values())) if maps else []
-    return {name: result for name, result in zip(maps, results, strict=True) if result is not None}

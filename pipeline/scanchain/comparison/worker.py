@@ -20,23 +20,28 @@ import numpy as np
 from numpy.lib.format import open_memmap
 
 from scanchain import plugins
-from scanchain.baselines import BASELINES, Baseline, InPlane
+from scanchain.baselines import BASELINES, InPlane
 from scanchain.clock import announcing_compilation
 from scanchain.comparison.methods import Method
-from scanchain.comparison.outcome import (
+from scanchain.comparison.processes import (
     CPU_FILE,
+    METHOD_FILE,
     POSES_FILE,
     REPORT_FILE,
     SECONDS_FILE,
     TRAJECTORY_FILE,
     EndReport,
     Status,
+    StoredScans,
+    open_store,
 )
-from scanchain.comparison.scan_store import StoredScans, open_store
 from scanchain.data import Pose, Scan, Trajectory
 from scanchain.errors import MissingExtraError, ScanchainError, shown
 from scanchain.processes import die_first, die_with_parent, peak_mib
 from scanchain.runs.job import Progress
+
+_WARM_UP_SCANS = 4
+_MAX_CHARACTERS = 300  # largest length of the message of an error raised by other code
 
 
 class Runner(Protocol):
@@ -65,14 +70,15 @@ def start(method: Method, T_base_lidar: Pose) -> Runner:
     return Ours(method, T_base_lidar)
 
 
-def can_start_again(method: Method) -> bool:
-    """True if instances are independent, so that one may be discarded after warming up."""
-    return method.base not in BASELINES or BASELINES[method.base].forgets
-
-
 class _Others:
     def __init__(self, method: Method, dimension: int) -> None:
-        self.baseline = _baseline(method, dimension)
+        if method.base in BASELINES:
+            entry = BASELINES[method.base]
+            self.baseline = entry.make(msgspec.convert(method.settings, type(entry.settings)))
+            if dimension == 2:
+                self.baseline = InPlane(self.baseline, is_raised=entry.is_raised)
+        else:
+            self.baseline = plugins.load(method.base, "track")(**method.settings)
         self.description = str(getattr(self.baseline, "description", "")) or method.base
 
     def track(self, scan: Scan) -> Pose:
@@ -80,19 +86,6 @@ class _Others:
 
     def finish(self, odometry: Trajectory, folder: Path) -> Trajectory:
         return odometry
-
-
-def _baseline(method: Method, dimension: int) -> Baseline:
-    if method.base not in BASELINES:
-        return plugins.load(method.base, "track")(**method.settings)
-    entry = BASELINES[method.base]
-    baseline = entry.make(msgspec.convert(method.settings, type(entry.settings)))
-    return baseline if dimension == 3 else InPlane(baseline, is_raised=entry.is_raised)
-
-
-METHOD_FILE = "method.msgpack"
-_WARM_UP_SCANS = 4
-_MAX_CHARACTERS = 300  # largest length of the message of an error raised by other code
 
 
 def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
@@ -123,7 +116,7 @@ def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
 
 def warm_up(scans: Iterable[Scan], method: Method, T_base_lidar: Pose) -> None:
     """Import and compile with an instance that is thrown away; what goes wrong will go wrong again."""
-    if not can_start_again(method):
+    if method.base in BASELINES and not BASELINES[method.base].forgets:
         return
     runner = start(method, T_base_lidar)
     with suppress(Exception):

@@ -1,8 +1,8 @@
-"""Absolute trajectory error (ATE), and the alignment of estimate and reference before it."""
+"""Absolute trajectory error (ATE), the alignment before it, and statistics of errors."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, field
 from enum import StrEnum
 
 import numpy as np
@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix, Pose, Trajectory
 from scanchain.errors import InputError
-from scanchain.evaluation.pairing import Pairs, PoseErrors, pair
+from scanchain.evaluation.pairing import Pairs, pair
 from scanchain.registration.svd_icp import DegeneratePairsError, rigid_transform
 
 _PLANAR = 1e-9  # meters of height and radians of tilt below which poses count as planar
-
 _FAR_OFF_SHARE, _FAR_OFF_M = 0.02, 0.1  # ATE above both of which odometry failed: share of the path, meters
 _SHORTEST_PATH_M = 1.0  # shortest path of which an error is given as a share
 
@@ -83,6 +82,70 @@ def far_off(ate_rmse_m: float, share: float | None, path_length_m: float) -> str
         f"{path_length_m:.1f} m; above {100.0 * _FAR_OFF_SHARE:g} % a trajectory is wrong somewhere, or the truth "
         "is in another unit, keeps another clock or follows another body"
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Statistics:
+    """Figures of a set of absolute errors, in the errors' own unit.
+
+    ``std`` is that of the errors at hand (divided by their count, not by count − 1); all are 0 for no errors.
+    """
+
+    count: int
+    mean: float
+    std: float
+    rmse: float
+    median: float
+    minimum: float
+    maximum: float
+
+    @classmethod
+    def of(cls, errors: NDArray[np.float64]) -> Statistics:
+        """The figures of (N,) errors."""
+        if not len(errors):
+            return cls(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        return cls(
+            count=len(errors),
+            mean=float(errors.mean()),
+            std=float(errors.std()),
+            rmse=float(np.sqrt(np.mean(errors * errors))),
+            median=float(np.median(errors)),
+            minimum=float(errors.min()),
+            maximum=float(errors.max()),
+        )
+
+    @property
+    def degrees(self) -> Statistics:
+        """Those of radians in degrees, for print."""
+        return Statistics(self.count, *(float(np.degrees(value)) for value in astuple(self)[1:]))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoseErrors:
+    """Errors of poses or of motions, one by one, and their figures.
+
+    definition : of the figures, as text; pairing : over which poses
+    errors_m, errors_rad : (N,) one by one; translation_m, rotation_rad : statistics of these
+    """
+
+    definition: str
+    pairing: str = ""
+    errors_m: NDArray[np.float64]
+    errors_rad: NDArray[np.float64]
+    translation_m: Statistics = field(init=False)
+    rotation_rad: Statistics = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "translation_m", Statistics.of(self.errors_m))
+        object.__setattr__(self, "rotation_rad", Statistics.of(self.errors_rad))
+
+    def __repr__(self) -> str:
+        return f"<{self.summary}>"
+
+    @property
+    def summary(self) -> str:
+        """The figures in one line."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)

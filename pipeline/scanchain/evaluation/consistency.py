@@ -1,14 +1,161 @@
-"""Consistency of odometries: NEES of their motions, and disagreement of methods without ground truth."""
+"""Expected errors of a trajectory, consistency of odometries (NEES), and disagreement of methods."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.data import Matrix
+from scanchain.config import Config
+from scanchain.data import KeyframeErrors, Matrix
+from scanchain.graph.between import turns
+from scanchain.graph.pose_graph import PoseGraph
+
+_BATCHES, _BATCH = 50, 10  # of samples, which together would fill the memory
+_BOUNDS = (2.5, 97.5)  # percentiles
+_RANK_TOLERANCE = 1e-9  # of the largest singular value, below which positions leave a rotation free
+_DRIFT_OF_NOISE = 2.0  # drift of a map over its renewal, in standard deviations of independent errors of the scans
+_DRIFT_OF_SYSTEMATIC = 5.0  # the same of errors that successive scans have in common; measured on simulated worlds
+_REVISIT = 3.0  # variances of the systematic error in a loop edge: of both passes, seen from different sides
+_SCALE_SIGMA = 0.5  # of the logarithm: how far the errors of a log are from these covariances; measured likewise
+_LEAST_VARIANCE = 1e-14  # m² or rad², which keeps covariances regular
+
+
+class ExpectedError(Struct, frozen=True):
+    """Mean of an error, and the bounds that contain it with a probability of 95 %; meters."""
+
+    mean: float
+    low: float
+    high: float
+
+    @property
+    def text(self) -> str:
+        """The mean and the bounds."""
+        return f"{self.mean:.3f} m ({self.low:.3f} to {self.high:.3f} with 95 %)"
+
+
+class ExpectedErrors(NamedTuple):
+    """ATE, and covariance (K, k, k) of each pose after the rigid alignment, of a twist in its own frame."""
+
+    ate: ExpectedError
+    covariances: Matrix
+
+
+def expected_ate(graph: PoseGraph, scans: NDArray[np.int64] | None = None) -> ExpectedError:
+    """ATE (rmse after rigid alignment) of the poses of a graph, if the covariances of its edges are right.
+
+    The distribution is that of samples of the position errors δ. To first order the alignment takes from them what
+    one twist of all positions explains:
+        ATE² = min over ξ of Σ wᵢ ‖δᵢ − ρ − φ × tᵢ‖² / Σ wᵢ
+    scans : (K,) wᵢ, number of scans that each pose stands for, 1 where left out
+    Raises InputError where the edges leave poses free.
+    """
+    return _sampled(graph, scans, np.zeros((len(graph), graph.freedom, graph.freedom)), 0.0).ate
+
+
+def expected_errors(
+    graph: PoseGraph, map_errors: Sequence[KeyframeErrors], config: Config, scans: NDArray[np.int64] | None = None
+) -> ExpectedErrors:
+    """Errors of keyframes that were aligned to a map, by ``with_map_errors``.
+
+    How well its covariances hold varies from log to log: samples are scaled by a factor whose logarithm has a
+    standard deviation of 0.5, as measured on simulated and real logs (tests.benchmarks.trust).
+    scans : as in ``expected_ate``
+    Raises InputError where the edges leave poses free.
+    """
+    drifting, own = with_map_errors(graph, map_errors, config)
+    R = _rotations(graph.poses, graph.freedom)
+    return _sampled(drifting, scans, R @ own @ np.swapaxes(R, 1, 2), _SCALE_SIGMA)
+
+
+def with_map_errors(
+    graph: PoseGraph, map_errors: Sequence[KeyframeErrors], config: Config
+) -> tuple[PoseGraph, Matrix]:
+    """The graph with covariances of edges for judging it, and covariances (K, k, k) of each pose by itself.
+
+    Poses that are aligned to one map err by themselves against it, and together as it drifts. With N the
+    covariance of a keyframe by its residuals, S that by which sectors of its scans disagree, and u the share of
+    the map that is new since the keyframe before, the motion between two keyframes drifts by the covariance
+        (2u)² N + (5u)² S.
+    A scan aligned to the mean of the m before walks by 2/(m + 1) of its error: hence 2u. S adds up from scan to
+    scan, by a factor that was measured. Every pose errs by N + S beside; loop edges have N + 3 S. The covariances
+    of the graph have floors instead, which serve the optimizer.
+    map_errors, config : of the run
+    """
+    k, source = graph.freedom, graph.edges.max(axis=1)
+    chosen = [map_errors[index] for index in source.tolist()]
+    covariance, by_itself = edge_errors(graph.information, graph.is_loop, chosen, config)
+    information = np.linalg.inv(covariance + _LEAST_VARIANCE * np.eye(k))
+    own = np.zeros((len(graph), k, k))
+    own[source[~graph.is_loop]] = by_itself[~graph.is_loop]
+    return graph.with_information(0.5 * (information + np.swapaxes(information, 1, 2))), own
+
+
+def edge_errors(
+    information: Matrix, is_loop: NDArray[np.bool_], map_errors: Sequence[KeyframeErrors], config: Config
+) -> tuple[Matrix, Matrix]:
+    """Covariances (E, k, k) of edges, and of the later pose of each by itself, by ``with_map_errors``.
+
+    information : (E, k, k) of the edges in the graph; map_errors : of the later keyframe of each
+    """
+    of_loops, of_odometry = (
+        lie.by_component(information.shape[-1], each.edge_sigma_m, each.edge_sigma_rad)
+        for each in (config.loops, config.odometry)
+    )
+    is_loop = is_loop[:, None, None]
+    floor = np.where(is_loop, np.diag(of_loops**2), np.diag(of_odometry**2))
+    factor, systematic, u = (np.array(column) for column in zip(*map_errors, strict=True))
+    factor, u = factor[:, None, None], u[:, None, None]
+    noise: Matrix = (factor * (np.linalg.inv(information) - floor)).astype(np.float64)
+    drift = np.minimum(_DRIFT_OF_NOISE * u, 1.0) ** 2 * noise + (_DRIFT_OF_SYSTEMATIC * u) ** 2 * systematic
+    return np.where(is_loop, noise + _REVISIT * systematic, drift), noise + systematic
+
+
+def _rotations(poses: Matrix, freedom: int) -> Matrix:
+    """(K, k, k) from a pose's own axes to the world's, of errors of position and orientation."""
+    d = poses.shape[-1] - 1
+    result = np.zeros((len(poses), freedom, freedom))
+    result[:, :d, :d] = poses[:, :d, :d]
+    result[:, d:, d:] = poses[:, :d, :d] if d == 3 else 1.0
+    return result
+
+
+def _sampled(graph: PoseGraph, scans: NDArray[np.int64] | None, own: Matrix, scale_sigma: float) -> ExpectedErrors:
+    """Errors by the edges of a graph, and with a covariance (K, k, k) of its own, world's axes, for each pose."""
+    positions = graph.poses[:, :-1, -1]
+    count, d = positions.shape
+    weight = np.ones(count) if scans is None else scans.astype(np.float64)
+    root = np.sqrt(weight / weight.sum())[:, None]
+    moved = np.concatenate(
+        [np.broadcast_to(np.eye(d), (count, d, d)), turns(positions - positions.mean(axis=0))], axis=2
+    )
+    basis, size, Vt = np.linalg.svd((root[..., None] * moved).reshape(count * d, -1), full_matrices=False)
+    kept = size > _RANK_TOLERANCE * size[0]
+    basis, to_twist = basis[:, kept], (Vt[kept].T / size[kept])
+    values, vectors = np.linalg.eigh(own)
+    half = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    random = np.random.default_rng(0)
+    ates_m, squares = [], np.zeros((count, graph.freedom, graph.freedom))
+    for seed in range(_BATCHES):
+        errors = graph.pose_errors(_BATCH, seed)
+        errors += (half @ random.normal(size=(*errors.shape, 1)))[..., 0]
+        errors *= np.exp(scale_sigma * random.normal(size=(_BATCH, 1, 1)))
+        weighted = (root * errors[..., :d]).reshape(_BATCH, -1)
+        twist = weighted @ basis @ to_twist.T
+        errors[..., :d] -= (moved @ twist[:, None, :, None])[..., 0]
+        errors[..., d:] -= twist[:, None, d:]
+        ates_m.extend(
+            np.sqrt(np.einsum("k,nki,nki->n", root[:, 0] ** 2, errors[..., :d], errors[..., :d])).tolist()
+        )
+        squares += np.einsum("nki,nkj->kij", errors, errors)
+    low, high = np.percentile(ates_m, _BOUNDS).tolist()
+    R = _rotations(graph.poses, graph.freedom)
+    covariances = np.swapaxes(R, 1, 2) @ (squares / (_BATCHES * _BATCH)) @ R
+    return ExpectedErrors(ExpectedError(float(np.mean(ates_m)), low, high), covariances)
 
 
 def motion_nees(poses: Matrix, covariances: Matrix, reference: Matrix) -> NDArray[np.float64]:

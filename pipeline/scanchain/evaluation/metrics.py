@@ -1,11 +1,10 @@
-"""Every metric of a trajectory against the truth at once."""
+"""Every metric of a trajectory against the truth at once, after its time offset and scale."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -14,29 +13,84 @@ import numpy as np
 from scanchain import checks
 from scanchain.data import Matrix, Trajectory
 from scanchain.errors import InputError
-from scanchain.evaluation.absolute import AbsoluteError, Alignment, absolute_error
-from scanchain.evaluation.offset_and_scale import find_time_offset, scale_of, scaled, shifted
-from scanchain.evaluation.pairing import Pairs, pair
-from scanchain.evaluation.reference import read_truth
-from scanchain.evaluation.relations import RelationError
+from scanchain.evaluation.absolute import AbsoluteError, Alignment, absolute_error, align
+from scanchain.evaluation.pairing import Pairs, pair, read_truth
 from scanchain.evaluation.relative import (
     KittiError,
+    RelationError,
     RelativeError,
-    kitti_error_of_any_path,
-    relative_error_over_distance,
-    relative_error_over_frames,
-    relative_error_over_time,
+    relative_errors,
 )
 from scanchain.trajectory import read_tum
+
+_FARTHEST_S, _STEP_S = 1.0, 0.05  # offsets that are tried: the largest, and from one to the next
+_EXACT_S = 1e-5  # error of the offset at which the search ends
+_FLAT = 1.02  # ratio of the ATE at the farthest offsets to the least, below which it does not depend on the offset
+
+
+def shifted(trajectory: Trajectory, offset_s: float) -> Trajectory:
+    """The trajectory with so many seconds added to its stamps."""
+    return Trajectory(trajectory.stamps_ns + round(offset_s * 1e9), trajectory.poses)
+
+
+def scaled(pairs: Pairs, scale: float) -> Pairs:
+    """Pairs with the positions of the estimate multiplied."""
+    estimate = pairs.estimate.copy()
+    estimate[:, :3, 3] *= scale
+    return replace(pairs, estimate=estimate)
+
+
+def scale_of(pairs: Pairs) -> float:
+    """Scale s of the estimate that minimizes Σ ‖t_ref − s R t_est − t‖² (Umeyama 1991, eq. 42).
+
+    Raises InputError where the estimate stands still, or no positive scale fits.
+    """
+    R = align(pairs.estimate, pairs.reference, Alignment.RIGID)[:3, :3]
+    estimate, reference = (
+        poses[:, :3, 3] - poses[:, :3, 3].mean(axis=0) for poses in (pairs.estimate, pairs.reference)
+    )
+    spread, common = float(np.sum(estimate**2)), float(np.sum(reference * (estimate @ R.T)))
+    if not 0.0 < common < np.inf or not spread:
+        raise InputError("no positive scale of the estimate fits the ground truth; leave the scale out")
+    return common / spread
+
+
+def find_time_offset(
+    estimate: Trajectory, truth: Trajectory, *, gap_s: float | None = None, with_scale: bool = False
+) -> float:
+    """Seconds to add to the stamps of the estimate at which its ATE after rigid alignment is least, within ±1 s.
+
+    with_scale : the estimate is scaled to fit at each offset, too
+    Raises InputError where the ATE does not depend on the offset, or is least at the farthest one that is tried.
+    """
+    from scipy.optimize import minimize_scalar
+
+    def ate_m(offset_s: float) -> float:
+        try:
+            pairs = pair(shifted(estimate, offset_s), truth, gap_s=gap_s)
+        except InputError:  # no pair at this offset
+            return np.inf
+        return absolute_error(scaled(pairs, scale_of(pairs)) if with_scale else pairs).translation_m.rmse
+
+    absolute_error(pair(estimate, truth, gap_s=gap_s))  # raises where no alignment is determined
+    offsets_s = np.arange(-_FARTHEST_S, _FARTHEST_S + _STEP_S / 2, _STEP_S)
+    errors_m = np.array([ate_m(offset_s) for offset_s in offsets_s])
+    best = int(np.argmin(errors_m))
+    if np.nanmax(errors_m[[0, -1]]) < _FLAT * errors_m[best]:
+        raise InputError(
+            "the ATE does not depend on the time offset, as at rest; give it in seconds, or leave it out"
+        )
+    if best in (0, len(offsets_s) - 1):
+        raise InputError(f"the time offset is not within {_FARTHEST_S:g} s; give it in seconds")
+    found = minimize_scalar(
+        ate_m, bounds=(offsets_s[best - 1], offsets_s[best + 1]), method="bounded", options={"xatol": _EXACT_S}
+    )
+    return float(found.x)
+
 
 Result = AbsoluteError | RelativeError | KittiError | RelationError
 Kind = TypeVar("Kind", bound=Result)
 
-_OVER: dict[str, Callable[[Pairs, float], RelativeError]] = {
-    "pose": lambda pairs, size: relative_error_over_frames(pairs, int(size)),
-    "s": relative_error_over_time,
-    "m": relative_error_over_distance,
-}
 _INTERVAL = re.compile(r"(\d+(?:\.\d+)?)(poses?|s|m)")
 
 
@@ -120,20 +174,12 @@ def evaluate(
     pairs = pair(shifted(trajectory, offset_s), truth, gap_s=max_gap_s)
     factor = scale_of(pairs) if scale else 1.0
     pairs = scaled(pairs, factor)
-    metrics: dict[str, Callable[[], Result]] = {
-        **{f"rpe_{size:g}_{unit}": partial(_OVER[unit], pairs, size) for size, unit in intervals},
-        "kitti": partial(kitti_error_of_any_path, pairs),
-    }
     ate = absolute_error(pairs, Alignment(align))
     warnings = [*filter(None, [ate.complaint]), *pairs.warnings]
     aligned = ate.T_reference_estimate @ pairs.estimate
-    results = Results({"ate": ate}, {}, pairs.description, warnings, factor, offset_s, aligned, pairs.reference)
-    for name, metric in metrics.items():
-        try:
-            results.found[name] = metric()
-        except InputError as error:
-            results.missing[name] = str(error)
-    return results
+    errors, missing = relative_errors(pairs, intervals)
+    found: dict[str, Result] = {"ate": ate, **errors}
+    return Results(found, missing, pairs.description, warnings, factor, offset_s, aligned, pairs.reference)
 
 
 def _intervals(text: str, source: str) -> list[tuple[float, str]]:

@@ -1,9 +1,10 @@
-"""Pairs of estimated and true poses at the same stamps, interpolated in between, and statistics of errors."""
+"""Pairs of estimated and true poses at the same stamps, interpolated in between; ground truth from files."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import astuple, dataclass, field
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix, Trajectory, brief
 from scanchain.errors import InputError
+from scanchain.trajectory import read_kitti, read_tum, text_lines
 from scanchain.words import counted
 
 _WIDEST_GAP_S = 0.6  # default widest gap in the reference: at 1 m/s² a line is up to 5 cm off within it
@@ -20,6 +22,10 @@ _SAME_S = 1e-6  # largest error of a stamp that was a floating-point number of s
 _ROUNDED_S = 5e-4  # largest error of a stamp written in milliseconds
 _FEW = 10  # number of poses below which their error has little meaning
 _ROUNDING_SHARE = 0.1  # share of the reference's median interval that either error is at most
+
+
+_KITTI_FIELDS = 12
+_SLACK_NS = 1_000_000_000  # largest error of the expected stamps of a log's scans
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,64 +227,56 @@ def _no_pairs(estimate: Trajectory, reference: Trajectory, gap_s: float) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Statistics:
-    """Figures of a set of absolute errors, in the errors' own unit.
+class TruthFile:
+    """Poses of the lidar from a TUM file, or from a KITTI file, whose k-th row is the k-th scan's.
 
-    ``std`` is that of the errors at hand (divided by their count, not by count − 1); all are 0 for no errors.
+    ``has_stamps`` : whether the stamps of ``poses`` are times
     """
 
-    count: int
-    mean: float
-    std: float
-    rmse: float
-    median: float
-    minimum: float
-    maximum: float
+    path: Path
+    poses: Trajectory
+    has_stamps: bool
 
-    @classmethod
-    def of(cls, errors: NDArray[np.float64]) -> Statistics:
-        """The figures of (N,) errors."""
-        if not len(errors):
-            return cls(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        return cls(
-            count=len(errors),
-            mean=float(errors.mean()),
-            std=float(errors.std()),
-            rmse=float(np.sqrt(np.mean(errors * errors))),
-            median=float(np.median(errors)),
-            minimum=float(errors.min()),
-            maximum=float(errors.max()),
+    def check(self, scans_ns: NDArray[np.int64], scans: int) -> None:
+        """Refuse a file that cannot belong to so many scans between these stamps. Raises InputError."""
+        if self.has_stamps:
+            check_overlap(str(self.path), self.poses.stamps_ns, scans_ns)
+        else:
+            self._check_rows(scans)
+
+    def at(self, stamps_ns: NDArray[np.int64]) -> Trajectory:
+        """The poses with their stamps; those of a KITTI file, of which there must be N, with those of N scans."""
+        if self.has_stamps:
+            return self.poses
+        self._check_rows(len(stamps_ns))
+        return Trajectory(stamps_ns, self.poses.poses)
+
+    def first(self, scans: int) -> TruthFile:
+        """Of a KITTI file that of the first scans alone; a TUM file as it is."""
+        if self.has_stamps:
+            return self
+        poses = Trajectory(self.poses.stamps_ns[:scans], self.poses.poses[:scans])
+        return TruthFile(self.path, poses, has_stamps=False)
+
+    def _check_rows(self, scans: int) -> None:
+        if len(self.poses) != scans:
+            raise InputError(
+                f"{self.path}: has {counted(len(self.poses), 'line')} for {counted(scans, 'scan')}; "
+                "a KITTI file has one line a scan that is read, or give a TUM file, which has stamps"
+            )
+
+
+def check_overlap(source: str, truth_ns: NDArray[np.int64], scans_ns: NDArray[np.int64]) -> None:
+    """Refuse a truth whose stamps, given whole or by both ends, lie all before or all after those of the scans."""
+    if truth_ns.min() > scans_ns.max() + _SLACK_NS or truth_ns.max() < scans_ns.min() - _SLACK_NS:
+        raise InputError(
+            f"{source}: its poses ({span(truth_ns)}) and the scans ({span(scans_ns)}) have no time in common; "
+            "check that both keep the same clock and that it belongs to this log"
         )
 
-    @property
-    def degrees(self) -> Statistics:
-        """Those of radians in degrees, for print."""
-        return Statistics(self.count, *(float(np.degrees(value)) for value in astuple(self)[1:]))
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PoseErrors:
-    """Errors of poses or of motions, one by one, and their figures.
-
-    definition : of the figures, as text; pairing : over which poses
-    errors_m, errors_rad : (N,) one by one; translation_m, rotation_rad : statistics of these
-    """
-
-    definition: str
-    pairing: str = ""
-    errors_m: NDArray[np.float64]
-    errors_rad: NDArray[np.float64]
-    translation_m: Statistics = field(init=False)
-    rotation_rad: Statistics = field(init=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "translation_m", Statistics.of(self.errors_m))
-        object.__setattr__(self, "rotation_rad", Statistics.of(self.errors_rad))
-
-    def __repr__(self) -> str:
-        return f"<{self.summary}>"
-
-    @property
-    def summary(self) -> str:
-        """The figures in one line."""
-        raise NotImplementedError
+def read_truth(path: Path) -> TruthFile:
+    """Ground truth of a TUM or a KITTI file, by the number of words in its first line."""
+    first = next(iter(text_lines(path)), None)
+    is_kitti = first is not None and len(first[1]) == _KITTI_FIELDS
+    return TruthFile(path, read_kitti(path) if is_kitti else read_tum(path), not is_kitti)

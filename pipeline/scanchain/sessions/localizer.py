@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scanchain import checks, lie
 from scanchain.config import Config
 from scanchain.data import AnyPoints, Closure, Keyframe, Matrix, Pose, Scan, State, Step, Trajectory, brief
-from scanchain.evaluation.expected import edge_errors, with_map_errors
+from scanchain.evaluation.consistency import edge_errors, with_map_errors
 from scanchain.loops.evidence import are_in_sight
 from scanchain.maps import SavedMap, open_saved_map
 from scanchain.placement import loop_information

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from scanchain.comparison.figures import Column, columns_of
-from scanchain.comparison.outcome import CLOSURES_FILE, Status
+from scanchain.comparison.processes import CLOSURES_FILE, Status
 from scanchain.comparison.results import MAP_FILE, SETTINGS_FILE, TRUTH_FILE, method_folder
 from scanchain.comparison.table import Row as TableRow
 from scanchain.comparison.table import Table, read_table
@@ -151,7 +151,7 @@ def _sections(
 
 def _sharpest(table: Table, trajectories: Sequence[DrawnTrajectory]) -> list[DrawnTrajectory]:
     """Trajectories whose maps are nearly as sharp as the best, which frame the pictures; all without maps."""
-    thickness_m = {row.name: row.figures.thickness_m or np.inf for row in table.rows}
+    thickness_m = {row.name: row.figures["thickness_m"] or np.inf for row in table.rows}
     limit_m = _NEARLY * min(thickness_m[trajectory.name] for trajectory in trajectories)
     return [trajectory for trajectory in trajectories if thickness_m[trajectory.name] <= limit_m]
 

@@ -1,0 +1,400 @@
+"""Odometries by others: KISS-ICP, GenZ-ICP, small_gicp, and Open3D's ICP from scan to scan."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from types import ModuleType
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from msgspec import Meta, Struct
+from numpy.typing import NDArray
+
+from scanchain import lie
+from scanchain.baselines.baseline import AtStamp, Baseline, finite, middle
+from scanchain.config import Count, NonNegative, Positive
+from scanchain.data import Pose, RawPoints
+from scanchain.errors import InputError, MissingExtraError
+
+_DISTORTED = 2  # it deskews by the motion before, and has none for its first two scans
+
+
+class KissSettings(Struct, frozen=True, forbid_unknown_fields=True):
+    """Its defaults; its own rule for voxels is a hundredth of the largest range. Threads: 0 are all."""
+
+    min_range_m: NonNegative = 0.0
+    max_range_m: Positive = 100.0
+    voxel_size_m: Positive = 1.0
+    max_points_per_voxel: Count = 20
+    max_iterations: Count = 500
+    threads: Annotated[int, Meta(ge=0)] = 0
+
+
+KISS = KissSettings()
+PLANAR_KISS = KissSettings(max_range_m=40.0, voxel_size_m=0.4)
+
+
+class KissIcp:
+    """KISS-ICP: point-to-point, scan to map, adaptive threshold."""
+
+    def __init__(self, settings: KissSettings = KISS) -> None:
+        try:
+            from kiss_icp.config.parser import load_config
+            from kiss_icp.kiss_icp import KissICP
+        except ImportError:
+            raise MissingExtraError("kiss-icp", "baselines") from None
+        config = load_config(None)
+        config.data.min_range, config.data.max_range = settings.min_range_m, settings.max_range_m
+        config.mapping.voxel_size = settings.voxel_size_m
+        config.mapping.max_points_per_voxel = settings.max_points_per_voxel
+        config.registration.max_num_iterations = settings.max_iterations
+        config.registration.max_num_threads = settings.threads
+        self.description = (
+            f"KISS-ICP, point-to-point scan to map, {settings.min_range_m:g} to {settings.max_range_m:g} m, "
+            f"voxels of {settings.voxel_size_m:g} m, {settings.threads or 'all'} threads, its own deskewing where "
+            "the log has times"
+        )
+        self.odometry = KissICP(config)
+        self.at_stamp = AtStamp()
+        self.scans = 0
+
+    def track(self, points: RawPoints, times_s: NDArray[np.float32], stamp_ns: int) -> Pose:
+        """Register one scan; KISS-ICP's pose holds at the last point once it deskews, ours at the scan's stamp."""
+        frame, times = finite(points, times_s)
+        self.odometry.register_frame(frame, times)
+        self.scans += 1
+        held_s = middle(times) if self.scans <= _DISTORTED or not len(times) else float(times.max())
+        return self.at_stamp.move(np.array(self.odometry.last_pose, np.float64), stamp_ns, held_s)
+
+
+Preset = Literal["outdoor", "indoor", "kitti"]
+
+# What its outdoor.yaml, indoor.yaml and kitti.yaml say beside its defaults.
+_DATA = {"outdoor": {"min_range": 0.5}, "indoor": {"min_range": 0.3}, "kitti": {"min_range": 5.0}}
+_OUTDOOR = {"voxel_size": 0.6, "desired_num_voxelized_points": 3000, "max_points_per_voxel": 3}
+_MAPPING = {"outdoor": _OUTDOOR, "indoor": {}, "kitti": _OUTDOOR | {"planarity_threshold": 0.18}}
+
+
+class GenzSettings(Struct, frozen=True, forbid_unknown_fields=True):
+    """Preset of its authors, by kind of environment."""
+
+    preset: Preset = "outdoor"
+
+
+GENZ = GenzSettings()
+
+
+class GenzIcp:
+    """GenZ-ICP with a preset of its authors.
+
+    It lets its voxels grow and shrink until a scan has the desired number of points, and keeps their size in a
+    static variable: a second odometry in the same process starts with the voxel size of the first.
+    """
+
+    def __init__(self, settings: GenzSettings = GENZ) -> None:
+        preset = settings.preset
+        try:
+            from genz_icp.config import load_config
+            from genz_icp.genz_icp import GenZICP
+        except ImportError:
+            raise MissingExtraError("genz-icp", "baselines") from None
+        config = load_config(None)
+        config.data = config.data.model_copy(update={"deskew": True} | _DATA[preset])
+        config.mapping = config.mapping.model_copy(update=_MAPPING[preset])
+        self.description = (
+            f"GenZ-ICP, planes and points, scan to map, its {preset}.yaml: {config.data.min_range:g} to "
+            f"{config.data.max_range:g} m, voxels of {config.mapping.voxel_size:g} m, about "
+            f"{config.mapping.desired_num_voxelized_points} points a scan, all threads; its own deskewing, off in "
+            "that file, on where the log has times"
+        )
+        self.odometry = GenZICP(config)
+        self.at_stamp = AtStamp()
+
+    def track(self, points: RawPoints, times_s: NDArray[np.float32], stamp_ns: int) -> Pose:
+        """Register one scan; GenZ-ICP wants times from 0 to 1 and its pose holds at 0.5, ours at the stamp."""
+        frame, times = finite(points, times_s)
+        share = (times - times.min()) / np.ptp(times) if len(times) else times
+        self.odometry.register_frame(frame, share)
+        return self.at_stamp.move(np.array(self.odometry.last_pose, np.float64), stamp_ns, middle(times))
+
+
+_CLEAR_CYCLE = 10  # of small_gicp's own odometry example, as are the defaults below
+
+
+class GicpSettings(Struct, frozen=True, forbid_unknown_fields=True):
+    """Settings of the scan-to-scan odometry; 0 threads are all."""
+
+    downsampling_m: Positive = 0.25
+    max_distance_m: Positive = 1.0
+    neighbors: Count = 20
+    threads: Annotated[int, Meta(ge=0)] = 0
+
+
+class VgicpSettings(Struct, frozen=True, forbid_unknown_fields=True):
+    """Settings of the scan-to-map odometry; 0 threads are all. Voxels unseen for ``horizon`` scans go."""
+
+    downsampling_m: Positive = 0.25
+    voxel_size_m: Positive = 1.0
+    horizon: Count = 100
+    neighbors: Count = 20
+    threads: Annotated[int, Meta(ge=0)] = 0
+
+
+GICP, PLANAR_GICP = GicpSettings(), GicpSettings(downsampling_m=0.05, max_distance_m=0.5)
+VGICP, PLANAR_VGICP = VgicpSettings(), VgicpSettings(downsampling_m=0.05, voxel_size_m=0.3)
+
+
+class SmallGicpModel:
+    """Scan to a map of Gaussian voxels (VGICP), started at constant velocity."""
+
+    def __init__(self, settings: VgicpSettings = VGICP) -> None:
+        self.library = _import_small_gicp()
+        self.settings = settings
+        self.threads = settings.threads or os.cpu_count() or 1
+        self.map: Any = self.library.GaussianVoxelMap(settings.voxel_size_m)
+        self.map.set_lru(horizon=settings.horizon, clear_cycle=_CLEAR_CYCLE)
+        self.started = False
+        self.T_odom_lidar = np.eye(4)
+        self.T_previous_current = np.eye(4)
+        self.at_stamp = AtStamp()
+
+    @property
+    def description(self) -> str:
+        """Method and parameters."""
+        return (
+            f"small_gicp VGICP, scan to map, downsampled to {self.settings.downsampling_m:g} m, voxels of "
+            f"{self.settings.voxel_size_m:g} m, "
+            f"{self.threads} threads, constant velocity, no deskewing"
+        )
+
+    def track(self, points: RawPoints, times_s: NDArray[np.float32], stamp_ns: int) -> Pose:
+        """Register one scan against the map, then add it."""
+        frame, times = finite(points, times_s)
+        cloud, _ = _preprocessed(self.library, frame, self.settings, self.threads)
+        if self.started:
+            guess = self.T_odom_lidar @ self.T_previous_current
+            result = self.library.align(self.map, cloud, guess, num_threads=self.threads)
+            T_odom_lidar = lie.normalize(np.array(result.T_target_source))
+            self.T_previous_current = lie.between(self.T_odom_lidar, T_odom_lidar)
+            self.T_odom_lidar = T_odom_lidar
+        self.map.insert(cloud, self.T_odom_lidar)
+        self.started = True
+        return self.at_stamp.move(self.T_odom_lidar, stamp_ns, middle(times))
+
+
+class _Pairs:
+    """Registration of each scan to the one before, started at constant velocity."""
+
+    def __init__(self) -> None:
+        self.previous: Any = None
+        self.T_odom_lidar = np.eye(4)
+        self.T_previous_current = np.eye(4)
+        self.at_stamp = AtStamp()
+
+    def track(self, points: RawPoints, times_s: NDArray[np.float32], stamp_ns: int) -> Pose:
+        """Register one scan against the last and chain the motions."""
+        frame, times = finite(points, times_s)
+        cloud = self._prepared(frame)
+        if self.previous is not None:
+            self.T_previous_current = self._registered(cloud)
+            self.T_odom_lidar = lie.normalize(self.T_odom_lidar @ self.T_previous_current)
+        self.previous = cloud
+        return self.at_stamp.move(self.T_odom_lidar, stamp_ns, middle(times))
+
+    def _prepared(self, points: NDArray[np.float64]) -> Any:
+        """What a scan is registered by."""
+        raise NotImplementedError
+
+    def _registered(self, cloud: Any) -> Pose:
+        """T_previous_current (4, 4) of a prepared scan."""
+        raise NotImplementedError
+
+
+class SmallGicpPairs(_Pairs):
+    """GICP from each scan to the one before."""
+
+    def __init__(self, settings: GicpSettings = GICP) -> None:
+        super().__init__()
+        self.library = _import_small_gicp()
+        self.settings = settings
+        self.threads = settings.threads or os.cpu_count() or 1
+
+    @property
+    def description(self) -> str:
+        """Method and parameters."""
+        return (
+            f"small_gicp GICP, scan to scan, downsampled to {self.settings.downsampling_m:g} m, "
+            f"correspondences within {self.settings.max_distance_m:g} m, {self.threads} threads, "
+            "constant velocity, no deskewing"
+        )
+
+    def _prepared(self, points: NDArray[np.float64]) -> Any:
+        return _preprocessed(self.library, points, self.settings, self.threads)
+
+    def _registered(self, cloud: Any) -> Pose:
+        (target, target_tree), (source, _) = self.previous, cloud
+        result = self.library.align(
+            target,
+            source,
+            target_tree,
+            self.T_previous_current,
+            max_correspondence_distance=self.settings.max_distance_m,
+            num_threads=self.threads,
+        )
+        return np.array(result.T_target_source)
+
+
+def _preprocessed(
+    library: ModuleType, points: NDArray[np.float64], settings: GicpSettings | VgicpSettings, threads: int
+) -> tuple[Any, Any]:
+    """Downsampled points with covariances, and their tree."""
+    return library.preprocess_points(
+        points,
+        downsampling_resolution=settings.downsampling_m,
+        num_neighbors=settings.neighbors,
+        num_threads=threads,
+    )
+
+
+def _import_small_gicp() -> ModuleType:
+    try:
+        return importlib.import_module("small_gicp")
+    except ImportError:
+        raise MissingExtraError("small-gicp", "baselines") from None
+
+
+Residual = Literal["point-to-plane", "point-to-point", "plane-to-plane"]
+
+# Open3D's registration function for a residual, and its estimation object.
+_REGISTRATIONS: dict[Residual, tuple[str, str]] = {
+    "point-to-plane": ("registration_icp", "TransformationEstimationPointToPlane"),
+    "point-to-point": ("registration_icp", "TransformationEstimationPointToPoint"),
+    "plane-to-plane": ("registration_generalized_icp", "TransformationEstimationForGeneralizedICP"),
+}
+
+
+class Open3dSettings(Struct, frozen=True, forbid_unknown_fields=True):
+    """Voxels for downsampling, largest distance of correspondences, and neighborhood of normals."""
+
+    voxel_size_m: Positive = 0.5
+    max_distance_m: Positive = 1.0
+    normal_radius_m: Positive = 1.5
+    normal_neighbors: Count = 20
+    max_iterations: Count = 30
+
+
+OPEN3D = Open3dSettings()
+PLANAR_OPEN3D = Open3dSettings(voxel_size_m=0.05, max_distance_m=0.5, normal_radius_m=0.5)
+
+
+class Open3dPairs(_Pairs):
+    """Scan-to-scan ICP on downsampled clouds."""
+
+    def __init__(self, residual: Residual, settings: Open3dSettings = OPEN3D) -> None:
+        super().__init__()
+        self.open3d = _import_open3d()
+        self.residual = residual
+        self.settings = settings
+        registration = self.open3d.pipelines.registration
+        register, estimation = _REGISTRATIONS[residual]
+        self.register, self.estimation = getattr(registration, register), getattr(registration, estimation)()
+        self.criteria: Any = registration.ICPConvergenceCriteria(max_iteration=settings.max_iterations)
+
+    @property
+    def description(self) -> str:
+        """Method and parameters."""
+        return (
+            f"Open3D {self.register.__name__}, {self.residual}, scan to scan, voxels of "
+            f"{self.settings.voxel_size_m:g} m, correspondences within {self.settings.max_distance_m:g} m, "
+            f"{self.settings.max_iterations} iterations, constant velocity, no deskewing"
+        )
+
+    def _registered(self, cloud: Any) -> Pose:
+        result = self.register(
+            cloud,
+            self.previous,
+            self.settings.max_distance_m,
+            self.T_previous_current,
+            self.estimation,
+            self.criteria,
+        )
+        return np.array(result.transformation)
+
+    def _prepared(self, points: NDArray[np.float64]) -> Any:
+        cloud = self.open3d.geometry.PointCloud(self.open3d.utility.Vector3dVector(points))
+        cloud = cloud.voxel_down_sample(self.settings.voxel_size_m)
+        if self.residual != "point-to-point":
+            cloud.estimate_normals(
+                self.open3d.geometry.KDTreeSearchParamHybrid(
+                    self.settings.normal_radius_m, self.settings.normal_neighbors
+                )
+            )
+        return cloud
+
+
+def _import_open3d() -> ModuleType:
+    """Open3D, with the libusb it needs, which slim machines lack, loaded from the package that ships it."""
+    try:
+        libusb = importlib.import_module("libusb_package")
+        path = libusb.get_library_path()
+    except ImportError:
+        path = None
+    if path is not None:
+        ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
+    try:
+        open3d = importlib.import_module("open3d")
+    except ImportError:
+        raise MissingExtraError("open3d, or the libusb-package that it needs,", "baselines") from None
+    open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
+    return open3d
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A registered baseline.
+
+    Attributes
+    ----------
+    make : constructor, given the settings; the package is imported there and not before
+    package : distribution whose version is reported
+    settings : for 3D scans; planar: for 2D ones, None where it makes no sense for these: nothing sets point-to-
+        plane the height, and GenZ-ICP's voxels grow until a scan has thousands of points
+    is_raised : whether a 2D scan must be given height, because surfaces are looked for
+    forgets : whether a second instance in a process is independent of the first
+    """
+
+    make: Callable[[Any], Baseline]
+    package: str
+    settings: Struct
+    planar: Struct | None
+    is_raised: bool = False
+    forgets: bool = True
+
+
+def _open3d(residual: Residual, planar: Struct | None, *, is_raised: bool = False) -> Entry:
+    return Entry(partial(Open3dPairs, residual), "open3d", OPEN3D, planar, is_raised)
+
+
+BASELINES: dict[str, Entry] = {
+    "open3d-p2p": _open3d("point-to-point", PLANAR_OPEN3D),
+    "open3d-p2l": _open3d("point-to-plane", None),
+    "open3d-gicp": _open3d("plane-to-plane", PLANAR_OPEN3D, is_raised=True),
+    "kiss-icp": Entry(KissIcp, "kiss-icp", KISS, PLANAR_KISS),
+    "small-gicp": Entry(SmallGicpPairs, "small-gicp", GICP, PLANAR_GICP, is_raised=True),
+    "small-vgicp": Entry(SmallGicpModel, "small-gicp", VGICP, PLANAR_VGICP, is_raised=True),
+    "genz-icp": Entry(GenzIcp, "genz-icp", GENZ, None, forgets=False),
+    "genz-icp-indoor": Entry(GenzIcp, "genz-icp", GenzSettings("indoor"), None, forgets=False),
+    "genz-icp-kitti": Entry(GenzIcp, "genz-icp", GenzSettings("kitti"), None, forgets=False),
+}
+
+
+def create(name: str) -> Baseline:
+    """A fresh baseline for 3D scans, as its authors recommend it. Raises InputError for an unknown name."""
+    if name not in BASELINES:
+        raise InputError(f"there is no baseline {name!r}; choose among {', '.join(BASELINES)}")
+    return BASELINES[name].make(BASELINES[name].settings)
