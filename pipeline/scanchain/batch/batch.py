@@ -13,13 +13,13 @@ from typing import Protocol
 from scanchain.batch.table import write_table
 from scanchain.batch.task import ROWS_FOLDER, Row, State, Task, attempt, finished_row, key_of, unfinished_row
 from scanchain.errors import InputError
+from scanchain.files import Source, source_of
 from scanchain.logs.files import matching, misspelled, spelled
 from scanchain.logs.opening import AUTO, logs_in
 from scanchain.processes import available_mib
 from scanchain.runs.directory import check_outside_runs
 from scanchain.runs.provenance import identity_of
 from scanchain.settings import Override
-from scanchain.source import Source, source_of
 from scanchain.verdict import Verdict
 from scanchain.words import counted
 

@@ -21,8 +21,8 @@ from scanchain.commands.options import (
     part_options,
 )
 from scanchain.errors import InputError, ScanchainError
+from scanchain.files import Source
 from scanchain.settings import Override, load_settings
-from scanchain.source import Source
 from scanchain.words import counted
 
 _PATH = click.Path(path_type=Path)

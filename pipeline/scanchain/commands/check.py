@@ -9,7 +9,7 @@ import click
 
 from scanchain.commands.options import LOG, OverrideCommand, overrides, part_options
 from scanchain.errors import InputError
-from scanchain.source import Source
+from scanchain.files import Source
 
 if TYPE_CHECKING:
     from scanchain.verdict import Judged

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import click
 
 from scanchain.commands.options import LOG, OverrideCommand, overrides, part_options
+from scanchain.files import Source
 from scanchain.settings import load_settings
-from scanchain.source import Source
 from scanchain.words import counted
 
 if TYPE_CHECKING:

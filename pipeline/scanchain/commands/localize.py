@@ -22,7 +22,7 @@ from scanchain.commands.options import (
     threads_option,
 )
 from scanchain.errors import InputError
-from scanchain.source import Source
+from scanchain.files import Source
 
 if TYPE_CHECKING:
     from scanchain.data import Pose

@@ -13,8 +13,8 @@ import click
 
 from scanchain.config import NO_TRUTH
 from scanchain.errors import InputError
+from scanchain.files import Source, source_of
 from scanchain.settings import Override
-from scanchain.source import Source, source_of
 from scanchain.threads import MOST, use_threads
 
 _GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to search them often costs a twentieth

@@ -23,7 +23,7 @@ from scanchain.commands.options import (
     threads_option,
 )
 from scanchain.errors import InputError, ScanchainError
-from scanchain.source import Source
+from scanchain.files import Source
 
 if TYPE_CHECKING:
     from scanchain.runs.job import SinkName

@@ -15,10 +15,10 @@ from scanchain import lie
 from scanchain.config import LocalMapConfig
 from scanchain.data import Keyframe, Matrix, Pose
 from scanchain.errors import InputError
+from scanchain.files import write_whole
 from scanchain.loops.descriptor import level_frame, upright_frame
 from scanchain.maps.saved_map import read_arrays
 from scanchain.registration import upright_columns
-from scanchain.whole_file import write_whole
 
 PLACES_FILE = "places.npz"
 VERSION = 1

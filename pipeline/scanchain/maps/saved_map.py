@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from scanchain.data import Keyframe, Matrix, Points
 from scanchain.errors import InputError, one_line, shown
-from scanchain.whole_file import write_whole
+from scanchain.files import write_whole
 from scanchain.words import counted
 
 MAP_FOLDER = "map"

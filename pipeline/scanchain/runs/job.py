@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scanchain.config import RecordingConfig
 from scanchain.data import Closure, GraphState, Matrix, Scan, Step, Trajectory
 from scanchain.errors import InputError
+from scanchain.files import Source
 from scanchain.settings import Override
-from scanchain.source import Source
 from scanchain.verdict import Judged
 
 if TYPE_CHECKING:

@@ -16,6 +16,7 @@ from scanchain.config import NO_TRUTH, Config
 from scanchain.data import Trajectory, brief
 from scanchain.errors import InputError
 from scanchain.evaluation import TruthFile, check_overlap, during, read_truth
+from scanchain.files import write_whole
 from scanchain.logs import Log, open_log
 from scanchain.logs.mounting import turned_by
 from scanchain.logs.topics import other_sensors
@@ -47,7 +48,6 @@ from scanchain.runs.step_table import StepTable
 from scanchain.settings import Settings, dump, load_settings, named
 from scanchain.slam import SlamResult
 from scanchain.trajectory import write_tum
-from scanchain.whole_file import write_whole
 from scanchain.words import counted
 
 _FEW_SCANS = 2  # scans whose trajectory shows at most one motion

@@ -23,7 +23,7 @@ from rerun.chunk import RrdReader
 from rerun.error_utils import RerunWarning
 
 from scanchain.errors import InputError
-from scanchain.whole_file import write_whole
+from scanchain.files import write_whole
 from scanchain.words import counted
 from scanchain_viz.recording.messages import Message
 

@@ -13,8 +13,8 @@ from markupsafe import Markup
 
 from scanchain.batch.table import totals
 from scanchain.batch.task import Row, State, output_file
+from scanchain.files import source_of, without_keys
 from scanchain.runs.metrics import Metrics
-from scanchain.source import source_of, without_keys
 from scanchain.trajectory import read_tum
 from scanchain.verdict import MOST_CONTRADICTED
 from scanchain.words import counted

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scanchain import checks, lie
 from scanchain.data import Matrix
 from scanchain.errors import InputError
+from scanchain.files import write_whole
 from scanchain.graph.files.g2o_lines import ROTATION_COMMENT, Rotation, write_lines
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.whole_file import write_whole
 
 TORO_SUFFIXES = (".graph", ".toro")
 GRAPH_SUFFIXES = (".g2o", *TORO_SUFFIXES)

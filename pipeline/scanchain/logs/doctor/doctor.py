@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from scanchain.config import Config, LogConfig, PreprocessConfig
 from scanchain.data import MOST_COPIES
+from scanchain.files import Source
 from scanchain.logs.bad_scans import are_millimeters, most_bad_scans
 from scanchain.logs.doctor.statistics import Survey, survey
 from scanchain.logs.log import open_log
 from scanchain.logs.messages.point_times import UNITS_S
 from scanchain.logs.messages.readers import is_scan
-from scanchain.source import Source
 from scanchain.words import counted
 
 _GAP_PERIODS = 2.5

@@ -23,6 +23,7 @@ from mcap.records import Channel, ChunkIndex, Schema, Statistics
 from mcap.stream_reader import StreamReader
 
 from scanchain.errors import InputError
+from scanchain.files import Source
 from scanchain.logs.files import RemoteFile
 from scanchain.logs.mcap.records import (
     CHANNEL,
@@ -40,7 +41,6 @@ from scanchain.logs.mcap.records import (
     FileIndex,
     read_definition,
 )
-from scanchain.source import Source
 from scanchain.words import counted
 
 HEADER, FOOTER, ATTACHMENT, METADATA, DATA_END = 1, 2, 9, 12, 15

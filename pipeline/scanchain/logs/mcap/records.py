@@ -20,7 +20,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 
 from scanchain.errors import one_line
-from scanchain.source import Source
+from scanchain.files import Source
 from scanchain.words import counted
 
 MAGIC = b"\x89MCAP0\r\n"
