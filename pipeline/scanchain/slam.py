@@ -30,7 +30,7 @@ from scanchain.data import (
     Trajectory,
     brief,
 )
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
 from scanchain.graph.background import BackgroundOptimization
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
@@ -42,7 +42,6 @@ from scanchain.odometry import FrontEnd, LiveStamps, Located, checked_start, own
 from scanchain.point_store import PointStore
 from scanchain.preprocess import Prepared
 from scanchain.processes import return_freed_memory
-from scanchain.words import counted
 
 _LOST_SIGMAS = (1.0, 0.2)  # m and rad, standard deviations of the motion over one scan that was lost
 _OPTIMIZE_EVERY = 10  # least number of keyframes between two optimizations

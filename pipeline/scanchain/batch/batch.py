@@ -12,7 +12,7 @@ from typing import Protocol
 
 from scanchain.batch.table import write_table
 from scanchain.batch.task import ROWS_FOLDER, Row, State, Task, attempt, finished_row, key_of, unfinished_row
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
 from scanchain.files import Source, source_of
 from scanchain.logs.files import matching, misspelled, spelled
 from scanchain.logs.opening import AUTO, logs_in
@@ -21,7 +21,6 @@ from scanchain.runs.directory import check_outside_runs
 from scanchain.runs.provenance import identity_of
 from scanchain.settings import Override
 from scanchain.verdict import Verdict
-from scanchain.words import counted
 
 _SHARE = 0.75  # of the memory that is free, for all workers together
 

@@ -20,10 +20,9 @@ from scanchain.commands.options import (
     overrides,
     part_options,
 )
-from scanchain.errors import InputError, ScanchainError
+from scanchain.errors import InputError, ScanchainError, counted
 from scanchain.files import Source
 from scanchain.settings import Override, load_settings
-from scanchain.words import counted
 
 _PATH = click.Path(path_type=Path)
 _DAY_S = 86_400.0

@@ -51,8 +51,8 @@ def check(
 
         judged = judge_run(sources[0])
     else:
+        from scanchain.errors import counted
         from scanchain.runs.foreign import judge_trajectory
-        from scanchain.words import counted
 
         judged, missing = judge_trajectory(trajectory, sources, settings)
         if missing:

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from scanchain.words import FREEDOM, counted
+from scanchain.errors import FREEDOM, counted
 
 if TYPE_CHECKING:
     import numpy as np

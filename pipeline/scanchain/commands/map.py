@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from scanchain.commands.options import NumberRange
-from scanchain.words import counted
+from scanchain.errors import counted
 
 _PATH = click.Path(path_type=Path)
 _ABOVE_ZERO = NumberRange(0.0, min_open=True)

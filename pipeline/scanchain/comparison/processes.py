@@ -13,9 +13,9 @@ from scanchain.comparison.methods import Method
 from scanchain.comparison.outcome import REPORT_FILE, SECONDS_FILE, EndReport, Outcome, Status, read_outcome
 from scanchain.comparison.scan_store import StoredScans
 from scanchain.comparison.worker import METHOD_FILE
+from scanchain.errors import counted
 from scanchain.processes import Ending, KilledFor, Limits, available_mib, run_within
 from scanchain.runs.job import Progress
-from scanchain.words import counted
 
 _LEAST_S, _SCAN_S = 300.0, 1.0  # default time limit, seconds: at least, and for each scan
 _SHARE = 0.75  # share of the free memory that is the default limit

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.data import Matrix, Trajectory, brief
-from scanchain.errors import InputError
-from scanchain.words import counted
+from scanchain.errors import InputError, counted
 
 _WIDEST_GAP_S = 0.6  # default widest gap in the reference: at 1 m/s² a line is up to 5 cm off within it
 _SHORTEST_GAP_S = 0.1  # least default gap: at 1 m/s² a straight line is up to 1.3 mm off within it

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.data import Trajectory
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
 from scanchain.evaluation.pairing import span
 from scanchain.trajectory import read_kitti, read_tum, text_lines
-from scanchain.words import counted
 
 _KITTI_FIELDS = 12
 _SLACK_NS = 1_000_000_000  # largest error of the expected stamps of a log's scans

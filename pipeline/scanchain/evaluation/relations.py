@@ -11,10 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from scanchain import lie
 from scanchain.data import Matrix, Trajectory
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
 from scanchain.evaluation.pairing import PoseErrors, Statistics, nearest
 from scanchain.trajectory import posed, table
-from scanchain.words import counted
 
 RELATION_LIMIT_S = 1e-3
 _FIELDS = "stamp1 stamp2 x y z roll pitch yaw"

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.data import Matrix, brief
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
 from scanchain.evaluation.absolute import path_length
 from scanchain.evaluation.pairing import Pairs, PoseErrors
-from scanchain.words import counted
 
 _LARGEST = 2.0  # largest length of a stretch over the requested one
 

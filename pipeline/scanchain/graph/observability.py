@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.data import Matrix
+from scanchain.errors import counted
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.edge_checks import is_connected, listed, loose
 from scanchain.graph.solvers.cholesky import SingularMatrixError
-from scanchain.words import counted
 
 _AXES = {3: ("x", "y", "yaw"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
 _MOST = 100  # largest number of directions of the null space that are computed

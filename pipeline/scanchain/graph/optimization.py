@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from scanchain.config import GraphConfig
 from scanchain.data import GraphState, Matrix, brief, fit_text
+from scanchain.errors import counted
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.edge_checks import has_loop
 from scanchain.graph.initialize import Initialization, first_guess
@@ -16,7 +17,6 @@ from scanchain.graph.robust.graduation import Graduated, minimize
 from scanchain.graph.robust.losses import robust_loss
 from scanchain.graph.robust.update import LIMITS, Since, update
 from scanchain.graph.solvers.minimizer import Limits, Minimizer, Minimum
-from scanchain.words import counted
 
 
 @dataclass(frozen=True, slots=True)

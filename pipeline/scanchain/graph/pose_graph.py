@@ -12,7 +12,7 @@ from scanchain import checks, lie
 from scanchain.clock import working_s
 from scanchain.config import GraphConfig
 from scanchain.data import REJECTED_WEIGHT, GraphState, Matrix, Pose
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.certificate import Certificate, certify
 from scanchain.graph.covariance import own_covariances, pose_errors, relative_covariance
@@ -37,7 +37,6 @@ from scanchain.graph.robust.loosened import Slip
 from scanchain.graph.robust.update import Since
 from scanchain.graph.solvers.cholesky import SingularMatrixError
 from scanchain.graph.solvers.minimizer import Evaluation
-from scanchain.words import counted
 
 _LAST, _MOST_LAST = 0.1, 2000  # share of the poses that are the last ones, and their largest number
 

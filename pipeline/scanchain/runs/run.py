@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.config import NO_TRUTH, Config
 from scanchain.data import Trajectory, brief
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
 from scanchain.evaluation import TruthFile, check_overlap, during, read_truth
 from scanchain.files import write_whole
 from scanchain.logs import Log, open_log
@@ -48,7 +48,6 @@ from scanchain.runs.step_table import StepTable
 from scanchain.settings import Settings, dump, load_settings, named
 from scanchain.slam import SlamResult
 from scanchain.trajectory import write_tum
-from scanchain.words import counted
 
 _FEW_SCANS = 2  # scans whose trajectory shows at most one motion
 _FOR_RESUMING = (JOURNAL_FILE, CHECKPOINT_FILE, POINTS_FILE)

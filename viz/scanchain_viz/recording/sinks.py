@@ -22,9 +22,8 @@ import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
 from rerun.error_utils import RerunWarning
 
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
 from scanchain.files import write_whole
-from scanchain.words import counted
 from scanchain_viz.recording.messages import Message
 
 _QUEUED_BATCHES = 16

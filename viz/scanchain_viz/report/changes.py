@@ -10,9 +10,9 @@ import numpy as np
 from markupsafe import Markup
 
 from scanchain.data import Matrix
+from scanchain.errors import counted
 from scanchain.sessions.change_run import COLORS, METRICS_FILE, TABLE_FILE
 from scanchain.sessions.changes import Changes, Cluster, Label
-from scanchain.words import counted
 from scanchain_viz.pictures.figure import INK
 from scanchain_viz.pictures.map_figures import extent, layers_picture
 from scanchain_viz.report.page import REPORT_FILE, Cell, Chip, Drawing, Grid, Head, Page, Row, Section, write_page

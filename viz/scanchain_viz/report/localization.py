@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from scanchain import lie
+from scanchain.errors import counted
 from scanchain.sessions.localize import LocalizedLog, Part
 from scanchain.sessions.localizer import MapState
 from scanchain.verdict import Judged
-from scanchain.words import counted
 from scanchain_viz.pictures.figure import INK, SvgFigure
 from scanchain_viz.pictures.map_figures import extent, map_points, path_over_map
 from scanchain_viz.pictures.trajectory_figures import PathLine

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import msgspec
 
+from scanchain.errors import counted
 from scanchain.maps import read_ply
 from scanchain.runs.directory import RUN_FILE
 from scanchain.runs.provenance import Provenance
 from scanchain.sessions.merging import MergeMetrics
-from scanchain.words import counted
 from scanchain_viz.pictures.map_figures import surroundings
 from scanchain_viz.pictures.merge import DrawnMerge, picture, read_merge
 from scanchain_viz.pictures.trajectory_figures import PathLine

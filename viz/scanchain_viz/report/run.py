@@ -13,6 +13,7 @@ import pyarrow.parquet as pq
 
 from scanchain import lie
 from scanchain.data import Pose, Trajectory
+from scanchain.errors import counted
 from scanchain.evaluation import absolute_error_of_any_path, pair
 from scanchain.evaluation.absolute import path_length
 from scanchain.maps import read_ply
@@ -24,7 +25,6 @@ from scanchain.runs.step_table import STAGES, nees_of_steps
 from scanchain.runs.vouching import poses_of
 from scanchain.settings import read_layer
 from scanchain.trajectory import read_tum
-from scanchain.words import counted
 from scanchain_viz.pictures.trajectory_figures import DrawnTrajectory, Floats, color_of
 from scanchain_viz.report.checks import verdict_section
 from scanchain_viz.report.page import REPORT_FILE, Cell, Collapsible, Grid, Head, Page, Row, Section, write_page

@@ -15,9 +15,9 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from scanchain.data import Points, State
+from scanchain.errors import counted
 from scanchain.runs.closures import BACK_END
 from scanchain.verdict import Kind, Stretch
-from scanchain.words import counted
 from scanchain_viz.pictures import trajectory_figures as figures
 from scanchain_viz.pictures.map_figures import map_picture, path_over_map, surroundings
 from scanchain_viz.pictures.trajectory_figures import CLOSURES, TRUTH, DrawnTrajectory, Floats, PathLine

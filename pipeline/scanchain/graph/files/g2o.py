@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from scanchain import checks, lie
 from scanchain.data import Matrix, brief
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
 from scanchain.graph.edge_checks import nearest_semidefinite, positive_semidefinite
 from scanchain.graph.files.g2o_lines import G2oLines, Rotation, Rows, sort_lines
 from scanchain.graph.initialize import follow_odometry
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.words import counted
 
 Indefinite = Literal["project", "refuse"]
 

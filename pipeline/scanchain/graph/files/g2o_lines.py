@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation as Turn
 from scanchain import lie
 from scanchain.checks import LARGEST
 from scanchain.data import Matrix
-from scanchain.errors import InputError, shown
-from scanchain.words import counted
+from scanchain.errors import InputError, counted, shown
 
 Rotation = Literal["vector", "quaternion"]  # of which Ω is in 3D
 ROTATION_COMMENT: dict[Rotation, str] = {

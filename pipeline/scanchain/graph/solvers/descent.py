@@ -11,8 +11,8 @@ from typing import Generic, Literal, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from scanchain.errors import counted
 from scanchain.graph.solvers.cholesky import SingularMatrixError
-from scanchain.words import counted
 
 Optimizer = Literal["gauss-newton", "levenberg-marquardt", "dogleg", "newton", "gradient-descent"]
 Vector = NDArray[np.float64]

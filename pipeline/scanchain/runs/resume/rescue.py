@@ -9,14 +9,13 @@ from pathlib import Path
 
 import msgspec
 
-from scanchain.errors import InputError, ScanchainError, remedy_of
+from scanchain.errors import InputError, ScanchainError, counted, remedy_of
 from scanchain.files import without_keys
 from scanchain.runs.directory import CHECKPOINT_FILE, RUN_FILE, RunDirectory
 from scanchain.runs.provenance import Provenance
 from scanchain.runs.resume.journal import JOURNAL_FILE
 from scanchain.runs.step_table import StepTable
 from scanchain.trajectory import write_tum
-from scanchain.words import counted
 
 
 class PartialRunError(ScanchainError):

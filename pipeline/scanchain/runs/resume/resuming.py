@@ -9,14 +9,13 @@ from pathlib import Path
 
 from scanchain.config import Config
 from scanchain.data import Scan
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
 from scanchain.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RECORDING_FILE, RUN_FILE, left_behind
 from scanchain.runs.job import Recorder
 from scanchain.runs.resume.checkpoint import Checkpoint, Checkpoints, read_checkpoint
 from scanchain.runs.resume.journal import JOURNAL_FILE, read_journal
 from scanchain.runs.step_table import StepRow, StepTable
 from scanchain.settings import dump
-from scanchain.words import counted
 
 _REMEDY = "run without --resume"
 _NEEDED = (RUN_FILE, "config.toml", JOURNAL_FILE, CHECKPOINT_FILE, POINTS_FILE)
