@@ -11,6 +11,7 @@ import click
 
 from scanchain.commands.options import (
     LOG,
+    PATH,
     OverrideCommand,
     config_option,
     ground_truth_option,
@@ -24,15 +25,14 @@ from scanchain.errors import InputError, ScanchainError, counted
 from scanchain.files import Source
 from scanchain.settings import Override, load_settings
 
-_PATH = click.Path(path_type=Path)
 _DAY_S = 86_400.0
 
 
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
 @click.argument("logs", metavar="LOG...", nargs=-1, type=LOG)
-@click.option("--out", required=True, metavar="DIR", type=_PATH, help="Directory to create, or to resume.")
+@click.option("--out", required=True, metavar="DIR", type=PATH, help="Directory to create, or to resume.")
 @click.option(
-    "--manifest", "manifests", multiple=True, metavar="FILE", type=_PATH, help="Text file with one log per line."
+    "--manifest", "manifests", multiple=True, metavar="FILE", type=PATH, help="Text file with one log per line."
 )
 @config_option
 @part_options("each log")

@@ -7,21 +7,19 @@ from typing import TYPE_CHECKING
 
 import click
 
-from scanchain.commands.options import LOG, OverrideCommand, overrides, part_options
+from scanchain.commands.options import LOG, PATH, OverrideCommand, overrides, part_options, strict_option
 from scanchain.errors import InputError
 from scanchain.files import Source
 
 if TYPE_CHECKING:
     from scanchain.verdict import Judged
 
-_PATH = click.Path(path_type=Path)
-
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--section.key VALUE]...")
 @click.argument("sources", metavar="RUN|LOG...", nargs=-1, required=True, type=LOG)
-@click.option("--trajectory", metavar="FILE.tum", type=_PATH, help="Check this trajectory of the lidar in LOG.")
+@click.option("--trajectory", metavar="FILE.tum", type=PATH, help="Check this trajectory of the lidar in LOG.")
 @part_options()
-@click.option("--strict", is_flag=True, help="Exit with 1 unless the verdict is trustworthy.")
+@strict_option
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.pass_context
 def check(

@@ -8,11 +8,17 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from scanchain.commands.options import NumberRange, OverrideCommand, config_option, overrides, threads_option
+from scanchain.commands.options import (
+    ABOVE_ZERO,
+    PATH,
+    OverrideCommand,
+    config_option,
+    overrides,
+    print_summary,
+    result_options,
+    threads_option,
+)
 from scanchain.errors import InputError, counted
-
-_PATH = click.Path(path_type=Path)
-_ABOVE_ZERO = NumberRange(0.0, min_open=True)
 
 
 @click.group("map")
@@ -26,17 +32,17 @@ def map_group() -> None:
 
 
 @map_group.command("import")
-@click.argument("file", metavar="FILE", type=_PATH)
-@click.option("--out", required=True, metavar="DIR", type=_PATH, help="Directory to create.")
+@click.argument("file", metavar="FILE", type=PATH)
+@click.option("--out", required=True, metavar="DIR", type=PATH, help="Directory to create.")
 @click.option(
     "--spacing",
-    type=_ABOVE_ZERO,
+    type=ABOVE_ZERO,
     metavar="METERS",
     help="Distance between the positions that the map is seen from. [default: 1.5 in the plane, 6 in space]",
 )
 @click.option(
     "--height",
-    type=_ABOVE_ZERO,
+    type=ABOVE_ZERO,
     default=1.6,
     show_default=True,
     metavar="METERS",
@@ -69,13 +75,11 @@ def import_file(file: Path, out: Path, spacing: float | None, height: float, for
 
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
 @click.argument("runs", metavar="RUN...", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Directory to create.")
+@result_options("DIR if it is the result of an earlier run or merge")
 @config_option
 @click.option("--fixed", is_flag=True, help="Leave the poses of the first RUN as they are.")
 @click.option("--update", is_flag=True, help="Remove from older sessions what newer ones saw through.")
 @threads_option
-@click.option("--force", is_flag=True, help="Replace DIR if it is the result of an earlier run or merge.")
-@click.option("--json", "as_json", is_flag=True, help="Print metrics.json instead of the summary.")
 @click.pass_context
 def merge(
     ctx: click.Context,
@@ -107,9 +111,7 @@ def merge(
         merged = merge_maps(
             runs, out, terminal, present_merge, overrides=overrides(ctx), command=tuple(sys.argv), **options
         )
-    click.echo((merged.path / "metrics.json").read_text() if as_json else merged.summary, nl=False)
-    if not as_json:
-        click.echo(f"written        {out}")
+    print_summary(out, merged.summary, as_json=as_json)
 
 
 if TYPE_CHECKING:
@@ -117,27 +119,25 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("earlier", metavar="RUN_A", type=_PATH)
-@click.argument("later", metavar="[RUN_B]", required=False, type=_PATH)
-@click.option("--out", required=True, metavar="DIR", type=_PATH, help="Directory to create.")
+@click.argument("earlier", metavar="RUN_A", type=PATH)
+@click.argument("later", metavar="[RUN_B]", required=False, type=PATH)
+@result_options("an existing comparison once the new one is complete")
 @click.option("--aligned", is_flag=True, help="Both maps are in one frame already.")
 @click.option(
     "--transform",
     metavar="X,Y[,Z],YAW",
     help="Pose of RUN_B's frame in RUN_A's, meters and degrees. [default: found]",
 )
-@click.option("--voxel", type=_ABOVE_ZERO, metavar="METERS", help="Resolution. [default: maps.voxel_size_m]")
+@click.option("--voxel", type=ABOVE_ZERO, metavar="METERS", help="Resolution. [default: maps.voxel_size_m]")
 @click.option(
     "--min-size",
-    type=_ABOVE_ZERO,
+    type=ABOVE_ZERO,
     default=0.2,
     show_default=True,
     metavar="METERS",
     help="Least length of a change; what is smaller is unknown.",
 )
 @threads_option
-@click.option("--force", is_flag=True, help="Replace an existing comparison once the new one is complete.")
-@click.option("--json", "as_json", is_flag=True, help="Print metrics.json instead of the summary.")
 def changes(
     earlier: Path,
     later: Path | None,
@@ -166,7 +166,7 @@ def changes(
     """
     from scanchain.api import present_changes
     from scanchain.commands.terminal import Terminal
-    from scanchain.sessions.change_run import METRICS_FILE, SUMMARY_FILE, compare_maps
+    from scanchain.sessions.change_run import SUMMARY_FILE, compare_maps
 
     if aligned and transform is not None:
         raise click.UsageError("--aligned and --transform are both given; give one of them")
@@ -184,9 +184,7 @@ def changes(
             min_size_m=min_size,
             force=force,
         )
-    click.echo((out / (METRICS_FILE if as_json else SUMMARY_FILE)).read_text(encoding="utf-8"), nl=False)
-    if not as_json:
-        click.echo(f"written        {out}")
+    print_summary(out, (out / SUMMARY_FILE).read_text(encoding="utf-8"), as_json=as_json)
 
 
 def _pose(earlier: Path, text: str | None) -> Pose | None:

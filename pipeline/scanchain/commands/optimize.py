@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, cast
 
 import click
 
-from scanchain.commands.options import OverrideCommand, check_output, key_option, overrides
+from scanchain.commands.options import PATH, OverrideCommand, check_output, key_option, overrides
 from scanchain.errors import FREEDOM, InputError, counted, remedy_of
 from scanchain.settings import Override, load_settings
 
@@ -21,14 +21,13 @@ if TYPE_CHECKING:
     from scanchain.graph.files.g2o import G2oFile, Indefinite
     from scanchain.graph.initialize import Initialization
 
-_PATH = click.Path(path_type=Path)
 _INITIALIZATIONS = ("auto", "given", "odometry", "spanning-tree", "chordal")
 
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--graph.key VALUE]...")
-@click.argument("source", metavar="GRAPH.g2o", type=_PATH)
+@click.argument("source", metavar="GRAPH.g2o", type=PATH)
 @click.option(
-    "--out", metavar="FILE", type=_PATH, help="Write the optimized graph: .g2o, or TORO's .graph or .toro."
+    "--out", metavar="FILE", type=PATH, help="Write the optimized graph: .g2o, or TORO's .graph or .toro."
 )
 @key_option(
     "--optimizer",
@@ -61,10 +60,8 @@ _INITIALIZATIONS = ("auto", "given", "odometry", "spanning-tree", "chordal")
     metavar="all|IDS",
     help="Write marginal covariances of these poses, in their own frames, to a .marginals.csv beside --out.",
 )
-@click.option("--png", metavar="FILE", type=_PATH, help="Draw the graph before and after optimization.")
-@click.option(
-    "--recording", metavar="FILE.rrd", type=_PATH, help="Record the graph before and after optimization."
-)
+@click.option("--png", metavar="FILE", type=PATH, help="Draw the graph before and after optimization.")
+@click.option("--recording", metavar="FILE.rrd", type=PATH, help="Record the graph before and after optimization.")
 @click.option("--force", is_flag=True, help="Replace files that exist.")
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.pass_context
