@@ -17,11 +17,19 @@ from scanchain.errors import FREEDOM, InputError, counted, remedy_of
 from scanchain.settings import Override, load_settings
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from scanchain.config import GraphConfig
+    from scanchain.graph.certificate import Certificate
     from scanchain.graph.files.g2o import G2oFile, Indefinite
     from scanchain.graph.initialize import Initialization
+    from scanchain.graph.observability import FreePose
+    from scanchain.graph.optimization import GraphChange, Optimization
 
 _INITIALIZATIONS = ("auto", "given", "odometry", "spanning-tree", "chordal")
+_POOR_FIT = 10.0  # χ² per degree of freedom, above which no noise model that is a little off explains it
+_HALF = 0.5  # robust weight below which an edge is contradicted by the rest, rejected or not
 
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--graph.key VALUE]...")
@@ -216,19 +224,6 @@ def _solved(file: G2oFile, name: str, config: GraphConfig, initialize: Initializ
     return GraphReport(file, change, done, free, weak, file.graph.certify())
 
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from scanchain.graph.certificate import Certificate
-    from scanchain.graph.files.g2o import G2oFile
-    from scanchain.graph.observability import FreePose
-    from scanchain.graph.optimization import GraphChange, Optimization
-
-_POOR_FIT = 10.0  # χ² per degree of freedom, above which no noise model that is a little off explains it
-_HALF = 0.5  # robust weight below which an edge is contradicted by the rest, rejected or not
-
-
 @dataclass(frozen=True, slots=True)
 class GraphReport:
     """Everything to print about an optimized graph."""
@@ -242,6 +237,8 @@ class GraphReport:
 
     def text(self, written: list[Path]) -> str:
         """One line per fact."""
+        from scanchain.graph.observability import free_text, weak_text
+
         graph, done = self.file.graph, self.optimization
         guess = done.initialization
         if guess == "given":
@@ -251,21 +248,30 @@ class GraphReport:
             *(f"warning        {warning}" for warning in self._warnings),
             f"graph          {self.change.name}: {size}",
             *(f"kept as is     {counted(count, 'line')} {tag}" for tag, count in self.file.other_tags),
-            *self._projected,
+        ]
+        if projection := self.file.projection:
+            lines.append(
+                f"projected      {projection.edges:,} of {projection.of:,} indefinite information matrices"
+            )
+        ending = done.reason if done.converged else f"DID NOT CONVERGE: {done.reason}"
+        lines += [
             f"initial guess  {guess}",
             f"chi2           {self._chi2}",
-            f"iterations     {done.iterations:,} in {1e3 * done.time_s:.0f} ms; {self._ending}",
+            f"iterations     {done.iterations:,} in {1e3 * done.time_s:.0f} ms; {ending}",
         ]
-        if graph.is_loop.any():
+        held = ""
+        if loops := int(graph.is_loop.sum()):
+            held = ", with fixed robust weights"
             rest = "; they do not count" if done.rejected.any() else ""
-            chain = len(graph.edges) - int(graph.is_loop.sum())
-            lines.append(
-                f"robust         on {counted(int(graph.is_loop.sum()), 'loop edge')}; "
-                f"the other {counted(chain, 'edge')} (odometry, points) in full weight"
-            )
-            lines.append(f"rejected       {done.rejected.sum():,} of {graph.is_loop.sum():,} loop edges{rest}")
-        lines += self._free
-        held = ", with fixed robust weights" if graph.is_loop.any() else ""
+            lines += [
+                f"robust         on {counted(loops, 'loop edge')}; the other "
+                f"{counted(len(graph.edges) - loops, 'edge')} (odometry, points) in full weight",
+                f"rejected       {done.rejected.sum():,} of {loops:,} loop edges{rest}",
+            ]
+        if self.free:
+            lines.append(f"free           {free_text(self.free)}")
+        if len(self.weak):
+            lines.append(f"weakly joined  {weak_text(self.weak)}")
         lines.append(f"certificate    {self.certificate.verdict}{held}; {1e3 * self.certificate.time_s:.0f} ms")
         return "\n".join([*lines, *(f"written        {path}" for path in written)])
 
@@ -290,26 +296,6 @@ class GraphReport:
             f"{downweighted:,} of {len(weight):,} loop edges are rejected or have a weight below ½: if they are "
             "right, all below is wrong; the certificate covers the edges in force, not their selection",
         ]
-
-    @property
-    def _free(self) -> list[str]:
-        from scanchain.graph.observability import free_text, weak_text
-
-        lines = [f"free           {free_text(self.free)}"] if self.free else []
-        return [*lines, f"weakly joined  {weak_text(self.weak)}"] if len(self.weak) else lines
-
-    @property
-    def _projected(self) -> list[str]:
-        projection = self.file.projection
-        if projection is None:
-            return []
-        return [f"projected      {projection.edges:,} of {projection.of:,} indefinite information matrices"]
-
-    @property
-    def _ending(self) -> str:
-        """Reason why the iteration stopped."""
-        done = self.optimization
-        return done.reason if done.converged else f"DID NOT CONVERGE: {done.reason}"
 
     @property
     def _chi2(self) -> str:
