@@ -23,7 +23,7 @@ from scanchain.commands.options import (
 )
 from scanchain.errors import InputError, ScanchainError, counted
 from scanchain.files import Source
-from scanchain.settings import Override, load_settings
+from scanchain.settings import load_settings
 
 _DAY_S = 86_400.0
 
@@ -104,12 +104,13 @@ def batch(
             f"--gt {ground_truth}: a batch has no file of true poses for all its logs; name a topic, or use run"
         )
     changes = overrides(ctx)
+    file = () if config_file is None else ("--config", str(config_file.resolve()))
     job = Batch(
         logs=collect(logs, manifests, load_settings(file=config_file, overrides=changes).config.log.format),
         out=out.resolve(),
         config_file=config_file,
         overrides=changes,
-        arguments=("--rerun", rerun, *_arguments(config_file, changes)),
+        arguments=("--rerun", rerun, *file, *(f"--{change.key}={change.text}" for change in changes)),
         workers=workers or os.cpu_count() or 1,
         time_s=time_s or _DAY_S,
         **limits,
@@ -125,9 +126,3 @@ def batch(
     failures = ", ".join(filter(None, (batched.failures, batched.doubts if strict else "")))
     if failures:
         raise ScanchainError(f"{failures}; {out}/summary.txt has the reason")
-
-
-def _arguments(config: Path | None, changes: tuple[Override, ...]) -> tuple[str, ...]:
-    """The same configuration for scanchain run."""
-    file = () if config is None else ("--config", str(config.resolve()))
-    return (*file, *(f"--{change.key}={change.text}" for change in changes))

@@ -57,13 +57,10 @@ def check(
             click.echo(
                 f"warning: {counted(missing, 'scan')} without a pose in {trajectory} are left out", err=True
             )
-    click.echo(_json(judged) if as_json else _text(judged))
+    lines = [judged.sentence, *(f"  {stretch.text}" for stretch in judged.unnamed)]
+    click.echo(_json(judged) if as_json else "\n".join(lines))
     if judged.verdict.fails(strict=strict):
         ctx.exit(1)
-
-
-def _text(judged: Judged) -> str:
-    return "\n".join([judged.sentence, *(f"  {stretch.text}" for stretch in judged.unnamed)])
 
 
 def _json(judged: Judged) -> str:
