@@ -21,7 +21,7 @@ _UNITS = {  # by the ending of a name; the first that fits
     "_m_s": "m/s", "_rad_s": "rad/s", "_m": "m", "_s": "s", "_rad": "rad", "_hz": "Hz", "_percent": "%",
     "_voxels": "voxels", "_keyframes": "keyframes",
 }  # fmt: skip
-_TRUTHS = dict.fromkeys(("true", "yes", "on", "1"), True) | dict.fromkeys(("false", "no", "off", "0"), False)
+_TRUTHS = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}
 _OWN = "MODULE:CLASS"  # a user's own
 LARGEST = 1e50  # beyond which products of a few numbers are infinite
 
@@ -55,10 +55,8 @@ class ConfigKey:
     def check(self, value: object, source: str, *, text: str = "") -> Value:
         """The value as this key holds it; ``source``, a file or a flag, is named in the error."""
         try:
-            is_number = isinstance(value, Real) and not isinstance(value, bool)
-            converted: Value = msgspec.convert(
-                float(value) if is_number else value, self.kind, strict=not is_number
-            )
+            given = float(value) if isinstance(value, Real) and not isinstance(value, bool) else value
+            converted: Value = msgspec.convert(given, self.kind, strict=not isinstance(given, float))
             return converted
         except (msgspec.ValidationError, OverflowError):  # the latter of an int of hundreds of digits
             subject = f"{source} is" if self.name in source else f"{source}: {self.name} is"
