@@ -13,24 +13,20 @@ from typing import NoReturn
 import click
 
 from scanchain.commands.batch import batch
-from scanchain.commands.changes import changes
 from scanchain.commands.check import check
 from scanchain.commands.compare import compare
-from scanchain.commands.config import config
 from scanchain.commands.convert import convert
 from scanchain.commands.doctor import doctor
 from scanchain.commands.evaluate import evaluate
 from scanchain.commands.info import info
 from scanchain.commands.landmarks import landmarks
 from scanchain.commands.localize import localize
-from scanchain.commands.map import map_group
-from scanchain.commands.merge import merge
+from scanchain.commands.maps import changes, map_group, merge
 from scanchain.commands.optimize import optimize
+from scanchain.commands.preparing import config, sequence, warm_up
 from scanchain.commands.run import run
-from scanchain.commands.sequence import sequence
 from scanchain.commands.simulate import simulate
 from scanchain.commands.view import view
-from scanchain.commands.warm_up import warm_up
 from scanchain.errors import InputError, ScanchainError, remedy_of
 
 

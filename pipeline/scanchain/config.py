@@ -10,14 +10,22 @@ from typing import Annotated, Literal
 from msgspec import Meta, Struct
 from msgspec.structs import fields, force_setattr
 
-from scanchain.config_keys import section_keys
+from scanchain.config_keys import LARGEST, section_keys
 from scanchain.errors import InputError, shown
+from scanchain.plugins import CLASS_NAME
 
-Positive = Annotated[float, Meta(gt=0.0)]
-NonNegative = Annotated[float, Meta(ge=0.0)]
+Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+Positive = Annotated[float, Meta(gt=0.0, le=LARGEST)]
+NonNegative = Annotated[float, Meta(ge=0.0, le=LARGEST)]
+Limit = Annotated[float, Meta(gt=0.0)]  # infinite: no limit
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 Percent = Annotated[float, Meta(ge=0.0, le=100.0)]
 Count = Annotated[int, Meta(ge=1)]
+
+
+def _one_of(choices: dict[str, str]) -> Meta:
+    """One of these words, or a class."""
+    return Meta(pattern=rf"^({'|'.join(choices)}|{CLASS_NAME})\Z", extra={"choices": tuple(choices)})
 
 
 NO_TRUTH = "none"  # of ``log.ground_truth_topic``
@@ -26,7 +34,7 @@ MATCHERS = {
     "plicp": "scanchain.registration.plicp:PointToShapeMatcher",
     "svd": "scanchain.registration.svd_icp:SvdMatcher",
 }
-Matcher = Annotated[str, Meta(extra={"choices": tuple(MATCHERS)})]  # or a user's own, MODULE:CLASS
+Matcher = Annotated[str, _one_of(MATCHERS)]  # or a user's own, MODULE:CLASS
 LOSSES = {  # of loop edges
     "none": "scanchain.graph.graduation.losses:Quadratic",
     "huber": "scanchain.graph.graduation.losses:Huber",
@@ -35,7 +43,7 @@ LOSSES = {  # of loop edges
     "tukey": "scanchain.graph.graduation.losses:Tukey",
     "truncated": "scanchain.graph.graduation.losses:Truncated",
 }
-Loss = Annotated[str, Meta(extra={"choices": tuple(LOSSES)})]  # likewise
+Loss = Annotated[str, _one_of(LOSSES)]  # likewise
 Optimizer = Literal["levenberg-marquardt", "gauss-newton", "newton", "gradient-descent"]
 
 
@@ -75,15 +83,15 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
     odometry_topic: str = ""
     ground_truth_topic: str = "/ground_truth"
     start_s: NonNegative = 0.0
-    end_s: Positive = float("inf")
+    end_s: Limit = float("inf")
     every: Count = 1
     rate_hz: NonNegative = 0.0
     max_bad_scans_percent: Percent = 10.0
     min_range_m: NonNegative = 0.0
-    max_range_m: Positive = float("inf")
+    max_range_m: Limit = float("inf")
     point_times: Literal["auto", "none", "s", "ms", "us", "ns", "clockwise", "counterclockwise"] = "auto"
     revolution_s: Positive = 0.1
-    revolution_start_rad: float = 3.141592653589793
+    revolution_start_rad: Number = 3.141592653589793
 
 
 class PreprocessConfig(Section, frozen=True, forbid_unknown_fields=True):
@@ -102,7 +110,7 @@ class PreprocessConfig(Section, frozen=True, forbid_unknown_fields=True):
     """
 
     min_range_m: NonNegative = 0.5
-    max_range_m: Positive = 100.0
+    max_range_m: Limit = 100.0
     deskew: bool = True
     calibrate_elevation: bool = True
     map_voxel_m: Positive = 0.5
@@ -123,7 +131,7 @@ class LocalMapConfig(Section, frozen=True, forbid_unknown_fields=True):
     """
 
     voxel_size_m: Positive = 1.0
-    max_distance_m: Positive = 100.0
+    max_distance_m: Limit = 100.0
     max_insertions: Count = 1000
     insert_distance_m: NonNegative = 0.0
     insert_angle_rad: NonNegative = 0.0
@@ -268,8 +276,8 @@ class MapsConfig(Section, frozen=True, forbid_unknown_fields=True):
     write_laz: bool = False
     grid_resolution_m: Positive = 0.2
     grid_max_range_m: Positive = 80.0
-    slice_min_z_m: float = -0.5
-    slice_max_z_m: float = 0.5
+    slice_min_z_m: Number = -0.5
+    slice_max_z_m: Number = 0.5
 
 
 class RecordingConfig(Section, frozen=True, forbid_unknown_fields=True):

@@ -14,7 +14,6 @@ from msgspec import inspect
 from msgspec.structs import fields
 
 from scanchain.errors import InputError, shown
-from scanchain.plugins import is_class_name
 
 Value = bool | int | float | str
 
@@ -22,10 +21,9 @@ _UNITS = {  # by the ending of a name; the first that fits
     "_m_s": "m/s", "_rad_s": "rad/s", "_m": "m", "_s": "s", "_rad": "rad", "_hz": "Hz", "_percent": "%",
     "_voxels": "voxels", "_keyframes": "keyframes",
 }  # fmt: skip
-_YES, _NO = ("true", "yes", "on", "1"), ("false", "no", "off", "0")
+_TRUTHS = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}
 _OWN = "MODULE:CLASS"  # a user's own
-_LARGEST = 1e50  # beyond which products of a few numbers are infinite
-_UNLIMITED = ("log.end_s", "log.max_range_m", "preprocess.max_range_m", "local_map.max_distance_m")  # take inf
+LARGEST = 1e50  # beyond which products of a few numbers are infinite
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,13 +55,15 @@ class ConfigKey:
     def check(self, value: object, source: str, *, text: str = "") -> Value:
         """The value as this key holds it; ``source``, a file or a flag, is named in the error."""
         try:
-            return self._converted(value)
-        except (ValueError, OverflowError):  # the latter of an int of hundreds of digits
+            given = float(value) if isinstance(value, Real) and not isinstance(value, bool) else value
+            converted: Value = msgspec.convert(given, self.kind, strict=not isinstance(given, float))
+            return converted
+        except (msgspec.ValidationError, OverflowError):  # the latter of an int of hundreds of digits
             subject = f"{source} is" if self.name in source else f"{source}: {self.name} is"
             unit = f", in {self.unit}" if self.unit else ""
             finite = ""
-            if isinstance(value, float) and abs(value) > _LARGEST:
-                finite = " and finite" if math.isinf(value) else f" and at most {_LARGEST:g}"
+            if isinstance(value, float) and abs(value) > LARGEST:
+                finite = " and finite" if math.isinf(value) else f" and at most {LARGEST:g}"
             message = f"{subject} {text or shown(value)}; it must be {self._demand}{finite}{unit}"
         raise InputError(message)
 
@@ -71,7 +71,7 @@ class ConfigKey:
         """The value that a flag's text stands for."""
         value: object = text
         if isinstance(self.default, bool):
-            value = True if text.lower() in _YES else False if text.lower() in _NO else text
+            value = _TRUTHS.get(text.lower(), text)
         elif not isinstance(self.default, str):
             with suppress(ValueError):
                 value = float(text)
@@ -86,18 +86,6 @@ class ConfigKey:
         words = self.range.removesuffix(f" | {_OWN}").replace(" | ", ", ")
         own = f" or a class of yours, {_OWN}" if self.choices else ""
         return words if words == "text" else f"one of {words}{own}"
-
-    def _converted(self, value: object) -> Value:
-        """The value as held: −∞ and NaN never are, +∞ where it means no limit. Raises ValueError."""
-        if isinstance(value, Real) and not isinstance(value, bool):
-            number = float(value)
-            if not abs(number) <= _LARGEST and (number != math.inf or self.name not in _UNLIMITED):
-                raise ValueError
-            value = int(number) if number.is_integer() and type(self.default) is int else number
-        converted: Value = msgspec.convert(value, self.kind)
-        if self.choices and converted not in self.choices and not is_class_name(str(converted)):
-            raise ValueError
-        return converted
 
 
 @functools.cache
@@ -128,10 +116,10 @@ def _values(kind: object) -> tuple[str, tuple[str, ...]]:
             return " | ".join((*choices, _OWN)), choices
         case (inspect.IntType() | inspect.FloatType()) as number:
             text = "whole number" if isinstance(number, inspect.IntType) else "number"
-            if number.le is not None:
+            if number.le is not None and number.le < LARGEST:
                 return f"{text} from {number.gt or number.ge or 0:g} to {number.le:g}", ()
             if number.gt is not None:
                 return f"{text} > {number.gt:g}", ()
-            return text if number.ge is None else f"{text} >= {number.ge:g}", ()
+            return text if number.ge in (None, -LARGEST) else f"{text} >= {number.ge:g}", ()
         case other:
             raise TypeError(f"configuration keys are bool, int, float, str or a choice, not {other}")

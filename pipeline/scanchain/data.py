@@ -16,8 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain.errors import InputError
-from scanchain.words import FREEDOM, counted
+from scanchain.errors import FREEDOM, InputError, counted
 
 Pose = NDArray[np.float64]
 Points = NDArray[np.float64]

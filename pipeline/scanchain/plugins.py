@@ -10,10 +10,12 @@ from types import ModuleType
 
 from scanchain.errors import InputError, one_line
 
+CLASS_NAME = r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*"
+
 
 def is_class_name(text: str) -> bool:
     """True if a text has the form ``package.module:Class``."""
-    return re.fullmatch(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*", text) is not None
+    return re.fullmatch(CLASS_NAME, text) is not None
 
 
 def load(name: str, *methods: str) -> type:

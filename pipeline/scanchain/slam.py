@@ -27,7 +27,7 @@ from scanchain.data import (
     Trajectory,
     brief,
 )
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.schedule import Schedule
 from scanchain.loops import ClosureTable, LoopCloser, refined, spread
@@ -37,7 +37,6 @@ from scanchain.placement import LARGEST_SIGMAS, Placement, edge_information
 from scanchain.point_store import PointStore
 from scanchain.preprocess import Prepared
 from scanchain.trail import Trail
-from scanchain.words import counted
 
 _LOST_SIGMAS = (1.0, 0.2)  # m and rad, standard deviations of the motion over one scan that was lost
 

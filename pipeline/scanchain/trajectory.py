@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from scanchain import checks, lie
 from scanchain.data import Matrix, Trajectory
-from scanchain.errors import InputError, remedy_of
-from scanchain.words import counted
+from scanchain.errors import InputError, counted, remedy_of
 
 _NS_PER_S = 1_000_000_000
 _TUM_ROW, _KITTI_ROW = 7 * " %.9f" + "\n", " ".join(12 * ["%.9e"]) + "\n"

@@ -18,12 +18,12 @@ import pytest
 from scanchain.__main__ import main
 from scanchain.batch.batch import collect
 from scanchain.errors import InputError
+from scanchain.files import Address
 from scanchain.logs.writing.pack import ORIGIN, pack_laser_scan, pack_odometry
 from scanchain.logs.writing.writer import LogWriter
 from scanchain.processes import resident_mib
 from scanchain.runs.directory import directory_name
 from scanchain.simulation import simulate
-from scanchain.source import Address
 from scanchain_viz.report.batch import names_of
 from tests.support.browser import look
 from tests.support.killing import processes_about, wait_until

@@ -21,6 +21,7 @@ from scanchain.__main__ import scanchain
 from scanchain.data import Trajectory
 from scanchain.evaluation.metrics import evaluate as scanchain_evaluate
 from scanchain.graph.g2o import read_g2o
+from scanchain.logs.writing.pack import ORIGIN, pack_laser_scan, pack_odometry
 from scanchain.logs.writing.writer import LogWriter
 from scanchain.settings import flatten
 from scanchain.simulation import simulate
@@ -669,10 +670,11 @@ def test_a_topic_of_true_poses_that_keeps_another_clock_is_refused_before_the_wo
     with LogWriter(tmp_path / "a.mcap") as log:
         for k in range(20):
             at_ns = 10**18 + k * 10**8
-            log.laser_scan(
-                "/scan", at_ns, "lidar", -1.5, 0.1, 0.0, np.full(31, 3.0), range_min_m=0.1, range_max_m=9.0
-            )
-            log.odometry("/mocap", 5 * 10**9 + k * 10**8, "world", "lidar", np.eye(3), log_time_ns=at_ns)
+            scan = pack_laser_scan(at_ns, "lidar", -1.5, 0.1, np.full(31, 3.0), range_min_m=0.1, range_max_m=9.0)
+            log.append("/scan", "sensor_msgs/msg/LaserScan", scan, at_ns)
+            true_ns = 5 * 10**9 + k * 10**8
+            pose = pack_odometry(true_ns, "world", "lidar", ORIGIN)
+            log.append("/mocap", "nav_msgs/msg/Odometry", pose, true_ns, at_ns)
     words = ["run", tmp_path / "a.mcap", "--out", tmp_path / "a", "--rerun", "off", "--gt"]
     says(refused(*words, "/mocap"), "/mocap", "5.000 to 6.900 s", "1000000000.000 to 1000000001.900 s")
     says(refused(*words, "/ground_truth"), "/ground_truth", "scanchain info")

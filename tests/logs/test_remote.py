@@ -14,6 +14,7 @@ import pytest
 from scanchain.__main__ import main
 from scanchain.config import LogConfig
 from scanchain.errors import InputError, MissingExtraError
+from scanchain.files import Address, source_of
 from scanchain.logs import files, open_log
 from scanchain.logs.mcap.index import walked
 from scanchain.logs.mcap.records import FileIndex
@@ -22,7 +23,6 @@ from scanchain.logs.opening import index_files
 from scanchain.logs.writing import writer
 from scanchain.runs.provenance import Provenance, identity_of
 from scanchain.simulation import simulate
-from scanchain.source import Address, source_of
 from tests.support.carmen_text import flaser, save
 from tests.support.scenes import shared_data
 from tests.support.web_server import serving

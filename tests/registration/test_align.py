@@ -8,11 +8,10 @@ import pytest
 
 import scanchain
 from scanchain import lie
-from scanchain.errors import InputError
+from scanchain.errors import InputError, below
 from scanchain.logs import open_log
 from scanchain.odometry import Odometry
 from scanchain.registration.align import _in_units_of
-from scanchain.words import below
 from tests.support.scenes import configured, kitti_scans, shared_data
 
 CSAIL, KITTI = "2d/mit_csail.mcap", "3d/kitti_0005_first60.mcap"

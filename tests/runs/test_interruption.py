@@ -16,6 +16,7 @@ import pytest
 
 from scanchain.data import Scan
 from scanchain.errors import InputError
+from scanchain.files import write_whole
 from scanchain.logs import open_log
 from scanchain.preprocess import Resolution
 from scanchain.runs.directory import POINTS_FILE, RECORDING_FILE
@@ -25,7 +26,6 @@ from scanchain.runs.step_table import StepTable
 from scanchain.simulation import simulate
 from scanchain.slam import Slam
 from scanchain.trajectory import read_tum
-from scanchain.whole_file import write_whole
 from scanchain_viz.recording import entities
 from tests.support.killing import (
     assert_readable,

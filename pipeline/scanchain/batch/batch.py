@@ -13,7 +13,8 @@ import msgspec
 
 from scanchain.batch.table import write_table
 from scanchain.batch.task import ROWS_FOLDER, Row, State, Task, attempt, finished_row, key_of
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
+from scanchain.files import Source, source_of, write_whole
 from scanchain.logs.files import matching, misspelled, spelled
 from scanchain.logs.opening import AUTO, logs_in
 from scanchain.processes import available_mib
@@ -21,10 +22,7 @@ from scanchain.runs.directory import check_outside_runs
 from scanchain.runs.job import Progress
 from scanchain.runs.provenance import identity_of
 from scanchain.settings import Override
-from scanchain.source import Source, source_of
 from scanchain.verdict import Verdict
-from scanchain.whole_file import write_whole
-from scanchain.words import counted
 
 _SHARE = 0.75  # of the memory that is free, for all workers together
 

@@ -11,10 +11,10 @@ import msgspec
 import numpy as np
 
 from scanchain.batch.task import Row, State
+from scanchain.errors import counted, duration
+from scanchain.files import write_whole
 from scanchain.runs.metrics import Metrics
 from scanchain.verdict import Verdict
-from scanchain.whole_file import write_whole
-from scanchain.words import counted, duration
 
 TABLE_FILE, SUMMARY_FILE = "batch.parquet", "summary.txt"
 _NUMBERS = (

@@ -12,13 +12,13 @@ from threading import Event
 import msgspec
 from msgspec import Struct
 
+from scanchain.files import source_of
 from scanchain.logs.files import spelled
 from scanchain.processes import Ending, KilledFor, Limits, run_within
 from scanchain.runs.directory import RUN_FILE, directory_name
 from scanchain.runs.metrics import METRICS_FILE, Metrics
 from scanchain.runs.provenance import Provenance, package_version
 from scanchain.settings import Override, dump, load_settings
-from scanchain.source import source_of
 from scanchain.threads import VARIABLE
 from scanchain.verdict import Verdict
 

@@ -11,6 +11,7 @@ import click
 
 from scanchain.commands.options import (
     LOG,
+    PATH,
     OverrideCommand,
     config_option,
     ground_truth_option,
@@ -20,20 +21,18 @@ from scanchain.commands.options import (
     overrides,
     part_options,
 )
-from scanchain.errors import InputError, ScanchainError
-from scanchain.settings import Override, load_settings
-from scanchain.source import Source
-from scanchain.words import counted
+from scanchain.errors import InputError, ScanchainError, counted
+from scanchain.files import Source
+from scanchain.settings import load_settings
 
-_PATH = click.Path(path_type=Path)
 _DAY_S = 86_400.0
 
 
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
 @click.argument("logs", metavar="LOG...", nargs=-1, type=LOG)
-@click.option("--out", required=True, metavar="DIR", type=_PATH, help="Directory to create, or to resume.")
+@click.option("--out", required=True, metavar="DIR", type=PATH, help="Directory to create, or to resume.")
 @click.option(
-    "--manifest", "manifests", multiple=True, metavar="FILE", type=_PATH, help="Text file with one log per line."
+    "--manifest", "manifests", multiple=True, metavar="FILE", type=PATH, help="Text file with one log per line."
 )
 @config_option
 @part_options("each log")
@@ -105,12 +104,13 @@ def batch(
             f"--gt {ground_truth}: a batch has no file of true poses for all its logs; name a topic, or use run"
         )
     changes = overrides(ctx)
+    file = () if config_file is None else ("--config", str(config_file.resolve()))
     job = Batch(
         logs=collect(logs, manifests, load_settings(file=config_file, overrides=changes).config.log.format),
         out=out.resolve(),
         config_file=config_file,
         overrides=changes,
-        arguments=("--rerun", rerun, *_arguments(config_file, changes)),
+        arguments=("--rerun", rerun, *file, *(f"--{change.key}={change.text}" for change in changes)),
         workers=workers or os.cpu_count() or 1,
         time_s=time_s or _DAY_S,
         **limits,
@@ -126,9 +126,3 @@ def batch(
     failures = ", ".join(filter(None, (batched.failures, batched.doubts if strict else "")))
     if failures:
         raise ScanchainError(f"{failures}; {out}/summary.txt has the reason")
-
-
-def _arguments(config: Path | None, changes: tuple[Override, ...]) -> tuple[str, ...]:
-    """The same configuration for scanchain run."""
-    file = () if config is None else ("--config", str(config.resolve()))
-    return (*file, *(f"--{change.key}={change.text}" for change in changes))

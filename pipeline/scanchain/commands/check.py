@@ -7,21 +7,19 @@ from typing import TYPE_CHECKING
 
 import click
 
-from scanchain.commands.options import LOG, OverrideCommand, overrides, part_options
+from scanchain.commands.options import LOG, PATH, OverrideCommand, overrides, part_options, strict_option
 from scanchain.errors import InputError
-from scanchain.source import Source
+from scanchain.files import Source
 
 if TYPE_CHECKING:
     from scanchain.verdict import Judged
 
-_PATH = click.Path(path_type=Path)
-
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--section.key VALUE]...")
 @click.argument("sources", metavar="RUN|LOG...", nargs=-1, required=True, type=LOG)
-@click.option("--trajectory", metavar="FILE.tum", type=_PATH, help="Check this trajectory of the lidar in LOG.")
+@click.option("--trajectory", metavar="FILE.tum", type=PATH, help="Check this trajectory of the lidar in LOG.")
 @part_options()
-@click.option("--strict", is_flag=True, help="Exit with 1 unless the verdict is trustworthy.")
+@strict_option
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 @click.pass_context
 def check(
@@ -51,21 +49,18 @@ def check(
 
         judged = judge_run(sources[0])
     else:
+        from scanchain.errors import counted
         from scanchain.runs.foreign import judge_trajectory
-        from scanchain.words import counted
 
         judged, missing = judge_trajectory(trajectory, sources, settings)
         if missing:
             click.echo(
                 f"warning: {counted(missing, 'scan')} without a pose in {trajectory} are left out", err=True
             )
-    click.echo(_json(judged) if as_json else _text(judged))
+    lines = [judged.sentence, *(f"  {stretch.text}" for stretch in judged.unnamed)]
+    click.echo(_json(judged) if as_json else "\n".join(lines))
     if judged.verdict.fails(strict=strict):
         ctx.exit(1)
-
-
-def _text(judged: Judged) -> str:
-    return "\n".join([judged.sentence, *(f"  {stretch.text}" for stretch in judged.unnamed)])
 
 
 def _json(judged: Judged) -> str:

@@ -18,7 +18,7 @@ from scanchain.commands.options import (
     threads_option,
 )
 from scanchain.errors import ScanchainError
-from scanchain.source import Source
+from scanchain.files import Source
 
 _PATH = click.Path(path_type=Path)
 

@@ -9,8 +9,8 @@ import click
 
 from scanchain.commands.options import LOG, OverrideCommand, key_option, overrides, part_options
 from scanchain.errors import InputError
+from scanchain.files import Source
 from scanchain.settings import load_settings
-from scanchain.source import Source
 
 _KEYS = tuple(f"log.{name}" for name in ("format", "rate_hz", "topic", "start_s", "end_s", "every"))
 

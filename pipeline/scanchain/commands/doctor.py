@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import click
 
 from scanchain.commands.options import LOG, OverrideCommand, overrides, part_options
+from scanchain.files import Source
 from scanchain.settings import load_settings
-from scanchain.source import Source
 
 if TYPE_CHECKING:
     from scanchain.logs.doctor.doctor import Diagnosis

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import click
 
 from scanchain.commands.options import LOG, OverrideCommand, overrides, part_options
+from scanchain.errors import counted
+from scanchain.files import Source
 from scanchain.settings import load_settings
-from scanchain.source import Source
-from scanchain.words import counted
 
 if TYPE_CHECKING:
     from scanchain.logs.info import LogInfo

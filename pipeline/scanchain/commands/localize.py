@@ -11,18 +11,17 @@ import click
 
 from scanchain.commands.options import (
     LOG,
+    PATH,
     OverrideCommand,
     collect_garbage_seldom,
-    config_option,
-    ground_truth_option,
-    matcher_option,
-    max_gap_option,
+    log_options,
     overrides,
-    part_options,
-    threads_option,
+    print_summary,
+    result_options,
+    strict_option,
 )
 from scanchain.errors import InputError
-from scanchain.source import Source
+from scanchain.files import Source
 
 if TYPE_CHECKING:
     from scanchain.data import Pose
@@ -31,24 +30,15 @@ if TYPE_CHECKING:
 
 @click.command(cls=OverrideCommand, options_metavar="--map RUN --out DIR [OPTIONS] [--section.key VALUE]...")
 @click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
-@click.option(
-    "--map", "prior", required=True, metavar="RUN", type=click.Path(path_type=Path), help="Run directory or map."
-)
-@click.option("--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Directory to create.")
+@click.option("--map", "prior", required=True, metavar="RUN", type=PATH, help="Run directory or map.")
+@result_options("an existing directory once the new one is complete")
 @click.option(
     "--initial",
     metavar="X,Y,YAW|FILE.tum",
     help="Pose of the first scan in the map: meters and degrees, or a TUM file. [default: searched for]",
 )
-@config_option
-@part_options()
-@matcher_option
-@ground_truth_option()
-@max_gap_option
-@threads_option
-@click.option("--force", is_flag=True, help="Replace an existing directory once the new one is complete.")
-@click.option("--strict", is_flag=True, help="Exit with 1 unless the verdict is trustworthy.")
-@click.option("--json", "as_json", is_flag=True, help="Print metrics.json instead of the summary.")
+@log_options
+@strict_option
 @click.pass_context
 def localize(
     ctx: click.Context,
@@ -83,9 +73,7 @@ def localize(
     fails = localized.metrics.verdict.fails(strict=strict)
     if fails and not sys.stdout.isatty():
         click.echo(f"error: {out}: {localized.metrics.sentence}", err=True)
-    click.echo((out / "metrics.json").read_text() if as_json else localized.summary, nl=False)
-    if not as_json:
-        click.echo(f"{'written':<15}{out}")
+    print_summary(out, localized.summary, as_json=as_json)
     if fails:
         ctx.exit(1)
 

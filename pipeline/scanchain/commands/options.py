@@ -13,8 +13,8 @@ import click
 
 from scanchain.config import NO_TRUTH
 from scanchain.errors import InputError
+from scanchain.files import Source, source_of
 from scanchain.settings import Override
-from scanchain.source import Source, source_of
 from scanchain.threads import MOST, use_threads
 
 _GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to search them often costs a twentieth
@@ -23,6 +23,9 @@ _GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to search the
 def collect_garbage_seldom() -> None:
     """Search for garbage less often, for commands that process a log."""
     gc.set_threshold(_GARBAGE_EVERY)
+
+
+PATH = click.Path(path_type=Path)
 
 
 class NumberRange(click.FloatRange):
@@ -34,6 +37,9 @@ class NumberRange(click.FloatRange):
         if isnan(number):
             self.fail(f"{value} is no number.", param, ctx)
         return number
+
+
+ABOVE_ZERO = NumberRange(0.0, min_open=True)
 
 
 class OverrideCommand(click.Command):
@@ -117,12 +123,16 @@ def part_options(log: str = "the log", *, topic: str = "the only one that fits")
     """
     of = "" if log == "the log" else f" of {log}"
     begin = f"Skip {log} up to this time, counted from its first message."
-    options = (
+    return _together(
         key_option("--topic", "log.topic", metavar="TOPIC", help=f"Lidar topic{of}. [default: {topic}]"),
         key_option("--start", "log.start_s", metavar="SECONDS", help=begin),
         key_option("--end", "log.end_s", metavar="SECONDS", help=f"Skip {log} after this time."),
         key_option("--every", "log.every", metavar="N", help="Take every N-th scan."),
     )
+
+
+def _together(*options: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Several options as one decorator, in this order."""
     return lambda command: reduce(lambda decorated, option: option(decorated), reversed(options), command)
 
 
@@ -151,30 +161,25 @@ no_loops_option = key_option("--no-loops", "loops.enabled", value="false", help=
 
 
 config_option = click.option(
-    "--config",
-    "config_file",
-    metavar="FILE",
-    type=click.Path(path_type=Path),
-    help="TOML file on top of the preset.",
+    "--config", "config_file", metavar="FILE", type=PATH, help="TOML file on top of the preset."
 )
-
-
-def max_gap_option(command: Callable[..., None]) -> Callable[..., None]:
-    """The option ``--max-gap``."""
-    return click.option(
-        "--max-gap",
-        "max_gap_s",
-        type=float,
-        callback=_checked_gap,
-        metavar="SECONDS",
-        help="Longest gap between true poses to interpolate. [default: 5 of their usual intervals, 0.1 to 0.6]",
-    )(command)
 
 
 def _checked_gap(_: click.Context, __: click.Parameter, value: float | None) -> float | None:
     if value is not None and not 0.0 <= value < inf:
         raise InputError(f"--max-gap is {value:g} s; choose a number from 0 up")
     return value
+
+
+max_gap_option = click.option(
+    "--max-gap",
+    "max_gap_s",
+    type=float,
+    callback=_checked_gap,
+    metavar="SECONDS",
+    help="Longest gap between true poses to interpolate. [default: 5 of their usual intervals, 0.1 to 0.6]",
+)
+strict_option = click.option("--strict", is_flag=True, help="Exit with 1 unless the verdict is trustworthy.")
 
 
 def ground_truth_option(
@@ -194,8 +199,33 @@ def ground_truth_option(
     return click.option("--gt", "ground_truth", metavar=metavar, callback=keep, help=help)
 
 
+def log_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """What ``run`` and ``localize`` take of a log: its part, configuration and true poses."""
+    return _together(
+        config_option, part_options(), matcher_option, ground_truth_option(), max_gap_option, threads_option
+    )(command)
+
+
+def result_options(replaced: str, *, out: str = "Directory to create.") -> Callable[[Any], Any]:
+    """``--out``, ``--force`` and ``--json`` of a command that writes a directory with its metrics.
+
+    replaced : what --force replaces, in words
+    """
+    return _together(
+        click.option("--out", required=True, metavar="DIR", type=PATH, help=out),
+        click.option("--force", is_flag=True, help=f"Replace {replaced}."),
+        click.option("--json", "as_json", is_flag=True, help="Print metrics.json instead of the summary."),
+    )
+
+
+def print_summary(out: Path, summary: str, *, as_json: bool) -> None:
+    """Print the summary of a result and where it lies, or its metrics as they are in the file."""
+    click.echo((out / "metrics.json").read_text(encoding="utf-8") if as_json else summary, nl=False)
+    if not as_json:
+        click.echo(f"written        {out}")
+
+
 _MIB_PER_GIB = 1024.0
-_ABOVE_ZERO = NumberRange(0.0, min_open=True)
 
 
 def limit_options(what: str, *, time_default: str, memory_default: str) -> Callable[[Any], Any]:
@@ -203,29 +233,23 @@ def limit_options(what: str, *, time_default: str, memory_default: str) -> Calla
 
     what : the thing limited, in words; time_default, memory_default : the defaults, in words
     """
-
-    def decorate(command: Any) -> Any:
-        for option in (
-            click.option(
-                "--memory-limit",
-                "memory_mib",
-                type=_ABOVE_ZERO,
-                callback=lambda _, __, gib: None if gib is None else _MIB_PER_GIB * gib,
-                metavar="GIB",
-                help=f"Memory limit of {what}. [default: {memory_default}]",
-            ),
-            click.option(
-                "--time-limit",
-                "time_s",
-                type=_ABOVE_ZERO,
-                metavar="SECONDS",
-                help=f"Time limit of {what}. [default: {time_default}]",
-            ),
-        ):
-            command = option(command)
-        return command
-
-    return decorate
+    return _together(
+        click.option(
+            "--time-limit",
+            "time_s",
+            type=ABOVE_ZERO,
+            metavar="SECONDS",
+            help=f"Time limit of {what}. [default: {time_default}]",
+        ),
+        click.option(
+            "--memory-limit",
+            "memory_mib",
+            type=ABOVE_ZERO,
+            callback=lambda _, __, gib: None if gib is None else _MIB_PER_GIB * gib,
+            metavar="GIB",
+            help=f"Memory limit of {what}. [default: {memory_default}]",
+        ),
+    )
 
 
 def check_output(path: Path, *, force: bool, endings: Sequence[str] = ()) -> None:

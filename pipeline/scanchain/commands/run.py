@@ -13,17 +13,14 @@ from scanchain.commands.options import (
     NumberRange,
     OverrideCommand,
     collect_garbage_seldom,
-    config_option,
-    ground_truth_option,
-    matcher_option,
-    max_gap_option,
+    log_options,
     no_loops_option,
     overrides,
-    part_options,
-    threads_option,
+    result_options,
+    strict_option,
 )
 from scanchain.errors import InputError, ScanchainError
-from scanchain.source import Source
+from scanchain.files import Source
 
 if TYPE_CHECKING:
     from scanchain.runs.job import SinkName
@@ -33,11 +30,8 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
 
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
 @click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
-@click.option(
-    "--out", required=True, metavar="DIR", type=click.Path(path_type=Path), help="Run directory to create."
-)
-@config_option
-@part_options()
+@result_options("an existing run directory once the new one is complete", out="Run directory to create.")
+@log_options
 @click.option(
     "--rerun",
     default="save",
@@ -45,12 +39,7 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
     metavar="LIST",
     help="Where the recording goes: save, spawn, connect, web, several with commas, or off.",
 )
-@matcher_option
 @no_loops_option
-@ground_truth_option()
-@max_gap_option
-@threads_option
-@click.option("--force", is_flag=True, help="Replace an existing run directory once the new one is complete.")
 @click.option("--resume", is_flag=True, help="Resume a run that was killed or stopped from its last checkpoint.")
 @click.option(
     "--checkpoint",
@@ -61,8 +50,7 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
     metavar="SECONDS",
     help="Time between checkpoints; writing them takes at most 5 % of the run.",
 )
-@click.option("--strict", is_flag=True, help="Exit with 1 unless the verdict is trustworthy.")
-@click.option("--json", "as_json", is_flag=True, help="Print metrics.json instead of the summary.")
+@strict_option
 @click.pass_context
 def run(
     ctx: click.Context,

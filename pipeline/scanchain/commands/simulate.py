@@ -6,8 +6,7 @@ from pathlib import Path
 
 import click
 
-from scanchain.errors import InputError
-from scanchain.words import counted
+from scanchain.errors import InputError, counted
 
 
 @click.command()

@@ -19,15 +19,14 @@ from scanchain.comparison.results import Reference, Results, write_results
 from scanchain.comparison.table import Table, maps_of, summarize, write_table
 from scanchain.config import NO_TRUTH
 from scanchain.data import Trajectory, brief
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
 from scanchain.evaluation import absolute_error_of_any_path, pair, read_relations, read_truth, relation_error
+from scanchain.files import Source
 from scanchain.logs import Log, open_log
 from scanchain.runs.directory import RUN_FILE, RunDirectory
 from scanchain.runs.job import Progress
 from scanchain.runs.provenance import Hashing, describe_start
 from scanchain.settings import Override, load_settings, named
-from scanchain.source import Source
-from scanchain.words import counted
 
 _SHARED = "scans"  # in the directory until it is complete: what all methods read, and where each writes
 

@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from scanchain.comparison.methods import Method
 from scanchain.data import Matrix, Pose, Scan, Trajectory
+from scanchain.errors import counted
 from scanchain.processes import KilledFor, Limits, available_mib, run_within
 from scanchain.runs.job import Progress
-from scanchain.words import counted
 
 _ARRAYS, _TABLE = "points_and_times.npy", "scans.npz"
 POSES_FILE, SECONDS_FILE, CPU_FILE = "poses.npy", "seconds.npy", "cpu_seconds.npy"

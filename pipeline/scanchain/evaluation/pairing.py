@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.data import Matrix, Trajectory, brief
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
 from scanchain.trajectory import read_kitti, read_tum, text_lines
-from scanchain.words import counted
 
 _WIDEST_GAP_S = 0.6  # default widest gap in the reference: at 1 m/s² a line is up to 5 cm off within it
 _SHORTEST_GAP_S = 0.1  # least default gap: at 1 m/s² a straight line is up to 1.3 mm off within it

@@ -13,11 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from scanchain import lie
 from scanchain.data import Matrix, Trajectory, brief
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
 from scanchain.evaluation.absolute import PoseErrors, Statistics, path_length
 from scanchain.evaluation.pairing import Pairs, nearest
 from scanchain.trajectory import posed, table
-from scanchain.words import counted
 
 _LARGEST = 2.0  # largest length of a stretch over the requested one
 KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)

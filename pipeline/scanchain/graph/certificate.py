@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.clock import working_s
 from scanchain.data import Matrix
+from scanchain.errors import counted
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.cholesky import BlockPattern, Packing, SingularMatrixError, SparseCholesky
 from scanchain.graph.edge_checks import is_connected
 from scanchain.kernels.graph.dual import scatter_dual
-from scanchain.words import counted
 
 _ZERO_CHI2 = 1e-9  # of the largest information, or of 1 if that is less: below it χ² is zero but for rounding
 _EXACT = 1e-12  # share of χ² that rounding alone may amount to

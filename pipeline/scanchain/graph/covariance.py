@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.errors import InputError
+from scanchain.files import write_whole
 from scanchain.graph.between import BetweenProblem, turns
-from scanchain.whole_file import write_whole
 
 _NAMES = {3: ("x", "y", "yaw"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
 

@@ -16,12 +16,11 @@ from scipy.spatial.transform import Rotation as Turn
 from scanchain import checks, lie
 from scanchain.checks import LARGEST
 from scanchain.data import Matrix, brief
-from scanchain.errors import InputError, shown
+from scanchain.errors import InputError, counted, shown
+from scanchain.files import write_whole
 from scanchain.graph.edge_checks import nearest_semidefinite, positive_semidefinite
 from scanchain.graph.initialize import follow_odometry
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.whole_file import write_whole
-from scanchain.words import counted
 
 Rotation = Literal["vector", "quaternion"]  # of which Ω is in 3D
 ROTATION_COMMENT: dict[Rotation, str] = {

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.data import Matrix
+from scanchain.errors import counted
 from scanchain.graph.between import BetweenProblem, NormalEquations
 from scanchain.graph.cholesky import SingularMatrixError
 from scanchain.graph.losses import InlierSet, RobustLoss
-from scanchain.words import counted
 
 _STEP = 1e-6  # step, m or rad, of the central differences
 Loss = RobustLoss | InlierSet

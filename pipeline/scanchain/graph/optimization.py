@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from scanchain.config import GraphConfig
 from scanchain.data import GraphState, Matrix, brief, fit_text
+from scanchain.errors import counted
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.edge_checks import has_loop
 from scanchain.graph.graduation import LIMITS, Since, minimize, update
 from scanchain.graph.initialize import Initialization, first_guess
 from scanchain.graph.losses import robust_loss
 from scanchain.graph.minimizer import Limits, Minimizer, Minimum
-from scanchain.words import counted
 
 
 @dataclass(frozen=True, slots=True)

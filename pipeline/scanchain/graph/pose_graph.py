@@ -12,7 +12,7 @@ from scanchain import checks, lie
 from scanchain.clock import working_s
 from scanchain.config import GraphConfig
 from scanchain.data import REJECTED_WEIGHT, GraphState, Matrix, Pose
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.certificate import Certificate, certify
 from scanchain.graph.cholesky import SingularMatrixError
@@ -36,7 +36,6 @@ from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.initialize import Initialization
 from scanchain.graph.odometry_errors import Slip, corrected
 from scanchain.graph.optimization import Optimization, Solved, solve
-from scanchain.words import counted
 
 
 class PoseGraph:

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.data import Matrix
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
 from scanchain.landmarks.problem import Kind, LandmarkData
-from scanchain.words import counted
 
 _SHAPES = {
     "gt_traj": "(poses, 2)",

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from scanchain.data import Matrix
+from scanchain.errors import counted
 from scanchain.landmarks.compare import MethodResult
 from scanchain.landmarks.study import Accuracy, Study
 from scanchain.trajectory import write_tum
-from scanchain.words import counted
 
 _HEADINGS = (
     "method",

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.clock import working_s
 from scanchain.data import Matrix, Pose, Trajectory
+from scanchain.errors import FREEDOM, counted
 from scanchain.evaluation import Alignment, absolute_error, pair
 from scanchain.landmarks.compare import MethodResult, compare_linear, compare_nonlinear
 from scanchain.landmarks.estimate import Optimizer, disturbed, from_odometry, minimize, of_relative_positions
@@ -30,7 +31,6 @@ from scanchain.landmarks.problem import (
 from scanchain.landmarks.ranges import OWN, OWN_UNITS, OdometryNoise, RangeSolution, solve_range_log
 from scanchain.landmarks.solvers import create_solver, methods_for
 from scanchain.landmarks.solvers.elimination import Covariance
-from scanchain.words import FREEDOM, counted
 
 _WIDEST_GAP_S = 0.5  # between motion-capture poses that are interpolated
 

@@ -9,11 +9,10 @@ import numpy as np
 from scanchain.checks import LONGEST_SWEEP_S
 from scanchain.config import LogConfig, PreprocessConfig
 from scanchain.data import MOST_COPIES, RawPoints, Scan
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
 from scanchain.kernels.geometry.validity import largest_magnitude
 from scanchain.logs.mcap.stream import Decoded
 from scanchain.logs.messages.returns import Returns
-from scanchain.words import counted
 
 _FARTHEST_M = 1000.0  # range beyond which a typical one is in another unit than meters
 _MOST_REPEATED = 0.5  # share of repeated stamps above which it is a warning

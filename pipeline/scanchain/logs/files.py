@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 from scanchain.download import fetch
 from scanchain.errors import InputError, MissingExtraError
-from scanchain.source import Address, Source
+from scanchain.files import Address, Source
 
 T = TypeVar("T")
 _ATTEMPTS = 4

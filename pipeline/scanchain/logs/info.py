@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from scanchain.config import LogConfig
-from scanchain.errors import InputError
+from scanchain.errors import InputError, grouped
+from scanchain.files import Source
 from scanchain.logs.files import size_of
 from scanchain.logs.log import Log
 from scanchain.logs.mcap.records import FileIndex
@@ -14,8 +15,6 @@ from scanchain.logs.mcap.selection import times_of, whole_span
 from scanchain.logs.messages.readers import kind
 from scanchain.logs.opening import index_files
 from scanchain.logs.topics import OtherSensor, find_ground_truth, find_odometry, other_sensors, topics_of
-from scanchain.source import Source
-from scanchain.words import grouped
 
 
 @dataclass(frozen=True, slots=True)

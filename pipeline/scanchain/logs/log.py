@@ -13,7 +13,8 @@ from scanchain.checks import instance
 from scanchain.clock import working_s
 from scanchain.config import LogConfig, PreprocessConfig
 from scanchain.data import Pose, Scan, Trajectory
-from scanchain.errors import InputError, shown
+from scanchain.errors import InputError, counted, grouped, shown
+from scanchain.files import Source, source_of
 from scanchain.logs.bad_scans import ScanCounts, check_count, defect
 from scanchain.logs.mcap.records import FileIndex, name_of
 from scanchain.logs.mcap.selection import (
@@ -36,8 +37,6 @@ from scanchain.logs.opening import index_files
 from scanchain.logs.recorded_poses import RecordedPoses
 from scanchain.logs.topics import files_with_scans, find_ground_truth, find_lidar, find_odometry
 from scanchain.settings import load_settings, overrides_of
-from scanchain.source import Source, source_of
-from scanchain.words import counted, grouped
 
 _DEFAULTS = LogConfig()
 _HOLD_NS = 500_000_000  # log time that a scan waits for the wheel reading behind it

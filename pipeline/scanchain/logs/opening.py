@@ -10,6 +10,7 @@ from pathlib import Path
 
 from scanchain.config import LogConfig
 from scanchain.errors import InputError
+from scanchain.files import Source
 from scanchain.logs.files import RemoteFile, fetch_whole, misspelled
 from scanchain.logs.formats.carmen import claims_carmen, index_carmen
 from scanchain.logs.formats.cloud_file import SUFFIXES
@@ -28,7 +29,6 @@ from scanchain.logs.mcap.index import claims_mcap, index_by_summary, index_file
 from scanchain.logs.mcap.records import FileIndex
 from scanchain.logs.mcap.selection import are_parts, complete
 from scanchain.logs.topics import is_lidar
-from scanchain.source import Source
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,9 +9,9 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.data import Pose, Trajectory
+from scanchain.errors import counted
 from scanchain.logs.mcap.stream import Decoded
 from scanchain.logs.messages.poses import StampedPose
-from scanchain.words import counted
 
 _REMEMBERED = 512  # largest number of readings in memory
 _NEAREST_NS = 500_000_000

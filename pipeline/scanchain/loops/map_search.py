@@ -16,6 +16,7 @@ from scanchain import lie
 from scanchain.config import Config, LocalMapConfig
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Points, Pose, Problem, Proposal
 from scanchain.errors import InputError
+from scanchain.files import write_whole
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
 from scanchain.loops.evidence import pose_in_map
@@ -24,7 +25,6 @@ from scanchain.loops.verification import Verifier
 from scanchain.maps.saved_map import read_arrays
 from scanchain.registration import SearchGrid, Wanted, Window, find
 from scanchain.registration.search import Found, Search, evenly, upright_columns
-from scanchain.whole_file import write_whole
 
 _MEMBERS = 10  # number of the newest keyframes that are sought together
 _RADIUS = 1.5  # radii of a submap, up to which structure around the lidar is sought

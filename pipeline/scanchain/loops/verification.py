@@ -12,12 +12,12 @@ import numpy as np
 from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Match, Points, Pose, Problem, Proposal
+from scanchain.errors import below
 from scanchain.kernels.raycast.free_space import compare_ranges, nearest_ranges
 from scanchain.kernels.registration.association import associate
 from scanchain.loops.submaps import Submap
 from scanchain.preprocess import downsample
 from scanchain.registration import PointToShapeMatcher, VoxelMap
-from scanchain.words import below
 
 _MIN_OVERLAP_ALONE = 0.8  # least overlap of a match that no expected pose supports
 _MIN_PLACE_OVERLAP, _MIN_PLACE_INFORMATION = 0.4, 0.005  # least of a recognized place, as loops.min_… of others

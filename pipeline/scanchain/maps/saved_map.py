@@ -24,9 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.data import Keyframe, Matrix, Points
-from scanchain.errors import InputError, one_line, shown
-from scanchain.whole_file import write_whole
-from scanchain.words import counted
+from scanchain.errors import InputError, counted, one_line, shown
+from scanchain.files import write_whole
 
 MAP_FOLDER = "map"
 VERSION = 2

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.config import OdometryConfig
 from scanchain.data import Match, Matrix, Pose, Prior, Scan, State
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
 from scanchain.kernels.geometry.validity import largest_magnitude
 from scanchain.kernels.registration.observability import WEAK, definite_inverse
 from scanchain.odometry.intervals import Intervals
-from scanchain.words import counted
 
 _EVEN = 2.0  # largest ratio of two intervals from which an acceleration is computed
 _LEAST_WINDOW_M, _LEAST_WINDOW_RAD = 0.3, 0.3  # least half width where stamps lie too close

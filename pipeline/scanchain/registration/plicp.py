@@ -9,13 +9,13 @@ import numpy as np
 from scanchain import checks, lie
 from scanchain.config import MatchingConfig
 from scanchain.data import LEAST_FIT, AnyPoints, Match, Points, Pose, Prior, Problem
+from scanchain.errors import below, counted
 from scanchain.kernels.geometry.validity import largest_magnitude
 from scanchain.kernels.registration import icp
 from scanchain.kernels.registration.match import Result, match
 from scanchain.kernels.registration.optimizers import GAUSS_NEWTON, GRADIENT_DESCENT, LEVENBERG_MARQUARDT, NEWTON
 from scanchain.kernels.registration.residuals import Settings
 from scanchain.registration.voxel_map import VoxelMap
-from scanchain.words import below, counted
 
 OPTIMIZERS = {
     "gradient-descent": GRADIENT_DESCENT,

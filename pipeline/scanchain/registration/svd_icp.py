@@ -8,14 +8,13 @@ from numpy.typing import NDArray
 from scanchain import checks, lie
 from scanchain.config import MatchingConfig
 from scanchain.data import AnyPoints, Match, Points, Pose, Prior
-from scanchain.errors import InputError, ScanchainError
+from scanchain.errors import InputError, ScanchainError, counted
 from scanchain.kernels.registration import icp
 from scanchain.kernels.registration.association import associate, weighted_pairs
 from scanchain.kernels.registration.icp import SHRINK, Fit
 from scanchain.kernels.registration.match import assess
 from scanchain.registration.plicp import checked, match_of, settings_of
 from scanchain.registration.voxel_map import VoxelMap
-from scanchain.words import counted
 
 _RANK_TOLERANCE = 1e-9  # of the largest singular value
 _ROUNDINGS = 64.0  # of the products of the means, below which a singular value is noise

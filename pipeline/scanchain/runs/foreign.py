@@ -14,12 +14,12 @@ from scanchain.config import Config
 from scanchain.data import Match, Matrix, Pose, Scan, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import pair
+from scanchain.files import Source
 from scanchain.logs import Log, open_log
 from scanchain.preprocess import Resolution
 from scanchain.registration import MapKeeper, create_matcher
 from scanchain.runs.vouching import evidence_of_trajectory
 from scanchain.settings import Override, load_settings
-from scanchain.source import Source
 from scanchain.trajectory import read_tum
 from scanchain.verdict import Evidence, Judged, apart_m, check_overlap, judge
 

@@ -11,8 +11,8 @@ from typing import Any, Literal
 
 from scanchain.data import Scan
 from scanchain.errors import InputError
+from scanchain.files import Source
 from scanchain.settings import Override
-from scanchain.source import Source
 
 SinkName = Literal["save", "spawn", "connect", "web"]
 Recorder = Any  # a Recording of scanchain_viz, which stands above runs: its type cannot be named here

@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import Struct
 
 from scanchain.data import State, Trajectory, fit_text
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
 from scanchain.evaluation import (
     ExpectedError,
     Pairs,
@@ -26,7 +26,6 @@ from scanchain.runs.results import Results
 from scanchain.runs.step_table import STAGES, StepTable, inlier_shares
 from scanchain.slam import SlamResult
 from scanchain.verdict import Judged, Stretch, Verdict
-from scanchain.words import counted
 
 METRICS_FILE = "metrics.json"
 VERDICT = "verdict"  # first word of a summary

@@ -15,9 +15,8 @@ import msgspec
 from msgspec import Struct
 
 from scanchain.errors import InputError
+from scanchain.files import Source, without_keys, write_whole
 from scanchain.logs.files import RemoteFile, files_of, size_of
-from scanchain.source import Source, without_keys
-from scanchain.whole_file import write_whole
 
 _PACKAGES = ("scanchain", "numpy", "numba", "scipy", "pyarrow", "mcap", "msgspec", "rerun-sdk")
 _BLOCK = 1 << 22

@@ -21,7 +21,8 @@ import msgspec
 from scanchain.clock import working_s
 from scanchain.config import Config
 from scanchain.data import Scan
-from scanchain.errors import InputError, ScanchainError, remedy_of
+from scanchain.errors import InputError, ScanchainError, counted, remedy_of
+from scanchain.files import without_keys
 from scanchain.point_store import PointStore
 from scanchain.registration.matcher import CheckedMatcher, Matcher, create_matcher
 from scanchain.runs.directory import (
@@ -38,9 +39,7 @@ from scanchain.runs.provenance import Provenance, package_version
 from scanchain.runs.step_table import StepTable
 from scanchain.settings import dump, flatten
 from scanchain.slam import Slam
-from scanchain.source import without_keys
 from scanchain.trajectory import write_tum
-from scanchain.words import counted
 
 _LEISURE = 20.0  # least time between two checkpoints over the time that one takes to write
 _REMEDY = "run without --resume"

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.config import NO_TRUTH, Config
 from scanchain.data import Scan, Trajectory, brief
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
 from scanchain.evaluation import TruthFile, check_overlap, during, on_the_estimate, read_truth
+from scanchain.files import write_whole
 from scanchain.logs import Log, open_log
 from scanchain.logs.mounting import turned_by
 from scanchain.logs.topics import other_sensors
@@ -55,8 +56,6 @@ from scanchain.slam import Slam, SlamResult
 from scanchain.threads import threads
 from scanchain.trajectory import write_tum
 from scanchain.verdict import Judged, judge, worst_place
-from scanchain.whole_file import write_whole
-from scanchain.words import counted
 
 _FEW_SCANS = 2  # scans whose trajectory shows at most one motion
 _TOGETHER = 16  # largest number of scans that are read together

@@ -25,12 +25,11 @@ from scanchain.data import (
     Scan,
     State,
 )
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
 from scanchain.maps import Edges, SavedMap
 from scanchain.odometry.front_end import Located
 from scanchain.odometry.tracked import Tracked, first_match
 from scanchain.slam import Slam
-from scanchain.words import counted
 
 _LATE = 10  # number of keyframes before the first one that was matched, from which on these are matched, too
 _FOUND = 0.5, 0.05  # m and rad, standard deviations of the pose that they start from

@@ -15,14 +15,13 @@ import pyarrow.parquet as pq
 from scanchain import checks, lie
 from scanchain.config import Config
 from scanchain.data import Pose
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
 from scanchain.maps import SavedMap, open_saved_map, write_ply
 from scanchain.runs.directory import RUN_FILE, RunDirectory
 from scanchain.runs.provenance import describe_start
 from scanchain.sessions.alignment import align_maps
 from scanchain.sessions.changes import Changes, Cluster, Label, Part, changes_between
 from scanchain.settings import load_settings
-from scanchain.words import counted
 
 TABLE_FILE, SUMMARY_FILE, METRICS_FILE = "changes.csv", "summary.txt", "metrics.json"
 COLORS = {

@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import Keyframe, Matrix, Points, Scan
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
 from scanchain.kernels.raycast.free_space import nearest_ranges
 from scanchain.logs.formats.cloud_file import SUFFIXES, CloudFileError, read_cloud_file
 from scanchain.maps import MAP_FOLDER, Edges, SavedPoints, Session, write_saved_map
@@ -25,7 +25,6 @@ from scanchain.preprocess.resolution import Resolution
 from scanchain.runs.directory import RUN_FILE, RunDirectory
 from scanchain.runs.provenance import describe_start
 from scanchain.settings import load_settings
-from scanchain.words import counted
 
 LAS_SUFFIXES, GRID_SUFFIXES = (".laz", ".las"), (".yaml", ".yml")
 SPACING_M = {2: 1.5, 3: 6.0}  # between the positions that a map is seen from

@@ -15,6 +15,7 @@ from scipy.spatial import KDTree
 from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import Closure, Keyframe, Matrix, Pose
+from scanchain.errors import counted
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
 from scanchain.loops.evidence import PlaceTest, compared, contradiction
@@ -23,7 +24,6 @@ from scanchain.loops.planar_map_search import PlanarMapSearch
 from scanchain.maps import Edges, SavedMap
 from scanchain.placement import loop_information
 from scanchain.sessions.alignment import align
-from scanchain.words import counted
 
 _APART_M = 200.0  # path between the last keyframe of a map and the first of the next: no submap holds both
 _CLEAR = 0.1  # share of a map's keyframes with a closure in force from which on no other is tried before it joins

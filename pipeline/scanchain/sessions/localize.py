@@ -18,7 +18,8 @@ from scanchain import lie
 from scanchain.clock import working_s
 from scanchain.config import Config
 from scanchain.data import ClosureVerdict, Pose, brief
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
+from scanchain.files import write_whole
 from scanchain.logs import Log
 from scanchain.maps import SavedMap, open_saved_map
 from scanchain.runs.directory import POINTS_FILE, RUN_FILE, RunDirectory
@@ -32,8 +33,6 @@ from scanchain.sessions.localizer import Localization, Localizer, MapState
 from scanchain.settings import dump
 from scanchain.trajectory import read_tum, write_tum
 from scanchain.verdict import Verdict
-from scanchain.whole_file import write_whole
-from scanchain.words import counted
 
 LOCALIZATION_FILE = "localization.parquet"
 _SHORT_M = {2: 5.0, 3: 20.0}  # path below which a place that is not found says nothing

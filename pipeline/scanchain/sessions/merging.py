@@ -12,7 +12,8 @@ import msgspec
 from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.config import Config
 from scanchain.data import REJECTED_WEIGHT, ClosureVerdict, brief
-from scanchain.errors import InputError, ScanchainError
+from scanchain.errors import InputError, ScanchainError, counted
+from scanchain.files import write_whole
 from scanchain.graph.optimization import fit
 from scanchain.maps import SavedMap, Session, open_saved_map
 from scanchain.runs.closures import FinalClosure
@@ -23,8 +24,6 @@ from scanchain.runs.results import Cloud, cloud_of
 from scanchain.sessions.joining import Doubt, Joined, changed, graph_of, join_all
 from scanchain.sessions.merged_map import MergedMap, final_closures, merged_map, session_names, write_merged
 from scanchain.settings import Override, dump, load_settings
-from scanchain.whole_file import write_whole
-from scanchain.words import counted
 
 
 class SessionMetrics(msgspec.Struct, frozen=True):

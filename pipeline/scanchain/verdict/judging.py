@@ -11,9 +11,9 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.data import LEAST_FIT, Matrix
+from scanchain.errors import counted
 from scanchain.verdict.checks import WINDOW_M, Kind, Stretch
 from scanchain.verdict.stretches import KNOWN, Evidence, find_stretches
-from scanchain.words import counted
 
 MOST_CONTRADICTED = 0.1  # largest share of contradicted scans; good real runs have up to 0.025
 _MOST_PREDICTED = 0.5  # largest share of scans whose pose is predicted and confirmed by nothing

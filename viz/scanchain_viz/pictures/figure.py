@@ -18,7 +18,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from scanchain.whole_file import write_whole
+from scanchain.files import write_whole
 from scanchain_viz.colors import rgb
 from scanchain_viz.pictures.axis import FONT, Axis, width_of
 

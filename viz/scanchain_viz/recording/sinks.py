@@ -22,9 +22,8 @@ import rerun.blueprint as rrb
 from rerun.chunk import RrdReader
 from rerun.error_utils import RerunWarning
 
-from scanchain.errors import InputError
-from scanchain.whole_file import write_whole
-from scanchain.words import counted
+from scanchain.errors import InputError, counted
+from scanchain.files import write_whole
 from scanchain_viz.recording.drawing import Message
 from scanchain_viz.recording.entities import UP
 

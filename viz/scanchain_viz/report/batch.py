@@ -13,11 +13,11 @@ from markupsafe import Markup
 
 from scanchain.batch.table import totals
 from scanchain.batch.task import Row, State, output_file
+from scanchain.errors import counted
+from scanchain.files import source_of, without_keys
 from scanchain.runs.metrics import Metrics
-from scanchain.source import source_of, without_keys
 from scanchain.trajectory import read_tum
 from scanchain.verdict import MOST_CONTRADICTED
-from scanchain.words import counted
 from scanchain_viz.pictures.figure import Plot
 from scanchain_viz.pictures.trajectory_figures import color_of
 from scanchain_viz.report import page

@@ -12,6 +12,7 @@ from markupsafe import Markup
 
 from scanchain import lie
 from scanchain.data import Matrix
+from scanchain.errors import counted
 from scanchain.maps import read_ply
 from scanchain.runs.directory import RUN_FILE
 from scanchain.runs.provenance import Provenance
@@ -21,7 +22,6 @@ from scanchain.sessions.localize import LocalizedLog
 from scanchain.sessions.localizer import MapState
 from scanchain.sessions.merging import MergeMetrics
 from scanchain.verdict import Judged
-from scanchain.words import counted
 from scanchain_viz.colors import hex_of
 from scanchain_viz.pictures.figure import INK, Plot
 from scanchain_viz.pictures.map_figures import (

@@ -12,8 +12,8 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from scanchain.files import write_whole
 from scanchain.verdict import Judged, Verdict
-from scanchain.whole_file import write_whole
 
 REPORT_FILE = "report.html"
 _TEMPLATES = Path(__file__).parent / "templates"

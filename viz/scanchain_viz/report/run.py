@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 
 from scanchain import lie
 from scanchain.data import Matrix, Trajectory
+from scanchain.errors import counted
 from scanchain.evaluation import absolute_error_of_any_path, pair
 from scanchain.evaluation.absolute import path_length
 from scanchain.maps import read_ply
@@ -24,7 +25,6 @@ from scanchain.runs.vouching import poses_of
 from scanchain.settings import read_layer
 from scanchain.trajectory import read_tum
 from scanchain.verdict import VELOCITY_LIMIT, WHEEL_LIMIT, Kind
-from scanchain.words import counted
 from scanchain_viz.pictures.map_figures import AFTER, BEFORE, overlay_picture
 from scanchain_viz.pictures.trajectory_figures import DrawnTrajectory, Floats, color_of, innovations, window
 from scanchain_viz.report import page, sections

@@ -15,9 +15,9 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from scanchain.data import Points, State
+from scanchain.errors import counted
 from scanchain.runs.closures import BACK_END
 from scanchain.verdict import Kind, Stretch
-from scanchain.words import counted
 from scanchain_viz.colors import STRETCH_COLORS
 from scanchain_viz.pictures import trajectory_figures as figures
 from scanchain_viz.pictures.figure import broken

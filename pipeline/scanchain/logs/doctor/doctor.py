@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from scanchain.config import Config, LogConfig, PreprocessConfig
 from scanchain.data import MOST_COPIES
+from scanchain.errors import counted
+from scanchain.files import Source
 from scanchain.logs.bad_scans import are_millimeters, most_bad_scans
 from scanchain.logs.doctor.statistics import Survey, survey
 from scanchain.logs.log import open_log
 from scanchain.logs.messages.point_times import UNITS_S
 from scanchain.logs.messages.readers import is_scan
-from scanchain.source import Source
-from scanchain.words import counted
 
 _GAP_PERIODS = 2.5
 _LONG_GAP_S, _LONG_GAP_ON_WHEELS_S = 0.5, 10.0

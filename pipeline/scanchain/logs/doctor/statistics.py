@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.data import RawPoints
-from scanchain.errors import InputError
+from scanchain.errors import InputError, grouped
 from scanchain.logs.log import Log
 from scanchain.logs.mcap.selection import whole_span
 from scanchain.logs.mcap.stream import decoded_messages
@@ -19,7 +19,6 @@ from scanchain.logs.messages.point_times import PointTimes
 from scanchain.logs.messages.poses import StampedPose
 from scanchain.logs.messages.readers import is_scan
 from scanchain.logs.messages.returns import Returns
-from scanchain.words import grouped
 
 _PERCENT = np.arange(101)
 _SAME_M = 1e-4  # largest difference of ranges that are one number: rounding of float32

@@ -20,12 +20,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
+from scanchain.files import Source
 from scanchain.logs.formats.on_demand import UnknownFormatError, add_block, add_channel, on_demand_index
 from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
 from scanchain.logs.writing.pack import LATEST_NS, Link, Place, pack_laser_scan, pack_odometry, pack_transforms
-from scanchain.source import Source
-from scanchain.words import counted
 
 _LINES_A_BLOCK = 512
 _LEAST_STEP_NS = 100_000  # least step between the log times of two scans

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
 from scanchain.logs.formats.cloud_file import (
     SUFFIXES,
     XYZI,
@@ -22,7 +22,6 @@ from scanchain.logs.formats.cloud_file import (
 from scanchain.logs.formats.on_demand import add_block, add_channel, left_out, natural_order, on_demand_index
 from scanchain.logs.mcap.records import Block, Contents, FileIndex, Message
 from scanchain.logs.writing.pack import LATEST_NS, pack_cloud
-from scanchain.words import counted
 
 _UNITS_NS = {19: 1, 16: 1_000, 13: 1_000_000}  # nanoseconds of a stamp's unit, by its number of digits since 2001
 _FIRST_FILES = 3  # number of files of which one has to be readable

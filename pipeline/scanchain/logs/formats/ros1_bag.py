@@ -19,11 +19,10 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
 from scanchain.logs.mcap.index import is_plausible_size
 from scanchain.logs.mcap.records import Block, Channel, Contents, Entry, FileIndex, Message, unpack
 from scanchain.logs.mcap.selection import messages_of
-from scanchain.words import counted
 
 MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7

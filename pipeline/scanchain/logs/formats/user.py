@@ -15,13 +15,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from scanchain import plugins
 from scanchain.checks import point_times
-from scanchain.errors import InputError, one_line, shown
+from scanchain.errors import InputError, counted, one_line, shown
+from scanchain.files import Source
 from scanchain.logs.mcap.index import index_file
 from scanchain.logs.mcap.records import FileIndex
 from scanchain.logs.writing.pack import LATEST_NS
 from scanchain.logs.writing.writer import LogWriter
-from scanchain.source import Source
-from scanchain.words import counted
 
 _TOPIC, _FRAME = "/points", "lidar"
 

@@ -22,7 +22,8 @@ import numpy as np
 from mcap.records import Channel, ChunkIndex, Schema, Statistics
 from mcap.stream_reader import StreamReader
 
-from scanchain.errors import InputError
+from scanchain.errors import InputError, counted
+from scanchain.files import Source
 from scanchain.logs.files import RemoteFile
 from scanchain.logs.mcap.records import (
     CHANNEL,
@@ -40,8 +41,6 @@ from scanchain.logs.mcap.records import (
     FileIndex,
     read_definition,
 )
-from scanchain.source import Source
-from scanchain.words import counted
 
 HEADER, FOOTER, ATTACHMENT, METADATA, DATA_END = 1, 2, 9, 12, 15
 _PRIVATE = 0x80  # opcodes from here on are those of applications

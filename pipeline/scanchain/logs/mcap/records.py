@@ -19,9 +19,8 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 
-from scanchain.errors import one_line
-from scanchain.source import Source
-from scanchain.words import counted
+from scanchain.errors import counted, one_line
+from scanchain.files import Source
 
 MAGIC = b"\x89MCAP0\r\n"
 SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = 3, 4, 5, 6, 7

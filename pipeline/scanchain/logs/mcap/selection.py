@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.config import LogConfig
-from scanchain.errors import InputError
+from scanchain.errors import InputError, duration
 from scanchain.logs.mcap.records import (
     Block,
     Channel,
@@ -21,7 +21,6 @@ from scanchain.logs.mcap.records import (
     name_of,
     read_block,
 )
-from scanchain.words import duration
 
 
 class Span(NamedTuple):

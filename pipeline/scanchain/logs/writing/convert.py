@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from scanchain.config import LogConfig
-from scanchain.errors import InputError
+from scanchain.errors import InputError, grouped
+from scanchain.files import Source
 from scanchain.logs.mcap.records import FileIndex, name_of
 from scanchain.logs.mcap.selection import (
     EVERYTHING,
@@ -22,8 +23,6 @@ from scanchain.logs.mcap.stream import Decoded, decoded_messages
 from scanchain.logs.opening import AUTO, index_files
 from scanchain.logs.topics import find_lidar, is_lidar, topics_of
 from scanchain.logs.writing.writer import LogWriter
-from scanchain.source import Source
-from scanchain.words import grouped
 
 _DEFAULTS = LogConfig()
 _WHOLE = (_DEFAULTS.topic, _DEFAULTS.start_s, _DEFAULTS.end_s, _DEFAULTS.every)

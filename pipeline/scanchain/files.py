@@ -1,4 +1,4 @@
-"""Source of a log: a path on this machine, or an address."""
+"""Files: where a log lies, and writing that is complete or not there."""
 
 from __future__ import annotations
 
@@ -55,3 +55,19 @@ def source_of(named: Source | str) -> Source:
 
         return Path(url2pathname(urlsplit(named).path))
     return Address(named)
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file; what was there before stays until all of the new one is on disk.
+
+    Raises OSError of ``path``.
+    """
+    new = path.with_name(f"{path.name}.new")
+    try:
+        new.write_bytes(data)
+        new.replace(path)
+    except BaseException as error:
+        new.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            error.filename = str(path)
+        raise
