@@ -36,12 +36,12 @@ MATCHERS = {
 }
 Matcher = Annotated[str, _one_of(MATCHERS)]  # or a user's own, MODULE:CLASS
 LOSSES = {  # of loop edges
-    "none": "scanchain.graph.graduation.losses:Quadratic",
-    "huber": "scanchain.graph.graduation.losses:Huber",
-    "cauchy": "scanchain.graph.graduation.losses:Cauchy",
-    "geman-mcclure": "scanchain.graph.graduation.losses:GemanMcClure",
-    "tukey": "scanchain.graph.graduation.losses:Tukey",
-    "truncated": "scanchain.graph.graduation.losses:Truncated",
+    "none": "scanchain.graph.losses:Quadratic",
+    "huber": "scanchain.graph.losses:Huber",
+    "cauchy": "scanchain.graph.losses:Cauchy",
+    "geman-mcclure": "scanchain.graph.losses:GemanMcClure",
+    "tukey": "scanchain.graph.losses:Tukey",
+    "truncated": "scanchain.graph.losses:Truncated",
 }
 Loss = Annotated[str, _one_of(LOSSES)]  # likewise
 Optimizer = Literal["levenberg-marquardt", "gauss-newton", "newton", "gradient-descent"]
