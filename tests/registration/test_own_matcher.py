@@ -58,9 +58,9 @@ NAME = "my_module:PointToPoint"
 
 @pytest.fixture(scope="module")
 def office(tmp_path_factory):
-    """Twelve seconds in the simulated office, 120 scans."""
+    """Half a minute in the simulated office, 300 scans."""
     path = tmp_path_factory.mktemp("log") / "office.mcap"
-    simulate("office", path, duration_s=12.0)
+    simulate("office", path, duration_s=30.0)
     return path
 
 
@@ -84,7 +84,7 @@ def test_it_runs_is_stopped_and_goes_on_to_the_same_result(office, folder):
     assert whole.wait() == 0, whole.stderr.read()
     assert NAME in (folder / "whole" / "config.toml").read_text()
     child = started(folder, *words, "--out", "run")
-    wait_for_steps(child, folder / "run", 40)
+    wait_for_steps(child, folder / "run", 1)
     child.kill()
     child.wait()
     again = started(folder, *words, "--out", "run", "--resume")

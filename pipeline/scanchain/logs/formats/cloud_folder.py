@@ -162,7 +162,7 @@ def _likely_layout(sample: NDArray[np.uint8], sizes: Sequence[int]) -> np.dtype[
             for columns in _LIKELY_COLUMNS
             if 2 * sum(size % (columns * kind.itemsize) == 0 for size in sizes) > len(sizes)  # some may be broken
         ]
-        if fitting and are_small.mean() > _MOSTLY:  # random bits would not
+        if fitting and len(values) and are_small.mean() > _MOSTLY:  # random bits would not
             contrasts = {columns: _contrast(_finite_rows(values, columns)) for columns in fitting}
             best = max(contrasts, key=lambda columns: contrasts[columns])
             if contrasts[best] < _NOTHING:
