@@ -1,5 +1,6 @@
 """What scripts call: arrays in, results out, without a log, a configuration or a command line."""
 
+import ast
 import subprocess
 import sys
 from importlib.metadata import version
@@ -11,7 +12,7 @@ import pytest
 import scanchain as sc
 from scanchain import lie
 from scanchain.errors import InputError
-from tests.support.scenes import configured, kitti_scans, shared_data
+from tests.support.scenes import ROOT, configured, kitti_scans, shared_data
 
 
 @pytest.fixture(scope="module")
@@ -287,3 +288,18 @@ def test_a_graph_is_optimized_and_written_and_read(tmp_path):
 def test_downsampling_takes_the_first_point_of_each_voxel():
     points = np.array([[0.1, 0.1, 0.1], [0.2, 0.2, 0.2], [1.1, 0.1, 0.1]])
     assert sc.downsample(points, 1.0).tolist() == points[[0, 2]].tolist()
+
+
+@pytest.mark.parametrize("folder", ["pipeline", "viz"])
+def test_no_module_gives_a_second_value_to_a_name_of_its_own(folder):
+    """Files that are joined may each have a constant of one name; the later value would hold for both."""
+    for path in sorted((ROOT / folder).rglob("*.py")):
+        targets = [
+            node.id
+            for statement in ast.parse(path.read_text(encoding="utf-8")).body
+            if isinstance(statement, ast.Assign)
+            for target in statement.targets
+            for node in ast.walk(target)
+            if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
+        ]
+        assert len(set(targets)) == len(targets), path

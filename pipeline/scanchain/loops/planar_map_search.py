@@ -34,14 +34,11 @@ _AMBIGUOUS = 0.8  # share of the best score, from which on a pose elsewhere make
 
 _FIRST_M = 1.0  # distance traveled in a new segment before the first search of the whole map
 _BACKOFF = 0.2  # share of the distance searched in vain that is traveled before the next search
-_APART_M = 0.5  # least distance traveled between two searches
+_LEAST_INTERVAL_M = 0.5  # least distance traveled between two searches
 _INTERVAL_M = 3.0  # largest distance traveled between two searches
 _PATH_M = 8.0  # length of the path whose points are searched for: over it odometry drifts less than a cell or two
 _AGREE_M, _AGREE_RAD = 0.5, 0.1  # largest difference between two results that confirm each other
-_SOURCES, _SUBMAPS = (
-    4,
-    6,
-)  # numbers of keyframes of the path that are aligned, and of submaps that are tried for each
+_SOURCES, _SUBMAPS = 4, 6  # keyframes of the path that are aligned, and submaps that are tried for each
 _NEAR_M = 8.0  # largest distance of such a submap's anchor
 
 
@@ -219,7 +216,7 @@ class Relocalizer:
         traveled_m = keyframes[-1].traveled_m - keyframes[start].traveled_m
         if traveled_m < _FIRST_M or keyframes[-1].traveled_m < self.next_m:
             return False
-        self.next_m = keyframes[-1].traveled_m + min(max(_BACKOFF * traveled_m, _APART_M), _INTERVAL_M)
+        self.next_m = keyframes[-1].traveled_m + min(max(_BACKOFF * traveled_m, _LEAST_INTERVAL_M), _INTERVAL_M)
         return True
 
     def _begin(self, start: int, old: NDArray[np.int64], keyframes: Sequence[Keyframe], T_world: Matrix) -> None:
