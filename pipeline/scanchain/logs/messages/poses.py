@@ -54,15 +54,6 @@ def chain(transforms: Sequence[StampedPose], target: str, source: str) -> Pose |
     return None if reached is None else reached[1]
 
 
-def frames_between(transforms: Sequence[StampedPose], target: str, source: str) -> list[str]:
-    """The frames that ``chain`` passes from target to source, both included; none where no path joins them."""
-    reached, frames, frame = _reached(transforms, source), [], target.lstrip("/")
-    while frame in reached:
-        frames.append(frame)
-        frame = reached[frame][0]
-    return frames
-
-
 def _reached(transforms: Sequence[StampedPose], source: str) -> dict[str, tuple[str, Pose]]:
     """Every frame that a path joins to ``source``: the frame before it on that path, and T_frame_source (4, 4)."""
     source = source.lstrip("/")
