@@ -240,7 +240,7 @@ class Slam:
             elevation_offset_rad=tracking.elevation.offset_rad,
             elevation_sigma_rad=tracking.elevation.sigma_rad,
             calibrated_from=tracking.calibrated_from,
-            map_log_odds=self.placement.evidence.best,
+            map_log_odds=self.placement.evidence.best if first else math.nan,
         )
 
     def _check_unfinished(self) -> None:
