@@ -84,6 +84,7 @@ class Log:
     odometry_topic : whose poses the scans carry, empty where there is none
     scans_with_wheels : how many scans had a reading of the wheels near, of those that passed so far
     notes : what was chosen or assumed
+    bad_scans : how many scans were left out, once ``scans`` is through or closed
     copies : a warning where scans that passed so far are copies of those before
     """
 
@@ -128,6 +129,7 @@ class Log:
             if channel is not None
         }
         self.scans_with_wheels = 0
+        self.bad_scans = 0
         self.copies: list[str] = []
         self._opening_notes = tuple(self.notes)
         self._truth: Trajectory | None = None
@@ -205,7 +207,7 @@ class Log:
         finally:  # also where the caller wants no more scans
             is_damaged = bool(self._damage)
             self._damage += [*counts.losses(), *poses.complaints()]
-            self.copies = counts.copied()
+            self.copies, self.bad_scans = counts.copied(), counts.bad
             self.notes += [*([] if is_scan(self.lidar) else [times.assumed]), *counts.notes()]
         if not index:
             raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
