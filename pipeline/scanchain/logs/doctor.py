@@ -127,7 +127,7 @@ class Facts(NamedTuple):
 
 
 class Survey:
-    """Facts of the readable scans of a log and their times; stamps and wheels' positions (d,) where there are such."""
+    """Facts of the readable scans of a log and their times; stamps and wheels' positions (d,) where known."""
 
     def __init__(self, log: Log) -> None:
         self.log = log
@@ -261,8 +261,10 @@ def _wheels(seen: Survey) -> Finding:
 
 def _wheel_speed_m_s(seen: Survey) -> float:
     """Median speed by the wheels while they turn; 0 where they stand still."""
+    if not seen.wheels:
+        return 0.0
     stamps_ns, order = np.unique([stamp_ns for stamp_ns, _ in seen.wheels], return_index=True)
-    positions = np.array([seen.wheels[k][1] for k in order]).reshape(len(order), -1)
+    positions = np.array([seen.wheels[k][1] for k in order])
     steps_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     moving = steps_m > _LEAST_STEP_M
     return float(np.median(steps_m[moving] / (1e-9 * np.diff(stamps_ns)[moving]))) if moving.any() else 0.0
