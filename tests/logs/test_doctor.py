@@ -140,7 +140,7 @@ def test_stamps_that_were_never_set_are_a_problem(tmp_path):
 def test_another_clock_is_told_and_wheels_that_miss_for_it_are_counted(tmp_path):
     found = diagnose(saved(tmp_path, drive(wheels=True, stamp=lambda k: -37 * SECOND)))
     assert found["clock"].severity == "warning" and "logged 37 s after" in found["clock"].found
-    assert "40 of 40 scans without one" in found["wheels"].found
+    assert "40 of 40 scans without a reading" in found["wheels"].found
     assert found["wheels"].remedy == found["clock"].remedy == ""  # without a reading nothing is taken from them
 
 

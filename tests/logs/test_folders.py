@@ -10,7 +10,7 @@ from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.logs import open_log
 from scanchain.logs.doctor.statistics import survey
-from scanchain.logs.formats.cloud_folder import stamp_of_name
+from scanchain.logs.formats.clouds import stamp_of_name
 from scanchain.simulation import simulate
 from tests.support import recorders
 from tests.support.folders import PCD, PLY, camera, kitti_odometry, kitti_raw, xyzi

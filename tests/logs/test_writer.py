@@ -7,8 +7,15 @@ from mcap_ros2.decoder import DecoderFactory
 
 from scanchain import lie
 from scanchain.errors import InputError
-from scanchain.logs.writing.pack import Link, pack_laser_scan, pack_odometry, pack_transforms, place, schema_text
-from scanchain.logs.writing.writer import LogWriter
+from scanchain.logs.writer import (
+    Link,
+    LogWriter,
+    pack_laser_scan,
+    pack_odometry,
+    pack_transforms,
+    place,
+    schema_text,
+)
 
 STAMP_NS = 1_700_000_000_123_456_789
 

@@ -28,13 +28,11 @@ from scanchain.logs.mcap.selection import (
 from scanchain.logs.mcap.stream import Decoded, Decoders, decoded_messages, first_messages
 from scanchain.logs.messages.laser_scan import LaserScanDecoder
 from scanchain.logs.messages.point_cloud import PlanarCloudDecoder, PointCloudDecoder, plane_height_m
-from scanchain.logs.messages.point_times import PointTimes
-from scanchain.logs.messages.poses import StampedPose
+from scanchain.logs.messages.poses import RecordedPoses, StampedPose
 from scanchain.logs.messages.readers import is_scan, pose_reader, reader
-from scanchain.logs.messages.returns import RangeLimits, Returns
+from scanchain.logs.messages.returns import PointTimes, RangeLimits, Returns
 from scanchain.logs.mounting import find_mounting, in_plane, is_upside_down
 from scanchain.logs.opening import index_files
-from scanchain.logs.recorded_poses import RecordedPoses
 from scanchain.logs.topics import files_with_scans, find_ground_truth, find_lidar, find_odometry
 from scanchain.settings import load_settings, overrides_of
 

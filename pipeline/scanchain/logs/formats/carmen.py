@@ -22,9 +22,9 @@ import numpy as np
 
 from scanchain.errors import InputError, counted
 from scanchain.files import Source
-from scanchain.logs.formats.on_demand import UnknownFormatError, add_block, add_channel, on_demand_index
+from scanchain.logs.formats import UnknownFormatError, add_block, add_channel, on_demand_index
 from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
-from scanchain.logs.writing.pack import LATEST_NS, Link, Place, pack_laser_scan, pack_odometry, pack_transforms
+from scanchain.logs.writer import LATEST_NS, Link, Place, pack_laser_scan, pack_odometry, pack_transforms
 
 _LINES_A_BLOCK = 512
 _LEAST_STEP_NS = 100_000  # least step between the log times of two scans

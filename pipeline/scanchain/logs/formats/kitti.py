@@ -16,10 +16,10 @@ from numpy.linalg import LinAlgError
 from scanchain import lie
 from scanchain.data import Matrix, Pose
 from scanchain.errors import InputError, counted
-from scanchain.logs.formats.cloud_file import XYZI, CloudFileError, read_raw
-from scanchain.logs.formats.on_demand import add_block, add_channel, natural_order, on_demand_index
+from scanchain.logs.formats import add_block, add_channel, natural_order, on_demand_index
+from scanchain.logs.formats.clouds import XYZI, CloudFileError, read_raw
 from scanchain.logs.mcap.records import Block, Contents, FileIndex, Message
-from scanchain.logs.writing.pack import LATEST_NS, pack_cloud, pack_odometry, place
+from scanchain.logs.writer import LATEST_NS, pack_cloud, pack_odometry, place
 
 _TRUTH = -1  # index of the block of the ground truth
 _POSE_BYTES = 720

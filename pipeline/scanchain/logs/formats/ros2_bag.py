@@ -9,9 +9,9 @@ from typing import Any
 
 from scanchain.errors import InputError, counted, one_line
 from scanchain.logs.files import size_of
-from scanchain.logs.formats.on_demand import on_demand_index
+from scanchain.logs.formats import on_demand_index
 from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
-from scanchain.logs.writing.pack import schema_text
+from scanchain.logs.writer import schema_text
 
 _BLOCK_BYTES = 8_000_000  # size of a block in bytes of the file, about
 _MOST_BLOCKS = 4096

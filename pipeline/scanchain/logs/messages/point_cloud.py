@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from scanchain.data import Pose
 from scanchain.errors import one_line
 from scanchain.kernels.cloud_fields import keep_valid
-from scanchain.logs.messages.point_times import NAMES, PointTimes
-from scanchain.logs.messages.returns import NO_TIMES, RangeLimits, Returns, moved
+from scanchain.logs.messages.returns import NAMES, NO_TIMES, PointTimes, RangeLimits, Returns, moved
 from scanchain.logs.messages.ros import MalformedMessageError, stamp_ns
 
 _FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField

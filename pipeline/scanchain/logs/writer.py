@@ -1,19 +1,165 @@
-"""Writing an MCAP log of ROS 2 messages, without ROS."""
+"""ROS 2 messages packed in CDR, and the MCAP logs that they are written to, without ROS."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
+from functools import cache
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Literal, Self
+from typing import IO, Any, Literal, NamedTuple, Self
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
+from scanchain import lie
+from scanchain.data import Matrix, Pose
 from scanchain.errors import InputError
 from scanchain.logs.mcap.records import Channel
-from scanchain.logs.writing.pack import pack_cloud, schema_text
+from scanchain.logs.messages.ros import new, packed, typestore
+
+LATEST_NS = (1 << 31) * 1_000_000_000  # largest stamp of ROS
+_FIELD_TYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}  # sensor_msgs/PointField
+
+
+class Place(NamedTuple):
+    """A pose in messages: meters and a unit quaternion."""
+
+    x: float
+    y: float
+    z: float
+    qx: float
+    qy: float
+    qz: float
+    qw: float
+
+
+ORIGIN = Place(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+
+
+def place(T: Pose) -> Place:
+    """An SE(2) or SE(3) pose, (3, 3) or (4, 4)."""
+    lifted = lie.lift(np.asarray(T, dtype=np.float64))
+    return Place(*lifted[:3, 3].tolist(), *lie.to_quaternion(lifted[:3, :3]).tolist())
+
+
+def pack_laser_scan(
+    stamp_ns: int,
+    frame: str,
+    angle_min_rad: float,
+    angle_increment_rad: float,
+    ranges_m: NDArray[np.floating],
+    *,
+    range_min_m: float,
+    range_max_m: float,
+    time_increment_s: float = 0.0,
+    scan_time_s: float = 0.0,
+) -> bytes:
+    """A sensor_msgs/LaserScan; (N,) ranges, inf where nothing came back, stamp = first beam."""
+    angle_max_rad = angle_min_rad + (len(ranges_m) - 1) * angle_increment_rad
+    angles_rad = angle_min_rad, angle_max_rad, angle_increment_rad
+    limits_m = range_min_m, range_max_m
+    ranges = np.ascontiguousarray(ranges_m, np.float32)
+    return packed(
+        "sensor_msgs/msg/LaserScan",
+        _header(stamp_ns, frame), *angles_rad, time_increment_s, scan_time_s, *limits_m, ranges, ranges[:0],
+    )  # fmt: skip
+
+
+def pack_cloud(stamp_ns: int, frame: str, rows: NDArray[np.void]) -> bytes:
+    """A sensor_msgs/PointCloud2 of one row: the fields of a structured array (N,), little endian."""
+    fields = [
+        new("sensor_msgs/msg/PointField", name, offset, _FIELD_TYPES[number.str[1:]], 1)
+        for name, (number, offset, *_) in (rows.dtype.fields or {}).items()
+    ]
+    data = np.frombuffer(rows.tobytes(), np.uint8)
+    return packed(
+        "sensor_msgs/msg/PointCloud2",
+        _header(stamp_ns, frame), 1, len(rows), fields, False, rows.itemsize, rows.nbytes, data, True,
+    )  # fmt: skip
+
+
+def pack_odometry(
+    stamp_ns: int, frame: str, child_frame: str, pose: Place, covariance: Matrix | None = None
+) -> bytes:
+    """A nav_msgs/Odometry: pose of ``child_frame`` in ``frame``, (6, 6) covariance; no twist."""
+    covariances = np.zeros(36) if covariance is None else covariance.astype(np.float64).ravel(), np.zeros(36)
+    still = new("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
+    return packed(
+        "nav_msgs/msg/Odometry",
+        _header(stamp_ns, frame),
+        child_frame,
+        new("geometry_msgs/msg/PoseWithCovariance", _pose(pose), covariances[0]),
+        new("geometry_msgs/msg/TwistWithCovariance", new("geometry_msgs/msg/Twist", still, still), covariances[1]),
+    )
+
+
+class Link(NamedTuple):
+    """The pose of the frame ``child`` in ``parent``."""
+
+    parent: str
+    child: str
+    pose: Place
+
+
+def pack_transforms(stamp_ns: int, *links: Link) -> bytes:
+    """A tf2_msgs/TFMessage."""
+    transforms = [
+        new(
+            "geometry_msgs/msg/TransformStamped",
+            _header(stamp_ns, link.parent),
+            link.child,
+            new("geometry_msgs/msg/Transform", *_parts(link.pose, "Vector3")),
+        )
+        for link in links
+    ]
+    return packed("tf2_msgs/msg/TFMessage", transforms)
+
+
+def pack_path(stamp_ns: int, frame: str, stamps_ns: Sequence[int], poses: Sequence[Place]) -> bytes:
+    """A nav_msgs/Path: poses in ``frame``, each with its own stamp."""
+    stamped = [
+        new("geometry_msgs/msg/PoseStamped", _header(each_ns, frame), _pose(pose))
+        for each_ns, pose in zip(stamps_ns, poses, strict=True)
+    ]
+    return packed("nav_msgs/msg/Path", _header(stamp_ns, frame), stamped)
+
+
+def pack_grid(stamp_ns: int, frame: str, cells: NDArray[np.int8], resolution_m: float, origin: Place) -> bytes:
+    """A nav_msgs/OccupancyGrid: (rows, columns) cells 0 free to 100 occupied, −1 unknown, row 0 at the origin."""
+    rows, columns = cells.shape
+    header = _header(stamp_ns, frame)
+    about = new("nav_msgs/msg/MapMetaData", header.stamp, resolution_m, columns, rows, _pose(origin))
+    return packed("nav_msgs/msg/OccupancyGrid", header, about, np.ascontiguousarray(cells, np.int8).ravel())
+
+
+def _header(stamp_ns: int, frame: str) -> Any:
+    return new("std_msgs/msg/Header", new("builtin_interfaces/msg/Time", *divmod(stamp_ns, 1_000_000_000)), frame)
+
+
+def _pose(pose: Place) -> Any:
+    return new("geometry_msgs/msg/Pose", *_parts(pose, "Point"))
+
+
+def _parts(pose: Place, kind: str) -> tuple[Any, Any]:
+    """Position, of a type of geometry_msgs, and orientation."""
+    return new(f"geometry_msgs/msg/{kind}", *pose[:3]), new("geometry_msgs/msg/Quaternion", *pose[3:])
+
+
+@cache
+def schema_text(name: str) -> bytes:
+    """The definition of ``pkg/msg/Type`` followed by those of every type it uses, as rosbag2 writes it.
+
+    Empty for a type that ROS 2 does not bring.
+    """
+    from rosbags.typesys import TypesysError
+
+    try:
+        return typestore().generate_msgdef(name, ros_version=2)[0].encode()
+    except TypesysError:
+        return b""
+
 
 CHUNK_BYTES = 4 * 1024 * 1024
 

@@ -22,7 +22,7 @@ from scanchain.logs.mcap.selection import (
 from scanchain.logs.mcap.stream import Decoded, decoded_messages
 from scanchain.logs.opening import AUTO, index_files
 from scanchain.logs.topics import find_lidar, is_lidar, topics_of
-from scanchain.logs.writing.writer import LogWriter
+from scanchain.logs.writer import LogWriter
 
 _DEFAULTS = LogConfig()
 _WHOLE = (_DEFAULTS.topic, _DEFAULTS.start_s, _DEFAULTS.end_s, _DEFAULTS.every)
