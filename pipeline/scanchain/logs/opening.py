@@ -148,7 +148,7 @@ def _index_path(path: Path, number: int, config: LogConfig, address: Source | No
         raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
     index = (_claiming(path, head) if config.format == AUTO else FORMATS[config.format]).index
     if index is index_clouds:
-        index = partial(index, rate_hz=config.rate_hz)
+        index = partial(index, rate_hz=config.rate_hz, bin_columns=config.bin_columns)
     elif index is index_file:
         index = partial(index, source=address)
     try:

@@ -109,23 +109,6 @@ def read_livox(data: memoryview, encoding: str) -> PointCloudMessage:
 ReadPointCloud = Callable[[memoryview], PointCloudMessage]
 
 
-def column(message: PointCloudMessage, name: str) -> NDArray[np.generic] | None:
-    """One field of all points (N,), None where the cloud does not have it."""
-    for field in message.fields:
-        if field.name == name and field.datatype in _FORMATS:
-            number = np.dtype((">" if message.is_bigendian else "<") + _FORMATS[field.datatype])
-            if field.offset + number.itemsize > message.point_step:
-                return None
-            point = np.dtype({
-                "names": [name],
-                "formats": [number.str],
-                "offsets": [field.offset],
-                "itemsize": message.point_step,
-            })  # fmt: skip
-            return _rows(message, point)[name]
-    return None
-
-
 class Layout(NamedTuple):
     """Fields of a channel: a structured type, and the name of the time field, if any."""
 
