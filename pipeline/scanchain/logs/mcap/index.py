@@ -79,7 +79,7 @@ def index_file(path: Path, number: int, source: Source | None = None) -> FileInd
     index = FileIndex(source or path, number, data)
     if not _take_summary(index, len(data), needs_crc=True):
         index = FileIndex(source or path, number, data, is_consistent=False)
-        _Walk(index).walk()
+        Walk(index).walk()
     return index
 
 
@@ -95,11 +95,16 @@ def index_by_summary(file: RemoteFile, number: int) -> FileIndex | None:
 def _take_summary(index: FileIndex, size: int, *, needs_crc: bool) -> bool:
     """Fill the index by the summary of a file of this size; False where that does not give every message."""
     tail = bytes(index.bytes_at(max(size - _TAIL_BYTES, 0), min(size, _TAIL_BYTES)))
-    begin, crc = _footer(tail)
-    if not 0 < begin <= size - _FOOTER_BYTES or (needs_crc and not crc):
+    footer = tail[-_FOOTER_BYTES:]
+    if len(footer) < _FOOTER_BYTES or not footer.endswith(MAGIC) or footer[0] != FOOTER:
+        return False
+    begin, _, crc = struct.unpack_from("<QQI", footer, RECORD.size)
+    if not 0 < begin <= size - len(footer) or (needs_crc and not crc):
         return False
     missing = size - len(tail) - begin
     summary = bytes(index.bytes_at(begin, missing)) + tail if missing > 0 else tail[-missing:]
+    if crc and zlib.crc32(summary[: -len(MAGIC) - 4]) != crc:
+        return False
     try:
         statistics = _fill(index, summary)
     except MALFORMED:
@@ -117,20 +122,8 @@ def _take_summary(index: FileIndex, size: int, *, needs_crc: bool) -> bool:
     )
 
 
-def _footer(tail: bytes) -> tuple[int, int]:
-    """Begin and CRC-32 of the summary that the end of a file states; zeros where it has no footer."""
-    footer = tail[-_FOOTER_BYTES:]
-    if len(footer) < _FOOTER_BYTES or not footer.endswith(MAGIC) or footer[0] != FOOTER:
-        return 0, 0
-    begin, _, crc = struct.unpack_from("<QQI", footer, RECORD.size)
-    return begin, crc
-
-
 def _fill(index: FileIndex, summary: bytes) -> Statistics | None:
     """Take in the records up to the closing magic; the statistics among them. Raises one of MALFORMED."""
-    _, crc = _footer(summary)
-    if crc and zlib.crc32(summary[: -len(MAGIC) - 4]) != crc:
-        raise struct.error("the CRC of the summary is wrong")
     statistics = None
     for record in StreamReader(BytesIO(summary), skip_magic=True, emit_chunks=True).records:
         if isinstance(record, Schema | Channel):
@@ -157,7 +150,7 @@ def _indexed(chunk: ChunkIndex, file: int) -> Block:
     return Block(file, end - size, size, chunk.compression, chunk.uncompressed_size, None, *times_ns, entries)
 
 
-class _Walk:
+class Walk:
     """Sorts records into an index; a chunk waits for its message index, loose messages for each other."""
 
     def __init__(self, index: FileIndex) -> None:
@@ -197,15 +190,14 @@ class _Walk:
         self._close(offset, complete=True)
 
     def _takes_summary(self, offset: int) -> bool:
-        """True if the data end here and a summary follows, which may define channels that nothing else does."""
-        summary = FileIndex(self.index.path, self.index.number, b"")
+        """True if the data end here and a summary ends the file; its channels are taken in as a last resort."""
+        if not _is_end(self.data, offset):
+            return False
+        uncertain = FileIndex(self.index.path, self.index.number, b"", channels=self.index.uncertain_channels)
         try:
-            if not _is_end(self.data, offset):
-                return False
-            _fill(summary, self.data[offset + len(_DATA_END) + 4 :])
+            _fill(uncertain, self.data[offset:])
         except MALFORMED:
             return False
-        self.index.channels |= {k: c for k, c in summary.channels.items() if not self.index.knows(k)}
         return True
 
     def _take(self, offset: int, end: int) -> None:

@@ -117,6 +117,7 @@ class FileIndex:
     data : the bytes of an MCAP file; ``fetch`` reads those of a remote one, by offset and size; of another
         format ``make`` makes the contents of a block, of all channels or of those wanted
     counts : messages by channel id; ``is_counted`` once they are complete
+    uncertain_channels : those of a summary that was not accepted, for channels defined nowhere else
     is_consistent : whether the channels that blocks state were checked
     """
 
@@ -132,6 +133,7 @@ class FileIndex:
     is_counted: bool = False
     takes_rate: bool = False
     is_consistent: bool = True
+    uncertain_channels: dict[int, Channel] = field(default_factory=dict)
     damage: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 

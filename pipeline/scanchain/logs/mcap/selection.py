@@ -188,6 +188,7 @@ def complete(index: FileIndex) -> None:
             messages = messages_of(index, block)
             counts.update(message.channel.key[1] for message in messages if not block.entries)
             unknown = {number for number in unknown if not index.knows(number)}
+    index.channels |= {k: channel for k, channel in index.uncertain_channels.items() if k in unknown}
     if not index.is_counted:
         index.counts = dict(counts)
         index.is_counted = True
