@@ -25,7 +25,7 @@ from scanchain.logs.mcap.selection import (
     notes_on,
     whole_span,
 )
-from scanchain.logs.mcap.stream import Decoded, Decoders, decoded_messages, first_messages
+from scanchain.logs.mcap.stream import Decoded, Decoders, decoded_messages, sampled_messages
 from scanchain.logs.messages.laser_scan import LaserScanDecoder
 from scanchain.logs.messages.point_cloud import PlanarCloudDecoder, PointCloudDecoder, plane_height_m
 from scanchain.logs.messages.poses import RecordedPoses, StampedPose
@@ -302,7 +302,7 @@ class Log:
         """Height of all points of the first clouds, None where they differ; samples their point times, too."""
         limits = RangeLimits(self.config.min_range_m, self.config.max_range_m)
         decoder = PointCloudDecoder(limits, self._sampled_times, reader(self.lidar))
-        height_m = plane_height_m(first_messages(self.indexes, self.topic, decoder.decode))
+        height_m = plane_height_m(sampled_messages(self.indexes, self.topic, decoder.decode))
         if height_m is not None:
             self.notes.append(
                 f"the clouds of {self.topic} are planar (z = {height_m:.3g} m everywhere): read as a 2D log"

@@ -12,7 +12,7 @@ from scanchain import lie
 from scanchain.data import Pose
 from scanchain.logs.mcap.records import Channel, FileIndex
 from scanchain.logs.mcap.selection import Span
-from scanchain.logs.mcap.stream import first_messages, spread_messages
+from scanchain.logs.mcap.stream import sampled_messages
 from scanchain.logs.messages.poses import StampedPose, chain
 from scanchain.logs.messages.readers import (
     has_transforms,
@@ -93,7 +93,7 @@ def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel 
     frame = _frame_of(indexes, lidar)
     stated = None
     if wheels is not None and is_odometry(wheels):
-        stated = next(first_messages(indexes, wheels.topic, pose_reader(wheels, 3)), None)
+        stated = next(sampled_messages(indexes, wheels.topic, pose_reader(wheels, 3)), None)
     bases = [name.lstrip("/") for name in ("" if stated is None else stated.child, *_BASE_FRAMES) if name]
     for base in bases:
         T_base_lidar = chain(fixed, base, frame)
@@ -168,7 +168,7 @@ def _moving_transforms(
     """Messages of each transform that may change, from parts of the log spread over it."""
     found: dict[Edge, list[StampedPose]] = {}
     for topic, channel in topics.items():
-        for transforms in spread_messages(indexes, topic, reader(channel), span):
+        for transforms in sampled_messages(indexes, topic, reader(channel), span):
             for each in transforms:
                 found.setdefault(_edge(each), []).append(each)
     return found
@@ -237,7 +237,7 @@ def _static_transforms(indexes: Sequence[FileIndex]) -> list[StampedPose]:
     found: list[StampedPose] = []
     for topic, channel in topics_of(indexes).items():
         if topic.endswith("tf_static") and has_transforms(channel):
-            for transforms in first_messages(indexes, topic, reader(channel)):
+            for transforms in sampled_messages(indexes, topic, reader(channel)):
                 found += transforms
     return found
 
@@ -245,4 +245,4 @@ def _static_transforms(indexes: Sequence[FileIndex]) -> list[StampedPose]:
 def _frame_of(indexes: Sequence[FileIndex], lidar: Channel) -> str:
     """The frame of a lidar's first messages, empty where they name none."""
     read = reader(lidar)
-    return next(first_messages(indexes, lidar.topic, lambda data: read(data).frame), "").lstrip("/")
+    return next(sampled_messages(indexes, lidar.topic, lambda data: read(data).frame), "").lstrip("/")

@@ -184,8 +184,7 @@ class LogWriter:
             raise InputError(f"{destination}: not writable ({error.strerror}); choose another place") from error
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(profile=profile, library="scanchain")
-        self._schemas: dict[tuple[str, str, bytes], int] = {}
-        self._channels: dict[tuple[str, str, str, bytes], int] = {}
+        self._numbers: dict[tuple[str | bytes, ...], int] = {}  # of schemas and of channels
         self._sequence = 0
 
     def __enter__(self) -> Self:
@@ -219,20 +218,17 @@ class LogWriter:
         times_s: NDArray[np.floating] | None = None,
         time_field: Literal["t", "time"] = "t",
         ring: NDArray[np.integer] | None = None,
-        intensity: NDArray[np.floating] | None = None,
         log_time_ns: int | None = None,
     ) -> None:
         """Append a sensor_msgs/PointCloud2 of one row.
 
         points : (N, 3) meters
         times_s : (N,) seconds after ``stamp_ns``; written as ``t`` (uint32 ns, from 0 up) or ``time`` (float32 s)
-        ring, intensity : (N,) written as uint16 and float32
+        ring : (N,) written as uint16
         """
         columns: dict[str, tuple[str, NDArray[np.number]]] = {
             name: ("<f4", points[:, axis]) for axis, name in enumerate("xyz")
         }
-        if intensity is not None:
-            columns["intensity"] = ("<f4", intensity)
         if times_s is not None:
             columns[time_field] = ("<f4", times_s) if time_field == "time" else ("<u4", _whole_ns(times_s))
         if ring is not None:
@@ -242,35 +238,23 @@ class LogWriter:
             rows[name] = values
         self.append(topic, "sensor_msgs/msg/PointCloud2", pack_cloud(stamp_ns, frame, rows), stamp_ns, log_time_ns)
 
-    def copy(self, channel: Channel, log_time_ns: int, data: bytes) -> None:
-        """Append a message of another log as it is, with its topic, type, encoding and definition."""
-        key = (channel.topic, channel.encoding, channel.type_name, channel.definition)
-        if key not in self._channels:
-            number = self._schema(channel.type_name, channel.schema_encoding, channel.definition)
-            self._channels[key] = self._writer.register_channel(channel.topic, channel.encoding, number)
-        self._add(self._channels[key], log_time_ns, data)
-
     def append(self, topic: str, schema: str, data: bytes, stamp_ns: int, log_time_ns: int | None = None) -> None:
         """Append a packed message of the type ``schema``, pkg/msg/Type."""
-        time_ns = stamp_ns if log_time_ns is None else log_time_ns
-        key = (topic, "cdr", schema, b"")
-        if key not in self._channels:
-            number = self._schema(schema, "ros2msg", schema_text(schema))
-            self._channels[key] = self._writer.register_channel(topic, "cdr", number)
-        self._add(self._channels[key], time_ns, data)
+        channel = Channel((0, 0), topic, "cdr", 0, schema, "ros2msg", schema_text(schema))
+        self.copy(channel, stamp_ns if log_time_ns is None else log_time_ns, data)
 
-    def _add(self, channel: int, log_time_ns: int, data: bytes) -> None:
-        self._writer.add_message(channel, log_time_ns, data, log_time_ns, self._sequence)
+    def copy(self, channel: Channel, log_time_ns: int, data: bytes) -> None:
+        """Append a message of another log as it is, with its topic, type, encoding and definition."""
+        schema = (channel.type_name, channel.schema_encoding, channel.definition)
+        key = (channel.topic, channel.encoding, *schema)
+        if key not in self._numbers:
+            is_known = bool(channel.type_name or channel.definition)  # 0 stands for none
+            if is_known and schema not in self._numbers:
+                self._numbers[schema] = self._writer.register_schema(*schema)
+            number = self._numbers[schema] if is_known else 0
+            self._numbers[key] = self._writer.register_channel(channel.topic, channel.encoding, number)
+        self._writer.add_message(self._numbers[key], log_time_ns, data, log_time_ns, self._sequence)
         self._sequence += 1
-
-    def _schema(self, name: str, encoding: str, definition: bytes) -> int:
-        """The id of a schema; 0 stands for none."""
-        key = (name, encoding, definition)
-        if not name and not definition:
-            return 0
-        if key not in self._schemas:
-            self._schemas[key] = self._writer.register_schema(name, encoding, definition)
-        return self._schemas[key]
 
 
 def _whole_ns(times_s: NDArray[np.floating]) -> NDArray[np.int64]:

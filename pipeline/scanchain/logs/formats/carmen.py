@@ -97,16 +97,13 @@ def _add_lines(index: FileIndex, lines: list[Line], parameters: dict[bytes, floa
             channel, frame = (odometry, "odom") if line.kind == b"ODOM" else (truth, "world")
             yield channel, pack_odometry(line.stamp_ns, frame, "base_link", planar(*_numbers(words[1:], 3)))
 
-    def make(block: Block, wanted: AbstractSet[int] | None) -> Contents:
+    def make(block: Block, _: AbstractSet[int] | None) -> Contents:
         made: list[Message] = []
         malformed: list[int] = []
         for line in lines[block.offset : block.offset + _LINES_A_BLOCK]:
             try:
-                made += [
-                    Message(channel, line.log_time_ns, memoryview(data))
-                    for channel, data in messages(line)
-                    if wanted is None or channel.key[1] in wanted
-                ]
+                said = list(messages(line))
+                made += [Message(channel, line.log_time_ns, memoryview(data)) for channel, data in said]
             except (ValueError, IndexError):
                 malformed.append(line.number)
         return Contents(made, _complaint(index.path, malformed))

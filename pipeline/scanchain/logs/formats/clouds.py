@@ -23,6 +23,10 @@ from scanchain.logs.formats import add_block, add_channel, left_out, natural_ord
 from scanchain.logs.mcap.records import Block, Contents, FileIndex, Message
 from scanchain.logs.writer import LATEST_NS, pack_cloud
 
+_UNITS_NS = {19: 1, 16: 1_000, 13: 1_000_000}  # nanoseconds of a stamp's unit, by its number of digits since 2001
+_FIRST_FILES = 3  # number of files of which one has to be readable
+_NS = 1_000_000_000
+
 SUFFIXES = (".pcd", ".ply", ".npy", ".bin")
 _MOST_COLUMNS = 16
 XYZI = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
@@ -230,11 +234,6 @@ def _ply_lines(file: IO[bytes]) -> Iterator[list[str]]:
     raise CloudFileError("is no PLY: its header does not end")
 
 
-_UNITS_NS = {19: 1, 16: 1_000, 13: 1_000_000}  # nanoseconds of a stamp's unit, by its number of digits since 2001
-_FIRST_FILES = 3  # number of files of which one has to be readable
-_NS = 1_000_000_000
-
-
 def claims_clouds(path: Path, _: bytes) -> bool:
     """True for a folder with such files."""
     return path.is_dir() and any(entry.suffix.lower() in SUFFIXES for entry in path.iterdir())
@@ -259,10 +258,8 @@ def index_clouds(folder: Path, number: int, rate_hz: float = 0.0, bin_columns: i
     for place, (file, stamp_ns) in enumerate(zip(files, stamps_ns, strict=True)):
         add_block(index, place, file.stat().st_size, [stamp_ns], {channel: 1})
 
-    def make(block: Block, wanted: AbstractSet[int] | None) -> Contents:
+    def make(block: Block, _: AbstractSet[int] | None) -> Contents:
         file, stamp_ns = files[block.offset], stamps_ns[block.offset]
-        if wanted is not None and channel.key[1] not in wanted:
-            return Contents([], "")
         try:
             data = pack_cloud(stamp_ns, "lidar", read_cloud_file(file, raw))
         except (CloudFileError, OSError) as error:

@@ -114,10 +114,8 @@ def _index(
             index, _TRUTH, _POSE_BYTES * len(truth), [stamp_ns for stamp_ns, _ in truth], {poses: len(truth)}
         )
 
-    def make(block: Block, wanted: AbstractSet[int] | None) -> Contents:
+    def make(block: Block, _: AbstractSet[int] | None) -> Contents:
         channel = index.channels[block.entries[0].channel]
-        if wanted is not None and channel.key[1] not in wanted:
-            return Contents([], "")
         if block.offset == _TRUTH:
             said = [(each, pack_odometry(each, "world", "velodyne", place(T))) for each, T in truth]
             return Contents([Message(channel, each, memoryview(data)) for each, data in said], "")

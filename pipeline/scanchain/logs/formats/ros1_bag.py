@@ -242,7 +242,7 @@ def _counted(index: FileIndex, block: Block) -> Block:
     return replace(block, start_ns=min(times_ns), end_ns=max(times_ns), entries=entries)
 
 
-def _contents(index: FileIndex, block: Block, wanted: AbstractSet[int] | None) -> Contents:
+def _contents(index: FileIndex, block: Block, _: AbstractSet[int] | None) -> Contents:
     """The messages of a chunk; connections found there join the index."""
     name = f"{index.path}: the chunk at byte {block.offset}"
     messages: list[Message] = []
@@ -256,7 +256,7 @@ def _contents(index: FileIndex, block: Block, wanted: AbstractSet[int] | None) -
                 number, time_ns = record.number(b"conn"), record.time_ns(b"time")
                 channel = index.channels.get(number)
                 undefined += channel is None
-                if channel is not None and (wanted is None or number in wanted):
+                if channel is not None:
                     messages.append(Message(channel, time_ns, payload[record.begin : record.end]))
     except struct.error:
         damage = f"{name}: a record in it is malformed; what follows was left out"

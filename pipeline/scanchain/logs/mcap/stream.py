@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from heapq import heappop, heappush
 from itertools import pairwise
 from typing import NamedTuple, TypeVar
@@ -119,39 +120,22 @@ def _result(future: Future[tuple[list[Decoded], str]], damage: list[str]) -> lis
     return messages
 
 
-def first_messages(indexes: Sequence[FileIndex], topic: str, decode: Callable[[memoryview], T]) -> Iterator[T]:
-    """Decoded messages of a topic's first blocks; malformed ones are passed over."""
-    yield from _decoded_in(indexes, _blocks_of(indexes, topic)[:_SAMPLED_BLOCKS], topic, decode, EVERYTHING)
-
-
-def spread_messages(
-    indexes: Sequence[FileIndex], topic: str, decode: Callable[[memoryview], T], span: Span
+def sampled_messages(
+    indexes: Sequence[FileIndex], topic: str, decode: Callable[[memoryview], T], span: Span | None = None
 ) -> Iterator[T]:
-    """Decoded messages of a topic in blocks from all over a span; malformed ones are passed over."""
-    blocks = [block for block in _blocks_of(indexes, topic) if span.meets(block)]
-    spread = sorted({k * (len(blocks) - 1) // (_SAMPLED_BLOCKS - 1) for k in range(_SAMPLED_BLOCKS)})
-    yield from _decoded_in(indexes, [blocks[k] for k in spread if blocks], topic, decode, span)
-
-
-def _blocks_of(indexes: Sequence[FileIndex], topic: str) -> list[Block]:
-    """Those that may hold messages of the topic, by time."""
+    """Decoded messages in a topic's first blocks, or in some from all over a span; malformed ones are left out."""
+    chosen = EVERYTHING if span is None else span
     blocks = [
-        block for index in indexes for block in index.blocks if index.may_hold(block, set(index.numbers_of(topic)))
+        block
+        for index in indexes
+        for block in index.blocks
+        if chosen.meets(block) and index.may_hold(block, set(index.numbers_of(topic)))
     ]
-    return sorted(blocks, key=lambda block: block.start_ns)
-
-
-def _decoded_in(
-    indexes: Sequence[FileIndex],
-    blocks: Sequence[Block],
-    topic: str,
-    decode: Callable[[memoryview], T],
-    span: Span,
-) -> Iterator[T]:
-    for block in blocks:
+    blocks.sort(key=lambda block: block.start_ns)
+    if span is not None and len(blocks) > _SAMPLED_BLOCKS:
+        blocks = [blocks[k * (len(blocks) - 1) // (_SAMPLED_BLOCKS - 1)] for k in range(_SAMPLED_BLOCKS)]
+    for block in blocks[:_SAMPLED_BLOCKS]:
         for message in messages_of(indexes[block.file], block):
-            if message.channel.topic == topic and span.begin_ns <= message.log_time_ns <= span.end_ns:
-                try:
+            if message.channel.topic == topic and chosen.begin_ns <= message.log_time_ns <= chosen.end_ns:
+                with suppress(MalformedMessageError):
                     yield decode(message.data)
-                except MalformedMessageError:
-                    continue
