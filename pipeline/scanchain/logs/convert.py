@@ -67,7 +67,9 @@ def convert(
     ):
         raise nothing_in_part(f"{name_of(indexes)}: no message", whole_span(indexes), config)
     damage = [line for index in indexes for line in index.damage]
-    with LogWriter(destination, force=force, profile=_profile(indexes)) as log:
+    encodings = {channel.encoding for index in indexes for channel in index.channels.values()}
+    profile = "ros2" if encodings == {"cdr"} else "ros1" if encodings == {"ros1"} else ""
+    with LogWriter(destination, force=force, profile=profile) as log:
         for message in _messages(indexes, counts, config, damage):
             assert isinstance(message.value, bytes)
             log.copy(message.channel, message.log_time_ns, message.value)
@@ -80,8 +82,6 @@ def convert(
                 f"{'; '.join(grouped(damage)) or 'it is empty'}"
             )
     notes = (*(line for index in indexes for line in index.notes), *notes_on(indexes, config))
-    if config.rate_hz and not any(index.takes_rate for index in indexes):
-        notes += (f"log.rate_hz {config.rate_hz:g} has no effect: the log has its own stamps",)
     return Converted(destination, counts, notes, tuple(grouped(damage)))
 
 
@@ -112,9 +112,3 @@ def _chosen(indexes: Sequence[FileIndex], topic: str) -> list[str]:
     lidar = find_lidar(indexes, topic) if topic else None
     channels = topics_of(indexes)
     return [name for name in channels if lidar is None or name == topic or not is_lidar(channels[name])]
-
-
-def _profile(indexes: Sequence[FileIndex]) -> str:
-    """The convention that all channels keep, empty where they differ."""
-    encodings = {channel.encoding for index in indexes for channel in index.channels.values()}
-    return {frozenset({"cdr"}): "ros2", frozenset({"ros1"}): "ros1"}.get(frozenset(encodings), "")

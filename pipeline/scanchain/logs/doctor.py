@@ -26,7 +26,6 @@ from scanchain.logs.messages.returns import UNITS_S
 
 _GAP_PERIODS = 2.5
 _LONG_GAP_S, _LONG_GAP_ON_WHEELS_S = 0.5, 10.0
-_OTHER_CLOCK_S = 1.0
 _PART_OF_SCAN, _MORE_THAN_SCAN = 0.3, 1.2  # shares of the period outside which a unit of time is implausible
 _SPINS_AT_S = (0.04, 0.25)
 _SURE = 0.9  # least share of the scans that turn alike, and least agreement of their starts
@@ -192,7 +191,6 @@ def _turning(points: RawPoints) -> tuple[int, float]:
 def _check(seen: Survey, config: Config, most_bad: float) -> Iterator[Finding]:
     """Every finding about a log. ``config`` is what a run of it would use; ``most_bad`` scans it may lack."""
     yield _gaps(seen, bool(seen.wheels) and config.odometry.prior != "constant-velocity")
-    yield _clock(seen)
     yield _wheels(seen)
     if not is_scan(seen.log.lidar):
         yield _point_times(seen)
@@ -223,20 +221,6 @@ def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:
         f"the rest, --start {again_s:g}, apart"
     )
     return Finding("gaps", Severity.WARNING, found, effect, f"--end {until_s:g}")
-
-
-def _clock(seen: Survey) -> Finding:
-    """Header stamp against log time."""
-    late_s = np.subtract(seen.log_times_ns, seen.stamps_ns) * 1e-9
-    least, median, most = (float(value) for value in np.percentile(late_s, [0.0, 50.0, 100.0]))
-    found = f"logged {median:.4g} s after the header stamp (from {least:.4g} to {most:.4g} s)"
-    if abs(median) > _OTHER_CLOCK_S:
-        effect = (
-            "header stamps are of another clock than log times: --start and --end count by log time, results by "
-            "header stamps, and wheels or ground truth of the recorder's clock do not meet the scans"
-        )
-        return Finding("clock", Severity.WARNING, found, effect)
-    return Finding("clock", Severity.OK, found)
 
 
 def _wheels(seen: Survey) -> Finding:

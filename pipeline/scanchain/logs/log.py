@@ -105,8 +105,7 @@ class Log:
         self.odometry_topic = "" if wheels is None else wheels.topic
         self.ground_truth_topic = "" if truth is None else truth.topic
         self.lidar = lidar
-        is_untimed = config.point_times == "none"  # distinguished from scans without any times
-        self._sampled_times = PointTimes(replace(config, point_times="auto") if is_untimed else config)
+        self._sampled_times = PointTimes(config)
         self.plane_height_m = None if is_scan(lidar) else self._plane_height_m()
         self.dimension = 3 if self.plane_height_m is None and not is_scan(lidar) else 2
         whole = whole_span(indexes)
@@ -233,10 +232,7 @@ class Log:
 
     def assumed_point_times(self) -> str:
         """Assumption of a run about per-point times, by the first scan that has returns; empty for laser scans."""
-        if is_scan(self.lidar):
-            return ""
-        is_untimed = self.config.point_times == "none"
-        return PointTimes(self.config).assumed if is_untimed else self._sampled_times.assumed
+        return "" if is_scan(self.lidar) else self._sampled_times.assumed
 
     def expected_stamps(self, topic: str) -> NDArray[np.int64]:
         """(2,) first and last header stamp to expect of a topic in the part that is read, by its first message.

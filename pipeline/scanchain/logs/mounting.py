@@ -101,7 +101,8 @@ def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel 
             return Mounting(base, frame, T_base_lidar)
     moving = _moving_transforms(indexes, topics, span)
     worlds = {"" if stated is None else stated.parent.lstrip("/")}
-    worlds |= {name for each in (*moving, *map(_edge, fixed)) for name in each if _is_of_the_world(name)}
+    frames = {name for edge in (*moving, *map(_edge, fixed)) for name in edge}
+    worlds |= {name for name in frames if _WORLD_WORDS & set(re.split(r"[/_]", name.lower()))}
     moving = {joint: poses for joint, poses in moving.items() if not worlds & set(joint)}
     tree = [*fixed, *(poses[0] for poses in moving.values())]
     base = next((base for base in bases if chain(tree, base, frame) is not None), "")
@@ -172,11 +173,6 @@ def _moving_transforms(
             for each in transforms:
                 found.setdefault(_edge(each), []).append(each)
     return found
-
-
-def _is_of_the_world(frame: str) -> bool:
-    """True if a frame has a name of those in which robots move: map, robot_1/odom, camera_init."""
-    return bool(_WORLD_WORDS & set(re.split(r"[/_]", frame.lower())))
 
 
 def _top(fixed: Sequence[StampedPose], moving: dict[Edge, list[StampedPose]], frame: str, worlds: set[str]) -> str:

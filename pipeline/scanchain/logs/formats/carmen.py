@@ -174,7 +174,9 @@ def read_scan(words: list[bytes], stamp_ns: int, parameters: dict[bytes, float])
         ranges_m = _numbers(words[9:], count)
         poses = _numbers(words[10 + count + int(words[9 + count]) :], 6)
         step_rad = step_rad if step_rad > 0.0 else opening_rad / max(count - 1, 1)
-        mounting = _mounting(poses[:3], poses[3:])
+        dx, dy, dyaw = (laser - robot for laser, robot in zip(poses[:3], poses[3:], strict=True))
+        cosine, sine = math.cos(poses[5]), math.sin(poses[5])
+        mounting = planar(cosine * dx + sine * dy, cosine * dy - sine * dx, dyaw)
     scan = pack_laser_scan(
         stamp_ns,
         "laser",
@@ -196,13 +198,6 @@ def _numbers(words: list[bytes], count: int) -> list[float]:
     if not 0 <= count <= len(words):
         raise ValueError(f"{count} numbers are stated, {len(words)} words follow")
     return [float(word) for word in words[:count]]
-
-
-def _mounting(laser: list[float], robot: list[float]) -> Place:
-    """The laser's pose in the robot's frame."""
-    dx, dy, dyaw = (a - b for a, b in zip(laser, robot, strict=True))
-    cosine, sine = math.cos(robot[2]), math.sin(robot[2])
-    return planar(cosine * dx + sine * dy, cosine * dy - sine * dx, dyaw)
 
 
 def read_text(path: Path) -> tuple[bytes, str]:

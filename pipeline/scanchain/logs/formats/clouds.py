@@ -249,7 +249,6 @@ def index_clouds(folder: Path, number: int, rate_hz: float = 0.0, bin_columns: i
     files = _files(folder)
     stamps_ns = [round(k * _NS / rate_hz) for k in range(len(files))] if rate_hz else _stamps(folder, files)
     index = on_demand_index(folder, number)
-    index.takes_rate = True
     raw = point_of_columns(np.dtype("<f4"), bin_columns)
     if files[0].suffix.lower() == ".bin":
         _check_size(files, bin_columns)

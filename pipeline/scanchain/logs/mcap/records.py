@@ -131,7 +131,6 @@ class FileIndex:
     channels: dict[int, Channel] = field(default_factory=dict)
     counts: dict[int, int] = field(default_factory=dict)
     is_counted: bool = False
-    takes_rate: bool = False
     is_consistent: bool = True
     uncertain_channels: dict[int, Channel] = field(default_factory=dict)
     damage: list[str] = field(default_factory=list)
