@@ -18,7 +18,7 @@ from scanchain.files import Address, source_of
 from scanchain.logs import files, open_log, writer
 from scanchain.logs.mcap.index import Walk
 from scanchain.logs.mcap.records import FileIndex
-from scanchain.logs.mcap.selection import complete
+from scanchain.logs.mcap.stream import complete
 from scanchain.logs.opening import index_files
 from scanchain.runs.provenance import Provenance, identity_of
 from scanchain.simulation import simulate

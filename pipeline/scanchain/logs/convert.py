@@ -11,15 +11,16 @@ from scanchain.config import LogConfig
 from scanchain.errors import InputError, grouped
 from scanchain.files import Source
 from scanchain.logs.mcap.records import FileIndex, name_of
-from scanchain.logs.mcap.selection import (
+from scanchain.logs.mcap.stream import (
     EVERYTHING,
+    Decoded,
     chosen_span,
     count_messages,
+    decoded_messages,
     notes_on,
     nothing_in_part,
     whole_span,
 )
-from scanchain.logs.mcap.stream import Decoded, decoded_messages
 from scanchain.logs.opening import AUTO, index_files
 from scanchain.logs.topics import find_lidar, is_lidar, topics_of
 from scanchain.logs.writer import LogWriter

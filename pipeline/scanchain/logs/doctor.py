@@ -20,7 +20,7 @@ from scanchain.errors import counted
 from scanchain.files import Source
 from scanchain.logs.bad_scans import are_millimeters, most_bad_scans
 from scanchain.logs.log import Log, open_log
-from scanchain.logs.mcap.selection import whole_span
+from scanchain.logs.mcap.stream import whole_span
 from scanchain.logs.messages.readers import is_scan
 from scanchain.logs.messages.returns import UNITS_S
 

@@ -17,15 +17,18 @@ from scanchain.errors import InputError, counted, grouped, shown
 from scanchain.files import Source, source_of
 from scanchain.logs.bad_scans import ScanCounts, check_count, defect
 from scanchain.logs.mcap.records import FileIndex, name_of
-from scanchain.logs.mcap.selection import (
+from scanchain.logs.mcap.stream import (
+    Decoded,
+    Decoders,
     check_one_log,
     chosen_span,
     count_scans,
+    decoded_messages,
     gap_notes,
     notes_on,
+    sampled_messages,
     whole_span,
 )
-from scanchain.logs.mcap.stream import Decoded, Decoders, decoded_messages, sampled_messages
 from scanchain.logs.messages.laser_scan import LaserScanDecoder
 from scanchain.logs.messages.point_cloud import PlanarCloudDecoder, PointCloudDecoder, plane_height_m
 from scanchain.logs.messages.poses import RecordedPoses, StampedPose

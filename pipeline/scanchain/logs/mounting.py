@@ -11,8 +11,7 @@ import numpy as np
 from scanchain import lie
 from scanchain.data import Pose
 from scanchain.logs.mcap.records import Channel, FileIndex
-from scanchain.logs.mcap.selection import Span
-from scanchain.logs.mcap.stream import sampled_messages
+from scanchain.logs.mcap.stream import Span, sampled_messages
 from scanchain.logs.messages.poses import StampedPose, chain
 from scanchain.logs.messages.readers import (
     has_transforms,

@@ -26,7 +26,7 @@ from scanchain.logs.formats.ros2_bag import claims_ros2_bag, index_ros2_bag, par
 from scanchain.logs.formats.user import index_scans, load_format
 from scanchain.logs.mcap.index import claims_mcap, index_by_summary, index_file
 from scanchain.logs.mcap.records import FileIndex
-from scanchain.logs.mcap.selection import are_parts, complete
+from scanchain.logs.mcap.stream import are_parts, complete
 from scanchain.logs.topics import is_lidar
 
 

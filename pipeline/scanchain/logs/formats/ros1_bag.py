@@ -22,7 +22,7 @@ import numpy as np
 from scanchain.errors import InputError, counted
 from scanchain.logs.mcap.index import is_plausible_size
 from scanchain.logs.mcap.records import Block, Channel, Contents, Entry, FileIndex, Message, unpack
-from scanchain.logs.mcap.selection import messages_of
+from scanchain.logs.mcap.stream import messages_of
 
 MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, HEADER, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 5, 6, 7
