@@ -19,8 +19,7 @@ from scanchain.__main__ import main
 from scanchain.batch.batch import collect
 from scanchain.errors import InputError
 from scanchain.files import Address
-from scanchain.logs.writing.pack import ORIGIN, pack_laser_scan, pack_odometry
-from scanchain.logs.writing.writer import LogWriter
+from scanchain.logs.writer import ORIGIN, LogWriter, pack_laser_scan, pack_odometry
 from scanchain.processes import resident_mib
 from scanchain.runs.directory import directory_name
 from scanchain.simulation import simulate

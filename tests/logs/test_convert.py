@@ -147,11 +147,6 @@ def test_a_part_of_a_log_is_written_by_the_keys_that_a_run_takes(tmp_path, capfd
     assert_same_log(open_log(tmp_path / "out.mcap"), open_log(source, LogConfig(**keys)))
 
 
-def test_a_rate_for_a_log_with_stamps_is_said_to_have_no_effect(tmp_path, capfd):
-    assert main(["convert", str(carmen(tmp_path)), str(tmp_path / "a.mcap"), "--rate", "5"]) == 0
-    assert "note: log.rate_hz 5 has no effect: the log has its own stamps" in capfd.readouterr().err
-
-
 def test_keys_that_mean_nothing_to_convert_are_refused(tmp_path, capfd):
     words = ["convert", str(tmp_path), str(tmp_path / "out.mcap"), "--log.min_range_m", "1"]
     assert main(words) == 2

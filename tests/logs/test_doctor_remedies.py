@@ -238,7 +238,7 @@ def test_the_flags_of_a_finding_help(world, tmp_path, capfd, fault):
 def test_every_flag_that_a_check_can_print_is_tried():
     """The flags in the texts of the checks are those of the faults above."""
     printed = set()
-    for node in ast.walk(ast.parse((ROOT / "pipeline/scanchain/logs/doctor/doctor.py").read_text())):
+    for node in ast.walk(ast.parse((ROOT / "pipeline/scanchain/logs/doctor.py").read_text())):
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             printed |= set(re.findall(r"--[a-z][a-z_.]*[a-z]", node.value))
     assert printed == {

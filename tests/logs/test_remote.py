@@ -15,12 +15,11 @@ from scanchain.__main__ import main
 from scanchain.config import LogConfig
 from scanchain.errors import InputError, MissingExtraError
 from scanchain.files import Address, source_of
-from scanchain.logs import files, open_log
-from scanchain.logs.mcap.index import walked
+from scanchain.logs import files, open_log, writer
+from scanchain.logs.mcap.index import Walk
 from scanchain.logs.mcap.records import FileIndex
-from scanchain.logs.mcap.selection import complete
+from scanchain.logs.mcap.stream import complete
 from scanchain.logs.opening import index_files
-from scanchain.logs.writing import writer
 from scanchain.runs.provenance import Provenance, identity_of
 from scanchain.simulation import simulate
 from tests.support.carmen_text import flaser, save
@@ -67,7 +66,8 @@ def test_an_index_by_the_summary_is_that_of_walking_the_file(site, log_file):
     (local,), (asked,) = index_files([log_file]), index_files([Address(site.log)])
     assert len(site.asked) == 2 and site.sent <= 65_537  # the last byte, and the tail
     checked = [replace(block, crc=asked.stored(block)[1]) for block in asked.blocks]
-    walk = walked(FileIndex(log_file, 0, log_file.read_bytes()))
+    walk = FileIndex(log_file, 0, log_file.read_bytes())
+    Walk(walk).walk()
     complete(walk)
     assert checked == walk.blocks and all(block.crc for block in checked)
     assert asked.channels == local.channels == walk.channels and asked.counts == local.counts == walk.counts

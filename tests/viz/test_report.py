@@ -22,8 +22,7 @@ from rerun.chunk import RrdReader
 from scanchain.__main__ import main
 from scanchain.comparison.figures import COLUMNS
 from scanchain.comparison.table import read_table
-from scanchain.logs.writing.pack import ORIGIN, pack_laser_scan, pack_odometry
-from scanchain.logs.writing.writer import LogWriter
+from scanchain.logs.writer import ORIGIN, LogWriter, pack_laser_scan, pack_odometry
 from scanchain.maps import read_ply
 from scanchain.runs.metrics import Metrics
 from scanchain.runs.overlay import OVERLAY_FILE

@@ -11,8 +11,7 @@ import numpy as np
 from scanchain import lie
 from scanchain.data import Pose
 from scanchain.logs.mcap.records import Channel, FileIndex
-from scanchain.logs.mcap.selection import Span
-from scanchain.logs.mcap.stream import first_messages, spread_messages
+from scanchain.logs.mcap.stream import Span, sampled_messages
 from scanchain.logs.messages.poses import StampedPose, chain
 from scanchain.logs.messages.readers import (
     has_transforms,
@@ -93,7 +92,7 @@ def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel 
     frame = _frame_of(indexes, lidar)
     stated = None
     if wheels is not None and is_odometry(wheels):
-        stated = next(first_messages(indexes, wheels.topic, pose_reader(wheels, 3)), None)
+        stated = next(sampled_messages(indexes, wheels.topic, pose_reader(wheels, 3)), None)
     bases = [name.lstrip("/") for name in ("" if stated is None else stated.child, *_BASE_FRAMES) if name]
     for base in bases:
         T_base_lidar = chain(fixed, base, frame)
@@ -101,7 +100,8 @@ def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel 
             return Mounting(base, frame, T_base_lidar)
     moving = _moving_transforms(indexes, topics, span)
     worlds = {"" if stated is None else stated.parent.lstrip("/")}
-    worlds |= {name for each in (*moving, *map(_edge, fixed)) for name in each if _is_of_the_world(name)}
+    frames = {name for edge in (*moving, *map(_edge, fixed)) for name in edge}
+    worlds |= {name for name in frames if _WORLD_WORDS & set(re.split(r"[/_]", name.lower()))}
     moving = {joint: poses for joint, poses in moving.items() if not worlds & set(joint)}
     tree = [*fixed, *(poses[0] for poses in moving.values())]
     base = next((base for base in bases if chain(tree, base, frame) is not None), "")
@@ -168,15 +168,10 @@ def _moving_transforms(
     """Messages of each transform that may change, from parts of the log spread over it."""
     found: dict[Edge, list[StampedPose]] = {}
     for topic, channel in topics.items():
-        for transforms in spread_messages(indexes, topic, reader(channel), span):
+        for transforms in sampled_messages(indexes, topic, reader(channel), span):
             for each in transforms:
                 found.setdefault(_edge(each), []).append(each)
     return found
-
-
-def _is_of_the_world(frame: str) -> bool:
-    """True if a frame has a name of those in which robots move: map, robot_1/odom, camera_init."""
-    return bool(_WORLD_WORDS & set(re.split(r"[/_]", frame.lower())))
 
 
 def _top(fixed: Sequence[StampedPose], moving: dict[Edge, list[StampedPose]], frame: str, worlds: set[str]) -> str:
@@ -237,7 +232,7 @@ def _static_transforms(indexes: Sequence[FileIndex]) -> list[StampedPose]:
     found: list[StampedPose] = []
     for topic, channel in topics_of(indexes).items():
         if topic.endswith("tf_static") and has_transforms(channel):
-            for transforms in first_messages(indexes, topic, reader(channel)):
+            for transforms in sampled_messages(indexes, topic, reader(channel)):
                 found += transforms
     return found
 
@@ -245,4 +240,4 @@ def _static_transforms(indexes: Sequence[FileIndex]) -> list[StampedPose]:
 def _frame_of(indexes: Sequence[FileIndex], lidar: Channel) -> str:
     """The frame of a lidar's first messages, empty where they name none."""
     read = reader(lidar)
-    return next(first_messages(indexes, lidar.topic, lambda data: read(data).frame), "").lstrip("/")
+    return next(sampled_messages(indexes, lidar.topic, lambda data: read(data).frame), "").lstrip("/")

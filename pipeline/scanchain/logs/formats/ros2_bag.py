@@ -9,9 +9,9 @@ from typing import Any
 
 from scanchain.errors import InputError, counted, one_line
 from scanchain.logs.files import size_of
-from scanchain.logs.formats.on_demand import on_demand_index
+from scanchain.logs.formats import on_demand_index
 from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
-from scanchain.logs.writing.pack import schema_text
+from scanchain.logs.writer import schema_text
 
 _BLOCK_BYTES = 8_000_000  # size of a block in bytes of the file, about
 _MOST_BLOCKS = 4096
@@ -27,8 +27,10 @@ def claims_ros2_bag(path: Path, head: bytes) -> bool:
 def index_ros2_bag(path: Path, number: int) -> FileIndex:
     """The topics of a .db3 or the folder of a ROS 2 bag. Raises InputError for what is none."""
     index, reader = on_demand_index(path, number), _open(path)
-    if not all(_is_valid(connection) for connection in reader.connections):
-        raise InputError(f"{path}: its metadata.yaml is damaged; ros2 bag reindex makes a new one")
+    for connection in reader.connections:
+        texts = connection.topic, connection.msgtype, connection.ext.serialization_format
+        if not (all(isinstance(text, str) for text in texts) and isinstance(connection.msgcount, int)):
+            raise InputError(f"{path}: its metadata.yaml is damaged; ros2 bag reindex makes a new one")
     bag = _Bag(index, reader)
     index.make = bag.make
     return index
@@ -70,7 +72,12 @@ class _Bag:
         chosen = [c for number, c in self.connections.items() if wanted is None or number in wanted]
         messages: list[Message] = []
         lost, first_ns, reason = 0, 0, ""
-        spans, tries = [self._ends(block)] if chosen else [], _MOST_TRIES
+        last = len(self.index.blocks) - 1  # the first and the last reach as far as time, whatever the metadata
+        whole = (
+            0 if block.offset == 0 else block.start_ns,
+            _LATEST_NS if block.offset == last else block.end_ns + 1,
+        )
+        spans, tries = [whole] if chosen else [], _MOST_TRIES
         with self.lock:
             while spans:
                 start_ns, stop_ns = spans.pop()
@@ -90,11 +97,6 @@ class _Bag:
                 ]
         what = f"at least {counted(lost, 'message')} from {first_ns * 1e-9:.3f} s on cannot be read ({reason})"
         return Contents(messages, f"{self.index.path}: {what}" if lost else "")
-
-    def _ends(self, block: Block) -> tuple[int, int]:
-        """First and last time of a block; the first and the last reach as far as time, whatever the metadata."""
-        is_first, is_last = block.offset == 0, block.offset == len(self.index.blocks) - 1
-        return 0 if is_first else block.start_ns, _LATEST_NS if is_last else block.end_ns + 1
 
     def _cut(self) -> None:
         """Spans of time of one length, so many that each holds a few megabytes on average."""
@@ -125,12 +127,6 @@ def _open(path: Path) -> Any:
 
 def _reason(error: Exception) -> str:
     return one_line(error) or type(error).__name__
-
-
-def _is_valid(connection: Any) -> bool:
-    """True if the metadata of a topic is of the right types."""
-    texts = connection.topic, connection.msgtype, connection.ext.serialization_format
-    return all(isinstance(text, str) for text in texts) and isinstance(connection.msgcount, int)
 
 
 def _channel(key: tuple[int, int], connection: Any) -> Channel:

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from scanchain.data import Pose
 from scanchain.errors import one_line
 from scanchain.kernels.cloud_fields import keep_valid
-from scanchain.logs.messages.point_times import NAMES, PointTimes
-from scanchain.logs.messages.returns import NO_TIMES, RangeLimits, Returns, moved
+from scanchain.logs.messages.returns import NAMES, NO_TIMES, PointTimes, RangeLimits, Returns, moved
 from scanchain.logs.messages.ros import MalformedMessageError, stamp_ns
 
 _FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
@@ -108,23 +107,6 @@ def read_livox(data: memoryview, encoding: str) -> PointCloudMessage:
 
 
 ReadPointCloud = Callable[[memoryview], PointCloudMessage]
-
-
-def column(message: PointCloudMessage, name: str) -> NDArray[np.generic] | None:
-    """One field of all points (N,), None where the cloud does not have it."""
-    for field in message.fields:
-        if field.name == name and field.datatype in _FORMATS:
-            number = np.dtype((">" if message.is_bigendian else "<") + _FORMATS[field.datatype])
-            if field.offset + number.itemsize > message.point_step:
-                return None
-            point = np.dtype({
-                "names": [name],
-                "formats": [number.str],
-                "offsets": [field.offset],
-                "itemsize": message.point_step,
-            })  # fmt: skip
-            return _rows(message, point)[name]
-    return None
 
 
 class Layout(NamedTuple):
