@@ -97,7 +97,8 @@ def solve(
     """
     outlier_free = config.robust == "none" or not is_loop.any()
     guess, source = first_guess(problem, poses, initialize, outlier_free=outlier_free)
-    shift = guess[:, :-1, -1].mean(axis=0)  # left twists turn about the origin: bring it into the middle
+    joined = np.unique(problem.edges) if len(problem.edges) else slice(None)
+    shift = guess[joined, :-1, -1].mean(axis=0)  # left twists turn about the origin: bring it into the middle
     guess[:, :-1, -1] -= shift
     loss = robust_loss(config.robust, config.robust_scale, problem.freedom)
     if since is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import get_args
 
 import numpy as np
@@ -35,7 +34,7 @@ from scanchain.graph.graduation import Rejection, Since
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.initialize import Initialization
 from scanchain.graph.odometry_errors import Slip, corrected
-from scanchain.graph.optimization import Optimization, Solved, solve
+from scanchain.graph.optimization import Optimization, solve
 
 
 class PoseGraph:
@@ -314,26 +313,32 @@ class PoseGraph:
 
         rejection : as in ``optimize``; what is judged is also explained by jumps of odometry there
         """
-        end = _End.of(self, first)
+        chosen = np.flatnonzero((self.edges >= first).any(axis=1))
+        edges, is_loop = self.edges[chosen], self.is_loop[chosen]
+        measured, information = (each[chosen - chosen[0]] for each in self.added_since(int(chosen[0])))
+        is_held = (np.arange(len(self)) < first) | self.fixed
+
+        def problem_of(further: Explanation) -> BetweenProblem:
+            return BetweenProblem(
+                edges, *further.applied(edges, measured, information, is_loop), is_held, self.is_point
+            )
+
+        none = Explanation.none(self.freedom)
         try:
-            solved = self._solved(end, config, rejection)
+            if rejection == "update":
+                solved = solve(problem_of(none), self.poses, is_loop, config, "given", Since(0, 0))
+            else:
+                explainer = Explainer(problem_of, measured, information, is_loop, config, jumps=True)
+                explained = explainer.solve(none, self.poses, "given")
+                solved, before = explained.solved, int((~self.is_loop).sum() - (~is_loop).sum())
+                self._explanation = self._explanation.with_later(explained.explanation, before)
         except SingularMatrixError as error:
-            raise self._singular(error, end.poses[~end.is_held]) from error
-        moved, weight = self.poses.copy(), self.weight.copy()
-        moved[end.poses], weight[end.chosen] = solved.poses, solved.minimum.weights
-        self._poses.replace(moved)
+            raise self._singular(error, np.flatnonzero(~is_held)) from error
+        weight = self.weight.copy()
+        weight[chosen] = solved.minimum.weights
+        self._poses.replace(solved.poses)
         self._weight.replace(weight)
         self._changed()
-
-    def _solved(self, end: _End, config: GraphConfig, rejection: Rejection) -> Solved:
-        none, poses = Explanation.none(self.freedom), self.poses[end.poses]
-        if rejection == "update":
-            return solve(end.problem_of(none), poses, end.is_loop, config, "given", Since(0, 0))
-        arrays = end.measured, end.information, end.is_loop
-        explained = Explainer(end.problem_of, *arrays, config, jumps=True).solve(none, poses, "given")
-        before = int((~self.is_loop).sum() - (~end.is_loop).sum())
-        self._explanation = self._explanation.with_later(explained.explanation, before)
-        return explained.solved
 
     def copy(self) -> PoseGraph:
         """The graph as it is, independent of what becomes of this one."""
@@ -504,42 +509,6 @@ class PoseGraph:
 
     def _changed(self) -> None:
         self._problem, self._factor_is_now = None, False
-
-
-@dataclass(frozen=True, slots=True)
-class _End:
-    """The last poses of a graph, with the edges to them, and the earlier ones that these join them to.
-
-    Attributes
-    ----------
-    chosen : (E,) the edges; poses : (K,) the poses at their ends, is_held (K,) the earlier ones
-    edges, measured, information, is_loop : (E, ...) of the edges, between places among these poses, odometry
-        corrected as it is now
-    """
-
-    chosen: NDArray[np.int64]
-    poses: NDArray[np.int64]
-    is_held: NDArray[np.bool_]
-    is_point: NDArray[np.bool_]
-    edges: NDArray[np.int64]
-    measured: Matrix
-    information: Matrix
-    is_loop: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, graph: PoseGraph, first: int) -> _End:
-        """The poses from this one on."""
-        chosen = np.flatnonzero((graph.edges >= first).any(axis=1))
-        poses, ends = np.unique(graph.edges[chosen], return_inverse=True)
-        measured, information = (each[chosen - chosen[0]] for each in graph.added_since(int(chosen[0])))
-        is_held = (poses < first) | graph.fixed[poses]
-        is_point, is_loop = graph.is_point[poses], graph.is_loop[chosen]
-        return cls(chosen, poses, is_held, is_point, ends.reshape(-1, 2), measured, information, is_loop)
-
-    def problem_of(self, explanation: Explanation) -> BetweenProblem:
-        """The problem under a further explanation."""
-        applied = explanation.applied(self.edges, self.measured, self.information, self.is_loop)
-        return BetweenProblem(self.edges, *applied, self.is_held, self.is_point)
 
 
 def _refused(undetermined: str) -> InputError:
