@@ -29,11 +29,11 @@ from scanchain.graph.edge_checks import (
     own_equations,
     ranks,
 )
-from scanchain.graph.explanation import Explained, Explainer, Explanation, corrections, odometry_of
+from scanchain.graph.explanation import Explained, Explainer
 from scanchain.graph.graduation import Rejection, Since
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.initialize import Initialization
-from scanchain.graph.odometry_errors import Slip, corrected
+from scanchain.graph.odometry_errors import Explanation, Loosened, corrected, odometry_of
 from scanchain.graph.optimization import Optimization, solve
 
 
@@ -108,27 +108,22 @@ class PoseGraph:
         return self._explanation.drift
 
     @property
-    def slips(self) -> tuple[Slip, ...]:
-        """Stretches of odometry that loop edges show to be off by more than their edges say."""
-        if not self._explanation.loosened:
-            return ()
-        odometry, errors = odometry_of(self.edges, self.is_loop), self._prepared().errors(self.poses)
-        arrays = errors[odometry], self._measurements.rows[odometry], self._information.rows[odometry]
-        return tuple(stretch.slip(*arrays) for stretch in self._explanation.loosened if not stretch.is_jump)
-
-    @property
-    def jumps(self) -> tuple[int, ...]:
-        """Edges of odometry, in the order of the poses, whose motion loop edges show to be wrong altogether."""
-        return self._explanation.jumps
+    def loosened(self) -> tuple[Loosened, ...]:
+        """Slips and jumps: stretches of odometry that loop edges show to be off by more than their edges say."""
+        return self._explanation.loosened
 
     def corrections(self, names: NDArray[np.int64], noun: str = "poses") -> list[str]:
         """Drift, slips and jumps in words, a line each; ``names`` (K,) number the poses for the reader."""
-        edges = self.edges[odometry_of(self.edges, self.is_loop)]
-        return corrections(self._explanation, self.slips, edges, names, noun)
+        if not self.drift.any() and not self.loosened:
+            return []
+        odometry = odometry_of(self.edges, self.is_loop)
+        errors = self._prepared().errors(self.poses)[odometry]
+        arrays = self._measurements.rows[odometry], self._information.rows[odometry]
+        return self._explanation.lines(names[self.edges[odometry]], noun, errors, *arrays)
 
     @property
     def information(self) -> Matrix:
-        """Ω of every edge, (E, k, k), that of odometry loosened in ``slips`` and ``jumps``."""
+        """Ω of every edge, (E, k, k), that of odometry loosened in slips and jumps."""
         return self._applied(self._explanation)[1]
 
     def added_since(self, first: int) -> tuple[Matrix, Matrix]:
@@ -289,8 +284,8 @@ class PoseGraph:
         except SingularMatrixError as error:
             raise self._singular(error, problem.free) from error
         self._problem, self._explanation = explained.problem, explained.explanation
-        solved, minimum = explained.solved, explained.solved.minimum
-        self._poses.replace(solved.poses)
+        minimum = explained.minimum
+        self._poses.replace(minimum.estimate.poses)
         self._weight.replace(minimum.weights)
         self._factor_is_now = False
         edges = len(self.edges)
@@ -304,7 +299,7 @@ class PoseGraph:
             iterations=minimum.iterations,
             converged=minimum.converged,
             reason=minimum.reason,
-            initialization=solved.initialization,
+            initialization=minimum.initialization,
             time_s=working_s() - begin,
         )
 
@@ -326,17 +321,17 @@ class PoseGraph:
         none = Explanation.none(self.freedom)
         try:
             if rejection == "update":
-                solved = solve(problem_of(none), self.poses, is_loop, config, "given", Since(0, 0))
+                minimum = solve(problem_of(none), self.poses, is_loop, config, "given", Since(0, 0))
             else:
                 explainer = Explainer(problem_of, measured, information, is_loop, config, jumps=True)
                 explained = explainer.solve(none, self.poses, "given")
-                solved, before = explained.solved, int((~self.is_loop).sum() - (~is_loop).sum())
+                minimum, before = explained.minimum, int((~self.is_loop).sum() - (~is_loop).sum())
                 self._explanation = self._explanation.with_later(explained.explanation, before)
         except SingularMatrixError as error:
             raise self._singular(error, np.flatnonzero(~is_held)) from error
         weight = self.weight.copy()
-        weight[chosen] = solved.minimum.weights
-        self._poses.replace(solved.poses)
+        weight[chosen] = minimum.weights
+        self._poses.replace(minimum.estimate.poses)
         self._weight.replace(weight)
         self._changed()
 
@@ -451,8 +446,8 @@ class PoseGraph:
     ) -> Explained:
         """The minimum, with the errors of odometry that explain loop edges; those at hand for an update."""
         if rejection == "update" and config.robust == "truncated":
-            solved = solve(problem, self.poses, self.is_loop, config, initialize, self.since)
-            return Explained(problem, solved, self._explanation)
+            minimum = solve(problem, self.poses, self.is_loop, config, initialize, self.since)
+            return Explained(problem, minimum, self._explanation)
         measured, information = self._measurements.rows, self._information.rows
         explainer = Explainer(self._problem_of, measured, information, self.is_loop, config)
         return explainer.solve(self._explanation, self.poses, initialize)
