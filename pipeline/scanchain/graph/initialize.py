@@ -28,7 +28,7 @@ def first_guess(
     "auto" keeps the poses at hand where they fit, else takes the better of them and the chordal relaxation. Where
     there may be outliers it keeps them in any case: no other guess is safe from a false loop.
     """
-    fixed, to_point = problem.variable < 0, problem.is_point[problem.edges].any(axis=1)
+    fixed, to_point = problem.variable < 0, np.asarray(problem.is_point[problem.edges].any(axis=1))
     if initialize in ("odometry", "spanning-tree"):
         follow = follow_odometry if initialize == "odometry" else follow_spanning_tree
         chained = follow(poses, fixed, problem.edges[~to_point], problem.measurements[~to_point])
