@@ -10,8 +10,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.linalg import spilu
 
 from scanchain.data import Matrix
-from scanchain.kernels.graph import cholesky, fronts, inverse, scatter, symbolic
-from scanchain.kernels.graph.fronts import Fronts
+from scanchain.kernels.graph import cholesky, fronts, inverse, symbolic
 
 _LOST_DIGITS = 1e-13  # a pivot below this share of its diagonal entry is rounding noise
 
@@ -51,9 +50,15 @@ class BlockPattern:
 
     def multiply(self, values: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
         """The product of the symmetric matrix of these values with a vector (scalars,)."""
-        result = np.zeros(self.scalars)
-        scatter.multiply(self.rows, self.columns, self.starts, self.sizes, values, x, result)
-        return result
+        counts = self.sizes[self.rows] * self.sizes[self.columns]
+        block, within = np.repeat(np.arange(len(counts)), counts), _ranges(np.zeros_like(counts), counts)
+        row, column = (starts[block] for starts in (self.starts[self.rows], self.starts[self.columns]))
+        below, beside = np.divmod(within, self.sizes[self.columns][block])
+        row, column, is_pair = row + below, column + beside, row != column
+        turned = (values * x[row])[is_pair]
+        return np.bincount(row, values * x[column], self.scalars) + np.bincount(
+            column[is_pair], turned, self.scalars
+        )
 
 
 class Packing:
@@ -135,11 +140,6 @@ class SparseCholesky:
         self._every_front = np.arange(len(self._fronts.pivots))
         self._first_pivot = np.cumsum(self._fronts.pivots) - self._fronts.pivots
         self._front_of = np.repeat(self._every_front, self._fronts.pivots)
-
-    @property
-    def entries(self) -> int:
-        """Stored entries of the factor, explicit zeros included."""
-        return int(self._fronts.factor_start[-1])
 
     @property
     def work(self) -> float:
@@ -258,16 +258,11 @@ def _fill_reducing_order(start: NDArray[np.int64], neighbors: NDArray[np.int64])
 
 def upper_factor(cholesky: SparseCholesky) -> csr_matrix:
     """U of the last factorization, A = Uᵀ U, in the order of elimination, with explicit zeros of the fill-in."""
-    return front_rows(cholesky._fronts, cholesky.factor)
-
-
-def front_rows(fronts: Fronts, factor: NDArray[np.float64]) -> csr_matrix:
-    """The upper triangular matrix whose rows the fronts store, in the order of elimination."""
-    widths = np.diff(fronts.row_start)
-    count = int(fronts.pivots.sum())
-    front = np.repeat(np.arange(len(widths)), fronts.pivots)
-    within = _ranges(np.zeros_like(fronts.pivots), fronts.pivots)
+    layout, size = cholesky._fronts, cholesky.pattern.scalars
+    widths = np.diff(layout.row_start)
+    front = np.repeat(np.arange(len(widths)), layout.pivots)
+    within = _ranges(np.zeros_like(layout.pivots), layout.pivots)
     lengths = widths[front] - within
     row_start = np.concatenate([[0], np.cumsum(lengths)])
-    columns = fronts.rows[_ranges(fronts.row_start[front] + within, lengths)]
-    return csr_matrix((factor.copy(), columns, row_start), shape=(count, count))
+    columns = layout.rows[_ranges(layout.row_start[front] + within, lengths)]
+    return csr_matrix((cholesky.factor.copy(), columns, row_start), shape=(size, size))
