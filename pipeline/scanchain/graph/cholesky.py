@@ -55,10 +55,9 @@ class BlockPattern:
         row, column = (starts[block] for starts in (self.starts[self.rows], self.starts[self.columns]))
         below, beside = np.divmod(within, self.sizes[self.columns][block])
         row, column, is_pair = row + below, column + beside, row != column
-        turned = (values * x[row])[is_pair]
-        return np.bincount(row, values * x[column], self.scalars) + np.bincount(
-            column[is_pair], turned, self.scalars
-        )
+        result = np.bincount(row, values * x[column], self.scalars)
+        result += np.bincount(column[is_pair], (values * x[row])[is_pair], self.scalars)
+        return result.astype(np.float64, copy=False)
 
 
 class Packing:
