@@ -51,7 +51,7 @@ class BlockPattern:
     def multiply(self, values: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
         """The product of the symmetric matrix of these values with a vector (scalars,)."""
         counts = self.sizes[self.rows] * self.sizes[self.columns]
-        block, within = np.repeat(np.arange(len(counts)), counts), _ranges(np.zeros_like(counts), counts)
+        block, within = np.repeat(np.arange(len(counts)), counts), fronts.ranges(np.zeros_like(counts), counts)
         row, column = (starts[block] for starts in (self.starts[self.rows], self.starts[self.columns]))
         below, beside = np.divmod(within, self.sizes[self.columns][block])
         row, column, is_pair = row + below, column + beside, row != column
@@ -191,9 +191,9 @@ class SparseCholesky:
         With A = Uᵀ U it is CᵀC, Uᵀ C = B: half of a solve, by the fronts between these variables and the roots of
         the elimination tree alone.
         """
-        places = self._places[_ranges(self.pattern.starts[variables], self.pattern.sizes[variables])]
+        places = self._places[fronts.ranges(self.pattern.starts[variables], self.pattern.sizes[variables])]
         path, local = self._path(places), np.empty(self._fronts.widest)
-        reached = _ranges(self._first_pivot[path], self._fronts.pivots[path])
+        reached = fronts.ranges(self._first_pivot[path], self._fronts.pivots[path])
         x, C = np.zeros(self.pattern.scalars), np.empty((B.shape[1], len(reached)))
         for row, column in zip(C, B.T, strict=True):
             x[places] = column
@@ -222,11 +222,6 @@ class SparseCholesky:
         result = np.empty(self.pattern.value_count)
         inverse.selected_inverse(self._fronts, self._blocks, self.factor, result, *self._room())
         return result
-
-
-def _ranges(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The numbers from each start on, so many, one range after the other."""
-    return np.repeat(starts - np.cumsum(counts) + counts, counts) + np.arange(int(counts.sum()))
 
 
 def _adjacency(pattern: BlockPattern) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -260,8 +255,8 @@ def upper_factor(cholesky: SparseCholesky) -> csr_matrix:
     layout, size = cholesky._fronts, cholesky.pattern.scalars
     widths = np.diff(layout.row_start)
     front = np.repeat(np.arange(len(widths)), layout.pivots)
-    within = _ranges(np.zeros_like(layout.pivots), layout.pivots)
+    within = fronts.ranges(np.zeros_like(layout.pivots), layout.pivots)
     lengths = widths[front] - within
     row_start = np.concatenate([[0], np.cumsum(lengths)])
-    columns = layout.rows[_ranges(layout.row_start[front] + within, lengths)]
+    columns = layout.rows[fronts.ranges(layout.row_start[front] + within, lengths)]
     return csr_matrix((cholesky.factor.copy(), columns, row_start), shape=(size, size))
