@@ -6,11 +6,10 @@ import pytest
 from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.graph.between import BetweenProblem
-from scanchain.graph.certificate import Minorants, minorize
+from scanchain.graph.certificate import Minorants, dual_matrix, minorize
 from scanchain.graph.cholesky import BlockPattern
 from scanchain.graph.g2o import read_g2o
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.kernels.graph.dual import scatter_dual
 from tests.support import naive_graph
 from tests.support.scenes import shared_data
 
@@ -113,9 +112,7 @@ def test_the_dual_matrix_is_the_sum_of_the_bounds_of_the_edges(dimension):
     A = rng.normal(size=(6, k, k))
     problem = BetweenProblem(edges, measured, A @ np.swapaxes(A, 1, 2) + np.eye(k), np.zeros(count, bool))
     bound = minorize(problem, poses, np.ones(6))
-    blocks = np.zeros((len(problem.pattern.rows), dimension + 1, dimension + 1))
-    residual = np.zeros((count, dimension + 1, dimension))
-    scatter_dual(bound.leap, bound.force, bound.torque, bound.tau, bound.kappa, problem.slots, blocks, residual)
+    blocks, residual = dual_matrix(problem, bound, np.ones(6, bool))
     pattern = BlockPattern(np.full(count, dimension + 1), problem.pattern.pairs)
     S = naive_graph.dense(pattern, blocks.reshape(-1))
 

@@ -8,10 +8,9 @@ from scanchain.config import GraphConfig
 from scanchain.data import Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import absolute_error, expected_ate, pair
-from scanchain.graph.explanation import Explanation
 from scanchain.graph.g2o import read_g2o
 from scanchain.graph.minimizer import Evaluation, Optimizer, full_curvature
-from scanchain.graph.odometry_errors import Loosened
+from scanchain.graph.odometry_errors import Explanation, Loosened
 from scanchain.graph.pose_graph import PoseGraph
 from tests.support.naive_graph import dense, normal_equations
 from tests.support.scenes import shared_data

@@ -14,7 +14,6 @@ from scanchain.errors import counted
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.cholesky import BlockPattern, Packing, SingularMatrixError, SparseCholesky
 from scanchain.graph.edge_checks import is_connected
-from scanchain.kernels.graph.dual import scatter_dual
 
 _ZERO_CHI2 = 1e-9  # of the largest information, or of 1 if that is less: below it χ² is zero but for rounding
 _EXACT = 1e-12  # share of χ² that rounding alone may amount to
@@ -121,12 +120,7 @@ def certify(
 def _gap(problem: BetweenProblem, minorants: Minorants, kept: NDArray[np.bool_], chi2: float) -> float | None:
     """χ² less the best bound that a few shifts of the dual matrix give, None where none gives any."""
     n, d = len(problem.free), minorants.leap.shape[1]
-    blocks = np.zeros((len(problem.pattern.rows), d + 1, d + 1))
-    residual = np.zeros((n, d + 1, d))
-    scatter_dual(
-        minorants.leap[kept], minorants.force[kept], minorants.torque[kept], minorants.tau[kept],
-        minorants.kappa[kept], problem.slots[kept], blocks, residual,
-    )  # fmt: skip
+    blocks, residual = dual_matrix(problem, minorants, kept)
     sizes = np.where(problem.is_point[problem.free], 1, d + 1)
     pattern = BlockPattern(sizes, problem.pattern.pairs)
     packing = Packing(pattern, d + 1, at_end=True)
@@ -143,6 +137,36 @@ def _gap(problem: BetweenProblem, minorants: Minorants, kept: NDArray[np.bool_],
         right = packing.rows(residual + shift * rotation[:, :d])
         return float((right * factor.solve(right)).sum())
     return None
+
+
+def dual_matrix(problem: BetweenProblem, bound: Minorants, kept: NDArray[np.bool_]) -> tuple[Matrix, Matrix]:
+    """S = Q − Λ of the bounds of the edges kept (E,), as blocks of the problem's pattern, and S X* (n, d+1, d).
+
+    Unknowns are G_i, the rotation of pose i against its estimate, seen from the world, and t_i, its position; at
+    the estimate X* every G is I. An edge contributes
+        q = τ‖t_j − t_i − G_i l‖² + fᵀG_iᵀ(t_j − t_i) + ½ κ‖G_i − G_j‖² + ½ ⟨[g]×, G_iᵀG_j⟩
+    and, by the multiplier Λ_i of G_iᵀG_i = I that makes X* stationary, −½ sym(f lᵀ) at G_i
+    (Carlone et al. 2015, eq. 26; Rosen et al. 2019, eq. 22). A row of S belongs to one row of each G and of t.
+    """
+    parts = (bound.leap, bound.force, bound.torque, bound.tau, bound.kappa)
+    leap, force, torque, tau, kappa = (np.where(kept.reshape(-1, *(x.ndim - 1) * [1]), x, 0.0) for x in parts)
+    d = leap.shape[1]
+    R, t = slice(0, d), d
+    of_i, of_j, coupling = (np.zeros((len(kept), d + 1, d + 1)) for _ in range(3))
+    bent, stretch = force[:, :, None] * leap[:, None], tau[:, None] * leap
+    even = 0.5 * kappa[:, None, None] * np.eye(d)
+    of_i[:, R, R] = stretch[:, :, None] * leap[:, None] - 0.25 * (bent + np.swapaxes(bent, 1, 2)) + even
+    of_i[:, R, t] = of_i[:, t, R] = stretch - 0.5 * force
+    of_j[:, R, R] = even
+    of_i[:, t, t] = of_j[:, t, t] = tau
+    coupling[:, R, R], coupling[:, R, t], coupling[:, t, t] = 0.25 * torque - even, 0.5 * force - stretch, -tau
+    residual = np.zeros((len(problem.free) + 1, d + 1, d))  # the last one of the fixed poses
+    i, j, _ = problem.slots.T
+    np.add.at(residual[:, R], i, 0.25 * (bent - np.swapaxes(bent, 1, 2) + torque))
+    np.add.at(residual[:, R], j, -0.25 * torque)
+    np.add.at(residual[:, t], i, -0.5 * force)
+    np.add.at(residual[:, t], j, 0.5 * force)
+    return problem.scattered(of_i, of_j, coupling), residual[:-1]
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,31 +24,6 @@ def squared_norms(errors: _Array, information: _Array, chi2: _Array) -> None:
 
 
 @njit(nogil=True)
-def multiply(
-    rows: NDArray[np.int64],
-    columns: NDArray[np.int64],
-    starts: NDArray[np.int64],
-    sizes: NDArray[np.int64],
-    values: _Array,
-    x: _Array,
-    result: _Array,
-) -> None:
-    """Add A x to the result; A is symmetric, of blocks (rows, columns) of which one triangle is given.
-
-    starts, sizes (n,) : scalars of the variables; values : the blocks one after the other, row-major
-    """
-    at = 0
-    for b in range(rows.size):
-        row, column = starts[rows[b]], starts[columns[b]]
-        for r in range(sizes[rows[b]]):
-            for c in range(sizes[columns[b]]):
-                result[row + r] += values[at] * x[column + c]
-                if row != column:
-                    result[column + c] += values[at] * x[row + r]
-                at += 1
-
-
-@njit(nogil=True)
 def scatter_between(
     jacobian: _Array,
     errors: _Array,
