@@ -7,9 +7,10 @@ import pytest
 
 from scanchain import lie
 from scanchain.verdict import Kind, Stretch
+from scanchain_viz.colors import palette_of
 from scanchain_viz.pictures.axis import Axis, width_of
-from scanchain_viz.pictures.figure import Plot, palette_of
-from scanchain_viz.pictures.map_figures import draw_points
+from scanchain_viz.pictures.figure import Plot
+from scanchain_viz.pictures.maps import draw_points
 from scanchain_viz.pictures.run import GridPicture, draw_map
 
 image = pytest.importorskip("matplotlib.image")
@@ -140,7 +141,7 @@ def test_a_logarithmic_axis_has_decades_and_where_they_are_few_more(ends, shown)
 def test_what_is_known_of_a_line_is_within_its_axes_and_breaks_where_it_is_not(name):
     x, y = np.array([1.0, 2.0, np.nan, 4.0, 5.0]), np.array([1.0, 10.0, 10.0, 100.0, 3.0])
     figure = Plot(logarithmic=name)
-    figure.line(x, y, "red")
+    figure.line(np.stack([x, y], axis=1), "red")
     drawn = re.search(r'<path d="([^"]*)" style="stroke: red', figure.svg())[1]
     assert re.sub(r"[\d. -]", "", drawn) == "MLML"
     places = numbers_of(drawn).reshape(-1, 2) / figure.extent
@@ -154,7 +155,7 @@ def test_what_is_known_of_a_line_is_within_its_axes_and_breaks_where_it_is_not(n
 def test_a_line_of_many_points_is_as_long_as_it_looks_and_ends_where_it_ends():
     angle = np.linspace(0.0, 1.9 * np.pi, 100_000)
     figure = Plot.of_plan(np.full(2, -1.1), np.full(2, 1.1))
-    figure.line(np.cos(angle), np.sin(angle), "red")
+    figure.line(np.stack([np.cos(angle), np.sin(angle)], axis=1), "red")
     end = np.array([np.cos(angle[-1]), np.sin(angle[-1])])
     svg = figure.svg()
     assert len(svg) < 150_000

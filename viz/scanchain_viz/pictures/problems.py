@@ -13,7 +13,8 @@ from scanchain.data import GraphState, Matrix
 from scanchain.graph.optimization import GraphChange, fit
 from scanchain.landmarks.compare import MethodResult
 from scanchain.landmarks.study import Estimate, Study
-from scanchain_viz.pictures.figure import INK, Plot, broken, palette_of, write_png
+from scanchain_viz.colors import palette_of
+from scanchain_viz.pictures.figure import INK, Plot, broken, write_png
 
 _CHAIN, _LOOP, _REJECTED = "#1f5fd0", "#8a8f98", "#d03030"
 _SEEN_FROM = np.array([[0.80, 0.60, 0.0], [-0.30, 0.40, 0.866]])  # rows: right and up of an oblique view, in 3D
@@ -55,7 +56,7 @@ def _graph(state: GraphState) -> Plot:
         (state.is_rejected, _REJECTED, width, "rejected"),
     ):
         if chosen.any():
-            figure.path(broken(seen[state.edges[chosen]]), color, thickness, name=name)
+            figure.line(broken(seen[state.edges[chosen]]), color, thickness, name=name)
     return figure
 
 
@@ -82,7 +83,7 @@ def plot_after(study: Study) -> Plot:
     along = axes_m[:, None] * np.stack([np.cos(around), np.sin(around)], axis=-1)
     c, s = np.cos(angles_rad), np.sin(angles_rad)
     outlines = along @ np.stack([c, s, -s, c], axis=-1).reshape(-1, 2, 2) + _in_truth(study.after)[1][:, None]
-    figure.path(broken(outlines), AFTER, 0.6, opacity=0.5, name="95 % ellipse of a landmark")
+    figure.line(broken(outlines), AFTER, 0.6, opacity=0.5, name="95 % ellipse of a landmark")
     return figure
 
 
@@ -91,8 +92,8 @@ def _plot(study: Study, estimate: Estimate, color: str, when: str) -> Plot:
     figure = Plot.of_plan(*_with_margin(np.concatenate(points)))
     poses, landmarks = _in_truth(estimate)
     if len(study.true_poses):
-        figure.path(study.true_poses, INK, 1.1, (4.0, 2.0), name="true trajectory")
-    figure.path(poses, color, opacity=0.85, name=f"trajectory {when}")
+        figure.line(study.true_poses, INK, 1.1, (4.0, 2.0), name="true trajectory")
+    figure.line(poses, color, opacity=0.85, name=f"trajectory {when}")
     if np.isfinite(study.true_landmarks).any():
         figure.marks(study.true_landmarks, "+", INK, 7.0, line=0.9, name="true landmarks")
     figure.marks(landmarks, "o", color, 4.0, line=0.9, name=f"landmarks {when}")

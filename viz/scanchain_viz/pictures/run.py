@@ -19,10 +19,9 @@ from scanchain.maps import open_saved_map, read_map, read_ply
 from scanchain.runs.directory import TRUTH_FILE
 from scanchain.trajectory import read_tum
 from scanchain.verdict import Kind, Stretch
-from scanchain_viz.colors import STRETCH_COLORS
-from scanchain_viz.pictures.figure import Floats, Plot, palette_of, write_png
-from scanchain_viz.pictures.map_figures import draw_points, extent, map_points
-from scanchain_viz.pictures.trajectory_figures import TRUTH, color_of
+from scanchain_viz.colors import STRETCH_COLORS, TRUTH, color_of, palette_of
+from scanchain_viz.pictures.figure import Floats, Plot, write_png
+from scanchain_viz.pictures.maps import draw_points, extent, map_points
 
 _WIDTH_INCHES = 8.0
 _ODOMETRY, _OPTIMIZED = "#e07b00", "#1f5fd0"
@@ -79,7 +78,7 @@ def draw_map(
     for each in stretches:
         if each.kind is not Kind.LOOPS:
             part = optimized[max(each.first - 1, 0) : each.last + 1, :2, -1]
-            figure.path(part, STRETCH_COLORS[each.kind], 3.0, name=str(each.kind))
+            figure.line(part, STRETCH_COLORS[each.kind], 3.0, name=str(each.kind))
     for place, shape, name in ((0, "o", "start"), (-1, "s", "end")):
         if len(optimized):
             figure.marks(optimized[place, None, :2, -1], shape, _OPTIMIZED, 7.0, line=1.0, name=name)
@@ -120,7 +119,7 @@ def _draw_path(
     """Draw one line, its length in the legend."""
     if poses is not None and len(poses):
         length_m = float(np.linalg.norm(np.diff(poses[:, :-1, -1], axis=0), axis=1).sum())
-        figure.path(poses[:, :2, -1], color, width, dashes, name=f"{name} ({length_m:.0f} m)")
+        figure.line(poses[:, :2, -1], color, width, dashes, name=f"{name} ({length_m:.0f} m)")
 
 
 def draw_evaluated(picture: Path, evaluated: Mapping[str, tuple[Matrix, Matrix]]) -> None:

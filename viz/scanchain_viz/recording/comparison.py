@@ -16,8 +16,7 @@ from scanchain.comparison.table import Table, read_table
 from scanchain.maps import read_ply
 from scanchain.trajectory import read_tum
 from scanchain_viz.colors import rgb
-from scanchain_viz.pictures.compared_trajectories import read_trajectories
-from scanchain_viz.pictures.trajectory_figures import DrawnTrajectory
+from scanchain_viz.pictures.trajectories import DrawnTrajectory, trajectories_of_comparison
 from scanchain_viz.recording import drawing, entities
 from scanchain_viz.recording.blueprint import scene, time_panel, up_to_now, whole_log
 from scanchain_viz.recording.drawing import Message, Times
@@ -31,7 +30,7 @@ _PLOTS = {"error": "position error [m]", "time": "time of a scan [ms]"}
 
 def record_comparison(directory: Path) -> None:
     """Write compare.rrd into a comparison's directory. Raises OSError."""
-    table, trajectories = read_table(directory), read_trajectories(directory)
+    table, trajectories = read_table(directory), trajectories_of_comparison(directory)
     name, messages = Path(table.log.split(", ")[0]).name, _messages(directory, trajectories, _stamps(directory))
     layout = _blueprint(trajectories, table)
     write_recording(directory / RECORDING_FILE, name, table.dimension, layout, messages, kind="comparison ")

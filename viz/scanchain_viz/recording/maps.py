@@ -17,7 +17,7 @@ from scanchain.sessions.changes import Changes, Label
 from scanchain.sessions.localize import LocalizedLog
 from scanchain.sessions.localizer import MapState
 from scanchain_viz.colors import rgb
-from scanchain_viz.pictures.map_figures import DrawnMerge, map_points, read_merge
+from scanchain_viz.pictures.maps import DrawnMerge, map_points, read_merge
 from scanchain_viz.recording import drawing, entities
 from scanchain_viz.recording.blueprint import scene, time_panel, whole_log
 from scanchain_viz.recording.drawing import Message, Times

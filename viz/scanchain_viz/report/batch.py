@@ -18,8 +18,8 @@ from scanchain.files import source_of, without_keys
 from scanchain.runs.metrics import Metrics
 from scanchain.trajectory import read_tum
 from scanchain.verdict import MOST_CONTRADICTED
+from scanchain_viz.colors import color_of
 from scanchain_viz.pictures.figure import Plot
-from scanchain_viz.pictures.trajectory_figures import color_of
 from scanchain_viz.report import page
 
 _MAX_TRAJECTORIES = 60
@@ -151,13 +151,13 @@ def _values(done: Sequence[Row], figure: Callable[[Row, Metrics], float | None])
 
 
 def _sorted_values(name: str, unit: str, values: Sequence[float]) -> Markup:
-    figure, ordered = Plot(), np.array(values)
-    share = 100.0 * (np.arange(len(values)) + 1) / len(values)
-    figure.steps(ordered, share, color_of(0))
-    figure.marks(np.stack([ordered, share], axis=1), "o", color_of(0), 3.5)
+    figure = Plot(f"{name} [{unit}]", "logs below [%]")
+    points = np.stack([values, 100.0 * (np.arange(len(values)) + 1) / len(values)], axis=1)
+    steps = np.stack([np.repeat(points[:, 0], 2)[1:], np.repeat(points[:, 1], 2)[:-1]], axis=1)
+    figure.line(steps, color_of(0))
+    figure.marks(points, "o", color_of(0), 3.5)
     figure.x.limit(0.0, _BEYOND * max(values) or 1.0)
     figure.y.limit(0.0, 105.0)
-    figure.x.label, figure.y.label, figure.has_grid = f"{name} [{unit}]", "logs below [%]", True
     return figure.svg()
 
 
@@ -179,8 +179,7 @@ def _trajectory(trajectory: Path) -> Markup:
     rows = np.linspace(0, len(positions) - 1, min(len(positions), _MAX_POINTS)).astype(int)
     middle, size = 0.5 * (positions.min(axis=0) + positions.max(axis=0)), np.ptp(positions, axis=0)
     half = _BEYOND * 0.5 * (max(size / _BOX) or 1.0) * _BOX
-    figure = Plot.of_plan(middle - half, middle + half)
-    figure.path(positions[rows], color_of(0))
+    figure = Plot.of_plan(middle - half, middle + half, has_grid=True)
+    figure.line(positions[rows], color_of(0))
     figure.marks(positions[:1], "o", color_of(0), 5.0)
-    figure.has_grid = True
     return figure.svg()

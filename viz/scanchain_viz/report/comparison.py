@@ -15,10 +15,9 @@ from scanchain.comparison.table import Row as TableRow
 from scanchain.comparison.table import Table, read_table
 from scanchain.maps import read_ply
 from scanchain.trajectory import read_tum
-from scanchain_viz.pictures import trajectory_figures as figures
-from scanchain_viz.pictures.compared_trajectories import read_trajectories
-from scanchain_viz.pictures.map_figures import map_picture, surroundings
-from scanchain_viz.pictures.trajectory_figures import DrawnTrajectory, Floats
+from scanchain_viz.pictures.figure import Floats
+from scanchain_viz.pictures.maps import map_picture, surroundings
+from scanchain_viz.pictures.trajectories import DrawnTrajectory, frame, trajectories_of_comparison
 from scanchain_viz.report import page, sections
 
 _VERDICT = page.Head(
@@ -30,7 +29,7 @@ _NEARLY = 1.25  # thickness of a map over that of the sharpest, up to which it f
 
 def write_compare_report(directory: Path) -> None:
     """Draw and write the page."""
-    table, trajectories = read_table(directory), read_trajectories(directory)
+    table, trajectories = read_table(directory), trajectories_of_comparison(directory)
     truth_file = directory / TRUTH_FILE
     truth = read_tum(truth_file).poses[:, :3, 3] if truth_file.exists() else None
     whole = page.Page(
@@ -136,12 +135,12 @@ def _sections(
         yield from sections.relation_section(drawn)
         yield from sections.time_section(drawn)
         yield from sections.uncertainty_section(drawn, is_planar=is_planar)
-        yield from _map_section(directory, drawn, framing, figures.frame(framing, truth), table.dimension)
+        yield from _map_section(directory, drawn, framing, frame(framing, truth), table.dimension)
     settings = {row.name: row.settings for row in table.rows}
     for trajectory in trajectories:
         yield from sections.loop_section(
             trajectory,
-            method_folder(directory, trajectory.name) / CLOSURES_FILE,
+            sections.read_closures(method_folder(directory, trajectory.name) / CLOSURES_FILE),
             f"Loop closures of {trajectory.name}",
             float(settings[trajectory.name].get("loops", {}).get("min_travel_m", 0.0)),
         )

@@ -22,23 +22,12 @@ from scanchain.sessions.localize import LocalizedLog
 from scanchain.sessions.localizer import MapState
 from scanchain.sessions.merging import MergeMetrics
 from scanchain.verdict import Judged
-from scanchain_viz.colors import hex_of
-from scanchain_viz.pictures.figure import INK, Plot
-from scanchain_viz.pictures.map_figures import (
-    DrawnMerge,
-    draw_points,
-    extent,
-    map_points,
-    merge_picture,
-    path_over_map,
-    read_merge,
-    surroundings,
-)
-from scanchain_viz.pictures.trajectory_figures import PathLine
-from scanchain_viz.recording.drawing import in_space
+from scanchain_viz.colors import CLOSURES, hex_of
+from scanchain_viz.pictures import maps
+from scanchain_viz.pictures.figure import INK, Line, Plot, broken
 from scanchain_viz.report import page
-from scanchain_viz.report.sections import provenance_sections
-from scanchain_viz.report.trajectory_map import SCRIPT, interactive_map
+from scanchain_viz.report.scene import SCRIPT, interactive_map
+from scanchain_viz.report.sections import chip, configuration, provenance_sections
 
 _HEADS = (
     page.Head("session"),
@@ -70,7 +59,7 @@ def write_merge_report(directory: Path) -> None:
     metrics = msgspec.json.decode((directory / "metrics.json").read_bytes(), type=MergeMetrics)
     made = msgspec.json.decode((directory / RUN_FILE).read_bytes(), type=Provenance)
     summary = (directory / "summary.txt").read_text(encoding="utf-8")
-    drawn = read_merge(directory)
+    drawn = maps.read_merge(directory)
     whole = page.Page(
         title="Merged map",
         subtitle=summary.partition("\n")[0].removeprefix("merged").strip(),
@@ -80,9 +69,7 @@ def write_merge_report(directory: Path) -> None:
         sections=(_merged_map(directory, drawn, metrics), _sessions(drawn, metrics)),
         collapsibles=(
             *provenance_sections(made, {}),
-            page.Collapsible(
-                "Configuration", (directory / "config.toml").read_text(encoding="utf-8"), is_long=True
-            ),
+            configuration(directory),
         ),
         script=SCRIPT,
     )
@@ -99,24 +86,23 @@ def _merge_facts(m: MergeMetrics) -> Iterator[tuple[str, str]]:
     yield "time", f"{m.run_s:.1f} s"
 
 
-def _merged_map(directory: Path, drawn: DrawnMerge, metrics: MergeMetrics) -> page.Section:
-    points = in_space(read_ply(directory / "map.ply")).astype(float)
-    low, high = surroundings(drawn.positions.min(axis=0), drawn.positions.max(axis=0), [points])
-    lines = [PathLine(each.positions, each.color, 1.4) for each in drawn.sessions]
+def _merged_map(directory: Path, drawn: maps.DrawnMerge, metrics: MergeMetrics) -> page.Section:
+    points = read_ply(directory / "map.ply").astype(float)
+    low, high = maps.surroundings(drawn.positions.min(axis=0), drawn.positions.max(axis=0), [points])
+    closures = Line("", broken(drawn.closures), CLOSURES[""][1], 0.5)
     is_flat = metrics.dimension == 2
     drawings = (
         page.Drawing(
             "Sessions over the map",
             "Seen from above; thin lines: closures in force between sessions.",
-            merge_picture(drawn, points, low, high),
+            maps.path_over_map(points, [closures, *drawn.sessions], low, high),
         ),
-        interactive_map(points, lines, low, high, grain_m=drawn.grain_m, is_flat=is_flat),
+        interactive_map(points, drawn.sessions, low, high, grain_m=drawn.grain_m, is_flat=is_flat),
     )
-    chips = tuple(page.Chip(each.name, each.color) for each in drawn.sessions)
-    return page.Section("Map", chips=chips, drawings=drawings)
+    return page.Section("Map", chips=tuple(map(chip, drawn.sessions)), drawings=drawings)
 
 
-def _sessions(drawn: DrawnMerge, metrics: MergeMetrics) -> page.Section:
+def _sessions(drawn: maps.DrawnMerge, metrics: MergeMetrics) -> page.Section:
     rows = tuple(
         page.Row(
             each.name,
@@ -126,7 +112,7 @@ def _sessions(drawn: DrawnMerge, metrics: MergeMetrics) -> page.Section:
                 f"{each.closures:,}",
                 *([f"{each.removed_points:,}"] if metrics.updated else []),
             ),
-            chip=page.Chip(each.name, line.color),
+            chip=chip(line),
         )
         for each, line in zip(metrics.sessions, drawn.sessions, strict=True)
     )
@@ -194,32 +180,34 @@ def _localized(localized: LocalizedLog) -> Iterator[page.Section]:
 
 
 def _path_picture(localized: LocalizedLog) -> page.Drawing:
-    found, points = localized.localization, map_points(localized.prior)
+    found, points = localized.localization, maps.map_points(localized.prior)
     final, live = (lie.lift_points(poses[:, :-1, -1]) for poses in (found.trajectory.poses, found.live))
-    (low, high), lines, ends = extent(points), [], np.full((2, 3), np.nan)
+    (low, high), lines, ends = maps.extent(points), [], np.full((2, 3), np.nan)
     if found.is_placed.any():
         later = found.is_placed & (found.states == MapState.SEARCHING)
-        lines.append(PathLine(np.where(later[:, None], final, np.nan), _PLACED_LATER, 1.2, is_dashed=True))
+        lines.append(
+            Line("placed afterwards", np.where(later[:, None], final, np.nan), _PLACED_LATER, 1.2, is_dashed=True)
+        )
         placed = final[found.is_placed]
         low, high, ends = np.minimum(low, placed.min(axis=0)), np.maximum(high, placed.max(axis=0)), placed
     for state, color in _STATE_COLORS.items():
-        lines.append(PathLine(np.where((found.states == state)[:, None], live, np.nan), color, 1.4))
+        lines.append(Line(state, np.where((found.states == state)[:, None], live, np.nan), color))
     margin = 0.02 * (high - low)
-    svg = path_over_map(points, ends, lines, low - margin, high + margin, is_wide=True)
+    svg = maps.path_over_map(points, lines, low - margin, high + margin, ends, is_wide=True)
     return page.Drawing("Path over the map", "Circle: first scan placed; square: last.", svg, is_wide=True)
 
 
 def _states_picture(localized: LocalizedLog) -> page.Drawing:
     """Standard deviation of the position and state, over the path."""
     found = localized.localization
-    figure, runs = Plot(2.0, is_wide=True), np.flatnonzero(found.states[1:] != found.states[:-1]) + 1
+    figure = Plot("path [m]", "sigma [m]", height_inches=2.0, is_wide=True)
+    runs = np.flatnonzero(found.states[1:] != found.states[:-1]) + 1
     top = float(np.nanmax(found.sigma_m, initial=0.01)) if np.isfinite(found.sigma_m).any() else 1.0
     for run in np.split(np.arange(len(found.states)), runs):
         first_m, last_m = found.traveled_m[[run[0], min(run[-1] + 1, len(found.states) - 1)]].tolist()
         figure.span(first_m, last_m, _STATE_COLORS[MapState(str(found.states[run[0]]))], 0.25)
-    figure.line(found.traveled_m, found.sigma_m, INK, 0.9)
+    figure.line(np.stack([found.traveled_m, found.sigma_m], axis=1), INK, 0.9)
     figure.y.limit(0.0, 1.1 * top)
-    figure.x.label, figure.y.label = "path [m]", "sigma [m]"
     count = counted(len(found.closures), "match with the map", "matches with the map")
     return page.Drawing(
         "Standard deviation of the position",
@@ -247,7 +235,7 @@ def write_changes_report(directory: Path, changes: Changes) -> None:
 def _changed(changes: Changes) -> Iterator[page.Section]:
     points = np.pad(changes.points, ((0, 0), (0, 3 - changes.dimension)))
     chips = tuple(page.Chip(label.name.lower(), _HEX[label]) for label in _ORDER)
-    plan = _changes_picture(points, changes, *extent(points), is_wide=True)
+    plan = _changes_picture(points, changes, *maps.extent(points), is_wide=True)
     drawing = page.Drawing("Plan", "Seen from above; boxes around clusters.", plan, is_wide=True)
     yield page.Section("Where", _HOW_TOLD, chips=chips, drawings=(drawing,))
     if changes.clusters:
@@ -268,9 +256,9 @@ def _changes_picture(
     """Points (M, 3) in the colors of their labels, seen from above, and boxes of clusters."""
     figure = Plot.of_plan(low, high, is_wide=is_wide)
     for label in _ORDER:
-        draw_points(figure, points[changes.labels == label], low, high, (_HEX[label],))
+        maps.draw_points(figure, points[changes.labels == label], low, high, (_HEX[label],))
     for cluster in changes.clusters:
-        figure.path(_outline(cluster)[[0, 1, 2, 3, 0]], INK, 0.8)
+        figure.line(_outline(cluster)[[0, 1, 2, 3, 0]], INK, 0.8)
     return figure.svg()
 
 
