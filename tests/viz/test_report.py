@@ -190,8 +190,8 @@ def test_a_run_tells_its_result_first_and_its_time_last(one_run):
 @pytest.mark.parametrize("verdict", list(Verdict))
 def test_the_verdict_stands_at_the_head_in_its_color_with_its_error_and_a_line_a_reason(tmp_path, verdict):
     judged = Judged(verdict, "first <b>; second", error="ATE below 1 m")
-    write_page(tmp_path / "a.html", Page("title", "", (("fact", "1"),), ("warned",), (), (), judged=judged))
-    page = (tmp_path / "a.html").read_text(encoding="utf-8").partition("<main>")[2]
+    write_page(tmp_path, Page("title", "", (("fact", "1"),), ("warned",), (), (), judged=judged))
+    page = (tmp_path / "report.html").read_text(encoding="utf-8").partition("<main>")[2]
     (head,) = re.findall(r'<div class="verdict ([\w-]+)"', page)
     assert head == verdict.replace(" ", "-")
     assert f"<strong>{verdict}</strong>" in page and "<li>first &lt;b&gt;</li><li>second</li>" in page
@@ -320,8 +320,8 @@ def test_the_map_is_turned_moved_and_zoomed_and_the_page_scrolls_unless_it_was_c
     ]
     drawing = interactive_map(points, lines, low, high, grain_m=0.2, is_flat=False, is_wide=True)
     section = Section("Map", drawings=(drawing,))
-    write_page(tmp_path / "a.html", Page("a", "b", (), (), (), (section,), script=SCRIPT))
-    text = re.sub('<meta http-equiv="Content-Security-Policy"[^>]*>', "", (tmp_path / "a.html").read_text())
+    write_page(tmp_path, Page("a", "b", (), (), (), (section,), script=SCRIPT))
+    text = re.sub('<meta http-equiv="Content-Security-Policy"[^>]*>', "", (tmp_path / "report.html").read_text())
     frames = "<script>window.requestAnimationFrame = act => setTimeout(act, 10);</script>"  # none without a window
     (tmp_path / "b.html").write_text(text.replace("<body>", f"<body>{frames}").replace("</body>", _HANDLED))
     same = json.loads(
@@ -476,5 +476,5 @@ def test_every_text_of_a_page_is_escaped(tmp_path):
     grid = Grid((Head(EVIL, EVIL, EVIL),), (Row(EVIL, ()),), (EVIL,))
     section = Section(EVIL, EVIL, (chip,), (drawing,), grid)
     fold = Collapsible(EVIL, EVIL)
-    write_page(tmp_path / "a.html", Page(EVIL, EVIL, ((EVIL, EVIL),), (EVIL,), (EVIL,), (section,), (fold,)))
-    assert "<script" not in (tmp_path / "a.html").read_text()
+    write_page(tmp_path, Page(EVIL, EVIL, ((EVIL, EVIL),), (EVIL,), (EVIL,), (section,), (fold,)))
+    assert "<script" not in (tmp_path / "report.html").read_text()

@@ -18,7 +18,7 @@ from scanchain.trajectory import read_tum
 from scanchain_viz.colors import rgb
 from scanchain_viz.pictures.trajectories import DrawnTrajectory, trajectories_of_comparison
 from scanchain_viz.recording import drawing, entities
-from scanchain_viz.recording.blueprint import scene, time_panel, up_to_now, whole_log
+from scanchain_viz.recording.blueprint import scene, up_to_now, whole_log, with_panels
 from scanchain_viz.recording.drawing import Message, Times
 from scanchain_viz.recording.sinks import write_recording
 
@@ -33,7 +33,7 @@ def record_comparison(directory: Path) -> None:
     table, trajectories = read_table(directory), trajectories_of_comparison(directory)
     name, messages = Path(table.log.split(", ")[0]).name, _messages(directory, trajectories, _stamps(directory))
     layout = _blueprint(trajectories, table)
-    write_recording(directory / RECORDING_FILE, name, table.dimension, layout, messages, kind="comparison ")
+    write_recording(directory / RECORDING_FILE, name, table.dimension, layout, messages, kind="comparison")
 
 
 def _messages(directory: Path, trajectories: Sequence[DrawnTrajectory], stamps_ns: np.ndarray) -> list[Message]:
@@ -53,7 +53,7 @@ def _of(trajectory: DrawnTrajectory, map_file: Path, stamps_ns: np.ndarray) -> l
     color, positions = rgb(trajectory.color), trajectory.positions.astype(np.float32)
     times = Times(np.arange(len(positions)), stamps_ns[: len(positions)])
     before = np.concatenate([positions[:1], positions[:-1]])
-    strips = rr.LineStrips3D.columns(strips=drawing.segments(before, positions))
+    strips = rr.LineStrips3D.columns(strips=np.stack([before, positions], axis=1))
     messages = [
         Message(f"world/{name}/trajectory", drawing.lines(color=color, radius=1.5)),
         Message(f"world/{name}/trajectory", strips, times),
@@ -88,11 +88,8 @@ def _blueprint(trajectories: Sequence[DrawnTrajectory], table: Table) -> rrb.Blu
     overrides |= {f"world/{name}/map": [rrb.EntityBehavior(visible=False)] for name in names[1:]}
     seen = trajectories[0].positions if trajectories else None
     world = scene("trajectories and maps", table.dimension, seen, overrides)
-    return rrb.Blueprint(
-        rrb.Vertical(world, rrb.Horizontal(*_plots(trajectories)), row_shares=[2, 1]),
-        time_panel(table.scans),
-        rrb.SelectionPanel(state="collapsed"),
-    )
+    below = rrb.Horizontal(*_plots(trajectories))
+    return with_panels(rrb.Vertical(world, below, row_shares=[2, 1]), scans=table.scans, has_toggles=True)
 
 
 def _plots(trajectories: Sequence[DrawnTrajectory]) -> list[rrb.TimeSeriesView]:

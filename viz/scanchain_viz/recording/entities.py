@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from scanchain.data import State
 from scanchain_viz.colors import between, height_shares
-from scanchain_viz.recording.drawing import Color, Floats, Message, dots, lines, pixels
+from scanchain_viz.recording.drawing import Floats, Message, dots, lines, pixels
 
 WORLD = "world"
 ODOM = "world/odom"
@@ -44,6 +44,13 @@ EVENTS = "events"
 LEGEND = "legend"
 VERDICT = "verdict"
 
+SERIES = {  # plots of one series each, and their names
+    OBSERVABILITY: "log10 observability",
+    RESIDUAL: "residual [m]",
+    INLIERS: "inliers",
+    INLIER_SHARE: "inlier share",
+    ITERATIONS: "iterations",
+}
 STAGES = ("read", "preprocess", "match", "map", "loops")
 COVARIANCE_SCALE = 100.0  # a standard deviation of 1 mm is drawn 10 cm long
 
@@ -105,24 +112,16 @@ def constants(dimension: int) -> list[Message]:
 
 
 def _series() -> list[Message]:
-    stages = [f"{stage} [ms]" for stage in STAGES]
-    colors = [CYAN, GREEN, BLUE, YELLOW, RED]
-    single = {
-        INLIERS: "inliers",
-        INLIER_SHARE: "inlier share",
-        RESIDUAL: "residual [m]",
-        OBSERVABILITY: "log10 observability",
-        ITERATIONS: "iterations",
-    }
+    stages = rr.SeriesLines(names=[f"{stage} [ms]" for stage in STAGES], colors=[CYAN, GREEN, BLUE, YELLOW, RED])
     states = rr.StateConfiguration(values=list(State), labels=list(State), colors=[GREEN, VIOLET, ORANGE, RED])
+    loops = rr.SeriesLines(
+        names=["accepted", "rejected"],
+        colors=[GREEN, RED],
+        interpolation_mode=rr.components.InterpolationMode.StepAfter,  # each holds until the next
+    )
     return [
-        Message(TIME, rr.SeriesLines(names=stages, colors=colors)),
-        *(Message(entity, rr.SeriesLines(names=[name], colors=[BLUE])) for entity, name in single.items()),
-        Message(LOOPS, _steps(["accepted", "rejected"], [GREEN, RED])),
+        Message(TIME, stages),
+        *(Message(entity, rr.SeriesLines(names=[name], colors=[BLUE])) for entity, name in SERIES.items()),
+        Message(LOOPS, loops),
         Message(STATE, states),
     ]
-
-
-def _steps(names: list[str], colors: list[Color]) -> rr.SeriesLines:
-    """Series that hold their value until the next."""
-    return rr.SeriesLines(names=names, colors=colors, interpolation_mode=rr.components.InterpolationMode.StepAfter)

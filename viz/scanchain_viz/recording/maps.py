@@ -19,7 +19,7 @@ from scanchain.sessions.localizer import MapState
 from scanchain_viz.colors import rgb
 from scanchain_viz.pictures.maps import DrawnMerge, map_points, read_merge
 from scanchain_viz.recording import drawing, entities
-from scanchain_viz.recording.blueprint import scene, time_panel, whole_log
+from scanchain_viz.recording.blueprint import scene, whole_log, with_panels
 from scanchain_viz.recording.drawing import Message, Times
 from scanchain_viz.recording.sinks import write_recording
 
@@ -45,9 +45,8 @@ def record_merge(directory: Path) -> None:
     """
     drawn = read_merge(directory)
     world = scene("sessions over the map", drawn.dimension, drawn.positions)
-    layout = rrb.Blueprint(world, rrb.TimePanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"))
-    messages = _merge(directory, drawn)
-    write_recording(directory / RECORDING_FILE, directory.name, drawn.dimension, layout, messages, kind="merge ")
+    layout, messages = with_panels(world, has_toggles=True), _merge(directory, drawn)
+    write_recording(directory / RECORDING_FILE, directory.name, drawn.dimension, layout, messages, kind="merge")
 
 
 def _merge(directory: Path, drawn: DrawnMerge) -> Iterator[Message]:
@@ -69,7 +68,7 @@ def record_changes(directory: Path, changes: Changes) -> None:
     points = drawing.in_space(changes.points)
     text = rrb.TextDocumentView(origin="summary", name="summary")
     world = scene("changes", changes.dimension, points)
-    layout = rrb.Blueprint(rrb.Horizontal(world, text, column_shares=[3, 1]), collapse_panels=True)
+    layout = with_panels(rrb.Horizontal(world, text, column_shares=[3, 1]))
     summary = rr.TextDocument((directory / SUMMARY_FILE).read_text(encoding="utf-8"))
     messages = [
         Message("summary", summary),
@@ -83,7 +82,8 @@ def record_changes(directory: Path, changes: Changes) -> None:
         *(_boxes(changes, label) for label in (Label.APPEARED, Label.VANISHED)),
         _arrows(changes),
     ]
-    write_recording(directory / RECORDING_FILE, directory.name, changes.dimension, layout, messages)
+    path = directory / RECORDING_FILE
+    write_recording(path, directory.name, changes.dimension, layout, messages, kind="changes")
 
 
 def _boxes(changes: Changes, label: Label) -> Message:
@@ -124,11 +124,8 @@ def record_localization(path: Path, localized: LocalizedLog) -> None:
         rrb.TimeSeriesView(origin=_SIGMA, name="standard deviation of the position", axis_x=whole_log()),
         rrb.StateTimelineView(origin=entities.STATE, name="state", time_view=whole_log()),
     )
-    layout = rrb.Blueprint(
-        rrb.Horizontal(scene("map", prior.dimension, points), side, column_shares=[5, 2]),
-        time_panel(len(localized.localization.states)),
-        collapse_panels=True,
-    )
+    views = rrb.Horizontal(scene("map", prior.dimension, points), side, column_shares=[5, 2])
+    layout = with_panels(views, scans=len(localized.localization.states))
     states = rr.StateConfiguration(
         values=list(MapState), labels=list(MapState), colors=list(_STATE_COLORS.values())
     )
@@ -141,7 +138,7 @@ def record_localization(path: Path, localized: LocalizedLog) -> None:
         Message(entities.STATE, states),
         *_localized(localized),
     ]
-    write_recording(path, localized.path.name, prior.dimension, layout, messages)
+    write_recording(path, localized.path.name, prior.dimension, layout, messages, kind="localization")
 
 
 def _localized(localized: LocalizedLog) -> Iterator[Message]:

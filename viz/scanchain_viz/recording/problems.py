@@ -16,6 +16,7 @@ from scanchain.landmarks.results import file_stem
 from scanchain.landmarks.study import Estimate, Study
 from scanchain_viz.pictures.problems import ellipses
 from scanchain_viz.recording import drawing, entities
+from scanchain_viz.recording.blueprint import with_panels
 from scanchain_viz.recording.drawing import Message, Times
 from scanchain_viz.recording.sinks import write_recording
 
@@ -24,14 +25,11 @@ _FLAT_M = 1e-4  # height of an ellipse
 
 def record_graph(change: GraphChange, path: Path) -> None:
     """Write a .rrd file of a pose graph, its edges colored by verdict. Raises OSError."""
-    layout = rrb.Blueprint(
-        rrb.Spatial3DView(origin=entities.WORLD, name="graph", line_grid=rrb.LineGrid3D(visible=False)),
-        rrb.TimePanel(timeline="scan", state="collapsed"),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-    )
+    grid = rrb.LineGrid3D(visible=False)
+    layout = with_panels(rrb.Spatial3DView(origin=entities.WORLD, name="graph", line_grid=grid))
     messages = [*_graph(change.before, 0), *_graph(change.after, 1)]
-    write_recording(path, change.name, change.after.poses.shape[-1] - 1, layout, messages)
+    dimension = change.after.poses.shape[-1] - 1
+    write_recording(path, change.name, dimension, layout, messages, kind="graph")
 
 
 def _graph(state: GraphState, when: int) -> Iterator[Message]:
@@ -54,11 +52,11 @@ def record_landmarks(studies: Sequence[Study], path: Path) -> None:
     Raises OSError.
     """
     views = [rrb.Spatial3DView(origin=_root(study), name=study.name) for study in studies]
-    layout = rrb.Blueprint(
-        rrb.Grid(*views), rrb.TimePanel(timeline="scan", state="collapsed"), collapse_panels=True
+    messages, name = (
+        [message for study in studies for message in _study(study)],
+        ", ".join(s.name for s in studies),
     )
-    messages = [message for study in studies for message in _study(study)]
-    write_recording(path, ", ".join(study.name for study in studies), 2, layout, messages)
+    write_recording(path, name, 2, with_panels(rrb.Grid(*views)), messages, kind="landmarks")
 
 
 def _root(study: Study) -> str:

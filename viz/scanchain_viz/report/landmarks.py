@@ -10,15 +10,7 @@ import numpy as np
 from scanchain.errors import InputError
 from scanchain.landmarks.results import accuracy_lines, file_stem, size_of, table_of
 from scanchain.landmarks.study import Study
-from scanchain_viz.pictures.problems import (
-    AFTER,
-    BEFORE,
-    draw_estimate,
-    draw_factors,
-    plot_after,
-    plot_before,
-    plot_factor,
-)  # fmt: skip
+from scanchain_viz.pictures import problems
 from scanchain_viz.report import page
 
 _TIMES = (
@@ -36,16 +28,16 @@ def write_report(directory: Path, studies: Sequence[Study]) -> None:
     """
     try:
         for study in studies:
-            draw_estimate(directory / f"{file_stem(study.name)}.png", study)
-            draw_factors(directory / f"{file_stem(study.name)}_factors.png", [study])
+            problems.draw_estimate(directory / f"{file_stem(study.name)}.png", study)
+            problems.draw_factors(directory / f"{file_stem(study.name)}_factors.png", [study])
         if len(studies) > 1:
-            draw_factors(directory / "factors.png", studies)
-        sections = tuple(each for study in studies for each in _sections(study))
+            problems.draw_factors(directory / "factors.png", studies)
+        sections = [each for study in studies for each in _sections(study)]
         title = f"Landmark problem{'s' if len(studies) > 1 else ''}"
         names = ", ".join(study.name for study in studies)
         definitions = dict.fromkeys(study.after.accuracy.definition for study in studies)
         fold = page.Collapsible("Definition of the errors", "\n\n".join(definitions))
-        page.write_page(directory / page.REPORT_FILE, page.Page(title, names, (), (), (), sections, (fold,)))
+        page.write_page(directory, page.Page(title, names, sections=sections, collapsibles=[fold]))
     except OSError as error:
         raise InputError(f"{directory}: not writable ({error.strerror}); choose another --out") from error
 
@@ -60,17 +52,17 @@ def _sections(study: Study) -> Iterator[page.Section]:
     )
     is_known = bool(len(study.true_poses) or np.isfinite(study.true_landmarks).any())
     truth = (page.Chip("truth", "var(--ink)", is_dashed=True),) if is_known else ()
-    chips = (page.Chip("before", BEFORE), page.Chip("after", AFTER), *truth)
+    chips = (page.Chip("before", problems.BEFORE), page.Chip("after", problems.AFTER), *truth)
     marks = "Circles: landmarks" + ("; crosses: true ones" if is_known else "")
     drawings = (
-        page.Drawing("Before optimization", f"{marks}.", plot_before(study).svg()),
-        page.Drawing("After optimization", f"{marks}; ellipses: 95 %.", plot_after(study).svg()),
+        page.Drawing("Before optimization", f"{marks}.", problems.plot_before(study).svg()),
+        page.Drawing("After optimization", f"{marks}; ellipses: 95 %.", problems.plot_after(study).svg()),
     )
     yield page.Section(study.name, facts=facts, chips=chips, drawings=drawings)
-    factors = tuple(
-        page.Drawing(f"{method.method}: {method.factor.name}", "", plot_factor(method).svg())
+    factors = [
+        page.Drawing(f"{method.method}: {method.factor.name}", "", problems.plot_factor(method).svg())
         for method in study.methods
-    )
+    ]
     text = f"The Jacobian A has {size_of(study)}. Drawn is where the factor of every method is not zero."
     yield page.Section(f"Linear solvers on {study.name}", text, grid=_grid(study), drawings=factors, is_small=True)
 
@@ -78,6 +70,6 @@ def _sections(study: Study) -> Iterator[page.Section]:
 def _grid(study: Study) -> page.Grid:
     headings, *rows = table_of(study)
     split = [heading.partition(" ms") for heading in headings]
-    heads = tuple(page.Head(name, unit.strip()) for name, unit, _ in split)
+    heads = [page.Head(name, unit.strip()) for name, unit, _ in split]
     notes = (_TIMES, *((_DIFFERS, _PINV) if len(rows) > 1 else ("--methods all compares the linear solvers.",)))
-    return page.Grid(heads, tuple(page.Row(name, tuple(cells)) for name, *cells in rows), notes)
+    return page.Grid(heads, [page.Row(name, cells) for name, *cells in rows], notes)

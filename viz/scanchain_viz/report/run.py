@@ -70,7 +70,7 @@ def write_run_report(directory: Path) -> None:
         script=SCRIPT,
         judged=metrics.judged,
     )
-    page.write_page(directory / page.REPORT_FILE, whole)
+    page.write_page(directory, whole)
 
 
 def _summary_lines(directory: Path) -> list[str]:
@@ -252,9 +252,7 @@ def accuracy_section(truth: GroundTruth) -> page.Section:
     rows = []
     for name, of in (("optimized", truth.optimized), ("odometry", truth.odometry)):
         ate, *others = (page.figure(getattr(of, key), scale, digits) for _, key, scale, digits in _ACCURACY)
-        rows.append(
-            page.Row(name, (page.Cell(ate, is_bad=of is truth.optimized and bool(truth.complaint)), *others))
-        )
+        rows.append(page.Row(name, (page.bad_if(of is truth.optimized and bool(truth.complaint), ate), *others)))
     missing = f", {truth.optimized.missing}" if truth.optimized.missing else ""
     text = (
         f"Against {truth.source}, {truth.path_length_m:.1f} m: {counted(truth.optimized.pairs, 'scan')}{missing}."

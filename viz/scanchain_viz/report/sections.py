@@ -299,7 +299,7 @@ def _verdict_grid(closures: pa.Table) -> Grid:
     for (verdict, cause), places in sorted(groups.items(), key=lambda group: -len(group[1])):
         residual = page.figure(float(np.median(residual_m[places])), 1e3, 0)
         share = f"{100.0 * np.median(overlap[places]):.0f}"
-        rows.append(Row(verdict, (f"{len(places):,}", share, residual, Cell(cause, is_wide=True))))
+        rows.append(Row(verdict, (f"{len(places):,}", share, residual, Cell(cause, "wide"))))
     heads = (
         Head("verdict"), Head("closures"), Head("overlap", "%", "median"), Head("residual", "mm", "median"),
         Head("cause", is_text=True),
