@@ -11,7 +11,7 @@ from scanchain_viz.colors import palette_of
 from scanchain_viz.pictures.axis import Axis, width_of
 from scanchain_viz.pictures.figure import Plot
 from scanchain_viz.pictures.maps import draw_points
-from scanchain_viz.pictures.run import GridPicture, draw_map
+from scanchain_viz.pictures.run import draw_map
 
 image = pytest.importorskip("matplotlib.image")
 
@@ -67,7 +67,7 @@ def test_a_grid_lies_where_its_origin_says_with_row_0_at_the_bottom(tmp_path):
     cells = np.zeros((200, 200), np.int8)
     cells[:60] = 100  # a wall along the lowest y
     cells[:, 100:] = np.where(cells[:, 100:] == 0, -1, cells[:, 100:])
-    grid = GridPicture(cells, 0.1, (-10.0, -10.0))
+    grid = (cells, 0.1, (-10.0, -10.0))
     draw_map(tmp_path / "a.png", title="t", optimized=circle(9.0), grid=grid)
     pixels = image.imread(tmp_path / "a.png")[..., 0]
     dark_rows = np.nonzero((np.abs(pixels - 0.15) < 0.03).mean(axis=1) > 0.4)[0]
