@@ -377,6 +377,7 @@ def _corridor(x_m, index, depths_m):
     return Keyframe(index, index, index, SavedPoints(points, 1.0), lie.pose_2d(x_m, 0.0, 0.0), x_m)
 
 
+@pytest.mark.slow
 def test_merging_searches_and_aligns_no_more_than_runs_do(runs, tmp_path, monkeypatch):
     folder, _ = runs
     truth = sc.simulate("office", tmp_path / "office.mcap", seed=2)
