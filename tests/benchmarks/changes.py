@@ -29,6 +29,7 @@ from scanchain.simulation.drive import EPOCH_NS
 from scanchain.simulation.log import record
 from scanchain.simulation.solids import FIXED, Solids
 from tests.benchmarks.harness import command_line, run_of
+from tests.support import made
 
 LEAST_M = 0.3  # size of the objects that count
 LEAST_RAYS = {2: 10, 3: 40}  # of the keyframes' scans, for an object to be in sight
@@ -78,22 +79,19 @@ def score_of(options: argparse.Namespace, seed: int) -> Score:
         second = Drive(first.solids, second.motion, second.sensor, second.T_base_lidar, second.scans)
     stem = f"{options.world}_{options.sensor or 'own'}_{seed}_{options.seconds or 'all'}"
     tail = f"_b{options.later_seconds or ''}{'_unchanged' if options.unchanged else ''}"
-    a = _run(first, options.cache / f"{stem}_a", seed, None)
-    b = _run(second, options.cache / f"{stem}{tail}", seed, 1)
+    a = _mapped(first, f"{stem}_a", options.cache, seed, None)
+    b = _mapped(second, f"{stem}{tail}", options.cache, seed, 1)
     config = load_settings(a.dimension).config
     aligned = align_maps(a, b, config)
     found = changes_between(Part("a", a.keyframes, a.poses), Part("b", b.keyframes, aligned.poses), config)
     return _score(found, first, second, a, b, verbose=options.verbose)
 
 
-def _run(drive: Drive, path: Path, seed: int, changed: int | None) -> SavedMap:
-    """The map of a drive, which is made where it is not there yet."""
-    if not (path / "map").is_dir():
-        log = path.with_suffix(".mcap")
-        record(drive, log, seed=seed, changed=changed, force=True)
-        run_of(log, path)
-        log.unlink()
-    return open_saved_map(path)
+def _mapped(drive: Drive, name: str, cache: Path, seed: int, changed: int | None) -> SavedMap:
+    def write(draft: Path) -> None:
+        record(drive, draft, seed=seed, changed=changed, force=True)
+
+    return open_saved_map(run_of(made.recorded(name, write, cache), cache, name))
 
 
 def _score(found: Changes, first: Drive, second: Drive, a: SavedMap, b: SavedMap, *, verbose: bool) -> Score:

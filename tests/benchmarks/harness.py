@@ -59,9 +59,11 @@ def drive_of(world: str, sensor: str, scans: int, cache: Path, seed: int = 1) ->
     return made.log(world, folder=cache, seed=seed, seconds=duration_s, sensor=sensor)
 
 
-def run_of(log: Path, out: Path, **options: object) -> Path:
-    """The run of a log without a recording; what is there is not run again."""
+def run_of(log: Path, cache: Path, name: str, **options: object) -> Path:
+    """The run of a log without a recording, made once for each version of the code."""
+    out = cache / f"runs_{made.version()}" / name
     if not out.exists():
+        out.parent.mkdir(parents=True, exist_ok=True)
         scanchain.run(log, out, recording=False, **options)
     return out
 

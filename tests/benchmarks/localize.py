@@ -105,8 +105,8 @@ def _truth(log: Path) -> Trajectory:
 def later_part(name: str, end_s: float, options: argparse.Namespace) -> Case:
     """A log, in the map of its first seconds."""
     log = DATA / "2d" / f"{name}.mcap"
-    prior = open_saved_map(run_of(log, options.cache / f"{name}_{end_s:g}.run", log__end_s=end_s))
-    whole = read_tum(run_of(log, options.cache / f"{name}.run") / "trajectory.tum")
+    prior = open_saved_map(run_of(log, options.cache, f"{name}_{end_s:g}", log__end_s=end_s))
+    whole = read_tum(run_of(log, options.cache, name) / "trajectory.tum")
     first = max(keyframe.scan_index for keyframe in prior.keyframes) + 1
     return Case(prior, log, true_in_map(prior, whole, whole.poses)[0], first)
 
@@ -114,8 +114,8 @@ def later_part(name: str, end_s: float, options: argparse.Namespace) -> Case:
 def driven_twice(world: str, options: argparse.Namespace) -> Case:
     """A simulated world, in the map of another drive through it."""
     drives = plan(world, seed=0), plan(world, seed=1)
-    logs = [_recorded(f"{world}_{k}", replace(drives[k], solids=drives[0].solids), k, options) for k in (0, 1)]
-    return _mapped(*logs)
+    logs = [_recorded(f"{world}_{k}", replace(drives[k], solids=drives[0].solids), options, k) for k in (0, 1)]
+    return _mapped(options, *logs)
 
 
 def another_day(map_world: str, log_world: str, options: argparse.Namespace, **of_log: object) -> Case:
@@ -123,7 +123,7 @@ def another_day(map_world: str, log_world: str, options: argparse.Namespace, **o
     drive = {"folder": options.cache, "seed": 1, "seconds": of_log.pop("seconds", 66.0)}
     mapped = made.log(map_world, **drive)
     again = made.log(log_world, reverse=True, **{"start_m": 130.0, "sensor": "hdl-64", **of_log}, **drive)
-    case = _mapped(mapped, again)
+    case = _mapped(options, mapped, again)
     return case if map_world == log_world else replace(case, T_map_lidar=None)
 
 
@@ -142,26 +142,24 @@ def city(options: argparse.Namespace) -> Case:
         drive = plan(name, seed=1, sensor=options.sensor, duration_s=duration_s, **of_part)
         drive = replace(drive, scans=drive.scans[:: options.every])
         stem = f"{name}_{part}_{options.sensor}_{options.every}"
-        logs.append(_recorded(stem, drive, 1, options, changed=of_part.get("changed")))
+        logs.append(_recorded(stem, drive, options, 1, of_part.get("changed")))
     run = logs[0].with_suffix(".run")
     if options.memory:
         run = run.with_suffix(".measured")
         _print_peak("run", str(logs[0]), "--out", str(run), "--force")
         _print_peak("localize", str(logs[1]), "--map", str(run), "--out", f"{run}.found", "--force")
-    return replace(_mapped(*logs), give_up_m=60.0)
+    return replace(_mapped(options, *logs), give_up_m=60.0)
 
 
-def _recorded(name: str, drive: Drive, seed: int, options: argparse.Namespace, **of_record: object) -> Path:
-    path = options.cache / f"{name}.mcap"
-    if not path.exists():
-        draft = path.with_suffix(".draft.mcap")
-        record(drive, draft, seed=seed, force=True, **of_record)
-        draft.rename(path)
-    return path
+def _recorded(name: str, drive: Drive, options: argparse.Namespace, seed: int, changed: int | None = None) -> Path:
+    def write(draft: Path) -> None:
+        record(drive, draft, seed=seed, changed=changed, force=True)
+
+    return made.recorded(name, write, options.cache)
 
 
-def _mapped(mapped: Path, log: Path) -> Case:
-    prior = open_saved_map(run_of(mapped, mapped.with_suffix(".run")))
+def _mapped(options: argparse.Namespace, mapped: Path, log: Path) -> Case:
+    prior = open_saved_map(run_of(mapped, options.cache, mapped.stem))
     return Case(prior, log, true_in_map(prior, _truth(mapped), _truth(log).poses)[0])
 
 
@@ -269,7 +267,7 @@ def whole(case: Case, scans: Iterable[Scan]) -> str:
 
 
 def _rmse(off: Matrix) -> float:
-    return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+    return float(np.sqrt(np.mean(np.sum(off**2, axis=1)))) if len(off) else np.nan
 
 
 def row(name: str, options: argparse.Namespace) -> str:

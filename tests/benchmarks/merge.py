@@ -35,7 +35,7 @@ LENGTH_S, SCANS = 2691.3, 2000
 
 def run(cache: Path, name: str, log: Path, start_s: float = 0.0, end_s: float = np.inf) -> Path:
     """The run of a part of a log."""
-    return run_of(log, cache / name, log__start_s=start_s, log__end_s=end_s)
+    return run_of(log, cache, name, log__start_s=start_s, log__end_s=end_s)
 
 
 def run_s(runs: Sequence[Path]) -> float:

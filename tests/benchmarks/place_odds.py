@@ -27,8 +27,8 @@ from scanchain.loops import LoopCloser, evidence
 from scanchain.loops.planar_map_search import PlanarMapSearch, WholeSearch
 from scanchain.maps import SavedMap, open_saved_map
 from scanchain.settings import load_settings
-from tests.benchmarks.harness import command_line, poses_at, run_of, true_in_map
-from tests.benchmarks.places import ENTRIES, REAL, log_of, prepared
+from tests.benchmarks.harness import command_line, poses_at, true_in_map
+from tests.benchmarks.places import ENTRIES, REAL, prepared, whole_of
 
 NEAR_M, AROUND = 5.0, 12
 PATH_M, STEP_M = 8.0, 8.0  # length of the paths, and between their begins
@@ -66,7 +66,7 @@ class Shown:
 def right(name: str, cache: Path) -> Iterator[tuple[float, float, float]]:
     """Features at right poses of a log that enters a map."""
     out, _, options, map_truth, truth = prepared(name, 0, cache)
-    saved, whole = open_saved_map(out), open_saved_map(cache / f"{ENTRIES[name].log}_whole.run")
+    saved, whole = open_saved_map(out), open_saved_map(whole_of(ENTRIES[name].log, cache))
     shown, random = Shown(saved), np.random.default_rng(0)
     begin_ns = whole.keyframes[0].stamp_ns
     for keyframe in whole.keyframes[::2]:
@@ -111,7 +111,7 @@ def told(name: str, weights: NDArray[np.float64], ours: Matrix, others: Matrix) 
 def main() -> None:
     cache = command_line(__doc__).parse_args().cache
     cache.mkdir(parents=True, exist_ok=True)
-    runs = {log: run_of(log_of(log, 0, cache, again=False), cache / f"{log}_whole.run") for log in REAL}
+    runs = {log: whole_of(log, cache) for log in REAL}
     maps = {log: open_saved_map(run) for log, run in runs.items()}
     ours = np.array([each for name, entry in ENTRIES.items() if entry.log in REAL for each in right(name, cache)])
     others = np.array([each for a, b in permutations(REAL, 2) for each in wrong(maps[a], maps[b])])

@@ -119,8 +119,8 @@ def outcome(guest: str, host: str, options: argparse.Namespace) -> tuple[str, st
     place, home, again = PLACES[guest], PLACES[host], guest == host
     mapped = log_of(host, options.seed, options.cache, again=False)
     part = home.mapped if again else {}
-    prior = options.cache / f"{host}_{options.seed}{'_part' if part else ''}.run"
-    run_of(mapped, prior, **(home.options | part if home.log else {}))
+    name = f"{host}_{options.seed}{'_part' if part else ''}"
+    prior = run_of(mapped, options.cache, name, **(home.options | part if home.log else {}))
     log = log_of(guest, options.seed, options.cache, again=again)
     chosen = (place.options | (place.again if again else {}) if place.log else {}) | settings_of(options.set)
     if options.share or options.half:
@@ -192,21 +192,26 @@ ENTRIES = {
 REAL = ("csail", "aces", "intel")
 
 
+def whole_of(name: str, cache: Path) -> Path:
+    """The run of a whole real log, whose poses are the truth of its parts."""
+    return run_of(DATA / PLACES[name].log, cache, f"{name}_whole")
+
+
 def prepared(name: str, seed: int, cache: Path) -> tuple[Path, Path, Options, Trajectory, Trajectory]:
     """Map, log, options of the log, and the truth of both."""
     entry = ENTRIES[name]
-    out = cache / f"late_{name}_{seed}.run"
+    out = f"late_{name}_{seed}"
     (map_begin, map_end), (begin, end) = entry.mapped, entry.entering
     if entry.log in REAL:
-        log = log_of(entry.log, seed, cache, again=False)
-        truth = read_tum(run_of(log, cache / f"{entry.log}_whole.run") / "trajectory.tum")
-        run_of(log, out, log__start_s=map_begin, log__end_s=map_end)
-        return out, log, {"log__start_s": begin, "log__end_s": end}, truth, truth
+        log = DATA / PLACES[entry.log].log
+        truth = read_tum(whole_of(entry.log, cache) / "trajectory.tum")
+        prior = run_of(log, cache, out, log__start_s=map_begin, log__end_s=map_end)
+        return prior, log, {"log__start_s": begin, "log__end_s": end}, truth, truth
     drive = {"folder": cache, "seed": seed, **entry.options}
     mapped = made.log(entry.log, start_m=map_begin, seconds=map_end, **drive)
     day = {} if entry.changed is None else {"changed": entry.changed}
     log = made.log(entry.log, start_m=begin, seconds=end, **day, **drive)
-    return run_of(mapped, out), log, {}, *(read_tum(each.with_suffix(".tum")) for each in (mapped, log))
+    return run_of(mapped, cache, out), log, {}, *(read_tum(each.with_suffix(".tum")) for each in (mapped, log))
 
 
 def entering(name: str, options: argparse.Namespace) -> str:

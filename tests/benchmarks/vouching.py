@@ -49,6 +49,7 @@ from scanchain.trajectory import read_tum
 from scanchain.verdict import Judged, judge
 from tests.benchmarks.harness import command_line
 from tests.benchmarks.vouching_logs import WHEELS, Case, LogSpec, cases
+from tests.support import made
 
 Floats = NDArray[np.float64]
 Row = dict[str, Any]
@@ -84,7 +85,7 @@ def measured(log_cases: Sequence[Case], cache: Path) -> list[Row]:
     """Rows of all cases of one log; a run that fails has a row that says so."""
     rows = []
     for case in log_cases:
-        out = cache / "runs" / case.name.replace(" ", "_").replace("/", "-").replace(",", "")
+        out = cache / f"runs_{made.version()}" / case.name.replace(" ", "_").replace("/", "-").replace(",", "")
         try:
             if not (out / "metrics.json").exists():
                 case.log.make(cache)
@@ -244,17 +245,18 @@ def _silent(is_silent: NDArray[np.bool_], motions: Motions, seconds: Floats) -> 
     return [round(float(each), 2) for each in (*span_s, size_m, size_deg)]
 
 
-def _checks(steps: Any, motions: Motions, wrong: NDArray[np.bool_], is_open: NDArray[np.bool_]) -> dict[str, Any]:
-    """The worst value of each check during every motion that is not open, and which of them are wrong."""
+def _checks(steps: Any, motions: Motions, wrong: NDArray[np.bool_], is_open: NDArray[np.bool_]) -> Row:
+    """The worst value of each check during every motion that is not open, high is bad, and which are wrong."""
     chosen = wrong | ~is_open
-    names = [name for name in steps.column_names if name in LOW_IS_BAD or name.endswith("_innovation")]
-    result: dict[str, Any] = {"wrong": wrong[chosen].astype(int).tolist()}
-    for name in names:
-        sign = -1.0 if name in LOW_IS_BAD else 1.0
-        values = sign * steps[name].to_numpy(zero_copy_only=False).astype(np.float64)
-        values = np.nan_to_num(values, nan=-np.inf)
-        worst = [values[a : b + 1].max() for a, b in zip(motions.first[chosen], motions.last[chosen], strict=True)]
-        result[name] = [None if not np.isfinite(each) else float(f"{sign * each:.4g}") for each in worst]
+    spans = list(zip(motions.first[chosen], motions.last[chosen], strict=True))
+    result: Row = {"wrong": wrong[chosen].tolist()}
+    for name in steps.column_names:
+        if name in LOW_IS_BAD or name.endswith("_innovation"):
+            values = (-1.0 if name in LOW_IS_BAD else 1.0) * steps[name].to_numpy(zero_copy_only=False).astype(
+                float
+            )
+            values = np.nan_to_num(values, nan=-np.inf)
+            result[name] = [values[first : last + 1].max() for first, last in spans]
     return result
 
 
@@ -344,8 +346,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
         for name in sorted({name for each in chosen for name in each} - {"wrong"}):
             sign = -1.0 if name in LOW_IS_BAD else 1.0
             wrong = np.concatenate([each["wrong"] for each in chosen if name in each]).astype(np.bool_)
-            values = np.concatenate([each[name] for each in chosen if name in each]).astype(np.float64)
-            score = np.nan_to_num(sign * values, nan=-np.inf)
+            score = np.concatenate([each[name] for each in chosen if name in each])
             if not wrong.any() or wrong.all():
                 continue
             order = np.argsort(-score, kind="stable")

@@ -21,7 +21,7 @@ from scanchain.simulation.motion import Motion
 from scanchain.simulation.sensors import Rays, Sensor
 from scanchain.simulation.solids import Solids
 from tests.benchmarks.harness import DATA
-from tests.support.scan_information import information
+from tests.support.scan_information import information, spectrum
 
 WHEELS = ("wheels", "checked", "no wheels")  # prior and check; check alone; none in the log
 
@@ -271,8 +271,10 @@ def _open_shares(drive: Drive) -> Matrix:
     stride = max(1, round(_SHARE_EVERY_S * 1e9 / drive.sensor.period_ns))
     starts_s = drive.scans[::stride] * (drive.sensor.period_ns * 1e-9)
     sensor = replace(drive.sensor, rays=_fewer(drive.sensor))
+    axes = [0, 1, 5] if sensor.dimension == 2 else range(6)
+    chosen = np.ix_(axes, axes)  # in the plane x, y and yaw
     shares = [
-        _least_share(information(drive.solids, T, sensor, index=int(index)), drive.sensor.dimension)
+        spectrum(information(drive.solids, T, sensor, index=int(index))[chosen])[0][0]
         for T, index in zip(drive.motion.lidar(starts_s), drive.scans[::stride], strict=True)
     ]
     return np.stack([truth.stamps_ns[::stride].astype(np.float64), shares], axis=1)
@@ -292,17 +294,6 @@ def _fewer(sensor: Sensor) -> Callable[[int], Rays]:
         )
 
     return rays
-
-
-def _least_share(H: Matrix, dimension: int) -> float:
-    """As ``scanchain.simulation.spectrum``, in the plane of x, y and yaw for a laser scanner."""
-    d, chosen = (2, [0, 1, 5]) if dimension == 2 else (3, [0, 1, 2, 3, 4, 5])
-    H = H[np.ix_(chosen, chosen)]
-    count, levers = np.trace(H[:d, :d]), np.trace(H[d:, d:])
-    if count <= 0.0:
-        return 0.0
-    scale = lie.by_component(len(chosen), 1.0, float(np.sqrt(count / max(levers, 1e-12 * count))))
-    return max(float(np.linalg.eigvalsh(scale[:, None] * H * scale / count)[0]), 0.0)
 
 
 _PLAIN_2D = (

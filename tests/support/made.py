@@ -3,8 +3,8 @@
     path = made.log("office", tmp_path, seconds=6)
     run = made.run("office", tmp_path, seconds=6, odometry__prior="constant-velocity")
 
-They lie in build/made, in a folder named after the code that makes them, and are hard-linked into the folder of a
-test. A test may delete, replace and add files there, but never write into one: every other test sees it.
+They lie in build/made, in a folder named after the code that makes them, and are copied into the folder of a test,
+which may damage them there. Without a folder the path is that of the original, to be read only.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -28,21 +29,27 @@ def log(world: str, into: Path | None = None, *, folder: Path = _FOLDER, **optio
     if "seconds" in options:
         options["duration_s"] = float(str(options.pop("seconds")))
     name = "_".join([world, *(f"{key}-{value}" for key, value in sorted(options.items()))])
-    path = _current(folder, "simulation", "kernels/raycast") / f"{name}.mcap"
+    path = recorded(name, lambda draft: scanchain.simulate(world, draft, force=True, **options), folder)
+    return path if into is None else _copied(path, into / f"{world}.mcap")
+
+
+def recorded(name: str, write: Callable[[Path], object], folder: Path = _FOLDER) -> Path:
+    """A log that a function of the simulator writes."""
+    path = _current(folder, "simulation", "kernels/raycast", "logs/writing") / f"{name}.mcap"
     if not path.exists():
         draft = path.with_name(f"{os.getpid()}_{path.name}")  # another process may be making the same
-        scanchain.simulate(world, draft, force=True, **options)
+        write(draft)
         for suffix in _FILES:
             if draft.with_suffix(suffix).exists():
                 draft.with_suffix(suffix).replace(path.with_suffix(suffix))
-    return path if into is None else _linked(path, into / f"{world}.mcap")
+    return path
 
 
 def run(world: str, into: Path | None = None, *, folder: Path = _FOLDER, **options: object) -> Path:
     """The run directory of a simulated log, without a recording; options of ``log`` and of ``scanchain.run``."""
     source = log(world, folder=folder, **{key: options.pop(key) for key in _OF_SIMULATE if key in options})
     name = "_".join([source.stem, *(f"{key}-{value}" for key, value in sorted(options.items()))])
-    path = _current(folder, "") / name
+    path = _current(folder) / name
     if not path.exists():
         draft = path.with_name(f"{os.getpid()}_{name}")
         scanchain.run(source, draft, recording=False, **options)
@@ -50,22 +57,22 @@ def run(world: str, into: Path | None = None, *, folder: Path = _FOLDER, **optio
             draft.rename(path)
         except OSError:  # another process was faster
             shutil.rmtree(draft)
-    return path if into is None else _linked(path, into / world)
+    return path if into is None else _copied(path, into / world)
 
 
-def _linked(source: Path, target: Path) -> Path:
+def _copied(source: Path, target: Path) -> Path:
     if source.is_dir():
-        shutil.copytree(source, target, copy_function=os.link)
+        shutil.copytree(source, target)
     else:
         for suffix in _FILES:
             if source.with_suffix(suffix).exists():
-                os.link(source.with_suffix(suffix), target.with_suffix(suffix))
+                shutil.copyfile(source.with_suffix(suffix), target.with_suffix(suffix))
     return target
 
 
 def _current(folder: Path, *parts: str) -> Path:
     """The folder of this version of some parts of the code; in the folder of the tests older ones are removed."""
-    path = folder / f"{'runs' if '' in parts else 'logs'}_{_version(parts)}"
+    path = folder / f"{'logs' if parts else 'runs'}_{version(*parts)}"
     if folder == _FOLDER and not path.exists():
         for old in folder.glob(f"{path.name.partition('_')[0]}_*"):
             shutil.rmtree(old, ignore_errors=True)
@@ -74,7 +81,8 @@ def _current(folder: Path, *parts: str) -> Path:
 
 
 @cache
-def _version(parts: tuple[str, ...]) -> str:
+def version(*parts: str) -> str:
+    """A name for some folders of the code as they are now, or for all of it."""
     root = Path(scanchain.__file__).parent
-    files = sorted(file for part in parts for file in (root / part).rglob("*.py"))
+    files = sorted(file for part in parts or ("",) for file in (root / part).rglob("*.py"))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:8]
