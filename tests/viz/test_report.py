@@ -41,7 +41,11 @@ from tests.support.scenes import ROOT
 EVIL = "<script>alert(1)</script>"
 SUPPORT = ROOT / "tests" / "support"
 BOTH = pytest.mark.parametrize("which", ["comparison", "one_run"])
-SIZES = [(1200, False), (1200, True), (390, False), (390, True)]
+SIZES = [
+    (1200, False),
+    (390, True),
+    *(pytest.param(*size, marks=pytest.mark.slow) for size in ((1200, True), (390, False))),
+]
 
 
 def renamed(source, destination, old, new):
