@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +13,8 @@ from scanchain.data import Closure, ClosureVerdict, GraphState, Keyframe, Matrix
 from scanchain.graph.schedule import LAG, Schedule
 from scanchain.loops import ClosureTable, LoopCloser, PlaceTest
 
+_TOO_FEW = Problem.plain("too few keyframes agree on the place")
+_CONTRADICTED = Problem.plain("withdrawn: what was seen since contradicts the place")
 LARGEST_SIGMAS = (300.0, 30.0)  # m and rad, of an edge: a pose that hangs on less information is lost to rounding
 
 
@@ -118,15 +120,18 @@ class Placement:
             self.evidence.drop(self.closer.segments.starts[-1])
             self.closer.search_again()
 
-    def set_apart(self) -> None:
-        """Take segments of the log for apart that too little joins to older ones in the end."""
-        segments, graph = self.closer.segments, self.graph
+    def set_apart(self) -> bool:
+        """Reject what joins segments to older ones where it is too little in the end; True if any is."""
+        segments, graph, is_any = self.closer.segments, self.graph, False
         targets, sources = graph.edges[graph.is_loop & ~graph.is_rejected].T
-        for number, start in enumerate(segments.starts[1:], 1):
+        for start in segments.starts[1:]:
             placed = range(*segments.span(start, len(graph)))
             is_joined = ((targets < start) & (sources >= start) & (sources < placed.stop)).any()
-            if is_joined and not self.evidence.holds(placed, self.keyframes, graph.poses):
-                segments.apart.add(number)
+            world, of_same_log = (self.keyframes, graph.poses), start > self.first
+            if is_joined and not self.evidence.holds(placed, *world, of_same_log=of_same_log):
+                self._take_back(placed, _TOO_FEW)
+                is_any = True
+        return is_any
 
     def follow_graph(self) -> None:
         """Put the odometry frame where the graph has the newest keyframe."""
@@ -153,26 +158,31 @@ class Placement:
         if evidence.is_gathering and not was_gathering:
             self._move_to(evidence.waiting[0])
             self.follow_graph()
-        too_few = Problem.plain("too few keyframes agree on the place")
-        alone = [each.rejected(too_few) if each.verdict is ClosureVerdict.ACCEPTED else each for each in tested]
+        alone = [each.rejected(_TOO_FEW) if each.verdict is ClosureVerdict.ACCEPTED else each for each in tested]
         return (*(each for each in closures if not joins(each)), *(joining or alone))
 
     def _withdrawn(self, closures: tuple[Closure, ...]) -> tuple[Closure, ...]:
         """The newest segment is not where it was joined to older ones: take back all of that; search again."""
         start = self.closer.segments.starts[-1]
-        problem = Problem.plain("withdrawn: what was seen since contradicts the place")
-
-        def is_wrong(closure: Closure) -> bool:
-            return closure.verdict is ClosureVerdict.ACCEPTED and closure.target < start <= closure.source
-
-        edges = self.graph.edges
-        self.graph.remove_loops(self.graph.is_loop & (edges[:, 0] < start) & (edges[:, 1] >= start))
-        self.closures.reject(is_wrong, problem)
+        is_taken_back = self._take_back(range(start, len(self.keyframes)), _CONTRADICTED)
         self.evidence.drop(start)
         self.closer.search_again()
         self.schedule.stop()
         self.by_map, self.joined_start = None, 0
-        return tuple(each.rejected(problem) if is_wrong(each) else each for each in closures)
+        return tuple(each.rejected(_CONTRADICTED) if is_taken_back(each) else each for each in closures)
+
+    def _take_back(self, segment: range, problem: Problem) -> Callable[[Closure], bool]:
+        """Reject the closures that join the keyframes of a segment to older ones; tells which these are."""
+
+        def is_meant(closure: Closure) -> bool:
+            is_accepted = closure.verdict is ClosureVerdict.ACCEPTED
+            return is_accepted and closure.target < segment.start <= closure.source < segment.stop
+
+        targets, sources = self.graph.edges.T
+        is_between = (targets < segment.start) & (sources >= segment.start) & (sources < segment.stop)
+        self.graph.remove_loops(self.graph.is_loop & is_between)
+        self.closures.reject(is_meant, problem)
+        return is_meant
 
     def _add(self, closure: Closure) -> Closure:
         """Make an edge of a closure; returns the closure with its innovation in the graph before."""

@@ -218,7 +218,8 @@ class Slam:
             self.placement.finish()
         progress(f"optimizing the graph of {counted(len(self.keyframes), 'keyframe')}")
         state = self.placement.schedule.finish()
-        self.placement.set_apart()
+        if self.placement.set_apart():
+            state = self.graph.state()
         odometry, scan_of = trail.odometry, trail.scan_of
         corrected = spread(state.poses[first:], scan_of, odometry.poses)
         if self._refines:

@@ -20,9 +20,6 @@ class Segments:
     def __init__(self) -> None:
         self.starts = [0]
         self.assumed = -1  # number of the one that the newest counts as joined to while that is being tested
-        self.apart: set[int] = (
-            set()
-        )  # numbers of those that loops do not join to older ones, on what evidence there is
 
     def start(self, keyframe: int) -> None:
         """Start a new segment at this keyframe."""
@@ -54,8 +51,7 @@ class Segments:
         number = np.arange(count)
         for pair in np.unique(ends[:, 0] * count + ends[:, 1]).tolist():
             i, j = divmod(pair, count)
-            if j not in self.apart:
-                number[number == number[j]] = number[i]
+            number[number == number[j]] = number[i]
         if with_assumed and self.assumed >= 0:
             number[number == number[-1]] = number[self.assumed]
         return np.unique(number, return_inverse=True)[1].astype(np.int64)[segment]

@@ -22,13 +22,11 @@ _IN_SIGHT = 0.3  # share of the points of a keyframe, from which on those in vie
 _RISK = 1e-3  # that a pose is taken up which is wrong
 _DROPPED = -3.0  # log-odds down to which a pose is tested
 _RESERVE = 5.0  # log-odds above that bound that are kept: what was right for long may turn out wrong
+_FINAL = math.log(10.0)  # log-odds more in the end, when nothing that is seen later can withdraw a pose
 _FOLLOWED_M = 50.0  # path since the last match, up to which keyframes without one speak against the place
 LARGEST_RATIO = 2.0  # of one keyframe, as a logarithm
 WEIGHTS = (2.8, -0.4, -4.9)  # of fit, no fit and contradiction in the evidence of a keyframe
-_OF_FIND = {
-    2: 4.0,
-    3: 5.0,
-}  # log-odds of what a search found: it finds most right places, others in 0.004 and 0.001
+_OF_FIND = {2: 4.0, 3: 5.0}  # log-odds of a find by a search: of most right places, of others in 0.004 and 0.001
 _SEARCHED_M = {2: 8.0, 3: 20.0}  # path whose points are sought together, at full scale
 _NO_OVERLAP = 0.3  # overlap from which on a fit is evidence
 _IN_SIGHT_OF_BOTH = 0.2  # share of the points in view of the other side, from which on that knows the place
@@ -183,9 +181,16 @@ class PlaceTest:
         self.is_given, self.log_odds = False, 0.0
         self.reset()
 
-    def holds(self, placed: range, keyframes: Sequence[Keyframe], T_world: Matrix) -> bool:
-        """True if some keyframes, by their numbers, stand at their final poses where they are tried."""
-        self.counted_m, self.log_odds = [], self.bound + _RESERVE if self.is_given else 0.0
+    def holds(
+        self, placed: range, keyframes: Sequence[Keyframe], T_world: Matrix, *, of_same_log: bool = False
+    ) -> bool:
+        """True if some keyframes, by their numbers, stand at their final poses where they are tried.
+
+        of_same_log : whether the older ones are of one log with them, and as likely near them as not; of a log in
+            a map what is seen has to speak for itself
+        """
+        prior = _OF_FIND[T_world.shape[-1] - 1] - _FINAL if of_same_log else 0.0
+        self.counted_m, self.log_odds = [], self.bound + _RESERVE if self.is_given else prior
         for closure in (self.tried[index] for index in placed if index in self.tried):
             ratio = self._ratio_at(T_world[closure.source], closure, keyframes, T_world)
             self.log_odds += self._weight(keyframes[closure.source]) * ratio
