@@ -12,7 +12,7 @@ from scanchain.errors import InputError
 from scanchain.logs import open_log
 from tests.support import recorders
 from tests.support.naive_logs import office, write
-from tests.support.recorders import STAMP_NS, Ros, assert_clouds, assert_planar
+from tests.support.recorders import Ros, assert_clouds, assert_planar
 
 
 def read(path, **config):
@@ -77,13 +77,6 @@ def test_mcap_and_db3_parts_in_a_folder_are_one_log(tmp_path):
         (tmp_path / "db3").mkdir(exist_ok=True)
         shutil.move(tmp_path / f"part_{number}" / f"part_{number}.db3", tmp_path / "db3")
     assert_drive(*read(tmp_path / "db3"))
-
-
-def test_a_part_of_a_bag_is_chosen_by_time(tmp_path):
-    path = recorders.bag1_of(tmp_path / "a.bag", Ros(recorders.ROS1).drive())
-    log, scans = read(path, start_s=0.1)
-    assert log.scan_count == len(scans) == 2
-    assert_planar(scans, recorders.planar()[1:])
 
 
 @pytest.mark.parametrize("compression", [None, "BZ2", "LZ4"])
@@ -207,11 +200,3 @@ def test_a_path_in_metadata_leads_nowhere_else(tmp_path):
     (folder / "metadata.yaml").write_text(text.replace("bag.mcap", f"../{outside.name}"))
     with pytest.raises(InputError):
         read(folder)
-
-
-def test_stamps_before_the_first_message_of_a_bag_do_not_matter(tmp_path):
-    ros = Ros(recorders.ROS1)
-    scan = recorders.planar(1)[0]
-    told = [("/scan", "sensor_msgs/msg/LaserScan", STAMP_NS + 5, ros.laser_scan(scan))]
-    _, scans = read(recorders.bag1_of(tmp_path / "a.bag", told))
-    assert scans[0].stamp_ns == STAMP_NS and scans[0].log_time_ns == STAMP_NS + 5
