@@ -24,7 +24,6 @@ from scanchain.logs.topics import topics_of
 _BASE_FRAMES = ("base_link", "base_footprint", "base")
 _WORLD_WORDS = {"map", "odom", "world", "earth", "global", "origin", "init"}  # in names of frames that stand still
 _TURN_RAD, _SHIFT_M = np.radians(0.2), 0.005  # least turn and shift of a mount that moves
-_TILT_RAD, _LIFT_M = np.radians(1.0), 0.1  # least tilt and lift of a planar lidar that leaves its plane
 _TILTED_RAD = np.radians(10.0)  # tilt of a planar lidar's plane from which on it is no floor plan
 _TURNED_DEG = 0.5  # least turn of a lidar on its robot that is worth a word
 _MOUNT_M = 1.0  # largest motion of a sensor on a robot; a frame that moves by more is no part of it
@@ -41,7 +40,6 @@ class Mounting(NamedTuple):
     T_base_lidar : (4, 4), the first one seen where it moves; the identity where the log does not state it
     source : of the pose, as text
     motion : the joint that moves the lidar and how far, as text; None where it stays where it is
-    leaves_plane : whether it tilts or rises then
     note : what was assumed, empty where nothing was
     """
 
@@ -50,7 +48,6 @@ class Mounting(NamedTuple):
     T_base_lidar: Pose
     source: str = "by static transforms"
     motion: str | None = None
-    leaves_plane: bool = False
     note: str = ""
 
     @property
@@ -140,7 +137,6 @@ def _on_joints(
             mounting = mounting._replace(
                 source="by transforms of /tf that change",
                 motion=f"{joint[0]} → {joint[1]} in /tf {turn}{shift}",
-                leaves_plane=mounting.leaves_plane or any(_leaves_plane(T_first, T) for T in seen),
             )
     return mounting
 
@@ -194,12 +190,6 @@ def _root(parents: dict[str, str], frame: str) -> str:
 
 def _edge(transform: StampedPose) -> Edge:
     return transform.parent.lstrip("/"), transform.child.lstrip("/")
-
-
-def _leaves_plane(T_base_first: Pose, T_base_lidar: Pose) -> bool:
-    """True if a planar lidar that was in a plane has tilted or risen out of it."""
-    cosine = float(T_base_first[:3, 2] @ T_base_lidar[:3, 2])
-    return cosine < np.cos(_TILT_RAD) or abs(T_base_first[2, 3] - T_base_lidar[2, 3]) > _LIFT_M
 
 
 def is_upside_down(T_base_lidar: Pose) -> bool:
