@@ -94,17 +94,6 @@ def test_messages_of_a_bag_stay_as_they_are_and_others_can_decode_them(tmp_path)
         assert sorted(message.data for _, _, message, _ in read) == sorted(told)
 
 
-@pytest.mark.parametrize("source", ["carmen", "kitti raw", "clouds"])
-def test_what_is_made_of_text_and_files_others_can_decode(tmp_path, source):
-    assert main(["convert", str(SOURCES[source](tmp_path)), str(tmp_path / "out.mcap")]) == 0
-    with (tmp_path / "out.mcap").open("rb") as stream:
-        read = list(make_reader(stream, decoder_factories=[Ros2Factory()]).iter_decoded_messages())
-    lidar = [decoded for schema, _, _, decoded in read if schema.name.startswith("sensor_msgs/msg/")]
-    assert len(lidar) == (600 if source == "carmen" else 3)
-    if source != "carmen":
-        assert [field.name for field in lidar[0].fields] == ["x", "y", "z", "intensity"]
-
-
 def test_a_rate_gives_stamps_to_files_that_are_only_numbered(tmp_path, capfd):
     (tmp_path / "scans").mkdir()
     for k, cloud in enumerate(recorders.clouds()):

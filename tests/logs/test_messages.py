@@ -5,9 +5,7 @@ import pytest
 from foxglove import Channel, Schema
 from foxglove import messages as fox
 from foxglove.channels import FrameTransformsChannel, PoseInFrameChannel
-from mcap.reader import make_reader
 from mcap.writer import Writer
-from mcap_ros1.decoder import DecoderFactory
 
 from scanchain import lie
 from scanchain.config import LogConfig
@@ -39,14 +37,6 @@ def test_clouds_of_either_ros_keep_every_point_and_its_time(tmp_path, store):
     log, scans = read(recorders.mcap_of(tmp_path / "a.mcap", Ros(store), Ros(store).sweeps()))
     assert log.dimension == 3
     assert_clouds(scans)
-
-
-def test_what_rosbags_writes_as_ros_1_is_what_mcap_ros1_support_reads(tmp_path):
-    path = recorders.mcap_of(tmp_path / "a.mcap", Ros(ROS1), Ros(ROS1).drive())
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        scans = [decoded for _, channel, _, decoded in reader.iter_decoded_messages() if channel.topic == "/scan"]
-    assert scans[0].header.frame_id == "laser" and scans[0].ranges[1] == recorders.planar()[0].ranges[1]
 
 
 @pytest.mark.parametrize("store", [ROS1, ROS2], ids=["ros1", "ros2"])

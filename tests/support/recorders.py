@@ -222,33 +222,29 @@ def mcap_of(path, ros, told):
 
 def bag1_of(path, told, compression=None, *, chunk_bytes=None):
     """A ROS 1 bag."""
-    ros = Ros(ROS1)
     writer = rosbag1.Writer(path)
     writer.chunk_threshold = chunk_bytes or writer.chunk_threshold
     if compression:
         writer.set_compression(rosbag1.Writer.CompressionFormat[compression])
-    with writer:
-        connections = {}
-        for topic, type_name, time_ns, message in told:
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, type_name, typestore=ROS1)
-            writer.write(connections[topic], time_ns, ros.serialize(message, type_name))
-    return path
+    return _bag_of(path, writer, Ros(ROS1), told)
 
 
 def bag2_of(folder, told, *, plugin="SQLITE3", compression="NONE"):
     """The folder of a ROS 2 bag."""
-    ros = Ros(ROS2)
     writer = rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin[plugin])
     if compression != "NONE":
         writer.set_compression(rosbag2.CompressionMode[compression], rosbag2.CompressionFormat.ZSTD)
+    return _bag_of(folder, writer, Ros(ROS2), told)
+
+
+def _bag_of(path, writer, ros, told):
     with writer:
         connections = {}
         for topic, type_name, time_ns, message in told:
             if topic not in connections:
-                connections[topic] = writer.add_connection(topic, type_name, typestore=ROS2)
+                connections[topic] = writer.add_connection(topic, type_name, typestore=ros.store)
             writer.write(connections[topic], time_ns, ros.serialize(message, type_name))
-    return folder
+    return path
 
 
 # Foxglove, by foxglove-sdk
