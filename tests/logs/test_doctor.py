@@ -130,18 +130,6 @@ def test_a_gap_is_found_where_it_is(tmp_path):
     assert (later.found, later.remedy) == (finding.found, finding.remedy)  # the flag counts from the same moment
 
 
-def test_stamps_that_were_never_set_are_a_problem(tmp_path):
-    found = diagnose(saved(tmp_path, drive(stamp=lambda k: -STAMP_NS - k * STEP_NS)))
-    assert "have the header stamp of the one before" in found["damage"].found
-    assert found["gaps"].severity == "ok"  # by log time
-
-
-def test_wheels_of_another_clock_are_told_to_miss_every_scan(tmp_path):
-    found = diagnose(saved(tmp_path, drive(wheels=True, stamp=lambda k: -37 * SECOND)))
-    assert "40 of 40 scans without a reading" in found["wheels"].found
-    assert found["wheels"].remedy == ""  # without a reading nothing is taken from them
-
-
 def test_a_range_that_stands_for_no_return_is_found_and_mended_by_its_flag(tmp_path):
     def ranges(k):
         values = room(k)
@@ -156,15 +144,43 @@ def test_a_range_that_stands_for_no_return_is_found_and_mended_by_its_flag(tmp_p
     assert diagnose(path, max_range_m=float(value))["no return"].severity == "ok"
 
 
-def test_nan_and_zero_shares_are_measured(tmp_path):
-    def ranges(k):
-        values = room(k)
-        values[:30], values[30:80] = np.nan, 0.0
-        return values
+def mostly_lost(k):
+    ranges = room(k)
+    ranges[:30], ranges[30:80] = np.nan, 0.0
+    return ranges
 
-    finding = diagnose(saved(tmp_path, drive(ranges=ranges)))["returns"]
-    assert finding.found == "80 % of the beams without a valid return, 20 valid a scan (median)"
-    assert finding.severity == "warning" and "40 scans with fewer than 50 returns" in finding.effect
+
+def at_times(k):
+    return STAMP_NS + k * STEP_NS
+
+
+NO_WHEELS = "--odometry.prior constant-velocity"
+IN_MILLIMETERS = [odometry_said(at_times(k), odometry(at_times(k), 100.0 * k, 0.0)) for k in range(40)]
+
+
+@pytest.mark.parametrize(
+    ("said", "check", "severity", "found", "remedy"),
+    [
+        (drive(stamp=lambda k: -at_times(k)), "damage", "warning", "have the header stamp of the one before", ""),
+        (drive(stamp=lambda k: -at_times(k)), "gaps", "ok", "none longer", ""),  # by log time
+        (drive(wheels=True, stamp=lambda k: -37 * SECOND), "wheels", "warning", "40 of 40 scans without", ""),
+        (drive(wheels=True, mounted=False), "wheels", "warning", "no static transform from base_link", NO_WHEELS),
+        ([*drive(), *IN_MILLIMETERS], "wheels", "problem", "moves at 1e+03 m/s", NO_WHEELS),
+        (
+            drive(ranges=mostly_lost),
+            "returns",
+            "warning",
+            "80 % of the beams without a valid return, 20 valid a",
+            "",
+        ),
+        (drive(ranges=lambda k: room(k // 2)), "duplicates", "warning", "20 of 40 scans", "--every 2"),
+        (drive(ranges=lambda k: room(min(k, 20))), "duplicates", "warning", "20 of them in a row", ""),
+    ],
+)
+def test_a_fault_is_measured_and_graded(tmp_path, said, check, severity, found, remedy):
+    finding = diagnose(saved(tmp_path, said))[check]
+    assert (finding.severity, finding.remedy) == (severity, remedy)
+    assert found in finding.found
 
 
 def test_scans_that_would_stop_a_run_are_a_problem_with_a_flag(tmp_path):
@@ -185,22 +201,6 @@ def test_a_log_that_was_cut_off_is_told(tmp_path):
     path.write_bytes(path.read_bytes()[:-1500])
     finding = diagnose(path)["damage"]
     assert finding.severity == "warning" and "cut off" in finding.found
-
-
-def test_copies_of_scans_are_counted_and_mended_by_taking_every_second(tmp_path):
-    finding = diagnose(saved(tmp_path, drive(ranges=lambda k: room(k // 2))))["duplicates"]
-    assert finding.severity == "warning" and "20 of 40 scans" in finding.found and finding.remedy == "--every 2"
-
-
-def test_a_stuck_driver_is_told_from_one_that_publishes_too_often(tmp_path):
-    finding = diagnose(saved(tmp_path, drive(ranges=lambda k: room(min(k, 20)))))["duplicates"]
-    assert "19 of 40 scans" in finding.found and "20 of them in a row" in finding.found and not finding.remedy
-
-
-def test_wheels_without_a_mounting_are_told(tmp_path):
-    finding = diagnose(saved(tmp_path, drive(wheels=True, mounted=False)))["wheels"]
-    assert finding.severity == "warning" and "no static transform from base_link to laser" in finding.found
-    assert finding.remedy == "--odometry.prior constant-velocity"
 
 
 # Clouds
@@ -296,15 +296,6 @@ def test_ranges_in_millimeters_are_a_problem_and_not_to_be_widened_to(call, tmp_
     assert (finding.severity, finding.remedy) == ("problem", "") and "100 % lie beyond" in finding.effect
     code, _, errors = call("run", path, "--out", tmp_path / "a", "--rerun", "off")
     assert code == 2 and "millimeters? convert them to meters" in errors and "widen" not in errors
-
-
-def test_wheels_in_millimeters_are_a_problem_with_the_flag_that_leaves_them_out(tmp_path):
-    said = [
-        odometry_said(STAMP_NS + k * STEP_NS, odometry(STAMP_NS + k * STEP_NS, 100.0 * k, 0.0)) for k in range(40)
-    ]
-    finding = diagnose(saved(tmp_path, [*drive(), *said]))["wheels"]
-    assert (finding.severity, finding.remedy) == ("problem", "--odometry.prior constant-velocity")
-    assert "moves at 1e+03 m/s" in finding.found
 
 
 def test_imu_gnss_and_truth_are_named_with_what_is_made_of_them(tmp_path, capfd):
