@@ -73,20 +73,15 @@ def covered(*numbers):
     return lambda k: np.full(100, 0.2) if k in numbers else room(k)
 
 
-@pytest.mark.parametrize("numbers", [(0, 1), (0, 20), (38, 39)])
-def test_scans_without_a_point_in_range_are_left_out_wherever_they_are(call, tmp_path, numbers):
-    path = saved(tmp_path, drive(ranges=covered(*numbers)))
+def test_scans_without_a_point_in_range_are_left_out(call, tmp_path):
+    path = saved(tmp_path, drive(ranges=covered(0, 20)))
     found = diagnose(path)["damage"]
-    assert (
-        found.severity == "warning"
-        and "2 scans without a point between preprocess.min_range_m (0.5)" in found.found
-    )
+    assert found.severity == "warning"
+    assert "2 scans without a point between preprocess.min_range_m (0.5)" in found.found
     flags = ["--preprocess.min_range_m", "0.5", "--rerun", "off"]
     code, output, errors = call("run", path, "--out", tmp_path / "a", *flags)
     assert code == 0 and "scans          38 over" in output
-    assert (
-        f"warning: 2 of 40 scans of /scan were left out (the first: {path}: scan {numbers[0]} of /scan" in errors
-    )
+    assert f"warning: 2 of 40 scans of /scan were left out (the first: {path}: scan 0 of /scan" in errors
     assert "no point between preprocess.min_range_m (0.5) and preprocess.max_range_m" in errors
 
 
@@ -336,7 +331,7 @@ def test_truth_and_wheels_are_named_though_the_lidar_is_not_chosen(tmp_path, cap
 # The whole
 
 
-def test_the_intel_log_is_known_for_its_stamps():
+def test_the_intel_log_has_none_of_these_faults():
     found = diagnose(shared_data("2d/intel.mcap"))
     assert found["no return"].severity == "ok"
     assert found["duplicates"].severity == "ok" and "0 of 13,631" in found["wheels"].found

@@ -119,26 +119,19 @@ def _on_joints(
     first = {joint: poses[0] for joint, poses in moving.items()}
     T_first = chain([*fixed, *first.values()], base, frame)
     assert T_first is not None
-    mounting = mounting._replace(T_base_lidar=T_first)
-    most_rad = -1.0
+    motion, most_rad, source = None, -1.0, mounting.source
     for joint, poses in moving.items():
         others = [*fixed, *(pose for other, pose in first.items() if other != joint)]
         if chain(others, base, frame) is not None:  # the lidar does not hang on it
             continue
-        if mounting.motion is None:
-            mounting = mounting._replace(source="by transforms of /tf, which do not change")
         seen = [T for pose in poses if (T := chain([*others, pose], base, frame)) is not None]
-        turn_rad = max(lie.apart(T_first, T)[1] for T in seen)
-        shift_m = max(lie.apart(T_first, T)[0] for T in seen)
+        shift_m, turn_rad = np.max([lie.apart(T_first, T) for T in seen], axis=0)
         if (turn_rad > _TURN_RAD or shift_m > _SHIFT_M) and turn_rad > most_rad:
             most_rad = turn_rad
-            turn = f"turns by up to {np.degrees(turn_rad):.0f} deg"
             shift = f" and shifts by {shift_m:.2f} m" if shift_m > _SHIFT_M else ""
-            mounting = mounting._replace(
-                source="by transforms of /tf that change",
-                motion=f"{joint[0]} → {joint[1]} in /tf {turn}{shift}",
-            )
-    return mounting
+            motion = f"{joint[0]} → {joint[1]} in /tf turns by up to {np.degrees(turn_rad):.0f} deg{shift}"
+        source = "by transforms of /tf" + (" that change" if motion else ", which do not change")
+    return mounting._replace(T_base_lidar=T_first, source=source, motion=motion)
 
 
 def moving_frame(
