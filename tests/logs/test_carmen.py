@@ -9,16 +9,11 @@ import numpy as np
 import pytest
 
 from scanchain import lie
-from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.logs import open_log
 from tests.support.carmen_text import BEGIN_S, flaser, odom, robotlaser, save
+from tests.support.recorders import read
 from tests.support.scenes import shared_data
-
-
-def read(path, **config):
-    log = open_log(path, LogConfig(**config))
-    return log, list(log.scans())
 
 
 def points(ranges, first=-np.pi / 2, step=np.pi / 180):

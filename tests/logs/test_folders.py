@@ -10,13 +10,8 @@ from scanchain.logs.formats.clouds import stamp_of_name
 from scanchain.simulation import simulate
 from tests.support import recorders
 from tests.support.folders import PCD, PLY, camera, kitti_odometry, kitti_raw, xyzi
-from tests.support.recorders import SECOND, STAMP_NS, assert_clouds
+from tests.support.recorders import SECOND, STAMP_NS, assert_clouds, read
 from tests.support.scenes import shared_data
-
-
-def read(path, **config):
-    log = open_log(path, LogConfig(**config))
-    return log, list(log.scans())
 
 
 def assert_points(scans, said):

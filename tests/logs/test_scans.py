@@ -35,12 +35,8 @@ from tests.support.naive_logs import (
     transforms_said,
     write,
 )
+from tests.support.recorders import read
 from tests.support.scenes import shared_data
-
-
-def read(*paths, **config):
-    log = open_log(list(paths), LogConfig(**config))
-    return log, list(log.scans())
 
 
 def assert_office(log, scans, count=40):

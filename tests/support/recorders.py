@@ -12,6 +12,9 @@ from mcap.writer import Writer
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from scanchain.config import LogConfig
+from scanchain.logs import open_log
+
 SECOND = 1_000_000_000
 STAMP_NS = 1_700_000_000 * SECOND
 FIRST_RAD, STEP_RAD = np.float32(-1.0), np.float32(0.03125)  # exact in binary, so that other formats can tell them
@@ -58,6 +61,18 @@ def clouds(count=3, points=50):
         rows["x"][0] = np.nan
         told.append(Cloud(STAMP_NS + k * SECOND // 8, rows))
     return told
+
+
+def read(*paths, **config):
+    """A log and its scans."""
+    log = open_log(list(paths), LogConfig(**config))
+    return log, list(log.scans())
+
+
+def read_undamaged(path, **config):
+    log, scans = read(path, **config)
+    assert log.damage == []
+    return log, scans
 
 
 def assert_planar(scans, said=None, *, exact=True):
