@@ -218,6 +218,7 @@ def figures(path, out, capfd, *flags):
     return metrics["ground_truth"]["odometry"]["ate_rmse_m"], metrics["lost"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)
 def test_the_flags_of_a_finding_help(world, tmp_path, capfd, fault):
     path = write(tmp_path / "log.mcap", list(fault(world)), chunk_size=1 << 20)

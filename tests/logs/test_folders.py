@@ -1,11 +1,8 @@
 """Folders of sweeps: KITTI raw and odometry, PCD and PLY as open3d writes them, raw float32."""
 
-import re
-
 import numpy as np
 import pytest
 
-from scanchain import lie
 from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.logs import open_log
@@ -13,13 +10,8 @@ from scanchain.logs.formats.clouds import stamp_of_name
 from scanchain.simulation import simulate
 from tests.support import recorders
 from tests.support.folders import PCD, PLY, camera, kitti_odometry, kitti_raw, xyzi
-from tests.support.recorders import SECOND, STAMP_NS, assert_clouds
+from tests.support.recorders import SECOND, STAMP_NS, assert_clouds, read
 from tests.support.scenes import shared_data
-
-
-def read(path, **config):
-    log = open_log(path, LogConfig(**config))
-    return log, list(log.scans())
 
 
 def assert_points(scans, said):
@@ -264,14 +256,6 @@ def test_a_file_that_is_broken_is_left_out_and_told(tmp_path, name, content):
     assert f"is malformed: {name} " in log.damage[1]
 
 
-@pytest.mark.parametrize("shape", [(3, 500), (500, 2), (500,)])
-def test_arrays_of_another_shape_are_named_with_it(tmp_path, shape):
-    for k in range(4):
-        np.save(tmp_path / f"{k}.npy", np.ones(shape, np.float32))
-    with pytest.raises(InputError, match=rf"is malformed: \d\.npy is an array {re.escape(str(shape))} of float32"):
-        read(tmp_path, rate_hz=10.0)
-
-
 def test_a_run_directory_is_no_log(tmp_path):
     (tmp_path / "run.json").write_text("{}")
     (tmp_path / "map.ply").write_text("")
@@ -335,18 +319,6 @@ def test_an_array_that_is_no_cloud_is_left_out_with_its_shape(tmp_path, array, s
     assert len(scans) == 1 and said in log.damage[0]
 
 
-def test_a_folder_of_nothing_that_is_known_says_what_is(tmp_path):
-    (tmp_path / "notes.txt").write_text("hello")
-    with pytest.raises(InputError, match="is a folder without a recognized log; give MCAP"):
-        read(tmp_path)
-
-
-def test_the_mounting_of_a_folder_is_not_known_and_taken_as_the_origin(tmp_path):
-    xyzi(recorders.clouds(1)[0]).tofile(tmp_path / "1.0.bin")
-    log, _ = read(tmp_path)
-    np.testing.assert_array_equal(log.T_base_lidar, lie.lift(np.eye(3)))
-
-
 def test_a_folder_of_several_kinds_of_clouds_says_which_it_left_out(tmp_path):
     np.save(tmp_path / "1.0.npy", swept(0))
     np.save(tmp_path / "2.0.npy", swept(1))
@@ -354,14 +326,9 @@ def test_a_folder_of_several_kinds_of_clouds_says_which_it_left_out(tmp_path):
     (tmp_path / "1.5.pcd").write_text(PCD.format(count=3, form="ascii") + "1 2 3\n" * 3)
     (note,) = [note for note in open_log(tmp_path).notes if "left out" in note]
     assert note.startswith(f"{tmp_path}: only its .pcd files are read, left out are 2 .npy;")
-
-
-def test_a_folder_of_parts_of_a_log_says_which_other_files_it_left_out(tmp_path):
     simulate("office", tmp_path / "part.mcap", duration_s=1.0)
-    np.save(tmp_path / "1.0.npy", swept(0))
-    (tmp_path / "notes.txt").touch()
     (note,) = [note for note in open_log(tmp_path).notes if "left out" in note]
-    assert note.startswith(f"{tmp_path}: only its .mcap files are read, left out are 1 .npy;")
+    assert note.startswith(f"{tmp_path}: only its .mcap files are read, left out are 1 .pcd, 2 .npy;")
 
 
 def test_many_bad_files_are_told_by_the_first_and_their_number(tmp_path):

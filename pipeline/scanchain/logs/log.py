@@ -216,16 +216,10 @@ class Log:
             self._damage.append(f"{scans} of {self.topic} {'was' if scans == '1 scan' else 'were'} recovered")
 
     def _mounting_notes(self) -> list[str]:
-        """Assumptions about the mounting. Raises InputError where a planar lidar moves out of its plane."""
+        """Assumptions about the mounting."""
         mounting = self.mounting
         notes = [mounting.note] if mounting.note else []
         if mounting.motion is not None:
-            if self.dimension == 2 and mounting.leaves_plane:
-                raise InputError(
-                    f"{self.name}: the planar lidar of {self.topic} does not stay in one plane: "
-                    f"{mounting.motion}; choose another --topic, a part in which it rests (--start, --end), or "
-                    "join its scans to 3D clouds first (laser_assembler)"
-                )
             wheels = f"; the wheels ({self.odometry_topic}) are no prior for it" if self.has_odometry else ""
             notes.append(
                 f"the lidar moves on the robot ({mounting.motion}): poses are the lidar's, this motion "

@@ -24,7 +24,6 @@ from scanchain.logs.topics import topics_of
 _BASE_FRAMES = ("base_link", "base_footprint", "base")
 _WORLD_WORDS = {"map", "odom", "world", "earth", "global", "origin", "init"}  # in names of frames that stand still
 _TURN_RAD, _SHIFT_M = np.radians(0.2), 0.005  # least turn and shift of a mount that moves
-_TILT_RAD, _LIFT_M = np.radians(1.0), 0.1  # least tilt and lift of a planar lidar that leaves its plane
 _TILTED_RAD = np.radians(10.0)  # tilt of a planar lidar's plane from which on it is no floor plan
 _TURNED_DEG = 0.5  # least turn of a lidar on its robot that is worth a word
 _MOUNT_M = 1.0  # largest motion of a sensor on a robot; a frame that moves by more is no part of it
@@ -41,7 +40,6 @@ class Mounting(NamedTuple):
     T_base_lidar : (4, 4), the first one seen where it moves; the identity where the log does not state it
     source : of the pose, as text
     motion : the joint that moves the lidar and how far, as text; None where it stays where it is
-    leaves_plane : whether it tilts or rises then
     note : what was assumed, empty where nothing was
     """
 
@@ -50,7 +48,6 @@ class Mounting(NamedTuple):
     T_base_lidar: Pose
     source: str = "by static transforms"
     motion: str | None = None
-    leaves_plane: bool = False
     note: str = ""
 
     @property
@@ -122,27 +119,19 @@ def _on_joints(
     first = {joint: poses[0] for joint, poses in moving.items()}
     T_first = chain([*fixed, *first.values()], base, frame)
     assert T_first is not None
-    mounting = mounting._replace(T_base_lidar=T_first)
-    most_rad = -1.0
+    motion, most_rad, source = None, -1.0, mounting.source
     for joint, poses in moving.items():
         others = [*fixed, *(pose for other, pose in first.items() if other != joint)]
         if chain(others, base, frame) is not None:  # the lidar does not hang on it
             continue
-        if mounting.motion is None:
-            mounting = mounting._replace(source="by transforms of /tf, which do not change")
         seen = [T for pose in poses if (T := chain([*others, pose], base, frame)) is not None]
-        turn_rad = max(lie.apart(T_first, T)[1] for T in seen)
-        shift_m = max(lie.apart(T_first, T)[0] for T in seen)
+        shift_m, turn_rad = np.max([lie.apart(T_first, T) for T in seen], axis=0)
         if (turn_rad > _TURN_RAD or shift_m > _SHIFT_M) and turn_rad > most_rad:
             most_rad = turn_rad
-            turn = f"turns by up to {np.degrees(turn_rad):.0f} deg"
             shift = f" and shifts by {shift_m:.2f} m" if shift_m > _SHIFT_M else ""
-            mounting = mounting._replace(
-                source="by transforms of /tf that change",
-                motion=f"{joint[0]} → {joint[1]} in /tf {turn}{shift}",
-                leaves_plane=mounting.leaves_plane or any(_leaves_plane(T_first, T) for T in seen),
-            )
-    return mounting
+            motion = f"{joint[0]} → {joint[1]} in /tf turns by up to {np.degrees(turn_rad):.0f} deg{shift}"
+        source = "by transforms of /tf" + (" that change" if motion else ", which do not change")
+    return mounting._replace(T_base_lidar=T_first, source=source, motion=motion)
 
 
 def moving_frame(
@@ -194,12 +183,6 @@ def _root(parents: dict[str, str], frame: str) -> str:
 
 def _edge(transform: StampedPose) -> Edge:
     return transform.parent.lstrip("/"), transform.child.lstrip("/")
-
-
-def _leaves_plane(T_base_first: Pose, T_base_lidar: Pose) -> bool:
-    """True if a planar lidar that was in a plane has tilted or risen out of it."""
-    cosine = float(T_base_first[:3, 2] @ T_base_lidar[:3, 2])
-    return cosine < np.cos(_TILT_RAD) or abs(T_base_first[2, 3] - T_base_lidar[2, 3]) > _LIFT_M
 
 
 def is_upside_down(T_base_lidar: Pose) -> bool:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from itertools import islice
 from pathlib import Path
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from scanchain.errors import InputError, counted
 from scanchain.logs.formats import add_block, add_channel, left_out, natural_order, on_demand_index
-from scanchain.logs.mcap.records import Block, Contents, FileIndex, Message
+from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
 from scanchain.logs.writer import LATEST_NS, pack_cloud
 
 _UNITS_NS = {19: 1, 16: 1_000, 13: 1_000_000}  # nanoseconds of a stamp's unit, by its number of digits since 2001
@@ -258,16 +258,22 @@ def index_clouds(folder: Path, number: int, rate_hz: float = 0.0, bin_columns: i
         add_block(index, place, file.stat().st_size, [stamp_ns], {channel: 1})
 
     def make(block: Block, _: AbstractSet[int] | None) -> Contents:
-        file, stamp_ns = files[block.offset], stamps_ns[block.offset]
-        try:
-            data = pack_cloud(stamp_ns, "lidar", read_cloud_file(file, raw))
-        except (CloudFileError, OSError) as error:
-            unreadable = Message(channel, stamp_ns, memoryview(b""), f"{file.name} {error}")
-            return Contents([unreadable], f"{file}: {error}; it was left out")
-        return Contents([Message(channel, stamp_ns, memoryview(data))], "")
+        return contents_of(files[block.offset], channel, block.start_ns, lambda file: read_cloud_file(file, raw))
 
     index.make = make
     return index
+
+
+def contents_of(
+    file: Path, channel: Channel, stamp_ns: int, read: Callable[[Path], NDArray[np.void]], frame: str = "lidar"
+) -> Contents:
+    """A cloud file as the one message of a block; a malformed one where it cannot be read."""
+    try:
+        data = pack_cloud(stamp_ns, frame, read(file))
+    except (CloudFileError, OSError) as error:
+        unreadable = Message(channel, stamp_ns, memoryview(b""), f"{file.name} {error}")
+        return Contents([unreadable], f"{file}: {error}; it was left out")
+    return Contents([Message(channel, stamp_ns, memoryview(data))], "")
 
 
 def _found(folder: Path, files: Sequence[Path], raw: np.dtype[np.void]) -> list[str]:

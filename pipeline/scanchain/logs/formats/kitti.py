@@ -16,9 +16,9 @@ from scanchain import lie
 from scanchain.data import Matrix, Pose
 from scanchain.errors import InputError, counted
 from scanchain.logs.formats import add_block, add_channel, natural_order, on_demand_index
-from scanchain.logs.formats.clouds import XYZI, CloudFileError, read_raw
+from scanchain.logs.formats.clouds import XYZI, contents_of, read_raw
 from scanchain.logs.mcap.records import Block, Contents, FileIndex, Message
-from scanchain.logs.writer import LATEST_NS, pack_cloud, pack_odometry, place
+from scanchain.logs.writer import LATEST_NS, pack_odometry, place
 
 _TRUTH = -1  # index of the block of the ground truth
 _POSE_BYTES = 720
@@ -119,12 +119,9 @@ def _index(
         if block.offset == _TRUTH:
             said = [(each, pack_odometry(each, "world", "velodyne", place(T))) for each, T in truth]
             return Contents([Message(channel, each, memoryview(data)) for each, data in said], "")
-        file, stamp_ns = files[block.offset], block.start_ns
-        try:
-            data = pack_cloud(stamp_ns, "velodyne", read_raw(file, XYZI))
-        except (CloudFileError, OSError) as error:
-            return Contents([], f"{file}: {error}; it was left out")
-        return Contents([Message(channel, stamp_ns, memoryview(data))], "")
+        return contents_of(
+            files[block.offset], channel, block.start_ns, lambda file: read_raw(file, XYZI), "velodyne"
+        )
 
     index.make = make
     return index

@@ -273,7 +273,10 @@ def decoded_messages(
     wanted = [{number for topic in decoders for number in index.numbers_of(topic)} for index in indexes]
 
     def decode(block: Block) -> tuple[list[Decoded], str]:
-        contents = read_block(indexes[block.file], block, wanted[block.file])
+        try:
+            contents = read_block(indexes[block.file], block, wanted[block.file])
+        except DamagedBlockError as error:
+            return [], f"{error}; it was left out"
         decoded = [
             Decoded(message.channel, message.log_time_ns, _decode(decoders[message.channel.topic], message))
             for message in contents.messages
@@ -282,13 +285,7 @@ def decoded_messages(
         release(indexes[block.file], block)
         return decoded, contents.damage
 
-    blocks = [
-        block
-        for index in indexes
-        for block in index.blocks
-        if span.meets(block) and index.may_hold(block, wanted[block.file])
-    ]
-    blocks.sort(key=lambda block: (block.start_ns, block.file, block.offset))
+    blocks = _blocks_of(indexes, wanted, span)
     waiting: list[tuple[int, int, int, int, Decoded]] = []
     is_remote = any(index.fetch is not None for index in indexes)
     ahead *= _REMOTE_TIMES if is_remote else 1
@@ -299,6 +296,12 @@ def decoded_messages(
             heappush(waiting, (message.log_time_ns, block.file, block.offset, place, message))
         while waiting and (following is None or waiting[0][0] < following.start_ns):
             yield heappop(waiting)[-1]
+
+
+def _blocks_of(indexes: Sequence[FileIndex], wanted: Sequence[set[int]], span: Span) -> list[Block]:
+    """Those that may hold messages of the wanted channels of each file, by time."""
+    found = [block for index in indexes for block in index.blocks if index.may_hold(block, wanted[block.file])]
+    return sorted(filter(span.meets, found), key=lambda block: (block.start_ns, block.file, block.offset))
 
 
 def _decode(decoder: Callable[[memoryview], object], message: Message) -> object:
@@ -323,29 +326,20 @@ def _ahead(
     size = 0
     pool = ThreadPoolExecutor(workers, thread_name_prefix="scanchain-read")
     try:
-        for block in blocks:
-            running.append((block, pool.submit(decode, block)))
-            size += block.uncompressed_size
-            while len(running) > ahead or (size > _MOST_BYTES_AHEAD and len(running) > 1):
+        for block in (*blocks, None):
+            if block is not None:
+                running.append((block, pool.submit(decode, block)))
+                size += block.uncompressed_size
+            while len(running) > (0 if block is None else ahead) or (
+                size > _MOST_BYTES_AHEAD and len(running) > 1
+            ):
                 done, future = running.popleft()
                 size -= done.uncompressed_size
-                yield _result(future, damage)
-        while running:
-            yield _result(running.popleft()[1], damage)
+                messages, lost = future.result()
+                damage += [lost] if lost and lost not in damage else []
+                yield messages
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _result(future: Future[tuple[list[Decoded], str]], damage: list[str]) -> list[Decoded]:
-    try:
-        messages, incomplete = future.result()
-    except DamagedBlockError as error:
-        line = f"{error}; it was left out"
-        damage += [] if line in damage else [line]
-        return []
-    if incomplete and incomplete not in damage:
-        damage.append(incomplete)
-    return messages
 
 
 def sampled_messages(
@@ -353,13 +347,7 @@ def sampled_messages(
 ) -> Iterator[T]:
     """Decoded messages in a topic's first blocks, or in some from all over a span; malformed ones are left out."""
     chosen = EVERYTHING if span is None else span
-    blocks = [
-        block
-        for index in indexes
-        for block in index.blocks
-        if chosen.meets(block) and index.may_hold(block, set(index.numbers_of(topic)))
-    ]
-    blocks.sort(key=lambda block: block.start_ns)
+    blocks = _blocks_of(indexes, [set(index.numbers_of(topic)) for index in indexes], chosen)
     if span is not None and len(blocks) > _SAMPLED_BLOCKS:
         blocks = [blocks[k * (len(blocks) - 1) // (_SAMPLED_BLOCKS - 1)] for k in range(_SAMPLED_BLOCKS)]
     for block in blocks[:_SAMPLED_BLOCKS]:

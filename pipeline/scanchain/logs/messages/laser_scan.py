@@ -28,10 +28,8 @@ class LaserScanMessage(NamedTuple):
     stamp_ns: int
     frame: str
     first_rad: float
-    last_rad: float
     step_rad: float
     beam_s: float
-    scan_s: float
     range_min_m: float
     range_max_m: float
     ranges_m: NDArray[np.float32]
@@ -44,10 +42,8 @@ def read_laser_scan(message: Any) -> LaserScanMessage:
         stamp_ns=stamp_ns(message),
         frame=message.header.frame_id,
         first_rad=message.angle_min,
-        last_rad=message.angle_max,
         step_rad=message.angle_increment,
         beam_s=message.time_increment,
-        scan_s=message.scan_time,
         range_min_m=message.range_min,
         range_max_m=message.range_max,
         ranges_m=message.ranges,

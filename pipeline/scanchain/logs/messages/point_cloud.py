@@ -31,14 +31,13 @@ class PointField(NamedTuple):
     name: str
     offset: int
     datatype: int
-    repeats: int
 
 
 _LIVOX_FIELDS = (
-    PointField("offset_time", 0, 6, 1),
-    PointField("x", 4, 7, 1),
-    PointField("y", 8, 7, 1),
-    PointField("z", 12, 7, 1),
+    PointField("offset_time", 0, 6),
+    PointField("x", 4, 7),
+    PointField("y", 8, 7),
+    PointField("z", 12, 7),
 )
 
 
@@ -64,7 +63,7 @@ def read_point_cloud(message: Any) -> PointCloudMessage:
     """A sensor_msgs/PointCloud2."""
     if len(message.fields) > _MOST_FIELDS:
         raise MalformedMessageError(f"it has {len(message.fields)} fields; at most {_MOST_FIELDS} are accepted")
-    fields = tuple(PointField(each.name, each.offset, each.datatype, each.count) for each in message.fields)
+    fields = tuple(PointField(each.name, each.offset, each.datatype) for each in message.fields)
     return PointCloudMessage(
         stamp_ns=stamp_ns(message),
         frame=message.header.frame_id,

@@ -53,27 +53,20 @@ def read_transforms(message: Any) -> list[StampedPose]:
 
 def chain(transforms: Sequence[StampedPose], target: str, source: str) -> Pose | None:
     """T_target_source (4, 4) through the tree of transforms, None where no path joins the two frames."""
-    reached = _reached(transforms, source).get(target.lstrip("/"))
-    return None if reached is None else reached[1]
-
-
-def _reached(transforms: Sequence[StampedPose], source: str) -> dict[str, tuple[str, Pose]]:
-    """Every frame that a path joins to ``source``: the frame before it on that path, and T_frame_source (4, 4)."""
-    source = source.lstrip("/")
     steps: dict[str, list[tuple[str, Pose]]] = {}
     for step in transforms:
         parent, child = step.parent.lstrip("/"), step.child.lstrip("/")
         steps.setdefault(child, []).append((parent, step.T_parent_child))
         steps.setdefault(parent, []).append((child, lie.inverse(step.T_parent_child)))
-    reached = {source: ("", np.eye(4))}
-    queue = deque([source])
+    reached = {source.lstrip("/"): np.eye(4)}  # poses of the source in frames
+    queue = deque(reached)
     while queue:
         frame = queue.popleft()
         for following, T in steps.get(frame, []):
             if following not in reached:
-                reached[following] = frame, T @ reached[frame][1]
+                reached[following] = T @ reached[frame]
                 queue.append(following)
-    return reached
+    return reached.get(target.lstrip("/"))
 
 
 def pose_of(position: Any, orientation: Any, dimension: int = 3) -> Pose:
