@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.graph.cholesky import BlockPattern, Packing, SparseCholesky, analyze
-from scanchain.kernels.graph import between, scatter
+from scanchain.kernels.graph import between
 
 WASTE = 0.1  # share of edges without weight that is worth a new analysis
 _FEW = 0.03  # the same where H⁻¹ is wanted too, which fill-in slows down more
@@ -164,7 +164,7 @@ class BetweenProblem:
     def chi2(self, errors: Matrix) -> NDArray[np.float64]:
         """Return eᵀΩe of every edge, (E,)."""
         result = np.empty(len(errors))
-        scatter.squared_norms(errors, self.information, result)
+        between.squared_norms(errors, self.information, result)
         return result
 
     def jacobians(self, poses: Matrix, errors: Matrix) -> Matrix:
@@ -176,7 +176,7 @@ class BetweenProblem:
         blocks = np.zeros((len(self.pattern.rows), self.freedom, self.freedom))
         gradient = np.zeros((len(self.free), self.freedom))
         jacobian = self.jacobians(poses, errors)
-        scatter.scatter_between(jacobian, errors, self.information, weights, self.slots, blocks, gradient)
+        between.scatter_between(jacobian, errors, self.information, weights, self.slots, blocks, gradient)
         return NormalEquations(self.packing.values(blocks), self.packing.rows(gradient), weights)
 
     def scattered(self, of_i: Matrix, of_j: Matrix, coupling: Matrix) -> Matrix:

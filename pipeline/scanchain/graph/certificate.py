@@ -207,51 +207,42 @@ def minorize(problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64
     of_seen = np.linalg.eigvalsh(information[seen, :d, :d])[:, 0]
     tau[seen], kappa[seen] = np.maximum(of_seen, _TINY), _TINY
     excess = _length(torque - 2.0 * kappa[:, None] * turned)
-    costs = _Costs(tau, kappa, _length(errors[:, :d]), _length(errors[:, d:]), _length(pull[:, :d]))
-    tau, kappa = costs.paid(0.5 * _length(force), excess)
-    short = np.setdiff1d(np.flatnonzero(~(kappa > 0.0) & (costs.theta < _FARTHEST)), seen)
+    rho, theta = _length(errors[:, :d]), _length(errors[:, d:])
+    tau, kappa = _paid(tau, kappa, rho, theta, _length(pull[:, :d]), 0.5 * _length(force), excess)
+    short = np.setdiff1d(np.flatnonzero(~(kappa > 0.0) & (theta < _FARTHEST)), seen)
     if len(short):
         parts = (information, errors, pull, force, torque, turned)
         tau[short], kappa[short] = _borrowed(*(part[short] for part in parts))
-    kappa[costs.theta >= _FARTHEST] = np.nan
+    kappa[theta >= _FARTHEST] = np.nan
     tau[seen], kappa[seen] = of_seen, 0.0
     return Minorants(poses[j, :d, d] - poses[i, :d, d], force, _cross_matrix(torque), tau, kappa)
 
 
-@dataclass(frozen=True, slots=True)
-class _Costs:
-    """Terms of the edges' bounds: isotropic information, residuals ‖ρ*‖ and θ*, and ‖y_t‖; each (E,)."""
+def _paid(
+    tau: NDArray[np.float64],
+    kappa: NDArray[np.float64],
+    rho: NDArray[np.float64],
+    theta: NDArray[np.float64],
+    pull: NDArray[np.float64],
+    force: NDArray[np.float64],
+    excess: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """τ and κ (2, E) less the cost of the bounds, of which as much is paid from τ as leaves the most of both.
 
-    tau: NDArray[np.float64]
-    kappa: NDArray[np.float64]
-    rho: NDArray[np.float64]
-    theta: NDArray[np.float64]
-    pull: NDArray[np.float64]
-
-    def paid(
-        self, force: NDArray[np.float64], excess: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """τ and κ less their cost; ``force`` is ‖V⁻ᵀy_t‖, ``excess`` the rotational slope beside 2κφ*."""
-        best_tau, best_kappa = self._left(_PAID_FROM_TAU[0], force, excess)
-        for share in _PAID_FROM_TAU[1:]:
-            tau, kappa = self._left(share, force, excess)
-            better = np.minimum(tau / self.tau, kappa / self.kappa) > np.minimum(
-                best_tau / self.tau, best_kappa / self.kappa
-            )
-            best_tau, best_kappa = np.where(better, tau, best_tau), np.where(better, kappa, best_kappa)
-        return best_tau, best_kappa
-
-    def _left(
-        self, share: float, force: NDArray[np.float64], excess: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        root = np.sqrt(self.tau * self.kappa)
-        bent = share * 0.5 * self.rho * np.sqrt(self.tau / self.kappa) + 1e-12
-        turned = np.minimum(share * _SLOPE * self.pull / root + 1e-12, 0.5)
-        tau = self.tau * (1.0 - turned) / (1.0 + bent)
-        cost = 0.25 * tau * (1.0 + 1.0 / bent) * self.rho**2 + (_SLOPE * self.pull) ** 2 / (turned * self.tau)
-        cost += force * self.rho / 3.0 + 0.5 * excess
-        kappa = self.kappa - cost / np.maximum(1.0 - self.theta, 1e-12)
-        return tau, np.where(self.theta < 1.0, (1.0 - 0.5 * _BEND * self.theta**2) * kappa, -1.0)
+    tau, kappa : isotropic information; rho, theta : residuals ‖ρ*‖ and θ*; pull : ‖y_t‖; force : ‖V⁻ᵀy_t‖;
+    excess : the rotational slope beside 2κφ*; each (E,)
+    """
+    left = np.empty((len(_PAID_FROM_TAU), 2, len(tau)))
+    for share, (tau_left, kappa_left) in zip(_PAID_FROM_TAU, left, strict=True):
+        bent = share * 0.5 * rho * np.sqrt(tau / kappa) + 1e-12
+        turned = np.minimum(share * _SLOPE * pull / np.sqrt(tau * kappa) + 1e-12, 0.5)
+        tau_left[:] = tau * (1.0 - turned) / (1.0 + bent)
+        cost = 0.25 * tau_left * (1.0 + 1.0 / bent) * rho**2 + (_SLOPE * pull) ** 2 / (turned * tau)
+        cost += force * rho / 3.0 + 0.5 * excess
+        rest = kappa - cost / np.maximum(1.0 - theta, 1e-12)
+        kappa_left[:] = np.where(theta < 1.0, (1.0 - 0.5 * _BEND * theta**2) * rest, -1.0)
+    best = np.minimum(left[:, 0] / tau, left[:, 1] / kappa).argmax(axis=0)
+    return left[best, :, np.arange(len(tau))].T
 
 
 def _borrowed(

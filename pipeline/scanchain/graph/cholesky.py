@@ -10,7 +10,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.linalg import spilu
 
 from scanchain.data import Matrix
-from scanchain.kernels.graph import cholesky, fronts, inverse, symbolic
+from scanchain.kernels.graph import cholesky, fronts, symbolic
 
 _LOST_DIGITS = 1e-13  # a pivot below this share of its diagonal entry is rounding noise
 
@@ -220,7 +220,7 @@ class SparseCholesky:
     def inverse_blocks(self) -> NDArray[np.float64]:
         """A⁻¹ by the last factor, where A may be nonzero: block values, laid out as those of A."""
         result = np.empty(self.pattern.value_count)
-        inverse.selected_inverse(self._fronts, self._blocks, self.factor, result, *self._room())
+        cholesky.selected_inverse(self._fronts, self._blocks, self.factor, result, *self._room())
         return result
 
 

@@ -13,7 +13,7 @@ from scanchain.config import GraphConfig
 from scanchain.data import REJECTED_WEIGHT, Matrix
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.consistency import apart
-from scanchain.graph.covariance import difference_covariance, edge_covariances, inverse_blocks, responses
+from scanchain.graph.covariance import difference_covariances, edge_covariances, inverse_blocks, responses
 from scanchain.graph.initialize import Initialization
 from scanchain.graph.losses import rejection_limit
 from scanchain.graph.minimizer import Minimum
@@ -177,7 +177,7 @@ class LeftOut:
         self.covariances = np.linalg.pinv(problem.information[self.edges], hermitian=True)
         self.joint = np.empty((len(self.edges), len(odometry), *J.shape[1:]))
         for place, edge in enumerate(self.edges):
-            of_edge = difference_covariance(self.factored, *problem.edges[edge])
+            of_edge = difference_covariances(self.factored, problem.edges[[edge]])[0, 0]
             self.covariances[place] += self.jacobians[edge] @ of_edge @ self.jacobians[edge].T
             moved = responses(self.factored, *problem.edges[edge])
             self.joint[place] = moved[end] - moved[begin]
