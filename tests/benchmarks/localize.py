@@ -122,7 +122,7 @@ def another_day(map_world: str, log_world: str, options: argparse.Namespace, **o
     """A drive in the map that another one made with an HDL-64."""
     drive = {"folder": options.cache, "seed": 1, "seconds": of_log.pop("seconds", 66.0)}
     mapped = made.log(map_world, **drive)
-    again = made.log(log_world, reverse=True, **{"start_m": 130.0, "sensor": "hdl-64", **of_log}, **drive)
+    again = made.log(log_world, **{"reverse": True, "start_m": 130.0, "sensor": "hdl-64", **of_log}, **drive)
     case = _mapped(options, mapped, again)
     return case if map_world == log_world else replace(case, T_map_lidar=None)
 
@@ -143,12 +143,12 @@ def city(options: argparse.Namespace) -> Case:
         drive = replace(drive, scans=drive.scans[:: options.every])
         stem = f"{name}_{part}_{options.sensor}_{options.every}"
         logs.append(_recorded(stem, drive, options, 1, of_part.get("changed")))
-    run = logs[0].with_suffix(".run")
+    case = replace(_mapped(options, *logs), give_up_m=60.0)
     if options.memory:
-        run = run.with_suffix(".measured")
-        _print_peak("run", str(logs[0]), "--out", str(run), "--force")
-        _print_peak("localize", str(logs[1]), "--map", str(run), "--out", f"{run}.found", "--force")
-    return replace(_mapped(options, *logs), give_up_m=60.0)
+        run, found = (str(options.cache / f"{name}.{command}") for command in ("run", "localize"))
+        _print_peak("run", str(logs[0]), "--out", run, "--force")
+        _print_peak("localize", str(logs[1]), "--map", run, "--out", found, "--force")
+    return case
 
 
 def _recorded(name: str, drive: Drive, options: argparse.Namespace, seed: int, changed: int | None = None) -> Path:
