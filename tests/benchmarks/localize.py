@@ -27,7 +27,6 @@ own.
 from __future__ import annotations
 
 import argparse
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
@@ -164,13 +163,19 @@ def _mapped(options: argparse.Namespace, mapped: Path, log: Path) -> Case:
 
 
 def _print_peak(*arguments: str) -> None:
-    """Run a command of scanchain; the peak of its resident memory."""
-    process = subprocess.Popen([sys.executable, "-m", "scanchain", *arguments], stdout=subprocess.DEVNULL)
-    status, usage = os.wait4(process.pid, 0)[1:]
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode not in (0, 1):  # 1: a verdict that is none to rely on
-        raise SystemExit(f"scanchain {' '.join(arguments)}: exit code {process.returncode}")
-    print(f"{arguments[0]}: {usage.ru_maxrss / 1024.0:.0f} MiB at most", flush=True)
+    """Run a command of scanchain; the peak of its resident memory, its exit code 1 being a verdict.
+
+    A small process starts it, for a child begins with the peak of its parent.
+    """
+    start = (
+        "import resource, subprocess, sys\n"
+        "code = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL).returncode\n"
+        "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)\n"
+        "sys.exit(code > 1)"
+    )
+    command = [sys.executable, "-c", start, sys.executable, "-m", "scanchain", *arguments]
+    kibibytes = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
+    print(f"{arguments[0]}: {int(kibibytes) / 1024.0:.0f} MiB at most", flush=True)
 
 
 CASES: dict[str, Callable[[argparse.Namespace], Case]] = {
