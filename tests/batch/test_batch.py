@@ -403,6 +403,7 @@ def test_logs_with_several_lidars_are_run_with_the_short_flags_of_run(two_lidars
     assert main([*words, "--gt", "truth.tum"]) == 2
 
 
+@pytest.mark.slow
 def test_the_report_on_a_phone_shows_figures_beside_long_names_and_links_to_every_run(two_lidars, tmp_path):
     out = tmp_path / "out"
     (tmp_path / "bad.mcap").write_bytes(b"no log at all")

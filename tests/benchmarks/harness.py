@@ -22,8 +22,8 @@ from scanchain.evaluation import absolute_error, pair
 from scanchain.maps import SavedMap
 from scanchain.simulation import SENSORS, WORLDS
 from tests.support import made
+from tests.support.scenes import ROOT
 
-ROOT = made.ROOT
 DATA = Path(os.environ.get("SCANCHAIN_DATA", ROOT.parent / "shared" / "data"))
 CACHE = Path(tempfile.gettempdir()) / "scanchain_benchmarks"
 LIDARS = [name for name, sensor in SENSORS.items() if sensor.dimension == 3]

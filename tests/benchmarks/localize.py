@@ -27,7 +27,6 @@ own.
 from __future__ import annotations
 
 import argparse
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
@@ -122,7 +121,7 @@ def another_day(map_world: str, log_world: str, options: argparse.Namespace, **o
     """A drive in the map that another one made with an HDL-64."""
     drive = {"folder": options.cache, "seed": 1, "seconds": of_log.pop("seconds", 66.0)}
     mapped = made.log(map_world, **drive)
-    again = made.log(log_world, reverse=True, **{"start_m": 130.0, "sensor": "hdl-64", **of_log}, **drive)
+    again = made.log(log_world, **{"reverse": True, "start_m": 130.0, "sensor": "hdl-64", **of_log}, **drive)
     case = _mapped(options, mapped, again)
     return case if map_world == log_world else replace(case, T_map_lidar=None)
 
@@ -143,12 +142,12 @@ def city(options: argparse.Namespace) -> Case:
         drive = replace(drive, scans=drive.scans[:: options.every])
         stem = f"{name}_{part}_{options.sensor}_{options.every}"
         logs.append(_recorded(stem, drive, options, 1, of_part.get("changed")))
-    run = logs[0].with_suffix(".run")
+    case = replace(_mapped(options, *logs), give_up_m=60.0)
     if options.memory:
-        run = run.with_suffix(".measured")
-        _print_peak("run", str(logs[0]), "--out", str(run), "--force")
-        _print_peak("localize", str(logs[1]), "--map", str(run), "--out", f"{run}.found", "--force")
-    return replace(_mapped(options, *logs), give_up_m=60.0)
+        run, found = (str(options.cache / f"{name}.{command}") for command in ("run", "localize"))
+        _print_peak("run", str(logs[0]), "--out", run, "--force")
+        _print_peak("localize", str(logs[1]), "--map", run, "--out", found, "--force")
+    return case
 
 
 def _recorded(name: str, drive: Drive, options: argparse.Namespace, seed: int, changed: int | None = None) -> Path:
@@ -164,13 +163,19 @@ def _mapped(options: argparse.Namespace, mapped: Path, log: Path) -> Case:
 
 
 def _print_peak(*arguments: str) -> None:
-    """Run a command of scanchain; the peak of its resident memory."""
-    process = subprocess.Popen([sys.executable, "-m", "scanchain", *arguments], stdout=subprocess.DEVNULL)
-    status, usage = os.wait4(process.pid, 0)[1:]
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode not in (0, 1):  # 1: a verdict that is none to rely on
-        raise SystemExit(f"scanchain {' '.join(arguments)}: exit code {process.returncode}")
-    print(f"{arguments[0]}: {usage.ru_maxrss / 1024.0:.0f} MiB at most", flush=True)
+    """Run a command of scanchain; the peak of its resident memory, its exit code 1 being a verdict.
+
+    A small process starts it, for a child begins with the peak of its parent.
+    """
+    start = (
+        "import resource, subprocess, sys\n"
+        "code = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL).returncode\n"
+        "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)\n"
+        "sys.exit(code > 1)"
+    )
+    command = [sys.executable, "-c", start, sys.executable, "-m", "scanchain", *arguments]
+    kibibytes = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
+    print(f"{arguments[0]}: {int(kibibytes) / 1024.0:.0f} MiB at most", flush=True)
 
 
 CASES: dict[str, Callable[[argparse.Namespace], Case]] = {

@@ -23,7 +23,8 @@ from time import perf_counter
 from scanchain.logs import open_log
 from scanchain.odometry import Odometry
 from scanchain.settings import load_settings
-from tests.benchmarks.harness import DATA, KITTI, ROOT, command_line
+from tests.benchmarks.harness import DATA, KITTI, command_line
+from tests.support.scenes import ROOT
 
 
 def main() -> None:

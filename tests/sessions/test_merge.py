@@ -35,6 +35,7 @@ def runs(tmp_path_factory):
     """Three sessions in an office and one elsewhere, and the truth."""
     folder = tmp_path_factory.mktemp("sessions")
     truth = read_tum(made.log("office", folder, seed=2, seconds=34.0).with_suffix(".tum"))
+    truth = Trajectory(truth.stamps_ns, lie.flatten(truth.poses))
     for name, (start_s, end_s) in PARTS.items():
         part = made.run("office", folder, seed=2, seconds=34.0, log__start_s=start_s, log__end_s=end_s)
         part.rename(folder / name)

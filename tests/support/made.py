@@ -17,8 +17,8 @@ from functools import cache
 from pathlib import Path
 
 import scanchain
+from tests.support.scenes import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 _FOLDER = ROOT / "build" / "made"
 _FILES = (".tum", ".changes.csv", ".mcap")  # of a simulated log, itself the last
 _OF_SIMULATE = ("seed", "seconds", "sensor", "changed", "reverse", "start_m", "drift")
