@@ -25,7 +25,7 @@ import numpy as np
 
 from scanchain.config import LogConfig
 from scanchain.data import Pose, Scan
-from scanchain.kernels.voxels.voxel_shapes import SEEN
+from scanchain.kernels.voxels import SEEN
 from scanchain.logs import open_log
 from scanchain.odometry import Odometry
 from scanchain.settings import load_settings

@@ -67,9 +67,11 @@ def office(tmp_path_factory):
 
 
 @pytest.fixture
-def folder(tmp_path):
-    """A working directory with the user's module."""
+def folder(tmp_path, monkeypatch):
+    """The working directory, with the user's module."""
     (tmp_path / "my_module.py").write_text(MATCHER)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [each for each in sys.path if each not in ("", str(tmp_path))])
     return tmp_path
 
 
@@ -97,38 +99,22 @@ def test_it_runs_is_stopped_and_goes_on_to_the_same_result(office, folder):
     assert "resumed after" in (folder / "run" / "summary.txt").read_text()
 
 
-def test_it_is_a_row_of_a_comparison_and_its_settings_can_be_given_back(office, folder, monkeypatch):
-    names = ("svd", "PointToPoint")
-    child = started(
-        folder,
-        "compare",
-        office,
-        "--log.end_s",
-        "3",
-        "--methods",
-        ",".join(names),
-        "--matcher",
-        NAME,
-        "--out",
-        "a",
-    )
+def test_it_is_a_row_of_a_comparison_and_its_settings_can_be_given_back(office, folder):
+    names, short = ("svd", "PointToPoint"), ("--log.end_s", "3")
+    words = ("compare", office, *short, "--methods", ",".join(names), "--matcher", NAME, "--out", "a")
+    child = started(folder, *words)
     _, errors = child.communicate()
     assert child.returncode == 0, errors
     svd, own = read_table(folder / "a").rows
     assert own.status is Status.OK and NAME in own.description
     assert own.figures["ate_m"] < 0.1 and own.figures["ate_m"] != svd.figures["ate_m"]
-    monkeypatch.chdir(folder)
-    monkeypatch.setattr(sys, "path", [*sys.path])
     given = resolve(names, 2, file=None, matcher=NAME)
     again = resolve(names, 2, file=folder / "a" / "settings.toml")
-    assert [(each.name, each.base, each.settings) for each in again] == [
-        (each.name, each.base, each.settings) for each in given
-    ]
+    for one, other in zip(again, given, strict=True):
+        assert (one.name, one.base, one.settings) == (other.name, other.base, other.settings)
 
 
-def test_one_added_to_the_methods_needs_no_name_of_its_own_there(folder, monkeypatch):
-    monkeypatch.chdir(folder)
-    monkeypatch.setattr(sys, "path", [*sys.path])
+def test_one_added_to_the_methods_needs_no_name_of_its_own_there(folder):
     for names in (("svd",), ("svd", "PointToPoint+loops")):
         chosen = [method.name for method in resolve(names, 2, file=None, matcher=NAME)]
         assert chosen == list(names if len(names) > 1 else (*names, "PointToPoint"))
@@ -148,11 +134,9 @@ def test_one_added_to_the_methods_needs_no_name_of_its_own_there(folder, monkeyp
         ("my_module.PointToPoint", "one of plicp, svd or a class of yours, MODULE:CLASS"),
     ],
 )
-def test_one_that_cannot_be_had_is_one_line_that_says_why(folder, monkeypatch, name, words):
+def test_one_that_cannot_be_had_is_one_line_that_says_why(folder, name, words):
     (folder / "broken.py").write_text("class Matcher(:\n")
     (folder / "needy.py").write_text("import not_there\n")
-    monkeypatch.chdir(folder)
-    monkeypatch.setattr(sys, "path", [*sys.path])
     with pytest.raises(InputError) as raised:
         create_matcher(MatchingConfig(matcher=name))
     assert words in str(raised.value) and "\n" not in str(raised.value)
@@ -177,11 +161,9 @@ def test_one_that_cannot_be_had_is_one_line_that_says_why(folder, monkeypatch, n
         ("fit=1.0,", "fit='good',", "fit is 'good'; wanted a number"),
     ],
 )
-def test_one_that_returns_something_else_is_one_line_that_names_it(folder, monkeypatch, old, new, words):
+def test_one_that_returns_something_else_is_one_line_that_names_it(folder, old, new, words):
     module = f"own_{abs(hash(new))}"
     (folder / f"{module}.py").write_text(MATCHER.replace(old, new))
-    monkeypatch.chdir(folder)
-    monkeypatch.setattr(sys, "path", [*sys.path])
     wall = np.random.default_rng(0).uniform(-3.0, 3.0, (200, 2))
     target = VoxelMap(2, LocalMapConfig())
     target.insert(wall, np.eye(3))
@@ -191,10 +173,7 @@ def test_one_that_returns_something_else_is_one_line_that_names_it(folder, monke
 
 def test_the_working_directory_comes_last(folder, monkeypatch):
     (folder / "numpy.py").write_text("raise RuntimeError('a stranger')\n")
-    monkeypatch.chdir(folder)
-    monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.delitem(sys.modules, "my_module", raising=False)
-    monkeypatch.setattr(sys, "path", [each for each in sys.path if each not in ("", str(folder))])
     before = [*sys.path]
     assert callable(create_matcher(MatchingConfig(matcher=NAME)).align)
     assert sys.path[: len(before)] == before and str(folder) in sys.path

@@ -3,8 +3,7 @@
 import numpy as np
 
 from scanchain import lie
-from scanchain.kernels.voxels.hashing import unpack
-from scanchain.kernels.voxels.voxel_shapes import (
+from scanchain.kernels.voxels import (
     ACROSS,
     BORN,
     DIRECTION,
@@ -14,6 +13,7 @@ from scanchain.kernels.voxels.voxel_shapes import (
     SLOPE_ACROSS,
     SLOPE_ALONG,
     THICKNESS,
+    unpack,
 )
 
 

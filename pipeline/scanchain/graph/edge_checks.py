@@ -16,7 +16,7 @@ from scanchain.data import Matrix
 from scanchain.errors import InputError, counted
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.cholesky import SingularMatrixError
-from scanchain.kernels.geometry.validity import largest_magnitude
+from scanchain.kernels.geometry import largest_magnitude
 
 _AXES = {3: ("x", "y", "yaw"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
 _MOST = 100  # largest number of directions of the null space that are computed

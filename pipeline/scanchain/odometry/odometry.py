@@ -14,7 +14,7 @@ from scanchain.clock import working_s
 from scanchain.config import Config
 from scanchain.data import LEAST_FIT, AnyPoints, Match, Points, Pose, Scan, State
 from scanchain.errors import InputError, shown
-from scanchain.kernels.geometry.validity import largest_magnitude
+from scanchain.kernels.geometry import largest_magnitude
 from scanchain.odometry.elevation import ElevationCalibration
 from scanchain.odometry.intervals import LiveStamps
 from scanchain.odometry.prediction import Prediction, Predictor
@@ -222,7 +222,7 @@ class Odometry:
         The second scan gives the velocity of the first one too, which stands distorted in the map until then.
         """
         T_odom_middle, prior = match.T_target_source, prediction.prior
-        velocity = prediction.velocity_at(T_odom_middle)
+        velocity = prediction.velocity_by(lie.log(lie.between(prediction.T_odom_last, T_odom_middle)))
         if prediction.is_second:
             T_moved = self._restart(velocity)
             T_odom_middle = T_moved @ T_odom_middle
@@ -237,12 +237,12 @@ class Odometry:
         """Rebuild the map from the first scan, deskewed; returns the pose of its middle. Its stamp stays put."""
         T_odom_middle = lie.exp(self.first_sweep.middle_s * velocity)
         self.first_points = lie.transform(T_odom_middle, self.first_sweep.from_middle(velocity))
-        self.map.restart(self.first_points)
+        self.map.replace([(self.first_points, lie.identity(self.dimension))])
         return T_odom_middle
 
     def _reset_map(self, points: Points, prediction: Prediction) -> _Registered:
         """Clear the map, to which the scan does not belong; a new one begins where the last scan was."""
-        self.map.forget()
+        self.map.replace([])
         self.recovery.forget()
         self.elevation.forget()
         self.standstill.begin(prediction.T_odom_last)

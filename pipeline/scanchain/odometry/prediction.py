@@ -12,8 +12,9 @@ from scanchain import lie
 from scanchain.config import OdometryConfig
 from scanchain.data import Match, Matrix, Pose, Prior, Scan, State
 from scanchain.errors import InputError, counted
-from scanchain.kernels.geometry.validity import largest_magnitude
-from scanchain.kernels.registration.observability import WEAK, definite_inverse
+from scanchain.kernels.geometry import largest_magnitude
+from scanchain.kernels.matrices import definite_inverse
+from scanchain.kernels.registration.observability import WEAK
 from scanchain.odometry.intervals import Intervals
 
 _EVEN = 2.0  # largest ratio of two intervals from which an acceleration is computed
@@ -79,13 +80,9 @@ class MotionFilter:
         self.motion_covariance = self.any_motion
         self.pose_covariance = self.covariance = self.nothing
 
-    def predicted_covariance(self, noise: Matrix) -> Matrix:
-        """(k, k) of the next pose; noise (k, k): covariance of the motion's change."""
-        return self._predicted(noise)[0]
-
     def correct(self, innovation: NDArray[np.float64], information: Matrix, noise: Matrix) -> None:
         """Take a pose that was measured (k,) away from the predicted one, with this information (k, k)."""
-        pose, covariance, motion = self._predicted(noise)
+        pose, covariance, motion = self.predicted(noise)
         known = np.linalg.inv(np.linalg.inv(pose) + information)
         gain = np.linalg.solve(pose, covariance).T  # how the motion follows the pose
         self.motion = lie.normalize(self.motion @ lie.exp(gain @ known @ information @ innovation))
@@ -93,8 +90,8 @@ class MotionFilter:
         self.covariance = known @ gain.T
         self.motion_covariance = motion - gain @ (pose - known) @ gain.T
 
-    def _predicted(self, noise: Matrix) -> tuple[Matrix, Matrix, Matrix]:
-        """Covariances (k, k) of the next pose, of pose and motion, and of the motion."""
+    def predicted(self, noise: Matrix) -> tuple[Matrix, Matrix, Matrix]:
+        """Covariances (k, k) of the next pose, of pose and motion, and of the motion, whose change is noise."""
         motion = self.motion_covariance + noise
         A = lie.adjoint(lie.inverse(self.motion))
         covariance = A @ self.covariance
@@ -205,12 +202,8 @@ class Prediction(msgspec.Struct, frozen=True):
         stretched = tuple(T @ _stretched(*moving, share=share) for share in (0.5, 1.0, 1.5))
         return T @ self.T_previous_current, *stretched, T
 
-    def velocity_at(self, T_odom_lidar: Pose) -> NDArray[np.float64]:
-        """Twist (k,) per second at a scan of this pose, in its own frame; the last one if stamps stand still."""
-        return self.velocity_by(lie.log(lie.between(self.T_odom_last, T_odom_lidar)))
-
     def velocity_by(self, motion: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Twist (k,) per second, as above, at a scan after this motion (k,) from the last one.
+        """Twist (k,) per second at a scan after this motion (k,); the last one if stamps stand still.
 
         The mean since the last scan, carried on by half an interval with the acceleration between the last two.
         """
@@ -272,7 +265,7 @@ class Predictor:
             motion = _stretched(self.T_previous_current, interval_s, times.last_s, times.usual_s)
             covariance, statistics, is_guess = self.filter.any_motion, self.by_velocity, True
         else:
-            covariance = self.filter.predicted_covariance(self.by_velocity.covariance)
+            covariance = self.filter.predicted(self.by_velocity.covariance)[0]
             motion, statistics = self.filter.motion, self.by_velocity
         T_predicted = lie.normalize(self.T_odom_lidar.dot(motion))  # here and below: half the time of @
         return Prediction(

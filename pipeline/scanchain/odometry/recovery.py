@@ -14,7 +14,8 @@ from scanchain.config import MatchingConfig
 from scanchain.data import LEAST_FIT, Match, Points, Pose, State
 from scanchain.odometry.prediction import Prediction
 from scanchain.preprocess import Sweep
-from scanchain.registration import AMBIGUOUS, Matcher, SearchGrid, VoxelMap, Wanted, Window, find, thinned
+from scanchain.registration import Matcher, SearchGrid, VoxelMap, Wanted, Window, find, thinned
+from scanchain.registration.align import AMBIGUOUS
 from scanchain.registration.search import evenly, upright_columns
 
 _WIDE_SCANS = 3  # number of scans searched wide at the start and after a loss, while no velocity is known

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.data import Match, Pose
-from scanchain.kernels.registration.observability import definite_inverse
+from scanchain.kernels.matrices import definite_inverse
 
 _SCANS = 10  # number of scans that agree with one pose, from which on the lidar stands
 _AGAIN = 30  # the same of scans beside a pose that is held

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scanchain import checks
 from scanchain.config import PreprocessConfig
 from scanchain.data import Points, Scan
-from scanchain.kernels.voxels import downsample as kernels
+from scanchain.kernels import scans as kernels
 
 _LEAST_SLOTS, _MOST_SLOTS = 1 << 10, 1 << 22  # of a table for downsampling; larger ones are not kept
 _GROWTH = 4  # of a table that has no room for all voxels

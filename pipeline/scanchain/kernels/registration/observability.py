@@ -6,11 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.geometry.eigen import eigensystem
-from scanchain.kernels.geometry.se import adjoint, centered
-from scanchain.kernels.registration.optimizers import factorize, substitute
-from scanchain.kernels.voxels.hashing import unpack
-from scanchain.kernels.voxels.voxel_shapes import (
+from scanchain.kernels.geometry import adjoint, centered
+from scanchain.kernels.matrices import congruent, eigensystem
+from scanchain.kernels.voxels import (
     ACROSS,
     BORN,
     MEAN_TERM,
@@ -20,6 +18,7 @@ from scanchain.kernels.voxels.voxel_shapes import (
     THICKNESS,
     move,
     shape_of,
+    unpack,
 )
 
 WEAK = 10.0  # times the limits of a degenerate direction, below which the prior counts along a direction
@@ -97,16 +96,6 @@ def agreement(H, unweighted, range_m: float) -> float:
 
 
 @njit(inline="always")
-def worst(spectrum) -> int:
-    """Index of the direction with the lowest signal-to-noise ratio."""
-    m = 0
-    for other in range(1, spectrum.values.shape[0]):
-        if spectrum.signals[other] < spectrum.signals[m]:
-            m = other
-    return m
-
-
-@njit(inline="always")
 def is_below(spectrum, m: int, times: float, settings) -> bool:
     """True if direction m lies below so many times the limits of a degenerate one."""
     return (
@@ -141,10 +130,7 @@ def weak_prior(spectrum, total_weight: float, believed, is_fused: bool, settings
             is_frozen = spectrum.values[m] < settings.min_information or real <= 0.0
         if is_frozen or strength > real * _FIXED * total_weight:
             strength, real = _FIXED * total_weight, 1.0
-        for i in range(k):
-            for j in range(k):
-                along = spectrum.vectors[i, m] * spectrum.vectors[j, m]
-                prior[i, j] += strength / real * along / (spectrum.scale[i] * spectrum.scale[j])
+        _add_along(spectrum, m, strength / real, prior)
     return prior
 
 
@@ -158,10 +144,16 @@ def remove_noise(spectrum, H, total_weight: float, settings):
         if not is_below(spectrum, m, WEAK, settings):
             continue
         noise = total_weight * spectrum.values[m] / max(spectrum.signals[m], 1.0)
-        for i in range(H.shape[0]):
-            for j in range(H.shape[0]):
-                along = spectrum.vectors[i, m] * spectrum.vectors[j, m]
-                H[i, j] -= noise * along / (spectrum.scale[i] * spectrum.scale[j])
+        _add_along(spectrum, m, -noise, H)
+
+
+@njit(inline="always")
+def _add_along(spectrum, m: int, amount: float, H):
+    """Add so much information along direction m to H (k, k)."""
+    for i in range(H.shape[0]):
+        for j in range(H.shape[0]):
+            along = spectrum.vectors[i, m] * spectrum.vectors[j, m]
+            H[i, j] += amount * along / (spectrum.scale[i] * spectrum.scale[j])
 
 
 @njit(inline="always")
@@ -270,32 +262,3 @@ def seen_from_source(T, T_first, H, direction, variance: float):
             information[i, j] /= variance
             turned[j] += Ad[i, j] * direction[i]
     return information, turned
-
-
-@njit(nogil=True)
-def definite_inverse(matrix):
-    """Inverse of a positive definite (k, k), of another zeros."""
-    k = matrix.shape[0]
-    out, factor, b = np.zeros((k, k)), np.zeros((k, k)), np.zeros(k)
-    if factorize(matrix, 0.0, factor):
-        for j in range(k):
-            b[j] = -1.0
-            substitute(factor, b, out[:, j])
-            b[j] = 0.0
-    return out
-
-
-@njit(nogil=True)
-def congruent(A, H):
-    """AᵀHA of two (k, k)."""
-    k = H.shape[0]
-    HA, out = np.zeros((k, k)), np.zeros((k, k))
-    for i in range(k):
-        for m in range(k):
-            for j in range(k):
-                HA[i, j] += H[i, m] * A[m, j]
-    for m in range(k):
-        for i in range(k):
-            for j in range(k):
-                out[i, j] += A[m, i] * HA[m, j]
-    return out

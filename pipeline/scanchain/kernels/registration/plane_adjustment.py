@@ -5,9 +5,8 @@ import math
 import numpy as np
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.geometry.eigen import eigenvalues_3d, eigenvector_3d
-from scanchain.kernels.voxels.hashing import find_row, key_of
-from scanchain.kernels.voxels.voxel_shapes import move
+from scanchain.kernels.matrices import eigenvalues_3d, eigenvector_3d
+from scanchain.kernels.voxels import add_moments, covariance_of, find_row, key_of, move
 
 _FEWEST, _FEWEST_SCANS = 8, 3  # least number of points in a cell that counts as a plane, and of scans that see it
 _THIN, _FLAT, _WIDE = 0.02, 0.15, 0.1  # of a plane: ratio of its variances, largest and least deviation in cells
@@ -55,7 +54,7 @@ def planes(points, number, poses, cell_m: float, beside, residual, plane, normal
             last[cell] = number[i]
             seen[cell] += 1
         beside[i, 0], beside[i, 1], beside[i, 2] = x, y, z
-        _add(sums, cell, x, y, z)
+        add_moments(sums, cell, x, y, z)
         plane[i] = cell
     count = 0
     for cell in range(cells):
@@ -82,26 +81,10 @@ def _from_mean(sums, cell: int, normals, p: int, beside, i: int) -> float:
     return residual
 
 
-@njit(inline="always")
-def _add(sums, cell: int, x: float, y: float, z: float):
-    sums[cell, 0] += 1.0
-    sums[cell, 1] += x
-    sums[cell, 2] += y
-    sums[cell, 3] += z
-    sums[cell, 4] += x * x
-    sums[cell, 5] += x * y
-    sums[cell, 6] += x * z
-    sums[cell, 7] += y * y
-    sums[cell, 8] += y * z
-    sums[cell, 9] += z * z
-
-
 @njit()
 def _is_plane(sums, cell_m: float, normal) -> bool:
     """True if points of these sums lie in a plane, whose normal (3,) is written."""
-    x, y, z = sums[1] / sums[0], sums[2] / sums[0], sums[3] / sums[0]
-    xx, xy, xz = sums[4] / sums[0] - x * x, sums[5] / sums[0] - x * y, sums[6] / sums[0] - x * z
-    yy, yz, zz = sums[7] / sums[0] - y * y, sums[8] / sums[0] - y * z, sums[9] / sums[0] - z * z
+    xx, xy, xz, yy, yz, zz = covariance_of(sums)
     small, middle, _ = eigenvalues_3d(xx, xy, xz, yy, yz, zz)
     if small >= min(_THIN * middle, (_FLAT * cell_m) ** 2) or middle <= (_WIDE * cell_m) ** 2:
         return False

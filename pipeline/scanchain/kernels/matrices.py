@@ -1,6 +1,8 @@
-"""Eigenvectors of small symmetric matrices, without allocation; of two and three rows in closed form."""
+"""Small symmetric matrices: eigenvectors, Cholesky factors, inverses, congruences."""
 
 import math
+
+import numpy as np
 
 from scanchain.kernels.compiling import njit
 
@@ -111,3 +113,75 @@ def _sort_columns(values, vectors):
             for row in range(vectors.shape[0]):
                 vectors[row, j], vectors[row, j - 1] = vectors[row, j - 1], vectors[row, j]
             j -= 1
+
+
+@njit(nogil=True)
+def solve(H, b, damping: float, factor, x) -> bool:
+    """Write −(H + damping · diag(H))⁻¹ b to ``x`` by Cholesky; False where that is not positive definite."""
+    if not factorize(H, damping, factor):
+        return False
+    substitute(factor, b, x)
+    return True
+
+
+@njit(nogil=True)
+def factorize(H, damping: float, factor) -> bool:
+    """Write L with L Lᵀ = H + damping · diag(H) to the lower half of ``factor``; False where there is none."""
+    k = H.shape[0]
+    for i in range(k):
+        for j in range(i + 1):
+            total = H[i, j] + (damping * abs(H[i, i]) if i == j else 0.0)
+            for m in range(j):
+                total -= factor[i, m] * factor[j, m]
+            if i != j:
+                factor[i, j] = total / factor[j, j]
+            elif total <= 1e-12 * abs(H[i, i]) or not math.isfinite(total):
+                return False
+            else:
+                factor[i, i] = math.sqrt(total)
+    return True
+
+
+@njit(nogil=True)
+def substitute(factor, b, x):
+    """Write −(L Lᵀ)⁻¹ b to ``x``."""
+    k = b.shape[0]
+    for i in range(k):
+        total = -b[i]
+        for m in range(i):
+            total -= factor[i, m] * x[m]
+        x[i] = total / factor[i, i]
+    for i in range(k - 1, -1, -1):
+        total = x[i]
+        for m in range(i + 1, k):
+            total -= factor[m, i] * x[m]
+        x[i] = total / factor[i, i]
+
+
+@njit(nogil=True)
+def definite_inverse(matrix):
+    """Inverse of a positive definite (k, k), of another zeros."""
+    k = matrix.shape[0]
+    out, factor, b = np.zeros((k, k)), np.zeros((k, k)), np.zeros(k)
+    if factorize(matrix, 0.0, factor):
+        for j in range(k):
+            b[j] = -1.0
+            substitute(factor, b, out[:, j])
+            b[j] = 0.0
+    return out
+
+
+@njit(nogil=True)
+def congruent(A, H):
+    """AᵀHA of two (k, k)."""
+    k = H.shape[0]
+    HA, out = np.zeros((k, k)), np.zeros((k, k))
+    for i in range(k):
+        for m in range(k):
+            for j in range(k):
+                HA[i, j] += H[i, m] * A[m, j]
+    for m in range(k):
+        for i in range(k):
+            for j in range(k):
+                out[i, j] += A[m, i] * HA[m, j]
+    return out
