@@ -13,8 +13,7 @@ from scanchain import lie
 from scanchain.config import PreprocessConfig
 from scanchain.data import Matrix, Points, Pose, Scan
 from scanchain.kernels.registration.plane_adjustment import lift, plane_equations, planes
-from scanchain.preprocess import Sweep
-from scanchain.preprocess.sweep import sweep_of
+from scanchain.preprocess import Sweep, sweep_of
 from scanchain.registration.search import evenly
 
 _FIRST, _LATER = (14, 0.6), (16, 0.9)  # scans adjusted together, and distance of two in cells: soon, then well

@@ -1,0 +1,234 @@
+"""Preprocessing of a raw scan: cropped and downsampled, in voxels that follow the surroundings, and deskewed."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections import deque
+from collections.abc import Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from copy import copy
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain import checks
+from scanchain.clock import working_s
+from scanchain.config import PreprocessConfig
+from scanchain.data import Points, Scan
+from scanchain.kernels import scans as kernels
+
+_LEAST_SLOTS, _MOST_SLOTS = 1 << 10, 1 << 22  # of a table for downsampling; larger ones are not kept
+_GROWTH = 4  # of a table that has no room for all voxels
+_RANGE_VOXELS = 14.0  # least number of voxels of the local map that the median range spans
+_DENSE, _SPARSE = 60_000, 40_000  # returns of a scan from which on it is dense, and below which it no longer is
+_FINE = math.sqrt(0.5)  # factor on the voxels of dense scans, which fill finer ones with points enough for a plane
+_HYSTERESIS = 0.75  # powers of two between the present scale and the target scale, from which on it changes
+_STEP = 2.0  # factor by which the voxels of matching shrink or grow from one scan to the next, at most
+_MAX_TRIES = 8  # number of times the first scan is downsampled, at most
+_AHEAD = 2  # scans that are prepared before they are asked for
+_ENOUGH = 0.9  # share of the old size above which a new one is not adopted: the choice of points would flicker
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """Points of a scan, one a voxel, with their times.
+
+    Attributes
+    ----------
+    points : (M, d) float64 meters, each in the lidar frame of its own instant
+    times_s : (M,) seconds after the middle of the scan; (0,) where all count as measured at once
+    middle_s : seconds from the scan's stamp to its middle
+    """
+
+    points: Points
+    times_s: NDArray[np.float64]
+    middle_s: float
+
+    @property
+    def is_distorted(self) -> bool:
+        """True if the points are distorted by the lidar's motion."""
+        return len(self.times_s) > 0
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds from the first point to the last."""
+        return float(np.ptp(self.times_s)) if self.is_distorted else 0.0
+
+    def downsampled(self, voxel_m: float) -> Sweep:
+        """The first point of every voxel of this size."""
+        chosen = first_per_voxel(self.points, voxel_m, 0.0, np.inf)
+        times_s = self.times_s[chosen] if self.is_distorted else self.times_s
+        return Sweep(_gather(self.points, chosen), times_s, self.middle_s)
+
+    def from_middle(self, velocity: NDArray[np.float64]) -> Points:
+        """The points (M, d) as seen from the lidar in the middle of the scan.
+
+        velocity : (k,) twist per second in the lidar frame, constant through the scan
+        Why the middle: an error of the velocity then moves as many points forward as back and leaves the pose
+        alone. Seen from the first point it would shift the pose by half of itself, the next velocity by as much
+        in the other direction, and so on.
+        """
+        if not self.is_distorted:
+            return self.points
+        points = self.points.copy()
+        deskew = kernels.deskew_in_plane if points.shape[1] == 2 else kernels.deskew_in_space
+        deskew(points, self.times_s, velocity)
+        return points
+
+
+def sweep_of(scan: Scan, config: PreprocessConfig, scale: float = 1.0) -> Sweep:
+    """The scan cropped to the range that is used and downsampled, times left out where deskewing is off.
+
+    scale : of the voxels, 1 for ``preprocess.map_voxel_m``
+    """
+    voxel_m = scale * config.map_voxel_m
+    chosen = first_per_voxel(scan.points, voxel_m, config.min_range_m, config.max_range_m)
+    points = _gather(scan.points, chosen)
+    if not config.deskew or not len(scan.times_s):
+        return Sweep(points, np.empty(0), 0.0)
+    middle_s = 0.5 * (float(scan.times_s.min()) + float(scan.times_s.max()))
+    return Sweep(points, scan.times_s[chosen].astype(np.float64) - middle_s, middle_s)
+
+
+def downsample(points: Points, voxel_m: float) -> Points:
+    """The first point of every voxel."""
+    return _gather(points, first_per_voxel(points, voxel_m, 0.0, np.inf))
+
+
+def first_per_voxel(
+    points: NDArray[np.floating], voxel_m: float, min_range_m: float, max_range_m: float
+) -> NDArray[np.int32]:
+    """Indices (M,) of the first point (N, d) in each voxel, near and far points left out.
+
+    Raises InputError where the voxels are too small for the points.
+    """
+    checks.within_voxels(points, voxel_m, "points", max_range_m=max_range_m)
+    while True:
+        table, chosen = _scratch.room(len(points))
+        count = kernels.first_per_voxel(points, voxel_m, min_range_m, max_range_m, table, chosen)
+        if count >= 0:
+            break
+        _scratch.resize(_GROWTH * len(table))
+    result = chosen[:count].copy()
+    if len(_scratch.table) > _MOST_SLOTS:
+        _scratch.resize(_LEAST_SLOTS)
+    return result
+
+
+class Resolution:
+    """Voxel sizes chosen scan by scan.
+
+    Attributes
+    ----------
+    scale : 1, ½, ¼ …, factor on all voxel sizes of the configuration: small in narrow places, so
+        that the median range spans about _RANGE_VOXELS voxels of the local map, or more; times √½ for dense scans
+    match_voxel_m : voxels of the points to match, so that about ``preprocess.match_points`` remain
+    """
+
+    def __init__(self, config: PreprocessConfig, voxel_size_m: float) -> None:
+        """voxel_size_m : of the local map, at scale 1."""
+        self.config = config
+        self.voxel_size_m = voxel_size_m
+        self.scale = self.octave = 1.0
+        self.is_dense = False
+        self.match_voxel_m = config.match_voxel_m
+        self.tries = _MAX_TRIES
+        self.is_fixed = config.min_scale == 1.0 and config.match_voxel_m <= config.map_voxel_m
+
+    def downsampled(self, scan: Scan) -> tuple[Sweep, Sweep]:
+        """The scan downsampled for the map, and that once more for matching.
+
+        Its points set the sizes for the next scan; the first scan is downsampled again until they fit.
+        """
+        sweep = sweep_of(scan, self.config, self.scale)
+        is_coarse = self.match_voxel_m <= self.scale * self.config.map_voxel_m
+        sparse = sweep if is_coarse else sweep.downsampled(self.match_voxel_m)
+        if self.is_fixed or not len(sparse.points):
+            return sweep, sparse
+        self.tries = 0 if self._fit(sparse.points, len(scan.points)) else self.tries - 1
+        return self.downsampled(scan) if self.tries > 0 else (sweep, sparse)
+
+    def _fit(self, points: Points, returns: int) -> bool:
+        """Adapt the sizes to the points to match, of so many returns; True if they fitted already."""
+        before = self.scale, self.match_voxel_m
+        median_range_m = float(np.median(np.linalg.norm(points, axis=1)))
+        target = math.log2(median_range_m / (_RANGE_VOXELS * self.voxel_size_m))
+        if abs(target - math.log2(self.octave)) > _HYSTERESIS:
+            self.octave = min(max(2.0 ** round(target), self.config.min_scale), 1.0)
+        self.is_dense = returns >= (_SPARSE if self.is_dense else _DENSE)
+        self.scale = max(self.octave * (_FINE if self.is_dense else 1.0), self.config.min_scale)
+        target_m = self.match_voxel_m * min(
+            max(math.sqrt(len(points) / self.config.match_points), 1.0 / _STEP), _STEP
+        )
+        coarse_m, fine_m = self.octave * self.config.match_voxel_m, self.scale * self.config.map_voxel_m
+        target_m = min(max(target_m, fine_m), coarse_m)
+        if not _ENOUGH < target_m / self.match_voxel_m < 1.0 / _ENOUGH:
+            self.match_voxel_m = target_m
+        return before == (self.scale, self.match_voxel_m)
+
+
+class Prepared(msgspec.Struct, frozen=True):
+    """A scan, downsampled for the map (``sweep``) and for matching (``sparse``), before anything moves it.
+
+    ``after`` holds the sizes for the next scan; ``seconds`` is the time that this one took.
+    """
+
+    scan: Scan
+    sweep: Sweep
+    sparse: Sweep
+    after: Resolution
+    seconds: float
+
+
+def prepare(scan: Scan, resolution: Resolution) -> Prepared:
+    """A scan, downsampled at a resolution, which stays as it is."""
+    started, after = working_s(), resolution if resolution.is_fixed else copy(resolution)
+    sweep, sparse = after.downsampled(scan)
+    return Prepared(scan, sweep, sparse, after, working_s() - started)
+
+
+def prepare_ahead(scans: Iterable[Scan], resolution: Resolution) -> Iterator[Prepared]:
+    """Scans prepared one after the other, in a thread of its own: none depends on a pose."""
+
+    def following(scan: Scan) -> Prepared:
+        nonlocal resolution
+        prepared = prepare(scan, resolution)
+        resolution = prepared.after
+        return prepared
+
+    waiting: deque[Future[Prepared]] = deque()
+    with ThreadPoolExecutor(1, thread_name_prefix="scanchain-prepare") as pool:
+        for scan in scans:
+            waiting.append(pool.submit(following, scan))
+            if len(waiting) > _AHEAD:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+
+
+class _Scratch(threading.local):
+    """Arrays of each thread, reused, as large as scans with so many voxels need: small ones stay in the cache."""
+
+    def __init__(self) -> None:
+        self.resize(_LEAST_SLOTS)
+
+    def resize(self, slots: int) -> None:
+        """Make others of this size."""
+        self.table, self.chosen = np.empty(slots, np.int64), np.empty(slots // 2, np.int32)
+
+    def room(self, count: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+        """Table and indices to downsample so many points, none larger than they need at most."""
+        slots = min(1 << max(2 * count - 1, 1).bit_length(), len(self.table))
+        return self.table[:slots], self.chosen[: slots // 2]
+
+
+_scratch = _Scratch()
+
+
+def _gather(points: NDArray[np.floating], chosen: NDArray[np.int32]) -> Points:
+    out = np.empty((len(chosen), points.shape[1]))
+    kernels.gather(points, chosen, out)
+    return out
