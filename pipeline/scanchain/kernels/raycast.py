@@ -17,8 +17,7 @@ def cast_rays(
     """Range to the first hit of every ray and the solid it hit; inf and −1 where nothing is within reach.
 
     Solids are seen from the outside only: a ray that starts inside one passes through it. Each ray tests the
-    solids of its azimuth sector from near to far, passes over those it goes above or below, and stops where the
-    next cannot begin before its best hit.
+    solids of its azimuth sector from near to far, and stops where the next cannot begin before its best hit.
 
     origins, rotations : (P, 3) meters and (P, 3, 3), sensor poses in the world, near to each other
     pose_of_ray : (N,) int32, the pose that ray n is fired from
@@ -32,7 +31,7 @@ def cast_rays(
     solid_of_ray : (N,) int32 out, counted through boxes, cylinders, ellipsoids; the ground comes last
     """
     ground_solid = len(boxes) + len(cylinders) + len(ellipsoids)
-    extents = extents_of(origins, boxes, cylinders, ellipsoids)
+    extents = _extents(origins, boxes, cylinders, ellipsoids)
     starts, members = _sectors(extents, max_range_m)
     for n in range(len(directions)):
         p = pose_of_ray[n]
@@ -51,8 +50,6 @@ def cast_rays(
             solid = members[k]
             if extents[solid, 2] > best * horizontal:
                 break
-            if dz < extents[solid, 3] * horizontal - 1e-9 or dz > extents[solid, 4] * horizontal + 1e-9:
-                continue
             t = hit_solid(ox, oy, oz, dx, dy, dz, solid, boxes, cylinders, ellipsoids)
             best, hit = _nearer(best, hit, t, solid)
         if not steep:
@@ -114,66 +111,45 @@ def _middle(origins):
 
 
 @njit()
-def extents_of(origins, boxes, cylinders, ellipsoids):
-    """(S, 5) extent of each solid: bearing, half angle, nearest distance in the plane, slopes between.
+def _extents(origins, boxes, cylinders, ellipsoids):
+    """(S, 3) extent of each solid in the plane: bearing, half angle, nearest distance.
 
     A ray from anywhere within ``slack`` of the middle of the origins that hits the solid has an azimuth in that
-    interval, because the parallel ray from the middle hits the footprint grown by ``slack``. Its slope, dz over
-    horizontal, lies between those to the solid's bottom and top.
+    interval, because the parallel ray from the middle hits the footprint grown by ``slack``.
     """
     x, y, slack = _middle(origins)
-    low, high = np.min(origins[:, 2]), np.max(origins[:, 2])
-    result = np.empty((len(boxes) + len(cylinders) + len(ellipsoids), 5))
+    result = np.empty((len(boxes) + len(cylinders) + len(ellipsoids), 3))
     for i in range(len(boxes)):
-        far = _box_extent(x, y, slack, boxes[i], result[i])
-        _slopes(far, boxes[i, 4] - high, boxes[i, 5] - low, result[i])
+        _box_extent(x, y, slack, boxes[i], result[i])
     for i in range(len(cylinders)):
-        c, out = cylinders[i], result[len(boxes) + i]
-        far = _disc_extent(c[0] - x, c[1] - y, c[2] + slack, out)
-        _slopes(far, c[3] - high, c[4] - low, out)
+        c = cylinders[i]
+        _disc_extent(c[0] - x, c[1] - y, c[2] + slack, result[len(boxes) + i])
     for i in range(len(ellipsoids)):
-        e, out = ellipsoids[i], result[len(boxes) + len(cylinders) + i]
-        far = _disc_extent(e[0] - x, e[1] - y, max(e[3], e[4]) + slack, out)
-        _slopes(far, e[2] - e[5] - high, e[2] + e[5] - low, out)
+        e, row = ellipsoids[i], len(boxes) + len(cylinders) + i
+        _disc_extent(e[0] - x, e[1] - y, max(e[3], e[4]) + slack, result[row])
     return result
 
 
 @njit()
-def _slopes(far, bottom, top, out):
-    """Least and greatest slope of a ray to a solid that begins ``out[2]`` away and ends ``far`` away."""
-    near = out[2]
-    if bottom >= 0.0:
-        out[3] = bottom / far
-    else:
-        out[3] = bottom / near if near > 0.0 else -np.inf
-    if top <= 0.0:
-        out[4] = top / far
-    else:
-        out[4] = top / near if near > 0.0 else np.inf
-
-
-@njit()
 def _disc_extent(dx, dy, radius, out):
-    """Bearing, half angle and nearest distance of a disc, into ``out``; returns its farthest distance."""
+    """Write bearing, half angle and nearest distance of a disc to ``out``."""
     distance = math.hypot(dx, dy)
     if distance <= radius:
         out[0], out[1], out[2] = 0.0, math.pi, 0.0
     else:
         out[0], out[1], out[2] = math.atan2(dy, dx), math.asin(radius / distance), distance - radius
-    return distance + radius
 
 
 @njit()
 def _box_extent(x, y, slack, box, out):
-    """Bearing, half angle and nearest distance of a box, into ``out``; returns its farthest distance."""
+    """Write bearing, half angle and nearest distance of a box to ``out``."""
     dx, dy, c, s = box[0] - x, box[1] - y, box[6], box[7]
-    far = math.hypot(dx, dy) + math.hypot(box[2], box[3]) + slack
     outside_x = max(abs(c * dx + s * dy) - box[2], 0.0)
     outside_y = max(abs(-s * dx + c * dy) - box[3], 0.0)
     near = math.hypot(outside_x, outside_y) - slack
     if near <= 0.0:
         out[0], out[1], out[2] = 0.0, math.pi, 0.0
-        return far
+        return
     bearing, half_angle = math.atan2(dy, dx), 0.0
     for i in range(4):
         u = box[2] if i % 2 else -box[2]
@@ -183,7 +159,6 @@ def _box_extent(x, y, slack, box, out):
         turn = abs(turn - 2.0 * math.pi * round(turn / (2.0 * math.pi)))
         half_angle = max(half_angle, turn + math.asin(min(slack / math.hypot(corner_x, corner_y), 1.0)))
     out[0], out[1], out[2] = bearing, half_angle, near
-    return far
 
 
 @njit()

@@ -67,12 +67,11 @@ class FrontEnd:
             self.T_odom_keyframe = tracked.T_odom_lidar
             self.covariance, self.since_keyframe = self.nothing, 0
             self.doubt = self.nothing
-        local_map = self.odometry.local_map
         return Located(
             tracked=tracked,
             is_keyframe=is_keyframe,
             scale=self.odometry.resolution.octave,
-            local_map=local_map.points() if is_keyframe else self.no_points,
+            local_map=self.odometry.local_map.points() if is_keyframe else self.no_points,
             information=self.information if is_keyframe else self.nothing,
             errors=self.errors,
             first_points=self.odometry.first_points,

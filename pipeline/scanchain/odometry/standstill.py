@@ -53,7 +53,7 @@ class Standstill:
         self.held: AgreeingMatches | None = None
         self.beside: AgreeingMatches | None = AgreeingMatches(
             T_odom_lidar
-        )  # of the last matches, none of which confirmed it
+        )  # of the last, which did not confirm it
         self.is_beginning = self.is_settling = False
 
     @property
@@ -118,9 +118,8 @@ class Standstill:
         moved = away - bias
         self.bias = bias
         if (np.abs(moved) < np.maximum(_limits(moved, _SAME_M, _SAME_RAD), sigma)).all():
-            self.held.mean_innovation = (
-                np.zeros(len(moved)) if mean is not self.held else self.held.mean_innovation
-            )
+            if mean is not self.held:
+                self.held.mean_innovation = np.zeros(len(moved))
             return
         self.T_odom_lidar = lie.normalize(self.T_odom_lidar @ lie.exp(moved))
         self.held = mean

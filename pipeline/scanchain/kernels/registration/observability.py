@@ -98,9 +98,8 @@ def agreement(H, unweighted, range_m: float) -> float:
 @njit(inline="always")
 def is_below(spectrum, m: int, times: float, settings) -> bool:
     """True if direction m lies below so many times the limits of a degenerate one."""
-    return (
-        spectrum.values[m] < times * settings.min_information or spectrum.signals[m] < times * settings.min_signal
-    )
+    is_blind = spectrum.values[m] < times * settings.min_information
+    return is_blind or spectrum.signals[m] < times * settings.min_signal
 
 
 @njit(nogil=True)
@@ -182,12 +181,8 @@ def signal_along(problem, T, twist) -> float:
 
     T (d+1, d+1) : pose at which the problem's points were associated
     """
-    voxels, points, origin, insertions = (
-        problem.voxels,
-        problem.points,
-        problem.origin,
-        problem.settings.insertions,
-    )
+    voxels, points, origin = problem.voxels, problem.points, problem.origin
+    insertions = problem.settings.insertions
     parameters = 2.0 if points.shape[1] == 2 else 3.0
     informative = np.zeros(points.shape[0])
     total, noise, most, dominant = 0.0, 0.0, 0.0, -1
@@ -220,9 +215,7 @@ def signal_along(problem, T, twist) -> float:
 
 
 @njit(inline="always")
-def _normal_variance(
-    cells, voxel: int, dx: float, dy: float, dz: float, beside: float, parameters: float
-) -> float:
+def _normal_variance(cells, voxel: int, dx, dy, dz, beside: float, parameters: float) -> float:
     """Variance of n·d by the fit of a voxel's normal n, ``beside`` being the squared length of d within the plane.
 
     τ² is estimated from m points less the parameters of the fit.
@@ -230,9 +223,8 @@ def _normal_variance(
     across = cells[voxel, ACROSS] * dx + cells[voxel, ACROSS + 1] * dy + cells[voxel, ACROSS + 2] * dz
     m = 1.0 / cells[voxel, MEAN_TERM]
     variance = cells[voxel, THICKNESS] * m / max(m - parameters, 1.0)
-    return variance * (
-        cells[voxel, SLOPE_ACROSS] * across * across + cells[voxel, SLOPE_ALONG] * (beside - across * across)
-    )
+    slope_across, slope_along = cells[voxel, SLOPE_ACROSS], cells[voxel, SLOPE_ALONG]
+    return variance * (slope_across * across * across + slope_along * (beside - across * across))
 
 
 @njit(nogil=True)

@@ -181,12 +181,9 @@ def _terms(beside, residual, i: int, normals, p: int, g):
 def _jacobian(points, i: int, normals, p: int, poses, k: int, J):
     """Write ∂r/∂(ρ, φ, δ) (7,)."""
     x, y, z = points[i, 0], points[i, 1], points[i, 2]
+    nx, ny, nz = normals[p, 0], normals[p, 1], normals[p, 2]
     for axis in range(3):
-        J[axis] = (
-            poses[k, 0, axis] * normals[p, 0]
-            + poses[k, 1, axis] * normals[p, 1]
-            + poses[k, 2, axis] * normals[p, 2]
-        )
+        J[axis] = poses[k, 0, axis] * nx + poses[k, 1, axis] * ny + poses[k, 2, axis] * nz
     J[3], J[4], J[5] = y * J[2] - z * J[1], z * J[0] - x * J[2], x * J[1] - y * J[0]
     level = max(math.sqrt(x * x + y * y), 1e-9)
     J[6] = level * J[2] - z / level * (x * J[0] + y * J[1])
