@@ -169,23 +169,17 @@ class Prediction(msgspec.Struct, frozen=True):
         """True if the scan may be outside any search window, after so long a gap."""
         return not self.prior.is_measured and self.silence_s * self.config.max_speed_m_s > _LARGEST_WINDOW_M
 
-    def window(self) -> tuple[float, float]:
-        """Half widths of the search window around the predicted pose in the plane, meters and radians."""
-        elapsed_s = max(self.interval_s, self.usual_s) + self.lost_s
-        return (
-            min(max(elapsed_s * self.config.max_speed_m_s, _LEAST_WINDOW_M), _LARGEST_WINDOW_M),
-            min(max(elapsed_s * self.config.max_turn_rad_s, _LEAST_WINDOW_RAD), math.pi),
-        )
+    def windows(self) -> tuple[tuple[float, float], ...]:
+        """Half widths of the search windows around the predicted pose, the likeliest first, meters and radians.
 
-    def windows_in_space(self) -> tuple[tuple[float, float], ...]:
-        """Half widths of the search windows in space, the likeliest first, meters and radians.
-
-        By the acceleration that a vehicle may have and, where nothing is found there, by its speed.
+        In space by the acceleration that a vehicle may have and, where nothing is found there, by its speed.
         """
         elapsed_s = max(self.interval_s, self.usual_s) + self.lost_s
         half_width_rad = min(max(elapsed_s * self.config.max_turn_rad_s, _LEAST_WINDOW_RAD), math.pi)
-        fastest_m_s = max(self.config.max_speed_m_s, _FASTEST_M_S)
-        by_speed = min(elapsed_s * fastest_m_s, _LARGEST_REACH_M), half_width_rad
+        if len(self.T_odom_last) == 3:
+            half_width_m = min(max(elapsed_s * self.config.max_speed_m_s, _LEAST_WINDOW_M), _LARGEST_WINDOW_M)
+            return ((half_width_m, half_width_rad),)
+        by_speed = min(elapsed_s * max(self.config.max_speed_m_s, _FASTEST_M_S), _LARGEST_REACH_M), half_width_rad
         if self.is_second or self.is_guess:
             return (by_speed,)
         by_acceleration = min(max(elapsed_s**2 * _ACCELERATION_M_S2, 1.0), by_speed[0]), half_width_rad

@@ -115,7 +115,7 @@ class Recovery:
         """
         structure = sweep.from_middle(prediction.velocity)
         best = tried[0]
-        for half_width_m, half_width_rad in prediction.windows_in_space():
+        for half_width_m, half_width_rad in prediction.windows():
             radius_m = float(np.percentile(np.abs(structure[:, :2]), _NEAR_PERCENT)) + half_width_m
             window = Window(lie.identity(2), half_width_m, half_width_rad)
             for seed in from_above(structure, surfaces, prediction.T_odom_lidar, window, radius_m):
@@ -196,7 +196,7 @@ def _guesses(points: Points, surfaces: VoxelMap, prediction: Prediction) -> tupl
     alternatives = prediction.alternatives()
     if surfaces.dimension == 3:
         return alternatives
-    half_width_m, half_width_rad = prediction.window()
+    ((half_width_m, half_width_rad),) = prediction.windows()
     reach_m = float(np.abs(points).max()) * math.sqrt(2.0) + half_width_m
     T_predicted = prediction.T_odom_lidar
     grid = SearchGrid.of_voxels(surfaces, T_predicted, reach_m)
