@@ -137,18 +137,6 @@ def test_a_smooth_floor_between_rough_walls_holds_height_and_tilt_as_its_own_res
     assert ((squares > 0.2) & (squares < 3.0)).all(), squares
 
 
-def test_a_prediction_holds_the_pose_where_the_map_does_not():
-    x = np.linspace(-10, 10, 2000)
-    wall = np.column_stack([x, np.full(2000, 1.0)])
-    target = VoxelMap(2, LocalMapConfig(voxel_size_m=0.4))
-    target.insert(wall, lie.identity(2))
-    start = lie.pose_2d(0.31, 0.1, 0.0)
-    prior = Prior(start, np.diag([1e-2, 1e-2, 1e-2]), np.full(3, 0.1))
-    match = create_matcher(MatchingConfig()).align(wall[500:1500], target, start, prior)
-    assert match.T_target_source[0, 2] == pytest.approx(0.31, abs=1e-2)
-    assert match.T_target_source[1, 2] == pytest.approx(0.0, abs=1e-2)
-
-
 def dented_corridor(dents, seed=0):
     """Two walls 20 m long, 1 cm of noise, with so many points on the faces of a dent across them."""
     rng = np.random.default_rng(seed)
