@@ -140,13 +140,9 @@ def draw_beams(starts, ends, offsets, origin, resolution_m, first_scan, hit, mis
                 drawn[row, column] = number
                 log_odds[row, column] = min(log_odds[row, column] + hit, high)
         for i in range(offsets[k], offsets[k + 1]):
-            _carve(
-                (starts[i, 0] - origin[0]) * scale,
-                (starts[i, 1] - origin[1]) * scale,
-                (ends[i, 0] - origin[0]) * scale,
-                (ends[i, 1] - origin[1]) * scale,
-                number, miss, low, log_odds, drawn,
-            )  # fmt: skip
+            x, y = (starts[i, 0] - origin[0]) * scale, (starts[i, 1] - origin[1]) * scale
+            end_x, end_y = (ends[i, 0] - origin[0]) * scale, (ends[i, 1] - origin[1]) * scale
+            _carve(x, y, end_x, end_y, number, miss, low, log_odds, drawn)
 
 
 @njit(inline="always")

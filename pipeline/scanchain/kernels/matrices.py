@@ -87,7 +87,7 @@ def eigensystem(A, values, vectors):
 
 
 @njit(nogil=True)
-def _rotate_pair(A, vectors, p: int, q: int):
+def _rotate_pair(A, V, p: int, q: int):
     """Turn axes p and q so that A[p, q] becomes zero: t = tan of the angle, the smaller root of t² + 2τt = 1."""
     tau = 0.5 * (A[q, q] - A[p, p]) / A[p, q]
     t = math.copysign(1.0, tau) / (abs(tau) + math.sqrt(1.0 + tau * tau))
@@ -95,10 +95,7 @@ def _rotate_pair(A, vectors, p: int, q: int):
     s = t * c
     for i in range(A.shape[0]):
         A[i, p], A[i, q] = c * A[i, p] - s * A[i, q], s * A[i, p] + c * A[i, q]
-        vectors[i, p], vectors[i, q] = (
-            c * vectors[i, p] - s * vectors[i, q],
-            s * vectors[i, p] + c * vectors[i, q],
-        )
+        V[i, p], V[i, q] = c * V[i, p] - s * V[i, q], s * V[i, p] + c * V[i, q]
     for i in range(A.shape[0]):
         A[p, i], A[q, i] = c * A[p, i] - s * A[q, i], s * A[p, i] + c * A[q, i]
 
@@ -162,12 +159,14 @@ def substitute(factor, b, x):
 def definite_inverse(matrix):
     """Inverse of a positive definite (k, k), of another zeros."""
     k = matrix.shape[0]
-    out, factor, b = np.zeros((k, k)), np.zeros((k, k)), np.zeros(k)
+    out, factor, b, x = np.zeros((k, k)), np.zeros((k, k)), np.zeros(k), np.empty(k)
     if factorize(matrix, 0.0, factor):
         for j in range(k):
             b[j] = -1.0
-            substitute(factor, b, out[:, j])
+            substitute(factor, b, x)
             b[j] = 0.0
+            for i in range(k):
+                out[i, j] = x[i]
     return out
 
 

@@ -209,13 +209,9 @@ def _hit_cylinder(ox, oy, oz, dx, dy, dz, cylinder):
 
 
 @njit()
-def _hit_ellipsoid(ox, oy, oz, dx, dy, dz, ellipsoid):
-    x, y, z = (
-        (ox - ellipsoid[0]) / ellipsoid[3],
-        (oy - ellipsoid[1]) / ellipsoid[4],
-        (oz - ellipsoid[2]) / ellipsoid[5],
-    )
-    u, v, w = dx / ellipsoid[3], dy / ellipsoid[4], dz / ellipsoid[5]
+def _hit_ellipsoid(ox, oy, oz, dx, dy, dz, e):
+    x, y, z = (ox - e[0]) / e[3], (oy - e[1]) / e[4], (oz - e[2]) / e[5]
+    u, v, w = dx / e[3], dy / e[4], dz / e[5]
     a, b, c = u * u + v * v + w * w, x * u + y * v + z * w, x * x + y * y + z * z - 1.0
     discriminant = b * b - a * c
     if discriminant < 0.0:

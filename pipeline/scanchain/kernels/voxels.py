@@ -128,12 +128,9 @@ def keep(voxels, kept, x: float, y: float, z: float, radius_m: float, oldest_tic
         if is_old or dx * dx + dy * dy + dz * dz > radius_m * radius_m:
             continue
         new = _voxel_at(kept, voxels.keys[voxel], 0)
-        for k in range(voxels.moments.shape[1]):
-            kept.moments[new, k] = voxels.moments[voxel, k]
-        for k in range(CELL):
-            kept.cells[new, k] = voxels.cells[voxel, k]
-        for k in range(voxels.history.shape[1]):
-            kept.history[new, k] = voxels.history[voxel, k]
+        kept.moments[new] = voxels.moments[voxel]
+        kept.cells[new] = voxels.cells[voxel]
+        kept.history[new] = voxels.history[voxel]
 
 
 @njit(inline="always")
@@ -178,14 +175,8 @@ def covariance_of(m):
     """xx, xy, xz, yy, yz, zz of the points with the moments m (10,)."""
     n = m[0]
     x, y, z = m[1] / n, m[2] / n, m[3] / n
-    return (
-        m[4] / n - x * x,
-        m[5] / n - x * y,
-        m[6] / n - x * z,
-        m[7] / n - y * y,
-        m[8] / n - y * z,
-        m[9] / n - z * z,
-    )
+    xx, xy, xz = m[4] / n - x * x, m[5] / n - x * y, m[6] / n - x * z
+    return xx, xy, xz, m[7] / n - y * y, m[8] / n - y * z, m[9] / n - z * z
 
 
 @njit(nogil=True)

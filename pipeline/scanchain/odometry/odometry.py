@@ -224,9 +224,7 @@ class Odometry:
         T_odom_middle, prior = match.T_target_source, prediction.prior
         velocity = prediction.velocity_by(lie.log(lie.between(prediction.T_odom_last, T_odom_middle)))
         if prediction.is_second:
-            T_moved = lie.exp(
-                self.first_sweep.middle_s * velocity
-            )  # the middle of the first scan; its stamp stays
+            T_moved = lie.exp(self.first_sweep.middle_s * velocity)  # of the first scan's middle; its stamp stays
             self.first_points = lie.transform(T_moved, self.first_sweep.from_middle(velocity))
             self.map.replace([(self.first_points, lie.identity(self.dimension))])
             T_odom_middle = T_moved @ T_odom_middle

@@ -51,9 +51,8 @@ class Standstill:
         self.T_odom_lidar = T_odom_lidar
         self.bias = np.zeros(lie.twist_size(T_odom_lidar))
         self.held: AgreeingMatches | None = None
-        self.beside: AgreeingMatches | None = AgreeingMatches(
-            T_odom_lidar
-        )  # of the last, which did not confirm it
+        # of the last matches, none of which confirmed it
+        self.beside: AgreeingMatches | None = AgreeingMatches(T_odom_lidar)
         self.is_beginning = self.is_settling = False
 
     @property

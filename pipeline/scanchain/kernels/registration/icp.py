@@ -183,9 +183,7 @@ def refine(voxels, points, starts, poses, prior, least_share, settings):
         problem = problem_of(voxels, scan, T, prior, settings)
         fit = align(problem, T, offset, settings.first_scale_m)
         if fit.ending == CONVERGED and fit.pairs >= least_share * scan.shape[0]:
-            for i in range(T.shape[0]):
-                for j in range(T.shape[0]):
-                    poses[k, i, j] = T[i, j]
+            poses[k] = T
 
 
 @njit(nogil=True)

@@ -190,7 +190,8 @@ def _systematic(problem, T, T_first, fit):
     spread, factor, shift = np.zeros((k, k)), np.empty((k, k)), np.empty(k)
     if not factorize(H, 0.0, factor):
         return spread
-    for b in problem.gradients:
+    for sector in range(problem.gradients.shape[0]):
+        b = problem.gradients[sector]
         groups += b[0] != 0.0 or b[1] != 0.0
         substitute(factor, b, shift)
         for m in range(k):

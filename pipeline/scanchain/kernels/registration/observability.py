@@ -185,7 +185,7 @@ def signal_along(problem, T, twist) -> float:
     insertions = problem.settings.insertions
     parameters = 2.0 if points.shape[1] == 2 else 3.0
     informative = np.zeros(points.shape[0])
-    total, noise, most, dominant = 0.0, 0.0, 0.0, -1
+    total, noise, most, dominant = 0.0, 0.0, 0.0, np.int64(-1)  # no literal, or else all is compiled twice
     youngest = insertions - min(_OLD, insertions - 1)
     for i in range(points.shape[0]):
         voxel, weight = problem.correspondence[i], problem.weight[i]
