@@ -244,7 +244,7 @@ class Predictor:
         self.lost_s = 0.0
         self.T_odom_base: Pose | None = None  # by the wheels at the last scan, where nothing contradicts it
         self.is_contradicted = False  # the reading at this scan
-        self.contradicted, self.first_contradicted, self.longest_jump_m = 0, 0, 0.0
+        self.jumps: list[tuple[int, float]] = []  # scan and meters of each reading that was left out
 
     def predict(self, scan: Scan, *, by_wheels: bool = True) -> Prediction:
         """The predicted pose of a scan that follows the last one corrected."""
@@ -288,17 +288,16 @@ class Predictor:
     def drop_wheels(self, scan: Scan, jump_m: float) -> None:
         """Leave out the reading at this scan, which is off by so much, here and for the motion to the next."""
         self.is_contradicted = True
-        self.first_contradicted = self.first_contradicted if self.contradicted else scan.index
-        self.contradicted += 1
-        self.longest_jump_m = max(self.longest_jump_m, jump_m)
+        self.jumps.append((scan.index, jump_m))
 
     def warnings(self) -> tuple[str, ...]:
         """A line on readings of the wheels that were left out."""
-        if not self.contradicted:
+        if not self.jumps:
             return ()
+        longest_m = max(jump_m for _, jump_m in self.jumps)
         return (
-            f"wheel odometry jumps by up to {self.longest_jump_m:.3g} m where the scans fit without it: left out "
-            f"at {counted(self.contradicted, 'scan')} (the first: scan {self.first_contradicted:,})",
+            f"wheel odometry jumps by up to {longest_m:.3g} m where the scans fit without it: left out "
+            f"at {counted(len(self.jumps), 'scan')} (the first: scan {self.jumps[0][0]:,})",
         )
 
     def correct(self, scan: Scan, prediction: Prediction, match: Match, state: State) -> None:
