@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -20,8 +19,7 @@ from scanchain.config import PreprocessConfig
 from scanchain.data import Points, Scan
 from scanchain.kernels import scans as kernels
 
-_LEAST_SLOTS, _MOST_SLOTS = 1 << 10, 1 << 22  # of a table for downsampling; larger ones are not kept
-_GROWTH = 4  # of a table that has no room for all voxels
+_SLOTS, _GROWTH = 1 << 18, 4  # of a table for downsampling: most at first, and growth where voxels have no room
 _RANGE_VOXELS = 14.0  # least number of voxels of the local map that the median range spans
 _DENSE, _SPARSE = 60_000, 40_000  # returns of a scan from which on it is dense, and below which it no longer is
 _FINE = math.sqrt(0.5)  # factor on the voxels of dense scans, which fill finer ones with points enough for a plane
@@ -106,16 +104,13 @@ def first_per_voxel(
     Raises InputError where the voxels are too small for the points.
     """
     checks.within_voxels(points, voxel_m, "points", max_range_m=max_range_m)
+    slots = min(1 << max(2 * len(points) - 1, 1).bit_length(), _SLOTS)
     while True:
-        table, chosen = _scratch.room(len(points))
+        table, chosen = np.empty(slots, np.int64), np.empty(slots // 2, np.int32)
         count = kernels.first_per_voxel(points, voxel_m, min_range_m, max_range_m, table, chosen)
         if count >= 0:
-            break
-        _scratch.resize(_GROWTH * len(table))
-    result = chosen[:count].copy()
-    if len(_scratch.table) > _MOST_SLOTS:
-        _scratch.resize(_LEAST_SLOTS)
-    return result
+            return chosen[:count].copy()
+        slots *= _GROWTH
 
 
 class Resolution:
@@ -207,25 +202,6 @@ def prepare_ahead(scans: Iterable[Scan], resolution: Resolution) -> Iterator[Pre
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
-
-
-class _Scratch(threading.local):
-    """Arrays of each thread, reused, as large as scans with so many voxels need: small ones stay in the cache."""
-
-    def __init__(self) -> None:
-        self.resize(_LEAST_SLOTS)
-
-    def resize(self, slots: int) -> None:
-        """Make others of this size."""
-        self.table, self.chosen = np.empty(slots, np.int64), np.empty(slots // 2, np.int32)
-
-    def room(self, count: int) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
-        """Table and indices to downsample so many points, none larger than they need at most."""
-        slots = min(1 << max(2 * count - 1, 1).bit_length(), len(self.table))
-        return self.table[:slots], self.chosen[: slots // 2]
-
-
-_scratch = _Scratch()
 
 
 def _gather(points: NDArray[np.floating], chosen: NDArray[np.int32]) -> Points:

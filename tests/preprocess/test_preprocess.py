@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from scanchain import preprocess
 from scanchain.config import PreprocessConfig
 from scanchain.data import Scan
 from scanchain.preprocess import Resolution, downsample, prepare_ahead, sweep_of
@@ -36,13 +37,15 @@ def test_a_sweep_is_the_first_point_of_every_voxel_in_range_and_seen_from_its_mi
     assert np.array_equal(sweep.points, scan.points[chosen].astype(float))
 
 
-def test_a_thinned_sweep_keeps_the_times_of_its_points():
+def test_a_thinned_sweep_keeps_the_times_of_its_points_however_many_voxels_there_is_room_for(monkeypatch):
     sweep = sweep_of(some_scan(), CONFIG)
     thin = sweep.downsampled(4.0)
     assert 10 < len(thin.points) < len(sweep.points)
     assert np.array_equal(thin.points, downsample(sweep.points, 4.0))
     place = {tuple(point): time for point, time in zip(sweep.points, sweep.times_s, strict=True)}
     assert [place[tuple(point)] for point in thin.points] == thin.times_s.tolist()
+    monkeypatch.setattr(preprocess, "_SLOTS", 4)
+    assert np.array_equal(thin.points, downsample(sweep.points, 4.0))
 
 
 @pytest.mark.parametrize(("with_times", "deskew"), [(False, True), (True, False)])
