@@ -14,7 +14,7 @@ from scanchain.kernels.registration import icp, observability
 from scanchain.kernels.registration.residuals import normal_equations
 from scanchain.registration import VoxelMap, create_matcher
 from scanchain.registration.plicp import settings_of
-from tests.support import naive_evidence as naive
+from tests.support import naive
 
 LIMITS = MatchingConfig(max_distance_m=1.0, sensor_noise_m=0.02)
 BEFORE = 12  # scans
