@@ -59,7 +59,7 @@ class Sweep:
         """The first point of every voxel of this size."""
         chosen = first_per_voxel(self.points, voxel_m, 0.0, np.inf)
         times_s = self.times_s[chosen] if self.is_distorted else self.times_s
-        return Sweep(_gather(self.points, chosen), times_s, self.middle_s)
+        return Sweep(self.points.take(chosen, axis=0), times_s, self.middle_s)
 
     def from_middle(self, velocity: NDArray[np.float64]) -> Points:
         """The points (M, d) as seen from the lidar in the middle of the scan.
@@ -84,7 +84,7 @@ def sweep_of(scan: Scan, config: PreprocessConfig, scale: float = 1.0) -> Sweep:
     """
     voxel_m = scale * config.map_voxel_m
     chosen = first_per_voxel(scan.points, voxel_m, config.min_range_m, config.max_range_m)
-    points = _gather(scan.points, chosen)
+    points = scan.points.take(chosen, axis=0).astype(np.float64)
     if not config.deskew or not len(scan.times_s):
         return Sweep(points, np.empty(0), 0.0)
     middle_s = 0.5 * (float(scan.times_s.min()) + float(scan.times_s.max()))
@@ -93,7 +93,7 @@ def sweep_of(scan: Scan, config: PreprocessConfig, scale: float = 1.0) -> Sweep:
 
 def downsample(points: Points, voxel_m: float) -> Points:
     """The first point of every voxel."""
-    return _gather(points, first_per_voxel(points, voxel_m, 0.0, np.inf))
+    return points.take(first_per_voxel(points, voxel_m, 0.0, np.inf), axis=0).astype(np.float64, copy=False)
 
 
 def first_per_voxel(
@@ -202,9 +202,3 @@ def prepare_ahead(scans: Iterable[Scan], resolution: Resolution) -> Iterator[Pre
                 yield waiting.popleft().result()
         while waiting:
             yield waiting.popleft().result()
-
-
-def _gather(points: NDArray[np.floating], chosen: NDArray[np.int32]) -> Points:
-    out = np.empty((len(chosen), points.shape[1]))
-    kernels.gather(points, chosen, out)
-    return out

@@ -77,14 +77,6 @@ def _key_in_range(x, y, z, scale: float, low: float, high: float):
 
 
 @njit(nogil=True)
-def gather(points, chosen, out):
-    """Copy the chosen rows of points (N, d) to ``out`` (M, d)."""
-    for k in range(out.shape[0]):
-        for axis in range(out.shape[1]):
-            out[k, axis] = points[chosen[k], axis]
-
-
-@njit(nogil=True)
 def deskew_in_plane(points, shares, twist):
     """Move each point, in place, to its position as seen by the lidar at one instant, usually the scan's middle.
 

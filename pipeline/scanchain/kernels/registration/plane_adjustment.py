@@ -15,17 +15,6 @@ _LEAST_SLOPE = 0.4  # of Σψ' over Σw, which bounds how much longer steps beco
 
 
 @njit(nogil=True)
-def lift(points, offset_rad: float, lifted):
-    """Write points (N, 3) of lidar frames with their elevation angles raised."""
-    sine, cosine = math.sin(offset_rad), math.cos(offset_rad)
-    for i in range(points.shape[0]):
-        level = max(math.sqrt(points[i, 0] ** 2 + points[i, 1] ** 2), 1e-9)
-        stretch = cosine - sine * points[i, 2] / level
-        lifted[i, 0], lifted[i, 1] = stretch * points[i, 0], stretch * points[i, 1]
-        lifted[i, 2] = cosine * points[i, 2] + sine * level
-
-
-@njit(nogil=True)
 def planes(points, number, poses, cell_m: float, beside, residual, plane, normals):
     """Find the cells of a grid whose points, of several scans, lie in a plane; returns how many, P.
 
