@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from scanchain.errors import InputError, one_line, shown
-from scanchain.kernels.geometry.validity import largest_magnitude, rigidity_error
-from scanchain.kernels.voxels.hashing import REACH
+from scanchain.kernels.geometry import largest_magnitude, rigidity_error
+from scanchain.kernels.voxels import REACH
 
 _RIGID = 1e-3  # largest entry of RᵀR − I; poses printed with four digits stay below it
 _LARGEST_VOXEL = float(1 << 31)  # of 32 bits, in which voxels are counted along an axis

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.data import Matrix, Pose
-from scanchain.kernels.geometry import se
+from scanchain.kernels import geometry
 
 _SMALL = 1e-8  # rad; below this angle the series replaces the closed form
 
@@ -24,7 +24,7 @@ def identity(dimension: int) -> Pose:
 def inverse(T: Pose) -> Pose:
     """T⁻¹ = [Rᵀ, −Rᵀt; 0, 1]."""
     if T.ndim == 2:
-        return se.inverse(np.ascontiguousarray(T, np.float64))
+        return geometry.inverse(np.ascontiguousarray(T, np.float64))
     d = T.shape[-1] - 1
     result = np.zeros(T.shape)
     R_t = np.swapaxes(T[..., :d, :d], -1, -2)
@@ -37,13 +37,13 @@ def inverse(T: Pose) -> Pose:
 def between(T_a: Pose, T_b: Pose) -> Pose:
     """The motion T_a⁻¹ T_b from one pose to another, in the former's frame."""
     if T_a.ndim == T_b.ndim == 2:
-        return se.between(np.ascontiguousarray(T_a, np.float64), np.ascontiguousarray(T_b, np.float64))
+        return geometry.between(np.ascontiguousarray(T_a, np.float64), np.ascontiguousarray(T_b, np.float64))
     return inverse(T_a) @ T_b
 
 
 def apart(T_a: Pose, T_b: Pose) -> tuple[float, float]:
     """Distance between two poses: meters, and the angle in [0, π] between their rotations."""
-    return se.apart(np.ascontiguousarray(T_a, np.float64), np.ascontiguousarray(T_b, np.float64))
+    return geometry.apart(np.ascontiguousarray(T_a, np.float64), np.ascontiguousarray(T_b, np.float64))
 
 
 def transform(T: Pose, points: NDArray[np.floating]) -> Matrix:
@@ -139,7 +139,7 @@ def by_component(k: int, meters: float, radians: float) -> NDArray[np.float64]:
 def adjoint(T: Pose) -> Matrix:
     """Ad with T exp(ξ) T⁻¹ = exp(Ad ξ); (..., k, k)."""
     if T.ndim == 2:
-        return se.adjoint(np.ascontiguousarray(T, np.float64))
+        return geometry.adjoint(np.ascontiguousarray(T, np.float64))
     d = T.shape[-1] - 1
     R, t = T[..., :d, :d], T[..., :d, d]
     k = twist_size(T)
@@ -157,7 +157,7 @@ def adjoint(T: Pose) -> Matrix:
 def normalize(T: Pose) -> Pose:
     """The pose with its rotation made orthonormal again, after many products."""
     result = np.array(T, np.float64, order="C")
-    se.orthonormalize(result)
+    geometry.orthonormalize(result)
     return result
 
 
@@ -169,7 +169,7 @@ def interpolate(T_a: Pose, T_b: Pose, share: float) -> Pose:
 def to_quaternion(R: Matrix) -> NDArray[np.float64]:
     """Unit quaternions xyzw of rotation matrices (..., 3, 3); w ≥ 0."""
     result = np.empty((*R.shape[:-2], 4))
-    se.quaternions(_stack(R), result.reshape(-1, 4))
+    geometry.quaternions(_stack(R), result.reshape(-1, 4))
     return result
 
 
@@ -195,7 +195,7 @@ def _exp_se2(twist: NDArray[np.float64]) -> Pose:
 
 def _log_se2(T: Pose) -> NDArray[np.float64]:
     if T.ndim == 2:
-        return se.twist_2d(np.ascontiguousarray(T, np.float64))
+        return geometry.twist_2d(np.ascontiguousarray(T, np.float64))
     theta = yaw(T)
     half = 0.5 * theta
     small = np.abs(theta) < _SMALL
@@ -239,7 +239,7 @@ def _so3_coefficients(theta: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
 
 def _log_se3(T: Pose) -> NDArray[np.float64]:
     result = np.empty((*T.shape[:-2], 6))
-    se.twists(_stack(T), result.reshape(-1, 6))
+    geometry.twists(_stack(T), result.reshape(-1, 6))
     return result
 
 

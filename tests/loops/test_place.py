@@ -10,7 +10,7 @@ import pytest
 from scanchain import lie
 from scanchain.data import ClosureVerdict, Keyframe, Proposal
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.kernels.raycast.free_space import FAR, compare_ranges, nearest_ranges
+from scanchain.kernels.free_space import FAR, compare_ranges, nearest_ranges
 from scanchain.loops import LoopCloser, outline_of
 from scanchain.loops.connectivity import Segments
 from scanchain.loops.descriptor import SIZE, DescriptorDatabase, compare, describe, heights_of

@@ -7,7 +7,7 @@ import pytest
 
 from scanchain import lie
 from scanchain.config import MapsConfig
-from scanchain.kernels.raycast.free_space import FAR, nearest_ranges, weigh_points
+from scanchain.kernels.free_space import FAR, nearest_ranges, weigh_points
 from scanchain.maps import View, build_point_map, draw_grid, moved
 from tests.support import moving_worlds
 from tests.support import naive_maps as naive

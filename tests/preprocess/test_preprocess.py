@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from scanchain import preprocess
 from scanchain.config import PreprocessConfig
 from scanchain.data import Scan
 from scanchain.preprocess import Resolution, downsample, prepare_ahead, sweep_of
@@ -24,33 +25,27 @@ def some_scan(dimension=3, n=2000, with_times=True):
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_a_sweep_is_the_first_point_of_every_voxel_in_range_with_its_time(dimension):
+def test_a_sweep_is_the_first_point_of_every_voxel_in_range_and_seen_from_its_middle(dimension):
     scan = some_scan(dimension)
     sweep = sweep_of(scan, CONFIG)
     chosen = naive.first_per_voxel(scan.points, 0.5, 1.0, 50.0)
-    assert np.array_equal(sweep.points, scan.points[chosen].astype(float))
     assert sweep.middle_s == pytest.approx(0.07, abs=1e-3)
     np.testing.assert_allclose(sweep.times_s, scan.times_s[chosen] - sweep.middle_s, atol=1e-7)
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_points_are_seen_from_the_middle_at_constant_velocity(dimension):
-    sweep = sweep_of(some_scan(dimension), CONFIG)
-    before = sweep.points.copy()
     velocity = np.array([8.0, 0.5, 0.3] if dimension == 2 else [8.0, 0.5, -0.2, 0.1, -0.2, 0.6])
-    np.testing.assert_allclose(
-        sweep.from_middle(velocity), naive.deskew(sweep.points, sweep.times_s, velocity), atol=1e-9
-    )
-    assert np.array_equal(sweep.points, before)
+    wanted = naive.deskew(sweep.points, sweep.times_s, velocity)
+    np.testing.assert_allclose(sweep.from_middle(velocity), wanted, atol=1e-9)
+    assert np.array_equal(sweep.points, scan.points[chosen].astype(float))
 
 
-def test_a_thinned_sweep_keeps_the_times_of_its_points():
+def test_a_thinned_sweep_keeps_the_times_of_its_points_however_many_voxels_there_is_room_for(monkeypatch):
     sweep = sweep_of(some_scan(), CONFIG)
     thin = sweep.downsampled(4.0)
     assert 10 < len(thin.points) < len(sweep.points)
     assert np.array_equal(thin.points, downsample(sweep.points, 4.0))
     place = {tuple(point): time for point, time in zip(sweep.points, sweep.times_s, strict=True)}
     assert [place[tuple(point)] for point in thin.points] == thin.times_s.tolist()
+    monkeypatch.setattr(preprocess, "_SLOTS", 4)
+    assert np.array_equal(thin.points, downsample(sweep.points, 4.0))
 
 
 @pytest.mark.parametrize(("with_times", "deskew"), [(False, True), (True, False)])
@@ -75,9 +70,8 @@ def test_voxels_are_small_where_the_place_is_narrow_and_enough_points_are_matche
     for k in range(5):
         sweep, sparse = resolution.downsampled(box_scan(half_m, seed=k))
     assert resolution.scale == scale
-    assert len(sweep.points) == len(
-        naive.first_per_voxel(box_scan(half_m, seed=4).points, 0.5 * scale, 0.5, 100.0)
-    )
+    chosen = naive.first_per_voxel(box_scan(half_m, seed=4).points, 0.5 * scale, 0.5, 100.0)
+    assert len(sweep.points) == len(chosen)
     most = resolution.match_voxel_m == 1.5 * scale
     least = resolution.match_voxel_m == 0.5 * scale
     assert most or least or 1500 < len(sparse.points) < 2600

@@ -57,31 +57,18 @@ def off(T_a, T_b):
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("optimizer", list(OPTIMIZERS))
-def test_all_four_optimizers_reach_the_same_minimum_near_the_truth(dimension, optimizer):
-    T = truth(dimension)
-    iterations = 20_000 if optimizer == "gradient-descent" else 200
-    matcher, target = set_up(dimension, optimizer=optimizer, max_iterations=iterations)
-    reference, _ = set_up(dimension)
-    match = matcher.align(scan_at(T), target, lie.identity(dimension))
-    expected = reference.align(scan_at(T), target, lie.identity(dimension))
-    assert expected.converged
-    assert off(expected.T_target_source, T) < 3e-3
-    # pairs and their trust stay after PATIENCE associations, when gradient descent is still on its way
-    assert off(match.T_target_source, expected.T_target_source) < (
-        5e-3 if optimizer == "gradient-descent" else 1e-3
-    )
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_second_order_methods_need_half_the_steps_of_gradient_descent(dimension):
-    steps = {}
+def test_all_four_optimizers_reach_one_minimum_near_the_truth_by_second_order_in_half_the_steps(dimension):
+    T, found = truth(dimension), {}
     for optimizer in OPTIMIZERS:
         matcher, target = set_up(dimension, optimizer=optimizer, max_iterations=20_000)
-        T = truth(dimension)
-        steps[optimizer] = matcher.align(scan_at(T), target, lie.identity(dimension)).iterations
-    assert max(steps["newton"], steps["gauss-newton"], steps["levenberg-marquardt"]) < 40
-    assert steps["gradient-descent"] >= 2 * steps["levenberg-marquardt"]
+        found[optimizer] = matcher.align(scan_at(T), target, lie.identity(dimension))
+    expected, slow = found["levenberg-marquardt"], found.pop("gradient-descent")
+    assert expected.converged and off(expected.T_target_source, T) < 3e-3
+    for match in found.values():
+        assert off(match.T_target_source, expected.T_target_source) < 1e-3 and match.iterations < 40
+    # correspondences and their weights stay after PATIENCE associations, when gradient descent is on its way still
+    assert off(slow.T_target_source, expected.T_target_source) < 5e-3
+    assert slow.iterations >= 2 * expected.iterations
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -145,36 +132,9 @@ def test_a_smooth_floor_between_rough_walls_holds_height_and_tilt_as_its_own_res
     matches = [matcher.align(room(2_000), target, lie.identity(3)) for _ in range(40)]
     errors = np.array([lie.log(match.T_target_source) for match in matches])
     covariances = np.array([np.linalg.inv(match.information) for match in matches])
-    squares = ((errors - errors.mean(axis=0)) ** 2).mean(axis=0) / np.diagonal(covariances, axis1=1, axis2=2).mean(
-        axis=0
-    )
+    variances = np.diagonal(covariances, axis1=1, axis2=2).mean(axis=0)
+    squares = ((errors - errors.mean(axis=0)) ** 2).mean(axis=0) / variances
     assert ((squares > 0.2) & (squares < 3.0)).all(), squares
-
-
-def test_a_corridor_is_reported_as_degenerate_along_its_axis():
-    rng = np.random.default_rng(0)
-    x = rng.uniform(-10, 10, 4000)
-    walls = np.column_stack([x, np.where(rng.random(4000) < 0.5, 1.0, -1.0) + 0.005 * rng.normal(size=4000)])
-    turned = lie.exp(np.array([0.0, 0.0, 0.5]))
-    target = VoxelMap(2, LocalMapConfig(voxel_size_m=0.4))
-    target.insert(lie.transform(turned, walls), lie.identity(2))
-    match = create_matcher(MatchingConfig(max_distance_m=0.8)).align(walls[::10], target, turned)
-    open_room, room_map = set_up(2)
-    free = open_room.align(scan_at(truth(2)), room_map, lie.identity(2))
-    assert match.degeneracy_eigenvalue < 1e-3 < 0.1 < free.degeneracy_eigenvalue
-    assert abs(match.degeneracy_direction[0]) > np.cos(np.radians(5.0))
-
-
-def test_a_prediction_holds_the_pose_where_the_map_does_not():
-    x = np.linspace(-10, 10, 2000)
-    wall = np.column_stack([x, np.full(2000, 1.0)])
-    target = VoxelMap(2, LocalMapConfig(voxel_size_m=0.4))
-    target.insert(wall, lie.identity(2))
-    start = lie.pose_2d(0.31, 0.1, 0.0)
-    prior = Prior(start, np.diag([1e-2, 1e-2, 1e-2]), np.full(3, 0.1))
-    match = create_matcher(MatchingConfig()).align(wall[500:1500], target, start, prior)
-    assert match.T_target_source[0, 2] == pytest.approx(0.31, abs=1e-2)
-    assert match.T_target_source[1, 2] == pytest.approx(0.0, abs=1e-2)
 
 
 def dented_corridor(dents, seed=0):
@@ -240,15 +200,12 @@ def test_planar_points_in_space_give_a_rotation_not_a_reflection():
     np.testing.assert_allclose(rigid_transform(x, lie.transform(T, x), np.ones(30)), T, atol=1e-9)
 
 
-def test_points_on_a_line_in_space_are_refused_not_answered():
-    x = np.outer(np.linspace(-1, 1, 20), [1.0, 2.0, -1.0])
-    with pytest.raises(DegeneratePairsError, match="on a line"):
-        rigid_transform(x, x + 1.0, np.ones(20))
-
-
-def test_points_on_one_spot_are_refused_in_the_plane():
-    with pytest.raises(DegeneratePairsError, match="on a point"):
-        rigid_transform(np.ones((5, 2)), np.zeros((5, 2)), np.ones(5))
+@pytest.mark.parametrize(
+    ("x", "word"), [(np.outer(np.linspace(-1, 1, 20), [1.0, 2.0, -1.0]), "line"), (np.ones((5, 2)), "point")]
+)
+def test_points_that_leave_a_rotation_free_are_refused_not_answered(x, word):
+    with pytest.raises(DegeneratePairsError, match=f"on a {word}"):
+        rigid_transform(x, x + 1.0, np.ones(len(x)))
 
 
 def test_a_map_forgets_what_is_far_and_what_is_old():

@@ -1,8 +1,10 @@
-"""A matcher of the user's, outside the package: named on the command line, compared, stopped and resumed."""
+"""The matcher of docs/extending.md, outside the package: named on the command line, compared, stopped, resumed."""
 
+import re
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,45 +19,9 @@ from scanchain.runs.directory import CHECKPOINT_FILE
 from scanchain.simulation import simulate
 from tests.support.killing import same_result
 
-MATCHER = '''
-import numpy as np
-from scipy.spatial import KDTree
-
-from scanchain import Match, rigid_transform
-
-
-class PointToPoint:
-    """Point-to-point ICP to the means of the map's voxels (Besl & McKay 1992)."""
-
-    def __init__(self, config):
-        self.config = config
-
-    def align(self, points, target, T_first, prior=None, *, wide=False):
-        limit_m = self.config.wide_max_distance_m if wide else self.config.max_distance_m
-        means, T, d = target.points(), T_first, points.shape[1]
-        tree = KDTree(means)
-        for iteration in range(self.config.max_iterations):
-            moved = points @ T[:d, :d].T + T[:d, d]
-            distance_m, nearest = tree.query(moved, distance_upper_bound=limit_m)
-            paired = np.isfinite(distance_m)
-            if paired.sum() < 10:
-                break
-            correction = rigid_transform(moved[paired], means[nearest[paired]])
-            T = correction @ T
-            if np.abs(correction - np.eye(d + 1)).max() < self.config.tolerance_m:
-                break
-        k, inliers = 3 * (d - 1), int(paired.sum())
-        is_good = inliers > self.config.min_inlier_share * len(points)
-        return Match(
-            T_target_source=T, information=np.eye(k) * inliers / self.config.sensor_noise_m**2,
-            cost=float(np.minimum(distance_m, limit_m) @ np.minimum(distance_m, limit_m)),
-            inliers=inliers, points=len(points), iterations=iteration + 1,
-            residual_m=float(np.sqrt(np.mean(distance_m[paired] ** 2))) if inliers else 0.0,
-            fit=1.0, at_minimum=is_good, converged=is_good, reason="" if is_good else "few correspondences",
-            degeneracy_eigenvalue=1.0, observability=1.0, degeneracy_direction=np.eye(k)[0],
-        )
-'''
-NAME = "my_module:PointToPoint"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "extending.md"
+(MATCHER,) = re.findall(r"```python\n(# my_matcher\.py\n.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+NAME = "my_matcher:PointToPoint"
 
 
 @pytest.fixture(scope="module")
@@ -67,9 +33,11 @@ def office(tmp_path_factory):
 
 
 @pytest.fixture
-def folder(tmp_path):
-    """A working directory with the user's module."""
-    (tmp_path / "my_module.py").write_text(MATCHER)
+def folder(tmp_path, monkeypatch):
+    """The working directory, with the user's module."""
+    (tmp_path / "my_matcher.py").write_text(MATCHER)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [each for each in sys.path if each not in ("", str(tmp_path))])
     return tmp_path
 
 
@@ -80,7 +48,6 @@ def started(folder, *words):
 
 
 def test_it_runs_is_stopped_and_goes_on_to_the_same_result(office, folder):
-    assert len(MATCHER.strip().splitlines()) <= 40
     words = ("run", office, "--matcher", NAME, "--rerun", "off", "--checkpoint", "0.1")
     whole = started(folder, *words, "--out", "whole")
     assert whole.wait() == 0, whole.stderr.read()
@@ -97,38 +64,22 @@ def test_it_runs_is_stopped_and_goes_on_to_the_same_result(office, folder):
     assert "resumed after" in (folder / "run" / "summary.txt").read_text()
 
 
-def test_it_is_a_row_of_a_comparison_and_its_settings_can_be_given_back(office, folder, monkeypatch):
-    names = ("svd", "PointToPoint")
-    child = started(
-        folder,
-        "compare",
-        office,
-        "--log.end_s",
-        "3",
-        "--methods",
-        ",".join(names),
-        "--matcher",
-        NAME,
-        "--out",
-        "a",
-    )
+def test_it_is_a_row_of_a_comparison_and_its_settings_can_be_given_back(office, folder):
+    names, short = ("svd", "PointToPoint"), ("--log.end_s", "3")
+    words = ("compare", office, *short, "--methods", ",".join(names), "--matcher", NAME, "--out", "a")
+    child = started(folder, *words)
     _, errors = child.communicate()
     assert child.returncode == 0, errors
     svd, own = read_table(folder / "a").rows
     assert own.status is Status.OK and NAME in own.description
     assert own.figures["ate_m"] < 0.1 and own.figures["ate_m"] != svd.figures["ate_m"]
-    monkeypatch.chdir(folder)
-    monkeypatch.setattr(sys, "path", [*sys.path])
     given = resolve(names, 2, file=None, matcher=NAME)
     again = resolve(names, 2, file=folder / "a" / "settings.toml")
-    assert [(each.name, each.base, each.settings) for each in again] == [
-        (each.name, each.base, each.settings) for each in given
-    ]
+    for one, other in zip(again, given, strict=True):
+        assert (one.name, one.base, one.settings) == (other.name, other.base, other.settings)
 
 
-def test_one_added_to_the_methods_needs_no_name_of_its_own_there(folder, monkeypatch):
-    monkeypatch.chdir(folder)
-    monkeypatch.setattr(sys, "path", [*sys.path])
+def test_one_added_to_the_methods_needs_no_name_of_its_own_there(folder):
     for names in (("svd",), ("svd", "PointToPoint+loops")):
         chosen = [method.name for method in resolve(names, 2, file=None, matcher=NAME)]
         assert chosen == list(names if len(names) > 1 else (*names, "PointToPoint"))
@@ -140,19 +91,17 @@ def test_one_added_to_the_methods_needs_no_name_of_its_own_there(folder, monkeyp
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("my_modul:PointToPoint", "there is no module my_modul in"),
-        ("my_module:PointToPlane", "has no class PointToPlane"),
-        ("my_module:KDTree", "has no method align"),
+        ("my_match:PointToPoint", "there is no module my_match in"),
+        ("my_matcher:PointToPlane", "has no class PointToPlane"),
+        ("my_matcher:KDTree", "has no method align"),
         ("broken:Matcher", "importing broken failed with SyntaxError"),
         ("needy:Matcher", "No module named 'not_there'"),
-        ("my_module.PointToPoint", "one of plicp, svd or a class of yours, MODULE:CLASS"),
+        ("my_matcher.PointToPoint", "one of plicp, svd or a class of yours, MODULE:CLASS"),
     ],
 )
-def test_one_that_cannot_be_had_is_one_line_that_says_why(folder, monkeypatch, name, words):
+def test_one_that_cannot_be_had_is_one_line_that_says_why(folder, name, words):
     (folder / "broken.py").write_text("class Matcher(:\n")
     (folder / "needy.py").write_text("import not_there\n")
-    monkeypatch.chdir(folder)
-    monkeypatch.setattr(sys, "path", [*sys.path])
     with pytest.raises(InputError) as raised:
         create_matcher(MatchingConfig(matcher=name))
     assert words in str(raised.value) and "\n" not in str(raised.value)
@@ -177,11 +126,9 @@ def test_one_that_cannot_be_had_is_one_line_that_says_why(folder, monkeypatch, n
         ("fit=1.0,", "fit='good',", "fit is 'good'; wanted a number"),
     ],
 )
-def test_one_that_returns_something_else_is_one_line_that_names_it(folder, monkeypatch, old, new, words):
+def test_one_that_returns_something_else_is_one_line_that_names_it(folder, old, new, words):
     module = f"own_{abs(hash(new))}"
     (folder / f"{module}.py").write_text(MATCHER.replace(old, new))
-    monkeypatch.chdir(folder)
-    monkeypatch.setattr(sys, "path", [*sys.path])
     wall = np.random.default_rng(0).uniform(-3.0, 3.0, (200, 2))
     target = VoxelMap(2, LocalMapConfig())
     target.insert(wall, np.eye(3))
@@ -191,10 +138,7 @@ def test_one_that_returns_something_else_is_one_line_that_names_it(folder, monke
 
 def test_the_working_directory_comes_last(folder, monkeypatch):
     (folder / "numpy.py").write_text("raise RuntimeError('a stranger')\n")
-    monkeypatch.chdir(folder)
-    monkeypatch.setattr(sys, "path", [*sys.path])
-    monkeypatch.delitem(sys.modules, "my_module", raising=False)
-    monkeypatch.setattr(sys, "path", [each for each in sys.path if each not in ("", str(folder))])
+    monkeypatch.delitem(sys.modules, "my_matcher", raising=False)
     before = [*sys.path]
     assert callable(create_matcher(MatchingConfig(matcher=NAME)).align)
     assert sys.path[: len(before)] == before and str(folder) in sys.path

@@ -8,7 +8,7 @@ from scanchain.config import LocalMapConfig
 from scanchain.odometry.recovery import from_above
 from scanchain.registration import SearchGrid, VoxelMap, Wanted, Window, find, search
 from scanchain.registration.search import Search, upright_columns
-from tests.support import naive_search
+from tests.support import naive
 
 CELL_M = 0.25
 
@@ -36,7 +36,7 @@ def scene(seed):
 
 def every(grid, points, turn_rad, T, shifts, turns):
     """Shares by pose: turn, x and y in steps from T."""
-    return naive_search.scores(grid.pyramid[0], grid.origin_m, CELL_M, points, T, shifts, turns, turn_rad)
+    return naive.scores(grid.pyramid[0], grid.origin_m, CELL_M, points, T, shifts, turns, turn_rad)
 
 
 def steps_of(found, T, turn_rad):
@@ -47,9 +47,9 @@ def steps_of(found, T, turn_rad):
 def test_every_level_holds_the_best_of_its_windows():
     means = walls(np.random.default_rng(0), 6, 5.0)
     grid = SearchGrid.of_points(means, CELL_M)
-    drawn = naive_search.hits(means, grid.origin_m, CELL_M, grid.room.shape)
+    drawn = naive.hits(means, grid.origin_m, CELL_M, grid.room.shape)
     for level, layer in enumerate(grid.pyramid):
-        assert np.array_equal(layer, naive_search.windows(drawn, 2**level))
+        assert np.array_equal(layer, naive.windows(drawn, 2**level))
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -6,7 +6,7 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.data import Matrix, Points, Pose
-from scanchain.preprocess.sweep import first_per_voxel
+from scanchain.preprocess import first_per_voxel
 from scanchain.simulation.drive import plan
 from scanchain.simulation.worlds.outdoor import town
 

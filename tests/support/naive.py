@@ -1,8 +1,9 @@
-"""Slow, clear twins of the matching kernels; every kernel test says fast == naive."""
+"""Slow, clear twins of the kernels of matching, observability and search; every test of one says fast == naive."""
 
 import numpy as np
 
 from scanchain import lie
+from scanchain.kernels import voxels
 
 
 def voxel_of(point, size):
@@ -166,3 +167,91 @@ def plane_equations(points, number, plane, beside, residual, normals, poses, sca
         H += whole[:size, :size] - eliminated @ whole[size:, :size]
         b += gradient[:size] - eliminated @ gradient[size:]
     return H, b
+
+
+def spectrum(H, weights, range_m):
+    k = len(H)
+    scale = np.append(np.ones(k // 2 + k % 2), np.full(k // 2, 1.0 / range_m))
+    values, vectors = np.linalg.eigh(np.diag(scale) @ H @ np.diag(scale) / weights)
+    return scale, values, vectors
+
+
+def weak_prior(H, weights, range_m, expected, signals, limits, is_fused):
+    """limits : the least information and the least signal"""
+    scale, values, vectors = spectrum(H, weights, range_m)
+    total = np.zeros(H.shape)
+    for value, signal, vector in zip(values, signals, vectors.T, strict=True):
+        times = min(value / limits[0], signal / limits[1])
+        if times < (1.0 if is_fused else 10.0):
+            twist = vector * scale
+            is_frozen = (value < limits[0] or signal <= 1.0) if is_fused else times < 1.0
+            strength = 1e3 * weights if is_frozen else twist @ expected @ twist / (1.0 - 1.0 / signal)
+            total += min(strength, 1e3 * weights) * np.outer(vector / scale, vector / scale)
+    return total
+
+
+def seen_from_source(T, T_first, H, worst, variance):
+    """Information and worst direction of twists in the source's frame."""
+    centered = T.copy()
+    centered[:-1, -1] -= T_first[:-1, -1]
+    turned = centered.copy()
+    turned[:-1, -1] = 0.0
+    return lie.adjoint(centered).T @ H @ lie.adjoint(centered) / variance, lie.adjoint(turned).T @ worst
+
+
+def signal_along(voxel_map, problem, T, twist):
+    """Signal-to-noise ratio along a twist, without the dominant surface and young ones."""
+    of_map = voxel_map.voxels
+    youngest = voxel_map.insertions - min(2, voxel_map.insertions - 1)
+    informative, cells, noise = [], [], 0.0
+    for point, j, weight in zip(problem.points, problem.correspondence, problem.weight, strict=True):
+        if j < 0 or weight == 0.0:
+            continue
+        cell = of_map.cells[j]
+        n, u = cell[voxels.DIRECTION : voxels.DIRECTION + 3], cell[voxels.ACROSS : voxels.ACROSS + 3]
+        v, is_plane = np.cross(n, u), cell[voxels.SHAPE] == voxels.PLANE
+        p = lie.transform(T, point[None])[0] - problem.origin
+        d = twist[:3] + np.cross(twist[3:], p)
+        if is_plane:
+            m = 1.0 / cell[voxels.MEAN_TERM]
+            spread = cell[voxels.SLOPE_ACROSS] * np.outer(u, u) + cell[voxels.SLOPE_ALONG] * np.outer(v, v)
+            noise += weight * cell[voxels.THICKNESS] * m / max(m - 3.0, 1.0) * d @ spread @ d
+        if of_map.history[j, voxels.BORN] <= youngest:
+            informative.append(weight * ((n @ d) ** 2 if is_plane else d @ d - (n @ d) ** 2))
+            cells.append(voxels.unpack(of_map.keys[j]))
+    dominant = np.array(cells[int(np.argmax(informative))])
+    is_away = np.abs(np.array(cells) - dominant).max(axis=1) > 1
+    return np.array(informative)[is_away].sum() / noise
+
+
+def hits(means, origin, resolution_m, shape):
+    """2 in cells with a surface point, 1 in those around them."""
+    grid = np.zeros(shape, int)
+    cells = [tuple(np.floor((mean[1::-1] - origin[::-1]) / resolution_m).astype(int)) for mean in means]
+    for row, column in cells:
+        grid[row - 1 : row + 2, column - 1 : column + 2] = 1
+    for cell in cells:
+        grid[cell] = 2
+    return grid
+
+
+def windows(grid, size):
+    """The largest value among the size × size cells that start at each cell."""
+    padded = np.pad(grid, ((0, size - 1), (0, size - 1)))
+    return np.max(
+        [padded[r : r + grid.shape[0], c : c + grid.shape[1]] for r in range(size) for c in range(size)], axis=0
+    )
+
+
+def scores(grid, origin, resolution_m, points, T, shifts, turns, turn_rad):
+    """Share of the highest score of every pose of the window, by (turn, shift along x, along y)."""
+    result = {}
+    for turn in range(-turns, turns + 1):
+        rotated = lie.transform(lie.pose_2d(T[0, 2], T[1, 2], float(lie.yaw(T)) + turn * turn_rad), points)
+        cells = np.floor((rotated - origin) / resolution_m).astype(int)
+        for dx in range(-shifts, shifts + 1):
+            for dy in range(-shifts, shifts + 1):
+                column, row = cells[:, 0] + dx, cells[:, 1] + dy
+                inside = (row >= 0) & (row < grid.shape[0]) & (column >= 0) & (column < grid.shape[1])
+                result[turn, dx, dy] = grid[row[inside], column[inside]].sum() / (2 * len(points))
+    return result

@@ -10,7 +10,7 @@ from scanchain.checks import LONGEST_SWEEP_S
 from scanchain.config import LogConfig, PreprocessConfig
 from scanchain.data import MOST_COPIES, RawPoints, Scan
 from scanchain.errors import InputError, counted
-from scanchain.kernels.geometry.validity import largest_magnitude
+from scanchain.kernels.geometry import largest_magnitude
 from scanchain.logs.mcap.stream import Decoded
 from scanchain.logs.messages.returns import Returns
 

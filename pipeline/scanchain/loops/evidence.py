@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 
 from scanchain import lie
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Pose, Proposal
-from scanchain.kernels.raycast.free_space import compare_ranges, nearest_ranges
+from scanchain.kernels.free_space import compare_ranges, nearest_ranges
 from scanchain.loops.connectivity import Segments
 
 _NEAR_M = {2: 5.0, 3: 10.0}  # largest distance of two keyframes that are compared for it, by dimension

@@ -14,7 +14,7 @@ from scanchain import lie
 from scanchain.config import MapsConfig
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Points, Pose, Problem, Proposal
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.kernels.search.branch_and_bound import FREE, NEAR, UNKNOWN
+from scanchain.kernels.search import FREE, NEAR, UNKNOWN
 from scanchain.loops.connectivity import Segments
 from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.loops.verification import Verifier

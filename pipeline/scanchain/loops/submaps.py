@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from scanchain import lie
 from scanchain.config import LocalMapConfig
 from scanchain.data import Keyframe, Points, Pose
-from scanchain.kernels.voxels.voxel_shapes import DIRECTION, PLANE, SHAPE
+from scanchain.kernels.voxels import DIRECTION, PLANE, SHAPE
 from scanchain.loops.connectivity import Segments
 from scanchain.registration import VoxelMap
 

@@ -13,7 +13,7 @@ from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Match, Points, Pose, Problem, Proposal
 from scanchain.errors import below
-from scanchain.kernels.raycast.free_space import compare_ranges, nearest_ranges
+from scanchain.kernels.free_space import compare_ranges, nearest_ranges
 from scanchain.kernels.registration.association import associate
 from scanchain.loops.submaps import Submap
 from scanchain.preprocess import downsample

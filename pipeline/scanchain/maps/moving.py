@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.data import Points, Pose
-from scanchain.kernels.raycast.free_space import nearest_ranges, weigh_points
+from scanchain.kernels.free_space import nearest_ranges, weigh_points
 from scanchain.threads import threads
 
 _COLUMNS = 720  # bins of azimuth, 0.5°; as fine in elevation

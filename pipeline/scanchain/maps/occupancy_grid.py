@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scanchain.config import MapsConfig
 from scanchain.data import Matrix, Pose
 from scanchain.errors import InputError
-from scanchain.kernels.raycast import grid
+from scanchain.kernels import maps as kernels
 
 OCCUPIED_PROBABILITY = 0.65  # above it a cell counts as occupied
 FREE_PROBABILITY = 0.35  # below it as free; between them, and where nothing was seen, as unknown
@@ -56,18 +56,16 @@ class OccupancyGrid:
         config = self.config
         for k, T in enumerate(poses):
             part = slice(int(kept[k]), int(kept[k]) + int(offsets[k + 1] - offsets[k]))
-            count = grid.beams_in_slice(
+            count = kernels.beams_in_slice(
                 T, points[offsets[k] : offsets[k + 1]], self.max_range_m,
                 config.slice_min_z_m, config.slice_max_z_m, starts[part], ends[part],
             )  # fmt: skip
             kept[k + 1] = kept[k] + count
         starts, ends = starts[: kept[-1]], ends[: kept[-1]]
         if len(starts):
-            extent = np.array([np.inf, np.inf, -np.inf, -np.inf])
-            grid.bounds(starts, extent)
-            grid.bounds(ends, extent)
-            self._cover(extent)
-            grid.draw_beams(
+            corners = [(each.min(axis=0), each.max(axis=0)) for each in (starts, ends)]
+            self._cover(np.concatenate([np.min(corners, axis=(0, 1)), np.max(corners, axis=(0, 1))]))
+            kernels.draw_beams(
                 starts, ends, kept, self.origin_m, self.resolution_m, self.scans + 1, np.float32(_HIT),
                 np.float32(_MISS), np.float32(_LOW), np.float32(_HIGH), self.log_odds, self.drawn,
             )  # fmt: skip

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scanchain.checks import LARGEST
 from scanchain.data import Points, Pose
 from scanchain.errors import InputError
-from scanchain.kernels.voxels import point_map as kernels
-from scanchain.kernels.voxels.hashing import EMPTY
+from scanchain.kernels import maps as kernels
+from scanchain.kernels.voxels import EMPTY
 
 MAX_VOXELS = 16_000_000  # largest number of voxels: a gigabyte
 _FIRST_VOXELS = 1 << 14

@@ -12,9 +12,8 @@ import numpy as np
 from scanchain import lie
 from scanchain.config import PreprocessConfig
 from scanchain.data import Matrix, Points, Pose, Scan
-from scanchain.kernels.registration.plane_adjustment import lift, plane_equations, planes
-from scanchain.preprocess import Sweep
-from scanchain.preprocess.sweep import sweep_of
+from scanchain.kernels.registration.plane_adjustment import plane_equations, planes
+from scanchain.preprocess import Sweep, sweep_of
 from scanchain.registration.search import evenly
 
 _FIRST, _LATER = (14, 0.6), (16, 0.9)  # scans adjusted together, and distance of two in cells: soon, then well
@@ -129,9 +128,10 @@ def _combined(estimates: Matrix) -> tuple[float, float]:
 
 def raised(points: Points, offset_rad: float) -> Points:
     """Points (N, 3) in the lidar frame with their elevation angles raised."""
-    lifted = np.empty(points.shape)
-    lift(np.ascontiguousarray(points, np.float64), offset_rad, lifted)
-    return lifted
+    x, y, z = np.asarray(points, np.float64).T
+    sine, cosine, level = math.sin(offset_rad), math.cos(offset_rad), np.maximum(np.sqrt(x**2 + y**2), 1e-9)
+    stretch = cosine - sine * z / level
+    return np.column_stack([stretch * x, stretch * y, cosine * z + sine * level])
 
 
 def adjusted(scans: list[Points], poses: Matrix, cell_m: float, offset_rad: float = 0.0) -> Adjustment:

@@ -65,14 +65,12 @@ class FrontEnd:
         if is_keyframe:
             self.errors = self.error_tracker.at_keyframe(tracked, self.T_odom_keyframe)
             self.T_odom_keyframe = tracked.T_odom_lidar
-            self.covariance, self.since_keyframe = self.nothing, 0
-            self.doubt = self.nothing
-        local_map = self.odometry.local_map
+            self.covariance, self.doubt, self.since_keyframe = self.nothing, self.nothing, 0
         return Located(
             tracked=tracked,
             is_keyframe=is_keyframe,
             scale=self.odometry.resolution.octave,
-            local_map=local_map.points() if is_keyframe else self.no_points,
+            local_map=self.odometry.local_map.points() if is_keyframe else self.no_points,
             information=self.information if is_keyframe else self.nothing,
             errors=self.errors,
             first_points=self.odometry.first_points,
@@ -90,12 +88,9 @@ class FrontEnd:
         if not self.has_wheels:
             self.covariance = None
         T_last, self.T_odom_last = self.T_odom_last, tracked.T_odom_lidar
-        is_planar = self.odometry.dimension == 2
-        if self.covariance is None and is_planar:
-            return of_match
         n = self.since_keyframe
         Ad = lie.adjoint(lie.inverse(lie.between(T_last, tracked.T_odom_lidar)))
-        if not is_planar:
+        if self.odometry.dimension == 3:
             self.doubt = Ad @ self.doubt @ Ad.T + _doubt_of(tracked)
         if self.covariance is None:
             return self._doubted(of_match)
@@ -106,15 +101,14 @@ class FrontEnd:
         if tracked.state is not State.LOST:
             information += of_match
         self.covariance = np.asarray(np.linalg.inv(information), np.float64)
-        return information if is_planar else self._doubted(information)
+        return self._doubted(information)
 
     def _doubted(self, information: Matrix) -> Matrix:
         """Information with the doubt added to the covariance."""
         if not self.doubt.any():
             return information
-        return np.asarray(
-            np.linalg.solve(np.eye(len(information)) + information @ self.doubt, information), np.float64
-        )
+        scale = np.eye(len(information)) + information @ self.doubt
+        return np.asarray(np.linalg.solve(scale, information), np.float64)
 
     def _moved_enough(self, tracked: Tracked) -> bool:
         distance_m, angle_rad = lie.apart(self.T_odom_keyframe, tracked.T_odom_lidar)

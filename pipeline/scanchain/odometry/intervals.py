@@ -99,22 +99,24 @@ class LiveStamps:
         self.intervals_s: list[float] = []
 
     def passed(self, scan: Scan, process: Callable[[Scan], Result]) -> Result:
-        """The result of a scan, which is checked before and remembered after it. Raises InputError."""
-        self.check(scan)
+        """The result of a scan, which is remembered after it.
+
+        Raises InputError, and nothing changes, where its stamp or point times contradict those before.
+        """
+        recent_s: list[float] = []
+        if self.last_ns is not None:
+            recent_s = [*self.intervals_s, 1e-9 * (scan.stamp_ns - self.last_ns)][-_REMEMBERED:]
+            self._check(scan, self.last_ns, recent_s)
         result = process(scan)
-        self.take(scan)
+        self.last_ns, self.intervals_s = scan.stamp_ns, recent_s
         return result
 
-    def check(self, scan: Scan) -> None:
-        """Refuse a scan whose stamp or point times contradict those before. Raises InputError; nothing changes."""
-        if self.last_ns is None:
-            return
-        if scan.stamp_ns <= self.last_ns:
+    def _check(self, scan: Scan, last_ns: int, recent_s: list[float]) -> None:
+        if scan.stamp_ns <= last_ns:
             raise InputError(
-                f"stamp_s is {format_stamp(scan.stamp_ns)}, that of the scan before {format_stamp(self.last_ns)}; "
+                f"stamp_s is {format_stamp(scan.stamp_ns)}, that of the scan before {format_stamp(last_ns)}; "
                 "wanted seconds that increase from scan to scan"
             )
-        recent_s = self._with(scan)
         if len(recent_s) < _LOOKED_AT:
             return
         shortest_s, longest_s = min(recent_s[-_LOOKED_AT:]), max(recent_s[-_LOOKED_AT:])
@@ -131,17 +133,6 @@ class LiveStamps:
                 f"times_s spans {span_s:.3g} s, but scans follow each other within {longest_s:.3g} s; wanted "
                 "seconds relative to stamp_s (of times from 0 to 1 over a sweep: times its duration)"
             )
-
-    def take(self, scan: Scan) -> None:
-        """Remember a scan."""
-        if self.last_ns is not None:
-            self.intervals_s = self._with(scan)
-        self.last_ns = scan.stamp_ns
-
-    def _with(self, scan: Scan) -> list[float]:
-        """The last intervals, this scan's included."""
-        assert self.last_ns is not None
-        return [*self.intervals_s, 1e-9 * (scan.stamp_ns - self.last_ns)][-_REMEMBERED:]
 
 
 def _since(last: Scan, scan: Scan) -> tuple[float, float]:

@@ -14,7 +14,7 @@ from scanchain.clock import working_s
 from scanchain.config import Config
 from scanchain.data import LEAST_FIT, AnyPoints, Match, Points, Pose, Scan, State
 from scanchain.errors import InputError, shown
-from scanchain.kernels.geometry.validity import largest_magnitude
+from scanchain.kernels.geometry import largest_magnitude
 from scanchain.odometry.elevation import ElevationCalibration
 from scanchain.odometry.intervals import LiveStamps
 from scanchain.odometry.prediction import Prediction, Predictor
@@ -42,8 +42,8 @@ _FEWEST_COPIED = 10  # least number of points of a scan that may be a copy
 class _Registered(msgspec.Struct, frozen=True):
     """The match of a scan, the points (N, d) that were aligned, deskewed to the middle, and the prediction.
 
-    ``elsewhere_m`` as in ``Tracked``, ``rival`` as in ``Aligned``; ``is_standing`` if the lidar did not move since
-    the scan before.
+    ``elsewhere_m`` as in ``Tracked``, ``rival`` the twist (k,) to another pose that fits nearly as well;
+    ``is_standing`` if the lidar did not move since the scan before.
     """
 
     points: Points
@@ -74,7 +74,7 @@ class Odometry:
         self.resolution = Resolution(config.preprocess, config.local_map.voxel_size_m)
         self.predictor = Predictor(config.odometry, T_base_lidar)
         self.matcher = create_matcher(config.matching)
-        self.recovery = Recovery(config.matching)
+        self.recovery = Recovery(config.matching, self.matcher)
         self.standstill = Standstill(self.dimension)
         self.map = MapKeeper(self.dimension, config.local_map)
         is_wanted = self.dimension == 3 and config.preprocess.calibrate_elevation
@@ -199,7 +199,7 @@ class Odometry:
             self.first_sweep, self.first_points = sweep, sweep.points
             return _Registered(points, match, State.OK, prediction)
         usual_cost = self.recovery.usual_cost
-        match, rival = self.recovery.align(self.matcher, points, sweep, self.local_map, prediction)
+        match, rival = self.recovery.align(points, sweep, self.local_map, prediction)
         is_placed = match.inlier_share >= self.config.matching.min_inlier_share
         may_stand = self.dimension == 3 and not prediction.prior.is_measured
         if is_placed and may_stand and self.standstill.confirms(match):
@@ -222,9 +222,11 @@ class Odometry:
         The second scan gives the velocity of the first one too, which stands distorted in the map until then.
         """
         T_odom_middle, prior = match.T_target_source, prediction.prior
-        velocity = prediction.velocity_at(T_odom_middle)
+        velocity = prediction.velocity_by(lie.log(lie.between(prediction.T_odom_last, T_odom_middle)))
         if prediction.is_second:
-            T_moved = self._restart(velocity)
+            T_moved = lie.exp(self.first_sweep.middle_s * velocity)  # of the first scan's middle; its stamp stays
+            self.first_points = lie.transform(T_moved, self.first_sweep.from_middle(velocity))
+            self.map.replace([(self.first_points, lie.identity(self.dimension))])
             T_odom_middle = T_moved @ T_odom_middle
             prior = prior._replace(T_target_source=T_moved @ prior.T_target_source)
             prediction = msgspec.structs.replace(prediction, T_odom_last=T_moved)
@@ -233,42 +235,31 @@ class Odometry:
         error = prediction.deskewing_error(match.T_target_source, sparse.duration_s)
         return points, blurred(match, error), prediction
 
-    def _restart(self, velocity: NDArray[np.float64]) -> Pose:
-        """Rebuild the map from the first scan, deskewed; returns the pose of its middle. Its stamp stays put."""
-        T_odom_middle = lie.exp(self.first_sweep.middle_s * velocity)
-        self.first_points = lie.transform(T_odom_middle, self.first_sweep.from_middle(velocity))
-        self.map.restart(self.first_points)
-        return T_odom_middle
-
     def _reset_map(self, points: Points, prediction: Prediction) -> _Registered:
         """Clear the map, to which the scan does not belong; a new one begins where the last scan was."""
-        self.map.forget()
+        self.map.replace([])
         self.recovery.forget()
         self.elevation.forget()
         self.standstill.begin(prediction.T_odom_last)
-        away_m = prediction.reach_m
-        reason = f"may be {away_m:.0f} m away after a time without scans: {NEW_MAP}"
+        reason = f"may be {prediction.reach_m:.0f} m away after a time without scans: {NEW_MAP}"
         match = first_match(prediction.T_odom_last, points, self.config.matching)
         match = replace(match, converged=False, reason=reason)
-        return _Registered(points, match, State.OK, prediction, away_m)
+        return _Registered(points, match, State.OK, prediction, prediction.reach_m)
 
     def _judge(self, match: Match) -> State:
-        if match.inlier_share < self.config.matching.min_inlier_share:
-            return State.LOST
-        if not math.isfinite(largest_magnitude(match.T_target_source)):
+        is_placed = match.inlier_share >= self.config.matching.min_inlier_share
+        if not is_placed or not math.isfinite(largest_magnitude(match.T_target_source)):
             return State.LOST
         return State.DEGENERATE if match.observability < 1.0 else State.OK
 
     def _extend(self, points: Points, registered: _Registered) -> None:
         """Insert the scan where its pose is known, or after so many lost scans that the map must be extended."""
         self.recovery.take(registered.state)
-        T_odom_lidar = self.predictor.T_odom_lidar
-        if registered.state is not State.LOST:
-            has_left = registered.is_standing or not self.standstill.is_standing
-            if has_left:  # else it may have been drawn aside by what moves past
-                self.map.extend(points, T_odom_lidar, is_standing=registered.is_standing)
-        elif self.recovery.has_given_up:
-            self.map.insert(points, T_odom_lidar)
+        if registered.state is State.LOST:
+            if self.recovery.has_given_up:
+                self.map.insert(points, self.predictor.T_odom_lidar)
+        elif registered.is_standing or not self.standstill.is_standing:  # else drawn aside by what moves past
+            self.map.extend(points, self.predictor.T_odom_lidar, is_standing=registered.is_standing)
 
     def _calibrate(self, scan: Scan, points: Points, state: State) -> None:
         """Take the scan for the elevation offset; where one is found, rebuild the map without it."""

@@ -12,8 +12,9 @@ from scanchain import lie
 from scanchain.config import OdometryConfig
 from scanchain.data import Match, Matrix, Pose, Prior, Scan, State
 from scanchain.errors import InputError, counted
-from scanchain.kernels.geometry.validity import largest_magnitude
-from scanchain.kernels.registration.observability import WEAK, definite_inverse
+from scanchain.kernels.geometry import largest_magnitude
+from scanchain.kernels.matrices import definite_inverse
+from scanchain.kernels.registration.observability import WEAK
 from scanchain.odometry.intervals import Intervals
 
 _EVEN = 2.0  # largest ratio of two intervals from which an acceleration is computed
@@ -79,13 +80,9 @@ class MotionFilter:
         self.motion_covariance = self.any_motion
         self.pose_covariance = self.covariance = self.nothing
 
-    def predicted_covariance(self, noise: Matrix) -> Matrix:
-        """(k, k) of the next pose; noise (k, k): covariance of the motion's change."""
-        return self._predicted(noise)[0]
-
     def correct(self, innovation: NDArray[np.float64], information: Matrix, noise: Matrix) -> None:
         """Take a pose that was measured (k,) away from the predicted one, with this information (k, k)."""
-        pose, covariance, motion = self._predicted(noise)
+        pose, covariance, motion = self.predicted(noise)
         known = np.linalg.inv(np.linalg.inv(pose) + information)
         gain = np.linalg.solve(pose, covariance).T  # how the motion follows the pose
         self.motion = lie.normalize(self.motion @ lie.exp(gain @ known @ information @ innovation))
@@ -93,8 +90,8 @@ class MotionFilter:
         self.covariance = known @ gain.T
         self.motion_covariance = motion - gain @ (pose - known) @ gain.T
 
-    def _predicted(self, noise: Matrix) -> tuple[Matrix, Matrix, Matrix]:
-        """Covariances (k, k) of the next pose, of pose and motion, and of the motion."""
+    def predicted(self, noise: Matrix) -> tuple[Matrix, Matrix, Matrix]:
+        """Covariances (k, k) of the next pose, of pose and motion, and of the motion, whose change is noise."""
         motion = self.motion_covariance + noise
         A = lie.adjoint(lie.inverse(self.motion))
         covariance = A @ self.covariance
@@ -172,23 +169,17 @@ class Prediction(msgspec.Struct, frozen=True):
         """True if the scan may be outside any search window, after so long a gap."""
         return not self.prior.is_measured and self.silence_s * self.config.max_speed_m_s > _LARGEST_WINDOW_M
 
-    def window(self) -> tuple[float, float]:
-        """Half widths of the search window around the predicted pose in the plane, meters and radians."""
-        elapsed_s = max(self.interval_s, self.usual_s) + self.lost_s
-        return (
-            min(max(elapsed_s * self.config.max_speed_m_s, _LEAST_WINDOW_M), _LARGEST_WINDOW_M),
-            min(max(elapsed_s * self.config.max_turn_rad_s, _LEAST_WINDOW_RAD), math.pi),
-        )
+    def windows(self) -> tuple[tuple[float, float], ...]:
+        """Half widths of the search windows around the predicted pose, the likeliest first, meters and radians.
 
-    def windows_in_space(self) -> tuple[tuple[float, float], ...]:
-        """Half widths of the search windows in space, the likeliest first, meters and radians.
-
-        By the acceleration that a vehicle may have and, where nothing is found there, by its speed.
+        In space by the acceleration that a vehicle may have and, where nothing is found there, by its speed.
         """
         elapsed_s = max(self.interval_s, self.usual_s) + self.lost_s
         half_width_rad = min(max(elapsed_s * self.config.max_turn_rad_s, _LEAST_WINDOW_RAD), math.pi)
-        fastest_m_s = max(self.config.max_speed_m_s, _FASTEST_M_S)
-        by_speed = min(elapsed_s * fastest_m_s, _LARGEST_REACH_M), half_width_rad
+        if len(self.T_odom_last) == 3:
+            half_width_m = min(max(elapsed_s * self.config.max_speed_m_s, _LEAST_WINDOW_M), _LARGEST_WINDOW_M)
+            return ((half_width_m, half_width_rad),)
+        by_speed = min(elapsed_s * max(self.config.max_speed_m_s, _FASTEST_M_S), _LARGEST_REACH_M), half_width_rad
         if self.is_second or self.is_guess:
             return (by_speed,)
         by_acceleration = min(max(elapsed_s**2 * _ACCELERATION_M_S2, 1.0), by_speed[0]), half_width_rad
@@ -205,12 +196,8 @@ class Prediction(msgspec.Struct, frozen=True):
         stretched = tuple(T @ _stretched(*moving, share=share) for share in (0.5, 1.0, 1.5))
         return T @ self.T_previous_current, *stretched, T
 
-    def velocity_at(self, T_odom_lidar: Pose) -> NDArray[np.float64]:
-        """Twist (k,) per second at a scan of this pose, in its own frame; the last one if stamps stand still."""
-        return self.velocity_by(lie.log(lie.between(self.T_odom_last, T_odom_lidar)))
-
     def velocity_by(self, motion: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Twist (k,) per second, as above, at a scan after this motion (k,) from the last one.
+        """Twist (k,) per second at a scan after this motion (k,); the last one if stamps stand still.
 
         The mean since the last scan, carried on by half an interval with the acceleration between the last two.
         """
@@ -257,7 +244,7 @@ class Predictor:
         self.lost_s = 0.0
         self.T_odom_base: Pose | None = None  # by the wheels at the last scan, where nothing contradicts it
         self.is_contradicted = False  # the reading at this scan
-        self.contradicted, self.first_contradicted, self.longest_jump_m = 0, 0, 0.0
+        self.jumps: list[tuple[int, float]] = []  # scan and meters of each reading that was left out
 
     def predict(self, scan: Scan, *, by_wheels: bool = True) -> Prediction:
         """The predicted pose of a scan that follows the last one corrected."""
@@ -272,7 +259,7 @@ class Predictor:
             motion = _stretched(self.T_previous_current, interval_s, times.last_s, times.usual_s)
             covariance, statistics, is_guess = self.filter.any_motion, self.by_velocity, True
         else:
-            covariance = self.filter.predicted_covariance(self.by_velocity.covariance)
+            covariance = self.filter.predicted(self.by_velocity.covariance)[0]
             motion, statistics = self.filter.motion, self.by_velocity
         T_predicted = lie.normalize(self.T_odom_lidar.dot(motion))  # here and below: half the time of @
         return Prediction(
@@ -301,17 +288,16 @@ class Predictor:
     def drop_wheels(self, scan: Scan, jump_m: float) -> None:
         """Leave out the reading at this scan, which is off by so much, here and for the motion to the next."""
         self.is_contradicted = True
-        self.first_contradicted = self.first_contradicted if self.contradicted else scan.index
-        self.contradicted += 1
-        self.longest_jump_m = max(self.longest_jump_m, jump_m)
+        self.jumps.append((scan.index, jump_m))
 
     def warnings(self) -> tuple[str, ...]:
         """A line on readings of the wheels that were left out."""
-        if not self.contradicted:
+        if not self.jumps:
             return ()
+        longest_m = max(jump_m for _, jump_m in self.jumps)
         return (
-            f"wheel odometry jumps by up to {self.longest_jump_m:.3g} m where the scans fit without it: left out "
-            f"at {counted(self.contradicted, 'scan')} (the first: scan {self.first_contradicted:,})",
+            f"wheel odometry jumps by up to {longest_m:.3g} m where the scans fit without it: left out "
+            f"at {counted(len(self.jumps), 'scan')} (the first: scan {self.jumps[0][0]:,})",
         )
 
     def correct(self, scan: Scan, prediction: Prediction, match: Match, state: State) -> None:

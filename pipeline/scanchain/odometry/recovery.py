@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,8 @@ from scanchain.config import MatchingConfig
 from scanchain.data import LEAST_FIT, Match, Points, Pose, State
 from scanchain.odometry.prediction import Prediction
 from scanchain.preprocess import Sweep
-from scanchain.registration import AMBIGUOUS, Matcher, SearchGrid, VoxelMap, Wanted, Window, find, thinned
+from scanchain.registration import Matcher, SearchGrid, VoxelMap, Wanted, Window, find, thinned
+from scanchain.registration.align import AMBIGUOUS
 from scanchain.registration.search import evenly, upright_columns
 
 _WIDE_SCANS = 3  # number of scans searched wide at the start and after a loss, while no velocity is known
@@ -33,51 +33,42 @@ _SEEDS_APART_M, _SEEDS_SHARE = 1.0, 0.8  # of those of the search in the plane: 
 _NEAR_PERCENT = 95.0  # share of the points within the radius of the map that is searched in space
 _MEMORY = 0.9  # weight of the running mean of the cost per point against the next one
 
-
-class Aligned(NamedTuple):
-    """The best alignment of a scan, and the twist (k,) from it to another pose that fits nearly as well."""
-
-    match: Match
-    rival: NDArray[np.float64] | None
+_Aligned = tuple[Match, NDArray[np.float64] | None]
 
 
 class Recovery:
     """Alignment of scans, also of those far from the predicted pose, by the usual cost of a point."""
 
-    def __init__(self, config: MatchingConfig) -> None:
-        self.config = config
+    def __init__(self, config: MatchingConfig, matcher: Matcher) -> None:
+        self.config, self.matcher = config, matcher
         self.usual_cost = 0.0
         self.wide_scans = _WIDE_SCANS
         self.lost_scans = 0
         self.rough_cost = _ROUGH * 0.5 * config.kernel_scale_m**2  # of a point
 
-    def align(
-        self, matcher: Matcher, points: Points, sweep: Sweep, surfaces: VoxelMap, prediction: Prediction
-    ) -> Aligned:
+    def align(self, points: Points, sweep: Sweep, surfaces: VoxelMap, prediction: Prediction) -> _Aligned:
         """The alignment from the predicted pose or, where that one is uncertain, the best of several.
 
+        With it the twist (k,) to another pose that fits nearly as well, None where there is none.
         points : (N, d) those to be aligned; sweep : all of the scan
         """
         wide = self.wide_scans > 0 or prediction.is_guess
-        best = matcher.align(points, surfaces, prediction.T_odom_lidar, prediction.prior, wide=wide)
+        best = self.matcher.align(points, surfaces, prediction.T_odom_lidar, prediction.prior, wide=wide)
         tried = [best]
         is_contradicted = surfaces.dimension == 3 and self._is_contradicted(best)
         if is_contradicted:
-            best = self._searched(tried, matcher, points, sweep, surfaces, prediction)
-        is_found = is_contradicted and is_sound(best)
-        if not is_found and self._is_uncertain(best.cost / len(points), prediction):
+            best = self._searched(tried, points, sweep, surfaces, prediction)
+        if not (is_contradicted and is_sound(best)) and self._is_uncertain(best.cost / len(points), prediction):
             for guess in _guesses(points, surfaces, prediction):
-                other = matcher.align(points, surfaces, guess, wide=True)
-                tried.append(other)
-                if self._cost(other, prediction) < self._cost(best, prediction):
-                    best = other
+                tried.append(self.matcher.align(points, surfaces, guess, wide=True))
+                best = min(best, tried[-1], key=lambda match: self._cost(match, prediction))
         rival = None
         if _is_free(prediction):
             best, rival = self._decided(best, tried, surfaces, prediction)
         if surfaces.dimension == 2 or is_sound(best):
             cost = best.cost / len(points)
             self.usual_cost = _MEMORY * self.usual_cost + (1.0 - _MEMORY) * cost if self.usual_cost else cost
-        return Aligned(best, rival)
+        return best, rival
 
     def fits_badly(self, match: Match, state: State, usual_cost: float) -> bool:
         """True if a scan without a reliable prediction does not fit the map at the pose that was found.
@@ -116,13 +107,7 @@ class Recovery:
         return cost > max(_UNCERTAIN * self.usual_cost, self.rough_cost)
 
     def _searched(
-        self,
-        tried: list[Match],
-        matcher: Matcher,
-        points: Points,
-        sweep: Sweep,
-        surfaces: VoxelMap,
-        prediction: Prediction,
+        self, tried: list[Match], points: Points, sweep: Sweep, surfaces: VoxelMap, prediction: Prediction
     ) -> Match:
         """The best alignment in space from where upright structure fits, or the one that there was.
 
@@ -130,12 +115,12 @@ class Recovery:
         """
         structure = sweep.from_middle(prediction.velocity)
         best = tried[0]
-        for half_width_m, half_width_rad in prediction.windows_in_space():
+        for half_width_m, half_width_rad in prediction.windows():
             radius_m = float(np.percentile(np.abs(structure[:, :2]), _NEAR_PERCENT)) + half_width_m
             window = Window(lie.identity(2), half_width_m, half_width_rad)
             for seed in from_above(structure, surfaces, prediction.T_odom_lidar, window, radius_m):
                 if not any(_is_near(seed, match.T_target_source, surfaces.voxels.size_m) for match in tried):
-                    tried.append(matcher.align(points, surfaces, seed, wide=True))
+                    tried.append(self.matcher.align(points, surfaces, seed, wide=True))
             found = min(tried, key=lambda match: self._cost(match, prediction))
             if found.observability >= 1.0 and found.cost < CLEARLY * best.cost:
                 best = found
@@ -143,7 +128,9 @@ class Recovery:
                 break
         return best
 
-    def _decided(self, best: Match, tried: Sequence[Match], surfaces: VoxelMap, prediction: Prediction) -> Aligned:
+    def _decided(
+        self, best: Match, tried: Sequence[Match], surfaces: VoxelMap, prediction: Prediction
+    ) -> _Aligned:
         """The one nearest to the prediction, of the best alignment and distinct ones that fit nearly as well."""
         distinct = [
             match
@@ -154,11 +141,11 @@ class Recovery:
             and not _is_near(match.T_target_source, best.T_target_source, surfaces.voxels.size_m)
         ]
         if not distinct:
-            return Aligned(best, None)
+            return best, None
         rival = min(distinct, key=lambda match: _away(match, prediction))
         if _away(rival, prediction) < _away(best, prediction):
             best, rival = rival, best
-        return Aligned(best, lie.log(lie.between(best.T_target_source, rival.T_target_source)))
+        return best, lie.log(lie.between(best.T_target_source, rival.T_target_source))
 
     def _cost(self, match: Match, prediction: Prediction) -> float:
         """Cost of a match and of its distance from the predicted pose, m²."""
@@ -209,7 +196,7 @@ def _guesses(points: Points, surfaces: VoxelMap, prediction: Prediction) -> tupl
     alternatives = prediction.alternatives()
     if surfaces.dimension == 3:
         return alternatives
-    half_width_m, half_width_rad = prediction.window()
+    ((half_width_m, half_width_rad),) = prediction.windows()
     reach_m = float(np.abs(points).max()) * math.sqrt(2.0) + half_width_m
     T_predicted = prediction.T_odom_lidar
     grid = SearchGrid.of_voxels(surfaces, T_predicted, reach_m)

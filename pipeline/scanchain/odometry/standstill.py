@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.data import Match, Pose
-from scanchain.kernels.registration.observability import definite_inverse
+from scanchain.kernels.matrices import definite_inverse
 
 _SCANS = 10  # number of scans that agree with one pose, from which on the lidar stands
 _AGAIN = 30  # the same of scans beside a pose that is held
@@ -51,9 +51,8 @@ class Standstill:
         self.T_odom_lidar = T_odom_lidar
         self.bias = np.zeros(lie.twist_size(T_odom_lidar))
         self.held: AgreeingMatches | None = None
-        self.beside: AgreeingMatches | None = AgreeingMatches(
-            T_odom_lidar
-        )  # of the last matches, none of which confirmed it
+        # of the last matches, none of which confirmed it
+        self.beside: AgreeingMatches | None = AgreeingMatches(T_odom_lidar)
         self.is_beginning = self.is_settling = False
 
     @property
@@ -118,9 +117,8 @@ class Standstill:
         moved = away - bias
         self.bias = bias
         if (np.abs(moved) < np.maximum(_limits(moved, _SAME_M, _SAME_RAD), sigma)).all():
-            self.held.mean_innovation = (
-                np.zeros(len(moved)) if mean is not self.held else self.held.mean_innovation
-            )
+            if mean is not self.held:
+                self.held.mean_innovation = np.zeros(len(moved))
             return
         self.T_odom_lidar = lie.normalize(self.T_odom_lidar @ lie.exp(moved))
         self.held = mean

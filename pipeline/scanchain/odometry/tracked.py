@@ -12,7 +12,7 @@ from scanchain import lie
 from scanchain.config import Config, MatchingConfig
 from scanchain.data import Match, Points, Pose, Prior, Scan, State, brief
 from scanchain.odometry.prediction import Prediction
-from scanchain.registration import as_ambiguous, with_source_frame
+from scanchain.registration.align import as_ambiguous, with_source_frame
 
 COPY = "the scan before once more, to the last bit: it has that pose, and says nothing of a motion since"
 NEW_MAP = "a new map begins"  # in the reason of a scan whose motion from the one before is unknown

@@ -1,9 +1,5 @@
 """SVD-ICP and LM-PLICP against a voxel map."""
 
-from scanchain.registration.align import AMBIGUOUS as AMBIGUOUS
-from scanchain.registration.align import align as align
-from scanchain.registration.align import as_ambiguous as as_ambiguous
-from scanchain.registration.align import with_source_frame as with_source_frame
 from scanchain.registration.matcher import Matcher as Matcher
 from scanchain.registration.matcher import create_matcher as create_matcher
 from scanchain.registration.plicp import PointToShapeMatcher as PointToShapeMatcher
@@ -13,7 +9,6 @@ from scanchain.registration.search import Window as Window
 from scanchain.registration.search import find as find
 from scanchain.registration.search import thinned as thinned
 from scanchain.registration.svd_icp import DegeneratePairsError as DegeneratePairsError
-from scanchain.registration.svd_icp import SvdMatcher as SvdMatcher
 from scanchain.registration.svd_icp import rigid_transform as rigid_transform
 from scanchain.registration.voxel_map import MapKeeper as MapKeeper
 from scanchain.registration.voxel_map import VoxelMap as VoxelMap

@@ -22,9 +22,7 @@ from scanchain.settings import Override, load_settings
 _RANGE_VOXELS = {2: 40.0, 3: 14.0}  # that the median distance from the centroid spans, at most
 _WINDOW, _WINDOW_RAD = 0.5, 1.0  # half the window searched in the plane: share of that distance, and angle
 _SEEDS, _SEEDS_APART_M, _RIVAL = 6, 1.0, 0.6  # beginnings in the plane: number, distance, share of the best score
-_SEEN_FROM = (
-    3.0  # times that distance from the centroid, up to which the origin of a cloud is where it was seen from
-)
+_SEEN_FROM = 3.0  # times that distance from the centroid, up to which a cloud was seen from its origin
 _ELSEWHERE_M, _ELSEWHERE_RAD = 0.1, 0.05  # distance from which on two matches are distinct
 AMBIGUOUS = 1.4  # times the cost of the best match, below which a distinct one is a rival: 25 surfaces, odds 150
 _APART = 10.0  # times that distance between the centroids, from which on the clouds cannot overlap
@@ -56,14 +54,7 @@ def align(
     Raises InputError naming the argument that is no cloud, pose, size or matcher.
     """
     d = checks.dimension_of(target, "target")
-    target, source = (
-        checks.valid_points(each, name, d)[0] for each, name in ((target, "target"), (source, "source"))
-    )
-    for name, cloud in (("target", target), ("source", source)):
-        if not len(cloud):
-            raise InputError(
-                f"{name} has no points that are finite; wanted (N, {d}) with N of at least a few hundred"
-            )
+    target, source = _valid(target, "target", d), _valid(source, "source", d)
     T_guess = lie.identity(d) if T_guess is None else checks.pose(T_guess, "T_guess", d)
     config = load_settings(d, overrides=(Override("matching.matcher", matcher, "matcher"),)).config
     at_target, at_source = _translation(target.mean(axis=0)), _translation(source.mean(axis=0))
@@ -87,6 +78,14 @@ def align(
     T_first = _scaled(T_first, 1.0 / unit_m)
     match = _matched(target / unit_m, source / unit_m, T_first, T_pivot_source, range_m / unit_m, config)
     return _restored(match, at_target, at_source, unit_m)
+
+
+def _valid(cloud: AnyPoints, name: str, d: int) -> Points:
+    """The finite ones of its points. Raises InputError where there are none."""
+    points, _ = checks.valid_points(cloud, name, d)
+    if not len(points):
+        raise InputError(f"{name} has no points that are finite; wanted (N, {d}) with N of at least a few hundred")
+    return points
 
 
 def _matched(

@@ -10,18 +10,17 @@ from scanchain import checks, lie
 from scanchain.config import MatchingConfig
 from scanchain.data import LEAST_FIT, AnyPoints, Match, Points, Pose, Prior, Problem
 from scanchain.errors import below, counted
-from scanchain.kernels.geometry.validity import largest_magnitude
+from scanchain.kernels.geometry import largest_magnitude
 from scanchain.kernels.registration import icp
 from scanchain.kernels.registration.match import Result, match
-from scanchain.kernels.registration.optimizers import GAUSS_NEWTON, GRADIENT_DESCENT, LEVENBERG_MARQUARDT, NEWTON
 from scanchain.kernels.registration.residuals import Settings
 from scanchain.registration.voxel_map import VoxelMap
 
 OPTIMIZERS = {
-    "gradient-descent": GRADIENT_DESCENT,
-    "newton": NEWTON,
-    "gauss-newton": GAUSS_NEWTON,
-    "levenberg-marquardt": LEVENBERG_MARQUARDT,
+    "gradient-descent": icp.GRADIENT_DESCENT,
+    "newton": icp.NEWTON,
+    "gauss-newton": icp.GAUSS_NEWTON,
+    "levenberg-marquardt": icp.LEVENBERG_MARQUARDT,
 }
 
 _REACH, _LARGEST_REACH = 0.4, 8  # share of the largest distance that is searched for sure; voxels

@@ -13,8 +13,8 @@ from scipy.ndimage import distance_transform_edt
 
 from scanchain import lie
 from scanchain.data import Points, Pose
-from scanchain.kernels.search.branch_and_bound import NEAR, SURFACE, climb, score_windows, split_best
-from scanchain.preprocess.sweep import downsample
+from scanchain.kernels.search import NEAR, SURFACE, climb, score_windows, split_best
+from scanchain.preprocess import downsample
 from scanchain.registration.voxel_map import VoxelMap
 
 _TOP = 2  # levels of the pyramid above the grid itself; windows start with 2² cells: larger ones rule out little

@@ -96,9 +96,20 @@ class SvdMatcher:
                 ending = icp.CONVERGED
                 break
             scale_m = max(settings.scale_m, SHRINK * scale_m)
-        fit = self._fit(T, source[:pairs], nearest[:pairs], weight[:pairs], len(points), iterations, ending)
-        result = assess(target.voxels, points, T, fit, settings)
-        return match_of(result, len(points), target, self.config)
+        source, weight = source[:pairs], weight[:pairs]
+        errors, s2 = source - nearest[:pairs], self.config.kernel_scale_m**2
+        squares = np.einsum("ij,ij->i", errors, errors)
+        fit = Fit(
+            H=_information(source - T[:-1, -1], weight),
+            unweighted=np.empty((0, 0)),
+            cost=0.5 * float((s2 * squares / (s2 + squares)).sum()) + 0.5 * s2 * (len(points) - pairs),
+            total_weight=float(weight.sum()),
+            squares=float(weight @ squares),
+            pairs=pairs,
+            iterations=iterations,
+            ending=ending,
+        )
+        return match_of(assess(target.voxels, points, T, fit, settings), len(points), target, self.config)
 
     def _is_small(self, correction: Pose, T: Pose) -> bool:
         position = T[:-1, -1]
@@ -106,35 +117,9 @@ class SvdMatcher:
         turn = lie.rotation_angle(correction)
         return float(shift @ shift) < self.config.tolerance_m**2 and float(turn) < self.config.tolerance_rad
 
-    def _fit(
-        self,
-        T: Pose,
-        source: Points,
-        nearest: Points,
-        weight: NDArray[np.float64],
-        tried: int,
-        iterations: int,
-        ending: int,
-    ) -> Fit:
-        """Normal equations of the point-to-point residuals about the lidar: J = [I, −p×]."""
-        errors = source - nearest
-        squares = np.einsum("ij,ij->i", errors, errors)
-        s2 = self.config.kernel_scale_m**2
-        cost = 0.5 * float((s2 * squares / (s2 + squares)).sum()) + 0.5 * s2 * (tried - len(source))
-        return Fit(
-            H=_information(source - T[:-1, -1], weight),
-            unweighted=np.empty((0, 0)),
-            cost=cost,
-            total_weight=float(weight.sum()),
-            squares=float(weight @ squares),
-            pairs=len(source),
-            iterations=iterations,
-            ending=ending,
-        )
-
 
 def _information(points: Points, weight: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Σ w JᵀJ with J = [I, −p×]; in 2D J = [I, (−p_y, p_x)ᵀ]."""
+    """Σ w JᵀJ of point-to-point residuals about the lidar: J = [I, −p×], in 2D J = [I, (−p_y, p_x)ᵀ]."""
     d = points.shape[1]
     J = np.zeros((len(points), d, 3 if d == 2 else 6))
     J[:, :, :d] = np.eye(d)

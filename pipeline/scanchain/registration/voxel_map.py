@@ -10,7 +10,7 @@ import numpy as np
 from scanchain import checks, lie
 from scanchain.config import LocalMapConfig
 from scanchain.data import AnyPoints, Points, Pose
-from scanchain.kernels.voxels.voxel_shapes import CELL, Voxels, insert, keep
+from scanchain.kernels.voxels import CELL, Voxels, insert, keep
 
 _SLOTS_PER_VOXEL = 4  # keeps the hash table at most a quarter full
 _MIN_POINTS_ALONE = {2: np.inf, 3: 10.0}  # from which on a voxel is fitted without its neighbors
@@ -109,18 +109,10 @@ class MapKeeper:
             self._remake(scale)
 
     def replace(self, scans: Iterable[tuple[Points, Pose]]) -> None:
-        """Rebuild the map from these scans (N, d), each in its own lidar frame, with its pose."""
+        """Rebuild the map from these scans (N, d), each in its own lidar frame, with its pose; none empty it."""
         self.recent.clear()
         self.recent.extend(scans)
         self._remake(self.surfaces.scale)
-
-    def restart(self, points: Points) -> None:
-        """Rebuild the map from a single scan (N, d), odom frame."""
-        self.replace([(points, lie.identity(self.surfaces.dimension))])
-
-    def forget(self) -> None:
-        """Empty the map."""
-        self.replace([])
 
     def _remake(self, scale: float) -> None:
         self.surfaces = VoxelMap(self.surfaces.dimension, self.config, scale)

@@ -17,11 +17,11 @@ from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import Keyframe, Matrix, Points, Scan
 from scanchain.errors import InputError, counted
-from scanchain.kernels.raycast.free_space import nearest_ranges
+from scanchain.kernels.free_space import nearest_ranges
 from scanchain.logs.formats.clouds import SUFFIXES, CloudFileError, read_cloud_file
 from scanchain.maps import MAP_FOLDER, Edges, SavedPoints, Session, write_saved_map
 from scanchain.maps.occupancy_grid import MAX_CELLS
-from scanchain.preprocess.resolution import Resolution
+from scanchain.preprocess import Resolution
 from scanchain.runs.directory import RUN_FILE, RunDirectory
 from scanchain.runs.provenance import describe_start
 from scanchain.settings import load_settings

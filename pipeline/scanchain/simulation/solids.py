@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.data import Matrix
-from scanchain.kernels.raycast.cast import cast_rays
+from scanchain.kernels.raycast import cast_rays
 
 FLAT = np.zeros(7)
 FIXED = -1  # owner of solids that belong to no movable object

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.geometry.se import second_coefficient, twist_3d
+from scanchain.kernels.geometry import second_coefficient, twist_3d
 
 _Array = NDArray[np.float64]
 _SMALL = 1e-4  # rad; below this angle the series replaces the closed form

@@ -3,8 +3,7 @@
 import numpy as np
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.voxels.hashing import find_row, pack
-from scanchain.kernels.voxels.voxel_shapes import (
+from scanchain.kernels.voxels import (
     ACROSS,
     DIRECTION,
     LINE,
@@ -14,7 +13,9 @@ from scanchain.kernels.voxels.voxel_shapes import (
     SLOPE_ACROSS,
     SLOPE_ALONG,
     THICKNESS,
+    find_row,
     move,
+    pack,
 )
 
 _GRAZING_SINE = 0.05  # of the angle between ray and plane at which the weight is halved

@@ -6,15 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.geometry.se import orthonormalize, perturb
+from scanchain.kernels.geometry import orthonormalize, perturb
+from scanchain.kernels.matrices import solve
 from scanchain.kernels.registration.association import associate, weigh
-from scanchain.kernels.registration.optimizers import (
-    LEVENBERG_MARQUARDT,
-    NEWTON,
-    predicted_decrease,
-    relax,
-    step,
-)
 from scanchain.kernels.registration.residuals import (
     WITHOUT_KERNEL_M,
     Problem,
@@ -22,7 +16,7 @@ from scanchain.kernels.registration.residuals import (
     normal_equations,
     robust_sums,
 )
-from scanchain.kernels.voxels.voxel_shapes import POINT, SHAPE
+from scanchain.kernels.voxels import POINT, SHAPE
 
 CONVERGED, OUT_OF_ITERATIONS, NO_CORRESPONDENCES, SINGULAR = 0, 1, 2, 3
 
@@ -71,10 +65,13 @@ class Fit(NamedTuple):
 @njit(nogil=True)
 def problem_of(voxels, points, T_first, prior, settings):
     """``Problem`` of points (N, d), twists about the position of T_first (d+1, d+1)."""
-    origin, N = np.zeros(3), points.shape[0]
-    for axis in range(points.shape[1]):
-        origin[axis] = T_first[axis, points.shape[1]]
-    gradients, range_m = np.zeros((_SECTORS, prior.shape[0])), root_mean_square_range(points)
+    (N, d), origin, squares = points.shape, np.zeros(3), 0.0
+    for axis in range(d):
+        origin[axis] = T_first[axis, d]
+    for i in range(N):
+        for axis in range(d):
+            squares += points[i, axis] * points[i, axis]
+    gradients, range_m = np.zeros((_SECTORS, prior.shape[0])), np.sqrt(squares / max(N, 1))
     return Problem(voxels, points, origin, prior, np.empty(N, np.int32), np.empty(N), gradients, range_m, settings)
 
 
@@ -186,19 +183,7 @@ def refine(voxels, points, starts, poses, prior, least_share, settings):
         problem = problem_of(voxels, scan, T, prior, settings)
         fit = align(problem, T, offset, settings.first_scale_m)
         if fit.ending == CONVERGED and fit.pairs >= least_share * scan.shape[0]:
-            for i in range(T.shape[0]):
-                for j in range(T.shape[0]):
-                    poses[k, i, j] = T[i, j]
-
-
-@njit(nogil=True)
-def root_mean_square_range(points) -> float:
-    """Of points (N, d) in the lidar frame; meters."""
-    total = 0.0
-    for i in range(points.shape[0]):
-        for axis in range(points.shape[1]):
-            total += points[i, axis] * points[i, axis]
-    return np.sqrt(total / max(points.shape[0], 1))
+            poses[k] = T
 
 
 @njit(nogil=True)
@@ -300,3 +285,53 @@ def _squares(x):
         else:
             turn += x[i] * x[i]
     return shift, turn
+
+
+GRADIENT_DESCENT, NEWTON, GAUSS_NEWTON, LEVENBERG_MARQUARDT = 0, 1, 2, 3
+
+
+@njit(nogil=True)
+def step(optimizer: int, H, b, damping: float, factor, x) -> bool:
+    """True if the normal equations could be solved; the step ξ of one iteration is written to ``x`` (k,).
+
+    Gradient descent    ξ = −(bᵀb / bᵀHb) b, the exact minimizer along the gradient (Cauchy's point)
+    Newton              ξ = −H⁻¹b with the full Hessian; where that is indefinite the diagonal is raised
+    Gauss–Newton        ξ = −(JᵀJ)⁻¹Jᵀr
+    Levenberg–Marquardt ξ = −(JᵀJ + λ diag(JᵀJ))⁻¹Jᵀr (Marquardt 1963)
+    factor : (k, k), room for the factorization
+    """
+    k = b.shape[0]
+    if optimizer == GRADIENT_DESCENT:
+        along = square = 0.0
+        for i in range(k):
+            square += b[i] * b[i]
+            for j in range(k):
+                along += b[i] * H[i, j] * b[j]
+        for i in range(k):
+            x[i] = -b[i] * square / along if along > 0.0 else 0.0
+        return along > 0.0
+    if optimizer != LEVENBERG_MARQUARDT:
+        damping = 0.0
+    solved = solve(H, b, damping, factor, x)
+    while not solved and optimizer == NEWTON and damping < 1e6:
+        damping = max(4.0 * damping, 1e-3)
+        solved = solve(H, b, damping, factor, x)
+    return solved
+
+
+@njit(nogil=True)
+def predicted_decrease(H, b, x) -> float:
+    """Decrease of the quadratic model along the step, −bᵀx − ½ xᵀHx."""
+    total = 0.0
+    for i in range(b.shape[0]):
+        row = b[i]
+        for j in range(b.shape[0]):
+            row += 0.5 * H[i, j] * x[j]
+        total -= x[i] * row
+    return total
+
+
+@njit(nogil=True)
+def relax(damping: float, gain: float) -> float:
+    """The damping after an accepted step of gain ratio ρ: λ · max(⅓, 1 − (2ρ − 1)³) (Nielsen 1999)."""
+    return damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)

@@ -7,27 +7,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.geometry.se import adjoint, between, centered, inverse, twist_2d, twist_3d
-from scanchain.kernels.registration.icp import (
-    NO_CORRESPONDENCES,
-    align,
-    fit_at,
-    problem_of,
-)
+from scanchain.kernels.geometry import adjoint, between, centered, inverse, twist_2d, twist_3d
+from scanchain.kernels.matrices import congruent, definite_inverse, factorize, substitute
+from scanchain.kernels.registration.icp import NO_CORRESPONDENCES, align, fit_at, problem_of
 from scanchain.kernels.registration.observability import (
     WEAK,
     add_signals,
     agreement,
-    congruent,
-    definite_inverse,
     is_below,
     remove_noise,
     seen_from_source,
     spectrum_of,
     weak_prior,
-    worst,
 )
-from scanchain.kernels.registration.optimizers import factorize, substitute
 from scanchain.kernels.registration.residuals import gradient_spread
 
 _TURN_INFORMATION = 25.0  # rad⁻² of a turn that nothing determines
@@ -130,7 +122,7 @@ def _result(problem, T, T_first, fit, last, spectrum, spread):
 
     spread : (k, k) covariance of the gradient, empty to have one variance for all residuals
     """
-    m = worst(spectrum)
+    m = np.argmin(spectrum.signals)
     H, variance = fit.H, _variance(problem, fit)
     if len(spread):
         H, variance = congruent(H, definite_inverse(spread)), 1.0
@@ -198,7 +190,8 @@ def _systematic(problem, T, T_first, fit):
     spread, factor, shift = np.zeros((k, k)), np.empty((k, k)), np.empty(k)
     if not factorize(H, 0.0, factor):
         return spread
-    for b in problem.gradients:
+    for sector in range(problem.gradients.shape[0]):
+        b = problem.gradients[sector]
         groups += b[0] != 0.0 or b[1] != 0.0
         substitute(factor, b, shift)
         for m in range(k):

@@ -6,11 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.geometry.eigen import eigensystem
-from scanchain.kernels.geometry.se import adjoint, centered
-from scanchain.kernels.registration.optimizers import factorize, substitute
-from scanchain.kernels.voxels.hashing import unpack
-from scanchain.kernels.voxels.voxel_shapes import (
+from scanchain.kernels.geometry import adjoint, centered
+from scanchain.kernels.matrices import congruent, eigensystem
+from scanchain.kernels.voxels import (
     ACROSS,
     BORN,
     MEAN_TERM,
@@ -20,6 +18,7 @@ from scanchain.kernels.voxels.voxel_shapes import (
     THICKNESS,
     move,
     shape_of,
+    unpack,
 )
 
 WEAK = 10.0  # times the limits of a degenerate direction, below which the prior counts along a direction
@@ -97,21 +96,10 @@ def agreement(H, unweighted, range_m: float) -> float:
 
 
 @njit(inline="always")
-def worst(spectrum) -> int:
-    """Index of the direction with the lowest signal-to-noise ratio."""
-    m = 0
-    for other in range(1, spectrum.values.shape[0]):
-        if spectrum.signals[other] < spectrum.signals[m]:
-            m = other
-    return m
-
-
-@njit(inline="always")
 def is_below(spectrum, m: int, times: float, settings) -> bool:
     """True if direction m lies below so many times the limits of a degenerate one."""
-    return (
-        spectrum.values[m] < times * settings.min_information or spectrum.signals[m] < times * settings.min_signal
-    )
+    is_blind = spectrum.values[m] < times * settings.min_information
+    return is_blind or spectrum.signals[m] < times * settings.min_signal
 
 
 @njit(nogil=True)
@@ -141,10 +129,7 @@ def weak_prior(spectrum, total_weight: float, believed, is_fused: bool, settings
             is_frozen = spectrum.values[m] < settings.min_information or real <= 0.0
         if is_frozen or strength > real * _FIXED * total_weight:
             strength, real = _FIXED * total_weight, 1.0
-        for i in range(k):
-            for j in range(k):
-                along = spectrum.vectors[i, m] * spectrum.vectors[j, m]
-                prior[i, j] += strength / real * along / (spectrum.scale[i] * spectrum.scale[j])
+        _add_along(spectrum, m, strength / real, prior)
     return prior
 
 
@@ -158,10 +143,16 @@ def remove_noise(spectrum, H, total_weight: float, settings):
         if not is_below(spectrum, m, WEAK, settings):
             continue
         noise = total_weight * spectrum.values[m] / max(spectrum.signals[m], 1.0)
-        for i in range(H.shape[0]):
-            for j in range(H.shape[0]):
-                along = spectrum.vectors[i, m] * spectrum.vectors[j, m]
-                H[i, j] -= noise * along / (spectrum.scale[i] * spectrum.scale[j])
+        _add_along(spectrum, m, -noise, H)
+
+
+@njit(inline="always")
+def _add_along(spectrum, m: int, amount: float, H):
+    """Add so much information along direction m to H (k, k)."""
+    for i in range(H.shape[0]):
+        for j in range(H.shape[0]):
+            along = spectrum.vectors[i, m] * spectrum.vectors[j, m]
+            H[i, j] += amount * along / (spectrum.scale[i] * spectrum.scale[j])
 
 
 @njit(inline="always")
@@ -190,15 +181,11 @@ def signal_along(problem, T, twist) -> float:
 
     T (d+1, d+1) : pose at which the problem's points were associated
     """
-    voxels, points, origin, insertions = (
-        problem.voxels,
-        problem.points,
-        problem.origin,
-        problem.settings.insertions,
-    )
+    voxels, points, origin = problem.voxels, problem.points, problem.origin
+    insertions = problem.settings.insertions
     parameters = 2.0 if points.shape[1] == 2 else 3.0
     informative = np.zeros(points.shape[0])
-    total, noise, most, dominant = 0.0, 0.0, 0.0, -1
+    total, noise, most, dominant = 0.0, 0.0, 0.0, np.int64(-1)  # no literal, or else all is compiled twice
     youngest = insertions - min(_OLD, insertions - 1)
     for i in range(points.shape[0]):
         voxel, weight = problem.correspondence[i], problem.weight[i]
@@ -228,9 +215,7 @@ def signal_along(problem, T, twist) -> float:
 
 
 @njit(inline="always")
-def _normal_variance(
-    cells, voxel: int, dx: float, dy: float, dz: float, beside: float, parameters: float
-) -> float:
+def _normal_variance(cells, voxel: int, dx, dy, dz, beside: float, parameters: float) -> float:
     """Variance of n·d by the fit of a voxel's normal n, ``beside`` being the squared length of d within the plane.
 
     τ² is estimated from m points less the parameters of the fit.
@@ -238,9 +223,8 @@ def _normal_variance(
     across = cells[voxel, ACROSS] * dx + cells[voxel, ACROSS + 1] * dy + cells[voxel, ACROSS + 2] * dz
     m = 1.0 / cells[voxel, MEAN_TERM]
     variance = cells[voxel, THICKNESS] * m / max(m - parameters, 1.0)
-    return variance * (
-        cells[voxel, SLOPE_ACROSS] * across * across + cells[voxel, SLOPE_ALONG] * (beside - across * across)
-    )
+    slope_across, slope_along = cells[voxel, SLOPE_ACROSS], cells[voxel, SLOPE_ALONG]
+    return variance * (slope_across * across * across + slope_along * (beside - across * across))
 
 
 @njit(nogil=True)
@@ -270,32 +254,3 @@ def seen_from_source(T, T_first, H, direction, variance: float):
             information[i, j] /= variance
             turned[j] += Ad[i, j] * direction[i]
     return information, turned
-
-
-@njit(nogil=True)
-def definite_inverse(matrix):
-    """Inverse of a positive definite (k, k), of another zeros."""
-    k = matrix.shape[0]
-    out, factor, b = np.zeros((k, k)), np.zeros((k, k)), np.zeros(k)
-    if factorize(matrix, 0.0, factor):
-        for j in range(k):
-            b[j] = -1.0
-            substitute(factor, b, out[:, j])
-            b[j] = 0.0
-    return out
-
-
-@njit(nogil=True)
-def congruent(A, H):
-    """AᵀHA of two (k, k)."""
-    k = H.shape[0]
-    HA, out = np.zeros((k, k)), np.zeros((k, k))
-    for i in range(k):
-        for m in range(k):
-            for j in range(k):
-                HA[i, j] += H[i, m] * A[m, j]
-    for m in range(k):
-        for i in range(k):
-            for j in range(k):
-                out[i, j] += A[m, i] * HA[m, j]
-    return out

@@ -5,25 +5,13 @@ import math
 import numpy as np
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.geometry.eigen import eigenvalues_3d, eigenvector_3d
-from scanchain.kernels.voxels.hashing import find_row, key_of
-from scanchain.kernels.voxels.voxel_shapes import move
+from scanchain.kernels.matrices import eigenvalues_3d, eigenvector_3d
+from scanchain.kernels.voxels import add_moments, covariance_of, find_row, key_of, move
 
 _FEWEST, _FEWEST_SCANS = 8, 3  # least number of points in a cell that counts as a plane, and of scans that see it
 _THIN, _FLAT, _WIDE = 0.02, 0.15, 0.1  # of a plane: ratio of its variances, largest and least deviation in cells
 
 _LEAST_SLOPE = 0.4  # of Σψ' over Σw, which bounds how much longer steps become
-
-
-@njit(nogil=True)
-def lift(points, offset_rad: float, lifted):
-    """Write points (N, 3) of lidar frames with their elevation angles raised."""
-    sine, cosine = math.sin(offset_rad), math.cos(offset_rad)
-    for i in range(points.shape[0]):
-        level = max(math.sqrt(points[i, 0] ** 2 + points[i, 1] ** 2), 1e-9)
-        stretch = cosine - sine * points[i, 2] / level
-        lifted[i, 0], lifted[i, 1] = stretch * points[i, 0], stretch * points[i, 1]
-        lifted[i, 2] = cosine * points[i, 2] + sine * level
 
 
 @njit(nogil=True)
@@ -55,7 +43,7 @@ def planes(points, number, poses, cell_m: float, beside, residual, plane, normal
             last[cell] = number[i]
             seen[cell] += 1
         beside[i, 0], beside[i, 1], beside[i, 2] = x, y, z
-        _add(sums, cell, x, y, z)
+        add_moments(sums, cell, x, y, z)
         plane[i] = cell
     count = 0
     for cell in range(cells):
@@ -82,26 +70,10 @@ def _from_mean(sums, cell: int, normals, p: int, beside, i: int) -> float:
     return residual
 
 
-@njit(inline="always")
-def _add(sums, cell: int, x: float, y: float, z: float):
-    sums[cell, 0] += 1.0
-    sums[cell, 1] += x
-    sums[cell, 2] += y
-    sums[cell, 3] += z
-    sums[cell, 4] += x * x
-    sums[cell, 5] += x * y
-    sums[cell, 6] += x * z
-    sums[cell, 7] += y * y
-    sums[cell, 8] += y * z
-    sums[cell, 9] += z * z
-
-
 @njit()
 def _is_plane(sums, cell_m: float, normal) -> bool:
     """True if points of these sums lie in a plane, whose normal (3,) is written."""
-    x, y, z = sums[1] / sums[0], sums[2] / sums[0], sums[3] / sums[0]
-    xx, xy, xz = sums[4] / sums[0] - x * x, sums[5] / sums[0] - x * y, sums[6] / sums[0] - x * z
-    yy, yz, zz = sums[7] / sums[0] - y * y, sums[8] / sums[0] - y * z, sums[9] / sums[0] - z * z
+    xx, xy, xz, yy, yz, zz = covariance_of(sums)
     small, middle, _ = eigenvalues_3d(xx, xy, xz, yy, yz, zz)
     if small >= min(_THIN * middle, (_FLAT * cell_m) ** 2) or middle <= (_WIDE * cell_m) ** 2:
         return False
@@ -198,12 +170,9 @@ def _terms(beside, residual, i: int, normals, p: int, g):
 def _jacobian(points, i: int, normals, p: int, poses, k: int, J):
     """Write ∂r/∂(ρ, φ, δ) (7,)."""
     x, y, z = points[i, 0], points[i, 1], points[i, 2]
+    nx, ny, nz = normals[p, 0], normals[p, 1], normals[p, 2]
     for axis in range(3):
-        J[axis] = (
-            poses[k, 0, axis] * normals[p, 0]
-            + poses[k, 1, axis] * normals[p, 1]
-            + poses[k, 2, axis] * normals[p, 2]
-        )
+        J[axis] = poses[k, 0, axis] * nx + poses[k, 1, axis] * ny + poses[k, 2, axis] * nz
     J[3], J[4], J[5] = y * J[2] - z * J[1], z * J[0] - x * J[2], x * J[1] - y * J[0]
     level = max(math.sqrt(x * x + y * y), 1e-9)
     J[6] = level * J[2] - z / level * (x * J[0] + y * J[1])

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.voxels.voxel_shapes import LINE, PLANE, POINT, Voxels, move, shape_of
+from scanchain.kernels.voxels import LINE, PLANE, POINT, Voxels, move, shape_of
 
 WITHOUT_KERNEL_M = 1e100  # scale at which every robust weight is one
 _SCATTER = 0x9E3779B1  # odd, near 2³² over the golden ratio, which scatters rows that follow each other (Knuth)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scanchain.data import Pose
 from scanchain.errors import one_line
-from scanchain.kernels.cloud_fields import keep_valid
+from scanchain.kernels.scans import keep_valid
 from scanchain.logs.messages.returns import NAMES, NO_TIMES, PointTimes, RangeLimits, Returns, moved
 from scanchain.logs.messages.ros import MalformedMessageError, stamp_ns
 

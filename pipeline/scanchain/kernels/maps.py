@@ -1,10 +1,78 @@
-"""Beams drawn into an occupancy grid up to their ends."""
+"""Maps of points: running means per voxel, and beams drawn into an occupancy grid."""
 
 import numpy as np
 
 from scanchain.kernels.compiling import njit
+from scanchain.kernels.voxels import REACH, find, key_of
 
 _LARGEST = 1e300  # m²; keeps points at infinity out where the range has no limit
+
+
+@njit(nogil=True)
+def add_points(T, points, max_range_m, voxel_m, center, slots, cells, sums, counts, used):
+    """Move points by a pose and add each to the sum of its voxel, until the table is full.
+
+    center : (3,) meters, of the space in which each voxel has a key of its own; it counts as full beyond
+
+    T : (d+1, d+1); points : (N, d) meters. slots : (S,) int64 keys and cells : (S,) int32 the row that each key
+    has; sums : (C, d) meters and counts : (C,) int64, of which the first ``used`` rows are taken.
+    Returns the rows taken now and the number of points done: fewer than N where rows or keys did not suffice.
+    """
+    d = points.shape[1]
+    scale = 1.0 / voxel_m
+    limit = min(max_range_m * max_range_m, _LARGEST)
+    moved = np.zeros(3)
+    for i in range(points.shape[0]):
+        square = 0.0
+        for axis in range(d):
+            square += points[i, axis] * points[i, axis]
+        if not square <= limit:
+            continue
+        for row in range(d):
+            value = T[row, d]
+            for axis in range(d):
+                value += T[row, axis] * points[i, axis]
+            moved[row] = value
+        row = np.int64(-1)
+        if max(abs(moved[0] - center[0]), abs(moved[1] - center[1]), abs(moved[2] - center[2])) < REACH * voxel_m:
+            used, row = _row_of(moved, scale, slots, cells, counts, used)
+        if row < 0:
+            return used, i
+        for axis in range(d):
+            sums[row, axis] += moved[axis]
+        counts[row] += 1
+    return used, points.shape[0]
+
+
+@njit(nogil=True)
+def merge_voxels(old_sums, old_counts, voxel_m, slots, cells, sums, counts):
+    """Put the voxels (M, d) of one table into another, empty one of the same or larger voxels; the rows taken."""
+    d = old_sums.shape[1]
+    scale = 1.0 / voxel_m
+    mean = np.zeros(3)
+    used = 0
+    for i in range(old_sums.shape[0]):
+        for axis in range(d):
+            mean[axis] = old_sums[i, axis] / old_counts[i]
+        used, row = _row_of(mean, scale, slots, cells, counts, used)
+        for axis in range(d):
+            sums[row, axis] += old_sums[i, axis]
+        counts[row] += old_counts[i]
+    return used
+
+
+@njit(inline="always")
+def _row_of(point, scale, slots, cells, counts, used):
+    """Rows taken, and the row of the point's voxel; −1 where it is new and there is no room."""
+    key = key_of(point[0], point[1], point[2], scale)
+    slot = find(slots, key)
+    if slot >= 0:
+        return used, np.int64(cells[slot])
+    if used == counts.size:
+        return used, np.int64(-1)
+    slots[~slot] = key
+    cells[~slot] = used
+    return used + 1, np.int64(used)
 
 
 @njit(nogil=True)
@@ -48,15 +116,6 @@ def beams_in_slice(T, points, max_range_m, min_z_m, max_z_m, starts, ends):
 
 
 @njit(nogil=True)
-def bounds(points, out):
-    """Widen ``out`` (4,), min x, min y, max x, max y, to hold the points (N, 2)."""
-    for i in range(points.shape[0]):
-        x, y = points[i, 0], points[i, 1]
-        out[0], out[1] = min(out[0], x), min(out[1], y)
-        out[2], out[3] = max(out[2], x), max(out[3], y)
-
-
-@njit(nogil=True)
 def draw_beams(starts, ends, offsets, origin, resolution_m, first_scan, hit, miss, low, high, log_odds, drawn):
     """Add the evidence of several scans: the cells that beams cross are free, the cells they end in occupied.
 
@@ -81,13 +140,9 @@ def draw_beams(starts, ends, offsets, origin, resolution_m, first_scan, hit, mis
                 drawn[row, column] = number
                 log_odds[row, column] = min(log_odds[row, column] + hit, high)
         for i in range(offsets[k], offsets[k + 1]):
-            _carve(
-                (starts[i, 0] - origin[0]) * scale,
-                (starts[i, 1] - origin[1]) * scale,
-                (ends[i, 0] - origin[0]) * scale,
-                (ends[i, 1] - origin[1]) * scale,
-                number, miss, low, log_odds, drawn,
-            )  # fmt: skip
+            x, y = (starts[i, 0] - origin[0]) * scale, (starts[i, 1] - origin[1]) * scale
+            end_x, end_y = (ends[i, 0] - origin[0]) * scale, (ends[i, 1] - origin[1]) * scale
+            _carve(x, y, end_x, end_y, number, miss, low, log_odds, drawn)
 
 
 @njit(inline="always")

@@ -14,11 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.geometry.eigen import eigenvalues_3d, eigenvector_3d, normal_2d
-from scanchain.kernels.voxels.hashing import find_row, first_slot, key_of, pack, unpack
+from scanchain.kernels.matrices import eigenvalues_3d, eigenvector_3d, normal_2d
 
+EMPTY = np.int64(-1)  # no key
+_OFFSET = 1 << 20
+_LIMIT = (1 << 21) - 1
+REACH = float(_OFFSET - 64)  # voxels around any point of the space, within which no two have one key
 POINT, LINE, PLANE = 0.0, 1.0, 2.0
-MEAN, DIRECTION, SHAPE, THICKNESS, ACROSS = 0, 3, 6, 7, 8
+DIRECTION, SHAPE, THICKNESS, ACROSS = 3, 6, 7, 8
 MEAN_TERM, SLOPE_ACROSS, SLOPE_ALONG = 11, 12, 13
 CELL = 16  # two more than are used, to fill the second cache line
 BORN, SEEN, FITTED = 0, 1, 2
@@ -125,12 +128,9 @@ def keep(voxels, kept, x: float, y: float, z: float, radius_m: float, oldest_tic
         if is_old or dx * dx + dy * dy + dz * dz > radius_m * radius_m:
             continue
         new = _voxel_at(kept, voxels.keys[voxel], 0)
-        for k in range(voxels.moments.shape[1]):
-            kept.moments[new, k] = voxels.moments[voxel, k]
-        for k in range(CELL):
-            kept.cells[new, k] = voxels.cells[voxel, k]
-        for k in range(voxels.history.shape[1]):
-            kept.history[new, k] = voxels.history[voxel, k]
+        kept.moments[new] = voxels.moments[voxel]
+        kept.cells[new] = voxels.cells[voxel]
+        kept.history[new] = voxels.history[voxel]
 
 
 @njit(inline="always")
@@ -151,21 +151,32 @@ def _voxel_at(voxels, key: int, tick: int) -> int:
 
 @njit(inline="always")
 def _accumulate(voxels, voxel: int, x: float, y: float, z: float):
-    ix, iy, iz = unpack(voxels.keys[voxel])
-    x -= (ix + 0.5) * voxels.size_m
-    y -= (iy + 0.5) * voxels.size_m
-    z -= (iz + 0.5) * voxels.size_m
-    moments = voxels.moments
-    moments[voxel, 0] += 1.0
-    moments[voxel, 1] += x
-    moments[voxel, 2] += y
-    moments[voxel, 3] += z
-    moments[voxel, 4] += x * x
-    moments[voxel, 5] += x * y
-    moments[voxel, 6] += x * z
-    moments[voxel, 7] += y * y
-    moments[voxel, 8] += y * z
-    moments[voxel, 9] += z * z
+    (ix, iy, iz), size = unpack(voxels.keys[voxel]), voxels.size_m
+    add_moments(voxels.moments, voxel, x - (ix + 0.5) * size, y - (iy + 0.5) * size, z - (iz + 0.5) * size)
+
+
+@njit(inline="always")
+def add_moments(moments, row: int, x: float, y: float, z: float):
+    """Add a point to the moments (10,) in a row."""
+    moments[row, 0] += 1.0
+    moments[row, 1] += x
+    moments[row, 2] += y
+    moments[row, 3] += z
+    moments[row, 4] += x * x
+    moments[row, 5] += x * y
+    moments[row, 6] += x * z
+    moments[row, 7] += y * y
+    moments[row, 8] += y * z
+    moments[row, 9] += z * z
+
+
+@njit(inline="always")
+def covariance_of(m):
+    """xx, xy, xz, yy, yz, zz of the points with the moments m (10,)."""
+    n = m[0]
+    x, y, z = m[1] / n, m[2] / n, m[3] / n
+    xx, xy, xz = m[4] / n - x * x, m[5] / n - x * y, m[6] / n - x * z
+    return xx, xy, xz, m[7] / n - y * y, m[8] / n - y * z, m[9] / n - z * z
 
 
 @njit(nogil=True)
@@ -224,8 +235,8 @@ def _fit_2d(m, cell):
     n = m[0]
     if n < 3.0:
         return 0.0
-    mx, my = m[1] / n, m[2] / n
-    small, large, nx, ny = normal_2d(m[4] / n - mx * mx, m[5] / n - mx * my, m[7] / n - my * my)
+    xx, xy, _, yy, _, _ = covariance_of(m)
+    small, large, nx, ny = normal_2d(xx, xy, yy)
     if large > 1e-12 and small < 0.1 * large:
         cell[SHAPE] = PLANE
         cell[DIRECTION], cell[DIRECTION + 1] = nx, ny
@@ -244,9 +255,7 @@ def _fit_3d(m, cell):
     n = m[0]
     if n < 5.0:
         return 0.0
-    mx, my, mz = m[1] / n, m[2] / n, m[3] / n
-    xx, xy, xz = m[4] / n - mx * mx, m[5] / n - mx * my, m[6] / n - mx * mz
-    yy, yz, zz = m[7] / n - my * my, m[8] / n - my * mz, m[9] / n - mz * mz
+    xx, xy, xz, yy, yz, zz = covariance_of(m)
     small, middle, large = eigenvalues_3d(xx, xy, xz, yy, yz, zz)
     if small < 0.1 * middle:
         cell[SHAPE] = PLANE
@@ -267,3 +276,57 @@ def _fit_3d(m, cell):
     if vx == 0.0 and vy == 0.0 and vz == 0.0:
         cell[SHAPE] = POINT
     return middle
+
+
+@njit(inline="always")
+def pack(ix: int, iy: int, iz: int) -> int:
+    """One non-negative int64 for a voxel; unique for coordinates in [−2²⁰, 2²⁰), larger ones collide."""
+    return (((ix + _OFFSET) & _LIMIT) << 42) | (((iy + _OFFSET) & _LIMIT) << 21) | ((iz + _OFFSET) & _LIMIT)
+
+
+@njit(inline="always")
+def key_of(x: float, y: float, z: float, scale: float) -> int:
+    """Key of the voxel that holds a point; scale : voxels a meter."""
+    return pack(int(np.floor(x * scale)), int(np.floor(y * scale)), int(np.floor(z * scale)))
+
+
+@njit(inline="always")
+def unpack(key: int):
+    """The voxel coordinates of a key, pack's inverse."""
+    return (key >> 42) - _OFFSET, ((key >> 21) & _LIMIT) - _OFFSET, (key & _LIMIT) - _OFFSET
+
+
+@njit(inline="always")
+def find(keys, key: int):
+    """Slot that holds the key, or ~slot (negative) of the empty slot where it belongs."""
+    slot = first_slot(keys.size, key)
+    while True:
+        held = keys[slot]
+        if held == key:
+            return slot
+        if held == EMPTY:
+            return ~slot
+        slot = (slot + 1) & (keys.size - 1)
+
+
+@njit(inline="always")
+def find_row(rows, keys, key: int) -> int:
+    """Row of ``keys`` (V,) that holds the key, or ~slot (negative) of the empty slot where that row belongs.
+
+    rows : (S,) int32, −1 where a slot is empty; much smaller than slots that hold keys, for fast probing
+    """
+    slot = first_slot(rows.size, key)
+    while True:
+        row = int(rows[slot])
+        if row < 0:
+            return ~slot
+        if keys[row] == key:
+            return row
+        slot = (slot + 1) & (rows.size - 1)
+
+
+@njit(inline="always")
+def first_slot(slots: int, key: int) -> int:
+    """The multiplicative hash of Knuth (1973, § 6.4) with 2⁶⁴/φ; the high bits are folded onto the low ones."""
+    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+    return int(np.int64((mixed >> np.uint64(32)) & np.uint64(slots - 1)))

@@ -1,6 +1,8 @@
-"""Eigenvectors of small symmetric matrices, without allocation; of two and three rows in closed form."""
+"""Small symmetric matrices: eigenvectors, Cholesky factors, inverses, congruences."""
 
 import math
+
+import numpy as np
 
 from scanchain.kernels.compiling import njit
 
@@ -85,7 +87,7 @@ def eigensystem(A, values, vectors):
 
 
 @njit(nogil=True)
-def _rotate_pair(A, vectors, p: int, q: int):
+def _rotate_pair(A, V, p: int, q: int):
     """Turn axes p and q so that A[p, q] becomes zero: t = tan of the angle, the smaller root of t² + 2τt = 1."""
     tau = 0.5 * (A[q, q] - A[p, p]) / A[p, q]
     t = math.copysign(1.0, tau) / (abs(tau) + math.sqrt(1.0 + tau * tau))
@@ -93,10 +95,7 @@ def _rotate_pair(A, vectors, p: int, q: int):
     s = t * c
     for i in range(A.shape[0]):
         A[i, p], A[i, q] = c * A[i, p] - s * A[i, q], s * A[i, p] + c * A[i, q]
-        vectors[i, p], vectors[i, q] = (
-            c * vectors[i, p] - s * vectors[i, q],
-            s * vectors[i, p] + c * vectors[i, q],
-        )
+        V[i, p], V[i, q] = c * V[i, p] - s * V[i, q], s * V[i, p] + c * V[i, q]
     for i in range(A.shape[0]):
         A[p, i], A[q, i] = c * A[p, i] - s * A[q, i], s * A[p, i] + c * A[q, i]
 
@@ -111,3 +110,77 @@ def _sort_columns(values, vectors):
             for row in range(vectors.shape[0]):
                 vectors[row, j], vectors[row, j - 1] = vectors[row, j - 1], vectors[row, j]
             j -= 1
+
+
+@njit(nogil=True)
+def solve(H, b, damping: float, factor, x) -> bool:
+    """Write −(H + damping · diag(H))⁻¹ b to ``x`` by Cholesky; False where that is not positive definite."""
+    if not factorize(H, damping, factor):
+        return False
+    substitute(factor, b, x)
+    return True
+
+
+@njit(nogil=True)
+def factorize(H, damping: float, factor) -> bool:
+    """Write L with L Lᵀ = H + damping · diag(H) to the lower half of ``factor``; False where there is none."""
+    k = H.shape[0]
+    for i in range(k):
+        for j in range(i + 1):
+            total = H[i, j] + (damping * abs(H[i, i]) if i == j else 0.0)
+            for m in range(j):
+                total -= factor[i, m] * factor[j, m]
+            if i != j:
+                factor[i, j] = total / factor[j, j]
+            elif total <= 1e-12 * abs(H[i, i]) or not math.isfinite(total):
+                return False
+            else:
+                factor[i, i] = math.sqrt(total)
+    return True
+
+
+@njit(nogil=True)
+def substitute(factor, b, x):
+    """Write −(L Lᵀ)⁻¹ b to ``x``."""
+    k = b.shape[0]
+    for i in range(k):
+        total = -b[i]
+        for m in range(i):
+            total -= factor[i, m] * x[m]
+        x[i] = total / factor[i, i]
+    for i in range(k - 1, -1, -1):
+        total = x[i]
+        for m in range(i + 1, k):
+            total -= factor[m, i] * x[m]
+        x[i] = total / factor[i, i]
+
+
+@njit(nogil=True)
+def definite_inverse(matrix):
+    """Inverse of a positive definite (k, k), of another zeros."""
+    k = matrix.shape[0]
+    out, factor, b, x = np.zeros((k, k)), np.zeros((k, k)), np.zeros(k), np.empty(k)
+    if factorize(matrix, 0.0, factor):
+        for j in range(k):
+            b[j] = -1.0
+            substitute(factor, b, x)
+            b[j] = 0.0
+            for i in range(k):
+                out[i, j] = x[i]
+    return out
+
+
+@njit(nogil=True)
+def congruent(A, H):
+    """AᵀHA of two (k, k)."""
+    k = H.shape[0]
+    HA, out = np.zeros((k, k)), np.zeros((k, k))
+    for i in range(k):
+        for m in range(k):
+            for j in range(k):
+                HA[i, j] += H[i, m] * A[m, j]
+    for m in range(k):
+        for i in range(k):
+            for j in range(k):
+                out[i, j] += A[m, i] * HA[m, j]
+    return out

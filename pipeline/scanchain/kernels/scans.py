@@ -1,12 +1,12 @@
-"""Downsampling to one point a voxel, and deskewing."""
+"""What is done to the points of a scan: valid ones kept, one chosen a voxel, and deskewed."""
 
 import math
 
 import numpy as np
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.geometry.se import perturb
-from scanchain.kernels.voxels.hashing import EMPTY, find, first_slot, pack
+from scanchain.kernels.geometry import perturb
+from scanchain.kernels.voxels import EMPTY, find, first_slot, pack
 
 _MOST_STEPS = 100.0  # of 1 rad in a sweep; no lidar turns faster
 _TERMS = 9  # of series in the square of an angle up to 1 rad
@@ -77,14 +77,6 @@ def _key_in_range(x, y, z, scale: float, low: float, high: float):
 
 
 @njit(nogil=True)
-def gather(points, chosen, out):
-    """Copy the chosen rows of points (N, d) to ``out`` (M, d)."""
-    for k in range(out.shape[0]):
-        for axis in range(out.shape[1]):
-            out[k, axis] = points[chosen[k], axis]
-
-
-@njit(nogil=True)
 def deskew_in_plane(points, shares, twist):
     """Move each point, in place, to its position as seen by the lidar at one instant, usually the scan's middle.
 
@@ -140,3 +132,22 @@ def _series(s: float, first: int) -> float:
     for n in range(_TERMS - 1, -1, -1):
         total = total * s + _INVERSE_FACTORIALS[2 * n + first]
     return total
+
+
+@njit(nogil=True)
+def keep_valid(x, y, z, low_square: float, high_square: float, points, kept):
+    """Copy the points whose squared range is finite, above low_square and at most high_square, in their order.
+
+    x, y, z : (N,) float32 meters, strided as the records are
+    points : (N, 3) float32, filled from the front; kept : (N,) int32, the place of each in the cloud
+    Returns how many were kept. NaN fails both comparisons.
+    """
+    count = 0
+    for i in range(x.size):
+        u, v, w = x[i], y[i], z[i]
+        square = u * u + v * v + w * w
+        if low_square < square <= high_square:
+            points[count, 0], points[count, 1], points[count, 2] = u, v, w
+            kept[count] = i
+            count += 1
+    return count

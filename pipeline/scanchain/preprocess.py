@@ -1,4 +1,4 @@
-"""Adaptive resolution: voxel sizes that follow the surroundings."""
+"""Preprocessing of a raw scan: cropped and downsampled, in voxels that follow the surroundings, and deskewed."""
 
 from __future__ import annotations
 
@@ -7,15 +7,19 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from copy import copy
+from dataclasses import dataclass
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
+from scanchain import checks
 from scanchain.clock import working_s
 from scanchain.config import PreprocessConfig
 from scanchain.data import Points, Scan
-from scanchain.preprocess.sweep import Sweep, sweep_of
+from scanchain.kernels import scans as kernels
 
+_SLOTS, _GROWTH = 1 << 18, 4  # of a table for downsampling: most at first, and growth where voxels have no room
 _RANGE_VOXELS = 14.0  # least number of voxels of the local map that the median range spans
 _DENSE, _SPARSE = 60_000, 40_000  # returns of a scan from which on it is dense, and below which it no longer is
 _FINE = math.sqrt(0.5)  # factor on the voxels of dense scans, which fill finer ones with points enough for a plane
@@ -24,6 +28,89 @@ _STEP = 2.0  # factor by which the voxels of matching shrink or grow from one sc
 _MAX_TRIES = 8  # number of times the first scan is downsampled, at most
 _AHEAD = 2  # scans that are prepared before they are asked for
 _ENOUGH = 0.9  # share of the old size above which a new one is not adopted: the choice of points would flicker
+
+
+@dataclass(frozen=True, slots=True)
+class Sweep:
+    """Points of a scan, one a voxel, with their times.
+
+    Attributes
+    ----------
+    points : (M, d) float64 meters, each in the lidar frame of its own instant
+    times_s : (M,) seconds after the middle of the scan; (0,) where all count as measured at once
+    middle_s : seconds from the scan's stamp to its middle
+    """
+
+    points: Points
+    times_s: NDArray[np.float64]
+    middle_s: float
+
+    @property
+    def is_distorted(self) -> bool:
+        """True if the points are distorted by the lidar's motion."""
+        return len(self.times_s) > 0
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds from the first point to the last."""
+        return float(np.ptp(self.times_s)) if self.is_distorted else 0.0
+
+    def downsampled(self, voxel_m: float) -> Sweep:
+        """The first point of every voxel of this size."""
+        chosen = first_per_voxel(self.points, voxel_m, 0.0, np.inf)
+        times_s = self.times_s[chosen] if self.is_distorted else self.times_s
+        return Sweep(self.points.take(chosen, axis=0), times_s, self.middle_s)
+
+    def from_middle(self, velocity: NDArray[np.float64]) -> Points:
+        """The points (M, d) as seen from the lidar in the middle of the scan.
+
+        velocity : (k,) twist per second in the lidar frame, constant through the scan
+        Why the middle: an error of the velocity then moves as many points forward as back and leaves the pose
+        alone. Seen from the first point it would shift the pose by half of itself, the next velocity by as much
+        in the other direction, and so on.
+        """
+        if not self.is_distorted:
+            return self.points
+        points = self.points.copy()
+        deskew = kernels.deskew_in_plane if points.shape[1] == 2 else kernels.deskew_in_space
+        deskew(points, self.times_s, velocity)
+        return points
+
+
+def sweep_of(scan: Scan, config: PreprocessConfig, scale: float = 1.0) -> Sweep:
+    """The scan cropped to the range that is used and downsampled, times left out where deskewing is off.
+
+    scale : of the voxels, 1 for ``preprocess.map_voxel_m``
+    """
+    voxel_m = scale * config.map_voxel_m
+    chosen = first_per_voxel(scan.points, voxel_m, config.min_range_m, config.max_range_m)
+    points = scan.points.take(chosen, axis=0).astype(np.float64)
+    if not config.deskew or not len(scan.times_s):
+        return Sweep(points, np.empty(0), 0.0)
+    middle_s = 0.5 * (float(scan.times_s.min()) + float(scan.times_s.max()))
+    return Sweep(points, scan.times_s[chosen].astype(np.float64) - middle_s, middle_s)
+
+
+def downsample(points: Points, voxel_m: float) -> Points:
+    """The first point of every voxel."""
+    return points.take(first_per_voxel(points, voxel_m, 0.0, np.inf), axis=0).astype(np.float64, copy=False)
+
+
+def first_per_voxel(
+    points: NDArray[np.floating], voxel_m: float, min_range_m: float, max_range_m: float
+) -> NDArray[np.int32]:
+    """Indices (M,) of the first point (N, d) in each voxel, near and far points left out.
+
+    Raises InputError where the voxels are too small for the points.
+    """
+    checks.within_voxels(points, voxel_m, "points", max_range_m=max_range_m)
+    slots = min(1 << max(2 * len(points) - 1, 1).bit_length(), _SLOTS)
+    while True:
+        table, chosen = np.empty(slots, np.int64), np.empty(slots // 2, np.int32)
+        count = kernels.first_per_voxel(points, voxel_m, min_range_m, max_range_m, table, chosen)
+        if count >= 0:
+            return chosen[:count].copy()
+        slots *= _GROWTH
 
 
 class Resolution:
@@ -62,7 +149,10 @@ class Resolution:
     def _fit(self, points: Points, returns: int) -> bool:
         """Adapt the sizes to the points to match, of so many returns; True if they fitted already."""
         before = self.scale, self.match_voxel_m
-        self.octave = self._octave_for(float(np.median(np.linalg.norm(points, axis=1))))
+        median_range_m = float(np.median(np.linalg.norm(points, axis=1)))
+        target = math.log2(median_range_m / (_RANGE_VOXELS * self.voxel_size_m))
+        if abs(target - math.log2(self.octave)) > _HYSTERESIS:
+            self.octave = min(max(2.0 ** round(target), self.config.min_scale), 1.0)
         self.is_dense = returns >= (_SPARSE if self.is_dense else _DENSE)
         self.scale = max(self.octave * (_FINE if self.is_dense else 1.0), self.config.min_scale)
         target_m = self.match_voxel_m * min(
@@ -73,12 +163,6 @@ class Resolution:
         if not _ENOUGH < target_m / self.match_voxel_m < 1.0 / _ENOUGH:
             self.match_voxel_m = target_m
         return before == (self.scale, self.match_voxel_m)
-
-    def _octave_for(self, median_range_m: float) -> float:
-        target = math.log2(median_range_m / (_RANGE_VOXELS * self.voxel_size_m))
-        if abs(target - math.log2(self.octave)) <= _HYSTERESIS:
-            return self.octave
-        return min(max(2.0 ** round(target), self.config.min_scale), 1.0)
 
 
 class Prepared(msgspec.Struct, frozen=True):

@@ -1,1 +1,0 @@
-"""Poses, twists and small matrices; compiled."""

@@ -1,0 +1,293 @@
+"""The nearest surface along each ray of a moving sensor, among boxes, cylinders, ellipsoids and rolling ground."""
+
+import math
+
+import numpy as np
+
+from scanchain.kernels.compiling import njit
+
+SECTORS = 720  # sectors of azimuth; a ray tests only the solids that overlap its own
+
+
+@njit(nogil=True)
+def cast_rays(
+    origins, rotations, pose_of_ray, directions, boxes, cylinders, ellipsoids, ground, max_range_m,
+    ranges_m, solid_of_ray,
+):  # fmt: skip
+    """Range to the first hit of every ray and the solid it hit; inf and −1 where nothing is within reach.
+
+    Solids are seen from the outside only: a ray that starts inside one passes through it. Each ray tests the
+    solids of its azimuth sector from near to far, and stops where the next cannot begin before its best hit.
+
+    origins, rotations : (P, 3) meters and (P, 3, 3), sensor poses in the world, near to each other
+    pose_of_ray : (N,) int32, the pose that ray n is fired from
+    directions : (N, 3) unit, sensor frame
+    boxes : (B, 8) center x, y, half lengths x, y, bottom, top, cos and sin of the yaw
+    cylinders : (C, 5) center x, y, radius, bottom, top
+    ellipsoids : (E, 6) center x, y, z, radii x, y, z
+    ground : (7 + 4 W,) z = g0 + g1 sin(g2 x + g3) + g4 sin(g5 y + g6) + Σ a sin(b x + c y + d), W rows a, b, c, d
+    max_range_m : reach
+    ranges_m : (N,) out
+    solid_of_ray : (N,) int32 out, counted through boxes, cylinders, ellipsoids; the ground comes last
+    """
+    ground_solid = len(boxes) + len(cylinders) + len(ellipsoids)
+    extents = _extents(origins, boxes, cylinders, ellipsoids)
+    starts, members = _sectors(extents, max_range_m)
+    for n in range(len(directions)):
+        p = pose_of_ray[n]
+        ox, oy, oz = origins[p, 0], origins[p, 1], origins[p, 2]
+        x, y, z = directions[n, 0], directions[n, 1], directions[n, 2]
+        dx = rotations[p, 0, 0] * x + rotations[p, 0, 1] * y + rotations[p, 0, 2] * z
+        dy = rotations[p, 1, 0] * x + rotations[p, 1, 1] * y + rotations[p, 1, 2] * z
+        dz = rotations[p, 2, 0] * x + rotations[p, 2, 1] * y + rotations[p, 2, 2] * z
+        steep = dz < -0.1  # hits the ground soon; a shallow ray is mostly stopped by a solid before
+        best, hit = max_range_m, -1
+        if steep:
+            best, hit = _nearer(best, hit, hit_ground(ox, oy, oz, dx, dy, dz, ground, best), ground_solid)
+        horizontal = math.sqrt(dx * dx + dy * dy)
+        sector = _sector(math.atan2(dy, dx)) % SECTORS
+        for k in range(starts[sector], starts[sector + 1]):
+            solid = members[k]
+            if extents[solid, 2] > best * horizontal:
+                break
+            t = hit_solid(ox, oy, oz, dx, dy, dz, solid, boxes, cylinders, ellipsoids)
+            best, hit = _nearer(best, hit, t, solid)
+        if not steep:
+            best, hit = _nearer(best, hit, hit_ground(ox, oy, oz, dx, dy, dz, ground, best), ground_solid)
+        ranges_m[n] = best if hit >= 0 else np.inf
+        solid_of_ray[n] = hit
+
+
+@njit()
+def _nearer(best, hit, t, solid):
+    return (t, solid) if t < best else (best, hit)
+
+
+@njit()
+def _sector(azimuth_rad):
+    return math.floor((azimuth_rad + math.pi) * (SECTORS / (2.0 * math.pi)))
+
+
+@njit()
+def _sectors(extents, max_range_m):
+    """The solids that overlap each sector, near to far: ``members[starts[s] : starts[s + 1]]``."""
+    order = np.argsort(extents[:, 2], kind="mergesort")
+    starts = np.zeros(SECTORS + 1, dtype=np.int64)
+    for solid in order:
+        first, count = _span(extents[solid], max_range_m)
+        for i in range(count):
+            starts[(first + i) % SECTORS + 1] += 1
+    starts = np.cumsum(starts)
+    filled = starts.copy()
+    members = np.empty(starts[-1], dtype=np.int64)
+    for solid in order:
+        first, count = _span(extents[solid], max_range_m)
+        for i in range(count):
+            sector = (first + i) % SECTORS
+            members[filled[sector]] = solid
+            filled[sector] += 1
+    return starts, members
+
+
+@njit()
+def _span(extent, max_range_m):
+    """First sector and number of sectors that an extent overlaps; none beyond the sensor's reach."""
+    if extent[2] > max_range_m:
+        return 0, 0
+    first = _sector(extent[0] - extent[1] - 1e-9)
+    return first, min(_sector(extent[0] + extent[1] + 1e-9) - first + 1, SECTORS)
+
+
+@njit()
+def _middle(origins):
+    """Middle of the origins in the plane and the largest distance of one from it."""
+    x, y, slack = 0.0, 0.0, 0.0
+    for i in range(len(origins)):
+        x += origins[i, 0] / len(origins)
+        y += origins[i, 1] / len(origins)
+    for i in range(len(origins)):
+        slack = max(slack, math.hypot(origins[i, 0] - x, origins[i, 1] - y))
+    return x, y, slack
+
+
+@njit()
+def _extents(origins, boxes, cylinders, ellipsoids):
+    """(S, 3) extent of each solid in the plane: bearing, half angle, nearest distance.
+
+    A ray from anywhere within ``slack`` of the middle of the origins that hits the solid has an azimuth in that
+    interval, because the parallel ray from the middle hits the footprint grown by ``slack``.
+    """
+    x, y, slack = _middle(origins)
+    result = np.empty((len(boxes) + len(cylinders) + len(ellipsoids), 3))
+    for i in range(len(boxes)):
+        _box_extent(x, y, slack, boxes[i], result[i])
+    for i in range(len(cylinders)):
+        c = cylinders[i]
+        _disc_extent(c[0] - x, c[1] - y, c[2] + slack, result[len(boxes) + i])
+    for i in range(len(ellipsoids)):
+        e, row = ellipsoids[i], len(boxes) + len(cylinders) + i
+        _disc_extent(e[0] - x, e[1] - y, max(e[3], e[4]) + slack, result[row])
+    return result
+
+
+@njit()
+def _disc_extent(dx, dy, radius, out):
+    """Write bearing, half angle and nearest distance of a disc to ``out``."""
+    distance = math.hypot(dx, dy)
+    if distance <= radius:
+        out[0], out[1], out[2] = 0.0, math.pi, 0.0
+    else:
+        out[0], out[1], out[2] = math.atan2(dy, dx), math.asin(radius / distance), distance - radius
+
+
+@njit()
+def _box_extent(x, y, slack, box, out):
+    """Write bearing, half angle and nearest distance of a box to ``out``."""
+    dx, dy, c, s = box[0] - x, box[1] - y, box[6], box[7]
+    outside_x = max(abs(c * dx + s * dy) - box[2], 0.0)
+    outside_y = max(abs(-s * dx + c * dy) - box[3], 0.0)
+    near = math.hypot(outside_x, outside_y) - slack
+    if near <= 0.0:
+        out[0], out[1], out[2] = 0.0, math.pi, 0.0
+        return
+    bearing, half_angle = math.atan2(dy, dx), 0.0
+    for i in range(4):
+        u = box[2] if i % 2 else -box[2]
+        v = box[3] if i // 2 else -box[3]
+        corner_x, corner_y = dx + c * u - s * v, dy + s * u + c * v
+        turn = math.atan2(corner_y, corner_x) - bearing
+        turn = abs(turn - 2.0 * math.pi * round(turn / (2.0 * math.pi)))
+        half_angle = max(half_angle, turn + math.asin(min(slack / math.hypot(corner_x, corner_y), 1.0)))
+    out[0], out[1], out[2] = bearing, half_angle, near
+
+
+@njit()
+def hit_solid(ox, oy, oz, dx, dy, dz, solid, boxes, cylinders, ellipsoids):
+    """Distance at which a ray enters the solid of that number, inf if it does not."""
+    if solid < len(boxes):
+        return _hit_box(ox, oy, oz, dx, dy, dz, boxes[solid])
+    solid -= len(boxes)
+    if solid < len(cylinders):
+        return _hit_cylinder(ox, oy, oz, dx, dy, dz, cylinders[solid])
+    return _hit_ellipsoid(ox, oy, oz, dx, dy, dz, ellipsoids[solid - len(cylinders)])
+
+
+@njit()
+def _slab(o, d, low, high):
+    """Interval of t in which o + t d lies between two planes (Kay & Kajiya 1986)."""
+    if abs(d) < 1e-12:
+        return (-np.inf, np.inf) if low <= o <= high else (np.inf, -np.inf)
+    a, b = (low - o) / d, (high - o) / d
+    return min(a, b), max(a, b)
+
+
+@njit()
+def _hit_box(ox, oy, oz, dx, dy, dz, box):
+    x, y, c, s = ox - box[0], oy - box[1], box[6], box[7]
+    enter_x, leave_x = _slab(c * x + s * y, c * dx + s * dy, -box[2], box[2])
+    enter_y, leave_y = _slab(-s * x + c * y, -s * dx + c * dy, -box[3], box[3])
+    enter_z, leave_z = _slab(oz, dz, box[4], box[5])
+    enter, leave = max(enter_x, enter_y, enter_z), min(leave_x, leave_y, leave_z)
+    return enter if 0.0 < enter <= leave else np.inf
+
+
+@njit()
+def _hit_cylinder(ox, oy, oz, dx, dy, dz, cylinder):
+    x, y = ox - cylinder[0], oy - cylinder[1]
+    a, b = dx * dx + dy * dy, x * dx + y * dy
+    c = x * x + y * y - cylinder[2] * cylinder[2]
+    enter, leave = _slab(oz, dz, cylinder[3], cylinder[4])
+    if a > 1e-24:
+        discriminant = b * b - a * c
+        if discriminant < 0.0:
+            return np.inf
+        root = math.sqrt(discriminant)
+        enter, leave = max(enter, (-b - root) / a), min(leave, (-b + root) / a)
+    elif c > 0.0:
+        return np.inf
+    return enter if 0.0 < enter <= leave else np.inf
+
+
+@njit()
+def _hit_ellipsoid(ox, oy, oz, dx, dy, dz, e):
+    x, y, z = (ox - e[0]) / e[3], (oy - e[1]) / e[4], (oz - e[2]) / e[5]
+    u, v, w = dx / e[3], dy / e[4], dz / e[5]
+    a, b, c = u * u + v * v + w * w, x * u + y * v + z * w, x * x + y * y + z * z - 1.0
+    discriminant = b * b - a * c
+    if discriminant < 0.0:
+        return np.inf
+    enter = (-b - math.sqrt(discriminant)) / a
+    return enter if enter > 0.0 else np.inf
+
+
+@njit()
+def hit_ground(ox, oy, oz, dx, dy, dz, ground, max_range_m):
+    """Distance at which a ray from above first meets the ground, inf if it does not.
+
+    Rough ground lies below its two long waves lifted by the sum of the short ones, so the ray meets those first.
+    """
+    if len(ground) == 7:
+        return _descend(ox, oy, oz, dx, dy, dz, ground, 0.0, max_range_m)
+    smooth, lift = ground[:7], 0.0
+    for k in range(7, len(ground), 4):
+        lift += abs(ground[k])
+    start, clear = 0.0, oz - lift
+    if _gap(ox, oy, clear, dx, dy, dz, smooth)[0] > 0.0:
+        start = _descend(ox, oy, clear, dx, dy, dz, smooth, 0.0, max_range_m)
+    return _descend(ox, oy, oz, dx, dy, dz, ground, start, max_range_m)
+
+
+@njit()
+def _descend(ox, oy, oz, dx, dy, dz, ground, start_m, max_range_m):
+    """Distance of the first root of the gap f(t) = z − h at or beyond ``start_m``, before which there is none.
+
+    |f'| is at most ``closing`` and |f''| at most ``curvature``, so a step of f / closing never jumps over a crest,
+    nor does (f' + √(f'² + 2 curvature f)) / curvature, which is tried too where the ground is rough. Where
+    curvature · |f| < f'² / 2 the first root is the only one ahead and Newton finds it.
+    """
+    closing, curvature = _steepest(dx, dy, dz, ground)
+    rough, t = len(ground) > 7, start_m
+    if closing <= 0.0 or t > max_range_m:
+        return np.inf
+    for _ in range(200):
+        gap, slope = _gap(ox + t * dx, oy + t * dy, oz + t * dz, dx, dy, dz, ground)
+        newton = slope < 0.0 and curvature * abs(gap) < 0.5 * slope * slope
+        if newton:
+            step, left = gap / -slope, curvature * gap * gap / abs(2.0 * slope * slope * slope)
+        else:
+            step, left = gap / closing, abs(gap / closing)
+            if rough:
+                step = max(step, (slope + math.sqrt(max(slope * slope + 2.0 * curvature * gap, 0.0))) / curvature)
+        t += step
+        if t > max_range_m or t < 0.0:
+            return np.inf
+        if left < 1e-9:  # meters that the step may have left to go
+            return t
+    return np.inf
+
+
+@njit()
+def _steepest(dx, dy, dz, ground):
+    """Bounds of the speed at which a ray and the ground approach each other, and of its derivative."""
+    slope_x, slope_y = ground[1] * ground[2], ground[4] * ground[5]
+    closing = abs(slope_x * dx) + abs(slope_y * dy) - dz
+    curvature = abs(slope_x * ground[2]) + abs(slope_y * ground[5])
+    for k in range(7, len(ground), 4):
+        a, b, c = ground[k], ground[k + 1], ground[k + 2]
+        closing += abs(a * (b * dx + c * dy))
+        curvature += abs(a) * (b * b + c * c)
+    return closing, curvature
+
+
+@njit()
+def _gap(x, y, z, dx, dy, dz, ground):
+    """Height of a position above the ground and its change along the ray."""
+    phase_x, phase_y = ground[2] * x + ground[3], ground[5] * y + ground[6]
+    gap = z - ground[0] - ground[1] * math.sin(phase_x) - ground[4] * math.sin(phase_y)
+    slope = dz - ground[1] * ground[2] * math.cos(phase_x) * dx - ground[4] * ground[5] * math.cos(phase_y) * dy
+    for k in range(7, len(ground), 4):
+        a, b, c = ground[k], ground[k + 1], ground[k + 2]
+        phase = b * x + c * y + ground[k + 3]
+        gap -= a * math.sin(phase)
+        slope -= a * math.cos(phase) * (b * dx + c * dy)
+    return gap, slope

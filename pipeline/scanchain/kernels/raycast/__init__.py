@@ -1,1 +1,0 @@
-"""Rays through grids and simulated solids; compiled."""

@@ -1,1 +1,0 @@
-"""Hash tables of voxels, and their contents; compiled."""
