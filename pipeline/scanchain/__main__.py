@@ -20,8 +20,7 @@ from scanchain.commands.doctor import doctor
 from scanchain.commands.evaluate import evaluate
 from scanchain.commands.info import info
 from scanchain.commands.landmarks import landmarks
-from scanchain.commands.localize import localize
-from scanchain.commands.maps import changes, map_group, merge
+from scanchain.commands.maps import changes, localize, map_group, merge
 from scanchain.commands.optimize import optimize
 from scanchain.commands.preparing import config, sequence, warm_up
 from scanchain.commands.run import run

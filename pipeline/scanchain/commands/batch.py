@@ -18,19 +18,19 @@ from scanchain.commands.options import (
     limit_options,
     matcher_option,
     no_loops_option,
-    overrides,
+    out_option,
     part_options,
 )
 from scanchain.errors import InputError, ScanchainError, counted
 from scanchain.files import Source
-from scanchain.settings import load_settings
+from scanchain.settings import Override, load_settings
 
 _DAY_S = 86_400.0
 
 
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
 @click.argument("logs", metavar="LOG...", nargs=-1, type=LOG)
-@click.option("--out", required=True, metavar="DIR", type=PATH, help="Directory to create, or to resume.")
+@out_option("Directory to create, or to resume.")
 @click.option(
     "--manifest", "manifests", multiple=True, metavar="FILE", type=PATH, help="Text file with one log per line."
 )
@@ -59,9 +59,7 @@ _DAY_S = 86_400.0
     help="Whether runs write a recording, some ten megabytes each.",
 )
 @click.option("--strict", is_flag=True, help="Exit with 1 unless every verdict is trustworthy.")
-@click.pass_context
 def batch(
-    ctx: click.Context,
     logs: tuple[Source, ...],
     out: Path,
     manifests: tuple[Path, ...],
@@ -72,6 +70,7 @@ def batch(
     ground_truth: Path | None,
     strict: bool,
     time_s: float | None,
+    overrides: tuple[Override, ...],
     **limits: Any,
 ) -> None:
     """Run many logs, each in its own process.
@@ -103,14 +102,13 @@ def batch(
         raise InputError(
             f"--gt {ground_truth}: a batch has no file of true poses for all its logs; name a topic, or use run"
         )
-    changes = overrides(ctx)
     file = () if config_file is None else ("--config", str(config_file.resolve()))
     job = Batch(
-        logs=collect(logs, manifests, load_settings(file=config_file, overrides=changes).config.log.format),
+        logs=collect(logs, manifests, load_settings(file=config_file, overrides=overrides).config.log.format),
         out=out.resolve(),
         config_file=config_file,
-        overrides=changes,
-        arguments=("--rerun", rerun, *file, *(f"--{change.key}={change.text}" for change in changes)),
+        overrides=overrides,
+        arguments=("--rerun", rerun, *file, *(f"--{change.key}={change.text}" for change in overrides)),
         workers=workers or os.cpu_count() or 1,
         time_s=time_s or _DAY_S,
         **limits,

@@ -9,22 +9,22 @@ from typing import Any
 import click
 
 from scanchain.commands.options import (
-    LOG,
+    PATH,
     OverrideCommand,
+    force_option,
     ground_truth_option,
     limit_options,
-    overrides,
+    logs_argument,
     part_options,
+    relations_option,
     threads_option,
 )
 from scanchain.errors import ScanchainError
 from scanchain.files import Source
 
-_PATH = click.Path(path_type=Path)
 
-
-@click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--section.key VALUE]...")
-@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
+@click.command(cls=OverrideCommand)
+@logs_argument
 @click.option("--methods", metavar="LIST", help="Comma-separated names. [default: all that apply to the log]")
 @click.option(
     "--matcher",
@@ -32,17 +32,15 @@ _PATH = click.Path(path_type=Path)
     default="",
     help="Compare odometry with your own matcher as well, row CLASS.",
 )
-@click.option("--out", metavar="DIR", type=_PATH, help="Directory to create. [default: runs/compare-LOG]")
+@click.option("--out", metavar="DIR", type=PATH, help="Directory to create. [default: runs/compare-LOG]")
 @ground_truth_option()
-@click.option(
-    "--relations", metavar="FILE", type=_PATH, help="Manually verified relative poses (Kümmerle et al. 2009)."
-)
+@relations_option
 @click.option(
     "--config",
     "--settings",
     "config_file",
     metavar="FILE",
-    type=_PATH,
+    type=PATH,
     help="TOML file on top of the preset, with a table for each method whose settings differ.",
 )
 @click.option(
@@ -51,16 +49,10 @@ _PATH = click.Path(path_type=Path)
 @limit_options("a run", time_default="300, plus 1 per scan", memory_default="three quarters of the free memory")
 @part_options()
 @threads_option
-@click.option("--force", is_flag=True, help="Replace an existing comparison once the new one is complete.")
+@force_option("an existing comparison once the new one is complete")
 @click.option("--json", "as_json", is_flag=True, help="Print table.json instead of the table.")
-@click.pass_context
 def compare(
-    ctx: click.Context,
-    logs: tuple[Source, ...],
-    methods: str | None,
-    out: Path | None,
-    as_json: bool,
-    **options: Any,
+    logs: tuple[Source, ...], methods: str | None, out: Path | None, as_json: bool, **options: Any
 ) -> None:
     """Compare odometry methods on the same decoded scans: accuracy, speed, memory.
 
@@ -109,7 +101,6 @@ def compare(
         logs=logs,
         out=Path("runs") / f"compare-{directory_name(logs[0].stem)}" if out is None else out,
         methods=tuple(name.strip() for name in methods.split(",") if name.strip()) if methods else (),
-        overrides=overrides(ctx),
         command=tuple(sys.argv),
         **options,
     )

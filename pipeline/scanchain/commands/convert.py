@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import click
 
-from scanchain.commands.options import LOG, OverrideCommand, key_option, overrides, part_options
+from scanchain.commands.options import (
+    LOG,
+    PATH,
+    OverrideCommand,
+    force_option,
+    json_option,
+    json_text,
+    key_option,
+    part_options,
+)
 from scanchain.errors import InputError
 from scanchain.files import Source
-from scanchain.settings import load_settings
+from scanchain.settings import Override, load_settings
 
 _KEYS = tuple(f"log.{name}" for name in ("format", "rate_hz", "topic", "start_s", "end_s", "every"))
 
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--log.key VALUE]...")
 @click.argument("source", metavar="SRC", type=LOG)
-@click.argument("destination", metavar="DST.mcap", type=click.Path(path_type=Path))
+@click.argument("destination", metavar="DST.mcap", type=PATH)
 @key_option(
     "--rate",
     "log.rate_hz",
@@ -25,15 +33,10 @@ _KEYS = tuple(f"log.{name}" for name in ("format", "rate_hz", "topic", "start_s"
     help="Scan rate of a folder of clouds without stamps; short for --log.rate_hz.",
 )
 @part_options(topic="all of them")
-@click.option("--force", is_flag=True, help="Replace an existing file.")
-@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
-@click.pass_context
+@force_option("an existing file")
+@json_option
 def convert(
-    ctx: click.Context,
-    source: Source,
-    destination: Path,
-    force: bool,
-    as_json: bool,
+    source: Source, destination: Path, force: bool, as_json: bool, overrides: tuple[Override, ...]
 ) -> None:
     """Convert a log of another format to MCAP, or cut one. The other commands read all of these formats directly.
 
@@ -61,11 +64,10 @@ def convert(
       scanchain convert drive.bag minute.mcap --start 60 --end 120
       scanchain convert drive.bag drive.mcap --json
     """
-    chosen = overrides(ctx)
-    for override in chosen:
+    for override in overrides:
         if override.key not in _KEYS:
             raise InputError(f"{override.flag} has no meaning for convert; its keys are {', '.join(_KEYS)}")
-    config = load_settings(overrides=chosen).config.log
+    config = load_settings(overrides=overrides).config.log
     from scanchain.commands.terminal import Terminal
     from scanchain.logs.writing.convert import convert as convert_log
 
@@ -75,7 +77,7 @@ def convert(
         click.echo(f"warning: {line}", err=True)
     if as_json:
         reported = {"path": str(done.path), "messages": done.messages, "notes": done.notes, "damage": done.damage}
-        click.echo(json.dumps(reported, indent=2))
+        click.echo(json_text(reported))
         return
     for note in done.notes:
         click.echo(f"note: {note}", err=True)

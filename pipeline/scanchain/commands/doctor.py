@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 import click
 
-from scanchain.commands.options import LOG, OverrideCommand, overrides, part_options
+from scanchain.commands.options import OverrideCommand, json_option, json_text, logs_argument, part_options
 from scanchain.files import Source
-from scanchain.settings import load_settings
+from scanchain.settings import Override, load_settings
 
 if TYPE_CHECKING:
+    from scanchain.config import Config
     from scanchain.logs.doctor.doctor import Diagnosis
 
 
-@click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--section.key VALUE]...")
-@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
+@click.command(cls=OverrideCommand)
+@logs_argument
 @part_options()
-@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
-@click.pass_context
-def doctor(ctx: click.Context, logs: tuple[Source, ...], as_json: bool) -> None:
+@json_option
+def doctor(logs: tuple[Source, ...], as_json: bool, overrides: tuple[Override, ...]) -> None:
     """Check every scan of a log: problems, their effect on the result, and the flags that fix them.
 
     Any configuration key is a flag, as for scanchain run, so that a fix can be tried.
@@ -35,23 +33,18 @@ def doctor(ctx: click.Context, logs: tuple[Source, ...], as_json: bool) -> None:
     from scanchain.commands.terminal import Terminal
     from scanchain.logs.doctor.doctor import examine
 
-    chosen = overrides(ctx)
-    early = load_settings(overrides=chosen).config
+    def config_for(dimension: int) -> Config:
+        return load_settings(dimension, overrides=overrides).config
 
     with Terminal("scans") as terminal:
-        found = examine(
-            logs, lambda dimension: load_settings(dimension, overrides=chosen).config, early.log, terminal.count
-        )
-    click.echo(json.dumps(asdict(found), indent=2) if as_json else _text(found))
+        found = examine(logs, config_for, load_settings(overrides=overrides).config.log, terminal.count)
+    click.echo(json_text(found) if as_json else _text(found))
 
 
 def _text(found: Diagnosis) -> str:
     lines = [f"{', '.join(found.files)} {found.topic} ({found.dimension}D)"]
     for finding in found.findings:
         lines.append(f"{finding.severity:<8} {finding.check:<12} {finding.found}")
-        lines += [f"{'':<21} {line}" for line in (finding.effect, _remedy(finding.remedy)) if line]
+        remedy = finding.remedy and f"→ {finding.remedy}"
+        lines += [f"{'':<21} {line}" for line in (finding.effect, remedy) if line]
     return "\n".join([*lines, *(f"{'note':<21} {note}" for note in found.notes)])
-
-
-def _remedy(remedy: str) -> str:
-    return f"→ {remedy}" if remedy else ""

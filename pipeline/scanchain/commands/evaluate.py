@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import fields, is_dataclass
-from math import isfinite
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from scanchain.commands.options import check_output, max_gap_option
+from scanchain.commands.options import (
+    PATH,
+    check_output,
+    force_option,
+    json_option,
+    json_text,
+    max_gap_option,
+    relations_option,
+)
 from scanchain.errors import InputError
 
 if TYPE_CHECKING:
     from scanchain.evaluation.metrics import Result, Results
-
-_PATH = click.Path(path_type=Path)
 
 
 class _Offset(click.ParamType):
@@ -27,11 +31,9 @@ class _Offset(click.ParamType):
 
 
 @click.command()
-@click.argument("files", metavar="EST.tum... [GT]", nargs=-1, required=True, type=_PATH)
-@click.option("--gt", metavar="FILE", type=_PATH, help="Ground truth. [default: the last of two files or more]")
-@click.option(
-    "--relations", metavar="FILE", type=_PATH, help="Manually verified relative poses (Kümmerle et al. 2009)."
-)
+@click.argument("files", metavar="EST.tum... [GT]", nargs=-1, required=True, type=PATH)
+@click.option("--gt", metavar="FILE", type=PATH, help="Ground truth. [default: the last of two files or more]")
+@relations_option
 @click.option(
     "--align",
     type=click.Choice(["rigid", "first", "none"]),
@@ -56,9 +58,9 @@ class _Offset(click.ParamType):
     help="Intervals of the RPE in poses, seconds or meters, comma-separated.",
 )
 @click.option("--kitti", is_flag=True, help="All files are KITTI's, 12 numbers a line; poses pair line by line.")
-@click.option("--png", metavar="FILE", type=_PATH, help="Draw the estimates, aligned, over the ground truth.")
-@click.option("--force", is_flag=True, help="Replace an existing picture.")
-@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
+@click.option("--png", metavar="FILE", type=PATH, help="Draw the estimates, aligned, over the ground truth.")
+@force_option("an existing picture")
+@json_option
 def evaluate(
     files: tuple[Path, ...],
     gt: Path | None,
@@ -102,7 +104,9 @@ def evaluate(
         from scanchain_viz.pictures.run import draw_evaluated
 
         draw_evaluated(png, {name: (each.aligned, each.reference) for name, each in evaluated.items()})
-    click.echo((_json if as_json else _text)(evaluated))
+    trees = {name: _tree(results) for name, results in evaluated.items()}
+    tree = trees if len(trees) > 1 else trees.popitem()[1]
+    click.echo(json_text(tree) if as_json else _text(evaluated))
     if png is not None and not as_json:
         click.echo(f"written {png}")
 
@@ -167,28 +171,13 @@ def _figure(result: Result) -> str:
     return f"{result.translation_m.mean if isinstance(result, RelationError) else result.translation_m.rmse:.4f}"
 
 
-def _json(evaluated: dict[str, Results]) -> str:
-    """The figures of one estimate, those of several by their names."""
-    trees = {name: _tree(results) for name, results in evaluated.items()}
-    return json.dumps(trees if len(trees) > 1 else trees.popitem()[1], indent=2)
-
-
 def _tree(results: Results) -> dict[str, object]:
     """The figures without the arrays behind them."""
-    tree = {name: _figures(result) for name, result in results.found.items()} | dict.fromkeys(results.missing)
+    import numpy as np
+
+    tree: dict[str, object] = {name: None for name in results.missing}
+    for name, result in results.found.items():
+        values = ((field.name, getattr(result, field.name)) for field in fields(result))
+        tree[name] = {key: value for key, value in values if not isinstance(value, np.ndarray)}
     tree |= {"time_offset_s": results.time_offset_s} if results.time_offset_s else {}
     return tree | ({"scale": results.scale} if results.scale != 1.0 else {})
-
-
-def _figures(record: object) -> object:
-    if is_dataclass(record) and not isinstance(record, type):
-        values = {field.name: _figures(getattr(record, field.name)) for field in fields(record)}
-        return {name: value for name, value in values.items() if value is not _LEFT_OUT}
-    if isinstance(record, tuple):
-        return [_figures(item) for item in record]
-    if isinstance(record, float):
-        return record if isfinite(record) else None
-    return record if isinstance(record, int | str | None) else _LEFT_OUT
-
-
-_LEFT_OUT = object()

@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 import click
 
-from scanchain.commands.options import LOG, OverrideCommand, overrides, part_options
+from scanchain.commands.options import OverrideCommand, json_option, json_text, logs_argument, part_options
 from scanchain.errors import counted
 from scanchain.files import Source
-from scanchain.settings import load_settings
+from scanchain.settings import Override, load_settings
 
 if TYPE_CHECKING:
     from scanchain.logs.info import LogInfo
 
 
-@click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--section.key VALUE]...")
-@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
+@click.command(cls=OverrideCommand)
+@logs_argument
 @part_options()
-@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
-@click.pass_context
-def info(ctx: click.Context, logs: tuple[Source, ...], as_json: bool) -> None:
+@json_option
+def info(logs: tuple[Source, ...], as_json: bool, overrides: tuple[Override, ...]) -> int:
     """Print the topics of a log with types and rates, and which of them a run with the same flags would use.
 
     Exit code 1: such a run would be refused, for the reason named as problem.
@@ -37,11 +34,9 @@ def info(ctx: click.Context, logs: tuple[Source, ...], as_json: bool) -> None:
     """
     from scanchain.logs.info import describe
 
-    chosen = overrides(ctx)
-    found = describe(logs, load_settings(overrides=chosen).config.log)
-    click.echo(json.dumps(asdict(found), indent=2) if as_json else _text(found))
-    if found.problem:
-        ctx.exit(1)
+    found = describe(logs, load_settings(overrides=overrides).config.log)
+    click.echo(json_text(found) if as_json else _text(found))
+    return int(bool(found.problem))
 
 
 def _text(log: LogInfo) -> str:

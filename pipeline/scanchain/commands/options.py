@@ -1,4 +1,4 @@
-"""Options that commands share: the LOG argument, configuration keys as flags, --gt, limits, output checks."""
+"""Options that commands share: the LOG argument, configuration keys as flags, --out, --gt, limits; and results."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+import msgspec
 
 from scanchain.config import NO_TRUTH
 from scanchain.errors import InputError
@@ -18,14 +19,14 @@ from scanchain.settings import Override
 from scanchain.threads import MOST, use_threads
 
 _GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to search them often costs a twentieth
+_ALIASES = "scanchain.commands.aliases"
+_MIB_PER_GIB = 1024.0
+PATH = click.Path(path_type=Path)
 
 
 def collect_garbage_seldom() -> None:
     """Search for garbage less often, for commands that process a log."""
     gc.set_threshold(_GARBAGE_EVERY)
-
-
-PATH = click.Path(path_type=Path)
 
 
 class NumberRange(click.FloatRange):
@@ -43,13 +44,16 @@ ABOVE_ZERO = NumberRange(0.0, min_open=True)
 
 
 class OverrideCommand(click.Command):
-    """Command that takes any configuration key as ``--section.key value``.
+    """Command that takes any configuration key as ``--section.key value``; ``overrides`` are all that are set.
 
     Options with a dot in their name are taken out of the arguments before click sees the rest.
     """
 
+    def __init__(self, *words: Any, options_metavar: str = "[OPTIONS] [--section.key VALUE]...", **more: Any):
+        super().__init__(*words, options_metavar=options_metavar, **more)
+
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Split the arguments into overrides, kept in the context, and ordinary ones."""
+        """Parse the overrides and the ordinary arguments. Raises click.UsageError for a key set by two options."""
         rest: list[str] = []
         overrides: list[Override] = []
         words = iter(args)
@@ -61,48 +65,35 @@ class OverrideCommand(click.Command):
             if not flag.startswith("--") or "." not in flag:
                 rest.append(word)
                 continue
-            if not equals:
-                text = next(words, "")
-                if not text:
-                    raise click.UsageError(f"{flag} needs a value, as in {flag} VALUE", ctx)
+            text = text if equals else next(words, "")
+            if not equals and not text:
+                raise click.UsageError(f"{flag} needs a value, as in {flag} VALUE", ctx)
             overrides.append(Override(flag[2:], text, flag))
-        ctx.meta[_KEY] = tuple(overrides)
-        return super().parse_args(ctx, rest)
+        unused = super().parse_args(ctx, rest)
+        chosen: dict[str, Override] = {}
+        for override in (*ctx.meta.get(_ALIASES, ()), *overrides):
+            other = chosen.setdefault(override.key, override)
+            if other is not override:
+                flag, key = override.flag, override.key
+                twice = f"{flag} is given twice ({other.text}, {override.text}); give it once"
+                both = f"{other.flag} and {flag} both set {key}; give one of them"
+                raise click.UsageError(twice if other.flag == flag else both, ctx)
+        ctx.params["overrides"] = tuple(chosen.values())
+        return unused
 
 
-def overrides(ctx: click.Context) -> tuple[Override, ...]:
-    """The keys that a command's options set: those of ``key_option`` as --matcher, and ``--section.key``.
-
-    Raises click.UsageError where two of them set the same key.
-    """
-    chosen: dict[str, Override] = {}
-    for override in (*ctx.meta.get(_ALIASES, ()), *ctx.meta[_KEY]):
-        other = chosen.setdefault(override.key, override)
-        if other is override:
-            continue
-        if other.flag == override.flag:
-            raise click.UsageError(
-                f"{other.flag} is given twice ({other.text}, {override.text}); give it once", ctx
-            )
-        raise click.UsageError(f"{other.flag} and {override.flag} both set {override.key}; give one of them", ctx)
-    return tuple(chosen.values())
-
-
-_KEY, _ALIASES = "scanchain.commands.overrides", "scanchain.commands.aliases"
+def _set(ctx: click.Context, override: Override) -> None:
+    ctx.meta.setdefault(_ALIASES, []).append(override)
 
 
 def key_option(flag: str, key: str, *, value: str | None = None, **attributes: Any) -> Callable[[Any], Any]:
-    """An option that sets a configuration key, which ``overrides`` returns; ``value`` is that of a flag."""
+    """An option that sets a configuration key; ``value`` is that of a flag."""
 
     def keep(ctx: click.Context, _: click.Parameter, given: str | bool | None) -> None:
         if given not in (None, False):
             _set(ctx, Override(key, value or str(given), flag))
 
     return click.option(flag, is_flag=True if value else None, expose_value=False, callback=keep, **attributes)
-
-
-def _set(ctx: click.Context, override: Override) -> None:
-    ctx.meta.setdefault(_ALIASES, []).append(override)
 
 
 class _LogType(click.ParamType):
@@ -114,6 +105,12 @@ class _LogType(click.ParamType):
 
 
 LOG = _LogType()
+logs_argument = click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
+
+
+def _together(*options: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Several options as one decorator, in this order."""
+    return lambda command: reduce(lambda decorated, option: option(decorated), reversed(options), command)
 
 
 def part_options(log: str = "the log", *, topic: str = "the only one that fits") -> Callable[[Any], Any]:
@@ -131,26 +128,14 @@ def part_options(log: str = "the log", *, topic: str = "the only one that fits")
     )
 
 
-def _together(*options: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Several options as one decorator, in this order."""
-    return lambda command: reduce(lambda decorated, option: option(decorated), reversed(options), command)
-
-
-def _use(context: click.Context, parameter: click.Parameter, count: int | None) -> None:
-    if count is not None:
-        use_threads(count)
-
-
 threads_option = click.option(
     "--threads",
     type=click.IntRange(1, MOST),
     metavar="N",
-    callback=_use,
+    callback=lambda _, __, count: None if count is None else use_threads(count),
     expose_value=False,
     help="Threads to compute with; the results are the same. [default: SCANCHAIN_THREADS, or one for each core]",
 )
-
-
 matcher_option = key_option(
     "--matcher",
     "matching.matcher",
@@ -158,11 +143,14 @@ matcher_option = key_option(
     help="LM-PLICP (the default), SVD-ICP, or your own class (scanchain.registration.Matcher).",
 )
 no_loops_option = key_option("--no-loops", "loops.enabled", value="false", help="Odometry only, no loop closures.")
-
-
 config_option = click.option(
     "--config", "config_file", metavar="FILE", type=PATH, help="TOML file on top of the preset."
 )
+relations_option = click.option(
+    "--relations", metavar="FILE", type=PATH, help="Manually verified relative poses (Kümmerle et al. 2009)."
+)
+strict_option = click.option("--strict", is_flag=True, help="Exit with 1 unless the verdict is trustworthy.")
+json_option = click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 
 
 def _checked_gap(_: click.Context, __: click.Parameter, value: float | None) -> float | None:
@@ -179,7 +167,6 @@ max_gap_option = click.option(
     metavar="SECONDS",
     help="Longest gap between true poses to interpolate. [default: 5 of their usual intervals, 0.1 to 0.6]",
 )
-strict_option = click.option("--strict", is_flag=True, help="Exit with 1 unless the verdict is trustworthy.")
 
 
 def ground_truth_option(
@@ -199,11 +186,19 @@ def ground_truth_option(
     return click.option("--gt", "ground_truth", metavar=metavar, callback=keep, help=help)
 
 
-def log_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """What ``run`` and ``localize`` take of a log: its part, configuration and true poses."""
-    return _together(
-        config_option, part_options(), matcher_option, ground_truth_option(), max_gap_option, threads_option
-    )(command)
+log_options = _together(  # what run and localize take of a log
+    config_option, part_options(), matcher_option, ground_truth_option(), max_gap_option, threads_option
+)
+
+
+def force_option(replaced: str) -> Callable[[Any], Any]:
+    """``--force``, with what it replaces in words."""
+    return click.option("--force", is_flag=True, help=f"Replace {replaced}.")
+
+
+def out_option(what: str = "Directory to create.") -> Callable[[Any], Any]:
+    """``--out``, required."""
+    return click.option("--out", required=True, metavar="DIR", type=PATH, help=what)
 
 
 def result_options(replaced: str, *, out: str = "Directory to create.") -> Callable[[Any], Any]:
@@ -211,11 +206,8 @@ def result_options(replaced: str, *, out: str = "Directory to create.") -> Calla
 
     replaced : what --force replaces, in words
     """
-    return _together(
-        click.option("--out", required=True, metavar="DIR", type=PATH, help=out),
-        click.option("--force", is_flag=True, help=f"Replace {replaced}."),
-        click.option("--json", "as_json", is_flag=True, help="Print metrics.json instead of the summary."),
-    )
+    as_json = click.option("--json", "as_json", is_flag=True, help="Print metrics.json instead of the summary.")
+    return _together(out_option(out), force_option(replaced), as_json)
 
 
 def print_summary(out: Path, summary: str, *, as_json: bool) -> None:
@@ -225,7 +217,9 @@ def print_summary(out: Path, summary: str, *, as_json: bool) -> None:
         click.echo(f"written        {out}")
 
 
-_MIB_PER_GIB = 1024.0
+def json_text(tree: object) -> str:
+    """Records, dictionaries and numbers of NumPy as indented JSON; what is not finite becomes null."""
+    return msgspec.json.format(msgspec.json.encode(tree, enc_hook=lambda number: number.item()), indent=2).decode()
 
 
 def limit_options(what: str, *, time_default: str, memory_default: str) -> Callable[[Any], Any]:

@@ -9,18 +9,16 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from scanchain.commands.options import (
-    LOG,
     NumberRange,
     OverrideCommand,
     collect_garbage_seldom,
     log_options,
+    logs_argument,
     no_loops_option,
-    overrides,
     result_options,
     strict_option,
 )
 from scanchain.errors import InputError, ScanchainError
-from scanchain.files import Source
 
 if TYPE_CHECKING:
     from scanchain.runs.job import SinkName
@@ -29,7 +27,7 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
 
 
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
-@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
+@logs_argument
 @result_options("an existing run directory once the new one is complete", out="Run directory to create.")
 @log_options
 @click.option(
@@ -51,16 +49,7 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
     help="Time between checkpoints; writing them takes at most 5 % of the run.",
 )
 @strict_option
-@click.pass_context
-def run(
-    ctx: click.Context,
-    logs: tuple[Source, ...],
-    out: Path,
-    rerun: str,
-    strict: bool,
-    as_json: bool,
-    **options: Any,
-) -> None:
+def run(out: Path, rerun: str, strict: bool, as_json: bool, **options: Any) -> int:
     """Compute the trajectory and the map of a log, with a rerun recording.
 
     LOG is an MCAP file, any other format that scanchain convert reads, or the address of one: of an MCAP at
@@ -86,8 +75,7 @@ def run(
     from scanchain.runs.resume import how_to_resume
     from scanchain.runs.run import run as run_log
 
-    command = tuple(sys.argv)
-    job = Job(logs=logs, out=out, overrides=overrides(ctx), sinks=_sinks(rerun), command=command, **options)
+    job = Job(out=out, sinks=_sinks(rerun), command=tuple(sys.argv), **options)
     with Terminal("scans") as terminal:
         finished = run_log(job, open_recorder, terminal, write_report)
     is_seen = sys.stdout.isatty() and not as_json  # the summary holds the same sentences
@@ -102,8 +90,7 @@ def run(
         raise ScanchainError(f"{finished.stopped}; the results so far are in {finished.path}; {again}")
     if not as_json:
         click.echo(f"written        {out}")
-    if fails:
-        ctx.exit(1)
+    return int(fails)
 
 
 def _sinks(text: str) -> frozenset[SinkName]:

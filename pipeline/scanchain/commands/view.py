@@ -6,20 +6,15 @@ from pathlib import Path
 
 import click
 
-from scanchain.commands.options import check_output
+from scanchain.commands.options import PATH, check_output, force_option
 from scanchain.errors import InputError
 
 
 @click.command()
-@click.argument("directory", metavar="DIR", type=click.Path(path_type=Path))
+@click.argument("directory", metavar="DIR", type=PATH)
 @click.option("--web", is_flag=True, help="Serve it to a browser on this machine, until Ctrl-C.")
-@click.option(
-    "--png",
-    metavar="FILE",
-    type=click.Path(path_type=Path),
-    help="Draw trajectory, ground truth and map to a PNG instead.",
-)
-@click.option("--force", is_flag=True, help="Replace an existing picture.")
+@click.option("--png", metavar="FILE", type=PATH, help="Draw trajectory, ground truth and map to a PNG instead.")
+@force_option("an existing picture")
 def view(directory: Path, web: bool, png: Path | None, force: bool) -> None:
     """Open the recording of a run in the rerun viewer, or draw its map to a picture.
 
