@@ -1,11 +1,9 @@
 """Downloads from a local server that understands ranges, and the catalog's recordings by way of it."""
 
 import hashlib
-import http.server
 import io
 import json
 import re
-import threading
 import zipfile
 
 import msgspec
@@ -20,23 +18,19 @@ from scanchain.logs import open_log
 from tests.support import recorders
 from tests.support.carmen_text import flaser, save
 from tests.support.folders import kitti_raw
+from tests.support.web_server import Site, serving
 
 CONTENT = np.random.default_rng(0).bytes(3_000_000)
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
 
 
-class Site:
-    """Files to serve; ``cuts`` are the numbers of bytes after which the next answers break off."""
+class BreakingSite(Site):
+    """``cuts`` are the numbers of bytes after which the next answers break off; it knows If-Range."""
 
-    def __init__(self):
-        self.files = {"/file.bin": CONTENT}
-        self.etag = '"one"'
-        self.has_ranges = self.tells_length = True
-        self.cuts = []
-        self.asked = []
-        self.sent = 0
+    cuts = ()
+    tells_length = True
 
-    def answer(self, handler):
+    def answer(self, handler, *, is_head):
         body = self.files.get(handler.path)
         wanted = handler.headers.get("Range")
         self.asked.append(wanted)
@@ -66,24 +60,8 @@ class Site:
 
 @pytest.fixture
 def site():
-    """A server; ``site.url`` is its address."""
-    served = Site()
-
-    class Handler(http.server.BaseHTTPRequestHandler):
-        def do_GET(self):
-            served.answer(self)
-
-        def log_message(self, *_):
-            pass
-
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    thread = threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True)
-    thread.start()
-    served.url = f"http://127.0.0.1:{server.server_address[1]}"
-    yield served
-    server.shutdown()
-    server.server_close()
-    thread.join()
+    with serving({"/file.bin": CONTENT}, BreakingSite) as served:
+        yield served
 
 
 def left(folder):
