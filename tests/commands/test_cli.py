@@ -19,15 +19,7 @@ from scanchain.__main__ import scanchain
 from scanchain.settings import flatten
 from tests.commands.conftest import FULL, flat
 from tests.support.messages import says
-from tests.support.naive_logs import (
-    SECOND,
-    STAMP_NS,
-    laser_scan,
-    odometry,
-    odometry_said,
-    scan_said,
-    write,
-)
+from tests.support.naive_logs import SECOND, STAMP_NS, laser_scan, odometry, odometry_said, scan_said, write
 from tests.support.scenes import ROOT, configured
 
 

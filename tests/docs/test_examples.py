@@ -22,7 +22,7 @@ from tests.support.scenes import ROOT
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 GIVEN = {  # what a page takes as done
-    "results.md": ("simulate office log.mcap --duration 20", "run log.mcap --out runs/log --rerun off"),
+    "results.md": ("simulate office log.mcap --duration 20", "run log.mcap --out runs/log --rerun off")
 }
 FENCE = re.compile(r"^(`{3,})(\w+)\n(.*?)^\1$", re.DOTALL | re.MULTILINE)
 FILE = re.compile(r"# (\w+\.\w+)\n")

@@ -15,13 +15,7 @@ from typing import Any
 
 import click
 
-from scanchain.commands.options import (
-    PATH,
-    OverrideCommand,
-    config_option,
-    json_option,
-    json_text,
-)
+from scanchain.commands.options import PATH, OverrideCommand, config_option, json_option, json_text
 from scanchain.config_keys import Value
 from scanchain.errors import ScanchainError
 from scanchain.settings import Override, Settings, config_keys, dump, flatten, load_settings
