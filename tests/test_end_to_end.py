@@ -26,7 +26,7 @@ from scanchain.settings import flatten
 from scanchain_viz.recording import entities
 from tests.support.naive_graph import error
 from tests.support.naive_maps import served_map
-from tests.support.recordings import EVERY_SCAN, FOR_EVER, column, rows_of, static_entities
+from tests.support.recordings import EVERY_SCAN, column, rows_of, static_entities
 from tests.support.scenes import ROOT, configured, shared_data
 
 FILES = {
@@ -329,31 +329,13 @@ def test_the_run_file_says_what_was_read_and_the_configuration_is_the_preset_wit
 # the recording
 
 
-def test_the_recording_has_every_entity_and_every_scan_on_both_timelines(drive):
-    path, count = drive.folder / "recording.rrd", drive.metrics["scans"]
-    rows, timelines = rows_of(path)
-    constant = static_entities(path)
-    for entity in EVERY_SCAN:
-        assert rows[entity] - (entity in constant) == count, entity
-    grown = {entities.ODOM, entities.LOCAL_MAP, entities.KEYFRAMES, entities.ODOMETRY_EDGES, entities.STATE}
-    if drive.metrics["closures_tried"]:
-        grown |= {entities.EVENTS, entities.ACCEPTED, entities.REJECTED}
-    for entity in (*EVERY_SCAN, *grown):
-        assert timelines[entity] == {"scan", "sensor_time"}, entity
-    for entity in (*FOR_EVER, entities.MAP, *([entities.GRID] if drive.dimension == 2 else [])):
-        assert timelines[entity] == set(), entity
-    assert RrdReader(str(path)).blueprints()
-
-
-def test_the_recorded_poses_are_those_of_the_trajectories(drive):
+def test_the_recorded_poses_are_those_of_the_trajectories_at_every_scan(drive):
     path = drive.folder / "recording.rrd"
     (strip,) = optimized_strips(path)
     np.testing.assert_allclose(strip, drive.tum()[:, 1:4], atol=1e-4)
-    steps = drive.steps
-    assert sorted(column(path, entities.INLIERS, "scan")) == steps["index"].tolist()
-    inliers = dict(zip(column(path, entities.INLIERS, "scan"), column(path, entities.INLIERS, "Scalars:scalars"),
-                       strict=True))  # fmt: skip
-    assert [inliers[i][0] for i in range(len(steps["index"]))] == steps["inliers"].tolist()
+    rows, constant = rows_of(path)[0], static_entities(path)
+    for entity in EVERY_SCAN:
+        assert rows[entity] - (entity in constant) == drive.metrics["scans"], entity
 
 
 def test_events_edges_counts_and_the_table_agree_on_the_verdict_of_every_closure(drive):

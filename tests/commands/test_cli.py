@@ -152,23 +152,6 @@ def test_info_as_json_counts_what_the_mcap_package_counts(call, office):
     assert (said["odometry"], said["problem"], said["damage"]) == ("/odom", "", [])
 
 
-def test_info_of_a_log_without_a_lidar_says_so_and_still_lists_it(call, tmp_path):
-    path = write(tmp_path / "x.mcap", [odometry_said(STAMP_NS, odometry(STAMP_NS, 0, 0))])
-    code, output, _ = call("info", path)
-    assert code == 1
-    says(output, "topic     /odom", f"problem   {path}: has no lidar topic")
-
-
-def test_info_and_convert_take_the_short_option_that_the_error_names(call, tmp_path):
-    said = [scan_said(STAMP_NS, laser_scan(STAMP_NS, [1.0] * 9), topic) for topic in ("/front", "/rear")]
-    path = write(tmp_path / "two.mcap", said)
-    says(call("info", path)[1], "choose one with --topic")
-    code, output, _ = call("info", path, "--topic", "/rear")
-    assert code == 0 and "lidar     /rear: 2D, 1 scan" in output and "problem" not in output
-    code, output, _ = call("convert", path, tmp_path / "rear.mcap", "--topic", "/rear")
-    assert code == 0 and "/rear" in output and "/front" not in output
-
-
 def test_config_show_lists_every_key_with_unit_range_and_description_and_marks_changes(call):
     code, output, errors = call("config", "show", "--lidar", "2d", "--log.every", "7")
     assert (code, errors) == (0, "")
