@@ -13,19 +13,14 @@ from typing import NoReturn
 import click
 
 from scanchain.commands.batch import batch
-from scanchain.commands.check import check
 from scanchain.commands.compare import compare
-from scanchain.commands.convert import convert
-from scanchain.commands.doctor import doctor
 from scanchain.commands.evaluate import evaluate
-from scanchain.commands.info import info
 from scanchain.commands.landmarks import landmarks
+from scanchain.commands.logs import convert, doctor, info, simulate
 from scanchain.commands.maps import changes, localize, map_group, merge
 from scanchain.commands.optimize import optimize
 from scanchain.commands.preparing import config, sequence, warm_up
-from scanchain.commands.run import run
-from scanchain.commands.simulate import simulate
-from scanchain.commands.view import view
+from scanchain.commands.run import check, run, view
 from scanchain.errors import InputError, ScanchainError, remedy_of
 
 

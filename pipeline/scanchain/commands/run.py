@@ -1,4 +1,4 @@
-"""``scanchain run``: the main job."""
+"""``scanchain run``, ``check`` and ``view``: a run, the verdict on it, and its recording."""
 
 from __future__ import annotations
 
@@ -9,16 +9,25 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from scanchain.commands.options import (
+    LOG,
+    PATH,
     NumberRange,
     OverrideCommand,
+    check_output,
     collect_garbage_seldom,
+    force_option,
+    json_option,
+    json_text,
     log_options,
     logs_argument,
     no_loops_option,
+    part_options,
     result_options,
     strict_option,
 )
-from scanchain.errors import InputError, ScanchainError
+from scanchain.errors import InputError, ScanchainError, counted
+from scanchain.files import Source
+from scanchain.settings import Override
 
 if TYPE_CHECKING:
     from scanchain.runs.job import SinkName
@@ -105,3 +114,95 @@ def _sinks(text: str) -> frozenset[SinkName]:
     if len(chosen - {"save"}) > 1:
         raise InputError(f"--rerun is {text!r}; take only one of spawn, connect, web beside save")
     return chosen
+
+
+@click.command(cls=OverrideCommand)
+@click.argument("sources", metavar="RUN|LOG...", nargs=-1, required=True, type=LOG)
+@click.option("--trajectory", metavar="FILE.tum", type=PATH, help="Check this trajectory of the lidar in LOG.")
+@part_options()
+@strict_option
+@json_option
+def check(
+    sources: tuple[Source, ...],
+    trajectory: Path | None,
+    strict: bool,
+    as_json: bool,
+    overrides: tuple[Override, ...],
+) -> int:
+    """Recompute the verdict on a run directory, or check any trajectory of a log.
+
+    A trajectory of another tool is checked at the scans whose stamps it has: against wheel odometry and constant
+    velocity, and by aligning each scan to a map of those before. Exit code 1: not trustworthy.
+
+    \b
+    Examples:
+      scanchain check runs/log
+      scanchain check runs/log --strict --json
+      scanchain check --trajectory kiss.tum log.mcap
+      scanchain check --trajectory other.tum part_0.mcap part_1.mcap --topic /lidar_front/points
+    """
+    if trajectory is None:
+        if len(sources) != 1 or not isinstance(sources[0], Path) or overrides:
+            raise InputError("check takes one run directory; to check a log, name a --trajectory FILE.tum")
+        from scanchain.runs.vouching import judge_run
+
+        judged = judge_run(sources[0])
+    else:
+        from scanchain.runs.foreign import judge_trajectory
+
+        judged, missing = judge_trajectory(trajectory, sources, overrides)
+        if missing:
+            click.echo(
+                f"warning: {counted(missing, 'scan')} without a pose in {trajectory} are left out", err=True
+            )
+    lines = [judged.sentence, *(f"  {stretch.text}" for stretch in judged.unnamed)]
+    tree = {
+        "verdict": judged.verdict,
+        "verdict_reason": judged.reason,
+        "verdict_error": judged.error,
+        "stretches": judged.stretches,
+    }
+    click.echo(json_text(tree) if as_json else "\n".join(lines))
+    return int(judged.verdict.fails(strict=strict))
+
+
+@click.command()
+@click.argument("directory", metavar="DIR", type=PATH)
+@click.option("--web", is_flag=True, help="Serve it to a browser on this machine, until Ctrl-C.")
+@click.option("--png", metavar="FILE", type=PATH, help="Draw trajectory, ground truth and map to a PNG instead.")
+@force_option("an existing picture")
+def view(directory: Path, web: bool, png: Path | None, force: bool) -> None:
+    """Open the recording of a run in the rerun viewer, or draw its map to a picture.
+
+    DIR is a directory of run, localize, merge or changes, or a .rrd file; a picture needs a trajectory.
+
+    \b
+    Examples:
+      scanchain view runs/log
+      scanchain view runs/log --web
+      scanchain view runs/log --png log.png
+    """
+    from scanchain.commands.terminal import Terminal
+
+    if not directory.exists():
+        raise InputError(
+            f"{directory}: no such directory or file; check the path (scanchain run makes it by --out)"
+        )
+    if png is not None:
+        from scanchain_viz.pictures.run import draw_run
+
+        check_output(png, force=force, endings=(".png",))
+        draw_run(directory, png)
+        click.echo(png)
+        return
+    path = directory / "recording.rrd" if directory.is_dir() else directory
+    if not path.exists():
+        raise InputError(
+            f"{directory}: holds no recording.rrd; scanchain run writes it unless --rerun leaves out save"
+        )
+    if path.suffix != ".rrd":
+        raise InputError(f"{path}: is no recording (.rrd); give a run directory")
+    from scanchain_viz.recording.viewer import show
+
+    with Terminal("recordings"):  # SIGTERM ends it like Ctrl-C: the server goes with it
+        show(path, click.echo, in_browser=web)
