@@ -9,18 +9,8 @@ from typing import Any
 
 import click
 
-from scanchain.commands.options import (
-    LOG,
-    PATH,
-    OverrideCommand,
-    config_option,
-    ground_truth_option,
-    limit_options,
-    matcher_option,
-    no_loops_option,
-    out_option,
-    part_options,
-)
+from scanchain.commands import options
+from scanchain.commands.options import LOG, PATH, OverrideCommand
 from scanchain.errors import InputError, ScanchainError, counted
 from scanchain.files import Source
 from scanchain.settings import Override, load_settings
@@ -30,20 +20,27 @@ _DAY_S = 86_400.0
 
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
 @click.argument("logs", metavar="LOG...", nargs=-1, type=LOG)
-@out_option("Directory to create, or to resume.")
+@options.out("Directory to create, or to resume.")
 @click.option(
-    "--manifest", "manifests", multiple=True, metavar="FILE", type=PATH, help="Text file with one log per line."
+    "--manifest",
+    "manifests",
+    multiple=True,
+    metavar="FILE",
+    type=PATH,
+    help="Text file with one log per line.",
 )
-@config_option
-@part_options("each log")
-@matcher_option
-@no_loops_option
-@ground_truth_option("TOPIC|none", "Ground truth in every log; none to ignore it. [default: /ground_truth]")
+@options.config
+@options.part("each log")
+@options.matcher
+@options.no_loops
+@options.ground_truth("TOPIC|none", "Ground truth in every log; none to ignore it. [default: /ground_truth]")
 @click.option(
     "--workers", type=click.IntRange(1), metavar="N", help="Logs run in parallel. [default: one per core]"
 )
 @click.option("--ray", metavar="auto|ADDRESS", help="Run on a Ray cluster that sees the same files.")
-@limit_options("a log", time_default="a day", memory_default="an equal share of three quarters of the free memory")
+@options.limits(
+    "a log", time_default="a day", memory_default="an equal share of three quarters of the free memory"
+)
 @click.option(
     "--retries",
     type=click.IntRange(0),

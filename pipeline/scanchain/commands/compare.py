@@ -8,23 +8,14 @@ from typing import Any
 
 import click
 
-from scanchain.commands.options import (
-    PATH,
-    OverrideCommand,
-    force_option,
-    ground_truth_option,
-    limit_options,
-    logs_argument,
-    part_options,
-    relations_option,
-    threads_option,
-)
+from scanchain.commands import options
+from scanchain.commands.options import PATH, OverrideCommand
 from scanchain.errors import ScanchainError
 from scanchain.files import Source
 
 
 @click.command(cls=OverrideCommand)
-@logs_argument
+@options.logs
 @click.option("--methods", metavar="LIST", help="Comma-separated names. [default: all that apply to the log]")
 @click.option(
     "--matcher",
@@ -33,8 +24,8 @@ from scanchain.files import Source
     help="Compare odometry with your own matcher as well, row CLASS.",
 )
 @click.option("--out", metavar="DIR", type=PATH, help="Directory to create. [default: runs/compare-LOG]")
-@ground_truth_option()
-@relations_option
+@options.ground_truth()
+@options.relations
 @click.option(
     "--config",
     "--settings",
@@ -46,14 +37,12 @@ from scanchain.files import Source
 @click.option(
     "--repeat", type=click.IntRange(1), default=1, show_default=True, help="Runs of every method, interleaved."
 )
-@limit_options("a run", time_default="300, plus 1 per scan", memory_default="three quarters of the free memory")
-@part_options()
-@threads_option
-@force_option("an existing comparison once the new one is complete")
+@options.limits("a run", time_default="300, plus 1 per scan", memory_default="three quarters of the free memory")
+@options.part()
+@options.threads
+@options.force("an existing comparison once the new one is complete")
 @click.option("--json", "as_json", is_flag=True, help="Print table.json instead of the table.")
-def compare(
-    logs: tuple[Source, ...], methods: str | None, out: Path | None, as_json: bool, **options: Any
-) -> None:
+def compare(logs: tuple[Source, ...], methods: str | None, out: Path | None, as_json: bool, **given: Any) -> None:
     """Compare odometry methods on the same decoded scans: accuracy, speed, memory.
 
     Writes tables, report.html and a rerun recording. Every method runs in its own process; one that crashes, hangs
@@ -102,7 +91,7 @@ def compare(
         out=Path("runs") / f"compare-{directory_name(logs[0].stem)}" if out is None else out,
         methods=tuple(name.strip() for name in methods.split(",") if name.strip()) if methods else (),
         command=tuple(sys.argv),
-        **options,
+        **given,
     )
     with Terminal("scans") as terminal:
         compared = run_comparison(comparison, present_comparison, terminal)

@@ -8,32 +8,18 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from scanchain.commands.options import (
-    PATH,
-    check_output,
-    force_option,
-    json_option,
-    json_text,
-    max_gap_option,
-    relations_option,
-)
+from scanchain.commands import options
+from scanchain.commands.options import PATH
 from scanchain.errors import InputError
 
 if TYPE_CHECKING:
     from scanchain.evaluation.metrics import Result, Results
 
 
-class _Offset(click.ParamType):
-    name = "offset"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float | str:
-        return value if value == "auto" else click.FLOAT.convert(value, param, ctx)
-
-
 @click.command()
 @click.argument("files", metavar="EST.tum... [GT]", nargs=-1, required=True, type=PATH)
 @click.option("--gt", metavar="FILE", type=PATH, help="Ground truth. [default: the last of two files or more]")
-@relations_option
+@options.relations
 @click.option(
     "--align",
     type=click.Choice(["rigid", "first", "none"]),
@@ -44,12 +30,12 @@ class _Offset(click.ParamType):
 @click.option("--scale", is_flag=True, help="Scale the estimate to fit, too: with --align rigid, Sim(3).")
 @click.option(
     "--time-offset",
-    type=_Offset(),
+    type=lambda text: text if text == "auto" else float(text),
     default=0.0,
     metavar="auto|SECONDS",
     help="Seconds to add to the stamps of EST; auto finds those of the least ATE within 1 s.",
 )
-@max_gap_option
+@options.max_gap
 @click.option(
     "--rpe",
     default="1pose,1s,10m,100m",
@@ -59,8 +45,8 @@ class _Offset(click.ParamType):
 )
 @click.option("--kitti", is_flag=True, help="All files are KITTI's, 12 numbers a line; poses pair line by line.")
 @click.option("--png", metavar="FILE", type=PATH, help="Draw the estimates, aligned, over the ground truth.")
-@force_option("an existing picture")
-@json_option
+@options.force("an existing picture")
+@options.as_json
 def evaluate(
     files: tuple[Path, ...],
     gt: Path | None,
@@ -69,7 +55,7 @@ def evaluate(
     png: Path | None,
     force: bool,
     as_json: bool,
-    **options: Any,
+    **given: Any,
 ) -> None:
     """Print ATE, RPE, KITTI metric and error over relations, each with its definition; several EST as a table.
 
@@ -90,13 +76,13 @@ def evaluate(
         files, gt = files[:-1], files[-1]
     if gt is None and relations is None:
         raise InputError("nothing to compare with; give GT (a TUM or KITTI file) or --relations FILE")
-    if kitti and options["time_offset"]:
+    if kitti and given["time_offset"]:
         raise InputError("--time-offset is for files with stamps; KITTI's have none")
     if png is not None and gt is None:
         raise InputError("--png draws over a ground truth; give GT")
     if png is not None:
-        check_output(png, force=force, endings=(".png",))
-    evaluated = {str(path): _evaluated(path, gt, relations, kitti, options) for path in files}
+        options.check_output(png, force=force, endings=(".png",))
+    evaluated = {str(path): _evaluated(path, gt, relations, kitti, given) for path in files}
     for name, results in evaluated.items():
         for warning in results.warnings:
             click.echo(f"warning: {f'{name}: ' * (len(evaluated) > 1)}{warning}", err=True)
@@ -106,13 +92,13 @@ def evaluate(
         draw_evaluated(png, {name: (each.aligned, each.reference) for name, each in evaluated.items()})
     trees = {name: _tree(results) for name, results in evaluated.items()}
     tree = trees if len(trees) > 1 else trees.popitem()[1]
-    click.echo(json_text(tree) if as_json else _text(evaluated))
+    click.echo(options.json_text(tree) if as_json else _text(evaluated))
     if png is not None and not as_json:
         click.echo(f"written {png}")
 
 
 def _evaluated(
-    estimate: Path, gt: Path | None, relations: Path | None, kitti: bool, options: dict[str, Any]
+    estimate: Path, gt: Path | None, relations: Path | None, kitti: bool, given: dict[str, Any]
 ) -> Results:
     """Every metric of a file, or of the trajectory of a run directory."""
     from scanchain.evaluation import read_relations, read_truth, relation_error
@@ -124,7 +110,7 @@ def _evaluated(
     results = Results({}, {})
     if gt is not None:
         truth = read_kitti(gt) if kitti else read_truth(gt).at(trajectory.stamps_ns)
-        results = evaluate(trajectory, truth, source="--rpe", **options)
+        results = evaluate(trajectory, truth, source="--rpe", **given)
     if relations is not None:
         results.found["relations"] = relation_error(trajectory, read_relations(relations))
     return results

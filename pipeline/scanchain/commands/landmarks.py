@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.core import ParameterSource
 
-from scanchain.commands.options import PATH, check_output, force_option, json_option, json_text, out_option
+from scanchain.commands import options
+from scanchain.commands.options import PATH
 from scanchain.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("data", metavar="DATA...", nargs=-1, required=True, type=PATH)
-@out_option()
+@options.out()
 @click.option(
     "--methods",
     "--method",
@@ -60,8 +61,8 @@ if TYPE_CHECKING:
     help="Optimizer for a nonlinear file.",
 )
 @click.option("--recording", metavar="FILE.rrd", type=PATH, help="Record before and after for rerun.")
-@force_option("DIR if it is the result of an earlier run")
-@json_option
+@options.force("DIR if it is the result of an earlier run")
+@options.as_json
 def landmarks(
     data: tuple[Path, ...],
     out: Path,
@@ -101,21 +102,21 @@ def landmarks(
     from scanchain.runs.provenance import describe_start
     from scanchain_viz.report.landmarks import write_report
 
-    options = Options(parse_methods(methods), noise=_noise(noise), **more)
+    chosen = Options(parse_methods(methods), noise=_noise(noise), **more)
     problems = [path if path.is_dir() else read_landmark_data(path) for path in data]
     _check_options({"log" if isinstance(each, Path) else each.kind for each in problems})
     if recording is not None:
-        check_output(recording, force=force, endings=(".rrd",))
+        options.check_output(recording, force=force, endings=(".rrd",))
     with RunDirectory(out, force=force) as directory, Terminal("problems") as terminal:
         with announcing_compilation(terminal.say):
             studies = [
-                study_log(each, options) if isinstance(each, Path) else study_file(each, options)
+                study_log(each, chosen) if isinstance(each, Path) else study_file(each, chosen)
                 for each in problems
             ]
         _check_names(studies)
         for study in studies:
             write_estimate(directory.path, study)
-        figures = json_text({"problems": [tree_of(study) for study in studies]})
+        figures = options.json_text({"problems": [tree_of(study) for study in studies]})
         (directory.path / "metrics.json").write_text(f"{figures}\n", encoding="utf-8")
         files = [file for path in data for file in (sorted(path.glob("*.dat")) if path.is_dir() else [path])]
         replace(describe_start(sys.argv, files, ""), complete=True).write(directory.path / "run.json")

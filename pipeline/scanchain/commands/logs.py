@@ -8,17 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from scanchain.commands.options import (
-    LOG,
-    PATH,
-    OverrideCommand,
-    force_option,
-    json_option,
-    json_text,
-    key_option,
-    logs_argument,
-    part_options,
-)
+from scanchain.commands import options
+from scanchain.commands.options import LOG, PATH, OverrideCommand
 from scanchain.errors import InputError, counted
 from scanchain.files import Source
 from scanchain.settings import Override, load_settings
@@ -32,9 +23,9 @@ _KEYS = tuple(f"log.{name}" for name in ("format", "rate_hz", "topic", "start_s"
 
 
 @click.command(cls=OverrideCommand)
-@logs_argument
-@part_options()
-@json_option
+@options.logs
+@options.part()
+@options.as_json
 def info(logs: tuple[Source, ...], as_json: bool, overrides: tuple[Override, ...]) -> int:
     """Print the topics of a log with types and rates, and which of them a run with the same flags would use.
 
@@ -50,7 +41,7 @@ def info(logs: tuple[Source, ...], as_json: bool, overrides: tuple[Override, ...
     from scanchain.logs.info import describe
 
     found = describe(logs, load_settings(overrides=overrides).config.log)
-    click.echo(json_text(found) if as_json else _info_text(found))
+    click.echo(options.json_text(found) if as_json else _info_text(found))
     return int(bool(found.problem))
 
 
@@ -89,9 +80,9 @@ def _info_text(log: LogInfo) -> str:
 
 
 @click.command(cls=OverrideCommand)
-@logs_argument
-@part_options()
-@json_option
+@options.logs
+@options.part()
+@options.as_json
 def doctor(logs: tuple[Source, ...], as_json: bool, overrides: tuple[Override, ...]) -> None:
     """Check every scan of a log: problems, their effect on the result, and the flags that fix them.
 
@@ -111,7 +102,7 @@ def doctor(logs: tuple[Source, ...], as_json: bool, overrides: tuple[Override, .
 
     with Terminal("scans") as terminal:
         found = examine(logs, config_for, load_settings(overrides=overrides).config.log, terminal.count)
-    click.echo(json_text(found) if as_json else _doctor_text(found))
+    click.echo(options.json_text(found) if as_json else _doctor_text(found))
 
 
 def _doctor_text(found: Diagnosis) -> str:
@@ -126,15 +117,15 @@ def _doctor_text(found: Diagnosis) -> str:
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--log.key VALUE]...")
 @click.argument("source", metavar="SRC", type=LOG)
 @click.argument("destination", metavar="DST.mcap", type=PATH)
-@key_option(
+@options.key(
     "--rate",
     "log.rate_hz",
     metavar="HZ",
     help="Scan rate of a folder of clouds without stamps; short for --log.rate_hz.",
 )
-@part_options(topic="all of them")
-@force_option("an existing file")
-@json_option
+@options.part(topic="all of them")
+@options.force("an existing file")
+@options.as_json
 def convert(
     source: Source, destination: Path, force: bool, as_json: bool, overrides: tuple[Override, ...]
 ) -> None:
@@ -177,7 +168,7 @@ def convert(
         click.echo(f"warning: {line}", err=True)
     if as_json:
         reported = {"path": str(done.path), "messages": done.messages, "notes": done.notes, "damage": done.damage}
-        click.echo(json_text(reported))
+        click.echo(options.json_text(reported))
         return
     for note in done.notes:
         click.echo(f"note: {note}", err=True)
@@ -224,10 +215,8 @@ def convert(
 @click.option(
     "--start-at", "start_m", default=0.0, show_default=True, metavar="METERS", help="Begin so far along the route."
 )
-@force_option("an existing file")
-def simulate(
-    world: str, destination: Path, wheels_slip: tuple[float, float, float] | None, **options: Any
-) -> None:
+@options.force("an existing file")
+def simulate(world: str, destination: Path, wheels_slip: tuple[float, float, float] | None, **given: Any) -> None:
     """Write a synthetic log with exact ground truth, and the truth beside it as .tum.
 
     \b
@@ -269,7 +258,7 @@ def simulate(
             destination,
             wheels_slip=NO_SLIP if wheels_slip is None else Slip(*wheels_slip),
             progress=terminal.count,
-            **options,
+            **given,
         )
     size_mb = destination.stat().st_size / 1e6
     click.echo(

@@ -9,21 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from scanchain.commands.options import (
-    ABOVE_ZERO,
-    PATH,
-    OverrideCommand,
-    collect_garbage_seldom,
-    config_option,
-    force_option,
-    log_options,
-    logs_argument,
-    out_option,
-    print_summary,
-    result_options,
-    strict_option,
-    threads_option,
-)
+from scanchain.commands import options
+from scanchain.commands.options import ABOVE_ZERO, PATH, OverrideCommand
 from scanchain.errors import InputError, counted
 
 if TYPE_CHECKING:
@@ -43,7 +30,7 @@ def map_group() -> None:
 
 @map_group.command("import")
 @click.argument("file", metavar="FILE", type=PATH)
-@out_option()
+@options.out()
 @click.option(
     "--spacing",
     "spacing_m",
@@ -60,8 +47,8 @@ def map_group() -> None:
     metavar="METERS",
     help="Of the lidar above the ground.",
 )
-@force_option("an existing map once the new one is complete")
-def import_file(file: Path, out: Path, **options: Any) -> None:
+@options.force("an existing map once the new one is complete")
+def import_file(file: Path, out: Path, **given: Any) -> None:
     """Make a map to localize in of a point cloud or an occupancy grid.
 
     FILE is a cloud in meters, z up (.ply, .pcd, .laz, .las, .npy), or map.yaml of nav2's or ROS 1's map_server
@@ -78,7 +65,7 @@ def import_file(file: Path, out: Path, **options: Any) -> None:
     from scanchain.sessions.elsewhere import import_map
 
     with Terminal("positions") as terminal:
-        made = import_map(file, out, say=terminal.say, **options)
+        made = import_map(file, out, say=terminal.say, **given)
     click.echo(
         f"{out}: {made.dimension}D map of {counted(made.points, 'point')}, seen from "
         f"{counted(made.keyframes, 'position')} {made.spacing_m:g} m apart"
@@ -86,17 +73,17 @@ def import_file(file: Path, out: Path, **options: Any) -> None:
 
 
 @click.command(cls=OverrideCommand, options_metavar="--map RUN --out DIR [OPTIONS] [--section.key VALUE]...")
-@logs_argument
+@options.logs
 @click.option("--map", "prior", required=True, metavar="RUN", type=PATH, help="Run directory or map.")
-@result_options("an existing directory once the new one is complete")
+@options.result("an existing directory once the new one is complete")
 @click.option(
     "--initial",
     metavar="X,Y,YAW|FILE.tum",
     help="Pose of the first scan in the map: meters and degrees, or a TUM file. [default: searched for]",
 )
-@log_options
-@strict_option
-def localize(prior: Path, out: Path, initial: str | None, strict: bool, as_json: bool, **options: Any) -> int:
+@options.of_log
+@options.strict
+def localize(prior: Path, out: Path, initial: str | None, strict: bool, as_json: bool, **given: Any) -> int:
     """Find a log in the map of an earlier run, and follow it there.
 
     Without --initial the place is searched for anywhere in the map. Exit code 1: the log is not from this place.
@@ -107,20 +94,20 @@ def localize(prior: Path, out: Path, initial: str | None, strict: bool, as_json:
       scanchain localize monday.mcap --map runs/sunday --out runs/monday --initial 12.5,-3,90
       scanchain localize part_0.mcap part_1.mcap --map runs/sunday --out runs/monday --topic /points
     """
-    collect_garbage_seldom()
+    options.collect_garbage_seldom()
     from scanchain.api import draw_localization
     from scanchain.commands.terminal import Terminal
     from scanchain.runs.job import Job
     from scanchain.sessions.localize import localize as localize_log
 
-    job = Job(out=out, command=tuple(sys.argv), **options)
+    job = Job(out=out, command=tuple(sys.argv), **given)
     first = None if initial is None else _initial(initial)
     with Terminal("scans") as terminal:
         localized = localize_log(job, prior, terminal, draw_localization, initial=first)
     fails = localized.metrics.verdict.fails(strict=strict)
     if fails and not sys.stdout.isatty():
         click.echo(f"error: {out}: {localized.metrics.sentence}", err=True)
-    print_summary(out, localized.summary, as_json=as_json)
+    options.print_summary(out, localized.summary, as_json=as_json)
     return int(fails)
 
 
@@ -138,12 +125,12 @@ def _initial(text: str) -> Callable[[int, SavedMap], Pose]:
 
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
 @click.argument("runs", metavar="RUN...", nargs=-1, required=True, type=PATH)
-@result_options("DIR if it is the result of an earlier run or merge")
-@config_option
+@options.result("DIR if it is the result of an earlier run or merge")
+@options.config
 @click.option("--fixed", is_flag=True, help="Leave the poses of the first RUN as they are.")
 @click.option("--update", is_flag=True, help="Remove from older sessions what newer ones saw through.")
-@threads_option
-def merge(runs: tuple[Path, ...], out: Path, as_json: bool, **options: Any) -> None:
+@options.threads
+def merge(runs: tuple[Path, ...], out: Path, as_json: bool, **given: Any) -> None:
     """Merge the maps of several runs into one map in one frame.
 
     RUN is a run directory, or that of an earlier merge; where each began need not be known. Loops are closed
@@ -164,14 +151,14 @@ def merge(runs: tuple[Path, ...], out: Path, as_json: bool, **options: Any) -> N
     from scanchain.sessions.merging import merge as merge_maps
 
     with Terminal("maps") as terminal:
-        merged = merge_maps(runs, out, terminal, present_merge, command=tuple(sys.argv), **options)
-    print_summary(out, merged.summary, as_json=as_json)
+        merged = merge_maps(runs, out, terminal, present_merge, command=tuple(sys.argv), **given)
+    options.print_summary(out, merged.summary, as_json=as_json)
 
 
 @click.command()
 @click.argument("earlier", metavar="RUN_A", type=PATH)
 @click.argument("later", metavar="[RUN_B]", required=False, type=PATH)
-@result_options("an existing comparison once the new one is complete")
+@options.result("an existing comparison once the new one is complete")
 @click.option("--aligned", is_flag=True, help="Both maps are in one frame already.")
 @click.option(
     "--transform",
@@ -179,7 +166,11 @@ def merge(runs: tuple[Path, ...], out: Path, as_json: bool, **options: Any) -> N
     help="Pose of RUN_B's frame in RUN_A's, meters and degrees. [default: found]",
 )
 @click.option(
-    "--voxel", "voxel_size_m", type=ABOVE_ZERO, metavar="METERS", help="Resolution. [default: maps.voxel_size_m]"
+    "--voxel",
+    "voxel_size_m",
+    type=ABOVE_ZERO,
+    metavar="METERS",
+    help="Resolution. [default: maps.voxel_size_m]",
 )
 @click.option(
     "--min-size",
@@ -190,7 +181,7 @@ def merge(runs: tuple[Path, ...], out: Path, as_json: bool, **options: Any) -> N
     metavar="METERS",
     help="Least length of a change; what is smaller is unknown.",
 )
-@threads_option
+@options.threads
 def changes(
     earlier: Path,
     later: Path | None,
@@ -198,7 +189,7 @@ def changes(
     aligned: bool,
     transform: str | None,
     as_json: bool,
-    **options: Any,
+    **given: Any,
 ) -> None:
     """Compare two maps of one place: what appeared, what vanished, what moved.
 
@@ -226,8 +217,8 @@ def changes(
     maps = [earlier] if later is None else [earlier, later]
     T = _pose(earlier, "0,0,0" if aligned else transform)
     with Terminal("maps") as terminal:
-        compare_maps(maps, out, present_changes, terminal.say, T_earlier_later=T, **options)
-    print_summary(out, (out / SUMMARY_FILE).read_text(encoding="utf-8"), as_json=as_json)
+        compare_maps(maps, out, present_changes, terminal.say, T_earlier_later=T, **given)
+    options.print_summary(out, (out / SUMMARY_FILE).read_text(encoding="utf-8"), as_json=as_json)
 
 
 def _pose(earlier: Path, text: str | None) -> Pose | None:

@@ -10,15 +10,8 @@ from typing import TYPE_CHECKING, cast
 
 import click
 
-from scanchain.commands.options import (
-    PATH,
-    OverrideCommand,
-    check_output,
-    force_option,
-    json_option,
-    json_text,
-    key_option,
-)
+from scanchain.commands import options
+from scanchain.commands.options import PATH, OverrideCommand
 from scanchain.errors import FREEDOM, InputError, counted, remedy_of
 from scanchain.settings import Override, load_settings
 
@@ -43,7 +36,7 @@ _HALF = 0.5  # robust weight below which an edge is contradicted by the rest, re
 @click.option(
     "--out", metavar="FILE", type=PATH, help="Write the optimized graph: .g2o, or TORO's .graph or .toro."
 )
-@key_option(
+@options.key(
     "--optimizer",
     "graph.optimizer",
     metavar="NAME",
@@ -56,7 +49,7 @@ _HALF = 0.5  # robust weight below which an edge is contradicted by the rest, re
     show_default=True,
     help="Initial guess; auto takes the file's, or the chordal one if that is poor.",
 )
-@key_option(
+@options.key(
     "--robust",
     "graph.robust",
     metavar="KERNEL",
@@ -76,8 +69,8 @@ _HALF = 0.5  # robust weight below which an edge is contradicted by the rest, re
 )
 @click.option("--png", metavar="FILE", type=PATH, help="Draw the graph before and after optimization.")
 @click.option("--recording", metavar="FILE.rrd", type=PATH, help="Record the graph before and after optimization.")
-@force_option("files that exist")
-@json_option
+@options.force("files that exist")
+@options.as_json
 def optimize(
     source: Path,
     out: Path | None,
@@ -114,7 +107,7 @@ def optimize(
     endings = {out: GRAPH_SUFFIXES, rejected: (), table: (), png: (".png",), recording: (".rrd",)}
     for path, allowed in endings.items():
         if path is not None:
-            check_output(path, force=force, endings=allowed)
+            options.check_output(path, force=force, endings=allowed)
     config = _config(overrides)
     is_robust = config.robust != "none" and any(override.key == "graph.robust" for override in overrides)
     file = _read(source, cast("Indefinite", indefinite), is_robust)
@@ -136,7 +129,7 @@ def optimize(
     written = [str(path) for path in writers]
     lines = [*report.lines(), *(("written", path) for path in written)]
     text = "\n".join(f"{name:<15}{fact}" for name, fact in lines)
-    click.echo(json_text(report.tree() | {"written": written}) if as_json else text)
+    click.echo(options.json_text(report.tree() | {"written": written}) if as_json else text)
     return int(not done.converged)
 
 

@@ -1,4 +1,4 @@
-"""Options that commands share: the LOG argument, configuration keys as flags, --out, --gt, limits; and results."""
+"""Options that commands share, as decorators: configuration keys as flags, --out, --gt, limits; and results."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import msgspec
 
 from scanchain.config import NO_TRUTH
 from scanchain.errors import InputError
-from scanchain.files import Source, source_of
+from scanchain.files import source_of
 from scanchain.settings import Override
 from scanchain.threads import MOST, use_threads
 
@@ -86,26 +86,18 @@ def _set(ctx: click.Context, override: Override) -> None:
     ctx.meta.setdefault(_ALIASES, []).append(override)
 
 
-def key_option(flag: str, key: str, *, value: str | None = None, **attributes: Any) -> Callable[[Any], Any]:
+def key(flag: str, name: str, *, value: str | None = None, **attributes: Any) -> Callable[[Any], Any]:
     """An option that sets a configuration key; ``value`` is that of a flag."""
 
     def keep(ctx: click.Context, _: click.Parameter, given: str | bool | None) -> None:
         if given not in (None, False):
-            _set(ctx, Override(key, value or str(given), flag))
+            _set(ctx, Override(name, value or str(given), flag))
 
     return click.option(flag, is_flag=True if value else None, expose_value=False, callback=keep, **attributes)
 
 
-class _LogType(click.ParamType):
-    name = "log"
-
-    def convert(self, value: str | Source, param: click.Parameter | None, ctx: click.Context | None) -> Source:
-        """Path or address that a word stands for."""
-        return source_of(value)
-
-
-LOG = _LogType()
-logs_argument = click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
+LOG = source_of
+logs = click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
 
 
 def _together(*options: Callable[[Any], Any]) -> Callable[[Any], Any]:
@@ -113,7 +105,7 @@ def _together(*options: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return lambda command: reduce(lambda decorated, option: option(decorated), reversed(options), command)
 
 
-def part_options(log: str = "the log", *, topic: str = "the only one that fits") -> Callable[[Any], Any]:
+def part(log: str = "the log", *, topic: str = "the only one that fits") -> Callable[[Any], Any]:
     """``--topic``, ``--start``, ``--end`` and ``--every``, the part of a log.
 
     log, topic : in words, what is cut and which lidar is taken without ``--topic``
@@ -121,14 +113,14 @@ def part_options(log: str = "the log", *, topic: str = "the only one that fits")
     of = "" if log == "the log" else f" of {log}"
     begin = f"Skip {log} up to this time, counted from its first message."
     return _together(
-        key_option("--topic", "log.topic", metavar="TOPIC", help=f"Lidar topic{of}. [default: {topic}]"),
-        key_option("--start", "log.start_s", metavar="SECONDS", help=begin),
-        key_option("--end", "log.end_s", metavar="SECONDS", help=f"Skip {log} after this time."),
-        key_option("--every", "log.every", metavar="N", help="Take every N-th scan."),
+        key("--topic", "log.topic", metavar="TOPIC", help=f"Lidar topic{of}. [default: {topic}]"),
+        key("--start", "log.start_s", metavar="SECONDS", help=begin),
+        key("--end", "log.end_s", metavar="SECONDS", help=f"Skip {log} after this time."),
+        key("--every", "log.every", metavar="N", help="Take every N-th scan."),
     )
 
 
-threads_option = click.option(
+threads = click.option(
     "--threads",
     type=click.IntRange(1, MOST),
     metavar="N",
@@ -136,21 +128,19 @@ threads_option = click.option(
     expose_value=False,
     help="Threads to compute with; the results are the same. [default: SCANCHAIN_THREADS, or one for each core]",
 )
-matcher_option = key_option(
+matcher = key(
     "--matcher",
     "matching.matcher",
     metavar="plicp|svd|MODULE:CLASS",
     help="LM-PLICP (the default), SVD-ICP, or your own class (scanchain.registration.Matcher).",
 )
-no_loops_option = key_option("--no-loops", "loops.enabled", value="false", help="Odometry only, no loop closures.")
-config_option = click.option(
-    "--config", "config_file", metavar="FILE", type=PATH, help="TOML file on top of the preset."
-)
-relations_option = click.option(
+no_loops = key("--no-loops", "loops.enabled", value="false", help="Odometry only, no loop closures.")
+config = click.option("--config", "config_file", metavar="FILE", type=PATH, help="TOML file on top of the preset.")
+relations = click.option(
     "--relations", metavar="FILE", type=PATH, help="Manually verified relative poses (Kümmerle et al. 2009)."
 )
-strict_option = click.option("--strict", is_flag=True, help="Exit with 1 unless the verdict is trustworthy.")
-json_option = click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
+strict = click.option("--strict", is_flag=True, help="Exit with 1 unless the verdict is trustworthy.")
+as_json = click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 
 
 def _checked_gap(_: click.Context, __: click.Parameter, value: float | None) -> float | None:
@@ -159,7 +149,7 @@ def _checked_gap(_: click.Context, __: click.Parameter, value: float | None) -> 
     return value
 
 
-max_gap_option = click.option(
+max_gap = click.option(
     "--max-gap",
     "max_gap_s",
     type=float,
@@ -169,7 +159,7 @@ max_gap_option = click.option(
 )
 
 
-def ground_truth_option(
+def ground_truth(
     metavar: str = "FILE|TOPIC|none",
     help: str = "Ground truth: TUM, KITTI or a topic; none to ignore that of the log. [default: /ground_truth]",
 ) -> Callable[[Any], Any]:
@@ -186,28 +176,23 @@ def ground_truth_option(
     return click.option("--gt", "ground_truth", metavar=metavar, callback=keep, help=help)
 
 
-log_options = _together(  # what run and localize take of a log
-    config_option, part_options(), matcher_option, ground_truth_option(), max_gap_option, threads_option
-)
+of_log = _together(config, part(), matcher, ground_truth(), max_gap, threads)
 
 
-def force_option(replaced: str) -> Callable[[Any], Any]:
+def force(replaced: str) -> Callable[[Any], Any]:
     """``--force``, with what it replaces in words."""
     return click.option("--force", is_flag=True, help=f"Replace {replaced}.")
 
 
-def out_option(what: str = "Directory to create.") -> Callable[[Any], Any]:
+def out(what: str = "Directory to create.") -> Callable[[Any], Any]:
     """``--out``, required."""
     return click.option("--out", required=True, metavar="DIR", type=PATH, help=what)
 
 
-def result_options(replaced: str, *, out: str = "Directory to create.") -> Callable[[Any], Any]:
-    """``--out``, ``--force`` and ``--json`` of a command that writes a directory with its metrics.
-
-    replaced : what --force replaces, in words
-    """
-    as_json = click.option("--json", "as_json", is_flag=True, help="Print metrics.json instead of the summary.")
-    return _together(out_option(out), force_option(replaced), as_json)
+def result(replaced: str, what: str = "Directory to create.") -> Callable[[Any], Any]:
+    """``--out``, ``--force`` and ``--json`` of a command that writes a directory with its metrics."""
+    as_metrics = click.option("--json", "as_json", is_flag=True, help="Print metrics.json instead of the summary.")
+    return _together(out(what), force(replaced), as_metrics)
 
 
 def print_summary(out: Path, summary: str, *, as_json: bool) -> None:
@@ -222,7 +207,7 @@ def json_text(tree: object) -> str:
     return msgspec.json.format(msgspec.json.encode(tree, enc_hook=lambda number: number.item()), indent=2).decode()
 
 
-def limit_options(what: str, *, time_default: str, memory_default: str) -> Callable[[Any], Any]:
+def limits(what: str, *, time_default: str, memory_default: str) -> Callable[[Any], Any]:
     """``--time-limit`` as ``time_s``, ``--memory-limit`` as ``memory_mib``; None where not given.
 
     what : the thing limited, in words; time_default, memory_default : the defaults, in words

@@ -15,7 +15,8 @@ from typing import Any
 
 import click
 
-from scanchain.commands.options import PATH, OverrideCommand, config_option, json_option, json_text
+from scanchain.commands import options
+from scanchain.commands.options import PATH, OverrideCommand
 from scanchain.config_keys import Value
 from scanchain.errors import ScanchainError
 from scanchain.settings import Override, Settings, config_keys, dump, flatten, load_settings
@@ -38,16 +39,16 @@ def _effective(command: Callable[..., Any]) -> Callable[..., Any]:
     """A command that takes ``settings``: of --lidar, --config and all keys."""
 
     @wraps(command)
-    def run(config_file: Path | None, lidar: str | None, overrides: tuple[Override, ...], **options: Any) -> None:
+    def run(config_file: Path | None, lidar: str | None, overrides: tuple[Override, ...], **given: Any) -> None:
         dimension = int(lidar[0]) if lidar else None
-        command(load_settings(dimension, file=config_file, overrides=overrides), **options)
+        command(load_settings(dimension, file=config_file, overrides=overrides), **given)
 
     kinds, help = click.Choice(["2d", "3d"]), "The preset that a log of this kind would get."
-    return config_option(click.option("--lidar", type=kinds, help=help)(run))
+    return options.config(click.option("--lidar", type=kinds, help=help)(run))
 
 
 @config.command("show", cls=OverrideCommand)
-@json_option
+@options.as_json
 @_effective
 def show(settings: Settings, as_json: bool) -> None:
     """Print every key with its value, unit and range, and what it sets.
@@ -71,7 +72,7 @@ def show(settings: Settings, as_json: bool) -> None:
             }
             for key in keys
         ]
-        click.echo(json_text(rows))
+        click.echo(options.json_text(rows))
         return
     click.echo(f"# {settings.source}; * differs from the default")
     cells = [
@@ -121,7 +122,7 @@ def sequence() -> None:
 
 
 @sequence.command("list")
-@json_option
+@options.as_json
 def list_sequences(as_json: bool) -> None:
     """List the catalog.
 
@@ -134,7 +135,7 @@ def list_sequences(as_json: bool) -> None:
 
     entries = {name: catalog.load(name) for name in catalog.names()}
     if as_json:
-        click.echo(json_text(entries))
+        click.echo(options.json_text(entries))
         return
     width = max(map(len, entries))
     for name, entry in entries.items():
@@ -148,7 +149,7 @@ def list_sequences(as_json: bool) -> None:
     "--out", default=Path("logs"), show_default=True, metavar="DIR", type=PATH, help="Folder of the log."
 )
 @click.option("--force", is_flag=True, help="Make it again even if it exists.")
-@json_option
+@options.as_json
 def get_sequence(name: str, out: Path, force: bool, as_json: bool) -> None:
     """Simulate a log of the catalog, or download and convert it, unless it exists, and print its path.
 
@@ -166,7 +167,7 @@ def get_sequence(name: str, out: Path, force: bool, as_json: bool) -> None:
     unit = "MiB" if isinstance(catalog.load(name).source, catalog.Download) else "scans"
     with Terminal(unit) as terminal:
         path = catalog.prepare(name, out, force=force, progress=terminal.count)
-    click.echo(json_text({"name": name, "path": str(path)}) if as_json else path)
+    click.echo(options.json_text({"name": name, "path": str(path)}) if as_json else path)
 
 
 _WORLDS = {"2d": ("office", 8), "3d": ("town", 3)}  # with the seconds driven there

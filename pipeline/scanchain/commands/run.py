@@ -8,23 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from scanchain.commands.options import (
-    LOG,
-    PATH,
-    NumberRange,
-    OverrideCommand,
-    check_output,
-    collect_garbage_seldom,
-    force_option,
-    json_option,
-    json_text,
-    log_options,
-    logs_argument,
-    no_loops_option,
-    part_options,
-    result_options,
-    strict_option,
-)
+from scanchain.commands import options
+from scanchain.commands.options import LOG, PATH, NumberRange, OverrideCommand
 from scanchain.errors import InputError, ScanchainError, counted
 from scanchain.files import Source
 from scanchain.settings import Override
@@ -36,9 +21,9 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
 
 
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
-@logs_argument
-@result_options("an existing run directory once the new one is complete", out="Run directory to create.")
-@log_options
+@options.logs
+@options.result("an existing run directory once the new one is complete", "Run directory to create.")
+@options.of_log
 @click.option(
     "--rerun",
     default="save",
@@ -46,7 +31,7 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
     metavar="LIST",
     help="Where the recording goes: save, spawn, connect, web, several with commas, or off.",
 )
-@no_loops_option
+@options.no_loops
 @click.option("--resume", is_flag=True, help="Resume a run that was killed or stopped from its last checkpoint.")
 @click.option(
     "--checkpoint",
@@ -57,8 +42,8 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
     metavar="SECONDS",
     help="Time between checkpoints; writing them takes at most 5 % of the run.",
 )
-@strict_option
-def run(out: Path, rerun: str, strict: bool, as_json: bool, **options: Any) -> int:
+@options.strict
+def run(out: Path, rerun: str, strict: bool, as_json: bool, **given: Any) -> int:
     """Compute the trajectory and the map of a log, with a rerun recording.
 
     LOG is an MCAP file, any other format that scanchain convert reads, or the address of one: of an MCAP at
@@ -77,14 +62,14 @@ def run(out: Path, rerun: str, strict: bool, as_json: bool, **options: Any) -> i
       scanchain run log.mcap --out runs/svd --matcher svd --no-loops --local_map.voxel_size_m 0.5
       scanchain run log.mcap --out runs/first_minute --end 60 --gt truth.tum --json
     """
-    collect_garbage_seldom()
+    options.collect_garbage_seldom()
     from scanchain.api import open_recorder, write_report
     from scanchain.commands.terminal import Terminal
     from scanchain.runs.job import Job
     from scanchain.runs.resume import how_to_resume
     from scanchain.runs.run import run as run_log
 
-    job = Job(out=out, sinks=_sinks(rerun), command=tuple(sys.argv), **options)
+    job = Job(out=out, sinks=_sinks(rerun), command=tuple(sys.argv), **given)
     with Terminal("scans") as terminal:
         finished = run_log(job, open_recorder, terminal, write_report)
     is_seen = sys.stdout.isatty() and not as_json  # the summary holds the same sentences
@@ -118,10 +103,15 @@ def _sinks(text: str) -> frozenset[SinkName]:
 
 @click.command(cls=OverrideCommand)
 @click.argument("sources", metavar="RUN|LOG...", nargs=-1, required=True, type=LOG)
-@click.option("--trajectory", metavar="FILE.tum", type=PATH, help="Check this trajectory of the lidar in LOG.")
-@part_options()
-@strict_option
-@json_option
+@click.option(
+    "--trajectory",
+    metavar="FILE.tum",
+    type=PATH,
+    help="Check this trajectory of the lidar in LOG.",
+)
+@options.part()
+@options.strict
+@options.as_json
 def check(
     sources: tuple[Source, ...],
     trajectory: Path | None,
@@ -162,7 +152,7 @@ def check(
         "verdict_error": judged.error,
         "stretches": judged.stretches,
     }
-    click.echo(json_text(tree) if as_json else "\n".join(lines))
+    click.echo(options.json_text(tree) if as_json else "\n".join(lines))
     return int(judged.verdict.fails(strict=strict))
 
 
@@ -170,7 +160,7 @@ def check(
 @click.argument("directory", metavar="DIR", type=PATH)
 @click.option("--web", is_flag=True, help="Serve it to a browser on this machine, until Ctrl-C.")
 @click.option("--png", metavar="FILE", type=PATH, help="Draw trajectory, ground truth and map to a PNG instead.")
-@force_option("an existing picture")
+@options.force("an existing picture")
 def view(directory: Path, web: bool, png: Path | None, force: bool) -> None:
     """Open the recording of a run in the rerun viewer, or draw its map to a picture.
 
@@ -191,7 +181,7 @@ def view(directory: Path, web: bool, png: Path | None, force: bool) -> None:
     if png is not None:
         from scanchain_viz.pictures.run import draw_run
 
-        check_output(png, force=force, endings=(".png",))
+        options.check_output(png, force=force, endings=(".png",))
         draw_run(directory, png)
         click.echo(png)
         return
