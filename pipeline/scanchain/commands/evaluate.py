@@ -161,9 +161,10 @@ def _tree(results: Results) -> dict[str, object]:
     """The figures without the arrays behind them."""
     import numpy as np
 
-    tree: dict[str, object] = {name: None for name in results.missing}
+    tree: dict[str, object] = {}
     for name, result in results.found.items():
         values = ((field.name, getattr(result, field.name)) for field in fields(result))
         tree[name] = {key: value for key, value in values if not isinstance(value, np.ndarray)}
+    tree |= dict.fromkeys(results.missing)
     tree |= {"time_offset_s": results.time_offset_s} if results.time_offset_s else {}
     return tree | ({"scale": results.scale} if results.scale != 1.0 else {})
