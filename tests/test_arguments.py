@@ -29,7 +29,6 @@ from scanchain import (
 )
 from scanchain.config import GraphConfig, LocalMapConfig, MatchingConfig, PreprocessConfig
 from scanchain.evaluation import absolute_error, pair
-from tests.support.scenes import shared_data
 
 CALLS = 200
 
@@ -209,37 +208,6 @@ def test_scans_of_a_bare_corridor_are_not_called_converged_however_noisy(matcher
         align, target = mapped(corridor(beams, noise_m, rng), matcher)
         match = align.align(corridor(beams, noise_m, rng), target, I3, wide=True)
         assert not match.converged and "undetermined" in match.reason
-
-
-def sweeps(name, *numbers):
-    """Sweeps of a real log."""
-    wanted = dict.fromkeys(numbers)
-    for each in open_log(shared_data(f"3d/{name}")).scans():
-        if each.index in wanted:
-            wanted[each.index] = each.points
-        if each.index == max(numbers):
-            return tuple(wanted.values())
-
-
-@pytest.mark.parametrize("matcher", ["plicp", "svd"])
-def test_real_sweeps_too_far_apart_for_the_search_or_of_another_place_are_not_called_converged(matcher):
-    first, fourth = sweeps("kitti_0001_first54.mcap", 0, 4)
-    (elsewhere,) = sweeps("kitti_0005_first60.mcap", 0)
-    for target, source in ((first, fourth), (first, elsewhere), (elsewhere, first)):
-        align, surfaces = mapped(target.astype(float), matcher)
-        match = align.align(source, surfaces, I4, wide=True)
-        assert not match.converged and match.fit < 0.6
-        assert match.inliers < 0.99 * len(source)
-
-
-def test_real_sweeps_within_the_search_are_called_converged():
-    first, second, fourth = sweeps("kitti_0001_first54.mcap", 0, 1, 4)
-    align, surfaces = mapped(first.astype(float))
-    ahead = lie.exp(np.array([5.3, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    for source, T_first, traveled_m in ((second, I4, 1.34), (fourth, ahead, 5.35)):
-        match = align.align(source, surfaces, T_first, wide=True)
-        assert match.converged and match.fit > 0.8
-        assert match.T_target_source[0, 3] == pytest.approx(traveled_m, abs=0.05)
 
 
 shapes = st.one_of(

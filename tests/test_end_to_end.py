@@ -121,7 +121,8 @@ def length_m(rows):
     return np.linalg.norm(np.diff(rows[:, 1:4], axis=0), axis=1).sum()
 
 
-# the directory
+def stamps_of(path):
+    return [line.split()[0] for line in path.read_text().splitlines()]
 
 
 def test_a_run_directory_holds_every_file_and_no_other(drive):
@@ -131,14 +132,11 @@ def test_a_run_directory_holds_every_file_and_no_other(drive):
 
 
 def test_trajectories_and_steps_have_the_same_pose_at_the_exact_stamp_of_every_scan(drive):
-    steps, stamps = (
-        drive.steps,
-        [line.split()[0] for line in drive.log.with_suffix(".tum").read_text().splitlines()],
-    )
+    steps, stamps = drive.steps, stamps_of(drive.log.with_suffix(".tum"))
     assert steps["index"].tolist() == list(range(len(stamps)))
     assert [f"{stamp // 10**9}.{stamp % 10**9:09d}" for stamp in steps["stamp_ns"].tolist()] == stamps
     for name, prefix in (("trajectory", ""), ("odometry", "odom_")):
-        assert [line.split()[0] for line in (drive.folder / f"{name}.tum").read_text().splitlines()] == stamps
+        assert stamps_of(drive.folder / f"{name}.tum") == stamps
         rows = drive.tum(name)
         np.testing.assert_allclose(np.linalg.norm(rows[:, 4:], axis=1), 1.0, atol=1e-8)
         assert drive.dimension == 3 or not rows[:, [3, 4, 5]].any()
@@ -270,15 +268,6 @@ def test_the_way_leads_over_free_cells(drive):
     assert (values != 100).all()
     if drive.dimension == 2:
         assert (values == 0).mean() > 0.95
-
-
-def test_the_cloud_of_a_3d_log_lies_round_the_way_and_is_thinned_out(town):
-    points = read_ply(town.folder / "map.ply")
-    distance_m, _ = cKDTree(town.tum()[:, 1:4]).query(points)
-    assert 1.0 < distance_m.min() < 5.0 and distance_m.max() < 101.0
-    assert np.ptp(points[:, 2]) > 2.0
-    voxels = np.unique(np.floor(points.astype(float) / 0.2).astype(int), axis=0)
-    assert len(voxels) > 0.95 * len(points)
 
 
 def test_the_metrics_agree_with_the_files(drive):
@@ -439,12 +428,3 @@ def test_a_real_drive_without_a_time_per_point_runs_without_any_flag(tmp_path):
     assert (metrics["scans"], metrics["ok"], metrics["dimension"]) == (60, 60, 3)
     assert metrics["ground_truth"] is None
     assert (tmp_path / "a" / "recording.rrd").stat().st_size / 60 < 150_000
-
-
-def test_a_real_drive_stays_within_10_cm_of_its_gps(tmp_path):
-    log = shared_data("3d/kitti_0001_first54.mcap")
-    succeed("run", log, "--out", tmp_path / "a", "--rerun", "off")
-    estimate = np.loadtxt(tmp_path / "a" / "trajectory.tum")
-    assert ate_m(estimate, np.loadtxt(log.with_suffix(".tum"))) <= 0.10
-    tree = json.loads(succeed("evaluate", tmp_path / "a" / "trajectory.tum", log.with_suffix(".tum"), "--json"))
-    assert tree["ate"]["translation_m"]["rmse"] <= 0.10 and tree["ate"]["translation_m"]["count"] == 54
