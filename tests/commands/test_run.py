@@ -1,23 +1,18 @@
 """``scanchain run`` and ``check``: what is printed where, what flags change, which true poses are used."""
 
-import errno
 import json
 import re
 import sys
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap.writer import Writer
 
 from scanchain.data import Trajectory
-from scanchain.logs.writing.pack import ORIGIN, pack_laser_scan, pack_odometry
 from scanchain.logs.writing.writer import LogWriter
 from scanchain.settings import flatten
 from scanchain.trajectory import read_tum, write_kitti, write_tum
-from tests.commands.conftest import FULL
 from tests.support.messages import says
-from tests.support.naive_logs import SECOND, STAMP_NS, laser_scan, scan_said, write
+from tests.support.naive_logs import SECOND, STAMP_NS
 from tests.support.scenes import configured
 
 
@@ -33,17 +28,6 @@ def test_a_run_is_quiet_but_for_its_summary_when_piped(call, tmp_path, office):
     assert json.loads(output)["scans"] == 60
     files = [{path.name for path in (tmp_path / name).iterdir()} for name in "ab"]
     assert files[0] - files[1] == {"recording.rrd"} and files[1] < files[0]
-
-
-def test_a_disk_that_fills_up_during_a_run_is_told_once_with_what_to_do(monkeypatch, office, ran):
-    def fail(*_):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr("scanchain.runs.run.write_results", fail)
-    run = ran(office)
-    assert run.code == 1 and "Errno" not in run.errors and run.errors.count("full") == 1
-    assert run.errors.startswith(f"error: {run.folder}: {FULL}; ")
-    says(run.errors, "60 scans until then are in")
 
 
 def test_a_run_whose_scans_tell_too_little_says_so_first_and_fails_with_its_results_written(call, tmp_path, ran):
@@ -126,13 +110,6 @@ def test_flags_stand_for_keys_and_change_the_preset_and_a_file(tmp_path, office,
     says(run.output.splitlines()[1], "wheel odometry /odom, not used: odometry.prior is constant-velocity;")
 
 
-def test_a_run_killed_before_its_first_checkpoint_is_named_when_it_starts_over(call, tmp_path, office):
-    (tmp_path / "a.partial-1").mkdir()
-    code, _, errors = call("run", office, "--rerun", "off", "--out", tmp_path / "a", "--resume")
-    assert code == 0
-    says(errors, "a.partial-1: no checkpoint to resume from, this run starts over")
-
-
 # true poses
 
 
@@ -167,17 +144,6 @@ def test_true_poses_that_fit_no_scan_are_refused_before_the_work(refused, tmp_pa
     first, last = truth.stamps_ns[[0, -1]] / 1e9
     says(refused("run", office, *words, tmp_path / "old.tum"), "1.000 to 2.000 s", f"{first:.3f} to {last:.3f} s")
     says(refused("run", office, *words, tmp_path / "poses.txt", "--end", "3"), "60 lines for 30 scans")
-    with LogWriter(tmp_path / "a.mcap") as log:
-        for k in range(20):
-            at_ns = 10**18 + k * 10**8
-            scan = pack_laser_scan(at_ns, "lidar", -1.5, 0.1, np.full(31, 3.0), range_min_m=0.1, range_max_m=9.0)
-            log.append("/scan", "sensor_msgs/msg/LaserScan", scan, at_ns)
-            true_ns = 5 * 10**9 + k * 10**8
-            pose = pack_odometry(true_ns, "world", "lidar", ORIGIN)
-            log.append("/mocap", "nav_msgs/msg/Odometry", pose, true_ns, at_ns)
-    text = refused("run", tmp_path / "a.mcap", *words, "/mocap")
-    says(text, "/mocap", "5.000 to 6.900 s", "1000000000.000 to 1000000001.900 s")
-    says(refused("run", tmp_path / "a.mcap", *words, "/ground_truth"), "/ground_truth", "scanchain info")
 
 
 def test_true_poses_too_far_apart_are_a_warning_and_the_run_stands(call, tmp_path, office, ran):
@@ -216,39 +182,6 @@ def test_a_truth_of_few_scans_is_a_warning_that_says_why(tmp_path, office, monke
     assert run.output.count(few) == 1 and run.errors == ""  # a terminal shows both, and the summary has it
 
 
-# logs
-
-
-def test_a_log_in_two_files_gives_what_the_one_file_gives(tmp_path, office, ran):
-    halves = [tmp_path / "0.mcap", tmp_path / "1.mcap"]
-    split(office, halves)
-    whole, run = ran(office), ran(*halves)
-    assert (run.code, run.errors) == (0, "")
-    says(run.output, f"{halves[0]}, {halves[1]} /scan")
-    for name in ("trajectory.tum", "odometry.tum", "graph.g2o", "map.ply"):
-        assert (run.folder / name).read_bytes() == (whole.folder / name).read_bytes(), name
-    logs = json.loads((run.folder / "run.json").read_text())["logs"]
-    assert [log["path"] for log in logs] == list(map(str, halves))
-
-
-def split(path, halves):
-    """Write the messages of a log into two, each with its own schemas and channels."""
-    with path.open("rb") as stream:
-        messages = list(make_reader(stream).iter_messages())
-    middle = len(messages) // 2
-    for half, part in zip(halves, (messages[:middle], messages[middle:]), strict=True):
-        with half.open("wb") as stream:
-            writer, channels = Writer(stream), {}
-            writer.start(profile="ros2")
-            for schema, channel, message in part:
-                if channel.topic not in channels:
-                    number = writer.register_schema(schema.name, schema.encoding, schema.data)
-                    channels[channel.topic] = writer.register_channel(channel.topic, "cdr", number)
-                number = channels[channel.topic]
-                writer.add_message(number, message.log_time, message.data, message.publish_time)
-            writer.finish()
-
-
 def test_a_log_cut_off_is_read_up_to_the_damage_and_the_damage_is_told(call, tmp_path, office, ran):
     path = tmp_path / "cut.mcap"
     whole = office.read_bytes()
@@ -262,13 +195,3 @@ def test_a_log_cut_off_is_read_up_to_the_damage_and_the_damage_is_told(call, tmp
     assert json.loads((run.folder / "run.json").read_text())["complete"]
     says(call("info", path)[1], "damage ", "cut off")
     assert json.loads(call("info", path, "--json")[1])["damage"]
-
-
-def test_a_robot_that_stands_still_gives_a_run_with_one_keyframe(tmp_path, ran):
-    ranges = [np.linspace(1.0, 3.0, 200)] * 5
-    said = [scan_said(STAMP_NS + k * SECOND, laser_scan(STAMP_NS + k * SECOND, r)) for k, r in enumerate(ranges)]
-    path = write(tmp_path / "still.mcap", said)
-    for _ in range(5):  # more than once: what is read beyond an array depends on what lies there
-        run = ran(path)
-        assert (run.code, run.errors) == (0, "")
-        assert run.metrics["keyframes"] == 1 and run.metrics["traveled_m"] < 0.01
