@@ -12,7 +12,7 @@ from scanchain.logs.writing.writer import LogWriter
 from scanchain.settings import flatten
 from scanchain.trajectory import read_tum, write_kitti, write_tum
 from tests.support.messages import says
-from tests.support.naive_logs import SECOND, STAMP_NS
+from tests.support.naive_logs import SECOND, STAMP_NS, laser_scan, odometry, odometry_said, scan_said, write
 from tests.support.scenes import configured
 
 
@@ -144,6 +144,12 @@ def test_true_poses_that_fit_no_scan_are_refused_before_the_work(refused, tmp_pa
     first, last = truth.stamps_ns[[0, -1]] / 1e9
     says(refused("run", office, *words, tmp_path / "old.tum"), "1.000 to 2.000 s", f"{first:.3f} to {last:.3f} s")
     says(refused("run", office, *words, tmp_path / "poses.txt", "--end", "3"), "60 lines for 30 scans")
+    stamps_ns = [STAMP_NS + k * SECOND for k in range(20)]
+    said = [scan_said(stamp_ns, laser_scan(stamp_ns, [3.0] * 31)) for stamp_ns in stamps_ns]
+    said += [odometry_said(stamp_ns, odometry(stamp_ns - STAMP_NS, 0, 0), "/mocap") for stamp_ns in stamps_ns]
+    log = write(tmp_path / "a.mcap", said)
+    says(refused("run", log, *words, "/mocap"), "/mocap", "0.000 to 19.000 s")
+    says(refused("run", log, *words, "/ground_truth"), "/ground_truth", "scanchain info")
 
 
 def test_true_poses_too_far_apart_are_a_warning_and_the_run_stands(call, tmp_path, office, ran):
