@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from scanchain import lie
 from scanchain.__main__ import main
+from scanchain.graph.g2o import read_g2o
 from scanchain.logs import open_log
 from scanchain.settings import flatten
 from scanchain_viz.recording import entities
@@ -165,57 +166,24 @@ def test_covariances_are_symmetric_positive_and_of_a_likely_size(drive):
 
 
 def test_the_graph_holds_the_keyframes_and_what_ties_them_and_chi2_is_the_sum_over_its_edges(drive):
-    vertices, edges = read_g2o(drive.folder / "graph.g2o")
+    graph = read_g2o(drive.folder / "graph.g2o").graph
     steps, metrics = drive.steps, drive.metrics
     scans = np.flatnonzero(steps["keyframe"] >= 0)
-    assert steps["keyframe"][scans].tolist() == list(range(metrics["keyframes"])) == list(vertices)
-    expected = matrices(drive.tum()[scans, 1:])
+    assert steps["keyframe"][scans].tolist() == list(range(metrics["keyframes"])) == list(range(len(graph)))
     refined_m = 0.03 if drive.dimension == 2 else 1e-7  # planar scans are aligned once more, after the graph
-    np.testing.assert_allclose(np.array(list(vertices.values())), expected, atol=refined_m)
-    pairs = [(i, j) for i, j, _, _ in edges]
-    chain = [(i, i + 1) for i in range(len(scans) - 1)]
+    np.testing.assert_allclose(lie.lift(graph.poses), matrices(drive.tum()[scans, 1:]), atol=refined_m)
     loops = drive.table("loops").to_pylist()
-    tied = [(row["target"], row["source"]) for row in loops if row["verdict"] == "accepted"]
-    assert sorted(pairs) == sorted(chain + tied)
+    tied = [[row["target"], row["source"]] for row in loops if row["verdict"] == "accepted"]
+    assert sorted(graph.edges.tolist()) == sorted([*([i, i + 1] for i in range(len(scans) - 1)), *tied])
     assert len(tied) == metrics["closures_accepted"]
     assert len(tied) + metrics["closures_rejected_by_back_end"] == metrics["closures_verified"]
-    for _, _, _, information in edges:
-        assert np.linalg.eigvalsh(information)[0] > 0.0
-    flat = [0, 1, 3] if drive.dimension == 2 else [0, 1, 2, 3]
+    assert (np.linalg.eigvalsh(graph.information)[:, 0] > 0.0).all()
     chi2 = 0.0
-    for i, j, Z, information in edges:
-        e = error(*(T[np.ix_(flat, flat)] for T in (vertices[i], vertices[j], Z)))
+    for (i, j), Z, information in zip(graph.edges, graph.measurements, graph.information, strict=True):
+        e = error(graph.poses[i], graph.poses[j], Z)
         chi2 += e @ information @ e
-    assert chi2 == pytest.approx(drive.metrics["chi2"], rel=1e-6, abs=1e-6)
-    k = len(information)
-    assert drive.metrics["degrees_of_freedom"] == k * (len(edges) - (len(vertices) - 1))
-
-
-def read_g2o(path):
-    """Vertices {id: T (4, 4)} and edges (i, j, Z (4, 4), Ω (k, k)) by the format's definition."""
-    vertices, edges = {}, []
-    for line in path.read_text().splitlines():
-        tag, *words = line.split()
-        if tag.startswith("#"):
-            continue
-        numbers = np.array(words, float)
-        if tag.startswith("VERTEX"):
-            vertices[int(words[0])] = g2o_pose(numbers[1:])
-            continue
-        assert tag in ("EDGE_SE2", "EDGE_SE3:QUAT"), line
-        k, width = (3, 3) if tag == "EDGE_SE2" else (6, 7)
-        information = np.zeros((k, k))
-        information[np.triu_indices(k)] = numbers[2 + width :]
-        information += np.triu(information, 1).T
-        edges.append((int(words[0]), int(words[1]), g2o_pose(numbers[2 : 2 + width]), information))
-    return vertices, edges
-
-
-def g2o_pose(numbers):
-    if len(numbers) == 7:
-        return matrices(numbers[None])[0]
-    x, y, yaw = numbers
-    return matrices(np.array([[x, y, 0.0, 0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)]]))[0]
+    assert chi2 == pytest.approx(metrics["chi2"], rel=1e-6, abs=1e-6)
+    assert metrics["degrees_of_freedom"] == len(information) * (len(graph.edges) - (len(graph) - 1))
 
 
 def test_loop_closures_are_told_with_verdict_and_reason_and_the_accepted_ones_are_true(office, town):
