@@ -1,6 +1,5 @@
 """Public functions end in a right answer, or in an InputError that names the argument and what is wanted."""
 
-import math
 from dataclasses import replace
 
 import msgspec
@@ -93,7 +92,6 @@ I3, I4 = np.eye(3), np.eye(4)
         (lambda: Slam(Config(), np.eye(5)), r"T_base_lidar has the shape \(5, 5\); wanted a \(4, 4\) pose"),
         (lambda: create_matcher(Config()), "config is .*; wanted a MatchingConfig"),
         (lambda: scan(np.zeros((9, 4))), r"points has the shape \(9, 4\); wanted \(N, 3\).*points\[:, :3\]"),
-        (lambda: scan(np.zeros((3, 9))), r"points has the shape \(3, 9\).*transposed\? pass points.T"),
         (lambda: scan(np.zeros((9, 3)), times_s=np.arange(8.0)), r"times_s has the shape \(8,\); wanted \(9,\)"),
         (lambda: scan(np.zeros((2, 3)), times_s=[0, 10**8]), "times_s: a point lies 1e.08 s from the stamp"),
         (lambda: Slam(Config(), I4).finish(), "no scan was processed"),
@@ -105,28 +103,18 @@ I3, I4 = np.eye(3), np.eye(4)
         (lambda: Odometry(Config(), I4).process(I3), "scan is an array of the shape .*; wanted a Scan"),
         (lambda: Odometry(Config(), I4).process(scan(FLAT)), "scan 0 has 2D points; wanted"),
         (lambda: PoseGraph(2).add_pose(I4, 0), r"T_world has the shape \(4, 4\); wanted a \(3, 3\) pose"),
-        (lambda: PoseGraph(2).add_pose(I3, 0.5), "stamp_ns is 0.5"),
-        (lambda: PoseGraph(2).add_point([1.0, math.nan], 0), "position holds NaN"),
-        (lambda: PoseGraph(3).add_edge(0, 1, I3, np.eye(6)), r"T_ij has the shape \(3, 3\)"),
         (lambda: PoseGraph(2).add_edge(0, 1, I3, np.eye(6)), r"information has the shape \(6, 6\); wanted"),
-        (lambda: PoseGraph(2).add_edge(0.0, 1, I3, I3), "i is 0.0; wanted the index of a pose"),
         (lambda: PoseGraph(2).add_edges([[0.5, 1]], I3[None], I3[None], [False]), "edges holds float64; wanted"),
-        (lambda: replace(scan(I3), dropped=-1), "dropped is -1; wanted a number of returns, from 0"),
         (lambda: PoseGraph(2).add_edge(0, 1, I3, I3, is_loop="no"), "is_loop is 'no'; wanted True or False"),
-        (lambda: PoseGraph(2).add_edges([[0, 1]], I3[None], I3[None], ["no"]), "is_loop .* wanted .* True or"),
         (lambda: PoseGraph(2).optimize(Config()), "config is .*; wanted a GraphConfig"),
         (lambda: PoseGraph(2).optimize(GraphConfig(), initialize="best"), "initialize is 'best'; it must be"),
-        (lambda: PoseGraph(2).optimize(GraphConfig(), rejection="fair"), "rejection is 'fair'; it must be"),
         (lambda: open_log("a.mcap", Config()), "config is .*; wanted a LogConfig"),
         (lambda: rigid_transform(ROOM, ROOM[:-1], np.ones(len(ROOM))), "wanted pairs"),
         (lambda: rigid_transform(ROOM, ROOM, -np.ones(len(ROOM))), "weight holds negative"),
         (lambda: rigid_transform(1e200 * ROOM, ROOM), r"source holds .*e\+20\d, over 1e\+50; give meters"),
-        (lambda: rigid_transform(ROOM, ROOM, np.full(len(ROOM), 1e300)), "weight holds .*huge"),
         (lambda: write_tum("/nope/x", Trajectory([0], I4[None])), "/nope/x: cannot be written .*folder"),
         (lambda: write_tum("a.tum", "abc"), "trajectory is 'abc'; wanted a Trajectory"),
-        (lambda: write_tum(3, Trajectory([0], I4[None])), "path is 3; wanted a path"),
         (lambda: read_tum(3), "path is 3; wanted a path"),
-        (lambda: read_tum("a\0b"), "path is .*; wanted a path"),
         (lambda: load_settings(overrides="x"), "overrides is 'x'; wanted a list of Override"),
         (lambda: load_settings(3, file=3), "file is 3; wanted the path"),
         (lambda: Trajectory(np.arange(3), np.zeros((2, 4, 4))), r"poses has the shape \(2, 4, 4\)"),
