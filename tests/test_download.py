@@ -84,22 +84,18 @@ def test_a_line_that_breaks_is_gone_on_with_and_nothing_comes_twice(site, tmp_pa
     assert site.asked == [None, "bytes=1000000-", "bytes=1500000-"]
 
 
-def test_a_download_that_was_given_up_is_resumed_by_the_next_call(site, tmp_path):
+@pytest.mark.parametrize("changes", [False, True])
+def test_a_download_that_was_given_up_is_resumed_by_the_next_call_unless_the_file_changed(site, tmp_path, changes):
     site.cuts = [700_000, 0, 0, 0]
     with pytest.raises(DownloadError, match="700,000 bytes are kept"):
-        fetch(f"{site.url}/file.bin", tmp_path / "a", sha256=SHA256)
-    assert left(tmp_path) == [".a.part", ".a.part.etag"]
-    fetch(f"{site.url}/file.bin", tmp_path / "a", sha256=SHA256)
-    assert left(tmp_path) == ["a"] and site.asked[-1] == "bytes=700000-" and site.sent == len(CONTENT)
-
-
-def test_a_file_that_changed_meanwhile_is_fetched_anew(site, tmp_path):
-    site.cuts = [700_000, 0, 0, 0]
-    with pytest.raises(DownloadError):
         fetch(f"{site.url}/file.bin", tmp_path / "a")
-    site.files["/file.bin"], site.etag = CONTENT[::-1], '"two"'
+    assert left(tmp_path) == [".a.part", ".a.part.etag"]
+    if changes:
+        site.files["/file.bin"], site.etag = CONTENT[::-1], '"two"'
     fetch(f"{site.url}/file.bin", tmp_path / "a")
-    assert (tmp_path / "a").read_bytes() == CONTENT[::-1]
+    assert left(tmp_path) == ["a"] and site.asked[-1] == "bytes=700000-"
+    assert (tmp_path / "a").read_bytes() == site.files["/file.bin"]
+    assert site.sent == len(CONTENT) + (700_000 if changes else 0)
 
 
 @pytest.mark.parametrize("lack", ["ranges", "etag"])
