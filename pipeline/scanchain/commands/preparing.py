@@ -59,35 +59,31 @@ def show(settings: Settings, as_json: bool) -> None:
       scanchain config show --lidar 2d --matching.max_distance_m 0.3
       scanchain config show --config mine.toml --json
     """
-    values, keys = flatten(settings.config), config_keys().values()
+    values = flatten(settings.config)
+    rows: list[dict[str, Any]] = [
+        {
+            "key": key.name,
+            "value": values[key.name],
+            "unit": key.unit,
+            "range": key.range,
+            "default": key.default,
+            "description": key.description,
+        }
+        for key in config_keys().values()
+    ]
     if as_json:
-        rows = [
-            {
-                "key": key.name,
-                "value": values[key.name],
-                "unit": key.unit,
-                "range": key.range,
-                "default": key.default,
-                "description": key.description,
-            }
-            for key in keys
-        ]
         click.echo(options.json_text(rows))
         return
     click.echo(f"# {settings.source}; * differs from the default")
+    marks = [" " if row["value"] == row["default"] else "*" for row in rows]
     cells = [
-        (
-            f"{'*' if values[key.name] != key.default else ' '} {key.name}",
-            _text(values[key.name]),
-            key.unit,
-            key.range,
-        )
-        for key in keys
+        (f"{mark} {row['key']}", _text(row["value"]), row["unit"], row["range"])
+        for mark, row in zip(marks, rows, strict=True)
     ]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    for row, key in zip(cells, keys, strict=True):
-        click.echo("  ".join(map(str.ljust, row, widths)).rstrip())
-        description = key.description.replace("``", "")
+    for cell, row in zip(cells, rows, strict=True):
+        click.echo("  ".join(map(str.ljust, cell, widths)).rstrip())
+        description = row["description"].replace("``", "")
         click.echo(textwrap.fill(description, 100, initial_indent=_INDENT, subsequent_indent=_INDENT))
 
 
