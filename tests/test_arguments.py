@@ -1,6 +1,5 @@
 """Public functions end in a right answer, or in an InputError that names the argument and what is wanted."""
 
-import math
 from dataclasses import replace
 
 import msgspec
@@ -20,7 +19,6 @@ from scanchain import (
     Trajectory,
     VoxelMap,
     create_matcher,
-    evaluate,
     lie,
     load_settings,
     open_log,
@@ -30,9 +28,8 @@ from scanchain import (
 )
 from scanchain.config import GraphConfig, LocalMapConfig, MatchingConfig, PreprocessConfig
 from scanchain.evaluation import absolute_error, pair
-from tests.support.scenes import shared_data
 
-CALLS = 500
+CALLS = 200
 
 
 def place(dimension, count, rng, unit=1.0):
@@ -84,10 +81,8 @@ I3, I4 = np.eye(3), np.eye(4)
     ("call", "words"),
     [
         (lambda: VoxelMap(4, LocalMapConfig()), "dimension is 4; it must be 2"),
-        (lambda: VoxelMap(3, LocalMapConfig(), -1.0), "scale is -1.0; wanted a finite number > 0"),
         (lambda: VoxelMap(3, Config()), "config is .*; wanted a LocalMapConfig"),
         (lambda: LocalMapConfig(voxel_size_m=-1.0), "voxel_size_m is -1.0; it must be a number > 0, in m"),
-        (lambda: LocalMapConfig(voxel_size_m=0), "local_map.voxel_size_m is 0; it must be a number > 0"),
         (lambda: MatchingConfig(matcher="gicp"), "matching.matcher is 'gicp'; it must be one of plicp, svd"),
         (lambda: MatchingConfig(max_iterations=2.5), "matching.max_iterations is 2.5; it must be a whole number"),
         (lambda: Config(matching=PreprocessConfig()), "matching is .*; wanted a MatchingConfig"),
@@ -95,53 +90,33 @@ I3, I4 = np.eye(3), np.eye(4)
         (lambda: Odometry(MatchingConfig(), I4), "config is .*; wanted a Config"),
         (lambda: Odometry(Config(), 2.0 * I4), r"T_base_lidar is no rigid transformation \(off by 3\)"),
         (lambda: Slam(Config(), np.eye(5)), r"T_base_lidar has the shape \(5, 5\); wanted a \(4, 4\) pose"),
-        (lambda: load_settings(4), "dimension is 4"),
         (lambda: create_matcher(Config()), "config is .*; wanted a MatchingConfig"),
         (lambda: scan(np.zeros((9, 4))), r"points has the shape \(9, 4\); wanted \(N, 3\).*points\[:, :3\]"),
-        (lambda: scan(np.zeros((3, 9))), r"points has the shape \(3, 9\).*transposed\? pass points.T"),
         (lambda: scan(np.zeros((9, 3)), times_s=np.arange(8.0)), r"times_s has the shape \(8,\); wanted \(9,\)"),
         (lambda: scan(np.zeros((2, 3)), times_s=[0, 10**8]), "times_s: a point lies 1e.08 s from the stamp"),
-        (lambda: scan(np.zeros((2, 3)), times_s=[0.0, np.nan]), "times_s"),
         (lambda: Slam(Config(), I4).finish(), "no scan was processed"),
         (lambda: finished().finish(), "Slam.finish was called: .*; begin another Slam"),
-        (lambda: finished().process(scan(ROOM)), "Slam.finish was called: .*; begin another Slam"),
         (lambda: open_log(3), "a log is 3; wanted a path"),
         (lambda: open_log([]), "no log was given; wanted a path"),
-        (lambda: open_log([None]), r"a log is \[None\]; wanted a path"),
         (lambda: scan(np.zeros((2, 2)), T_odom_base=I4), r"T_odom_base has the shape \(4, 4\); wanted a \(3, 3\)"),
         (lambda: replace(scan(I3), stamp_ns=1.7e9), "stamp_ns is 1700000000.0; wanted nanoseconds as int"),
         (lambda: Odometry(Config(), I4).process(I3), "scan is an array of the shape .*; wanted a Scan"),
         (lambda: Odometry(Config(), I4).process(scan(FLAT)), "scan 0 has 2D points; wanted"),
-        (lambda: Slam(Config(), I4).process(ROOM), "scan is an array"),
-        (lambda: PoseGraph(4), "dimension is 4"),
         (lambda: PoseGraph(2).add_pose(I4, 0), r"T_world has the shape \(4, 4\); wanted a \(3, 3\) pose"),
-        (lambda: PoseGraph(2).add_pose(I3, 0.5), "stamp_ns is 0.5"),
-        (lambda: PoseGraph(2).add_point([1.0, math.nan], 0), "position holds NaN"),
-        (lambda: PoseGraph(3).add_edge(0, 1, I3, np.eye(6)), r"T_ij has the shape \(3, 3\)"),
         (lambda: PoseGraph(2).add_edge(0, 1, I3, np.eye(6)), r"information has the shape \(6, 6\); wanted"),
-        (lambda: PoseGraph(2).add_edge(0.0, 1, I3, I3), "i is 0.0; wanted the index of a pose"),
         (lambda: PoseGraph(2).add_edges([[0.5, 1]], I3[None], I3[None], [False]), "edges holds float64; wanted"),
-        (lambda: replace(scan(I3), dropped=-1), "dropped is -1; wanted a number of returns, from 0"),
-        (lambda: replace(scan(I3), index=-1), "index is -1; wanted the number of the scan, from 0"),
         (lambda: PoseGraph(2).add_edge(0, 1, I3, I3, is_loop="no"), "is_loop is 'no'; wanted True or False"),
-        (lambda: PoseGraph(2).add_edges([[0, 1]], I3[None], I3[None], ["no"]), "is_loop .* wanted .* True or"),
-        (lambda: PoseGraph(2).add_edges([[0, 1]], I3[None], I3[None], [0]), "is_loop .* wanted .* True or"),
         (lambda: PoseGraph(2).optimize(Config()), "config is .*; wanted a GraphConfig"),
         (lambda: PoseGraph(2).optimize(GraphConfig(), initialize="best"), "initialize is 'best'; it must be"),
-        (lambda: PoseGraph(2).optimize(GraphConfig(), rejection="fair"), "rejection is 'fair'; it must be"),
         (lambda: open_log("a.mcap", Config()), "config is .*; wanted a LogConfig"),
         (lambda: rigid_transform(ROOM, ROOM[:-1], np.ones(len(ROOM))), "wanted pairs"),
         (lambda: rigid_transform(ROOM, ROOM, -np.ones(len(ROOM))), "weight holds negative"),
         (lambda: rigid_transform(1e200 * ROOM, ROOM), r"source holds .*e\+20\d, over 1e\+50; give meters"),
-        (lambda: rigid_transform(ROOM, ROOM, np.full(len(ROOM), 1e300)), "weight holds .*huge"),
         (lambda: write_tum("/nope/x", Trajectory([0], I4[None])), "/nope/x: cannot be written .*folder"),
         (lambda: write_tum("a.tum", "abc"), "trajectory is 'abc'; wanted a Trajectory"),
-        (lambda: write_tum(3, Trajectory([0], I4[None])), "path is 3; wanted a path"),
         (lambda: read_tum(3), "path is 3; wanted a path"),
-        (lambda: read_tum("a\0b"), "path is .*; wanted a path"),
         (lambda: load_settings(overrides="x"), "overrides is 'x'; wanted a list of Override"),
         (lambda: load_settings(3, file=3), "file is 3; wanted the path"),
-        (lambda: evaluate(Trajectory([0], I4[None]), Trajectory([0], I4[None])), "one paired pose alone"),
         (lambda: Trajectory(np.arange(3), np.zeros((2, 4, 4))), r"poses has the shape \(2, 4, 4\)"),
     ],
 )  # fmt: skip
@@ -151,21 +126,6 @@ def test_a_wrong_argument_is_named_with_what_came_and_what_is_wanted(call, words
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("matcher", "given", "words"),
-    [
-        ("plicp", {"wide": "no"}, "wide is 'no'; wanted True or False"),
-        ("svd", {"wide": 1}, "wide is 1; wanted True or False"),
-        ("plicp", {"prior": I4}, "prior is an array .*; wanted a Prior"),
-    ],
-)
-def test_how_to_align_is_told_by_the_right_kind_of_argument(matcher, given, words):
-    align, target = mapped(ROOM, matcher)
-    with pytest.raises(InputError, match=words):
-        align.align(ROOM, target, I4, **given)
-    assert align.align(ROOM, target, I4, wide=np.True_).converged
-
-
 @pytest.mark.parametrize("matcher", ["plicp", "svd"])
 @pytest.mark.parametrize(
     ("points", "T_first", "words"),
@@ -173,13 +133,10 @@ def test_how_to_align_is_told_by_the_right_kind_of_argument(matcher, given, word
         (np.column_stack([ROOM, np.ones(len(ROOM))]), I4, r"wanted \(N, 3\).*points\[:, :3\]"),
         (ROOM[:, :2], I4, r"wanted \(N, 3\), one row a point; 2D points need a 2D map"),
         (ROOM.T, I4, "transposed"),
-        (ROOM[0], I4, r"points has the shape \(3,\)"),
         ([["a", "b", "c"]], I4, "points holds text, not real numbers"),
         ([[1.0, 2.0, 3.0], [4.0]], I4, "no array"),
-        (ROOM.astype(complex), I4, "complex"),
         (np.where(ROOM > 1.9, np.nan, ROOM), I4, "points: .* of 4,000 points are NaN or infinite"),
         (1e7 * ROOM, I4, "points reach .* m from the origin"),
-        (ROOM, 2.0 * I4, "T_first is no rigid transformation"),
         (ROOM, np.diag([1.0, 1.0, -1.0, 1.0]), "T_first is no rigid transformation"),
         (ROOM, I3, r"T_first has the shape \(3, 3\); wanted a \(4, 4\) pose, because the points are 3D"),
         (ROOM, None, "T_first is None; wanted a"),
@@ -187,6 +144,8 @@ def test_how_to_align_is_told_by_the_right_kind_of_argument(matcher, given, word
 )
 def test_what_cannot_be_aligned_or_inserted_is_refused(matcher, points, T_first, words):
     align, target = mapped(ROOM, matcher)
+    with pytest.raises(InputError, match="wide is 'no'; wanted True or False"):
+        align.align(ROOM, target, I4, wide="no")
     with pytest.raises(InputError, match=words):
         align.align(points, target, T_first)
     with pytest.raises(InputError, match=words.replace("T_first", "T_map_lidar")):
@@ -212,13 +171,6 @@ def test_what_converts_without_loss_is_aligned_like_a_contiguous_array_of_double
     assert given.converged
 
 
-def test_integers_and_half_precision_are_points_too():
-    align, target = mapped(10.0 * ROOM)
-    for dtype in (np.float16, np.int16, np.uint8):
-        source = np.abs(np.round(10.0 * ROOM[::3])).astype(dtype)
-        assert align.align(source, target, I4).points == len(source)
-
-
 @pytest.mark.parametrize("matcher", ["plicp", "svd"])
 def test_a_single_point_or_a_plane_is_not_called_converged(matcher):
     align, target = mapped(ROOM, matcher)
@@ -236,8 +188,7 @@ def corridor(beams, noise_m, rng):
 
 
 @pytest.mark.parametrize("matcher", ["plicp", "svd"])
-@pytest.mark.parametrize("noise_m", [0.005, 0.01, 0.02, 0.03])
-@pytest.mark.parametrize("beams", [360, 1080])
+@pytest.mark.parametrize(("noise_m", "beams"), [(0.005, 360), (0.01, 1080), (0.03, 360), (0.03, 1080)])
 def test_scans_of_a_bare_corridor_are_not_called_converged_however_noisy(matcher, noise_m, beams):
     """Noise bends the walls' normals, which then seem to hold the scan along the corridor."""
     rng = np.random.default_rng(0)
@@ -245,37 +196,6 @@ def test_scans_of_a_bare_corridor_are_not_called_converged_however_noisy(matcher
         align, target = mapped(corridor(beams, noise_m, rng), matcher)
         match = align.align(corridor(beams, noise_m, rng), target, I3, wide=True)
         assert not match.converged and "undetermined" in match.reason
-
-
-def sweeps(name, *numbers):
-    """Sweeps of a real log."""
-    wanted = dict.fromkeys(numbers)
-    for each in open_log(shared_data(f"3d/{name}")).scans():
-        if each.index in wanted:
-            wanted[each.index] = each.points
-        if each.index == max(numbers):
-            return tuple(wanted.values())
-
-
-@pytest.mark.parametrize("matcher", ["plicp", "svd"])
-def test_real_sweeps_too_far_apart_for_the_search_or_of_another_place_are_not_called_converged(matcher):
-    first, fourth = sweeps("kitti_0001_first54.mcap", 0, 4)
-    (elsewhere,) = sweeps("kitti_0005_first60.mcap", 0)
-    for target, source in ((first, fourth), (first, elsewhere), (elsewhere, first)):
-        align, surfaces = mapped(target.astype(float), matcher)
-        match = align.align(source, surfaces, I4, wide=True)
-        assert not match.converged and match.fit < 0.6
-        assert match.inliers < 0.99 * len(source)
-
-
-def test_real_sweeps_within_the_search_are_called_converged():
-    first, second, fourth = sweeps("kitti_0001_first54.mcap", 0, 1, 4)
-    align, surfaces = mapped(first.astype(float))
-    ahead = lie.exp(np.array([5.3, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    for source, T_first, traveled_m in ((second, I4, 1.34), (fourth, ahead, 5.35)):
-        match = align.align(source, surfaces, T_first, wide=True)
-        assert match.converged and match.fit > 0.8
-        assert match.T_target_source[0, 3] == pytest.approx(traveled_m, abs=0.05)
 
 
 shapes = st.one_of(
@@ -393,22 +313,16 @@ def test_the_closed_form_takes_pairs_or_refuses_them(source, target, weight):
     assert T is None or np.isfinite(T).all()
 
 
-@fuzzed(st.one_of(arrays(), good_points), anything, anything, anything)
-def test_a_scan_of_anything_is_tracked_or_refused(points, times_s, T_odom_base, stamp_ns):
-    made = tried(lambda: Scan(0, stamp_ns, 0, points, times_s, 0, T_odom_base))
-    if made is not None:
-        config = load_settings(made.points.shape[1]).config
-        odometry = Odometry(config, lie.identity(made.points.shape[1]))
-        tracked = [tried(lambda: odometry.process(made)) for _ in range(2)]
-        assert all(np.isfinite(each.T_odom_lidar).all() for each in tracked if each is not None)
+times = st.one_of(anything, st.just(np.empty(0)))
 
 
-@fuzzed(st.one_of(arrays(), good_points), st.one_of(arrays(), st.just(np.empty(0))), st.integers(0, 10**10))
-def test_odometry_and_slam_go_on_after_any_scan_that_they_take(points, times_s, later_ns):
+@fuzzed(st.one_of(arrays(), good_points), times, st.one_of(anything, st.none()), st.integers(0, 10**10))
+def test_odometry_and_slam_go_on_after_any_scan_that_they_take(points, times_s, T_odom_base, later_ns):
     for d, place_ in ((2, FLAT[::10]), (3, ROOM[::10])):
         slam = Slam(load_settings(d).config, lie.identity(d))
         slam.process(scan(place_))
-        tried(lambda: slam.process(replace(scan(points, times_s=times_s), stamp_ns=later_ns)))  # noqa: B023
+        given = {"times_s": times_s, "T_odom_base": T_odom_base}
+        tried(lambda: slam.process(replace(scan(points, **given), stamp_ns=later_ns)))  # noqa: B023
         assert np.isfinite(slam.process(replace(scan(place_), stamp_ns=2 * 10**8)).T_world_lidar).all()
 
 

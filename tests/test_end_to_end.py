@@ -21,12 +21,13 @@ from scipy.spatial.transform import Rotation
 
 from scanchain import lie
 from scanchain.__main__ import main
+from scanchain.graph.g2o import read_g2o
 from scanchain.logs import open_log
 from scanchain.settings import flatten
 from scanchain_viz.recording import entities
 from tests.support.naive_graph import error
 from tests.support.naive_maps import served_map
-from tests.support.recordings import EVERY_SCAN, FOR_EVER, column, rows_of, static_entities
+from tests.support.recordings import EVERY_SCAN, column, rows_of, static_entities
 from tests.support.scenes import ROOT, configured, shared_data
 
 FILES = {
@@ -121,7 +122,8 @@ def length_m(rows):
     return np.linalg.norm(np.diff(rows[:, 1:4], axis=0), axis=1).sum()
 
 
-# the directory
+def stamps_of(path):
+    return [line.split()[0] for line in path.read_text().splitlines()]
 
 
 def test_a_run_directory_holds_every_file_and_no_other(drive):
@@ -130,42 +132,26 @@ def test_a_run_directory_holds_every_file_and_no_other(drive):
     assert [path.name for path in drive.folder.parent.iterdir() if "partial" in path.name] == []
 
 
-@pytest.mark.parametrize("name", ["trajectory", "odometry"])
-def test_trajectories_have_a_unit_quaternion_at_the_exact_stamp_of_every_scan(drive, name):
-    stamps = [line.split()[0] for line in (drive.folder / f"{name}.tum").read_text().splitlines()]
-    assert stamps == [line.split()[0] for line in drive.log.with_suffix(".tum").read_text().splitlines()]
-    assert all(re.fullmatch(r"\d+\.\d{9}", stamp) for stamp in stamps)
-    rows = drive.tum(name)
-    np.testing.assert_allclose(np.linalg.norm(rows[:, 4:], axis=1), 1.0, atol=1e-8)
-    if drive.dimension == 2:
-        assert not rows[:, [3, 4, 5]].any()
-
-
-def test_the_robot_has_a_trajectory_of_its_own_in_the_frame_of_the_lidar(drive):
+def test_trajectories_and_steps_have_the_same_pose_at_the_exact_stamp_of_every_scan(drive):
+    steps, stamps = drive.steps, stamps_of(drive.log.with_suffix(".tum"))
+    assert steps["index"].tolist() == list(range(len(stamps)))
+    assert [f"{stamp // 10**9}.{stamp % 10**9:09d}" for stamp in steps["stamp_ns"].tolist()] == stamps
+    for name, prefix in (("trajectory", ""), ("odometry", "odom_")):
+        assert stamps_of(drive.folder / f"{name}.tum") == stamps
+        rows = drive.tum(name)
+        np.testing.assert_allclose(np.linalg.norm(rows[:, 4:], axis=1), 1.0, atol=1e-8)
+        assert drive.dimension == 3 or not rows[:, [3, 4, 5]].any()
+        columns = [steps[prefix + axis] for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+        np.testing.assert_allclose(np.column_stack(columns), rows[:, 1:], atol=1e-9)
+    lidars = matrices(drive.tum()[:, 1:])
+    rows = np.loadtxt(drive.folder / "trajectory.kitti.txt").reshape(-1, 3, 4)
+    np.testing.assert_allclose(rows, lidars[:, :3], atol=1e-7)
     T_base_lidar = open_log(drive.log).T_base_lidar
     mounted = T_base_lidar if drive.dimension == 3 else lie.lift(T_base_lidar)
     assert abs(mounted[0, 3]) > 0.1 or abs(mounted[2, 3]) > 0.1
-    bases, lidars = matrices(drive.tum("trajectory_base")[:, 1:]), matrices(drive.tum()[:, 1:])
-    np.testing.assert_allclose(bases @ mounted, lidars, atol=1e-7)
-
-
-def test_the_kitti_file_holds_the_same_poses(drive):
-    rows = np.loadtxt(drive.folder / "trajectory.kitti.txt").reshape(-1, 3, 4)
-    np.testing.assert_allclose(rows, matrices(drive.tum()[:, 1:])[:, :3], atol=1e-7)
-
-
-def test_steps_have_a_row_a_scan_that_agrees_with_the_trajectories(drive):
-    steps = drive.steps
-    assert steps["index"].tolist() == list(range(len(drive.truth)))
-    for name, prefix in (("trajectory", ""), ("odometry", "odom_")):
-        columns = [steps[prefix + axis] for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")]
-        np.testing.assert_allclose(np.column_stack(columns), drive.tum(name)[:, 1:], atol=1e-9)
-    stamps = [f"{stamp // 10**9}.{stamp % 10**9:09d}" for stamp in steps["stamp_ns"].tolist()]
-    assert stamps == [line.split()[0] for line in (drive.folder / "trajectory.tum").read_text().splitlines()]
+    np.testing.assert_allclose(matrices(drive.tum("trajectory_base")[:, 1:]) @ mounted, lidars, atol=1e-7)
     assert set(steps["state"]) == {"ok"} and (steps["inliers"] <= steps["points"]).all()
-    for name in TIMED_COLUMNS:
-        assert (steps[name] >= 0.0).all(), name
-    assert (steps["match_s"] > 0.0).all()
+    assert all((steps[name] >= 0.0).all() for name in TIMED_COLUMNS) and (steps["match_s"] > 0.0).all()
 
 
 def test_covariances_are_symmetric_positive_and_of_a_likely_size(drive):
@@ -179,65 +165,28 @@ def test_covariances_are_symmetric_positive_and_of_a_likely_size(drive):
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0, atol=1e-6)
 
 
-def test_the_graph_holds_the_keyframes_and_what_ties_them(drive):
-    vertices, edges = read_g2o(drive.folder / "graph.g2o")
+def test_the_graph_holds_the_keyframes_and_what_ties_them_and_chi2_is_the_sum_over_its_edges(drive):
+    graph = read_g2o(drive.folder / "graph.g2o").graph
     steps, metrics = drive.steps, drive.metrics
     scans = np.flatnonzero(steps["keyframe"] >= 0)
-    assert steps["keyframe"][scans].tolist() == list(range(metrics["keyframes"])) == list(vertices)
-    expected = matrices(drive.tum()[scans, 1:])
+    assert steps["keyframe"][scans].tolist() == list(range(metrics["keyframes"])) == list(range(len(graph)))
     refined_m = 0.03 if drive.dimension == 2 else 1e-7  # planar scans are aligned once more, after the graph
-    np.testing.assert_allclose(np.array(list(vertices.values())), expected, atol=refined_m)
-    pairs = [(i, j) for i, j, _, _ in edges]
-    chain = [(i, i + 1) for i in range(len(scans) - 1)]
+    np.testing.assert_allclose(lie.lift(graph.poses), matrices(drive.tum()[scans, 1:]), atol=refined_m)
     loops = drive.table("loops").to_pylist()
-    tied = [(row["target"], row["source"]) for row in loops if row["verdict"] == "accepted"]
-    assert sorted(pairs) == sorted(chain + tied)
+    tied = [[row["target"], row["source"]] for row in loops if row["verdict"] == "accepted"]
+    assert sorted(graph.edges.tolist()) == sorted([*([i, i + 1] for i in range(len(scans) - 1)), *tied])
     assert len(tied) == metrics["closures_accepted"]
     assert len(tied) + metrics["closures_rejected_by_back_end"] == metrics["closures_verified"]
-    for _, _, _, information in edges:
-        assert np.linalg.eigvalsh(information)[0] > 0.0
-
-
-def test_chi2_is_the_sum_over_the_edges_of_the_graph(drive):
-    vertices, edges = read_g2o(drive.folder / "graph.g2o")
-    flat = [0, 1, 3] if drive.dimension == 2 else [0, 1, 2, 3]
+    assert (np.linalg.eigvalsh(graph.information)[:, 0] > 0.0).all()
     chi2 = 0.0
-    for i, j, Z, information in edges:
-        e = error(*(T[np.ix_(flat, flat)] for T in (vertices[i], vertices[j], Z)))
+    for (i, j), Z, information in zip(graph.edges, graph.measurements, graph.information, strict=True):
+        e = error(graph.poses[i], graph.poses[j], Z)
         chi2 += e @ information @ e
-    assert chi2 == pytest.approx(drive.metrics["chi2"], rel=1e-6, abs=1e-6)
-    k = len(information)
-    assert drive.metrics["degrees_of_freedom"] == k * (len(edges) - (len(vertices) - 1))
+    assert chi2 == pytest.approx(metrics["chi2"], rel=1e-6, abs=1e-6)
+    assert metrics["degrees_of_freedom"] == len(information) * (len(graph.edges) - (len(graph) - 1))
 
 
-def read_g2o(path):
-    """Vertices {id: T (4, 4)} and edges (i, j, Z (4, 4), Ω (k, k)) by the format's definition."""
-    vertices, edges = {}, []
-    for line in path.read_text().splitlines():
-        tag, *words = line.split()
-        if tag.startswith("#"):
-            continue
-        numbers = np.array(words, float)
-        if tag.startswith("VERTEX"):
-            vertices[int(words[0])] = g2o_pose(numbers[1:])
-            continue
-        assert tag in ("EDGE_SE2", "EDGE_SE3:QUAT"), line
-        k, width = (3, 3) if tag == "EDGE_SE2" else (6, 7)
-        information = np.zeros((k, k))
-        information[np.triu_indices(k)] = numbers[2 + width :]
-        information += np.triu(information, 1).T
-        edges.append((int(words[0]), int(words[1]), g2o_pose(numbers[2 : 2 + width]), information))
-    return vertices, edges
-
-
-def g2o_pose(numbers):
-    if len(numbers) == 7:
-        return matrices(numbers[None])[0]
-    x, y, yaw = numbers
-    return matrices(np.array([[x, y, 0.0, 0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)]]))[0]
-
-
-def test_loop_closures_are_told_with_verdict_and_reason_and_the_accepted_ones_are_true(office):
+def test_loop_closures_are_told_with_verdict_and_reason_and_the_accepted_ones_are_true(office, town):
     rows, metrics = office.table("loops").to_pylist(), office.metrics
     verdicts = [row["verdict"] for row in rows]
     assert (len(rows), verdicts.count("accepted")) == (metrics["closures_tried"], metrics["closures_accepted"])
@@ -253,9 +202,6 @@ def test_loop_closures_are_told_with_verdict_and_reason_and_the_accepted_ones_ar
             assert row["weight"] >= 0.1
         else:
             assert row["weight"] < 0.1
-
-
-def test_a_run_without_closures_has_an_empty_table_of_the_same_columns(office, town):
     assert town.table("loops").num_rows == town.metrics["closures_tried"] == 0
     assert town.table("loops").schema.names == office.table("loops").schema.names
 
@@ -292,15 +238,6 @@ def test_the_way_leads_over_free_cells(drive):
         assert (values == 0).mean() > 0.95
 
 
-def test_the_cloud_of_a_3d_log_lies_round_the_way_and_is_thinned_out(town):
-    points = read_ply(town.folder / "map.ply")
-    distance_m, _ = cKDTree(town.tum()[:, 1:4]).query(points)
-    assert 1.0 < distance_m.min() < 5.0 and distance_m.max() < 101.0
-    assert np.ptp(points[:, 2]) > 2.0
-    voxels = np.unique(np.floor(points.astype(float) / 0.2).astype(int), axis=0)
-    assert len(voxels) > 0.95 * len(points)
-
-
 def test_the_metrics_agree_with_the_files(drive):
     metrics, steps = drive.metrics, drive.steps
     assert metrics["dimension"] == drive.dimension
@@ -312,15 +249,8 @@ def test_the_metrics_agree_with_the_files(drive):
     assert metrics["times_real_time"] == pytest.approx(span_s / metrics["run_s"])
     assert metrics["scans_per_s"] == pytest.approx(metrics["scans"] / metrics["run_s"])
     assert metrics["map_points"] == len(read_ply(drive.folder / "map.ply"))
-    left_out = f"{metrics['moving_points_removed']:,} more removed as moving"
-    assert left_out in (drive.folder / "summary.txt").read_text(encoding="utf-8")
-    assert metrics["moving_points_removed"] < 0.01 * metrics["map_points"]  # nothing moves there
     assert metrics["traveled_m"] == pytest.approx(length_m(drive.tum()), abs=1e-5)
-    assert (metrics["scan_points"], metrics["dropped_points"]) == (
-        steps["scan_points"].sum(),
-        steps["dropped"].sum(),
-    )
-    assert metrics["median_iterations"] == np.median(steps["iterations"])
+    assert metrics["scan_points"] == steps["scan_points"].sum()
     assert metrics["median_residual_m"] == pytest.approx(np.median(steps["residual_m"]))
     assert metrics["median_inlier_share"] == pytest.approx(np.median(steps["inliers"] / steps["points"]))
     for name in TIMED_COLUMNS:
@@ -329,33 +259,17 @@ def test_the_metrics_agree_with_the_files(drive):
         assert metrics["p95_ms"][stage] == pytest.approx(1e3 * np.percentile(steps[name], 95))
 
 
-def test_the_error_told_is_the_one_scipy_finds(drive):
+def test_the_error_told_is_the_one_scipy_finds_and_below_5_cm_and_3_per_mille_of_the_path(drive):
     told = drive.metrics["ground_truth"]
     assert told["path_length_m"] == pytest.approx(length_m(drive.truth), abs=1e-5)
     for key, name in (("optimized", "trajectory"), ("odometry", "odometry")):
         assert told[key]["ate_rmse_m"] == pytest.approx(ate_m(drive.tum(name), drive.truth), abs=1e-6)
         assert told[key]["pairs"] == len(drive.truth)
-        share = told[key]["ate_rmse_m"] / told["path_length_m"]
-        assert told[key]["ate_share_of_path"] == pytest.approx(share)
-
-
-def test_the_error_is_below_5_cm_and_3_per_mille_of_the_path(drive):
-    found_m = ate_m(drive.tum(), drive.truth)
+    found_m = told["optimized"]["ate_rmse_m"]
     assert found_m < 0.05 and found_m < 0.003 * length_m(drive.truth)
 
 
-def test_the_summary_says_what_the_metrics_say(drive):
-    text, metrics = (drive.folder / "summary.txt").read_text(), drive.metrics
-    assert text.splitlines()[1].startswith(str(drive.log))
-    for part in (
-        f"{metrics['scans']:,} over {metrics['log_span_s']:.1f} s",
-        f"loop closures  {metrics['closures_tried'] or 'none'} tried",
-        f"ATE            rmse {metrics['ground_truth']['optimized']['ate_rmse_m']:.4f} m",
-    ):
-        assert part in text
-
-
-def test_the_run_file_says_what_was_read_and_with_what(drive):
+def test_the_run_file_says_what_was_read_and_the_configuration_is_the_preset_with_the_flags(drive):
     said = json.loads((drive.folder / "run.json").read_text())
     assert said["complete"] and said["stopped"] == ""
     (log,) = said["logs"]
@@ -363,43 +277,22 @@ def test_the_run_file_says_what_was_read_and_with_what(drive):
     assert log["sha256"] == hashlib.sha256(drive.log.read_bytes()).hexdigest()
     assert said["versions"]["scanchain"] and said["versions"]["rerun-sdk"].startswith("0.41")
     assert f"preset lidar{drive.dimension}d" in said["configuration"]
-
-
-def test_the_configuration_written_is_the_preset_with_the_flags(drive):
     tree = tomllib.loads((drive.folder / "config.toml").read_text())
-    flat = {f"{a}.{b}": value for a, branch in tree.items() for b, value in branch.items()}
+    values = {f"{a}.{b}": value for a, branch in tree.items() for b, value in branch.items()}
     changes = {"odometry.prior": "constant-velocity", "loops.min_travel_m": 5.0} if drive.dimension == 2 else {}
-    assert flat == flatten(configured(drive.dimension)) | changes
+    assert values == flatten(configured(drive.dimension)) | changes
 
 
 # the recording
 
 
-def test_the_recording_has_every_entity_and_every_scan_on_both_timelines(drive):
-    path, count = drive.folder / "recording.rrd", drive.metrics["scans"]
-    rows, timelines = rows_of(path)
-    constant = static_entities(path)
-    for entity in EVERY_SCAN:
-        assert rows[entity] - (entity in constant) == count, entity
-    grown = {entities.ODOM, entities.LOCAL_MAP, entities.KEYFRAMES, entities.ODOMETRY_EDGES, entities.STATE}
-    if drive.metrics["closures_tried"]:
-        grown |= {entities.EVENTS, entities.ACCEPTED, entities.REJECTED}
-    for entity in (*EVERY_SCAN, *grown):
-        assert timelines[entity] == {"scan", "sensor_time"}, entity
-    for entity in (*FOR_EVER, entities.MAP, *([entities.GRID] if drive.dimension == 2 else [])):
-        assert timelines[entity] == set(), entity
-    assert RrdReader(str(path)).blueprints()
-
-
-def test_the_recorded_poses_are_those_of_the_trajectories(drive):
+def test_the_recorded_poses_are_those_of_the_trajectories_at_every_scan(drive):
     path = drive.folder / "recording.rrd"
     (strip,) = optimized_strips(path)
     np.testing.assert_allclose(strip, drive.tum()[:, 1:4], atol=1e-4)
-    steps = drive.steps
-    assert sorted(column(path, entities.INLIERS, "scan")) == steps["index"].tolist()
-    inliers = dict(zip(column(path, entities.INLIERS, "scan"), column(path, entities.INLIERS, "Scalars:scalars"),
-                       strict=True))  # fmt: skip
-    assert [inliers[i][0] for i in range(len(steps["index"]))] == steps["inliers"].tolist()
+    rows, constant = rows_of(path)[0], static_entities(path)
+    for entity in EVERY_SCAN:
+        assert rows[entity] - (entity in constant) == drive.metrics["scans"], entity
 
 
 def test_events_edges_counts_and_the_table_agree_on_the_verdict_of_every_closure(drive):
@@ -439,10 +332,6 @@ def test_the_truth_is_drawn_in_recording_and_picture_where_the_trajectory_is(dri
     np.testing.assert_allclose(shown["ground_truth"][:, :3, 3], found, atol=0.1)
 
 
-def test_a_3d_scan_takes_at_most_150_kilobytes_of_recording(town):
-    assert (town.folder / "recording.rrd").stat().st_size / town.metrics["scans"] < 150_000
-
-
 # again
 
 
@@ -466,12 +355,6 @@ def test_the_configuration_written_repeats_the_run(drive, tmp_path):
     words = ["--config", drive.folder / "config.toml", "--rerun", "off"]
     succeed("run", drive.log, "--out", tmp_path / "again", *words)
     assert_same(drive.folder, tmp_path / "again")
-
-
-def test_the_office_needs_no_flag(tmp_path):
-    drive = driven(tmp_path, "office", 2, ["--duration", "20", "--seed", "3"])
-    found_m = ate_m(drive.tum(), drive.truth)
-    assert found_m < 0.05 and found_m < 0.003 * length_m(drive.truth)
 
 
 # real logs
@@ -513,12 +396,3 @@ def test_a_real_drive_without_a_time_per_point_runs_without_any_flag(tmp_path):
     assert (metrics["scans"], metrics["ok"], metrics["dimension"]) == (60, 60, 3)
     assert metrics["ground_truth"] is None
     assert (tmp_path / "a" / "recording.rrd").stat().st_size / 60 < 150_000
-
-
-def test_a_real_drive_stays_within_10_cm_of_its_gps(tmp_path):
-    log = shared_data("3d/kitti_0001_first54.mcap")
-    succeed("run", log, "--out", tmp_path / "a", "--rerun", "off")
-    estimate = np.loadtxt(tmp_path / "a" / "trajectory.tum")
-    assert ate_m(estimate, np.loadtxt(log.with_suffix(".tum"))) <= 0.10
-    tree = json.loads(succeed("evaluate", tmp_path / "a" / "trajectory.tum", log.with_suffix(".tum"), "--json"))
-    assert tree["ate"]["translation_m"]["rmse"] <= 0.10 and tree["ate"]["translation_m"]["count"] == 54

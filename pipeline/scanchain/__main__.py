@@ -8,25 +8,18 @@ import errno
 import os
 import sys
 from collections.abc import Sequence
-from typing import NoReturn
 
 import click
 
 from scanchain.commands.batch import batch
-from scanchain.commands.check import check
 from scanchain.commands.compare import compare
-from scanchain.commands.convert import convert
-from scanchain.commands.doctor import doctor
 from scanchain.commands.evaluate import evaluate
-from scanchain.commands.info import info
 from scanchain.commands.landmarks import landmarks
-from scanchain.commands.localize import localize
-from scanchain.commands.maps import changes, map_group, merge
+from scanchain.commands.logs import convert, doctor, info, simulate
+from scanchain.commands.maps import changes, localize, map_group, merge
 from scanchain.commands.optimize import optimize
 from scanchain.commands.preparing import config, sequence, warm_up
-from scanchain.commands.run import run
-from scanchain.commands.simulate import simulate
-from scanchain.commands.view import view
+from scanchain.commands.run import check, run, view
 from scanchain.errors import InputError, ScanchainError, remedy_of
 
 
@@ -46,26 +39,22 @@ def scanchain() -> None:
     """
 
 
-_COMMANDS = (
+for _command in (
     run, localize, merge, changes, map_group, check, batch, view, compare, info, doctor, convert, simulate,
     evaluate, optimize, landmarks, config, sequence, warm_up,
-)  # fmt: skip
-for _command in _COMMANDS:
+):  # fmt: skip
     scanchain.add_command(_command)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; every error is one line on stderr, the exit code is returned.
 
-    arguments : those of the process where left out, which then ends with that code
+    arguments : those of the process where left out, which then ends with that code, without the quarter of a
+        second in which the interpreter frees what the system frees at once
     """
-    if arguments is None:
-        _leave(_run(sys.argv[1:]))
-    return _run(list(arguments))
-
-
-def _leave(code: int) -> NoReturn:
-    """End the process: the interpreter would take a quarter of a second to free what the system frees at once."""
+    if arguments is not None:
+        return _run(list(arguments))
+    code = _run(sys.argv[1:])
     atexit._run_exitfuncs()
     sys.stdout.flush()
     sys.stderr.flush()
@@ -87,10 +76,8 @@ def _run(words: list[str]) -> int:
         return _fail(f"{error.format_message().rstrip('.')}; see {path} --help", 2)
     except click.ClickException as error:
         return _fail(error.format_message(), 2)
-    except InputError as error:
-        return _fail(error.text, 2)
     except ScanchainError as error:
-        return _fail(error.text, 1)
+        return _fail(error.text, 2 if isinstance(error, InputError) else 1)
     except (KeyboardInterrupt, click.Abort):
         return _fail("interrupted", 1)
     except BrokenPipeError:  # the reader of our output went away, as `head` does

@@ -117,7 +117,8 @@ def run(
     Returns path, metrics, summary and warnings; ``metrics.verdict`` says whether to rely on it.
     Raises InputError for bad input.
     """
-    job = _job(log, out, config, ground_truth, recording=recording, force=force, overrides=overrides)
+    file, truth = _optional_path(config, "config"), _optional_path(ground_truth, "ground_truth")
+    job = _job(log, out, recording, overrides, config_file=file, ground_truth=truth, force=force)
     return run_job(job, open_recorder, Progress(), write_report)
 
 
@@ -140,30 +141,19 @@ def localize(
     """
     from scanchain.sessions.localize import localize as localize_log
 
-    job = _job(log, out, config, ground_truth, recording=recording, force=force, overrides=overrides)
+    file, truth = _optional_path(config, "config"), _optional_path(ground_truth, "ground_truth")
+    job = _job(log, out, recording, overrides, config_file=file, ground_truth=truth, force=force)
     draw = draw_localization if recording else lambda folder, localized: None
     return localize_log(job, checks.path(prior, "prior"), Progress(), draw)
 
 
-def _job(
-    log: Logs,
-    out: str | Path,
-    config: str | Path | None,
-    ground_truth: str | Path | None,
-    *,
-    recording: bool,
-    force: bool,
-    overrides: dict[str, object],
-) -> Job:
-    return Job(
-        logs=sources_of(log),
-        out=checks.path(out, "out"),
-        config_file=None if config is None else checks.path(config, "config"),
-        overrides=overrides_of(overrides),
-        sinks=frozenset({"save"}) if recording else frozenset(),
-        ground_truth=None if ground_truth is None else checks.path(ground_truth, "ground_truth"),
-        force=force,
-    )
+def _job(log: Logs, out: str | Path, recording: bool, overrides: dict[str, object], **more: Any) -> Job:
+    files = sources_of(log), checks.path(out, "out")
+    return Job(*files, overrides=overrides_of(overrides), sinks=frozenset({"save"} if recording else ()), **more)
+
+
+def _optional_path(value: object, name: str) -> Path | None:
+    return None if value is None else checks.path(value, name)
 
 
 def merge(
@@ -190,7 +180,7 @@ def merge(
         checks.path(out, "out"),
         Progress(),
         present_merge,
-        config_file=None if config is None else checks.path(config, "config"),
+        config_file=_optional_path(config, "config"),
         overrides=overrides_of(overrides),
         fixed=checks.truth(fixed, "fixed"),
         update=checks.truth(update, "update"),
@@ -219,8 +209,9 @@ def changes(
     """
     from scanchain.sessions.change_run import compare_maps
 
+    maps = [checks.path(earlier, "earlier"), _optional_path(later, "later")]
     return compare_maps(
-        [checks.path(earlier, "earlier"), *([] if later is None else [checks.path(later, "later")])],
+        [each for each in maps if each is not None],
         checks.path(out, "out"),
         present_changes if recording else lambda directory, found: None,
         T_earlier_later=T_earlier_later,
@@ -254,7 +245,7 @@ def compare(
         out=checks.path(out, "out"),
         methods=(methods,) if isinstance(methods, str) else tuple(methods),
         overrides=overrides_of(overrides),
-        ground_truth=None if ground_truth is None else checks.path(ground_truth, "ground_truth"),
+        ground_truth=_optional_path(ground_truth, "ground_truth"),
         repeat=repeat,
         force=force,
     )

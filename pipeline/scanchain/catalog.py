@@ -1,9 +1,8 @@
-"""The catalog of sequences: the files in sequences/, and the preparation of a log from each."""
+"""The catalog of sequences: the files in sequences/, and logs of them, simulated or downloaded."""
 
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 from urllib.parse import urlsplit
@@ -12,7 +11,7 @@ import msgspec
 from msgspec import Meta, Struct
 from msgspec.structs import asdict
 
-from scanchain.download import fetch
+from scanchain.download import Progress, fetch
 from scanchain.errors import InputError
 from scanchain.logs.convert import convert
 from scanchain.settings import shipped
@@ -78,20 +77,14 @@ def load(name: str) -> Sequence:
     """Entry of a sequence."""
     if name not in names():
         raise InputError(f"sequence {name!r} is not in the catalog; choose one of {', '.join(names())}")
-    return read(shipped("sequences") / f"{name}.toml")
-
-
-def read(file: Path) -> Sequence:
-    """Contents of a file of the catalog."""
+    file = shipped("sequences") / f"{name}.toml"
     try:
         return msgspec.toml.decode(file.read_bytes(), type=Sequence)
     except (msgspec.DecodeError, UnicodeDecodeError, OSError) as error:
         raise InputError(f"{file}: {error}; compare it with the other sequences") from error
 
 
-def prepare(
-    name: str, folder: Path, *, force: bool = False, progress: Callable[[int, int], None] | None = None
-) -> Path:
+def prepare(name: str, folder: Path, *, force: bool = False, progress: Progress | None = None) -> Path:
     """The path of the sequence's log in ``folder``; simulated, or downloaded and converted, where it is missing.
 
     progress : called with the scans made, or the MiB downloaded, and their total
@@ -112,29 +105,20 @@ def prepare(
     return destination
 
 
-def _download(name: str, source: Download, folder: Path, progress: Callable[[int, int], None] | None) -> Path:
+def _download(name: str, source: Download, folder: Path, progress: Progress | None) -> Path:
     """Download the recording and what belongs to it; the file or folder that is to be converted."""
     sha256 = "" if source.sha256 == "unknown" else source.sha256
-    recording = folder / _file_name(source.url)
+    recording, reference = (folder / Path(urlsplit(url).path).name for url in (source.url, source.reference_url))
     fetch(source.url, recording, sha256=sha256, progress=progress)
     if source.reference_url:
-        fetch(source.reference_url, folder / _file_name(source.reference_url))
+        fetch(source.reference_url, reference)
     if not source.converts:
         return recording
     unpacked = folder / f"{name}-unpacked"
-    for url in filter(None, (source.url, source.reference_url)):
-        _unpack(folder / _file_name(url), unpacked)
+    for archive in (recording, reference) if source.reference_url else (recording,):
+        try:
+            with zipfile.ZipFile(archive) as packed:
+                packed.extractall(unpacked)  # whatever the names of its files, they stay below that folder
+        except (zipfile.BadZipFile, OSError) as error:
+            raise InputError(f"{archive}: does not unpack ({error}); delete it and call again") from error
     return unpacked / source.converts
-
-
-def _unpack(archive: Path, destination: Path) -> None:
-    """The files of a ZIP archive; whatever their names, they stay below the destination."""
-    try:
-        with zipfile.ZipFile(archive) as packed:
-            packed.extractall(destination)
-    except (zipfile.BadZipFile, OSError) as error:
-        raise InputError(f"{archive}: does not unpack ({error}); delete it and call again") from error
-
-
-def _file_name(url: str) -> str:
-    return Path(urlsplit(url).path).name

@@ -11,7 +11,7 @@ import operator
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -48,10 +48,7 @@ def dimension_of(value: object, name: str) -> int:
 
 def points(value: object, name: str, d: int, *, dtype: DTypeLike = np.float64) -> NDArray[Any]:
     """Points (N, d), finite; N may be 0."""
-    if _is_ready(value, dtype):
-        array: NDArray[Any] = value  # type: ignore[assignment]
-    else:
-        array = _numbers(value, name, f"an (N, {d}) array of meters{_where(value, name)}", dtype)
+    array = _numbers(value, name, f"an (N, {d}) array of meters{_where(value, name)}", dtype)
     if array.ndim != 2 or array.shape[1] != d:
         raise InputError(
             f"{name} has the shape {array.shape}; wanted (N, {d}), one row a point{_remedy(array, name, d)}"
@@ -82,27 +79,20 @@ def valid_points(
 def pose(value: object, name: str, d: int) -> NDArray[np.float64]:
     """A rigid transformation of SE(d): (d+1, d+1), RᵀR = I, det R = 1, last row 0 … 0 1."""
     n = d + 1
-    array = _numbers(value, name, f"a ({n}, {n}) pose", np.float64)
-    if array.shape != (n, n):
-        raise InputError(
-            f"{name} has the shape {array.shape}; wanted a ({n}, {n}) pose, because the points are {d}D"
-        )
+    wanted = f"a ({n}, {n}) pose, because the points are {d}D"
+    array = _shaped(_numbers(value, name, f"a ({n}, {n}) pose"), name, (n, n), wanted)
     error = rigidity_error(array)
     if not error <= _RIGID:
-        what = (
-            "holds NaN or infinite values"
-            if math.isinf(error)
-            else f"is no rigid transformation (off by {error:.2g})"
-        )
+        off = f"is no rigid transformation (off by {error:.2g})"
+        what = "holds NaN or infinite values" if math.isinf(error) else off
         raise InputError(f"{name} {what}; wanted [R t; 0 1] with RᵀR = I and det R = 1")
     return array
 
 
 def poses(value: object, name: str, d: int) -> NDArray[np.float64]:
     """Rigid transformations (N, d+1, d+1)."""
-    array = _numbers(value, name, f"an (N, {d + 1}, {d + 1}) array of poses", np.float64)
-    if array.ndim != 3 or array.shape[1:] != (d + 1, d + 1):
-        raise InputError(f"{name} has the shape {array.shape}; wanted (N, {d + 1}, {d + 1})")
+    wanted = f"(N, {d + 1}, {d + 1})"
+    array = _shaped(_numbers(value, name, f"an {wanted} array of poses"), name, (None, d + 1, d + 1), wanted)
     for index, each in enumerate(array):
         if not rigidity_error(each) <= _RIGID:
             pose(each, f"{name}[{index}]", d)
@@ -147,8 +137,8 @@ def point_times(value: object, name: str, count: int) -> NDArray[np.float32]:
         return value
     is_ready = _is_ready(value, np.float32)
     array = _numbers(value, name, "seconds, one a point", np.float32 if is_ready else np.float64)
-    if array.shape not in ((count,), (0,)):
-        raise InputError(f"{name} has the shape {array.shape}; wanted ({count},), one a point, or None")
+    if array.shape != (0,):
+        _shaped(array, name, (count,), f"({count},), one a point, or None")
     farthest_s = largest_magnitude(array)
     if not farthest_s <= LONGEST_SWEEP_S:
         raise InputError(
@@ -181,40 +171,38 @@ def one_of(value: object, choices: tuple[str, ...], name: str) -> None:
 
 def integer(value: object, name: str, wanted: str, *, least: int | None = None) -> int:
     """A whole number, not below ``least``; floats are refused, also those without a fraction."""
-    if type(value) is int and -_MOST_WHOLE < value < _MOST_WHOLE and (least is None or value >= least):
-        return value
-    if isinstance(value, bool):
-        raise InputError(f"{name} is {value}; wanted {wanted}")
     try:
         whole = operator.index(value)  # type: ignore[arg-type]
     except TypeError:
-        raise InputError(f"{name} is {shown(value)}; wanted {wanted}") from None
+        whole = None
+    if whole is None or isinstance(value, bool) or (least is not None and whole < least):
+        raise InputError(f"{name} is {shown(value)}; wanted {wanted}")
     if abs(whole) >= _MOST_WHOLE:
         raise InputError(f"{name} is {shown(value)}, too large for 64 bits; wanted {wanted}")
-    if least is not None and whole < least:
-        raise InputError(f"{name} is {whole}; wanted {wanted}")
     return whole
+
+
+def _is_number(value: object) -> TypeGuard[float]:
+    return isinstance(value, int | float | np.number) and not isinstance(value, bool)
 
 
 def positive(value: object, name: str) -> float:
     """A finite number above 0."""
-    if isinstance(value, int | float | np.number) and not isinstance(value, bool) and 0.0 < value < math.inf:
+    if _is_number(value) and 0.0 < value < math.inf:
         return float(value)
     raise InputError(f"{name} is {shown(value)}; wanted a finite number > 0")
 
 
 def seconds(value: object, name: str) -> float:
     """A stamp in seconds; nanoseconds of our time are refused."""
-    if isinstance(value, int | float | np.number) and not isinstance(value, bool) and abs(value) < _LATEST_S:
+    if _is_number(value) and abs(value) < _LATEST_S:
         return float(value)
     raise InputError(f"{name} is {shown(value)}; wanted seconds, as a number below {_LATEST_S:.0e}{SMALLER_UNITS}")
 
 
 def weights(value: object, name: str, count: int) -> NDArray[np.float64]:
     """Weights (N,), finite and not negative."""
-    array = _numbers(value, name, f"({count},) weights", np.float64)
-    if array.shape != (count,):
-        raise InputError(f"{name} has the shape {array.shape}; wanted ({count},), one a pair")
+    array = _shaped(_numbers(value, name, f"({count},) weights"), name, (count,), f"({count},), one a pair")
     if not ((array >= 0.0) & (array <= LARGEST)).all():
         raise InputError(
             f"{name} holds negative, NaN, infinite or huge values; wanted weights from 0 to {LARGEST:g}"
@@ -224,9 +212,7 @@ def weights(value: object, name: str, count: int) -> NDArray[np.float64]:
 
 def matrices(value: object, name: str, wanted: tuple[int, ...]) -> NDArray[np.float64]:
     """Finite numbers of a shape."""
-    array = _numbers(value, name, f"an array of the shape {wanted}", np.float64)
-    if array.shape != wanted:
-        raise InputError(f"{name} has the shape {array.shape}; wanted {wanted}")
+    array = _shaped(_numbers(value, name, f"an array of the shape {wanted}"), name, wanted, f"{wanted}")
     if not np.isfinite(array).all():
         raise InputError(f"{name} holds NaN or infinite values")
     return array
@@ -242,10 +228,8 @@ def whole_numbers(value: object, name: str, wanted: str) -> NDArray[np.int64]:
 
 def indices(value: object, name: str) -> NDArray[np.int64]:
     """Pairs (E, 2) of whole numbers."""
-    array = _array(value, name, "(E, 2) indices of poses")
-    if array.ndim != 2 or array.shape[1] != 2:
-        raise InputError(f"{name} is {shown(array)}; wanted (E, 2) whole numbers: indices of poses")
-    return whole_numbers(array, name, "(E, 2) indices of poses")
+    pairs, wanted = _array(value, name, "(E, 2) indices of poses"), "(E, 2) whole numbers: indices of poses"
+    return whole_numbers(_shaped(pairs, name, (None, 2), wanted), name, "(E, 2) indices of poses")
 
 
 def instance(value: object, kind: type, name: str, remedy: str) -> None:
@@ -277,7 +261,14 @@ def writing(path: Path, *, force: bool = True) -> Generator[None]:
         ) from None
 
 
-def _numbers(value: object, name: str, wanted: str, dtype: DTypeLike) -> NDArray[Any]:
+def _shaped(array: NDArray[Any], name: str, shape: tuple[int | None, ...], wanted: str) -> NDArray[Any]:
+    """The array, which must have this shape; None stands for any size."""
+    if array.ndim == len(shape) and all(size in (n, None) for n, size in zip(array.shape, shape, strict=True)):
+        return array
+    raise InputError(f"{name} has the shape {array.shape}; wanted {wanted}")
+
+
+def _numbers(value: object, name: str, wanted: str, dtype: DTypeLike = np.float64) -> NDArray[Any]:
     """The value as a C-contiguous, writeable array of this dtype."""
     if _is_ready(value, dtype):
         return value  # type: ignore[return-value]
@@ -324,6 +315,5 @@ def _where(value: object, name: str) -> str:
 
 
 def _kind(array: NDArray[Any]) -> str:
-    return {"b": "booleans", "c": "complex numbers", "O": "objects", "U": "text", "S": "text"}.get(
-        array.dtype.kind, f"{array.dtype}"
-    )
+    kinds = {"b": "booleans", "c": "complex numbers", "O": "objects", "U": "text", "S": "text"}
+    return kinds.get(array.dtype.kind, f"{array.dtype}")

@@ -36,7 +36,6 @@ class ConfigKey:
     kind : type of its values, with their limits
     default : before presets, files and flags
     range : its values as text
-    choices : of a word; a user's class, MODULE:CLASS, may stand instead. Empty where ``kind`` says it all
     description : what it sets, from the docstring of its section
     """
 
@@ -44,7 +43,6 @@ class ConfigKey:
     kind: object
     default: Value
     range: str
-    choices: tuple[str, ...]
     description: str
 
     @property
@@ -83,9 +81,9 @@ class ConfigKey:
             return "true or false"
         if not isinstance(self.default, str):
             return f"a {self.range}"
-        words = self.range.removesuffix(f" | {_OWN}").replace(" | ", ", ")
-        own = f" or a class of yours, {_OWN}" if self.choices else ""
-        return words if words == "text" else f"one of {words}{own}"
+        words, own, _ = self.range.partition(f" | {_OWN}")
+        yours = f" or a class of yours, {_OWN}" if own else ""
+        return words if words == "text" else f"one of {words.replace(' | ', ', ')}{yours}"
 
 
 @functools.cache
@@ -95,31 +93,28 @@ def section_keys(section: type) -> tuple[ConfigKey, ...]:
     lines = re.findall(r"^ *(\w+) : (.*(?:\n {8,}\S.*)*)", section.__doc__ or "", re.MULTILINE)
     descriptions = {leaf: " ".join(text.split()) for leaf, text in lines}
     return tuple(
-        ConfigKey(
-            f"{name}.{leaf.name}", leaf.type, leaf.default, *_values(leaf.type), descriptions.get(leaf.name, "")
-        )
-        for leaf in fields(section)
+        ConfigKey(f"{name}.{key.name}", key.type, key.default, _values(key.type), descriptions.get(key.name, ""))
+        for key in fields(section)
     )
 
 
-def _values(kind: object) -> tuple[str, tuple[str, ...]]:
-    """Values of a type as text, and the words of an open choice."""
+def _values(kind: object) -> str:
+    """Values of a type as text."""
     match inspect.type_info(kind):
         case inspect.BoolType():
-            return "true | false", ()
+            return "true | false"
         case inspect.StrType():
-            return "text", ()
+            return "text"
         case inspect.LiteralType() as words:
-            return " | ".join(map(str, words.values)), ()
+            return " | ".join(map(str, words.values))
         case inspect.Metadata() as open_choice:
-            choices: tuple[str, ...] = (open_choice.extra or {})["choices"]
-            return " | ".join((*choices, _OWN)), choices
+            return " | ".join((*(open_choice.extra or {})["choices"], _OWN))
         case (inspect.IntType() | inspect.FloatType()) as number:
             text = "whole number" if isinstance(number, inspect.IntType) else "number"
             if number.le is not None and number.le < LARGEST:
-                return f"{text} from {number.gt or number.ge or 0:g} to {number.le:g}", ()
+                return f"{text} from {number.gt or number.ge or 0:g} to {number.le:g}"
             if number.gt is not None:
-                return f"{text} > {number.gt:g}", ()
-            return text if number.ge in (None, -LARGEST) else f"{text} >= {number.ge:g}", ()
+                return f"{text} > {number.gt:g}"
+            return text if number.ge in (None, -LARGEST) else f"{text} >= {number.ge:g}"
         case other:
             raise TypeError(f"configuration keys are bool, int, float, str or a choice, not {other}")

@@ -47,7 +47,8 @@ def fetch(url: str, destination: Path, *, sha256: str = "", progress: Progress |
 
 def _complete(url: str, part: Path, version: Path, progress: Progress | None) -> None:
     """Download the missing bytes, with a new request after each interruption."""
-    for attempt in range(1, _ATTEMPTS + 1):
+    reason = ""
+    for _ in range(_ATTEMPTS):
         try:
             if _more(url, part, version, progress):
                 return
@@ -55,15 +56,12 @@ def _complete(url: str, part: Path, version: Path, progress: Progress | None) ->
         except urllib.error.HTTPError as error:
             if error.code != http.client.REQUESTED_RANGE_NOT_SATISFIABLE:
                 raise DownloadError(f"{url}: {error.code} {error.reason}; see whether its page moved") from error
-            if error.headers.get("Content-Range", "") == f"bytes */{part.stat().st_size}":
-                return
             part.unlink()
-            reason = "the file on the server is another, and shorter, than the one begun"
+            reason = "the file on the server is not longer than the one begun"
         except _BROKEN as error:
             reason = str(getattr(error, "reason", error)) or type(error).__name__
-        if attempt == _ATTEMPTS:
-            have = part.stat().st_size if part.exists() else 0
-            raise DownloadError(f"{url}: {reason}; {have:,} bytes are kept, call it again to resume")
+    have = part.stat().st_size if part.exists() else 0
+    raise DownloadError(f"{url}: {reason}; {have:,} bytes are kept, call it again to resume")
 
 
 def _more(url: str, part: Path, version: Path, progress: Progress | None) -> bool:

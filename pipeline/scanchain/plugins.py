@@ -37,10 +37,8 @@ def load(name: str, *methods: str) -> type:
         raise InputError(f"{name}: {module.__file__} has no class {class_name}; {there}")
     for method in methods:
         if not callable(getattr(found, method, None)):
-            raise InputError(
-                f"{name}: the class has no method {method}; it needs {' and '.join(methods)} (documentation: "
-                "Extending)"
-            )
+            needs = f"it needs {' and '.join(methods)} (documentation: Extending)"
+            raise InputError(f"{name}: the class has no method {method}; {needs}")
     return found
 
 
@@ -57,14 +55,11 @@ def _imported(module_name: str, name: str) -> ModuleType:
         return importlib.import_module(module_name)
     except Exception as error:  # whatever the module does at its top level
         if _is_missing(module_name, error):
-            raise InputError(
-                f"{name}: there is no module {module_name} in {here} or on PYTHONPATH; go to its folder, or set "
-                "PYTHONPATH to it"
-            ) from None
-        reason = one_line(error)
-        raise InputError(
-            f"{name}: importing {module_name} failed with {type(error).__name__}: {reason}"
-        ) from error
+            remedy = "go to its folder, or set PYTHONPATH to it"
+            reason = f"there is no module {module_name} in {here} or on PYTHONPATH; {remedy}"
+            raise InputError(f"{name}: {reason}") from None
+        reason = f"importing {module_name} failed with {type(error).__name__}: {one_line(error)}"
+        raise InputError(f"{name}: {reason}") from error
 
 
 def _is_missing(module_name: str, error: Exception) -> bool:

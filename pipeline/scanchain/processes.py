@@ -113,11 +113,6 @@ class Ending:
     duration_s: float
 
     @property
-    def how(self) -> str:
-        """Signal or exit code as text, if it was not killed here."""
-        return signal.Signals(-self.code).name if self.code < 0 else f"exit code {self.code}"
-
-    @property
     def ran_out_of_memory(self) -> bool:
         """True if it was killed for its memory, here or by the system."""
         by_system = self.killed_for is KilledFor.NOTHING and self.code == _SYSTEM_KILL
@@ -131,8 +126,9 @@ class Ending:
             return f"took more than --memory-limit ({limits.memory_mib / 1024.0:.3g} GiB)"
         if self.ran_out_of_memory:
             return "killed, as the system does when memory runs out"
+        how = signal.Signals(-self.code).name if self.code < 0 else f"exit code {self.code}"
         last = " ".join(output.split())[-_LAST_CHARACTERS:]
-        return f"ended by {self.how}" + (f": {last}" if last else "")
+        return f"ended by {how}" + (f": {last}" if last else "")
 
 
 def die_with_parent(leftover: Path | None = None) -> None:

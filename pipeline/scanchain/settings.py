@@ -92,10 +92,7 @@ def _as_argument(key: str, source: str) -> str:
 
 
 def load_settings(
-    dimension: int | None = None,
-    *,
-    file: Path | str | None = None,
-    overrides: Sequence[Override] = (),
+    dimension: int | None = None, *, file: Path | str | None = None, overrides: Sequence[Override] = ()
 ) -> Settings:
     """Defaults < the preset for logs of this dimension, if it is known < ``file`` < ``overrides``.
 

@@ -15,7 +15,7 @@ from scanchain.data import Matrix, Trajectory
 from scanchain.errors import InputError, counted, remedy_of
 
 _NS_PER_S = 1_000_000_000
-_TUM_ROW, _KITTI_ROW = 7 * " %.9f" + "\n", " ".join(12 * ["%.9e"]) + "\n"
+_TUM_ROW, _KITTI_ROW = 7 * " %.9f", " ".join(12 * ["%.9e"]) + "\n"
 _TUM_FIELDS = "stamp x y z qx qy qz qw"
 _KITTI_FIELDS = "r11 r12 r13 x r21 r22 r23 y r31 r32 r33 z"
 _OUT_OF_PLANE = 1e-12  # m² or rad², variance of z, roll and pitch of poses in the plane
@@ -58,11 +58,15 @@ def write_tum(path: Path | str, trajectory: Trajectory, *, force: bool = False) 
     """
     path = checks.path(path, "path")
     checks.instance(trajectory, Trajectory, "trajectory", "Trajectory(stamps_ns, poses), or read_tum(path)")
+    with checks.writing(path, force=force), path.open("w", encoding="utf-8", newline="\n") as file:
+        file.writelines(f"{row}\n" for row in _tum_rows(trajectory))
+
+
+def _tum_rows(trajectory: Trajectory) -> Iterator[str]:
     poses = lie.lift(trajectory.poses)
     rows = np.hstack([poses[:, :3, 3], lie.to_quaternion(poses[:, :3, :3])]).tolist()
-    with checks.writing(path, force=force), path.open("w", encoding="utf-8", newline="\n") as file:
-        for stamp_ns, row in zip(trajectory.stamps_ns.tolist(), rows, strict=True):
-            file.write(f"{format_stamp(stamp_ns)}{_TUM_ROW % tuple(row)}")
+    for stamp_ns, row in zip(trajectory.stamps_ns.tolist(), rows, strict=True):
+        yield f"{format_stamp(stamp_ns)}{_TUM_ROW % tuple(row)}"
 
 
 def write_wide_tum(path: Path, trajectory: Trajectory, covariances: Matrix) -> None:
@@ -71,18 +75,14 @@ def write_wide_tum(path: Path, trajectory: Trajectory, covariances: Matrix) -> N
     Of a twist in the pose's own frame, T exp(ξ), (translation, rotation): the lower triangle of (6, 6), by rows.
     In the plane, what lies outside of it is known to a micrometer. Raises OSError where the disk is full.
     """
-    poses = lie.lift(trajectory.poses)
-    rows = np.hstack([poses[:, :3, 3], lie.to_quaternion(poses[:, :3, :3])])
     lifted = covariances
     if trajectory.dimension == 2:
-        rows_in, columns_in = np.meshgrid((0, 1, 5), (0, 1, 5), indexing="ij")
-        lifted = np.tile(_OUT_OF_PLANE * np.eye(6), (len(poses), 1, 1))
-        lifted[:, rows_in, columns_in] = covariances
+        lifted = np.tile(_OUT_OF_PLANE * np.eye(6), (len(trajectory), 1, 1))
+        lifted[:, *np.ix_((0, 1, 5), (0, 1, 5))] = covariances
     lower = np.tril_indices(6)
     with checks.writing(path), path.open("w", encoding="utf-8", newline="\n") as file:
-        for stamp_ns, pose, covariance in zip(trajectory.stamps_ns.tolist(), rows, lifted, strict=True):
-            values = " ".join(f"{value:.6e}" for value in covariance[lower].tolist())
-            file.write(f"{format_stamp(stamp_ns)}{(_TUM_ROW % tuple(pose.tolist())).rstrip()} {values}\n")
+        for row, covariance in zip(_tum_rows(trajectory), lifted, strict=True):
+            file.write(f"{row} {' '.join(f'{value:.6e}' for value in covariance[lower].tolist())}\n")
 
 
 def read_kitti(path: Path | str) -> Trajectory:

@@ -44,10 +44,7 @@ PICTURES = {  # for each picture the commands, and the pictures drawn by them th
         ),
         ("without_wheels.png", "with_wheels.png"),
     ),
-    "intel": (
-        (f"run {DATA}/2d/intel.mcap --out intel --rerun off", "view intel --png intel.png"),
-        ("intel.png",),
-    ),
+    "intel": ((f"run {DATA}/2d/intel.mcap --out intel --rerun off", "view intel --png intel.png"), ("intel.png",)),
     "mit_csail": (
         (f"run {DATA}/2d/mit_csail.mcap --out mit_csail --rerun off", "view mit_csail --png mit_csail.png"),
         ("mit_csail.png",),

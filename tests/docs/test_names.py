@@ -1,11 +1,13 @@
-"""What README and docs name exists: modules, configuration keys, files of the repository, benchmarks."""
+"""What README and docs name exists: modules, configuration keys, files, benchmarks, pages, headings."""
 
 import importlib
 import re
 
 import pytest
 
+import scanchain
 from scanchain.settings import config_keys
+from tests.docs.test_examples import FENCE
 from tests.support.scenes import ROOT
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -50,3 +52,32 @@ def test_every_name_on_the_page_exists(page):
         if not (ROOT / f"tests/benchmarks/{name}.py").exists()
     ]
     assert (names, keys, files, benchmarks) == ([], set(), [], [])
+
+
+def test_every_public_name_is_in_the_reference_of_the_api():
+    public = {name for name in dir(scanchain) if not name.startswith("_")}
+    assert public == {*scanchain.__all__, "evaluation", "lie"}
+    documented = re.findall(r"^\.\. auto\w+:: (\w+)(?:\(.*)?$", (ROOT / "docs/api.md").read_text(), re.MULTILINE)
+    assert sorted(documented) == sorted(scanchain.__all__)
+
+
+def test_every_page_is_in_the_table_of_contents_and_the_readme_is_short():
+    listed = re.findall(r"^(\w+)$", (ROOT / "docs/index.md").read_text(), re.MULTILINE)
+    assert sorted([*listed, "index"]) == sorted(page.stem for page in PAGES[1:])
+    assert len((ROOT / "README.md").read_bytes()) <= 8000
+
+
+def anchors(page):
+    """Anchors of the headings of a page, as GitHub and MyST make them."""
+    headings = re.findall(r"^#+ (.*)$", FENCE.sub("", page.read_text(encoding="utf-8")), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_link_has_a_text_and_leads_to_a_file_and_a_heading(page):
+    text = FENCE.sub("", page.read_text(encoding="utf-8"))
+    for words, path, anchor in re.findall(r"\[([^\]]*)\]\(([^)\s#]*)(?:#([^)\s]+))?[^)]*\)", text):
+        target = (page.parent / path) if path else page
+        assert words, f"a link to {path} has no text"
+        assert "://" in path or target.exists(), path
+        assert not anchor or "://" in path or anchor in anchors(target), f"{path}#{anchor}"

@@ -8,6 +8,7 @@ import scanchain
 from tests.support.scenes import ROOT
 
 TEXT = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
+pytestmark = pytest.mark.slow  # minutes of simulated drives; the numbers change rarely
 WITHIN = 3.0  # factor between an error that the page says and the one measured
 
 

@@ -56,9 +56,9 @@ class Site:
 
 
 @contextmanager
-def serving(files):
+def serving(files, kind=Site):
     """A site on this machine; ``site.url`` is its address."""
-    site = Site(files)
+    site = kind(files)
 
     class Handler(http.server.BaseHTTPRequestHandler):
         def do_GET(self):

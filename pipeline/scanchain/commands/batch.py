@@ -9,41 +9,38 @@ from typing import Any
 
 import click
 
-from scanchain.commands.options import (
-    LOG,
-    PATH,
-    OverrideCommand,
-    config_option,
-    ground_truth_option,
-    limit_options,
-    matcher_option,
-    no_loops_option,
-    overrides,
-    part_options,
-)
+from scanchain.commands import options
+from scanchain.commands.options import LOG, PATH, OverrideCommand
 from scanchain.errors import InputError, ScanchainError, counted
 from scanchain.files import Source
-from scanchain.settings import load_settings
+from scanchain.settings import Override, load_settings
 
 _DAY_S = 86_400.0
 
 
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
 @click.argument("logs", metavar="LOG...", nargs=-1, type=LOG)
-@click.option("--out", required=True, metavar="DIR", type=PATH, help="Directory to create, or to resume.")
+@options.out("Directory to create, or to resume.")
 @click.option(
-    "--manifest", "manifests", multiple=True, metavar="FILE", type=PATH, help="Text file with one log per line."
+    "--manifest",
+    "manifests",
+    multiple=True,
+    metavar="FILE",
+    type=PATH,
+    help="Text file with one log per line.",
 )
-@config_option
-@part_options("each log")
-@matcher_option
-@no_loops_option
-@ground_truth_option("TOPIC|none", "Ground truth in every log; none to ignore it. [default: /ground_truth]")
+@options.config
+@options.part("each log")
+@options.matcher
+@options.no_loops
+@options.ground_truth("TOPIC|none", "Ground truth in every log; none to ignore it. [default: /ground_truth]")
 @click.option(
     "--workers", type=click.IntRange(1), metavar="N", help="Logs run in parallel. [default: one per core]"
 )
 @click.option("--ray", metavar="auto|ADDRESS", help="Run on a Ray cluster that sees the same files.")
-@limit_options("a log", time_default="a day", memory_default="an equal share of three quarters of the free memory")
+@options.limits(
+    "a log", time_default="a day", memory_default="an equal share of three quarters of the free memory"
+)
 @click.option(
     "--retries",
     type=click.IntRange(0),
@@ -59,9 +56,7 @@ _DAY_S = 86_400.0
     help="Whether runs write a recording, some ten megabytes each.",
 )
 @click.option("--strict", is_flag=True, help="Exit with 1 unless every verdict is trustworthy.")
-@click.pass_context
 def batch(
-    ctx: click.Context,
     logs: tuple[Source, ...],
     out: Path,
     manifests: tuple[Path, ...],
@@ -72,6 +67,7 @@ def batch(
     ground_truth: Path | None,
     strict: bool,
     time_s: float | None,
+    overrides: tuple[Override, ...],
     **limits: Any,
 ) -> None:
     """Run many logs, each in its own process.
@@ -103,14 +99,13 @@ def batch(
         raise InputError(
             f"--gt {ground_truth}: a batch has no file of true poses for all its logs; name a topic, or use run"
         )
-    changes = overrides(ctx)
     file = () if config_file is None else ("--config", str(config_file.resolve()))
     job = Batch(
-        logs=collect(logs, manifests, load_settings(file=config_file, overrides=changes).config.log.format),
+        logs=collect(logs, manifests, load_settings(file=config_file, overrides=overrides).config.log.format),
         out=out.resolve(),
         config_file=config_file,
-        overrides=changes,
-        arguments=("--rerun", rerun, *file, *(f"--{change.key}={change.text}" for change in changes)),
+        overrides=overrides,
+        arguments=("--rerun", rerun, *file, *(f"--{change.key}={change.text}" for change in overrides)),
         workers=workers or os.cpu_count() or 1,
         time_s=time_s or _DAY_S,
         **limits,

@@ -8,23 +8,14 @@ from typing import Any
 
 import click
 
-from scanchain.commands.options import (
-    LOG,
-    OverrideCommand,
-    ground_truth_option,
-    limit_options,
-    overrides,
-    part_options,
-    threads_option,
-)
+from scanchain.commands import options
+from scanchain.commands.options import PATH, OverrideCommand
 from scanchain.errors import ScanchainError
 from scanchain.files import Source
 
-_PATH = click.Path(path_type=Path)
 
-
-@click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--section.key VALUE]...")
-@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
+@click.command(cls=OverrideCommand)
+@options.logs
 @click.option("--methods", metavar="LIST", help="Comma-separated names. [default: all that apply to the log]")
 @click.option(
     "--matcher",
@@ -32,36 +23,26 @@ _PATH = click.Path(path_type=Path)
     default="",
     help="Compare odometry with your own matcher as well, row CLASS.",
 )
-@click.option("--out", metavar="DIR", type=_PATH, help="Directory to create. [default: runs/compare-LOG]")
-@ground_truth_option()
-@click.option(
-    "--relations", metavar="FILE", type=_PATH, help="Manually verified relative poses (Kümmerle et al. 2009)."
-)
+@click.option("--out", metavar="DIR", type=PATH, help="Directory to create. [default: runs/compare-LOG]")
+@options.ground_truth()
+@options.relations
 @click.option(
     "--config",
     "--settings",
     "config_file",
     metavar="FILE",
-    type=_PATH,
+    type=PATH,
     help="TOML file on top of the preset, with a table for each method whose settings differ.",
 )
 @click.option(
     "--repeat", type=click.IntRange(1), default=1, show_default=True, help="Runs of every method, interleaved."
 )
-@limit_options("a run", time_default="300, plus 1 per scan", memory_default="three quarters of the free memory")
-@part_options()
-@threads_option
-@click.option("--force", is_flag=True, help="Replace an existing comparison once the new one is complete.")
+@options.limits("a run", time_default="300, plus 1 per scan", memory_default="three quarters of the free memory")
+@options.part()
+@options.threads
+@options.force("an existing comparison once the new one is complete")
 @click.option("--json", "as_json", is_flag=True, help="Print table.json instead of the table.")
-@click.pass_context
-def compare(
-    ctx: click.Context,
-    logs: tuple[Source, ...],
-    methods: str | None,
-    out: Path | None,
-    as_json: bool,
-    **options: Any,
-) -> None:
+def compare(logs: tuple[Source, ...], methods: str | None, out: Path | None, as_json: bool, **given: Any) -> None:
     """Compare odometry methods on the same decoded scans: accuracy, speed, memory.
 
     Writes tables, report.html and a rerun recording. Every method runs in its own process; one that crashes, hangs
@@ -109,9 +90,8 @@ def compare(
         logs=logs,
         out=Path("runs") / f"compare-{directory_name(logs[0].stem)}" if out is None else out,
         methods=tuple(name.strip() for name in methods.split(",") if name.strip()) if methods else (),
-        overrides=overrides(ctx),
         command=tuple(sys.argv),
-        **options,
+        **given,
     )
     with Terminal("scans") as terminal:
         compared = run_comparison(comparison, present_comparison, terminal)

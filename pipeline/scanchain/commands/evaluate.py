@@ -2,36 +2,24 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import fields, is_dataclass
-from math import isfinite
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from scanchain.commands.options import check_output, max_gap_option
+from scanchain.commands import options
+from scanchain.commands.options import PATH
 from scanchain.errors import InputError
 
 if TYPE_CHECKING:
     from scanchain.evaluation.metrics import Result, Results
 
-_PATH = click.Path(path_type=Path)
-
-
-class _Offset(click.ParamType):
-    name = "offset"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float | str:
-        return value if value == "auto" else click.FLOAT.convert(value, param, ctx)
-
 
 @click.command()
-@click.argument("files", metavar="EST.tum... [GT]", nargs=-1, required=True, type=_PATH)
-@click.option("--gt", metavar="FILE", type=_PATH, help="Ground truth. [default: the last of two files or more]")
-@click.option(
-    "--relations", metavar="FILE", type=_PATH, help="Manually verified relative poses (Kümmerle et al. 2009)."
-)
+@click.argument("files", metavar="EST.tum... [GT]", nargs=-1, required=True, type=PATH)
+@click.option("--gt", metavar="FILE", type=PATH, help="Ground truth. [default: the last of two files or more]")
+@options.relations
 @click.option(
     "--align",
     type=click.Choice(["rigid", "first", "none"]),
@@ -42,12 +30,12 @@ class _Offset(click.ParamType):
 @click.option("--scale", is_flag=True, help="Scale the estimate to fit, too: with --align rigid, Sim(3).")
 @click.option(
     "--time-offset",
-    type=_Offset(),
+    type=lambda text: text if text == "auto" else float(text),
     default=0.0,
     metavar="auto|SECONDS",
     help="Seconds to add to the stamps of EST; auto finds those of the least ATE within 1 s.",
 )
-@max_gap_option
+@options.max_gap
 @click.option(
     "--rpe",
     default="1pose,1s,10m,100m",
@@ -56,9 +44,9 @@ class _Offset(click.ParamType):
     help="Intervals of the RPE in poses, seconds or meters, comma-separated.",
 )
 @click.option("--kitti", is_flag=True, help="All files are KITTI's, 12 numbers a line; poses pair line by line.")
-@click.option("--png", metavar="FILE", type=_PATH, help="Draw the estimates, aligned, over the ground truth.")
-@click.option("--force", is_flag=True, help="Replace an existing picture.")
-@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
+@click.option("--png", metavar="FILE", type=PATH, help="Draw the estimates, aligned, over the ground truth.")
+@options.force("an existing picture")
+@options.as_json
 def evaluate(
     files: tuple[Path, ...],
     gt: Path | None,
@@ -67,7 +55,7 @@ def evaluate(
     png: Path | None,
     force: bool,
     as_json: bool,
-    **options: Any,
+    **given: Any,
 ) -> None:
     """Print ATE, RPE, KITTI metric and error over relations, each with its definition; several EST as a table.
 
@@ -88,13 +76,13 @@ def evaluate(
         files, gt = files[:-1], files[-1]
     if gt is None and relations is None:
         raise InputError("nothing to compare with; give GT (a TUM or KITTI file) or --relations FILE")
-    if kitti and options["time_offset"]:
+    if kitti and given["time_offset"]:
         raise InputError("--time-offset is for files with stamps; KITTI's have none")
     if png is not None and gt is None:
         raise InputError("--png draws over a ground truth; give GT")
     if png is not None:
-        check_output(png, force=force, endings=(".png",))
-    evaluated = {str(path): _evaluated(path, gt, relations, kitti, options) for path in files}
+        options.check_output(png, force=force, endings=(".png",))
+    evaluated = {str(path): _evaluated(path, gt, relations, kitti, given) for path in files}
     for name, results in evaluated.items():
         for warning in results.warnings:
             click.echo(f"warning: {f'{name}: ' * (len(evaluated) > 1)}{warning}", err=True)
@@ -102,13 +90,15 @@ def evaluate(
         from scanchain_viz.pictures.run import draw_evaluated
 
         draw_evaluated(png, {name: (each.aligned, each.reference) for name, each in evaluated.items()})
-    click.echo((_json if as_json else _text)(evaluated))
+    trees = {name: _tree(results) for name, results in evaluated.items()}
+    tree = trees if len(trees) > 1 else trees.popitem()[1]
+    click.echo(options.json_text(tree) if as_json else _text(evaluated))
     if png is not None and not as_json:
         click.echo(f"written {png}")
 
 
 def _evaluated(
-    estimate: Path, gt: Path | None, relations: Path | None, kitti: bool, options: dict[str, Any]
+    estimate: Path, gt: Path | None, relations: Path | None, kitti: bool, given: dict[str, Any]
 ) -> Results:
     """Every metric of a file, or of the trajectory of a run directory."""
     from scanchain.evaluation import read_relations, read_truth, relation_error
@@ -120,7 +110,7 @@ def _evaluated(
     results = Results({}, {})
     if gt is not None:
         truth = read_kitti(gt) if kitti else read_truth(gt).at(trajectory.stamps_ns)
-        results = evaluate(trajectory, truth, source="--rpe", **options)
+        results = evaluate(trajectory, truth, source="--rpe", **given)
     if relations is not None:
         results.found["relations"] = relation_error(trajectory, read_relations(relations))
     return results
@@ -167,28 +157,14 @@ def _figure(result: Result) -> str:
     return f"{result.translation_m.mean if isinstance(result, RelationError) else result.translation_m.rmse:.4f}"
 
 
-def _json(evaluated: dict[str, Results]) -> str:
-    """The figures of one estimate, those of several by their names."""
-    trees = {name: _tree(results) for name, results in evaluated.items()}
-    return json.dumps(trees if len(trees) > 1 else trees.popitem()[1], indent=2)
-
-
 def _tree(results: Results) -> dict[str, object]:
     """The figures without the arrays behind them."""
-    tree = {name: _figures(result) for name, result in results.found.items()} | dict.fromkeys(results.missing)
+    import numpy as np
+
+    tree: dict[str, object] = {}
+    for name, result in results.found.items():
+        values = ((field.name, getattr(result, field.name)) for field in fields(result))
+        tree[name] = {key: value for key, value in values if not isinstance(value, np.ndarray)}
+    tree |= dict.fromkeys(results.missing)
     tree |= {"time_offset_s": results.time_offset_s} if results.time_offset_s else {}
     return tree | ({"scale": results.scale} if results.scale != 1.0 else {})
-
-
-def _figures(record: object) -> object:
-    if is_dataclass(record) and not isinstance(record, type):
-        values = {field.name: _figures(getattr(record, field.name)) for field in fields(record)}
-        return {name: value for name, value in values.items() if value is not _LEFT_OUT}
-    if isinstance(record, tuple):
-        return [_figures(item) for item in record]
-    if isinstance(record, float):
-        return record if isfinite(record) else None
-    return record if isinstance(record, int | str | None) else _LEFT_OUT
-
-
-_LEFT_OUT = object()

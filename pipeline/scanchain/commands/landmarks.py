@@ -2,32 +2,26 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.core import ParameterSource
 
+from scanchain.commands import options
+from scanchain.commands.options import PATH
 from scanchain.errors import InputError
 
 if TYPE_CHECKING:
-    from scanchain.landmarks.estimate import Optimizer
     from scanchain.landmarks.ranges import OdometryNoise
-    from scanchain.landmarks.study import Guess, Study
+    from scanchain.landmarks.study import Study
 
 
 @click.command()
-@click.argument("data", metavar="DATA...", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option(
-    "--out",
-    required=True,
-    metavar="DIR",
-    type=click.Path(path_type=Path),
-    help="Directory to create.",
-)
+@click.argument("data", metavar="DATA...", nargs=-1, required=True, type=PATH)
+@options.out()
 @click.option(
     "--methods",
     "--method",
@@ -39,6 +33,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--repeat",
+    "repeats",
     type=click.IntRange(1, 1000),
     default=3,
     show_default=True,
@@ -65,26 +60,19 @@ if TYPE_CHECKING:
     show_default=True,
     help="Optimizer for a nonlinear file.",
 )
-@click.option(
-    "--recording", metavar="FILE.rrd", type=click.Path(path_type=Path), help="Record before and after for rerun."
-)
-@click.option("--force", is_flag=True, help="Replace DIR if it is the result of an earlier run.")
-@click.option("--json", "as_json", is_flag=True, help="Print the figures as JSON.")
-@click.pass_context
+@click.option("--recording", metavar="FILE.rrd", type=PATH, help="Record before and after for rerun.")
+@options.force("DIR if it is the result of an earlier run")
+@options.as_json
 def landmarks(
-    ctx: click.Context,
     data: tuple[Path, ...],
     out: Path,
     methods: str,
-    repeat: int,
-    robot: int,
     noise: str | None,
-    guess: Guess,
-    optimizer: Optimizer,
     recording: Path | None,
     force: bool,
     as_json: bool,
-) -> None:
+    **more: Any,
+) -> int:
     """Solve landmark SLAM problems, and compare linear solvers on them.
 
     DATA is an npz file with a linear problem or with bearing and range measurements, or a folder of the UTIAS
@@ -102,41 +90,46 @@ def landmarks(
       scanchain landmarks 2d_nonlinear.npz --optimizer dogleg --out runs/dogleg --recording dogleg.rrd
       scanchain landmarks MRCLAM_Dataset6 --robot 1 --out runs/mrclam --json
     """
+    from msgspec.structs import replace
+
     from scanchain.clock import announcing_compilation
-    from scanchain.commands.options import check_output
     from scanchain.commands.terminal import Terminal
     from scanchain.landmarks.files import read_landmark_data
-    from scanchain.landmarks.results import text_of, tree_of
+    from scanchain.landmarks.results import text_of, tree_of, write_estimate
     from scanchain.landmarks.solvers import parse_methods
     from scanchain.landmarks.study import Options, study_file, study_log
     from scanchain.runs.directory import RunDirectory
+    from scanchain.runs.provenance import describe_start
     from scanchain_viz.report.problems import write_report
 
-    options = Options(parse_methods(methods), repeat, robot, _noise(noise), guess, optimizer)
+    chosen = Options(parse_methods(methods), noise=_noise(noise), **more)
     problems = [path if path.is_dir() else read_landmark_data(path) for path in data]
-    _check_options(ctx, {"log" if isinstance(each, Path) else each.kind for each in problems})
+    _check_options({"log" if isinstance(each, Path) else each.kind for each in problems})
     if recording is not None:
-        check_output(recording, force=force, endings=(".rrd",))
+        options.check_output(recording, force=force, endings=(".rrd",))
     with RunDirectory(out, force=force) as directory, Terminal("problems") as terminal:
         with announcing_compilation(terminal.say):
             studies = [
-                study_log(each, options) if isinstance(each, Path) else study_file(each, options)
+                study_log(each, chosen) if isinstance(each, Path) else study_file(each, chosen)
                 for each in problems
             ]
         _check_names(studies)
-        tree: dict[str, object] = {"problems": [tree_of(study) for study in studies]}
-        _write(directory.path, data, studies, tree)
+        for study in studies:
+            write_estimate(directory.path, study)
+        figures = options.json_text({"problems": [tree_of(study) for study in studies]})
+        (directory.path / "metrics.json").write_text(f"{figures}\n", encoding="utf-8")
+        files = [file for path in data for file in (sorted(path.glob("*.dat")) if path.is_dir() else [path])]
+        replace(describe_start(sys.argv, files, ""), complete=True).write(directory.path / "run.json")
         write_report(directory.path, studies)
         if recording is not None:
             from scanchain_viz.recording.results import record_landmarks
 
             record_landmarks(studies, recording)
         directory.complete()
-    click.echo(json.dumps(tree, indent=2) if as_json else "\n\n".join(text_of(study) for study in studies))
+    click.echo(figures if as_json else "\n\n".join(text_of(study) for study in studies))
     if not as_json:
         click.echo("".join(f"\nwritten        {path}" for path in (out, recording) if path is not None))
-    if not all(study.converged for study in studies):
-        ctx.exit(1)
+    return int(not all(study.converged for study in studies))
 
 
 _OF_LOGS, _OF_NONLINEAR = ("log", "MRCLAM folders"), ("bearing-range", "nonlinear files")
@@ -148,8 +141,9 @@ _ALONE = {  # options that only some problems take
 }
 
 
-def _check_options(ctx: click.Context, kinds: Collection[str]) -> None:
+def _check_options(kinds: Collection[str]) -> None:
     """Refuse options that none of the problems, of these kinds, takes."""
+    ctx = click.get_current_context()
     for name, (flag, kind, what) in _ALONE.items():
         if kind not in kinds and ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE:
             raise InputError(f"{flag} is for {what} alone, and DATA names none; leave it out")
@@ -178,17 +172,3 @@ def _check_names(studies: Sequence[Study]) -> None:
     for study, stem in zip(studies, stems, strict=True):
         if stems.count(stem) > 1:
             raise InputError(f"two problems are called {study.name}; rename one, or give each a call of its own")
-
-
-def _write(directory: Path, data: Sequence[Path], studies: Sequence[Study], tree: dict[str, object]) -> None:
-    """Write the estimates and the figures of all solvers."""
-    from msgspec.structs import replace
-
-    from scanchain.landmarks.results import write_estimate
-    from scanchain.runs.provenance import describe_start
-
-    for study in studies:
-        write_estimate(directory, study)
-    (directory / "metrics.json").write_text(json.dumps(tree, indent=2) + "\n", encoding="utf-8")
-    files = [file for path in data for file in (sorted(path.glob("*.dat")) if path.is_dir() else [path])]
-    replace(describe_start(sys.argv, files, ""), complete=True).write(directory / "run.json")

@@ -1,24 +1,21 @@
-"""``scanchain map``, ``merge`` and ``changes``: maps of a place, imported, merged and compared."""
+"""``scanchain map``, ``localize``, ``merge`` and ``changes``: maps of a place, and logs in them."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from scanchain.commands.options import (
-    ABOVE_ZERO,
-    PATH,
-    OverrideCommand,
-    config_option,
-    overrides,
-    print_summary,
-    result_options,
-    threads_option,
-)
+from scanchain.commands import options
+from scanchain.commands.options import ABOVE_ZERO, PATH, OverrideCommand
 from scanchain.errors import InputError, counted
+
+if TYPE_CHECKING:
+    from scanchain.data import Pose
+    from scanchain.maps import SavedMap
 
 
 @click.group("map")
@@ -33,23 +30,25 @@ def map_group() -> None:
 
 @map_group.command("import")
 @click.argument("file", metavar="FILE", type=PATH)
-@click.option("--out", required=True, metavar="DIR", type=PATH, help="Directory to create.")
+@options.out()
 @click.option(
     "--spacing",
+    "spacing_m",
     type=ABOVE_ZERO,
     metavar="METERS",
     help="Distance between the positions that the map is seen from. [default: 1.5 in the plane, 6 in space]",
 )
 @click.option(
     "--height",
+    "height_m",
     type=ABOVE_ZERO,
     default=1.6,
     show_default=True,
     metavar="METERS",
     help="Of the lidar above the ground.",
 )
-@click.option("--force", is_flag=True, help="Replace an existing map once the new one is complete.")
-def import_file(file: Path, out: Path, spacing: float | None, height: float, force: bool) -> None:
+@options.force("an existing map once the new one is complete")
+def import_file(file: Path, out: Path, **given: Any) -> None:
     """Make a map to localize in of a point cloud or an occupancy grid.
 
     FILE is a cloud in meters, z up (.ply, .pcd, .laz, .las, .npy), or map.yaml of nav2's or ROS 1's map_server
@@ -66,28 +65,72 @@ def import_file(file: Path, out: Path, spacing: float | None, height: float, for
     from scanchain.sessions.elsewhere import import_map
 
     with Terminal("positions") as terminal:
-        made = import_map(file, out, spacing_m=spacing, height_m=height, force=force, say=terminal.say)
+        made = import_map(file, out, say=terminal.say, **given)
     click.echo(
         f"{out}: {made.dimension}D map of {counted(made.points, 'point')}, seen from "
         f"{counted(made.keyframes, 'position')} {made.spacing_m:g} m apart"
     )
 
 
+@click.command(cls=OverrideCommand, options_metavar="--map RUN --out DIR [OPTIONS] [--section.key VALUE]...")
+@options.logs
+@click.option("--map", "prior", required=True, metavar="RUN", type=PATH, help="Run directory or map.")
+@options.result("an existing directory once the new one is complete")
+@click.option(
+    "--initial",
+    metavar="X,Y,YAW|FILE.tum",
+    help="Pose of the first scan in the map: meters and degrees, or a TUM file. [default: searched for]",
+)
+@options.of_log
+@options.strict
+def localize(prior: Path, out: Path, initial: str | None, strict: bool, as_json: bool, **given: Any) -> int:
+    """Find a log in the map of an earlier run, and follow it there.
+
+    Without --initial the place is searched for anywhere in the map. Exit code 1: the log is not from this place.
+
+    \b
+    Examples:
+      scanchain localize monday.mcap --map runs/sunday --out runs/monday
+      scanchain localize monday.mcap --map runs/sunday --out runs/monday --initial 12.5,-3,90
+      scanchain localize part_0.mcap part_1.mcap --map runs/sunday --out runs/monday --topic /points
+    """
+    options.collect_garbage_seldom()
+    from scanchain.api import draw_localization
+    from scanchain.commands.terminal import Terminal
+    from scanchain.runs.job import Job
+    from scanchain.sessions.localize import localize as localize_log
+
+    job = Job(out=out, command=tuple(sys.argv), **given)
+    first = None if initial is None else _initial(initial)
+    with Terminal("scans") as terminal:
+        localized = localize_log(job, prior, terminal, draw_localization, initial=first)
+    fails = localized.metrics.verdict.fails(strict=strict)
+    if fails and not sys.stdout.isatty():
+        click.echo(f"error: {out}: {localized.metrics.sentence}", err=True)
+    options.print_summary(out, localized.summary, as_json=as_json)
+    return int(fails)
+
+
+def _initial(text: str) -> Callable[[int, SavedMap], Pose]:
+    from scanchain.sessions.localize import pose_in_file, pose_near
+
+    if text.endswith(".tum"):
+        return pose_in_file(Path(text))
+    try:
+        x_m, y_m, yaw_deg = map(float, text.split(","))
+    except ValueError:
+        raise InputError(f"--initial is {text!r}; give x,y,yaw in meters and degrees, or a file .tum") from None
+    return pose_near(x_m, y_m, yaw_deg)
+
+
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
-@click.argument("runs", metavar="RUN...", nargs=-1, required=True, type=click.Path(path_type=Path))
-@result_options("DIR if it is the result of an earlier run or merge")
-@config_option
+@click.argument("runs", metavar="RUN...", nargs=-1, required=True, type=PATH)
+@options.result("DIR if it is the result of an earlier run or merge")
+@options.config
 @click.option("--fixed", is_flag=True, help="Leave the poses of the first RUN as they are.")
 @click.option("--update", is_flag=True, help="Remove from older sessions what newer ones saw through.")
-@threads_option
-@click.pass_context
-def merge(
-    ctx: click.Context,
-    runs: tuple[Path, ...],
-    out: Path,
-    as_json: bool,
-    **options: Any,
-) -> None:
+@options.threads
+def merge(runs: tuple[Path, ...], out: Path, as_json: bool, **given: Any) -> None:
     """Merge the maps of several runs into one map in one frame.
 
     RUN is a run directory, or that of an earlier merge; where each began need not be known. Loops are closed
@@ -108,46 +151,45 @@ def merge(
     from scanchain.sessions.merging import merge as merge_maps
 
     with Terminal("maps") as terminal:
-        merged = merge_maps(
-            runs, out, terminal, present_merge, overrides=overrides(ctx), command=tuple(sys.argv), **options
-        )
-    print_summary(out, merged.summary, as_json=as_json)
-
-
-if TYPE_CHECKING:
-    from scanchain.data import Pose
+        merged = merge_maps(runs, out, terminal, present_merge, command=tuple(sys.argv), **given)
+    options.print_summary(out, merged.summary, as_json=as_json)
 
 
 @click.command()
 @click.argument("earlier", metavar="RUN_A", type=PATH)
 @click.argument("later", metavar="[RUN_B]", required=False, type=PATH)
-@result_options("an existing comparison once the new one is complete")
+@options.result("an existing comparison once the new one is complete")
 @click.option("--aligned", is_flag=True, help="Both maps are in one frame already.")
 @click.option(
     "--transform",
     metavar="X,Y[,Z],YAW",
     help="Pose of RUN_B's frame in RUN_A's, meters and degrees. [default: found]",
 )
-@click.option("--voxel", type=ABOVE_ZERO, metavar="METERS", help="Resolution. [default: maps.voxel_size_m]")
+@click.option(
+    "--voxel",
+    "voxel_size_m",
+    type=ABOVE_ZERO,
+    metavar="METERS",
+    help="Resolution. [default: maps.voxel_size_m]",
+)
 @click.option(
     "--min-size",
+    "min_size_m",
     type=ABOVE_ZERO,
     default=0.2,
     show_default=True,
     metavar="METERS",
     help="Least length of a change; what is smaller is unknown.",
 )
-@threads_option
+@options.threads
 def changes(
     earlier: Path,
     later: Path | None,
     out: Path,
     aligned: bool,
     transform: str | None,
-    voxel: float | None,
-    min_size: float,
-    force: bool,
     as_json: bool,
+    **given: Any,
 ) -> None:
     """Compare two maps of one place: what appeared, what vanished, what moved.
 
@@ -172,19 +214,11 @@ def changes(
         raise click.UsageError("--aligned and --transform are both given; give one of them")
     if later is None and (aligned or transform is not None):
         raise click.UsageError("--aligned and --transform are for two maps; give RUN_B, or leave them out")
+    maps = [earlier] if later is None else [earlier, later]
     T = _pose(earlier, "0,0,0" if aligned else transform)
     with Terminal("maps") as terminal:
-        compare_maps(
-            [earlier] if later is None else [earlier, later],
-            out,
-            present_changes,
-            terminal.say,
-            T_earlier_later=T,
-            voxel_size_m=voxel,
-            min_size_m=min_size,
-            force=force,
-        )
-    print_summary(out, (out / SUMMARY_FILE).read_text(encoding="utf-8"), as_json=as_json)
+        compare_maps(maps, out, present_changes, terminal.say, T_earlier_later=T, **given)
+    options.print_summary(out, (out / SUMMARY_FILE).read_text(encoding="utf-8"), as_json=as_json)
 
 
 def _pose(earlier: Path, text: str | None) -> Pose | None:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import warnings
-from collections.abc import Generator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import click
 
-from scanchain.commands.options import PATH, OverrideCommand, check_output, key_option, overrides
+from scanchain.commands import options
+from scanchain.commands.options import PATH, OverrideCommand
 from scanchain.errors import FREEDOM, InputError, counted, remedy_of
 from scanchain.settings import Override, load_settings
 
@@ -37,7 +36,7 @@ _HALF = 0.5  # robust weight below which an edge is contradicted by the rest, re
 @click.option(
     "--out", metavar="FILE", type=PATH, help="Write the optimized graph: .g2o, or TORO's .graph or .toro."
 )
-@key_option(
+@options.key(
     "--optimizer",
     "graph.optimizer",
     metavar="NAME",
@@ -50,7 +49,7 @@ _HALF = 0.5  # robust weight below which an edge is contradicted by the rest, re
     show_default=True,
     help="Initial guess; auto takes the file's, or the chordal one if that is poor.",
 )
-@key_option(
+@options.key(
     "--robust",
     "graph.robust",
     metavar="KERNEL",
@@ -70,11 +69,9 @@ _HALF = 0.5  # robust weight below which an edge is contradicted by the rest, re
 )
 @click.option("--png", metavar="FILE", type=PATH, help="Draw the graph before and after optimization.")
 @click.option("--recording", metavar="FILE.rrd", type=PATH, help="Record the graph before and after optimization.")
-@click.option("--force", is_flag=True, help="Replace files that exist.")
-@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
-@click.pass_context
+@options.force("files that exist")
+@options.as_json
 def optimize(
-    ctx: click.Context,
     source: Path,
     out: Path | None,
     initialize: str,
@@ -84,7 +81,8 @@ def optimize(
     recording: Path | None,
     force: bool,
     as_json: bool,
-) -> None:
+    overrides: tuple[Override, ...],
+) -> int:
     """Optimize a pose graph and certify whether the minimum is global.
 
     GRAPH is a g2o file (SE2, SE3:QUAT, XY) or a TORO file. The certificate is a lower bound of χ² over all poses.
@@ -99,105 +97,48 @@ def optimize(
       scanchain optimize candidates.g2o --robust truncated --out robust.g2o --marginals all
       scanchain optimize manhattan.g2o --initialize spanning-tree --optimizer dogleg --graph.max_iterations 100
     """
-    outputs = Outputs(out, marginals, png, recording)
-    outputs.check(force)
-    settings = overrides(ctx)
-    config = _config(settings)
-    is_robust = config.robust != "none" and any(setting.key == "graph.robust" for setting in settings)
+    from scanchain.graph.g2o import GRAPH_SUFFIXES, rejected_path
+    from scanchain.graph.optimization import GraphChange
+
+    if marginals is not None and out is None:
+        raise InputError("--marginals writes a table beside the graph; give --out FILE")
+    rejected = rejected_path(out) if out else None
+    table = out.with_suffix(".marginals.csv") if out and marginals else None
+    endings = {out: GRAPH_SUFFIXES, rejected: (), table: (), png: (".png",), recording: (".rrd",)}
+    for path, allowed in endings.items():
+        if path is not None:
+            options.check_output(path, force=force, endings=allowed)
+    config = _config(overrides)
+    is_robust = config.robust != "none" and any(override.key == "graph.robust" for override in overrides)
     file = _read(source, cast("Indefinite", indefinite), is_robust)
-    report = _solved(file, source.name, config, cast("Initialization", initialize))
-    written = outputs.write(report)
-    click.echo(report.json(written) if as_json else report.text(written))
-    if not report.optimization.converged:
-        ctx.exit(1)
+    before = file.graph.state()
+    done = file.graph.optimize(config, initialize=cast("Initialization", initialize))
+    change = GraphChange(source.name, before, done.state)
+    free, weak = file.graph.free_poses(), file.graph.weakly_joined()
+    report = _Report(file, change, done, free, weak, file.graph.certify())
+    writers = _writers(file, change, out, marginals, png, recording)
+    for path, write in writers.items():
+        try:
+            write()
+        except OSError as error:
+            if remedy_of(error):
+                raise
+            raise InputError(f"{path}: not writable ({error.strerror}); choose another place") from error
+    if rejected is not None and rejected not in writers:
+        rejected.unlink(missing_ok=True)  # of an earlier report, whose place --force gave away
+    written = [str(path) for path in writers]
+    lines = [*report.lines(), *(("written", path) for path in written)]
+    text = "\n".join(f"{name:<15}{fact}" for name, fact in lines)
+    click.echo(options.json_text(report.tree() | {"written": written}) if as_json else text)
+    return int(not done.converged)
 
 
-@dataclass(frozen=True, slots=True)
-class Outputs:
-    """Files to write, and the poses whose covariances are requested."""
-
-    graph: Path | None
-    marginals: str | None
-    picture: Path | None
-    recording: Path | None
-
-    @property
-    def table(self) -> Path | None:
-        """File of the covariances."""
-        return self.graph.with_suffix(".marginals.csv") if self.graph and self.marginals else None
-
-    @property
-    def paths(self) -> list[Path]:
-        """Every requested file."""
-        return [path for path in (self.graph, self.table, self.picture, self.recording) if path is not None]
-
-    @property
-    def rejected(self) -> Path | None:
-        """File of the rejected edges, written if there are any."""
-        from scanchain.graph.g2o import rejected_path
-
-        return rejected_path(self.graph) if self.graph else None
-
-    def check(self, force: bool) -> None:
-        """Refuse, before the work, files that could not be written after it."""
-        if self.marginals is not None and self.graph is None:
-            raise InputError("--marginals writes a table beside the graph; give --out FILE")
-        from scanchain.graph.g2o import GRAPH_SUFFIXES
-
-        endings = {self.graph: GRAPH_SUFFIXES, self.picture: (".png",), self.recording: (".rrd",)}
-        for path in (*self.paths, *filter(None, [self.rejected])):
-            check_output(path, force=force, endings=endings.get(path, ()))
-
-    def write(self, report: GraphReport) -> list[Path]:
-        """Write them all and return their paths."""
-        from scanchain.graph.covariance import chosen_poses, write_covariances
-        from scanchain.graph.g2o import write_g2o
-
-        file = report.file
-        chosen = chosen_poses(self.marginals, file.ids) if self.marginals is not None else file.ids[:0]
-        written = self.paths
-        if self.graph is not None and self.rejected is not None:
-            with _written(self.graph):
-                write_g2o(self.graph, file.graph, ids=file.ids, other_lines=file.other_lines, force=True)
-            with _written(self.rejected):
-                if file.graph.is_rejected.any():
-                    write_g2o(self.rejected, file.graph, ids=file.ids, edges="rejected", force=True)
-                    written.insert(1, self.rejected)
-                else:  # of an earlier report, whose place --force gave away
-                    self.rejected.unlink(missing_ok=True)
-        if self.table is not None:
-            with _written(self.table):
-                write_covariances(self.table, file.ids[chosen], file.graph.covariances()[chosen])
-        if self.picture is not None:
-            from scanchain_viz.report.problems import draw_graph
-
-            with _written(self.picture):
-                draw_graph(report.change, self.picture)
-        if self.recording is not None:
-            from scanchain_viz.recording.results import record_graph
-
-            with _written(self.recording):
-                record_graph(report.change, self.recording)
-        return written
-
-
-@contextmanager
-def _written(path: Path) -> Generator[None]:
-    """Name the file that could not be written, and the remedy."""
-    try:
-        yield
-    except OSError as error:
-        if remedy_of(error):
-            raise
-        raise InputError(f"{path}: not writable ({error.strerror}); choose another place") from error
-
-
-def _config(settings: Sequence[Override]) -> GraphConfig:
+def _config(overrides: Sequence[Override]) -> GraphConfig:
     """The graph's branch of the configuration; other keys are refused."""
-    for setting in settings:
-        if not setting.key.startswith("graph."):
-            raise InputError(f"{setting.flag} has no meaning for optimize; its keys begin with --graph.")
-    return load_settings(overrides=settings).config.graph
+    for override in overrides:
+        if not override.key.startswith("graph."):
+            raise InputError(f"{override.flag} has no meaning for optimize; its keys begin with --graph.")
+    return load_settings(overrides=overrides).config.graph
 
 
 def _read(source: Path, indefinite: Indefinite, is_robust: bool) -> G2oFile:
@@ -213,19 +154,41 @@ def _read(source: Path, indefinite: Indefinite, is_robust: bool) -> G2oFile:
     return file
 
 
-def _solved(file: G2oFile, name: str, config: GraphConfig, initialize: Initialization) -> GraphReport:
-    """Optimize and certify."""
-    from scanchain.graph.optimization import GraphChange
+def _writers(
+    file: G2oFile,
+    change: GraphChange,
+    out: Path | None,
+    marginals: str | None,
+    png: Path | None,
+    recording: Path | None,
+) -> dict[Path, Callable[[], None]]:
+    """What writes each of the files."""
+    from scanchain.graph.covariance import chosen_poses, write_covariances
+    from scanchain.graph.g2o import rejected_path, write_g2o
 
-    before = file.graph.state()
-    done = file.graph.optimize(config, initialize=initialize)
-    change = GraphChange(name, before, done.state)
-    free, weak = file.graph.free_poses(), file.graph.weakly_joined()
-    return GraphReport(file, change, done, free, weak, file.graph.certify())
+    graph, ids = file.graph, file.ids
+    writers: dict[Path, Callable[[], None]] = {}
+    if out is not None:
+        writers[out] = lambda: write_g2o(out, graph, ids=ids, other_lines=file.other_lines, force=True)
+        rejected = rejected_path(out)
+        if graph.is_rejected.any():
+            writers[rejected] = lambda: write_g2o(rejected, graph, ids=ids, edges="rejected", force=True)
+        if marginals is not None:
+            chosen, table = chosen_poses(marginals, ids), out.with_suffix(".marginals.csv")
+            writers[table] = lambda: write_covariances(table, ids[chosen], graph.covariances()[chosen])
+    if png is not None:
+        from scanchain_viz.report.problems import draw_graph
+
+        writers[png] = lambda: draw_graph(change, png)
+    if recording is not None:
+        from scanchain_viz.recording.results import record_graph
+
+        writers[recording] = lambda: record_graph(change, recording)
+    return writers
 
 
 @dataclass(frozen=True, slots=True)
-class GraphReport:
+class _Report:
     """Everything to print about an optimized graph."""
 
     file: G2oFile
@@ -235,48 +198,43 @@ class GraphReport:
     weak: NDArray[np.int64]
     certificate: Certificate
 
-    def text(self, written: list[Path]) -> str:
-        """One line per fact."""
+    def lines(self) -> list[tuple[str, str]]:
+        """Facts by name."""
         from scanchain.graph.edge_checks import free_text, weak_text
 
-        graph, done = self.file.graph, self.optimization
+        file, graph, done = self.file, self.file.graph, self.optimization
         guess = done.initialization
         if guess == "given":
-            guess = "the file's poses" if self.file.has_guess else "odometry, as the file has no vertices"
+            guess = "the file's poses" if file.has_guess else "odometry, as the file has no vertices"
         size = f"{graph.dimension}D, {counted(len(graph), 'pose')}, {counted(len(graph.edges), 'edge')}"
-        lines = [
-            *(f"warning        {warning}" for warning in self._warnings),
-            f"graph          {self.change.name}: {size}",
-            *(f"kept as is     {counted(count, 'line')} {tag}" for tag, count in self.file.other_tags),
-        ]
-        if projection := self.file.projection:
-            lines.append(
-                f"projected      {projection.edges:,} of {projection.of:,} indefinite information matrices"
-            )
-        ending = done.reason if done.converged else f"DID NOT CONVERGE: {done.reason}"
-        lines += [
-            f"initial guess  {guess}",
-            f"chi2           {self._chi2}",
-            f"iterations     {done.iterations:,} in {1e3 * done.time_s:.0f} ms; {ending}",
-        ]
-        held = ""
-        if loops := int(graph.is_loop.sum()):
-            held = ", with fixed robust weights"
+        loops, certified, robust = int(graph.is_loop.sum()), self.certificate.verdict, []
+        if loops:
+            certified += ", with fixed robust weights"
+            others = f"the other {counted(len(graph.edges) - loops, 'edge')} (odometry, points) in full weight"
             rest = "; they do not count" if done.rejected.any() else ""
-            lines += [
-                f"robust         on {counted(loops, 'loop edge')}; the other "
-                f"{counted(len(graph.edges) - loops, 'edge')} (odometry, points) in full weight",
-                f"rejected       {done.rejected.sum():,} of {loops:,} loop edges{rest}",
+            robust = [
+                ("robust", f"on {counted(loops, 'loop edge')}; {others}"),
+                ("rejected", f"{done.rejected.sum():,} of {loops:,} loop edges{rest}"),
             ]
-        if self.free:
-            lines.append(f"free           {free_text(self.free)}")
-        if len(self.weak):
-            lines.append(f"weakly joined  {weak_text(self.weak)}")
-        lines.append(f"certificate    {self.certificate.verdict}{held}; {1e3 * self.certificate.time_s:.0f} ms")
-        return "\n".join([*lines, *(f"written        {path}" for path in written)])
+        projected = file.projection
+        indefinite = projected and f"{projected.edges:,} of {projected.of:,} indefinite information matrices"
+        ending = done.reason if done.converged else f"DID NOT CONVERGE: {done.reason}"
+        return [
+            *(("warning", warning) for warning in self.warnings),
+            ("graph", f"{self.change.name}: {size}"),
+            *(("kept as is", f"{counted(count, 'line')} {tag}") for tag, count in file.other_tags),
+            *([("projected", indefinite)] if indefinite else []),
+            ("initial guess", guess),
+            ("chi2", self._chi2),
+            ("iterations", f"{done.iterations:,} in {1e3 * done.time_s:.0f} ms; {ending}"),
+            *robust,
+            *([("free", free_text(self.free))] if self.free else []),
+            *([("weakly joined", weak_text(self.weak))] if len(self.weak) else []),
+            ("certificate", f"{certified}; {1e3 * self.certificate.time_s:.0f} ms"),
+        ]
 
     @property
-    def _warnings(self) -> list[str]:
+    def warnings(self) -> list[str]:
         """Warnings to read before the rest."""
         notes = [self.file.note] if self.file.note else []
         after, graph = self.change.after, self.file.graph
@@ -289,13 +247,12 @@ class GraphReport:
             )
         weight = graph.weight[graph.is_loop]
         downweighted = int((weight < _HALF).sum())
-        if 2 * downweighted <= len(weight):
-            return notes
-        return [
-            *notes,
-            f"{downweighted:,} of {len(weight):,} loop edges are rejected or have a weight below ½: if they are "
-            "right, all below is wrong; the certificate covers the edges in force, not their selection",
-        ]
+        if 2 * downweighted > len(weight):
+            notes.append(
+                f"{downweighted:,} of {len(weight):,} loop edges are rejected or have a weight below ½: if they "
+                "are right, all below is wrong; the certificate covers the edges in force, not their selection"
+            )
+        return notes
 
     @property
     def _chi2(self) -> str:
@@ -309,18 +266,18 @@ class GraphReport:
             return f"{first}; {second}"
         return f"{first}; after, {fit(after)}" if has_loops(before) else fit(after)
 
-    def json(self, written: list[Path]) -> str:
+    def tree(self) -> dict[str, object]:
         """The same, and every rejected edge, by vertex ids."""
         graph, done = self.file.graph, self.optimization
-        tree = {
-            "warnings": self._warnings,
+        return {
+            "warnings": self.warnings,
             "graph": self.change.name,
             "dimension": graph.dimension,
             "poses": len(graph),
             "edges": len(graph.edges),
             "robust_edges": int(graph.is_loop.sum()),
             "rejected": self.file.ids[done.state.edges[done.rejected]].tolist(),
-            "projected": None if self.file.projection is None else asdict(self.file.projection),
+            "projected": self.file.projection,
             "kept_lines": dict(self.file.other_tags),
             "chi2_before": done.chi2_before,
             "chi2_after": done.chi2_after,
@@ -332,9 +289,7 @@ class GraphReport:
             "reason": done.reason,
             "initialization": done.initialization,
             "time_s": done.time_s,
-            "free": [asdict(pose) for pose in self.free],
+            "free": self.free,
             "weakly_joined": self.weak.tolist(),
             "certificate": asdict(self.certificate) | {"relative_gap": self.certificate.relative_gap},
-            "written": [str(path) for path in written],
         }
-        return json.dumps(tree, indent=2)

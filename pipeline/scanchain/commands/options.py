@@ -1,4 +1,4 @@
-"""Options that commands share: the LOG argument, configuration keys as flags, --gt, limits, output checks."""
+"""Options that commands share, as decorators: configuration keys as flags, --out, --gt, limits; and results."""
 
 from __future__ import annotations
 
@@ -10,22 +10,23 @@ from pathlib import Path
 from typing import Any
 
 import click
+import msgspec
 
 from scanchain.config import NO_TRUTH
 from scanchain.errors import InputError
-from scanchain.files import Source, source_of
+from scanchain.files import source_of
 from scanchain.settings import Override
 from scanchain.threads import MOST, use_threads
 
 _GARBAGE_EVERY = 500_000  # new objects; most stay to the end, and to search them often costs a twentieth
+_ALIASES = "scanchain.commands.aliases"
+_MIB_PER_GIB = 1024.0
+PATH = click.Path(path_type=Path)
 
 
 def collect_garbage_seldom() -> None:
     """Search for garbage less often, for commands that process a log."""
     gc.set_threshold(_GARBAGE_EVERY)
-
-
-PATH = click.Path(path_type=Path)
 
 
 class NumberRange(click.FloatRange):
@@ -43,13 +44,16 @@ ABOVE_ZERO = NumberRange(0.0, min_open=True)
 
 
 class OverrideCommand(click.Command):
-    """Command that takes any configuration key as ``--section.key value``.
+    """Command that takes any configuration key as ``--section.key value``; ``overrides`` are all that are set.
 
     Options with a dot in their name are taken out of the arguments before click sees the rest.
     """
 
+    def __init__(self, *words: Any, options_metavar: str = "[OPTIONS] [--section.key VALUE]...", **more: Any):
+        super().__init__(*words, options_metavar=options_metavar, **more)
+
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Split the arguments into overrides, kept in the context, and ordinary ones."""
+        """Parse the overrides and the ordinary arguments. Raises click.UsageError for a key set by two options."""
         rest: list[str] = []
         overrides: list[Override] = []
         words = iter(args)
@@ -61,74 +65,39 @@ class OverrideCommand(click.Command):
             if not flag.startswith("--") or "." not in flag:
                 rest.append(word)
                 continue
-            if not equals:
-                text = next(words, "")
-                if not text:
-                    raise click.UsageError(f"{flag} needs a value, as in {flag} VALUE", ctx)
+            text = text if equals else next(words, "")
+            if not equals and not text:
+                raise click.UsageError(f"{flag} needs a value, as in {flag} VALUE", ctx)
             overrides.append(Override(flag[2:], text, flag))
-        ctx.meta[_KEY] = tuple(overrides)
-        return super().parse_args(ctx, rest)
-
-
-def overrides(ctx: click.Context) -> tuple[Override, ...]:
-    """The keys that a command's options set: those of ``key_option`` as --matcher, and ``--section.key``.
-
-    Raises click.UsageError where two of them set the same key.
-    """
-    chosen: dict[str, Override] = {}
-    for override in (*ctx.meta.get(_ALIASES, ()), *ctx.meta[_KEY]):
-        other = chosen.setdefault(override.key, override)
-        if other is override:
-            continue
-        if other.flag == override.flag:
-            raise click.UsageError(
-                f"{other.flag} is given twice ({other.text}, {override.text}); give it once", ctx
-            )
-        raise click.UsageError(f"{other.flag} and {override.flag} both set {override.key}; give one of them", ctx)
-    return tuple(chosen.values())
-
-
-_KEY, _ALIASES = "scanchain.commands.overrides", "scanchain.commands.aliases"
-
-
-def key_option(flag: str, key: str, *, value: str | None = None, **attributes: Any) -> Callable[[Any], Any]:
-    """An option that sets a configuration key, which ``overrides`` returns; ``value`` is that of a flag."""
-
-    def keep(ctx: click.Context, _: click.Parameter, given: str | bool | None) -> None:
-        if given not in (None, False):
-            _set(ctx, Override(key, value or str(given), flag))
-
-    return click.option(flag, is_flag=True if value else None, expose_value=False, callback=keep, **attributes)
+        unused = super().parse_args(ctx, rest)
+        chosen: dict[str, Override] = {}
+        for override in (*ctx.meta.get(_ALIASES, ()), *overrides):
+            other = chosen.setdefault(override.key, override)
+            if other is not override:
+                flag, key = override.flag, override.key
+                twice = f"{flag} is given twice ({other.text}, {override.text}); give it once"
+                both = f"{other.flag} and {flag} both set {key}; give one of them"
+                raise click.UsageError(twice if other.flag == flag else both, ctx)
+        ctx.params["overrides"] = tuple(chosen.values())
+        return unused
 
 
 def _set(ctx: click.Context, override: Override) -> None:
     ctx.meta.setdefault(_ALIASES, []).append(override)
 
 
-class _LogType(click.ParamType):
-    name = "log"
+def key(flag: str, name: str, *, value: str | None = None, **attributes: Any) -> Callable[[Any], Any]:
+    """An option that sets a configuration key; ``value`` is that of a flag."""
 
-    def convert(self, value: str | Source, param: click.Parameter | None, ctx: click.Context | None) -> Source:
-        """Path or address that a word stands for."""
-        return source_of(value)
+    def keep(ctx: click.Context, _: click.Parameter, given: str | bool | None) -> None:
+        if given not in (None, False):
+            _set(ctx, Override(name, value or str(given), flag))
+
+    return click.option(flag, is_flag=True if value else None, expose_value=False, callback=keep, **attributes)
 
 
-LOG = _LogType()
-
-
-def part_options(log: str = "the log", *, topic: str = "the only one that fits") -> Callable[[Any], Any]:
-    """``--topic``, ``--start``, ``--end`` and ``--every``, the part of a log.
-
-    log, topic : in words, what is cut and which lidar is taken without ``--topic``
-    """
-    of = "" if log == "the log" else f" of {log}"
-    begin = f"Skip {log} up to this time, counted from its first message."
-    return _together(
-        key_option("--topic", "log.topic", metavar="TOPIC", help=f"Lidar topic{of}. [default: {topic}]"),
-        key_option("--start", "log.start_s", metavar="SECONDS", help=begin),
-        key_option("--end", "log.end_s", metavar="SECONDS", help=f"Skip {log} after this time."),
-        key_option("--every", "log.every", metavar="N", help="Take every N-th scan."),
-    )
+LOG = source_of
+logs = click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
 
 
 def _together(*options: Callable[[Any], Any]) -> Callable[[Any], Any]:
@@ -136,33 +105,42 @@ def _together(*options: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return lambda command: reduce(lambda decorated, option: option(decorated), reversed(options), command)
 
 
-def _use(context: click.Context, parameter: click.Parameter, count: int | None) -> None:
-    if count is not None:
-        use_threads(count)
+def part(log: str = "the log", *, topic: str = "the only one that fits") -> Callable[[Any], Any]:
+    """``--topic``, ``--start``, ``--end`` and ``--every``, the part of a log.
+
+    log, topic : in words, what is cut and which lidar is taken without ``--topic``
+    """
+    of = "" if log == "the log" else f" of {log}"
+    begin = f"Skip {log} up to this time, counted from its first message."
+    return _together(
+        key("--topic", "log.topic", metavar="TOPIC", help=f"Lidar topic{of}. [default: {topic}]"),
+        key("--start", "log.start_s", metavar="SECONDS", help=begin),
+        key("--end", "log.end_s", metavar="SECONDS", help=f"Skip {log} after this time."),
+        key("--every", "log.every", metavar="N", help="Take every N-th scan."),
+    )
 
 
-threads_option = click.option(
+threads = click.option(
     "--threads",
     type=click.IntRange(1, MOST),
     metavar="N",
-    callback=_use,
+    callback=lambda _, __, count: None if count is None else use_threads(count),
     expose_value=False,
     help="Threads to compute with; the results are the same. [default: SCANCHAIN_THREADS, or one for each core]",
 )
-
-
-matcher_option = key_option(
+matcher = key(
     "--matcher",
     "matching.matcher",
     metavar="plicp|svd|MODULE:CLASS",
     help="LM-PLICP (the default), SVD-ICP, or your own class (scanchain.registration.Matcher).",
 )
-no_loops_option = key_option("--no-loops", "loops.enabled", value="false", help="Odometry only, no loop closures.")
-
-
-config_option = click.option(
-    "--config", "config_file", metavar="FILE", type=PATH, help="TOML file on top of the preset."
+no_loops = key("--no-loops", "loops.enabled", value="false", help="Odometry only, no loop closures.")
+config = click.option("--config", "config_file", metavar="FILE", type=PATH, help="TOML file on top of the preset.")
+relations = click.option(
+    "--relations", metavar="FILE", type=PATH, help="Manually verified relative poses (Kümmerle et al. 2009)."
 )
+strict = click.option("--strict", is_flag=True, help="Exit with 1 unless the verdict is trustworthy.")
+as_json = click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 
 
 def _checked_gap(_: click.Context, __: click.Parameter, value: float | None) -> float | None:
@@ -171,7 +149,7 @@ def _checked_gap(_: click.Context, __: click.Parameter, value: float | None) -> 
     return value
 
 
-max_gap_option = click.option(
+max_gap = click.option(
     "--max-gap",
     "max_gap_s",
     type=float,
@@ -179,10 +157,9 @@ max_gap_option = click.option(
     metavar="SECONDS",
     help="Longest gap between true poses to interpolate. [default: 5 of their usual intervals, 0.1 to 0.6]",
 )
-strict_option = click.option("--strict", is_flag=True, help="Exit with 1 unless the verdict is trustworthy.")
 
 
-def ground_truth_option(
+def ground_truth(
     metavar: str = "FILE|TOPIC|none",
     help: str = "Ground truth: TUM, KITTI or a topic; none to ignore that of the log. [default: /ground_truth]",
 ) -> Callable[[Any], Any]:
@@ -199,23 +176,23 @@ def ground_truth_option(
     return click.option("--gt", "ground_truth", metavar=metavar, callback=keep, help=help)
 
 
-def log_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """What ``run`` and ``localize`` take of a log: its part, configuration and true poses."""
-    return _together(
-        config_option, part_options(), matcher_option, ground_truth_option(), max_gap_option, threads_option
-    )(command)
+of_log = _together(config, part(), matcher, ground_truth(), max_gap, threads)
 
 
-def result_options(replaced: str, *, out: str = "Directory to create.") -> Callable[[Any], Any]:
-    """``--out``, ``--force`` and ``--json`` of a command that writes a directory with its metrics.
+def force(replaced: str) -> Callable[[Any], Any]:
+    """``--force``, with what it replaces in words."""
+    return click.option("--force", is_flag=True, help=f"Replace {replaced}.")
 
-    replaced : what --force replaces, in words
-    """
-    return _together(
-        click.option("--out", required=True, metavar="DIR", type=PATH, help=out),
-        click.option("--force", is_flag=True, help=f"Replace {replaced}."),
-        click.option("--json", "as_json", is_flag=True, help="Print metrics.json instead of the summary."),
-    )
+
+def out(what: str = "Directory to create.") -> Callable[[Any], Any]:
+    """``--out``, required."""
+    return click.option("--out", required=True, metavar="DIR", type=PATH, help=what)
+
+
+def result(replaced: str, what: str = "Directory to create.") -> Callable[[Any], Any]:
+    """``--out``, ``--force`` and ``--json`` of a command that writes a directory with its metrics."""
+    as_metrics = click.option("--json", "as_json", is_flag=True, help="Print metrics.json instead of the summary.")
+    return _together(out(what), force(replaced), as_metrics)
 
 
 def print_summary(out: Path, summary: str, *, as_json: bool) -> None:
@@ -225,10 +202,12 @@ def print_summary(out: Path, summary: str, *, as_json: bool) -> None:
         click.echo(f"written        {out}")
 
 
-_MIB_PER_GIB = 1024.0
+def json_text(tree: object) -> str:
+    """Records, dictionaries and numbers of NumPy as indented JSON; what is not finite becomes null."""
+    return msgspec.json.format(msgspec.json.encode(tree, enc_hook=lambda number: number.item()), indent=2).decode()
 
 
-def limit_options(what: str, *, time_default: str, memory_default: str) -> Callable[[Any], Any]:
+def limits(what: str, *, time_default: str, memory_default: str) -> Callable[[Any], Any]:
     """``--time-limit`` as ``time_s``, ``--memory-limit`` as ``memory_mib``; None where not given.
 
     what : the thing limited, in words; time_default, memory_default : the defaults, in words

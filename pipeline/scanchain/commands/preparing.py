@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 import textwrap
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import wraps
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import perf_counter
@@ -15,15 +15,13 @@ from typing import Any
 
 import click
 
-from scanchain.commands.options import OverrideCommand, config_option, overrides
+from scanchain.commands import options
+from scanchain.commands.options import PATH, OverrideCommand
 from scanchain.config_keys import Value
 from scanchain.errors import ScanchainError
-from scanchain.settings import Settings, config_keys, dump, flatten, load_settings
+from scanchain.settings import Override, Settings, config_keys, dump, flatten, load_settings
 
 _INDENT = 6 * " "
-_LIDAR = click.option(
-    "--lidar", type=click.Choice(["2d", "3d"]), help="The preset that a log of this kind would get."
-)
 
 
 @click.group()
@@ -38,13 +36,21 @@ def config() -> None:
 
 
 def _effective(command: Callable[..., Any]) -> Callable[..., Any]:
-    return click.pass_context(config_option(_LIDAR(command)))
+    """A command that takes ``settings``: of --lidar, --config and all keys."""
+
+    @wraps(command)
+    def run(config_file: Path | None, lidar: str | None, overrides: tuple[Override, ...], **given: Any) -> None:
+        dimension = int(lidar[0]) if lidar else None
+        command(load_settings(dimension, file=config_file, overrides=overrides), **given)
+
+    kinds, help = click.Choice(["2d", "3d"]), "The preset that a log of this kind would get."
+    return options.config(click.option("--lidar", type=kinds, help=help)(run))
 
 
 @config.command("show", cls=OverrideCommand)
-@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
+@options.as_json
 @_effective
-def show(ctx: click.Context, config_file: Path | None, lidar: str | None, as_json: bool) -> None:
+def show(settings: Settings, as_json: bool) -> None:
     """Print every key with its value, unit and range, and what it sets.
 
     \b
@@ -53,41 +59,37 @@ def show(ctx: click.Context, config_file: Path | None, lidar: str | None, as_jso
       scanchain config show --lidar 2d --matching.max_distance_m 0.3
       scanchain config show --config mine.toml --json
     """
-    settings = _settings(ctx, config_file, lidar)
     values = flatten(settings.config)
+    rows: list[dict[str, Any]] = [
+        {
+            "key": key.name,
+            "value": values[key.name],
+            "unit": key.unit,
+            "range": key.range,
+            "default": key.default,
+            "description": key.description,
+        }
+        for key in config_keys().values()
+    ]
     if as_json:
-        keys = config_keys().values()
-        rows = [
-            {
-                "key": k.name,
-                "value": _plain(values[k.name]),
-                "unit": k.unit,
-                "range": k.range,
-                "default": _plain(k.default),
-                "description": k.description,
-            }
-            for k in keys
-        ]
-        click.echo(json.dumps(rows, indent=2))
+        click.echo(options.json_text(rows))
         return
     click.echo(f"# {settings.source}; * differs from the default")
+    marks = [" " if row["value"] == row["default"] else "*" for row in rows]
     cells = [
-        (f"{'*' if values[k.name] != k.default else ' '} {k.name}", _text(values[k.name]), k.unit, k.range)
-        for k in config_keys().values()
+        (f"{mark} {row['key']}", _text(row["value"]), row["unit"], row["range"])
+        for mark, row in zip(marks, rows, strict=True)
     ]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    for row, key in zip(cells, config_keys().values(), strict=True):
-        click.echo("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
-        click.echo(
-            textwrap.fill(
-                key.description.replace("``", ""), 100, initial_indent=_INDENT, subsequent_indent=_INDENT
-            )
-        )
+    for cell, row in zip(cells, rows, strict=True):
+        click.echo("  ".join(map(str.ljust, cell, widths)).rstrip())
+        description = row["description"].replace("``", "")
+        click.echo(textwrap.fill(description, 100, initial_indent=_INDENT, subsequent_indent=_INDENT))
 
 
 @config.command("dump", cls=OverrideCommand)
 @_effective
-def dump_settings(ctx: click.Context, config_file: Path | None, lidar: str | None) -> None:
+def dump_settings(settings: Settings) -> None:
     """Print the effective configuration as TOML, to be edited and given back with --config.
 
     \b
@@ -95,22 +97,13 @@ def dump_settings(ctx: click.Context, config_file: Path | None, lidar: str | Non
       scanchain config dump --lidar 2d > mine.toml
       scanchain config dump --config mine.toml --loops.enabled false
     """
-    click.echo(dump(_settings(ctx, config_file, lidar).config), nl=False)
-
-
-def _settings(ctx: click.Context, file: Path | None, lidar: str | None) -> Settings:
-    dimension = int(lidar[0]) if lidar else None
-    return load_settings(dimension, file=file, overrides=overrides(ctx))
+    click.echo(dump(settings.config), nl=False)
 
 
 def _text(value: Value) -> str:
-    return (
-        str(value).lower() if isinstance(value, bool) else f"{value!r}" if isinstance(value, str) else f"{value:g}"
-    )
-
-
-def _plain(value: Value) -> Value | None:
-    return None if value == float("inf") else value
+    if isinstance(value, bool):
+        return str(value).lower()
+    return repr(value) if isinstance(value, str) else f"{value:g}"
 
 
 @click.group()
@@ -125,7 +118,7 @@ def sequence() -> None:
 
 
 @sequence.command("list")
-@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
+@options.as_json
 def list_sequences(as_json: bool) -> None:
     """List the catalog.
 
@@ -134,13 +127,11 @@ def list_sequences(as_json: bool) -> None:
       scanchain sequence list
       scanchain sequence list --json
     """
-    from msgspec import to_builtins
-
     from scanchain import catalog
 
     entries = {name: catalog.load(name) for name in catalog.names()}
     if as_json:
-        click.echo(json.dumps({name: to_builtins(entry) for name, entry in entries.items()}, indent=2))
+        click.echo(options.json_text(entries))
         return
     width = max(map(len, entries))
     for name, entry in entries.items():
@@ -151,15 +142,10 @@ def list_sequences(as_json: bool) -> None:
 @sequence.command("get")
 @click.argument("name", metavar="NAME")
 @click.option(
-    "--out",
-    default=Path("logs"),
-    show_default=True,
-    metavar="DIR",
-    type=click.Path(path_type=Path),
-    help="Folder of the log.",
+    "--out", default=Path("logs"), show_default=True, metavar="DIR", type=PATH, help="Folder of the log."
 )
 @click.option("--force", is_flag=True, help="Make it again even if it exists.")
-@click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
+@options.as_json
 def get_sequence(name: str, out: Path, force: bool, as_json: bool) -> None:
     """Simulate a log of the catalog, or download and convert it, unless it exists, and print its path.
 
@@ -177,7 +163,7 @@ def get_sequence(name: str, out: Path, force: bool, as_json: bool) -> None:
     unit = "MiB" if isinstance(catalog.load(name).source, catalog.Download) else "scans"
     with Terminal(unit) as terminal:
         path = catalog.prepare(name, out, force=force, progress=terminal.count)
-    click.echo(json.dumps({"name": name, "path": str(path)}) if as_json else path)
+    click.echo(options.json_text({"name": name, "path": str(path)}) if as_json else path)
 
 
 _WORLDS = {"2d": ("office", 8), "3d": ("town", 3)}  # with the seconds driven there
@@ -200,13 +186,11 @@ def warm_up(which: str) -> None:
     from numba import config
 
     kinds = tuple(_WORLDS) if which == "all" else (which,)
-    click.echo(
-        f"compiling what {' and '.join(kind.upper() for kind in kinds)} logs need, once after an installation"
-    )
+    named = " and ".join(kind.upper() for kind in kinds)
+    click.echo(f"compiling what {named} logs need, once after an installation")
     began = perf_counter()
     with TemporaryDirectory() as folder, ThreadPoolExecutor(len(kinds)) as together:
-        for _ in together.map(_go_through, kinds, [Path(folder, kind) for kind in kinds]):
-            pass
+        list(together.map(_go_through, kinds, [Path(folder, kind) for kind in kinds]))
     where = config.CACHE_DIR or "beside the source"  # pyright: ignore[reportAttributeAccessIssue]
     click.echo(f"compiled in {perf_counter() - began:.0f} s: {where}")
 

@@ -1,4 +1,4 @@
-"""``scanchain run``: the main job."""
+"""``scanchain run``, ``check`` and ``view``: a run, the verdict on it, and its recording."""
 
 from __future__ import annotations
 
@@ -8,19 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from scanchain.commands.options import (
-    LOG,
-    NumberRange,
-    OverrideCommand,
-    collect_garbage_seldom,
-    log_options,
-    no_loops_option,
-    overrides,
-    result_options,
-    strict_option,
-)
-from scanchain.errors import InputError, ScanchainError
+from scanchain.commands import options
+from scanchain.commands.options import LOG, PATH, NumberRange, OverrideCommand
+from scanchain.errors import InputError, ScanchainError, counted
 from scanchain.files import Source
+from scanchain.settings import Override
 
 if TYPE_CHECKING:
     from scanchain.runs.job import SinkName
@@ -29,9 +21,9 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
 
 
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
-@click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=LOG)
-@result_options("an existing run directory once the new one is complete", out="Run directory to create.")
-@log_options
+@options.logs
+@options.result("an existing run directory once the new one is complete", "Run directory to create.")
+@options.of_log
 @click.option(
     "--rerun",
     default="save",
@@ -39,7 +31,7 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
     metavar="LIST",
     help="Where the recording goes: save, spawn, connect, web, several with commas, or off.",
 )
-@no_loops_option
+@options.no_loops
 @click.option("--resume", is_flag=True, help="Resume a run that was killed or stopped from its last checkpoint.")
 @click.option(
     "--checkpoint",
@@ -50,17 +42,8 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
     metavar="SECONDS",
     help="Time between checkpoints; writing them takes at most 5 % of the run.",
 )
-@strict_option
-@click.pass_context
-def run(
-    ctx: click.Context,
-    logs: tuple[Source, ...],
-    out: Path,
-    rerun: str,
-    strict: bool,
-    as_json: bool,
-    **options: Any,
-) -> None:
+@options.strict
+def run(out: Path, rerun: str, strict: bool, as_json: bool, **given: Any) -> int:
     """Compute the trajectory and the map of a log, with a rerun recording.
 
     LOG is an MCAP file, any other format that scanchain convert reads, or the address of one: of an MCAP at
@@ -79,15 +62,14 @@ def run(
       scanchain run log.mcap --out runs/svd --matcher svd --no-loops --local_map.voxel_size_m 0.5
       scanchain run log.mcap --out runs/first_minute --end 60 --gt truth.tum --json
     """
-    collect_garbage_seldom()
+    options.collect_garbage_seldom()
     from scanchain.api import open_recorder, write_report
     from scanchain.commands.terminal import Terminal
     from scanchain.runs.job import Job
     from scanchain.runs.resume import how_to_resume
     from scanchain.runs.run import run as run_log
 
-    command = tuple(sys.argv)
-    job = Job(logs=logs, out=out, overrides=overrides(ctx), sinks=_sinks(rerun), command=command, **options)
+    job = Job(out=out, sinks=_sinks(rerun), command=tuple(sys.argv), **given)
     with Terminal("scans") as terminal:
         finished = run_log(job, open_recorder, terminal, write_report)
     is_seen = sys.stdout.isatty() and not as_json  # the summary holds the same sentences
@@ -102,8 +84,7 @@ def run(
         raise ScanchainError(f"{finished.stopped}; the results so far are in {finished.path}; {again}")
     if not as_json:
         click.echo(f"written        {out}")
-    if fails:
-        ctx.exit(1)
+    return int(fails)
 
 
 def _sinks(text: str) -> frozenset[SinkName]:
@@ -118,3 +99,100 @@ def _sinks(text: str) -> frozenset[SinkName]:
     if len(chosen - {"save"}) > 1:
         raise InputError(f"--rerun is {text!r}; take only one of spawn, connect, web beside save")
     return chosen
+
+
+@click.command(cls=OverrideCommand)
+@click.argument("sources", metavar="RUN|LOG...", nargs=-1, required=True, type=LOG)
+@click.option(
+    "--trajectory",
+    metavar="FILE.tum",
+    type=PATH,
+    help="Check this trajectory of the lidar in LOG.",
+)
+@options.part()
+@options.strict
+@options.as_json
+def check(
+    sources: tuple[Source, ...],
+    trajectory: Path | None,
+    strict: bool,
+    as_json: bool,
+    overrides: tuple[Override, ...],
+) -> int:
+    """Recompute the verdict on a run directory, or check any trajectory of a log.
+
+    A trajectory of another tool is checked at the scans whose stamps it has: against wheel odometry and constant
+    velocity, and by aligning each scan to a map of those before. Exit code 1: not trustworthy.
+
+    \b
+    Examples:
+      scanchain check runs/log
+      scanchain check runs/log --strict --json
+      scanchain check --trajectory kiss.tum log.mcap
+      scanchain check --trajectory other.tum part_0.mcap part_1.mcap --topic /lidar_front/points
+    """
+    if trajectory is None:
+        if len(sources) != 1 or not isinstance(sources[0], Path) or overrides:
+            raise InputError("check takes one run directory; to check a log, name a --trajectory FILE.tum")
+        from scanchain.runs.vouching import judge_run
+
+        judged = judge_run(sources[0])
+    else:
+        from scanchain.runs.foreign import judge_trajectory
+
+        judged, missing = judge_trajectory(trajectory, sources, overrides)
+        if missing:
+            click.echo(
+                f"warning: {counted(missing, 'scan')} without a pose in {trajectory} are left out", err=True
+            )
+    lines = [judged.sentence, *(f"  {stretch.text}" for stretch in judged.unnamed)]
+    tree = {
+        "verdict": judged.verdict,
+        "verdict_reason": judged.reason,
+        "verdict_error": judged.error,
+        "stretches": judged.stretches,
+    }
+    click.echo(options.json_text(tree) if as_json else "\n".join(lines))
+    return int(judged.verdict.fails(strict=strict))
+
+
+@click.command()
+@click.argument("directory", metavar="DIR", type=PATH)
+@click.option("--web", is_flag=True, help="Serve it to a browser on this machine, until Ctrl-C.")
+@click.option("--png", metavar="FILE", type=PATH, help="Draw trajectory, ground truth and map to a PNG instead.")
+@options.force("an existing picture")
+def view(directory: Path, web: bool, png: Path | None, force: bool) -> None:
+    """Open the recording of a run in the rerun viewer, or draw its map to a picture.
+
+    DIR is a directory of run, localize, merge or changes, or a .rrd file; a picture needs a trajectory.
+
+    \b
+    Examples:
+      scanchain view runs/log
+      scanchain view runs/log --web
+      scanchain view runs/log --png log.png
+    """
+    from scanchain.commands.terminal import Terminal
+
+    if not directory.exists():
+        raise InputError(
+            f"{directory}: no such directory or file; check the path (scanchain run makes it by --out)"
+        )
+    if png is not None:
+        from scanchain_viz.pictures.run import draw_run
+
+        options.check_output(png, force=force, endings=(".png",))
+        draw_run(directory, png)
+        click.echo(png)
+        return
+    path = directory / "recording.rrd" if directory.is_dir() else directory
+    if not path.exists():
+        raise InputError(
+            f"{directory}: holds no recording.rrd; scanchain run writes it unless --rerun leaves out save"
+        )
+    if path.suffix != ".rrd":
+        raise InputError(f"{path}: is no recording (.rrd); give a run directory")
+    from scanchain_viz.recording.viewer import show
+
+    with Terminal("recordings"):  # SIGTERM ends it like Ctrl-C: the server goes with it
+        show(path, click.echo, in_browser=web)

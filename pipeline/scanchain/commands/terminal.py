@@ -7,12 +7,16 @@ import sys
 import threading
 from collections.abc import Iterator
 from time import monotonic
-from types import FrameType, TracebackType
-from typing import TYPE_CHECKING, Self
+from types import FrameType
+from typing import TYPE_CHECKING, Any, Self
+
+import click
 
 from scanchain.runs.job import Progress
 
 if TYPE_CHECKING:
+    from rich.progress import Progress as Bar
+
     from scanchain.data import Scan
 
 _REDRAW_S = 0.2
@@ -27,12 +31,10 @@ class Terminal(Progress):
     """
 
     def __init__(self, unit: str) -> None:
-        self.unit = unit
-        self.stopped = False
-        self.is_tracking = False
-        self.is_shown = sys.stderr.isatty()
-        self.bar = _Bar(unit) if self.is_shown else None
+        self.stopped = self.is_tracking = False
+        self.started_s = self.drawn_s = 0.0
         self.handlers = {}
+        self.bar = _bar(unit) if sys.stderr.isatty() else None
 
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():
@@ -40,26 +42,21 @@ class Terminal(Progress):
                 self.handlers[number] = signal.signal(number, self._interrupt)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self.bar is not None:
-            self.bar.close()
+    def __exit__(self, *raised: object) -> None:
+        self._close()
         for number, handler in self.handlers.items():
             signal.signal(number, handler)
 
     def say(self, line: str) -> None:
-        """Show a line on a terminal only."""
+        """Show a line on a terminal only, above the bar."""
         if self.bar is not None:
-            self.bar.say(line)
+            self.bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
 
     def announce(self, line: str) -> None:
         """Show a line on a terminal or in a pipe."""
         if self.bar is None:
-            sys.stderr.write(f"{line}\n")
-            sys.stderr.flush()
-        else:
-            self.bar.say(line)
+            click.echo(line, err=True)
+        self.say(line)
 
     def track(self, scans: Iterator[Scan], count: int) -> Iterator[Scan]:
         """Pass the scans on until they end or the user stops."""
@@ -70,13 +67,28 @@ class Terminal(Progress):
             if self.stopped:
                 break
         self.is_tracking = False
-        if self.bar is not None:
-            self.bar.close()
+        self._close()
 
     def count(self, done: int, total: int) -> None:
-        """Show that so many of all are done."""
-        if self.bar is not None:
-            self.bar.show(done, total)
+        """Draw how many are done, but not more often than an eye can follow."""
+        if self.bar is None:
+            return
+        now_s = monotonic()
+        if not self.bar.live.is_started:
+            self.started_s = now_s
+            self.bar.start()
+        if now_s - self.drawn_s < _REDRAW_S and done < total:
+            return
+        self.drawn_s = now_s
+        rate = done / max(now_s - self.started_s, 1e-3)
+        self.bar.update(self.bar.task_ids[0], completed=done, total=max(done, total), rate=rate)
+        self.bar.refresh()
+
+    def _close(self) -> None:
+        """Leave the bar as it is."""
+        if self.bar is not None and self.bar.live.is_started:
+            self.bar.refresh()
+            self.bar.stop()
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
         if not self.is_tracking or self.stopped:
@@ -85,45 +97,18 @@ class Terminal(Progress):
         self.say("stopping: finishing with what there is; once more to quit at once")
 
 
-class _Bar:
-    """rich's progress bar on stderr, drawn by hand so that no thread takes time from the run."""
+def _bar(unit: str) -> Bar:
+    """Progress bar of rich on stderr, drawn by hand so that no thread takes time from the run."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
 
-    def __init__(self, unit: str) -> None:
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-        self.progress = Progress(
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn(f"{unit}  {{task.fields[rate]:.0f}} {unit}/s"),
-            TimeRemainingColumn(compact=True, elapsed_when_finished=True),
-            console=Console(stderr=True),
-            auto_refresh=False,
-        )
-        self.task = self.progress.add_task("", total=None, rate=0.0)
-        self.is_open = False
-        self.started_s = self.drawn_s = 0.0
-
-    def show(self, done: int, total: int) -> None:
-        """Draw, but not more often than an eye can follow."""
-        now_s = monotonic()
-        if not self.is_open:
-            self.is_open, self.started_s = True, now_s
-            self.progress.start()
-        if now_s - self.drawn_s < _REDRAW_S and done < total:
-            return
-        self.drawn_s = now_s
-        rate = done / max(now_s - self.started_s, 1e-3)
-        self.progress.update(self.task, completed=done, total=max(done, total), rate=rate)
-        self.progress.refresh()
-
-    def say(self, line: str) -> None:
-        """A line above the bar."""
-        self.progress.console.print(line, highlight=False, markup=False, soft_wrap=True)
-
-    def close(self) -> None:
-        """Leave the bar as it is."""
-        if self.is_open:
-            self.progress.refresh()
-            self.progress.stop()
-            self.is_open = False
+    columns: list[Any] = [
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn(f"{unit}  {{task.fields[rate]:.0f}} {unit}/s"),
+        TimeRemainingColumn(compact=True, elapsed_when_finished=True),
+    ]
+    bar = Bar(*columns, console=Console(stderr=True), auto_refresh=False)
+    bar.add_task("", total=None, rate=0.0)
+    return bar

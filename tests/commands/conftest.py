@@ -1,0 +1,78 @@
+"""A log, and commands that are run on it: successful ones with their directory, refused ones with their line."""
+
+import json
+import re
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from scanchain.simulation import simulate
+
+FULL = "the disk is full; free some space on it, or write to another one"
+
+
+@pytest.fixture(scope="package")
+def office(tmp_path_factory):
+    """Six seconds in the simulated office, 60 scans, with the truth beside it."""
+    path = tmp_path_factory.mktemp("log") / "office.mcap"
+    simulate("office", path, duration_s=6.0)
+    return path
+
+
+@pytest.fixture
+def refused(call, tmp_path):
+    """Run a command that must fail as bad input: the one line it says."""
+
+    def run(*words):
+        before = sorted(tmp_path.rglob("*"))
+        code, output, errors = call(*words)
+        assert code == 2 and output == ""
+        assert re.fullmatch(r"error: [^\n]+\n", errors), errors
+        assert not any(word in errors for word in ("Traceback", "Error:", "Errno"))
+        assert sorted(tmp_path.rglob("*")) == before, "something was left behind"
+        return errors
+
+    return run
+
+
+@dataclass(frozen=True)
+class Ran:
+    """A run of a log by the command line: exit code, output, and its directory."""
+
+    code: int
+    output: str
+    errors: str
+    folder: Path
+
+    @property
+    def metrics(self):
+        return json.loads((self.folder / "metrics.json").read_text())
+
+    @property
+    def config(self):
+        return flat((self.folder / "config.toml").read_text())
+
+    @property
+    def stamps(self):
+        return [line.split()[0] for line in (self.folder / "trajectory.tum").read_text().splitlines()]
+
+
+def flat(text):
+    """The keys of a configuration as TOML."""
+    return {f"{a}.{b}": value for a, branch in tomllib.loads(text).items() for b, value in branch.items()}
+
+
+@pytest.fixture
+def ran(call, tmp_path):
+    """Run a log without a recording, each time into another directory."""
+    count = 0
+
+    def run(*words):
+        nonlocal count
+        count += 1
+        folder = tmp_path / f"run_{count}"
+        return Ran(*call("run", *words, "--rerun", "off", "--out", folder), folder)
+
+    return run
