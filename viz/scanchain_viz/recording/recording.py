@@ -133,12 +133,8 @@ class Recording:
 
     def preview(self, scan: Scan) -> None:
         """Show a viewer, but no file, every n-th point of the first scan until its step is recorded."""
-        viewers, times = (
-            [sink for sink in self.sinks if sink is not self.file],
-            Times.at(scan.index, scan.stamp_ns),
-        )
-        cloud = drawing.dots(drawing.at_most(scan.points, self.config.max_map_points))
-        self._send(lambda: [Message(entities.SCAN, cloud, times)], viewers)
+        viewers = [sink for sink in self.sinks if sink is not self.file]
+        self._send(lambda: self._cloud(entities.SCAN, scan.points, Times.at(scan.index, scan.stamp_ns)), viewers)
 
     def log(self, step: Step) -> None:
         """Record one step; most of it is gathered and written in batches."""
@@ -269,12 +265,15 @@ class Recording:
         """True for every so many keyframes."""
         return step.keyframe >= 0 and step.keyframe % self.config.local_map_every == 0 and len(step.local_map) > 0
 
+    def _cloud(self, entity: str, points: NDArray[np.floating], times: Times) -> list[Message]:
+        """Every n-th point, so that a viewer can draw them."""
+        return [Message(entity, drawing.dots(drawing.at_most(points, self.config.max_map_points)), times)]
+
     def _step(self, step: Step) -> list[Message]:
         """Messages that are due after a step."""
         messages = self.batcher.graph.draw(self.now) if self.batcher.graph.has_grown else []
         if self._draws_map_of(step):
-            points = drawing.at_most(step.local_map, self.config.max_map_points)
-            messages.append(Message(entities.LOCAL_MAP, drawing.dots(points), self.now))
+            messages += self._cloud(entities.LOCAL_MAP, step.local_map, self.now)
         return [*messages, *self.batcher.messages()] if self.batcher.is_due else messages
 
     def _send(self, say: Callable[[], Iterable[Message]], sinks: Sequence[Sink] | None = None) -> None:
