@@ -30,21 +30,24 @@ _VIRIDIS = (
 )  # fmt: skip
 _OPAQUE, _OPACITIES = 40_000, (0.4, 1.0)  # points that each are drawn so; one among many shows less
 _BULK, _REACH = (0.5, 99.5), 0.5  # percentiles of a map; its sizes that a point may lie outside of these
+_ALL_BUT_FEW, _MARGIN = (0.05, 99.95), 0.02  # percentiles that are shown, and the share of their range around them
 
 
 def surroundings(low: Floats, high: Floats, clouds: Sequence[Points]) -> tuple[Floats, Floats]:
-    """Corners (3,) that hold a trajectory, from ``low`` to ``high``, and the extents of its maps."""
+    """Corners (3,) that hold a trajectory, from ``low`` to ``high``, and the extents of its maps with a margin."""
     boxes = np.array([(low, high), *(extent(points) for points in clouds if len(points))])
+    boxes[1:] += _MARGIN * np.ptp(boxes[1:], axis=1, keepdims=True) * np.array([[-1.0], [1.0]])
     return boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
 
 
 def extent(points: NDArray[np.floating]) -> tuple[Floats, Floats]:
-    """Corners (d,) of a map (M, d), but for outliers: points that lie far beyond 99 % of all, along any axis."""
+    """Corners (d,) of a map (M, d), but for outliers along any axis: far beyond 99 % of all, and few."""
     low, high = np.percentile(points, _BULK, axis=0)
     size = high - low
     size[:2] = size[:2].max()
     inside = points[((points >= low - _REACH * size) & (points <= high + _REACH * size)).all(axis=1)]
-    return inside.min(axis=0).astype(np.float64), inside.max(axis=0).astype(np.float64)
+    low, high = np.percentile(inside, _ALL_BUT_FEW, axis=0)
+    return low, high
 
 
 def map_points(prior: SavedMap, limit: int = _SAMPLE) -> Points:

@@ -94,6 +94,7 @@ def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
     yield "configuration", made.configuration
     yield "speed", f"{counted(round(m.scans_per_s), 'scan')}/s, {m.times_real_time:.1f} × real time{m.compiling}"
     yield "machine", f"{made.platform}, {made.cores} cores"
+    yield "made", sections.when(made)
 
 
 def _accuracy(m: Metrics) -> str:
@@ -244,7 +245,8 @@ def _stretches(stretches: Sequence[Stretch]) -> page.Grid:
         *map(page.Head, ("finding", "first", "last", "scans")),
         page.Head("start", "s"), page.Head("end", "s"), page.Head("size", "m"),
     )  # fmt: skip
-    return page.Grid(heads, tuple(rows))
+    left = len(stretches) - len(rows)
+    return page.Grid(heads, rows, [f"and {left:,} shorter ones: metrics.json"] if left else ())
 
 
 def accuracy_section(truth: GroundTruth) -> page.Section:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -315,6 +316,11 @@ def provenance_sections(made: Provenance, others: dict[str, str]) -> Iterator[Co
     yield Collapsible("Versions", "\n".join(lines))
     logs = (f"{log.path}  {log.size_bytes:,} bytes  sha256 {log.sha256}" for log in made.logs)
     yield Collapsible("Log files", "\n".join(logs))
+
+
+def when(made: Provenance) -> str:
+    """When a result was made, and how long that took."""
+    return f"{datetime.fromisoformat(made.started):%Y-%m-%d %H:%M} UTC, in {made.duration_s:.0f} s"
 
 
 def configuration(directory: Path) -> Collapsible:
