@@ -25,8 +25,8 @@ from scanchain.runs.step_table import StepTable
 from scanchain.verdict import Judged, Kind, Stretch, Verdict
 from scanchain_viz.recording import drawing, entities, viewer
 from scanchain_viz.recording import recording as module
-from scanchain_viz.recording.blueprint import blueprint
 from scanchain_viz.recording.drawing import Message
+from scanchain_viz.recording.entities import blueprint
 from scanchain_viz.recording.recording import Recording
 from scanchain_viz.recording.sinks import file_sink, open_stream, write_recording
 from tests.support.killing import same_recording

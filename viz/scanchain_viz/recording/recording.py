@@ -24,12 +24,12 @@ from scanchain.errors import InputError
 from scanchain.runs.closures import FinalClosure
 from scanchain.runs.job import SinkName
 from scanchain.runs.step_table import StepTable
-from scanchain.verdict import Judged, Kind, Stretch
+from scanchain.verdict import Judged, Kind
 from scanchain_viz.colors import STRETCH_COLORS, rgb
 from scanchain_viz.recording import drawing, entities, viewer
 from scanchain_viz.recording.batching import WARNING, Batcher, events
-from scanchain_viz.recording.blueprint import blueprint
 from scanchain_viz.recording.drawing import Message, Times
+from scanchain_viz.recording.entities import blueprint
 from scanchain_viz.recording.sinks import Sink, file_sink, open_stream, viewer_sink
 
 _LISTED = 50  # largest number of stretches in the text of a verdict
@@ -171,8 +171,14 @@ class Recording:
         yield Message(entities.VERDICT, document)
         if judged.stretches:
             path = drawing.positions(trajectory.poses)
+            strips = [  # of disagreeing loops the line between their ends
+                path[[each.first, each.last]]
+                if each.kind is Kind.LOOPS
+                else path[max(each.first - 1, 0) : each.last + 1]
+                for each in judged.stretches
+            ]
             lines = rr.LineStrips3D(
-                [_stretch_line(path, each) for each in judged.stretches],
+                strips,
                 colors=[rgb(STRETCH_COLORS[each.kind]) for each in judged.stretches],
                 radii=drawing.pixels(_RADIUS),
                 labels=[str(each.kind) for each in judged.stretches],
@@ -304,10 +310,3 @@ def _document(judged: Judged) -> str:
     more = len(judged.unnamed) - _LISTED
     head = f"## {judged.verdict}\n\n{judged.vouched}\n\n{judged.reason}\n\n"
     return head + listed + (f"- and {more:,} more\n" if more > 0 else "")
-
-
-def _stretch_line(path: drawing.Floats, stretch: Stretch) -> drawing.Floats:
-    """The part of the path that leads through a stretch; of disagreeing loops the line between their ends."""
-    if stretch.kind is Kind.LOOPS:
-        return path[[stretch.first, stretch.last]]
-    return path[max(stretch.first - 1, 0) : stretch.last + 1]

@@ -17,7 +17,7 @@ from scanchain.maps import read_ply
 from scanchain.runs.directory import RUN_FILE
 from scanchain.runs.provenance import Provenance
 from scanchain.sessions.change_run import COLORS, METRICS_FILE, TABLE_FILE
-from scanchain.sessions.changes import Changes, Cluster, Label
+from scanchain.sessions.changes import Changes, Label
 from scanchain.sessions.localize import LocalizedLog
 from scanchain.sessions.localizer import MapState
 from scanchain.sessions.merging import MergeMetrics
@@ -205,14 +205,12 @@ def _changed(changes: Changes) -> Iterator[page.Section]:
     yield page.Section("Where", _HOW_TOLD, chips, [drawing])
     if changes.clusters:
         yield page.Section("What changed", grid=_cluster_grid(changes))
-        drawings = [_close_up(points, changes, cluster) for cluster in changes.clusters[:_CLOSE_UPS]]
+        drawings = []
+        for each in changes.clusters[:_CLOSE_UPS]:
+            center, half_m = np.append(each.center[:2], 0.0), 0.5 * float(each.size_m[:2].max()) + _AROUND_M
+            svg = _changes_picture(points, changes, center - half_m, center + half_m)
+            drawings.append(page.Drawing(f"{each.number}: {each.kind}", counted(each.points, "point"), svg))
         yield page.Section("The largest changes", drawings=drawings, is_small=True)
-
-
-def _close_up(points: Matrix, changes: Changes, cluster: Cluster) -> page.Drawing:
-    center, half_m = np.append(cluster.center[:2], 0.0), 0.5 * float(cluster.size_m[:2].max()) + _AROUND_M
-    svg = _changes_picture(points, changes, center - half_m, center + half_m)
-    return page.Drawing(f"{cluster.number}: {cluster.kind}", counted(cluster.points, "point"), svg)
 
 
 def _changes_picture(
@@ -223,15 +221,10 @@ def _changes_picture(
     for label in _ORDER:
         maps.draw_points(figure, points[changes.labels == label], low, high, (_HEX[label],))
     for cluster in changes.clusters:
-        figure.line(_outline(cluster)[[0, 1, 2, 3, 0]], INK, 0.8)
+        c, s = np.cos(cluster.yaw_rad), np.sin(cluster.yaw_rad)
+        corners = 0.5 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]]) * cluster.size_m[:2]
+        figure.line(corners @ np.array([[c, s], [-s, c]]) + cluster.center[:2], INK, 0.8)
     return figure.svg()
-
-
-def _outline(cluster: Cluster) -> Matrix:
-    """Corners (4, 2) of a cluster's box seen from above."""
-    c, s = np.cos(cluster.yaw_rad), np.sin(cluster.yaw_rad)
-    corners = 0.5 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * cluster.size_m[:2]
-    return corners @ np.array([[c, s], [-s, c]]) + cluster.center[:2]
 
 
 def _cluster_grid(changes: Changes) -> page.Grid:
