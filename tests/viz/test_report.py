@@ -254,22 +254,6 @@ assert "matplotlib" not in sys.modules
     assert pages[which].read_bytes() == before
 
 
-def test_warnings_of_a_run_stand_above_everything_and_a_large_error_is_one(evil, tmp_path, capfd):
-    """The truth of a log twice as large as it is."""
-    truth = np.loadtxt(evil.parent / "office.tum")
-    truth[:, 1:4] *= 2.0
-    rows = [" ".join([f"{row[0]:.9f}", *(f"{value:.9f}" for value in row[1:])]) for row in truth]
-    (tmp_path / "twice.tum").write_text("\n".join(rows))
-    arguments = ["--rerun", "off", "--gt", str(tmp_path / "twice.tum")]
-    assert main(["run", str(evil), "--out", str(tmp_path / "out"), *arguments]) == 0
-    assert capfd.readouterr()[1].startswith("warning: far from the ground truth: ATE ")
-    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    warned = re.search(
-        r'<div class="warning" role="alert">far from the ground truth: ATE [\d.]+ m, [\d.]+ %', page
-    )
-    assert warned and warned.start() < page.index("<dl>") < page.index("<h2>")
-
-
 def test_the_map_of_a_run_is_drawn_in_the_page_under_its_own_security_policy(one_run, tmp_path):
     page = (one_run / "report.html").read_text(encoding="utf-8")
     digest = b64encode(sha256(SCRIPT.encode()).digest()).decode()
