@@ -175,7 +175,7 @@ def _states_picture(localized: LocalizedLog) -> page.Drawing:
     top = float(np.nanmax(found.sigma_m, initial=0.01)) if np.isfinite(found.sigma_m).any() else 1.0
     for run in np.split(np.arange(len(found.states)), runs):
         first_m, last_m = found.traveled_m[[run[0], min(run[-1] + 1, len(found.states) - 1)]].tolist()
-        figure.span(first_m, last_m, _STATE_COLORS[MapState(str(found.states[run[0]]))], 0.25)
+        figure.span(first_m, last_m, f"{_STATE_COLORS[MapState(str(found.states[run[0]]))]}40")
     figure.line(np.stack([found.traveled_m, found.sigma_m], axis=1), INK, 0.9)
     figure.y.limit(0.0, 1.1 * top)
     count = counted(len(found.closures), "match with the map", "matches with the map")

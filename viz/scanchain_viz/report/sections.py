@@ -156,7 +156,7 @@ def innovations(
     """Innovations (N,) over their limits scan by scan, in their colors, over stretches in theirs."""
     figure = Plot("scan", "innovation / limit", is_wide=is_wide)
     for first, last, color in stretches:
-        figure.span(first - 0.5, last + 0.5, color, 0.2)
+        figure.span(first - 0.5, last + 0.5, f"{color}33")
     for values, color in curves:
         x, y = _over_scans(np.clip(np.nan_to_num(values), _LOWEST, _HIGHEST), np.max)
         figure.line(np.stack([x, y], axis=1), color, 0.9)
