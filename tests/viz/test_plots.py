@@ -10,8 +10,7 @@ from scanchain.verdict import Kind, Stretch
 from scanchain_viz.colors import palette_of
 from scanchain_viz.pictures.axis import Axis, width_of
 from scanchain_viz.pictures.figure import Plot
-from scanchain_viz.pictures.maps import draw_points
-from scanchain_viz.pictures.run import draw_map
+from scanchain_viz.pictures.maps import draw_map, draw_points
 
 image = pytest.importorskip("matplotlib.image")
 
