@@ -15,6 +15,7 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from scanchain.data import State
+from scanchain.runs.step_table import STAGES
 from scanchain_viz.colors import between, height_shares
 from scanchain_viz.recording.drawing import Floats, Message, dots, lines, pixels
 
@@ -55,7 +56,6 @@ SERIES = {  # plots of one series each, and their names
     INLIER_SHARE: "inlier share",
     ITERATIONS: "iterations",
 }
-STAGES = ("read", "preprocess", "match", "map", "loops")
 COVARIANCE_SCALE = 100.0  # a standard deviation of 1 mm is drawn 10 cm long
 
 YELLOW, GRAY, WHITE = (255, 205, 60), (110, 120, 135), (235, 235, 235)
