@@ -32,9 +32,20 @@ from scanchain.verdict import Judged, Kind, Stretch, Verdict
 from scanchain_viz.pictures.figure import Line
 from scanchain_viz.pictures.maps import AFTER, BEFORE, path_over_map, surroundings
 from scanchain_viz.pictures.trajectories import DrawnTrajectory
-from scanchain_viz.report.page import Chip, Collapsible, Drawing, Grid, Head, Page, Row, Section, write_page
+from scanchain_viz.report.page import (
+    SCRIPT,
+    Chip,
+    Collapsible,
+    Drawing,
+    Grid,
+    Head,
+    Page,
+    Row,
+    Section,
+    interactive_map,
+    write_page,
+)  # fmt: skip
 from scanchain_viz.report.run import map_section, trajectory_lines, write_run_report
-from scanchain_viz.report.scene import SCRIPT, interactive_map
 from scanchain_viz.report.sections import loop_section, trajectories_section
 from tests.support.browser import find_browser, look
 from tests.support.scenes import ROOT
@@ -307,7 +318,7 @@ def test_the_map_is_turned_moved_and_zoomed_and_the_page_scrolls_unless_it_was_c
     low, high = points.min(axis=0), points.max(axis=0)
     solid, dashed = Line("", np.linspace(low, high, 50), "red"), Line("", np.linspace(high, low, 9), "", 1.0, True)
     drawing = interactive_map(points, [solid, dashed], low, high, grain_m=0.2, is_flat=False, is_wide=True)
-    write_page(tmp_path, Page("a", "b", sections=[Section("Map", drawings=[drawing])], script=SCRIPT))
+    write_page(tmp_path, Page("a", "b", sections=[Section("Map", drawings=[drawing])]))
     text = re.sub('<meta http-equiv="Content-Security-Policy"[^>]*>', "", (tmp_path / "report.html").read_text())
     frames = "<script>window.requestAnimationFrame = act => setTimeout(act, 10);</script>"  # none without a window
     (tmp_path / "b.html").write_text(text.replace("<body>", f"<body>{frames}").replace("</body>", _HANDLED))

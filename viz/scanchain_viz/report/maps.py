@@ -26,7 +26,6 @@ from scanchain_viz.colors import CLOSURES, hex_of
 from scanchain_viz.pictures import maps
 from scanchain_viz.pictures.figure import INK, Line, Plot, broken
 from scanchain_viz.report import page
-from scanchain_viz.report.scene import SCRIPT, interactive_map
 from scanchain_viz.report.sections import chip, configuration, provenance_sections
 
 _HEADS = (
@@ -66,7 +65,6 @@ def write_merge_report(directory: Path) -> None:
         warnings=metrics.warnings,
         sections=(_merged_map(directory, drawn, metrics), _sessions(drawn, metrics)),
         collapsibles=(*provenance_sections(made, {}), configuration(directory)),
-        script=SCRIPT,
     )
     page.write_page(directory, whole)
 
@@ -92,7 +90,7 @@ def _merged_map(directory: Path, drawn: maps.DrawnMerge, metrics: MergeMetrics) 
             "Seen from above; thin lines: closures in force between sessions.",
             maps.path_over_map(points, [closures, *drawn.sessions], low, high),
         ),
-        interactive_map(points, drawn.sessions, low, high, grain_m=drawn.grain_m, is_flat=is_flat),
+        page.interactive_map(points, drawn.sessions, low, high, grain_m=drawn.grain_m, is_flat=is_flat),
     )
     return page.Section("Map", chips=list(map(chip, drawn.sessions)), drawings=drawings)
 
