@@ -327,7 +327,7 @@ def test_the_truth_is_drawn_in_recording_and_picture_where_the_trajectory_is(dri
     (line,) = drawn.to_record_batch().column("LineStrips3D:strips").to_pylist()[0]
     np.testing.assert_allclose(np.array(line), found, atol=0.1)
     shown = {}
-    monkeypatch.setattr("scanchain_viz.pictures.run.draw_map", lambda path, **what: shown.update(what))
+    monkeypatch.setattr("scanchain_viz.pictures.maps.draw_map", lambda path, **what: shown.update(what))
     succeed("view", drive.folder, "--png", tmp_path / "a.png")
     np.testing.assert_allclose(shown["ground_truth"][:, :3, 3], found, atol=0.1)
 

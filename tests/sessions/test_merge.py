@@ -23,7 +23,7 @@ from scanchain.runs.job import Progress
 from scanchain.sessions.joining import Joined, changed, doubt_about, graph_of
 from scanchain.sessions.merging import merge
 from scanchain.trajectory import read_tum
-from scanchain_viz.pictures.run import draw_run
+from scanchain_viz.pictures.maps import draw_run
 from tests.support import made
 
 PARTS = {"morning": (0.0, 18.0), "noon": (6.0, 24.0), "evening": (14.0, 34.0)}

@@ -10,8 +10,7 @@ from scanchain.verdict import Kind, Stretch
 from scanchain_viz.colors import palette_of
 from scanchain_viz.pictures.axis import Axis, width_of
 from scanchain_viz.pictures.figure import Plot
-from scanchain_viz.pictures.maps import draw_points
-from scanchain_viz.pictures.run import draw_map
+from scanchain_viz.pictures.maps import draw_map, draw_points
 
 image = pytest.importorskip("matplotlib.image")
 
@@ -24,69 +23,65 @@ def circle(radius_m, dimension=2):
     return lie.exp(twists) @ arm
 
 
+BLUE, AMBER, MAGENTA, PINK = (
+    (0.122, 0.373, 0.816),
+    (0.878, 0.482, 0.0),
+    (0.878, 0.149, 0.62),
+    (0.839, 0.188, 0.561),
+)
+WHITE = (1.0, 1.0, 1.0)
+
+
+@pytest.fixture
+def drawn(tmp_path):
+    """Pixels of a map with a circular trajectory and what else is given."""
+
+    def pixels(**what):
+        draw_map(tmp_path / "a.png", **{"title": "t", "optimized": circle(10.0)} | what)
+        return image.imread(tmp_path / "a.png")
+
+    return pixels
+
+
 def share_of(pixels, color, tolerance=0.06):
     """Share of the pixels that have a color."""
     return float(np.mean(np.all(np.abs(pixels[..., :3] - np.array(color)) < tolerance, axis=-1)))
 
 
-def test_ways_are_drawn_in_their_colors_on_white(tmp_path):
-    draw_map(
-        tmp_path / "a.png", title="t", optimized=circle(10.0), odometry=circle(12.0), ground_truth=circle(8.0)
-    )
-    pixels = image.imread(tmp_path / "a.png")
-    for color in ((0.122, 0.373, 0.816), (0.878, 0.482, 0.0), (0.878, 0.149, 0.62)):
-        assert share_of(pixels, color) > 0.001
-    assert share_of(pixels, (1.0, 1.0, 1.0)) > 0.8
-
-
-def test_stretches_to_check_are_marked_on_their_trajectory(tmp_path):
+def test_trajectories_and_stretches_to_check_are_drawn_in_their_colors_on_white(drawn):
     stretches = (Stretch(Kind.WHEELS, 10, 30, 21, 1.0, 3.0, 0.7), Stretch(Kind.WHEELS, 60, 60, 1, 6.0, 6.0))
-    draw_map(tmp_path / "a.png", title="t", optimized=circle(10.0), stretches=stretches)
-    draw_map(tmp_path / "b.png", title="t", optimized=circle(10.0))
-    pink = (0.839, 0.188, 0.561)
-    marked, plain = (share_of(image.imread(tmp_path / name), pink) for name in ("a.png", "b.png"))
-    assert marked > 0.001 and plain == 0.0
+    pixels = drawn(odometry=circle(12.0), ground_truth=circle(8.0), stretches=stretches)
+    assert all(share_of(pixels, color) > 0.001 for color in (BLUE, AMBER, MAGENTA, PINK))
+    assert share_of(pixels, WHITE) > 0.8
+    assert [share_of(drawn(), color) for color in (AMBER, MAGENTA, PINK)] == [0.0, 0.0, 0.0]
 
 
-def test_without_odometry_and_ground_truth_only_one_way_is_drawn(tmp_path):
-    draw_map(tmp_path / "a.png", title="t", optimized=circle(10.0))
-    assert share_of(image.imread(tmp_path / "a.png"), (0.878, 0.482, 0.0)) == 0.0
-
-
-def test_one_far_outlier_does_not_shrink_the_map(tmp_path):
-    rng = np.random.default_rng(2)
-    points = rng.uniform(-10.0, 10.0, (5000, 2))
-    draw_map(tmp_path / "a.png", title="t", optimized=circle(10.0), points=points)
-    draw_map(tmp_path / "b.png", title="t", optimized=circle(10.0), points=np.vstack([points, [[4000.0, 0.0]]]))
-    blue = (0.122, 0.373, 0.816)
-    near, far = (share_of(image.imread(tmp_path / name), blue) for name in ("a.png", "b.png"))
+def test_one_far_outlier_does_not_shrink_the_map(drawn):
+    points = np.random.default_rng(2).uniform(-10.0, 10.0, (5000, 2))
+    near, far = (share_of(drawn(points=some), BLUE) for some in (points, np.vstack([points, [[4000.0, 0.0]]])))
     assert far == pytest.approx(near, rel=0.1)
 
 
-def test_a_grid_lies_where_its_origin_says_with_row_0_at_the_bottom(tmp_path):
+def test_a_grid_lies_where_its_origin_says_with_row_0_at_the_bottom(drawn):
     cells = np.zeros((200, 200), np.int8)
     cells[:60] = 100  # a wall along the lowest y
     cells[:, 100:] = np.where(cells[:, 100:] == 0, -1, cells[:, 100:])
-    grid = (cells, 0.1, (-10.0, -10.0))
-    draw_map(tmp_path / "a.png", title="t", optimized=circle(9.0), grid=grid)
-    pixels = image.imread(tmp_path / "a.png")[..., 0]
+    pixels = drawn(optimized=circle(9.0), grid=(cells, 0.1, (-10.0, -10.0)))[..., 0]
     dark_rows = np.nonzero((np.abs(pixels - 0.15) < 0.03).mean(axis=1) > 0.4)[0]
     assert dark_rows.min() > 0.5 * len(pixels)
     assert (np.abs(pixels - 0.90) < 0.01).mean() > 0.15  # unknown is gray, not white
 
 
-def test_a_3d_map_is_drawn_from_above(tmp_path):
+def test_a_3d_map_is_drawn_from_above(drawn):
     points = np.random.default_rng(3).uniform(-15.0, 15.0, (20_000, 3))
-    draw_map(tmp_path / "a.png", title="t", optimized=circle(10.0, dimension=3), points=points)
-    assert share_of(image.imread(tmp_path / "a.png"), (1.0, 1.0, 1.0)) < 0.95
+    assert share_of(drawn(optimized=circle(10.0, dimension=3), points=points), WHITE) < 0.95
 
 
-def test_a_run_without_any_scan_gives_an_empty_sheet_and_no_error(tmp_path):
-    draw_map(tmp_path / "a.png", title="t", optimized=np.empty((0, 3, 3)))
-    assert (tmp_path / "a.png").stat().st_size > 0
+def test_a_run_without_any_scan_gives_an_empty_sheet_and_no_error(drawn):
+    assert share_of(drawn(optimized=np.empty((0, 3, 3))), WHITE) > 0.9
 
 
-def test_a_picture_that_cannot_be_drawn_leaves_the_old_one(tmp_path, monkeypatch):
+def test_a_picture_that_cannot_be_drawn_leaves_the_old_one(tmp_path, monkeypatch, drawn):
     def fail(figure, file, **_):
         file.write(b"half")
         raise OSError(28, "No space left on device")
@@ -94,12 +89,8 @@ def test_a_picture_that_cannot_be_drawn_leaves_the_old_one(tmp_path, monkeypatch
     (tmp_path / "a.png").write_bytes(b"old")
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", fail)
     with pytest.raises(OSError, match="No space"):
-        draw_map(tmp_path / "a.png", title="t", optimized=circle(10.0))
+        drawn()
     assert (tmp_path / "a.png").read_bytes() == b"old" and len(list(tmp_path.iterdir())) == 1
-
-
-def numbers_of(text):
-    return np.array(re.findall(r"-?[\d.]+", text), float)
 
 
 @pytest.mark.parametrize("is_upright", [False, True])
@@ -144,7 +135,7 @@ def test_what_is_known_of_a_line_is_within_its_axes_and_breaks_where_it_is_not(n
     figure.line(np.stack([x, y], axis=1), "red")
     drawn = re.search(r'<path d="([^"]*)" style="stroke: red', figure.svg())[1]
     assert re.sub(r"[\d. -]", "", drawn) == "MLML"
-    places = numbers_of(drawn).reshape(-1, 2) / figure.extent
+    places = np.array(re.findall(r"-?[\d.]+", drawn), float).reshape(-1, 2) / figure.extent
     assert (places > 0.0).all() and (places < 1.0).all()
     known = np.isfinite(x)
     for column, (values, is_logarithmic) in enumerate(((x, name == "x"), (-y, name == "y"))):
@@ -159,7 +150,8 @@ def test_a_line_of_many_points_is_as_long_as_it_looks_and_ends_where_it_ends():
     end = np.array([np.cos(angle[-1]), np.sin(angle[-1])])
     svg = figure.svg()
     assert len(svg) < 150_000
-    points = numbers_of(re.search(r'd="(M[^"]*)" style="stroke: red', svg)[1]).reshape(-1, 2)
+    path = re.search(r'd="(M[^"]*)" style="stroke: red', svg)[1]
+    points = np.array(re.findall(r"-?[\d.]+", path), float).reshape(-1, 2)
     off = np.hypot(*(points / figure.extent * 2.2 - 1.1).T) - 1.0
     assert np.abs(off).max() < 1e-4
     np.testing.assert_allclose(points[-1], 129.6 * (1.0 + np.array([1.0, -1.0]) * end / 1.1), atol=0.1)
@@ -167,27 +159,27 @@ def test_a_line_of_many_points_is_as_long_as_it_looks_and_ends_where_it_ends():
 
 def test_the_pixels_of_a_map_are_square_and_begin_at_its_corner():
     low, high = np.zeros(3), np.array([13.7, 6.95, 0.0])
-    points = np.random.default_rng(0).uniform(low, high, (1000, 3))
     figure = Plot.of_plan(low, high)
-    draw_points(figure, points, low, high)
-    x, y, width, height = map(
-        float, re.search(r'<image x="(.*?)" y="(.*?)" width="(.*?)" height="(.*?)"', figure.svg()).groups()
-    )
-    rows, columns = image.imread(BytesIO(b64decode(re.search(r"base64,(.*?)\"", figure.svg())[1]))).shape[:2]
+    draw_points(figure, np.random.default_rng(0).uniform(low, high, (1000, 3)), low, high)
+    box = re.search(r'<image x="(.*?)" y="(.*?)" width="(.*?)" height="(.*?)"', figure.svg()).groups()
+    (x, y, width, height), (rows, columns) = map(float, box), image_in(figure).shape[:2]
     assert width / columns == pytest.approx(height / rows, rel=1e-3)
     assert (x, y + height) == pytest.approx((0.0, figure.extent[1]), abs=0.01)
 
 
-def test_an_image_of_a_figure_has_its_colors_and_its_first_row_at_the_lower_corner():
+def image_in(figure):
+    """Pixels of the image in the SVG of a figure."""
+    return image.imread(BytesIO(b64decode(re.search(r"base64,([^\"]*)", figure.svg())[1])))
+
+
+@pytest.mark.parametrize("is_downward", [False, True])
+def test_an_image_of_a_figure_has_its_colors_and_its_first_row_at_the_lower_corner(is_downward):
     pixels = np.random.default_rng(0).integers(0, 8, (5, 7)).astype(np.uint8)
     palette = palette_of(("ff0000", "00ff00", "0000ff"), 8)
     palette[:, 3] = np.arange(8) * 36
-    for is_downward in (False, True):
-        figure = Plot.of_plan(np.zeros(2), np.array([7.0, 5.0]))
-        if is_downward:
-            figure.y.limit(5.0, 0.0)
-        figure.image(pixels, palette, np.zeros(2), np.array([7.0, 5.0]))
-        data = re.search(r"base64,([^\"]*)", figure.svg())[1]
-        seen = np.rint(255.0 * image.imread(BytesIO(b64decode(data)))).astype(np.uint8)
-        expected = palette[pixels if is_downward else pixels[::-1]]
-        assert np.array_equal(seen, expected)
+    figure = Plot.of_plan(np.zeros(2), np.array([7.0, 5.0]))
+    if is_downward:
+        figure.y.limit(5.0, 0.0)
+    figure.image(pixels, palette, np.zeros(2), np.array([7.0, 5.0]))
+    expected = palette[pixels if is_downward else pixels[::-1]]
+    assert np.array_equal(np.rint(255.0 * image_in(figure)).astype(np.uint8), expected)

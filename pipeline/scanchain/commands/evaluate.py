@@ -87,7 +87,7 @@ def evaluate(
         for warning in results.warnings:
             click.echo(f"warning: {f'{name}: ' * (len(evaluated) > 1)}{warning}", err=True)
     if png is not None:
-        from scanchain_viz.pictures.run import draw_evaluated
+        from scanchain_viz.pictures.maps import draw_evaluated
 
         draw_evaluated(png, {name: (each.aligned, each.reference) for name, each in evaluated.items()})
     trees = {name: _tree(results) for name, results in evaluated.items()}

@@ -179,7 +179,7 @@ def view(directory: Path, web: bool, png: Path | None, force: bool) -> None:
             f"{directory}: no such directory or file; check the path (scanchain run makes it by --out)"
         )
     if png is not None:
-        from scanchain_viz.pictures.run import draw_run
+        from scanchain_viz.pictures.maps import draw_run
 
         options.check_output(png, force=force, endings=(".png",))
         draw_run(directory, png)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,12 +69,10 @@ class Axis:
     def ticks(self, length: float, *, is_upright: bool) -> list[tuple[float, str]]:
         """Fraction and number of each tick on an axis so many points long."""
         low, high = min(self.ends), max(self.ends)
-        if self.only_ticks is not None:
-            values = list(self.only_ticks)
-        else:
-            values = self._decades(low, high) or _round_steps(low, high, length, is_upright)
-        is_linear = self.only_ticks is None and not self.is_logarithmic
-        texts = _fixed(values) if is_linear else (f"{value:g}" for value in values)
+        values = self._decades(low, high) if self.only_ticks is None else list(self.only_ticks)
+        texts = [f"{value:g}" for value in values]
+        if self.only_ticks is None and not values:
+            values, texts = _round_steps(low, high, length, is_upright)
         places = self.fractions(np.array(values, np.float64)).tolist()
         return [(place, text.replace("-", "−")) for place, text in zip(places, texts, strict=True)]
 
@@ -90,34 +88,21 @@ class Axis:
         return within if len(within) > 1 else []
 
 
-def _round_steps(low: float, high: float, length: float, is_upright: bool) -> list[float]:
-    """Multiples of the least round step whose numbers do not touch each other."""
+def _round_steps(low: float, high: float, length: float, is_upright: bool) -> tuple[list[float], list[str]]:
+    """Multiples of the least round step whose numbers do not touch each other, and these numbers."""
     most = int(np.clip(length / FONT / (2.0 if is_upright else 3.0), 1, _MOST))
+    values: list[float] = []
+    texts: list[str] = []
     for intervals in range(most, 0, -1):
-        values = _multiples(low, high, intervals)
-        room = length * _step(values) / (high - low) - _GAP
-        if is_upright or max(map(width_of, _fixed(values)), default=0.0) <= room:
-            return values
-    return _multiples(low, high, 1)
-
-
-def _multiples(low: float, high: float, intervals: int) -> list[float]:
-    """Multiples within a range of the least round step that makes so many intervals at most."""
-    least = (high - low) / intervals
-    power = 10.0 ** np.floor(np.log10(least))
-    step = next(factor * power for factor in _ROUND if factor * power >= least * (1.0 - _TINY))
-    first, last = int(np.ceil(low / step - _TINY)), int(np.floor(high / step + _TINY))
-    return [number * float(step) for number in range(first, last + 1)]
-
-
-def _step(values: Sequence[float]) -> float:
-    return values[1] - values[0] if len(values) > 1 else np.inf
-
-
-def _fixed(values: Sequence[float]) -> Iterator[str]:
-    """Multiples of a step as text, with as many decimals as the step has."""
-    step = _step(values) if len(values) > 1 else (abs(values[0]) if values else 0.0) or 1.0
-    digits = next(
-        (n for n in range(12) if abs(round(step * 10.0**n) - step * 10.0**n) < 1e-6 * step * 10.0**n), 12
-    )
-    return (f"{value + 0.0:.{digits}f}" for value in values)
+        least = (high - low) / intervals
+        exponent = int(np.floor(np.log10(least)))
+        factor = next(each for each in _ROUND if each * 10.0**exponent >= least * (1.0 - _TINY))
+        step = factor * 10.0**exponent
+        decimals = max(0, (factor == 2.5) - exponent - (factor == 10.0))
+        first, last = int(np.ceil(low / step - _TINY)), int(np.floor(high / step + _TINY))
+        values = [number * step for number in range(first, last + 1)]
+        texts = [f"{value + 0.0:.{decimals}f}" for value in values]
+        room = length * step / (high - low) - _GAP
+        if is_upright or len(values) < 2 or max(map(width_of, texts)) <= room:
+            break
+    return values, texts

@@ -123,20 +123,20 @@ class Plot:
         color: str,
         width: float = 1.2,
         dashes: Sequence[float] = (),
-        opacity: float = 1.0,
         *,
         name: str = "",
     ) -> None:
         """Draw a line through positions (N, 2) or, from above, (N, 3), broken where they are NaN.
 
+        color : #rrggbb, or #rrggbbaa with its opacity
         dashes : lengths of dashes and gaps in widths
         name : in the legend of a PNG, once for all lines of this name
         """
         x, y = self._included(positions)
         dashed = f"; stroke-dasharray: {' '.join(f'{width * each:.4g}' for each in dashes)}" if dashes else ""
-        style = f"stroke: {color}; stroke-width: {width:g}{dashed}{_opacity(opacity)}"
+        style = f"stroke: {color}; stroke-width: {width:g}{dashed}"
         self._within.append(lambda: f'<path d="{_path(self._at(x, y))}" style="{style}"/>')
-        drawn = {"color": _on_white(color), "linewidth": width, "alpha": opacity, "label": name or None}
+        drawn = {"color": _on_white(color), "linewidth": width, "label": name or None}
         self._on_axes.append(lambda axes: axes.plot(x, y, linestyle=(0, (*dashes,)) if dashes else "-", **drawn))
 
     def marks(
@@ -188,14 +188,14 @@ class Plot:
             lambda axes: axes.imshow(palette[pixels], origin="lower", extent=extent, interpolation="antialiased")
         )
 
-    def span(self, first: float, last: float, color: str, opacity: float) -> None:
+    def span(self, first: float, last: float, color: str) -> None:
         """Shade what lies between two values of x."""
         self.x.include(np.array([first, last]))
 
         def drawn() -> str:
             left, right = self.extent[0] * self.x.fractions(np.array([first, last]))
             box = f'x="{left:.2f}" width="{right - left:.2f}" height="{self.extent[1]:.2f}"'
-            return f'<rect {box} style="fill: {color}{_opacity(opacity)}"/>'
+            return f'<rect {box} style="fill: {color}"/>'
 
         self._within.append(drawn)
 
@@ -287,10 +287,6 @@ class Plot:
         """Positions (N, 2) in points from the upper left corner of the axes."""
         places = np.stack([self.x.fractions(x), 1.0 - self.y.fractions(y)], axis=1) * self.extent
         return np.clip(places, -_FAR, _FAR)
-
-
-def _opacity(opacity: float) -> str:
-    return f"; opacity: {opacity:g}" if opacity < 1.0 else ""
 
 
 def _rule(x: float, y: float, steps: str, width: float) -> str:

@@ -12,7 +12,7 @@ import rerun as rr
 from scanchain import lie
 from scanchain.data import Closure, ClosureVerdict, GraphState, Matrix, State, Step
 from scanchain.runs.closures import FinalClosure, final_verdicts
-from scanchain.runs.step_table import StepTable
+from scanchain.runs.step_table import STAGES, StepTable
 from scanchain_viz.recording import drawing, entities
 from scanchain_viz.recording.drawing import Floats, Message, Times
 
@@ -264,10 +264,10 @@ def _plots(steps: list[Step], times: Times) -> list[Message]:
         messages.append(Message(entity, rr.Scalars.columns(scalars=known), times))
     informations = np.array([match.information for match in matches])
     covariances = drawing.ellipsoids(informations, entities.COVARIANCE_SCALE)
-    timings = [[getattr(step.timing, f"{stage}_s") for stage in entities.STAGES] for step in steps]
+    timings = [[getattr(step.timing, f"{stage}_s") for stage in STAGES] for step in steps]
     stages = rr.Scalars.columns(scalars=1e3 * np.array(timings).reshape(-1))
     return [
         *messages,
         Message(entities.COVARIANCE, covariances, times),
-        Message(entities.TIME, stages.partition([len(entities.STAGES)] * len(steps)), times),
+        Message(entities.TIME, stages.partition([len(STAGES)] * len(steps)), times),
     ]

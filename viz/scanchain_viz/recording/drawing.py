@@ -5,7 +5,7 @@ The pipeline has SE(2) or SE(3) in float64; rerun draws float32 in space, a 2D l
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -62,13 +62,11 @@ class Message:
             assert isinstance(self.content, rr.AsComponents)
             stream.log(self.entity, self.content, static=True, strict=True)
         else:
-            stream.send_columns(self.entity, self.times.columns(), self._columns(), strict=True)
-
-    def _columns(self) -> Iterable[rr.ComponentColumn]:
-        if isinstance(self.content, rr.ComponentColumnList):
-            return self.content
-        parts = self.content.as_component_batches()
-        return [part.partition([len(part.as_arrow_array())]) for part in parts]
+            columns = self.content
+            if not isinstance(columns, rr.ComponentColumnList):
+                parts = columns.as_component_batches()
+                columns = [part.partition([len(part.as_arrow_array())]) for part in parts]
+            stream.send_columns(self.entity, self.times.columns(), columns, strict=True)
 
 
 def pixels(radius: float | None) -> float | None:

@@ -1,4 +1,4 @@
-"""The entities of a recording: their paths, colors, and static messages.
+"""The entities of a recording, their paths, colors and static messages, and their layout in the viewer.
 
 Frames are entities: points under ``world/lidar`` move with the scan's pose, points under ``world/odom`` with the
 correction that loop closures make. A 2D log is drawn in the plane z = 0.
@@ -6,11 +6,16 @@ correction that loop closures make. A 2D log is drawn in the plane z = 0.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from scanchain.data import State
+from scanchain.runs.step_table import STAGES
 from scanchain_viz.colors import between, height_shares
 from scanchain_viz.recording.drawing import Floats, Message, dots, lines, pixels
 
@@ -51,7 +56,6 @@ SERIES = {  # plots of one series each, and their names
     INLIER_SHARE: "inlier share",
     ITERATIONS: "iterations",
 }
-STAGES = ("read", "preprocess", "match", "map", "loops")
 COVARIANCE_SCALE = 100.0  # a standard deviation of 1 mm is drawn 10 cm long
 
 YELLOW, GRAY, WHITE = (255, 205, 60), (110, 120, 135), (235, 235, 235)
@@ -59,6 +63,10 @@ BLUE, GREEN, RED, ORANGE, VIOLET = (70, 150, 255), (60, 200, 90), (235, 70, 60),
 CYAN = (70, 210, 210)
 
 _HEIGHT_COLORS = ((50, 60, 150), (40, 140, 170), (60, 190, 120), (220, 210, 80), (240, 240, 230))
+
+_BACKGROUND = (13, 16, 17)  # of scenes, also where the viewer is light: lines of ground truth are white
+_PLAY_S = 30.0
+_ORDINARY_MS = {2: 5.0, 3: 20.0}  # what a stage takes, but for the first scans, which load the kernels
 
 # a list, since the viewer wraps its lines; those of a table it cuts off
 _LEGEND = f"""
@@ -125,3 +133,85 @@ def _series() -> list[Message]:
         Message(LOOPS, loops),
         Message(STATE, states),
     ]
+
+
+def blueprint(dimension: int, box: Floats | None = None, scans: int = 0) -> rrb.Blueprint:
+    """The layout of a 2D log (seen from above) or a 3D one.
+
+    box : (2, 3) lowest and highest coordinates that the view should frame
+    scans : how many there are, where that is known: they are played in half a minute, but no slower than 30 Hz
+    """
+    hidden, whole = rrb.PlotLegend(visible=False), whole_log()
+    observability, residual, *others = (
+        rrb.TimeSeriesView(origin=entity, name=name, axis_x=whole, plot_legend=hidden)
+        for entity, name in SERIES.items()
+    )
+    ordinary_ms = rrb.ScalarAxis(range=(0.0, _ORDINARY_MS[dimension]))
+    tabs = rrb.Tabs(
+        rrb.TextDocumentView(origin=LEGEND, name="legend"),
+        rrb.TextLogView(origin=EVENTS, name="events"),
+        *others,
+        rrb.TimeSeriesView(origin=TIME, name="time", axis_x=whole, axis_y=ordinary_ms),
+    )
+    left = rrb.PlotLegend(rrb.Corner2D.LeftTop)  # there are few closures at first
+    loops = rrb.TimeSeriesView(origin=LOOPS, name="loop closures", axis_x=whole, plot_legend=left)
+    state = rrb.StateTimelineView(origin=STATE, name="state", time_view=whole)
+    growing = {ODOMETRY: up_to_now(), TRAJECTORY: up_to_now()}
+    world = scene("seen from above" if dimension == 2 else "scene", dimension, box, growing)
+    verdict = rrb.TextDocumentView(origin=VERDICT, name="verdict")
+    shares = [3, 3, 3, 3, 2, 5]
+    side = rrb.Vertical(verdict, observability, residual, loops, state, tabs, row_shares=shares)
+    return with_panels(rrb.Horizontal(world, side, column_shares=[5, 3]), scans=scans)
+
+
+def with_panels(root: rrb.Container | rrb.View, *, scans: int = 0, has_toggles: bool = False) -> rrb.Blueprint:
+    """Views with collapsed panels around them, but for the list of entities where they are there to toggle."""
+    return rrb.Blueprint(
+        root,
+        rrb.TimePanel(timeline="scan", state="collapsed", fps=max(30.0, scans / _PLAY_S)),
+        rrb.BlueprintPanel(state="expanded" if has_toggles else "collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+    )
+
+
+def whole_log() -> rrb.TimeAxis:
+    """From the first scan to the last."""
+    return rrb.TimeAxis(
+        view_range=rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite())
+    )
+
+
+def up_to_now() -> rrb.VisibleTimeRanges:
+    """Time range of a trajectory that grows with the time cursor, instead of showing its last segment only."""
+    start, end = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
+    return rrb.VisibleTimeRanges(
+        [rrb.VisibleTimeRange(timeline, start=start, end=end) for timeline in ("scan", "sensor_time")]
+    )
+
+
+def scene(
+    name: str, dimension: int, seen: NDArray[np.floating] | None, overrides: Mapping[Any, Any] | None = None
+) -> rrb.Spatial3DView:
+    """The world, dark whatever the viewer is: from above for a 2D log, obliquely for a 3D one.
+
+    seen : (N, 3) points, or corners, that the view should hold
+    """
+    known = np.array([[-20.0] * 3, [20.0] * 3]) if seen is None or not len(seen) else seen
+    low, high = known.min(axis=0), known.max(axis=0)
+    center, is_flat = 0.5 * (low + high), dimension == 2
+    size_m = max(float(np.linalg.norm(high - low)), 20.0 if is_flat else 60.0)
+    away = (0.0, 0.0, 1.3) if is_flat else (-0.35, -0.7, 0.7)
+    eye = rrb.EyeControls3D(
+        kind=rrb.Eye3DKind.Orbital,
+        position=center + size_m * np.array(away),
+        look_target=center,
+        eye_up=(0.0, 1.0, 0.0) if is_flat else (0.0, 0.0, 1.0),
+    )
+    return rrb.Spatial3DView(
+        origin=WORLD,
+        name=name,
+        overrides=overrides,
+        background=_BACKGROUND,
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=eye,
+    )

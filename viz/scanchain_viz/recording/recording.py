@@ -24,12 +24,12 @@ from scanchain.errors import InputError
 from scanchain.runs.closures import FinalClosure
 from scanchain.runs.job import SinkName
 from scanchain.runs.step_table import StepTable
-from scanchain.verdict import Judged, Kind, Stretch
+from scanchain.verdict import Judged, Kind
 from scanchain_viz.colors import STRETCH_COLORS, rgb
 from scanchain_viz.recording import drawing, entities, viewer
 from scanchain_viz.recording.batching import WARNING, Batcher, events
-from scanchain_viz.recording.blueprint import blueprint
 from scanchain_viz.recording.drawing import Message, Times
+from scanchain_viz.recording.entities import blueprint
 from scanchain_viz.recording.sinks import Sink, file_sink, open_stream, viewer_sink
 
 _LISTED = 50  # largest number of stretches in the text of a verdict
@@ -133,12 +133,8 @@ class Recording:
 
     def preview(self, scan: Scan) -> None:
         """Show a viewer, but no file, every n-th point of the first scan until its step is recorded."""
-        viewers, times = (
-            [sink for sink in self.sinks if sink is not self.file],
-            Times.at(scan.index, scan.stamp_ns),
-        )
-        cloud = drawing.dots(drawing.at_most(scan.points, self.config.max_map_points))
-        self._send(lambda: [Message(entities.SCAN, cloud, times)], viewers)
+        viewers = [sink for sink in self.sinks if sink is not self.file]
+        self._send(lambda: self._cloud(entities.SCAN, scan.points, Times.at(scan.index, scan.stamp_ns)), viewers)
 
     def log(self, step: Step) -> None:
         """Record one step; most of it is gathered and written in batches."""
@@ -175,8 +171,14 @@ class Recording:
         yield Message(entities.VERDICT, document)
         if judged.stretches:
             path = drawing.positions(trajectory.poses)
+            strips = [  # of disagreeing loops the line between their ends
+                path[[each.first, each.last]]
+                if each.kind is Kind.LOOPS
+                else path[max(each.first - 1, 0) : each.last + 1]
+                for each in judged.stretches
+            ]
             lines = rr.LineStrips3D(
-                [_stretch_line(path, each) for each in judged.stretches],
+                strips,
                 colors=[rgb(STRETCH_COLORS[each.kind]) for each in judged.stretches],
                 radii=drawing.pixels(_RADIUS),
                 labels=[str(each.kind) for each in judged.stretches],
@@ -269,12 +271,15 @@ class Recording:
         """True for every so many keyframes."""
         return step.keyframe >= 0 and step.keyframe % self.config.local_map_every == 0 and len(step.local_map) > 0
 
+    def _cloud(self, entity: str, points: NDArray[np.floating], times: Times) -> list[Message]:
+        """Every n-th point, so that a viewer can draw them."""
+        return [Message(entity, drawing.dots(drawing.at_most(points, self.config.max_map_points)), times)]
+
     def _step(self, step: Step) -> list[Message]:
         """Messages that are due after a step."""
         messages = self.batcher.graph.draw(self.now) if self.batcher.graph.has_grown else []
         if self._draws_map_of(step):
-            points = drawing.at_most(step.local_map, self.config.max_map_points)
-            messages.append(Message(entities.LOCAL_MAP, drawing.dots(points), self.now))
+            messages += self._cloud(entities.LOCAL_MAP, step.local_map, self.now)
         return [*messages, *self.batcher.messages()] if self.batcher.is_due else messages
 
     def _send(self, say: Callable[[], Iterable[Message]], sinks: Sequence[Sink] | None = None) -> None:
@@ -305,10 +310,3 @@ def _document(judged: Judged) -> str:
     more = len(judged.unnamed) - _LISTED
     head = f"## {judged.verdict}\n\n{judged.vouched}\n\n{judged.reason}\n\n"
     return head + listed + (f"- and {more:,} more\n" if more > 0 else "")
-
-
-def _stretch_line(path: drawing.Floats, stretch: Stretch) -> drawing.Floats:
-    """The part of the path that leads through a stretch; of disagreeing loops the line between their ends."""
-    if stretch.kind is Kind.LOOPS:
-        return path[[stretch.first, stretch.last]]
-    return path[max(stretch.first - 1, 0) : stretch.last + 1]

@@ -33,8 +33,8 @@ from scanchain_viz.colors import rgb
 from scanchain_viz.pictures.maps import DrawnMerge, map_points, read_merge
 from scanchain_viz.pictures.trajectories import DrawnTrajectory, trajectories_of_comparison
 from scanchain_viz.recording import drawing, entities
-from scanchain_viz.recording.blueprint import scene, up_to_now, whole_log, with_panels
 from scanchain_viz.recording.drawing import Message, Times
+from scanchain_viz.recording.entities import scene, up_to_now, whole_log, with_panels
 from scanchain_viz.recording.sinks import write_recording
 from scanchain_viz.report.problems import ellipses
 

@@ -177,7 +177,7 @@ def file_sink(path: Path, stream: rr.RecordingStream, blueprint: rrb.Blueprint) 
 
 
 def write_recording(
-    path: Path, name: str, dimension: int, blueprint: rrb.Blueprint, messages: Iterable[Message], *, kind: str = ""
+    path: Path, name: str, dimension: int, blueprint: rrb.Blueprint, messages: Iterable[Message], *, kind: str
 ) -> None:
     """Write a .rrd file of complete data, whole or not at all; z is up in it. Raises OSError.
 

@@ -58,12 +58,7 @@ def start_window(port: int) -> None:
         return
     if not has_display():
         raise ViewerError("no viewer spawned: there is no display; use --rerun web, or open the recording later")
-    process = _launch("--port", str(port), "--expect-data-soon")
-    try:
-        _wait(process, (port,))
-    except ViewerError:
-        stop(process)
-        raise
+    _launch((port,), "--port", str(port), "--expect-data-soon")
 
 
 def start_web(port: int, web_port: int, recording: Path | None = None) -> subprocess.Popen[bytes]:
@@ -74,13 +69,8 @@ def start_web(port: int, web_port: int, recording: Path | None = None) -> subpro
                 f"no web viewer: port {taken} is taken; close the program that uses it (another viewer?)"
             )
     files = [] if recording is None else [str(recording)]
-    process = _launch("--serve-web", "--port", str(port), "--web-viewer-port", str(web_port), *files)
-    try:
-        _wait(process, (port, web_port))
-    except BaseException:  # Ctrl-C as well: it is a process of its own session
-        stop(process)
-        raise
-    return process
+    served = "--serve-web", "--port", str(port), "--web-viewer-port", str(web_port)
+    return _launch((port, web_port), *served, *files)
 
 
 def stop(process: subprocess.Popen[bytes]) -> None:
@@ -93,15 +83,21 @@ def stop(process: subprocess.Popen[bytes]) -> None:
     process.wait(timeout=5.0)
 
 
-def _launch(*arguments: str) -> subprocess.Popen[bytes]:
-    """Start rerun bound to this machine alone (its own default is every interface)."""
-    return subprocess.Popen(
+def _launch(ports: tuple[int, ...], *arguments: str) -> subprocess.Popen[bytes]:
+    """Start rerun bound to this machine alone (its own default is every interface), and wait for these ports."""
+    process = subprocess.Popen(
         [sys.executable, "-P", "-m", "rerun_cli", "--bind", HOST, *arguments],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
     )
+    try:
+        _wait(process, ports)
+    except BaseException:  # Ctrl-C as well: it is a process of its own session
+        stop(process)
+        raise
+    return process
 
 
 def _wait(process: subprocess.Popen[bytes], ports: tuple[int, ...]) -> None:

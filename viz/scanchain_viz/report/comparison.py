@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +37,7 @@ def write_compare_report(directory: Path) -> None:
         ("scans", f"{table.scans:,} of {table.points_per_scan:,.0f} points, {table.dimension}D"),
         ("runs of a method", str(table.repeats)),
         ("machine", f"{made.platform}, {made.cores} cores"),
-        ("made", f"{datetime.fromisoformat(made.started):%Y-%m-%d %H:%M} UTC, in {made.duration_s:.0f} s"),
+        ("made", sections.when(made)),
     )
     how = "through every method, each in its own process"
     whole = page.Page(

@@ -17,7 +17,7 @@ from scanchain.maps import read_ply
 from scanchain.runs.directory import RUN_FILE
 from scanchain.runs.provenance import Provenance
 from scanchain.sessions.change_run import COLORS, METRICS_FILE, TABLE_FILE
-from scanchain.sessions.changes import Changes, Cluster, Label
+from scanchain.sessions.changes import Changes, Label
 from scanchain.sessions.localize import LocalizedLog
 from scanchain.sessions.localizer import MapState
 from scanchain.sessions.merging import MergeMetrics
@@ -26,7 +26,6 @@ from scanchain_viz.colors import CLOSURES, hex_of
 from scanchain_viz.pictures import maps
 from scanchain_viz.pictures.figure import INK, Line, Plot, broken
 from scanchain_viz.report import page
-from scanchain_viz.report.scene import SCRIPT, interactive_map
 from scanchain_viz.report.sections import chip, configuration, provenance_sections
 
 _HEADS = (
@@ -66,7 +65,6 @@ def write_merge_report(directory: Path) -> None:
         warnings=metrics.warnings,
         sections=(_merged_map(directory, drawn, metrics), _sessions(drawn, metrics)),
         collapsibles=(*provenance_sections(made, {}), configuration(directory)),
-        script=SCRIPT,
     )
     page.write_page(directory, whole)
 
@@ -92,7 +90,7 @@ def _merged_map(directory: Path, drawn: maps.DrawnMerge, metrics: MergeMetrics) 
             "Seen from above; thin lines: closures in force between sessions.",
             maps.path_over_map(points, [closures, *drawn.sessions], low, high),
         ),
-        interactive_map(points, drawn.sessions, low, high, grain_m=drawn.grain_m, is_flat=is_flat),
+        page.interactive_map(points, drawn.sessions, low, high, grain_m=drawn.grain_m, is_flat=is_flat),
     )
     return page.Section("Map", chips=list(map(chip, drawn.sessions)), drawings=drawings)
 
@@ -175,7 +173,7 @@ def _states_picture(localized: LocalizedLog) -> page.Drawing:
     top = float(np.nanmax(found.sigma_m, initial=0.01)) if np.isfinite(found.sigma_m).any() else 1.0
     for run in np.split(np.arange(len(found.states)), runs):
         first_m, last_m = found.traveled_m[[run[0], min(run[-1] + 1, len(found.states) - 1)]].tolist()
-        figure.span(first_m, last_m, _STATE_COLORS[MapState(str(found.states[run[0]]))], 0.25)
+        figure.span(first_m, last_m, f"{_STATE_COLORS[MapState(str(found.states[run[0]]))]}40")
     figure.line(np.stack([found.traveled_m, found.sigma_m], axis=1), INK, 0.9)
     figure.y.limit(0.0, 1.1 * top)
     count = counted(len(found.closures), "match with the map", "matches with the map")
@@ -205,14 +203,12 @@ def _changed(changes: Changes) -> Iterator[page.Section]:
     yield page.Section("Where", _HOW_TOLD, chips, [drawing])
     if changes.clusters:
         yield page.Section("What changed", grid=_cluster_grid(changes))
-        drawings = [_close_up(points, changes, cluster) for cluster in changes.clusters[:_CLOSE_UPS]]
+        drawings = []
+        for each in changes.clusters[:_CLOSE_UPS]:
+            center, half_m = np.append(each.center[:2], 0.0), 0.5 * float(each.size_m[:2].max()) + _AROUND_M
+            svg = _changes_picture(points, changes, center - half_m, center + half_m)
+            drawings.append(page.Drawing(f"{each.number}: {each.kind}", counted(each.points, "point"), svg))
         yield page.Section("The largest changes", drawings=drawings, is_small=True)
-
-
-def _close_up(points: Matrix, changes: Changes, cluster: Cluster) -> page.Drawing:
-    center, half_m = np.append(cluster.center[:2], 0.0), 0.5 * float(cluster.size_m[:2].max()) + _AROUND_M
-    svg = _changes_picture(points, changes, center - half_m, center + half_m)
-    return page.Drawing(f"{cluster.number}: {cluster.kind}", counted(cluster.points, "point"), svg)
 
 
 def _changes_picture(
@@ -223,15 +219,10 @@ def _changes_picture(
     for label in _ORDER:
         maps.draw_points(figure, points[changes.labels == label], low, high, (_HEX[label],))
     for cluster in changes.clusters:
-        figure.line(_outline(cluster)[[0, 1, 2, 3, 0]], INK, 0.8)
+        c, s = np.cos(cluster.yaw_rad), np.sin(cluster.yaw_rad)
+        corners = 0.5 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]]) * cluster.size_m[:2]
+        figure.line(corners @ np.array([[c, s], [-s, c]]) + cluster.center[:2], INK, 0.8)
     return figure.svg()
-
-
-def _outline(cluster: Cluster) -> Matrix:
-    """Corners (4, 2) of a cluster's box seen from above."""
-    c, s = np.cos(cluster.yaw_rad), np.sin(cluster.yaw_rad)
-    corners = 0.5 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * cluster.size_m[:2]
-    return corners @ np.array([[c, s], [-s, c]]) + cluster.center[:2]
 
 
 def _cluster_grid(changes: Changes) -> page.Grid:

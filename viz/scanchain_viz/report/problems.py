@@ -77,7 +77,7 @@ def _estimates(study: Study) -> tuple[Plot, Plot]:
     along = axes_m[:, None] * np.stack([np.cos(around), np.sin(around)], axis=-1)
     c, s = np.cos(angles_rad), np.sin(angles_rad)
     outlines = along @ np.stack([c, s, -s, c], axis=-1).reshape(-1, 2, 2) + _in_truth(study.after)[1][:, None]
-    after.line(broken(outlines), AFTER, 0.6, opacity=0.5, name="95 % ellipse of a landmark")
+    after.line(broken(outlines), f"{AFTER}80", 0.6, name="95 % ellipse of a landmark")
     return before, after
 
 
@@ -88,7 +88,7 @@ def _plot(study: Study, estimate: Estimate, color: str, when: str) -> Plot:
     poses, landmarks = _in_truth(estimate)
     if len(study.true_poses):
         figure.line(study.true_poses, INK, 1.1, (4.0, 2.0), name="true trajectory")
-    figure.line(poses, color, opacity=0.85, name=f"trajectory {when}")
+    figure.line(poses, f"{color}d9", name=f"trajectory {when}")
     if np.isfinite(study.true_landmarks).any():
         figure.marks(study.true_landmarks, "+", INK, 7.0, line=0.9, name="true landmarks")
     figure.marks(landmarks, "o", color, 4.0, line=0.9, name=f"landmarks {when}")

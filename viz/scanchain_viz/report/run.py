@@ -29,7 +29,6 @@ from scanchain_viz.pictures.figure import Floats, Line
 from scanchain_viz.pictures.maps import AFTER, BEFORE, map_picture, overlay_picture, path_over_map, surroundings
 from scanchain_viz.pictures.trajectories import frame, trajectories_of_run
 from scanchain_viz.report import page, sections
-from scanchain_viz.report.scene import SCRIPT, interactive_map
 
 _CURVES = (  # a column of steps.parquet, its name, its limit
     ("wheel_innovation", "wheels", WHEEL_LIMIT),
@@ -67,7 +66,6 @@ def write_run_report(directory: Path) -> None:
             *sections.provenance_sections(made, {}),
             sections.configuration(directory),
         ),
-        script=SCRIPT,
         judged=metrics.judged,
     )
     page.write_page(directory, whole)
@@ -94,6 +92,7 @@ def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
     yield "configuration", made.configuration
     yield "speed", f"{counted(round(m.scans_per_s), 'scan')}/s, {m.times_real_time:.1f} × real time{m.compiling}"
     yield "machine", f"{made.platform}, {made.cores} cores"
+    yield "made", sections.when(made)
 
 
 def _accuracy(m: Metrics) -> str:
@@ -144,7 +143,7 @@ def map_section(lines: Sequence[Line], points: Points, low: Floats, high: Floats
     drawings = (
         page.Drawing("Trajectory over the map", "Seen from above; circle: start, square: end.", over_map),
         *(() if is_flat else (page.Drawing("Map", f"map.ply, {above}", map_picture(points, low, high)),)),
-        interactive_map(points, lines, low, high, grain_m=grain_m, is_flat=is_flat, is_wide=not is_flat),
+        page.interactive_map(points, lines, low, high, grain_m=grain_m, is_flat=is_flat, is_wide=not is_flat),
     )
     return page.Section("Trajectory and map", chips=tuple(map(sections.chip, lines)), drawings=drawings)
 
@@ -244,7 +243,8 @@ def _stretches(stretches: Sequence[Stretch]) -> page.Grid:
         *map(page.Head, ("finding", "first", "last", "scans")),
         page.Head("start", "s"), page.Head("end", "s"), page.Head("size", "m"),
     )  # fmt: skip
-    return page.Grid(heads, tuple(rows))
+    left = len(stretches) - len(rows)
+    return page.Grid(heads, rows, [f"and {left:,} shorter ones: metrics.json"] if left else ())
 
 
 def accuracy_section(truth: GroundTruth) -> page.Section:

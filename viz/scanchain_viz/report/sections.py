@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -155,7 +156,7 @@ def innovations(
     """Innovations (N,) over their limits scan by scan, in their colors, over stretches in theirs."""
     figure = Plot("scan", "innovation / limit", is_wide=is_wide)
     for first, last, color in stretches:
-        figure.span(first - 0.5, last + 0.5, color, 0.2)
+        figure.span(first - 0.5, last + 0.5, f"{color}33")
     for values, color in curves:
         x, y = _over_scans(np.clip(np.nan_to_num(values), _LOWEST, _HIGHEST), np.max)
         figure.line(np.stack([x, y], axis=1), color, 0.9)
@@ -315,6 +316,11 @@ def provenance_sections(made: Provenance, others: dict[str, str]) -> Iterator[Co
     yield Collapsible("Versions", "\n".join(lines))
     logs = (f"{log.path}  {log.size_bytes:,} bytes  sha256 {log.sha256}" for log in made.logs)
     yield Collapsible("Log files", "\n".join(logs))
+
+
+def when(made: Provenance) -> str:
+    """When a result was made, and how long that took."""
+    return f"{datetime.fromisoformat(made.started):%Y-%m-%d %H:%M} UTC, in {made.duration_s:.0f} s"
 
 
 def configuration(directory: Path) -> Collapsible:
