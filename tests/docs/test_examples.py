@@ -97,7 +97,11 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(page, marks=[pytest.mark.slow] * (page.name == "extending.md")) for page in PAGES],
+    ids=lambda page: page.name,
+)
 def test_every_example_prints_what_the_page_says(page, folder, capsys):
     compared = ran = 0
     text = page.read_text(encoding="utf-8")
