@@ -123,7 +123,14 @@ def seen(pages, tmp_path_factory):
     return looked
 
 
-@pytest.mark.parametrize(("width", "dark"), [(1200, False), (1200, True), (390, False), (390, True)])
+@pytest.mark.parametrize(
+    ("width", "dark"),
+    [
+        (1200, False),
+        (390, True),
+        *(pytest.param(*each, marks=pytest.mark.slow) for each in ((1200, True), (390, False))),
+    ],
+)
 @BOTH
 def test_nothing_is_cut_and_nothing_overlaps(which, width, dark, seen):
     page = seen(which, width, dark)
@@ -131,10 +138,7 @@ def test_nothing_is_cut_and_nothing_overlaps(which, width, dark, seen):
     for number, drawing in enumerate(page["svgs"]):
         assert drawing["cut"] == [] and drawing["overlapping"] == [], number
         assert drawing["width"] > 200 and drawing["height"] > 80
-SLOW = [pytest.param(*size, marks=pytest.mark.slow) for size in ((1200, True), (390, False))]
-
-
-@pytest.mark.parametrize(("width", "dark"), [(1200, False), (390, True), *SLOW])
+    assert page["scrolled"] == 0
     assert page["paper"] == ("rgb(20, 23, 27)" if dark else "rgb(255, 255, 255)")
 
 
