@@ -113,7 +113,7 @@ def main():
             seconds[name].append((spent, state))
     print(f"{log.name}: {'method':22} {'median ms':>10} {'min ms':>8} {'ATE m':>8} {'landmarks m':>12}")
     for name, runs in seconds.items():
-        accuracy, _ = against_truth(runs[-1][1], model.nodes_s, truth)
+        accuracy = against_truth(runs[-1][1], model.nodes_s, truth)
         spent = 1e3 * np.array([run[0] for run in runs])
         print(f"{log.name}: {name:22} {np.median(spent):10.1f} {spent.min():8.1f} {accuracy.poses_m:8.4f}"
               f" {accuracy.landmarks_m:12.4f}")  # fmt: skip

@@ -10,10 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from scanchain.landmarks.compare import compare_linear
 from scanchain.landmarks.files import read_landmark_data
 from scanchain.landmarks.problem import linear_system
-from scanchain.landmarks.solvers import METHODS
+from scanchain.landmarks.solvers import METHODS, compare
 
 ROOT = Path(__file__).resolve().parents[2]
 OF_THE_REPORT = ("default", "pinv", "lu", "lu_colamd", "qr", "qr_colamd")
@@ -60,7 +59,9 @@ def main():
     options = parser.parse_args()
     for name in REPORT_S:
         system = linear_system(read_landmark_data(options.data / f"{name}.npz"))
-        report(name, compare_linear(system, with_suitesparse(), options.repeats))
+        report(
+            name, compare(lambda solver, system=system: solver.solve(system), with_suitesparse(), options.repeats)
+        )
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ from scanchain.data import Matrix
 from scanchain.graph.cholesky import SingularMatrixError
 from scanchain.graph.losses import RobustLoss
 from scanchain.graph.minimizer import LocalModel, descend, step_rule
-from scanchain.kernels.landmarks import normal_equations
 from scanchain.landmarks.problem import (
     BearingRangeProblem,
     LandmarkData,
@@ -199,20 +198,20 @@ class Evaluation:
 
 def _model(problem: BearingRangeProblem, solver: LinearSolver, system: LinearSystem) -> LocalModel:
     """H = AᵀA and g = −Aᵀb."""
-    pattern = system.pattern
-    downhill, diagonal = np.empty(pattern.shape[1]), np.empty(pattern.shape[1])
-    normal_equations.gradient(pattern.row_start, pattern.columns, system.values, system.b, downhill, diagonal)
+    A = system.A
+    lengths = np.bincount(system.pattern.columns, system.values**2, system.pattern.shape[1])
+    diagonal = np.asarray(lengths, np.float64)
 
     def solve(damping: float) -> NDArray[np.float64]:
         if not damping:
-            return solver.solve(system).x
+            return solver.solve(system)
         try:
-            return solver.solve(problem.damped(system, damping * diagonal)).x
+            return solver.solve(problem.damped(system, damping * diagonal))
         except UndeterminedError as error:
             column = int(error.columns[0])
             raise SingularMatrixError(column, column) from error
 
-    return LocalModel(-downhill, diagonal, solve, lambda step: system.A.T @ (system.A @ step))
+    return LocalModel(-(A.T @ system.b), diagonal, solve, lambda step: A.T @ (A @ step))
 
 
 def _cost(at: Linearization, loss: Loss) -> float:

@@ -132,12 +132,10 @@ class Pattern:
         """Number of rows and columns of A."""
         return len(self.row_start) - 1, self.layout.columns
 
-    def by_column(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Start of each column's rows (n + 1,), and the rows."""
-        counts = csr_matrix(
-            (np.ones(len(self.columns), np.int8), self.columns, self.row_start), self.shape
-        ).tocsc()
-        return counts.indptr.astype(np.int64), counts.indices.astype(np.int64)
+    def products(self) -> csr_matrix:
+        """Entries of AᵀA that may be nonzero, as ones and more, (n, n)."""
+        there = csr_matrix((np.ones(len(self.columns)), self.columns, self.row_start), self.shape)
+        return csr_matrix(there.T @ there)
 
 
 @dataclass(frozen=True, slots=True)

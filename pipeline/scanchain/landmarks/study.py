@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,6 @@ from scanchain.clock import working_s
 from scanchain.data import Matrix, Pose, Trajectory
 from scanchain.errors import FREEDOM, counted
 from scanchain.evaluation import Alignment, absolute_error, pair
-from scanchain.landmarks.compare import MethodResult, compare_linear, compare_nonlinear
 from scanchain.landmarks.estimate import Optimizer, disturbed, from_odometry, minimize, of_relative_positions
 from scanchain.landmarks.files import RangeLog, read_mrclam
 from scanchain.landmarks.problem import (
@@ -29,16 +28,24 @@ from scanchain.landmarks.problem import (
     world_referenced,
 )
 from scanchain.landmarks.ranges import OWN, OWN_UNITS, OdometryNoise, RangeSolution, solve_range_log
-from scanchain.landmarks.solvers import create_solver, methods_for
+from scanchain.landmarks.solvers import MethodResult, compare, create_solver, methods_for
 from scanchain.landmarks.solvers.elimination import Covariance
 
 _WIDEST_GAP_S = 0.5  # between motion-capture poses that are interpolated
 
 
 @dataclass(frozen=True, slots=True)
-class Accuracy:
-    """Root mean squared distances from the truth; NaN without truth. ``definition`` defines them as text."""
+class Estimate:
+    """Poses and landmarks, and their accuracy.
 
+    Attributes
+    ----------
+    T_truth_estimate : (3, 3) aligns them to the truth
+    poses_m, landmarks_m : root mean squared distances from the truth, NaN without; ``definition`` defines them
+    """
+
+    state: Values
+    T_truth_estimate: Pose
     poses_m: float
     landmarks_m: float
     definition: str
@@ -60,16 +67,14 @@ class Truth:
     landmarks: Matrix
 
 
-def of_positions(state: Values, data: LandmarkData) -> Accuracy:
+def of_positions(state: Values, data: LandmarkData) -> Estimate:
     """Against the positions of an npz file, where it has them; both lie in one frame."""
     known = len(data.true_poses) > 0
     if not known and np.isnan(data.true_landmarks).all():
-        return Accuracy(np.nan, np.nan, "no true positions in the file")
-    return Accuracy(
-        _rms(state.poses - data.true_poses) if known else np.nan,
-        _rms(state.landmarks - data.true_landmarks),
-        "root mean squared distance from the true positions, nothing aligned",
-    )
+        return Estimate(state, lie.identity(2), np.nan, np.nan, "no true positions in the file")
+    poses_m = _rms(state.poses - data.true_poses) if known else np.nan
+    definition = "root mean squared distance from the true positions, nothing aligned"
+    return Estimate(state, lie.identity(2), poses_m, _rms(state.landmarks - data.true_landmarks), definition)
 
 
 def truth_at(log: RangeLog, nodes_s: NDArray[np.float64], landmarks: NDArray[np.int64]) -> Truth:
@@ -89,15 +94,17 @@ def truth_at(log: RangeLog, nodes_s: NDArray[np.float64], landmarks: NDArray[np.
     return Truth(known, poses, surveyed)
 
 
-def against_truth(state: Values, nodes_s: NDArray[np.float64], truth: Truth) -> tuple[Accuracy, Pose]:
-    """ATE of the poses after rigid alignment, landmarks by the same alignment; and T_truth_estimate (3, 3)."""
+def against_truth(state: Values, nodes_s: NDArray[np.float64], truth: Truth) -> Estimate:
+    """ATE of the poses after rigid alignment, landmarks by the same alignment."""
+    if np.count_nonzero(truth.known) < 2:
+        return Estimate(state, lie.identity(2), np.nan, np.nan, "no motion capture at these times")
     stamps_ns = nanoseconds(nodes_s[truth.known])
     estimate = Trajectory(stamps_ns, pose_matrices(state.poses[truth.known]))
     error = absolute_error(pair(estimate, Trajectory(stamps_ns, pose_matrices(truth.poses))), Alignment.RIGID)
     T_truth_estimate = lie.flatten(error.T_reference_estimate)
-    moved = lie.transform(T_truth_estimate, state.landmarks)
+    landmarks_m = _rms(lie.transform(T_truth_estimate, state.landmarks) - truth.landmarks)
     definition = f"{error.definition}, over {error.pairing}"
-    return Accuracy(error.translation_m.rmse, _rms(moved - truth.landmarks), definition), T_truth_estimate
+    return Estimate(state, T_truth_estimate, error.translation_m.rmse, landmarks_m, definition)
 
 
 def nanoseconds(times_s: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -146,21 +153,11 @@ class Options:
     optimizer: Optimizer
 
 
-@dataclass(frozen=True, slots=True)
-class Fact:
+class Fact(NamedTuple):
     """A line about a problem: label, and value as text."""
 
     label: str
     value: str
-
-
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """Poses and landmarks, their accuracy, and T_truth_estimate (3, 3) that aligns them to the truth."""
-
-    state: Values
-    accuracy: Accuracy
-    T_truth_estimate: Pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,7 +201,7 @@ def _linear(data: LandmarkData, options: Options) -> Study:
     system = linear_system(data)
     build_s = working_s() - begin
     names, left_out = methods_for(options.methods, system.pattern.shape[1])
-    methods = compare_linear(system, names, options.repeats)
+    methods = compare(lambda solver: solver.solve(system), names, options.repeats)
     chi2 = float(np.square(system.A @ methods[0].x - system.b).sum())
     facts = (
         Fact("problem", "linear: steps between poses, landmarks' positions relative to them"),
@@ -224,9 +221,13 @@ def _nonlinear(data: LandmarkData, options: Options) -> Study:
     system = problem.system(problem.linearize(minimum.state), minimum.weights)
     build_s = working_s() - begin
     if options.optimizer == "gradient-descent" or not minimum.iterations:  # solves none: take its end
-        methods = compare_linear(system, names, options.repeats)
+        methods = compare(lambda solver: solver.solve(system), names, options.repeats)
     else:
-        methods = compare_nonlinear(problem, guess, options.optimizer, names, options.repeats)
+        methods = compare(
+            lambda solver: minimize(problem, guess, solver, optimizer=options.optimizer).state.unknowns,
+            names,
+            options.repeats,
+        )
     ended = "converged" if minimum.converged else "DID NOT CONVERGE"
     facts = (
         Fact("problem", "nonlinear: steps between poses, bearing and range of landmarks; headings known"),
@@ -275,8 +276,8 @@ def _of_file(
     return Study(
         name=data.name,
         facts=facts,
-        before=Estimate(before, of_positions(before, data), lie.identity(2)),
-        after=Estimate(after, of_positions(after, data), lie.identity(2)),
+        before=of_positions(before, data),
+        after=of_positions(after, data),
         converged=True,
         pose_covariance=covariance.of(pose_columns(layout, np.arange(layout.poses))),
         landmark_covariance=covariance.of(landmark_columns(layout, np.arange(len(layout.landmarks)))),
@@ -306,8 +307,8 @@ def study_log(folder: Path, options: Options) -> Study:
     return Study(
         name=log.name,
         facts=(*_facts(log, solution, is_stated=options.noise is not None), *_left_out(left_out)),
-        before=_estimate(solution.reckoned, solution.nodes_s, truth),
-        after=_estimate(solution.minimum.state, solution.nodes_s, truth),
+        before=against_truth(solution.reckoned, solution.nodes_s, truth),
+        after=against_truth(solution.minimum.state, solution.nodes_s, truth),
         converged=solution.minimum.converged,
         pose_covariance=solution.pose_covariance,
         landmark_covariance=solution.landmark_covariance,
@@ -315,17 +316,9 @@ def study_log(folder: Path, options: Options) -> Study:
         true_landmarks=truth.landmarks,
         system=system,
         build_s=build_s,
-        methods=compare_linear(system, names, options.repeats),
+        methods=compare(lambda solver: solver.solve(system), names, options.repeats),
         trajectory=Trajectory(nanoseconds(solution.nodes_s), pose_matrices(solution.minimum.state.poses)),
     )
-
-
-def _estimate(state: Values, nodes_s: NDArray[np.float64], truth: Truth) -> Estimate:
-    if np.count_nonzero(truth.known) < 2:
-        nothing = Accuracy(np.nan, np.nan, "no motion capture at these times")
-        return Estimate(state, nothing, lie.identity(2))
-    accuracy, T_truth_estimate = against_truth(state, nodes_s, truth)
-    return Estimate(state, accuracy, T_truth_estimate)
 
 
 def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> tuple[Fact, ...]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import GraphState, Matrix
 from scanchain.graph.optimization import GraphChange, fit
-from scanchain.landmarks.compare import MethodResult
+from scanchain.landmarks.solvers import MethodResult
 from scanchain.landmarks.study import Estimate, Study
 from scanchain_viz.pictures.figure import INK, Plot, broken, palette_of, write_png
 
@@ -63,7 +63,7 @@ def draw_estimate(path: Path, study: Study) -> None:
     """Draw both estimates of a landmark problem side by side, over the truth, to a PNG. Raises OSError."""
     panels = []
     for when, plot in (("before", plot_before(study)), ("after", plot_after(study))):
-        off_m = (study.before if when == "before" else study.after).accuracy.poses_m
+        off_m = (study.before if when == "before" else study.after).poses_m
         error = f": poses {off_m:.3g} m off" if np.isfinite(off_m) else ""
         panels.append((f"{study.name}, {when}{error}", plot))
     write_png(path, panels, width_inches=5.5, columns=2)

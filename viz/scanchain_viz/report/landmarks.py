@@ -43,7 +43,7 @@ def write_report(directory: Path, studies: Sequence[Study]) -> None:
         sections = tuple(each for study in studies for each in _sections(study))
         title = f"Landmark problem{'s' if len(studies) > 1 else ''}"
         names = ", ".join(study.name for study in studies)
-        definitions = dict.fromkeys(study.after.accuracy.definition for study in studies)
+        definitions = dict.fromkeys(study.after.definition for study in studies)
         fold = page.Collapsible("Definition of the errors", "\n\n".join(definitions))
         page.write_page(directory / page.REPORT_FILE, page.Page(title, names, (), (), (), sections, (fold,)))
     except OSError as error:
