@@ -54,7 +54,7 @@ def test_without_the_truth_the_kind_is_found_and_the_estimate_stands(tmp_path, a
     np.testing.assert_allclose(study.after.state.landmarks, true_landmarks, atol=1e-6)
     (_, after), _ = accuracy_lines(study)[1:]
     assert after.count("unknown") == 1
-    assert np.isnan(study.after.accuracy.poses_m) == ("gt_traj" in missing)
+    assert np.isnan(study.after.poses_m) == ("gt_traj" in missing)
 
 
 def test_without_the_truth_bearings_in_degrees_are_refused_and_what_nothing_tells_apart(tmp_path, arrays):
@@ -168,13 +168,13 @@ def test_other_robots_unknown_barcodes_and_untimely_observations_are_counted(fol
 
 def test_an_exact_drive_is_found_exactly(folder):
     study = study_log(folder, Options(("schur",), 1, 1, None, "odometry", "levenberg-marquardt"))
-    assert study.after.accuracy.poses_m < 0.01 and study.after.accuracy.landmarks_m < 0.01
+    assert study.after.poses_m < 0.01 and study.after.landmarks_m < 0.01
 
 
 def test_without_motion_capture_the_estimate_stands_and_its_accuracy_is_unknown(folder):
     (folder / "Robot1_Groundtruth.dat").unlink()
     study = study_log(folder, Options(("schur",), 1, 1, None, "odometry", "levenberg-marquardt"))
-    assert np.isnan(study.after.accuracy.poses_m) and study.converged
+    assert np.isnan(study.after.poses_m) and study.converged
 
 
 @pytest.mark.parametrize(
@@ -221,8 +221,8 @@ def test_utias_6_robot_1_is_as_accurate_as_a_batch_in_gtsam_or_better():
     study = study_log(
         shared_data("landmarks/utias_mrclam6"), Options(("schur",), 1, 1, None, "odometry", "levenberg-marquardt")
     )
-    assert study.before.accuracy.poses_m == pytest.approx(2.06, abs=0.01)
-    assert study.after.accuracy.poses_m <= 0.113
+    assert study.before.poses_m == pytest.approx(2.06, abs=0.01)
+    assert study.after.poses_m <= 0.113
     facts = {fact.label: fact.value for fact in study.facts}
     assert facts["left out"].startswith("407 of other robots, 1 of unknown barcodes, 0 ")
     assert facts["odometry noise"].endswith("fits") and facts["sensor noise"].endswith("fits")

@@ -31,6 +31,7 @@ class CholeskyMethod:
             pattern = BlockPattern(np.ones(len(g), np.int64), pairs)
             self._known = system.pattern, SparseCholesky(pattern, analyze(pattern))
         cholesky = self._known[1]
+        H.sum_duplicates()  # sorts it, so that entries are found by bisection
         cholesky.factorize(np.asarray(H[cholesky.pattern.rows, cholesky.pattern.columns]).ravel())
         U, order = upper_factor, cholesky.analysis.order
         return Factored(lambda: cholesky.solve(g), lambda: Factor("U of AᵀA", csc_matrix(U(cholesky)), order))
