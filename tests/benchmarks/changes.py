@@ -26,8 +26,7 @@ from scanchain.sessions.alignment import align_maps
 from scanchain.sessions.changes import Changes, Part, changes_between
 from scanchain.settings import load_settings
 from scanchain.simulation import Drive, plan
-from scanchain.simulation.drive import EPOCH_NS
-from scanchain.simulation.log import record
+from scanchain.simulation.drive import EPOCH_NS, record
 from scanchain.simulation.solids import FIXED, Solids
 
 LEAST_M = 0.3  # size of the objects that count

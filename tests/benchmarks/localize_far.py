@@ -35,10 +35,8 @@ from scanchain.maps import open_saved_map
 from scanchain.maps.saved_map import write_saved_map
 from scanchain.sessions.localizer import Localizer, MapState
 from scanchain.settings import load_settings
-from scanchain.simulation.drive import plan
-from scanchain.simulation.log import record
-from scanchain.simulation.worlds import outdoor
-from scanchain.simulation.worlds.registry import WORLDS, World
+from scanchain.simulation.drive import plan, record
+from scanchain.simulation.worlds import WORLDS, World, outdoor
 from tests.benchmarks.odometry3d_set import simulator_version
 
 CACHE = Path(tempfile.gettempdir()) / "scanchain_localize_far"

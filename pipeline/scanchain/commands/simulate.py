@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -15,7 +16,9 @@ from scanchain.errors import InputError, counted
 @click.option(
     "--seed", default=0, show_default=True, metavar="N", help="Random seed; the same seed gives the same bytes."
 )
-@click.option("--duration", type=float, metavar="SECONDS", help="Length of the drive. [default: the world's]")
+@click.option(
+    "--duration", "duration_s", type=float, metavar="SECONDS", help="Length of the drive. [default: the world's]"
+)
 @click.option("--sensor", metavar="NAME", help="Lidar: lms-270, utm-30, hdl-64, os1-32, vlp-16 or rosette.")
 @click.option(
     "--drift", default=1.0, show_default=True, metavar="FACTOR", help="Scale of the errors of the wheel odometry."
@@ -28,7 +31,11 @@ from scanchain.errors import InputError, counted
     help="Let the wheels turn so far ahead between these seconds, and the robot not move by it.",
 )
 @click.option(
-    "--noise", type=float, metavar="METERS", help="Standard deviation of the ranges. [default: the sensor's]"
+    "--noise",
+    "noise_m",
+    type=float,
+    metavar="METERS",
+    help="Standard deviation of the ranges. [default: the sensor's]",
 )
 @click.option(
     "--dropout", type=float, metavar="SHARE", help="Share of returns that are lost. [default: the sensor's]"
@@ -40,22 +47,12 @@ from scanchain.errors import InputError, counted
     help="Drive again on another day, number N: furniture or parked cars came, went and moved.",
 )
 @click.option("--reverse", is_flag=True, help="Drive the route the other way round.")
-@click.option("--start-at", default=0.0, show_default=True, metavar="METERS", help="Begin so far along the route.")
+@click.option(
+    "--start-at", "start_m", default=0.0, show_default=True, metavar="METERS", help="Begin so far along the route."
+)
 @click.option("--force", is_flag=True, help="Replace an existing file.")
 def simulate(
-    world: str,
-    destination: Path,
-    seed: int,
-    duration: float | None,
-    sensor: str | None,
-    drift: float,
-    wheels_slip: tuple[float, float, float] | None,
-    noise: float | None,
-    dropout: float | None,
-    changed: int | None,
-    reverse: bool,
-    start_at: float,
-    force: bool,
+    world: str, destination: Path, wheels_slip: tuple[float, float, float] | None, **options: Any
 ) -> None:
     """Write a synthetic log with exact ground truth, and the truth beside it as .tum.
 
@@ -93,22 +90,8 @@ def simulate(
     from scanchain.simulation import simulate as simulate_log
 
     with Terminal("scans") as terminal:
-        truth = simulate_log(
-            world,
-            destination,
-            seed=seed,
-            duration_s=duration,
-            sensor=sensor,
-            drift=drift,
-            wheels_slip=NO_SLIP if wheels_slip is None else Slip(*wheels_slip),
-            noise_m=noise,
-            dropout=dropout,
-            changed=changed,
-            reverse=reverse,
-            start_m=start_at,
-            force=force,
-            progress=terminal.count,
-        )
+        slip = NO_SLIP if wheels_slip is None else Slip(*wheels_slip)
+        truth = simulate_log(world, destination, wheels_slip=slip, progress=terminal.count, **options)
     size_mb = destination.stat().st_size / 1e6
     click.echo(
         f"{destination}: {counted(len(truth), 'scan')}, {size_mb:.1f} MB; ground truth in it and in "
