@@ -62,7 +62,7 @@ def squared_distances(solution, landmarks, first):
     off = solution.minimum.state.landmarks - from_first(
         first, landmarks[solution.problem.measurements.landmarks - 6]
     )
-    return np.einsum("li,lij,lj->l", off, np.linalg.inv(solution.landmark_covariance), off) / 2.0
+    return np.einsum("li,lij,lj->l", off, np.linalg.inv(solution.covariance.landmarks), off) / 2.0
 
 
 def test_the_robots_own_errors_the_noise_and_its_effect_are_found():

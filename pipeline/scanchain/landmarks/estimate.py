@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,18 +118,31 @@ def chain(start: NDArray[np.float64], motion: Matrix) -> Matrix:
 Optimizer = Literal["gauss-newton", "levenberg-marquardt", "dogleg", "gradient-descent"]
 
 
-class Loss(Protocol):
-    """Robust loss of observations."""
+_FREEDOM = 4.0
+_SCALE2 = _FREEDOM + 2.0  # the weight (ν + 2) / (ν + χ²) is, but for a factor that σ takes up, s² / (s² + χ²)
+
+
+@dataclass(frozen=True, slots=True)
+class StudentLoss:
+    """ρ(χ²) of a bearing and a range together, ν = 4, times the share of the observation.
+
+    Attributes
+    ----------
+    share : (N,) of an independent observation, above 0 up to 1
+    """
+
+    share: NDArray[np.float64]
 
     def weight(self, chi2: NDArray[np.float64]) -> NDArray[np.float64]:
-        """dρ/dχ², (N,)."""
-        ...
+        """Up to the share, (N,)."""
+        return self.share * _SCALE2 / (_SCALE2 + chi2)
 
     def loss(self, chi2: NDArray[np.float64]) -> NDArray[np.float64]:
-        """ρ(χ²), (N,)."""
-        ...
+        """The share of χ² near zero, (N,)."""
+        return self.share * _SCALE2 * np.log1p(chi2 / _SCALE2)
 
 
+Loss = RobustLoss | StudentLoss
 QUADRATIC = RobustLoss("none", 1.0, 1.0)
 
 

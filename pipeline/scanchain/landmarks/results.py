@@ -16,16 +16,9 @@ from scanchain.landmarks.study import Estimate, Study
 from scanchain.trajectory import write_tum
 
 _HEADINGS = (
-    "method",
-    "build ms",
-    "factor ms",
-    "solve ms",
-    "total ms",
-    "again ms",
-    "solves",
-    "nnz factor",
-    "differs by",
-)
+    "method", "build ms", "factor ms", "solve ms", "total ms", "again ms", "solves", "nnz factor", "differs by",
+)  # fmt: skip
+_FIGURES = ("method", "build_s", "factor_s", "solve_s", "again_s", "iterations")
 
 
 def file_stem(name: str) -> str:
@@ -95,12 +88,7 @@ def tree_of(study: Study) -> dict[str, object]:
         "A": {"rows": rows, "columns": columns, "entries": len(study.system.values), "build_s": study.build_s},
         "methods": [
             {
-                "method": method.method,
-                "build_s": method.build_s,
-                "factor_s": method.factor_s,
-                "solve_s": method.solve_s,
-                "again_s": method.again_s,
-                "iterations": method.iterations,
+                **{name: getattr(method, name) for name in _FIGURES},
                 "factor": method.factor.name,
                 "factor_entries": method.factor.nnz,
                 "difference": method.difference,
@@ -120,11 +108,11 @@ def write_estimate(directory: Path, study: Study) -> None:
         np.arange(len(state.poses)),
         names,
         state.poses,
-        study.pose_covariance,
+        study.covariance.poses,
     )
     numbers = study.system.pattern.layout.landmarks
     file = directory / f"{stem}_landmarks.csv"
-    _write_csv(file, "landmark", numbers, ["x_m", "y_m"], state.landmarks, study.landmark_covariance)
+    _write_csv(file, "landmark", numbers, ["x_m", "y_m"], state.landmarks, study.covariance.landmarks)
     if study.trajectory is not None:
         write_tum(directory / f"{stem}.tum", study.trajectory, force=True)
 

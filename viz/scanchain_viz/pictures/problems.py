@@ -116,7 +116,7 @@ def _in_truth(estimate: Estimate) -> tuple[Matrix, Matrix]:
 def ellipses(study: Study) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The 95 % ellipse of every landmark: half axes (N, 2) in meters, the longer first, and angle to x (N,)."""
     turn = study.after.T_truth_estimate[:2, :2]
-    values, vectors = np.linalg.eigh(turn @ study.landmark_covariance @ turn.T)
+    values, vectors = np.linalg.eigh(turn @ study.covariance.landmarks @ turn.T)
     axes_m = _ELLIPSE * np.sqrt(np.maximum(values[:, ::-1], 0.0))
     return axes_m, np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
 

@@ -11,7 +11,7 @@ from scipy.sparse import csc_matrix, triu
 from scanchain.data import Matrix
 from scanchain.graph.cholesky import BlockPattern, SingularMatrixError, SparseCholesky, analyze, upper_factor
 from scanchain.kernels.landmarks import arrow
-from scanchain.landmarks.problem import LinearSystem, Pattern
+from scanchain.landmarks.problem import LinearSystem, Pattern, landmark_columns, pose_columns
 from scanchain.landmarks.solvers.direct import LOST_DIGITS, Factor, Factored, normal_equations, undetermined
 
 
@@ -85,7 +85,7 @@ class Covariance:
 
     def __init__(self, system: LinearSystem) -> None:
         """Raises UndeterminedError where A has not full column rank."""
-        pattern = system.pattern
+        pattern, self._layout = system.pattern, system.pattern.layout
         U, _ = _form(system, arrow.bandwidth(pattern.row_start, pattern.columns, pattern.layout.split))
         try:
             _eliminate(U)
@@ -93,6 +93,16 @@ class Covariance:
             raise undetermined(system) from error
         self._band, self._border, self._corner = (np.empty_like(part) for part in (U.band, U.border, U.corner))
         arrow.invert(U.band, U.border, U.corner, self._band, self._border, self._corner)
+
+    @property
+    def poses(self) -> Matrix:
+        """Of every pose, (K, p, p), relative to the first where that is held; m, rad."""
+        return self.of(pose_columns(self._layout, np.arange(self._layout.poses)))
+
+    @property
+    def landmarks(self) -> Matrix:
+        """Of every landmark, (L, 2, 2) m²."""
+        return self.of(landmark_columns(self._layout, np.arange(len(self._layout.landmarks))))
 
     def of(self, columns: NDArray[np.int64]) -> Matrix:
         """Covariances of groups of unknowns, (N, c) columns of A to (N, c, c); NaN for poses far apart."""
