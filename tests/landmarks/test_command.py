@@ -106,23 +106,13 @@ def test_a_recording_holds_truth_before_and_after_and_is_not_overwritten(call, s
     assert code == 2 and "exists; choose another name" in errors and not (tmp_path / "again").exists()
 
 
-@pytest.mark.parametrize("optimizer", ["dogleg", "gauss-newton", "gradient-descent"])
-def test_every_optimizer_tells_how_it_ended(call, tmp_path, optimizer):
-    problem = shared_data("landmarks/2d_nonlinear.npz")
-    code, output, _ = call(
-        "landmarks",
-        problem,
-        "--out",
-        tmp_path / "out",
-        "--optimizer",
-        optimizer,
-        "--method",
-        "schur",
-        "--repeat",
-        "1",
-    )
-    ended = "DID NOT CONVERGE after 100 steps" if optimizer == "gradient-descent" else "converged after"
-    assert code == (optimizer == "gradient-descent") and f"{optimizer} {ended}" in output
+@pytest.mark.parametrize(
+    ("optimizer", "ended"), [("dogleg", "converged"), ("gradient-descent", "DID NOT CONVERGE")]
+)
+def test_every_optimizer_tells_how_it_ended(call, tmp_path, optimizer, ended):
+    words = ["--out", tmp_path / "out", "--optimizer", optimizer, "--repeat", "1"]
+    code, output, _ = call("landmarks", shared_data("landmarks/2d_nonlinear.npz"), *words)
+    assert code == (ended != "converged") and f"{optimizer} {ended} after" in output
 
 
 def test_two_problems_stand_side_by_side_and_the_figures_come_as_json(call, small, tmp_path):
@@ -145,14 +135,9 @@ def test_two_problems_stand_side_by_side_and_the_figures_come_as_json(call, smal
     ("words", "said"),
     [
         (["--method", "chol"], "there is no method 'chol'"),
-        (["--odometry-noise", "1,2"], "give four positive numbers"),
         (["--odometry-noise", "0.1,0.1,-1,1"], "give four positive numbers"),
-        (["--robot", "0"], "--robot"),
-        (["--methods", "lu,lu"], "--methods names one twice: lu, lu"),
         (["--robot", "3"], "--robot is for MRCLAM folders alone"),
-        (["--odometry-noise", "1,1,1,1"], "--odometry-noise is for MRCLAM folders alone"),
         (["--guess", "odometry"], "--guess is for nonlinear files alone"),
-        (["--optimizer", "dogleg"], "--optimizer is for nonlinear files alone"),
     ],
 )
 def test_bad_arguments_are_one_line_and_leave_nothing(call, small, tmp_path, words, said):

@@ -6,7 +6,7 @@ import json
 import sys
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.core import ParameterSource
@@ -14,9 +14,8 @@ from click.core import ParameterSource
 from scanchain.errors import InputError
 
 if TYPE_CHECKING:
-    from scanchain.landmarks.estimate import Optimizer
     from scanchain.landmarks.ranges import OdometryNoise
-    from scanchain.landmarks.study import Guess, Study
+    from scanchain.landmarks.study import Study
 
 
 @click.command()
@@ -39,6 +38,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--repeat",
+    "repeats",
     type=click.IntRange(1, 1000),
     default=3,
     show_default=True,
@@ -76,14 +76,11 @@ def landmarks(
     data: tuple[Path, ...],
     out: Path,
     methods: str,
-    repeat: int,
-    robot: int,
     noise: str | None,
-    guess: Guess,
-    optimizer: Optimizer,
     recording: Path | None,
     force: bool,
     as_json: bool,
+    **chosen: Any,
 ) -> None:
     """Solve landmark SLAM problems, and compare linear solvers on them.
 
@@ -112,7 +109,7 @@ def landmarks(
     from scanchain.runs.directory import RunDirectory
     from scanchain_viz.report.landmarks import write_report
 
-    options = Options(parse_methods(methods), repeat, robot, _noise(noise), guess, optimizer)
+    options = Options(methods=parse_methods(methods), noise=_noise(noise), **chosen)
     problems = [path if path.is_dir() else read_landmark_data(path) for path in data]
     _check_options(ctx, {"log" if isinstance(each, Path) else each.kind for each in problems})
     if recording is not None:

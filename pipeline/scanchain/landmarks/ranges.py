@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scanchain.clock import working_s
 from scanchain.data import Matrix
 from scanchain.errors import InputError
-from scanchain.kernels.landmarks import dead_reckoning
+from scanchain.kernels.landmarks import factors
 from scanchain.landmarks.estimate import Minimum, StudentLoss, from_odometry, growing, minimize
 from scanchain.landmarks.files import RangeLog
 from scanchain.landmarks.problem import BearingRangeProblem, Calibration, Measurements, Values
@@ -91,7 +91,7 @@ def _integrated(
     )
     steps = len(nodes_s) - 1
     motion, spread = np.empty((steps, 3)), np.empty((steps, sources, 3, 3))
-    dead_reckoning.integrate(log.times_s + own[4], driven, nodes_s, motion, spread)
+    factors.integrate(log.times_s + own[4], driven, nodes_s, motion, spread)
     return motion, spread
 
 
