@@ -61,7 +61,7 @@ def whole(office, tmp_path_factory):
     return out
 
 
-@pytest.fixture(scope="module", params=["2D", "3D"])
+@pytest.fixture(scope="module", params=["2D", pytest.param("3D", marks=pytest.mark.slow)])
 def undisturbed(request, office, whole, tmp_path_factory):
     """A log and its run."""
     if request.param == "2D":
@@ -297,7 +297,9 @@ def test_without_anything_to_go_on_with_a_run_begins_at_the_beginning(office, wh
     same_result(tmp_path / "run", whole)
 
 
-@pytest.mark.parametrize(("limit_kib", "words"), [(64, LIVELY), (400, LIVELY), (400, RECORDED)])
+@pytest.mark.parametrize(
+    ("limit_kib", "words"), [(64, LIVELY), pytest.param(400, LIVELY, marks=pytest.mark.slow), (400, RECORDED)]
+)
 def test_a_full_disk_is_an_error_and_what_is_on_it_is_whole(office, tmp_path, limit_kib, words):
     full = f"""
 import resource, signal, sys

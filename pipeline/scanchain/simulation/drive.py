@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from scanchain import checks, lie
 from scanchain.data import Matrix, Trajectory
 from scanchain.errors import InputError
-from scanchain.logs.writing.pack import Link, pack_laser_scan, pack_odometry, pack_transforms, place
-from scanchain.logs.writing.writer import LogWriter
+from scanchain.logs.writer import Link, LogWriter, pack_laser_scan, pack_odometry, pack_transforms, place
 from scanchain.simulation.another_day import Change, another_day, write_changes
 from scanchain.simulation.motion import Motion, wheel_odometry
 from scanchain.simulation.sensors import SENSORS, Sensor, Sweep, take_sweep

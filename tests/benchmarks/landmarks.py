@@ -1,28 +1,81 @@
-"""An MRCLAM log against a batch in GTSAM, interleaved: python -m tests.benchmarks.landmark_log [FOLDER].
+"""The landmark problems of the course report by every linear solver, and an MRCLAM log against GTSAM.
 
-GTSAM gets the same dead reckoning and guess, Huber weights (k = 1.345), noise of 0.03 rad and 0.12 m, and the
-odometry's noise as it is thought to be beforehand. Its time is that of building the graph and of its optimizer,
-with the covariance of every pose and landmark where it says so. "ours as given" does just the same, "ours" the
-whole estimate: dead reckoning, guess, the robot's own errors, all noise, all covariances.
+    python -m tests.benchmarks.landmarks linear [--repeats 9]
+    python -m tests.benchmarks.landmarks log [--robot 1] [--repeats 9]
+
+linear: each round solves every problem by every method in turn; times are medians of whole solutions of A x = b,
+a new solver each time; "again" is with the same solver once more, which keeps what it found out about the
+pattern. The report's seconds are of another machine (and its QR is SuiteSparseQR): ratios within a column
+compare.
+
+log: a batch in GTSAM gets the same dead reckoning and guess, Huber weights (k = 1.345), noise of 0.03 rad and
+0.12 m, and the odometry's noise as it is thought to be beforehand. Its time is that of building the graph and of
+its optimizer, with the covariance of every pose and landmark where it says so. "ours as given" does just the
+same, "ours" the whole estimate: dead reckoning, guess, the robot's own errors, all noise, all covariances.
+Methods take turns.
 """
 
-import argparse
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import gtsam
 import numpy as np
 
 from scanchain.graph.losses import RobustLoss
 from scanchain.landmarks.estimate import from_odometry, minimize
-from scanchain.landmarks.files import read_mrclam
-from scanchain.landmarks.problem import BearingRangeProblem, Values, no_calibration
+from scanchain.landmarks.files import read_landmark_data, read_mrclam
+from scanchain.landmarks.problem import BearingRangeProblem, Values, linear_system, no_calibration
 from scanchain.landmarks.ranges import OWN, LogModel, OdometryNoise, solve_range_log
-from scanchain.landmarks.solvers import create_solver
+from scanchain.landmarks.solvers import METHODS, compare, create_solver
 from scanchain.landmarks.study import against_truth, truth_at
+from tests.benchmarks.harness import DATA, command_line
 
-ROOT = Path(__file__).resolve().parents[2]
+OF_THE_REPORT = ("default", "pinv", "lu", "lu_colamd", "qr", "qr_colamd")
+REPORT_S = {
+    "2d_linear": (0.04870, 1.1802, 0.0260, 0.1152, 0.3671, 0.2509),
+    "2d_linear_loop": (0.0054, 0.1629, 0.0295, 0.0087, 0.2487, 0.0190),
+}
+AGREEMENT = 1e-8
+
+
+def with_suitesparse():
+    try:
+        import sparseqr  # noqa: F401
+    except ImportError:
+        return METHODS
+    return (*METHODS, "spqr", "spqr_colamd")
+
+
+def report(name, results):
+    published = dict(zip(OF_THE_REPORT, REPORT_S[name], strict=True))
+    print(f"\n{name}")
+    print(f"  {'method':12} {'report s':>9} {'total ms':>9} {'build':>8} {'factor':>8} {'solve':>7}"
+          f" {'again ms':>9} {'nnz factor':>11} {'differs by':>10}")  # fmt: skip
+    for result in results:
+        told = f"{published[result.method]:9.4f}" if result.method in published else f"{'-':>9}"
+        build, factor, solve, again = (
+            1e3 * seconds for seconds in (result.build_s, result.factor_s, result.solve_s, result.again_s)
+        )
+        print(f"  {result.method:12} {told} {1e3 * result.total_s:9.2f} {build:8.2f} {factor:8.2f} {solve:7.2f}"
+              f" {again:9.2f} {result.factor.nnz:11,} {result.difference:10.1e}")  # fmt: skip
+    spread = max(float(np.abs(a.x - b.x).max()) for a in results for b in results)
+    print(f"  all agree to {spread:.1e}" + ("" if spread <= AGREEMENT else f": MORE THAN {AGREEMENT:g}"))
+    fastest = min((result for result in results if result.method in OF_THE_REPORT), key=lambda r: r.total_s)
+    for result in results:
+        if result.method in ("cholesky", "schur"):
+            print(f"  {result.method}: {fastest.total_s / result.total_s:.1f} × as fast as {fastest.method},"
+                  f" {fastest.total_s / result.again_s:.1f} × with its analysis kept")  # fmt: skip
+
+
+def linear(options):
+    for name in REPORT_S:
+        system = linear_system(read_landmark_data(DATA / "landmarks" / f"{name}.npz"))
+        report(name, compare(lambda solver, it=system: solver.solve(it), with_suitesparse(), options.repeats))
+
+
+# ---------------------------------------------------------------- the log
+
+
 HUBER = 1.345
 SIGMAS = np.array([0.03, 0.12])
 LANDMARK = 10_000_000  # first key of a landmark
@@ -82,7 +135,7 @@ def with_gtsam(log, optimizer, parameters, *, covariances=False):
     return seconds, Values(np.array([[pose.x(), pose.y(), pose.theta()] for pose in poses]), landmarks)
 
 
-METHODS = {
+OF_THE_LOG = {
     "ours": ours,
     "ours as given": as_given,
     "gtsam LM": lambda log: with_gtsam(log, gtsam.LevenbergMarquardtOptimizer, gtsam.LevenbergMarquardtParams()),
@@ -93,22 +146,15 @@ METHODS = {
 }
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "folder", nargs="?", type=Path, default=ROOT.parent / "shared" / "data" / "landmarks" / "utias_mrclam6"
-    )
-    parser.add_argument("--robot", type=int, default=1)
-    parser.add_argument("--repeats", type=int, default=9)
-    options = parser.parse_args()
-    log = read_mrclam(options.folder, options.robot)
+def real_log(options):
+    log = read_mrclam(DATA / "landmarks" / "utias_mrclam6", options.robot)
     model = LogModel(log)
     truth = truth_at(log, model.nodes_s, model.landmarks)
-    seconds = {name: [] for name in METHODS}
-    for method in METHODS.values():
+    seconds = {name: [] for name in OF_THE_LOG}
+    for method in OF_THE_LOG.values():
         method(log)  # compiles
     for _ in range(options.repeats):
-        for name, method in METHODS.items():
+        for name, method in OF_THE_LOG.items():
             spent, state = method(log)
             seconds[name].append((spent, state))
     print(f"{log.name}: {'method':22} {'median ms':>10} {'min ms':>8} {'ATE m':>8} {'landmarks m':>12}")
@@ -117,6 +163,15 @@ def main():
         spent = 1e3 * np.array([run[0] for run in runs])
         print(f"{log.name}: {name:22} {np.median(spent):10.1f} {spent.min():8.1f} {accuracy.poses_m:8.4f}"
               f" {accuracy.landmarks_m:12.4f}")  # fmt: skip
+
+
+def main():
+    parser = command_line(__doc__, cache=False)
+    parser.add_argument("which", choices=("linear", "log"))
+    parser.add_argument("--robot", type=int, default=1)
+    parser.add_argument("--repeats", type=int, default=9)
+    options = parser.parse_args()
+    {"linear": linear, "log": real_log}[options.which](options)
 
 
 if __name__ == "__main__":
