@@ -25,8 +25,7 @@ from scanchain.sessions.alignment import align_maps
 from scanchain.sessions.changes import Changes, Part, changes_between
 from scanchain.settings import load_settings
 from scanchain.simulation import Drive, plan
-from scanchain.simulation.drive import EPOCH_NS
-from scanchain.simulation.log import record
+from scanchain.simulation.drive import EPOCH_NS, record
 from scanchain.simulation.solids import FIXED, Solids
 from tests.benchmarks.harness import command_line, run_of
 from tests.support import made

@@ -22,12 +22,11 @@ import gtsam
 import numpy as np
 
 from scanchain.graph.losses import RobustLoss
-from scanchain.landmarks.compare import compare_linear
 from scanchain.landmarks.estimate import from_odometry, minimize
 from scanchain.landmarks.files import read_landmark_data, read_mrclam
 from scanchain.landmarks.problem import BearingRangeProblem, Values, linear_system, no_calibration
 from scanchain.landmarks.ranges import OWN, LogModel, OdometryNoise, solve_range_log
-from scanchain.landmarks.solvers import METHODS, create_solver
+from scanchain.landmarks.solvers import METHODS, compare, create_solver
 from scanchain.landmarks.study import against_truth, truth_at
 from tests.benchmarks.harness import DATA, command_line
 
@@ -71,7 +70,7 @@ def report(name, results):
 def linear(options):
     for name in REPORT_S:
         system = linear_system(read_landmark_data(DATA / "landmarks" / f"{name}.npz"))
-        report(name, compare_linear(system, with_suitesparse(), options.repeats))
+        report(name, compare(lambda solver, it=system: solver.solve(it), with_suitesparse(), options.repeats))
 
 
 # ---------------------------------------------------------------- the log
@@ -160,7 +159,7 @@ def real_log(options):
             seconds[name].append((spent, state))
     print(f"{log.name}: {'method':22} {'median ms':>10} {'min ms':>8} {'ATE m':>8} {'landmarks m':>12}")
     for name, runs in seconds.items():
-        accuracy, _ = against_truth(runs[-1][1], model.nodes_s, truth)
+        accuracy = against_truth(runs[-1][1], model.nodes_s, truth)
         spent = 1e3 * np.array([run[0] for run in runs])
         print(f"{log.name}: {name:22} {np.median(spent):10.1f} {spent.min():8.1f} {accuracy.poses_m:8.4f}"
               f" {accuracy.landmarks_m:12.4f}")  # fmt: skip

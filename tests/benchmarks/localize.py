@@ -48,10 +48,8 @@ from scanchain.maps import SavedMap, open_saved_map
 from scanchain.odometry import Odometry
 from scanchain.sessions.localizer import Localizer
 from scanchain.settings import load_settings
-from scanchain.simulation.drive import Drive, plan
-from scanchain.simulation.log import record
-from scanchain.simulation.worlds import outdoor
-from scanchain.simulation.worlds.registry import WORLDS
+from scanchain.simulation.drive import Drive, plan, record
+from scanchain.simulation.worlds import WORLDS, outdoor
 from scanchain.trajectory import read_tum
 from tests.benchmarks.harness import DATA, command_line, in_fresh_process, run_of, traveled_m, true_in_map
 from tests.support import made

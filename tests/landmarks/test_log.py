@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from scanchain.kernels.landmarks import dead_reckoning
 from scanchain.landmarks.estimate import chain
 from scanchain.landmarks.files import RangeLog
 from scanchain.landmarks.ranges import OWN, OdometryNoise, SightingPairs, reckon, solve_range_log
@@ -23,11 +22,14 @@ def made_up_log(seed, duration_s=600.0, alike=0.0):
     turning = np.repeat(rng.choice([0.0, 0.3, -0.3, 0.1], len(times) // 8 + 1), 8)[: len(times)]
     velocities = np.stack([np.full(len(times), 0.1), turning], axis=1)
     nodes = np.sort(rng.uniform(2.0, duration_s - 1.0, int(2.0 * duration_s)))
-    log = RangeLog(
-        "made up", times, velocities, nodes, np.zeros(0, int), np.zeros((0, 2)), 0, 0, 0, np.zeros(0),
-        np.zeros((0, 3)), np.zeros(0, int), np.zeros((0, 2)),
-    )  # fmt: skip
-    reckoning = reckon(log, nodes, OF_ITS_OWN)
+
+    def logged(*seen):
+        return RangeLog(
+            "made up", times, velocities, *seen, 0, 0, 0, np.zeros(0), np.zeros((0, 3)), np.zeros(0, int),
+            np.zeros((0, 2)),
+        )  # fmt: skip
+
+    reckoning = reckon(logged(nodes, np.zeros(0, int), np.zeros((0, 2))), nodes, OF_ITS_OWN)
     roots = np.linalg.cholesky(reckoning.covariance(NOISE.densities))
     moves = reckoning.motion + (roots @ rng.normal(size=(*reckoning.motion.shape, 1)))[..., 0]
     poses = chain(np.zeros(3), moves)
@@ -43,12 +45,8 @@ def made_up_log(seed, duration_s=600.0, alike=0.0):
             seen.append((k, j + 6))
             rows.append(np.array([bearing[j], np.hypot(*away[j])]) + SIGMAS * noise[j])
     which, subjects = np.array(seen).T
-    first = which[0]
-    log = RangeLog(
-        "made up", times, velocities, nodes[which], subjects, np.array(rows), 0, 0, 0, np.zeros(0),
-        np.zeros((0, 3)), np.zeros(0, int), np.zeros((0, 2)),
-    )  # fmt: skip
-    return log, poses[np.unique(which)], landmarks, poses[first]
+    log = logged(nodes[which], subjects, np.array(rows))
+    return log, poses[np.unique(which)], landmarks, poses[which[0]]
 
 
 def from_first(first, points):
@@ -62,7 +60,7 @@ def squared_distances(solution, landmarks, first):
     off = solution.minimum.state.landmarks - from_first(
         first, landmarks[solution.problem.measurements.landmarks - 6]
     )
-    return np.einsum("li,lij,lj->l", off, np.linalg.inv(solution.landmark_covariance), off) / 2.0
+    return np.einsum("li,lij,lj->l", off, np.linalg.inv(solution.covariance.landmarks), off) / 2.0
 
 
 def test_the_robots_own_errors_the_noise_and_its_effect_are_found():
@@ -120,13 +118,3 @@ def test_slopes_of_the_motion_equal_central_differences():
         ahead, behind = (reckon(log, nodes_s, sign * away).motion for sign in (1.0, -1.0))
         expected = (ahead - behind) / (2.0 * step)
         assert np.median(np.abs(slope[..., column] - expected)) < 1e-3
-
-
-def test_without_sources_the_motion_is_the_same():
-    log = made_up_log(2, duration_s=30.0)[0]
-    nodes_s = np.unique(log.seen_s)
-    motions = [np.empty((len(nodes_s) - 1, 3)) for _ in range(2)]
-    for motion, sources in zip(motions, (4, 0), strict=True):
-        spread = np.empty((len(motion), sources, 3, 3))
-        dead_reckoning.integrate(log.times_s, log.velocities, nodes_s, motion, spread)
-    assert np.array_equal(*motions)

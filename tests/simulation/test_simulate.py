@@ -22,17 +22,8 @@ from scanchain.simulation.sensors import take_sweep
 from scanchain.simulation.solids import Solids
 from scanchain.simulation.worlds.indoor import CORRIDOR_M, CORRIDOR_SIGHT_M, CORRIDOR_STRUCTURE_M
 from tests.support import naive_raycast
-from tests.support.scan_information import information, spectrum, surface_normals, undetermined
 
 LIDARS = [name for name, sensor in SENSORS.items() if sensor.dimension == 3]
-STRESSING = [name for name in WORLDS if name not in ("office", "town")]
-
-
-def drive(name, duration_s, seed=0):
-    world = WORLDS[name]
-    solids = world.build(np.random.default_rng(seed))
-    rng = np.random.default_rng(seed + 100)
-    return solids, world.motion(solids, duration_s=duration_s, rng=rng)
 
 
 @cache
@@ -55,18 +46,10 @@ def in_reach(solids, place, reach_m):
     )
 
 
-@pytest.fixture(scope="module")
-def drives():
-    return {"office": drive("office", 240.0), "town": drive("town", 60.0)}
-
-
-def perfect(name):
-    return replace(SENSORS[name], noise_m=0.0, dropout=0.0)
-
-
-def undistorted(sweep, motion, start_s):
-    poses = motion.lidar(start_s + sweep.times_s())
-    return np.einsum("nij,nj->ni", poses[:, :3, :3], sweep.points().astype(np.float64)) + poses[:, :3, 3]
+def swept(drive, index):
+    """A scan of a planned drive."""
+    start_s = index * drive.sensor.period_ns * 1e-9
+    return take_sweep(drive.solids, drive.motion, drive.sensor, index, start_s, np.random.default_rng(0))
 
 
 def messages(path, topic):
@@ -77,14 +60,6 @@ def messages(path, topic):
 
 def nanoseconds(message):
     return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-
-
-def pose_of(odometry):
-    p, q = odometry.pose.pose.position, odometry.pose.pose.orientation
-    pose = np.eye(4)
-    pose[:3, :3] = lie.from_quaternion(np.array([q.x, q.y, q.z, q.w]))
-    pose[:3, 3] = p.x, p.y, p.z
-    return pose
 
 
 # --- ray casting -----------------------------------------------------------------------------------------------
@@ -108,9 +83,7 @@ def random_solids(rng, ground=SMOOTH):
     )
 
 
-@pytest.mark.parametrize(
-    ("seed", "ground"), [(0, SMOOTH), (1, SMOOTH), (2, SMOOTH), (3, SMOOTH), (4, ROUGH), (5, ROUGH)]
-)
+@pytest.mark.parametrize(("seed", "ground"), [(0, SMOOTH), (1, SMOOTH), (4, ROUGH), (5, ROUGH)])
 def test_the_kernel_equals_the_naive_ray_caster(seed, ground):
     rng = np.random.default_rng(seed)
     solids = random_solids(rng, ground)
@@ -129,62 +102,33 @@ def test_the_kernel_equals_the_naive_ray_caster(seed, ground):
     assert np.allclose(fast, naive, atol=1e-7, rtol=0.0)
 
 
-def test_a_ray_into_empty_space_comes_back_infinite():
-    solids = Solids(np.zeros((0, 8)), np.zeros((0, 5)), np.zeros((0, 6)), np.zeros(7))
-    pose = np.eye(4)[None]
-    pose[0, 2, 3] = 2.0
-    directions = np.array([[1.0, 0, 0], [0, 0, 1], [0, 0, -1], [0.6, 0, -0.8], [0.999, 0, -0.0447]])
-    ranges = solids.cast(pose, np.zeros(5, dtype=np.int32), directions, 30.0)
-    assert np.allclose(ranges, [np.inf, np.inf, 2.0, 2.5, np.inf])
-
-
-def test_a_normal_is_the_way_straight_off_the_surface():
-    rng = np.random.default_rng(0)
-    solids = random_solids(rng, ROUGH)
-    directions = rng.normal(size=(600, 3)) * [1.0, 1.0, 0.25]
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    ranges, solid = solids.strike(np.eye(4)[None], np.zeros(600, dtype=np.int32), directions, 50.0)
-    hit = np.isfinite(ranges)
-    places = directions[hit] * ranges[hit, None]
-    normals = surface_normals(places, solid[hit], solids)
-    assert set(np.digitize(solid[hit], [30, 60, 90])) == {0, 1, 2, 3}  # boxes, cylinders, ellipsoids, ground
-    assert np.all(np.sum(normals * directions[hit], axis=1) < 0.0)
-    off = naive_raycast.distance_to_surface(places + 1e-4 * normals, solids)
-    assert np.mean(np.abs(off - 1e-4) < 1e-7) > 0.98  # but near the seam of two solids
-
-
 # --- worlds and motion -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", [name for name in WORLDS if name not in ("staircase", "gap")])
 @pytest.mark.parametrize("seed", range(4))
 def test_the_path_crosses_no_wall_and_no_furniture(name, seed):
-    solids, motion = drive(name, 120.0, seed)
-    places = motion.base(np.arange(0.0, 120.0, 0.05 if name in ("office", "town") else 0.2))[:, :2, 3]
-    assert solids.clearance_m(places, below_m=2.0).min() > WORLDS[name].vehicle.radius_m + 0.05
+    drive = plan(name, seed=seed, duration_s=120.0)
+    places = drive.motion.base(np.arange(0.0, 120.0, 0.05 if name in ("office", "town") else 0.2))[:, :2, 3]
+    assert drive.solids.clearance_m(places, below_m=2.0).min() > WORLDS[name].vehicle.radius_m + 0.05
 
 
 @pytest.mark.parametrize("name", ["office", "town"])
-def test_the_drive_starts_from_standstill_and_never_jerks(drives, name):
-    _, motion = drives[name]
-    vehicle = WORLDS[name].vehicle
-    step = 1e-3
+def test_the_drive_starts_from_standstill_within_the_limits_of_the_vehicle(name):
+    motion = planned(name, "vlp-16").motion
+    vehicle, step = WORLDS[name].vehicle, 1e-3
     times = np.arange(0.0, 50.0, step)
-    poses = motion.base(times)
-    assert motion.speed_m_s(np.array([0.0]))[0] < 1e-3
-    speed = motion.speed_m_s(times)
+    poses, speed = motion.base(times), motion.speed_m_s(times)
+    assert speed[0] < 1e-3 and speed.max() < 1.01 * vehicle.speed_m_s
     traveled = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)
     assert np.allclose(traveled / step, 0.5 * (speed[1:] + speed[:-1]), atol=0.01 * vehicle.speed_m_s)
-    assert speed.max() < 1.01 * vehicle.speed_m_s
     assert np.abs(np.diff(speed)).max() / step < 1.5 * vehicle.acceleration_m_s2
-    yaw_rate = lie.wrap(np.diff(lie.yaw(poses))) / step
-    assert np.abs(yaw_rate).max() > 0.5  # it does turn
-    assert np.abs(np.diff(yaw_rate)).max() < 0.02  # within a millisecond
+    assert np.abs(lie.wrap(np.diff(lie.yaw(poses)))).max() / step > 0.5  # it does turn
 
 
-def test_the_car_follows_the_ground(drives):
-    solids, motion = drives["town"]
-    poses = motion.base(np.arange(0.0, 60.0, 0.1))
+def test_the_car_follows_the_ground():
+    drive = planned("town", "vlp-16")
+    solids, poses = drive.solids, drive.motion.base(np.arange(0.0, 60.0, 0.1))
     height = poses[:, 2, 3]
     assert height.max() - height.min() > 0.3
     assert np.abs(height - solids.ground_height(poses[:, :2, 3])).max() < 1.1 * WORLDS["town"].vehicle.heave_m
@@ -194,9 +138,8 @@ def test_the_car_follows_the_ground(drives):
 @pytest.mark.parametrize("name", ["demo-office", "demo-town", "office", "town"])
 def test_a_sequence_comes_back_to_where_it_was(name):
     source = catalog.load(name).source
-    _, motion = drive(source.world, source.duration_s, source.seed)
-    times = np.arange(0.0, source.duration_s, 0.1)
-    poses = lie.flatten(motion.lidar(times))
+    motion = plan(source.world, seed=source.seed, duration_s=source.duration_s).motion
+    poses = lie.flatten(motion.lidar(np.arange(0.0, source.duration_s, 0.1)))
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :2, 2], axis=0), axis=1))])
     gap = np.linalg.norm(poses[:, None, :2, 2] - poses[None, :, :2, 2], axis=-1)
     turn = np.abs(lie.wrap(lie.yaw(poses)[:, None] - lie.yaw(poses)[None]))
@@ -208,7 +151,7 @@ def test_a_sequence_comes_back_to_where_it_was(name):
 # --- worlds that are hard on odometry ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", STRESSING)
+@pytest.mark.parametrize("name", WORLDS)
 def test_the_seed_alone_draws_the_place_and_the_motion(name):
     first, same, other = (plan(name, seed=seed, duration_s=5.0) for seed in (3, 3, 4))
     for kind in ("boxes", "cylinders", "ellipsoids", "ground"):
@@ -220,27 +163,24 @@ def test_the_seed_alone_draws_the_place_and_the_motion(name):
     )
 
 
-@pytest.mark.parametrize("name", STRESSING)
+@pytest.mark.parametrize("name", WORLDS)
 def test_the_motion_is_smooth(name):
     motion, step = planned(name, "vlp-16").motion, 1e-3
-    poses = motion.lidar(np.arange(0.0, WORLDS[name].duration_s, step))
+    poses = motion.lidar(np.arange(0.0, min(WORLDS[name].duration_s, 60.0), step))
     rates = lie.log(lie.inverse(poses[:-1]) @ poses[1:]) / step
     change = np.abs(np.diff(rates, axis=0)).max(axis=0)  # within a millisecond
     assert change[:3].max() < 0.01 and change[3:].max() < 0.02
 
 
 @pytest.mark.parametrize("sensor", LIDARS)
-@pytest.mark.parametrize("name", STRESSING)
+@pytest.mark.parametrize("name", [name for name in WORLDS if name != "office"])
 def test_every_lidar_sees_something_everywhere(name, sensor):
     drive = planned(name, sensor)
     fewest = {"hdl-64": 90_000, "os1-32": 13_000, "vlp-16": 11_000, "rosette": 3_000}[sensor]
     if (name, sensor) == ("identical", "hdl-64"):
         fewest = 60_000  # where its walls are nearer than it can see
-    for index in drive.scans[[0, len(drive.scans) // 2, -1]]:
-        sweep = take_sweep(
-            drive.solids, drive.motion, drive.sensor, int(index), index * 0.1, np.random.default_rng(0)
-        )
-        assert sweep.returned.sum() > fewest
+    for index in drive.scans[[0, len(drive.scans) // 2, -1]].tolist():
+        assert swept(drive, index).returned.sum() > fewest
 
 
 def test_the_rounds_pass_streets_again_in_both_directions_and_in_the_other_lane():
@@ -282,22 +222,6 @@ def test_all_rooms_of_the_identical_floor_look_the_same():
     np.testing.assert_allclose(rooms[2], rooms[0], atol=1e-9)
 
 
-@pytest.mark.parametrize("name", STRESSING)
-def test_rays_hit_what_the_naive_ray_caster_says(name):
-    drive = planned(name, "rosette" if name == "hall" else "os1-32")
-    index = int(drive.scans[-20])
-    sweep = take_sweep(drive.solids, drive.motion, drive.sensor, index, index * 0.1, np.random.default_rng(0))
-    poses = drive.motion.lidar(index * 0.1 + sweep.rays.instants_ns * 1e-9)[sweep.rays.instant_of_ray]
-    reach_m = drive.sensor.max_range_m
-    solids = in_reach(drive.solids, poses[0, :3, 3], reach_m)
-    some = np.random.default_rng(1).choice(len(poses), 16, replace=False)
-    naive = [
-        naive_raycast.cast(poses[k, :3, 3], poses[k, :3, :3] @ sweep.rays.directions[k], solids, reach_m)
-        for k in some
-    ]  # fmt: skip
-    assert np.allclose(sweep.ranges_m[some], naive, atol=1e-6, rtol=0.0)
-
-
 def test_the_highway_is_at_full_speed_from_the_first_scan():
     drive = planned("highway", "vlp-16")
     steps = np.linalg.norm(np.diff(drive.truth().poses[:, :3, 3], axis=0), axis=1)
@@ -316,7 +240,7 @@ def test_rings_on_a_flat_floor_stay_where_they_are_while_the_lidar_moves():
     drive = planned("hall", "vlp-16")
     height = WORLDS["hall"].vehicle.T_base_lidar[2, 3]
     for index in (5, 60):  # at rest, at 5 m/s
-        sweep = take_sweep(drive.solids, drive.motion, drive.sensor, index, index * 0.1, np.random.default_rng(0))
+        sweep = swept(drive, index)
         points, ring = sweep.points(), sweep.rays.ring[sweep.returned]
         floor = np.abs(points[:, 2] + height) < 1e-4
         for lowest, elevation_deg in enumerate((-15.0, -13.0, -11.0)):
@@ -374,67 +298,49 @@ def test_wheel_odometry_goes_on_in_a_gap_and_log_time_never_steps_back(tmp_path)
     assert [nanoseconds(scan) for _, scan in messages(tmp_path / "a.mcap", "/scan")] == truth.stamps_ns.tolist()
 
 
-# --- information -----------------------------------------------------------------------------------------------
+# --- what moves without a trace --------------------------------------------------------------------------------
 
 
-def informed(drive, scan):
-    """Shares, and the undetermined twists seen from the world: left perturbations of T_world_lidar."""
-    index = int(np.searchsorted(drive.scans, scan))
-    pose = drive.truth().poses[index]
-    H = information(drive.solids, pose, drive.sensor, index=scan)
-    return pose, spectrum(H)[0], undetermined(H) @ lie.adjoint(pose).T
-
-
-def test_information_is_the_curvature_of_the_point_to_plane_error():
-    drive, sensor = planned("forest", "vlp-16"), SENSORS["vlp-16"]
-    pose, rays = drive.truth().poses[100], sensor.rays(0)
-    standing = np.zeros(len(rays.directions), dtype=np.int32)
-    ranges, solid = drive.solids.strike(pose[None], standing, rays.directions, sensor.max_range_m)
-    hit = np.isfinite(ranges) & (ranges >= sensor.min_range_m)
-    points = rays.directions[hit] * ranges[hit, None]
-    places = lie.transform(pose, points)
-    normals = surface_normals(places, solid[hit], drive.solids)
-
-    def residuals(twist):
-        return np.sum(normals * (lie.transform(pose @ lie.exp(twist), points) - places), axis=1)
-
-    J = np.stack([(residuals(step) - residuals(-step)) / 2e-6 for step in 1e-6 * np.eye(6)], axis=1)
-    assert np.allclose(information(drive.solids, pose, sensor), J.T @ J, rtol=1e-5, atol=1e-3 * len(points))
+def seen_from(drive, index, twists):
+    """Ranges of a scan without noise from where the lidar is, moved by each twist (K, 6) in the world's axes."""
+    rays, T = drive.sensor.rays(index), drive.motion.lidar(np.array([index * 0.1]))[0]
+    moved = T.copy()[None].repeat(len(twists), axis=0)
+    moved[:, :3, :3] = lie.exp(twists)[:, :3, :3] @ T[:3, :3]
+    moved[:, :3, 3] += twists[:, :3]
+    standing = np.zeros(len(rays.directions), np.int32)
+    return T, [
+        drive.solids.cast(each[None], standing, rays.directions, drive.sensor.max_range_m) for each in moved
+    ]
 
 
 @pytest.mark.parametrize("sensor", LIDARS)
-def test_the_middle_of_the_corridor_leaves_the_way_along_it_undetermined(sensor):
-    drive = planned("corridor", sensor)
-    seen = set()
+def test_motion_along_the_middle_of_the_corridor_changes_no_range(sensor):
+    drive, seen = planned("corridor", sensor), set()
+    bare_m = CORRIDOR_STRUCTURE_M + CORRIDOR_SIGHT_M + 0.5
     for scan in range(0, 400, 40):
-        pose, shares, twists = informed(drive, scan)
-        x = pose[0, 3]
-        if CORRIDOR_STRUCTURE_M + CORRIDOR_SIGHT_M < x < CORRIDOR_M - CORRIDOR_STRUCTURE_M - CORRIDOR_SIGHT_M:
-            assert shares[0] < 1e-12 and shares[1] > 1e-3 and len(twists) == 1
-            assert np.allclose(np.abs(twists[0]), [1.0, 0, 0, 0, 0, 0], atol=1e-6)
+        T, (here, along, across) = seen_from(drive, scan, np.eye(6)[[0, 0, 1]] * [[0.0], [0.5], [0.2]])
+        if bare_m < T[0, 3] < CORRIDOR_M - bare_m:
+            assert np.allclose(along, here, atol=1e-9) and not np.allclose(across, here, atol=0.1)
             seen.add("middle")
-        elif x > CORRIDOR_M - 12.0:
-            assert shares[0] > 3e-3 and len(twists) == 0
+        elif T[0, 3] > CORRIDOR_M - 12.0:
+            assert not np.allclose(along, here, atol=0.1)
             seen.add("end")
     assert seen == {"middle", "end"}
 
 
 @pytest.mark.parametrize("sensor", LIDARS)
-def test_the_field_leaves_place_and_heading_undetermined_where_no_pole_is_in_range(sensor):
-    drive = planned("field", sensor)
-    poles = drive.solids.cylinders[:, :2]
-    reach_m, wide = (58.0, 0.3) if sensor == "rosette" else (50.0, np.inf)  # it looks ahead only
-    seen = set()
+def test_place_and_heading_change_no_range_in_the_field_where_no_pole_is_in_sight(sensor):
+    drive, seen = planned("field", sensor), set()
+    poles, sight_m = drive.solids.cylinders[:, :2], WORLDS["field"].sight_m
     for scan in range(0, 400, 20):
-        pose, shares, twists = informed(drive, scan)
-        offsets = (poles - pose[:2, 3]) @ pose[:2, :2]  # ahead, to the left
-        distance = np.linalg.norm(offsets, axis=1)
-        if distance.min() > WORLDS["field"].sight_m:
-            assert shares[2] < 1e-12 and shares[3] > 1e-3 and len(twists) == 3
-            assert np.abs(twists[:, [2, 3, 4]]).max() < 1e-6  # neither height nor roll nor pitch
+        T, (here, *moved) = seen_from(drive, scan, np.eye(6)[[0, 0, 1, 5]] * [[0.0], [0.5], [0.5], [0.1]])
+        offsets = (poles - T[:2, 3]) @ T[:2, :2]  # ahead, to the left
+        if np.linalg.norm(offsets, axis=1).min() > sight_m + 1.0:
+            assert all(np.allclose(each, here, atol=1e-9) for each in moved)
             seen.add("none")
-        elif np.sum((distance < reach_m) & (np.abs(offsets[:, 1]) < wide * offsets[:, 0])) == 3:
-            assert shares[0] > 1e-5 and len(twists) == 0
+        ahead, left = offsets.T
+        if np.any((ahead > 20.0) & (ahead < 40.0) & (np.abs(left) < 0.3 * ahead)):
+            assert not any(np.allclose(each, here, atol=0.1) for each in moved)
             seen.add("poles")
     assert seen == {"none", "poles"}
 
@@ -445,27 +351,29 @@ def test_the_field_leaves_place_and_heading_undetermined_where_no_pole_is_in_ran
 @pytest.mark.parametrize(
     ("world", "sensor"),
     [("office", "lms-270"), ("office", "utm-30"), ("office", "vlp-16"), ("town", "hdl-64"), ("town", "os1-32"),
-     ("town", "vlp-16"), ("town", "rosette"), ("highway", "hdl-64"), ("corridor", "rosette"), ("field", "vlp-16"),
-     ("forest", "os1-32"), ("staircase", "hdl-64"), ("hall", "rosette"), ("turns", "os1-32")],
+     ("town", "vlp-16"), ("town", "rosette"), ("rounds", "os1-32"), ("identical", "os1-32"), ("highway", "hdl-64"),
+     ("corridor", "rosette"), ("field", "vlp-16"), ("forest", "os1-32"), ("staircase", "hdl-64"),
+     ("hall", "rosette"), ("turns", "os1-32")],
 )  # fmt: skip
-def test_undistorted_with_the_truth_every_point_lies_on_a_surface(drives, world, sensor):
-    planned_drive = planned(world, sensor)
-    solids, motion = drives.get(world, (planned_drive.solids, planned_drive.motion))
-    sweep = take_sweep(solids, motion, perfect(sensor), 37, 12.3, np.random.default_rng(0))
-    points = undistorted(sweep, motion, 12.3)
-    some = np.random.default_rng(1).choice(len(points), min(len(points), 1500), replace=False)
+def test_undistorted_with_the_truth_every_point_lies_on_the_first_surface(world, sensor):
+    drive, index = planned(world, sensor), 123
+    start_s = index * drive.sensor.period_ns * 1e-9
+    sweep = swept(drive, index)
+    poses = drive.motion.lidar(start_s + sweep.rays.instants_ns * 1e-9)[sweep.rays.instant_of_ray]
+    at = poses[sweep.returned]
+    points = np.einsum("nij,nj->ni", at[:, :3, :3], sweep.points().astype(np.float64)) + at[:, :3, 3]
+    random = np.random.default_rng(1)
+    some = random.choice(len(points), min(len(points), 1500), replace=False)
     assert len(points) > (0.4 if world == "field" else 0.5) * len(sweep.ranges_m)
-    assert naive_raycast.distance_to_surface(points[some], solids).max() < 1e-5
-
-
-def test_a_scan_of_a_moving_car_is_distorted(drives):
-    solids, motion = drives["town"]
-    sweep = take_sweep(solids, motion, perfect("hdl-64"), 0, 12.3, np.random.default_rng(0))
-    frozen = lie.transform(motion.lidar(np.array([12.3]))[0], sweep.points().astype(np.float64))
-    shift = np.linalg.norm(frozen - undistorted(sweep, motion, 12.3), axis=1)
-    expected = 0.1 * motion.speed_m_s(np.array([12.3]))[0]
-    assert 0.8 * expected < shift.max()
-    assert shift[sweep.times_s() < 0.001].max() < 0.02 * shift.max() + 0.02
+    assert naive_raycast.distance_to_surface(points[some], drive.solids).max() < 1e-5
+    solids = in_reach(drive.solids, poses[0, :3, 3], drive.sensor.max_range_m)
+    few, reach_m = random.choice(len(poses), 16, replace=False), drive.sensor.max_range_m
+    naive = np.array([
+        naive_raycast.cast(poses[k, :3, 3], poses[k, :3, :3] @ sweep.rays.directions[k], solids, reach_m)
+        for k in few
+    ])  # fmt: skip
+    naive[naive < drive.sensor.min_range_m] = np.inf
+    assert np.allclose(sweep.ranges_m[few], naive, atol=1e-6, rtol=0.0)
 
 
 @pytest.mark.parametrize("name", SENSORS)
@@ -475,24 +383,13 @@ def test_rays_are_unit_vectors_fired_in_order_within_the_period(name):
     assert np.allclose(np.linalg.norm(rays.directions, axis=1), 1.0)
     times = rays.instants_ns[rays.instant_of_ray]
     assert times[0] == 0 and np.all(np.diff(times) >= 0) and times[-1] < sensor.period_ns
+    assert np.array_equal(rays.directions, sensor.rays(4).directions) == (name != "rosette")
 
 
-def test_the_rosette_never_repeats():
-    rays = SENSORS["rosette"].rays
-    assert np.abs(rays(0).directions - rays(1).directions).max() > 0.1
-
-
-def test_a_64_ring_scan_of_the_town_has_a_hundred_thousand_points(drives):
-    solids, motion = drives["town"]
-    sweep = take_sweep(solids, motion, SENSORS["hdl-64"], 0, 20.0, np.random.default_rng(0))
-    assert sweep.returned.sum() > 100_000
-
-
-def test_noise_and_losses_are_as_large_as_asked_for(drives):
-    solids, motion = drives["town"]
-    clean = take_sweep(solids, motion, perfect("hdl-64"), 0, 20.0, np.random.default_rng(0))
-    sensor = replace(SENSORS["hdl-64"], noise_m=0.05, dropout=0.1)
-    noisy = take_sweep(solids, motion, sensor, 0, 20.0, np.random.default_rng(0))
+def test_noise_and_losses_are_as_large_as_asked_for():
+    drive = planned("town", "hdl-64")
+    sensor = replace(drive.sensor, noise_m=0.05, dropout=0.1)
+    clean, noisy = swept(drive, 200), swept(replace(drive, sensor=sensor), 200)
     both = clean.returned & noisy.returned
     assert both.sum() / clean.returned.sum() == pytest.approx(0.9, abs=0.01)
     assert np.std(noisy.ranges_m[both] - clean.ranges_m[both]) == pytest.approx(0.05, rel=0.02)
@@ -501,25 +398,18 @@ def test_noise_and_losses_are_as_large_as_asked_for(drives):
 # --- wheels ----------------------------------------------------------------------------------------------------
 
 
-def test_wheels_without_drift_report_the_planar_truth(drives):
-    poses = drives["office"][1].base(np.arange(0.0, 100.0, 0.02))
-    odometry = wheel_odometry(poses, drift=0.0, rng=np.random.default_rng(0))
-    planar = lie.flatten(poses)
-    assert np.allclose(odometry, lie.inverse(planar[0]) @ planar, atol=1e-9)
-
-
 @pytest.mark.parametrize("name", ["office", "town"])
-def test_wheel_odometry_drifts_more_the_larger_the_drift(drives, name):
-    poses = drives[name][1].base(np.arange(0.0, 60.0, 0.02))
+def test_wheel_odometry_is_the_planar_truth_without_drift_and_drifts_more_the_larger_the_drift(name):
+    poses = planned(name, "vlp-16").motion.base(np.arange(0.0, 60.0, 0.02))
     planar = lie.flatten(poses)
     truth = lie.inverse(planar[0]) @ planar
     length = np.linalg.norm(np.diff(truth[:, :2, 2], axis=0), axis=1).sum()
     errors = []
-    for drift in (0.3, 1.0, 3.0):
+    for drift in (0.0, 0.3, 1.0, 3.0):
         odometry = wheel_odometry(poses, drift=drift, rng=np.random.default_rng(5))
-        errors.append(np.linalg.norm(odometry[:, :2, 2] - truth[:, :2, 2], axis=1).max() / length)
-    assert errors[0] < errors[1] < errors[2]
-    assert 0.002 < errors[1] < 0.1
+        errors.append(np.abs(odometry - truth).max() / length)
+    assert errors[0] < 1e-9 < errors[1] < errors[2] < errors[3]
+    assert 0.002 < errors[2] < 0.1
 
 
 def test_wheels_slip_once_between_two_seconds_and_nowhere_else(tmp_path):
@@ -537,6 +427,7 @@ def test_wheels_slip_once_between_two_seconds_and_nowhere_else(tmp_path):
         simulate("office", tmp_path / "a.mcap", wheels_slip=Slip(3.0, 2.0, 1.0))
 
 
+@pytest.mark.slow
 def test_wheels_that_slip_are_named_and_doubt_no_run_that_closes_loops_around(tmp_path):
     code = main(
         ["simulate", "office", str(tmp_path / "a.mcap"), "--duration", "60", "--wheels-slip", "20", "24", "6"]
@@ -577,7 +468,9 @@ def test_an_office_log_reads_back(tmp_path):
     assert [nanoseconds(scan) for _, scan in scans] == truth.stamps_ns.tolist()
     assert [nanoseconds(pose) for _, pose in poses] == truth.stamps_ns.tolist()
     assert [record.log_time - nanoseconds(scan) for record, scan in scans] == [100_000_000] * 40
-    assert np.allclose([lie.flatten(pose_of(pose)) for _, pose in poses], truth.poses, atol=1e-9)
+    stated = [pose.pose.pose for _, pose in poses]
+    flat = [(p.position.x, p.position.y, 2.0 * np.arctan2(p.orientation.z, p.orientation.w)) for p in stated]
+    assert np.allclose([lie.pose_2d(*pose) for pose in flat], truth.poses, atol=1e-9)
 
     scan = scans[0][1]  # the robot stands still
     angles = scan.angle_min + np.arange(len(scan.ranges)) * scan.angle_increment
@@ -606,24 +499,11 @@ def test_a_town_log_reads_back(tmp_path):
         assert rows["t"][0] < 1_000_000 and rows["t"].max() < 100_000_000 and rows["ring"].max() == 15
     ((_, static),) = messages(path, "/tf_static")
     assert static.transforms[0].transform.translation.z == 1.73
-    wheels = messages(path, "/odom")
-    stamps = [nanoseconds(odometry) for _, odometry in wheels]
+    stamps = [nanoseconds(odometry) for _, odometry in messages(path, "/odom")]
     assert stamps == list(range(truth.stamps_ns[0], truth.stamps_ns[0] + 500_000_001, 20_000_000))
-
-
-def test_log_time_never_steps_back(tmp_path):
-    simulate("office", tmp_path / "a.mcap", duration_s=2.0)
-    with (tmp_path / "a.mcap").open("rb") as stream:
-        times = [message.log_time for _, _, message in make_reader(stream).iter_messages(log_time_order=False)]
-    assert times == sorted(times)
-
-
-def test_the_tum_file_holds_the_truth_to_the_nanosecond(tmp_path):
-    truth = simulate("town", tmp_path / "a.mcap", duration_s=0.3, sensor="vlp-16")
-    lines = (tmp_path / "a.tum").read_text().splitlines()
-    stamps = [line.split()[0] for line in lines]
-    assert [int(stamp.replace(".", "")) for stamp in stamps] == truth.stamps_ns.tolist()
-    values = np.array([[float(word) for word in line.split()[1:]] for line in lines])
+    lines = [line.split() for line in (tmp_path / "town.tum").read_text().splitlines()]
+    assert [int(stamp.replace(".", "")) for stamp, *_ in lines] == truth.stamps_ns.tolist()
+    values = np.array([[float(word) for word in words] for _, *words in lines])
     assert np.allclose(values[:, :3], truth.poses[:, :3, 3], atol=1e-9)
     assert np.allclose(lie.from_quaternion(values[:, 3:]), truth.poses[:, :3, :3], atol=1e-8)
 
@@ -682,14 +562,11 @@ def test_a_simulated_sequence_is_made_once(tmp_path, monkeypatch):
     assert catalog.prepare("demo-office", tmp_path).stat().st_mtime_ns == written
 
 
-def test_an_unknown_sequence_names_the_known_ones():
+def test_an_unknown_sequence_and_a_misspelt_key_are_refused(tmp_path):
     with pytest.raises(InputError, match="demo-office, demo-town"):
         catalog.load("mars")
-
-
-def test_a_misspelt_key_is_refused(tmp_path):
     text = (shipped("sequences") / "office.toml").read_text()
-    (tmp_path / "office.toml").write_text(text.replace("drift", "drfit").replace("seed", "sede"))
+    (tmp_path / "office.toml").write_text(text.replace("seed", "sede"))
     with pytest.raises(InputError, match="sede"):
         catalog.read(tmp_path / "office.toml")
 

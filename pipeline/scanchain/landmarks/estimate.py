@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,6 @@ from scanchain.data import Matrix
 from scanchain.graph.cholesky import SingularMatrixError
 from scanchain.graph.losses import RobustLoss
 from scanchain.graph.minimizer import LocalModel, descend, step_rule
-from scanchain.kernels.landmarks import normal_equations
 from scanchain.landmarks.problem import (
     BearingRangeProblem,
     LandmarkData,
@@ -119,18 +118,31 @@ def chain(start: NDArray[np.float64], motion: Matrix) -> Matrix:
 Optimizer = Literal["gauss-newton", "levenberg-marquardt", "dogleg", "gradient-descent"]
 
 
-class Loss(Protocol):
-    """Robust loss of observations."""
+_FREEDOM = 4.0
+_SCALE2 = _FREEDOM + 2.0  # the weight (ν + 2) / (ν + χ²) is, but for a factor that σ takes up, s² / (s² + χ²)
+
+
+@dataclass(frozen=True, slots=True)
+class StudentLoss:
+    """ρ(χ²) of a bearing and a range together, ν = 4, times the share of the observation.
+
+    Attributes
+    ----------
+    share : (N,) of an independent observation, above 0 up to 1
+    """
+
+    share: NDArray[np.float64]
 
     def weight(self, chi2: NDArray[np.float64]) -> NDArray[np.float64]:
-        """dρ/dχ², (N,)."""
-        ...
+        """Up to the share, (N,)."""
+        return self.share * _SCALE2 / (_SCALE2 + chi2)
 
     def loss(self, chi2: NDArray[np.float64]) -> NDArray[np.float64]:
-        """ρ(χ²), (N,)."""
-        ...
+        """The share of χ² near zero, (N,)."""
+        return self.share * _SCALE2 * np.log1p(chi2 / _SCALE2)
 
 
+Loss = RobustLoss | StudentLoss
 QUADRATIC = RobustLoss("none", 1.0, 1.0)
 
 
@@ -199,20 +211,20 @@ class Evaluation:
 
 def _model(problem: BearingRangeProblem, solver: LinearSolver, system: LinearSystem) -> LocalModel:
     """H = AᵀA and g = −Aᵀb."""
-    pattern = system.pattern
-    downhill, diagonal = np.empty(pattern.shape[1]), np.empty(pattern.shape[1])
-    normal_equations.gradient(pattern.row_start, pattern.columns, system.values, system.b, downhill, diagonal)
+    A = system.A
+    lengths = np.bincount(system.pattern.columns, system.values**2, system.pattern.shape[1])
+    diagonal = np.asarray(lengths, np.float64)
 
     def solve(damping: float) -> NDArray[np.float64]:
         if not damping:
-            return solver.solve(system).x
+            return solver.solve(system)
         try:
-            return solver.solve(problem.damped(system, damping * diagonal)).x
+            return solver.solve(problem.damped(system, damping * diagonal))
         except UndeterminedError as error:
             column = int(error.columns[0])
             raise SingularMatrixError(column, column) from error
 
-    return LocalModel(-downhill, diagonal, solve, lambda step: system.A.T @ (system.A @ step))
+    return LocalModel(-(A.T @ system.b), diagonal, solve, lambda step: A.T @ (A @ step))
 
 
 def _cost(at: Linearization, loss: Loss) -> float:

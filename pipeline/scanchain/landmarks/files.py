@@ -41,7 +41,12 @@ def read_landmark_data(path: Path) -> LandmarkData:
         )
     observed = _indices(path, table, len(odometry) + 1, len(arrays.get("gt_landmarks", ())))
     landmarks = arrays.get("gt_landmarks", np.full((int(observed[:, 1].max()) + 1, 2), np.nan))
-    _check_observed(path, observed[:, 1], len(landmarks))
+    unseen = np.setdiff1d(np.arange(len(landmarks)), observed[:, 1])
+    if len(unseen):
+        raise InputError(
+            f"{path}: {len(unseen)} of {counted(len(landmarks), 'landmark')} are not observed, the first is "
+            f"{unseen[0]}; add observations of them, or leave them out and number the others on"
+        )
     reckoned = np.cumsum(np.vstack([np.zeros(2), odometry]), axis=0)
     return LandmarkData(
         name=path.stem,
@@ -111,16 +116,6 @@ def _indices(path: Path, table: Matrix, poses: int, landmarks: int) -> NDArray[n
                 f" it must be a whole number from 0 to {count - 1}"
             )
     return table[:, :2].astype(np.int64)
-
-
-def _check_observed(path: Path, seen: NDArray[np.int64], landmarks: int) -> None:
-    """Refuse landmarks without an observation, which leaves them open."""
-    open_ones = np.setdiff1d(np.arange(landmarks), seen)
-    if len(open_ones):
-        raise InputError(
-            f"{path}: {len(open_ones)} of {counted(landmarks, 'landmark')} are not observed, the first is "
-            f"{open_ones[0]}; add observations of them, or leave them out and number the others on"
-        )
 
 
 def _covariance(path: Path, name: str, arrays: dict[str, Matrix]) -> Matrix:

@@ -132,12 +132,10 @@ class Pattern:
         """Number of rows and columns of A."""
         return len(self.row_start) - 1, self.layout.columns
 
-    def by_column(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Start of each column's rows (n + 1,), and the rows."""
-        counts = csr_matrix(
-            (np.ones(len(self.columns), np.int8), self.columns, self.row_start), self.shape
-        ).tocsc()
-        return counts.indptr.astype(np.int64), counts.indices.astype(np.int64)
+    def products(self) -> csr_matrix:
+        """Entries of AᵀA that may be nonzero, as ones and more, (n, n)."""
+        there = csr_matrix((np.ones(len(self.columns)), self.columns, self.row_start), self.shape)
+        return csr_matrix(there.T @ there)
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,14 +150,6 @@ class LinearSystem:
     def A(self) -> csr_matrix:
         """The matrix in scipy's form."""
         return csr_matrix((self.values, self.pattern.columns, self.pattern.row_start), self.pattern.shape)
-
-
-@dataclass(frozen=True, slots=True)
-class Rows:
-    """Rows of A with equally many entries each: their columns and values, both (rows, entries)."""
-
-    columns: NDArray[np.int64]
-    values: Matrix
 
 
 def whitening(covariance: Matrix) -> Matrix:
@@ -184,19 +174,20 @@ def landmark_columns(layout: Layout, landmarks: NDArray[np.int64]) -> NDArray[np
     return layout.landmark_start + 2 * landmarks[:, None] + np.arange(2)
 
 
-def difference_rows(W: Matrix, first: NDArray[np.int64], second: NDArray[np.int64]) -> Rows:
-    """Rows W (second − first) of many pairs of points with one and the same whitening.
+def _differences(
+    W: Matrix, first: NDArray[np.int64], second: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], Matrix]:
+    """Columns and values of the rows W (second − first) of many pairs of points, without entries zero for all.
 
-    first, second (N, 2) : columns of the points. Entries that are zero for all are left out.
+    first, second (N, 2) : columns of the points
     """
     if not np.any(W - np.diag(W.diagonal())):
         columns = np.stack([first, second], axis=-1)
-        values = np.broadcast_to(np.stack([-W.diagonal(), W.diagonal()], axis=-1), columns.shape)
+        values = np.stack([-W.diagonal(), W.diagonal()], axis=-1)
     else:
-        columns = np.broadcast_to(np.concatenate([first, second], axis=1)[:, None], (len(first), 2, 4))
-        values = np.broadcast_to(np.concatenate([-W, W], axis=1), columns.shape)
-    width = columns.shape[-1]
-    return Rows(np.ascontiguousarray(columns).reshape(-1, width), values.reshape(-1, width))
+        columns = np.repeat(np.concatenate([first, second], axis=1)[:, None], 2, axis=1)
+        values = np.concatenate([-W, W], axis=1)
+    return columns.reshape(-1, columns.shape[-1]), np.broadcast_to(values, columns.shape)
 
 
 def linear_system(data: LandmarkData) -> LinearSystem:
@@ -209,20 +200,12 @@ def linear_system(data: LandmarkData) -> LinearSystem:
     W_odometry, W_observation = whitening(data.odometry_covariance), whitening(data.observation_covariance)
     poses = pose_columns(layout, np.arange(layout.poses))
     seen_from, seen = data.observed.T
-    groups = [
-        Rows(poses[0][:, None], _FIRST_POSE * W_odometry.diagonal()[:, None]),
-        difference_rows(W_odometry, poses[:-1], poses[1:]),
-        difference_rows(W_observation, poses[seen_from], landmark_columns(layout, seen)),
-    ]
+    steps, stepped = _differences(W_odometry, poses[:-1], poses[1:])
+    pairs, weighed = _differences(W_observation, poses[seen_from], landmark_columns(layout, seen))
+    values = [_FIRST_POSE * W_odometry.diagonal(), stepped.ravel(), weighed.ravel()]
     b = [np.zeros(2), (data.odometry @ W_odometry.T).ravel(), (data.measured @ W_observation.T).ravel()]
-    values = np.concatenate([group.values.ravel() for group in groups])
-    return LinearSystem(pattern_of([group.columns for group in groups], layout), values, np.concatenate(b))
-
-
-def state_of(data: LandmarkData, x: np.ndarray) -> Values:
-    """The unknowns as positions."""
-    split = 2 * (len(data.odometry) + 1)
-    return Values(x[:split].reshape(-1, 2), x[split:].reshape(-1, 2))
+    pattern = pattern_of([poses[0][:, None], steps, pairs], layout)
+    return LinearSystem(pattern, np.concatenate(values), np.concatenate(b))
 
 
 _ANCHOR = 0.01  # noise of the first pose as a share of a step's
@@ -235,14 +218,13 @@ class Linearization:
     Attributes
     ----------
     prior, calibration, odometry, observations : residuals (p,), (C,), (K − 1, p), (N, 2); pure numbers
-    prior_rows, odometry_rows, observation_rows : of A: (p, p), (K − 1, p, 2 p + C), (N, 2, p + 2)
+    odometry_rows, observation_rows : of A: (K − 1, p, 2 p + C), (N, 2, p + 2)
     """
 
     prior: NDArray[np.float64]
     calibration: NDArray[np.float64]
     odometry: Matrix
     observations: Matrix
-    prior_rows: Matrix
     odometry_rows: Matrix
     observation_rows: Matrix
 
@@ -366,14 +348,14 @@ class BearingRangeProblem:
         off = state.poses[0] - given.first_pose
         off[2:] = (off[2:] + np.pi) % (2.0 * np.pi) - np.pi
         own = (state.calibration - calibration.mean) / calibration.sigma
-        return Linearization(self._first @ off, own, motion, seen, self._first, J_motion, J_seen)
+        return Linearization(self._first @ off, own, motion, seen, J_motion, J_seen)
 
     def system(self, at: Linearization, weights: NDArray[np.float64]) -> LinearSystem:
         """The step's system A x = −r, observations weighed by √w (N,)."""
         root = np.sqrt(weights)[:, None]
         seen = at.observation_rows * root[..., None]
         own = 1.0 / self.measurements.calibration.sigma
-        values = np.concatenate([at.prior_rows.ravel(), own, at.odometry_rows.ravel(), seen.ravel()])
+        values = np.concatenate([self._first.ravel(), own, at.odometry_rows.ravel(), seen.ravel()])
         b = -np.concatenate([at.prior, at.calibration, at.odometry.ravel(), (at.observations * root).ravel()])
         return LinearSystem(self.pattern, values, b)
 

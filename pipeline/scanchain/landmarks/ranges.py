@@ -10,17 +10,10 @@ from numpy.typing import NDArray
 from scanchain.clock import working_s
 from scanchain.data import Matrix
 from scanchain.errors import InputError
-from scanchain.kernels.landmarks import dead_reckoning
-from scanchain.landmarks.estimate import Minimum, from_odometry, growing, minimize
+from scanchain.kernels.landmarks import factors
+from scanchain.landmarks.estimate import Minimum, StudentLoss, from_odometry, growing, minimize
 from scanchain.landmarks.files import RangeLog
-from scanchain.landmarks.problem import (
-    BearingRangeProblem,
-    Calibration,
-    Measurements,
-    Values,
-    landmark_columns,
-    pose_columns,
-)
+from scanchain.landmarks.problem import BearingRangeProblem, Calibration, Measurements, Values
 from scanchain.landmarks.solvers import ESTIMATOR, LinearSolver, create_solver
 from scanchain.landmarks.solvers.elimination import Covariance
 
@@ -98,36 +91,14 @@ def _integrated(
     )
     steps = len(nodes_s) - 1
     motion, spread = np.empty((steps, 3)), np.empty((steps, sources, 3, 3))
-    dead_reckoning.integrate(log.times_s + own[4], driven, nodes_s, motion, spread)
+    factors.integrate(log.times_s + own[4], driven, nodes_s, motion, spread)
     return motion, spread
 
 
-_FREEDOM = 4.0
-_SCALE2 = _FREEDOM + 2.0  # the weight (ν + 2) / (ν + χ²) is, but for a factor that σ takes up, s² / (s² + χ²)
 _LAGS_S = np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0])  # edges; farther apart errors count as independent
 _FEWEST = 30  # least number of pairs from which a correlation is estimated
 _STATED = np.array([10.0, 10.0, 10.0, 10.0, 2.0, 2.0])  # degrees of freedom that the stated noise counts as
 _LEAST_REDUNDANCY = 0.05  # least redundancy as a share of the sightings
-
-
-@dataclass(frozen=True, slots=True)
-class StudentLoss:
-    """ρ(χ²) of a bearing and a range together, ν = 4, times the share of the observation.
-
-    Attributes
-    ----------
-    share : (N,) of an independent observation, above 0 up to 1
-    """
-
-    share: NDArray[np.float64]
-
-    def weight(self, chi2: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Up to the share, (N,)."""
-        return self.share * _SCALE2 / (_SCALE2 + chi2)
-
-    def loss(self, chi2: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The share of χ² near zero, (N,)."""
-        return self.share * _SCALE2 * np.log1p(chi2 / _SCALE2)
 
 
 class SightingPairs:
@@ -294,17 +265,6 @@ class RangeSolution:
     consistency: Consistency
     iterations: int
     time_s: float
-
-    @property
-    def pose_covariance(self) -> Matrix:
-        """(K, 3, 3) relative to the first pose."""
-        return self.covariance.of(pose_columns(self.problem.pattern.layout, np.arange(len(self.nodes_s))))
-
-    @property
-    def landmark_covariance(self) -> Matrix:
-        """(L, 2, 2) relative to the first pose."""
-        layout = self.problem.pattern.layout
-        return self.covariance.of(landmark_columns(layout, np.arange(len(layout.landmarks))))
 
     @property
     def sigmas(self) -> list[float]:

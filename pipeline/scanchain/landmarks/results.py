@@ -11,21 +11,14 @@ import numpy as np
 
 from scanchain.data import Matrix
 from scanchain.errors import counted
-from scanchain.landmarks.compare import MethodResult
-from scanchain.landmarks.study import Accuracy, Study
+from scanchain.landmarks.solvers import MethodResult
+from scanchain.landmarks.study import Estimate, Study
 from scanchain.trajectory import write_tum
 
 _HEADINGS = (
-    "method",
-    "build ms",
-    "factor ms",
-    "solve ms",
-    "total ms",
-    "again ms",
-    "solves",
-    "nnz factor",
-    "differs by",
-)
+    "method", "build ms", "factor ms", "solve ms", "total ms", "again ms", "solves", "nnz factor", "differs by",
+)  # fmt: skip
+_FIGURES = ("method", "build_s", "factor_s", "solve_s", "again_s", "iterations")
 
 
 def file_stem(name: str) -> str:
@@ -77,9 +70,9 @@ def size_of(study: Study) -> str:
 def accuracy_lines(study: Study) -> list[tuple[str, str]]:
     """Label and value of the accuracy before and after, and how it is defined."""
     return [
-        ("before", _accuracy(study.before.accuracy)),
-        ("after", _accuracy(study.after.accuracy)),
-        ("accuracy", study.after.accuracy.definition),
+        ("before", _accuracy(study.before)),
+        ("after", _accuracy(study.after)),
+        ("accuracy", study.after.definition),
     ]
 
 
@@ -90,17 +83,12 @@ def tree_of(study: Study) -> dict[str, object]:
         "name": study.name,
         "facts": {fact.label: fact.value for fact in study.facts},
         "converged": study.converged,
-        "before": _figures(study.before.accuracy),
-        "after": _figures(study.after.accuracy),
+        "before": _figures(study.before),
+        "after": _figures(study.after),
         "A": {"rows": rows, "columns": columns, "entries": len(study.system.values), "build_s": study.build_s},
         "methods": [
             {
-                "method": method.method,
-                "build_s": method.build_s,
-                "factor_s": method.factor_s,
-                "solve_s": method.solve_s,
-                "again_s": method.again_s,
-                "iterations": method.iterations,
+                **{name: getattr(method, name) for name in _FIGURES},
                 "factor": method.factor.name,
                 "factor_entries": method.factor.nnz,
                 "difference": method.difference,
@@ -120,11 +108,11 @@ def write_estimate(directory: Path, study: Study) -> None:
         np.arange(len(state.poses)),
         names,
         state.poses,
-        study.pose_covariance,
+        study.covariance.poses,
     )
     numbers = study.system.pattern.layout.landmarks
     file = directory / f"{stem}_landmarks.csv"
-    _write_csv(file, "landmark", numbers, ["x_m", "y_m"], state.landmarks, study.landmark_covariance)
+    _write_csv(file, "landmark", numbers, ["x_m", "y_m"], state.landmarks, study.covariance.landmarks)
     if study.trajectory is not None:
         write_tum(directory / f"{stem}.tum", study.trajectory, force=True)
 
@@ -143,17 +131,17 @@ def _write_csv(
             writer.writerow([number, *(f"{value:.9g}" for value in row)])
 
 
-def _accuracy(accuracy: Accuracy) -> str:
+def _accuracy(estimate: Estimate) -> str:
     poses, landmarks = (
         "unknown" if math.isnan(error_m) else f"{error_m:.4f} m off"
-        for error_m in (accuracy.poses_m, accuracy.landmarks_m)
+        for error_m in (estimate.poses_m, estimate.landmarks_m)
     )
     return "unknown" if poses == landmarks == "unknown" else f"poses {poses}, landmarks {landmarks}"
 
 
-def _figures(accuracy: Accuracy) -> dict[str, float | str | None]:
+def _figures(estimate: Estimate) -> dict[str, float | str | None]:
     return {
-        "poses_m": None if math.isnan(accuracy.poses_m) else accuracy.poses_m,
-        "landmarks_m": None if math.isnan(accuracy.landmarks_m) else accuracy.landmarks_m,
-        "definition": accuracy.definition,
+        "poses_m": None if math.isnan(estimate.poses_m) else estimate.poses_m,
+        "landmarks_m": None if math.isnan(estimate.landmarks_m) else estimate.landmarks_m,
+        "definition": estimate.definition,
     }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,31 +14,42 @@ from scanchain.clock import working_s
 from scanchain.data import Matrix, Pose, Trajectory
 from scanchain.errors import FREEDOM, counted
 from scanchain.evaluation import Alignment, absolute_error, pair
-from scanchain.landmarks.compare import MethodResult, compare_linear, compare_nonlinear
-from scanchain.landmarks.estimate import Optimizer, disturbed, from_odometry, minimize, of_relative_positions
+from scanchain.landmarks.estimate import (
+    Minimum,
+    Optimizer,
+    disturbed,
+    from_odometry,
+    minimize,
+    of_relative_positions,
+)
 from scanchain.landmarks.files import RangeLog, read_mrclam
 from scanchain.landmarks.problem import (
     BearingRangeProblem,
     LandmarkData,
     LinearSystem,
     Values,
-    landmark_columns,
     linear_system,
-    pose_columns,
-    state_of,
     world_referenced,
 )
 from scanchain.landmarks.ranges import OWN, OWN_UNITS, OdometryNoise, RangeSolution, solve_range_log
-from scanchain.landmarks.solvers import create_solver, methods_for
+from scanchain.landmarks.solvers import LinearSolver, MethodResult, compare, create_solver, methods_for
 from scanchain.landmarks.solvers.elimination import Covariance
 
 _WIDEST_GAP_S = 0.5  # between motion-capture poses that are interpolated
 
 
 @dataclass(frozen=True, slots=True)
-class Accuracy:
-    """Root mean squared distances from the truth; NaN without truth. ``definition`` defines them as text."""
+class Estimate:
+    """Poses and landmarks, and their accuracy.
 
+    Attributes
+    ----------
+    T_truth_estimate : (3, 3) aligns them to the truth
+    poses_m, landmarks_m : root mean squared distances from the truth, NaN without; ``definition`` defines them
+    """
+
+    state: Values
+    T_truth_estimate: Pose
     poses_m: float
     landmarks_m: float
     definition: str
@@ -60,16 +71,14 @@ class Truth:
     landmarks: Matrix
 
 
-def of_positions(state: Values, data: LandmarkData) -> Accuracy:
+def of_positions(state: Values, data: LandmarkData) -> Estimate:
     """Against the positions of an npz file, where it has them; both lie in one frame."""
     known = len(data.true_poses) > 0
     if not known and np.isnan(data.true_landmarks).all():
-        return Accuracy(np.nan, np.nan, "no true positions in the file")
-    return Accuracy(
-        _rms(state.poses - data.true_poses) if known else np.nan,
-        _rms(state.landmarks - data.true_landmarks),
-        "root mean squared distance from the true positions, nothing aligned",
-    )
+        return Estimate(state, lie.identity(2), np.nan, np.nan, "no true positions in the file")
+    poses_m = _rms(state.poses - data.true_poses) if known else np.nan
+    definition = "root mean squared distance from the true positions, nothing aligned"
+    return Estimate(state, lie.identity(2), poses_m, _rms(state.landmarks - data.true_landmarks), definition)
 
 
 def truth_at(log: RangeLog, nodes_s: NDArray[np.float64], landmarks: NDArray[np.int64]) -> Truth:
@@ -89,31 +98,23 @@ def truth_at(log: RangeLog, nodes_s: NDArray[np.float64], landmarks: NDArray[np.
     return Truth(known, poses, surveyed)
 
 
-def against_truth(state: Values, nodes_s: NDArray[np.float64], truth: Truth) -> tuple[Accuracy, Pose]:
-    """ATE of the poses after rigid alignment, landmarks by the same alignment; and T_truth_estimate (3, 3)."""
-    stamps_ns = nanoseconds(nodes_s[truth.known])
-    estimate = Trajectory(stamps_ns, pose_matrices(state.poses[truth.known]))
-    error = absolute_error(pair(estimate, Trajectory(stamps_ns, pose_matrices(truth.poses))), Alignment.RIGID)
+def against_truth(state: Values, nodes_s: NDArray[np.float64], truth: Truth) -> Estimate:
+    """ATE of the poses after rigid alignment, landmarks by the same alignment."""
+    if np.count_nonzero(truth.known) < 2:
+        return Estimate(state, lie.identity(2), np.nan, np.nan, "no motion capture at these times")
+    known_s = nodes_s[truth.known]
+    pairs = pair(trajectory_of(known_s, state.poses[truth.known]), trajectory_of(known_s, truth.poses))
+    error = absolute_error(pairs, Alignment.RIGID)
     T_truth_estimate = lie.flatten(error.T_reference_estimate)
-    moved = lie.transform(T_truth_estimate, state.landmarks)
+    landmarks_m = _rms(lie.transform(T_truth_estimate, state.landmarks) - truth.landmarks)
     definition = f"{error.definition}, over {error.pairing}"
-    return Accuracy(error.translation_m.rmse, _rms(moved - truth.landmarks), definition), T_truth_estimate
+    return Estimate(state, T_truth_estimate, error.translation_m.rmse, landmarks_m, definition)
 
 
-def nanoseconds(times_s: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Whole nanoseconds of times that were written with milliseconds."""
-    return np.round(times_s * 1e3).astype(np.int64) * 1_000_000
-
-
-def pose_matrices(poses: Matrix) -> Matrix:
-    """SE(2) matrices (K, 3, 3) of x, y, heading (K, 3)."""
-    result = np.zeros((len(poses), 3, 3))
-    result[:, 0, 0] = result[:, 1, 1] = np.cos(poses[:, 2])
-    result[:, 1, 0] = np.sin(poses[:, 2])
-    result[:, 0, 1] = -result[:, 1, 0]
-    result[:, :2, 2] = poses[:, :2]
-    result[:, 2, 2] = 1.0
-    return result
+def trajectory_of(nodes_s: NDArray[np.float64], poses: Matrix) -> Trajectory:
+    """Poses x, y, heading (K, 3) at times that were written with milliseconds."""
+    stamps_ns = np.round(nodes_s * 1e3).astype(np.int64) * 1_000_000
+    return Trajectory(stamps_ns, np.array([lie.pose_2d(*pose) for pose in poses]))
 
 
 def _rms(differences: Matrix) -> float:
@@ -146,21 +147,11 @@ class Options:
     optimizer: Optimizer
 
 
-@dataclass(frozen=True, slots=True)
-class Fact:
+class Fact(NamedTuple):
     """A line about a problem: label, and value as text."""
 
     label: str
     value: str
-
-
-@dataclass(frozen=True, slots=True)
-class Estimate:
-    """Poses and landmarks, their accuracy, and T_truth_estimate (3, 3) that aligns them to the truth."""
-
-    state: Values
-    accuracy: Accuracy
-    T_truth_estimate: Pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +163,7 @@ class Study:
     name, facts : of the problem, and lines about it
     before, after : optimization
     converged : whether every iteration came to an end by itself
-    pose_covariance, landmark_covariance : (K, p, p), (L, 2, 2) after it; m, rad
+    covariance : of poses and landmarks after it
     true_poses, true_landmarks : (k, 2), (L, 2) m; empty or NaN where unknown
     system, build_s : A x = b as the methods solved it, and the time to put it together
     methods : how every method fared
@@ -184,14 +175,13 @@ class Study:
     before: Estimate
     after: Estimate
     converged: bool
-    pose_covariance: Matrix
-    landmark_covariance: Matrix
+    covariance: Covariance
     true_poses: Matrix
     true_landmarks: Matrix
     system: LinearSystem
     build_s: float
     methods: tuple[MethodResult, ...]
-    trajectory: Trajectory | None
+    trajectory: Trajectory | None = None
 
 
 def study_file(data: LandmarkData, options: Options) -> Study:
@@ -204,15 +194,19 @@ def _linear(data: LandmarkData, options: Options) -> Study:
     system = linear_system(data)
     build_s = working_s() - begin
     names, left_out = methods_for(options.methods, system.pattern.shape[1])
-    methods = compare_linear(system, names, options.repeats)
+    methods = compare(lambda solver: solver.solve(system), names, options.repeats)
     chi2 = float(np.square(system.A @ methods[0].x - system.b).sum())
     facts = (
         Fact("problem", "linear: steps between poses, landmarks' positions relative to them"),
-        _chi2(chi2, len(system.b), system.pattern.shape[1]),
+        _chi2(chi2, system),
         *_left_out(left_out),
     )
-    before, after = of_relative_positions(data), state_of(data, methods[0].x)
-    return _of_file(data, before, after, facts, system, build_s, methods)
+    poses, landmarks = (part.reshape(-1, 2) for part in np.split(methods[0].x, [system.pattern.layout.split]))
+    before, after = (of_positions(each, data) for each in (of_relative_positions(data), Values(poses, landmarks)))
+    return Study(
+        data.name, facts, before, after, True, Covariance(system), data.true_poses, data.true_landmarks, system,
+        build_s, methods,
+    )  # fmt: skip
 
 
 def _nonlinear(data: LandmarkData, options: Options) -> Study:
@@ -223,34 +217,25 @@ def _nonlinear(data: LandmarkData, options: Options) -> Study:
     begin = working_s()
     system = problem.system(problem.linearize(minimum.state), minimum.weights)
     build_s = working_s() - begin
-    if options.optimizer == "gradient-descent" or not minimum.iterations:  # solves none: take its end
-        methods = compare_linear(system, names, options.repeats)
-    else:
-        methods = compare_nonlinear(problem, guess, options.optimizer, names, options.repeats)
-    ended = "converged" if minimum.converged else "DID NOT CONVERGE"
+
+    def solve(solver: LinearSolver) -> NDArray[np.float64]:
+        if options.optimizer == "gradient-descent" or not minimum.iterations:  # solves none: take its end
+            return solver.solve(system)
+        return minimize(problem, guess, solver, optimizer=options.optimizer).state.unknowns
+
+    after = f"after {counted(minimum.iterations, 'step')}: {minimum.reason}"
     facts = (
         Fact("problem", "nonlinear: steps between poses, bearing and range of landmarks; headings known"),
         Fact("guess", options.guess),
-        Fact(
-            "iteration",
-            f"{options.optimizer} {ended} after {counted(minimum.iterations, 'step')}: {minimum.reason}",
-        ),
-        _chi2(minimum.cost, len(system.b), system.pattern.shape[1]),
+        Fact("iteration", f"{options.optimizer} {_ended(minimum)} {after}"),
+        _chi2(minimum.cost, system),
         *_left_out(left_out),
     )
-    study = _of_file(data, guess, minimum.state, facts, system, build_s, methods)
-    return replace(study, converged=minimum.converged)
-
-
-def _chi2(chi2: float, rows: int, unknowns: int) -> Fact:
-    """χ² over its degrees of freedom, and its meaning."""
-    freedom = max(rows - unknowns, 1)
-    verdict = (
-        "the noise model fits"
-        if 0.5 <= chi2 / freedom <= 2.0
-        else "the noise model does not fit, or a poor minimum"
-    )
-    return Fact("χ²", f"{chi2:.4f} over {counted(freedom, *FREEDOM)}: {chi2 / freedom:.3f}; {verdict}")
+    before, end = (of_positions(each, data) for each in (guess, minimum.state))
+    return Study(
+        data.name, facts, before, end, minimum.converged, Covariance(system), data.true_poses,
+        data.true_landmarks, system, build_s, compare(solve, names, options.repeats),
+    )  # fmt: skip
 
 
 def _guess(problem: BearingRangeProblem, guess: Guess) -> Values:
@@ -262,31 +247,18 @@ def _guess(problem: BearingRangeProblem, guess: Guess) -> Values:
     return state
 
 
-def _of_file(
-    data: LandmarkData,
-    before: Values,
-    after: Values,
-    facts: tuple[Fact, ...],
-    system: LinearSystem,
-    build_s: float,
-    methods: tuple[MethodResult, ...],
-) -> Study:
-    layout, covariance = system.pattern.layout, Covariance(system)
-    return Study(
-        name=data.name,
-        facts=facts,
-        before=Estimate(before, of_positions(before, data), lie.identity(2)),
-        after=Estimate(after, of_positions(after, data), lie.identity(2)),
-        converged=True,
-        pose_covariance=covariance.of(pose_columns(layout, np.arange(layout.poses))),
-        landmark_covariance=covariance.of(landmark_columns(layout, np.arange(len(layout.landmarks)))),
-        true_poses=data.true_poses,
-        true_landmarks=data.true_landmarks,
-        system=system,
-        build_s=build_s,
-        methods=methods,
-        trajectory=None,
-    )
+def _chi2(chi2: float, system: LinearSystem) -> Fact:
+    """χ² over its degrees of freedom, and its meaning."""
+    rows, unknowns = system.pattern.shape
+    freedom = max(rows - unknowns, 1)
+    low, high = _FITS
+    is_fit = low <= chi2 / freedom <= high
+    verdict = "the noise model fits" if is_fit else "the noise model does not fit, or a poor minimum"
+    return Fact("χ²", f"{chi2:.4f} over {counted(freedom, *FREEDOM)}: {chi2 / freedom:.3f}; {verdict}")
+
+
+def _ended(minimum: Minimum) -> str:
+    return "converged" if minimum.converged else "DID NOT CONVERGE"
 
 
 def study_log(folder: Path, options: Options) -> Study:
@@ -302,35 +274,19 @@ def study_log(folder: Path, options: Options) -> Study:
     system = solution.problem.system(at, solution.loss.weight(at.observation_chi2))
     build_s = working_s() - begin
     names, left_out = methods_for(options.methods, system.pattern.shape[1])
-    truth = truth_at(log, solution.nodes_s, system.pattern.layout.landmarks)
+    facts = (*_facts(log, solution, is_stated=options.noise is not None), *_left_out(left_out))
+    minimum, nodes_s = solution.minimum, solution.nodes_s
+    truth = truth_at(log, nodes_s, system.pattern.layout.landmarks)
+    before, after = (against_truth(each, nodes_s, truth) for each in (solution.reckoned, minimum.state))
     return Study(
-        name=log.name,
-        facts=(*_facts(log, solution, is_stated=options.noise is not None), *_left_out(left_out)),
-        before=_estimate(solution.reckoned, solution.nodes_s, truth),
-        after=_estimate(solution.minimum.state, solution.nodes_s, truth),
-        converged=solution.minimum.converged,
-        pose_covariance=solution.pose_covariance,
-        landmark_covariance=solution.landmark_covariance,
-        true_poses=truth.poses[:, :2],
-        true_landmarks=truth.landmarks,
-        system=system,
-        build_s=build_s,
-        methods=compare_linear(system, names, options.repeats),
-        trajectory=Trajectory(nanoseconds(solution.nodes_s), pose_matrices(solution.minimum.state.poses)),
-    )
-
-
-def _estimate(state: Values, nodes_s: NDArray[np.float64], truth: Truth) -> Estimate:
-    if np.count_nonzero(truth.known) < 2:
-        nothing = Accuracy(np.nan, np.nan, "no motion capture at these times")
-        return Estimate(state, nothing, lie.identity(2))
-    accuracy, T_truth_estimate = against_truth(state, nodes_s, truth)
-    return Estimate(state, accuracy, T_truth_estimate)
+        log.name, facts, before, after, minimum.converged, solution.covariance, truth.poses[:, :2],
+        truth.landmarks, system, build_s, compare(lambda solver: solver.solve(system), names, options.repeats),
+        trajectory_of(nodes_s, minimum.state.poses),
+    )  # fmt: skip
 
 
 def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> tuple[Fact, ...]:
     noise = solution.consistency
-    ended = "converged" if solution.minimum.converged else "DID NOT CONVERGE"
     count = len(log.seen_s)
     worth = f"count as {solution.loss.share.sum():.0f}, as errors of a landmark's successive sightings are alike"
     nodes = counted(len(solution.nodes_s), "pose")
@@ -343,7 +299,7 @@ def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> tuple[
     )
     own = zip(OWN, solution.minimum.state.calibration, OWN_UNITS, strict=True)
     found = f"bearing {bearing_rad:.4f} rad, range {range_m:.4f} m (Student's t)"
-    after = f"{ended} after {counted(solution.iterations, 'step')}: {solution.minimum.reason}"
+    after = f"{_ended(solution.minimum)} after {counted(solution.iterations, 'step')}: {solution.minimum.reason}"
     downweighted = int(np.count_nonzero(solution.minimum.weights < _DOWNWEIGHTED * solution.loss.share))
     return (
         Fact("observations", seen),

@@ -1,24 +1,30 @@
-"""A drive before it is recorded: world, motion, lidar, and stamps of its scans."""
+"""A drive through a world: planned, and recorded as an MCAP log with its exact truth."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain import lie
+from scanchain import checks, lie
 from scanchain.data import Matrix, Trajectory
 from scanchain.errors import InputError
-from scanchain.simulation.another_day import Change, another_day
-from scanchain.simulation.motion import Motion
-from scanchain.simulation.sensors import SENSORS, Sensor
+from scanchain.logs.writer import Link, LogWriter, pack_laser_scan, pack_odometry, pack_transforms, place
+from scanchain.simulation.another_day import Change, another_day, write_changes
+from scanchain.simulation.motion import Motion, wheel_odometry
+from scanchain.simulation.sensors import SENSORS, Sensor, Sweep, take_sweep
 from scanchain.simulation.solids import Solids
-from scanchain.simulation.worlds.registry import WORLDS, World
+from scanchain.simulation.worlds import WORLDS, World
+from scanchain.trajectory import write_tum
 
 EPOCH_NS = 1_700_000_000_000_000_000  # stamp of the first scan
 PLACE, DEVIATION, WHEELS, RANGES = range(4)  # every purpose draws its own random numbers
+_ODOMETRY_PERIOD_NS = 20_000_000
 _DROPOUT_S = 1.0
 _PATH_STEP_S = 0.1  # between the positions of a drive that objects must not be moved to
 _LONGEST_S = 36_000.0
@@ -72,16 +78,16 @@ def plan(
     """The drive that ``simulate`` records for the same arguments."""
     if world not in WORLDS:
         raise InputError(f"world {world!r} does not exist; choose one of {', '.join(WORLDS)}")
-    place = WORLDS[world]
-    lidar = _sensor(sensor or place.sensor, noise_m, dropout, place.sight_m)
-    length_s = place.duration_s if duration_s is None else duration_s
+    scene = WORLDS[world]
+    lidar = _sensor(sensor or scene.sensor, noise_m, dropout, scene.sight_m)
+    length_s = scene.duration_s if duration_s is None else duration_s
     check_range("duration_s", length_s, lidar.period_ns * 1e-9, _LONGEST_S)
     count = int(length_s * 1e9 / lidar.period_ns + 1e-6)
     check_range("start_m", start_m, 0.0, _FARTHEST_M)
-    if isinstance(place.route, tuple) and (reverse or start_m):
+    if isinstance(scene.route, tuple) and (reverse or start_m):
         raise InputError(f"{world} is no route round which one could drive; leave reverse and start_m out")
-    solids = place.build(random_numbers(seed, PLACE))
-    motion = place.motion(
+    solids = scene.build(random_numbers(seed, PLACE))
+    motion = scene.motion(
         solids,
         duration_s=length_s + lidar.period_ns * 1e-9,
         rng=random_numbers(seed, DEVIATION, changed),
@@ -91,10 +97,10 @@ def plan(
     changes: tuple[Change, ...] = ()
     if changed is not None:
         path = motion.base(np.arange(0.0, length_s, _PATH_STEP_S))[:, :2, 3]
-        free_m = place.vehicle.radius_m + place.vehicle.deviation_m
+        free_m = scene.vehicle.radius_m + scene.vehicle.deviation_m
         solids, changes = another_day(solids, path, free_m, random_numbers(seed, PLACE, changed))
-    scans = _recorded(place, motion, lidar, count)
-    return Drive(solids, motion, lidar, place.vehicle.T_base_lidar, scans, changes=changes)
+    scans = _recorded(scene, motion, lidar, count)
+    return Drive(solids, motion, lidar, scene.vehicle.T_base_lidar, scans, changes=changes)
 
 
 def random_numbers(seed: int, purpose: int, changed: int | None = None) -> np.random.Generator:
@@ -118,8 +124,8 @@ def _recorded(world: World, motion: Motion, sensor: Sensor, count: int) -> NDArr
     lacking = round(_DROPOUT_S * 1e9 / sensor.period_ns)
     times_s = np.arange(count) * (sensor.period_ns * 1e-9)
     path = motion.base(times_s)[:, :2, 3] if world.dropouts else np.empty((count, 2))
-    for place in world.dropouts:
-        distance_m = np.linalg.norm(path - place, axis=1)
+    for middle in world.dropouts:
+        distance_m = np.linalg.norm(path - middle, axis=1)
         near = np.flatnonzero(distance_m < 6.0)
         visit = near[: np.argmax(np.append(np.diff(near) > 1, True)) + 1]
         if len(visit) and visit[-1] + 1 < count:
@@ -141,3 +147,161 @@ def _sensor(name: str, noise_m: float | None, dropout: float | None, sight_m: fl
     check_range("noise_m", sensor.noise_m, 0.0, 10.0)
     check_range("dropout", sensor.dropout, 0.0, 1.0)
     return sensor
+
+
+class Slip(NamedTuple):
+    """Distance that the wheels turn ahead without moving the vehicle, evenly between two seconds of the drive."""
+
+    start_s: float
+    end_s: float
+    size_m: float
+
+    def slipped_m(self, times_s: NDArray[np.floating]) -> NDArray[np.floating]:
+        """(N,) up to each instant."""
+        return self.size_m * np.clip((times_s - self.start_s) / (self.end_s - self.start_s), 0.0, 1.0)
+
+
+NO_SLIP = Slip(0.0, 1.0, 0.0)
+
+
+def simulate(
+    world: str,
+    destination: str | Path,
+    *,
+    seed: int = 0,
+    changed: int | None = None,
+    drift: float = 1.0,
+    wheels_slip: Slip = NO_SLIP,
+    force: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+    **options: Any,
+) -> Trajectory:
+    """Write a log of a drive to ``destination`` and the truth beside it as .tum; the same seed, the same bytes.
+
+    A scan's stamp is the instant of its first ray, point times count from there, and it is recorded at its end.
+    The log holds /scan or /points, /odom (50 Hz, T_odom_base, drifts), /ground_truth (T_world_lidar at the stamp
+    of every scan, exact) and /tf_static (T_base_lidar); in the dropouts of a world, /odom alone goes on.
+
+    changed : a seed; it is another day: furniture or parked cars came, went and moved, as .changes.csv beside the
+        log lists, and the drive is repeated with other deviations and noise
+    drift : multiplies the errors of the wheel odometry, which slips once by ``wheels_slip``
+    progress : called with the scans done and in all
+    options : ``duration_s``; ``sensor``, by name; ``noise_m`` and ``dropout`` in place of the sensor's own;
+        ``reverse`` to drive the other way round, from ``start_m`` along that route
+
+    Returns the truth, SE(2) for a laser scanner and SE(3) for a lidar.
+    """
+    check_range("drift", drift, 0.0, 100.0)
+    start_s, end_s, size_m = wheels_slip
+    if not (0.0 <= start_s < end_s < np.inf and np.isfinite(size_m)):
+        raise InputError(
+            f"wheels_slip from {start_s:g} to {end_s:g} s by {size_m:g} m: begin at 0 s or later, end later"
+        )
+    destination = checks.path(destination, "destination")
+    changes_file = destination.with_suffix(".changes.csv")
+    for file in (destination.with_suffix(".tum"), *(() if changed is None else (changes_file,))):
+        if file.exists() and not force:
+            raise InputError(f"{file}: exists; choose another name or pass --force to replace it")
+    drive = plan(world, seed=seed, changed=changed, **options)
+    truth = record(
+        drive, destination, seed=seed, changed=changed, drift=drift, wheels_slip=wheels_slip, force=force,
+        progress=progress,
+    )  # fmt: skip
+    if changed is not None:
+        write_changes(changes_file, drive.changes)
+    return truth
+
+
+def record(
+    drive: Drive,
+    destination: Path,
+    *,
+    seed: int = 0,
+    changed: int | None = None,
+    drift: float = 1.0,
+    wheels_slip: Slip = NO_SLIP,
+    force: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Trajectory:
+    """Write a log of any drive, as ``simulate`` does of one that is planned; the truth, beside it as well."""
+    truth = drive.truth()
+    period_ns = drive.sensor.period_ns
+    with LogWriter(destination, force=force) as log:
+        mounting = pack_transforms(EPOCH_NS, Link("base_link", "lidar", place(drive.T_base_lidar)))
+        log.append("/tf_static", "tf2_msgs/msg/TFMessage", mounting, EPOCH_NS)
+        end_ns = int(truth.stamps_ns[-1]) - EPOCH_NS + period_ns
+        wheels = _Wheels(log, drive.motion, end_ns, drift, wheels_slip, random_numbers(seed, WHEELS, changed))
+        for done, sweep in enumerate(_sweeps(drive, random_numbers(seed, RANGES, changed))):
+            stamp_ns = int(truth.stamps_ns[done])
+            wheels.write_until(stamp_ns - 1)  # in a dropout
+            pose = pack_odometry(stamp_ns, "world", "lidar", place(truth.poses[done]))
+            log.append("/ground_truth", "nav_msgs/msg/Odometry", pose, stamp_ns)
+            wheels.write_until(stamp_ns + period_ns)
+            _write_sweep(log, sweep, drive.sensor, stamp_ns)
+            if progress is not None:
+                progress(done + 1, len(truth))
+    write_tum(destination.with_suffix(".tum"), truth, force=True)
+    return truth
+
+
+def _sweeps(drive: Drive, rng: np.random.Generator) -> Iterator[Sweep]:
+    """All recorded scans in order; the next is cast in a thread while the last is written."""
+
+    def take(index: int) -> Sweep:
+        start_s = index * drive.sensor.period_ns * 1e-9
+        return take_sweep(drive.solids_at(start_s), drive.motion, drive.sensor, index, start_s, rng)
+
+    with ThreadPoolExecutor(max_workers=1) as caster:
+        upcoming = caster.submit(take, int(drive.scans[0]))
+        for index in drive.scans[1:]:
+            sweep = upcoming.result()
+            upcoming = caster.submit(take, int(index))
+            yield sweep
+        yield upcoming.result()
+
+
+class _Wheels:
+    """Writer of the wheel odometry up to the log's present time."""
+
+    def __init__(
+        self, log: LogWriter, motion: Motion, end_ns: int, drift: float, slip: Slip, rng: np.random.Generator
+    ) -> None:
+        self._log = log
+        self._stamps_ns = EPOCH_NS + np.arange(0, end_ns + 1, _ODOMETRY_PERIOD_NS)
+        times_s = (self._stamps_ns - EPOCH_NS) * 1e-9
+        slips_m = np.diff(slip.slipped_m(times_s))
+        self._poses = wheel_odometry(motion.base(times_s), drift=drift, rng=rng, slips_m=slips_m)
+        self._covariance = np.diag([1e-4, 1e-4, 1e-6, 1e-6, 1e-6, 1e-4]) * max(drift, 1e-3) ** 2
+        self._next = 0
+
+    def write_until(self, time_ns: int) -> None:
+        while self._next < len(self._stamps_ns) and self._stamps_ns[self._next] <= time_ns:
+            stamp_ns = int(self._stamps_ns[self._next])
+            pose = place(self._poses[self._next])
+            data = pack_odometry(stamp_ns, "odom", "base_link", pose, self._covariance)
+            self._log.append("/odom", "nav_msgs/msg/Odometry", data, stamp_ns)
+            self._next += 1
+
+
+def _write_sweep(log: LogWriter, sweep: Sweep, sensor: Sensor, stamp_ns: int) -> None:
+    end_ns = stamp_ns + sensor.period_ns
+    if sensor.dimension == 3:
+        points, ring = sweep.points(), sweep.rays.ring[sweep.returned]
+        log.point_cloud(
+            "/points", stamp_ns, "lidar", points, times_s=sweep.times_s(), ring=ring, log_time_ns=end_ns
+        )
+        return
+    first, second = sweep.rays.directions[:2]
+    angle_min = float(np.arctan2(first[1], first[0]))
+    data = pack_laser_scan(
+        stamp_ns,
+        "lidar",
+        angle_min,
+        float(np.arctan2(second[1], second[0])) - angle_min,
+        sweep.ranges_m,
+        range_min_m=sensor.min_range_m,
+        range_max_m=sensor.max_range_m,
+        time_increment_s=float(sweep.rays.instants_ns[-1]) * 1e-9 / (len(sweep.ranges_m) - 1),
+        scan_time_s=sensor.period_ns * 1e-9,
+    )
+    log.append("/scan", "sensor_msgs/msg/LaserScan", data, stamp_ns, end_ns)

@@ -1,4 +1,4 @@
-"""Motion of a vehicle on the ground, and the odometry that its wheels report."""
+"""Motion of a vehicle: laps round a closed route, turns on the spot with short moves; odometry of its wheels."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
+from scipy.interpolate import BSpline, make_interp_spline
+from scipy.ndimage import gaussian_filter1d
 
 from scanchain import lie
 from scanchain.data import Matrix
@@ -29,11 +32,11 @@ class Vehicle:
     Attributes
     ----------
     speed_m_s, acceleration_m_s2, lateral_acceleration_m_s2 : limits along the path and in bends
+    radius_m : half its width
+    T_base_lidar : (4, 4)
     corner_m : standard deviation of the smoothing that rounds the route; a right angle gets 0.9 of it as radius
     deviation_m : how far it strays from the route, differently on every lap
     sway_rad, heave_m : roll, pitch and height of the body at full speed, amplitudes
-    radius_m : half its width
-    T_base_lidar : (4, 4)
     swing_rad, swing_m : heading and sideways motion of the body at full speed, amplitudes
     start_m_s : speed at the first instant
     standstill_s : how long it stands before it sets off
@@ -42,12 +45,12 @@ class Vehicle:
     speed_m_s: float
     acceleration_m_s2: float
     lateral_acceleration_m_s2: float
-    corner_m: float
-    deviation_m: float
-    sway_rad: float
-    heave_m: float
     radius_m: float
     T_base_lidar: Matrix
+    corner_m: float = 0.0
+    deviation_m: float = 0.0
+    sway_rad: float = 0.0
+    heave_m: float = 0.0
     swing_rad: float = 0.0
     swing_m: float = 0.0
     start_m_s: float = 0.0
@@ -165,3 +168,159 @@ def wheel_odometry(
     poses[1:, :2, 2] = np.cumsum(ahead, axis=0)
     poses[:, 2, 2] = 1.0
     return poses
+
+
+_HOLD_S = 1.0  # before it sets off, as long as the easing reaches
+_STEP_S = 0.02  # spacing of the speed profile
+_EASE_S = 0.25  # standard deviation of the smoothing that makes the acceleration continuous
+_MARGIN_S = 2.0  # the profile begins and ends that much beyond the drive
+
+TURN_RAD_S = np.deg2rad(120.0)
+_TURN_RAD_S2 = np.deg2rad(400.0)
+_PIVOT_STEP_S = 0.005  # spacing of the profiles
+_PIVOT_EASE_S = 0.05  # standard deviation of the smoothing that makes the accelerations continuous
+_PAUSE_S = 0.4  # between a turn and a move, as long as the easing reaches on both sides
+_FIRST_PAUSE_S = 1.0  # standstill at the beginning
+
+
+class Lap:
+    """A closed route (W, d) by the distance along it; ``corners_m`` (W + 1,) are those of its corners."""
+
+    def __init__(self, route: Matrix) -> None:
+        self._corners = np.vstack([route, route[:1]])
+        self.corners_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self._corners, axis=0), axis=1))])
+        self.length_m = float(self.corners_m[-1])
+
+    def at(self, along_m: NDArray[np.float64] | float) -> Matrix:
+        """Positions (..., d), on whichever lap."""
+        place_m = along_m % self.length_m
+        return np.stack([np.interp(place_m, self.corners_m, column) for column in self._corners.T], axis=-1)
+
+    def yaw_rad(self, along_m: float) -> float:
+        """Direction of a route on the ground, over one meter."""
+        ahead = self.at(along_m + 0.5) - self.at(along_m - 0.5)
+        return float(np.arctan2(ahead[1], ahead[0]))
+
+    def beside(self, along_m: float, left_m: float) -> tuple[float, float]:
+        """The position so far along a route on the ground and to its left."""
+        yaw_rad = self.yaw_rad(along_m)
+        x, y = self.at(along_m) + left_m * np.array([-np.sin(yaw_rad), np.cos(yaw_rad)])
+        return float(x), float(y)
+
+
+def laps(
+    route: Matrix, vehicle: Vehicle, solids: Solids, *, duration_s: float, rng: np.random.Generator
+) -> Motion:
+    """A drive round a closed ``route``: (W, 2) along the ground, (W, 3) walked upright at the heights it gives."""
+    phases = rng.uniform(0.0, 2.0 * np.pi, 3)
+    reach_m = vehicle.speed_m_s * duration_s + 10.0 * vehicle.corner_m + 2.0 * _MARGIN_S * vehicle.start_m_s
+    line = _deviate(Lap(route).at(np.arange(0.0, reach_m, 0.02 * vehicle.corner_m)), vehicle, rng)
+    phases = np.concatenate([phases, rng.uniform(0.0, 2.0 * np.pi, 2)])
+    smooth = gaussian_filter1d(line, 50.0, axis=0, mode="nearest")
+    arc_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(smooth, axis=0), axis=1))])
+    position = make_interp_spline(arc_m, smooth, k=3)
+    driven_m = _drive(position, arc_m, vehicle, duration_s)
+
+    def course(times_s: NDArray[np.floating]) -> Course:
+        along_m = driven_m(times_s)
+        forward = position(along_m, 1)[:, :2]
+        forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+        return Course(position(along_m), forward, driven_m(times_s, 1))
+
+    return Motion(course, vehicle, solids, phases)
+
+
+def begun_at(route: Matrix, start_m: float) -> Matrix:
+    """The closed route (W, d) from a point on, so many meters along it."""
+    if start_m == 0.0:
+        return route
+    lap = Lap(route)
+    ahead = int(np.searchsorted(lap.corners_m[:-1], start_m % lap.length_m, side="right"))
+    return np.vstack([lap.at(start_m), route[ahead:], route[:ahead]])
+
+
+def sampled(route: Matrix, step_m: float) -> Matrix:
+    """Points along the straight segments of the closed route, both corners of each and one about every step."""
+    segments = zip(route, np.roll(route, -1, axis=0), strict=True)
+    return np.vstack([np.linspace(a, b, max(int(np.linalg.norm(b - a) / step_m), 2)) for a, b in segments])
+
+
+def _deviate(line: Matrix, vehicle: Vehicle, rng: np.random.Generator) -> Matrix:
+    """The line shifted by slow waves, at most ``deviation_m`` in x and in y."""
+    place = np.arange(len(line)) / 50.0  # in units of corner_m
+    shift = np.zeros_like(line)
+    for axis in (0, 1):
+        for wavelength in rng.uniform(8.0, 30.0, 3):
+            shift[:, axis] += np.sin(2.0 * np.pi * (place / wavelength + rng.uniform())) / 3.0
+    return line + vehicle.deviation_m * shift
+
+
+def _drive(position: BSpline, arc_m: NDArray[np.float64], vehicle: Vehicle, duration_s: float) -> BSpline:
+    """Arc length over time: as fast as the limits allow, then eased so that the acceleration is continuous."""
+    first, second = position(arc_m, 1), position(arc_m, 2)
+    bend = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
+    energy = np.minimum(vehicle.speed_m_s**2, vehicle.lateral_acceleration_m_s2 / np.maximum(bend, 1e-9))
+    energy[0] = vehicle.start_m_s**2
+    gain = 2.0 * vehicle.acceleration_m_s2 * arc_m  # v² grows by at most 2 a Δs, ahead and looking back
+    energy = np.minimum.accumulate(energy - gain) + gain
+    energy = (np.minimum.accumulate((energy + gain)[::-1]))[::-1] - gain
+    speed = np.sqrt(np.maximum(energy, 0.0))
+    taken_s = np.concatenate([[0.0], np.cumsum(2.0 * np.diff(arc_m) / (speed[1:] + speed[:-1]))])
+    times_s = np.arange(-_MARGIN_S, duration_s + _MARGIN_S, _STEP_S)
+    begun_s = times_s - _HOLD_S - vehicle.standstill_s
+    eased = gaussian_filter1d(np.interp(begun_s, taken_s, speed), _EASE_S / _STEP_S)
+    reached_m = cumulative_trapezoid(eased, dx=_STEP_S, initial=0.0)
+    return make_interp_spline(times_s, reached_m, k=3)
+
+
+class Pivot(NamedTuple):
+    """A turn on the spot, then a straight move."""
+
+    turn_deg: float
+    ahead_m: float
+
+
+def pivots(
+    steps: tuple[Pivot, ...], vehicle: Vehicle, solids: Solids, *, duration_s: float, rng: np.random.Generator
+) -> Motion:
+    """Turns and short moves from the origin, heading along x: ``steps`` that end as they began, repeated."""
+    phases = rng.uniform(0.0, 2.0 * np.pi, 5)
+    lap = np.vstack([_rates(step, vehicle) for step in steps])
+    rounds = int((duration_s + 2.0) / (len(lap) * _PIVOT_STEP_S)) + 1
+    rates = np.vstack([np.zeros((round(_FIRST_PAUSE_S / _PIVOT_STEP_S), 2)), *[lap] * rounds])
+    eased = np.asarray(gaussian_filter1d(rates, _PIVOT_EASE_S / _PIVOT_STEP_S, axis=0))
+    turning, moving = eased[:, 0], eased[:, 1]
+    instants_s = np.arange(len(rates)) * _PIVOT_STEP_S
+    turned = cumulative_trapezoid(turning, dx=_PIVOT_STEP_S, initial=0.0)
+    velocity = moving[:, np.newaxis] * np.column_stack([np.cos(turned), np.sin(turned)])
+    moved = cumulative_trapezoid(velocity, dx=_PIVOT_STEP_S, axis=0, initial=0.0)
+    heading, place = (make_interp_spline(instants_s, values, k=3) for values in (turned, moved))
+
+    def course(times_s: NDArray[np.floating]) -> Course:
+        yaw = heading(times_s)
+        forward = np.column_stack([np.cos(yaw), np.sin(yaw)])
+        return Course(place(times_s), forward, np.linalg.norm(place(times_s, 1), axis=1))
+
+    return Motion(course, vehicle, solids, phases)
+
+
+def _rates(step: Pivot, vehicle: Vehicle) -> Matrix:
+    """Turning and moving speeds (T, 2) of one step, each followed by a pause."""
+    turn = _trapezoid(np.deg2rad(step.turn_deg), TURN_RAD_S, _TURN_RAD_S2)
+    ahead = _trapezoid(step.ahead_m, vehicle.speed_m_s, vehicle.acceleration_m_s2)
+    rates = np.zeros((len(turn) + len(ahead), 2))
+    rates[: len(turn), 0] = turn
+    rates[len(turn) :, 1] = ahead
+    return rates
+
+
+def _trapezoid(distance: float, limit: float, acceleration: float) -> NDArray[np.float64]:
+    """Speeds, ``_PIVOT_STEP_S`` apart, that cover the distance within both limits; then a pause."""
+    peak = min(limit, np.sqrt(abs(distance) * acceleration))
+    if peak == 0.0:
+        return np.zeros(0)
+    taken_s = abs(distance) / peak + peak / acceleration
+    times_s = np.arange(0.0, taken_s, _PIVOT_STEP_S)
+    speed = np.minimum(peak, acceleration * np.minimum(times_s, taken_s - times_s))
+    speed *= distance / (np.sum(speed) * _PIVOT_STEP_S)
+    return np.concatenate([speed, np.zeros(round(_PAUSE_S / _PIVOT_STEP_S))])

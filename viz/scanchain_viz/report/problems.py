@@ -12,8 +12,8 @@ from scanchain import lie
 from scanchain.data import GraphState, Matrix
 from scanchain.errors import InputError
 from scanchain.graph.optimization import GraphChange, fit
-from scanchain.landmarks.compare import MethodResult
 from scanchain.landmarks.results import accuracy_lines, file_stem, size_of, table_of
+from scanchain.landmarks.solvers import MethodResult
 from scanchain.landmarks.study import Estimate, Study
 from scanchain_viz.colors import palette_of
 from scanchain_viz.pictures.figure import INK, Plot, broken, write_png
@@ -112,7 +112,7 @@ def _in_truth(estimate: Estimate) -> tuple[Matrix, Matrix]:
 def ellipses(study: Study) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The 95 % ellipse of every landmark: half axes (N, 2) in meters, the longer first, and angle to x (N,)."""
     turn = study.after.T_truth_estimate[:2, :2]
-    values, vectors = np.linalg.eigh(turn @ study.landmark_covariance @ turn.T)
+    values, vectors = np.linalg.eigh(turn @ study.covariance.landmarks @ turn.T)
     axes_m = _ELLIPSE * np.sqrt(np.maximum(values[:, ::-1], 0.0))
     return axes_m, np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
 
@@ -161,7 +161,7 @@ def write_report(directory: Path, studies: Sequence[Study]) -> None:
         for study in studies:
             plots, panels = _estimates(study), []
             for plot, when, estimate in zip(plots, ("before", "after"), (study.before, study.after), strict=True):
-                off_m = estimate.accuracy.poses_m
+                off_m = estimate.poses_m
                 error = f": poses {off_m:.3g} m off" if np.isfinite(off_m) else ""
                 panels.append((f"{study.name}, {when}{error}", plot))
             write_png(directory / f"{file_stem(study.name)}.png", panels, width_inches=5.5, columns=2)
@@ -171,7 +171,7 @@ def write_report(directory: Path, studies: Sequence[Study]) -> None:
             _draw_factors(directory / "factors.png", studies)
         title = f"Landmark problem{'s' if len(studies) > 1 else ''}"
         names = ", ".join(study.name for study in studies)
-        definitions = dict.fromkeys(study.after.accuracy.definition for study in studies)
+        definitions = dict.fromkeys(study.after.definition for study in studies)
         fold = page.Collapsible("Definition of the errors", "\n\n".join(definitions))
         page.write_page(directory, page.Page(title, names, sections=sections, collapsibles=[fold]))
     except OSError as error:

@@ -1,60 +1,61 @@
-"""Linear solvers of A x = b by name: those of the course report, sparse Cholesky, Schur complement."""
+"""Linear solvers of A x = b by name: those of the course report, sparse Cholesky, Schur complement; compared."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
 
 from scanchain.errors import InputError
+from scanchain.landmarks.problem import Layout, LinearSystem, Pattern
 from scanchain.landmarks.solvers.direct import (
     PINV_BELOW,
-    DefaultSolver,
     Factor,
     LinearSolver,
-    LuSolver,
-    PinvSolver,
-    Solution,
+    ScipyMethod,
     UndeterminedError,
     check_pinv,
 )
-from scanchain.landmarks.solvers.elimination import CholeskySolver, SchurSolver
-from scanchain.landmarks.solvers.qr import QrSolver, SuiteSparseQrSolver
+from scanchain.landmarks.solvers.elimination import CholeskyMethod, SchurMethod
+from scanchain.landmarks.solvers.qr import QrMethod, SuiteSparseQrMethod
 
 __all__ = [
-    "ESTIMATOR", "METHODS", "Factor", "LinearSolver", "Solution", "UndeterminedError", "create_solver",
-    "methods_for", "parse_methods",
+    "ESTIMATOR", "METHODS", "Factor", "LinearSolver", "MethodResult", "UndeterminedError", "compare",
+    "create_solver", "methods_for", "parse_methods",
 ]  # fmt: skip
 
 _MAKERS = {
-    "default": DefaultSolver,
-    "pinv": PinvSolver,
-    "lu": lambda: LuSolver("NATURAL"),
-    "lu_colamd": lambda: LuSolver("COLAMD"),
-    "qr": lambda: QrSolver("natural"),
-    "qr_colamd": lambda: QrSolver("colamd"),
-    "cholesky": CholeskySolver,
-    "schur": SchurSolver,
-    "spqr": lambda: SuiteSparseQrSolver("natural"),
-    "spqr_colamd": lambda: SuiteSparseQrSolver("colamd"),
+    "default": lambda: ScipyMethod("default"),
+    "pinv": lambda: ScipyMethod("pinv"),
+    "lu": lambda: ScipyMethod("lu"),
+    "lu_colamd": lambda: ScipyMethod("lu_colamd"),
+    "qr": lambda: QrMethod("natural"),
+    "qr_colamd": lambda: QrMethod("colamd"),
+    "cholesky": CholeskyMethod,
+    "schur": SchurMethod,
+    "spqr": lambda: SuiteSparseQrMethod("natural"),
+    "spqr_colamd": lambda: SuiteSparseQrMethod("colamd"),
 }
 METHODS = tuple(name for name in _MAKERS if not name.startswith("spqr"))
 ESTIMATOR = "schur"  # the fastest: it estimates where no other is requested
 
 
 def create_solver(method: str) -> LinearSolver:
-    """The solver of that name."""
-    if method not in _MAKERS:
-        raise InputError(f"there is no method {method!r}; choose from {', '.join(_MAKERS)}")
-    return _MAKERS[method]()
+    """A solver by the method of that name."""
+    return LinearSolver(_MAKERS[method]())
 
 
 def parse_methods(text: str) -> tuple[str, ...]:
     """The names of a list with commas; "all" stands for every method that suits the problem."""
     names = [name.strip() for name in text.split(",") if name.strip()]
+    choice = f"choose from all, {', '.join(_MAKERS)}"
     for name in names:
         if name != "all" and name not in _MAKERS:
-            raise InputError(f"there is no method {name!r}; choose from all, {', '.join(_MAKERS)}")
+            raise InputError(f"there is no method {name!r}; {choice}")
     if not names:
-        raise InputError(f"no method is named; choose from all, {', '.join(_MAKERS)}")
+        raise InputError(f"no method is named; {choice}")
     if len(set(names)) < len(names):
         raise InputError(f"--methods names one twice: {', '.join(names)}; name each once")
     return tuple(names)
@@ -71,6 +72,76 @@ def methods_for(requested: Sequence[str], unknowns: int) -> tuple[tuple[str, ...
     if "pinv" not in chosen or unknowns < PINV_BELOW:
         return tuple(chosen), ""
     del chosen["pinv"]
-    return tuple(
-        chosen
-    ), f"pinv, whose inverse is all but dense: {unknowns:,} unknowns, its limit is {PINV_BELOW:,}"
+    note = f"pinv, whose inverse is all but dense: {unknowns:,} unknowns, its limit is {PINV_BELOW:,}"
+    return tuple(chosen), note
+
+
+_SLOW_S = 1.0  # seconds of a solution above which it is not repeated
+
+
+@dataclass(frozen=True, slots=True)
+class MethodResult:
+    """One method on one problem.
+
+    Attributes
+    ----------
+    method : its name
+    build_s, factor_s, solve_s : medians over the repetitions, each with a new solver; sums over the iterations
+    again_s : the whole once more with the same solver, which reuses its analysis of the pattern
+    iterations : linear solves
+    factor : of the last one
+    x : (n,) the unknowns
+    difference : largest entry of x minus that of the first method
+    """
+
+    method: str
+    build_s: float
+    factor_s: float
+    solve_s: float
+    again_s: float
+    iterations: int
+    factor: Factor
+    x: NDArray[np.float64]
+    difference: float
+
+    @property
+    def total_s(self) -> float:
+        """Seconds of one solution from scratch."""
+        return self.build_s + self.factor_s + self.solve_s
+
+
+def compare(
+    solve: Callable[[LinearSolver], NDArray[np.float64]], methods: Sequence[str], repeats: int
+) -> tuple[MethodResult, ...]:
+    """Let ``solve`` find the unknowns (n,) by every method in turn, slow ones once only."""
+    times_s: dict[str, list[NDArray[np.float64]]] = {method: [] for method in methods}
+    last: dict[str, tuple[int, LinearSolver, NDArray[np.float64]]] = {}
+    for method in methods:
+        create_solver(method).solve(_small_system())  # compiles
+    for _ in range(repeats):
+        for method, earlier in times_s.items():
+            if earlier and earlier[0][-1] > _SLOW_S:
+                continue
+            solver = create_solver(method)
+            x = solve(solver)
+            spent_s, iterations = solver.spent_s.copy(), solver.solutions
+            solve(solver)
+            earlier.append(np.append(spent_s, (solver.spent_s - spent_s).sum()))
+            last[method] = iterations, solver, x
+    reference = last[methods[0]][2]
+    results = []
+    for method, (iterations, solver, x) in last.items():
+        build_s, factor_s, solve_s, again_s = np.median(times_s[method], axis=0).tolist()
+        difference = float(np.abs(x - reference).max())
+        results.append(
+            MethodResult(method, build_s, factor_s, solve_s, again_s, iterations, solver.factor(), x, difference)
+        )
+    return tuple(results)
+
+
+def _small_system() -> LinearSystem:
+    """Two poses and a landmark, one step and two observations."""
+    row_start = np.concatenate([[0, 1, 2], 2 + 2 * np.arange(1, 7)])
+    columns = np.array([0, 1, 0, 2, 1, 3, 0, 4, 1, 5, 2, 4, 3, 5])
+    values = np.concatenate([[1.0, 1.0], np.tile([-1.0, 1.0], 6)])
+    return LinearSystem(Pattern(row_start, columns, Layout(2, 2, np.zeros(1, np.int64))), values, np.ones(8))

@@ -1,12 +1,11 @@
-"""Solution and error of the linear solvers; those of SciPy, on the normal equations AᵀA x = Aᵀb with SuperLU."""
+"""A linear solver with the time it takes and the error it raises; SciPy's methods on AᵀA x = Aᵀb."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from scipy.sparse.linalg import MatrixRankWarning, SuperLU, inv, splu, spsolve
 
 from scanchain.clock import working_s
 from scanchain.errors import InputError
+from scanchain.graph.cholesky import SingularMatrixError
 from scanchain.landmarks.problem import Layout, LinearSystem
 
 LOST_DIGITS = 1e-13  # a pivot below this share of its diagonal entry (of AᵀA) or column (of A) is rounding noise
@@ -42,37 +42,66 @@ class Factor:
         return int(self.matrix.count_nonzero())
 
 
-@dataclass(frozen=True, slots=True)
-class Solution:
-    """Result of a linear solver.
+class Factored(NamedTuple):
+    """What a method factored: ``solve`` gives x (n,), ``factor`` puts the factor together as a matrix."""
+
+    solve: Callable[[], NDArray[np.float64]]
+    factor: Callable[[], Factor]
+
+
+class Method(Protocol):
+    """A way to solve A x = b in the least-squares sense.
+
+    An analysis is kept for as long as the pattern is the same object. Both raise SingularMatrixError or
+    RuntimeError where A has not full column rank.
+    """
+
+    def build(self, system: LinearSystem) -> Any:
+        """What is factored: AᵀA and Aᵀb, or the rows of A in their order."""
+        ...
+
+    def factorize(self, system: LinearSystem, built: Any) -> Factored:
+        """Order, analyze and factor it."""
+        ...
+
+
+class LinearSolver:
+    """Solves A x = b by one method.
 
     Attributes
     ----------
-    x : (n,)
-    build_s : time to form what is factored (AᵀA and Aᵀb), or to sort the rows of A
-    factor_s : time of ordering, symbolic analysis (where not kept from before) and factorization
-    solve_s : time of the triangular solves
-    factor : makes the factor as a matrix; not part of the times
+    spent_s : (3,) time of all solutions so far: to build, to factor with all analysis, to solve triangular systems
+    solutions : their number
     """
 
-    x: NDArray[np.float64]
-    build_s: float
-    factor_s: float
-    solve_s: float
-    factor: Callable[[], Factor]
+    def __init__(self, method: Method) -> None:
+        self._method = method
+        self.spent_s = np.zeros(3)
+        self.solutions = 0
+        self._factored: Factored | None = None
 
-    @property
-    def total_s(self) -> float:
-        """All of it."""
-        return self.build_s + self.factor_s + self.solve_s
+    def solve(self, system: LinearSystem) -> NDArray[np.float64]:
+        """Solution (n,) in the least-squares sense; raises UndeterminedError where A has not full column rank."""
+        laps_s = [working_s()]
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error", MatrixRankWarning)
+                built = self._method.build(system)
+                laps_s.append(working_s())
+                self._factored = self._method.factorize(system, built)
+                laps_s.append(working_s())
+                x = self._factored.solve()
+                laps_s.append(working_s())
+        except (RuntimeError, MatrixRankWarning, SingularMatrixError) as error:
+            raise undetermined(system) from error
+        self.spent_s += np.diff(laps_s)
+        self.solutions += 1
+        return x
 
-
-class LinearSolver(Protocol):
-    """Solves A x = b; reuses its analysis for as long as the pattern is the same object."""
-
-    def solve(self, system: LinearSystem) -> Solution:
-        """Solve in the least-squares sense; raises UndeterminedError where A has not full column rank."""
-        ...
+    def factor(self) -> Factor:
+        """That of the last solution."""
+        assert self._factored is not None
+        return self._factored.factor()
 
 
 class UndeterminedError(InputError):
@@ -86,19 +115,6 @@ class UndeterminedError(InputError):
             " add measurements of them or a prior, or leave them out"
         )
         self.columns = columns
-
-
-class Stopwatch:
-    """Seconds since the last lap."""
-
-    def __init__(self) -> None:
-        self._last_s = working_s()
-
-    def lap(self) -> float:
-        """Time since the last lap."""
-        now_s = working_s()
-        lap_s, self._last_s = now_s - self._last_s, now_s
-        return lap_s
 
 
 def undetermined(system: LinearSystem) -> UndeterminedError:
@@ -124,28 +140,14 @@ def undetermined(system: LinearSystem) -> UndeterminedError:
     return UndeterminedError(system.pattern.layout, np.flatnonzero(null > 1e-6 * null.max()))
 
 
+def check_pivots(pivots: NDArray[np.float64], whole: NDArray[np.float64]) -> None:
+    """Refuse pivots (n,) that are but rounding of their diagonal entries before elimination, ``whole`` (n,)."""
+    failed = np.flatnonzero(~(pivots > LOST_DIGITS * whole))
+    if len(failed):
+        raise SingularMatrixError(int(failed[0]), int(failed[0]))
+
+
 PINV_BELOW = 3_000  # largest number of unknowns: their inverse is all but dense, 110 MB, and takes seconds
-
-
-class PinvSolver:
-    """``pinv``: x = (AᵀA)⁻¹ Aᵀb with the inverse formed explicitly."""
-
-    def solve(self, system: LinearSystem) -> Solution:
-        """Solve in the least-squares sense; the factor is the inverse."""
-        n = system.pattern.shape[1]
-        check_pinv(n)
-        watch = Stopwatch()
-        H, g = _normal_equations(system)
-        build_s = watch.lap()
-        with _naming_the_undetermined(system):
-            inverse = csc_matrix(inv(H))
-        factor_s = watch.lap()
-        # the k-th pivot of an elimination that takes unknown k last is 1 / inverse[k, k]
-        _check_pivots(1.0 / np.asarray(inverse.diagonal(), np.float64), H, system)
-        watch.lap()
-        x = inverse @ g
-        solve_s = watch.lap()
-        return Solution(x, build_s, factor_s, solve_s, lambda: Factor("(AᵀA)⁻¹", inverse, np.arange(n)))
 
 
 def check_pinv(unknowns: int) -> None:
@@ -157,70 +159,39 @@ def check_pinv(unknowns: int) -> None:
         )
 
 
-class DefaultSolver:
-    """``default``: scipy's spsolve, which returns no factor.
-
-    Its time counts as factorization. The factor is that of splu with the same settings as spsolve has.
-    """
-
-    def solve(self, system: LinearSystem) -> Solution:
-        """Solve in the least-squares sense."""
-        watch = Stopwatch()
-        H, g = _normal_equations(system)
-        build_s = watch.lap()
-        with _naming_the_undetermined(system):
-            x = spsolve(H, g)
-        factor_s = watch.lap()
-        return Solution(np.asarray(x), build_s, factor_s, 0.0, lambda: _upper(_factorize(H, "COLAMD", system)))
-
-
-class LuSolver:
-    """``lu`` and ``lu_colamd``: SuperLU on AᵀA in the natural order or in that of COLAMD."""
-
-    def __init__(self, ordering: Literal["NATURAL", "COLAMD"]) -> None:
-        self._ordering = ordering
-
-    def solve(self, system: LinearSystem) -> Solution:
-        """Solve in the least-squares sense; the factor is U."""
-        watch = Stopwatch()
-        H, g = _normal_equations(system)
-        build_s = watch.lap()
-        lu = _factorize(H, self._ordering, system)
-        factor_s = watch.lap()
-        x = lu.solve(g)
-        solve_s = watch.lap()
-        return Solution(x, build_s, factor_s, solve_s, lambda: _upper(lu))
-
-
-@contextmanager
-def _naming_the_undetermined(system: LinearSystem) -> Iterator[None]:
-    """Raise scipy's error about a singular matrix as one that names its unknowns."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", MatrixRankWarning)
-            yield
-    except (RuntimeError, MatrixRankWarning) as error:
-        raise undetermined(system) from error
-
-
-def _normal_equations(system: LinearSystem) -> tuple[csc_matrix, NDArray[np.float64]]:
+def normal_equations(system: LinearSystem) -> tuple[csc_matrix, NDArray[np.float64]]:
+    """AᵀA and Aᵀb."""
     A = system.A
     return csc_matrix(A.T @ A), A.T @ system.b
 
 
-def _factorize(H: csc_matrix, ordering: str, system: LinearSystem) -> SuperLU:
-    try:
-        lu = splu(H, permc_spec=ordering)
-    except RuntimeError as error:  # an exact zero
-        raise undetermined(system) from error
-    _check_pivots(np.abs(lu.U.diagonal())[lu.perm_c], H, system)
-    return lu
+class ScipyMethod:
+    """AᵀA x = Aᵀb by what SciPy offers.
 
+    ``default`` is spsolve, which returns no factor: that of splu with the same settings stands for it. ``pinv``
+    forms (AᵀA)⁻¹; ``lu`` and ``lu_colamd`` are SuperLU in the natural order and in that of COLAMD.
+    """
 
-def _check_pivots(pivots: NDArray[np.float64], H: csc_matrix, system: LinearSystem) -> None:
-    """Refuse pivots (n,) by column that are no more than rounding; the factor of a singular matrix has such."""
-    if not np.all(pivots > LOST_DIGITS * np.asarray(H.diagonal())):
-        raise undetermined(system)
+    build = staticmethod(normal_equations)
+
+    def __init__(self, name: Literal["default", "pinv", "lu", "lu_colamd"]) -> None:
+        self._name = name
+
+    def factorize(self, system: LinearSystem, built: tuple[csc_matrix, NDArray[np.float64]]) -> Factored:
+        """U of AᵀA, or its inverse."""
+        H, g = built
+        if self._name == "default":
+            return Factored(lambda: np.asarray(spsolve(H, g)), lambda: _upper(splu(H, permc_spec="COLAMD")))
+        diagonal = np.asarray(H.diagonal(), np.float64)
+        if self._name == "pinv":
+            check_pinv(len(g))
+            inverse = csc_matrix(inv(H))
+            # the k-th pivot of an elimination that takes unknown k last is 1 / inverse[k, k]
+            check_pivots(1.0 / np.asarray(inverse.diagonal(), np.float64), diagonal)
+            return Factored(lambda: inverse @ g, lambda: Factor("(AᵀA)⁻¹", inverse, np.arange(len(g))))
+        lu = splu(H, permc_spec="COLAMD" if self._name == "lu_colamd" else "NATURAL")
+        check_pivots(np.abs(lu.U.diagonal())[lu.perm_c], diagonal)
+        return Factored(lambda: lu.solve(g), lambda: _upper(lu))
 
 
 def _upper(lu: SuperLU) -> Factor:

@@ -6,82 +6,43 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_matrix
+from scipy.sparse import csc_matrix, triu
 
 from scanchain.data import Matrix
-from scanchain.graph.cholesky import (
-    BlockPattern,
-    SingularMatrixError,
-    SparseCholesky,
-    analyze,
-    upper_factor,
-)
-from scanchain.kernels.landmarks import arrow, normal_equations
-from scanchain.landmarks.problem import LinearSystem, Pattern
-from scanchain.landmarks.solvers.direct import LOST_DIGITS, Factor, Solution, Stopwatch, undetermined
+from scanchain.graph.cholesky import BlockPattern, SingularMatrixError, SparseCholesky, analyze, upper_factor
+from scanchain.kernels.landmarks import arrow
+from scanchain.landmarks.problem import LinearSystem, Pattern, landmark_columns, pose_columns
+from scanchain.landmarks.solvers.direct import LOST_DIGITS, Factor, Factored, normal_equations, undetermined
 
 
-class NormalEquations:
-    """H = AᵀA and g = Aᵀb for one pattern of A; where every product of two entries goes is found once.
-
-    ``pattern`` is that of H, the values are its diagonal and then its pairs.
-    """
-
-    def __init__(self, pattern: Pattern) -> None:
-        n = pattern.shape[1]
-        start, others, self._slots = normal_equations.product_structure(
-            pattern.row_start, pattern.columns, *pattern.by_column()
-        )
-        owners = np.repeat(np.arange(n), np.diff(start))
-        self.pattern = BlockPattern(np.ones(n, np.int64), np.stack([owners, others], axis=1))
-
-    def form(self, system: LinearSystem) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Values of H and g."""
-        H, g = np.empty(self.pattern.value_count), np.empty(self.pattern.scalars)
-        pattern = system.pattern
-        normal_equations.products(pattern.row_start, pattern.columns, system.values, system.b, self._slots, H, g)
-        return H, g
-
-
-class CholeskySolver:
+class CholeskyMethod:
     """Multifrontal Cholesky of AᵀA; while the pattern is the same only the numbers are computed again."""
 
+    build = staticmethod(normal_equations)
+
     def __init__(self) -> None:
-        self._known: tuple[Pattern, NormalEquations, SparseCholesky] | None = None
+        self._known: tuple[Pattern, SparseCholesky] | None = None
 
-    def solve(self, system: LinearSystem) -> Solution:
-        """Solve in the least-squares sense; the factor is U with AᵀA = UᵀU."""
-        watch = Stopwatch()
-        equations, cholesky = self._prepared(system.pattern)
-        H, g = equations.form(system)
-        build_s = watch.lap()
-        try:
-            cholesky.factorize(H)
-        except SingularMatrixError as error:
-            raise undetermined(system) from error
-        factor_s = watch.lap()
-        x = cholesky.solve(g)
-        solve_s = watch.lap()
-        return Solution(x, build_s, factor_s, solve_s, lambda: _factor(cholesky))
-
-    def _prepared(self, pattern: Pattern) -> tuple[NormalEquations, SparseCholesky]:
-        if self._known is None or self._known[0] is not pattern:
-            equations = NormalEquations(pattern)
-            cholesky = SparseCholesky(equations.pattern, analyze(equations.pattern))
-            self._known = pattern, equations, cholesky
-        return self._known[1:]
-
-
-def _factor(cholesky: SparseCholesky) -> Factor:
-    return Factor("U of AᵀA", csc_matrix(upper_factor(cholesky)), cholesky.analysis.order)
+    def factorize(self, system: LinearSystem, built: tuple[csc_matrix, NDArray[np.float64]]) -> Factored:
+        """U with AᵀA = UᵀU."""
+        H, g = built
+        if self._known is None or self._known[0] is not system.pattern:
+            pairs = np.stack(triu(system.pattern.products(), k=1).nonzero(), axis=1).astype(np.int64)
+            pattern = BlockPattern(np.ones(len(g), np.int64), pairs)
+            self._known = system.pattern, SparseCholesky(pattern, analyze(pattern))
+        cholesky = self._known[1]
+        H.sum_duplicates()  # sorts it, so that entries are found by bisection
+        cholesky.factorize(np.asarray(H[cholesky.pattern.rows, cholesky.pattern.columns]).ravel())
+        U, order = upper_factor, cholesky.analysis.order
+        return Factored(lambda: cholesky.solve(g), lambda: Factor("U of AᵀA", csc_matrix(U(cholesky)), order))
 
 
 _WIDEST_BAND = 64  # widest band in scalars; beyond it poses are joined by more than odometry
 _LARGEST_BORDER = 25_000_000  # largest number of entries of the dense border: 200 MB
 
 
-class SchurSolver:
-    """Two stages: S = C − B P⁻¹ Bᵀ of AᵀA = [P, Bᵀ; B, C], then the rest.
+class SchurMethod:
+    """Two stages: S = C − B P⁻¹ Bᵀ of AᵀA = [P, Bᵀ; B, C], dense as it joins every two landmarks, then the rest.
 
     Poses joined by odometry alone make P banded. Where they are joined by more, or where fewer than the landmarks,
     or B too large to be kept dense, sparse Cholesky of the whole is faster and takes its place.
@@ -89,18 +50,25 @@ class SchurSolver:
 
     def __init__(self) -> None:
         self._known: tuple[Pattern, int] | None = None
-        self._cholesky = CholeskySolver()
+        self._cholesky = CholeskyMethod()
 
-    def solve(self, system: LinearSystem) -> Solution:
-        """Solve in the least-squares sense; the factor is U with AᵀA = UᵀU."""
+    def build(self, system: LinearSystem) -> tuple[Arrow | csc_matrix, NDArray[np.float64]]:
+        """AᵀA, as an arrow where that is faster, and Aᵀb."""
         pattern = system.pattern
-        if self._known is None or self._known[0] is not pattern:
-            layout = pattern.layout
-            self._known = pattern, arrow.bandwidth(pattern.row_start, pattern.columns, layout.split)
         split, rest = pattern.layout.split, pattern.shape[1] - pattern.layout.split
+        if self._known is None or self._known[0] is not pattern:
+            self._known = pattern, arrow.bandwidth(pattern.row_start, pattern.columns, split)
         if self._known[1] > _WIDEST_BAND or rest > split or rest * split > _LARGEST_BORDER:
-            return self._cholesky.solve(system)
-        return _eliminate_poses(system, self._known[1])
+            return normal_equations(system)
+        return _form(system, self._known[1])
+
+    def factorize(self, system: LinearSystem, built: tuple[Arrow | csc_matrix, NDArray[np.float64]]) -> Factored:
+        """U with AᵀA = UᵀU."""
+        U, g = built
+        if not isinstance(U, Arrow):
+            return self._cholesky.factorize(system, (U, g))
+        _eliminate(U)
+        return Factored(lambda: _solved(U, g), lambda: _factor_of_arrow(U))
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,11 +85,24 @@ class Covariance:
 
     def __init__(self, system: LinearSystem) -> None:
         """Raises UndeterminedError where A has not full column rank."""
-        pattern = system.pattern
+        pattern, self._layout = system.pattern, system.pattern.layout
         U, _ = _form(system, arrow.bandwidth(pattern.row_start, pattern.columns, pattern.layout.split))
-        _eliminate(U, system)
+        try:
+            _eliminate(U)
+        except SingularMatrixError as error:
+            raise undetermined(system) from error
         self._band, self._border, self._corner = (np.empty_like(part) for part in (U.band, U.border, U.corner))
         arrow.invert(U.band, U.border, U.corner, self._band, self._border, self._corner)
+
+    @property
+    def poses(self) -> Matrix:
+        """Of every pose, (K, p, p), relative to the first where that is held; m, rad."""
+        return self.of(pose_columns(self._layout, np.arange(self._layout.poses)))
+
+    @property
+    def landmarks(self) -> Matrix:
+        """Of every landmark, (L, 2, 2) m²."""
+        return self.of(landmark_columns(self._layout, np.arange(len(self._layout.landmarks))))
 
     def of(self, columns: NDArray[np.int64]) -> Matrix:
         """Covariances of groups of unknowns, (N, c) columns of A to (N, c, c); NaN for poses far apart."""
@@ -130,21 +111,15 @@ class Covariance:
         return result
 
 
-def _eliminate_poses(system: LinearSystem, width: int) -> Solution:
-    """P = UᵀU banded, Y = U⁻ᵀ Bᵀ, S = C − YᵀY dense: it joins every two landmarks anyway."""
-    watch = Stopwatch()
-    U, g = _form(system, width)
-    build_s = watch.lap()
-    _eliminate(U, system)
-    factor_s = watch.lap()
+def _solved(U: Arrow, g: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Solve UᵀU x = g, in place of g."""
     poses, landmarks = np.split(g, [U.band.shape[1]])
     arrow.solve_forward(U.band, poses)
     landmarks -= poses @ U.border
     arrow.solve_corner(U.corner, landmarks)
     poses -= U.border @ landmarks
     arrow.solve_backward(U.band, poses)
-    solve_s = watch.lap()
-    return Solution(g, build_s, factor_s, solve_s, lambda: _factor_of_arrow(U))
+    return g
 
 
 def _form(system: LinearSystem, width: int) -> tuple[Arrow, NDArray[np.float64]]:
@@ -159,14 +134,15 @@ def _form(system: LinearSystem, width: int) -> tuple[Arrow, NDArray[np.float64]]
     return H, g
 
 
-def _eliminate(H: Arrow, system: LinearSystem) -> None:
-    """Turn AᵀA into its factor, in place."""
+def _eliminate(H: Arrow) -> None:
+    """Turn AᵀA into its factor, in place: P = UᵀU banded, Y = U⁻ᵀ Bᵀ, S = C − YᵀY = UᵀU dense."""
     floor = LOST_DIGITS * H.corner.diagonal()
-    if arrow.eliminate(H.band, H.border, LOST_DIGITS) >= 0:
-        raise undetermined(system)
-    arrow.complement(H.corner, H.border)
-    if arrow.eliminate_corner(H.corner, floor) >= 0:
-        raise undetermined(system)
+    failed = arrow.eliminate(H.band, H.border, LOST_DIGITS)
+    if failed < 0:
+        arrow.complement(H.corner, H.border)
+        failed = arrow.eliminate_corner(H.corner, floor)
+    if failed >= 0:
+        raise SingularMatrixError(failed, failed)
 
 
 def _factor_of_arrow(U: Arrow) -> Factor:

@@ -11,15 +11,15 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix, csc_matrix, csr_matrix
+from scipy.sparse import coo_matrix, csc_matrix, csr_matrix, triu
 from scipy.sparse.linalg import spsolve_triangular
 
 from scanchain.errors import MissingExtraError
-from scanchain.graph.cholesky import BlockPattern, analyze
+from scanchain.graph.cholesky import BlockPattern, SingularMatrixError, analyze
 from scanchain.kernels.graph import symbolic
-from scanchain.kernels.landmarks import normal_equations, sparse_qr
+from scanchain.kernels.landmarks import sparse_qr
 from scanchain.landmarks.problem import LinearSystem, Pattern
-from scanchain.landmarks.solvers.direct import LOST_DIGITS, Factor, Solution, Stopwatch, undetermined
+from scanchain.landmarks.solvers.direct import Factor, Factored, check_pivots
 
 Ordering = Literal["natural", "colamd"]
 _REST = 4  # rows that wait for the dense factorization, over its columns
@@ -39,35 +39,38 @@ class _Analysis:
     rows: NDArray[np.int64]
 
 
-class QrSolver:
+class QrMethod:
     """QR by Givens rotations, full columns by LAPACK; its analysis is reused while the pattern is the same."""
 
     def __init__(self, ordering: Ordering) -> None:
         self._ordering: Ordering = ordering
         self._known: tuple[Pattern, _Analysis] | None = None
 
-    def solve(self, system: LinearSystem) -> Solution:
-        """Solve in the least-squares sense; the factor is R."""
-        watch = Stopwatch()
-        pattern, n = system.pattern, system.pattern.shape[1]
-        if self._known is None or self._known[0] is not pattern:
-            self._known = pattern, _analyze(pattern, self._ordering)
-        known = self._known[1]
-        build_s = watch.lap()
-        R, z = _factorize(system, known)
-        starts, k = known.begin + np.arange(n + 1), np.arange(n)
-        matrix = csr_matrix((R, np.insert(known.right, known.begin[:-1], k), starts), shape=(n, n))
-        factor_s = watch.lap()
-        lengths = np.bincount(pattern.columns, system.values**2, n)
-        if not np.all(np.abs(R[starts[:-1]]) > LOST_DIGITS * np.sqrt(lengths[known.order])):
-            raise undetermined(system)
-        watch.lap()
-        x = spsolve_triangular(matrix, z, lower=False)[known.place]
-        solve_s = watch.lap()
-        return Solution(x, build_s, factor_s, solve_s, lambda: Factor("R of A", csc_matrix(matrix), known.order))
+    def build(self, system: LinearSystem) -> _Analysis:
+        """The order of columns and rows."""
+        if self._known is None or self._known[0] is not system.pattern:
+            self._known = system.pattern, _analyze(system.pattern, self._ordering)
+        return self._known[1]
+
+    def factorize(self, system: LinearSystem, built: _Analysis) -> Factored:
+        """R of A, and the head of Qᵀb."""
+        R, z = _rotated(system, built)
+        n = len(z)
+        starts = built.begin + np.arange(n + 1)
+        matrix = csr_matrix((R, np.insert(built.right, built.begin[:-1], np.arange(n)), starts), shape=(n, n))
+        check_pivots(np.abs(R[starts[:-1]]), _column_lengths(system)[built.order])
+        return Factored(
+            lambda: spsolve_triangular(matrix, z, lower=False)[built.place],
+            lambda: Factor("R of A", csc_matrix(matrix), built.order),
+        )
 
 
-def _factorize(system: LinearSystem, known: _Analysis) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _column_lengths(system: LinearSystem) -> NDArray[np.float64]:
+    """Length of each column of A, (n,)."""
+    return np.sqrt(np.bincount(system.pattern.columns, system.values**2, system.pattern.shape[1]))
+
+
+def _rotated(system: LinearSystem, known: _Analysis) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Entries of R, row by row, and the head of Qᵀb."""
     pattern, n = system.pattern, system.pattern.shape[1]
     R, z, width = np.zeros(len(known.right) + n), np.zeros(n), n - known.dense
@@ -86,42 +89,28 @@ def _factorize(system: LinearSystem, known: _Analysis) -> tuple[NDArray[np.float
 def _analyze(pattern: Pattern, ordering: Ordering) -> _Analysis:
     """Order the columns, those of "colamd" by minimum degree in AᵀA, and find where R has entries."""
     n = pattern.shape[1]
-    start, others, _ = normal_equations.product_structure(pattern.row_start, pattern.columns, *pattern.by_column())
+    joined = pattern.products()
+    joined.setdiag(0.0)
+    joined.eliminate_zeros()
+    joined.sort_indices()
+    start, neighbors = joined.indptr.astype(np.int64), joined.indices.astype(np.int64)
     order = np.arange(n)
     if ordering == "colamd":
-        pairs = np.stack([np.repeat(order, np.diff(start)), others], axis=1)
+        pairs = np.stack(triu(joined).nonzero(), axis=1).astype(np.int64)
         order = analyze(BlockPattern(np.ones(n, np.int64), pairs)).order
-    start, neighbors = _neighbor_lists(start, others)
     parent = symbolic.elimination_tree(start, neighbors, order)
     begin, right = symbolic.column_structures(start, neighbors, order, parent)
     sparse = np.flatnonzero(np.diff(begin) < n - 1 - np.arange(n))
+    dense = int(sparse[-1]) + 1 if len(sparse) else 0
     place = np.empty(n, np.int64)
     place[order] = np.arange(n)
     rows = np.flatnonzero(np.diff(pattern.row_start))
     places = place[pattern.columns]
     first, last = (ends.reduceat(places, pattern.row_start[rows]) for ends in (np.minimum, np.maximum))
-    return _Analysis(
-        order,
-        place,
-        begin,
-        right,
-        parent,
-        int(sparse[-1]) + 1 if len(sparse) else 0,
-        rows[np.lexsort((-last, first))],
-    )
+    return _Analysis(order, place, begin, right, parent, dense, rows[np.lexsort((-last, first))])
 
 
-def _neighbor_lists(
-    start: NDArray[np.int64], others: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Every column's neighbors on either side, from those beyond it: (start (n + 1,), neighbors)."""
-    n = len(start) - 1
-    beyond = csr_matrix((np.ones(len(others), np.int8), others, start), shape=(n, n))
-    both = csr_matrix(beyond + beyond.T)
-    return both.indptr.astype(np.int64), both.indices.astype(np.int64)
-
-
-class SuiteSparseQrSolver:
+class SuiteSparseQrMethod:
     """Householder QR with the fronts of SuiteSparse; GPL, so never part of the default installation."""
 
     def __init__(self, ordering: Ordering) -> None:
@@ -132,20 +121,23 @@ class SuiteSparseQrSolver:
         self._rz = sparseqr.rz
         self._ordering: Ordering = ordering
 
-    def solve(self, system: LinearSystem) -> Solution:
-        """Solve in the least-squares sense; the factor is R."""
-        watch = Stopwatch()
-        A, n = coo_matrix(system.A), system.pattern.shape[1]
-        lengths = np.bincount(system.pattern.columns, system.values**2, n)
-        build_s = watch.lap()
-        z, R, permutation, rank = self._rz(A, system.b[:, None], ordering=_SPQR_ORDERINGS[self._ordering])
-        factor_s = watch.lap()
+    def build(self, system: LinearSystem) -> coo_matrix:
+        """A by triplets."""
+        return coo_matrix(system.A)
+
+    def factorize(self, system: LinearSystem, built: coo_matrix) -> Factored:
+        """R of A, and the head of Qᵀb."""
+        n = system.pattern.shape[1]
+        z, R, permutation, rank = self._rz(built, system.b[:, None], ordering=_SPQR_ORDERINGS[self._ordering])
+        if rank < n:
+            raise SingularMatrixError(rank, rank)
         order = np.asarray(permutation, np.int64) if self._ordering == "colamd" else np.arange(n)
         R = csc_matrix(R)
-        if rank < n or not np.all(np.abs(R.diagonal()) > LOST_DIGITS * np.sqrt(lengths[order])):
-            raise undetermined(system)
-        watch.lap()
-        x = np.empty(n)
-        x[order] = spsolve_triangular(R.tocsr(), np.asarray(z).reshape(-1)[:n], lower=False)
-        solve_s = watch.lap()
-        return Solution(x, build_s, factor_s, solve_s, lambda: Factor("R of A", R, order))
+        check_pivots(np.abs(R.diagonal()), _column_lengths(system)[order])
+
+        def solve() -> NDArray[np.float64]:
+            x = np.empty(n)
+            x[order] = spsolve_triangular(R.tocsr(), np.asarray(z).reshape(-1)[:n], lower=False)
+            return x
+
+        return Factored(solve, lambda: Factor("R of A", R, order))

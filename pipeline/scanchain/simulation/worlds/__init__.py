@@ -1,1 +1,72 @@
-"""The worlds that can be simulated."""
+"""The worlds that can be driven through, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from scanchain.data import Matrix
+from scanchain.simulation.motion import Motion, Pivot, Vehicle, begun_at, laps, pivots
+from scanchain.simulation.solids import Solids
+from scanchain.simulation.worlds import indoor, outdoor
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """A world, the route through it, the vehicle, and the default lidar and duration.
+
+    Attributes
+    ----------
+    build : draws the place
+    route : the closed route driven, (W, 2) along the ground or (W, 3) at heights of its own, or turns and moves
+    sight_m : how far any lidar sees there
+    dropouts : places (x, y) in meters; for 1 s around the moment they are first passed, the log lacks its scans
+    """
+
+    build: Callable[[np.random.Generator], Solids]
+    route: Matrix | tuple[Pivot, ...]
+    vehicle: Vehicle
+    sensor: str
+    duration_s: float
+    sight_m: float = np.inf
+    dropouts: tuple[tuple[float, float], ...] = ()
+
+    def motion(
+        self,
+        solids: Solids,
+        *,
+        duration_s: float,
+        rng: np.random.Generator,
+        reverse: bool = False,
+        start_m: float = 0.0,
+    ) -> Motion:
+        """The drive; ``rng`` draws its deviations and its sway.
+
+        reverse : drive the route the other way round; start_m : begin so far along it
+        """
+        if isinstance(self.route, tuple):
+            return pivots(self.route, self.vehicle, solids, duration_s=duration_s, rng=rng)
+        route = begun_at(self.route[::-1] if reverse else self.route, start_m)
+        return laps(route, self.vehicle, solids, duration_s=duration_s, rng=rng)
+
+
+_GAPS = ((0.0, 40.0), (25.0, 0.0))  # a crossing that is turned at, the middle of a street
+
+WORLDS: dict[str, World] = {
+    "office": World(indoor.office, indoor.OFFICE_ROUTE, indoor.OFFICE_ROBOT, "lms-270", 240.0),
+    "town": World(outdoor.town, outdoor.TOWN_ROUTE, outdoor.TOWN_CAR, "hdl-64", 60.0),
+    "rounds": World(outdoor.rounds, outdoor.ROUNDS_ROUTE, outdoor.ROUNDS_CAR, "hdl-64", 160.0),
+    "identical": World(indoor.identical, indoor.IDENTICAL_ROUTE, indoor.OFFICE_ROBOT, "lms-270", 300.0),
+    "highway": World(outdoor.highway, outdoor.HIGHWAY_ROUTE, outdoor.HIGHWAY_CAR, "hdl-64", 30.0),
+    "corridor": World(
+        indoor.corridor, indoor.CORRIDOR_ROUTE, indoor.CORRIDOR_ROBOT, "os1-32", 40.0, indoor.CORRIDOR_SIGHT_M
+    ),
+    "field": World(outdoor.field, outdoor.FIELD_ROUTE, outdoor.TRACTOR, "hdl-64", 40.0, outdoor.FIELD_SIGHT_M),
+    "forest": World(outdoor.forest, outdoor.FOREST_ROUTE, outdoor.MULE, "os1-32", 30.0),
+    "staircase": World(indoor.staircase, indoor.STAIRCASE_ROUTE, indoor.WALKER, "os1-32", 40.0),
+    "hall": World(indoor.hall, indoor.HALL_ROUTE, indoor.TRUCK, "vlp-16", 25.0),
+    "turns": World(outdoor.yard, outdoor.YARD_STEPS, outdoor.YARD_ROBOT, "os1-32", 40.0),
+    "gap": World(outdoor.town, outdoor.TOWN_ROUTE, outdoor.TOWN_CAR, "hdl-64", 30.0, dropouts=_GAPS),
+}

@@ -11,8 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from scanchain.data import Matrix
-from scanchain.simulation.motion import Vehicle, mount
-from scanchain.simulation.routes import sampled
+from scanchain.simulation.motion import Vehicle, mount, sampled
 from scanchain.simulation.solids import Scenery, Solids
 from scanchain.simulation.worlds.interior import CEILING_M, Furnisher, Room, Wall, build_wall
 
@@ -20,16 +19,9 @@ from scanchain.simulation.worlds.interior import CEILING_M, Furnisher, Room, Wal
 
 _OFFICE_WIDTH_M, _OFFICE_DEPTH_M = 26.0, 18.0
 OFFICE_ROBOT = Vehicle(
-    speed_m_s=1.0,
-    acceleration_m_s2=0.5,
-    lateral_acceleration_m_s2=0.5,
-    corner_m=0.6,
-    deviation_m=0.05,
-    sway_rad=0.0,
-    heave_m=0.0,
-    radius_m=0.25,
-    T_base_lidar=mount(0.15, 0.25),
-)
+    speed_m_s=1.0, acceleration_m_s2=0.5, lateral_acceleration_m_s2=0.5, corner_m=0.6, deviation_m=0.05,
+    radius_m=0.25, T_base_lidar=mount(0.15, 0.25),
+)  # fmt: skip
 
 # Round the ring by two rooms; then again, across the core, and by two more rooms.
 OFFICE_ROUTE = np.array([
@@ -170,16 +162,9 @@ _CORRIDOR_HALF_M, _CORRIDOR_HEIGHT_M, _CORRIDOR_WALL_M = 1.5, 2.7, 0.3
 _LOBBY_M, _LOBBY_HALF_M = 9.0, 4.5
 
 CORRIDOR_ROBOT = Vehicle(
-    speed_m_s=2.5,
-    acceleration_m_s2=0.8,
-    lateral_acceleration_m_s2=0.8,
-    corner_m=0.7,
-    deviation_m=0.08,
-    sway_rad=0.004,
-    heave_m=0.004,
-    radius_m=0.35,
-    T_base_lidar=mount(0.1, 0.9),
-)
+    speed_m_s=2.5, acceleration_m_s2=0.8, lateral_acceleration_m_s2=0.8, corner_m=0.7, deviation_m=0.08,
+    sway_rad=0.004, heave_m=0.004, radius_m=0.35, T_base_lidar=mount(0.1, 0.9),
+)  # fmt: skip
 
 # To the other lobby on the right, round in it, and back.
 CORRIDOR_ROUTE = np.array([
@@ -243,17 +228,9 @@ _HALL_LENGTH_M, _HALL_WIDTH_M, _HALL_HEIGHT_M, _HALL_WALL_M = 60.0, 40.0, 9.0, 0
 _PILLARS = ((15.0, 20.0), (30.0, 20.0), (45.0, 20.0))
 
 TRUCK = Vehicle(
-    speed_m_s=5.0,
-    acceleration_m_s2=5.0,
-    lateral_acceleration_m_s2=4.0,
-    corner_m=6.5,
-    deviation_m=0.3,
-    sway_rad=0.0,
-    heave_m=0.0,
-    radius_m=0.7,
-    T_base_lidar=mount(0.4, 1.3),
-    standstill_s=2.0,
-)
+    speed_m_s=5.0, acceleration_m_s2=5.0, lateral_acceleration_m_s2=4.0, corner_m=6.5, deviation_m=0.3,
+    radius_m=0.7, T_base_lidar=mount(0.4, 1.3), standstill_s=2.0,
+)  # fmt: skip
 
 HALL_ROUTE = np.array([[12.0, 9.0], [51.0, 9.0], [51.0, 31.0], [9.0, 31.0], [9.0, 9.0]])
 
@@ -295,18 +272,9 @@ _TOP_M = _FLIGHTS * _FLIGHT_M
 _ROOF_M = _TOP_M + 2.8
 
 WALKER = Vehicle(
-    speed_m_s=0.8,
-    acceleration_m_s2=0.8,
-    lateral_acceleration_m_s2=0.5,
-    corner_m=0.3,
-    deviation_m=0.05,
-    sway_rad=0.05,
-    heave_m=0.03,
-    radius_m=0.3,
-    T_base_lidar=mount(0.3, 1.4),
-    swing_rad=0.08,
-    swing_m=0.03,
-)
+    speed_m_s=0.8, acceleration_m_s2=0.8, lateral_acceleration_m_s2=0.5, corner_m=0.3, deviation_m=0.05,
+    sway_rad=0.05, heave_m=0.03, radius_m=0.3, T_base_lidar=mount(0.3, 1.4), swing_rad=0.08, swing_m=0.03,
+)  # fmt: skip
 
 
 def _staircase_route() -> Matrix:

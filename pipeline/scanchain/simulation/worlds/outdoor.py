@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.data import Matrix
-from scanchain.simulation.motion import Vehicle, mount
-from scanchain.simulation.routes import Lap, Pivot, sampled
+from scanchain.simulation.motion import Lap, Pivot, Vehicle, mount, sampled
 from scanchain.simulation.solids import Scenery, Solids
 
 BELOW_M = -1.0  # foundations reach this deep, so that nothing floats on a slope
@@ -57,16 +56,9 @@ _STREETS_Y_M = (-40.0, 0.0, 40.0, 80.0)  # and east
 _KERB_M, _PARKED_M, _LAMP_M, _TREE_M, _FRONT_M = 4.0, 3.1, 4.7, 5.2, 7.0  # from the middle of the street
 
 TOWN_CAR = Vehicle(
-    speed_m_s=9.0,
-    acceleration_m_s2=2.5,
-    lateral_acceleration_m_s2=4.0,
-    corner_m=7.0,
-    deviation_m=0.4,
-    sway_rad=0.006,
-    heave_m=0.015,
-    radius_m=1.0,
-    T_base_lidar=mount(0.8, 1.73),
-)
+    speed_m_s=9.0, acceleration_m_s2=2.5, lateral_acceleration_m_s2=4.0, corner_m=7.0, deviation_m=0.4,
+    sway_rad=0.006, heave_m=0.015, radius_m=1.0, T_base_lidar=mount(0.8, 1.73),
+)  # fmt: skip
 
 # A figure of eight round two blocks; the street between them is driven northwards on both loops.
 TOWN_ROUTE = np.array([
@@ -242,17 +234,9 @@ _MEDIAN_M, _EDGE_M, _FAR_EDGE_M = 6.5, -4.5, 17.5  # rails, to the left of the l
 _PANEL_M = 4.0  # of a rail, between two posts
 
 HIGHWAY_CAR = Vehicle(
-    speed_m_s=25.0,
-    acceleration_m_s2=3.0,
-    lateral_acceleration_m_s2=3.0,
-    corner_m=15.0,
-    deviation_m=0.3,
-    sway_rad=0.006,
-    heave_m=0.02,
-    radius_m=1.0,
-    T_base_lidar=mount(0.8, 1.73),
-    start_m_s=25.0,
-)
+    speed_m_s=25.0, acceleration_m_s2=3.0, lateral_acceleration_m_s2=3.0, corner_m=15.0, deviation_m=0.3,
+    sway_rad=0.006, heave_m=0.02, radius_m=1.0, T_base_lidar=mount(0.8, 1.73), start_m_s=25.0,
+)  # fmt: skip
 
 
 def _stadium() -> Matrix:
@@ -333,16 +317,9 @@ _FIELD_LONG_M, _FIELD_SHORT_M = 440.0, 160.0
 _POLES = ((30.0, 0.0), (260.0, 0.0), (425.0, 0.0), (300.0, _FIELD_SHORT_M), (70.0, _FIELD_SHORT_M))
 
 TRACTOR = Vehicle(
-    speed_m_s=10.0,
-    acceleration_m_s2=2.0,
-    lateral_acceleration_m_s2=3.0,
-    corner_m=12.0,
-    deviation_m=0.4,
-    sway_rad=0.008,
-    heave_m=0.02,
-    radius_m=1.2,
-    T_base_lidar=mount(0.8, 1.9),
-)
+    speed_m_s=10.0, acceleration_m_s2=2.0, lateral_acceleration_m_s2=3.0, corner_m=12.0, deviation_m=0.4,
+    sway_rad=0.008, heave_m=0.02, radius_m=1.2, T_base_lidar=mount(0.8, 1.9),
+)  # fmt: skip
 
 FIELD_ROUTE = np.array([[0.0, 0.0], [_FIELD_LONG_M, 0.0], [_FIELD_LONG_M, _FIELD_SHORT_M], [0.0, _FIELD_SHORT_M]])
 
@@ -364,17 +341,9 @@ _PATH_FREE_M = 1.6  # kept free beside the route
 _WAVES = 4
 
 MULE = Vehicle(
-    speed_m_s=2.5,
-    acceleration_m_s2=1.0,
-    lateral_acceleration_m_s2=1.2,
-    corner_m=2.5,
-    deviation_m=0.25,
-    sway_rad=0.025,
-    heave_m=0.03,
-    radius_m=0.6,
-    T_base_lidar=mount(0.3, 1.1),
-    swing_rad=0.02,
-)
+    speed_m_s=2.5, acceleration_m_s2=1.0, lateral_acceleration_m_s2=1.2, corner_m=2.5, deviation_m=0.25,
+    sway_rad=0.025, heave_m=0.03, radius_m=0.6, T_base_lidar=mount(0.3, 1.1), swing_rad=0.02,
+)  # fmt: skip
 
 FOREST_ROUTE = np.array([
     [0.0, 0.0], [16.0, 3.0], [26.0, -6.0], [40.0, 0.0], [44.0, 14.0], [32.0, 22.0], [34.0, 34.0], [16.0, 36.0],
@@ -442,16 +411,9 @@ def _undergrowth(scenery: Scenery, place: NDArray[np.float64], room: float, rng:
 _YARD_X_M, _YARD_Y_M = 19.0, 15.0
 
 YARD_ROBOT = Vehicle(
-    speed_m_s=1.5,
-    acceleration_m_s2=1.5,
-    lateral_acceleration_m_s2=1.0,
-    corner_m=0.0,
-    deviation_m=0.0,
-    sway_rad=0.006,
-    heave_m=0.004,
-    radius_m=0.4,
-    T_base_lidar=mount(0.15, 0.9),
-)
+    speed_m_s=1.5, acceleration_m_s2=1.5, lateral_acceleration_m_s2=1.0, sway_rad=0.006, heave_m=0.004,
+    radius_m=0.4, T_base_lidar=mount(0.15, 0.9),
+)  # fmt: skip
 
 # A triangle, a square in the other direction, there and back, once round on the spot and once back; it closes.
 YARD_STEPS = (
