@@ -55,7 +55,7 @@ def score(result: SlamResult, truth: Trajectory) -> Score:
     )
     true_poses = truth.poses[[keyframe.scan_index for keyframe in result.keyframes]]
     judged = final_verdicts(result.closures, result.state)
-    closures = [item.closure for item in judged if item.verdict is ClosureVerdict.ACCEPTED]
+    closures = [item for item in judged if item.verdict is ClosureVerdict.ACCEPTED]
     false = 0
     for closure in closures:
         T_true = lie.inverse(true_poses[closure.target]) @ true_poses[closure.source]

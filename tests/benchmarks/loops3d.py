@@ -27,10 +27,10 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import LogConfig
-from scanchain.data import ClosureVerdict, Keyframe, Matrix, Proposal, Trajectory
+from scanchain.data import BACK_END, Closure, ClosureVerdict, Keyframe, Matrix, Proposal, Trajectory
 from scanchain.evaluation import absolute_error, pair
 from scanchain.logs import open_log
-from scanchain.runs.closures import FinalClosure, final_verdicts
+from scanchain.runs.closures import final_verdicts
 from scanchain.settings import load_settings
 from tests.benchmarks.contest import in_fresh_process
 from tests.benchmarks.odometry3d_set import CACHE, LIDARS, log_of
@@ -73,9 +73,12 @@ def score(path: Path, error_per_m: NDArray[np.float64], false_share: float) -> S
     wrong = false_closures(slam, false_share) if false_share else ()
     slam.placement.take(wrong)
     result = slam.finish()
-    everything = final_verdicts(result.closures, result.state)
-    judged = [item for item in everything if item.closure.reason != MADE_UP]
-    named = [item.verdict is ClosureVerdict.REJECTED for item in everything if item.closure.reason == MADE_UP]
+    judged, named = [], []
+    for tried, item in zip(result.closures, final_verdicts(result.closures, result.state), strict=True):
+        if tried.reason == MADE_UP:
+            named.append(item.verdict is ClosureVerdict.REJECTED)
+        else:
+            judged.append(item)
     accepted = [item for item in judged if item.verdict is ClosureVerdict.ACCEPTED]
     true_poses = _true_poses(result.keyframes, truth)
     revisit, opposite = revisits(true_poses, _traveled_m(true_poses))
@@ -87,9 +90,9 @@ def score(path: Path, error_per_m: NDArray[np.float64], false_share: float) -> S
         recall=_mean(found[revisit]),
         opposite_recall=_mean(found[opposite]),
         accepted=len(accepted),
-        by_place=sum(item.closure.proposed_by is Proposal.PLACE for item in accepted),
+        by_place=sum(item.proposed_by is Proposal.PLACE for item in accepted),
         precision=_mean(np.array(true)),
-        rejected_in_the_end=sum(item.verdict is not item.closure.verdict for item in judged),
+        rejected_in_the_end=sum(item.rejected_by == BACK_END for item in judged),
         named=_mean(np.array(named)),
         ate_before_m=_ate_m(result.odometry, truth),
         ate_after_m=_ate_m(result.trajectory, truth),
@@ -109,16 +112,15 @@ def revisits(poses: Matrix, traveled_m: NDArray[np.float64]) -> tuple[NDArray[np
     return revisit, opposite
 
 
-def is_true(item: FinalClosure, poses: Matrix) -> bool:
+def is_true(closure: Closure, poses: Matrix) -> bool:
     """Whether a closure says what the truth says."""
-    closure = item.closure
     truth = lie.inverse(poses[closure.target]) @ poses[closure.source]
     error = lie.inverse(truth) @ closure.match.T_target_source
     return bool(np.linalg.norm(error[:3, 3]) <= TRUE_M) and float(lie.rotation_angle(error)) <= TRUE_RAD
 
 
-def _found(accepted: list[FinalClosure], traveled_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-    sources = traveled_m[[item.closure.source for item in accepted]]
+def _found(accepted: list[Closure], traveled_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+    sources = traveled_m[[item.source for item in accepted]]
     return np.any(np.abs(traveled_m[:, None] - sources) <= ALONG_M, axis=1)
 
 

@@ -459,7 +459,7 @@ def test_a_table_holds_the_figures_of_the_steps():
         table.append(step)
     columns = table.columns
     assert len(table) == 20 and columns["has_wheels"].tolist() == [k == 9 for k in range(20)]
-    assert table.texts(columns["reason"]).to_pylist() == [step.reason for step in steps]
+    assert table.texts("reason").to_pylist() == [step.reason for step in steps]
     np.testing.assert_array_equal(columns["T_odom_base"][9], T_odom_base)
     np.testing.assert_array_equal(columns["information"], [step.match.information for step in steps])
     np.testing.assert_array_equal(columns["timing"][:, 2], [step.timing.match_s for step in steps])

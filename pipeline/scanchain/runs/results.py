@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import Config, MapsConfig
-from scanchain.data import Keyframe, Matrix, Points, Pose, Trajectory
+from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import ExpectedErrors, expected_errors
 from scanchain.graph.g2o import rejected_path, write_g2o
@@ -38,7 +38,7 @@ from scanchain.maps import (
     write_ply,
     write_saved_map,
 )
-from scanchain.runs.closures import FinalClosure, write_closures
+from scanchain.runs.closures import write_closures
 from scanchain.runs.job import Recorder
 from scanchain.runs.results_mcap import write_results_mcap
 from scanchain.runs.step_table import StepTable
@@ -69,7 +69,7 @@ class Results:
     config: Config
     steps: StepTable
     result: SlamResult
-    final: tuple[FinalClosure, ...]
+    final: tuple[Closure, ...]
     drawn: Future[Cloud]
     grid: OccupancyGrid
     expected: ExpectedErrors | None
@@ -161,7 +161,7 @@ OUTPUTS = (  # a new format: a function of path and Results in a file of its own
 
 
 def results_of(
-    log: Log, config: Config, steps: StepTable, result: SlamResult, final: tuple[FinalClosure, ...]
+    log: Log, config: Config, steps: StepTable, result: SlamResult, final: tuple[Closure, ...]
 ) -> Results:
     """The results of a log with the maps made from its keyframes."""
     beside = ThreadPoolExecutor(1, thread_name_prefix="scanchain-cloud")

@@ -214,9 +214,8 @@ def find_left(out: Path, config: Config) -> Checkpoint | None:
 
 def after(left: Checkpoint, scans: Generator[Scan, None, None]) -> Generator[Scan, None, None]:
     """The scans that follow those already done. Raises InputError where these were not the same."""
-    for index, *known in left.steps.columns[
-        ["index", "stamp_ns", "log_time_ns", "scan_points", "dropped"]
-    ].tolist():
+    names = ("index", "stamp_ns", "log_time_ns", "scan_points", "dropped")
+    for index, *known in zip(*(left.steps.columns[name].tolist() for name in names), strict=True):
         scan = next(scans, None)
         if scan is None or [scan.stamp_ns, scan.log_time_ns, len(scan.points), scan.dropped] != known:
             raise InputError(f"{left.folder}: scan {index} of the log is not the one that was run; {_REMEDY}")

@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.data import Matrix, Proposal, State, Trajectory
+from scanchain.data import VERIFICATION, Matrix, Proposal, State, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import ExpectedError
-from scanchain.runs.closures import VERIFICATION
 from scanchain.runs.metrics import METRICS_FILE
 from scanchain.verdict import (
     KNOWN,

@@ -11,12 +11,11 @@ import msgspec
 
 from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.config import Config
-from scanchain.data import REJECTED_WEIGHT, ClosureVerdict, brief
+from scanchain.data import REJECTED_WEIGHT, Closure, ClosureVerdict, brief
 from scanchain.errors import InputError, ScanchainError, counted
 from scanchain.files import write_whole
 from scanchain.graph.optimization import fit
 from scanchain.maps import SavedMap, Session, open_saved_map
-from scanchain.runs.closures import FinalClosure
 from scanchain.runs.directory import RUN_FILE, RunDirectory
 from scanchain.runs.job import Progress
 from scanchain.runs.provenance import Hashing, describe_start
@@ -233,7 +232,7 @@ def _changed_text(name: str, share: float) -> str:
 
 
 def _measured(
-    merged: MergedMap, cloud: Cloud, final: Sequence[FinalClosure], config: Config, held: int
+    merged: MergedMap, cloud: Cloud, final: Sequence[Closure], config: Config, held: int
 ) -> MergeMetrics:
     """The metrics of a map but for what joined it."""
     graph = graph_of(merged.joined, held)

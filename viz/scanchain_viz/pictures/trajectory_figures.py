@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup
 from scipy.special import gammaincinv
 
-from scanchain.runs.closures import BACK_END, VERIFICATION
+from scanchain.data import BACK_END, VERIFICATION
 from scanchain_viz.colors import hex_of
 from scanchain_viz.pictures.axis import Axis
 from scanchain_viz.pictures.figure import INK, Floats, Plot, palette_of

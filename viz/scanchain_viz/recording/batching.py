@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from time import perf_counter
 
 import msgspec
@@ -13,7 +14,7 @@ import rerun as rr
 
 from scanchain import lie
 from scanchain.data import Closure, ClosureVerdict, GraphState, Match, Matrix, State, Step
-from scanchain.runs.closures import FinalClosure, final_verdicts
+from scanchain.runs.closures import final_verdicts
 from scanchain.runs.step_table import StepTable
 from scanchain_viz.recording import drawing, entities
 from scanchain_viz.recording.drawing import Floats, Message, Times
@@ -40,7 +41,8 @@ class KeyframeGraph:
 
     def __init__(self) -> None:
         self.positions: list[Floats] = []
-        self.closures: list[FinalClosure] = []
+        self.tried: list[Closure] = []  # with the verdicts of the matcher alone
+        self.closures: list[Closure] = []
         self.graph: GraphState | None = None
         self.counts = (0, 0)
         self.drawn = 0
@@ -53,14 +55,14 @@ class KeyframeGraph:
             self.is_current = False
         events: list[str] = []
         if step.closures:
-            found = [FinalClosure(c, c.verdict, c.cause, c.reason, 1.0, math.nan) for c in step.closures]
-            events += self._update([*self.closures, *found])  # verdicts of the matcher alone
+            self.tried += step.closures
+            events += self._update([*self.closures, *(replace(each, weight=1.0) for each in step.closures)])
         if step.graph is not None:
             self.graph = step.graph
-            events += self._update(final_verdicts([item.closure for item in self.closures], step.graph))
+            events += self._update(final_verdicts(self.tried, step.graph))
         return Verdicts(events, *self.counts)
 
-    def settle(self, closures: Sequence[FinalClosure], graph: GraphState) -> Verdicts:
+    def settle(self, closures: Sequence[Closure], graph: GraphState) -> Verdicts:
         """Take in the final graph with every closure tried."""
         self.graph = graph
         self.is_current = False
@@ -68,7 +70,7 @@ class KeyframeGraph:
 
     def restore(self, steps: StepTable, closures: Sequence[Closure], graph: GraphState) -> Verdicts:
         """Restore the state after these steps from the closures and the graph at that time."""
-        self.graph = graph
+        self.graph, self.tried = graph, list(closures)
         self._update(final_verdicts(closures, graph))
         for position in drawing.positions(steps.columns["T_world_lidar"][steps.columns["keyframe"] >= 0]):
             self.positions.append(position)
@@ -99,22 +101,22 @@ class KeyframeGraph:
             Message(entities.REJECTED, drawing.lines(_edges(nodes, rejected)), times),
         ]
 
-    def _update(self, closures: Sequence[FinalClosure]) -> list[str]:
+    def _update(self, closures: Sequence[Closure]) -> list[str]:
         """Store the verdicts; a line for each new one, the number being the closure's row in loops.parquet."""
         before = [item.verdict for item in self.closures]
         self.closures = list(closures)
         counts = Counter(item.verdict for item in closures)
         self.counts = (counts[ClosureVerdict.ACCEPTED], counts[ClosureVerdict.REJECTED])
         return [
-            f"closure {number} ({item.closure.target} to {item.closure.source}) {item.verdict}: {item.reason}"
+            f"closure {number} ({item.target} to {item.source}) {item.verdict}: {item.reason}"
             for number, item in enumerate(closures)
             if number >= len(before) or item.verdict is not before[number]
         ]
 
 
-def _edges(nodes: Floats, closures: list[FinalClosure]) -> Floats:
+def _edges(nodes: Floats, closures: list[Closure]) -> Floats:
     """Line strips (E, 2, 3) between the keyframes of closures."""
-    pairs = np.array([(item.closure.target, item.closure.source) for item in closures], np.int64).reshape(-1, 2)
+    pairs = np.array([(item.target, item.source) for item in closures], np.int64).reshape(-1, 2)
     return nodes[pairs]
 
 
@@ -188,7 +190,7 @@ class Batcher:
             *self._states(steps, verdicts, times),
         ]
 
-    def settled(self, closures: Sequence[FinalClosure], graph: GraphState, times: Times) -> list[Message]:
+    def settled(self, closures: Sequence[Closure], graph: GraphState, times: Times) -> list[Message]:
         """All that is left, and the final verdicts at ``times``, of the last step; their numbers in any case."""
         messages, verdicts, self.closures = self.messages(), self.graph.settle(closures, graph), None
         told = events([[(_INFORMATION, text) for text in verdicts.events]], times)

@@ -19,7 +19,6 @@ from rerun.error_utils import catch_and_log_exceptions
 from scanchain.config import RecordingConfig
 from scanchain.data import Closure, GraphState, Matrix, Scan, Step, Trajectory
 from scanchain.errors import InputError
-from scanchain.runs.closures import FinalClosure
 from scanchain.runs.job import SinkName
 from scanchain.runs.step_table import StepTable
 from scanchain.verdict import Judged, Kind, Stretch
@@ -140,7 +139,7 @@ class Recording:
         """Record the optimized trajectory: poses (N, d+1, d+1) of the scans ``indices``."""
         self._send(lambda: self._trajectory(Times(indices, stamps_ns), poses_optimized))
 
-    def log_closures(self, closures: Sequence[FinalClosure], graph: GraphState) -> None:
+    def log_closures(self, closures: Sequence[Closure], graph: GraphState) -> None:
         """Record the final graph and the final verdict on every closure, at the last scan."""
         self._send(lambda: self.batcher.settled(closures, graph, self.now))
 

@@ -14,9 +14,8 @@ import pyarrow.parquet as pq
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from scanchain.data import Points, State
+from scanchain.data import BACK_END, Points, State
 from scanchain.errors import counted
-from scanchain.runs.closures import BACK_END
 from scanchain.verdict import Kind, Stretch
 from scanchain_viz.colors import STRETCH_COLORS
 from scanchain_viz.pictures import trajectory_figures as figures
