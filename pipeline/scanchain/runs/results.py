@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -165,12 +165,12 @@ def results_of(
 ) -> Results:
     """The results of a log with the maps made from its keyframes."""
     beside = ThreadPoolExecutor(1, thread_name_prefix="scanchain-cloud")
-    drawn = beside.submit(cloud_of, result, config)
+    drawn = beside.submit(cloud_of, result.keyframes, result.T_world_keyframes, config)
     beside.shutdown(wait=False)
     T_world_level = lie.identity(log.dimension)
     if log.dimension == 3:
         T_world_level = level_of(result.keyframes, result.T_world_keyframes, config.local_map)
-    grid = grid_of(result, config.maps, lie.inverse(T_world_level))
+    grid = grid_of(result.keyframes, lie.inverse(T_world_level) @ result.T_world_keyframes, config.maps)
     return Results(log, config, steps, result, final, drawn, grid, expected_of(result, config), T_world_level)
 
 
@@ -210,41 +210,25 @@ def occupancy(grid: OccupancyGrid) -> NDArray[np.int8]:
     return np.where(grid.drawn > 0, np.rint(100.0 * grid.probability()), -1.0).astype(np.int8)
 
 
-class Posed(Protocol):
-    """Keyframes and their final poses, (K, d+1, d+1)."""
-
-    @property
-    def keyframes(self) -> Sequence[Keyframe]:
-        """In order."""
-        ...
-
-    @property
-    def T_world_keyframes(self) -> Matrix:
-        """Their poses."""
-        ...
-
-
-def cloud_of(result: Posed, config: Config) -> Cloud:
-    """The cloud of all keyframes, without moving objects if so configured."""
-    dimension = result.T_world_keyframes.shape[-1] - 1
-    scans = zip(result.T_world_keyframes, (keyframe.points for keyframe in result.keyframes), strict=True)
-    built = build_point_map(scans, dimension=dimension, voxel_size_m=config.maps.voxel_size_m)
+def cloud_of(keyframes: Sequence[Keyframe], poses: Matrix, config: Config) -> Cloud:
+    """The cloud of keyframes at their final poses (K, d+1, d+1), without moving objects if so configured."""
+    scans = ((T, keyframe.points) for T, keyframe in zip(poses, keyframes, strict=True))
+    built = build_point_map(scans, dimension=poses.shape[-1] - 1, voxel_size_m=config.maps.voxel_size_m)
     points = built.points()
     if not config.maps.remove_moving:
         return Cloud(points, 0)
     views = (
-        View(pose, keyframe.points, keyframe.scale * config.preprocess.map_voxel_m)
-        for pose, keyframe in zip(result.T_world_keyframes, result.keyframes, strict=True)
+        View(T, keyframe.points, keyframe.scale * config.preprocess.map_voxel_m)
+        for T, keyframe in zip(poses, keyframes, strict=True)
     )
     gone = moved(points, built.voxel_size_m, views)
     return Cloud(points[~gone], int(gone.sum()))
 
 
-def grid_of(result: Posed, config: MapsConfig, T_grid_world: Pose | None = None) -> OccupancyGrid:
-    """The grid of all keyframes, in a frame or the world, coarser than configured where that is too large."""
-    poses = result.T_world_keyframes if T_grid_world is None else T_grid_world @ result.T_world_keyframes
+def grid_of(keyframes: Sequence[Keyframe], poses: Matrix, config: MapsConfig) -> OccupancyGrid:
+    """The grid of keyframes at poses (K, d+1, d+1), coarser than configured where that is too large."""
     max_range_m = config.grid_max_range_m
     resolution_m = fitting_resolution(poses, resolution_m=config.grid_resolution_m, max_range_m=max_range_m)
     fitting = msgspec.structs.replace(config, grid_resolution_m=resolution_m)
-    scans = ((pose, keyframe.points) for pose, keyframe in zip(poses, result.keyframes, strict=True))
+    scans = ((T, keyframe.points) for T, keyframe in zip(poses, keyframes, strict=True))
     return draw_grid(scans, fitting, max_range_m=max_range_m)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, suppress
 from dataclasses import dataclass
@@ -90,26 +91,20 @@ def run(
 
     Raises InputError for bad input, which leaves nothing behind unless scans were processed before it was met.
     """
-    job.check_logs()
-    with Hashing(job.logs) as hashing:  # from the beginning on: while the log is opened a core is idle
-        this = _Run(job, progress)
-        with (
-            this.directory,
-            announcing_compilation(progress.say, ("scanchain.runs.warm_up", str(this.log.dimension))),
-        ):
-            this.provenance.write(this.directory.path / RUN_FILE)
-            write_whole(this.directory.path / "config.toml", dump(this.config).encode())
-            try:
-                slam, scans, checkpoints = this.begin()
-                with this.recording(record) as recording:
-                    result = this.process(slam, scans, checkpoints, recording)
-                    results, judged = this.write(result, recording)
-                    slam.points.close()
-                    held_s = this.hold(recording)
-                metrics, text = this.judge(results, judged, recording.warnings, held_s)
-                return this.complete(metrics, text, hashing, report)
-            except (Exception, KeyboardInterrupt) as error:
-                raise rescued(error, this.directory, this.steps, this.provenance) from error
+    this = _Run(job, progress)
+    compiling = announcing_compilation(progress.say, ("scanchain.runs.warm_up", str(this.log.dimension)))
+    with this.directory, compiling:
+        try:
+            slam, scans, checkpoints = this.begin()
+            with this.recording(record) as recording:
+                result = this.process(slam, scans, checkpoints, recording)
+                results, judged = this.write(result, recording)
+                slam.points.close()
+                held_s = this.hold(recording)
+            metrics, text = this.judge(results, judged, recording.warnings, held_s)
+            return this.complete(metrics, text, report)
+        except (Exception, KeyboardInterrupt) as error:
+            raise rescued(error, this.directory, this.steps, this.provenance) from error
 
 
 class _Run:
@@ -118,13 +113,13 @@ class _Run:
     def __init__(self, job: Job, progress: Progress) -> None:
         """Open the log, and what a stopped run left. Raises InputError where either does not fit the job."""
         self.began_s, self.compiled_before_s = working_s(), compiled_s()
+        self.hashing = Hashing(job.logs)  # from the beginning on: while the log is opened a core is idle
         self.job, self.progress = job, progress
         self.log, settings, self.truth_file = opened(job)
         self.config, self.source = settings.config, settings.source
         self.left = find_left(job.out, self.config) if job.resume else None
         self.directory = RunDirectory(job.out, force=job.force, left=self.left and self.left.folder)
         log = self.log
-        _check_prior(log, self.config)
         progress.say(f"{log.topic}: {log.dimension}D, {counted(log.scan_count, 'scan')}; {self.source}")
         for gap in log.gaps:
             progress.announce(f"warning: {gap}")
@@ -145,15 +140,17 @@ class _Run:
             progress.announce(f"{names}: no checkpoint to resume from, this run starts over")
 
     def begin(self) -> tuple[Slam, Generator[Scan, None, None], Checkpoints]:
-        """SLAM, new or as of the checkpoint, the scans that follow, and the writer of checkpoints."""
+        """SLAM, new or as of the checkpoint, the scans that follow, and the writer of checkpoints.
+
+        The directory states from here on what is run in it.
+        """
         folder, every_s, left = self.directory.path, self.job.checkpoint_s, self.left
+        self.provenance.write(folder / RUN_FILE)
+        write_whole(folder / "config.toml", dump(self.config).encode())
         scans = self.log.scans(self.config.preprocess)
         if left is None:
-            return (
-                Slam(self.config, self.log.T_base_lidar, folder / POINTS_FILE),
-                scans,
-                Checkpoints(folder, every_s),
-            )
+            slam = Slam(self.config, self.log.T_base_lidar, folder / POINTS_FILE)
+            return slam, scans, Checkpoints(folder, every_s)
         left.slam.points.reopen(folder / POINTS_FILE)
         scans = after(left, scans)
         set_aside(folder, left)
@@ -248,12 +245,12 @@ class _Run:
             (folder / "summary.txt").write_text(text, encoding="utf-8")
         return metrics, text
 
-    def complete(self, metrics: Metrics, text: str, hashing: Hashing, report: Callable[[Path], None]) -> Finished:
+    def complete(self, metrics: Metrics, text: str, report: Callable[[Path], None]) -> Finished:
         """Add the report and give a complete run its name; a stopped one stays marked partial."""
         directory, stopped, warnings = self.directory, metrics.stopped, metrics.warnings
         if stopped:
             directory.worth_keeping()
-        made = self.provenance if stopped else self.provenance.hashed(hashing)
+        made = self.provenance if stopped else self.provenance.hashed(self.hashing)
         made = msgspec.structs.replace(
             made, complete=not stopped, stopped=stopped, duration_s=metrics.run_s + metrics.compile_s
         )
@@ -299,27 +296,29 @@ def few_at_once(scans: Iterator[Scan], resolution: Resolution) -> Iterator[Prepa
 
 
 def opened(job: Job) -> tuple[Log, Settings, TruthFile | None]:
-    """The log of a job, the settings for it, and the ground truth if a file is named. Raises InputError."""
+    """The log of a job, the settings for it, and the ground truth if a file is named.
+
+    Raises InputError for what does not fit together, before anything is processed.
+    """
+    for source, count in Counter(source.resolve() for source in job.logs).items():
+        if count > 1:
+            raise InputError(f"{source}: is named {count} times; name each file of a log once")
     truth_file = None if job.ground_truth is None else read_truth(job.ground_truth)
     early = load_settings(file=job.config_file, overrides=job.overrides)
     RunDirectory(job.out, force=job.force)  # refused before the log is read
     log = open_log(job.logs, early.config.log)
     settings = load_settings(log.dimension, file=job.config_file, overrides=job.overrides)
-    _check_truth(job, log, truth_file)
-    return log, settings, truth_file
-
-
-def _check_prior(log: Log, config: Config) -> None:
-    """Refuse a prior that the log does not have before anything is processed."""
-    if config.odometry.prior == "wheel" and not log.has_odometry:
+    if settings.config.odometry.prior == "wheel" and not log.has_odometry:
         raise InputError(
             f"{log.name}: odometry.prior is 'wheel', but the log has no wheel odometry that is known; "
             "set log.odometry_topic, or odometry.prior to 'auto'"
         )
+    _check_truth(job, log, truth_file)
+    return log, settings, truth_file
 
 
 def _check_truth(job: Job, log: Log, file: TruthFile | None) -> None:
-    """Refuse a ground truth that was named and has no time in common with the scans before they are processed."""
+    """Refuse a ground truth that was named and has no time in common with the scans."""
     if file is not None:
         file.check(log.expected_stamps(log.topic), log.scan_count)
         return

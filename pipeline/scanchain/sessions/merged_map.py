@@ -137,7 +137,7 @@ def write_merged(folder: Path, merged: MergedMap, cloud: Cloud, final: Sequence[
         write_tum(folder / f"{session.name}.tum", trajectory, force=True)
     write_ply(folder / "map.ply", cloud.points)
     if merged.joined.dimension == 2:
-        write_map(folder, grid_of(merged, config.maps))
+        write_map(folder, grid_of(keyframes, poses, config.maps))
     write_g2o(folder / GRAPH_FILE, graph_of(replace(merged.joined, edges=in_force)))
     write_closures(folder / "loops.parquet", final, merged.keyframes, merged.joined.dimension)
 

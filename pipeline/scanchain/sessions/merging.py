@@ -120,14 +120,14 @@ def merge(
     config, held, folders = settings.config, 0 if fixed else -1, [saved.folder for saved in maps]
     order = _canonical(maps, held)
     names = session_names(maps, order)
-    provenance = describe_start(command, folders, settings.source)
-    with directory, announcing_compilation(progress.say), Hashing(folders) as hashing:
+    provenance, hashing = describe_start(command, folders, settings.source), Hashing(folders)
+    with directory, announcing_compilation(progress.say):
         firsts = [names[number, 0] for number in range(len(maps))]
         groups, uncertain = join_all(maps, order, firsts, config, held, progress.say)
         joined = _chosen(groups, held, maps, uncertain)
         progress.say(f"making the map of {counted(len(joined.keyframes), 'keyframe')}")
         merged = merged_map(joined, maps, names, config, first=min(joined.maps), held=held, update=update)
-        cloud, final = cloud_of(merged, config), final_closures(merged)
+        cloud, final = cloud_of(merged.keyframes, merged.T_world_keyframes, config), final_closures(merged)
         write_merged(directory.path, merged, cloud, final, config)
         apart = tuple(
             tuple(names[number, k] for number in group.maps for k in range(len(maps[number].sessions)))
