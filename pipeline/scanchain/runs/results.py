@@ -1,13 +1,12 @@
-"""Results of a run: the table of its output files and their writers, and the maps made from the keyframes."""
+"""Results of a run: its output files, and the maps made from the keyframes."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -92,34 +91,6 @@ class Results:
         )
 
 
-class Output(NamedTuple):
-    """A file of a run directory: name, writer, and the condition on the configuration."""
-
-    file: str
-    write: Callable[[Path, Results], None]
-    is_wanted: Callable[[Config], bool] = lambda config: True
-
-
-def _write_graph(path: Path, results: Results) -> None:
-    graph = results.result.graph
-    write_g2o(path, graph)
-    if graph.is_rejected.any():
-        write_g2o(rejected_path(path), graph, edges="rejected")
-
-
-def _write_keyframes(path: Path, results: Results) -> None:
-    """Poses and covariances of the keyframes, where these are known."""
-    if results.expected is not None:
-        write_wide_tum(path, results.result.keyframe_trajectory, results.expected.covariances)
-
-
-def _write_base(path: Path, results: Results) -> None:
-    """The robot's trajectory, in the frame of the lidar's; none where the log does not state the mounting."""
-    log, trajectory = results.log, results.result.trajectory
-    if log.mounting.base and log.mounting.motion is None:
-        write_tum(path, Trajectory(trajectory.stamps_ns, trajectory.poses @ lie.inverse(log.T_base_lidar)))
-
-
 def _write_saved_map(path: Path, results: Results) -> None:
     """The map of the largest piece of the log."""
     result, graph = results.result, results.result.graph
@@ -133,31 +104,6 @@ def _write_saved_map(path: Path, results: Results) -> None:
     write_saved_map(path, keyframes, result.T_world_keyframes[chosen], numbers, (session,), in_force)
     if results.config.loops.enabled and graph.dimension == 3:
         outline_of(path, open_saved_map(path).keyframes, results.config.local_map)
-
-
-OUTPUTS = (  # a new format: a function of path and Results in a file of its own, and a line here
-    Output("trajectory.tum", lambda path, r: write_tum(path, r.result.trajectory)),
-    Output("keyframes.tum", _write_keyframes),
-    Output("trajectory_base.tum", _write_base),
-    Output("odometry.tum", lambda path, r: write_tum(path, r.result.odometry)),
-    Output("trajectory.kitti.txt", lambda path, r: write_kitti(path, r.result.trajectory)),
-    Output(GRAPH_FILE, _write_graph),
-    Output("map.pgm", lambda path, r: write_map(path.parent, r.grid)),  # with map.yaml
-    Output(
-        "loops.parquet",
-        lambda path, r: write_closures(path, r.final, r.result.keyframes, r.result.trajectory.dimension),
-    ),
-    Output("steps.parquet", lambda path, r: r.steps.write(path, r.result.trajectory, r.log.T_base_lidar)),
-    Output(MAP_FOLDER, _write_saved_map, lambda config: config.outputs.map),
-    Output("map.ply", lambda path, r: write_ply(path, r.cloud.points)),
-    Output("map.pcd", lambda path, r: write_pcd(path, r.cloud.points), lambda config: config.maps.write_pcd),
-    Output("map.laz", lambda path, r: write_laz(path, r.cloud.points), lambda config: config.maps.write_laz),
-    Output(  # after the maps, which it reads
-        "results.mcap",
-        lambda path, r: write_results_mcap(path, r.log, r.steps, r.result, r.T_world_level),
-        lambda config: config.outputs.mcap,
-    ),
-)
 
 
 def results_of(
@@ -187,10 +133,33 @@ def expected_of(result: SlamResult, config: Config) -> ExpectedErrors | None:
 
 
 def write_results(folder: Path, results: Results) -> None:
-    """Write every requested output into a run directory."""
-    for output in OUTPUTS:
-        if output.is_wanted(results.config):
-            output.write(folder / output.file, results)
+    """Write every requested output into a run directory; a new format is a writer, and a line here."""
+    log, config, result = results.log, results.config, results.result
+    trajectory, graph, expected = result.trajectory, result.graph, results.expected
+    write_tum(folder / "trajectory.tum", trajectory)
+    write_kitti(folder / "trajectory.kitti.txt", trajectory)
+    write_tum(folder / "odometry.tum", result.odometry)
+    if expected is not None:
+        write_wide_tum(folder / "keyframes.tum", result.keyframe_trajectory, expected.covariances)
+    if log.mounting.base and log.mounting.motion is None:  # the robot's, in the frame of the lidar's
+        poses = trajectory.poses @ lie.inverse(log.T_base_lidar)
+        write_tum(folder / "trajectory_base.tum", Trajectory(trajectory.stamps_ns, poses))
+    write_g2o(folder / GRAPH_FILE, graph)
+    if graph.is_rejected.any():
+        write_g2o(rejected_path(folder / GRAPH_FILE), graph, edges="rejected")
+    write_closures(folder / "loops.parquet", results.final, result.keyframes, trajectory.dimension)
+    results.steps.write(folder / "steps.parquet", trajectory, log.T_base_lidar)
+    write_map(folder, results.grid)
+    if config.outputs.map:
+        _write_saved_map(folder / MAP_FOLDER, results)
+    points = results.cloud.points
+    write_ply(folder / "map.ply", points)
+    if config.maps.write_pcd:
+        write_pcd(folder / "map.pcd", points)
+    if config.maps.write_laz:
+        write_laz(folder / "map.laz", points)
+    if config.outputs.mcap:  # after the maps, which it reads
+        write_results_mcap(folder / "results.mcap", log, results.steps, result, results.T_world_level)
 
 
 def record_results(recording: Recorder, results: Results) -> None:
