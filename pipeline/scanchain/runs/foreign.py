@@ -128,6 +128,7 @@ def _evidence(
     """
     poses, nothing = trajectory.poses, np.zeros(len(trajectory), np.bool_)
     seconds, checked = (log_times_ns - log_times_ns[0]) * 1e-9, check_wheels(poses, wheels)
+    matched_m = _matched_bound_m(poses, [T for _, T in matches])
     least, farthest_m = config.matching.min_inlier_share, config.matching.max_distance_m
     fit = [np.nan if m is None else m.fit * (np.linalg.norm(T[:-1, -1]) < farthest_m) for m, T in matches]
     return Evidence(
@@ -143,9 +144,7 @@ def _evidence(
         velocity=check_velocity(trajectory.stamps_ns, log_times_ns, poses),
         overlap=check_overlap(np.array([1.0 if match is None else match.inlier_share for match, _ in matches])),
         closures=no_closures(poses),
-        error=bound_text(
-            poses, seconds, checked, {"scan matching": _matched_bound_m(poses, [T for _, T in matches])}
-        ),
+        error=bound_text(poses, seconds, checked, {"scan matching": matched_m}),
     )
 
 

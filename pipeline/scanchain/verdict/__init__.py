@@ -19,6 +19,6 @@ from scanchain.verdict.stretches import KNOWN, Evidence, WorstPlace, worst_place
 
 __all__ = [
     "KNOWN", "MOST_CONTRADICTED", "VELOCITY_LIMIT", "WHEEL_LIMIT", "Closures", "Evidence", "Judged", "Kind",
-    "Stretch", "Verdict", "WheelCheck", "WorstPlace", "apart_m", "check_overlap", "check_velocity", "check_wheels", "judge",
-    "smallest_jump_m", "wheel_bound_m", "worst_place",
+    "Stretch", "Verdict", "WheelCheck", "WorstPlace", "apart_m", "check_overlap", "check_velocity",
+    "check_wheels", "judge", "smallest_jump_m", "wheel_bound_m", "worst_place",
 ]  # fmt: skip
