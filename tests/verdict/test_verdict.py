@@ -10,10 +10,9 @@ import pytest
 
 from scanchain import lie
 from scanchain.data import Trajectory
-from scanchain.runs.foreign import bound_text
 from scanchain.runs.overlay import read_overlay, write_overlay
 from scanchain.runs.step_table import StepTable
-from scanchain.runs.vouching import evidence_of
+from scanchain.runs.vouching import evidence_of, evidence_of_trajectory
 from scanchain.verdict import (
     Closures,
     Evidence,
@@ -350,12 +349,15 @@ def test_the_error_of_another_tool_is_below_its_distance_to_an_independent_estim
     assert 0.5 * true_m < bound_m < 4.0 * true_m
     assert wheel_bound_m(estimate, other) == pytest.approx(bound_m, rel=0.2)
     unknown = np.full_like(truth, np.nan)
+    times_ns = (1e9 * INTERVAL_S * np.arange(N)).astype(np.int64)
+    trajectory = Trajectory(times_ns, estimate)
     for wheels, bounds, error in (
         (unknown, {}, "no jump above 0.67 m, drift unchecked"),
         (other, {}, f"ATE below {wheel_bound_m(estimate, other):.2g} m by wheels"),
         (other, {"ours": 0.001}, "ATE below 0.001 m by ours"),
     ):
-        assert bound_text(estimate, INTERVAL_S * np.arange(N), check_wheels(estimate, wheels), bounds) == error
+        found = evidence_of_trajectory(trajectory, times_ns, wheels, np.full(N, 500), bounds)
+        assert judge(found).error == error
 
 
 @pytest.mark.parametrize(("count", "verdict"), [(2, Verdict.TRUSTWORTHY), (3, Verdict.CHECK)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,22 +18,10 @@ from scanchain.files import Source
 from scanchain.logs import Log, open_log
 from scanchain.preprocess import Resolution
 from scanchain.registration import MapKeeper, create_matcher
-from scanchain.runs.vouching import no_closures
+from scanchain.runs.vouching import evidence_of_trajectory
 from scanchain.settings import Override, load_settings
 from scanchain.trajectory import read_tum
-from scanchain.verdict import (
-    KNOWN,
-    Evidence,
-    Judged,
-    WheelCheck,
-    apart_m,
-    check_overlap,
-    check_velocity,
-    check_wheels,
-    judge,
-    smallest_jump_m,
-    wheel_bound_m,
-)
+from scanchain.verdict import Evidence, Judged, apart_m, check_overlap, judge
 
 _FEWEST = 3  # scans with a pose
 
@@ -58,8 +47,11 @@ def judge_trajectory(file: Path, logs: Sequence[Source], overrides: Sequence[Ove
     is_chosen[found] = True
     scans = (scan for scan in log.scans(config.preprocess) if is_chosen[scan.index])
     matches = _matches(scans, trajectory, config)
-    evidence = _evidence(trajectory, log_times_ns[found], points[found], wheels[found], matches, config)
-    return judge(evidence), len(stamps_ns) - len(pairs)
+    evidence = evidence_of_trajectory(
+        trajectory, log_times_ns[found], wheels[found], points[found],
+        {"scan matching": _matched_bound_m(trajectory.poses, [T for _, T in matches])},
+    )  # fmt: skip
+    return judge(_with_matches(evidence, matches, config)), len(stamps_ns) - len(pairs)
 
 
 def _table(log: Log, config: Config) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Matrix]:
@@ -114,49 +106,18 @@ def _velocities(trajectory: Trajectory) -> NDArray[np.float64]:
     return np.vstack([velocities, velocities[-1:]])
 
 
-def _evidence(
-    trajectory: Trajectory,
-    log_times_ns: NDArray[np.int64],
-    points: NDArray[np.int64],
-    wheels: Matrix,
-    matches: Sequence[tuple[Match | None, Pose]],
-    config: Config,
-) -> Evidence:
-    """Evidence of the scans (N,) of a trajectory, states and fit by their matches.
-
-    A match that ends elsewhere contradicts the pose.
-    """
-    poses, nothing = trajectory.poses, np.zeros(len(trajectory), np.bool_)
-    seconds, checked = (log_times_ns - log_times_ns[0]) * 1e-9, check_wheels(poses, wheels)
-    matched_m = _matched_bound_m(poses, [T for _, T in matches])
+def _with_matches(evidence: Evidence, matches: Sequence[tuple[Match | None, Pose]], config: Config) -> Evidence:
+    """With states and fit by the matches; one that ends elsewhere contradicts the pose."""
     least, farthest_m = config.matching.min_inlier_share, config.matching.max_distance_m
-    fit = [np.nan if m is None else m.fit * (np.linalg.norm(T[:-1, -1]) < farthest_m) for m, T in matches]
-    return Evidence(
-        seconds=seconds,
-        poses=poses,
+    return replace(
+        evidence,
         is_lost=np.array([match is not None and match.inlier_share < least for match, _ in matches]),
         is_degenerate=np.array([match is not None and match.observability < 1.0 for match, _ in matches]),
-        fit=np.array(fit),
-        starts_segment=nothing,
-        is_copy=nothing,
-        points=points,
-        wheels=checked,
-        velocity=check_velocity(trajectory.stamps_ns, log_times_ns, poses),
         overlap=check_overlap(np.array([1.0 if match is None else match.inlier_share for match, _ in matches])),
-        closures=no_closures(poses),
-        error=bound_text(poses, seconds, checked, {"scan matching": matched_m}),
+        fit=np.array(
+            [
+                np.nan if match is None else match.fit * (np.linalg.norm(T[:-1, -1]) < farthest_m)
+                for match, T in matches
+            ]
+        ),
     )
-
-
-def bound_text(poses: Matrix, seconds: NDArray[np.float64], wheels: WheelCheck, bounds_m: dict[str, float]) -> str:
-    """What is known of the error of poses (N, d+1, d+1) that no closures tie together.
-
-    bounds_m : on it, by the name of another estimate of the same motion; the wheels are one as well
-    """
-    bounds = dict(bounds_m)
-    if wheels.known_share >= KNOWN:
-        bounds["wheels"] = wheel_bound_m(poses, wheels.poses)
-    by = min(bounds, key=bounds.__getitem__, default="")
-    if not by:
-        return f"no jump above {smallest_jump_m(seconds):.2g} m, drift unchecked"
-    return f"ATE below {bounds[by]:.2g} m by {by}"

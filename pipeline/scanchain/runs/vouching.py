@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.data import VERIFICATION, Matrix, Proposal, State
+from scanchain.data import VERIFICATION, Matrix, Proposal, State, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import ExpectedError
 from scanchain.runs.metrics import METRICS_FILE
 from scanchain.verdict import (
+    KNOWN,
     Closures,
     Evidence,
     Judged,
@@ -21,6 +25,8 @@ from scanchain.verdict import (
     check_velocity,
     check_wheels,
     judge,
+    smallest_jump_m,
+    wheel_bound_m,
 )
 
 if TYPE_CHECKING:
@@ -90,10 +96,44 @@ def evidence_of(steps: pa.Table, closures: pa.Table | None, expected: ExpectedEr
         wheels=check_wheels(poses, wheels),
         velocity=check_velocity(stamps_ns, log_times_ns, poses),
         overlap=check_overlap(steps["inliers"].to_numpy() / np.maximum(steps["points"].to_numpy(), 1)),
-        closures=no_closures(poses) if closures is None else _verified(closures, dimension),
+        closures=_no_closures(poses) if closures is None else _verified(closures, dimension),
         odometry=poses_of(steps, "odom_", dimension),
         error="" if expected is None else f"ATE {expected.low:.3f} to {expected.high:.3f} m with 95 %",
     )
+
+
+def evidence_of_trajectory(
+    trajectory: Trajectory,
+    log_times_ns: NDArray[np.int64],
+    wheels: Matrix,
+    points: NDArray[np.int64],
+    bounds_m: Mapping[str, float] | None = None,
+) -> Evidence:
+    """Evidence of a trajectory without matches: wheels (N, d+1, d+1), NaN where unknown, at the same scans.
+
+    bounds_m : on its error, by the name of another estimate of the same motion; the wheels are one as well
+    """
+    n, unknown = len(trajectory), np.zeros(len(trajectory), np.bool_)
+    found = Evidence(
+        seconds=(log_times_ns - log_times_ns[0]) * 1e-9,
+        poses=trajectory.poses,
+        is_lost=unknown,
+        is_degenerate=unknown,
+        fit=np.full(n, np.nan),
+        starts_segment=unknown,
+        is_copy=unknown,
+        points=points,
+        wheels=check_wheels(trajectory.poses, wheels),
+        velocity=check_velocity(trajectory.stamps_ns, log_times_ns, trajectory.poses),
+        overlap=np.full(n, np.nan),
+        closures=_no_closures(trajectory.poses),
+    )
+    bounds = dict(bounds_m or {})
+    if found.wheels.known_share >= KNOWN:
+        bounds["wheels"] = wheel_bound_m(trajectory.poses, wheels)
+    by = min(bounds, key=bounds.__getitem__, default="")
+    error = f"no jump above {smallest_jump_m(found.seconds):.2g} m, drift unchecked"
+    return replace(found, error=f"ATE below {bounds[by]:.2g} m by {by}" if by else error)
 
 
 def _verified(table: pa.Table, dimension: int) -> Closures:
@@ -109,8 +149,7 @@ def _verified(table: pa.Table, dimension: int) -> Closures:
     )
 
 
-def no_closures(poses: Matrix) -> Closures:
-    """None, of these poses."""
+def _no_closures(poses: Matrix) -> Closures:
     nothing = np.empty(0, np.int64)
     return Closures(nothing, nothing, poses[:0], np.empty(0, np.bool_))
 

@@ -5,7 +5,6 @@ from scanchain.verdict.checks import (
     WHEEL_LIMIT,
     Kind,
     Stretch,
-    WheelCheck,
     apart_m,
     check_overlap,
     check_velocity,
@@ -19,6 +18,6 @@ from scanchain.verdict.stretches import KNOWN, Evidence, WorstPlace, worst_place
 
 __all__ = [
     "KNOWN", "MOST_CONTRADICTED", "VELOCITY_LIMIT", "WHEEL_LIMIT", "Closures", "Evidence", "Judged", "Kind",
-    "Stretch", "Verdict", "WheelCheck", "WorstPlace", "apart_m", "check_overlap", "check_velocity",
-    "check_wheels", "judge", "smallest_jump_m", "wheel_bound_m", "worst_place",
+    "Stretch", "Verdict", "WorstPlace", "apart_m", "check_overlap", "check_velocity", "check_wheels", "judge",
+    "smallest_jump_m", "wheel_bound_m", "worst_place",
 ]  # fmt: skip
