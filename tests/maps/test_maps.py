@@ -114,14 +114,14 @@ def test_returns_beyond_the_usable_range_do_not_carve():
 
 
 TURNED = lie.exp(np.array([1.0, 2.0, 10.0, 0, 0, 0])) @ lie.exp(np.array([0, 0, 0, 0, 0, np.pi / 2]))
-TILTED = lie.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.5, 0.0]))
+TILTED, FAR = lie.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.5, 0.0])), np.array([4.05, 0.05, 0.0])
 
 
 @pytest.mark.parametrize(
     ("T", "points", "hit"),
     [
         (TURNED, np.array([[3.0, 0.0, 0.2], [0.0, 3.0, 1.5], [0.0, -3.0, -1.7]]), (1.0, 5.05)),
-        (TILTED, np.vstack([[4.0, 0, 0], lie.transform(lie.inverse(TILTED), np.array([[4.05, 0.05, 0]]))]), (4.05, 0.05)),
+        (TILTED, np.vstack([[4.0, 0, 0], lie.transform(lie.inverse(TILTED), FAR[None])]), FAR[:2]),
     ],
 )  # fmt: skip
 def test_a_3d_scan_is_drawn_by_its_slice_at_the_height_of_the_lidar_along_the_worlds_vertical(T, points, hit):
