@@ -15,14 +15,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from scanchain.data import Scan
 from scanchain.errors import InputError
 from scanchain.files import write_whole
 from scanchain.logs import open_log
-from scanchain.preprocess import Resolution
 from scanchain.runs.directory import POINTS_FILE, RECORDING_FILE
 from scanchain.runs.resume import Checkpoints, read_checkpoint
-from scanchain.runs.run import few_at_once
 from scanchain.runs.step_table import StepTable
 from scanchain.simulation import simulate
 from scanchain.slam import Slam
@@ -343,18 +340,3 @@ def test_a_checkpoint_that_names_code_or_another_configuration_is_not_resumed(of
     slam.config = slam.front_end.odometry.config = config
     Checkpoints(tmp_path, 10.0).write(slam, StepTable())
     assert read_checkpoint(tmp_path, config).slam.config == config
-
-
-def test_scans_that_were_read_before_an_error_are_processed():
-    config = configured(2)
-    nothing, points = np.empty(0, np.float32), np.ones((9, 2), np.float32)
-
-    def scans():
-        yield from (Scan(index, index, index, points, nothing, 0, None) for index in range(20))
-        raise InputError("too many bad scans")
-
-    seen = []
-    with pytest.raises(InputError, match="too many"):
-        for prepared in few_at_once(scans(), Resolution(config.preprocess, config.local_map.voxel_size_m)):
-            seen.append(prepared.scan.index)
-    assert seen == list(range(20))

@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, suppress
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from time import perf_counter
 
@@ -23,7 +22,7 @@ from scanchain.files import write_whole
 from scanchain.logs import Log, open_log
 from scanchain.logs.mounting import turned_by
 from scanchain.logs.topics import other_sensors
-from scanchain.preprocess import Prepared, Resolution, prepare, prepare_ahead
+from scanchain.preprocess import prepare_ahead
 from scanchain.runs.closures import final_verdicts
 from scanchain.runs.directory import (
     CHECKPOINT_FILE,
@@ -59,7 +58,6 @@ from scanchain.trajectory import write_tum
 from scanchain.verdict import Judged, judge, worst_place
 
 _FEW_SCANS = 2  # scans whose trajectory shows at most one motion
-_TOGETHER = 16  # largest number of scans that are read together
 TruePoses = Callable[[NDArray[np.int64]], Trajectory | None]  # of scans with these stamps; may raise InputError
 _FOR_RESUMING = (CHECKPOINT_FILE, POINTS_FILE)
 
@@ -176,7 +174,9 @@ class _Run:
             self.notes.append(resume_recording(self.directory.path, self.left, recording, checkpoints))
         with closing(scans):  # what it left out is counted then, also if the run was stopped
             tracked = self.progress.track(self._previewed(scans, recording), self.log.scan_count - len(self.steps))
-            for scan in _ahead(tracked, slam):
+            if slam.dimension == 3 and threads() > 1:
+                tracked = prepare_ahead(tracked, slam.front_end.odometry.resolution)
+            for scan in tracked:
                 step = slam.place(slam.front_end.locate(scan))
                 self.steps.append(step)
                 recording.log(step)
@@ -268,31 +268,6 @@ class _Run:
 
     def _true_poses(self, stamps_ns: NDArray[np.int64]) -> Trajectory | None:
         return true_poses(self.log, self.truth_file, self.progress, stamps_ns)
-
-
-def _ahead(scans: Iterator[Scan], slam: Slam) -> Iterator[Scan | Prepared]:
-    """The scans, clouds prepared in a thread beside; laser scans a few at once, which is quicker than either."""
-    resolution = slam.front_end.odometry.resolution
-    if slam.dimension == 3 and threads() > 1:
-        yield from prepare_ahead(scans, resolution)
-    elif resolution.is_fixed:
-        yield from few_at_once(scans, resolution)
-    else:
-        yield from scans
-
-
-def few_at_once(scans: Iterator[Scan], resolution: Resolution) -> Iterator[Prepared]:
-    """Scans, a few read and prepared together; those before an error come before this."""
-    while True:
-        some: list[Prepared] = []
-        try:
-            some.extend(prepare(scan, resolution) for scan in islice(scans, _TOGETHER))
-        except BaseException:  # of the log, or the user's wish to end
-            yield from some
-            raise
-        if not some:
-            return
-        yield from some
 
 
 def opened(job: Job) -> tuple[Log, Settings, TruthFile | None]:
