@@ -10,7 +10,7 @@ import pytest
 
 from scanchain import lie
 from scanchain.data import Trajectory
-from scanchain.runs.overlay import read_overlay, write_overlay
+from scanchain.runs.results import read_overlay, write_overlay
 from scanchain.runs.step_table import StepTable
 from scanchain.runs.vouching import evidence_of, evidence_of_trajectory
 from scanchain.verdict import (

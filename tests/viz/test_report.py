@@ -26,7 +26,7 @@ from scanchain.logs.writing.pack import ORIGIN, pack_laser_scan, pack_odometry
 from scanchain.logs.writing.writer import LogWriter
 from scanchain.maps import read_ply
 from scanchain.runs.metrics import Metrics
-from scanchain.runs.overlay import OVERLAY_FILE
+from scanchain.runs.results import OVERLAY_FILE
 from scanchain.simulation import simulate
 from scanchain.verdict import Judged, Kind, Stretch, Verdict
 from scanchain_viz.pictures.map_figures import AFTER, BEFORE, path_over_map, surroundings

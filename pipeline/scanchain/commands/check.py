@@ -50,7 +50,7 @@ def check(
         judged = judge_run(sources[0])
     else:
         from scanchain.errors import counted
-        from scanchain.runs.foreign import judge_trajectory
+        from scanchain.runs.vouching import judge_trajectory
 
         judged, missing = judge_trajectory(trajectory, sources, settings)
         if missing:

@@ -45,9 +45,8 @@ from scanchain.runs.metrics import (
     measure,
     summary,
 )
-from scanchain.runs.overlay import OVERLAY_FILE, write_overlay
 from scanchain.runs.provenance import Hashing, describe_start
-from scanchain.runs.results import Results, record_results, results_of, write_results
+from scanchain.runs.results import OVERLAY_FILE, Results, record_results, results_of, write_overlay, write_results
 from scanchain.runs.resume import Checkpoints, after, find_left, rescued, resume_recording, set_aside
 from scanchain.runs.step_table import StepTable
 from scanchain.runs.vouching import evidence_of_run

@@ -14,7 +14,7 @@ from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import Points
 from scanchain.maps import SavedMap, open_saved_map
-from scanchain.runs.overlay import Overlay
+from scanchain.runs.results import Overlay
 from scanchain_viz.pictures.figure import INK, Floats, Plot, broken, palette_of
 from scanchain_viz.pictures.trajectory_figures import CLOSURES, DrawnTrajectory, PathLine, color_of
 

@@ -18,8 +18,8 @@ from scanchain.evaluation.absolute import path_length
 from scanchain.maps import read_ply
 from scanchain.runs.directory import RUN_FILE, TRUTH_FILE
 from scanchain.runs.metrics import VERDICT, Accuracy, GroundTruth, Metrics
-from scanchain.runs.overlay import OVERLAY_FILE, read_overlay
 from scanchain.runs.provenance import Provenance
+from scanchain.runs.results import OVERLAY_FILE, read_overlay
 from scanchain.runs.step_table import STAGES, nees_of_steps
 from scanchain.runs.vouching import poses_of
 from scanchain.settings import read_layer
