@@ -70,13 +70,13 @@ class Checkpoint:
 class Checkpoints:
     """Writer of checkpoints, at an interval at which they take at most 5 % of the time."""
 
-    def __init__(self, folder: Path, every_s: float, *, run_s: float = 0.0, process: int = 0) -> None:
-        """run_s : seconds that the ``process`` earlier processes took up to the checkpoint."""
+    def __init__(self, folder: Path, every_s: float, left: Checkpoint | None = None) -> None:
+        """Left : the checkpoint of the processes before, whose work counts as this one's."""
         self.path = folder / CHECKPOINT_FILE
         self.version = _version()
-        self.process = process
+        self.process = 0 if left is None else left.process + 1
         self.every_s = every_s
-        self.began_s = working_s() - run_s
+        self.began_s = working_s() - (0.0 if left is None else left.run_s)
         self.next_s = perf_counter() + every_s
 
     def are_due(self) -> bool:

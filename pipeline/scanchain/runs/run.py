@@ -31,9 +31,8 @@ from scanchain.runs.directory import (
     RUN_FILE,
     TRUTH_FILE,
     RunDirectory,
-    left_behind,
     partial_runs,
-    writer_of,
+    stopped_run,
 )
 from scanchain.runs.job import Job, OpenRecorder, Progress, Recorder
 from scanchain.runs.metrics import (
@@ -92,9 +91,9 @@ def run(
     compiling = announcing_compilation(progress.say, ("scanchain.runs.warm_up", str(this.log.dimension)))
     with this.directory, compiling:
         try:
-            slam, scans, checkpoints = this.begin()
+            slam, scans = this.begin()
             with this.recording(record) as recording:
-                result = this.process(slam, scans, checkpoints, recording)
+                result = this.process(slam, scans, recording)
                 results, judged = this.write(result, recording)
                 slam.points.close()
                 held_s = this.hold(recording)
@@ -114,20 +113,20 @@ class _Run:
         self.job, self.progress = job, progress
         self.log, settings, self.truth_file = opened(job)
         self.config, self.source = settings.config, settings.source
-        self.left = find_left(job.out, self.config) if job.resume else None
-        self.directory = RunDirectory(job.out, force=job.force, left=self.left and self.left.folder)
+        self.provenance = describe_start(job.command, job.logs, self.source)
+        self.steps, self.notes = StepTable(), list[str]()
+        self.left = left = find_left(job.out, self.config) if job.resume else None
+        self.directory = RunDirectory(job.out, force=job.force, left=left and left.folder)
+        self.checkpoints = Checkpoints(self.directory.path, job.checkpoint_s, left)
         log = self.log
         progress.say(f"{log.topic}: {log.dimension}D, {counted(log.scan_count, 'scan')}; {self.source}")
         for gap in log.gaps:
             progress.announce(f"warning: {gap}")
-        self.provenance = describe_start(job.command, job.logs, self.source)
-        self.notes: list[str] = []
-        self.steps = StepTable()
-        if self.left is not None:
-            self.steps = self.left.steps
-            self.began_s -= self.left.run_s
-            progress.announce(f"resuming after {counted(len(self.steps), 'scan')} of {self.left.folder.name}")
-        elif (idle := left_behind(job.out)) is not None and not writer_of(idle):
+        if left is not None:
+            self.steps = left.steps
+            self.began_s -= left.run_s
+            progress.announce(f"resuming after {counted(len(self.steps), 'scan')} of {left.folder.name}")
+        elif idle := stopped_run(job.out):
             progress.announce(
                 f"{idle.name} is of a run that was stopped; --resume would continue it, this run starts over and "
                 "removes it once complete"
@@ -136,22 +135,18 @@ class _Run:
             names = ", ".join(path.name for path in begun)
             progress.announce(f"{names}: no checkpoint to resume from, this run starts over")
 
-    def begin(self) -> tuple[Slam, Generator[Scan, None, None], Checkpoints]:
-        """SLAM, new or as of the checkpoint, the scans that follow, and the writer of checkpoints.
-
-        The directory states from here on what is run in it.
-        """
-        folder, every_s, left = self.directory.path, self.job.checkpoint_s, self.left
+    def begin(self) -> tuple[Slam, Generator[Scan, None, None]]:
+        """SLAM, new or as of the checkpoint, and the scans that follow; the directory states what is run in it."""
+        folder, left = self.directory.path, self.left
         self.provenance.write(folder / RUN_FILE)
         write_whole(folder / "config.toml", dump(self.config).encode())
         scans = self.log.scans(self.config.preprocess)
         if left is None:
-            slam = Slam(self.config, self.log.T_base_lidar, folder / POINTS_FILE)
-            return slam, scans, Checkpoints(folder, every_s)
+            return Slam(self.config, self.log.T_base_lidar, folder / POINTS_FILE), scans
         left.slam.points.reopen(folder / POINTS_FILE)
         scans = after(left, scans)
         set_aside(folder, left)
-        return left.slam, scans, Checkpoints(folder, every_s, run_s=left.run_s, process=left.process + 1)
+        return left.slam, scans
 
     def recording(self, record: OpenRecorder) -> AbstractContextManager[Recorder]:
         """The recording, to be entered before the first scan."""
@@ -163,10 +158,9 @@ class _Run:
             config=self.config.recording,
         )
 
-    def process(
-        self, slam: Slam, scans: Generator[Scan, None, None], checkpoints: Checkpoints, recording: Recorder
-    ) -> SlamResult:
+    def process(self, slam: Slam, scans: Generator[Scan, None, None], recording: Recorder) -> SlamResult:
         """Place every scan, from the first on or from the checkpoint."""
+        checkpoints = self.checkpoints
         if recording.web_address:
             self.progress.announce(f"viewer: {recording.web_address}")
         if self.left is not None:
