@@ -258,17 +258,16 @@ def test_a_point_map_equals_naive(dimension):
 
 def test_a_full_point_map_doubles_its_voxels_and_keeps_every_point():
     random = np.random.default_rng(4)
-    built = PointMap(3, 0.1, max_voxels=500, max_range_m=50.0)
+    built = PointMap(3, 0.1, max_voxels=500)
     points = random.uniform(-10.0, 10.0, (20_000, 3))
-    points[0] = 60.0
     for part in np.array_split(points, 7):
         built.insert(lie.identity(3), part)
     assert len(built) <= 500
     assert built.voxel_size_m in (3.2, 6.4)
-    assert built.counts[: len(built)].sum() == 19_999
+    assert built.counts[: len(built)].sum() == 20_000
     voxels = np.floor(built.points() / built.voxel_size_m).astype(int)
     assert len(np.unique(voxels, axis=0)) == len(built)
-    np.testing.assert_allclose(built.sums[: len(built)].sum(axis=0), points[1:].sum(axis=0))
+    np.testing.assert_allclose(built.sums[: len(built)].sum(axis=0), points.sum(axis=0))
 
 
 def test_points_that_are_not_finite_stay_out_of_the_maps():
@@ -335,7 +334,7 @@ def test_a_street_of_real_sweeps_becomes_a_map_with_walls_and_free_road():
     assert max(road) < 0.0
     probability = grid.probability()
     assert 1000 < (probability > 0.65).sum() < 0.1 * (probability < 0.35).sum()
-    cloud = build_point_map(scans, dimension=3, voxel_size_m=0.2, max_range_m=100.0)
+    cloud = build_point_map(scans, dimension=3, voxel_size_m=0.2)
     assert 50_000 < len(cloud) < 200_000
     assert np.isfinite(cloud.points()).all()
 
