@@ -7,11 +7,12 @@ DEV := .venv/dev-installed
 BASELINES := .venv/baselines-installed
 DOCS := .venv/docs-installed
 
-.PHONY: help demo test lint count docs clean
+.PHONY: help demo test slow lint count docs clean
 
 help:
 	@echo "make demo   simulate an office and a town, run both, compare the town with KISS-ICP and Open3D (within four minutes)"
-	@echo "make test   run the whole test suite"
+	@echo "make test   run the tests, but for the slow ones"
+	@echo "make slow   run the slow tests"
 	@echo "make lint   format, lint, type and import checks"
 	@echo "make count  print how many files and lines each part has"
 	@echo "make docs   build the documentation into build/docs; warnings are errors"
@@ -30,7 +31,10 @@ demo: $(BASELINES)
 	@echo "Look at the pictures in runs/, or open the recordings: $(BIN)/scanchain view runs/demo-town"
 
 test: $(DEV)
-	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile -m "not slow"
+
+slow: $(DEV)
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile -m slow
 
 lint: $(DEV)
 	$(BIN)/ruff format --check .

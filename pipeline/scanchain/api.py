@@ -297,7 +297,7 @@ def write_report(directory: Path) -> None:
 def draw_localization(folder: Path, localized: LocalizedLog) -> None:
     """Add report.html and a recording to the directory of a localized log."""
     from scanchain.runs.directory import RECORDING_FILE
-    from scanchain_viz.recording.maps import record_localization
+    from scanchain_viz.recording.results import record_localization
     from scanchain_viz.report.maps import write_localization_report
 
     write_localization_report(folder, localized)
@@ -306,7 +306,7 @@ def draw_localization(folder: Path, localized: LocalizedLog) -> None:
 
 def present_merge(directory: Path) -> None:
     """Add report.html and a recording to the directory of a merge."""
-    from scanchain_viz.recording.maps import record_merge
+    from scanchain_viz.recording.results import record_merge
     from scanchain_viz.report.maps import write_merge_report
 
     write_merge_report(directory)
@@ -315,7 +315,7 @@ def present_merge(directory: Path) -> None:
 
 def present_comparison(directory: Path) -> None:
     """Add report.html and a recording to the directory of a comparison."""
-    from scanchain_viz.recording.comparison import record_comparison
+    from scanchain_viz.recording.results import record_comparison
     from scanchain_viz.report.comparison import write_compare_report
 
     write_compare_report(directory)
@@ -324,7 +324,7 @@ def present_comparison(directory: Path) -> None:
 
 def present_changes(directory: Path, found: Changes) -> None:
     """Add report.html and a recording to the directory of changes."""
-    from scanchain_viz.recording.maps import record_changes
+    from scanchain_viz.recording.results import record_changes
     from scanchain_viz.report.maps import write_changes_report
 
     write_changes_report(directory, found)

@@ -14,7 +14,7 @@ from msgspec.structs import asdict
 
 from scanchain.download import fetch
 from scanchain.errors import InputError
-from scanchain.logs.writing.convert import convert
+from scanchain.logs.convert import convert
 from scanchain.settings import shipped
 from scanchain.simulation import simulate
 

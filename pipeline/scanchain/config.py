@@ -68,6 +68,7 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
     end_s : what comes after is left out
     every : every N-th scan is taken
     rate_hz : scan rate of a folder of clouds whose files are not named by their stamps; 0 where they are
+    bin_columns : number of float32 columns of a cloud in a .bin file, x y z first
     max_bad_scans_percent : share of scans that may be malformed or empty, rounded up; such scans are left out
         and counted, and a run stops when there are more
     min_range_m : returns nearer than this are dropped by the reader and counted
@@ -86,6 +87,7 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
     end_s: Limit = float("inf")
     every: Count = 1
     rate_hz: NonNegative = 0.0
+    bin_columns: Annotated[int, Meta(ge=3, le=16)] = 4
     max_bad_scans_percent: Percent = 10.0
     min_range_m: NonNegative = 0.0
     max_range_m: Limit = float("inf")

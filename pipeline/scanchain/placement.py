@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,14 +13,17 @@ from scanchain.data import Closure, ClosureVerdict, GraphState, Keyframe, Matrix
 from scanchain.graph.schedule import LAG, Schedule
 from scanchain.loops import ClosureTable, LoopCloser, PlaceTest
 
+_TOO_FEW = Problem.plain("too few keyframes agree on the place")
+_CONTRADICTED = Problem.plain("withdrawn: what was seen since contradicts the place")
 LARGEST_SIGMAS = (300.0, 30.0)  # m and rad, of an edge: a pose that hangs on less information is lost to rounding
 
 
 class Placement:
     """Takes closures into the graph, and with them finds where the newest segment of the log lies.
 
-    The first closure to an older segment moves it there. In a prior map, whose keyframes come first and are fixed,
-    closures wait until they are evidence enough, and those that later scans contradict are withdrawn.
+    Closures of a new segment to older keyframes, of segments before or of a prior map, which come first and are
+    fixed, wait until they are evidence enough. Then the segment is moved there. Those that later scans contradict
+    are withdrawn.
     """
 
     def __init__(
@@ -32,13 +35,13 @@ class Placement:
         self.closures = ClosureTable()
         self.T_world_odom = lie.identity(self.graph.dimension)
         self.first = 0  # number of the first keyframe of the log, after those of the map
-        self.evidence = PlaceTest(closer.segments, 0)
+        self.evidence = PlaceTest(closer.segments)
         self.by_map: Closure | None = None  # with the map, of the newest keyframe that has one
         self.joined_start = 0  # first keyframe of the last segment that a loop joined to older ones
 
     def begin_in(self, count: int) -> None:
         """Begin in a map: so many keyframes, the first ones, stay where they are."""
-        self.first = self.evidence.of_map = count
+        self.first = count
 
     @property
     def is_in_map(self) -> bool:
@@ -78,7 +81,7 @@ class Placement:
         """Keep closures; those accepted become edges of the graph."""
         if not closures:
             return ()
-        closures = self._tested(closures) if self.first else closures
+        closures = self._tested(closures) if self.closer.segments.starts[-1] else closures
         taken = tuple(
             self._add(closure) if closure.verdict is ClosureVerdict.ACCEPTED else closure for closure in closures
         )
@@ -112,23 +115,23 @@ class Placement:
         self.give_up()
 
     def give_up(self) -> None:
-        """The pose in the map that is being tested, if any, is wrong: search the newest segment again."""
+        """The pose that is being tested, if any, is wrong: search the newest segment again."""
         if self.evidence.is_gathering:
             self.evidence.drop(self.closer.segments.starts[-1])
             self.closer.search_again()
 
-    def set_apart(self) -> None:
-        """Take segments of the log for apart from the map that too little joins to it in the end."""
-        segments, graph = self.closer.segments, self.graph
-        chosen = graph.is_loop & ~graph.is_rejected & (graph.edges[:, 0] < self.first)
-        in_force = graph.edges[chosen & (graph.edges[:, 1] >= self.first), 1]
-        for number, start in enumerate(segments.starts[1:], 1):
-            end = segments.span(start, len(graph))[1]
-            if not ((in_force >= start) & (in_force < end)).any():
-                continue
-            placed = [replace(self.keyframes[k], T_odom_lidar=graph.poses[k]) for k in range(start, end)]
-            if not self.evidence.holds(placed, self.keyframes):
-                segments.apart.add(number)
+    def set_apart(self) -> bool:
+        """Reject what joins segments to older ones where it is too little in the end; True if any is."""
+        segments, graph, is_any = self.closer.segments, self.graph, False
+        targets, sources = graph.edges[graph.is_loop & ~graph.is_rejected].T
+        for start in segments.starts[1:]:
+            placed = range(*segments.span(start, len(graph)))
+            is_joined = ((targets < start) & (sources >= start) & (sources < placed.stop)).any()
+            world, of_same_log = (self.keyframes, graph.poses), start > self.first
+            if is_joined and not self.evidence.holds(placed, *world, of_same_log=of_same_log):
+                self._take_back(placed, _TOO_FEW)
+                is_any = True
+        return is_any
 
     def follow_graph(self) -> None:
         """Put the odometry frame where the graph has the newest keyframe."""
@@ -136,39 +139,50 @@ class Placement:
         self.T_world_odom = lie.normalize(self.graph.poses[-1] @ T_lidar_odom)
 
     def _tested(self, closures: tuple[Closure, ...]) -> tuple[Closure, ...]:
-        """Closures; those that would join the newest segment to the map are rejected until they are enough."""
-        start = self.closer.segments.starts[-1]
-        with_map = [each for each in closures if each.target < self.first and each.source >= start]
-        self.evidence.note(with_map)
-        if self.is_in_map:
-            return closures if self.evidence.follow(with_map, self.keyframes) else self._withdrawn(closures)
-        others = [each for each in closures if each.target >= self.first or each.source < start]
-        was_gathering = self.evidence.is_gathering
-        joining = self.evidence.collect(with_map, self.keyframes)
-        if self.evidence.is_gathering and not was_gathering:
-            self._move_to(self.evidence.waiting[0])
+        """Closures; those that would join the newest segment to older ones are rejected until they are enough."""
+        start, evidence, world = self.closer.segments.starts[-1], self.evidence, (self.keyframes, self.graph.poses)
+        older = [each for each in closures if each.target < start <= each.source]
+        evidence.note(older)
+        components = self.closer.segments.components(self.graph, with_assumed=False)
+
+        def joins(closure: Closure) -> bool:
+            is_older = closure.target < start <= closure.source
+            return is_older and bool(components[closure.target] != components[-1])
+
+        known = [each for each in older if components[each.target] == components[-1]]
+        if known and not evidence.is_gathering and not evidence.follow(known, *world):
+            return self._withdrawn(closures)
+        tested = [each for each in closures if joins(each)]
+        was_gathering = evidence.is_gathering
+        joining = evidence.collect(tested, *world)
+        if evidence.is_gathering and not was_gathering:
+            self._move_to(evidence.waiting[0])
             self.follow_graph()
-        too_few = Problem.plain("too few keyframes agree on the place in the map")
-        alone = [each.rejected(too_few) if each.verdict is ClosureVerdict.ACCEPTED else each for each in with_map]
-        return (*others, *(joining or alone))
+        alone = [each.rejected(_TOO_FEW) if each.verdict is ClosureVerdict.ACCEPTED else each for each in tested]
+        return (*(each for each in closures if not joins(each)), *(joining or alone))
 
     def _withdrawn(self, closures: tuple[Closure, ...]) -> tuple[Closure, ...]:
-        """The newest segment is not where it was joined to the map: take back all that joins it; search again."""
+        """The newest segment is not where it was joined to older ones: take back all of that; search again."""
         start = self.closer.segments.starts[-1]
-        problem = Problem.plain("withdrawn: what was seen since contradicts the place in the map")
-
-        def is_wrong(closure: Closure) -> bool:
-            is_accepted = closure.verdict is ClosureVerdict.ACCEPTED
-            return is_accepted and closure.target < self.first and closure.source >= start
-
-        edges = self.graph.edges
-        self.graph.remove_loops(self.graph.is_loop & (edges[:, 0] < self.first) & (edges[:, 1] >= start))
-        self.closures.reject(is_wrong, problem)
+        is_taken_back = self._take_back(range(start, len(self.keyframes)), _CONTRADICTED)
         self.evidence.drop(start)
         self.closer.search_again()
         self.schedule.stop()
         self.by_map, self.joined_start = None, 0
-        return tuple(each.rejected(problem) if is_wrong(each) else each for each in closures)
+        return tuple(each.rejected(_CONTRADICTED) if is_taken_back(each) else each for each in closures)
+
+    def _take_back(self, segment: range, problem: Problem) -> Callable[[Closure], bool]:
+        """Reject the closures that join the keyframes of a segment to older ones; tells which these are."""
+
+        def is_meant(closure: Closure) -> bool:
+            is_accepted = closure.verdict is ClosureVerdict.ACCEPTED
+            return is_accepted and closure.target < segment.start <= closure.source < segment.stop
+
+        targets, sources = self.graph.edges.T
+        is_between = (targets < segment.start) & (sources >= segment.start) & (sources < segment.stop)
+        self.graph.remove_loops(self.graph.is_loop & is_between)
+        self.closures.reject(is_meant, problem)
+        return is_meant
 
     def _add(self, closure: Closure) -> Closure:
         """Make an edge of a closure; returns the closure with its innovation in the graph before."""

@@ -218,7 +218,8 @@ class Slam:
             self.placement.finish()
         progress(f"optimizing the graph of {counted(len(self.keyframes), 'keyframe')}")
         state = self.placement.schedule.finish()
-        self.placement.set_apart()
+        if self.placement.set_apart():
+            state = self.graph.state()
         odometry, scan_of = trail.odometry, trail.scan_of
         corrected = spread(state.poses[first:], scan_of, odometry.poses)
         if self._refines:
@@ -240,7 +241,7 @@ class Slam:
             elevation_offset_rad=tracking.elevation.offset_rad,
             elevation_sigma_rad=tracking.elevation.sigma_rad,
             calibrated_from=tracking.calibrated_from,
-            map_log_odds=self.placement.evidence.best,
+            map_log_odds=self.placement.evidence.best if first else math.nan,
         )
 
     def _check_unfinished(self) -> None:

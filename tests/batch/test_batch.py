@@ -19,8 +19,7 @@ from scanchain.__main__ import main
 from scanchain.batch.batch import collect
 from scanchain.errors import InputError
 from scanchain.files import Address
-from scanchain.logs.writing.pack import ORIGIN, pack_laser_scan, pack_odometry
-from scanchain.logs.writing.writer import LogWriter
+from scanchain.logs.writer import ORIGIN, LogWriter, pack_laser_scan, pack_odometry
 from scanchain.processes import resident_mib
 from scanchain.runs.directory import directory_name
 from scanchain.simulation import simulate
@@ -369,6 +368,7 @@ def test_logs_with_several_lidars_are_run_with_the_short_flags_of_run(two_lidars
     assert main([*words, "--gt", "truth.tum"]) == 2
 
 
+@pytest.mark.slow
 def test_the_report_on_a_phone_shows_figures_beside_long_names_and_links_to_every_run(two_lidars, tmp_path):
     out = tmp_path / "out"
     (tmp_path / "bad.mcap").write_bytes(b"no log at all")

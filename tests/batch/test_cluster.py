@@ -26,6 +26,7 @@ class Watching:
             self.kill()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="needs a local cluster")
 def test_of_two_nodes_one_dies_and_nothing_is_lost(tmp_path, monkeypatch):
     from ray.cluster_utils import Cluster

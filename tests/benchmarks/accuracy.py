@@ -1,13 +1,18 @@
-"""How far off each matcher is, before and after loop closing: ``python -m tests.benchmarks.accuracy``.
+"""How far off each matcher is, before and after loop closing; how far the pose of a lidar that stands walks.
 
-Real logs come from ../shared/data (or SCANCHAIN_DATA) and are named where they are absent; the simulated ones are
-made in a temporary folder. Prints a Markdown table.
+    python -m tests.benchmarks.accuracy [--only WORDS]
+    python -m tests.benchmarks.accuracy --standing [--scans 150] [--seeds 0 5]
+
+Real logs that are absent are named; the simulated ones are made in the cache. Prints a Markdown table.
+
+--standing: twelve people walk around the lidar and four cars drive by; ranges err by 2.5 cm. A row has the
+distance of the last pose from the first, the root mean square of all, and the share of scans at which the pose
+was held.
 """
 
 from __future__ import annotations
 
-import os
-import tempfile
+import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,47 +23,49 @@ import numpy as np
 from scanchain.data import Trajectory
 from scanchain.evaluation import absolute_error, pair, read_relations, relation_error
 from scanchain.logs import open_log
-from scanchain.settings import Override, load_settings
-from scanchain.simulation import simulate
+from scanchain.odometry import Odometry
+from scanchain.settings import load_settings, overrides_of
 from scanchain.slam import Slam, SlamResult
 from scanchain.trajectory import read_tum
+from tests.benchmarks.harness import DATA, command_line
+from tests.support import made
+from tests.support.standing import standing
 
-DATA = Path(os.environ.get("SCANCHAIN_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 MATCHERS = ("plicp", "svd")
+STANDING = (
+    ("town", "hdl-64"), ("town", "vlp-16"), ("forest", "vlp-16"), ("hall", "vlp-16"), ("highway", "os1-32"),
+    ("highway", "vlp-16"),
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A log, which of its scans are run and how, and its reference (a .tum or a .relations file)."""
+    """A log with its reference (.tum or .relations) beside it, and which of its scans are run and how."""
 
     name: str
     log: Path
-    reference: Path
-    overrides: tuple[Override, ...] = ()
+    suffix: str = ".tum"
+    prior: str = "auto"
     every: int = 1
 
 
-def cases(folder: Path) -> Iterator[Case]:
-    """The real logs that are there, then the simulated ones, made in the folder."""
-    no_wheels = (Override("odometry.prior", "constant-velocity", "--odometry.prior"),)
+def cases(cache: Path) -> Iterator[Case]:
+    """The real logs, then the simulated ones."""
     for name in ("Intel", "ACES"):
         log = DATA / f"2d/{name.lower()}.mcap"
-        yield Case(f"{name}, wheels", log, log.with_suffix(".relations"))
-        yield Case(f"{name}, no wheels", log, log.with_suffix(".relations"), no_wheels)
-    kitti = DATA / "3d/kitti_0001_first54.mcap"
+        yield Case(f"{name}, wheels", log, ".relations")
+        yield Case(f"{name}, no wheels", log, ".relations", "constant-velocity")
     for every in (1, 2, 3, 5):
-        yield Case(f"KITTI 0001, every {every} of 54 scans", kitti, kitti.with_suffix(".tum"), every=every)
-    for world, duration_s in (("office", 240.0), ("town", 30.0)):
-        log = folder / f"{world}.mcap"
-        simulate(world, log, duration_s=duration_s, seed=1)
-        yield Case(f"simulated {world}, {duration_s:g} s", log, log.with_suffix(".tum"))
+        yield Case(f"KITTI 0001, every {every} of 54 scans", DATA / "3d/kitti_0001_first54.mcap", every=every)
+    for world, seconds in (("office", 240.0), ("town", 30.0)):
+        yield Case(f"simulated {world}, {seconds:g} s", made.log(world, folder=cache, seed=1, seconds=seconds))
 
 
 def run(case: Case, matcher: str) -> tuple[SlamResult, float]:
     """The result, and seconds per scan, reading included."""
-    overrides = (*case.overrides, Override("matching.matcher", matcher, "--matching.matcher"))
     log = open_log([case.log], every=case.every)
-    slam = Slam(load_settings(log.dimension, overrides=overrides).config, log.T_base_lidar)
+    options = {"matching__matcher": matcher, "odometry__prior": case.prior}
+    slam = Slam(load_settings(log.dimension, overrides=overrides_of(options)).config, log.T_base_lidar)
     started = perf_counter()
     for scan in log.scans():
         slam.process(scan)
@@ -75,18 +82,47 @@ def error(trajectory: Trajectory, reference: Path) -> str:
     return f"{relations.translation_m.mean:.4f} m, {np.degrees(relations.rotation_rad.mean):.3f}°"
 
 
-def main() -> None:
+def moving(options: argparse.Namespace) -> None:
     print("| log | matcher | before loops | after loops | ms a scan |")
     print("|---|---|---|---|---|")
-    with tempfile.TemporaryDirectory() as folder:
-        for case in cases(Path(folder)):
-            if not case.log.exists():
-                print(f"| {case.name} | | absent: {case.log} | | |")
-                continue
-            for matcher in MATCHERS:
-                result, seconds = run(case, matcher)
-                before, after = (error(t, case.reference) for t in (result.odometry, result.trajectory))
-                print(f"| {case.name} | {matcher} | {before} | {after} | {1e3 * seconds:.2f} |", flush=True)
+    for case in cases(options.cache):
+        if options.only not in case.name:
+            continue
+        if not case.log.exists():
+            print(f"| {case.name} | | absent: {case.log} | | |")
+            continue
+        for matcher in MATCHERS:
+            result, seconds = run(case, matcher)
+            reference = case.log.with_suffix(case.suffix)
+            before, after = (error(each, reference) for each in (result.odometry, result.trajectory))
+            print(f"| {case.name} | {matcher} | {before} | {after} | {1e3 * seconds:.2f} |", flush=True)
+
+
+def standing_still(options: argparse.Namespace) -> None:
+    print("| world | sensor | seed | last | rms | held |")
+    print("|---|---|---|---|---|---|")
+    for world, sensor in STANDING:
+        for seed in options.seeds:
+            odometry = Odometry(dimension=3)
+            scans = standing(sensor, options.scans, world, seed, noise_m=0.025, people=12, cars=4)
+            places = np.array([odometry.process(scan).T_odom_lidar[:3, 3] for scan in scans])
+            off_mm = 1e3 * np.linalg.norm(places, axis=1)
+            held = 100.0 * np.mean(np.ptp(np.diff(places, axis=0), axis=1) == 0.0)
+            rms_mm = np.sqrt((off_mm**2).mean())
+            print(
+                f"| {world} | {sensor} | {seed} | {off_mm[-1]:.1f} mm | {rms_mm:.1f} mm | {held:.0f} % |",
+                flush=True,
+            )
+
+
+def main() -> None:
+    parser = command_line(__doc__)
+    parser.add_argument("--only", default="", help="cases whose names hold this")
+    parser.add_argument("--standing", action="store_true")
+    parser.add_argument("--scans", type=int, default=150)
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 5])
+    options = parser.parse_args()
+    (standing_still if options.standing else moving)(options)
 
 
 if __name__ == "__main__":

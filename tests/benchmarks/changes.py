@@ -1,13 +1,13 @@
 """Changes named between two maps of simulated places against what changed in truth.
 
-    python -m tests.benchmarks.changes FOLDER [--world office] [--seeds 1 2 3] [--sensor NAME] [--seconds S]
+    python -m tests.benchmarks.changes [--world office] [--seeds 1 2 3] [--sensor NAME] [--seconds S]
         [--later-seconds S] [--unchanged]
 
 For each seed the place is driven twice, the second time on another day (``simulate --changed``); logs and runs
-stay in FOLDER. An object counts where it is larger than 0.3 m and both drives had it, or its place, in sight: so
-many rays of their keyframes' scans end on it, or would, within the reach of the comparison. A cluster is right
-where most of its points lie on an object that vanished or appeared. With ``--later-seconds`` the second drive sees
-a part of the first one's world only, with ``--unchanged`` nothing changed: every cluster is wrong.
+stay in the cache. An object counts where it is larger than 0.3 m and both drives had it, or its place, in sight:
+so many rays of their keyframes' scans end on it, or would, within the reach of the comparison. A cluster is
+right where most of its points lie on an object that vanished or appeared. With ``--later-seconds`` the second
+drive sees a part of the first one's world only, with ``--unchanged`` nothing changed: every cluster is wrong.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from pathlib import Path
 
 import numpy as np
 
-import scanchain
 from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.maps import SavedMap, open_saved_map
@@ -29,6 +28,8 @@ from scanchain.simulation import Drive, plan
 from scanchain.simulation.drive import EPOCH_NS
 from scanchain.simulation.log import record
 from scanchain.simulation.solids import FIXED, Solids
+from tests.benchmarks.harness import command_line, run_of
+from tests.support import made
 
 LEAST_M = 0.3  # size of the objects that count
 LEAST_RAYS = {2: 10, 3: 40}  # of the keyframes' scans, for an object to be in sight
@@ -49,8 +50,7 @@ class Score:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path)
+    parser = command_line(__doc__)
     parser.add_argument("--world", default="office")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
     parser.add_argument("--sensor")
@@ -59,7 +59,7 @@ def main() -> None:
     parser.add_argument("--unchanged", action="store_true")
     parser.add_argument("--verbose", action="store_true")
     options = parser.parse_args()
-    options.folder.mkdir(parents=True, exist_ok=True)
+    options.cache.mkdir(parents=True, exist_ok=True)
     scores = [score_of(options, seed) for seed in options.seeds]
     total = Score(*(sum(getattr(score, name) for score in scores) for name in Score.__slots__))
     for name, score in (*zip(map(str, options.seeds), scores, strict=True), ("all", total)):
@@ -79,22 +79,19 @@ def score_of(options: argparse.Namespace, seed: int) -> Score:
         second = Drive(first.solids, second.motion, second.sensor, second.T_base_lidar, second.scans)
     stem = f"{options.world}_{options.sensor or 'own'}_{seed}_{options.seconds or 'all'}"
     tail = f"_b{options.later_seconds or ''}{'_unchanged' if options.unchanged else ''}"
-    a = _run(first, options.folder / f"{stem}_a", seed, None)
-    b = _run(second, options.folder / f"{stem}{tail}", seed, 1)
+    a = _mapped(first, f"{stem}_a", options.cache, seed, None)
+    b = _mapped(second, f"{stem}{tail}", options.cache, seed, 1)
     config = load_settings(a.dimension).config
     aligned = align_maps(a, b, config)
     found = changes_between(Part("a", a.keyframes, a.poses), Part("b", b.keyframes, aligned.poses), config)
     return _score(found, first, second, a, b, verbose=options.verbose)
 
 
-def _run(drive: Drive, path: Path, seed: int, changed: int | None) -> SavedMap:
-    """The map of a drive, which is made where it is not there yet."""
-    if not (path / "map").is_dir():
-        log = path.with_suffix(".mcap")
-        record(drive, log, seed=seed, changed=changed, force=True)
-        scanchain.run(log, path, recording=False, force=True)
-        log.unlink()
-    return open_saved_map(path)
+def _mapped(drive: Drive, name: str, cache: Path, seed: int, changed: int | None) -> SavedMap:
+    def write(draft: Path) -> None:
+        record(drive, draft, seed=seed, changed=changed, force=True)
+
+    return open_saved_map(run_of(made.recorded(name, write, cache), cache, name))
 
 
 def _score(found: Changes, first: Drive, second: Drive, a: SavedMap, b: SavedMap, *, verbose: bool) -> Score:

@@ -3,18 +3,18 @@
 python -m tests.benchmarks.fuzz --cases 50000 --seed 1 [--only formats] [--keep DIR]
 """
 
-import argparse
 import tempfile
 import time
 from pathlib import Path
 
 import numpy as np
 
+from tests.benchmarks.harness import command_line
 from tests.support import fuzzing, fuzzing_formats
 
 
 def main():
-    parser = argparse.ArgumentParser()
+    parser = command_line(__doc__, cache=False)
     parser.add_argument("--cases", type=int, default=20_000, help="of each kind")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", choices=KINDS, help="one kind of case; else all")

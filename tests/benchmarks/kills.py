@@ -3,27 +3,26 @@
 python -m tests.benchmarks.kills --kills 50 --seed 1 [LOG END_S ...]
 """
 
-import argparse
 import tempfile
 import time
 from collections import Counter
 from pathlib import Path
 
+from tests.benchmarks.harness import DATA, command_line
 from tests.support.killing import kill_at_random, start
-from tests.support.scenes import shared_data
 
 LOGS = ("2d/intel.mcap", "300"), ("3d/kitti_0005_first60.mcap", "3")
 LIVELY = ("--checkpoint", "0.2")
 
 
 def main():
-    parser = argparse.ArgumentParser()
+    parser = command_line(__doc__, cache=False)
     parser.add_argument("--kills", type=int, default=50, help="of each log")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("logs", nargs="*", help="a file, the second at which it is cut, the next file ...")
     options = parser.parse_args()
     named = list(zip(options.logs[::2], options.logs[1::2], strict=True))
-    for log, end_s in named or [(shared_data(name), end_s) for name, end_s in LOGS]:
+    for log, end_s in named or [(DATA / name, end_s) for name, end_s in LOGS]:
         torture(Path(log), (*LIVELY, "--end", end_s), options)
 
 

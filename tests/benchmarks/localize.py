@@ -1,222 +1,326 @@
-"""Localization in a map from nowhere: ``python -m tests.benchmarks.localize``.
+"""Localization in a map from nowhere: how soon, how surely, how accurately, and what it costs.
 
-    [--world intel|aces|identical ...] [--starts N] [--half 0|1] [--cache DIR] [--verbose]
+    python -m tests.benchmarks.localize [--cases intel,vlp-16,...] [--starts 200] [--half 0|1] [--whole]
+    python -m tests.benchmarks.localize --cases city [--km 10] [--sensor vlp-16] [--every 2] [--live] [--memory]
 
-From each start a log begins anew, in a map of another log or of an earlier part of its own, and is processed until
-it is found and ``AFTER_M`` farther, or until it has traveled ``GIVE_UP_M``; logs of other places are run whole by
-``tests.benchmarks.foreign``. Starts are evenly spread over places
-that the map has seen: of the scans of the next ``SEEN_M`` the share ``SEEN_SHARE`` of points lies on its points.
-Maps, logs and references stay in the cache. --half takes every second start.
+From each start a log begins anew, in the map of another drive or of an earlier part of its own, and is processed
+until it is found and 3 m farther, or until it has traveled 15 m (in space 40 m, in the city 60 m). Logs of other
+places are run whole by ``tests.benchmarks.places``. Starts are evenly spread; those of planar logs over places
+that the map has seen: of the scans of the next 5 m 60 % of the points lie on its points. --half takes every
+second.
 
-  found     travel until the first accepted closure to the map
-  wrong     a pose after that is more than 0.5 m or 5° off the reference
-  error     median over the scans after that. The reference is the truth of a simulated log; of a real one it is
-            SLAM over the whole log, moved to the map's nearest keyframe
-  time      CPU time a scan, over that of odometry alone on the same scans
+  found     travel until the state is no longer ``searching``
+  wrong     a pose from there on is more than 0.5 m or 5° off the reference, in space 1 m or 3°
+  error     median over the scans after that. The reference is the truth of a simulated log, of a real one SLAM
+            over all of it; seen from the map's nearest keyframe, which leaves out the map's own error
+  time      CPU time a scan, over that of odometry alone on the same scans; longest of one without the first three
+  whole     the log from its first scan to its last: ATE of all scans, and of the poses known at the time; time
+            over that of odometry, after the first quarter; time to open the map; growth of the resident memory
+
+"vlp-16", "os1-32", "changed": a town mapped with an HDL-64, on another day, with other parked cars, driven the
+other way round with that lidar. "rounds" and "woods" likewise; "forest": a forest in the map of the town.
+"city": a town with so many kilometers of streets, of which every so many sweeps are recorded. --live: in slices,
+so that no scan waits. --memory: the peak of ``run`` and ``localize`` with all they write, each a process of its
+own.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
-import tempfile
-import time
-from collections.abc import Callable, Sequence
+import subprocess
+import sys
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import islice
 from pathlib import Path
+from time import perf_counter, thread_time
 
 import numpy as np
+import psutil
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from scanchain import lie
-from scanchain.api import open_recorder
-from scanchain.data import ClosureVerdict, Matrix, Scan
+from scanchain.data import Matrix, Scan, Trajectory
 from scanchain.logs import open_log
 from scanchain.maps import SavedMap, open_saved_map
 from scanchain.odometry import Odometry
-from scanchain.runs.job import Job, Progress
-from scanchain.runs.run import run
-from scanchain.settings import load_settings, overrides_of
-from scanchain.simulation import plan, record
-from scanchain.slam import Slam
+from scanchain.sessions.localizer import Localizer
+from scanchain.settings import load_settings
+from scanchain.simulation.drive import Drive, plan
+from scanchain.simulation.log import record
+from scanchain.simulation.worlds import outdoor
+from scanchain.simulation.worlds.registry import WORLDS
 from scanchain.trajectory import read_tum
+from tests.benchmarks.harness import DATA, command_line, in_fresh_process, run_of, traveled_m, true_in_map
+from tests.support import made
 
-DATA = Path(os.environ.get("SCANCHAIN_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 SEEN_M, SEEN_SHARE, ON_MAP_M = 5.0, 0.6, 0.2
-GIVE_UP_M, AFTER_M = 15.0, 3.0
-WRONG_M, WRONG_RAD = 0.5, np.radians(5.0)
-FOUND_M = (5.0, 10.0)
+GIVE_UP_M, AFTER_M, WARM_UP = {2: 15.0, 3: 40.0}, 3.0, 3
+WRONG = {2: (0.5, np.radians(5.0)), 3: (1.0, np.radians(3.0))}
+WITHIN_M = (5.0, 10.0)
+STREET_M, BLOCK_M, CITY_SPEED_M_S = 1000.0, (50.0, 40.0), 8.7  # bends included
+HEAD = "| case | starts | within 5 m | 10 m | ever | wrong | error | time | longest |"
+WHOLE = " ATE | at the time | time | opening | memory |"
 
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A map, a log to localize in it, and the poses of both by one reference.
+    """A map, a log to localize in it, and its true poses (N, 4, 4) in the map; without any it is of another place.
 
-    ``map_poses`` are those of the scans that the map was made of, ``poses`` of the log's, ``first`` is its first
-    scan that may be started from.
+    ``first`` is the first scan that may be started from.
     """
 
-    map: SavedMap
+    prior: SavedMap
     log: Path
-    map_poses: Matrix
-    poses: Matrix
+    T_map_lidar: Matrix | None
     first: int = 0
+    give_up_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """The travel until the log was found, infinite if it was not; errors (M, 2) of poses after that; CPU times."""
+    """Travel until a log was found, infinite if it was not; errors (M, 2) from there on; CPU seconds of scans."""
 
     found_m: float
     errors: NDArray[np.float64]
-    is_wrong: bool
-    slam_s: float
+    seconds: list[float]
     odometry_s: float
 
-
-def map_of(log: Path, out: Path, **options: object) -> Path:
-    """The run directory of a log, made unless it is there."""
-    if not (out / "map").is_dir():
-        run(
-            Job((log,), out, overrides=overrides_of(options), sinks=frozenset(), force=True),
-            open_recorder,
-            Progress(),
-        )
-    return out
+    def is_wrong(self, dimension: int) -> bool:
+        return bool((self.errors > WRONG[dimension]).any())
 
 
-def later_part(name: str, end_s: float) -> Callable[[Path], Case]:
+# ---------------------------------------------------------------- cases
+
+
+def _truth(log: Path) -> Trajectory:
+    truth = open_log(log).ground_truth()
+    assert truth is not None
+    return truth
+
+
+def later_part(name: str, end_s: float, options: argparse.Namespace) -> Case:
     """A log, in the map of its first seconds."""
-
-    def case(cache: Path) -> Case:
-        log = DATA / "2d" / f"{name}.mcap"
-        saved = open_saved_map(map_of(log, cache / f"{name}_{end_s:g}", log__end_s=end_s))
-        poses = lie.flatten(read_tum(map_of(log, cache / name) / "trajectory.tum").poses)
-        return Case(saved, log, poses, poses, max(keyframe.scan_index for keyframe in saved.keyframes) + 1)
-
-    return case
+    log = DATA / "2d" / f"{name}.mcap"
+    prior = open_saved_map(run_of(log, options.cache, f"{name}_{end_s:g}", log__end_s=end_s))
+    whole = read_tum(run_of(log, options.cache, name) / "trajectory.tum")
+    first = max(keyframe.scan_index for keyframe in prior.keyframes) + 1
+    return Case(prior, log, true_in_map(prior, whole, whole.poses)[0], first)
 
 
-def driven_twice(world: str, **options: float) -> Callable[[Path], Case]:
+def driven_twice(world: str, options: argparse.Namespace) -> Case:
     """A simulated world, in the map of another drive through it."""
+    drives = plan(world, seed=0), plan(world, seed=1)
+    logs = [_recorded(f"{world}_{k}", replace(drives[k], solids=drives[0].solids), options, k) for k in (0, 1)]
+    return _mapped(options, *logs)
 
-    def case(cache: Path) -> Case:
-        first, second = plan(world, seed=0, **options), plan(world, seed=1, **options)
-        drives = {f"{world}_map": (first, 0), f"{world}_log": (replace(second, solids=first.solids), 1)}
-        for name, (drive, seed) in drives.items():
-            if not (cache / f"{name}.mcap").exists():
-                record(drive, cache / f"{name}.mcap", seed=seed, force=True)
-        saved = open_saved_map(map_of(cache / f"{world}_map.mcap", cache / f"{world}_map"))
-        return Case(saved, cache / f"{world}_log.mcap", first.truth().poses, second.truth().poses)
 
+def another_day(map_world: str, log_world: str, options: argparse.Namespace, **of_log: object) -> Case:
+    """A drive in the map that another one made with an HDL-64."""
+    drive = {"folder": options.cache, "seed": 1, "seconds": of_log.pop("seconds", 66.0)}
+    mapped = made.log(map_world, **drive)
+    again = made.log(log_world, **{"reverse": True, "start_m": 130.0, "sensor": "hdl-64", **of_log}, **drive)
+    case = _mapped(options, mapped, again)
+    return case if map_world == log_world else replace(case, T_map_lidar=None)
+
+
+def city(options: argparse.Namespace) -> Case:
+    """Streets that run east, a kilometer each, driven from end to end one after the other; then back."""
+    x_m = np.arange(0.0, min(STREET_M, 1e3 * options.km) + 1.0, BLOCK_M[0]).tolist()
+    y_m = (np.arange(max(round(1e3 * options.km / STREET_M), 2)) * BLOCK_M[1]).tolist()
+    ends = ((x_m[0], x_m[-1]), (x_m[-1], x_m[0]))
+    route = np.array([(x, y) for k, y in enumerate(y_m) for x in ends[k % 2]])
+    name = f"city-{options.km:g}"
+    build = partial(outdoor.town, streets_x_m=x_m, streets_y_m=y_m)
+    WORLDS[name] = replace(WORLDS["town"], build=build, route=route)
+    logs = []
+    for part, of_part in (("map", {}), ("log", {"changed": 1, "reverse": True})):
+        duration_s = 1e3 * options.km / CITY_SPEED_M_S
+        drive = plan(name, seed=1, sensor=options.sensor, duration_s=duration_s, **of_part)
+        drive = replace(drive, scans=drive.scans[:: options.every])
+        stem = f"{name}_{part}_{options.sensor}_{options.every}"
+        logs.append(_recorded(stem, drive, options, 1, of_part.get("changed")))
+    case = replace(_mapped(options, *logs), give_up_m=60.0)
+    if options.memory:
+        run, found = (str(options.cache / f"{name}.{command}") for command in ("run", "localize"))
+        _print_peak("run", str(logs[0]), "--out", run, "--force")
+        _print_peak("localize", str(logs[1]), "--map", run, "--out", found, "--force")
     return case
 
 
-WORLDS: dict[str, Callable[[Path], Case]] = {
-    "intel": later_part("intel", 1400.0),
-    "aces": later_part("aces", 700.0),
-    "identical": driven_twice("identical"),
+def _recorded(name: str, drive: Drive, options: argparse.Namespace, seed: int, changed: int | None = None) -> Path:
+    def write(draft: Path) -> None:
+        record(drive, draft, seed=seed, changed=changed, force=True)
+
+    return made.recorded(name, write, options.cache)
+
+
+def _mapped(options: argparse.Namespace, mapped: Path, log: Path) -> Case:
+    prior = open_saved_map(run_of(mapped, options.cache, mapped.stem))
+    return Case(prior, log, true_in_map(prior, _truth(mapped), _truth(log).poses)[0])
+
+
+def _print_peak(*arguments: str) -> None:
+    """Run a command of scanchain; the peak of its resident memory, its exit code 1 being a verdict.
+
+    A small process starts it, for a child begins with the peak of its parent.
+    """
+    start = (
+        "import resource, subprocess, sys\n"
+        "code = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL).returncode\n"
+        "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)\n"
+        "sys.exit(code > 1)"
+    )
+    command = [sys.executable, "-c", start, sys.executable, "-m", "scanchain", *arguments]
+    kibibytes = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
+    print(f"{arguments[0]}: {int(kibibytes) / 1024.0:.0f} MiB at most", flush=True)
+
+
+CASES: dict[str, Callable[[argparse.Namespace], Case]] = {
+    "intel": partial(later_part, "intel", 1400.0),
+    "aces": partial(later_part, "aces", 700.0),
+    "csail": partial(later_part, "mit_csail", 212.0),
+    "office": partial(driven_twice, "office"),
+    "identical": partial(driven_twice, "identical"),
+    "same": partial(another_day, "town", "town", reverse=False, start_m=0.0),
+    "changed": partial(another_day, "town", "town", changed=1),
+    "vlp-16": partial(another_day, "town", "town", sensor="vlp-16", changed=2),
+    "os1-32": partial(another_day, "town", "town", sensor="os1-32", changed=3, start_m=50.0),
+    "rounds": partial(another_day, "rounds", "rounds", changed=4, start_m=300.0, seconds=160.0),
+    "forest": partial(another_day, "town", "forest", changed=1),
+    "woods": partial(another_day, "forest", "forest", changed=1),
+    "city": city,
 }
 
 
-def in_map(case: Case) -> Matrix:
-    """(N, d+1, d+1) T_map_lidar of the log's scans by the reference, as seen from the map's nearest keyframe."""
-    reference = case.map_poses[[keyframe.scan_index for keyframe in case.map.keyframes]]
-    nearest = cKDTree(reference[:, :-1, -1]).query(case.poses[:, :-1, -1])[1]
-    return case.map.poses[nearest] @ lie.between(reference[nearest], case.poses)
+# ---------------------------------------------------------------- starts
 
 
-def starts_of(case: Case, scans: Sequence[Scan], poses: Matrix) -> NDArray[np.int64]:
-    """Scans from which the log may begin."""
-    surfaces = cKDTree(np.vstack([lie.transform(k.T_odom_lidar, k.points[::2]) for k in case.map.keyframes]))
-    stride = 5
-    some = np.arange(case.first, len(scans), stride)
+def starts_of(case: Case, log_scans: list[Scan], count: int) -> list[int]:
+    """Scans from which the log begins."""
+    if case.prior.dimension == 3:
+        length = len(_truth(case.log))
+        return np.linspace(0, int(length * 0.9), count).astype(int).tolist()  # so that there is path left
+    surfaces = KDTree(np.vstack([lie.transform(k.T_odom_lidar, k.points[::2]) for k in case.prior.keyframes]))
+    assert case.T_map_lidar is not None
+    poses = lie.flatten(case.T_map_lidar)
+    some = np.arange(case.first, len(log_scans), 5)
     share = np.array([
-        np.mean(surfaces.query(lie.transform(poses[i], scans[i].points[::3].astype(float)))[0] < ON_MAP_M)
+        np.mean(surfaces.query(lie.transform(poses[i], log_scans[i].points[::3].astype(float)))[0] < ON_MAP_M)
         for i in some.tolist()
     ])  # fmt: skip
-    traveled = np.cumsum(np.append(0.0, np.linalg.norm(np.diff(poses[some][:, :-1, -1], axis=0), axis=1)))
-    ends = np.searchsorted(traveled, traveled + SEEN_M)
+    path_m = traveled_m(poses[some])
+    ends = np.searchsorted(path_m, path_m + SEEN_M).tolist()
     is_seen = [
-        share[k] > SEEN_SHARE and share[k : end + 1].mean() > SEEN_SHARE and traveled[-1] > traveled[k] + GIVE_UP_M
-        for k, end in enumerate(ends.tolist())
+        share[k] > SEEN_SHARE and share[k : end + 1].mean() > SEEN_SHARE and path_m[-1] > path_m[k] + GIVE_UP_M[2]
+        for k, end in enumerate(ends)
     ]
-    return some[is_seen]
+    seen = some[is_seen]
+    return seen[np.linspace(0, len(seen) - 1, min(count, len(seen))).astype(int)].tolist()
 
 
-def localized(case: Case, scans: Sequence[Scan], start: int, poses: Matrix) -> Outcome:
-    """What becomes of the log that begins at this scan."""
-    config, T_base_lidar = load_settings(case.map.dimension).config, open_log([case.log]).T_base_lidar
-    slam, began_s = Slam(config, T_base_lidar, prior=case.map), time.process_time()
-    found_m, traveled_m, count = np.inf, 0.0, 0
-    errors: list[tuple[float, float]] = []
-    T_last = None
-    for scan in scans[start:]:
-        step = slam.process(scan)
-        count += 1
-        traveled_m += 0.0 if T_last is None else lie.apart(T_last, step.T_odom_lidar)[0]
-        T_last = step.T_odom_lidar
-        if np.isfinite(found_m):
-            errors.append(lie.apart(poses[scan.index], step.T_world_lidar))
-        is_found = any(c.verdict is ClosureVerdict.ACCEPTED and c.target < slam.trail.first for c in step.closures)
-        if is_found and np.isinf(found_m):
-            found_m = traveled_m
-        if traveled_m > min(found_m + AFTER_M, GIVE_UP_M):
-            break
-    slam_s, began_s = time.process_time() - began_s, time.process_time()
+def localized(case: Case, scans: Iterable[Scan], *, is_live: bool) -> Outcome:
+    """What becomes of the log that begins with these scans."""
+    config, T_base_lidar = load_settings(case.prior.dimension).config, open_log(case.log).T_base_lidar
+    localizer = Localizer(case.prior, config, T_base_lidar, is_live=is_live)
     odometry = Odometry(config, T_base_lidar)
-    for scan in scans[start : start + count]:
+    give_up_m = case.give_up_m or GIVE_UP_M[case.prior.dimension]
+    found_m, odometry_s = np.inf, 0.0
+    seconds: list[float] = []
+    errors: list[tuple[float, float]] = []
+    for number, scan in enumerate(scans):
+        begun_s = thread_time()
+        placed = localizer.process(replace(scan, index=number))
+        between_s = thread_time()
         odometry.process(scan)
-    odometry_s = time.process_time() - began_s
-    found = np.array(errors).reshape(-1, 2)
-    is_wrong = bool((found > (WRONG_M, WRONG_RAD)).any())
-    return Outcome(found_m, found, is_wrong, slam_s, odometry_s)
+        seconds.append(between_s - begun_s)
+        odometry_s += thread_time() - between_s
+        gone_m = localizer.traveled_m[-1]
+        if placed.T_map_lidar is not None:
+            found_m = min(found_m, gone_m)
+            true = None if case.T_map_lidar is None else case.T_map_lidar[scan.index]
+            errors.append((np.inf, np.inf) if true is None else lie.apart(true, lie.lift(placed.T_map_lidar)))
+        if gone_m > min(found_m + AFTER_M, give_up_m):
+            break
+    return Outcome(found_m, np.array(errors).reshape(-1, 2), seconds, odometry_s)
 
 
-def row(name: str, outcomes: Sequence[Outcome]) -> str:
-    """The line of the table for one world."""
+def whole(case: Case, scans: Iterable[Scan]) -> str:
+    """The whole log in the map, and odometry alone scan by scan beside it: both timed under the same load."""
+    config, T_base_lidar = load_settings(case.prior.dimension).config, open_log(case.log).T_base_lidar
+    held, started = psutil.Process().memory_info().rss, perf_counter()
+    prior = open_saved_map(case.prior.folder)
+    localizer = Localizer(prior, config, T_base_lidar, is_live=False)
+    opening_s = perf_counter() - started
+    odometry = Odometry(config, T_base_lidar)
+    seconds = []
+    for scan in scans:
+        begun_s = thread_time()
+        odometry.process(scan)
+        between_s = thread_time()
+        localizer.process(scan)
+        seconds.append((between_s - begun_s, thread_time() - between_s))
+    grown_mib = (psutil.Process().memory_info().rss - held) / 2**20
+    odometry_s, scan_s = np.mean(seconds[len(seconds) // 4 :], axis=0)
+    found = localizer.finish()
+    true, known = case.T_map_lidar[:, :3, 3], np.isfinite(found.live[:, 0, 0])
+    live_m = _rmse(lie.lift(found.live[known])[:, :3, 3] - true[known])
+    ate_m = _rmse(lie.lift(found.trajectory.poses)[:, :3, 3] - true)
+    figures = f"{ate_m:.4f} m | {live_m:.4f} m | {1e3 * scan_s:.0f} ms, {scan_s / odometry_s:.2f}"
+    return f"{figures} | {opening_s:.2f} s | {grown_mib:.0f} MiB |"
+
+
+def _rmse(off: Matrix) -> float:
+    return float(np.sqrt(np.mean(np.sum(off**2, axis=1)))) if len(off) else np.nan
+
+
+def row(name: str, options: argparse.Namespace) -> str:
+    """The line of the table for one case."""
+    case = CASES[name](options)
+    d, log = case.prior.dimension, open_log(case.log)
+    scans = [] if name == "city" else list(log.scans(load_settings(d).config.preprocess))
+    outcomes = []
+    for start in starts_of(case, scans, options.starts)[options.half :: 1 if options.half is None else 2]:
+        following = scans[start:] or islice(log.scans(load_settings(d).config.preprocess), start, None)
+        outcomes.append(localized(case, following, is_live=options.live))
+        if options.verbose:
+            last = outcomes[-1]
+            worst = np.round(last.errors.max(axis=0, initial=0.0), 3).tolist()
+            print(f"start {start}: {last.found_m:.1f} m {worst}{' WRONG' * last.is_wrong(d)}", flush=True)
     found_m = np.array([each.found_m for each in outcomes])
-    errors = np.vstack([each.errors for each in outcomes if not each.is_wrong])
+    errors = np.vstack([each.errors for each in outcomes if not each.is_wrong(d)])
     m, rad = np.median(errors, axis=0) if len(errors) else (np.nan, np.nan)
-    ratio = sum(each.slam_s for each in outcomes) / max(sum(each.odometry_s for each in outcomes), 1e-9)
-    shares = " | ".join(f"{100.0 * np.mean(found_m <= limit):.1f} %" for limit in FOUND_M)
-    wrong = sum(each.is_wrong for each in outcomes)
-    error = f"{100.0 * m:.1f} cm, {np.degrees(rad):.2f}°"
-    return f"| {name} | {len(outcomes)} | {shares} | {wrong} | {error} | {ratio:.2f} |"
+    ratio = sum(sum(each.seconds) for each in outcomes) / max(sum(each.odometry_s for each in outcomes), 1e-9)
+    longest_s = max(max(each.seconds[WARM_UP:], default=0.0) for each in outcomes[1:] or outcomes)
+    shares = " | ".join(f"{100.0 * np.mean(found_m <= limit):.1f} %" for limit in (*WITHIN_M, 1e9))
+    wrong = sum(each.is_wrong(d) for each in outcomes)
+    error = f"{1e3 * m:.0f} mm, {np.degrees(rad):.2f}°"
+    line = f"| {name} | {len(outcomes)} | {shares} | {wrong} | {error} | {ratio:.2f} | {1e3 * longest_s:.0f} ms |"
+    return line + (f" {whole(case, scans)}" if options.whole and case.T_map_lidar is not None else "")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--world", nargs="+", choices=list(WORLDS), default=list(WORLDS))
+    parser = command_line(__doc__)
+    parser.add_argument(
+        "--cases", default="intel,aces,identical,vlp-16,os1-32,changed", help="default: %(default)s"
+    )
     parser.add_argument("--starts", type=int, default=200)
     parser.add_argument("--half", type=int, choices=(0, 1))
-    parser.add_argument("--cache", type=Path)
+    parser.add_argument("--whole", action="store_true")
+    parser.add_argument("--live", action="store_true")
     parser.add_argument("--verbose", action="store_true", help="print a line for each start")
+    parser.add_argument("--km", type=float, default=10.0, help="of streets, default: %(default)s")
+    parser.add_argument("--sensor", default="vlp-16", help="of the city, default: %(default)s")
+    parser.add_argument("--every", type=int, default=2, help="sweeps a scan, default: %(default)s")
+    parser.add_argument("--memory", action="store_true")
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        cache = options.cache or Path(folder)
-        cache.mkdir(parents=True, exist_ok=True)
-        limits = " | ".join(f"within {limit:g} m" for limit in FOUND_M)
-        print(f"| world | starts | {limits} | wrong | error | time |\n|---|---|---|---|---|---|---|")
-        for name in options.world:
-            case = WORLDS[name](cache)
-            scans, poses = list(open_log([case.log]).scans()), in_map(case)
-            seen = starts_of(case, scans, poses)
-            starts = seen[np.linspace(0, len(seen) - 1, min(options.starts, len(seen))).astype(int)]
-            if options.half is not None:
-                starts = starts[options.half :: 2]
-            outcomes = []
-            for start in starts.tolist():
-                outcomes.append(localized(case, scans, start, poses))
-                if options.verbose:
-                    last = outcomes[-1]
-                    worst = np.round(last.errors.max(axis=0, initial=0.0), 3).tolist()
-                    print(
-                        f"start {start}: {last.found_m:.1f} m {worst} {'WRONG' if last.is_wrong else ''}",
-                        flush=True,
-                    )
-            print(row(name, outcomes), flush=True)
+    options.cache.mkdir(parents=True, exist_ok=True)
+    print(HEAD + (WHOLE if options.whole else ""))
+    print("|---" * (HEAD + (WHOLE if options.whole else "")).count(" |") + "|")
+    for name in options.cases.split(","):
+        print(in_fresh_process(row, name, options), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,17 +1,17 @@
 """Time and memory of SLAM along a long log.
 
-    python -m tests.benchmarks.long_run [--log LOG] [--scans N] [--live N] [--finish]
+    python -m tests.benchmarks.long_run [--log LOG] [--scans N] [--pass N] [--live N] [--finish] [--odometry]
 
 A laser scanner goes round the simulated office for hours; or a log given is played forward and backward in turn.
 Every tenth of the way: the mean CPU time of ``Slam.process`` a scan, loops and optimizations included, of this
 thread and of all, the memory of this process and its peak, and what it keeps in a file instead. With ``--live``,
 so many scans more come in real time, forty a second: the longest that ``Slam.track`` took of one, by the clock.
-With ``--finish`` the last optimization follows, of everything.
+With ``--finish`` the last optimization follows, of everything. ``--odometry`` tracks the scans and does nothing
+else: its memory stays as it is.
 """
 
 from __future__ import annotations
 
-import argparse
 import os
 import tempfile
 from collections.abc import Iterator
@@ -19,61 +19,69 @@ from itertools import islice
 from pathlib import Path
 from time import perf_counter, process_time, sleep, thread_time
 
-from scanchain import Slam
+import numpy as np
+
+from scanchain import Odometry, Slam
 from scanchain.data import Scan
-from scanchain.logs import Log, open_log
+from scanchain.logs import open_log
 from scanchain.processes import peak_mib, resident_mib
 from scanchain.settings import load_settings
 from scanchain.simulation import SENSORS, simulate
+from tests.benchmarks.harness import command_line
 from tests.support.back_and_forth import BackAndForth
 
 _LIVE_S = 0.025  # period of a fast laser scanner
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__, cache=False)
     parser.add_argument("--scans", type=int, default=20_000)
     parser.add_argument("--log", type=Path, help="take the scans of this log instead of simulating one")
     parser.add_argument("--pass", type=int, dest="length", help="scans of the log that are played")
     parser.add_argument("--live", type=int, default=0)
     parser.add_argument("--finish", action="store_true")
+    parser.add_argument("--odometry", action="store_true")
     arguments = parser.parse_args()
+    count = arguments.scans + arguments.live
     with tempfile.TemporaryDirectory() as folder:
         path = arguments.log or Path(folder) / "office.mcap"
         if arguments.log is None:
-            simulate("office", path, duration_s=arguments.scans * SENSORS["lms-270"].period_ns * 1e-9)
+            simulate("office", path, duration_s=count * SENSORS["lms-270"].period_ns * 1e-9)
         log = open_log(path)
-        slam = Slam(load_settings(log.dimension).config, log.T_base_lidar)
-        scans = _scans(log, arguments.scans + arguments.live, arguments.log is None, arguments.length)
-        _follow(slam, islice(scans, arguments.scans), arguments.scans)
-        _follow_live(slam, scans)
-        if arguments.finish:
-            _finish(slam)
+        config = load_settings(log.dimension).config
+        scans = BackAndForth(log, arguments.length).scans(count) if arguments.log else log.scans()
+        chain = (Odometry if arguments.odometry else Slam)(config, log.T_base_lidar)
+        _follow(chain, islice(scans, arguments.scans), arguments.scans)
+        if isinstance(chain, Slam):
+            _follow_live(chain, scans)
+            if arguments.finish:
+                started = process_time()
+                chain.finish()
+                print(f"last optimization: {process_time() - started:.1f} s, peak {peak_mib():.1f} MiB")
 
 
-def _scans(log: Log, count: int, is_long: bool, length: int | None) -> Iterator[Scan]:
-    return log.scans() if is_long else BackAndForth(log, length).scans(count)
-
-
-def _follow(slam: Slam, scans: Iterator[Scan], count: int) -> None:
-    tenth, spent_s, taken_s, all_s = max(count // 10, 1), [], 0.0, 0.0
+def _follow(chain: Slam | Odometry, scans: Iterator[Scan], count: int) -> None:
+    tenth, spent_s, held_mib, taken_s, all_s = max(count // 10, 1), [], [], 0.0, 0.0
     for number, scan in enumerate(scans, 1):
         started, all_started = thread_time(), process_time()
-        slam.process(scan)
+        chain.process(scan)
         taken_s, all_s = taken_s + thread_time() - started, all_s + process_time() - all_started
         if number % tenth == 0:
             spent_s.append(taken_s)
-            stored_mib = 4 * slam.dimension * slam.points.rows / 2**20
-            print(
+            held_mib.append(resident_mib(os.getpid()))
+            line = (
                 f"{number:6} scans {1e3 * taken_s / tenth:6.2f} ms a scan "
-                f"({1e3 * all_s / tenth:.2f} with threads), "
-                f"{resident_mib(os.getpid()):6.1f} MiB (peak {peak_mib():.1f}), {stored_mib:5.1f} in a file; "
-                f"{len(slam.keyframes)} keyframes, {len(slam.closures)} closures tried",
-                flush=True,
+                f"({1e3 * all_s / tenth:.2f} with threads), {held_mib[-1]:6.1f} MiB (peak {peak_mib():.1f})"
             )
+            if isinstance(chain, Slam):
+                stored_mib = 4 * chain.dimension * chain.points.rows / 2**20
+                kept = f"{len(chain.keyframes)} keyframes, {len(chain.closures)} closures tried"
+                line += f", {stored_mib:5.1f} in a file; {kept}"
+            print(line, flush=True)
             taken_s, all_s = 0.0, 0.0
     if len(spent_s) >= 10:
-        print(f"last tenth / second tenth: {spent_s[9] / spent_s[1]:.2f}")
+        varies = 100.0 * np.ptp(held_mib) / held_mib[0]
+        print(f"last tenth / second tenth: {spent_s[9] / spent_s[1]:.2f}; memory varies by {varies:.1f} %")
 
 
 def _follow_live(slam: Slam, scans: Iterator[Scan]) -> None:
@@ -89,12 +97,6 @@ def _follow_live(slam: Slam, scans: Iterator[Scan]) -> None:
             f"live: {longest_s:.3f} s at most a scan, {len(slam.keyframes) - before} keyframes, "
             f"{optimizations} optimizations taken over"
         )
-
-
-def _finish(slam: Slam) -> None:
-    started = process_time()
-    slam.finish()
-    print(f"last optimization: {process_time() - started:.1f} s, peak {peak_mib():.1f} MiB")
 
 
 if __name__ == "__main__":

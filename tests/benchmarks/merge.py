@@ -1,4 +1,4 @@
-"""Sessions cut from logs and merged, their starts unknown: ``python -m tests.benchmarks.merge [--cache DIR]``.
+"""Sessions cut from logs and merged, their starts unknown: ``python -m tests.benchmarks.merge [--only PART ...]``.
 
 Intel is run whole, and in four parts of a quarter of its time, which are merged; the error over the relations of
 Kümmerle et al. (2009) is that of all scans of both. A simulated town (64 rings) is cut in two, which share 4 s,
@@ -11,8 +11,6 @@ Prints a Markdown table.
 
 from __future__ import annotations
 
-import argparse
-import os
 import tempfile
 from collections.abc import Sequence
 from itertools import combinations
@@ -24,23 +22,20 @@ import numpy as np
 import scanchain as sc
 from scanchain import lie
 from scanchain.data import Trajectory
-from scanchain.evaluation import absolute_error, pair, read_relations, relation_error
+from scanchain.evaluation import read_relations, relation_error
 from scanchain.runs.metrics import Metrics
 from scanchain.sessions.merging import Merged
 from scanchain.trajectory import read_tum
+from tests.benchmarks.harness import DATA, ate_m, command_line, run_of
+from tests.support import made
 
-DATA = Path(os.environ.get("SCANCHAIN_DATA", Path(__file__).resolve().parents[3] / "shared" / "data")) / "2d"
-INTEL, RELATIONS, CSAIL = DATA / "intel.mcap", DATA / "intel.relations", DATA / "mit_csail.mcap"
-ACES = DATA / "aces.mcap"
+INTEL, ACES, CSAIL = (DATA / f"2d/{name}.mcap" for name in ("intel", "aces", "mit_csail"))
 LENGTH_S, SCANS = 2691.3, 2000
 
 
 def run(cache: Path, name: str, log: Path, start_s: float = 0.0, end_s: float = np.inf) -> Path:
     """The run of a part of a log."""
-    out = cache / name
-    if not out.exists():
-        sc.run(log, out, recording=False, log__start_s=start_s, log__end_s=end_s)
-    return out
+    return run_of(log, cache, name, log__start_s=start_s, log__end_s=end_s)
 
 
 def run_s(runs: Sequence[Path]) -> float:
@@ -66,15 +61,19 @@ def show(name: str, runs: Sequence[Path], merged: Merged, error: str = "") -> No
     )
 
 
+def over_relations(log: Path, merged: Merged, whole: Trajectory) -> str:
+    """Mean error over the relations of a log, merged and uncut."""
+    relations = read_relations(log.with_suffix(".relations"))
+    found, known = (relation_error(each, relations).translation_m.mean for each in (trajectory(merged), whole))
+    return f"relations {1e3 * found:.1f} mm, uncut {1e3 * known:.1f} mm ({100.0 * (found / known - 1.0):+.1f} %)"
+
+
 def intel(cache: Path, folder: Path) -> None:
     quarter_s = LENGTH_S / 4.0
     parts = [run(cache, f"intel-{k + 1}", INTEL, k * quarter_s, (k + 1) * quarter_s) for k in range(4)]
     whole = read_tum(run(cache, "intel", INTEL) / "trajectory.tum")
     merged = sc.merge(parts, folder / "intel")
-    relations = read_relations(RELATIONS)
-    found, known = (relation_error(each, relations).translation_m.mean for each in (trajectory(merged), whole))
-    error = f"relations {1e3 * found:.1f} mm, uncut {1e3 * known:.1f} mm ({100.0 * (found / known - 1.0):+.1f} %)"
-    show("Intel in four parts", parts, merged, error)
+    show("Intel in four parts", parts, merged, over_relations(INTEL, merged, whole))
     parts.append(run(cache, "csail", CSAIL))
     show("the same, and CSAIL", parts, sc.merge(parts, folder / "csail"))
 
@@ -87,20 +86,15 @@ def eight(cache: Path, folder: Path) -> None:
 
 
 def town(cache: Path, folder: Path) -> None:
-    log = cache / "town.mcap"
-    truth = (
-        read_tum(log.with_suffix(".tum")) if log.exists() else sc.simulate("town", log, seed=1, duration_s=60.0)
-    )
+    log = made.log("town", folder=cache, seed=1, seconds=60.0)
     parts = [run(cache, "town-1", log, end_s=32.0), run(cache, "town-2", log, start_s=28.0)]
     merged = sc.merge(parts, folder / "town")
-    error = absolute_error(pair(trajectory(merged), truth)).translation_m.rmse
-    show("town, two sessions", parts, merged, f"ATE {error:.4f} m")
+    error_m = ate_m(trajectory(merged), read_tum(log.with_suffix(".tum")))
+    show("town, two sessions", parts, merged, f"ATE {error_m:.4f} m")
 
 
 def cut(cache: Path, folder: Path) -> None:
-    stairs = cache / "staircase.mcap"
-    if not stairs.exists():
-        sc.simulate("staircase", stairs, seed=1)
+    stairs = made.log("staircase", folder=cache, seed=1)
     for name, log in (("aces", ACES), ("csail", CSAIL), ("staircase", stairs)):
         whole = read_tum(run(cache, name, log) / "trajectory.tum")
         length_s = float(np.ptp(whole.stamps_ns)) * 1e-9
@@ -112,19 +106,13 @@ def cut(cache: Path, folder: Path) -> None:
             except sc.ScanchainError as error:
                 print(f"| {name} in {count} parts | none: {error} |", flush=True)
                 continue
-            error = ""
-            if name == "aces":
-                relations = read_relations(ACES.with_suffix(".relations"))
-                found, known = (
-                    relation_error(e, relations).translation_m.mean for e in (trajectory(merged), whole)
-                )
-                error = f"relations {1e3 * found:.1f} mm, uncut {1e3 * known:.1f} mm"
+            error = over_relations(log, merged, whole) if name == "aces" else ""
             show(f"{name} in {count} parts", parts, merged, error)
 
 
 def look_alikes(cache: Path, folder: Path) -> None:
-    log = cache / "identical.mcap"
-    truth = read_tum(log.with_suffix(".tum")) if log.exists() else sc.simulate("identical", log)
+    log = made.log("identical", folder=cache)
+    truth = read_tum(log.with_suffix(".tum"))
     true = Trajectory(truth.stamps_ns, lie.lift(truth.poses))
     parts = [run(cache, f"identical-{k + 1}", log, 50.0 * k, 50.0 * (k + 1)) for k in range(6)]
     right = wrong = uncertain = 0
@@ -134,22 +122,24 @@ def look_alikes(cache: Path, folder: Path) -> None:
         except sc.ScanchainError as error:
             uncertain += "not certain" in str(error)
             continue
-        is_right = absolute_error(pair(trajectory(merged), true)).translation_m.rmse < 0.5
+        is_right = ate_m(trajectory(merged), true) < 0.5
         right, wrong = right + is_right, wrong + (not is_right)
     print(f"\nidentical corridors, 15 pairs: {wrong} joined wrongly, {right} rightly, {uncertain} named uncertain")
 
 
+PARTS = {"intel": intel, "eight": eight, "cut": cut, "town": town, "look-alikes": look_alikes}
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cache", type=Path, help="folder of the runs")
-    cache = parser.parse_args().cache
+    parser = command_line(__doc__)
+    parser.add_argument("--only", nargs="+", choices=list(PARTS), default=list(PARTS))
+    options = parser.parse_args()
+    options.cache.mkdir(parents=True, exist_ok=True)
     print("| sessions | in the map | apart | closures in force | certified | error | runs | merge |")
     print("|---|---|---|---|---|---|---|---|")
     with tempfile.TemporaryDirectory() as folder:
-        runs = cache or Path(folder) / "runs"
-        runs.mkdir(parents=True, exist_ok=True)
-        for part in (intel, eight, cut, town, look_alikes):
-            part(runs, Path(folder))
+        for name in options.only:
+            PARTS[name](options.cache, Path(folder))
 
 
 if __name__ == "__main__":

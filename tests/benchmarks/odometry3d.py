@@ -1,131 +1,173 @@
 """3D odometry, ours against others, on the same decoded scans, scan by scan in turn.
 
-    python -m tests.benchmarks.odometry3d [LOG ...] [--methods plicp,kiss-icp,...] [--scans N] [--indoor] [--quick]
+    python -m tests.benchmarks.odometry3d [LOG ...] [--methods plicp,...] [--scans 300] [--indoor]
+    python -m tests.benchmarks.odometry3d --set [--worlds town,...] [--sensors vlp-16,...] [--scans 300]
 
-LOG is any MCAP with a 3D lidar. Its scans are decoded once into memory. Each method first gets the first few
-scans on a throwaway instance, so that compilation and imports are done; then every scan goes through all methods
-in turn, starting with another one each time, so that whatever else the machine does meets all of them alike. The
-time is that of ``track`` alone, the first scan left out. Poses hold at the scan's stamp; where a method's own hold
-elsewhere in the sweep, its wrapper moves them. Every log has a process of its own, and so has every method for its
-memory (the scans held here would drown it). --indoor takes the settings that others recommend for indoors where
-they have some; --quick leaves memory and sharpness out.
+Methods, settings and warm-up are those of ``scanchain compare``, where each has a process of its own. LOG is any
+MCAP with a 3D lidar. Its scans are decoded once into memory, then every one goes through all methods in turn,
+starting with another one each time, so that whatever else the machine does meets all of them alike. The time is
+that of ``track`` alone, the first scan left out. Poses hold at the scan's stamp; where a method's own hold
+elsewhere in the sweep, its wrapper moves them. Every log has a process of its own. --indoor takes the settings
+that others recommend for indoors where they have some. Memory and sharpness of maps are figures of ``scanchain
+compare``.
+
+--set: every world of scanchain.simulation that is driven with a 3D lidar, with every 3D sensor. A cell is the
+KITTI translation error in % over stretches of 10, 20 and 40 m, and the ATE in meters. Where the path is shorter
+than 20 m the first number is the ATE over the length of the path, marked *. LOST: the last pose, seen from the
+first, is off by more than 5 % of the path or 2 m, whichever is larger, or there is none.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Sequence
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
+from time import perf_counter, process_time
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.data import Trajectory
+from scanchain.comparison.methods import Method, resolve
+from scanchain.comparison.worker import start, warm_up
+from scanchain.data import Pose, Scan, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import (
     SHORT_LENGTHS_M,
-    Sharpness,
     absolute_error,
     kitti_error,
     pair,
     relative_error_over_frames,
-    sampled_map,
-    sampling_step,
-    sharpness,
 )
-from tests.benchmarks.contest import OURS, Recording, Run, default_methods, in_fresh_process, read, run_all
-from tests.benchmarks.peak_memory import PeakMemory, measure
+from scanchain.logs import open_log
+from tests.benchmarks.harness import DATA, KITTI, choose_sequences, command_line, drive_of, in_fresh_process
 
-ROOT = Path(__file__).resolve().parents[2]
-DATA = Path(os.environ.get("SCANCHAIN_DATA", ROOT.parent / "shared" / "data")) / "3d"
-DEFAULT_LOGS = ("kitti_0005_first60.mcap", "kitti_0001_first54.mcap")
+OURS = ("plicp", "svd")
+INDOORS = frozenset({"corridor", "staircase", "hall"})  # where others' settings for indoors are taken
+SHORT_PATH_M, LOST_SHARE, LOST_M = 20.0, 0.05, 2.0
+COLUMNS = (  # heads, digits, and whether the ratio to ours says anything
+    ("median ms", 2, True), ("p95 ms", 1, False), ("CPU ms", 2, True), ("ATE m", 4, True), ("RPE mm", 1, True),
+    ("KITTI %", 3, True), ("KITTI deg/m", 4, True), ("to KISS mm", 1, False),
+)  # fmt: skip
 LEGEND = """\
   x: over the same of the first row of ours; CPU ms: median, all threads together
-  peak: resident memory of a process that reads the log and runs this method only; growth: of it, after one scan
   ATE: rmse after rigid alignment; RPE: rmse from scan to scan; KITTI: mean over all stretches of 10, 20 and 40 m
-  entropy, planes: mean map entropy and plane thickness, lower is sharper (scanchain.evaluation.map_sharpness)
   to KISS: median distance between the motion of a scan and that which KISS-ICP finds"""
 
 
 @dataclass(frozen=True, slots=True)
-class Column:
-    """How a number is shown, and whether its ratio to ours says anything."""
+class Recording:
+    """A log in memory: scans, where the lidar sits and, where the log has it, the ground truth."""
 
-    head: str
-    digits: int
-    has_ratio: bool = True
+    scans: list[Scan]
+    T_base_lidar: Pose
+    ground_truth: Trajectory | None
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """What a method made of a recording; the poses after a ``failure`` (empty if there was none) are NaN.
+
+    ``seconds`` (N,) passed on the clock while a scan was tracked, ``cpu_seconds`` were spent by all threads.
+    """
+
+    name: str
+    description: str
+    trajectory: Trajectory
+    seconds: NDArray[np.float64]
+    cpu_seconds: NDArray[np.float64]
+    failure: str
 
     @property
-    def width(self) -> int:
-        return max(len(self.head), 14 if self.has_ratio else 7) + 2
-
-    def show(self, value: float, base: float) -> str:
-        if not np.isfinite(value):
-            return f"{'-':>{self.width}}"
-        ratio = f" x{value / base:.2f}" if self.has_ratio and base > 0.0 else ""
-        return f"{f'{value:.{self.digits}f}{ratio}':>{self.width}}"
+    def is_whole(self) -> bool:
+        return bool(np.isfinite(self.trajectory.poses).all())
 
 
-COLUMNS = (
-    *(
-        Column("median ms", 2),
-        Column("p95 ms", 1, False),
-        Column("CPU ms", 2),
-        Column("peak MiB", 0),
-        Column("growth MiB", 1, False),
-    ),
-    *(Column("ATE m", 4), Column("RPE mm", 1), Column("KITTI %", 3), Column("KITTI deg/m", 4)),
-    *(Column("entropy nats", 4, False), Column("planes mm", 2), Column("to KISS mm", 1, False)),
-)
+def method_of(name: str) -> Method:
+    """One of ours or of the baselines."""
+    return resolve((name,), 3, file=None)[0]
 
 
-def run_log(path: Path, methods: tuple[str, ...], scans: int, quick: bool) -> None:
-    """Race, measure, print."""
+def default_methods(path: Path, *, indoor: bool) -> tuple[str, ...]:
+    """Ours and all others that are worth a row; GenZ-ICP as its authors tuned it for such a log."""
+    genz = "genz-icp-indoor" if indoor else "genz-icp-kitti" if "kitti" in path.name else "genz-icp"
+    return (*OURS, "kiss-icp", "small-vgicp", "small-gicp", genz, "open3d-p2l")
+
+
+def read(path: Path, count: int | None = None) -> Recording:
+    """The first scans of a log, and its ground truth."""
+    log = open_log(path)
+    if log.dimension != 3:
+        raise InputError(f"{path}: {log.topic} is 2D; this benchmark is for 3D lidars")
+    return Recording(list(islice(log.scans(), count)), log.T_base_lidar, log.ground_truth())
+
+
+def run_all(recording: Recording, methods: Sequence[str]) -> list[Run]:
+    """All methods over all scans, in turn, each scan starting with another one."""
+    for name in methods:
+        warm_up(recording.scans, method_of(name), recording.T_base_lidar)
+    racers = [start(method_of(name), recording.T_base_lidar) for name in methods]
+    poses = np.full((len(methods), len(recording.scans), 4, 4), np.nan)
+    seconds, cpu_seconds = np.zeros((2, len(methods), len(recording.scans)))
+    failures = [""] * len(methods)
+    for k, scan in enumerate(recording.scans):
+        for place in range(len(methods)):
+            m = (place + k) % len(methods)
+            if failures[m]:
+                continue
+            started, cpu_started = perf_counter(), process_time()
+            try:
+                poses[m, k] = racers[m].track(scan)
+            except Exception as error:  # others' code may raise anything; the race goes on
+                failures[m] = f"scan {k}: {type(error).__name__}: {error}"
+            seconds[m, k], cpu_seconds[m, k] = perf_counter() - started, process_time() - cpu_started
+    stamps_ns = np.array([scan.stamp_ns for scan in recording.scans])
+    trajectories = [Trajectory(stamps_ns, each) for each in poses]
+    descriptions = [racer.description for racer in racers]
+    return list(map(Run, methods, descriptions, trajectories, seconds, cpu_seconds, failures))
+
+
+# ---------------------------------------------------------------- one log in detail
+
+
+def run_log(path: Path, methods: Sequence[str], scans: int) -> None:
+    """One line a method, then what each one did."""
     recording = read(path, scans)
     runs = run_all(recording, methods)
-    whole = [run for run in runs if run.is_whole]
-    sharp: dict[str, Sharpness | None] = {}
-    memory: dict[str, PeakMemory | None] = {}
-    if not quick:
-        step = sampling_step(sum(len(scan.points) for scan in recording.scans))
-        answers = sharpness([sampled_map(recording.scans, run.trajectory, step) for run in whole])
-        sharp = {run.name: answer for run, answer in zip(whole, answers, strict=True)}
-        memory = {run.name: measure(path, run.name, len(recording.scans)) for run in runs}
-    report(path, recording, runs, sharp, memory)
-
-
-def report(
-    path: Path,
-    recording: Recording,
-    runs: list[Run],
-    sharp: dict[str, Sharpness | None],
-    memory: dict[str, PeakMemory | None],
-) -> None:
-    """One line a method, then what each one did."""
     points = np.mean([len(scan.points) for scan in recording.scans])
     timed = "with" if len(recording.scans[0].times_s) else "without"
     print(f"\n{path.name}: {len(recording.scans)} scans of {points:.0f} points, {timed} times")
     print(f"{os.cpu_count()} cores, load average of the last minute {os.getloadavg()[0]:.1f}; quiet is below 2")
-    print(f"{'method':17}" + "".join(f"{column.head:>{column.width}}" for column in COLUMNS))
     kiss = next((run for run in runs if run.name == "kiss-icp" and run.is_whole), None)
     rows = {
         run.name: (
             *(1e3 * np.median(run.seconds[1:]), 1e3 * np.percentile(run.seconds[1:], 95)),
-            1e3 * np.median(run.cpu_seconds[1:]),
-            *_memory(memory.get(run.name)),
-            *accuracy(run, recording.ground_truth),
-            *_sharpness(sharp.get(run.name)),
-            apart_mm(run, kiss),
+            *(1e3 * np.median(run.cpu_seconds[1:]), *accuracy(run, recording.ground_truth), apart_mm(run, kiss)),
         )
         for run in runs
     }
+    widths = [max(len(head), 14 if has_ratio else 7) + 2 for head, _, has_ratio in COLUMNS]
     base = rows[next((run.name for run in runs if run.name in OURS), runs[0].name)]
+    print(
+        f"{'method':17}" + "".join(f"{head:>{width}}" for (head, *_), width in zip(COLUMNS, widths, strict=True))
+    )
     for name, row in rows.items():
-        print(f"{name:17}" + "".join(c.show(v, b) for c, v, b in zip(COLUMNS, row, base, strict=True)))
+        cells = [_cell(column, *values) for column, *values in zip(COLUMNS, row, base, strict=True)]
+        print(f"{name:17}" + "".join(f"{cell:>{width}}" for cell, width in zip(cells, widths, strict=True)))
     print(LEGEND)
     for run in runs:
         print(f"  {run.name}: {run.description}{'; FAILED at ' + run.failure if run.failure else ''}", flush=True)
+
+
+def _cell(column: tuple[str, int, bool], value: float, base: float) -> str:
+    _, digits, has_ratio = column
+    if not np.isfinite(value):
+        return "-"
+    return f"{value:.{digits}f}" + (f" x{value / base:.2f}" if has_ratio and base > 0.0 else "")
 
 
 def accuracy(run: Run, ground_truth: Trajectory | None) -> tuple[float, float, float, float]:
@@ -146,33 +188,117 @@ def apart_mm(run: Run, other: Run | None) -> float:
     """Median over the scans of the distance between two methods' motions; NaN without one of them."""
     if other is None or not run.is_whole:
         return np.nan
-    first, second = (lie.inverse(r.trajectory.poses[:-1]) @ r.trajectory.poses[1:] for r in (run, other))
-    return 1e3 * float(np.median(np.linalg.norm((lie.inverse(first) @ second)[:, :3, 3], axis=1)))
+    first, second = (lie.between(r.trajectory.poses[:-1], r.trajectory.poses[1:]) for r in (run, other))
+    return 1e3 * float(np.median(np.linalg.norm(lie.between(first, second)[:, :3, 3], axis=1)))
 
 
-def _memory(memory: PeakMemory | None) -> tuple[float, float]:
-    return (memory.peak_mib, memory.growth_mib) if memory else (np.nan, np.nan)
+# ---------------------------------------------------------------- all worlds
 
 
-def _sharpness(sharp: Sharpness | None) -> tuple[float, float]:
-    return (sharp.mean_map_entropy, 1e3 * sharp.thickness_m) if sharp else (np.nan, np.nan)
+@dataclass(frozen=True, slots=True)
+class Score:
+    """How good a method was on a sequence; infinite where it was lost for want of a pose."""
+
+    translation_percent: float
+    is_of_path: bool
+    ate_m: float
+    is_lost: bool
+    median_s: float
+
+    def __str__(self) -> str:
+        star = "*" if self.is_of_path else ""
+        return f"{self.translation_percent:.3f}{star} {self.ate_m:.3f}m{' LOST' if self.is_lost else ''}"
+
+
+def scores(path: Path, methods: Sequence[str]) -> list[Score]:
+    """One score a method."""
+    recording = read(path)
+    assert recording.ground_truth is not None
+    return [score(run, recording.ground_truth) for run in run_all(recording, methods)]
+
+
+def score(run: Run, ground_truth: Trajectory) -> Score:
+    """Errors of a run against the truth."""
+    median_s = float(np.median(run.seconds[1:]))
+    if not run.is_whole:
+        return Score(np.inf, False, np.inf, True, median_s)
+    pairs = pair(run.trajectory, ground_truth)
+    absolute = absolute_error(pairs)
+    ends = (lie.between(poses[0], poses[-1])[:3, 3] for poses in (pairs.estimate, pairs.reference))
+    is_lost = float(np.linalg.norm(next(ends) - next(ends))) > max(LOST_SHARE * absolute.path_length_m, LOST_M)
+    is_short = absolute.path_length_m < SHORT_PATH_M
+    share = absolute.share_of_path if is_short else kitti_error(pairs, SHORT_LENGTHS_M, every=1).translation_share
+    return Score(100.0 * share, is_short, absolute.translation_m.rmse, is_lost, median_s)
+
+
+def rank(row: Sequence[Score], first_rival: int, place: int) -> int:
+    """Place of one of ours among itself and the rivals, 1 is best; the lost stand behind all others."""
+    own = (row[place].is_lost, row[place].translation_percent)
+    return 1 + sum((rival.is_lost, rival.translation_percent) < own for rival in row[first_rival:])
+
+
+def run_set(arguments: argparse.Namespace, methods: Sequence[str]) -> None:
+    """A line a sequence, then the summary."""
+    methods = sorted(methods, key=lambda name: name not in OURS)
+    first_rival = sum(name in OURS for name in methods)
+    print(f"{'sequence':22}" + "".join(f"{name:>21}" for name in methods) + f"{'rank':>6}", flush=True)
+    rows: dict[str, list[Score]] = {}
+    for world in arguments.worlds.split(","):
+        settings = {"genz-icp": "genz-icp-indoor"} if world in INDOORS else {}
+        for sensor in arguments.sensors.split(","):
+            path = drive_of(world, sensor, arguments.scans, arguments.cache)
+            try:
+                row = in_fresh_process(scores, path, tuple(settings.get(name, name) for name in methods))
+            except BrokenProcessPool:
+                print(f"{world} {sensor}: a method broke the process; try them one by one with --methods")
+                continue
+            rows[f"{world} {sensor}"] = row
+            cells = "".join(f"{cell!s:>21}" for cell in row)
+            print(f"{world + ' ' + sensor:22}{cells}{rank(row, first_rival, 0):6}", flush=True)
+    summary(rows, methods, first_rival)
+
+
+def summary(rows: dict[str, list[Score]], methods: Sequence[str], first_rival: int) -> None:
+    """Means, ranks and losses."""
+    table = list(rows.values())
+    percent = np.array([[score.translation_percent for score in row] for row in table])
+    lost = np.array([[score.is_lost for score in row] for row in table])
+    median_ms = 1e3 * np.median([[score.median_s for score in row] for row in table], axis=0)
+    held = percent[~lost.any(axis=1)]
+    for head, values in (
+        ("mean", [f"{value:.3f}" for value in percent.mean(axis=0)]),
+        ("median", [f"{value:.3f}" for value in np.median(percent, axis=0)]),
+        (f"mean of {len(held)} all hold", [f"{value:.3f}" for value in held.mean(axis=0)] if len(held) else []),
+        ("lost", [str(value) for value in lost.sum(axis=0)]),
+        ("ms a scan", [f"{value:.1f}" for value in median_ms]),
+    ):
+        print(f"{head:22}" + "".join(f"{value:>21}" for value in values))
+    for place, name in enumerate(methods[:first_rival]):
+        ranks = np.array([rank(row, first_rival, place) for row in table])
+        is_lost_alone = lost[:, place] & ~lost[:, first_rival:].all(axis=1)
+        alone = [case for case, is_alone in zip(rows, is_lost_alone, strict=True) if is_alone]
+        print(
+            f"{name}: first on {np.sum(ranks == 1)}, first or second on {np.sum(ranks <= 2)} of {len(ranks)} "
+            f"({100.0 * np.mean(ranks <= 2):.0f} %); lost where another holds: {', '.join(alone) or 'never'}"
+        )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("logs", nargs="*", type=Path, default=[DATA / name for name in DEFAULT_LOGS])
-    parser.add_argument(
-        "--methods", help="ours are plicp and svd; one that is unknown is answered with all others"
-    )
-    parser.add_argument("--scans", type=int, default=10**9)
+    parser = command_line(__doc__)
+    parser.add_argument("logs", nargs="*", type=Path, default=[DATA / "3d" / name for name in KITTI])
+    parser.add_argument("--methods", help="one that is unknown is answered with all others; --set: genz-icp "
+                        "stands for its settings for the place")  # fmt: skip
     parser.add_argument("--indoor", action="store_true")
-    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--set", action="store_true", help="simulated worlds instead of logs")
+    choose_sequences(parser)
     arguments = parser.parse_args()
+    named = tuple(arguments.methods.split(",")) if arguments.methods else ()
+    if arguments.set:
+        run_set(arguments, named or default_methods(Path("log"), indoor=False))
+        return
     for path in arguments.logs:
-        methods = (
-            arguments.methods.split(",") if arguments.methods else default_methods(path, indoor=arguments.indoor)
-        )
-        in_fresh_process(run_log, path, tuple(methods), arguments.scans, arguments.quick)
+        methods = named or default_methods(path, indoor=arguments.indoor)
+        in_fresh_process(run_log, path, methods, arguments.scans)
 
 
 if __name__ == "__main__":

@@ -1,17 +1,17 @@
 """What keyframes show at right and wrong poses in a map: ``python -m tests.benchmarks.place_odds [--cache DIR]``.
 
-Right poses are those of logs that enter a map (the real cases of ``late_entry``), up to 5 m from its keyframes and
-disturbed by 0.3 m and 0.03 rad. Wrong ones are the best that a search finds for paths of real logs in the maps of
-other buildings, and the keyframes up to 12 before and after. At each a keyframe is aligned as for a loop closure.
+Right poses are those of logs that enter a map (the real ones of ``places --late``), up to 5 m from its keyframes
+and disturbed by 0.3 m and 0.03 rad. Wrong ones are the best that a search finds for paths of real logs in the
+maps of other buildings, and the keyframes up to 12 before and after. At each a keyframe is aligned as for a loop
+closure.
 
-Prints the weights of a logistic regression over fit, no fit and contradicted free space, the two classes of equal
-weight, beside those of ``loops.evidence.log_ratio``; and for both the share of pairs that they order rightly and
-the mean log-odds of a keyframe.
+Prints the weights of a logistic regression over fit, no fit and contradicted free space, the two classes of
+equal weight, beside those of ``loops.evidence.log_ratio``; and for both the share of pairs that they order
+rightly and the mean log-odds of a keyframe.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import permutations
@@ -21,15 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-import scanchain as sc
 from scanchain import lie
 from scanchain.data import Keyframe, Matrix, Pose
 from scanchain.loops import LoopCloser, evidence
 from scanchain.loops.planar_map_search import PlanarMapSearch, WholeSearch
 from scanchain.maps import SavedMap, open_saved_map
 from scanchain.settings import load_settings
-from tests.benchmarks.foreign import CACHE, log_of
-from tests.benchmarks.late_entry import CASES, REAL, at, prepared, true_in_map
+from tests.benchmarks.harness import command_line, poses_at, true_in_map
+from tests.benchmarks.places import ENTRIES, REAL, prepared, whole_of
 
 NEAR_M, AROUND = 5.0, 12
 PATH_M, STEP_M = 8.0, 8.0  # length of the paths, and between their begins
@@ -67,11 +66,11 @@ class Shown:
 def right(name: str, cache: Path) -> Iterator[tuple[float, float, float]]:
     """Features at right poses of a log that enters a map."""
     out, _, options, map_truth, truth = prepared(name, 0, cache)
-    saved, whole = open_saved_map(out), open_saved_map(cache / f"{CASES[name].log}_whole.run")
+    saved, whole = open_saved_map(out), open_saved_map(whole_of(ENTRIES[name].log, cache))
     shown, random = Shown(saved), np.random.default_rng(0)
     begin_ns = whole.keyframes[0].stamp_ns
     for keyframe in whole.keyframes[::2]:
-        expected, away_m = true_in_map(saved, map_truth, at(truth, np.array([keyframe.stamp_ns])))
+        expected, away_m = true_in_map(saved, map_truth, poses_at(truth, np.array([keyframe.stamp_ns])))
         after_s = (keyframe.stamp_ns - begin_ns) * 1e-9
         if away_m[0] < NEAR_M and float(str(options["log__start_s"])) <= after_s <= float(
             str(options["log__end_s"])
@@ -110,21 +109,14 @@ def told(name: str, weights: NDArray[np.float64], ours: Matrix, others: Matrix) 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cache", type=Path, default=CACHE)
-    cache = parser.parse_args().cache
+    cache = command_line(__doc__).parse_args().cache
     cache.mkdir(parents=True, exist_ok=True)
-    for log in REAL:
-        if not (cache / f"{log}_whole.run").exists():
-            sc.run(log_of(log, 0, cache, again=False), cache / f"{log}_whole.run", recording=False)
-    maps = {log: open_saved_map(cache / f"{log}_whole.run") for log in REAL}
-    ours = np.array([each for name, case in CASES.items() if case.log in REAL for each in right(name, cache)])
+    runs = {log: whole_of(log, cache) for log in REAL}
+    maps = {log: open_saved_map(run) for log, run in runs.items()}
+    ours = np.array([each for name, entry in ENTRIES.items() if entry.log in REAL for each in right(name, cache)])
     others = np.array([each for a, b in permutations(REAL, 2) for each in wrong(maps[a], maps[b])])
-    signs, shares = (
-        np.repeat([1.0, -1.0], (len(ours), len(others))),
-        np.repeat([0.5, 0.5], (len(ours), len(others))),
-    )
-    shares /= np.repeat([len(ours), len(others)], (len(ours), len(others)))
+    counts = np.array([len(ours), len(others)])
+    signs, shares = np.repeat([1.0, -1.0], counts), np.repeat(0.5 / counts, counts)
     rows = np.vstack([ours, others])
     fitted = minimize(lambda w: float(shares @ np.logaddexp(0.0, -signs * (rows @ w))), np.zeros(3)).x
     print(f"{len(ours):,} keyframes at right poses, {len(others):,} at wrong ones\n")

@@ -13,7 +13,6 @@ last bit for any number of threads, or the benchmark fails.
 
 from __future__ import annotations
 
-import argparse
 import os
 from collections.abc import Iterator
 from dataclasses import replace
@@ -37,8 +36,7 @@ from scanchain.simulation import record
 from scanchain.simulation.drive import plan
 from scanchain.simulation.sensors import SENSORS, spinning
 from scanchain.threads import threads, use_threads
-from tests.benchmarks.contest import in_fresh_process
-from tests.benchmarks.odometry3d import DATA
+from tests.benchmarks.harness import DATA, command_line, in_fresh_process
 
 OURS = "plicp"
 METHODS = (OURS, "kiss-icp", "small-vgicp", "genz-icp")
@@ -123,16 +121,10 @@ def draw(path: Path, rows: list[tuple[str, int, int, float]]) -> None:
     figure.savefig(path, dpi=120)
 
 
-def _log(name: str) -> Path:
-    return Path(name) if Path(name).exists() else DATA / name
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__, cache=False)
     parser.add_argument("--points", type=int, nargs="*", default=[10_000, 30_000, 100_000, 300_000, 1_000_000])
-    parser.add_argument(
-        "--log", type=_log, nargs="*", default=[], help="a path, or a name in the folder of real logs"
-    )
+    parser.add_argument("--log", nargs="*", default=[], help="a path, or a name in the folder of real 3D logs")
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2, 4, 8])
     parser.add_argument("--methods", nargs="+", default=METHODS)
     parser.add_argument("--scans", type=int, default=40)
@@ -144,12 +136,13 @@ def main() -> None:
     )
     rows: list[tuple[str, int, int, float]] = []
     with TemporaryDirectory() as folder:
-        for log in [*arguments.points, *arguments.log]:
-            path = log if isinstance(log, Path) else Path(folder) / f"town_{log}.mcap"
-            if path != log:
-                scans_of(path, int(log), arguments.scans)
-            seen = measured(path, arguments.methods, arguments.threads, arguments.scans)
-            rows += seen if path != log else []  # the picture is of one place
+        for points in arguments.points:
+            path = Path(folder) / f"town_{points}.mcap"
+            scans_of(path, points, arguments.scans)
+            rows += measured(path, arguments.methods, arguments.threads, arguments.scans)
+        for name in arguments.log:  # not in the picture, which is of one place
+            path = Path(name) if Path(name).exists() else DATA / "3d" / name
+            measured(path, arguments.methods, arguments.threads, arguments.scans)
     if arguments.png:
         draw(arguments.png, rows)
 

@@ -2,7 +2,7 @@
 
     python -m tests.benchmarks.trust [--worlds town,...] [--sensors vlp-16,...] [--seeds 1,2,3] [--scans N]
 
-Worlds of 3D lidars, sensors and cache are those of tests.benchmarks.odometry3d_set; planar worlds are driven with
+Worlds of 3D lidars, sensors and cache are those of ``odometry3d --set``; planar worlds are driven with
 LMS-270 and UTM-30, all without wheels. A line says
 
   ATE       of the final trajectory
@@ -49,8 +49,7 @@ from scanchain.settings import Override, load_settings
 from scanchain.simulation import SENSORS, WORLDS
 from scanchain.slam import Slam, SlamResult
 from scanchain.trajectory import write_tum, write_wide_tum
-from tests.benchmarks.accuracy import DATA
-from tests.benchmarks.odometry3d_set import PLACES, log_of, parser_of
+from tests.benchmarks.harness import DATA, PLACES, choose_sequences, command_line, drive_of
 
 WARM_UP_SCANS = 3
 NO_WHEELS = (Override("odometry.prior", "constant-velocity", "this benchmark"),)
@@ -149,19 +148,6 @@ def _gap(result: SlamResult, expected: ExpectedErrors, truth: Trajectory) -> flo
     return float(found[0]) if found else np.nan
 
 
-def along_and_across(error: Floats, covariance: Matrix) -> Floats:
-    """(N, 2) squared errors (N, k) over variances along the translation of largest and of smallest variance."""
-    d = 2 if error.shape[1] == 3 else 3
-    variances, directions = np.linalg.eigh(covariance[:, :d, :d])
-    parts = np.einsum("nij,ni->nj", directions, error[:, :d]) ** 2 / variances
-    return parts[:, [-1, 0]]
-
-
-def nees(error: Floats, covariance: Matrix) -> Floats:
-    """(N,) NEES of errors (N, k), divided by k."""
-    return np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error) / error.shape[1]
-
-
 def relations_line(name: str) -> Line:
     """A log whose truth are relations."""
     log = DATA / f"2d/{name}.mcap"
@@ -187,10 +173,11 @@ def relations_line(name: str) -> Line:
     )
     poses = result.trajectory.poses
     error = lie.log(lie.between(true, lie.between(poses[a], poses[b])))[chosen]
+    nees = float(np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error).mean()) / 3.0
     expected_m = float(np.sqrt(covariance[:, [0, 1], [0, 1]].sum(axis=1).mean()))
     true_m = float(np.sqrt((error[:, :2] ** 2).sum(axis=1).mean()))
     low, high = (expected_m * each / expected.ate.mean for each in (expected.ate.low, expected.ate.high))
-    return Line(f"{name}, relations", true_m, expected_m, low, high, float(nees(error, covariance).mean()), np.nan)
+    return Line(f"{name}, relations", true_m, expected_m, low, high, nees, np.nan)
 
 
 def _own_noise(
@@ -223,8 +210,8 @@ def summary(kind: str, lines: Sequence[Line]) -> None:
 
 
 def main() -> None:
-    parser = parser_of(__doc__)
-    parser.set_defaults(worlds=",".join((*PLACES, *PLANAR)), scans=150)
+    parser = command_line(__doc__)
+    choose_sequences(parser, worlds=(*PLACES, *PLANAR), scans=150)
     parser.add_argument("--seeds", default="1,2,3")
     parser.add_argument("--real", action="store_true", help="the real logs alone")
     arguments = parser.parse_args()
@@ -234,7 +221,7 @@ def main() -> None:
         is_planar = SENSORS[WORLDS[world].sensor].dimension == 2
         for sensor in PLANAR_SENSORS if is_planar else arguments.sensors.split(","):
             for seed in map(int, arguments.seeds.split(",")):
-                path = log_of(world, sensor, arguments.scans, arguments.cache, seed)
+                path = drive_of(world, sensor, arguments.scans, arguments.cache, seed)
                 lines.append(line(f"{world} {sensor} {seed}", path))
                 print(lines[-1], flush=True)
     if lines:

@@ -1,14 +1,13 @@
 """Wrong and right motions of runs, flagged or not, and their verdicts: ``python -m tests.benchmarks.vouching``.
 
-    [--quick] [--only WORDS] [--jobs N] [--cache DIR] [--again | --judge] [--from FILE] [--png FILE]
+    [--quick] [--only WORDS] [--jobs N] [--cache DIR] [--png FILE]
 
 Simulated worlds and real logs (tests.benchmarks.vouching_logs), with and without wheels, at 10, 5 and 2 Hz, with
-dropped scans, a kidnapping, crowds and traffic, a wrong mounting. Logs and run directories stay in the cache, with
-a row for every run in ``results.jsonl``: what is there is not run again unless --again is given; --judge judges
-the runs that are there anew, without processing. --from prints the table of such a file.
+dropped scans, a kidnapping, crowds and traffic, a wrong mounting. Logs and run directories stay in the cache:
+what is there is not run again, but judged by the code as it is now.
 
-A motion is that from a scan to the first one a second or more later, or one of the relations that come with a real
-log, of at most 5 s. It is
+A motion is that from a scan to the first one a second or more later, or one of the relations that come with a
+real log, of at most 5 s. It is
 
   wrong     if the final poses are off by more than 0.1 m or 1° in the plane, 0.2 m or 1° in space, and by more
             than three standard deviations along the error. These are of ``covariance`` in steps.parquet, that of a
@@ -20,17 +19,15 @@ log, of at most 5 s. It is
 
 A run is good if its ATE is below 0.15 m (plane), 0.3 m (space) and no motion is wrong, bad from 1 m on; over
 relations the mean error takes the place of the ATE, 0.1 m and 1 m, and one relation more than 1 m off is bad as
-well. Good runs are doubted if they are not called trustworthy, those through open geometry if they are called not
-trustworthy. Cases are split in two halves by a hash of the log's name.
+well. Good runs are doubted if they are not called trustworthy, those through open geometry if they are called
+not trustworthy. Cases are split in two halves by a hash of the log's name.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import shutil
 import sys
-import tempfile
 import traceback
 from collections import Counter
 from collections.abc import Sequence
@@ -42,18 +39,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+import scanchain
 from scanchain import lie
-from scanchain.api import open_recorder
 from scanchain.data import Matrix, Trajectory
 from scanchain.evaluation import absolute_error, pair, read_relations, relation_error
 from scanchain.evaluation.pairing import nearest
-from scanchain.runs.job import Job, Progress
-from scanchain.runs.run import run
 from scanchain.runs.vouching import evidence_of
-from scanchain.settings import overrides_of
 from scanchain.trajectory import read_tum
 from scanchain.verdict import Judged, judge
+from tests.benchmarks.harness import command_line
 from tests.benchmarks.vouching_logs import WHEELS, Case, LogSpec, cases
+from tests.support import made
 
 Floats = NDArray[np.float64]
 Row = dict[str, Any]
@@ -85,15 +81,13 @@ class Motions(NamedTuple):
 # ---------------------------------------------------------------- one run
 
 
-def measured(log_cases: Sequence[Case], cache: Path, *, again: bool, rejudge: bool) -> list[Row]:
+def measured(log_cases: Sequence[Case], cache: Path) -> list[Row]:
     """Rows of all cases of one log; a run that fails has a row that says so."""
     rows = []
     for case in log_cases:
-        out = cache / "runs" / case.name.replace(" ", "_").replace("/", "-").replace(",", "")
+        out = cache / f"runs_{made.version()}" / case.name.replace(" ", "_").replace("/", "-").replace(",", "")
         try:
-            if again or not (out / "metrics.json").exists():
-                if rejudge:
-                    continue
+            if not (out / "metrics.json").exists():
                 case.log.make(cache)
                 _process(case, cache, out)
             rows.append(judged(case, cache, out))
@@ -109,12 +103,8 @@ def _process(case: Case, cache: Path, out: Path) -> None:
     if case.wheels != "wheels":
         options["odometry__prior"] = "constant-velocity"
     is_tum = reference is not None and reference.suffix == ".tum"
-    shutil.rmtree(out, ignore_errors=True)  # without run.json it would not be replaced
-    job = Job(
-        (file,), out, overrides=overrides_of(options), sinks=frozenset(), force=True,
-        ground_truth=reference if is_tum else None,
-    )  # fmt: skip
-    run(job, open_recorder, Progress())
+    shutil.rmtree(out, ignore_errors=True)  # what was left of a run that was killed
+    scanchain.run(file, out, recording=False, ground_truth=reference if is_tum else None, **options)
     for path in out.iterdir():
         if path.name not in KEPT:
             shutil.rmtree(path) if path.is_dir() else path.unlink()
@@ -255,17 +245,18 @@ def _silent(is_silent: NDArray[np.bool_], motions: Motions, seconds: Floats) -> 
     return [round(float(each), 2) for each in (*span_s, size_m, size_deg)]
 
 
-def _checks(steps: Any, motions: Motions, wrong: NDArray[np.bool_], is_open: NDArray[np.bool_]) -> dict[str, Any]:
-    """The worst value of each check during every motion that is not open, and which of them are wrong."""
+def _checks(steps: Any, motions: Motions, wrong: NDArray[np.bool_], is_open: NDArray[np.bool_]) -> Row:
+    """The worst value of each check during every motion that is not open, high is bad, and which are wrong."""
     chosen = wrong | ~is_open
-    names = [name for name in steps.column_names if name in LOW_IS_BAD or name.endswith("_innovation")]
-    result: dict[str, Any] = {"wrong": wrong[chosen].astype(int).tolist()}
-    for name in names:
-        sign = -1.0 if name in LOW_IS_BAD else 1.0
-        values = sign * steps[name].to_numpy(zero_copy_only=False).astype(np.float64)
-        values = np.nan_to_num(values, nan=-np.inf)
-        worst = [values[a : b + 1].max() for a, b in zip(motions.first[chosen], motions.last[chosen], strict=True)]
-        result[name] = [None if not np.isfinite(each) else float(f"{sign * each:.4g}") for each in worst]
+    spans = list(zip(motions.first[chosen], motions.last[chosen], strict=True))
+    result: Row = {"wrong": wrong[chosen].tolist()}
+    for name in steps.column_names:
+        if name in LOW_IS_BAD or name.endswith("_innovation"):
+            values = (-1.0 if name in LOW_IS_BAD else 1.0) * steps[name].to_numpy(zero_copy_only=False).astype(
+                float
+            )
+            values = np.nan_to_num(values, nan=-np.inf)
+            result[name] = [values[first : last + 1].max() for first, last in spans]
     return result
 
 
@@ -355,8 +346,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
         for name in sorted({name for each in chosen for name in each} - {"wrong"}):
             sign = -1.0 if name in LOW_IS_BAD else 1.0
             wrong = np.concatenate([each["wrong"] for each in chosen if name in each]).astype(np.bool_)
-            values = np.concatenate([each[name] for each in chosen if name in each]).astype(np.float64)
-            score = np.nan_to_num(sign * values, nan=-np.inf)
+            score = np.concatenate([each[name] for each in chosen if name in each])
             if not wrong.any() or wrong.all():
                 continue
             order = np.argsort(-score, kind="stable")
@@ -378,59 +368,33 @@ def draw(rows: Sequence[Row], path: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = command_line(__doc__)
     parser.add_argument("--quick", action="store_true", help=f"every {QUICK}th case")
     parser.add_argument("--only", default="", help="cases whose names hold all of these words")
     parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "scanchain_vouching")
-    parser.add_argument("--again", action="store_true", help="process what was processed before as well")
-    parser.add_argument("--judge", action="store_true", help="judge the runs in the cache anew, process nothing")
-    parser.add_argument("--from", dest="source", type=Path, help="print the table of a results.jsonl")
     parser.add_argument("--png", type=Path, help="ROC curves of the checks")
-    arguments = parser.parse_args()
-    if arguments.source:
-        rows = _read(arguments.source)
-    else:
-        chosen = [case for case in cases() if all(word in case.name for word in arguments.only.split())]
-        rows = _run_all(chosen[:: QUICK if arguments.quick else 1], arguments)
+    options = parser.parse_args()
+    chosen = [case for case in cases() if all(word in case.name for word in options.only.split())]
+    rows = _run_all(chosen[:: QUICK if options.quick else 1], options)
     table(rows)
-    if arguments.png:
-        draw(rows, arguments.png)
+    if options.png:
+        draw(rows, options.png)
 
 
-def _run_all(chosen: Sequence[Case], arguments: argparse.Namespace) -> list[Row]:
-    """Rows of the cases, in their order; each is written as soon as its log is done."""
-    results = arguments.cache / "results.jsonl"
-    results.parent.mkdir(parents=True, exist_ok=True)
-    known = {} if arguments.again or arguments.judge else {row["name"]: row for row in _read(results)}
+def _run_all(chosen: Sequence[Case], options: argparse.Namespace) -> list[Row]:
+    """Rows of the cases, in their order; those of one log in one process."""
     by_log: dict[str, list[Case]] = {}
     for case in chosen:
-        if case.name not in known or "failed" in known[case.name]:
-            by_log.setdefault(case.log.name, []).append(case)
-    with (
-        ProcessPoolExecutor(arguments.jobs, mp_context=get_context("spawn")) as pool,
-        results.open("a", encoding="utf-8") as file,
-    ):
-        tasks = [
-            pool.submit(measured, group, arguments.cache, again=arguments.again, rejudge=arguments.judge)
-            for group in by_log.values()
-        ]
+        by_log.setdefault(case.log.name, []).append(case)
+    rows: dict[str, Row] = {}
+    with ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool:
+        tasks = [pool.submit(measured, group, options.cache) for group in by_log.values()]
         for number, task in enumerate(as_completed(tasks), start=1):
             for row in task.result():
-                known[row["name"]] = row
-                file.write(json.dumps(row) + "\n")
+                rows[row["name"]] = row
                 said = row.get("verdict", row.get("failed"))
                 print(f"{number}/{len(tasks)} {row['name']}: {said}", file=sys.stderr)
-            file.flush()
-    return [known[case.name] for case in chosen if case.name in known]
-
-
-def _read(path: Path) -> list[Row]:
-    """The last row of every case in a file."""
-    if not path.exists():
-        return []
-    rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    return list({row["name"]: row for row in rows}.values())
+    return [rows[case.name] for case in chosen]
 
 
 if __name__ == "__main__":

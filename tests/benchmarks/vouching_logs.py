@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-import os
+import struct
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from mcap.reader import make_reader
+from mcap.writer import Writer
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from scanchain import lie
 from scanchain.data import Matrix
@@ -17,10 +20,9 @@ from scanchain.simulation import SENSORS, Drive, plan, record
 from scanchain.simulation.motion import Motion
 from scanchain.simulation.sensors import Rays, Sensor
 from scanchain.simulation.solids import Solids
-from tests.benchmarks.backward_logs import play_backward
-from tests.support.scan_information import information
+from tests.benchmarks.harness import DATA
+from tests.support.scan_information import information, spectrum
 
-DATA = Path(os.environ.get("SCANCHAIN_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 WHEELS = ("wheels", "checked", "no wheels")  # prior and check; check alone; none in the log
 
 _AHEAD_S = 9.0  # a kidnapped lidar goes on where it would have been so much later
@@ -33,6 +35,8 @@ _SHARE_RAYS = 4000  # of a scan that such a look takes
 _PEOPLE, _AROUND_M, _NEAREST_M = 30, 8.0, 0.9
 _WALK_M_S = 1.4
 _ON_ROADS = ("town", "rounds", "highway", "gap")
+_STAMP = struct.Struct("<iI")  # seconds and nanoseconds, after the four bytes that begin a CDR message
+_STAMPED = ("LaserScan", "PointCloud2", "Odometry", "PoseStamped", "Imu")
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,14 +225,56 @@ def _traffic(drive: Drive, rng: np.random.Generator) -> Callable[[float], Solids
     return solids
 
 
+def play_backward(log: Path, reference: Path, out: Path) -> None:
+    """Write a ROS 2 log to ``out``, the last message first, and its .tum or .relations beside it.
+
+    Time runs backward between the first and the last message; points have no times of their own. What a lidar
+    that faces where it came from sees is in no map yet.
+    """
+    with log.open("rb") as file:
+        messages = list(make_reader(file).iter_messages(log_time_order=False))
+    times_ns = [message.log_time for _, _, message in messages]
+    both_ns = min(times_ns) + max(times_ns)
+    with out.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2")
+        channels: dict[int, int] = {}
+        for schema, channel, message in sorted(messages, key=lambda each: -each[2].log_time):
+            if channel.id not in channels:
+                known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, known)
+            data, time_ns = message.data, both_ns - message.log_time
+            if schema.name.rpartition("/")[2] in _STAMPED:
+                seconds, nanoseconds = _STAMP.unpack_from(data, 4)
+                stamp_ns = both_ns - (seconds * 10**9 + nanoseconds)
+                data = data[:4] + _STAMP.pack(*divmod(stamp_ns, 10**9)) + data[12:]
+            writer.add_message(channels[channel.id], time_ns, data, time_ns)
+        writer.finish()
+    mirrored = _mirrored_relations if reference.suffix == ".relations" else _mirrored_poses
+    np.savetxt(out.with_suffix(reference.suffix), mirrored(np.loadtxt(reference), 1e-9 * both_ns), "%.9f")
+
+
+def _mirrored_poses(rows: np.ndarray, both_s: float) -> np.ndarray:
+    rows[:, 0] = both_s - rows[:, 0]
+    return rows[::-1]
+
+
+def _mirrored_relations(rows: np.ndarray, both_s: float) -> np.ndarray:
+    """From the pose that is the earlier one now: the motion is the inverse."""
+    turned = Rotation.from_euler("xyz", rows[:, 5:]).inv()
+    return np.hstack([both_s - rows[:, [1, 0]], -turned.apply(rows[:, 2:5]), turned.as_euler("xyz")])
+
+
 def _open_shares(drive: Drive) -> Matrix:
     """As ``LogSpec.open_shares``, from the true geometry without what moves."""
     truth = drive.truth()
     stride = max(1, round(_SHARE_EVERY_S * 1e9 / drive.sensor.period_ns))
     starts_s = drive.scans[::stride] * (drive.sensor.period_ns * 1e-9)
     sensor = replace(drive.sensor, rays=_fewer(drive.sensor))
+    axes = [0, 1, 5] if sensor.dimension == 2 else range(6)
+    chosen = np.ix_(axes, axes)  # in the plane x, y and yaw
     shares = [
-        _least_share(information(drive.solids, T, sensor, index=int(index)), drive.sensor.dimension)
+        spectrum(information(drive.solids, T, sensor, index=int(index))[chosen])[0][0]
         for T, index in zip(drive.motion.lidar(starts_s), drive.scans[::stride], strict=True)
     ]
     return np.stack([truth.stamps_ns[::stride].astype(np.float64), shares], axis=1)
@@ -248,17 +294,6 @@ def _fewer(sensor: Sensor) -> Callable[[int], Rays]:
         )
 
     return rays
-
-
-def _least_share(H: Matrix, dimension: int) -> float:
-    """As ``scanchain.simulation.spectrum``, in the plane of x, y and yaw for a laser scanner."""
-    d, chosen = (2, [0, 1, 5]) if dimension == 2 else (3, [0, 1, 2, 3, 4, 5])
-    H = H[np.ix_(chosen, chosen)]
-    count, levers = np.trace(H[:d, :d]), np.trace(H[d:, d:])
-    if count <= 0.0:
-        return 0.0
-    scale = lie.by_component(len(chosen), 1.0, float(np.sqrt(count / max(levers, 1e-12 * count))))
-    return max(float(np.linalg.eigvalsh(scale[:, None] * H * scale / count)[0]), 0.0)
 
 
 _PLAIN_2D = (

@@ -2,47 +2,40 @@
 
     python -m tests.benchmarks.whole_run [LOG ...] [--repeats 5] [--cold]
 
-*run* is ``scanchain run LOG --out DIR``: loops on, recording, map and report written. *odometry* is a process that
-reads the same log and tracks its scans with the same configuration, and nothing else. Both are taken by the clock,
-from the start of the interpreter to its end, with compiled kernels. *tracking* is the sum over the scans of
-``Odometry.track`` in that process: without interpreter, imports and reading. Each is the least of several repeats,
-which take turns, with Python's bytecode on disk as after any installation. The stages are those of one more run,
-in the main thread and beside it; it imports rather more at its start than others do. With ``--cold`` one more run
+*run* is ``scanchain run LOG --out DIR``: loops on, recording, map and report written. *odometry* is a process
+that reads the same log and tracks its scans with the same configuration, and nothing else. Both are taken by the
+clock, from the start of the interpreter to its end, with compiled kernels. *tracking* is the sum over the scans
+of ``Odometry.track`` in that process: without interpreter, imports and reading. Each is the least of several
+repeats, which take turns, with Python's bytecode on disk as after any installation. With ``--cold`` one more run
 compiles all kernels.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from time import perf_counter, time
-from typing import Any
+from time import perf_counter
 
 from scanchain.logs import open_log
 from scanchain.odometry import Odometry
 from scanchain.settings import load_settings
-from tests.benchmarks.odometry3d import DATA, DEFAULT_LOGS
-from tests.benchmarks.peak_memory import ROOT
-from tests.benchmarks.stopwatch import Stopwatch
+from tests.benchmarks.harness import DATA, KITTI, command_line
+from tests.support.scenes import ROOT
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("logs", nargs="*", type=Path, default=[DATA / name for name in DEFAULT_LOGS])
+    parser = command_line(__doc__, cache=False)
+    parser.add_argument("logs", nargs="*", type=Path, default=[DATA / "3d" / name for name in KITTI])
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--cold", action="store_true", help="time a first run too, which compiles")
     parser.add_argument("--track", action="store_true", help=argparse.SUPPRESS)
-    parser.add_argument("--stages", type=float, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.track:
         print(track(arguments.logs[0]))
-    elif arguments.stages:
-        print(json.dumps(seconds_by_stage(arguments.logs[0], arguments.stages)))
     else:
         for path in arguments.logs:
             show(path.resolve(), arguments.repeats)
@@ -63,13 +56,6 @@ def show(path: Path, repeats: int) -> None:
     print(f"\n{path.name}, least of {repeats}")
     print(f"  run {run_s:.2f} s, odometry {alone_s:.2f} s, tracking {tracking_s:.2f} s")
     print(f"  run / odometry {run_s / alone_s:.2f}, run / tracking {run_s / tracking_s:.2f}")
-    whole_s, answer = timed("tests.benchmarks.whole_run", str(path), "--stages", repr(time()))
-    stages = json.loads(answer.splitlines()[-1])
-    print(f"  {'stage':26}{'in turn':>10}{'beside':>10}")
-    for name, (main_s, beside_s) in stages.items():
-        print(f"  {name:26}{main_s:8.2f} s{beside_s:8.2f} s")
-    rest_s = whole_s - sum(main_s for main_s, _ in stages.values())
-    print(f"  {'the rest':26}{rest_s:8.2f} s\n  {'whole':26}{whole_s:8.2f} s", flush=True)
 
 
 def show_cold(path: Path) -> None:
@@ -104,44 +90,6 @@ def track(path: Path) -> float:
         odometry.process(scan)
         seconds += perf_counter() - started
     return seconds
-
-
-def seconds_by_stage(path: Path, began: float) -> dict[str, tuple[float, float]]:
-    """A run in this process, which was begun at that time, with a watch over what it consists of."""
-    from scanchain import api
-    from scanchain.__main__ import main as scanchain
-    from scanchain.graph.pose_graph import PoseGraph
-    from scanchain.loops import LoopCloser
-    from scanchain.point_store import PointStore
-    from scanchain.runs import results, run
-    from scanchain.runs.step_table import StepTable
-
-    watch = Stopwatch()
-    watch.add("start and imports", time() - began)
-    watch.over("opening the log", run, "open_log")
-    watch.over("odometry", Odometry, "process")
-    watch.over("loops", LoopCloser, "close", "finish")
-    watch.over("optimizing", PoseGraph, "optimize")
-    watch.over("points kept", PointStore, "add", "read")
-    watch.over("table of steps", StepTable, "append")
-    watch.over("map", results, "build_point_map", "write_ply", "draw_grid", "write_map")
-    watch.over("what moved", results, "moved")
-    watch.over("other results", run, "write_results", "record_results")
-    watch.over("other results", StepTable, "write")
-    watch.over("other results", run, "accuracy_of", "measure")
-    watch.over("report", run._Run, "complete")
-    open_recording = api.open_recorder
-
-    def record(*arguments: Any, **options: Any) -> Any:
-        recording = open_recording(*arguments, **options)
-        watch.over("recording", type(recording), "__enter__", "close", "log", "log_trajectory", "log_map")
-        watch.over("recording", sys.modules["scanchain_viz.recording.drawing"].Message, "send")
-        return recording
-
-    api.open_recorder = watch.timed("recording", record)
-    with tempfile.TemporaryDirectory() as folder:
-        assert scanchain(["run", str(path), "--out", f"{folder}/run", "--json"]) == 0
-    return watch.seconds
 
 
 if __name__ == "__main__":

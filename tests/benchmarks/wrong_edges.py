@@ -7,19 +7,16 @@ successive poses, as along a corridor that looks like another. A share is of the
 wrong. The trajectory is compared with the optimum of the graph without them.
 """
 
-import argparse
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.data import Trajectory
-from scanchain.evaluation import Alignment, absolute_error, pair
 from scanchain.graph.g2o import read_g2o
+from tests.benchmarks.harness import DATA, ate_m, command_line
 
-ROOT = Path(__file__).resolve().parents[2]
 KINDS = {"anywhere": 1, "nearby": 1, "groups": 5, "groups of 10": 10}  # how many agree with each other
 
 
@@ -86,26 +83,19 @@ def try_wrong_loops(path, share, kind, seed, robust="truncated"):
     return Outcome(
         float(rejected[is_wrong].mean()),
         float(rejected[graph.is_loop & ~is_wrong].mean()),
-        ate_m(alone, clean),
-        ate_m(graph, clean),
+        *(ate_m(*(Trajectory(g.stamps_ns, g.poses) for g in (each, clean))) for each in (alone, graph)),
         answer.time_s,
         graph.certify().certified,
     )
 
 
-def ate_m(graph, reference):
-    ways = [Trajectory(g.stamps_ns, g.poses) for g in (graph, reference)]
-    return absolute_error(pair(*ways), Alignment.RIGID).translation_m.rmse
-
-
 def main():
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = command_line(__doc__, cache=False)
     parser.add_argument("graphs", nargs="*", default=("manhattan", "intel"))
     parser.add_argument("--shares", type=float, nargs="+", default=(0.1, 0.3, 0.5))
     parser.add_argument("--kinds", nargs="+", default=KINDS)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--robust", default="truncated")
-    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data" / "graphs")
     options = parser.parse_args()
     print(
         f"{'graph':12} {'kind':12} {'added':>6} {'seed':>4} {'wrong rejected':>15} {'true rejected':>14} "
@@ -115,7 +105,7 @@ def main():
         for kind in options.kinds:
             for share in options.shares:
                 for seed in range(options.seeds):
-                    o = try_wrong_loops(options.data / f"{name}.g2o", share, kind, seed, options.robust)
+                    o = try_wrong_loops(DATA / "graphs" / f"{name}.g2o", share, kind, seed, options.robust)
                     print(
                         f"{name:12} {kind:12} {100 * share:5.0f}% {seed:4d} {100 * o.wrong_rejected:14.2f}% "
                         f"{100 * o.true_rejected:13.2f}% {o.ate_m:9.4f} {o.ate_clean_m:9.4f} {o.time_s:7.2f}",

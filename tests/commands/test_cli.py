@@ -21,8 +21,7 @@ from scanchain.__main__ import scanchain
 from scanchain.data import Trajectory
 from scanchain.evaluation.metrics import evaluate as scanchain_evaluate
 from scanchain.graph.g2o import read_g2o
-from scanchain.logs.writing.pack import ORIGIN, pack_laser_scan, pack_odometry
-from scanchain.logs.writing.writer import LogWriter
+from scanchain.logs.writer import ORIGIN, LogWriter, pack_laser_scan, pack_odometry
 from scanchain.settings import flatten
 from scanchain.simulation import simulate
 from scanchain.trajectory import read_tum, write_kitti, write_tum

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from tests.benchmarks.accuracy import DATA
+from tests.benchmarks.harness import DATA
 from tests.support.scenes import ROOT
 
 FOLDER = ROOT / "docs" / "pictures"

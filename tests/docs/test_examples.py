@@ -115,6 +115,7 @@ def test_every_example_prints_what_the_page_says(page, folder, capsys):
     assert compared or not ran, f"{page.name}: no example says what it prints"
 
 
+@pytest.mark.slow
 def test_examples_and_their_results_pass_a_type_checker_where_the_package_is_installed(tmp_path):
     examples = tmp_path / "examples"
     examples.mkdir()

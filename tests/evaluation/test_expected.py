@@ -14,9 +14,9 @@ from scanchain.data import State
 from scanchain.evaluation import absolute_error_of_any_path, expected_errors, motion_nees, pair
 from scanchain.logs import open_log
 from scanchain.settings import Override, load_settings
-from scanchain.simulation import simulate
 from scanchain.slam import Slam
 from scanchain.trajectory import write_tum, write_wide_tum
+from tests.support import made
 
 WITHOUT_WHEELS = (Override("odometry.prior", "constant-velocity", "this test"),)
 DRIVES = [
@@ -28,11 +28,9 @@ DRIVES = [
 
 
 @cache
-def driven(folder, world, sensor, duration_s):
+def driven(world, sensor, duration_s):
     """Result, steps, truth and expected errors of a simulated drive."""
-    path = folder / f"{world}.mcap"
-    simulate(world, path, sensor=sensor, duration_s=duration_s, seed=2, force=True)
-    log = open_log(path)
+    log = open_log(made.log(world, sensor=sensor, seconds=duration_s, seed=2))
     config = load_settings(log.dimension, overrides=WITHOUT_WHEELS).config
     slam = Slam(config, log.T_base_lidar)
     steps = [slam.process(scan) for scan in log.scans()]
@@ -41,22 +39,17 @@ def driven(folder, world, sensor, duration_s):
     return result, steps, log.ground_truth(), expected_errors(result.graph, result.map_errors, config, scans)
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("expected")
-
-
 @pytest.mark.parametrize("drive", DRIVES, ids=lambda drive: drive[0])
-def test_the_true_ate_of_a_simulated_drive_lies_within_its_expected_bounds(folder, drive):
-    result, _, truth, expected = driven(folder, *drive)
+def test_the_true_ate_of_a_simulated_drive_lies_within_its_expected_bounds(drive):
+    result, _, truth, expected = driven(*drive)
     true_m = absolute_error_of_any_path(pair(result.trajectory, truth)).translation_m.rmse
     assert expected.ate.low <= true_m <= expected.ate.high
     assert true_m / 3.0 < expected.ate.mean < 3.0 * true_m
 
 
 @pytest.mark.parametrize("drive", DRIVES, ids=lambda drive: drive[0])
-def test_motions_between_simulated_scans_err_as_their_covariances_say(folder, drive):
-    result, steps, truth, _ = driven(folder, *drive)
+def test_motions_between_simulated_scans_err_as_their_covariances_say(drive):
+    result, steps, truth, _ = driven(*drive)
     pairs = pair(result.odometry, truth)
     estimate, reference = pairs.estimate, pairs.reference
     if result.odometry.dimension == 2:
@@ -67,10 +60,10 @@ def test_motions_between_simulated_scans_err_as_their_covariances_say(folder, dr
 
 
 @pytest.mark.parametrize("drive", DRIVES[::2], ids=lambda drive: drive[0])
-def test_smfeval_finds_the_covariances_of_keyframes_neither_far_too_tight_nor_far_too_loose(folder, drive):
+def test_smfeval_finds_the_covariances_of_keyframes_neither_far_too_tight_nor_far_too_loose(tmp_path, drive):
     smfeval = pytest.importorskip("smfeval.cli.main", reason="smfeval is not installed")
-    result, _, truth, expected = driven(folder, *drive)
-    estimate, reference, said = folder / "keyframes.tum", folder / "truth.tum", io.StringIO()
+    result, _, truth, expected = driven(*drive)
+    estimate, reference, said = tmp_path / "keyframes.tum", tmp_path / "truth.tum", io.StringIO()
     write_wide_tum(estimate, result.keyframe_trajectory, expected.covariances)
     write_tum(reference, truth, force=True)
     frames = ["--est-body-frame", "lidar", "--ref-body-frame", "lidar"]
@@ -80,10 +73,10 @@ def test_smfeval_finds_the_covariances_of_keyframes_neither_far_too_tight_nor_fa
     assert 0.05 < float(gap) < 6.0
 
 
-def test_a_wide_tum_file_has_the_pose_and_the_lower_triangle_of_its_covariance(folder):
-    result, _, _, expected = driven(folder, *DRIVES[0])
-    write_wide_tum(folder / "wide.tum", result.keyframe_trajectory, expected.covariances)
-    rows = np.loadtxt(folder / "wide.tum")
+def test_a_wide_tum_file_has_the_pose_and_the_lower_triangle_of_its_covariance(tmp_path):
+    result, _, _, expected = driven(*DRIVES[0])
+    write_wide_tum(tmp_path / "wide.tum", result.keyframe_trajectory, expected.covariances)
+    rows = np.loadtxt(tmp_path / "wide.tum")
     assert rows.shape == (len(result.keyframes), 29)
     covariance = np.zeros((6, 6))
     covariance[np.tril_indices(6)] = rows[5, 8:]

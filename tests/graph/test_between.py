@@ -4,7 +4,6 @@ import pytest
 from scanchain import lie
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.losses import RobustLoss, robust_loss
-from scanchain.kernels.graph import between
 from tests.support import naive_graph
 
 ANGLES = [0.0, 1e-9, 1e-5, 1e-3, 0.05, 0.1, 1.0, 2.5, np.pi - 1e-3, np.pi - 1e-5]
@@ -45,43 +44,6 @@ def test_jacobians_equal_finite_differences_from_zero_to_nearly_pi(dimension, an
             ahead = naive_graph.moved(poses, 0, 1, end, a, step, problem.measurements[0])
             back = naive_graph.moved(poses, 0, 1, end, a, -step, problem.measurements[0])
             assert np.allclose(sign * J[:, a], (ahead - back) / (2.0 * step), rtol=2e-6, atol=2e-6)
-
-
-@pytest.mark.parametrize("angle", ANGLES)
-def test_the_blocks_in_coordinates_equal_finite_differences(angle):
-    problem, poses, _ = _problem_with_error(2, angle)
-    Z = problem.measurements[0]
-    coordinates = np.array([[*T[:2, 2], lie.yaw(T)] for T in poses])
-
-    def residual(values):
-        r = np.empty(3)
-        T_i, T_j = (lie.pose_2d(*row) for row in values)
-        between.chart_blocks(T_i, T_j, Z, r, np.empty((3, 3)), np.empty((3, 3)))
-        return r
-
-    A, B = np.empty((3, 3)), np.empty((3, 3))
-    between.chart_blocks(*poses, Z, np.empty(3), A, B)
-    for end, block in ((0, A), (1, B)):
-        for a in range(3):
-            shift = np.zeros((2, 3))
-            shift[end, a] = 1e-6
-            slope = (residual(coordinates + shift) - residual(coordinates - shift)) / 2e-6
-            assert np.allclose(block[:, a], slope, atol=1e-7)
-
-
-def test_the_blocks_in_coordinates_are_those_of_the_textbook():
-    problem, (T_i, T_j), _ = _problem_with_error(2, 0.4)
-    Z = problem.measurements[0]
-    R_i, R_z, theta = T_i[:2, :2], Z[:2, :2], lie.yaw(T_i)
-    slope = np.array([[-np.sin(theta), np.cos(theta)], [-np.cos(theta), -np.sin(theta)]])  # ∂R_iᵀ/∂θ_i
-    A, B, r = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
-    between.chart_blocks(T_i, T_j, Z, r, A, B)
-    assert np.allclose(A[:2, :2], -R_z.T @ R_i.T)
-    assert np.allclose(A[:2, 2], R_z.T @ slope @ (T_j[:2, 2] - T_i[:2, 2]))
-    assert np.allclose(B[:2, :2], R_z.T @ R_i.T)
-    assert np.allclose(A[2], [0, 0, -1]) and np.allclose(B[2], [0, 0, 1]) and np.allclose(B[:2, 2], 0)
-    assert np.allclose(r[:2], R_z.T @ (R_i.T @ (T_j[:2, 2] - T_i[:2, 2]) - Z[:2, 2]))
-    assert r[2] == pytest.approx(float(lie.wrap(lie.yaw(T_j) - lie.yaw(T_i) - lie.yaw(Z))))
 
 
 def test_an_angle_difference_across_pi_is_wrapped():

@@ -36,7 +36,8 @@ def _graphs(draw):
 def test_the_sparse_solution_solves_the_dense_system_for_any_pattern_and_block_sizes(graph):
     pattern, values, A = _matrix(*graph)
     cholesky = SparseCholesky(pattern, analyze(pattern))
-    cholesky.factorize(values)
+    for scale in (5.0, 1.0):  # of the first factorization nothing is left
+        cholesky.factorize(scale * values)
     b = np.random.default_rng(graph[2]).normal(size=(len(A), 2))
     assert np.allclose(cholesky.solve(b), np.linalg.solve(A, b), rtol=1e-9, atol=1e-12)
     assert np.allclose(cholesky.solve(b[:, 0]), np.linalg.solve(A, b[:, 0]), rtol=1e-9, atol=1e-12)
@@ -70,15 +71,6 @@ def test_wide_fronts_are_eliminated_in_panels_and_tiles(size):
     assert np.allclose(A @ cholesky.solve(b), b, atol=1e-10)
 
 
-def test_a_new_factorization_forgets_the_values_of_the_last():
-    pattern, values, A = _matrix([3, 2, 3, 1], [(0, 1), (3, 1), (2, 0)], 1)
-    cholesky = SparseCholesky(pattern, analyze(pattern))
-    b = np.arange(9.0)
-    cholesky.factorize(5.0 * values)
-    cholesky.factorize(values)
-    assert np.allclose(A @ cholesky.solve(b), b)
-
-
 def test_a_grid_fills_in_far_less_than_a_dense_factor():
     side = 40
     index = np.arange(side * side).reshape(side, side)
@@ -91,27 +83,14 @@ def test_a_grid_fills_in_far_less_than_a_dense_factor():
     pattern = BlockPattern(np.full(side * side, 3, np.int64), pairs)
     cholesky = SparseCholesky(pattern, analyze(pattern))
     n = 3 * side * side
-    assert cholesky.entries < 0.03 * n * (n + 1)
+    assert cholesky._fronts.factor_start[-1] < 0.03 * n * (n + 1)
 
 
-def test_a_singular_matrix_names_the_undetermined_variable():
-    pattern = BlockPattern(np.array([2, 2, 2]), np.array([[1, 0]]))
-    values = np.concatenate([np.eye(2).ravel(), 2.0 * np.eye(2).ravel(), np.diag([1.0, 0.0]).ravel(), np.zeros(4)])
-    with pytest.raises(SingularMatrixError, match="variable 2"):
-        SparseCholesky(pattern, analyze(pattern)).factorize(values)
-
-
-def test_an_indefinite_matrix_is_refused():
-    pattern = BlockPattern(np.array([1, 1]), np.array([[1, 0]]))
-    with pytest.raises(SingularMatrixError):
-        SparseCholesky(pattern, analyze(pattern)).factorize(np.array([1.0, 1.0, 2.0]))
-
-
-def test_the_same_factorization_twice_is_equal_to_the_bit():
-    pattern, values, A = _matrix([6] * 30, [(i, i - d) for i in range(30) for d in (1, 5) if i >= d], 2)
-    answers = []
-    for _ in range(2):
-        cholesky = SparseCholesky(pattern, analyze(pattern))
-        cholesky.factorize(values)
-        answers.append(cholesky.solve(A[:, 7]))
-    assert np.array_equal(*answers)
+@pytest.mark.parametrize(
+    ("sizes", "values", "words"),
+    [([2, 2, 2], [1, 0, 0, 1, 2, 0, 0, 2, 1, 0, 0, 0, 0, 0, 0, 0], "variable 2"), ([1, 1], [1, 1, 2], "variable")],
+)
+def test_a_singular_or_indefinite_matrix_names_the_undetermined_variable(sizes, values, words):
+    pattern = BlockPattern(np.array(sizes), np.array([[1, 0]]))
+    with pytest.raises(SingularMatrixError, match=words):
+        SparseCholesky(pattern, analyze(pattern)).factorize(np.array(values, float))

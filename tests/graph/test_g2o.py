@@ -5,7 +5,7 @@ from scipy.spatial.transform import Rotation
 from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.errors import InputError
-from scanchain.graph.edge_checks import check_connected, nearest_semidefinite
+from scanchain.graph.edge_checks import nearest_semidefinite, positive_semidefinite, ranks
 from scanchain.graph.g2o import read_g2o, write_g2o
 from scanchain.graph.pose_graph import PoseGraph
 from tests.support.scenes import shared_data
@@ -25,23 +25,36 @@ EDGE_BEARING_SE2_XY 10 7 1 2
 """
 
 
-@pytest.mark.parametrize("name", ["manhattan", "intel", "MIT", "sphere2500", "smallGrid3D"])
-def test_what_is_written_reads_back_the_same(name, tmp_path):
-    first = read_g2o(shared_data(f"graphs/{name}.g2o"))
-    path = tmp_path / "again.g2o"
+@pytest.fixture
+def read(tmp_path):
+    """Write this text to a file and read it as a graph."""
+
+    def written(text, name="x.g2o", **options):
+        (tmp_path / name).write_text(text)
+        return read_g2o(tmp_path / name, **options)
+
+    return written
+
+
+@pytest.mark.parametrize("suffix", [".g2o", ".graph"])
+@pytest.mark.parametrize("name", ["manhattan", "intel", "smallGrid3D"])
+def test_what_is_written_reads_back_the_same(name, suffix, tmp_path):
+    first, path = read_g2o(shared_data(f"graphs/{name}.g2o")), tmp_path / f"again{suffix}"
     write_g2o(path, first.graph, ids=first.ids, other_lines=first.other_lines)
     second = read_g2o(path)
-    assert np.array_equal(first.graph.edges, second.graph.edges)
-    assert np.array_equal(first.graph.information, second.graph.information)
-    assert np.allclose(first.graph.measurements, second.graph.measurements, rtol=0, atol=1e-12)
-    assert np.allclose(first.graph.poses, second.graph.poses, rtol=0, atol=1e-12)
-    assert second.has_guess
+    assert second.has_guess and second.other_lines == first.other_lines
+    assert_same(first.graph, second.graph)
 
 
-def test_the_numbers_of_a_line_go_where_they_belong(tmp_path):
-    path = tmp_path / "square.g2o"
-    path.write_text(SQUARE)
-    file = read_g2o(path)
+def assert_same(first, second):
+    for name in ("edges", "is_point", "information", "held"):
+        assert np.array_equal(getattr(first, name), getattr(second, name))
+    for name in ("poses", "measurements"):
+        assert np.allclose(getattr(first, name), getattr(second, name), rtol=0, atol=1e-12)
+
+
+def test_the_numbers_of_a_line_go_where_they_belong(read):
+    file = read(SQUARE)
     graph = file.graph
     assert file.ids.tolist() == [10, 20, 30, 7]
     assert graph.edges.tolist() == [[0, 1], [1, 2], [2, 0], [0, 3]]
@@ -56,53 +69,26 @@ def test_the_numbers_of_a_line_go_where_they_belong(tmp_path):
     assert not graph.is_loop.any()
 
 
-def test_lines_not_understood_are_counted_and_kept(tmp_path):
-    path, copy = tmp_path / "square.g2o", tmp_path / "copy.g2o"
-    path.write_text(SQUARE)
-    file = read_g2o(path)
+def test_points_and_lines_not_understood_are_kept_and_counted(read, tmp_path):
+    file, copy = read(SQUARE), tmp_path / "copy.g2o"
     assert dict(file.other_tags) == {"#": 1, "EDGE_BEARING_SE2_XY": 1}
     write_g2o(copy, file.graph, ids=file.ids, other_lines=file.other_lines)
     again = read_g2o(copy)
-    assert again.other_lines == file.other_lines
-    assert again.ids.tolist() == [10, 20, 30, 7] and again.graph.held == [1]
+    assert again.other_lines == file.other_lines and again.ids.tolist() == [10, 20, 30, 7]
+    assert_same(file.graph, again.graph)
+    with pytest.raises(InputError, match="TORO has no points, and the graph has 1"):
+        write_g2o(tmp_path / "x.graph", file.graph)
 
 
-def test_points_and_their_sightings_read_back_the_same(tmp_path):
-    path, copy = tmp_path / "square.g2o", tmp_path / "copy.g2o"
-    path.write_text(SQUARE)
-    first = read_g2o(path)
-    write_g2o(copy, first.graph, ids=first.ids)
-    second = read_g2o(copy).graph
-    for name in ("edges", "is_point", "information"):
-        assert np.array_equal(getattr(first.graph, name), getattr(second, name))
-    for name in ("poses", "measurements"):
-        assert np.allclose(getattr(first.graph, name), getattr(second, name), rtol=0, atol=1e-12)
-
-
-def test_points_without_vertices_begin_where_they_are_seen(tmp_path):
-    path = tmp_path / "seen.g2o"
-    path.write_text("EDGE_SE2 0 1 1 0 1.5707963267948966 1 0 0 1 0 1\nEDGE_SE2_XY 1 9 2 0.5 1 0 1\n")
-    file = read_g2o(path)
+def test_points_without_vertices_begin_where_they_are_seen(read):
+    file = read("EDGE_SE2 0 1 1 0 1.5707963267948966 1 0 0 1 0 1\nEDGE_SE2_XY 1 9 2 0.5 1 0 1\n")
     assert file.ids.tolist() == [0, 1, 9] and not file.has_guess
     assert np.allclose(file.graph.poses[2][:2, 2], [0.5, 2.0])
 
 
-@pytest.mark.parametrize("name", ["intel", "MIT", "sphere2500", "torus3D"])
-def test_what_is_written_as_toro_reads_back_the_same(name, tmp_path):
-    first = read_g2o(shared_data(f"graphs/{name}.g2o"))
-    path = tmp_path / "again.graph"
-    write_g2o(path, first.graph, ids=first.ids)
-    second = read_g2o(path).graph
-    assert np.array_equal(first.graph.edges, second.edges)
-    assert np.array_equal(first.graph.information, second.information)
-    assert np.allclose(first.graph.measurements, second.measurements, rtol=0, atol=1e-12)
-    assert np.allclose(first.graph.poses, second.poses, rtol=0, atol=1e-12)
-
-
-def test_toro_orders_the_information_of_the_plane_in_its_own_way(tmp_path):
-    path = tmp_path / "pair.graph"
-    path.write_text("VERTEX2 0 0 0 0\nVERTEX2 1 1 0 0\nEDGE2 0 1 1 0 0.1 11 12 22 33 13 23\n")
-    graph = read_g2o(path).graph
+def test_toro_orders_the_information_of_the_plane_in_its_own_way(read):
+    text = "VERTEX2 0 0 0 0\nVERTEX2 1 1 0 0\nEDGE2 0 1 1 0 0.1 11 12 22 33 13 23\n"
+    graph = read(text, "pair.graph").graph
     assert graph.information[0].tolist() == [[11, 12, 13], [12, 22, 23], [13, 23, 33]]
 
 
@@ -122,27 +108,12 @@ def test_toro_angles_are_roll_pitch_and_yaw_also_looking_straight_up(pitch, tmp_
         assert np.allclose(np.array(path.read_text().split()[5:8], float), angles[0])
 
 
-def test_toro_cannot_hold_points(tmp_path):
-    path = tmp_path / "square.g2o"
-    path.write_text(SQUARE)
-    with pytest.raises(InputError, match="TORO has no points, and the graph has 1"):
-        write_g2o(tmp_path / "x.graph", read_g2o(path).graph)
-
-
-def test_a_quaternion_edge_keeps_its_order_and_its_information(tmp_path):
-    path = tmp_path / "pair.g2o"
-    upper = " ".join(str(float(v)) for v in _triangle(np.diag([1.0, 2, 3, 4, 5, 6]) + 0.01))
-    half = np.sqrt(0.5)
-    path.write_text(
-        f"EDGE_SE3:QUAT 0 1 1 2 3 {2 * half} 0 0 {2 * half} {upper}\n"
-    )  # a quarter about x, not of length 1
-    graph = read_g2o(path).graph
+def test_a_quaternion_edge_keeps_its_order_and_its_information(read):
+    omega, half = np.diag([1.0, 2, 3, 4, 5, 6]) + 0.01, np.sqrt(0.5)
+    upper = " ".join(map(str, omega[np.triu_indices(6)].tolist()))
+    graph = read(f"EDGE_SE3:QUAT 0 1 1 2 3 {2 * half} 0 0 {2 * half} {upper}\n").graph  # not of length 1
     assert np.allclose(graph.measurements[0], [[1, 0, 0, 1], [0, 0, -1, 2], [0, 1, 0, 3], [0, 0, 0, 1]])
-    assert np.allclose(graph.information[0], np.diag([1.0, 2, 3, 4, 5, 6]) + 0.01)
-
-
-def _triangle(matrix):
-    return matrix[np.triu_indices(len(matrix))]
+    assert np.allclose(graph.information[0], omega)
 
 
 def test_information_is_of_a_rotation_vector_or_as_the_comment_says_of_a_quaternion(tmp_path):
@@ -232,12 +203,10 @@ EDGE = "EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1"
         ("EDGE_SE3:QUAT 0 1 0 0 0 0 0 0 0 " + "0 " * 21 + "\n", r":1: quaternion of length 0"),
     ],
 )
-def test_a_malformed_file_is_refused_in_one_line_that_names_the_place(text, words, tmp_path):
-    path = tmp_path / "bad.g2o"
-    path.write_text(text)
+def test_a_malformed_file_is_refused_in_one_line_that_names_the_place(text, words, read):
     with pytest.raises(InputError, match=words) as caught:
-        read_g2o(path, indefinite="refuse")
-    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+        read(text, indefinite="refuse")
+    assert "x.g2o" in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_a_missing_file_a_folder_and_bytes_are_refused(tmp_path):
@@ -245,12 +214,6 @@ def test_a_missing_file_a_folder_and_bytes_are_refused(tmp_path):
     for path in (tmp_path / "none.g2o", tmp_path, tmp_path / "bytes.g2o"):
         with pytest.raises(InputError, match="cannot be read as g2o"):
             read_g2o(path)
-
-
-def test_poses_that_nothing_holds_are_called_by_their_ids():
-    held = np.array([True, False, False, False])
-    with pytest.raises(InputError, match="not joined to a fixed one: 30, 40"):
-        check_connected(np.array([[0, 1], [2, 3]]), held, np.array([10, 20, 30, 40]))
 
 
 def with_indefinite_matrices(path, copy, share):
@@ -295,11 +258,9 @@ def test_indefinite_matrices_are_projected_with_a_warning_that_says_how_many_how
 
 
 @pytest.mark.parametrize("tag", ["EDGE2 0 1 1 0 0 1 0 1 1 5 0", "EDGE_SE2 0 1 1 0 0 1 0 5 1 0 1"])
-def test_toro_has_its_indefinite_matrices_projected_too(tag, tmp_path):
-    path = tmp_path / "bad.graph"
-    path.write_text(f"{tag}\n")
+def test_toro_has_its_indefinite_matrices_projected_too(tag, read):
     with pytest.warns(UserWarning, match="1 of 1 edges .* first 0-1 in line 1"):
-        information = read_g2o(path).graph.information[0]
+        information = read(f"{tag}\n", "bad.graph").graph.information[0]
     assert np.allclose(information, [[3, 0, 3], [0, 1, 0], [3, 0, 3]])
 
 
@@ -314,14 +275,11 @@ def test_the_projected_matrix_is_the_nearest_semidefinite_one():
     assert np.abs(np.einsum("eab,eab->e", A - nearest, nearest)).max() < 1e-11
 
 
-def test_angles_beyond_a_turn_are_asked_about(call, tmp_path):
+def test_angles_beyond_a_turn_are_asked_about(call, read, tmp_path):
     lines = ["VERTEX_SE2 0 0 0 0", "VERTEX_SE2 1 1 0 90", "EDGE_SE2 0 1 1 0 90 1 0 0 1 0 1"]
-    (tmp_path / "a.g2o").write_text("\n".join(lines))
-    with pytest.warns(
-        UserWarning, match="2 lines have an angle beyond a whole turn, up to 90 in line 2; degrees?"
-    ):
-        assert "degrees?" in read_g2o(tmp_path / "a.g2o").note
-    assert "degrees?" in call("optimize", tmp_path / "a.g2o")[1]
+    with pytest.warns(UserWarning, match="2 lines have an angle beyond a whole turn, up to 90 in line 2; degrees"):
+        assert "degrees?" in read("\n".join(lines)).note
+    assert "degrees?" in call("optimize", tmp_path / "x.g2o")[1]
 
 
 def test_a_poor_fit_points_to_the_robust_losses_which_leave_the_chain_alone(call, tmp_path):
@@ -338,3 +296,45 @@ def test_a_poor_fit_points_to_the_robust_losses_which_leave_the_chain_alone(call
         assert "where 1 is expected" not in output
         assert "on 7 loop edges; the other 7 edges (odometry, points) in full weight" in output
         assert read_g2o(out).graph.poses[-1][0, 2] == pytest.approx(7.0, abs=0.01)
+
+
+def some_matrices(k, seed=0):
+    """Definite, of rank one, indefinite, lopsided, not finite and zero, by turns; (600, k, k)."""
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(600, k, k))
+    matrices = A @ np.swapaxes(A, 1, 2)
+    v = rng.normal(size=(600, k, 1))
+    matrices[1::6] = (v @ np.swapaxes(v, 1, 2))[1::6]
+    matrices[2::6, 0, 0] *= -1.0
+    matrices[3::6] = A[3::6]
+    matrices[4::12, 1, 1], matrices[10::12, 0, 1] = np.nan, np.inf
+    matrices[5::6] = 0.0
+    return matrices
+
+
+@pytest.mark.parametrize("k", [2, 3, 6])
+def test_a_matrix_is_sound_that_is_finite_symmetric_and_has_no_negative_eigenvalue(k):
+    matrices = some_matrices(k)
+    finite = np.isfinite(matrices).all(axis=(1, 2))
+    known = np.where(finite[:, None, None], matrices, 0.0)
+    symmetric = np.isclose(known, np.swapaxes(known, 1, 2)).all(axis=(1, 2))
+    definite = np.linalg.eigvalsh(known)[:, 0] >= -1e-6 * np.abs(known).max(axis=(1, 2))
+    wanted = finite & symmetric & definite
+    assert 100 < wanted.sum() < 500
+    np.testing.assert_array_equal(positive_semidefinite(matrices), wanted)
+    assert len(positive_semidefinite(matrices[:0])) == 0
+
+
+@pytest.mark.parametrize(("negative", "is_sound"), [(1e-7, True), (1e-5, False)])
+def test_printed_digits_may_make_an_eigenvalue_a_little_negative(negative, is_sound):
+    assert positive_semidefinite(np.diag([1.0, 1.0, -negative])[None])[0] == is_sound
+
+
+@pytest.mark.parametrize("k", [2, 3, 6])
+def test_the_rank_of_an_information_matrix_does_not_depend_on_its_units(k):
+    rng = np.random.default_rng(0)
+    for rank in range(k + 1):
+        A = rng.normal(size=(20, rank, k))
+        units = np.diag(10.0 ** rng.uniform(-6.0, 6.0, k))
+        assert (ranks(units @ np.swapaxes(A, 1, 2) @ A @ units) == rank).all()
+    assert ranks(np.diag([1e-12, *[1e9] * (k - 1)])[None]).tolist() == [k]

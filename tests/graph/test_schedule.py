@@ -5,10 +5,9 @@ from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.errors import InputError
 from scanchain.graph import schedule
-from scanchain.graph.g2o import read_g2o
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.graph.schedule import BackgroundOptimization, Plan, Schedule
-from tests.support.scenes import shared_data
+from tests.support.graphs import graph_of, published
 
 SIGMA = np.array([0.01, 0.01, 0.005])
 LAP = 60  # poses
@@ -109,7 +108,7 @@ def test_a_live_log_waits_for_no_long_optimization_of_a_large_graph(monkeypatch)
 
 
 def test_an_optimization_beside_takes_the_graph_as_it_was_and_moves_what_was_added_since():
-    whole, graph = (read_g2o(shared_data("graphs/intel.g2o")).graph for _ in range(2))
+    whole, graph = published("intel"), published("intel")
     before, last = graph.poses[-1].copy(), len(graph) - 1
     beside = BackgroundOptimization(graph, GraphConfig(), Plan(0, "judge"), len(graph) + 1)
     T_last_new, information = lie.pose_2d(1.0, 0.2, 0.3), np.eye(3)
@@ -123,9 +122,7 @@ def test_an_optimization_beside_takes_the_graph_as_it_was_and_moves_what_was_add
 
 
 def test_an_error_of_an_optimization_beside_is_raised_where_its_result_is_taken():
-    graph = PoseGraph(2)
-    for index in range(2):
-        graph.add_pose(lie.identity(2), index)
+    graph = graph_of([lie.identity(2)] * 2)
     beside = BackgroundOptimization(graph, GraphConfig(), Plan(0, "judge"), 2)
     with pytest.raises(InputError, match="not joined to a fixed one"):
         beside.result()

@@ -16,7 +16,6 @@ from tests.support import recorders
 from tests.support.carmen_text import flaser, odom, save
 from tests.support.folders import kitti_odometry, kitti_raw, xyzi
 from tests.support.naive_logs import office, write
-from tests.support.scenes import shared_data
 
 
 def carmen(folder):
@@ -95,31 +94,6 @@ def test_messages_of_a_bag_stay_as_they_are_and_others_can_decode_them(tmp_path)
         assert sorted(message.data for _, _, message, _ in read) == sorted(told)
 
 
-@pytest.mark.parametrize("source", ["carmen", "kitti raw", "clouds"])
-def test_what_is_made_of_text_and_files_others_can_decode(tmp_path, source):
-    assert main(["convert", str(SOURCES[source](tmp_path)), str(tmp_path / "out.mcap")]) == 0
-    with (tmp_path / "out.mcap").open("rb") as stream:
-        read = list(make_reader(stream, decoder_factories=[Ros2Factory()]).iter_decoded_messages())
-    lidar = [decoded for schema, _, _, decoded in read if schema.name.startswith("sensor_msgs/msg/")]
-    assert len(lidar) == (600 if source == "carmen" else 3)
-    if source != "carmen":
-        assert [field.name for field in lidar[0].fields] == ["x", "y", "z", "intensity"]
-
-
-def test_the_first_part_of_the_intel_log_converts_to_what_its_mcap_holds(tmp_path):
-    import bz2
-
-    lines = bz2.decompress(shared_data("2d/intel.clf.bz2").read_bytes()).splitlines()[:2500]
-    (tmp_path / "intel.clf").write_bytes(b"\n".join(lines) + b"\n")
-    assert main(["convert", str(tmp_path / "intel.clf"), str(tmp_path / "intel.mcap")]) == 0
-    ours = list(open_log(tmp_path / "intel.mcap").scans())
-    assert len(ours) > 500
-    for one, other in zip(ours, open_log(shared_data("2d/intel.mcap")).scans(), strict=False):
-        assert (one.stamp_ns, one.log_time_ns) == (other.stamp_ns, other.log_time_ns)
-        assert one.points.tobytes() == other.points.tobytes()
-        assert one.T_odom_base.tobytes() == other.T_odom_base.tobytes()
-
-
 def test_a_rate_gives_stamps_to_files_that_are_only_numbered(tmp_path, capfd):
     (tmp_path / "scans").mkdir()
     for k, cloud in enumerate(recorders.clouds()):
@@ -145,11 +119,6 @@ def test_a_part_of_a_log_is_written_by_the_keys_that_a_run_takes(tmp_path, capfd
     assert main(["convert", str(source), str(tmp_path / "out.mcap"), *flags]) == 0
     assert "/scan" not in capfd.readouterr().out
     assert_same_log(open_log(tmp_path / "out.mcap"), open_log(source, LogConfig(**keys)))
-
-
-def test_a_rate_for_a_log_with_stamps_is_said_to_have_no_effect(tmp_path, capfd):
-    assert main(["convert", str(carmen(tmp_path)), str(tmp_path / "a.mcap"), "--rate", "5"]) == 0
-    assert "note: log.rate_hz 5 has no effect: the log has its own stamps" in capfd.readouterr().err
 
 
 def test_keys_that_mean_nothing_to_convert_are_refused(tmp_path, capfd):

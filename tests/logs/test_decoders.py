@@ -74,22 +74,18 @@ def test_angles_in_degrees_are_refused_and_a_turn_and_a_bit_is_not(tmp_path, ste
     assert len(laser(tmp_path, np.full(370, 2.0), first=-np.pi, step=np.radians(1.0)).points) == 370
 
 
-def test_a_scanner_that_leaves_its_range_limits_at_zero_loses_nothing(tmp_path):
-    scan = laser(tmp_path, [1.0, 50.0, 0.0, np.inf], low=0.0, high=0.0)
-    assert distances(scan) == pytest.approx([1.0, 50.0]) and scan.dropped == 2
-
-
-@pytest.mark.parametrize("high", [np.inf, np.nan, -1.0])
-def test_a_nonsense_range_max_is_no_limit(tmp_path, high):
-    assert distances(laser(tmp_path, [1.0, 70.0, np.inf], high=high)) == pytest.approx([1.0, 70.0])
-
-
-def test_a_nonsense_range_min_is_no_limit(tmp_path):
-    assert distances(laser(tmp_path, [0.5, 0.0, 2.0], low=np.nan)) == pytest.approx([0.5, 2.0])
-
-
-def test_the_sick_value_for_no_return_is_dropped(tmp_path):
-    assert distances(laser(tmp_path, [1.0, 81.83, 81.91], high=81.83)) == pytest.approx([1.0])
+@pytest.mark.parametrize(
+    ("ranges", "limits", "kept"),
+    [
+        ([1.0, 50.0, 0.0, np.inf], {"low": 0.0, "high": 0.0}, [1.0, 50.0]),
+        *(([1.0, 70.0, np.inf], {"high": high}, [1.0, 70.0]) for high in (np.inf, np.nan, -1.0)),
+        ([0.5, 0.0, 2.0], {"low": np.nan}, [0.5, 2.0]),
+        ([1.0, 81.83, 81.91], {"high": 81.83}, [1.0]),  # the SICK's value for no return
+    ],
+)
+def test_range_limits_of_zero_or_nonsense_are_none(tmp_path, ranges, limits, kept):
+    scan = laser(tmp_path, ranges, **limits)
+    assert distances(scan) == pytest.approx(kept) and scan.dropped == len(ranges) - len(kept)
 
 
 def test_a_lidar_that_turns_clockwise_has_a_negative_step(tmp_path):
@@ -136,53 +132,43 @@ def xyz(rows):
 
 
 @pytest.mark.parametrize("code", ["f4", "f8", "i1", "u1", "i2", "u2", "i4", "u4"])
-@pytest.mark.parametrize("big", [True, False])
-@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize(("big", "order"), [(False, "<"), (True, "<"), (True, ">")])
 def test_coordinates_of_any_number_type_and_byte_order_are_read(tmp_path, code, big, order):
-    kind = (">" if big else "<") + code
-    rows = random_rows([("x", kind), ("ring", "<u2"), ("y", kind), ("z", kind)])
-    if code.endswith("1"):
-        rows = random_rows([("x", kind), ("ring", ">u2" if big else "<u2"), ("y", kind), ("z", kind)])
-    elif big:
-        rows = random_rows([("x", kind), ("ring", ">u2"), ("y", kind), ("z", kind)])
+    sign = ">" if big else "<"
+    rows = random_rows([("x", sign + code), ("ring", f"{sign}u2"), ("y", sign + code), ("z", sign + code)])
     scan = cloud(tmp_path, rows, order=order)
     assert np.array_equal(scan.points, xyz(rows))
     assert scan.points.dtype == np.float32 and scan.points.flags.c_contiguous
 
 
-@pytest.mark.parametrize("padding", [0, 1, 7, 16, 100])
-@pytest.mark.parametrize("height", [1, 4])
-def test_padding_behind_rows_is_no_point(tmp_path, padding, height):
-    rows = random_rows(XYZ)
-    assert np.array_equal(cloud(tmp_path, rows, height=height, padding=padding).points, xyz(rows))
+ROWS = random_rows(XYZ)
+SCATTERED = np.dtype({
+    "names": ["intensity", "z", "x", "y"],
+    "formats": ["f4", "f4", "f4", "f8"],
+    "offsets": [3, 7, 21, 11],
+    "itemsize": 48,
+})  # fmt: skip
 
 
-def test_a_last_row_without_its_padding_is_complete(tmp_path):
-    rows = random_rows(XYZ)
-    data = b"".join(part.tobytes() + b"\xff" * 5 for part in rows.reshape(4, 6))[:-5]
-    assert np.array_equal(cloud(tmp_path, rows, height=4, padding=5, data=data).points, xyz(rows))
-
-
-def test_a_row_step_of_zero_is_taken_from_the_points(tmp_path):
-    rows = random_rows(XYZ)
-    assert np.array_equal(cloud(tmp_path, rows, row_step=0).points, xyz(rows))
-
-
-def test_fields_may_lie_anywhere_and_overlap_nothing_else(tmp_path):
-    dtype = np.dtype({
-        "names": ["intensity", "z", "x", "y"],
-        "formats": ["f4", "f4", "f4", "f8"],
-        "offsets": [3, 7, 21, 11],
-        "itemsize": 48,
-    })  # fmt: skip
-    rows = random_rows(dtype)
-    assert np.array_equal(cloud(tmp_path, rows).points, xyz(rows))
-
-
-def test_names_of_any_length_leave_the_data_aligned(tmp_path):
-    for extra in ["i", "in", "int", "inte", "inten"]:
-        rows = random_rows([*XYZ, (extra, "u1")])
-        assert np.array_equal(cloud(tmp_path, rows, frame=extra).points, xyz(rows))
+@pytest.mark.parametrize(
+    ("rows", "options"),
+    [
+        *((ROWS, {"height": height, "padding": padding}) for height in (1, 4) for padding in (0, 1, 7, 100)),
+        (
+            ROWS,
+            {
+                "height": 4,
+                "padding": 5,
+                "data": b"\xff\xff\xff\xff\xff".join(r.tobytes() for r in ROWS.reshape(4, 6)),
+            },
+        ),
+        (ROWS, {"row_step": 0}),
+        (random_rows(SCATTERED), {}),
+        *((random_rows([*XYZ, (name, "u1")]), {"frame": name}) for name in ("i", "in", "int", "inte", "inten")),
+    ],
+)
+def test_rows_may_be_padded_and_fields_lie_anywhere(tmp_path, rows, options):
+    assert np.array_equal(cloud(tmp_path, rows, **options).points, xyz(rows))
 
 
 def test_a_channel_may_change_its_layout(tmp_path):
@@ -230,64 +216,41 @@ def test_limits_of_the_configuration_filter_clouds(tmp_path):
 # times of points
 
 
-def times_of(folder, name, values, code, stamp_ns=STAMP_NS):
-    rows = random_rows([*XYZ, (name, code)], count=len(values))
-    rows[name] = values
-    scan = only_scan(folder, cloud_said(stamp_ns, point_cloud(stamp_ns, rows)))
-    assert scan.times_s.dtype == np.float32
-    return scan.times_s
-
-
 RISING_S = np.linspace(0.0, 0.1, 11)
 
 
-@pytest.mark.parametrize("name", ["t", "time", "timestamp", "offset_time", "time_offset"])
-@pytest.mark.parametrize("code", ["<u4", ">u4", "<i4", "<f4", "<f8"])
-def test_relative_times_are_nanoseconds_if_whole_and_seconds_if_not(tmp_path, name, code):
-    if code[0] == ">":
-        dtype = [("x", ">f4"), ("y", ">f4"), ("z", ">f4"), (name, code)]
-        rows = np.ones(len(RISING_S), dtype)
-        rows[name] = RISING_S * 1e9
-        scan = cloud(tmp_path, rows)
-        return np.testing.assert_allclose(scan.times_s, RISING_S, atol=1e-7)
-    values = RISING_S if "f" in code else np.rint(RISING_S * 1e9)
-    return np.testing.assert_allclose(times_of(tmp_path, name, values, code), RISING_S, atol=1e-7)
+STAMP_S = STAMP_NS * 1e-9
 
 
-def test_absolute_seconds_are_made_relative_to_the_stamp(tmp_path):
-    values = STAMP_NS * 1e-9 + RISING_S
-    np.testing.assert_allclose(times_of(tmp_path, "timestamp", values, "<f8"), RISING_S, atol=1e-6)
-
-
-def test_absolute_nanoseconds_in_a_double_are_made_relative_to_the_stamp(tmp_path):
-    values = STAMP_NS + RISING_S * 1e9
-    np.testing.assert_allclose(times_of(tmp_path, "timestamp", values, "<f8"), RISING_S, atol=1e-6)
-
-
-@pytest.mark.parametrize("off_s", [37.0, -37.0, 1800.0])
-def test_absolute_times_of_a_clock_that_is_off_count_from_the_first_point(tmp_path, off_s):
-    values = STAMP_NS * 1e-9 + off_s + RISING_S
-    np.testing.assert_allclose(times_of(tmp_path, "timestamp", values, "<f8"), RISING_S, atol=1e-6)
-
-
-def test_absolute_times_that_a_float32_cannot_tell_apart_say_nothing(tmp_path):
-    values = np.float32(STAMP_NS * 1e-9) + np.zeros(len(RISING_S), np.float32)
-    assert len(times_of(tmp_path, "timestamp", values, "<f4")) == 0
-
-
-def test_times_before_the_stamp_are_negative(tmp_path):
-    np.testing.assert_allclose(times_of(tmp_path, "time", RISING_S - 0.1, "<f4"), RISING_S - 0.1, atol=1e-7)
-    values = STAMP_NS * 1e-9 + RISING_S - 0.1
-    np.testing.assert_allclose(times_of(tmp_path, "timestamp", values, "<f8"), RISING_S - 0.1, atol=1e-6)
-
-
-def test_nanoseconds_in_a_float_are_recognized(tmp_path):
-    np.testing.assert_allclose(times_of(tmp_path, "t", RISING_S * 1e9, "<f8"), RISING_S, atol=1e-7)
-    np.testing.assert_allclose(times_of(tmp_path, "time", RISING_S * 1e9, "<f4"), RISING_S, atol=1e-7)
-
-
-def test_whole_milliseconds_are_recognized(tmp_path):
-    np.testing.assert_allclose(times_of(tmp_path, "t", RISING_S * 1e3, "<u4"), RISING_S, atol=1e-3)
+@pytest.mark.parametrize(
+    ("name", "code", "values", "expected_s", "within_s"),
+    [
+        *(
+            (name, code, RISING_S if "f" in code else np.rint(RISING_S * 1e9), RISING_S, 1e-7)
+            for name in ("t", "time", "timestamp", "offset_time", "time_offset")
+            for code in ("<u4", ">u4", "<i4", "<f4", "<f8")
+        ),
+        ("timestamp", "<f8", STAMP_S + RISING_S, RISING_S, 1e-6),
+        ("timestamp", "<f8", STAMP_NS + RISING_S * 1e9, RISING_S, 1e-6),
+        *(("timestamp", "<f8", STAMP_S + off_s + RISING_S, RISING_S, 1e-6) for off_s in (37.0, -37.0, 1800.0)),
+        ("time", "<f4", RISING_S - 0.1, RISING_S - 0.1, 1e-7),
+        ("timestamp", "<f8", STAMP_S + RISING_S - 0.1, RISING_S - 0.1, 1e-6),
+        ("t", "<f8", RISING_S * 1e9, RISING_S, 1e-7),
+        ("time", "<f4", RISING_S * 1e9, RISING_S, 1e-7),
+        ("t", "<u4", RISING_S * 1e3, RISING_S, 1e-3),
+        ("timestamp", "<f4", np.full(11, STAMP_S), [], 0.0),  # which a float32 does not tell apart
+        ("t", "<u4", np.zeros(5), [], 0.0),
+    ],
+)
+def test_the_unit_and_the_origin_of_times_are_those_that_their_values_suggest(
+    tmp_path, name, code, values, expected_s, within_s
+):
+    order = code[0]
+    rows = np.ones(len(values), [("x", order + "f4"), ("y", order + "f4"), ("z", order + "f4"), (name, code)])
+    rows[name] = values
+    times_s = cloud(tmp_path, rows).times_s
+    assert times_s.dtype == np.float32
+    np.testing.assert_allclose(times_s, expected_s, atol=within_s)
 
 
 def test_an_undefined_time_of_a_dropped_point_harms_no_other(tmp_path):
@@ -297,22 +260,14 @@ def test_an_undefined_time_of_a_dropped_point_harms_no_other(tmp_path):
     np.testing.assert_allclose(cloud(tmp_path, rows).times_s, [0.01, 0.02, 0.03], atol=1e-7)
 
 
-def test_times_that_are_all_the_same_say_nothing_and_harm_nothing(tmp_path):
-    assert len(times_of(tmp_path, "t", np.zeros(5), "<u4")) == 0
-
-
-@pytest.mark.parametrize(("unit", "per_second"), [("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
-def test_the_unit_of_times_can_be_set(tmp_path, unit, per_second):
+@pytest.mark.parametrize(
+    ("unit", "per_second"), [("s", 1.0), ("ms", 1e3), ("us", 1e6), ("ns", 1e9), ("none", 1.0)]
+)
+def test_the_unit_of_times_can_be_set_or_times_left_alone(tmp_path, unit, per_second):
     rows = random_rows([*XYZ, ("t", "f8")], count=3)
     rows["t"] = np.array([0.0, 0.002, 0.005]) * per_second
     scan = cloud(tmp_path, rows, config={"point_times": unit})
-    np.testing.assert_allclose(scan.times_s, [0.0, 0.002, 0.005], atol=1e-7)
-
-
-def test_times_can_be_left_alone(tmp_path):
-    rows = random_rows([*XYZ, ("t", "f8")], count=3)
-    rows["t"] = [0.0, 0.05, 0.1]
-    assert len(cloud(tmp_path, rows, config={"point_times": "none"}).times_s) == 0
+    np.testing.assert_allclose(scan.times_s, [] if unit == "none" else [0.0, 0.002, 0.005], atol=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -329,22 +284,18 @@ def test_a_lidar_without_times_can_be_timed_by_its_azimuth(tmp_path, sense, star
     np.testing.assert_allclose(cloud(tmp_path, rows, config=config).times_s, expected_s, atol=1e-6)
 
 
-def test_the_azimuth_of_a_spinning_lidar_tells_its_times(tmp_path):
+def test_the_azimuth_of_a_spinning_lidar_tells_its_times_and_what_was_assumed_is_told(tmp_path):
     simulate("town", tmp_path / "town.mcap", duration_s=0.2, sensor="os1-32")
-    timed = next(iter(open_log(tmp_path / "town.mcap").scans()))
-    config = LogConfig(point_times="clockwise")
-    guessed = next(iter(open_log(tmp_path / "town.mcap", config).scans()))
-    assert np.median(np.abs(timed.times_s - guessed.times_s)) < 1e-3
-
-
-def test_what_was_assumed_of_the_times_is_told(tmp_path):
-    simulate("town", tmp_path / "town.mcap", duration_s=0.2, sensor="os1-32")
-    log = open_log(tmp_path / "town.mcap")
-    assert list(log.scans())
-    assert [note for note in log.notes if "field t (uint32) taken as ns after the stamp" in note]
-    log = open_log(tmp_path / "town.mcap", LogConfig(point_times="none"))
-    assert list(log.scans())
-    assert [note for note in log.notes if note.startswith("no point times")]
+    times_s = {}
+    for unit, note in (
+        ("auto", "field t (uint32) taken as ns after the stamp"),
+        ("clockwise", "point times by the azimuth: clockwise"),
+        ("none", "no point times"),
+    ):
+        log = open_log(tmp_path / "town.mcap", LogConfig(point_times=unit))
+        times_s[unit] = next(iter(list(log.scans()))).times_s
+        assert any(note in line for line in log.notes)
+    assert np.median(np.abs(times_s["auto"] - times_s["clockwise"])) < 1e-3
 
 
 # poses

@@ -218,6 +218,7 @@ def figures(path, out, capfd, *flags):
     return metrics["ground_truth"]["odometry"]["ate_rmse_m"], metrics["lost"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)
 def test_the_flags_of_a_finding_help(world, tmp_path, capfd, fault):
     path = write(tmp_path / "log.mcap", list(fault(world)), chunk_size=1 << 20)
@@ -238,7 +239,7 @@ def test_the_flags_of_a_finding_help(world, tmp_path, capfd, fault):
 def test_every_flag_that_a_check_can_print_is_tried():
     """The flags in the texts of the checks are those of the faults above."""
     printed = set()
-    for node in ast.walk(ast.parse((ROOT / "pipeline/scanchain/logs/doctor/doctor.py").read_text())):
+    for node in ast.walk(ast.parse((ROOT / "pipeline/scanchain/logs/doctor.py").read_text())):
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             printed |= set(re.findall(r"--[a-z][a-z_.]*[a-z]", node.value))
     assert printed == {

@@ -35,12 +35,8 @@ from tests.support.naive_logs import (
     transforms_said,
     write,
 )
+from tests.support.recorders import read
 from tests.support.scenes import shared_data
-
-
-def read(*paths, **config):
-    log = open_log(list(paths), LogConfig(**config))
-    return log, list(log.scans())
 
 
 def assert_office(log, scans, count=40):
@@ -55,61 +51,38 @@ def assert_office(log, scans, count=40):
         np.testing.assert_allclose(scan.T_odom_base, lie.pose_2d(0.1 * k, 0.0, 0.01 * k), atol=1e-12)
 
 
-def test_messages_packed_by_hand_are_what_an_independent_decoder_reads(tmp_path):
-    rows = np.array([(1, 2, 3, 4)], dtype=[("x", "f4"), ("y", "f4"), ("z", "f8"), ("t", "u4")])
-    said = [*office(1), cloud_said(STAMP_NS + 1, point_cloud(STAMP_NS, rows, padding=3))]
-    path = write(tmp_path / "a.mcap", said)
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        mount, wheels, scan, cloud = [message[3] for message in reader.iter_decoded_messages()]
-    assert mount.transforms[0].child_frame_id == "laser" and mount.transforms[0].transform.translation.z == 0.5
-    assert wheels.child_frame_id == "base_link" and wheels.pose.pose.orientation.w == 1.0
-    assert scan.header.frame_id == "laser" and scan.ranges[1] == pytest.approx(1.05) and scan.range_max == 30.0
-    assert [field.name for field in cloud.fields] == ["x", "y", "z", "t"] and len(
-        cloud.data
-    ) == cloud.row_step == 23
+CONTAINERS = [
+    {"compression": compression, "summary": summary}
+    for compression in ("none", "lz4", "zstd")
+    for summary in (0, 1)
+]
+LEFT_OUT = [
+    {"repeat_channels": False},
+    {"repeat_schemas": False},
+    {"repeat_channels": False, "repeat_schemas": False},
+    {"use_statistics": False},
+    {"index_types": IndexType.NONE},
+    {"index_types": IndexType.CHUNK, "use_statistics": False},
+    {"use_summary_offsets": False},
+    {"crcs": False},
+    {"chunk_size": 100},
+    {"chunk_size": 10_000_000},
+    {"enable_data_crcs": True},
+]
+NAMES = [
+    {"encoding": encoding, "rename": rename}
+    for encoding in ("ros2msg", "ros2idl")
+    for rename in (str, lambda kind: kind.replace("/msg/", "/"))
+]
 
 
+@pytest.mark.parametrize("options", [*CONTAINERS, *LEFT_OUT, *NAMES], ids=str)
 @pytest.mark.parametrize("chunked", [True, False])
-@pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
-@pytest.mark.parametrize("summary", [True, False])
-def test_every_container_gives_the_same_scans(tmp_path, chunked, compression, summary):
-    path = write(tmp_path / "a.mcap", office(), chunked=chunked, compression=compression, summary=summary)
-    log, scans = read(path)
+def test_every_container_gives_the_same_scans(tmp_path, chunked, options):
+    log, scans = read(write(tmp_path / "a.mcap", office(), chunked=chunked, **options))
     assert_office(log, scans)
     assert log.has_odometry and log.duration_s == pytest.approx(3.9)
     np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(0.2, 0.1, 0.3), atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"repeat_channels": False},
-        {"repeat_schemas": False},
-        {"repeat_channels": False, "repeat_schemas": False},
-        {"use_statistics": False},
-        {"index_types": IndexType.NONE},
-        {"index_types": IndexType.CHUNK, "use_statistics": False},
-        {"use_summary_offsets": False},
-        {"crcs": False},
-        {"chunk_size": 100},
-        {"chunk_size": 10_000_000},
-        {"enable_data_crcs": True},
-    ],
-    ids=str,
-)
-@pytest.mark.parametrize("chunked", [True, False])
-def test_a_summary_may_leave_anything_out(tmp_path, chunked, options):
-    assert_office(*read(write(tmp_path / "a.mcap", office(), chunked=chunked, **options)))
-
-
-@pytest.mark.parametrize("encoding", ["ros2msg", "ros2idl"])
-@pytest.mark.parametrize("short", [True, False])
-def test_type_names_of_either_form_are_known(tmp_path, encoding, short):
-    def rename(kind):
-        return kind.replace("/msg/", "/") if short else kind
-
-    assert_office(*read(write(tmp_path / "a.mcap", office(), encoding=encoding, rename=rename)))
 
 
 def test_messages_come_by_log_time_even_where_chunks_overlap(tmp_path):
@@ -137,12 +110,10 @@ def test_interleaved_files_with_equal_times_keep_the_order_of_the_files(tmp_path
 
 
 def test_a_channel_announced_in_an_empty_chunk_does_not_stretch_the_log(tmp_path):
-    empty = [scan_said(0, b"", "/quiet/scan_of_nothing")]
     path = write(tmp_path / "a.mcap", office(), announced=[odometry_said(0, b"", "/other")], chunk_size=1)
     log, scans = read(path, odometry_topic="/odom")
     assert log.duration_s == pytest.approx(3.9)
     assert_office(log, scans)
-    assert empty[0].data == b""
 
 
 def test_start_end_and_every_choose_scans_by_log_time(tmp_path):
@@ -255,13 +226,6 @@ def blinded(*at):
     return [scan_said(STAMP_NS + k * SECOND, laser_scan(STAMP_NS, [np.nan] * 5)) for k in at]
 
 
-def test_one_scan_without_a_return_does_not_stop_a_log_and_is_told(tmp_path):
-    log, scans = read(write(tmp_path / "a.mcap", [*office(5), *blinded(5)]))
-    assert [scan.index for scan in scans] == list(range(5))
-    assert any("1 of 6 scans of /scan was left out (the first: " in line for line in log.damage)
-    assert not any("recovered" in line for line in log.damage)  # nothing is damaged
-
-
 def test_one_empty_cloud_does_not_stop_a_log_of_clouds(tmp_path):
     rows = np.ones(20, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
     nowhere = np.full(60, np.nan, "<f4").view(rows.dtype)
@@ -285,12 +249,12 @@ def test_more_bad_scans_than_the_limit_in_percent_are_refused_with_the_flag(tmp_
 
 
 def test_bad_scans_are_left_out_and_counted(tmp_path):
-    blind = blinded(5, 7)
-    log, scans = read(write(tmp_path / "a.mcap", [*office(10), *blind]), max_bad_scans_percent=100.0)
+    log, scans = read(write(tmp_path / "a.mcap", [*office(10), *blinded(5)]))
     assert [scan.index for scan in scans] == list(range(10))
-    assert any("2 of 12 scans of /scan were left out (the first: " in line for line in log.damage)
+    (line,) = log.damage  # which does not say that scans were recovered: nothing is damaged
+    assert "1 of 11 scans of /scan was left out (the first: " in line
     with pytest.raises(InputError, match=r"a\.mcap: no scan of /scan could be read: 2 of 2"):
-        read(write(tmp_path / "a.mcap", blind), max_bad_scans_percent=100.0)
+        read(write(tmp_path / "a.mcap", blinded(5, 7)), max_bad_scans_percent=100.0)
 
 
 def test_stamps_that_step_back_or_repeat_are_told(tmp_path):
@@ -347,14 +311,19 @@ def prior_x(path, **config):
     return None if scan.T_odom_base is None else scan.T_odom_base[0, 2]
 
 
-def test_the_prior_is_interpolated_between_the_readings_around_the_stamp(tmp_path):
-    path = write(tmp_path / "a.mcap", [*wheels((0.0, 0.0, 1.0)), one_scan(0.05, 0.05), *wheels((0.2, 0.2, 3.0))])
-    assert prior_x(path) == pytest.approx(1.5)
-
-
-def test_a_reading_with_the_scans_own_stamp_is_taken_as_it_is(tmp_path):
-    said = [*wheels((0.0, 0.3, 7.0), (0.1, 0.05, 5.0)), one_scan(0.11, 0.05), *wheels((0.2, 0.01, 9.0))]
-    assert prior_x(write(tmp_path / "a.mcap", said)) == 5.0
+@pytest.mark.parametrize(
+    ("before", "scan", "behind", "expected"),
+    [
+        ([(0.0, 0.0, 1.0)], (0.05, 0.05), [(0.2, 0.2, 3.0)], 1.5),  # interpolated
+        ([(0.0, 0.3, 7.0), (0.1, 0.05, 5.0)], (0.11, 0.05), [(0.2, 0.01, 9.0)], 5.0),  # at the stamp of the scan
+        ([(0.0, 0.0, 4.0)], (0.4, 0.4), [], 4.0),  # the nearest, up to half a second
+        ([], (0.0, 0.0), [(0.4, 0.4, 6.0)], 6.0),
+        ([(0.0, 0.0, 4.0)], (0.6, 0.6), [], None),
+    ],
+)
+def test_the_prior_is_the_wheels_pose_at_the_stamp(tmp_path, before, scan, behind, expected):
+    path = write(tmp_path / "a.mcap", [*wheels(*before), one_scan(*scan), *wheels(*behind)])
+    assert prior_x(path) == (expected if expected is None else pytest.approx(expected))
 
 
 def test_the_prior_turns_the_short_way_round(tmp_path):
@@ -367,24 +336,11 @@ def test_the_prior_turns_the_short_way_round(tmp_path):
     assert abs(lie.yaw(scan.T_odom_base)) == pytest.approx(np.pi)
 
 
-def test_the_nearest_reading_serves_up_to_half_a_second_and_none_beyond(tmp_path):
-    near = write(tmp_path / "near.mcap", [*wheels((0.0, 0.0, 4.0)), one_scan(0.4, 0.4)])
-    late = write(tmp_path / "late.mcap", [one_scan(0.0, 0.0), *wheels((0.4, 0.4, 6.0))])
-    far = write(tmp_path / "far.mcap", [*wheels((0.0, 0.0, 4.0)), one_scan(0.6, 0.6)])
-    assert prior_x(near) == 4.0 and prior_x(late) == 6.0 and prior_x(far) is None
-
-
 def test_a_scan_does_not_wait_for_ever_for_a_reading(tmp_path):
     said = [*wheels((0.0, 0.0, 4.0)), *(one_scan(0.01 * k, 0.01 * k) for k in range(1, 200))]
     _, scans = read(write(tmp_path / "a.mcap", said))
     assert len(scans) == 199
     assert all(scan.T_odom_base is not None for scan in scans[:50]) and scans[-1].T_odom_base is None
-
-
-def test_ground_truth_is_never_a_prior(tmp_path):
-    said = [*wheels((0.0, 0.0, 4.0), topic="/ground_truth"), one_scan(0.0, 0.0)]
-    log, (scan,) = read(write(tmp_path / "a.mcap", said))
-    assert not log.has_odometry and scan.T_odom_base is None
 
 
 def test_of_several_odometry_topics_none_is_used_until_one_is_chosen(tmp_path):
@@ -399,61 +355,41 @@ def test_of_several_odometry_topics_none_is_used_until_one_is_chosen(tmp_path):
 # the mounting
 
 
-def mounted(path, *entries):
-    said = [transforms_said(STAMP_NS, transforms(*entries)), *wheels((0.0, 0.0, 0.0)), one_scan(0.1, 0.1)]
-    log, (scan,) = read(write(path, said))
-    return log.T_base_lidar, scan.points
+LASER = ("mast", "laser", 0.5, 0.0, 0.0, 0.0)
+MAST = ("mast", 1.0, 0.0, np.pi / 2, 0.0)
 
 
-def test_the_mounting_is_chained_through_the_static_tree(tmp_path):
-    T, _ = mounted(
-        tmp_path / "a.mcap",
-        ("base_link", "mast", 1.0, 0.0, np.pi / 2, 0.0),
-        ("mast", "laser", 0.5, 0.0, 0.0, 0.0),
-    )
-    np.testing.assert_allclose(T, lie.pose_2d(1.0, 0.5, np.pi / 2), atol=1e-12)
-
-
-def test_the_mounting_is_the_identity_where_no_chain_joins_the_frames(tmp_path):
-    T, _ = mounted(tmp_path / "a.mcap", ("map", "camera", 1.0, 0.0, 0.0, 0.0))
-    np.testing.assert_array_equal(T, np.eye(3))
-
-
-def test_without_a_base_link_the_root_of_the_static_tree_is_the_base_and_said_to_be(tmp_path):
-    said = [
-        transforms_said(
-            STAMP_NS,
-            transforms(("imu_link", "mast", 1.0, 0.0, np.pi / 2, 0.0), ("mast", "laser", 0.5, 0.0, 0.0, 0.0)),
+@pytest.mark.parametrize(
+    ("entries", "wheels_of", "expected", "base", "note"),
+    [
+        ([("base_link", *MAST), LASER], "base_link", (1.0, 0.5, np.pi / 2), "base_link", ""),
+        ([("map", "camera", 1.0, 0.0, 0.0, 0.0)], "base_link", (0.0, 0.0, 0.0), "", "sit at the robot's origin"),
+        (
+            [("imu_link", *MAST), LASER], None, (1.0, 0.5, np.pi / 2), "imu_link",
+            "the log has no transform from base_link to laser: imu_link is taken as the base",
         ),
-        one_scan(0.1, 0.1),
-    ]
-    log, _ = read(write(tmp_path / "a.mcap", said))
-    np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(1.0, 0.5, np.pi / 2), atol=1e-12)
-    assert log.mounting.base == "imu_link"
-    assert log.notes == ["the log has no transform from base_link to laser: imu_link is taken as the base"]
-
-
-def test_the_frame_of_the_wheels_is_the_base_before_the_root_is(tmp_path):
-    said = [
-        transforms_said(
-            STAMP_NS,
-            transforms(("rig", "chassis", 5.0, 0.0, 0.0, 0.0), ("chassis", "laser", 0.5, 0.0, 0.0, 0.0)),
+        (
+            [("rig", "chassis", 5.0, 0.0, 0.0, 0.0), ("chassis", "laser", 0.5, 0.0, 0.0, 0.0)], "chassis",
+            (0.5, 0.0, 0.0), "chassis", "",
         ),
-        odometry_said(STAMP_NS, odometry(STAMP_NS, 0.0, 0.0, child="chassis")),
-        one_scan(0.1, 0.1),
-    ]
+        ([("map", "mast", 9.0, 0.0, 0.0, 0.0), LASER], None, (0.5, 0.0, 0.0), "mast", "mast is taken as the base"),
+    ],
+    ids=["chained", "no chain", "root of the tree", "frame of the wheels", "below the world"],
+)  # fmt: skip
+def test_the_mounting_is_that_of_the_static_transforms(tmp_path, entries, wheels_of, expected, base, note):
+    said = [transforms_said(STAMP_NS, transforms(*entries)), one_scan(0.1, 0.1)]
+    said += [odometry_said(STAMP_NS, odometry(STAMP_NS, 0.0, 0.0, child=wheels_of))] if wheels_of else []
     log, _ = read(write(tmp_path / "a.mcap", said))
-    assert log.mounting.base == "chassis" and log.T_base_lidar[0, 2] == 0.5 and log.notes == []
-
-
-def test_a_frame_of_the_world_is_never_the_base(tmp_path):
-    T, _ = mounted(tmp_path / "a.mcap", ("map", "mast", 9.0, 0.0, 0.0, 0.0), ("mast", "laser", 0.5, 0.0, 0.0, 0.0))
-    assert T[0, 2] == 0.5
+    np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(*expected), atol=1e-12)
+    assert log.mounting.base == base
+    assert note in log.notes[0] if note else log.notes == []
 
 
 def test_an_upside_down_lidar_sees_the_plane_as_from_above(tmp_path):
     yaw, x, y = 0.4, 0.2, -0.1
-    T, points = mounted(tmp_path / "a.mcap", ("base_link", "laser", x, y, yaw, np.pi))
+    said = [transforms_said(STAMP_NS, transforms(("base_link", "laser", x, y, yaw, np.pi))), one_scan(0.1, 0.1)]
+    log, (scan,) = read(write(tmp_path / "a.mcap", said))
+    T, points = log.T_base_lidar, scan.points
     raw = np.column_stack([laser_points(np.array([1.0, 2.0])), np.zeros(2)])
     c, s = np.cos(yaw), np.sin(yaw)
     R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ np.diag([1.0, -1.0, -1.0])
@@ -485,19 +421,16 @@ def test_a_truth_that_is_named_does_not_hide_why_no_scan_can_be_read(tmp_path):
         log.expected_stamps("/scan")
 
 
-def test_copies_of_scans_are_a_warning(tmp_path):
-    ranges = [1.0 + 0.05 * np.arange(31) + 0.01 * min(k, 13) for k in range(20)]
+@pytest.mark.parametrize("copies", [6, 1])
+def test_many_copies_of_scans_are_a_warning_and_a_few_are_a_note(tmp_path, copies):
+    ranges = [1.0 + 0.05 * np.arange(31) + 0.01 * min(k, 19 - copies) for k in range(20)]
     said = [scan_said(STAMP_NS + k * SECOND, laser_scan(STAMP_NS + k, each)) for k, each in enumerate(ranges)]
     log, scans = read(write(tmp_path / "a.mcap", said))
-    (line,) = log.copies
-    assert len(scans) == 20 and "6 of 20 scans of /scan are the one before once more" in line
-
-
-def test_a_few_copies_of_scans_are_a_note(tmp_path):
-    ranges = [1.0 + 0.05 * np.arange(31) + 0.01 * min(k, 18) for k in range(20)]
-    said = [scan_said(STAMP_NS + k * SECOND, laser_scan(STAMP_NS + k, each)) for k, each in enumerate(ranges)]
-    log, _ = read(write(tmp_path / "a.mcap", said))
-    assert not log.copies and any("1 of 20 scans of /scan logged twice" in note for note in log.notes)
+    assert len(scans) == 20
+    if copies > 1:
+        assert "6 of 20 scans of /scan are the one before once more" in log.copies[0]
+    else:
+        assert not log.copies and any("1 of 20 scans of /scan logged twice" in note for note in log.notes)
 
 
 def test_a_cloud_keeps_the_full_mounting(tmp_path):
@@ -586,30 +519,13 @@ def tilt(at):
 
 
 @pytest.mark.parametrize("parent", ["base_link", "torso"])
-def test_a_tilting_planar_lidar_is_refused_with_its_frames_and_its_range(tmp_path, capfd, parent):
-    path = write(tmp_path / "a.mcap", swinging(tilt, parent=parent))
-    with pytest.raises(InputError) as caught:
-        open_log(path)
-    for part in (
-        f"{parent} → laser in /tf turns by up to 40 deg",
-        "--topic",
-        "/scan",
-        "--end",
-    ):
-        assert part in caught.value.text
-    for words in (["run", path, "--out", tmp_path / "a"], ["doctor", path]):
-        assert main([str(word) for word in words]) == 2
-        assert capfd.readouterr().err == f"error: {caught.value.text}\n"
-    assert main(["info", str(path)]) == 1
-    assert f"problem   {caught.value.text}" in capfd.readouterr().out
-
-
-def test_the_part_of_a_log_in_which_a_planar_lidar_rests_is_read(tmp_path):
-    path = write(tmp_path / "a.mcap", swinging(lambda at: tilt(max(at - 1.0, 0.0))))
-    log, scans = read(path, end_s=0.95)
+def test_a_lidar_that_moves_on_the_robot_is_told_with_its_frames_and_its_range(tmp_path, parent):
+    path = write(tmp_path / "a.mcap", swinging(lambda at: tilt(max(at - 1.0, 0.0)), parent=parent))
+    assert any(
+        f"({parent} → laser in /tf turns by up to 40 deg): poses are the" in n for n in open_log(path).notes
+    )
+    log, scans = read(path, end_s=0.95)  # while it rests
     assert len(scans) == 10 and log.mounting.motion is None
-    with pytest.raises(InputError, match="does not stay in one plane"):
-        open_log(path)
 
 
 @pytest.mark.parametrize("seconds", [2.0, 40.0])
@@ -633,16 +549,13 @@ def test_transforms_of_the_robot_in_the_world_are_no_moving_mount(tmp_path):
         assert log.T_base_lidar[0, 2] == (0.2 if mount else 0.0)
 
 
-@pytest.mark.parametrize("frame", ["t265_odom_frame", "robot_1/odom", "camera_init", "world"])
-def test_a_robot_that_turns_on_the_spot_in_a_frame_of_the_world_is_no_mount(tmp_path, frame):
-    log, _ = read(write(tmp_path / "a.mcap", swinging(tilt, parent=frame)))
-    assert log.mounting.motion is None and log.mounting.base == ""
-
-
-def test_the_frame_above_a_lidar_that_travels_is_no_base(tmp_path):
-    said = []
-    for k in range(20):
-        said += [joined(k / 10, ("start", "laser", 0.2 * k, 0.0, 0.0, 0.02 * k)), one_scan(k / 10, k / 10)]
+@pytest.mark.parametrize("frame", ["t265_odom_frame", "robot_1/odom", "camera_init", "world", "start"])
+def test_a_frame_in_which_the_robot_moves_is_no_mount(tmp_path, frame):
+    said = swinging(tilt, parent=frame)
+    if frame == "start":  # no word for a world: by its travel
+        said = []
+        for k in range(20):
+            said += [joined(k / 10, (frame, "laser", 0.2 * k, 0.0, 0.0, 0.02 * k)), one_scan(k / 10, k / 10)]
     log, _ = read(write(tmp_path / "a.mcap", said))
     assert log.mounting.motion is None and log.mounting.base == ""
 
@@ -655,17 +568,6 @@ def test_wheels_are_no_prior_for_a_lidar_that_pans_by_tf(tmp_path):
     assert "the wheels (/odom) are no prior for it" in log.notes[0]
     assert [scan.T_odom_base for scan in scans] == [None, None] and not log.has_odometry
     np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(0.2, 0.0, 0.0), atol=1e-12)
-
-
-def test_a_cloud_lidar_may_move_out_of_any_plane(tmp_path):
-    rows = np.array([(1, 2, 3)], dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
-    said = []
-    for k in range(20):
-        time_ns = STAMP_NS + k * SECOND // 10
-        said += [joined(k / 10, ("base_link", "lidar", 0.0, 0.0, 0.0, tilt(k / 10)))]
-        said += [cloud_said(time_ns, point_cloud(time_ns, rows))]
-    log, scans = read(write(tmp_path / "a.mcap", said))
-    assert len(scans) == 20 and log.mounting.leaves_plane and "poses are the lidar's" in log.notes[0]
 
 
 # real logs
@@ -736,20 +638,21 @@ def test_kitti_ground_truth_is_that_of_the_published_file():
     np.testing.assert_allclose(truth.poses[:, :3, :3], lie.from_quaternion(published[:, 4:]), atol=1e-6)
 
 
-def test_ground_truth_of_a_planar_log_is_planar_and_a_missing_topic_is_named(tmp_path):
+def test_ground_truth_of_a_planar_log_is_planar(tmp_path):
     path = write(tmp_path / "a.mcap", [*office(3), *wheels((0.05, 0.05, 2.0), topic="/ground_truth")])
-    log = open_log([path], LogConfig())
-    truth = log.ground_truth()
+    truth = open_log([path], LogConfig()).ground_truth()
     assert truth.poses.shape == (1, 3, 3) and truth.poses[0, 0, 2] == 2.0
-    with pytest.raises(InputError, match=r"a\.mcap.*?/nowhere.*?/odom"):
-        open_log([path], LogConfig(ground_truth_topic="/nowhere"))
 
 
-def test_the_truth_met_on_the_way_is_that_of_a_pass_of_its_own(tmp_path):
-    said = [*office(3), *wheels(*[(0.1 * k, 0.1 * k, float(k)) for k in range(5)], topic="/ground_truth")]
+def test_the_truth_met_on_the_way_is_that_of_a_pass_of_its_own_and_no_prior(tmp_path):
+    said = [
+        *(one_scan(0.1 * k, 0.1 * k) for k in range(3)),
+        *wheels(*[(0.1 * k, 0.1 * k, float(k)) for k in range(5)], topic="/ground_truth"),
+    ]
     path = write(tmp_path / "a.mcap", said)
     alone = open_log([path], LogConfig()).ground_truth()
-    log, _ = read(path)
+    log, scans = read(path)
+    assert not log.has_odometry and all(scan.T_odom_base is None for scan in scans)
     np.testing.assert_array_equal(log.ground_truth().poses, alone.poses)
     np.testing.assert_array_equal(log.ground_truth().stamps_ns, alone.stamps_ns)
 
@@ -758,7 +661,3 @@ def test_the_truth_of_a_log_can_be_left_unused_and_does_not_become_wheels(tmp_pa
     path = write(tmp_path / "a.mcap", [*wheels((0.0, 0.0, 4.0), topic="/ground_truth"), one_scan(0.0, 0.0)])
     log = open_log([path], LogConfig(ground_truth_topic="none"))
     assert log.ground_truth() is None and not log.ground_truth_topic and not log.has_odometry
-
-
-def test_a_log_without_truth_has_none(tmp_path):
-    assert open_log([write(tmp_path / "a.mcap", office(3))], LogConfig()).ground_truth() is None

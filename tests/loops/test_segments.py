@@ -116,7 +116,13 @@ def keyframes_in(rooms, away_m=()):
 def begun():
     segments = Segments()
     segments.start(3)
-    return PlaceTest(segments, 3), segments
+    return PlaceTest(segments), segments
+
+
+def up_to(index, keyframes):
+    """The keyframes up to one of them, and their poses."""
+    known = keyframes[: index + 1]
+    return known, np.array([each.T_odom_lidar for each in known])
 
 
 def tried(*sources, y_m=0.0, overlap=0.95, verdict=ClosureVerdict.ACCEPTED):
@@ -128,10 +134,10 @@ def test_keyframes_that_fit_one_place_join_a_log_to_a_map_once_they_are_enough()
     keyframes = keyframes_in([4.0] * 8)
     evidence, segments = begun()
     graph = graph_of(11)
-    assert not evidence.collect(tried(3, overlap=0.61), keyframes[:4]) and connected(segments, graph).all()
-    assert not evidence.collect(tried(4, overlap=0.61), keyframes[:5])
-    assert not evidence.collect(tried(5, y_m=3.0), keyframes[:6]), "it is at another pose"
-    joining = [evidence.collect(tried(source, overlap=0.61), keyframes[: source + 1]) for source in range(6, 9)]
+    assert not evidence.collect(tried(3, overlap=0.61), *up_to(3, keyframes)) and connected(segments, graph).all()
+    assert not evidence.collect(tried(4, overlap=0.61), *up_to(4, keyframes))
+    assert not evidence.collect(tried(5, y_m=3.0), *up_to(5, keyframes)), "it is at another pose"
+    joining = [evidence.collect(tried(source, overlap=0.61), *up_to(source, keyframes)) for source in range(6, 9)]
     assert [[each.source for each in closures] for closures in joining] == [[], [], [3, 4, 6, 7, 8]]
     assert not evidence.is_gathering and evidence.bound == pytest.approx(np.log(1e3))
     assert connected(segments, graph).tolist() == [False] * 3 + [True] * 8
@@ -141,7 +147,7 @@ def test_a_place_that_was_seen_through_is_dropped_however_well_the_scans_fit():
     keyframes = keyframes_in([9.0] * 8)
     evidence, _ = begun()
     for source in range(3, 9):
-        assert not evidence.collect(tried(source), keyframes[: source + 1])
+        assert not evidence.collect(tried(source), *up_to(source, keyframes))
     assert evidence.is_in_vain
     evidence.drop(3)
     assert not evidence.is_gathering and np.isnan(evidence.best)
@@ -153,8 +159,8 @@ def test_keyframes_closer_than_a_meter_count_for_the_path_between_them():
     odds = []
     for keyframes in (apart, close):
         evidence, _ = begun()
-        evidence.collect(tried(3), keyframes[:4])
-        evidence.collect(tried(4), keyframes[:5])
+        evidence.collect(tried(3), *up_to(3, keyframes))
+        evidence.collect(tried(4), *up_to(4, keyframes))
         odds.append(evidence.log_odds)
     assert [each - FOUND[2] for each in odds] == pytest.approx([4.0, 2.5])
 
@@ -162,11 +168,12 @@ def test_keyframes_closer_than_a_meter_count_for_the_path_between_them():
 def test_the_longer_the_path_that_was_sought_the_more_a_place_has_to_show():
     keyframes = [replace(each, traveled_m=20.0 * each.index) for each in keyframes_in([4.0] * 8)]
     evidence, _ = begun()
-    evidence.collect(tried(3, overlap=0.61), keyframes[:4])
+    evidence.collect(tried(3, overlap=0.61), *up_to(3, keyframes))
     assert evidence.bound == pytest.approx(np.log(1e3))
+    log_odds = evidence.log_odds
     evidence.drop(3)
-    assert evidence.best == pytest.approx(evidence.log_odds), "that was cut short, and so is not certain"
-    evidence.collect(tried(7, overlap=0.61), keyframes[:8])
+    assert evidence.best == log_odds, "that was cut short, and so is not certain"
+    evidence.collect(tried(7, overlap=0.61), *up_to(7, keyframes))
     assert evidence.bound == pytest.approx(np.log(1e3 * 80.0 / 8.0))
 
 
@@ -174,9 +181,9 @@ def test_what_is_joined_is_withdrawn_once_the_place_is_seen_through_and_not_befo
     keyframes = keyframes_in([4.0] * 6 + [9.0] * 12)
     evidence, _ = begun()
     for source in range(3, 7):
-        evidence.collect(tried(source), keyframes[: source + 1])
+        evidence.collect(tried(source), *up_to(source, keyframes))
     assert not evidence.is_gathering
-    holds = [evidence.follow(tried(source), keyframes[: source + 1]) for source in range(9, 21)]
+    holds = [evidence.follow(tried(source), *up_to(source, keyframes)) for source in range(9, 21)]
     assert holds[0] and holds[3] and not holds[-1]
 
 
@@ -184,24 +191,24 @@ def test_a_place_that_was_given_is_believed_until_it_is_seen_through():
     keyframes = keyframes_in([4.0] * 2 + [9.0] * 12)
     evidence, _ = begun()
     evidence.give()
-    assert evidence.holds(keyframes[3:], keyframes), "nothing was tried"
-    holds = [evidence.follow(tried(source), keyframes[: source + 1]) for source in range(3, 17)]
+    assert evidence.holds(range(3, len(keyframes)), *up_to(len(keyframes), keyframes)), "nothing was tried"
+    holds = [evidence.follow(tried(source), *up_to(source, keyframes)) for source in range(3, 17)]
     assert all(holds[:6]) and not holds[-1]
     evidence.note(tried(*range(3, 17)))
-    assert not evidence.holds(keyframes[3:], keyframes)
+    assert not evidence.holds(range(3, len(keyframes)), *up_to(len(keyframes), keyframes))
 
 
 def test_places_proposed_elsewhere_say_nothing_about_a_place_that_is_joined():
     keyframes = keyframes_in([4.0] * 6)
     evidence, _ = begun()
     for source in range(3, 7):
-        evidence.collect(tried(source), keyframes[: source + 1])
+        evidence.collect(tried(source), *up_to(source, keyframes))
     before = evidence.log_odds
     elsewhere = [
         replace(each, proposed_by=Proposal.PLACE)
         for each in tried(8, y_m=9.0, overlap=0.1, verdict=ClosureVerdict.REJECTED)
     ]
-    assert evidence.follow(elsewhere, keyframes) and evidence.log_odds == before
+    assert evidence.follow(elsewhere, *up_to(8, keyframes)) and evidence.log_odds == before
 
 
 @pytest.mark.parametrize(("away_m", "holds"), [(0.0, False), (30.0, True)])
@@ -211,7 +218,7 @@ def test_what_does_not_match_counts_against_a_log_only_where_the_map_shows_it(aw
     evidence.note(tried(*range(3, 9)))
     at_wrong = tried(*range(9, 29), overlap=0.2, verdict=ClosureVerdict.REJECTED)
     evidence.note(at_wrong)
-    assert evidence.holds(keyframes[3:], keyframes) is holds
+    assert evidence.holds(range(3, len(keyframes)), *up_to(len(keyframes), keyframes)) is holds
     assert np.isfinite(evidence.best) is np.bool_(holds)
 
 
@@ -245,6 +252,16 @@ def test_a_robot_that_was_carried_elsewhere_is_found_again():
         if item.verdict is ClosureVerdict.ACCEPTED and item.target < slam.closer.segments.starts[1] <= item.source
     ]
     assert len(across) > 10
+
+
+def test_a_robot_that_was_carried_to_another_corridor_like_one_before_stays_apart():
+    log = open_log(shared_data("2d/intel.mcap"))
+    scans = list(islice(log.scans(), 3485, 10087))
+    slam = Slam(configured(2), log.T_base_lidar)
+    result, starts = carried(slam, scans, 3743, 4901)
+    joined = [each for each in result.closures if each.target < slam.closer.segments.starts[-1] <= each.source]
+    assert len(starts) == 1 and joined, "some scans fit"
+    assert result.components[0] != result.components[-1]
 
 
 def test_poses_beyond_a_motion_that_nothing_measured_are_still_optimized():

@@ -12,7 +12,7 @@ from scanchain.baselines.wrapped import Open3dPairs
 from scanchain.config import MapsConfig
 from scanchain.errors import InputError
 from scanchain.logs import open_log
-from scanchain.logs.formats.cloud_file import read_pcd
+from scanchain.logs.formats.clouds import read_pcd
 from scanchain.maps import (
     OccupancyGrid,
     PointMap,

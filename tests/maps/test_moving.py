@@ -42,6 +42,7 @@ def test_people_who_walk_about_leave_the_cloud_and_the_office_stays(office):
     assert gone[moves].mean() > 0.95 and gone[~moves].mean() < 0.002
 
 
+@pytest.mark.slow
 def test_traffic_leaves_the_cloud_but_for_what_is_close_to_the_ground_and_the_town_stays(town):
     voxels, moves, gone = judged(town, 0.2, 0.5)
     way = np.array([scan.T_world_lidar[:3, 3] for scan in town])
@@ -52,6 +53,7 @@ def test_traffic_leaves_the_cloud_but_for_what_is_close_to_the_ground_and_the_to
     assert (moves & high).sum() > 5000 and gone[moves & high].mean() > 0.95
 
 
+@pytest.mark.slow
 def test_a_world_where_nothing_moves_loses_next_to_nothing(town, office):
     for scans, voxel_m, spacing_m in ((town, 0.2, 0.5), (office, 0.05, 0.01)):
         still = [replace(scan, points=scan.points[~scan.moves], moves=scan.moves[~scan.moves]) for scan in scans]

@@ -364,6 +364,7 @@ def test_without_loops_the_world_is_the_odometry_frame(office):
     np.testing.assert_allclose(result.trajectory.poses, result.odometry.poses, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_intel_without_wheels_meets_the_published_relations():
     log = open_log([shared_data("2d/intel.mcap")], Config().log)
     relations = read_relations(shared_data("2d/intel.relations"))

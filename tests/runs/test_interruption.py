@@ -59,7 +59,7 @@ def whole(office, tmp_path_factory):
     return out
 
 
-@pytest.fixture(scope="module", params=["2D", "3D"])
+@pytest.fixture(scope="module", params=["2D", pytest.param("3D", marks=pytest.mark.slow)])
 def undisturbed(request, office, whole, tmp_path_factory):
     """A log and its run."""
     if request.param == "2D":

@@ -11,7 +11,7 @@ from scanchain import lie
 from scanchain.__main__ import main
 from scanchain.data import Keyframe
 from scanchain.errors import InputError
-from scanchain.logs.formats.cloud_file import read_ply
+from scanchain.logs.formats.clouds import read_ply
 from scanchain.maps import Edges, SavedPoints, Session, open_saved_map, write_saved_map
 from scanchain.sessions.changes import Changes, Label, Part, changes_between
 from scanchain.sessions.joining import Joined

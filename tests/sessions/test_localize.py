@@ -19,7 +19,6 @@ from scanchain import (
     localize,
     open_log,
     read_tum,
-    run,
     simulate,
     write_tum,
 )
@@ -30,14 +29,15 @@ from scanchain.sessions.localize import measure, pose_near
 from scanchain.sessions.localizer import MapState
 from scanchain.settings import load_settings
 from scanchain.verdict import Verdict
+from tests.support import made
 
 
 @pytest.fixture(scope="module")
 def office(tmp_path_factory):
     """Folder with office.mcap, the truth and the map of the first 100 s."""
     folder = tmp_path_factory.mktemp("office")
-    simulate("office", folder / "office.mcap", seed=3)
-    run(folder / "office.mcap", folder / "map", recording=False, log__end_s=100.0)
+    made.log("office", folder, seed=3)
+    made.run("office", folder, seed=3, log__end_s=100.0).rename(folder / "map")
     return folder
 
 
@@ -80,7 +80,7 @@ def test_a_log_is_followed_in_the_map_from_a_rough_pose(office, tmp_path, call):
 
 
 def test_a_log_of_another_place_is_never_placed(office, tmp_path, call):
-    simulate("identical", tmp_path / "other.mcap", seed=5, duration_s=40.0)
+    made.log("identical", tmp_path, seed=5, seconds=40.0).rename(tmp_path / "other.mcap")
     code, out, error = call(
         "localize", tmp_path / "other.mcap", "--map", office / "map", "--out", tmp_path / "loc"
     )
@@ -92,8 +92,7 @@ def test_a_log_of_another_place_is_never_placed(office, tmp_path, call):
 
 
 def test_a_whole_log_of_another_place_that_returns_to_its_start_is_refused_in_one_line(office, tmp_path):
-    simulate("identical", tmp_path / "other.mcap", seed=5, duration_s=60.0)
-    run(tmp_path / "other.mcap", tmp_path / "other", recording=False)
+    made.run("identical", tmp_path, seed=5, seconds=60.0).rename(tmp_path / "other")
     found = localize(office / "office.mcap", tmp_path / "other", tmp_path / "loc", recording=False)
     metrics = found.metrics
     assert metrics.sentence.startswith("not trustworthy: not from this place: nothing in ")

@@ -24,6 +24,7 @@ from scanchain.sessions.joining import Joined, changed, doubt_about, graph_of
 from scanchain.sessions.merging import merge
 from scanchain.trajectory import read_tum
 from scanchain_viz.pictures.run import draw_run
+from tests.support import made
 
 PARTS = {"morning": (0.0, 18.0), "noon": (6.0, 24.0), "evening": (14.0, 34.0)}
 FILES = ("map/points.i16", "map/edges.npz", "map/keyframes.npz", "map.ply", "map.pgm", "evening.tum", "graph.g2o")
@@ -33,11 +34,12 @@ FILES = ("map/points.i16", "map/edges.npz", "map/keyframes.npz", "map.ply", "map
 def runs(tmp_path_factory):
     """Three sessions in an office and one elsewhere, and the truth."""
     folder = tmp_path_factory.mktemp("sessions")
-    truth = sc.simulate("office", folder / "office.mcap", seed=2, duration_s=34.0)
+    truth = read_tum(made.log("office", folder, seed=2, seconds=34.0).with_suffix(".tum"))
+    truth = Trajectory(truth.stamps_ns, lie.flatten(truth.poses))
     for name, (start_s, end_s) in PARTS.items():
-        sc.run(folder / "office.mcap", folder / name, recording=False, log__start_s=start_s, log__end_s=end_s)
-    sc.simulate("identical", folder / "other.mcap", duration_s=12.0)
-    sc.run(folder / "other.mcap", folder / "stranger", recording=False)
+        part = made.run("office", folder, seed=2, seconds=34.0, log__start_s=start_s, log__end_s=end_s)
+        part.rename(folder / name)
+    made.run("identical", folder, seconds=12.0).rename(folder / "stranger")
     return folder, truth
 
 
@@ -200,8 +202,9 @@ def updates(runs, tmp_path_factory):
     """A session of another day, merged with one before it without and with ``update``."""
     folder, _ = runs
     out = tmp_path_factory.mktemp("updates")
-    sc.simulate("office", out / "later.mcap", seed=2, duration_s=34.0, changed=1)
-    sc.run(out / "later.mcap", out / "later", recording=False, log__start_s=6.0, log__end_s=24.0)
+    drive = {"seed": 2, "seconds": 34.0, "changed": 1}
+    made.log("office", out, **drive).rename(out / "later.mcap")
+    made.run("office", out, **drive, log__start_s=6.0, log__end_s=24.0).rename(out / "later")
     sc.merge([folder / "morning", out / "later"], out / "plain")
     return out, sc.merge([folder / "morning", out / "later"], out / "updated", update=True)
 
@@ -377,14 +380,15 @@ def _corridor(x_m, index, depths_m):
     return Keyframe(index, index, index, SavedPoints(points, 1.0), lie.pose_2d(x_m, 0.0, 0.0), x_m)
 
 
+@pytest.mark.slow
 def test_merging_searches_and_aligns_no_more_than_runs_do(runs, tmp_path, monkeypatch):
     folder, _ = runs
-    truth = sc.simulate("office", tmp_path / "office.mcap", seed=2)
+    truth = read_tum(made.log("office", seed=2).with_suffix(".tum"))
     quarter_s = float(np.ptp(truth.stamps_ns)) * 1e-9 / 4.0
     parts = [tmp_path / f"part-{k}" for k in range(4)]
     for k, part in enumerate(parts):
         span = {"log__start_s": k * quarter_s, "log__end_s": (k + 1) * quarter_s}
-        sc.run(tmp_path / "office.mcap", part, recording=False, **span)
+        made.run("office", tmp_path, seed=2, **span).rename(part)
     work: Counter[str] = Counter()
     for owner, name in ((WholeSearch, "__init__"), (Verifier, "scan"), (PoseGraph, "optimize")):
         monkeypatch.setattr(owner, name, _counted(getattr(owner, name), owner.__name__, work))

@@ -20,7 +20,6 @@ from scanchain.logs import open_log
 from scanchain.logs.mcap.records import Channel
 from scanchain.logs.messages.laser_scan import LaserScanDecoder
 from scanchain.logs.messages.point_cloud import PointCloudDecoder
-from scanchain.logs.messages.point_times import PointTimes
 from scanchain.logs.messages.readers import (
     has_poses,
     has_transforms,
@@ -29,7 +28,7 @@ from scanchain.logs.messages.readers import (
     pose_reader,
     reader,
 )
-from scanchain.logs.messages.returns import RangeLimits
+from scanchain.logs.messages.returns import PointTimes, RangeLimits
 from scanchain.logs.messages.ros import MalformedMessageError
 from tests.support import recorders
 from tests.support.mutations import CHUNK, Seed, cut_and_flipped, cut_at, mutant, mutated_message

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from mcap.writer import CompressionType, IndexType, Writer
 
-from scanchain.logs.writing.pack import schema_text
+from scanchain.logs.writer import schema_text
 
 SECOND = 1_000_000_000
 STAMP_NS = 1_700_000_000 * SECOND

@@ -12,6 +12,9 @@ from mcap.writer import Writer
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from scanchain.config import LogConfig
+from scanchain.logs import open_log
+
 SECOND = 1_000_000_000
 STAMP_NS = 1_700_000_000 * SECOND
 FIRST_RAD, STEP_RAD = np.float32(-1.0), np.float32(0.03125)  # exact in binary, so that other formats can tell them
@@ -58,6 +61,18 @@ def clouds(count=3, points=50):
         rows["x"][0] = np.nan
         told.append(Cloud(STAMP_NS + k * SECOND // 8, rows))
     return told
+
+
+def read(*paths, **config):
+    """A log and its scans."""
+    log = open_log(list(paths), LogConfig(**config))
+    return log, list(log.scans())
+
+
+def read_undamaged(path, **config):
+    log, scans = read(path, **config)
+    assert log.damage == []
+    return log, scans
 
 
 def assert_planar(scans, said=None, *, exact=True):
@@ -222,33 +237,29 @@ def mcap_of(path, ros, told):
 
 def bag1_of(path, told, compression=None, *, chunk_bytes=None):
     """A ROS 1 bag."""
-    ros = Ros(ROS1)
     writer = rosbag1.Writer(path)
     writer.chunk_threshold = chunk_bytes or writer.chunk_threshold
     if compression:
         writer.set_compression(rosbag1.Writer.CompressionFormat[compression])
-    with writer:
-        connections = {}
-        for topic, type_name, time_ns, message in told:
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, type_name, typestore=ROS1)
-            writer.write(connections[topic], time_ns, ros.serialize(message, type_name))
-    return path
+    return _bag_of(path, writer, Ros(ROS1), told)
 
 
 def bag2_of(folder, told, *, plugin="SQLITE3", compression="NONE"):
     """The folder of a ROS 2 bag."""
-    ros = Ros(ROS2)
     writer = rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin[plugin])
     if compression != "NONE":
         writer.set_compression(rosbag2.CompressionMode[compression], rosbag2.CompressionFormat.ZSTD)
+    return _bag_of(folder, writer, Ros(ROS2), told)
+
+
+def _bag_of(path, writer, ros, told):
     with writer:
         connections = {}
         for topic, type_name, time_ns, message in told:
             if topic not in connections:
-                connections[topic] = writer.add_connection(topic, type_name, typestore=ROS2)
+                connections[topic] = writer.add_connection(topic, type_name, typestore=ros.store)
             writer.write(connections[topic], time_ns, ros.serialize(message, type_name))
-    return folder
+    return path
 
 
 # Foxglove, by foxglove-sdk

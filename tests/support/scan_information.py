@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from scanchain import lie
 from scanchain.data import Matrix, Pose
 from scanchain.simulation.sensors import Sensor
 from scanchain.simulation.solids import Solids
@@ -29,17 +30,18 @@ def information(solids: Solids, T_world_lidar: Pose, sensor: Sensor, *, index: i
 
 
 def spectrum(information: Matrix) -> tuple[NDArray[np.float64], Matrix]:
-    """Shares (6,) of the returns that constrain each direction, least first, and the directions (6, 6) as rows.
+    """Shares (k,) of the returns that constrain each direction, least first, and the directions (k, k) as rows.
 
     Rotations are measured by what they do to the returns: H is scaled by L = √(Σ|p × n|² / N), N = Σ|n|², so that
     the twist of every row, in meters and radians, moves the returns by about a meter. Shares do not depend on the
     number of returns nor on units; a share of 1e-4 means that H constrains the direction as well as if one
     return in ten thousand faced it squarely.
     """
-    count, levers = np.trace(information[:3, :3]), np.trace(information[3:, 3:])
+    k, d = len(information), (len(information) + 1) // 2
+    count, levers = np.trace(information[:d, :d]), np.trace(information[d:, d:])
     if count <= 0.0:
-        return np.zeros(6), np.eye(6)
-    scale = np.repeat([1.0, np.sqrt(count / max(levers, 1e-12 * count))], 3)
+        return np.zeros(k), np.eye(k)
+    scale = lie.by_component(k, 1.0, float(np.sqrt(count / max(levers, 1e-12 * count))))
     shares, columns = np.linalg.eigh(scale[:, None] * information * scale / count)
     return np.maximum(shares, 0.0), (scale[:, None] * columns).T
 

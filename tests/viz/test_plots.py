@@ -7,10 +7,11 @@ import pytest
 
 from scanchain import lie
 from scanchain.verdict import Kind, Stretch
+from scanchain_viz.colors import palette_of
 from scanchain_viz.pictures.axis import Axis, width_of
-from scanchain_viz.pictures.figure import Plot, palette_of
-from scanchain_viz.pictures.map_figures import draw_points
-from scanchain_viz.pictures.run import GridPicture, draw_map
+from scanchain_viz.pictures.figure import Plot
+from scanchain_viz.pictures.maps import draw_points
+from scanchain_viz.pictures.run import draw_map
 
 image = pytest.importorskip("matplotlib.image")
 
@@ -66,7 +67,7 @@ def test_a_grid_lies_where_its_origin_says_with_row_0_at_the_bottom(tmp_path):
     cells = np.zeros((200, 200), np.int8)
     cells[:60] = 100  # a wall along the lowest y
     cells[:, 100:] = np.where(cells[:, 100:] == 0, -1, cells[:, 100:])
-    grid = GridPicture(cells, 0.1, (-10.0, -10.0))
+    grid = (cells, 0.1, (-10.0, -10.0))
     draw_map(tmp_path / "a.png", title="t", optimized=circle(9.0), grid=grid)
     pixels = image.imread(tmp_path / "a.png")[..., 0]
     dark_rows = np.nonzero((np.abs(pixels - 0.15) < 0.03).mean(axis=1) > 0.4)[0]
@@ -140,7 +141,7 @@ def test_a_logarithmic_axis_has_decades_and_where_they_are_few_more(ends, shown)
 def test_what_is_known_of_a_line_is_within_its_axes_and_breaks_where_it_is_not(name):
     x, y = np.array([1.0, 2.0, np.nan, 4.0, 5.0]), np.array([1.0, 10.0, 10.0, 100.0, 3.0])
     figure = Plot(logarithmic=name)
-    figure.line(x, y, "red")
+    figure.line(np.stack([x, y], axis=1), "red")
     drawn = re.search(r'<path d="([^"]*)" style="stroke: red', figure.svg())[1]
     assert re.sub(r"[\d. -]", "", drawn) == "MLML"
     places = numbers_of(drawn).reshape(-1, 2) / figure.extent
@@ -154,7 +155,7 @@ def test_what_is_known_of_a_line_is_within_its_axes_and_breaks_where_it_is_not(n
 def test_a_line_of_many_points_is_as_long_as_it_looks_and_ends_where_it_ends():
     angle = np.linspace(0.0, 1.9 * np.pi, 100_000)
     figure = Plot.of_plan(np.full(2, -1.1), np.full(2, 1.1))
-    figure.line(np.cos(angle), np.sin(angle), "red")
+    figure.line(np.stack([np.cos(angle), np.sin(angle)], axis=1), "red")
     end = np.array([np.cos(angle[-1]), np.sin(angle[-1])])
     svg = figure.svg()
     assert len(svg) < 150_000

@@ -1,7 +1,11 @@
-"""Colors as numbers and as text, and those of the stretches of a verdict in pages, pictures and recordings."""
+"""Colors as numbers and as text, and what they stand for in pages, pictures and recordings."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain.data import BACK_END, VERIFICATION
 from scanchain.verdict import Kind
 
 STRETCH_COLORS = {
@@ -17,6 +21,22 @@ STRETCH_COLORS = {
     Kind.DISCONNECTED: "#6b7280",
     Kind.COPIES: "#4d7c0f",
 }
+CLOSURES = {  # by whom a closure was rejected, "" where it was accepted: what it is called and its line's color
+    VERIFICATION: ("rejected by verification", "#f0958d"),
+    BACK_END: ("rejected by the back end", "#eb463c"),
+    "": ("accepted", "#3f9b2f"),
+}
+TRUTH = "#e0269e"  # dashed; on white and on black like the others, and never the color of a method
+# Distinguishable on white and on black, also for most color-blind readers.
+_COLORS = (
+    "#2f7de1", "#e0532f", "#1aa179", "#c77800", "#a55bd6", "#d6457f", "#0f9bb5", "#7f8c1d", "#8a6d5b", "#8c9096",
+    "#b0413e", "#5f8f57",
+)  # fmt: skip
+
+
+def color_of(place: int) -> str:
+    """Color of the method or session at this row of the table."""
+    return _COLORS[place % len(_COLORS)]
 
 
 def rgb(color: str) -> tuple[int, int, int]:
@@ -28,3 +48,23 @@ def rgb(color: str) -> tuple[int, int, int]:
 def hex_of(color: Iterable[int]) -> str:
     """#rrggbb of red, green and blue."""
     return f"#{bytes(color).hex()}"
+
+
+def height_shares(z: NDArray[np.floating]) -> NDArray[np.floating]:
+    """(N,) places of heights between the 2nd percentile, 0, and the 98th, 1."""
+    low, high = np.percentile(z, (2.0, 98.0))
+    return np.clip((z - low) / max(float(high - low), 1e-9), 0.0, 1.0)
+
+
+def between(anchors: Sequence[tuple[int, int, int]], shares: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """(N, 3) colors at shares (N,) of the way through colors that are equally far from each other."""
+    places = shares * (len(anchors) - 1.0)
+    channels = np.array(anchors, np.float64).T
+    mixed = np.stack([np.interp(places, np.arange(len(anchors)), channel) for channel in channels], axis=1)
+    return np.rint(mixed).astype(np.uint8)
+
+
+def palette_of(colors: Sequence[str], count: int = 256) -> NDArray[np.uint8]:
+    """(K, 4) opaque colors between some that are equally far from each other, #rrggbb."""
+    mixed = between([rgb(color) for color in colors], np.linspace(0.0, 1.0, count))
+    return np.pad(mixed, ((0, 0), (0, 1)), constant_values=255)

@@ -67,7 +67,7 @@ def convert(
             raise InputError(f"{override.flag} has no meaning for convert; its keys are {', '.join(_KEYS)}")
     config = load_settings(overrides=chosen).config.log
     from scanchain.commands.terminal import Terminal
-    from scanchain.logs.writing.convert import convert as convert_log
+    from scanchain.logs.convert import convert as convert_log
 
     with Terminal("messages") as terminal:
         done = convert_log([source], destination, config=config, force=force, progress=terminal.count)

@@ -13,7 +13,7 @@ from scanchain.files import Source
 from scanchain.settings import load_settings
 
 if TYPE_CHECKING:
-    from scanchain.logs.doctor.doctor import Diagnosis
+    from scanchain.logs.doctor import Diagnosis
 
 
 @click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--section.key VALUE]...")
@@ -33,7 +33,7 @@ def doctor(ctx: click.Context, logs: tuple[Source, ...], as_json: bool) -> None:
       scanchain doctor log.mcap --log.point_times ms
     """
     from scanchain.commands.terminal import Terminal
-    from scanchain.logs.doctor.doctor import examine
+    from scanchain.logs.doctor import examine
 
     chosen = overrides(ctx)
     early = load_settings(overrides=chosen).config

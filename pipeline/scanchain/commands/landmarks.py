@@ -110,7 +110,7 @@ def landmarks(
     from scanchain.landmarks.solvers import parse_methods
     from scanchain.landmarks.study import Options, study_file, study_log
     from scanchain.runs.directory import RunDirectory
-    from scanchain_viz.report.landmarks import write_report
+    from scanchain_viz.report.problems import write_report
 
     options = Options(parse_methods(methods), repeat, robot, _noise(noise), guess, optimizer)
     problems = [path if path.is_dir() else read_landmark_data(path) for path in data]
@@ -128,7 +128,7 @@ def landmarks(
         _write(directory.path, data, studies, tree)
         write_report(directory.path, studies)
         if recording is not None:
-            from scanchain_viz.recording.problems import record_landmarks
+            from scanchain_viz.recording.results import record_landmarks
 
             record_landmarks(studies, recording)
         directory.complete()

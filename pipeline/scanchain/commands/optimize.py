@@ -169,12 +169,12 @@ class Outputs:
             with _written(self.table):
                 write_covariances(self.table, file.ids[chosen], file.graph.covariances()[chosen])
         if self.picture is not None:
-            from scanchain_viz.pictures.problems import draw_graph
+            from scanchain_viz.report.problems import draw_graph
 
             with _written(self.picture):
                 draw_graph(report.change, self.picture)
         if self.recording is not None:
-            from scanchain_viz.recording.problems import record_graph
+            from scanchain_viz.recording.results import record_graph
 
             with _written(self.recording):
                 record_graph(report.change, self.recording)

@@ -1,4 +1,4 @@
-"""The least-squares problem of a pose graph: between factors, their structure, their normal equations."""
+"""The least-squares problem of a pose graph: its factors, their structure, their normal equations."""
 
 from __future__ import annotations
 
@@ -12,10 +12,58 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.graph.cholesky import BlockPattern, Packing, SparseCholesky, analyze
-from scanchain.kernels.graph import between, scatter
+from scanchain.kernels.graph import between
 
 WASTE = 0.1  # share of edges without weight that is worth a new analysis
 _FEW = 0.03  # the same where H⁻¹ is wanted too, which fill-in slows down more
+
+
+class Between:
+    """e = log(Z⁻¹ T_i⁻¹ T_j): the twist that the relative pose is off by on its right, T_i⁻¹ T_j = Z exp(e).
+
+    As every factor it depends on T_i⁻¹ T_j alone: one and the same left twist of both poses changes nothing, hence
+    ∂e/∂ξ_i = −∂e/∂ξ_j. What concerns one pose only, as a prior, has a fixed pose at the origin for its i.
+    """
+
+    def residual(self, poses: Matrix, edges: NDArray[np.int64], Z: Matrix) -> Matrix:
+        """Residuals e (E, k) of edges (E, 2) that measure Z (E, d+1, d+1), at these poses (K, d+1, d+1)."""
+        d = poses.shape[-1] - 1
+        errors = np.empty((len(edges), d * (d + 1) // 2))
+        residuals = between.residuals_2d if d == 2 else between.residuals_3d
+        residuals(_kept(poses), _kept(edges), _kept(Z), errors)
+        return errors
+
+    def linearize(self, poses: Matrix, edges: NDArray[np.int64], Z: Matrix, errors: Matrix) -> Matrix:
+        """∂e/∂ξ_j (E, k, k) for left twists, T_j ← exp(ξ_j) T_j, where the residuals are these errors (E, k)."""
+        jacobian = np.empty((*errors.shape, errors.shape[1]))
+        if errors.shape[1] == 3:
+            between.jacobians_2d(_kept(poses), _kept(edges), _kept(Z), jacobian)
+        else:
+            between.jacobians_3d(_kept(poses), _kept(edges), errors, jacobian)
+        return jacobian
+
+
+class Position:
+    """e = (R_zᵀ(R_iᵀ(t_j − t_i) − t_z), 0): the position of j in frame i, whatever its rotation, as g2o has it."""
+
+    def residual(self, poses: Matrix, edges: NDArray[np.int64], Z: Matrix) -> Matrix:
+        """As of ``Between``, zero in the rotation."""
+        d, (T_i, T_j) = poses.shape[-1] - 1, poses[edges.T]
+        errors = np.zeros((len(edges), d * (d + 1) // 2))
+        seen = (T_j[:, None, :d, d] - T_i[:, None, :d, d]) @ T_i[:, :d, :d]
+        errors[:, :d] = ((seen - Z[:, None, :d, d]) @ Z[:, :d, :d])[:, 0]
+        return errors
+
+    def linearize(self, poses: Matrix, edges: NDArray[np.int64], Z: Matrix, errors: Matrix) -> Matrix:
+        """R_zᵀ R_iᵀ [I, ∂t_j/∂φ]."""
+        d, (T_i, T_j) = poses.shape[-1] - 1, poses[edges.T]
+        R_t = np.swapaxes(T_i[:, :d, :d] @ Z[:, :d, :d], 1, 2)
+        jacobian = np.zeros((*errors.shape, errors.shape[1]))
+        jacobian[:, :d, :d], jacobian[:, :d, d:] = R_t, R_t @ turns(T_j[:, :d, d])
+        return jacobian
+
+
+FACTORS = {"between": Between(), "position": Position()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,16 +79,14 @@ class NormalEquations:
 
 
 class BetweenProblem:
-    """Between factors e = log(Z_ij⁻¹ T_i⁻¹ T_j), χ² = Σ eᵀΩe, of one graph; the structure is worked out once.
+    """Factors of one graph, χ² = Σ eᵀΩe; the structure is worked out once.
 
-    e is the twist that the relative pose is off by on its right, T_i⁻¹ T_j = Z exp(e), so Ω is the inverse
-    covariance of a right twist on Z. Poses move by left twists, T ← exp(ξ) T. The gauge is fixed by leaving the
-    fixed poses out of the system: ``variable`` (K,) is the block of each pose, -1 where it is fixed, ``free`` (n,)
-    the pose of each block, ``slots`` (E, 3) the blocks of i, of j and of the pair in the matrix.
+    Poses move by left twists, T ← exp(ξ) T. The gauge is fixed by leaving the fixed poses out of the system:
+    ``variable`` (K,) is the block of each pose, -1 where it is fixed, ``free`` (n,) the pose of each block,
+    ``slots`` (E, 3) the blocks of i, of j and of the pair in the matrix.
 
-    Edges whose Ω has no information about the rotation are ``sightings`` of a position: e is
-    (R_zᵀ(R_iᵀ(t_j − t_i) − t_z), 0), as g2o has it, whatever the rotation of j. In the plane, j may be a point: a
-    pose without a heading, its rotation the identity, of whose block only the translation is kept.
+    Edges whose Ω has no information about the rotation are ``sightings`` of a position. In the plane, j of these
+    may be a point: a pose without a heading, its rotation the identity, whose block holds the translation alone.
     """
 
     def __init__(
@@ -68,7 +114,10 @@ class BetweenProblem:
         self.slots[joined, 2] = len(self.free) + which
         self.is_point = np.zeros(len(fixed), np.bool_) if is_point is None else is_point
         d = measurements.shape[-1] - 1
-        self.sightings = np.flatnonzero(self.is_point[edges].any(axis=1) | ~information[:, d:].any(axis=(1, 2)))
+        is_seen = self.is_point[edges].any(axis=1) | ~information[:, d:].any(axis=(1, 2))
+        self.sightings = np.flatnonzero(is_seen)
+        kinds = {"between": np.flatnonzero(~is_seen), "position": self.sightings}
+        self._factors = [(FACTORS[kind], of) for kind, of in kinds.items() if len(of)]
         sizes = np.where(self.is_point[self.free], 2, self.freedom)
         self.pattern = BlockPattern(sizes, np.stack(np.divmod(unique, count), axis=1))
         self.packing = Packing(self.pattern, self.freedom, at_end=False)
@@ -115,7 +164,7 @@ class BetweenProblem:
     def chi2(self, errors: Matrix) -> NDArray[np.float64]:
         """Return eᵀΩe of every edge, (E,)."""
         result = np.empty(len(errors))
-        scatter.squared_norms(errors, self.information, result)
+        between.squared_norms(errors, self.information, result)
         return result
 
     def jacobians(self, poses: Matrix, errors: Matrix) -> Matrix:
@@ -127,7 +176,7 @@ class BetweenProblem:
         blocks = np.zeros((len(self.pattern.rows), self.freedom, self.freedom))
         gradient = np.zeros((len(self.free), self.freedom))
         jacobian = self.jacobians(poses, errors)
-        scatter.scatter_between(jacobian, errors, self.information, weights, self.slots, blocks, gradient)
+        between.scatter_between(jacobian, errors, self.information, weights, self.slots, blocks, gradient)
         return NormalEquations(self.packing.values(blocks), self.packing.rows(gradient), weights)
 
     def scattered(self, of_i: Matrix, of_j: Matrix, coupling: Matrix) -> Matrix:
@@ -150,29 +199,14 @@ class BetweenProblem:
 
     def _errors(self, poses: Matrix, edges: NDArray[np.int64]) -> Matrix:
         errors = np.empty((len(edges), self.freedom))
-        residuals = between.residuals_2d if self.freedom == 3 else between.residuals_3d
-        residuals(_kept(poses), _kept(edges), self.measurements, errors)
-        if len(self.sightings):
-            d, Z = poses.shape[-1] - 1, self.measurements[self.sightings]
-            T_i, T_j = poses[edges[self.sightings].T]
-            seen = (T_j[:, None, :d, d] - T_i[:, None, :d, d]) @ T_i[:, :d, :d]
-            errors[self.sightings, :d] = ((seen - Z[:, None, :d, d]) @ Z[:, :d, :d])[:, 0]
-            errors[self.sightings, d:] = 0.0
+        for factor, of in self._factors:
+            errors[of] = factor.residual(poses, edges[of], self.measurements[of])
         return errors
 
     def _jacobians(self, poses: Matrix, edges: NDArray[np.int64], errors: Matrix) -> Matrix:
         jacobian = np.empty((len(edges), self.freedom, self.freedom))
-        if self.freedom == 3:
-            between.jacobians_2d(_kept(poses), _kept(edges), self.measurements, jacobian)
-        else:
-            between.jacobians_3d(_kept(poses), _kept(edges), errors, jacobian)
-        if len(self.sightings):
-            d = poses.shape[-1] - 1
-            T_i, T_j = poses[edges[self.sightings].T]
-            R_t = np.swapaxes(T_i[:, :d, :d] @ self.measurements[self.sightings, :d, :d], 1, 2)
-            jacobian[self.sightings] = 0.0
-            jacobian[self.sightings, :d, :d] = R_t
-            jacobian[self.sightings, :d, d:] = R_t @ turns(T_j[:, :d, d])
+        for factor, of in self._factors:
+            jacobian[of] = factor.linearize(poses, edges[of], self.measurements[of], errors[of])
         return jacobian
 
 

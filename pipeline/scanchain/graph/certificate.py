@@ -14,7 +14,6 @@ from scanchain.errors import counted
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.cholesky import BlockPattern, Packing, SingularMatrixError, SparseCholesky
 from scanchain.graph.edge_checks import is_connected
-from scanchain.kernels.graph.dual import scatter_dual
 
 _ZERO_CHI2 = 1e-9  # of the largest information, or of 1 if that is less: below it χ² is zero but for rounding
 _EXACT = 1e-12  # share of χ² that rounding alone may amount to
@@ -121,12 +120,7 @@ def certify(
 def _gap(problem: BetweenProblem, minorants: Minorants, kept: NDArray[np.bool_], chi2: float) -> float | None:
     """χ² less the best bound that a few shifts of the dual matrix give, None where none gives any."""
     n, d = len(problem.free), minorants.leap.shape[1]
-    blocks = np.zeros((len(problem.pattern.rows), d + 1, d + 1))
-    residual = np.zeros((n, d + 1, d))
-    scatter_dual(
-        minorants.leap[kept], minorants.force[kept], minorants.torque[kept], minorants.tau[kept],
-        minorants.kappa[kept], problem.slots[kept], blocks, residual,
-    )  # fmt: skip
+    blocks, residual = dual_matrix(problem, minorants, kept)
     sizes = np.where(problem.is_point[problem.free], 1, d + 1)
     pattern = BlockPattern(sizes, problem.pattern.pairs)
     packing = Packing(pattern, d + 1, at_end=True)
@@ -143,6 +137,36 @@ def _gap(problem: BetweenProblem, minorants: Minorants, kept: NDArray[np.bool_],
         right = packing.rows(residual + shift * rotation[:, :d])
         return float((right * factor.solve(right)).sum())
     return None
+
+
+def dual_matrix(problem: BetweenProblem, bound: Minorants, kept: NDArray[np.bool_]) -> tuple[Matrix, Matrix]:
+    """S = Q − Λ of the bounds of the edges kept (E,), as blocks of the problem's pattern, and S X* (n, d+1, d).
+
+    Unknowns are G_i, the rotation of pose i against its estimate, seen from the world, and t_i, its position; at
+    the estimate X* every G is I. An edge contributes
+        q = τ‖t_j − t_i − G_i l‖² + fᵀG_iᵀ(t_j − t_i) + ½ κ‖G_i − G_j‖² + ½ ⟨[g]×, G_iᵀG_j⟩
+    and, by the multiplier Λ_i of G_iᵀG_i = I that makes X* stationary, −½ sym(f lᵀ) at G_i
+    (Carlone et al. 2015, eq. 26; Rosen et al. 2019, eq. 22). A row of S belongs to one row of each G and of t.
+    """
+    parts = (bound.leap, bound.force, bound.torque, bound.tau, bound.kappa)
+    leap, force, torque, tau, kappa = (np.where(kept.reshape(-1, *(x.ndim - 1) * [1]), x, 0.0) for x in parts)
+    d = leap.shape[1]
+    R, t = slice(0, d), d
+    of_i, of_j, coupling = (np.zeros((len(kept), d + 1, d + 1)) for _ in range(3))
+    bent, stretch = force[:, :, None] * leap[:, None], tau[:, None] * leap
+    even = 0.5 * kappa[:, None, None] * np.eye(d)
+    of_i[:, R, R] = stretch[:, :, None] * leap[:, None] - 0.25 * (bent + np.swapaxes(bent, 1, 2)) + even
+    of_i[:, R, t] = of_i[:, t, R] = stretch - 0.5 * force
+    of_j[:, R, R] = even
+    of_i[:, t, t] = of_j[:, t, t] = tau
+    coupling[:, R, R], coupling[:, R, t], coupling[:, t, t] = 0.25 * torque - even, 0.5 * force - stretch, -tau
+    residual = np.zeros((len(problem.free) + 1, d + 1, d))  # the last one of the fixed poses
+    i, j, _ = problem.slots.T
+    np.add.at(residual[:, R], i, 0.25 * (bent - np.swapaxes(bent, 1, 2) + torque))
+    np.add.at(residual[:, R], j, -0.25 * torque)
+    np.add.at(residual[:, t], i, -0.5 * force)
+    np.add.at(residual[:, t], j, 0.5 * force)
+    return problem.scattered(of_i, of_j, coupling), residual[:-1]
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,51 +207,42 @@ def minorize(problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64
     of_seen = np.linalg.eigvalsh(information[seen, :d, :d])[:, 0]
     tau[seen], kappa[seen] = np.maximum(of_seen, _TINY), _TINY
     excess = _length(torque - 2.0 * kappa[:, None] * turned)
-    costs = _Costs(tau, kappa, _length(errors[:, :d]), _length(errors[:, d:]), _length(pull[:, :d]))
-    tau, kappa = costs.paid(0.5 * _length(force), excess)
-    short = np.setdiff1d(np.flatnonzero(~(kappa > 0.0) & (costs.theta < _FARTHEST)), seen)
+    rho, theta = _length(errors[:, :d]), _length(errors[:, d:])
+    tau, kappa = _paid(tau, kappa, rho, theta, _length(pull[:, :d]), 0.5 * _length(force), excess)
+    short = np.setdiff1d(np.flatnonzero(~(kappa > 0.0) & (theta < _FARTHEST)), seen)
     if len(short):
         parts = (information, errors, pull, force, torque, turned)
         tau[short], kappa[short] = _borrowed(*(part[short] for part in parts))
-    kappa[costs.theta >= _FARTHEST] = np.nan
+    kappa[theta >= _FARTHEST] = np.nan
     tau[seen], kappa[seen] = of_seen, 0.0
     return Minorants(poses[j, :d, d] - poses[i, :d, d], force, _cross_matrix(torque), tau, kappa)
 
 
-@dataclass(frozen=True, slots=True)
-class _Costs:
-    """Terms of the edges' bounds: isotropic information, residuals ‖ρ*‖ and θ*, and ‖y_t‖; each (E,)."""
+def _paid(
+    tau: NDArray[np.float64],
+    kappa: NDArray[np.float64],
+    rho: NDArray[np.float64],
+    theta: NDArray[np.float64],
+    pull: NDArray[np.float64],
+    force: NDArray[np.float64],
+    excess: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """τ and κ (2, E) less the cost of the bounds, of which as much is paid from τ as leaves the most of both.
 
-    tau: NDArray[np.float64]
-    kappa: NDArray[np.float64]
-    rho: NDArray[np.float64]
-    theta: NDArray[np.float64]
-    pull: NDArray[np.float64]
-
-    def paid(
-        self, force: NDArray[np.float64], excess: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """τ and κ less their cost; ``force`` is ‖V⁻ᵀy_t‖, ``excess`` the rotational slope beside 2κφ*."""
-        best_tau, best_kappa = self._left(_PAID_FROM_TAU[0], force, excess)
-        for share in _PAID_FROM_TAU[1:]:
-            tau, kappa = self._left(share, force, excess)
-            better = np.minimum(tau / self.tau, kappa / self.kappa) > np.minimum(
-                best_tau / self.tau, best_kappa / self.kappa
-            )
-            best_tau, best_kappa = np.where(better, tau, best_tau), np.where(better, kappa, best_kappa)
-        return best_tau, best_kappa
-
-    def _left(
-        self, share: float, force: NDArray[np.float64], excess: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        root = np.sqrt(self.tau * self.kappa)
-        bent = share * 0.5 * self.rho * np.sqrt(self.tau / self.kappa) + 1e-12
-        turned = np.minimum(share * _SLOPE * self.pull / root + 1e-12, 0.5)
-        tau = self.tau * (1.0 - turned) / (1.0 + bent)
-        cost = 0.25 * tau * (1.0 + 1.0 / bent) * self.rho**2 + (_SLOPE * self.pull) ** 2 / (turned * self.tau)
-        cost += force * self.rho / 3.0 + 0.5 * excess
-        kappa = self.kappa - cost / np.maximum(1.0 - self.theta, 1e-12)
-        return tau, np.where(self.theta < 1.0, (1.0 - 0.5 * _BEND * self.theta**2) * kappa, -1.0)
+    tau, kappa : isotropic information; rho, theta : residuals ‖ρ*‖ and θ*; pull : ‖y_t‖; force : ‖V⁻ᵀy_t‖;
+    excess : the rotational slope beside 2κφ*; each (E,)
+    """
+    left = np.empty((len(_PAID_FROM_TAU), 2, len(tau)))
+    for share, (tau_left, kappa_left) in zip(_PAID_FROM_TAU, left, strict=True):
+        bent = share * 0.5 * rho * np.sqrt(tau / kappa) + 1e-12
+        turned = np.minimum(share * _SLOPE * pull / np.sqrt(tau * kappa) + 1e-12, 0.5)
+        tau_left[:] = tau * (1.0 - turned) / (1.0 + bent)
+        cost = 0.25 * tau_left * (1.0 + 1.0 / bent) * rho**2 + (_SLOPE * pull) ** 2 / (turned * tau)
+        cost += force * rho / 3.0 + 0.5 * excess
+        rest = kappa - cost / np.maximum(1.0 - theta, 1e-12)
+        kappa_left[:] = np.where(theta < 1.0, (1.0 - 0.5 * _BEND * theta**2) * rest, -1.0)
+    best = np.minimum(left[:, 0] / tau, left[:, 1] / kappa).argmax(axis=0)
+    return left[best, :, np.arange(len(tau))].T
 
 
 def _borrowed(

@@ -10,8 +10,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.linalg import spilu
 
 from scanchain.data import Matrix
-from scanchain.kernels.graph import cholesky, fronts, inverse, scatter, symbolic
-from scanchain.kernels.graph.fronts import Fronts
+from scanchain.kernels.graph import cholesky, fronts, symbolic
 
 _LOST_DIGITS = 1e-13  # a pivot below this share of its diagonal entry is rounding noise
 
@@ -51,9 +50,14 @@ class BlockPattern:
 
     def multiply(self, values: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
         """The product of the symmetric matrix of these values with a vector (scalars,)."""
-        result = np.zeros(self.scalars)
-        scatter.multiply(self.rows, self.columns, self.starts, self.sizes, values, x, result)
-        return result
+        counts = self.sizes[self.rows] * self.sizes[self.columns]
+        block, within = np.repeat(np.arange(len(counts)), counts), fronts.ranges(np.zeros_like(counts), counts)
+        row, column = (starts[block] for starts in (self.starts[self.rows], self.starts[self.columns]))
+        below, beside = np.divmod(within, self.sizes[self.columns][block])
+        row, column, is_pair = row + below, column + beside, row != column
+        result = np.bincount(row, values * x[column], self.scalars)
+        result += np.bincount(column[is_pair], (values * x[row])[is_pair], self.scalars)
+        return result.astype(np.float64, copy=False)
 
 
 class Packing:
@@ -137,11 +141,6 @@ class SparseCholesky:
         self._front_of = np.repeat(self._every_front, self._fronts.pivots)
 
     @property
-    def entries(self) -> int:
-        """Stored entries of the factor, explicit zeros included."""
-        return int(self._fronts.factor_start[-1])
-
-    @property
     def work(self) -> float:
         """Multiplications of a factorization, roughly: the pivots of every front times its entries."""
         return float((self._fronts.pivots * np.diff(self._fronts.row_start).astype(np.float64) ** 2).sum())
@@ -192,9 +191,9 @@ class SparseCholesky:
         With A = Uᵀ U it is CᵀC, Uᵀ C = B: half of a solve, by the fronts between these variables and the roots of
         the elimination tree alone.
         """
-        places = self._places[_ranges(self.pattern.starts[variables], self.pattern.sizes[variables])]
+        places = self._places[fronts.ranges(self.pattern.starts[variables], self.pattern.sizes[variables])]
         path, local = self._path(places), np.empty(self._fronts.widest)
-        reached = _ranges(self._first_pivot[path], self._fronts.pivots[path])
+        reached = fronts.ranges(self._first_pivot[path], self._fronts.pivots[path])
         x, C = np.zeros(self.pattern.scalars), np.empty((B.shape[1], len(reached)))
         for row, column in zip(C, B.T, strict=True):
             x[places] = column
@@ -221,13 +220,8 @@ class SparseCholesky:
     def inverse_blocks(self) -> NDArray[np.float64]:
         """A⁻¹ by the last factor, where A may be nonzero: block values, laid out as those of A."""
         result = np.empty(self.pattern.value_count)
-        inverse.selected_inverse(self._fronts, self._blocks, self.factor, result, *self._room())
+        cholesky.selected_inverse(self._fronts, self._blocks, self.factor, result, *self._room())
         return result
-
-
-def _ranges(starts: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The numbers from each start on, so many, one range after the other."""
-    return np.repeat(starts - np.cumsum(counts) + counts, counts) + np.arange(int(counts.sum()))
 
 
 def _adjacency(pattern: BlockPattern) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -258,16 +252,11 @@ def _fill_reducing_order(start: NDArray[np.int64], neighbors: NDArray[np.int64])
 
 def upper_factor(cholesky: SparseCholesky) -> csr_matrix:
     """U of the last factorization, A = Uᵀ U, in the order of elimination, with explicit zeros of the fill-in."""
-    return front_rows(cholesky._fronts, cholesky.factor)
-
-
-def front_rows(fronts: Fronts, factor: NDArray[np.float64]) -> csr_matrix:
-    """The upper triangular matrix whose rows the fronts store, in the order of elimination."""
-    widths = np.diff(fronts.row_start)
-    count = int(fronts.pivots.sum())
-    front = np.repeat(np.arange(len(widths)), fronts.pivots)
-    within = _ranges(np.zeros_like(fronts.pivots), fronts.pivots)
+    layout, size = cholesky._fronts, cholesky.pattern.scalars
+    widths = np.diff(layout.row_start)
+    front = np.repeat(np.arange(len(widths)), layout.pivots)
+    within = fronts.ranges(np.zeros_like(layout.pivots), layout.pivots)
     lengths = widths[front] - within
     row_start = np.concatenate([[0], np.cumsum(lengths)])
-    columns = fronts.rows[_ranges(fronts.row_start[front] + within, lengths)]
-    return csr_matrix((factor.copy(), columns, row_start), shape=(count, count))
+    columns = layout.rows[fronts.ranges(layout.row_start[front] + within, lengths)]
+    return csr_matrix((cholesky.factor.copy(), columns, row_start), shape=(size, size))

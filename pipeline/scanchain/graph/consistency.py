@@ -139,6 +139,3 @@ def apart(ends: NDArray[np.int64], edges: NDArray[np.int64]) -> NDArray[np.int64
     for place, near in enumerate(KDTree(ends[edges]).query_ball_point(ends[edges], _REACH, p=np.inf)):
         is_chosen[place] = not is_chosen[near].any()
     return edges[is_chosen]
-
-
-# a few steps with one set of edges, until the poses have settled roughly; the next update goes on

@@ -33,7 +33,7 @@ def own_covariances(problem: BetweenProblem) -> Matrix:
 def relative_covariance(problem: BetweenProblem, poses: Matrix, i: int, j: int) -> Matrix:
     """Covariance (k, k) of a right twist on T_i⁻¹ T_j, Ad(T_j⁻¹) Cov(ξ_j − ξ_i) Ad(T_j⁻¹)ᵀ."""
     adjoint = lie.adjoint(lie.inverse(poses[j]))
-    return adjoint @ difference_covariance(problem, i, j) @ adjoint.T
+    return adjoint @ difference_covariances(problem, np.array([[i, j]]))[0, 0] @ adjoint.T
 
 
 def responses(problem: BetweenProblem, i: int, j: int) -> Matrix:
@@ -45,11 +45,6 @@ def responses(problem: BetweenProblem, i: int, j: int) -> Matrix:
     result[problem.free] = packing.spread_rows(problem.cholesky.solve(packing.rows(result[problem.free])))
     result[problem.variable < 0] = 0.0
     return result
-
-
-def difference_covariance(problem: BetweenProblem, i: int, j: int) -> Matrix:
-    """Cov(ξ_j − ξ_i), (k, k), of the left twists of two poses, by the factor of H."""
-    return difference_covariances(problem, np.array([[i, j]]))[0, 0]
 
 
 def difference_covariances(problem: BetweenProblem, pairs: NDArray[np.int64]) -> Matrix:

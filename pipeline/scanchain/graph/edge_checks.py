@@ -16,7 +16,6 @@ from scanchain.data import Matrix
 from scanchain.errors import InputError, counted
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.cholesky import SingularMatrixError
-from scanchain.kernels.geometry.validity import largest_magnitude
 
 _AXES = {3: ("x", "y", "yaw"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
 _MOST = 100  # largest number of directions of the null space that are computed
@@ -176,31 +175,21 @@ _ROUNDING = 1e-6  # share of the largest entry that a negative eigenvalue may ha
 
 def check_edges(edges: NDArray[np.int64], measurements: Matrix, information: Matrix, pose_count: int) -> None:
     """Refuse edges to unknown poses, from a pose to itself, or with impossible numbers."""
-    is_sound = positive_semidefinite(information)
-    largest = max(largest_magnitude(each.reshape(-1, each.shape[-1])) for each in (measurements, information))
-    is_known = edges.min(initial=0) >= 0 and edges.max(initial=-1) < pose_count
-    if is_known and is_sound.all() and largest <= LARGEST and (edges[:, 0] != edges[:, 1]).all():
-        return
-    lowest, highest = edges.min(axis=1, initial=0), edges.max(axis=1, initial=-1)
-    for index in np.flatnonzero((lowest < 0) | (highest >= pose_count))[:1]:
-        i, j = edges[index]
-        raise InputError(f"edge {i}-{j} joins a pose that is not there: the graph has {pose_count}; add it first")
-    for index in np.flatnonzero(edges[:, 0] == edges[:, 1])[:1]:
-        i, j = edges[index]
-        raise InputError(f"edge {i}-{j} joins a pose to itself; remove it")
-    for numbers, what in ((measurements, "measurement"), (information, "information")):
-        largest = np.abs(numbers).max(axis=(1, 2), initial=0.0)
-        for index in np.flatnonzero(np.isfinite(largest) & (largest > LARGEST))[:1]:
-            i, j = edges[index]
-            raise InputError(
-                f"edge {i}-{j}: {what} of {largest[index]:g}, over {LARGEST:g}; give meters and radians, "
-                "and an inverse covariance of these"
-            )
-    for index in np.flatnonzero(~is_sound)[:1]:
-        i, j = edges[index]
-        raise InputError(
-            f"edge {i}-{j}: information matrix is not symmetric positive semidefinite; give an inverse covariance"
-        )
+    is_known = ((edges >= 0) & (edges < pose_count)).all(axis=1)
+    faults = [
+        (~is_known, f" joins a pose that is not there: the graph has {pose_count}; add it first"),
+        (edges[:, 0] == edges[:, 1], " joins a pose to itself; remove it"),
+    ]
+    limit = f"over {LARGEST:g}; give meters and radians, and an inverse covariance of these"
+    for what, matrices in (("measurement", measurements), ("information", information)):
+        size = np.nan_to_num(np.abs(matrices).max(axis=(1, 2), initial=0.0), posinf=0.0)
+        largest = size.max(initial=LARGEST)
+        faults.append(((size > LARGEST) & (size == largest), f": {what} of {largest:g}, {limit}"))
+    is_indefinite = ~positive_semidefinite(information)
+    text = ": information matrix is not symmetric positive semidefinite; give an inverse covariance"
+    for is_bad, words in [*faults, (is_indefinite, text)]:
+        for i, j in edges[is_bad][:1].tolist():
+            raise InputError(f"edge {i}-{j}{words}")
 
 
 def positive_semidefinite(information: Matrix) -> NDArray[np.bool_]:

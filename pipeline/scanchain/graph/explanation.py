@@ -8,124 +8,39 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.data import REJECTED_WEIGHT, Matrix
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.consistency import apart
+from scanchain.graph.covariance import difference_covariances, edge_covariances, inverse_blocks, responses
 from scanchain.graph.initialize import Initialization
-from scanchain.graph.left_out import LeftOut
 from scanchain.graph.losses import rejection_limit
+from scanchain.graph.minimizer import Minimum
 from scanchain.graph.odometry_errors import (
     FEWEST,
+    Explanation,
     Loosened,
-    Slip,
-    corrected,
+    Vector,
+    changed,
     cost_of,
-    drift_step,
-    loosened,
-    next_loosened,
-    penalty,
-    rescaled,
-    size,
+    direction,
+    odometry_of,
+    prior,
+    spread,
 )
-from scanchain.graph.optimization import Solved, solve
+from scanchain.graph.optimization import solve
 
 _LARGE = 2000  # edges of odometry from which on groups of loop edges are judged once, under the last explanation
 _FEWEST = 2  # least number of loop edges left out, none near another, that are to be explained
 _MAX_STEPS = 20  # largest number of changes of an explanation in one optimization
 _SETTLED = 0.1  # share of the price of a loop edge below which a change gains nothing
-
-
-@dataclass(frozen=True, slots=True)
-class Explanation:
-    """Errors of odometry.
-
-    Attributes
-    ----------
-    drift : (2,) or (4,) share of its way by which odometry is too short, and radians a meter it turns too little
-    loosened : slips and jumps, stretches of odometry that are off by more than their edges say
-    """
-
-    drift: NDArray[np.float64]
-    loosened: tuple[Loosened, ...] = ()
-
-    @classmethod
-    def none(cls, freedom: int) -> Explanation:
-        """Odometry as it is."""
-        return cls(np.zeros(size(freedom)))
-
-    def applied(
-        self, edges: NDArray[np.int64], measured: Matrix, information: Matrix, is_loop: NDArray[np.bool_]
-    ) -> tuple[Matrix, Matrix]:
-        """Measurements (E, d+1, d+1) without drift, and their information (E, k, k), slips and jumps loosened."""
-        if not self.drift.any() and not self.loosened:
-            return measured, information
-        odometry = odometry_of(edges, is_loop)
-        of_odometry, Z = information[odometry], measured[odometry]
-        for stretch in self.loosened:
-            twists = stretch.spread(Z, information[odometry])
-            of_odometry[stretch.edges] = loosened(of_odometry[stretch.edges], twists)
-        measured, information = measured.copy(), information.copy()
-        measured[odometry] = corrected(Z, self.drift, _sign(edges[odometry]))
-        information[odometry] = rescaled(of_odometry, self.drift)
-        return measured, information
-
-    def with_later(self, other: Explanation, before: int) -> Explanation:
-        """The same with slips and jumps of another, of the edges of odometry that come after so many."""
-        later = (replace(stretch, first=stretch.first + before) for stretch in other.loosened)
-        return replace(self, loosened=(*self.loosened, *later))
-
-    def cost(self, measured: Matrix, information: Matrix, price: float, nominal: float) -> float:
-        """Cost of the explanation itself, where a loop edge left out costs this price; the arrays of odometry.
-
-        nominal : price where the noise model is right
-        """
-        result = penalty(self.drift) + (FEWEST * price if self.drift.any() else 0.0)
-        for stretch in self.loosened:
-            B = stretch.spread(measured, information)
-            claimed = (np.swapaxes(B, 1, 2) @ information[stretch.edges] @ B).sum(axis=0)
-            result += float(cost_of(claimed, is_jump=stretch.is_jump, price=price, nominal=nominal))
-        return result
-
-    @property
-    def jumps(self) -> tuple[int, ...]:
-        """Edges of odometry, in the order of the poses, whose motion is wrong altogether."""
-        return tuple(stretch.first for stretch in self.loosened if stretch.is_jump)
-
-
-def odometry_of(edges: NDArray[np.int64], is_loop: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Edges of odometry (O,), in the order of the poses."""
-    odometry = np.flatnonzero(~is_loop)
-    return odometry[np.argsort(edges[odometry].min(axis=1), kind="stable")]
-
-
-def _sign(edges: NDArray[np.int64]) -> NDArray[np.float64]:
-    """1 of edges (O, 2) to a later pose, −1 of those to an earlier one."""
-    return np.sign(edges[:, 1] - edges[:, 0]).astype(np.float64)
-
-
-def corrections(
-    explanation: Explanation,
-    slips: tuple[Slip, ...],
-    edges: NDArray[np.int64],
-    names: NDArray[np.int64],
-    noun: str,
-) -> list[str]:
-    """Corrections of odometry in words, a line each.
-
-    edges : (O, 2) those of odometry, in the order of the poses
-    names (K,), noun : numbers of the poses for the reader, and what they number
-    """
-    found = []
-    if explanation.drift.any():
-        scale, *turns = explanation.drift.tolist()
-        turn = ", ".join(f"{1e3 * rad_per_m:+.1f}" for rad_per_m in turns)
-        found.append(f"length {100.0 * scale:+.1f} %, turn {turn} mrad/m")
-    stretches = [(f"a slip of {slip.size_m:+.1f} m", slip.first, slip.count) for slip in slips]
-    for what, first, count in [*stretches, *(("a jump", jump, 1) for jump in explanation.jumps)]:
-        poses = edges[first : first + count]
-        found.append(f"{what} between {noun} {names[poses.min()]:,} and {names[poses.max()]:,}")
-    return [f"corrected by loop closures: {what}" for what in found]
+_MOST_LEFT_OUT = 30  # largest number of loop edges that are looked at
+_MOST_ENTRIES = 4_000_000  # largest number of covariances between these and odometry, 32 MB
+_CURVATURE = 0.3  # share of a change by a drift that its linearization may be off by
+_SLIP_LENGTHS = (4, 16, 64)  # number of edges of the stretches that are tried
+_MOST_STRETCHES = 100  # largest number of stretches that are looked at more closely
+_DRIFT_ROUNDS, _STRETCH_ROUNDS = 5, 3  # of the least squares over the loop edges that one explains
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,49 +48,44 @@ class Explained:
     """The minimum of the problem under an explanation."""
 
     problem: BetweenProblem
-    solved: Solved
+    minimum: Minimum
     explanation: Explanation
 
 
+@dataclass(frozen=True, slots=True)
 class Explainer:
-    """Optimizes a graph with explanations that lower the cost by more than they cost themselves."""
+    """Optimizes a graph with explanations that lower the cost by more than they cost themselves.
 
-    def __init__(
-        self,
-        problem_of: Callable[[Explanation], BetweenProblem],
-        measured: Matrix,
-        information: Matrix,
-        is_loop: NDArray[np.bool_],
-        config: GraphConfig,
-        *,
-        jumps: bool = False,
-    ) -> None:
-        """problem_of : the problem under an explanation; measured, information : of all edges, as added.
+    Attributes
+    ----------
+    problem_of : the problem under an explanation
+    measured, information, is_loop : (E, ...) of all edges, as added
+    jumps : whether to look for jumps rather than for a drift, which is one of all odometry
+    """
 
-        jumps : whether to look for jumps rather than for a drift, which is one of all odometry
-        """
-        self._problem_of, self._is_loop, self._config = problem_of, is_loop, config
-        self._measured, self._information = measured, information
-        self._is_large = len(is_loop) - int(is_loop.sum()) >= _LARGE
-        self._jumps = jumps
-        self._nominal = rejection_limit(config.robust_scale, measured.shape[-1] * (measured.shape[-1] - 1) // 2)
+    problem_of: Callable[[Explanation], BetweenProblem]
+    measured: Matrix
+    information: Matrix
+    is_loop: NDArray[np.bool_]
+    config: GraphConfig
+    jumps: bool = False
 
     def solve(self, explanation: Explanation, poses: Matrix, initialize: Initialization) -> Explained:
         """The minimum, from these poses and this explanation."""
         best = first = self._solved(explanation, poses, initialize, groups=True)
         explains = not len(best.problem.sightings)
         for _ in range(_MAX_STEPS):
-            better = next(self._better(best), None) if explains and best.solved.minimum.price else None
+            better = next(self._better(best), None) if explains and best.minimum.price else None
             if better is None:
                 break
             best = better
         if best is not first and self._is_large:
-            best = self._solved(best.explanation, best.solved.poses, "given", groups=True)
+            best = self._solved(best.explanation, best.minimum.estimate.poses, "given", groups=True)
         return best
 
     def _better(self, best: Explained) -> Iterator[Explained]:
         """Explanations under which the cost is lower, those that promise most first."""
-        price = best.solved.minimum.price
+        price = best.minimum.price
         for explanation, poses in self._candidates(best):
             trial = self._solved(explanation, poses, "given", groups=not self._is_large)
             if self._cost(trial, price) < self._cost(best, price) - _SETTLED * price:
@@ -183,28 +93,22 @@ class Explainer:
 
     def _candidates(self, best: Explained) -> list[tuple[Explanation, Matrix]]:
         """Explanations, and poses to begin with."""
-        problem, now, price = best.problem, best.explanation, best.solved.minimum.price
-        poses = best.solved.poses
-        kept = best.solved.minimum.weights > REJECTED_WEIGHT
+        problem, now, price = best.problem, best.explanation, best.minimum.price
+        poses = best.minimum.estimate.poses
+        kept = best.minimum.weights > REJECTED_WEIGHT
         rejected = np.flatnonzero(~kept)
         if len(rejected) < _FEWEST or len(apart(problem.edges, rejected)) < _FEWEST:
             return []
-        odometry = odometry_of(problem.edges, self._is_loop)
-        left_out = LeftOut.at(problem, poses, odometry, kept)
+        odometry = odometry_of(problem.edges, self.is_loop)
+        left_out = LeftOut(problem, poses, odometry, kept)
         found: list[tuple[float, Explanation, Matrix]] = []
-        if not self._jumps and (now.drift.any() or len(rejected) > FEWEST):
-            gain, change = drift_step(left_out, _sign(problem.edges[odometry]), now.drift, price)
+        if not self.jumps and (now.drift.any() or len(rejected) > FEWEST):
+            gain, change = drift_step(left_out, direction(problem.edges[odometry]), now.drift, price)
             gain -= 0.0 if now.drift.any() else FEWEST * price
             found.append((gain, replace(now, drift=now.drift + change), poses))
-        for is_jump in (False, True)[: 1 + self._jumps]:
-            next_one = next_loosened(
-                left_out,
-                self._measured[odometry],
-                now.loosened,
-                is_jump=is_jump,
-                price=price,
-                nominal=self._nominal,
-            )
+        for is_jump in (False, True)[: 1 + self.jumps]:
+            measured, costs = self.measured[odometry], (price, self._nominal)
+            next_one = next_loosened(left_out, measured, now.loosened, *costs, is_jump=is_jump)
             if next_one is not None:
                 gain, stretch, twists = next_one
                 start = left_out.moved(poses, twists, stretch.edges)
@@ -215,15 +119,244 @@ class Explainer:
     def _solved(
         self, explanation: Explanation, poses: Matrix, initialize: Initialization, *, groups: bool
     ) -> Explained:
-        problem = self._problem_of(explanation)
-        solved = solve(problem, poses, self._is_loop, self._config, initialize, groups=groups)
-        return Explained(problem, solved, explanation)
+        problem = self.problem_of(explanation)
+        minimum = solve(problem, poses, self.is_loop, self.config, initialize, groups=groups)
+        return Explained(problem, minimum, explanation)
 
     def _cost(self, explained: Explained, price: float) -> float:
         """Cost of a minimum at this price of a loop edge, and of its explanation."""
-        minimum, odometry = explained.solved.minimum, odometry_of(explained.problem.edges, self._is_loop)
+        minimum, odometry = explained.minimum, odometry_of(explained.problem.edges, self.is_loop)
         kept = minimum.weights > REJECTED_WEIGHT
-        own = explained.explanation.cost(
-            self._measured[odometry], self._information[odometry], price, self._nominal
-        )
+        own = explained.explanation.cost(self.measured[odometry], self.information[odometry], price, self._nominal)
         return float(minimum.estimate.chi2[kept].sum()) + price * int((~kept).sum()) + own
+
+    @property
+    def _is_large(self) -> bool:
+        return int((~self.is_loop).sum()) >= _LARGE
+
+    @property
+    def _nominal(self) -> float:
+        """Price of a loop edge left out where the noise model is right."""
+        d = self.measured.shape[-1] - 1
+        return rejection_limit(self.config.robust_scale, d * (d + 1) // 2)
+
+
+class LeftOut:
+    """Loop edges that a minimum leaves out, L of them, and how odometry would change them, to first order.
+
+    None is near another: those near each other may share a mistake.
+
+    Attributes
+    ----------
+    problem, factored : all edges, and those kept with H factored at the poses
+    edges : (L,) these loop edges, each of them for ``stride`` such edges
+    odometry : (O,) the edges of odometry in the order of the poses
+    errors, jacobians : (E, k), (E, k, k) residuals e and ∂e/∂ξ_j of all edges
+    covariances : (L, k, k) of their residuals, by their own noise and the graph without them
+    predicted : (O, k, k) covariances of what the graph predicts of odometry
+    joint : (L, O, k, k) covariances of the left twists of both, Cov(ξ_end − ξ_begin, ξ_j − ξ_i)
+    """
+
+    def __init__(
+        self, problem: BetweenProblem, poses: Matrix, odometry: NDArray[np.int64], kept: NDArray[np.bool_]
+    ) -> None:
+        """Those of a minimum with the edges kept (E,)."""
+        is_loop = np.ones(len(kept), np.bool_)
+        is_loop[odometry] = False
+        edges = apart(problem.edges, np.flatnonzero(is_loop & ~kept))
+        most = min(_MOST_LEFT_OUT, _MOST_ENTRIES // (max(len(odometry), 1) * problem.freedom**2))
+        self.stride = max(1, -(-len(edges) // max(most, 1)))
+        self.problem, self.odometry, self.edges = problem, odometry, edges[:: self.stride]
+        self.errors = problem.errors(poses)
+        self.jacobians = problem.jacobians(poses, self.errors)
+        self.factored = problem.factored(poses, self.errors, kept)
+        of_odometry = edge_covariances(self.factored, inverse_blocks(self.factored))[np.cumsum(kept)[odometry] - 1]
+        J = self.jacobians[odometry]
+        self.predicted = J @ of_odometry @ np.swapaxes(J, 1, 2)
+        begin, end = problem.edges[odometry].T
+        self.covariances = np.linalg.pinv(problem.information[self.edges], hermitian=True)
+        self.joint = np.empty((len(self.edges), len(odometry), *J.shape[1:]))
+        for place, edge in enumerate(self.edges):
+            of_edge = difference_covariances(self.factored, problem.edges[[edge]])[0, 0]
+            self.covariances[place] += self.jacobians[edge] @ of_edge @ self.jacobians[edge].T
+            moved = responses(self.factored, *problem.edges[edge])
+            self.joint[place] = moved[end] - moved[begin]
+
+    def shifts(self, twists: Matrix, among: slice = slice(None)) -> Iterator[Matrix]:
+        """∂e (n, k, p) of each of these loop edges, by right twists (n, k, p) on some edges of odometry."""
+        problem, odometry = self.problem, self.odometry[among]
+        pull = np.swapaxes(self.jacobians[odometry], 1, 2) @ (problem.information[odometry] @ twists)
+        for edge, joint in zip(self.edges, self.joint[:, among], strict=True):
+            yield self.jacobians[edge] @ (np.swapaxes(joint, 1, 2) @ pull)
+
+    def quadratic(self, twists: Matrix, among: slice = slice(None)) -> tuple[NDArray[np.float64], Matrix]:
+        """Slope b (p,) and curvature A (p, p) of right twists τ (n, k, p) on some edges of odometry.
+
+        With g = Σ JᵀΩτ, twists τδ move the poses by H⁻¹gδ; the cost of the kept edges changes by δᵀAδ − 2 bᵀδ,
+        where A = Σ τᵀΩτ − gᵀH⁻¹g and b = Σ τᵀΩe.
+        """
+        odometry = self.odometry[among]
+        weighted = self.problem.information[odometry] @ twists
+        g = self._pull(weighted, odometry)
+        A = np.einsum("oap,oaq->pq", twists, weighted) - g.T @ self.factored.cholesky.solve(g)
+        b = np.einsum("oap,oa->p", weighted, self.errors[odometry])
+        return b, A
+
+    def moved(self, poses: Matrix, twists: Matrix, among: slice) -> Matrix:
+        """These poses after right twists (n, k) on the measurements of some edges of odometry."""
+        odometry = self.odometry[among]
+        weighted = self.problem.information[odometry] @ twists[..., None]
+        return self.problem.moved(poses, self.factored.cholesky.solve(self._pull(weighted, odometry))[:, 0])
+
+    def _pull(self, weighted: Matrix, edges: NDArray[np.int64]) -> Matrix:
+        """Σ JᵀΩτ of the poses, (scalars, p), of Ωτ (n, k, p) of some edges."""
+        problem = self.problem
+        forces = np.swapaxes(self.jacobians[edges], 1, 2) @ weighted
+        whole = np.zeros((len(problem.variable), *forces.shape[1:]))
+        begin, end = problem.edges[edges].T
+        np.add.at(whole, end, forces)
+        np.add.at(whole, begin, -forces)
+        return self.factored.packing.rows(whole[problem.free])
+
+
+def drift_step(left_out: LeftOut, sign: Vector, drift: Vector, price: float) -> tuple[float, Vector]:
+    """The fall of the cost by a change of the drift, to first order, and this change.
+
+    Every loop edge left out gives a candidate, refined by least squares over the edges that it explains; the one
+    with the least cost Σ min(χ², price) is chosen.
+    """
+    odometry = left_out.odometry
+    twists = lie.log(left_out.problem.measurements[odometry])
+    B = np.stack([changed(twists, unit, sign) - twists for unit in np.eye(len(drift))], axis=-1)  # ∂Z/∂drift
+    d = twists.shape[1] - len(drift) + 1
+    B[:, :d, 0] += left_out.errors[odometry, :d]  # the noise grows with the scale
+    slope, curvature = left_out.quadratic(B)
+    V = np.array([shift.sum(axis=0) for shift in left_out.shifts(B)])
+    slope, curvature = slope - prior(len(drift)) * drift, curvature + np.diag(prior(len(drift)))
+    errors, noise = left_out.errors[left_out.edges], left_out.covariances
+    best, most = np.zeros(len(drift)), 0.0
+    if drift.any():
+        best = np.asarray(np.linalg.solve(curvature, slope), np.float64)
+        most = float(slope @ best)
+
+    def solved(members: NDArray[np.int64], weight: Matrix) -> Vector:
+        A = curvature + np.einsum("eap,eab,ebq->pq", V[members], weight, V[members])
+        return np.asarray(
+            np.linalg.solve(A, slope - np.einsum("eap,eab,eb->p", V[members], weight, errors[members])), np.float64
+        )
+
+    def fitting(change: Vector) -> tuple[Vector, Matrix]:
+        size_2 = (V @ change) ** 2
+        for part in (size_2[:, :d], size_2[:, d:]):
+            part[:] = part.sum(axis=1, keepdims=True)
+        spread = _CURVATURE**2 * size_2[:, :, None] * np.eye(errors.shape[1])
+        weight = np.asarray(np.linalg.inv(noise + spread), np.float64)
+        left = errors + V @ change
+        return np.einsum("ea,eab,eb->e", left, weight, left), weight
+
+    for start in range(len(errors)):
+        members = np.array([start])
+        change = solved(members, np.asarray(np.linalg.inv(noise[[start]]), np.float64))
+        for _ in range(_DRIFT_ROUNDS):
+            chi2, weight = fitting(change)
+            members = np.flatnonzero(chi2 < price)
+            change = solved(members, weight[members])
+        chi2, _ = fitting(change)
+        explained = price - chi2[chi2 < price]
+        gain = float(explained.sum() + 2.0 * slope @ change - change @ curvature @ change)
+        if gain > most and (drift.any() or len(explained) >= FEWEST):
+            best, most = change, gain
+    return most, best
+
+
+def next_loosened(
+    left_out: LeftOut,
+    measured: Matrix,
+    others: tuple[Loosened, ...],
+    price: float,
+    nominal: float,
+    *,
+    is_jump: bool,
+) -> tuple[float, Loosened, Matrix] | None:
+    """The fall of the cost by one more slip or jump, to first order, it, and the twists (n, k) of its edges.
+
+    measured : (O, d+1, d+1) as odometry has it, in the order of ``left_out.odometry``
+    Errors t, in standard deviations, change the cost by tᵀA t − 2 bᵀt, prior included, and by what each loop edge
+    left out then costs less than its price: min(price, (e + V t)ᵀC⁻¹(e + V t)). Each of them gives a candidate.
+
+    A takes a solve, so that stretches are tried in the order of a bound, for which each loop edge has errors of
+    its own at its share of that change, and A is estimated: along a chain whose ends are well known, the
+    information on a slip of all edges is what they claim, that on a slip of one the share of its redundancy; these
+    add up to one.
+    """
+    tried = _stretches(len(measured), others, is_jump=is_jump)
+    if not tried:
+        return None
+    first, count = np.array([(stretch.first, stretch.count) for stretch in tried]).T
+    information = left_out.problem.information[left_out.odometry]
+    B = spread(measured, information, is_jump=is_jump)
+    pull = information @ B
+    pull_t, unit = np.swapaxes(pull, 1, 2), np.eye(B.shape[2])
+    own = np.swapaxes(B, 1, 2) @ pull
+    claimed = _means(own, first, count) / count[:, None, None]
+    learned = _means(own - pull_t @ left_out.predicted @ pull, first, count)
+    A = unit + (learned if is_jump else np.minimum(learned, claimed))
+    b = _means(pull_t @ left_out.errors[left_out.odometry][..., None], first, count)[..., 0]
+    costs = cost_of(claimed, is_jump=is_jump, price=price, nominal=nominal)
+    e, price = left_out.errors[left_out.edges], left_out.stride * price
+    M = np.asarray(left_out.stride * np.linalg.inv(left_out.covariances), np.float64)
+    alone = (b * np.linalg.solve(A, b[..., None])[..., 0]).sum(axis=1) / len(e)  # without any of them explained
+    hoped = -costs
+    for error, weight, shift in zip(e, M, left_out.shifts(B), strict=True):
+        V = _means(shift, first, count)
+        g = b / len(e) - np.swapaxes(V, 1, 2) @ (weight @ error)
+        H = A / len(e) + np.swapaxes(V, 1, 2) @ weight @ V
+        fall = (g * np.linalg.solve(H, g[..., None])[..., 0]).sum(axis=1) + price - error @ weight @ error
+        hoped += np.maximum(fall, alone)
+    best, most = None, 0.0
+    for index in np.argsort(-hoped, kind="stable")[:_MOST_STRETCHES]:
+        if not hoped[index] > most:
+            break
+        stretch, twists = tried[index], B[tried[index].edges] / count[index]
+        slope, curvature = left_out.quadratic(twists, stretch.edges)
+        V = np.stack([shift.sum(axis=0) for shift in left_out.shifts(twists, stretch.edges)])
+        fall, t = _largest_fall(unit + curvature, slope, e, M, V, price)
+        if fall - costs[index] > most:
+            best, most = (stretch, twists @ t), fall - float(costs[index])
+    return None if best is None else (most, *best)
+
+
+def _largest_fall(A: Matrix, b: Vector, e: Matrix, M: Matrix, V: Matrix, price: float) -> tuple[float, Vector]:
+    """Largest fall of the cost by errors (p,) of one stretch that explain a loop edge, and the errors.
+
+    A (p, p), b (p,) : of the stretch; e, M, V : (L, ...) of the loop edges
+    """
+    VM = np.swapaxes(V, 1, 2) @ M
+    VMV, VMe = VM @ V, (VM @ e[..., None])[..., 0]
+    chosen, largest, best = np.eye(len(e)), 0.0, np.zeros(len(b))
+    for _ in range(_STRETCH_ROUNDS):
+        t = np.linalg.solve(A + np.einsum("cl,lab->cab", chosen, VMV), (b - chosen @ VMe)[..., None])[..., 0]
+        left = e + np.einsum("lab,cb->cla", V, t)
+        saved = np.maximum(price - np.einsum("cla,lab,clb->cl", left, M, left), 0.0)
+        falls = 2.0 * t @ b - np.einsum("ca,ab,cb->c", t, A, t) + saved.sum(axis=1)
+        falls[~saved.any(axis=1)] = 0.0
+        if falls.max() > largest:
+            largest, best = float(falls.max()), t[int(np.argmax(falls))]
+        chosen = (saved > 0.0).astype(np.float64)
+    return largest, best
+
+
+def _means(each: Matrix, first: NDArray[np.int64], count: NDArray[np.int64]) -> Matrix:
+    """Mean (S, ...) over the edges of each stretch, of values (O, ...)."""
+    sums = np.concatenate([np.zeros((1, *each.shape[1:])), np.cumsum(each, axis=0)])
+    return (sums[first + count] - sums[first]) / count.reshape(-1, *(each.ndim - 1) * [1])
+
+
+def _stretches(edges: int, others: tuple[Loosened, ...], *, is_jump: bool) -> list[Loosened]:
+    """Stretches of every length, of so many edges, that overlap none of the others, each half beside the last."""
+    return [
+        Loosened(first, length, is_jump)
+        for length in ((1,) if is_jump else _SLIP_LENGTHS)
+        for first in range(0, edges - length + 1, max(length // 2, 1))
+        if all(first >= other.edges.stop or other.first >= first + length for other in others)
+    ]

@@ -7,7 +7,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,127 +118,155 @@ class Rows(NamedTuple):
     is_point: NDArray[np.bool_]
 
 
-@dataclass(frozen=True, slots=True)
-class G2oLines:
-    """Content of a file.
+class Lines:
+    """Content of a file; a line that cannot be understood is an error that names it.
 
     Attributes
     ----------
     dimension : 2 or 3
-    fixed : line and vertex id of every pose that is held
+    vertices, edges : their lines; fixed : line and vertex id (n, 2) of every pose that is held
     others : lines of other tags
     rotation : of which the information is, by the comment that ``write_g2o`` writes
     turns : line and size of angles beyond a turn, which may be degrees
     """
 
-    dimension: int
-    vertices: Rows
-    edges: Rows
-    fixed: list[tuple[int, int]]
-    others: list[str]
-    rotation: Rotation
-    turns: list[tuple[int, float]]
+    def __init__(self, path: Path) -> None:
+        self.path, self.dimension = path, 0
+        self.rotation: Rotation = "vector"
+        self.others, self.turns = list[str](), list[tuple[int, float]]()
+        by_tag = defaultdict[str, list[tuple[int, list[int], list[float]]]](list)
+        comments: dict[str, Rotation] = {comment: name for name, comment in ROTATION_COMMENT.items()}
+        fixed = list[tuple[int, int]]()
+        for number, line in enumerate(self._text().splitlines(), start=1):
+            words = line.split()
+            tag = TAGS.get(words[0]) if words else None
+            if words[:1] == ["FIX"]:
+                fixed += [(number, self._vertex_id(number, "FIX", word)) for word in words[1:]]
+            elif line in comments:
+                self.rotation = comments[line]
+            elif tag is not None:
+                by_tag[words[0]].append((number, *self._parsed(number, tag, words)))
+            elif words:
+                self.others.append(line)
+        self.fixed = np.array(fixed, np.int64).reshape(-1, 2)
+        rows = {name: self._rows(name, lines) for name, lines in by_tag.items()}
+        self.vertices, self.edges = (_joined([rows[name] for name in rows if TAGS[name].ids == n]) for n in (1, 2))
+        if not len(self.edges.lines):
+            raise InputError(f"{path}: holds no EDGE_SE2 and no EDGE_SE3:QUAT line; is it a g2o pose graph?")
 
+    def error(self, line: object, text: str) -> InputError:
+        """The error that names this line."""
+        return InputError(f"{self.path}:{line}: {text}")
 
-def sort_lines(path: Path) -> G2oLines:
-    """Read the file; a line that cannot be understood is an error that names it."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "not text"
-        raise InputError(
-            f"{path}: cannot be read as g2o: {reason}; give a text file of vertices and edges"
-        ) from error
-    dimension = 0
-    rotation: Rotation = "vector"
-    others, fixed, turns = list[str](), list[tuple[int, int]](), list[tuple[int, float]]()
-    by_tag = defaultdict[str, list[tuple[int, list[int], list[float]]]](list)
-    comments: dict[str, Rotation] = {comment: name for name, comment in ROTATION_COMMENT.items()}
-    for number, line in enumerate(text.splitlines(), start=1):
-        words = line.split()
-        if not words:
-            continue
-        tag = TAGS.get(words[0])
-        if words[0] == "FIX":
-            fixed += [(number, _vertex_id(f"{path}:{number}: FIX", word)) for word in words[1:]]
-        elif line in comments:
-            rotation = comments[line]
-        elif tag is None:
-            others.append(line)
-        elif dimension not in (0, tag.dimension):
+    def indices(
+        self, lines: NDArray[np.int64], names: NDArray[np.int64], ids: NDArray[np.int64]
+    ) -> NDArray[np.int64]:
+        """Indices (n, w) of vertices by their names among ``ids`` (K,), of lines (n,) that name them."""
+        order = np.argsort(ids)
+        indices = order[np.minimum(np.searchsorted(ids, names, sorter=order), len(ids) - 1)]
+        self.check_known(lines, names, ids[indices] == names)
+        return indices
+
+    def check_known(self, lines: NDArray[np.int64], names: NDArray[np.int64], is_known: NDArray[np.bool_]) -> None:
+        """Refuse lines (n,) that name vertices (n, w) that are not there."""
+        for row, column in np.argwhere(~is_known)[:1]:
+            raise self.error(lines[row], f"vertex {names[row, column]} is not in the file; add its VERTEX line")
+
+    def poses(self, rows: Rows) -> Matrix:
+        """Poses (n, d+1, d+1) that rows x y θ, or x y z qx qy qz qw, begin with; quaternions are normalized."""
+        d, numbers = self.dimension, rows.numbers
+        result = np.tile(lie.identity(d), (len(numbers), 1, 1))
+        result[:, :d, d] = numbers[:, :d]
+        if d == 2:
+            result[:, 0, 0] = result[:, 1, 1] = np.cos(numbers[:, 2])
+            result[:, 1, 0] = np.sin(numbers[:, 2])
+            result[:, 0, 1] = -result[:, 1, 0]
+            return result
+        for bad in np.flatnonzero(np.linalg.norm(numbers[:, 3:7], axis=1) < 1e-6)[:1]:
+            raise self.error(rows.lines[bad], "quaternion of length 0; write qx qy qz qw, 0 0 0 1 for none")
+        result[:, :3, :3] = lie.from_quaternion(numbers[:, 3:7])
+        return result
+
+    @property
+    def note(self) -> str:
+        """That angles lie beyond a whole turn, by the largest; empty where none does."""
+        if not self.turns:
+            return ""
+        line, largest = max(self.turns, key=lambda turn: turn[1])
+        return (
+            f"{counted(len(self.turns), 'line has', 'lines have')} an angle beyond a whole turn, up to "
+            f"{largest:.6g} in line {line}; degrees? they are taken as radians"
+        )
+
+    def _text(self) -> str:
+        try:
+            return self.path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            reason = getattr(error, "strerror", None) or "not text"
             raise InputError(
-                f"{path}:{number}: {words[0]} in an SE({dimension}) graph; keep to one dimension a file"
+                f"{self.path}: cannot be read as g2o: {reason}; give a text file of vertices and edges"
+            ) from error
+
+    def _parsed(self, line: int, tag: Tag, words: list[str]) -> tuple[list[int], list[float]]:
+        """Vertex ids and numbers of a line."""
+        if self.dimension not in (0, tag.dimension):
+            raise self.error(line, f"{words[0]} in an SE({self.dimension}) graph; keep to one dimension a file")
+        self.dimension = tag.dimension
+        if len(words) != 1 + tag.ids + len(tag.columns):
+            count, wanted = counted(len(words) - 1, "value"), tag.ids + len(tag.columns)
+            raise self.error(line, f"{words[0]} has {count}, needs {wanted}")
+        ids = [self._vertex_id(line, words[0], word) for word in words[1 : 1 + tag.ids]]
+        try:
+            return ids, list(map(float, words[1 + tag.ids :]))
+        except ValueError as error:
+            raise self.error(line, f"{words[0]}: {error}") from error
+
+    def _vertex_id(self, line: int, tag: str, word: str) -> int:
+        try:
+            value = int(word)
+        except ValueError:
+            text = f"{tag}: vertex id {shown(word)} is not a whole number; write 0, 1, 2, ..."
+            raise self.error(line, text) from None
+        if abs(value) > _LARGEST_ID:
+            raise self.error(line, f"{tag}: vertex id {shown(word)} is too large; the limit is {_LARGEST_ID}")
+        return value
+
+    def _rows(self, name: str, lines: list[tuple[int, list[int], list[float]]]) -> Rows:
+        """Lines of one tag as arrays, checked; angles beyond a turn are added to ``turns``."""
+        tag = TAGS[name]
+        places, ids, numbers = (np.array(column) for column in zip(*lines, strict=True))
+        for row in np.flatnonzero(~np.isfinite(numbers).all(axis=1))[:1]:
+            raise self.error(places[row], f"{name} has a value that is not finite; remove or mend the line")
+        for row, column in np.argwhere(np.abs(numbers) > LARGEST)[:1]:
+            start = " ".join([name, *map(str, ids[row].tolist())])
+            raise self.error(
+                places[row],
+                f"{start} has the value {numbers[row, column]:g}, over {LARGEST:g}; "
+                "write meters and radians, and an inverse covariance of these",
             )
-        else:
-            dimension = tag.dimension
-            by_tag[words[0]].append((number, *_parsed(f"{path}:{number}: {words[0]}", tag, words)))
-    rows = {name: _rows(path, name, lines, turns) for name, lines in by_tag.items()}
-    vertices, edges = (_joined([rows[name] for name in rows if TAGS[name].ids == ids], ids) for ids in (1, 2))
-    if not len(edges.ids):
-        raise InputError(f"{path}: holds no EDGE_SE2 and no EDGE_SE3:QUAT line; is it a g2o pose graph?")
-    return G2oLines(dimension, vertices, edges, fixed, others, rotation, turns)
+        if not tag.is_point and (tag.dimension == 2 or tag.is_toro):
+            largest = np.abs(numbers[:, 3:6] if tag.dimension == 3 else numbers[:, 2:3]).max(axis=1)
+            beyond = largest > _WHOLE_TURN
+            self.turns += zip(places[beyond].tolist(), largest[beyond].tolist(), strict=True)
+        whole = numbers
+        if tag.dimension == 2:
+            whole = np.zeros((len(numbers), 3 if tag.ids == 1 else 9))
+            whole[:, tag.columns] = numbers
+        elif tag.is_toro:
+            whole = np.hstack([numbers[:, :3], from_angles(numbers[:, 3:6]), numbers[:, 6:]])
+        return Rows(places, ids, whole, np.full(len(numbers), tag.is_point))
 
 
-def _joined(parts: list[Rows], ids: int) -> Rows:
+def _joined(parts: list[Rows]) -> Rows:
     """Rows of several tags, or none."""
     if not parts:
-        return Rows(np.empty(0, np.int64), np.empty((0, ids), np.int64), np.empty((0, 0)), np.empty(0, np.bool_))
-    lines, is_point = (
-        np.concatenate([part.lines for part in parts]),
-        np.concatenate([part.is_point for part in parts]),
-    )
-    names, numbers = np.concatenate([part.ids for part in parts]), np.concatenate([part.numbers for part in parts])
-    order = np.lexsort((lines, is_point))
-    return Rows(lines[order], names[order], numbers[order], is_point[order])
+        return Rows(np.empty(0, np.int64), np.empty((0, 1), np.int64), np.empty((0, 0)), np.empty(0, np.bool_))
 
+    def column(index: int) -> NDArray[Any]:
+        return np.concatenate([part[index] for part in parts])
 
-def _parsed(place: str, tag: Tag, words: list[str]) -> tuple[list[int], list[float]]:
-    """Vertex ids and numbers of a line; ``place`` is for messages."""
-    if len(words) != 1 + tag.ids + len(tag.columns):
-        count, wanted = counted(len(words) - 1, "value"), tag.ids + len(tag.columns)
-        raise InputError(f"{place} has {count}, needs {wanted}")
-    ids = [_vertex_id(place, word) for word in words[1 : 1 + tag.ids]]
-    try:
-        return ids, list(map(float, words[1 + tag.ids :]))
-    except ValueError as error:
-        raise InputError(f"{place}: {error}") from error
-
-
-def _rows(
-    path: Path, name: str, lines: list[tuple[int, list[int], list[float]]], turns: list[tuple[int, float]]
-) -> Rows:
-    """Lines of one tag as arrays, checked; angles beyond a turn are added to ``turns``."""
-    tag = TAGS[name]
-    places, ids, numbers = (np.array(column) for column in zip(*lines, strict=True))
-    for row in np.flatnonzero(~np.isfinite(numbers).all(axis=1))[:1]:
-        raise InputError(f"{path}:{places[row]}: {name} has a value that is not finite; remove or mend the line")
-    for row, column in np.argwhere(np.abs(numbers) > LARGEST)[:1]:
-        start = " ".join([name, *map(str, ids[row].tolist())])
-        raise InputError(
-            f"{path}:{places[row]}: {start} has the value {numbers[row, column]:g}, over {LARGEST:g}; "
-            "write meters and radians, and an inverse covariance of these"
-        )
-    if not tag.is_point and (tag.dimension == 2 or tag.is_toro):
-        largest = np.abs(numbers[:, 3:6] if tag.dimension == 3 else numbers[:, 2:3]).max(axis=1)
-        beyond = largest > _WHOLE_TURN
-        turns += zip(places[beyond].tolist(), largest[beyond].tolist(), strict=True)
-    whole = numbers
-    if tag.dimension == 2:
-        whole = np.zeros((len(numbers), 3 if tag.ids == 1 else 9))
-        whole[:, tag.columns] = numbers
-    elif tag.is_toro:
-        whole = np.hstack([numbers[:, :3], from_angles(numbers[:, 3:6]), numbers[:, 6:]])
-    return Rows(places, ids, whole, np.full(len(numbers), tag.is_point))
-
-
-def _vertex_id(place: str, word: str) -> int:
-    try:
-        value = int(word)
-    except ValueError:
-        raise InputError(f"{place}: vertex id {shown(word)} is not a whole number; write 0, 1, 2, ...") from None
-    if abs(value) > _LARGEST_ID:
-        raise InputError(f"{place}: vertex id {shown(word)} is too large; the limit is {_LARGEST_ID}")
-    return value
+    order = np.lexsort((column(0), column(3)))
+    return Rows(column(0)[order], column(1)[order], column(2)[order], column(3)[order])
 
 
 TORO_SUFFIXES = (".graph", ".toro")
@@ -376,23 +404,26 @@ def read_g2o(
     rotation : of what the information is in 3D, as in ``write_g2o``; as the file says, else "vector"
     """
     path = checks.path(path, "path")
-    lines = sort_lines(path)
+    lines = Lines(path)
     edges, dimension = lines.edges, lines.dimension
-    ids, is_point, poses = _vertices(path, lines)
-    pairs = _indices(path, edges.lines, edges.ids, ids)
-    sees_none = np.stack([is_point[pairs[:, 0]], is_point[pairs[:, 1]] != edges.is_point], axis=1)
-    _refuse_unknown(path, edges.lines, edges.ids, sees_none)
+    ids, is_point, poses = _vertices(lines)
+    pairs = lines.indices(edges.lines, edges.ids, ids)
+    lines.check_known(
+        edges.lines, edges.ids, np.stack([~is_point[pairs[:, 0]], is_point[pairs[:, 1]] == edges.is_point], axis=1)
+    )
     for bad in np.flatnonzero(pairs[:, 0] == pairs[:, 1])[:1]:
         i, j = edges.ids[bad]
-        raise InputError(f"{path}:{edges.lines[bad]}: edge {i}-{j} joins a vertex to itself; remove it")
-    held = np.array(lines.fixed, np.int64).reshape(-1, 2)
-    fixed = _indices(path, held[:, 0], held[:, 1:], ids)[:, 0]
-    measurements, information = _poses(path, edges, dimension), _information(edges, dimension)
+        raise lines.error(edges.lines[bad], f"edge {i}-{j} joins a vertex to itself; remove it")
+    fixed = lines.indices(lines.fixed[:, 0], lines.fixed[:, 1:], ids)[:, 0]
+    measurements, k = lines.poses(edges), 3 if dimension == 2 else 6
+    information = np.zeros((len(pairs), k, k))
+    a, b = np.triu_indices(k)
+    information[:, a, b] = information[:, b, a] = edges.numbers[:, -len(a) :]
     if dimension == 3 and (rotation or lines.rotation) == "quaternion":
         units = lie.by_component(6, 1.0, 0.5)
         information *= np.outer(units, units)
-    projection = _project(path, edges, information, indefinite)
-    has_guess = bool(len(lines.vertices.ids))
+    projection = _project(lines, information, indefinite)
+    has_guess = bool(len(lines.vertices.lines))
     if not has_guess:
         chain, to_points = ~edges.is_point, edges.is_point
         is_held = np.isin(np.arange(len(ids)), fixed if len(fixed) else 0)
@@ -406,110 +437,50 @@ def read_g2o(
     graph.add_edges(pairs, measurements, information, is_robust)
     for index in fixed.tolist():
         graph.fix(index)
-    note = _degrees_note(lines.turns)
-    if note:
-        warnings.warn(f"{path}: {note}", stacklevel=2)
-    return G2oFile(graph, ids, tuple(lines.others), has_guess, projection, note)
+    if lines.note:
+        warnings.warn(f"{path}: {lines.note}", stacklevel=2)
+    return G2oFile(graph, ids, tuple(lines.others), has_guess, projection, lines.note)
 
 
-def _degrees_note(turns: list[tuple[int, float]]) -> str:
-    """That angles lie beyond a whole turn, by the largest; empty where none does."""
-    if not turns:
-        return ""
-    line, largest = max(turns, key=lambda turn: turn[1])
-    return (
-        f"{counted(len(turns), 'line has', 'lines have')} an angle beyond a whole turn, up to {largest:.6g} in "
-        f"line {line}; degrees? they are taken as radians"
-    )
-
-
-def _project(path: Path, edges: Rows, information: Matrix, indefinite: Indefinite) -> Projection | None:
+def _project(lines: Lines, information: Matrix, indefinite: Indefinite) -> Projection | None:
     """Replace indefinite matrices (E, k, k) by the nearest semidefinite ones, and warn of the change."""
     bad = np.flatnonzero(~positive_semidefinite(information))
     if not len(bad):
         return None
-    (i, j), line = edges.ids[bad[0]], edges.lines[bad[0]]
+    (i, j), line = lines.edges.ids[bad[0]], lines.edges.lines[bad[0]]
     if indefinite == "refuse":
-        raise InputError(
-            f"{path}:{line}: information matrix of edge {i}-{j} is not positive semidefinite, the first of "
-            f"{len(bad):,}; give the upper triangle of an inverse covariance, or have it projected"
+        raise lines.error(
+            line,
+            f"information matrix of edge {i}-{j} is not positive semidefinite, the first of "
+            f"{len(bad):,}; give the upper triangle of an inverse covariance, or have it projected",
         )
     before, nearest = information[bad], nearest_semidefinite(information[bad])
     information[bad] = nearest
     off = np.linalg.norm(nearest - before, axis=(1, 2)) / np.linalg.norm(before, axis=(1, 2))
     first = f"{i}-{j} in line {line}"
-    projection = Projection(len(bad), len(edges.ids), float(np.median(off)), float(off.max()), first)
+    projection = Projection(len(bad), len(information), float(np.median(off)), float(off.max()), first)
     warnings.warn(projection.text, stacklevel=3)
     return projection
 
 
-def _vertices(path: Path, lines: G2oLines) -> tuple[NDArray[np.int64], NDArray[np.bool_], Matrix]:
+def _vertices(lines: Lines) -> tuple[NDArray[np.int64], NDArray[np.bool_], Matrix]:
     """Ids (K,), those of poses and then those of points, ascending, which are points, and poses (K, d+1, d+1).
 
     Without vertex lines those of the edges, at the identity.
     """
     vertices, edges = lines.vertices, lines.edges
-    if not len(vertices.ids):
+    if not len(vertices.lines):
         seen = edges.ids[edges.is_point]
         of_poses, of_points = np.unique(np.append(edges.ids[~edges.is_point], seen[:, 0])), np.unique(seen[:, 1])
         ids, is_point = np.append(of_poses, of_points), np.arange(len(of_poses) + len(of_points)) >= len(of_poses)
         poses = np.tile(lie.identity(lines.dimension), (len(ids), 1, 1))
     else:
         order = np.lexsort((vertices.ids[:, 0], vertices.is_point))
-        ids, is_point, poses = (
-            vertices.ids[order, 0],
-            vertices.is_point[order],
-            _poses(path, vertices, lines.dimension)[order],
-        )
+        ids, is_point, poses = vertices.ids[order, 0], vertices.is_point[order], lines.poses(vertices)[order]
         again = order[1:][(ids[1:] == ids[:-1]) & (is_point[1:] == is_point[:-1])]
         for row in np.sort(again)[:1]:
-            raise InputError(
-                f"{path}:{vertices.lines[row]}: vertex {vertices.ids[row, 0]} stands in the file twice; remove one"
-            )
+            name = vertices.ids[row, 0]
+            raise lines.error(vertices.lines[row], f"vertex {name} stands in the file twice; remove one")
     for name in np.intersect1d(ids[is_point], ids[~is_point])[:1]:
-        raise InputError(f"{path}: vertex {name} is a pose and a point; give each an id of its own")
+        raise InputError(f"{lines.path}: vertex {name} is a pose and a point; give each an id of its own")
     return ids, is_point, poses
-
-
-def _indices(
-    path: Path, lines: NDArray[np.int64], names: NDArray[np.int64], ids: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """Indices (n, w) of vertices by their names among ``ids`` (K,), of lines (n,) that name them."""
-    order = np.argsort(ids)
-    indices = order[np.minimum(np.searchsorted(ids, names, sorter=order), len(ids) - 1)]
-    _refuse_unknown(path, lines, names, ids[indices] != names)
-    return indices
-
-
-def _refuse_unknown(
-    path: Path, lines: NDArray[np.int64], names: NDArray[np.int64], unknown: NDArray[np.bool_]
-) -> None:
-    for row, column in np.argwhere(unknown)[:1]:
-        raise InputError(
-            f"{path}:{lines[row]}: vertex {names[row, column]} is not in the file; add its VERTEX line"
-        )
-
-
-def _information(edges: Rows, dimension: int) -> Matrix:
-    """Information matrices (E, k, k) of the upper triangles that the rows end with."""
-    k = 3 if dimension == 2 else 6
-    information = np.zeros((len(edges.ids), k, k))
-    a, b = np.triu_indices(k)
-    information[:, a, b] = information[:, b, a] = edges.numbers[:, -len(a) :]
-    return information
-
-
-def _poses(path: Path, rows: Rows, d: int) -> Matrix:
-    """Poses (n, d+1, d+1) that rows x y θ, or x y z qx qy qz qw, begin with; quaternions are normalized."""
-    numbers = rows.numbers
-    result = np.tile(lie.identity(d), (len(numbers), 1, 1))
-    result[:, :d, d] = numbers[:, :d]
-    if d == 2:
-        result[:, 0, 0] = result[:, 1, 1] = np.cos(numbers[:, 2])
-        result[:, 1, 0] = np.sin(numbers[:, 2])
-        result[:, 0, 1] = -result[:, 1, 0]
-        return result
-    for bad in np.flatnonzero(np.linalg.norm(numbers[:, 3:7], axis=1) < 1e-6)[:1]:
-        raise InputError(f"{path}:{rows.lines[bad]}: quaternion of length 0; write qx qy qz qw, 0 0 0 1 for none")
-    result[:, :3, :3] = lie.from_quaternion(numbers[:, 3:7])
-    return result

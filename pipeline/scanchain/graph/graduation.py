@@ -12,7 +12,7 @@ from scanchain.data import REJECTED_WEIGHT, Matrix
 from scanchain.graph.between import WASTE
 from scanchain.graph.consistency import Consistency, agreeing_groups
 from scanchain.graph.edge_checks import is_connected
-from scanchain.graph.losses import Graduation, InlierSet, RobustLoss, fair_price, rejection_limit
+from scanchain.graph.losses import InlierSet, RobustLoss, fair_price, rejection_limit
 from scanchain.graph.minimizer import Evaluation, Limits, Minimizer, Minimum
 
 Rejection = Literal["update", "judge"]
@@ -28,9 +28,8 @@ def minimize(minimizer: Minimizer, poses: Matrix, loss: RobustLoss, *, groups: b
     Truncated edges are judged by how much each contradicts the others, with ``groups`` also by groups that agree.
     """
     now, used = minimizer.evaluate(poses, loss), 0
-    graduation = loss.graduation(now.chi2[minimizer.loops])
-    if graduation is not None and len(minimizer.loops):
-        now, loss, used = _graduate(minimizer, now, graduation)
+    if len(minimizer.loops):
+        now, loss, used = _graduate(minimizer, now, loss.relaxed(now.chi2[minimizer.loops]))
     if loss.kernel == "truncated" and len(minimizer.loops):
         minimum = _refine(minimizer, now, loss, groups=groups)
     else:
@@ -50,16 +49,15 @@ def settle(minimizer: Minimizer, start: Evaluation, inliers: InlierSet) -> Minim
     return replace(minimum, estimate=minimizer.evaluate(minimum.estimate.poses, inliers), weights=weights)
 
 
-def _graduate(minimizer: Minimizer, now: Evaluation, graduation: Graduation) -> tuple[Evaluation, RobustLoss, int]:
+def _graduate(minimizer: Minimizer, now: Evaluation, loss: RobustLoss) -> tuple[Evaluation, RobustLoss, int]:
     """Follow the minimum from the convex loss to the loss itself, one step for each level."""
     used, focus = 0, Focus(minimizer)
-    while not graduation.is_over(now.chi2[minimizer.loops]):
-        loss = graduation.loss
+    while not loss.is_final(now.chi2[minimizer.loops]):
         chosen = focus.on(minimizer.weights(now.chi2, loss))
         minimum = chosen.descend(chosen.evaluate(now.poses, loss), loss, Limits(1, 0.0))
         now, used = minimizer.evaluate(minimum.estimate.poses, loss), used + minimum.iterations
-        graduation.tighten()
-    return minimizer.reweighed(now, graduation.loss), graduation.loss, used
+        loss = loss.tightened()
+    return minimizer.reweighed(now, loss), loss, used
 
 
 def _settle_without_outliers(minimizer: Minimizer, minimum: Minimum, loss: RobustLoss) -> Minimum:
@@ -193,6 +191,7 @@ def _against(minimizer: Minimizer, minimum: Minimum, price: float) -> NDArray[np
     return Consistency(minimizer.problem, minimum.estimate.poses, kept).of_each(price)[minimizer.loops]
 
 
+# a few steps with one set of edges, until the poses have settled roughly; the next update goes on
 LIMITS = Limits(max_iterations=3, tolerance=1e-3)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Literal
 
 import numpy as np
@@ -27,65 +28,39 @@ def first_guess(
     "auto" keeps the poses at hand where they fit, else takes the better of them and the chordal relaxation. Where
     there may be outliers it keeps them in any case: no other guess is safe from a false loop.
     """
-    if problem.is_point.any():
-        return _with_points(problem, poses, initialize, outlier_free=outlier_free)
-    fixed = problem.variable < 0
-    if initialize == "odometry":
-        return follow_odometry(poses, fixed, problem.edges, problem.measurements), initialize
-    if initialize == "spanning-tree":
-        return follow_spanning_tree(poses, fixed, problem.edges, problem.measurements), initialize
+    fixed, to_point = problem.variable < 0, np.asarray(problem.is_point[problem.edges].any(axis=1))
+    if initialize in ("odometry", "spanning-tree"):
+        follow = follow_odometry if initialize == "odometry" else follow_spanning_tree
+        chained = follow(poses, fixed, problem.edges[~to_point], problem.measurements[~to_point])
+        return _with_points(problem, chained, to_point), initialize
     if initialize == "chordal":
         return relax_chordally(problem, poses), initialize
-    chi2 = problem.chi2(problem.errors(poses)).sum()
+    guess, chi2 = poses.copy(), problem.chi2(problem.errors(poses)).sum()
+    if initialize == "given":
+        return guess, "given"
+    if to_point.any():
+        placed = _with_points(problem, poses, to_point)
+        chi2_placed = problem.chi2(problem.errors(placed)).sum()
+        if chi2_placed < chi2:
+            guess, chi2 = placed, chi2_placed
     redundancy = problem.freedom * max(len(problem.edges) - len(problem.free), 1)
-    if initialize == "auto" and outlier_free and chi2 > _GOOD_GUESS * redundancy:
-        try:
+    if outlier_free and chi2 > _GOOD_GUESS * redundancy:
+        with suppress(SingularMatrixError):
             relaxed = relax_chordally(problem, poses)
-        except SingularMatrixError:
-            return poses.copy(), "given"
-        if problem.chi2(problem.errors(relaxed)).sum() < chi2:
-            return relaxed, "chordal"
-    return poses.copy(), "given"
+            if problem.chi2(problem.errors(relaxed)).sum() < chi2:
+                return relaxed, "chordal"
+    return guess, "given"
 
 
-def place_points(problem: BetweenProblem, poses: Matrix) -> Matrix:
-    """Poses with every free point where it is seen from its poses, on average."""
-    i, j = problem.edges[problem.sightings].T
-    seen = (poses[i] @ problem.measurements[problem.sightings])[:, :-1, -1]
-    total, count = np.zeros((len(poses), seen.shape[1])), np.zeros(len(poses))
-    np.add.at(total, j, seen)
-    np.add.at(count, j, 1.0)
-    placed = (count > 0) & (problem.variable >= 0)
+def _with_points(problem: BetweenProblem, poses: Matrix, to_point: NDArray[np.bool_]) -> Matrix:
+    """Poses with every free point where it is seen from its poses, on average, by these edges (E,)."""
+    i, j = problem.edges[to_point].T
+    total = np.zeros(poses.shape)
+    np.add.at(total, j, poses[i] @ problem.measurements[to_point])
+    placed = (total[:, -1, -1] > 0.0) & (problem.variable >= 0)
     result = poses.copy()
-    result[placed, :-1, -1] = total[placed] / count[placed, None]
+    result[placed, :-1, -1] = total[placed, :-1, -1] / total[placed, -1:, -1]
     return result
-
-
-def _with_points(
-    problem: BetweenProblem, poses: Matrix, initialize: Initialization, *, outlier_free: bool
-) -> tuple[Matrix, Initialization]:
-    """The initial poses, with the points as observed from there, if that fits better."""
-    headed = np.flatnonzero(~problem.is_point)
-    place = np.cumsum(~problem.is_point) - 1
-    between = np.setdiff1d(np.arange(len(problem.edges)), problem.sightings)
-    alone = BetweenProblem(
-        place[problem.edges[between]],
-        problem.measurements[between],
-        problem.information[between],
-        problem.variable[headed] < 0,
-    )
-    try:
-        guess, source = first_guess(alone, poses[headed], initialize, outlier_free=outlier_free)
-    except SingularMatrixError:
-        return poses.copy(), "given"
-    result = poses.copy()
-    result[headed] = guess
-    placed = place_points(problem, result)
-    if source != "given" or initialize == "auto":
-        chi2 = [problem.chi2(problem.errors(candidate)).sum() for candidate in (poses, placed)]
-        if source != "given" or chi2[1] < chi2[0]:
-            return placed, source
-    return poses.copy(), source
 
 
 def follow_odometry(poses: Matrix, fixed: NDArray[np.bool_], edges: NDArray[np.int64], Z: Matrix) -> Matrix:
@@ -141,6 +116,7 @@ def relax_chordally(problem: BetweenProblem, poses: Matrix) -> Matrix:
     known = np.swapaxes(poses[:, :d, :d], 1, 2)
     rotations = _least_squares(problem, R_z_t, kappa, np.zeros((len(Z), d, d)), known)
     result[problem.free, :d, :d] = _nearest_rotation(np.swapaxes(rotations[problem.free], 1, 2))
+    result[problem.is_point, :d, :d] = np.eye(d)
     tau = np.trace(information[:, :d, :d], axis1=1, axis2=2)
     leaps = (result[problem.edges[:, 0], :d, :d] @ Z[:, :d, d, None])[:, None, :, 0]
     ones = np.ones((len(Z), 1, 1))
@@ -151,7 +127,10 @@ def relax_chordally(problem: BetweenProblem, poses: Matrix) -> Matrix:
 def _least_squares(
     problem: BetweenProblem, A: Matrix, weight: NDArray[np.float64], offset: Matrix, known: Matrix
 ) -> Matrix:
-    """X (K, b, m) that minimizes Σ w ‖X_j − A X_i − c‖², with A (E, b, b) orthogonal and X given where fixed."""
+    """X (K, b, m) that minimizes Σ w ‖X_j − A X_i − c‖², with A (E, b, b) orthogonal and X given where fixed.
+
+    Points, which have no rotation, have a unit prior on that.
+    """
     size, columns = known.shape[1:]
     n, w = len(problem.free), weight[:, None, None]
     A_t = np.swapaxes(A, 1, 2)
@@ -162,6 +141,8 @@ def _least_squares(
     for end, target in ((problem.slots[:, 0], for_i), (problem.slots[:, 1], for_j)):
         np.add.at(right, end[end >= 0], target[end >= 0])
     blocks = problem.scattered(w * np.eye(size), w * np.eye(size), -w * A_t)
+    if size > 1:
+        blocks[:n][problem.is_point[problem.free]] += np.eye(size)
     pattern = BlockPattern(np.full(n, size, np.int64), problem.pattern.pairs)
     factor = SparseCholesky(pattern, problem.cholesky.analysis)
     factor.factorize(blocks.reshape(-1))

@@ -185,29 +185,22 @@ class RobustLoss:
         """ρ(χ²), equal to χ² near zero."""
         return _kernel(self.kernel).loss(chi2, self.scale, self.control)
 
-    def graduation(self, chi2: Array) -> Graduation | None:
-        """Its graduation from the convex end, for residuals that begin at these χ²; None where it has none."""
-        schedule: Schedule | None = getattr(_kernel(self.kernel), "schedule", None)
-        if schedule is None:
-            return None
+    def relaxed(self, chi2: Array) -> RobustLoss:
+        """The convex end of its graduation, for residuals that begin at these χ²; itself where it has none."""
         ratio = 2.0 * float(chi2.max(initial=0.0)) / self.scale**2
-        return Graduation(replace(self, control=schedule.first(ratio)), schedule)
+        return replace(self, control=self._schedule.first(ratio)) if self._schedule else self
 
+    def tightened(self) -> RobustLoss:
+        """The next, less convex loss."""
+        return replace(self, control=self._schedule.following(self.control)) if self._schedule else self
 
-class Graduation:
-    """The present ``loss``, made less convex step by step."""
+    def is_final(self, chi2: Array) -> bool:
+        """True at the end of the graduation: the loss itself, or weights that are all 0 or 1."""
+        return self._schedule is None or self._schedule.is_over(self.control, self.weight(chi2))
 
-    def __init__(self, loss: RobustLoss, schedule: Schedule) -> None:
-        self.loss = loss
-        self._schedule = schedule
-
-    def is_over(self, chi2: Array) -> bool:
-        """True at the end of the schedule: the loss itself, or weights that are all 0 or 1."""
-        return self._schedule.is_over(self.loss.control, self.loss.weight(chi2))
-
-    def tighten(self) -> None:
-        """Go on to the next, less convex loss."""
-        self.loss = replace(self.loss, control=self._schedule.following(self.loss.control))
+    @property
+    def _schedule(self) -> Schedule | None:
+        return getattr(_kernel(self.kernel), "schedule", None)
 
 
 def rejection_limit(scale: float, degrees: int) -> float:

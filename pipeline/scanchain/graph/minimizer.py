@@ -16,6 +16,7 @@ from scanchain.data import Matrix
 from scanchain.errors import counted
 from scanchain.graph.between import BetweenProblem, NormalEquations
 from scanchain.graph.cholesky import SingularMatrixError
+from scanchain.graph.initialize import Initialization
 from scanchain.graph.losses import InlierSet, RobustLoss
 
 _STEP = 1e-6  # step, m or rad, of the central differences
@@ -41,7 +42,7 @@ class Evaluation:
 
 @dataclass(frozen=True, slots=True)
 class Minimum:
-    """End of a minimization: poses, robust weights (E,), number of linear solves, and reason.
+    """End of a minimization: poses, robust weights (E,), number of linear solves, reason, and where it began.
 
     ``price`` is what leaving a loop edge out cost, in χ²; 0 where the set of inliers was not refined.
     """
@@ -52,6 +53,7 @@ class Minimum:
     converged: bool
     reason: str
     price: float = 0.0
+    initialization: Initialization = "given"
 
 
 def full_curvature(problem: BetweenProblem, now: Evaluation, equations: NormalEquations) -> NDArray[np.float64]:

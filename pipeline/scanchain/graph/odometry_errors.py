@@ -1,141 +1,23 @@
-"""Errors of odometry in a graph: drift that is the same all along, and stretches that are loosened."""
+"""Errors of odometry that loop edges show: drift that is the same all along, and stretches that are loosened."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.data import Matrix
-from scanchain.graph.left_out import LeftOut
 
 Vector = NDArray[np.float64]
 
-SCALE_SIGMA, TURN_SIGMA_RAD_M = 0.03, 0.01  # prior standard deviations, of the scale and of the turn a meter
-FEWEST = 3  # least number of loop edges left out, none near another, that a drift must explain
-_CURVATURE = 0.3  # share of a predicted change that its linearization may be off by
-_ROUNDS = 5  # of the least squares over the edges that a drift explains
-
-
-def size(freedom: int) -> int:
-    """Entries of a drift: the scale, and the turn a meter about every axis."""
-    return 2 if freedom == 3 else 4
-
-
-def corrected(measurements: Matrix, drift: Vector, sign: Vector | float = 1.0) -> Matrix:
-    """Motions (E, d+1, d+1) made longer by a share of themselves, drift[0], and turned by drift[1:] a meter.
-
-    sign : (E,) −1 of a motion that is measured backward
-    """
-    if not drift.any():
-        return measurements
-    return lie.exp(_changed(lie.log(measurements), drift, sign))
-
-
-def rescaled(information: Matrix, drift: Vector) -> Matrix:
-    """Information (E, k, k) of corrected motions: their noise is longer by the same share.
-
-    With the noise left as it was, a motion made shorter would fit better for its shorter noise alone.
-    """
-    if not drift[0]:
-        return information
-    scale = lie.by_component(information.shape[-1], 1.0 / (1.0 + drift[0]), 1.0)
-    return information * np.outer(scale, scale)
-
-
-def penalty(drift: Vector) -> float:
-    """Squared Mahalanobis distance of a drift from none."""
-    return float((drift**2 * _prior(len(drift))).sum())
-
-
-def _prior(count: int) -> Vector:
-    return np.array([SCALE_SIGMA] + (count - 1) * [TURN_SIGMA_RAD_M]) ** -2.0
-
-
-def _changed(twists: Matrix, drift: Vector, sign: Vector | float) -> Matrix:
-    turns = len(drift) - 1
-    d = twists.shape[-1] - turns
-    length_m = np.linalg.norm(twists[..., :d], axis=-1, keepdims=True) * np.asarray(sign)[..., None]
-    return np.concatenate([(1.0 + drift[0]) * twists[..., :d], twists[..., d:] + length_m * drift[1:]], axis=-1)
-
-
-def drift_step(left_out: LeftOut, sign: Vector, drift: Vector, price: float) -> tuple[float, Vector]:
-    """The fall of the cost by a change of the drift, to first order, and this change.
-
-    Every loop edge left out gives a candidate, refined by least squares over the edges that it explains; the one
-    with the least cost Σ min(χ², price) is chosen.
-    """
-    odometry = left_out.odometry
-    twists = lie.log(left_out.problem.measurements[odometry])
-    B = np.stack([_changed(twists, unit, sign) - twists for unit in np.eye(len(drift))], axis=-1)  # ∂Z/∂drift
-    d = twists.shape[1] - len(drift) + 1
-    B[:, :d, 0] += left_out.errors[odometry, :d]  # the noise grows with the scale
-    slope, curvature = left_out.quadratic(B)
-    V = np.array([shift.sum(axis=0) for shift in left_out.shifts(B)])
-    slope, curvature = slope - _prior(len(drift)) * drift, curvature + np.diag(_prior(len(drift)))
-    errors, noise = left_out.errors[left_out.edges], left_out.covariances
-    best, most = np.zeros(len(drift)), 0.0
-    if drift.any():
-        best = np.asarray(np.linalg.solve(curvature, slope), np.float64)
-        most = float(slope @ best)
-
-    def solved(members: NDArray[np.int64], weight: Matrix) -> Vector:
-        A = curvature + np.einsum("eap,eab,ebq->pq", V[members], weight, V[members])
-        return np.asarray(
-            np.linalg.solve(A, slope - np.einsum("eap,eab,eb->p", V[members], weight, errors[members])), np.float64
-        )
-
-    def fitting(change: Vector) -> tuple[Vector, Matrix]:
-        size_2 = np.repeat(_squared_sizes(V @ change), _parts(errors.shape[1]), axis=1)
-        spread = _CURVATURE**2 * size_2[:, :, None] * np.eye(errors.shape[1])
-        weight = np.asarray(np.linalg.inv(noise + spread), np.float64)
-        left = errors + V @ change
-        return np.einsum("ea,eab,eb->e", left, weight, left), weight
-
-    for start in range(len(errors)):
-        members = np.array([start])
-        change = solved(members, np.asarray(np.linalg.inv(noise[[start]]), np.float64))
-        for _ in range(_ROUNDS):
-            chi2, weight = fitting(change)
-            members = np.flatnonzero(chi2 < price)
-            change = solved(members, weight[members])
-        chi2, _ = fitting(change)
-        explained = price - chi2[chi2 < price]
-        gain = float(explained.sum() + 2.0 * slope @ change - change @ curvature @ change)
-        if gain > most and (drift.any() or len(explained) >= FEWEST):
-            best, most = change, gain
-    return most, best
-
-
-def _parts(k: int) -> list[int]:
-    return [2, 1] if k == 3 else [3, 3]
-
-
-def _squared_sizes(twists: Matrix) -> Matrix:
-    """Squared lengths (E, 2) of translation and rotation."""
-    d = 2 if twists.shape[1] == 3 else 3
-    return np.stack([(twists[:, :d] ** 2).sum(axis=1), (twists[:, d:] ** 2).sum(axis=1)], axis=1)
-
-
-JUMP_FEWEST = 3  # number of loop edges that a jump must explain beyond its likelihood
+FEWEST = 3  # least number of loop edges left out, none near another, that a drift or a jump must explain
+_SCALE_SIGMA, _TURN_SIGMA_RAD_M = 0.03, 0.01  # prior standard deviations, of the scale and of the turn a meter
 _SLIP_SIGMA_M, _JUMP_SIGMAS = 1.0, (1.0, 0.2)  # standard deviations, m or (m, rad)
 _SLIP_PROBABILITY, _JUMP_PROBABILITY = 1e-3, 1e-4  # of one that begins at an edge
-_SLIP_LENGTHS = (4, 16, 64)  # number of edges of the stretches that are tried
 _WEAKER = 2.0  # factor between the least and the largest information of a translation from which on one is weak
 _MOVES = 3.0  # least length of a motion that may slip, in its standard deviations
-_MOST = 100  # largest number of stretches that are looked at more closely
-_STRETCH_ROUNDS = 3  # of the least squares over the loop edges that a stretch explains
-
-
-@dataclass(frozen=True, slots=True)
-class Slip:
-    """So many odometry edges from the first on, by which odometry is too short all together, in meters."""
-
-    first: int
-    count: int
-    size_m: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,10 +40,117 @@ class Loosened:
         """Twists (count, k, p) of its edges by a standard deviation of each of its p errors; of all odometry."""
         return spread(measured[self.edges], information[self.edges], is_jump=self.is_jump) / self.count
 
-    def slip(self, errors: Matrix, measured: Matrix, information: Matrix) -> Slip:
-        """The slip that the residuals (O, k) of odometry show."""
-        along = self.spread(measured, information)[..., 0] * (self.count / _SLIP_SIGMA_M)
-        return Slip(self.first, self.count, float((along * errors[self.edges]).sum()))
+
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """Errors of odometry.
+
+    Attributes
+    ----------
+    drift : (2,) or (4,) share of its way by which odometry is too short, and radians a meter it turns too little
+    loosened : slips and jumps, stretches of odometry that are off by more than their edges say
+    """
+
+    drift: Vector
+    loosened: tuple[Loosened, ...] = ()
+
+    @classmethod
+    def none(cls, freedom: int) -> Explanation:
+        """Odometry as it is."""
+        return cls(np.zeros(2 if freedom == 3 else 4))
+
+    def applied(
+        self, edges: NDArray[np.int64], measured: Matrix, information: Matrix, is_loop: NDArray[np.bool_]
+    ) -> tuple[Matrix, Matrix]:
+        """Measurements (E, d+1, d+1) without drift, and their information (E, k, k), slips and jumps loosened.
+
+        The noise of a motion that is made longer is longer by the same share: with the noise left as it was, one
+        made shorter would fit better for its shorter noise alone.
+        """
+        if not self.drift.any() and not self.loosened:
+            return measured, information
+        odometry = odometry_of(edges, is_loop)
+        of_odometry, Z = information[odometry], measured[odometry]
+        for stretch in self.loosened:
+            twists = stretch.spread(Z, information[odometry])
+            of_odometry[stretch.edges] = _loosened(of_odometry[stretch.edges], twists)
+        if self.drift[0]:
+            scale = lie.by_component(information.shape[-1], 1.0 / (1.0 + self.drift[0]), 1.0)
+            of_odometry = of_odometry * np.outer(scale, scale)
+        measured, information = measured.copy(), information.copy()
+        measured[odometry] = corrected(Z, self.drift, direction(edges[odometry]))
+        information[odometry] = of_odometry
+        return measured, information
+
+    def with_later(self, other: Explanation, before: int) -> Explanation:
+        """The same with slips and jumps of another, of the edges of odometry that come after so many."""
+        later = (replace(stretch, first=stretch.first + before) for stretch in other.loosened)
+        return replace(self, loosened=(*self.loosened, *later))
+
+    def cost(self, measured: Matrix, information: Matrix, price: float, nominal: float) -> float:
+        """Cost of the explanation itself, where a loop edge left out costs this price; the arrays of odometry.
+
+        nominal : price where the noise model is right
+        """
+        result = float((self.drift**2 * prior(len(self.drift))).sum())
+        result += FEWEST * price if self.drift.any() else 0.0
+        for stretch in self.loosened:
+            B = stretch.spread(measured, information)
+            claimed = (np.swapaxes(B, 1, 2) @ information[stretch.edges] @ B).sum(axis=0)
+            result += float(cost_of(claimed, is_jump=stretch.is_jump, price=price, nominal=nominal))
+        return result
+
+    def lines(
+        self, ends: NDArray[np.int64], noun: str, errors: Matrix, measured: Matrix, information: Matrix
+    ) -> list[str]:
+        """The corrections in words, a line each.
+
+        ends (O, 2), noun : numbers for the reader of the poses that odometry joins, and what they number
+        errors (O, k), measured, information : of odometry, in the order of the poses
+        """
+        found = []
+        if self.drift.any():
+            scale, *turns = self.drift.tolist()
+            turn = ", ".join(f"{1e3 * rad_per_m:+.1f}" for rad_per_m in turns)
+            found.append(f"length {100.0 * scale:+.1f} %, turn {turn} mrad/m")
+        for stretch in sorted(self.loosened, key=lambda each: each.is_jump):
+            along = stretch.spread(measured, information)[..., 0] * (stretch.count / _SLIP_SIGMA_M)
+            size_m = float((along * errors[stretch.edges]).sum())
+            what = "a jump" if stretch.is_jump else f"a slip of {size_m:+.1f} m"
+            poses = ends[stretch.edges]
+            found.append(f"{what} between {noun} {poses.min():,} and {poses.max():,}")
+        return [f"corrected by loop closures: {what}" for what in found]
+
+
+def odometry_of(edges: NDArray[np.int64], is_loop: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Edges of odometry (O,), in the order of the poses."""
+    odometry = np.flatnonzero(~is_loop)
+    return odometry[np.argsort(edges[odometry].min(axis=1), kind="stable")]
+
+
+def direction(edges: NDArray[np.int64]) -> Vector:
+    """1 of edges (O, 2) to a later pose, −1 of those to an earlier one."""
+    return np.sign(edges[:, 1] - edges[:, 0]).astype(np.float64)
+
+
+def corrected(measurements: Matrix, drift: Vector, sign: Vector | float = 1.0) -> Matrix:
+    """Motions (E, d+1, d+1) made longer by a share of themselves, drift[0], and turned by drift[1:] a meter.
+
+    sign : (E,) −1 of a motion that is measured backward
+    """
+    return lie.exp(changed(lie.log(measurements), drift, sign)) if drift.any() else measurements
+
+
+def changed(twists: Matrix, drift: Vector, sign: Vector | float) -> Matrix:
+    """The same of twists (E, k)."""
+    d = twists.shape[-1] - len(drift) + 1
+    length_m = np.linalg.norm(twists[..., :d], axis=-1, keepdims=True) * np.asarray(sign)[..., None]
+    return np.concatenate([(1.0 + drift[0]) * twists[..., :d], twists[..., d:] + length_m * drift[1:]], axis=-1)
+
+
+def prior(count: int) -> Vector:
+    """Information of a drift of so many entries."""
+    return np.array([_SCALE_SIGMA] + (count - 1) * [_TURN_SIGMA_RAD_M]) ** -2.0
 
 
 def spread(measured: Matrix, information: Matrix, *, is_jump: bool) -> Matrix:
@@ -186,7 +175,7 @@ def spread(measured: Matrix, information: Matrix, *, is_jump: bool) -> Matrix:
     return result
 
 
-def loosened(information: Matrix, twists: Matrix) -> Matrix:
+def _loosened(information: Matrix, twists: Matrix) -> Matrix:
     """Information (n, k, k) of the edges of a stretch with its errors added to theirs, (Ω⁻¹ + n BBᵀ)⁻¹.
 
     twists : (n, k, p) B; n times its covariance on each edge make that of the whole stretch, as errors that are
@@ -209,97 +198,4 @@ def cost_of(claimed: Matrix, *, is_jump: bool, price: float, nominal: float) -> 
     log_ratio = np.linalg.slogdet(np.eye(claimed.shape[-1]) + claimed)[1]
     if not is_jump:
         return log_ratio - 2.0 * np.log(_SLIP_PROBABILITY)
-    return JUMP_FEWEST * price + (price / nominal) * (log_ratio - 2.0 * np.log(_JUMP_PROBABILITY))
-
-
-def next_loosened(
-    left_out: LeftOut,
-    measured: Matrix,
-    others: tuple[Loosened, ...],
-    *,
-    is_jump: bool,
-    price: float,
-    nominal: float,
-) -> tuple[float, Loosened, Matrix] | None:
-    """The fall of the cost by one more slip or jump, to first order, it, and the twists (n, k) of its edges.
-
-    measured : (O, d+1, d+1) as odometry has it, in the order of ``left_out.odometry``
-    Errors t, in standard deviations, change the cost by tᵀA t − 2 bᵀt, prior included, and by what each loop edge
-    left out then costs less than its price: min(price, (e + V t)ᵀC⁻¹(e + V t)). Each of them gives a candidate.
-
-    A takes a solve, so that stretches are tried in the order of a bound, for which each loop edge has errors of
-    its own at its share of that change, and A is estimated: along a chain whose ends are well known, the
-    information on a slip of all edges is what they claim, that on a slip of one the share of its redundancy; these
-    add up to one.
-    """
-    tried = _stretches(len(measured), others, is_jump=is_jump)
-    if not tried:
-        return None
-    first, count = np.array([(stretch.first, stretch.count) for stretch in tried]).T
-    information = left_out.problem.information[left_out.odometry]
-    B = spread(measured, information, is_jump=is_jump)
-    pull = information @ B
-    pull_t, unit = np.swapaxes(pull, 1, 2), np.eye(B.shape[2])
-    own = np.swapaxes(B, 1, 2) @ pull
-    claimed = _means(own, first, count) / count[:, None, None]
-    learned = _means(own - pull_t @ left_out.predicted @ pull, first, count)
-    A = unit + (learned if is_jump else np.minimum(learned, claimed))
-    b = _means(pull_t @ left_out.errors[left_out.odometry][..., None], first, count)[..., 0]
-    costs = cost_of(claimed, is_jump=is_jump, price=price, nominal=nominal)
-    e, price = left_out.errors[left_out.edges], left_out.stride * price
-    M = np.asarray(left_out.stride * np.linalg.inv(left_out.covariances), np.float64)
-    alone = (b * np.linalg.solve(A, b[..., None])[..., 0]).sum(axis=1) / len(e)  # without any of them explained
-    hoped = -costs
-    for error, weight, shift in zip(e, M, left_out.shifts(B), strict=True):
-        V = _means(shift, first, count)
-        g = b / len(e) - np.swapaxes(V, 1, 2) @ (weight @ error)
-        H = A / len(e) + np.swapaxes(V, 1, 2) @ weight @ V
-        fall = (g * np.linalg.solve(H, g[..., None])[..., 0]).sum(axis=1) + price - error @ weight @ error
-        hoped += np.maximum(fall, alone)
-    best, most = None, 0.0
-    for index in np.argsort(-hoped, kind="stable")[:_MOST]:
-        if not hoped[index] > most:
-            break
-        stretch, twists = tried[index], B[tried[index].edges] / count[index]
-        slope, curvature = left_out.quadratic(twists, stretch.edges)
-        V = np.stack([shift.sum(axis=0) for shift in left_out.shifts(twists, stretch.edges)])
-        fall, t = _largest_fall(unit + curvature, slope, e, M, V, price)
-        if fall - costs[index] > most:
-            best, most = (stretch, twists @ t), fall - float(costs[index])
-    return None if best is None else (most, *best)
-
-
-def _largest_fall(A: Matrix, b: Vector, e: Matrix, M: Matrix, V: Matrix, price: float) -> tuple[float, Vector]:
-    """Largest fall of the cost by errors (p,) of one stretch that explain a loop edge, and the errors.
-
-    A (p, p), b (p,) : of the stretch; e, M, V : (L, ...) of the loop edges
-    """
-    VM = np.swapaxes(V, 1, 2) @ M
-    VMV, VMe = VM @ V, (VM @ e[..., None])[..., 0]
-    chosen, largest, best = np.eye(len(e)), 0.0, np.zeros(len(b))
-    for _ in range(_STRETCH_ROUNDS):
-        t = np.linalg.solve(A + np.einsum("cl,lab->cab", chosen, VMV), (b - chosen @ VMe)[..., None])[..., 0]
-        left = e + np.einsum("lab,cb->cla", V, t)
-        saved = np.maximum(price - np.einsum("cla,lab,clb->cl", left, M, left), 0.0)
-        falls = 2.0 * t @ b - np.einsum("ca,ab,cb->c", t, A, t) + saved.sum(axis=1)
-        falls[~saved.any(axis=1)] = 0.0
-        if falls.max() > largest:
-            largest, best = float(falls.max()), t[int(np.argmax(falls))]
-        chosen = (saved > 0.0).astype(np.float64)
-    return largest, best
-
-
-def _means(each: Matrix, first: NDArray[np.int64], count: NDArray[np.int64]) -> Matrix:
-    """Mean (S, ...) over the edges of each stretch, of values (O, ...)."""
-    sums = np.concatenate([np.zeros((1, *each.shape[1:])), np.cumsum(each, axis=0)])
-    return (sums[first + count] - sums[first]) / count.reshape(-1, *(each.ndim - 1) * [1])
-
-
-def _stretches(edges: int, others: tuple[Loosened, ...], *, is_jump: bool) -> list[Loosened]:
-    """Stretches of every length, of so many edges, that overlap none of the others, each half beside the last."""
-    return [
-        Loosened(first, length, is_jump)
-        for length in ((1,) if is_jump else _SLIP_LENGTHS)
-        for first in range(0, edges - length + 1, max(length // 2, 1))
-        if all(first >= other.edges.stop or other.first >= first + length for other in others)
-    ]
+    return FEWEST * price + (price / nominal) * (log_ratio - 2.0 * np.log(_JUMP_PROBABILITY))

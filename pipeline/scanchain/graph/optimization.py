@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,15 +71,6 @@ class Optimization:
         return self.state.is_rejected
 
 
-@dataclass(frozen=True, slots=True)
-class Solved:
-    """Poses (K, d+1, d+1) of the minimum, the minimum itself, and its initialization."""
-
-    poses: Matrix
-    minimum: Minimum
-    initialization: Initialization
-
-
 def solve(
     problem: BetweenProblem,
     poses: Matrix,
@@ -89,7 +80,7 @@ def solve(
     since: Since | None = None,
     *,
     groups: bool = True,
-) -> Solved:
+) -> Minimum:
     """Minimize from the chosen guess; fixed poses stay to the bit. Loop edges (E,) bool get the robust loss.
 
     since : for an update, under the truncated loss; groups : otherwise, as for ``minimize``
@@ -97,7 +88,8 @@ def solve(
     """
     outlier_free = config.robust == "none" or not is_loop.any()
     guess, source = first_guess(problem, poses, initialize, outlier_free=outlier_free)
-    shift = guess[:, :-1, -1].mean(axis=0)  # left twists turn about the origin: bring it into the middle
+    joined = np.unique(problem.edges) if len(problem.edges) else slice(None)
+    shift = guess[joined, :-1, -1].mean(axis=0)  # left twists turn about the origin: bring it into the middle
     guess[:, :-1, -1] -= shift
     loss = robust_loss(config.robust, config.robust_scale, problem.freedom)
     if since is not None:
@@ -109,7 +101,7 @@ def solve(
     found[:, :-1, -1] += shift
     fixed = problem.variable < 0
     found[fixed] = poses[fixed]
-    return Solved(found, minimum, source)
+    return replace(minimum, estimate=replace(minimum.estimate, poses=found), initialization=source)
 
 
 def _orthonormal(poses: Matrix) -> Matrix:

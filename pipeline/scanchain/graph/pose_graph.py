@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import get_args
 
 import numpy as np
@@ -30,12 +29,12 @@ from scanchain.graph.edge_checks import (
     own_equations,
     ranks,
 )
-from scanchain.graph.explanation import Explained, Explainer, Explanation, corrections, odometry_of
+from scanchain.graph.explanation import Explained, Explainer
 from scanchain.graph.graduation import Rejection, Since
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.initialize import Initialization
-from scanchain.graph.odometry_errors import Slip, corrected
-from scanchain.graph.optimization import Optimization, Solved, solve
+from scanchain.graph.odometry_errors import Explanation, Loosened, corrected, odometry_of
+from scanchain.graph.optimization import Optimization, solve
 
 
 class PoseGraph:
@@ -109,27 +108,22 @@ class PoseGraph:
         return self._explanation.drift
 
     @property
-    def slips(self) -> tuple[Slip, ...]:
-        """Stretches of odometry that loop edges show to be off by more than their edges say."""
-        if not self._explanation.loosened:
-            return ()
-        odometry, errors = odometry_of(self.edges, self.is_loop), self._prepared().errors(self.poses)
-        arrays = errors[odometry], self._measurements.rows[odometry], self._information.rows[odometry]
-        return tuple(stretch.slip(*arrays) for stretch in self._explanation.loosened if not stretch.is_jump)
-
-    @property
-    def jumps(self) -> tuple[int, ...]:
-        """Edges of odometry, in the order of the poses, whose motion loop edges show to be wrong altogether."""
-        return self._explanation.jumps
+    def loosened(self) -> tuple[Loosened, ...]:
+        """Slips and jumps: stretches of odometry that loop edges show to be off by more than their edges say."""
+        return self._explanation.loosened
 
     def corrections(self, names: NDArray[np.int64], noun: str = "poses") -> list[str]:
         """Drift, slips and jumps in words, a line each; ``names`` (K,) number the poses for the reader."""
-        edges = self.edges[odometry_of(self.edges, self.is_loop)]
-        return corrections(self._explanation, self.slips, edges, names, noun)
+        if not self.drift.any() and not self.loosened:
+            return []
+        odometry = odometry_of(self.edges, self.is_loop)
+        errors = self._prepared().errors(self.poses)[odometry]
+        arrays = self._measurements.rows[odometry], self._information.rows[odometry]
+        return self._explanation.lines(names[self.edges[odometry]], noun, errors, *arrays)
 
     @property
     def information(self) -> Matrix:
-        """Ω of every edge, (E, k, k), that of odometry loosened in ``slips`` and ``jumps``."""
+        """Ω of every edge, (E, k, k), that of odometry loosened in slips and jumps."""
         return self._applied(self._explanation)[1]
 
     def added_since(self, first: int) -> tuple[Matrix, Matrix]:
@@ -290,8 +284,8 @@ class PoseGraph:
         except SingularMatrixError as error:
             raise self._singular(error, problem.free) from error
         self._problem, self._explanation = explained.problem, explained.explanation
-        solved, minimum = explained.solved, explained.solved.minimum
-        self._poses.replace(solved.poses)
+        minimum = explained.minimum
+        self._poses.replace(minimum.estimate.poses)
         self._weight.replace(minimum.weights)
         self._factor_is_now = False
         edges = len(self.edges)
@@ -305,7 +299,7 @@ class PoseGraph:
             iterations=minimum.iterations,
             converged=minimum.converged,
             reason=minimum.reason,
-            initialization=solved.initialization,
+            initialization=minimum.initialization,
             time_s=working_s() - begin,
         )
 
@@ -314,26 +308,32 @@ class PoseGraph:
 
         rejection : as in ``optimize``; what is judged is also explained by jumps of odometry there
         """
-        end = _End.of(self, first)
+        chosen = np.flatnonzero((self.edges >= first).any(axis=1))
+        edges, is_loop = self.edges[chosen], self.is_loop[chosen]
+        measured, information = (each[chosen - chosen[0]] for each in self.added_since(int(chosen[0])))
+        is_held = (np.arange(len(self)) < first) | self.fixed
+
+        def problem_of(further: Explanation) -> BetweenProblem:
+            return BetweenProblem(
+                edges, *further.applied(edges, measured, information, is_loop), is_held, self.is_point
+            )
+
+        none = Explanation.none(self.freedom)
         try:
-            solved = self._solved(end, config, rejection)
+            if rejection == "update":
+                minimum = solve(problem_of(none), self.poses, is_loop, config, "given", Since(0, 0))
+            else:
+                explainer = Explainer(problem_of, measured, information, is_loop, config, jumps=True)
+                explained = explainer.solve(none, self.poses, "given")
+                minimum, before = explained.minimum, int((~self.is_loop).sum() - (~is_loop).sum())
+                self._explanation = self._explanation.with_later(explained.explanation, before)
         except SingularMatrixError as error:
-            raise self._singular(error, end.poses[~end.is_held]) from error
-        moved, weight = self.poses.copy(), self.weight.copy()
-        moved[end.poses], weight[end.chosen] = solved.poses, solved.minimum.weights
-        self._poses.replace(moved)
+            raise self._singular(error, np.flatnonzero(~is_held)) from error
+        weight = self.weight.copy()
+        weight[chosen] = minimum.weights
+        self._poses.replace(minimum.estimate.poses)
         self._weight.replace(weight)
         self._changed()
-
-    def _solved(self, end: _End, config: GraphConfig, rejection: Rejection) -> Solved:
-        none, poses = Explanation.none(self.freedom), self.poses[end.poses]
-        if rejection == "update":
-            return solve(end.problem_of(none), poses, end.is_loop, config, "given", Since(0, 0))
-        arrays = end.measured, end.information, end.is_loop
-        explained = Explainer(end.problem_of, *arrays, config, jumps=True).solve(none, poses, "given")
-        before = int((~self.is_loop).sum() - (~end.is_loop).sum())
-        self._explanation = self._explanation.with_later(explained.explanation, before)
-        return explained.solved
 
     def copy(self) -> PoseGraph:
         """The graph as it is, independent of what becomes of this one."""
@@ -446,8 +446,8 @@ class PoseGraph:
     ) -> Explained:
         """The minimum, with the errors of odometry that explain loop edges; those at hand for an update."""
         if rejection == "update" and config.robust == "truncated":
-            solved = solve(problem, self.poses, self.is_loop, config, initialize, self.since)
-            return Explained(problem, solved, self._explanation)
+            minimum = solve(problem, self.poses, self.is_loop, config, initialize, self.since)
+            return Explained(problem, minimum, self._explanation)
         measured, information = self._measurements.rows, self._information.rows
         explainer = Explainer(self._problem_of, measured, information, self.is_loop, config)
         return explainer.solve(self._explanation, self.poses, initialize)
@@ -504,42 +504,6 @@ class PoseGraph:
 
     def _changed(self) -> None:
         self._problem, self._factor_is_now = None, False
-
-
-@dataclass(frozen=True, slots=True)
-class _End:
-    """The last poses of a graph, with the edges to them, and the earlier ones that these join them to.
-
-    Attributes
-    ----------
-    chosen : (E,) the edges; poses : (K,) the poses at their ends, is_held (K,) the earlier ones
-    edges, measured, information, is_loop : (E, ...) of the edges, between places among these poses, odometry
-        corrected as it is now
-    """
-
-    chosen: NDArray[np.int64]
-    poses: NDArray[np.int64]
-    is_held: NDArray[np.bool_]
-    is_point: NDArray[np.bool_]
-    edges: NDArray[np.int64]
-    measured: Matrix
-    information: Matrix
-    is_loop: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, graph: PoseGraph, first: int) -> _End:
-        """The poses from this one on."""
-        chosen = np.flatnonzero((graph.edges >= first).any(axis=1))
-        poses, ends = np.unique(graph.edges[chosen], return_inverse=True)
-        measured, information = (each[chosen - chosen[0]] for each in graph.added_since(int(chosen[0])))
-        is_held = (poses < first) | graph.fixed[poses]
-        is_point, is_loop = graph.is_point[poses], graph.is_loop[chosen]
-        return cls(chosen, poses, is_held, is_point, ends.reshape(-1, 2), measured, information, is_loop)
-
-    def problem_of(self, explanation: Explanation) -> BetweenProblem:
-        """The problem under a further explanation."""
-        applied = explanation.applied(self.edges, self.measured, self.information, self.is_loop)
-        return BetweenProblem(self.edges, *applied, self.is_held, self.is_point)
 
 
 def _refused(undetermined: str) -> InputError:

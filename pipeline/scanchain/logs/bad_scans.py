@@ -78,13 +78,6 @@ def are_millimeters(range_m: float, config: PreprocessConfig) -> bool:
     return range_m > _FARTHEST_M and config.min_range_m <= 1e-3 * range_m <= config.max_range_m
 
 
-def _is_copy(points: RawPoints, last: RawPoints) -> bool:
-    """True if the points of a scan are those of the one before, to the last bit."""
-    if points.shape != last.shape or len(points) < _FEWEST_COPIED:
-        return False
-    return np.array_equal(points[:_SAMPLE], last[:_SAMPLE]) and np.array_equal(points, last)
-
-
 class ScanCounts:
     """Counts of scans left out, copied, with stamps out of order, and without wheels, for the report of a log."""
 
@@ -105,9 +98,11 @@ class ScanCounts:
         self.first_complaint = self.first_complaint or complaint
 
     def repeats(self, points: RawPoints) -> bool:
-        """True if the points of a scan are those of the one before."""
+        """True if the points of a scan are those of the one before, to the last bit."""
         last, self._last_points = self._last_points, points
-        return _is_copy(points, last)
+        if points.shape != last.shape or len(points) < _FEWEST_COPIED:
+            return False
+        return np.array_equal(points[:_SAMPLE], last[:_SAMPLE]) and np.array_equal(points, last)
 
     def take(self, scan: Scan) -> None:
         """Count a scan that is passed on."""

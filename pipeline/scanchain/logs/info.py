@@ -11,7 +11,7 @@ from scanchain.files import Source
 from scanchain.logs.files import size_of
 from scanchain.logs.log import Log
 from scanchain.logs.mcap.records import FileIndex
-from scanchain.logs.mcap.selection import times_of, whole_span
+from scanchain.logs.mcap.stream import times_of, whole_span
 from scanchain.logs.messages.readers import kind
 from scanchain.logs.opening import index_files
 from scanchain.logs.topics import OtherSensor, find_ground_truth, find_odometry, other_sensors, topics_of

@@ -17,24 +17,25 @@ from scanchain.errors import InputError, counted, grouped, shown
 from scanchain.files import Source, source_of
 from scanchain.logs.bad_scans import ScanCounts, check_count, defect
 from scanchain.logs.mcap.records import FileIndex, name_of
-from scanchain.logs.mcap.selection import (
+from scanchain.logs.mcap.stream import (
+    Decoded,
+    Decoders,
     check_one_log,
     chosen_span,
     count_scans,
+    decoded_messages,
     gap_notes,
     notes_on,
+    sampled_messages,
     whole_span,
 )
-from scanchain.logs.mcap.stream import Decoded, Decoders, decoded_messages, first_messages
 from scanchain.logs.messages.laser_scan import LaserScanDecoder
 from scanchain.logs.messages.point_cloud import PlanarCloudDecoder, PointCloudDecoder, plane_height_m
-from scanchain.logs.messages.point_times import PointTimes
-from scanchain.logs.messages.poses import StampedPose
+from scanchain.logs.messages.poses import RecordedPoses, StampedPose
 from scanchain.logs.messages.readers import is_scan, pose_reader, reader
-from scanchain.logs.messages.returns import RangeLimits, Returns
+from scanchain.logs.messages.returns import PointTimes, RangeLimits, Returns
 from scanchain.logs.mounting import find_mounting, in_plane, is_upside_down
 from scanchain.logs.opening import index_files
-from scanchain.logs.recorded_poses import RecordedPoses
 from scanchain.logs.topics import files_with_scans, find_ground_truth, find_lidar, find_odometry
 from scanchain.settings import load_settings, overrides_of
 
@@ -84,6 +85,7 @@ class Log:
     odometry_topic : whose poses the scans carry, empty where there is none
     scans_with_wheels : how many scans had a reading of the wheels near, of those that passed so far
     notes : what was chosen or assumed
+    bad_scans : how many scans were left out, once ``scans`` is through or closed
     copies : a warning where scans that passed so far are copies of those before
     """
 
@@ -106,8 +108,7 @@ class Log:
         self.odometry_topic = "" if wheels is None else wheels.topic
         self.ground_truth_topic = "" if truth is None else truth.topic
         self.lidar = lidar
-        is_untimed = config.point_times == "none"  # distinguished from scans without any times
-        self._sampled_times = PointTimes(replace(config, point_times="auto") if is_untimed else config)
+        self._sampled_times = PointTimes(config)
         self.plane_height_m = None if is_scan(lidar) else self._plane_height_m()
         self.dimension = 3 if self.plane_height_m is None and not is_scan(lidar) else 2
         whole = whole_span(indexes)
@@ -128,6 +129,7 @@ class Log:
             if channel is not None
         }
         self.scans_with_wheels = 0
+        self.bad_scans = 0
         self.copies: list[str] = []
         self._opening_notes = tuple(self.notes)
         self._truth: Trajectory | None = None
@@ -205,7 +207,7 @@ class Log:
         finally:  # also where the caller wants no more scans
             is_damaged = bool(self._damage)
             self._damage += [*counts.losses(), *poses.complaints()]
-            self.copies = counts.copied()
+            self.copies, self.bad_scans = counts.copied(), counts.bad
             self.notes += [*([] if is_scan(self.lidar) else [times.assumed]), *counts.notes()]
         if not index:
             raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
@@ -214,16 +216,10 @@ class Log:
             self._damage.append(f"{scans} of {self.topic} {'was' if scans == '1 scan' else 'were'} recovered")
 
     def _mounting_notes(self) -> list[str]:
-        """Assumptions about the mounting. Raises InputError where a planar lidar moves out of its plane."""
+        """Assumptions about the mounting."""
         mounting = self.mounting
         notes = [mounting.note] if mounting.note else []
         if mounting.motion is not None:
-            if self.dimension == 2 and mounting.leaves_plane:
-                raise InputError(
-                    f"{self.name}: the planar lidar of {self.topic} does not stay in one plane: "
-                    f"{mounting.motion}; choose another --topic, a part in which it rests (--start, --end), or "
-                    "join its scans to 3D clouds first (laser_assembler)"
-                )
             wheels = f"; the wheels ({self.odometry_topic}) are no prior for it" if self.has_odometry else ""
             notes.append(
                 f"the lidar moves on the robot ({mounting.motion}): poses are the lidar's, this motion "
@@ -233,10 +229,7 @@ class Log:
 
     def assumed_point_times(self) -> str:
         """Assumption of a run about per-point times, by the first scan that has returns; empty for laser scans."""
-        if is_scan(self.lidar):
-            return ""
-        is_untimed = self.config.point_times == "none"
-        return PointTimes(self.config).assumed if is_untimed else self._sampled_times.assumed
+        return "" if is_scan(self.lidar) else self._sampled_times.assumed
 
     def expected_stamps(self, topic: str) -> NDArray[np.int64]:
         """(2,) first and last header stamp to expect of a topic in the part that is read, by its first message.
@@ -302,7 +295,7 @@ class Log:
         """Height of all points of the first clouds, None where they differ; samples their point times, too."""
         limits = RangeLimits(self.config.min_range_m, self.config.max_range_m)
         decoder = PointCloudDecoder(limits, self._sampled_times, reader(self.lidar))
-        height_m = plane_height_m(first_messages(self.indexes, self.topic, decoder.decode))
+        height_m = plane_height_m(sampled_messages(self.indexes, self.topic, decoder.decode))
         if height_m is not None:
             self.notes.append(
                 f"the clouds of {self.topic} are planar (z = {height_m:.3g} m everywhere): read as a 2D log"

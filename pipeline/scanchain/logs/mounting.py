@@ -11,8 +11,7 @@ import numpy as np
 from scanchain import lie
 from scanchain.data import Pose
 from scanchain.logs.mcap.records import Channel, FileIndex
-from scanchain.logs.mcap.selection import Span
-from scanchain.logs.mcap.stream import first_messages, spread_messages
+from scanchain.logs.mcap.stream import Span, sampled_messages
 from scanchain.logs.messages.poses import StampedPose, chain
 from scanchain.logs.messages.readers import (
     has_transforms,
@@ -25,7 +24,6 @@ from scanchain.logs.topics import topics_of
 _BASE_FRAMES = ("base_link", "base_footprint", "base")
 _WORLD_WORDS = {"map", "odom", "world", "earth", "global", "origin", "init"}  # in names of frames that stand still
 _TURN_RAD, _SHIFT_M = np.radians(0.2), 0.005  # least turn and shift of a mount that moves
-_TILT_RAD, _LIFT_M = np.radians(1.0), 0.1  # least tilt and lift of a planar lidar that leaves its plane
 _TILTED_RAD = np.radians(10.0)  # tilt of a planar lidar's plane from which on it is no floor plan
 _TURNED_DEG = 0.5  # least turn of a lidar on its robot that is worth a word
 _MOUNT_M = 1.0  # largest motion of a sensor on a robot; a frame that moves by more is no part of it
@@ -42,7 +40,6 @@ class Mounting(NamedTuple):
     T_base_lidar : (4, 4), the first one seen where it moves; the identity where the log does not state it
     source : of the pose, as text
     motion : the joint that moves the lidar and how far, as text; None where it stays where it is
-    leaves_plane : whether it tilts or rises then
     note : what was assumed, empty where nothing was
     """
 
@@ -51,7 +48,6 @@ class Mounting(NamedTuple):
     T_base_lidar: Pose
     source: str = "by static transforms"
     motion: str | None = None
-    leaves_plane: bool = False
     note: str = ""
 
     @property
@@ -93,7 +89,7 @@ def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel 
     frame = _frame_of(indexes, lidar)
     stated = None
     if wheels is not None and is_odometry(wheels):
-        stated = next(first_messages(indexes, wheels.topic, pose_reader(wheels, 3)), None)
+        stated = next(sampled_messages(indexes, wheels.topic, pose_reader(wheels, 3)), None)
     bases = [name.lstrip("/") for name in ("" if stated is None else stated.child, *_BASE_FRAMES) if name]
     for base in bases:
         T_base_lidar = chain(fixed, base, frame)
@@ -101,7 +97,8 @@ def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel 
             return Mounting(base, frame, T_base_lidar)
     moving = _moving_transforms(indexes, topics, span)
     worlds = {"" if stated is None else stated.parent.lstrip("/")}
-    worlds |= {name for each in (*moving, *map(_edge, fixed)) for name in each if _is_of_the_world(name)}
+    frames = {name for edge in (*moving, *map(_edge, fixed)) for name in edge}
+    worlds |= {name for name in frames if _WORLD_WORDS & set(re.split(r"[/_]", name.lower()))}
     moving = {joint: poses for joint, poses in moving.items() if not worlds & set(joint)}
     tree = [*fixed, *(poses[0] for poses in moving.values())]
     base = next((base for base in bases if chain(tree, base, frame) is not None), "")
@@ -122,27 +119,19 @@ def _on_joints(
     first = {joint: poses[0] for joint, poses in moving.items()}
     T_first = chain([*fixed, *first.values()], base, frame)
     assert T_first is not None
-    mounting = mounting._replace(T_base_lidar=T_first)
-    most_rad = -1.0
+    motion, most_rad, source = None, -1.0, mounting.source
     for joint, poses in moving.items():
         others = [*fixed, *(pose for other, pose in first.items() if other != joint)]
         if chain(others, base, frame) is not None:  # the lidar does not hang on it
             continue
-        if mounting.motion is None:
-            mounting = mounting._replace(source="by transforms of /tf, which do not change")
         seen = [T for pose in poses if (T := chain([*others, pose], base, frame)) is not None]
-        turn_rad = max(lie.apart(T_first, T)[1] for T in seen)
-        shift_m = max(lie.apart(T_first, T)[0] for T in seen)
+        shift_m, turn_rad = np.max([lie.apart(T_first, T) for T in seen], axis=0)
         if (turn_rad > _TURN_RAD or shift_m > _SHIFT_M) and turn_rad > most_rad:
             most_rad = turn_rad
-            turn = f"turns by up to {np.degrees(turn_rad):.0f} deg"
             shift = f" and shifts by {shift_m:.2f} m" if shift_m > _SHIFT_M else ""
-            mounting = mounting._replace(
-                source="by transforms of /tf that change",
-                motion=f"{joint[0]} → {joint[1]} in /tf {turn}{shift}",
-                leaves_plane=mounting.leaves_plane or any(_leaves_plane(T_first, T) for T in seen),
-            )
-    return mounting
+            motion = f"{joint[0]} → {joint[1]} in /tf turns by up to {np.degrees(turn_rad):.0f} deg{shift}"
+        source = "by transforms of /tf" + (" that change" if motion else ", which do not change")
+    return mounting._replace(T_base_lidar=T_first, source=source, motion=motion)
 
 
 def moving_frame(
@@ -168,15 +157,10 @@ def _moving_transforms(
     """Messages of each transform that may change, from parts of the log spread over it."""
     found: dict[Edge, list[StampedPose]] = {}
     for topic, channel in topics.items():
-        for transforms in spread_messages(indexes, topic, reader(channel), span):
+        for transforms in sampled_messages(indexes, topic, reader(channel), span):
             for each in transforms:
                 found.setdefault(_edge(each), []).append(each)
     return found
-
-
-def _is_of_the_world(frame: str) -> bool:
-    """True if a frame has a name of those in which robots move: map, robot_1/odom, camera_init."""
-    return bool(_WORLD_WORDS & set(re.split(r"[/_]", frame.lower())))
 
 
 def _top(fixed: Sequence[StampedPose], moving: dict[Edge, list[StampedPose]], frame: str, worlds: set[str]) -> str:
@@ -199,12 +183,6 @@ def _root(parents: dict[str, str], frame: str) -> str:
 
 def _edge(transform: StampedPose) -> Edge:
     return transform.parent.lstrip("/"), transform.child.lstrip("/")
-
-
-def _leaves_plane(T_base_first: Pose, T_base_lidar: Pose) -> bool:
-    """True if a planar lidar that was in a plane has tilted or risen out of it."""
-    cosine = float(T_base_first[:3, 2] @ T_base_lidar[:3, 2])
-    return cosine < np.cos(_TILT_RAD) or abs(T_base_first[2, 3] - T_base_lidar[2, 3]) > _LIFT_M
 
 
 def is_upside_down(T_base_lidar: Pose) -> bool:
@@ -237,7 +215,7 @@ def _static_transforms(indexes: Sequence[FileIndex]) -> list[StampedPose]:
     found: list[StampedPose] = []
     for topic, channel in topics_of(indexes).items():
         if topic.endswith("tf_static") and has_transforms(channel):
-            for transforms in first_messages(indexes, topic, reader(channel)):
+            for transforms in sampled_messages(indexes, topic, reader(channel)):
                 found += transforms
     return found
 
@@ -245,4 +223,4 @@ def _static_transforms(indexes: Sequence[FileIndex]) -> list[StampedPose]:
 def _frame_of(indexes: Sequence[FileIndex], lidar: Channel) -> str:
     """The frame of a lidar's first messages, empty where they name none."""
     read = reader(lidar)
-    return next(first_messages(indexes, lidar.topic, lambda data: read(data).frame), "").lstrip("/")
+    return next(sampled_messages(indexes, lidar.topic, lambda data: read(data).frame), "").lstrip("/")

@@ -12,22 +12,21 @@ from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.files import Source
 from scanchain.logs.files import RemoteFile, fetch_whole, misspelled
+from scanchain.logs.formats import UnknownFormatError, left_out, natural_order
 from scanchain.logs.formats.carmen import claims_carmen, index_carmen
-from scanchain.logs.formats.cloud_file import SUFFIXES
-from scanchain.logs.formats.cloud_folder import claims_clouds, index_clouds
+from scanchain.logs.formats.clouds import SUFFIXES, claims_clouds, index_clouds
 from scanchain.logs.formats.kitti import (
     claims_kitti_odometry,
     claims_kitti_raw,
     index_kitti_odometry,
     index_kitti_raw,
 )
-from scanchain.logs.formats.on_demand import UnknownFormatError, left_out, natural_order
 from scanchain.logs.formats.ros1_bag import claims_ros1_bag, index_ros1_bag
 from scanchain.logs.formats.ros2_bag import claims_ros2_bag, index_ros2_bag, parts_of_bag
 from scanchain.logs.formats.user import index_scans, load_format
 from scanchain.logs.mcap.index import claims_mcap, index_by_summary, index_file
 from scanchain.logs.mcap.records import FileIndex
-from scanchain.logs.mcap.selection import are_parts, complete
+from scanchain.logs.mcap.stream import are_parts, complete
 from scanchain.logs.topics import is_lidar
 
 
@@ -149,7 +148,7 @@ def _index_path(path: Path, number: int, config: LogConfig, address: Source | No
         raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
     index = (_claiming(path, head) if config.format == AUTO else FORMATS[config.format]).index
     if index is index_clouds:
-        index = partial(index, rate_hz=config.rate_hz)
+        index = partial(index, rate_hz=config.rate_hz, bin_columns=config.bin_columns)
     elif index is index_file:
         index = partial(index, source=address)
     try:

@@ -19,14 +19,15 @@ class Segments:
 
     def __init__(self) -> None:
         self.starts = [0]
-        self.is_assumed = False  # whether the newest one counts as joined to the first: its pose is being tested
-        self.apart: set[int] = (
-            set()
-        )  # numbers of those that loops do not join to the first, on what evidence there is
+        self.assumed = -1  # number of the one that the newest counts as joined to while that is being tested
 
     def start(self, keyframe: int) -> None:
         """Start a new segment at this keyframe."""
         self.starts.append(keyframe)
+
+    def assume(self, target: int) -> None:
+        """Count the newest segment as joined to that of a keyframe."""
+        self.assumed = int(self.of(np.array(target)))
 
     def of(self, keyframes: NDArray[np.int64]) -> NDArray[np.int64]:
         """Number of the segment of each keyframe."""
@@ -37,8 +38,11 @@ class Segments:
         number = int(self.of(np.array(keyframe)))
         return self.starts[number], [*self.starts[1:], count][number]
 
-    def components(self, graph: PoseGraph) -> NDArray[np.int64]:
-        """Number of the connected component of each keyframe (K,): segments that loops join have the same one."""
+    def components(self, graph: PoseGraph, *, with_assumed: bool = True) -> NDArray[np.int64]:
+        """Number of the connected component of each keyframe (K,): segments that loops join have the same one.
+
+        with_assumed : whether the newest segment is taken for joined to where it is being tested
+        """
         count = len(self.starts)
         segment = np.repeat(np.arange(count), np.diff([*self.starts, len(graph)]))
         if count == 1:
@@ -47,10 +51,9 @@ class Segments:
         number = np.arange(count)
         for pair in np.unique(ends[:, 0] * count + ends[:, 1]).tolist():
             i, j = divmod(pair, count)
-            if i or j not in self.apart:
-                number[number == number[j]] = number[i]
-        if self.is_assumed:
-            number[number == number[-1]] = number[0]
+            number[number == number[j]] = number[i]
+        if with_assumed and self.assumed >= 0:
+            number[number == number[-1]] = number[self.assumed]
         return np.unique(number, return_inverse=True)[1].astype(np.int64)[segment]
 
 

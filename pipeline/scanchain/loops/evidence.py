@@ -1,4 +1,4 @@
-"""Evidence that keyframes belong to a map: a sequential test of their fits, and of free space that agrees."""
+"""Evidence that keyframes are at a place: a sequential test of their fits, and of free space that agrees."""
 
 from __future__ import annotations
 
@@ -22,13 +22,11 @@ _IN_SIGHT = 0.3  # share of the points of a keyframe, from which on those in vie
 _RISK = 1e-3  # that a pose is taken up which is wrong
 _DROPPED = -3.0  # log-odds down to which a pose is tested
 _RESERVE = 5.0  # log-odds above that bound that are kept: what was right for long may turn out wrong
+_FINAL = math.log(10.0)  # log-odds more in the end, when nothing that is seen later can withdraw a pose
 _FOLLOWED_M = 50.0  # path since the last match, up to which keyframes without one speak against the place
 LARGEST_RATIO = 2.0  # of one keyframe, as a logarithm
 WEIGHTS = (2.8, -0.4, -4.9)  # of fit, no fit and contradiction in the evidence of a keyframe
-_OF_FIND = {
-    2: 4.0,
-    3: 5.0,
-}  # log-odds of what a search found: it finds most right places, others in 0.004 and 0.001
+_OF_FIND = {2: 4.0, 3: 5.0}  # log-odds of a find by a search: of most right places, of others in 0.004 and 0.001
 _SEARCHED_M = {2: 8.0, 3: 20.0}  # path whose points are sought together, at full scale
 _NO_OVERLAP = 0.3  # overlap from which on a fit is evidence
 _IN_SIGHT_OF_BOTH = 0.2  # share of the points in view of the other side, from which on that knows the place
@@ -83,54 +81,57 @@ def nearest(keyframes: Sequence[Keyframe], others: Sequence[Keyframe]) -> list[K
 
 
 class PlaceTest:
-    """Sequential test (Wald 1945) of the pose in a map where the newest segment of a log is taken to be.
+    """Sequential test (Wald 1945) of the pose where the newest segment of a log is taken to be.
 
-    Each keyframe that was tried against the map there adds the logarithm of how much likelier what it shows is at
-    a right pose than at the best of wrong ones; keyframes closer than they are independent count in part. The pose
-    is taken up where the sum passes what the risk asks for, over all the path sought. It is dropped where
-    the sum says that it is wrong: withdrawn, if it had been taken up.
+    Older keyframes, of a map or of segments before, are the place. Each keyframe that was tried against them there
+    adds the logarithm of how much likelier what it shows is at a right pose than at the best of wrong ones;
+    keyframes closer than they are independent count in part. The pose is taken up where the sum passes what the
+    risk asks for, over all the path sought. It is dropped where the sum says that it is wrong: withdrawn, if it
+    had been taken up.
+
+    Methods take closures with older keyframes, all keyframes so far, and their poses T_world (K, d+1, d+1).
     """
 
-    def __init__(self, segments: Segments, of_map: int) -> None:
-        """of_map : number of the keyframes of the map, which come first."""
+    def __init__(self, segments: Segments) -> None:
         self.segments = segments
-        self.of_map = of_map
-        self.is_given = False  # whether the pose of the first scan in the map is
-        self.positions = np.empty((0, 0))
+        self.is_given = False  # whether the pose of the first scan in a map is
         self.searches = 1.0  # for independent parts of the path so far
         self.log_odds = 0.0  # of the present one
         self.best = math.nan  # of those that the log ended with, or a segment
-        self.matched_m = 0.0  # path up to the last match with the map
-        self.waiting: list[Closure] = []  # with the map, accepted and agreeing with the first
+        self.matched_m = 0.0  # path up to the last match with older keyframes
+        self.waiting: list[Closure] = []  # accepted and agreeing with the first
         self.counted_m: list[float] = []  # places along the path of the keyframes that counted
-        self.tried: dict[int, Closure] = {}  # of each keyframe, the best closure with the map at its pose there
+        self.tried: dict[int, Closure] = {}  # of each keyframe, the best closure at its pose there
 
     @property
     def is_gathering(self) -> bool:
-        """True while a pose in the map is being tested."""
-        return self.segments.is_assumed
+        """True while a pose is being tested."""
+        return self.segments.assumed >= 0
 
     @property
     def bound(self) -> float:
         """Log-odds from which on a pose is taken up: the longer the path that was sought, the higher."""
         return math.log(max(self.searches, 1.0) / _RISK)
 
-    def collect(self, closures: Sequence[Closure], keyframes: Sequence[Keyframe]) -> tuple[Closure, ...]:
-        """Take closures with the map of a segment that is not joined to it; all that waited, once they join it."""
+    def collect(
+        self, closures: Sequence[Closure], keyframes: Sequence[Keyframe], T_world: Matrix
+    ) -> tuple[Closure, ...]:
+        """Take closures of a segment that none joins to older ones; all that waited, once they join it."""
         if not self.is_gathering:
-            if not any(each.verdict is ClosureVerdict.ACCEPTED for each in closures):
+            accepted = [each for each in closures if each.verdict is ClosureVerdict.ACCEPTED]
+            if not accepted:
                 return ()
-            self.segments.is_assumed = True
+            self.segments.assume(accepted[0].target)
             newest, start = keyframes[-1], keyframes[self.segments.starts[-1]]
             d = newest.T_odom_lidar.shape[0] - 1
             searches = (newest.traveled_m - start.traveled_m) / (_SEARCHED_M[d] * newest.scale)
             self.searches = max(searches, self.searches)
             self.log_odds, self.counted_m = _OF_FIND[d], []
         for each in _best_of_each(closures):
-            agrees = not self.waiting or self._agrees(each, keyframes)
+            agrees = not self.waiting or self._agrees(each, keyframes, T_world)
             if each.verdict is ClosureVerdict.ACCEPTED and agrees:
                 self.waiting.append(each)
-            ratio = self._ratio(each, keyframes) if agrees else -LARGEST_RATIO
+            ratio = self._ratio(each, keyframes, T_world) if agrees else -LARGEST_RATIO
             self.log_odds += self._weight(keyframes[each.source]) * ratio
         if self.log_odds < self.bound or not self.waiting:
             return ()
@@ -143,21 +144,21 @@ class PlaceTest:
         """The pose of the first scan in the map is given: it is believed until what is seen contradicts it."""
         self.is_given, self.log_odds = True, self.bound + _RESERVE
 
-    def follow(self, closures: Sequence[Closure], keyframes: Sequence[Keyframe]) -> bool:
-        """Take closures with the map of a segment that is joined to it; False once they say that it is not there.
+    def follow(self, closures: Sequence[Closure], keyframes: Sequence[Keyframe], T_world: Matrix) -> bool:
+        """Take closures of a segment that is joined to older ones; False once they say that it is not there.
 
-        Far from the last match nothing counts: drift may have led away from the map.
+        Far from the last match nothing counts: drift may have led away from the place.
         """
         for each in _best_of_each([each for each in closures if _is_there(each)]):
             if keyframes[each.source].traveled_m - self.matched_m <= _FOLLOWED_M * keyframes[each.source].scale:
-                self.log_odds += self._weight(keyframes[each.source]) * self._ratio(each, keyframes)
+                self.log_odds += self._weight(keyframes[each.source]) * self._ratio(each, keyframes, T_world)
             if each.verdict is ClosureVerdict.ACCEPTED:
                 self.matched_m = keyframes[each.source].traveled_m
         self.log_odds = min(self.log_odds, self.bound + _RESERVE)
         return self.log_odds > _DROPPED
 
     def note(self, closures: Sequence[Closure]) -> None:
-        """Note closures with the map that were tried at the pose where their keyframes lie in it."""
+        """Note closures that were tried at the pose where their keyframes lie."""
         for each in filter(_is_there, closures):
             known = self.tried.get(each.source)
             if known is None or _rank(each) > _rank(known):
@@ -170,22 +171,29 @@ class PlaceTest:
 
     def reset(self) -> None:
         """Nothing waits, and no pose is being tested."""
-        self.segments.is_assumed = False
+        self.segments.assumed = -1
         self.waiting = []
 
     def drop(self, start: int) -> None:
         """The newest segment, from a keyframe on, is not where it was tested; forget what was tried."""
         self._remember()
         self.tried = {source: each for source, each in self.tried.items() if source < start}
-        self.is_given = False
+        self.is_given, self.log_odds = False, 0.0
         self.reset()
 
-    def holds(self, placed: Sequence[Keyframe], keyframes: Sequence[Keyframe]) -> bool:
-        """True if keyframes of a segment, at their final poses, stand in the map where they are."""
-        self.counted_m, self.log_odds = [], self.bound + _RESERVE if self.is_given else 0.0
-        for each in placed:
-            if each.index in self.tried:
-                self.log_odds += self._weight(each) * self._ratio_at(each, self.tried[each.index], keyframes)
+    def holds(
+        self, placed: range, keyframes: Sequence[Keyframe], T_world: Matrix, *, of_same_log: bool = False
+    ) -> bool:
+        """True if some keyframes, by their numbers, stand at their final poses where they are tried.
+
+        of_same_log : whether the older ones are of one log with them, and as likely near them as not; of a log in
+            a map what is seen has to speak for itself
+        """
+        prior = _OF_FIND[T_world.shape[-1] - 1] - _FINAL if of_same_log else 0.0
+        self.counted_m, self.log_odds = [], self.bound + _RESERVE if self.is_given else prior
+        for closure in (self.tried[index] for index in placed if index in self.tried):
+            ratio = self._ratio_at(T_world[closure.source], closure, keyframes, T_world)
+            self.log_odds += self._weight(keyframes[closure.source]) * ratio
         self._remember()
         return self.log_odds >= self.bound
 
@@ -201,27 +209,27 @@ class PlaceTest:
         self.counted_m.append(keyframe.traveled_m)
         return min(since_m / apart_m, 1.0)
 
-    def _ratio(self, closure: Closure, keyframes: Sequence[Keyframe]) -> float:
-        T_map_source = pose_in_map(closure, closure.source, keyframes)
-        placed = replace(keyframes[closure.source], T_odom_lidar=T_map_source)
-        return self._ratio_at(placed, closure, keyframes)
+    def _ratio(self, closure: Closure, keyframes: Sequence[Keyframe], T_world: Matrix) -> float:
+        return self._ratio_at(pose_by(closure, closure.source, keyframes, T_world), closure, keyframes, T_world)
 
-    def _ratio_at(self, placed: Keyframe, closure: Closure, keyframes: Sequence[Keyframe]) -> float:
-        """Logarithm of the likelihood ratio of what a keyframe at a pose shows, of a right pose to a wrong one."""
-        away_m = np.linalg.norm(self._positions(keyframes) - placed.T_odom_lidar[:-1, -1], axis=1)
-        beside = keyframes[int(away_m.argmin())]
+    def _ratio_at(
+        self, T_world_source: Pose, closure: Closure, keyframes: Sequence[Keyframe], T_world: Matrix
+    ) -> float:
+        """Logarithm of the likelihood ratio of what a keyframe at a pose shows, of a right pose to a wrong one.
+
+        Free space is that of the nearest keyframe of the segment which the closure is with.
+        """
+        first, end = self.segments.span(closure.target, closure.source)
+        away_m = np.linalg.norm(T_world[first:end, :-1, -1] - T_world_source[:-1, -1], axis=1)
+        nearest = first + int(away_m.argmin())
+        placed = replace(keyframes[closure.source], T_odom_lidar=T_world_source)
+        beside = replace(keyframes[nearest], T_odom_lidar=T_world[nearest])
         agreeing, contradicting = (compared([placed], [beside]) + compared([beside], [placed])).tolist()
         return log_ratio(closure, agreeing, contradicting, len(placed.points) + len(beside.points))
 
-    def _positions(self, keyframes: Sequence[Keyframe]) -> Matrix:
-        """(K, d) of the keyframes of the map."""
-        if len(self.positions) != self.of_map:
-            self.positions = np.array([each.T_odom_lidar[:-1, -1] for each in keyframes[: self.of_map]])
-        return self.positions
-
-    def _agrees(self, closure: Closure, keyframes: Sequence[Keyframe]) -> bool:
+    def _agrees(self, closure: Closure, keyframes: Sequence[Keyframe], T_world: Matrix) -> bool:
         """True if a closure implies the pose of its source that the first one does."""
-        poses = (pose_in_map(each, closure.source, keyframes) for each in (self.waiting[0], closure))
+        poses = (pose_by(each, closure.source, keyframes, T_world) for each in (self.waiting[0], closure))
         off_m, off_rad = lie.apart(*poses)
         return off_m < _AGREE_M * keyframes[closure.source].scale and off_rad < _AGREE_RAD
 
@@ -266,7 +274,7 @@ def _rank(closure: Closure) -> tuple[bool, float]:
     return closure.verdict is ClosureVerdict.ACCEPTED, closure.overlap
 
 
-def pose_in_map(closure: Closure, keyframe: int, keyframes: Sequence[Keyframe]) -> Pose:
-    """T_map_keyframe by a closure with the map and odometry."""
-    T_map_source = keyframes[closure.target].T_odom_lidar @ closure.match.T_target_source
-    return T_map_source @ lie.between(keyframes[closure.source].T_odom_lidar, keyframes[keyframe].T_odom_lidar)
+def pose_by(closure: Closure, keyframe: int, keyframes: Sequence[Keyframe], T_world: Matrix) -> Pose:
+    """T_world_keyframe by a closure with an older keyframe and odometry."""
+    T_world_source = T_world[closure.target] @ closure.match.T_target_source
+    return T_world_source @ lie.between(keyframes[closure.source].T_odom_lidar, keyframes[keyframe].T_odom_lidar)

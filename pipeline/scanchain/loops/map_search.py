@@ -19,7 +19,7 @@ from scanchain.errors import InputError
 from scanchain.files import write_whole
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
-from scanchain.loops.evidence import pose_in_map
+from scanchain.loops.evidence import pose_by
 from scanchain.loops.submaps import Submap, level_frame, upright_frame
 from scanchain.loops.verification import Verifier
 from scanchain.maps.saved_map import read_arrays
@@ -87,8 +87,8 @@ class MapSearch:
         self.of_map = len(keyframes)
         self.radius_m = config.loops.place_radius_m * float(np.median([each.scale for each in keyframes]))
         outline = outline_of(folder, keyframes, config.local_map)
-        poses = np.array([each.T_odom_lidar for each in keyframes])
-        self.T_level_keyframes = lie.inverse(outline.T_map_level) @ poses
+        self.T_map_keyframes = np.array([each.T_odom_lidar for each in keyframes])
+        self.T_level_keyframes = lie.inverse(outline.T_map_level) @ self.T_map_keyframes
         self.size_m, self.columns = outline.size_m, outline.columns
         self.grid: SearchGrid | None = None  # drawn when first searched
         self.search: Generator[None, None, Closure | None] | None = None  # the one that is under way
@@ -220,9 +220,9 @@ class MapSearch:
         if not accepted:
             return tried[0] if tried else None
         best = max(accepted, key=lambda each: each.overlap)
-        if all(_agree(best, each, keyframes) for each in accepted):
-            return best
-        return best.rejected(_ALIKE)
+        poses = [pose_by(each, newest.index, keyframes, self.T_map_keyframes) for each in (best, *accepted)]
+        off_m, off_rad = np.array([lie.apart(poses[0], each) for each in poses]).T
+        return best if (off_m < _AGREE_M).all() and (off_rad < _AGREE_RAD).all() else best.rejected(_ALIKE)
 
     def _seeds(self, points: Points) -> Generator[None, None, Sequence[Found]]:
         """The best poses (3, 3) in the map's level frame, sought coarsely, then refined."""
@@ -293,7 +293,7 @@ class MapSearch:
         self, closure: Closure, keyframes: Sequence[Keyframe], T_world: Matrix, traveled_m: float
     ) -> Problem | None:
         """Why a find contradicts the prediction since the last match, None if it does not."""
-        T_found = pose_in_map(closure, closure.source, keyframes)
+        T_found = pose_by(closure, closure.source, keyframes, T_world)
         moved_m = lie.apart(T_world[closure.source], T_found)[0]
         if moved_m <= max(_DRIFT * traveled_m, self.config.loops.min_radius_m):
             return None
@@ -365,9 +365,3 @@ def _together(members: Sequence[Keyframe], T_level_newest: Pose) -> Points:
     """(N, 3) points of keyframes in the level frame of the last one."""
     T_level_odom = T_level_newest @ lie.inverse(members[-1].T_odom_lidar)
     return np.vstack([lie.transform(T_level_odom @ each.T_odom_lidar, each.points) for each in members])
-
-
-def _agree(a: Closure, b: Closure, keyframes: Sequence[Keyframe]) -> bool:
-    """True if two closures with the map imply the same pose of the newest keyframe."""
-    off_m, off_rad = lie.apart(pose_in_map(a, a.source, keyframes), pose_in_map(b, a.source, keyframes))
-    return off_m < _AGREE_M and off_rad < _AGREE_RAD

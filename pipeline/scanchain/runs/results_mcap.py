@@ -11,8 +11,9 @@ from scanchain import lie
 from scanchain.data import Matrix, Points, Pose
 from scanchain.logs import Log
 from scanchain.logs.mounting import MovingFrame, moving_frame
-from scanchain.logs.writing.pack import (
+from scanchain.logs.writer import (
     Link,
+    LogWriter,
     pack_cloud,
     pack_grid,
     pack_odometry,
@@ -20,7 +21,6 @@ from scanchain.logs.writing.pack import (
     pack_transforms,
     place,
 )
-from scanchain.logs.writing.writer import LogWriter
 from scanchain.maps import read_map, read_ply
 from scanchain.runs.step_table import StepTable
 from scanchain.slam import SlamResult

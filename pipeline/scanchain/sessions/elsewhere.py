@@ -18,7 +18,7 @@ from scanchain.config import Config
 from scanchain.data import Keyframe, Matrix, Points, Scan
 from scanchain.errors import InputError, counted
 from scanchain.kernels.raycast.free_space import nearest_ranges
-from scanchain.logs.formats.cloud_file import SUFFIXES, CloudFileError, read_cloud_file
+from scanchain.logs.formats.clouds import SUFFIXES, CloudFileError, read_cloud_file
 from scanchain.maps import MAP_FOLDER, Edges, SavedPoints, Session, write_saved_map
 from scanchain.maps.occupancy_grid import MAX_CELLS
 from scanchain.preprocess.resolution import Resolution

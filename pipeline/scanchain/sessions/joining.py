@@ -270,9 +270,11 @@ def doubt_about(joined: Joined, old: int, config: Config) -> str:
 
     The evidence is that of a log in a map, at the poses that fit all closures. What agrees is sought elsewhere.
     """
-    in_force, evidence, guest = _joining(joined, old), PlaceTest(Segments(), old), joined.keyframes[old:]
+    in_force, guest, segments = _joining(joined, old), joined.keyframes[old:], Segments()
+    segments.start(old)
+    evidence = PlaceTest(segments)
     evidence.note([closure for closure in joined.closures if closure.source >= old])
-    evidence.holds(guest, joined.keyframes)
+    evidence.holds(range(old, len(joined.keyframes)), joined.keyframes, joined.poses)
     asked = evidence.bound + (_STORIES if joined.dimension == 3 else 0.0)
     if evidence.log_odds < asked:
         agree = f"{counted(len(in_force), 'keyframe')} of it agree"

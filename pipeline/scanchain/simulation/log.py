@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from scanchain import checks
 from scanchain.data import Trajectory
 from scanchain.errors import InputError
-from scanchain.logs.writing.pack import Link, pack_laser_scan, pack_odometry, pack_transforms, place
-from scanchain.logs.writing.writer import LogWriter
+from scanchain.logs.writer import Link, LogWriter, pack_laser_scan, pack_odometry, pack_transforms, place
 from scanchain.simulation.another_day import write_changes
 from scanchain.simulation.drive import EPOCH_NS, RANGES, WHEELS, Drive, check_range, plan, random_numbers
 from scanchain.simulation.motion import Motion, wheel_odometry

@@ -22,11 +22,6 @@ def width_of(text: str) -> float:
     return _DIGIT * FONT * len(text)
 
 
-def plain(value: float) -> str:
-    """A number without powers of ten."""
-    return f"{value:g}"
-
-
 class Axis:
     """The range of what is drawn along one direction.
 
@@ -78,7 +73,8 @@ class Axis:
             values = list(self.only_ticks)
         else:
             values = self._decades(low, high) or _round_steps(low, high, length, is_upright)
-        texts = _fixed(values) if self.only_ticks is None and not self.is_logarithmic else map(plain, values)
+        is_linear = self.only_ticks is None and not self.is_logarithmic
+        texts = _fixed(values) if is_linear else (f"{value:g}" for value in values)
         places = self.fractions(np.array(values, np.float64)).tolist()
         return [(place, text.replace("-", "−")) for place, text in zip(places, texts, strict=True)]
 

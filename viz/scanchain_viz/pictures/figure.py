@@ -9,6 +9,7 @@ import struct
 import zlib
 from base64 import b64encode
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from io import BytesIO
 from itertools import zip_longest
 from pathlib import Path
@@ -19,7 +20,6 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from scanchain.files import write_whole
-from scanchain_viz.colors import rgb
 from scanchain_viz.pictures.axis import FONT, Axis, width_of
 
 if TYPE_CHECKING:
@@ -48,27 +48,41 @@ _STYLE = (
 )
 
 
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A line through positions (N, 3), broken where they are NaN, with its name in a legend."""
+
+    name: str
+    positions: Floats
+    color: str
+    width: float = 1.4
+    is_dashed: bool = False
+
+
 class Plot:
     """One figure with one pair of axes: draw in their units, then ask for the ``svg``, or ``write_png``.
 
     Only lines, marks and images are drawn in a PNG as well.
 
-    height_inches : of the whole figure
     logarithmic : the axis whose decades are equally long, "x" or "y"
+    height_inches : of the whole figure
     spare_inches : left free beside the axes
     is_wide : over the whole width of the page
     """
 
     def __init__(
         self,
-        height_inches: float = 2.7,
+        x_label: str = "",
+        y_label: str = "",
         *,
         logarithmic: str = "",
+        height_inches: float = 2.7,
         spare_inches: float = 0.0,
         is_wide: bool = False,
     ) -> None:
         self.x, self.y = (Axis(is_logarithmic=name == logarithmic) for name in "xy")
-        self.has_grid = False
+        self.x.label, self.y.label = x_label, y_label
+        self.has_grid = True
         self.is_wide, self.spare, self.proportions = is_wide, spare_inches, (0.0, 0.0)  # of a plan
         self._lay_out(height_inches, is_wide=is_wide)
         self._within: list[Callable[[], str]] = []
@@ -76,13 +90,14 @@ class Plot:
         self._beside: list[Callable[[], str]] = []
 
     @classmethod
-    def of_plan(cls, low: Floats, high: Floats, spare_inches: float = 0.0, *, is_wide: bool = False) -> Plot:
+    def of_plan(
+        cls, low: Floats, high: Floats, spare_inches: float = 0.0, *, is_wide: bool = False, has_grid: bool = False
+    ) -> Plot:
         """A figure in the proportions of the box between two corners."""
-        figure = cls(spare_inches=spare_inches, is_wide=is_wide)
+        figure = cls("x [m]", "y [m]", spare_inches=spare_inches, is_wide=is_wide)
         figure.x.limit(low[0], high[0])
         figure.y.limit(low[1], high[1])
-        figure.x.label, figure.y.label = "x [m]", "y [m]"
-        figure.proportions = (float(high[0] - low[0]), float(high[1] - low[1]))
+        figure.proportions, figure.has_grid = (float(high[0] - low[0]), float(high[1] - low[1])), has_grid
         figure._lay_out(0.0, is_wide=is_wide)
         return figure
 
@@ -104,28 +119,6 @@ class Plot:
 
     def line(
         self,
-        x: Floats,
-        y: Floats,
-        color: str,
-        width: float = 1.2,
-        dashes: Sequence[float] = (),
-        opacity: float = 1.0,
-        *,
-        name: str = "",
-    ) -> None:
-        """Draw a line through positions, broken where they are NaN; lengths of dashes and gaps are in widths.
-
-        name : in the legend of a PNG, once for all lines of this name
-        """
-        self._include(x, y)
-        dashed = f"; stroke-dasharray: {' '.join(f'{width * each:.4g}' for each in dashes)}" if dashes else ""
-        style = f"stroke: {color}; stroke-width: {width:g}{dashed}{_opacity(opacity)}"
-        self._within.append(lambda: f'<path d="{_path(self._at(x, y))}" style="{style}"/>')
-        drawn = {"color": _on_white(color), "linewidth": width, "alpha": opacity, "label": name or None}
-        self._on_axes.append(lambda axes: axes.plot(x, y, linestyle=(0, (*dashes,)) if dashes else "-", **drawn))
-
-    def path(
-        self,
         positions: NDArray[np.floating],
         color: str,
         width: float = 1.2,
@@ -134,39 +127,39 @@ class Plot:
         *,
         name: str = "",
     ) -> None:
-        """Draw a line through positions (N, 2) or, from above, (N, 3)."""
-        x, y = positions[:, :2].T.astype(np.float64)
-        self.line(x, y, color, width, dashes, opacity, name=name)
+        """Draw a line through positions (N, 2) or, from above, (N, 3), broken where they are NaN.
 
-    def steps(self, x: Floats, y: Floats, color: str) -> None:
-        """Draw a line that rises or falls at positions only."""
-        self.line(np.repeat(x, 2)[1:], np.repeat(y, 2)[:-1], color)
+        dashes : lengths of dashes and gaps in widths
+        name : in the legend of a PNG, once for all lines of this name
+        """
+        x, y = self._included(positions)
+        dashed = f"; stroke-dasharray: {' '.join(f'{width * each:.4g}' for each in dashes)}" if dashes else ""
+        style = f"stroke: {color}; stroke-width: {width:g}{dashed}{_opacity(opacity)}"
+        self._within.append(lambda: f'<path d="{_path(self._at(x, y))}" style="{style}"/>')
+        drawn = {"color": _on_white(color), "linewidth": width, "alpha": opacity, "label": name or None}
+        self._on_axes.append(lambda axes: axes.plot(x, y, linestyle=(0, (*dashes,)) if dashes else "-", **drawn))
 
     def marks(
-        self, positions: Floats, shape: str, color: str, size: float, *, line: float = 0.0, name: str = ""
+        self,
+        positions: NDArray[np.floating],
+        shape: str,
+        color: str,
+        size: float,
+        *,
+        line: float = 0.0,
+        name: str = "",
     ) -> None:
         """Draw a mark of so many points at each position (N, 2): a disk "o", a square "s" or a cross "+".
 
         line : width of the line that it is drawn with; 0 fills it
         name : as of a line
         """
-        x, y = positions.T
-        self._include(x, y)
+        x, y = self._included(positions)
         style = f"fill: {color}" if not line else f"stroke: {color}; stroke-width: {line:g}"
         self._within.append(lambda: _marks(self._at(x, y), shape, 0.5 * size, style))
         drawn = {"markersize": size, "color": _on_white(color), "label": name or None}
         drawn |= {"markerfacecolor": "none", "markeredgewidth": line} if line else {}
         self._on_axes.append(lambda axes: axes.plot(x, y, linestyle="none", marker=shape, **drawn))
-
-    def dots(self, x: Floats, y: Floats, colors: Sequence[str], size: float) -> None:
-        """Draw a disk in a color of its own at each position, the last ones on top."""
-        self._include(x, y)
-        self._within.append(
-            lambda: "".join(
-                f'<circle cx="{u:.1f}" cy="{v:.1f}" r="{0.5 * size:.2f}" style="fill: {color}"/>'
-                for (u, v), color in zip(self._at(x, y).tolist(), colors, strict=True)
-            )
-        )
 
     def image(
         self,
@@ -251,10 +244,9 @@ class Plot:
         axes.set_ylabel(self.y.label, fontsize=font - 2.0)
         axes.set_title(title, loc="left", fontsize=font)
         axes.tick_params(labelsize=font - 2.0, color=_FRAME)
-        if self.x.only_ticks is not None:
-            axes.set_xticks(self.x.only_ticks)
-        if self.y.only_ticks is not None:
-            axes.set_yticks(self.y.only_ticks)
+        for axis, shown in ((axes.xaxis, self.x), (axes.yaxis, self.y)):
+            if shown.only_ticks is not None:
+                axis.set_ticks(shown.only_ticks)
         for spine in axes.spines.values():
             spine.set_color(_FRAME)
 
@@ -284,9 +276,12 @@ class Plot:
         parts += [drawn() for drawn in self._beside]
         return "".join([*parts, "</svg>"])
 
-    def _include(self, x: Floats, y: Floats) -> None:
+    def _included(self, positions: NDArray[np.floating]) -> Floats:
+        """The columns x and y of positions, which widen the axes."""
+        x, y = places = positions[:, :2].T.astype(np.float64)
         self.x.include(x)
         self.y.include(y)
+        return places
 
     def _at(self, x: Floats, y: Floats) -> Floats:
         """Positions (N, 2) in points from the upper left corner of the axes."""
@@ -360,14 +355,6 @@ def _png(rows: NDArray[np.uint8], palette: NDArray[np.uint8]) -> bytes:
         struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
         for kind, data in chunks
     )
-
-
-def palette_of(colors: Sequence[str], count: int = 256) -> NDArray[np.uint8]:
-    """(K, 4) opaque colors between some that are equally far from each other, #rrggbb."""
-    anchors = np.array(list(map(rgb, colors)), np.float64)
-    places = np.linspace(0.0, len(anchors) - 1.0, count)
-    mixed = np.stack([np.interp(places, np.arange(len(anchors)), channel) for channel in anchors.T], axis=1)
-    return np.pad(np.rint(mixed).astype(np.uint8), ((0, 0), (0, 1)), constant_values=255)
 
 
 def broken(segments: NDArray[np.floating]) -> Floats:

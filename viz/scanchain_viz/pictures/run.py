@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,35 +11,23 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.errors import InputError
 from scanchain.evaluation import on_the_estimate
+from scanchain.evaluation.absolute import path_length
 from scanchain.maps import open_saved_map, read_map, read_ply
 from scanchain.runs.directory import TRUTH_FILE
 from scanchain.trajectory import read_tum
 from scanchain.verdict import Kind, Stretch
-from scanchain_viz.colors import STRETCH_COLORS
-from scanchain_viz.pictures.figure import Floats, Plot, palette_of, write_png
-from scanchain_viz.pictures.map_figures import draw_points, extent, map_points
-from scanchain_viz.pictures.trajectory_figures import TRUTH, color_of
+from scanchain_viz.colors import STRETCH_COLORS, TRUTH, color_of, palette_of
+from scanchain_viz.pictures.figure import Floats, Plot, write_png
+from scanchain_viz.pictures.maps import draw_points, extent, map_points
 
 _WIDTH_INCHES = 8.0
 _ODOMETRY, _OPTIMIZED = "#e07b00", "#1f5fd0"
 _SHADES = ("#a9b1bd", "#747c88", "#14171b")  # of points in space, by height
-_FREE, _OCCUPIED = 35, 65  # per cent of occupancy below which a cell is drawn white, and above which dark
-_UNKNOWN = "#e6e6e6"
-
-
-@dataclass(frozen=True, slots=True)
-class GridPicture:
-    """An occupancy grid: cells (H, W) from 0 free to 100 occupied, −1 unknown; row 0 at the lowest y.
-
-    ``origin_m`` : x, y of the outer corner of cells[0, 0]
-    """
-
-    cells: NDArray[np.int8]
-    resolution_m: float
-    origin_m: tuple[float, float]
+Grid = tuple[NDArray[np.int8], float, tuple[float, float]]  # as ``read_map`` returns it
 
 
 def draw_map(
@@ -53,7 +40,7 @@ def draw_map(
     sessions: Sequence[tuple[str, Matrix]] = (),
     stretches: Sequence[Stretch] = (),
     points: NDArray[np.floating] | None = None,
-    grid: GridPicture | None = None,
+    grid: Grid | None = None,
 ) -> None:
     """Draw trajectories (N, d+1, d+1) over a map, all in the world frame, to a PNG.
 
@@ -69,8 +56,7 @@ def draw_map(
     if grid is not None:
         _draw_grid(figure, grid, low, high)
     if points is not None and len(points):
-        space = np.pad(points, ((0, 0), (0, 3 - points.shape[1]))).astype(np.float64)
-        draw_points(figure, space, low, high, _SHADES)
+        draw_points(figure, lie.lift_points(points), low, high, _SHADES)
     _draw_path(figure, odometry, "odometry", _ODOMETRY, 1.0)
     _draw_path(figure, optimized, "optimized", _OPTIMIZED, 1.8)
     _draw_path(figure, ground_truth, "ground truth", TRUTH, 1.2, (4.0, 3.0))
@@ -79,39 +65,38 @@ def draw_map(
     for each in stretches:
         if each.kind is not Kind.LOOPS:
             part = optimized[max(each.first - 1, 0) : each.last + 1, :2, -1]
-            figure.path(part, STRETCH_COLORS[each.kind], 3.0, name=str(each.kind))
+            figure.line(part, STRETCH_COLORS[each.kind], 3.0, name=str(each.kind))
     for place, shape, name in ((0, "o", "start"), (-1, "s", "end")):
         if len(optimized):
             figure.marks(optimized[place, None, :2, -1], shape, _OPTIMIZED, 7.0, line=1.0, name=name)
     write_png(path, [(title, figure)], width_inches=_WIDTH_INCHES)
 
 
-def _frame(
-    paths: list[Matrix], points: NDArray[np.floating] | None, grid: GridPicture | None
-) -> tuple[Floats, Floats]:
+def _frame(paths: list[Matrix], points: NDArray[np.floating] | None, grid: Grid | None) -> tuple[Floats, Floats]:
     """Corners of the required view: every trajectory, the map without outliers, and a margin."""
     corners: list[NDArray[np.floating]] = [path[:, :2, -1] for path in paths]
     if points is not None and len(points):
         corners.append(np.array(extent(points[:, :2])))
     elif grid is not None:
-        rows, columns = np.nonzero(grid.cells >= _OCCUPIED)
+        cells, resolution_m, origin_m = grid
+        rows, columns = np.nonzero(cells > 0)
         if len(rows):
             seen = np.array(extent(np.stack([columns, rows], axis=-1).astype(np.float64)))
-            corners.append(np.array(grid.origin_m) + grid.resolution_m * seen)
+            corners.append(np.array(origin_m) + resolution_m * seen)
     known = np.concatenate(corners) if corners else np.zeros((1, 2))
     low, high = known.min(axis=0), known.max(axis=0)
     margin = max(0.04 * float((high - low).max()), 1.0)
     return low - margin, high + margin
 
 
-def _draw_grid(figure: Plot, grid: GridPicture, low: Floats, high: Floats) -> None:
+def _draw_grid(figure: Plot, grid: Grid, low: Floats, high: Floats) -> None:
     """Free white, occupied dark, unknown a light gray, like the paper around the grid."""
-    palette = np.vstack([palette_of(("#ffffff", "#262626"), 255), palette_of((_UNKNOWN,), 1)])
-    figure.image(np.full((1, 1), 255, np.uint8), palette, low, high)
-    share = np.clip((grid.cells - float(_FREE)) / (_OCCUPIED - _FREE), 0.0, 1.0)
-    shades = np.where(grid.cells < 0, 255.0, np.rint(254.0 * share)).astype(np.uint8)
-    first = np.array(grid.origin_m)
-    figure.image(shades, palette, first, first + grid.resolution_m * np.array(shades.shape[::-1]))
+    cells, resolution_m, origin_m = grid
+    palette = np.vstack([palette_of((color,), 1) for color in ("#ffffff", "#262626", "#e6e6e6")])
+    shades = np.where(cells < 0, 2, cells > 0).astype(np.uint8)
+    figure.image(np.full((1, 1), 2, np.uint8), palette, low, high)
+    first = np.array(origin_m)
+    figure.image(shades, palette, first, first + resolution_m * np.array(shades.shape[::-1]))
 
 
 def _draw_path(
@@ -119,8 +104,7 @@ def _draw_path(
 ) -> None:
     """Draw one line, its length in the legend."""
     if poses is not None and len(poses):
-        length_m = float(np.linalg.norm(np.diff(poses[:, :-1, -1], axis=0), axis=1).sum())
-        figure.path(poses[:, :2, -1], color, width, dashes, name=f"{name} ({length_m:.0f} m)")
+        figure.line(poses[:, :2, -1], color, width, dashes, name=f"{name} ({path_length(poses)[-1]:.0f} m)")
 
 
 def draw_evaluated(picture: Path, evaluated: Mapping[str, tuple[Matrix, Matrix]]) -> None:
@@ -186,4 +170,4 @@ def _localized(directory: Path, metrics: dict[str, Any]) -> dict[str, Any]:
 
 def _map(directory: Path) -> dict[str, Any]:
     points = read_ply(directory / "map.ply")
-    return {"points": points} if points[:, 2].any() else {"grid": GridPicture(*read_map(directory))}
+    return {"points": points} if points[:, 2].any() else {"grid": read_map(directory)}

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from time import perf_counter
 
-import msgspec
 import numpy as np
 import rerun as rr
 
 from scanchain import lie
-from scanchain.data import Closure, ClosureVerdict, GraphState, Match, Matrix, State, Step
+from scanchain.data import Closure, ClosureVerdict, GraphState, Matrix, State, Step
 from scanchain.runs.closures import final_verdicts
 from scanchain.runs.step_table import StepTable
 from scanchain_viz.recording import drawing, entities
@@ -28,55 +26,45 @@ _GROWTH = 1.05  # factor of growth between two drawings: the recording stays lin
 _DOWNWEIGHTED = 0.5  # robust weight below which an accepted closure is drawn amber
 
 
-class Verdicts(msgspec.Struct, frozen=True):
-    """Events of a step, one per closure with a new verdict, and the numbers accepted and rejected since."""
-
-    events: Sequence[str]
-    accepted: int
-    rejected: int
-
-
 class KeyframeGraph:
-    """Takes in every step; returns the verdicts on closures, and draws the graph when it has grown enough."""
+    """Takes in every step; returns the news of closures, and draws the graph when it has grown enough."""
 
     def __init__(self) -> None:
         self.positions: list[Floats] = []
         self.tried: list[Closure] = []  # with the verdicts of the matcher alone
         self.closures: list[Closure] = []
         self.graph: GraphState | None = None
-        self.counts = (0, 0)
+        self.counts = (0, 0)  # of closures accepted and rejected
         self.drawn = 0
         self.is_current = True
 
-    def add(self, step: Step) -> Verdicts:
+    def add(self, step: Step) -> list[str]:
         """Take in a step; the verdicts on its closures are those of the matcher, then of the back end for all."""
         if step.keyframe >= 0:
             self.positions.append(drawing.positions(step.T_world_lidar[None])[0])
             self.is_current = False
-        events: list[str] = []
+        news: list[str] = []
         if step.closures:
             self.tried += step.closures
-            events += self._update([*self.closures, *(replace(each, weight=1.0) for each in step.closures)])
+            news += self._update([*self.closures, *(replace(each, weight=1.0) for each in step.closures)])
         if step.graph is not None:
             self.graph = step.graph
-            events += self._update(final_verdicts(self.tried, step.graph))
-        return Verdicts(events, *self.counts)
+            news += self._update(final_verdicts(self.tried, step.graph))
+        return news
 
-    def settle(self, closures: Sequence[Closure], graph: GraphState) -> Verdicts:
+    def settle(self, closures: Sequence[Closure], graph: GraphState) -> list[str]:
         """Take in the final graph with every closure tried."""
-        self.graph = graph
-        self.is_current = False
-        return Verdicts(self._update(closures), *self.counts)
+        self.graph, self.is_current = graph, False
+        return self._update(closures)
 
-    def restore(self, steps: StepTable, closures: Sequence[Closure], graph: GraphState) -> Verdicts:
-        """Restore the state after these steps from the closures and the graph at that time."""
+    def restore(self, positions: Floats, closures: Sequence[Closure], graph: GraphState) -> None:
+        """Restore the state after keyframes at these positions from the closures and the graph at that time."""
         self.graph, self.tried = graph, list(closures)
         self._update(final_verdicts(closures, graph))
-        for position in drawing.positions(steps.columns["T_world_lidar"][steps.columns["keyframe"] >= 0]):
+        for position in positions:
             self.positions.append(position)
             self.drawn = len(self.positions) if self.has_grown else self.drawn
         self.is_current = self.drawn == len(self.positions)
-        return Verdicts((), *self.counts)
 
     @property
     def has_grown(self) -> bool:
@@ -91,22 +79,28 @@ class KeyframeGraph:
         nodes = np.array(self.positions)
         if self.graph is not None:
             nodes[: len(self.graph.poses)] = drawing.positions(self.graph.poses)
-        accepted = [item for item in self.closures if item.verdict is ClosureVerdict.ACCEPTED]
-        rejected = [item for item in self.closures if item.verdict is ClosureVerdict.REJECTED]
+
+        def edges(closures: list[Closure]) -> Floats:
+            pairs = [(item.target, item.source) for item in closures]
+            return nodes[np.array(pairs, np.int64).reshape(-1, 2)]
+
+        accepted = self._of(ClosureVerdict.ACCEPTED)
         colors = [entities.ORANGE if item.weight < _DOWNWEIGHTED else entities.GREEN for item in accepted]
         return [
             Message(entities.KEYFRAMES, drawing.dots(nodes), times),
             Message(entities.ODOMETRY_EDGES, drawing.lines([nodes]), times),
-            Message(entities.ACCEPTED, drawing.lines(_edges(nodes, accepted), colors or None), times),
-            Message(entities.REJECTED, drawing.lines(_edges(nodes, rejected)), times),
+            Message(entities.ACCEPTED, drawing.lines(edges(accepted), colors or None), times),
+            Message(entities.REJECTED, drawing.lines(edges(self._of(ClosureVerdict.REJECTED))), times),
         ]
+
+    def _of(self, verdict: ClosureVerdict) -> list[Closure]:
+        return [item for item in self.closures if item.verdict is verdict]
 
     def _update(self, closures: Sequence[Closure]) -> list[str]:
         """Store the verdicts; a line for each new one, the number being the closure's row in loops.parquet."""
         before = [item.verdict for item in self.closures]
         self.closures = list(closures)
-        counts = Counter(item.verdict for item in closures)
-        self.counts = (counts[ClosureVerdict.ACCEPTED], counts[ClosureVerdict.REJECTED])
+        self.counts = len(self._of(ClosureVerdict.ACCEPTED)), len(self._of(ClosureVerdict.REJECTED))
         return [
             f"closure {number} ({item.target} to {item.source}) {item.verdict}: {item.reason}"
             for number, item in enumerate(closures)
@@ -114,47 +108,41 @@ class KeyframeGraph:
         ]
 
 
-def _edges(nodes: Floats, closures: list[Closure]) -> Floats:
-    """Line strips (E, 2, 3) between the keyframes of closures."""
-    pairs = np.array([(item.target, item.source) for item in closures], np.int64).reshape(-1, 2)
-    return nodes[pairs]
-
-
 class Batcher:
     """Holds the steps since the last batch; every batch turns them into messages."""
 
-    def __init__(self, dimension: int) -> None:
+    def __init__(self) -> None:
         self.graph = KeyframeGraph()
         self.steps: list[Step] = []
-        self.verdicts: list[Verdicts] = []  # of each step
+        self.news: list[list[str]] = []  # of each step
+        self.counts: list[tuple[int, int]] = []  # of closures after each step
         self.bytes = 0
         self.scans = 0
         self.points = 0
         self.box: Floats | None = None
         self.started_s = perf_counter()
-        self.T_odom_before: Matrix | None = None
-        self.T_world_odom: Matrix = lie.identity(dimension)
-        self.has_odom = False
+        self.last: tuple[Matrix, Matrix] | None = None  # pose (1, d+1, d+1) of the scan before, odometry and world
         self.state: State | None = None
-        self.closures: tuple[int, int] | None = None
+        self.last_counts: tuple[int, int] | None = None
 
     def restore(self, steps: StepTable, closures: Sequence[Closure], graph: GraphState) -> None:
         """Restore the state after these steps from the closures and the graph at that time."""
-        verdicts = self.graph.restore(steps, closures, graph)
         odom, world = steps.columns["T_odom_lidar"], steps.columns["T_world_lidar"]
+        positions = drawing.positions(world)
+        self.graph.restore(positions[steps.columns["keyframe"] >= 0], closures, graph)
         self.scans, self.points = len(steps), int(steps.columns["points"].sum())
-        self._frame(drawing.positions(world))
-        self.T_odom_before = odom[-1]
-        self.has_odom, self.T_world_odom = True, world[-1] @ lie.inverse(odom[-1])
-        self.state, self.closures = steps.last_state, (verdicts.accepted, verdicts.rejected)
+        self._frame(positions)
+        self.last = odom[-1:], world[-1:]
+        self.state, self.last_counts = steps.last_state, self.graph.counts
 
     def add(self, step: Step) -> None:
         """Take in one step, and the verdicts of that moment."""
-        verdicts = self.graph.add(step)
+        news = self.graph.add(step)
         if not self.steps:
             self.started_s = perf_counter()
         self.steps.append(step)
-        self.verdicts.append(verdicts)
+        self.news.append(news)
+        self.counts.append(self.graph.counts)
         self.bytes += 12 * len(step.points)
         self.points += len(step.points)
         self.scans += 1
@@ -171,7 +159,7 @@ class Batcher:
     def messages(self) -> list[Message]:
         """Messages of the gathered steps, scan by scan; the batch is empty afterwards."""
         steps, self.steps, self.bytes = self.steps, [], 0
-        verdicts, self.verdicts = self.verdicts, []
+        news, self.news, counts, self.counts = self.news, [], self.counts, []
         if not steps:
             return []
         times = Times(
@@ -181,20 +169,22 @@ class Batcher:
         odom = np.array([step.T_odom_lidar for step in steps])
         world = np.array([step.T_world_lidar for step in steps])
         self._frame(drawing.positions(world))
+        points = drawing.in_space(np.concatenate([step.points for step in steps]))
+        scans = rr.Points3D.columns(positions=points).partition([len(step.points) for step in steps])
         return [
             Message(entities.LIDAR, drawing.transforms(world), times),
-            Message(entities.SCAN, _scans(steps), times),
+            Message(entities.SCAN, scans, times),
             *self._trails(times, odom, world),
-            *_matches([step.match for step in steps], times),
-            Message(entities.TIME, _times_by_stage(steps), times),
-            *self._states(steps, verdicts, times),
+            *_plots(steps, times),
+            *self._states(steps, news, times),
+            *self._counts(counts, times),
         ]
 
     def settled(self, closures: Sequence[Closure], graph: GraphState, times: Times) -> list[Message]:
         """All that is left, and the final verdicts at ``times``, of the last step; their numbers in any case."""
-        messages, verdicts, self.closures = self.messages(), self.graph.settle(closures, graph), None
-        told = events([[(_INFORMATION, text) for text in verdicts.events]], times)
-        return [*messages, *told, *self._counts([verdicts], times), *self.graph.draw(times)]
+        messages, news, self.last_counts = self.messages(), self.graph.settle(closures, graph), None
+        told = events([[(_INFORMATION, text) for text in news]], times)
+        return [*messages, *told, *self._counts([self.graph.counts], times), *self.graph.draw(times)]
 
     def _frame(self, positions: Floats) -> None:
         """Widen the box around everything that was passed, (2, 3)."""
@@ -207,45 +197,43 @@ class Batcher:
         A segment of the corrected trajectory starts where the scan before stands under the same correction, so
         that a closure does not draw a jump.
         """
-        first = odom[:1] if self.T_odom_before is None else self.T_odom_before[None]
-        before = np.concatenate([first, odom[:-1]])
-        self.T_odom_before = odom[-1]
-        corrections = world @ lie.inverse(odom)
-        steps = np.abs(np.diff(np.concatenate([self.T_world_odom[None], corrections]), axis=0)).max(axis=(1, 2))
-        changed = steps > 1e-6
-        changed[0] |= not self.has_odom
-        self.has_odom, self.T_world_odom = True, corrections[-1]
-        odometry = drawing.segments(drawing.positions(before), drawing.positions(odom))
-        trajectory = drawing.segments(drawing.positions(corrections @ before), drawing.positions(world))
-        messages = [
-            Message(entities.ODOMETRY, rr.LineStrips3D.columns(strips=odometry), times),
-            Message(entities.TRAJECTORY, rr.LineStrips3D.columns(strips=trajectory), times),
-        ]
+        is_first, last = self.last is None, self.last or (odom[:1], world[:1])
+        self.last = odom[-1:], world[-1:]
+        before = np.concatenate([last[0], odom[:-1]])
+        corrections = np.concatenate([last[1], world]) @ lie.inverse(np.concatenate([last[0], odom]))
+        changed = np.abs(np.diff(corrections, axis=0)).max(axis=(1, 2)) > 1e-6
+        changed[0] |= is_first
+        messages = []
+        for entity, *ends in (
+            (entities.ODOMETRY, before, odom),
+            (entities.TRAJECTORY, corrections[1:] @ before, world),
+        ):
+            strips = np.stack([drawing.positions(poses) for poses in ends], axis=1)
+            messages.append(Message(entity, rr.LineStrips3D.columns(strips=strips), times))
         if changed.any():
-            messages.append(Message(entities.ODOM, drawing.transforms(corrections[changed]), times[changed]))
+            messages.append(Message(entities.ODOM, drawing.transforms(corrections[1:][changed]), times[changed]))
         return messages
 
-    def _states(self, steps: list[Step], verdicts: list[Verdicts], times: Times) -> list[Message]:
-        """The state where it changes, with the reason as an event, and the verdicts on loop closures."""
+    def _states(self, steps: list[Step], news: list[list[str]], times: Times) -> list[Message]:
+        """The state where it changes, with the reason as an event, and the news of loop closures."""
         before = [self.state, *(step.state for step in steps[:-1])]
         changed = np.array([step.state is not state for step, state in zip(steps, before, strict=True)])
         self.state = steps[-1].state
         told: list[list[tuple[str, str]]] = []
-        for step, is_new, verdict in zip(steps, changed, verdicts, strict=True):
+        for step, is_new, texts in zip(steps, changed, news, strict=True):
             why = [(WARNING, f"{step.state}: {step.reason}")] if is_new and step.state is not State.OK else []
-            told.append([*why, *((_INFORMATION, text) for text in verdict.events)])
-        messages = [*events(told, times), *self._counts(verdicts, times)]
+            told.append([*why, *((_INFORMATION, text) for text in texts)])
+        messages = events(told, times)
         if changed.any():
             states = [str(step.state) for step, new in zip(steps, changed, strict=True) if new]
             messages.append(Message(entities.STATE, rr.StateChange.columns(state=states), times[changed]))
         return messages
 
-    def _counts(self, verdicts: list[Verdicts], times: Times) -> list[Message]:
+    def _counts(self, counts: list[tuple[int, int]], times: Times) -> list[Message]:
         """Numbers of accepted and rejected closures, where they change."""
-        counts = [(verdict.accepted, verdict.rejected) for verdict in verdicts]
-        before = [self.closures, *counts[:-1]]
+        before = [self.last_counts, *counts[:-1]]
         changed = np.array([now != then for now, then in zip(counts, before, strict=True)])
-        self.closures = counts[-1]
+        self.last_counts = counts[-1]
         if not changed.any():
             return []
         columns = rr.Scalars.columns(scalars=np.array(counts, np.float64)[changed].reshape(-1))
@@ -262,42 +250,26 @@ def events(events: Sequence[Sequence[tuple[str, str]]], times: Times) -> list[Me
     return [Message(entities.EVENTS, columns, times[np.array(rows)])]
 
 
-def _scans(steps: list[Step]) -> rr.ComponentColumnList:
-    points = drawing.in_space(np.concatenate([step.points for step in steps]))
-    return rr.Points3D.columns(positions=points).partition([len(step.points) for step in steps])
-
-
-def _matches(matches: list[Match], times: Times) -> list[Message]:
-    """Plots and covariance of the registrations; what is infinite is a gap."""
-    numbers = np.array(
-        [
-            (
-                match.inliers,
-                match.inlier_share,
-                match.residual_m,
-                math.log10(max(match.observability, _LEAST_DRAWN)),
-                match.iterations,
-            )
-            for match in matches
-        ],
-        np.float64,
-    )
-    numbers[~np.isfinite(numbers)] = np.nan
-    series = (
-        entities.INLIERS, entities.INLIER_SHARE, entities.RESIDUAL, entities.OBSERVABILITY, entities.ITERATIONS,
-    )  # fmt: skip
+def _plots(steps: list[Step], times: Times) -> list[Message]:
+    """Figures and covariance of the registrations, what is infinite is a gap, and times of the stages."""
+    matches = [step.match for step in steps]
+    figures = {
+        entities.INLIERS: [match.inliers for match in matches],
+        entities.INLIER_SHARE: [match.inlier_share for match in matches],
+        entities.RESIDUAL: [match.residual_m for match in matches],
+        entities.OBSERVABILITY: [math.log10(max(match.observability, _LEAST_DRAWN)) for match in matches],
+        entities.ITERATIONS: [match.iterations for match in matches],
+    }
+    messages = []
+    for entity, values in figures.items():
+        known = np.where(np.isfinite(values), values, np.nan)
+        messages.append(Message(entity, rr.Scalars.columns(scalars=known), times))
     informations = np.array([match.information for match in matches])
+    covariances = drawing.ellipsoids(informations, entities.COVARIANCE_SCALE)
+    timings = [[getattr(step.timing, f"{stage}_s") for stage in entities.STAGES] for step in steps]
+    stages = rr.Scalars.columns(scalars=1e3 * np.array(timings).reshape(-1))
     return [
-        *(
-            Message(entity, rr.Scalars.columns(scalars=np.ascontiguousarray(column)), times)
-            for entity, column in zip(series, numbers.T, strict=True)
-        ),
-        Message(entities.COVARIANCE, drawing.ellipsoids(informations, entities.COVARIANCE_SCALE), times),
+        *messages,
+        Message(entities.COVARIANCE, covariances, times),
+        Message(entities.TIME, stages.partition([len(entities.STAGES)] * len(steps)), times),
     ]
-
-
-def _times_by_stage(steps: list[Step]) -> rr.ComponentColumnList:
-    """Milliseconds of every stage, one series each, in the order of ``entities.STAGES``."""
-    seconds = [(t.read_s, t.preprocess_s, t.match_s, t.map_s, t.loops_s) for t in (step.timing for step in steps)]
-    milliseconds = 1e3 * np.array(seconds).reshape(-1)
-    return rr.Scalars.columns(scalars=milliseconds).partition([len(entities.STAGES)] * len(steps))

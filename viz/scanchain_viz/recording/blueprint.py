@@ -16,8 +16,6 @@ from scanchain_viz.recording.drawing import Floats
 _BACKGROUND = (13, 16, 17)  # of scenes, also where the viewer is light: lines of ground truth are white
 _PLAY_S = 30.0
 _ORDINARY_MS = {2: 5.0, 3: 20.0}  # what a stage takes, but for the first scans, which load the kernels
-_FIRST = {"log10 observability": entities.OBSERVABILITY, "residual [m]": entities.RESIDUAL}
-_BEHIND = {"inliers": entities.INLIERS, "inlier share": entities.INLIER_SHARE, "iterations": entities.ITERATIONS}
 
 
 def blueprint(dimension: int, box: Floats | None = None, scans: int = 0) -> rrb.Blueprint:
@@ -26,40 +24,37 @@ def blueprint(dimension: int, box: Floats | None = None, scans: int = 0) -> rrb.
     box : (2, 3) lowest and highest coordinates that the view should frame
     scans : how many there are, where that is known: they are played in half a minute, but no slower than 30 Hz
     """
-    whole = whole_log()
+    hidden, whole = rrb.PlotLegend(visible=False), whole_log()
+    observability, residual, *others = (
+        rrb.TimeSeriesView(origin=entity, name=name, axis_x=whole, plot_legend=hidden)
+        for entity, name in entities.SERIES.items()
+    )
     ordinary_ms = rrb.ScalarAxis(range=(0.0, _ORDINARY_MS[dimension]))
     tabs = rrb.Tabs(
         rrb.TextDocumentView(origin=entities.LEGEND, name="legend"),
         rrb.TextLogView(origin=entities.EVENTS, name="events"),
-        *_plots(_BEHIND),
+        *others,
         rrb.TimeSeriesView(origin=entities.TIME, name="time", axis_x=whole, axis_y=ordinary_ms),
     )
-    loops = rrb.TimeSeriesView(
-        origin=entities.LOOPS,
-        name="loop closures",
-        axis_x=whole,
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),  # there are few at first
-    )
+    left = rrb.PlotLegend(rrb.Corner2D.LeftTop)  # there are few closures at first
+    loops = rrb.TimeSeriesView(origin=entities.LOOPS, name="loop closures", axis_x=whole, plot_legend=left)
     state = rrb.StateTimelineView(origin=entities.STATE, name="state", time_view=whole)
     growing = {entities.ODOMETRY: up_to_now(), entities.TRAJECTORY: up_to_now()}
     world = scene("seen from above" if dimension == 2 else "scene", dimension, box, growing)
     verdict = rrb.TextDocumentView(origin=entities.VERDICT, name="verdict")
-    side = rrb.Vertical(verdict, *_plots(_FIRST), loops, state, tabs, row_shares=[3, 3, 3, 3, 2, 5])
+    shares = [3, 3, 3, 3, 2, 5]
+    side = rrb.Vertical(verdict, observability, residual, loops, state, tabs, row_shares=shares)
+    return with_panels(rrb.Horizontal(world, side, column_shares=[5, 3]), scans=scans)
+
+
+def with_panels(root: rrb.Container | rrb.View, *, scans: int = 0, has_toggles: bool = False) -> rrb.Blueprint:
+    """Views with collapsed panels around them, but for the list of entities where they are there to toggle."""
     return rrb.Blueprint(
-        rrb.Horizontal(world, side, column_shares=[5, 3]),
-        time_panel(scans),
-        rrb.BlueprintPanel(state="collapsed"),
+        root,
+        rrb.TimePanel(timeline="scan", state="collapsed", fps=max(30.0, scans / _PLAY_S)),
+        rrb.BlueprintPanel(state="expanded" if has_toggles else "collapsed"),
         rrb.SelectionPanel(state="collapsed"),
     )
-
-
-def _plots(entity_by_name: dict[str, str]) -> list[rrb.TimeSeriesView]:
-    """Plots of one series each, which need no legend."""
-    hidden = rrb.PlotLegend(visible=False)
-    return [
-        rrb.TimeSeriesView(origin=entity, name=name, axis_x=whole_log(), plot_legend=hidden)
-        for name, entity in entity_by_name.items()
-    ]
 
 
 def whole_log() -> rrb.TimeAxis:
@@ -75,11 +70,6 @@ def up_to_now() -> rrb.VisibleTimeRanges:
     return rrb.VisibleTimeRanges(
         [rrb.VisibleTimeRange(timeline, start=start, end=end) for timeline in ("scan", "sensor_time")]
     )
-
-
-def time_panel(scans: int) -> rrb.TimePanel:
-    """Small, and as fast as ``blueprint`` says."""
-    return rrb.TimePanel(timeline="scan", state="collapsed", fps=max(30.0, scans / _PLAY_S))
 
 
 def scene(

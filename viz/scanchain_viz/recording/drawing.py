@@ -100,11 +100,6 @@ def positions(poses: Matrix) -> Floats:
     return in_space(poses[:, :-1, -1])
 
 
-def segments(starts: Floats, ends: Floats) -> Floats:
-    """Line strips (N, 2, 3) of two points each."""
-    return np.stack([starts, ends], axis=1)
-
-
 def transforms(poses: Matrix) -> rr.ComponentColumnList:
     """Transform columns of poses (N, d+1, d+1)."""
     quat_xyzw = lie.to_quaternion(lie.lift(poses)[:, :3, :3]).astype(np.float32)

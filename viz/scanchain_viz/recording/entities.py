@@ -11,7 +11,8 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from scanchain.data import State
-from scanchain_viz.recording.drawing import Color, Floats, Message, dots, lines, pixels
+from scanchain_viz.colors import between, height_shares
+from scanchain_viz.recording.drawing import Floats, Message, dots, lines, pixels
 
 WORLD = "world"
 ODOM = "world/odom"
@@ -43,6 +44,13 @@ EVENTS = "events"
 LEGEND = "legend"
 VERDICT = "verdict"
 
+SERIES = {  # plots of one series each, and their names
+    OBSERVABILITY: "log10 observability",
+    RESIDUAL: "residual [m]",
+    INLIERS: "inliers",
+    INLIER_SHARE: "inlier share",
+    ITERATIONS: "iterations",
+}
 STAGES = ("read", "preprocess", "match", "map", "loops")
 COVARIANCE_SCALE = 100.0  # a standard deviation of 1 mm is drawn 10 cm long
 
@@ -50,9 +58,7 @@ YELLOW, GRAY, WHITE = (255, 205, 60), (110, 120, 135), (235, 235, 235)
 BLUE, GREEN, RED, ORANGE, VIOLET = (70, 150, 255), (60, 200, 90), (235, 70, 60), (255, 140, 40), (190, 120, 255)
 CYAN = (70, 210, 210)
 
-_HEIGHT_COLORS = np.array(
-    [(50, 60, 150), (40, 140, 170), (60, 190, 120), (220, 210, 80), (240, 240, 230)], np.float64
-)
+_HEIGHT_COLORS = ((50, 60, 150), (40, 140, 170), (60, 190, 120), (220, 210, 80), (240, 240, 230))
 
 # a list, since the viewer wraps its lines; those of a table it cuts off
 _LEGEND = f"""
@@ -81,11 +87,7 @@ UP = Message(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
 
 def height_colors(points: Floats) -> NDArray[np.uint8]:
     """Colors (N, 3) of points (N, 3) by height, from the 2nd to the 98th percentile."""
-    low, high = np.percentile(points[:, 2], (2.0, 98.0))
-    share = np.clip((points[:, 2] - low) / max(float(high - low), 1e-3), 0.0, 1.0)
-    anchors = np.linspace(0.0, 1.0, len(_HEIGHT_COLORS))
-    channels = [np.interp(share, anchors, channel) for channel in _HEIGHT_COLORS.T]
-    return np.stack(channels, axis=-1).astype(np.uint8)
+    return between(_HEIGHT_COLORS, height_shares(points[:, 2]))
 
 
 def constants(dimension: int) -> list[Message]:
@@ -110,24 +112,16 @@ def constants(dimension: int) -> list[Message]:
 
 
 def _series() -> list[Message]:
-    stages = [f"{stage} [ms]" for stage in STAGES]
-    colors = [CYAN, GREEN, BLUE, YELLOW, RED]
-    single = {
-        INLIERS: "inliers",
-        INLIER_SHARE: "inlier share",
-        RESIDUAL: "residual [m]",
-        OBSERVABILITY: "log10 observability",
-        ITERATIONS: "iterations",
-    }
+    stages = rr.SeriesLines(names=[f"{stage} [ms]" for stage in STAGES], colors=[CYAN, GREEN, BLUE, YELLOW, RED])
     states = rr.StateConfiguration(values=list(State), labels=list(State), colors=[GREEN, VIOLET, ORANGE, RED])
+    loops = rr.SeriesLines(
+        names=["accepted", "rejected"],
+        colors=[GREEN, RED],
+        interpolation_mode=rr.components.InterpolationMode.StepAfter,  # each holds until the next
+    )
     return [
-        Message(TIME, rr.SeriesLines(names=stages, colors=colors)),
-        *(Message(entity, rr.SeriesLines(names=[name], colors=[BLUE])) for entity, name in single.items()),
-        Message(LOOPS, _steps(["accepted", "rejected"], [GREEN, RED])),
+        Message(TIME, stages),
+        *(Message(entity, rr.SeriesLines(names=[name], colors=[BLUE])) for entity, name in SERIES.items()),
+        Message(LOOPS, loops),
         Message(STATE, states),
     ]
-
-
-def _steps(names: list[str], colors: list[Color]) -> rr.SeriesLines:
-    """Series that hold their value until the next."""
-    return rr.SeriesLines(names=names, colors=colors, interpolation_mode=rr.components.InterpolationMode.StepAfter)

@@ -6,9 +6,11 @@ Nothing that goes wrong here after the start ends a run; it is collected in ``Re
 from __future__ import annotations
 
 import subprocess
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import wraps
 from pathlib import Path
 from types import TracebackType
+from typing import Concatenate, ParamSpec
 from uuid import uuid4
 
 import numpy as np
@@ -31,6 +33,19 @@ from scanchain_viz.recording.sinks import Sink, file_sink, open_stream, viewer_s
 
 _LISTED = 50  # largest number of stretches in the text of a verdict
 _RADIUS = 3.5  # of a stretch, in points of the screen
+Given = ParamSpec("Given")
+
+
+def _recorded(
+    draw: Callable[Concatenate[Recording, Given], Iterable[Message]],
+) -> Callable[Concatenate[Recording, Given], None]:
+    """A method that sends the messages which it makes to every sink."""
+
+    @wraps(draw)
+    def send(recording: Recording, *values: Given.args, **named: Given.kwargs) -> None:
+        recording._send(lambda: draw(recording, *values, **named))
+
+    return send
 
 
 class Recording:
@@ -66,7 +81,7 @@ class Recording:
         self.sinks: list[Sink] = []
         self.file: Sink | None = None
         self.server: subprocess.Popen[bytes] | None = None
-        self.batcher = Batcher(dimension)
+        self.batcher = Batcher()
         self.last = (0, 0)  # scan and stamp of the last step
         self.problems: list[str] = []
 
@@ -117,8 +132,12 @@ class Recording:
 
     def preview(self, scan: Scan) -> None:
         """Show a viewer, but no file, every n-th point of the first scan until its step is recorded."""
-        viewers = [sink for sink in self.sinks if sink is not self.file]
-        self._send(lambda: self._previewed(scan), viewers)
+        viewers, times = (
+            [sink for sink in self.sinks if sink is not self.file],
+            Times.at(scan.index, scan.stamp_ns),
+        )
+        cloud = drawing.dots(drawing.at_most(scan.points, self.config.max_map_points))
+        self._send(lambda: [Message(entities.SCAN, cloud, times)], viewers)
 
     def log(self, step: Step) -> None:
         """Record one step; most of it is gathered and written in batches."""
@@ -133,38 +152,74 @@ class Recording:
         if has_news or self.batcher.is_due:
             self._send(lambda: self._step(step))
 
+    @_recorded
     def log_trajectory(
         self, stamps_ns: NDArray[np.int64], poses_optimized: Matrix, indices: NDArray[np.int64]
-    ) -> None:
+    ) -> Iterable[Message]:
         """Record the optimized trajectory: poses (N, d+1, d+1) of the scans ``indices``."""
-        self._send(lambda: self._trajectory(Times(indices, stamps_ns), poses_optimized))
+        path = drawing.lines([drawing.positions(poses_optimized)], entities.CYAN, 0.75)
+        yield Message(entities.OPTIMIZED, path)
+        times = Times(indices, stamps_ns)
+        yield Message(entities.OPTIMIZED_LIDAR, drawing.transforms(poses_optimized), times)
 
-    def log_closures(self, closures: Sequence[Closure], graph: GraphState) -> None:
+    @_recorded
+    def log_closures(self, closures: Sequence[Closure], graph: GraphState) -> Iterable[Message]:
         """Record the final graph and the final verdict on every closure, at the last scan."""
-        self._send(lambda: self.batcher.settled(closures, graph, self.now))
+        return self.batcher.settled(closures, graph, self.now)
 
-    def log_verdict(self, judged: Judged, trajectory: Trajectory) -> None:
-        """Record the verdict, and its stretches on the optimized trajectory."""
-        self._send(lambda: _verdict(judged, trajectory))
+    @_recorded
+    def log_verdict(self, judged: Judged, trajectory: Trajectory) -> Iterable[Message]:
+        """Record the verdict, and its stretches on the optimized trajectory of all scans of the log."""
+        document = rr.TextDocument(_document(judged), media_type=rr.MediaType.MARKDOWN)
+        yield Message(entities.VERDICT, document)
+        if judged.stretches:
+            path = drawing.positions(trajectory.poses)
+            lines = rr.LineStrips3D(
+                [_stretch_line(path, each) for each in judged.stretches],
+                colors=[rgb(STRETCH_COLORS[each.kind]) for each in judged.stretches],
+                radii=drawing.pixels(_RADIUS),
+                labels=[str(each.kind) for each in judged.stretches],
+                show_labels=False,
+            )
+            yield Message(entities.STRETCHES, lines)
+            first = np.array([each.first for each in judged.stretches], np.int64)
+            texts = [[(WARNING, f"stretch to check: {each.text}")] for each in judged.stretches]
+            yield from events(texts, Times(first, trajectory.stamps_ns[first]))
 
-    def log_ground_truth(self, poses: Matrix) -> None:
+    @_recorded
+    def log_ground_truth(self, poses: Matrix) -> Iterable[Message]:
         """Record true poses (N, 4, 4), aligned to the optimized trajectory."""
         line = drawing.lines([drawing.positions(poses)], entities.WHITE, 0.75)
-        self._send(lambda: [Message(entities.GROUND_TRUTH, line)])
+        yield Message(entities.GROUND_TRUTH, line)
 
-    def log_map(self, points: NDArray[np.floating]) -> None:
+    @_recorded
+    def log_map(self, points: NDArray[np.floating]) -> Iterable[Message]:
         """Record the finished map (N, d), downsampled to a third of the points of the scans."""
-        self._send(lambda: self._map(points))
+        limit = max(self.config.max_map_points, self.batcher.points // 3)
+        drawn = drawing.at_most(points, limit)
+        if len(drawn):
+            color = entities.height_colors(drawn) if self.dimension == 3 else entities.WHITE
+            yield Message(entities.MAP, drawing.dots(drawn, color, 1.0))
 
+    @_recorded
     def log_grid(
         self, cells: NDArray[np.int8] | NDArray[np.uint8], *, resolution_m: float, origin_m: tuple[float, float]
-    ) -> None:
+    ) -> Iterable[Message]:
         """Record the finished occupancy grid of a 2D log.
 
         cells : (H, W), as ROS counts: 0 free to 100 occupied, −1 (255) unknown; row 0 at the lowest y
         origin_m : x, y of the outer corner of cells[0, 0]
         """
-        self._send(lambda: self._grid(cells, resolution_m, origin_m))
+        height, width = cells.shape
+        pixels = np.ascontiguousarray(cells[::-1]).view(np.uint8)  # rerun's first row is the top one
+        grid = rr.GridMap(
+            data=pixels.tobytes(),
+            format=rr.components.ImageFormat(width=width, height=height, color_model="L", channel_datatype="U8"),
+            cell_size=resolution_m,
+            translation=[*origin_m, -0.05],
+            colormap=rr.components.Colormap.RvizMap,
+        )
+        yield Message(entities.GRID, grid)
 
     def close(self) -> None:
         """Write the last batch, frame the view, and close file and viewer; may be called twice."""
@@ -221,46 +276,12 @@ class Recording:
             messages.append(Message(entities.LOCAL_MAP, drawing.dots(points), self.now))
         return [*messages, *self.batcher.messages()] if self.batcher.is_due else messages
 
-    def _previewed(self, scan: Scan) -> list[Message]:
-        points = drawing.at_most(scan.points, self.config.max_map_points)
-        return [Message(entities.SCAN, drawing.dots(points), Times.at(scan.index, scan.stamp_ns))]
-
-    def _trajectory(self, times: Times, poses: Matrix) -> list[Message]:
-        return [
-            Message(entities.OPTIMIZED, drawing.lines([drawing.positions(poses)], entities.CYAN, 0.75)),
-            Message(entities.OPTIMIZED_LIDAR, drawing.transforms(poses), times),
-        ]
-
-    def _map(self, points: NDArray[np.floating]) -> list[Message]:
-        limit = max(self.config.max_map_points, self.batcher.points // 3)
-        drawn = drawing.at_most(points, limit)
-        if not len(drawn):
-            return []
-        color = entities.height_colors(drawn) if self.dimension == 3 else entities.WHITE
-        return [Message(entities.MAP, drawing.dots(drawn, color, 1.0))]
-
-    def _grid(
-        self, cells: NDArray[np.int8] | NDArray[np.uint8], resolution_m: float, origin_m: tuple[float, float]
-    ) -> list[Message]:
-        """Rerun's first row is the top one, at the highest y."""
-        height, width = cells.shape
-        pixels = np.ascontiguousarray(cells[::-1]).view(np.uint8)
-        grid = rr.GridMap(
-            data=pixels.tobytes(),
-            format=rr.components.ImageFormat(width=width, height=height, color_model="L", channel_datatype="U8"),
-            cell_size=resolution_m,
-            translation=[*origin_m, -0.05],
-            colormap=rr.components.Colormap.RvizMap,
-        )
-        return [Message(entities.GRID, grid)]
-
-    def _send(self, say: Callable[[], list[Message]], sinks: Sequence[Sink] | None = None) -> None:
+    def _send(self, say: Callable[[], Iterable[Message]], sinks: Sequence[Sink] | None = None) -> None:
         """Send the messages that ``say`` returns to these sinks, or to every one."""
         sinks = self.sinks if sinks is None else sinks
-        if not sinks:
-            return
         messages: list[Message] = []
-        self._guard(lambda: messages.extend(say()))
+        if sinks:
+            self._guard(lambda: messages.extend(say()))
         for sink in sinks if messages else ():
             sink.send(messages)
 
@@ -276,26 +297,6 @@ class Recording:
         problem = f"the recording lacks something: {type(error).__name__}: {error}"
         if problem not in self.problems:
             self.problems.append(problem)
-
-
-def _verdict(judged: Judged, trajectory: Trajectory) -> list[Message]:
-    """Text, lines and events; the indices of the trajectory's scans are those of the log."""
-    document = rr.TextDocument(_document(judged), media_type=rr.MediaType.MARKDOWN)
-    messages = [Message(entities.VERDICT, document)]
-    if judged.stretches:
-        path = drawing.positions(trajectory.poses)
-        lines = rr.LineStrips3D(
-            [_stretch_line(path, each) for each in judged.stretches],
-            colors=[rgb(STRETCH_COLORS[each.kind]) for each in judged.stretches],
-            radii=drawing.pixels(_RADIUS),
-            labels=[str(each.kind) for each in judged.stretches],
-            show_labels=False,
-        )
-        messages.append(Message(entities.STRETCHES, lines))
-        first = np.array([each.first for each in judged.stretches], np.int64)
-        texts = [[(WARNING, f"stretch to check: {each.text}")] for each in judged.stretches]
-        messages += events(texts, Times(first, trajectory.stamps_ns[first]))
-    return messages
 
 
 def _document(judged: Judged) -> str:

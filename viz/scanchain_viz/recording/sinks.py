@@ -152,7 +152,8 @@ class Sink:
 
 def open_stream(name: str, dimension: int, recording_id: UUID, kind: str = "") -> rr.RecordingStream:
     """A stream that knows its recording's name and adds no timeline of its own; each ``kind`` has its layout."""
-    stream = rr.RecordingStream(f"scanchain {kind}{dimension}D", recording_id=recording_id)
+    application = " ".join(filter(None, ("scanchain", kind, f"{dimension}D")))
+    stream = rr.RecordingStream(application, recording_id=recording_id)
     stream.set_log_time_enabled(False)
     stream.send_recording_name(name)
     return stream

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from urllib.parse import quote
 
@@ -15,11 +15,10 @@ from scanchain.batch.batch import totals
 from scanchain.batch.task import Row, State, output_file
 from scanchain.errors import counted
 from scanchain.files import source_of, without_keys
-from scanchain.runs.metrics import Metrics
 from scanchain.trajectory import read_tum
 from scanchain.verdict import MOST_CONTRADICTED
+from scanchain_viz.colors import color_of
 from scanchain_viz.pictures.figure import Plot
-from scanchain_viz.pictures.trajectory_figures import color_of
 from scanchain_viz.report import page
 
 _MAX_TRAJECTORIES = 60
@@ -51,22 +50,19 @@ def write_batch_report(directory: Path, rows: Sequence[Row], command: Sequence[s
     """Draw and write the page; runs are looked up in the directory."""
     done, names = [row for row in rows if row.metrics is not None], names_of([row.log for row in rows])
     missing = len(rows) - len(done)
-    doubted = [f"{row.log} is not trustworthy: {row.why}" for row in rows if row.state is State.NOT_TRUSTWORTHY]
-    whole = page.Page(
-        title=f"Batch of {counted(len(rows), 'log')}",
-        subtitle="Each was run in its own process.",
-        facts=tuple(totals(rows)),
-        warnings=(f"{missing:,} of {len(rows):,} logs have no result; see the table for the reason",)
-        * bool(missing)
-        + tuple(doubted),
-        notes=(),
-        sections=(_logs(directory, rows, names), *_spread(done), *_trajectories(directory, done, names)),
-        collapsibles=(
-            page.Collapsible("Command", shlex.join(without_keys(command))),
-            page.Collapsible("Paths", "\n".join(map(_paths, rows))),
-        ),
+    warnings = (
+        [f"{missing:,} of {len(rows):,} logs have no result; see the table for the reason"] if missing else []
     )
-    page.write_page(directory / page.REPORT_FILE, whole)
+    warnings += [f"{row.log} is not trustworthy: {row.why}" for row in rows if row.state is State.NOT_TRUSTWORTHY]
+    paths = (f"{row.log}  {row.run or '–'}  sha256 {row.sha256 or '–'}" for row in rows)
+    folds = (
+        page.Collapsible("Command", shlex.join(without_keys(command))),
+        page.Collapsible("Paths", "\n".join(paths)),
+    )
+    sections = (_logs(directory, rows, names), *_spread(done), *_trajectories(directory, done, names))
+    title = f"Batch of {counted(len(rows), 'log')}"
+    subtitle = "Each was run in its own process."
+    page.write_page(directory, page.Page(title, subtitle, totals(rows), warnings, (), sections, folds))
 
 
 def names_of(logs: Sequence[str]) -> dict[str, str]:
@@ -81,38 +77,36 @@ def names_of(logs: Sequence[str]) -> dict[str, str]:
 
 
 def _logs(directory: Path, rows: Sequence[Row], names: dict[str, str]) -> page.Section:
-    legend = tuple(f"{head.text}: {head.hint}" for head in _HEADS if head.hint)
+    legend = [f"{head.text}: {head.hint}" for head in _HEADS if head.hint]
     text = "A name links to the report of its run, or to its output if there is none."
-    return page.Section(
-        "Logs", text, grid=page.Grid(_HEADS, tuple(_row(directory, row, names[row.log]) for row in rows), legend)
-    )
+    lines = [page.Row(names[row.log], _cells(row), link=_link(directory, row)) for row in rows]
+    return page.Section("Logs", text, grid=page.Grid(_HEADS, lines, legend))
 
 
-def _row(directory: Path, row: Row, name: str) -> page.Row:
+def _cells(row: Row) -> Sequence[page.Cell | str]:
     """The figures of a log, or the reason for none."""
-    m, link = row.metrics, _link(directory, row)
+    m = row.metrics
     if m is None:
-        return page.Row(name, (page.Cell(f"{row.state}: {row.why}", is_wide=True),), link=link)
+        return [page.Cell(f"{row.state}: {row.why}", "wide")]
     truth = None if m.ground_truth is None else m.ground_truth.optimized
     is_far_off = m.ground_truth is not None and bool(m.ground_truth.complaint)
-    cells = (
+    return [
         page.verdict_cell(m.verdict),
         f"{m.scans:,}",
-        page.Cell(f"{m.contradicted:,}", is_bad=m.contradicted > MOST_CONTRADICTED * m.scans),
-        page.Cell(f"{m.degenerate:,}", is_bad=m.degenerate > _MANY_DEGENERATE * m.scans),
-        page.Cell(f"{m.lost:,}", is_bad=m.lost > _MANY_LOST * m.scans),
-        page.Cell(f"{row.warnings:,}", is_bad=row.warnings > 0),
+        page.bad_if(m.contradicted > MOST_CONTRADICTED * m.scans, f"{m.contradicted:,}"),
+        page.bad_if(m.degenerate > _MANY_DEGENERATE * m.scans, f"{m.degenerate:,}"),
+        page.bad_if(m.lost > _MANY_LOST * m.scans, f"{m.lost:,}"),
+        page.bad_if(row.warnings > 0, f"{row.warnings:,}"),
         f"{m.traveled_m:,.1f}",
         f"{m.closures_accepted:,}",
-        page.Cell(page.figure(None if truth is None else truth.ate_rmse_m, 1.0, 4), is_bad=is_far_off),
+        page.bad_if(is_far_off, page.figure(None if truth is None else truth.ate_rmse_m, 1.0, 4)),
         page.figure(None if truth is None else truth.kitti_translation_share, 100.0, 3),
         f"{100.0 * m.median_inlier_share:.0f}",
         page.figure(m.median_residual_m, 1e3, 1),
         f"{m.times_real_time:.1f}",
         f"{row.duration_s:.1f}",
         f"{row.peak_mib:,.0f}",
-    )
-    return page.Row(name, cells, link=link)
+    ]
 
 
 def _link(directory: Path, row: Row) -> str:
@@ -123,41 +117,32 @@ def _link(directory: Path, row: Row) -> str:
     return ""
 
 
-def _paths(row: Row) -> str:
-    return f"{row.log}  {row.run or '–'}  sha256 {row.sha256 or '–'}"
-
-
 def _spread(done: Sequence[Row]) -> Iterator[page.Section]:
     """Distributions of the figures, if there are several logs."""
-    drawn = (
-        ("ATE", "m", lambda row, m: None if m.ground_truth is None else m.ground_truth.optimized.ate_rmse_m),
-        ("Speed", "× real time", lambda row, m: m.times_real_time),
-        ("Memory", "MiB", lambda row, m: row.peak_mib),
-    )
+    every = [(row, row.metrics) for row in done if row.metrics is not None]
+    figures = {
+        "ATE [m]": [m.ground_truth.optimized.ate_rmse_m for _, m in every if m.ground_truth is not None],
+        "Speed [× real time]": [m.times_real_time for _, m in every],
+        "Memory [MiB]": [row.peak_mib for row, _ in every],
+    }
     drawings = [
-        page.Drawing(title, "", _sorted_values(title, unit, values))
-        for title, unit, figure in drawn
-        if len(values := _values(done, figure)) > 1
+        page.Drawing(name.partition(" [")[0], "", _sorted_values(name, sorted(values)))
+        for name, values in figures.items()
+        if len(values) > 1
     ]
     if drawings:
-        yield page.Section(
-            "Distributions", "Cumulative distribution over the logs.", drawings=tuple(drawings), is_small=True
-        )
+        text = "Cumulative distribution over the logs."
+        yield page.Section("Distributions", text, drawings=drawings, is_small=True)
 
 
-def _values(done: Sequence[Row], figure: Callable[[Row, Metrics], float | None]) -> list[float]:
-    found = (figure(row, row.metrics) for row in done if row.metrics is not None)
-    return sorted(value for value in found if value is not None)
-
-
-def _sorted_values(name: str, unit: str, values: Sequence[float]) -> Markup:
-    figure, ordered = Plot(), np.array(values)
-    share = 100.0 * (np.arange(len(values)) + 1) / len(values)
-    figure.steps(ordered, share, color_of(0))
-    figure.marks(np.stack([ordered, share], axis=1), "o", color_of(0), 3.5)
+def _sorted_values(name: str, values: Sequence[float]) -> Markup:
+    figure = Plot(name, "logs below [%]")
+    points = np.stack([values, 100.0 * (np.arange(len(values)) + 1) / len(values)], axis=1)
+    steps = np.stack([np.repeat(points[:, 0], 2)[1:], np.repeat(points[:, 1], 2)[:-1]], axis=1)
+    figure.line(steps, color_of(0))
+    figure.marks(points, "o", color_of(0), 3.5)
     figure.x.limit(0.0, _BEYOND * max(values) or 1.0)
     figure.y.limit(0.0, 105.0)
-    figure.x.label, figure.y.label, figure.has_grid = f"{name} [{unit}]", "logs below [%]", True
     return figure.svg()
 
 
@@ -169,9 +154,8 @@ def _trajectories(directory: Path, done: Sequence[Row], names: dict[str, str]) -
     ]
     text = f"The first {_MAX_TRAJECTORIES} of {len(done):,}." if len(done) > _MAX_TRAJECTORIES else ""
     if drawings:
-        yield page.Section(
-            "Optimized trajectories, seen from above", text, drawings=tuple(drawings), is_small=True
-        )
+        title = "Optimized trajectories, seen from above"
+        yield page.Section(title, text, drawings=drawings, is_small=True)
 
 
 def _trajectory(trajectory: Path) -> Markup:
@@ -179,8 +163,7 @@ def _trajectory(trajectory: Path) -> Markup:
     rows = np.linspace(0, len(positions) - 1, min(len(positions), _MAX_POINTS)).astype(int)
     middle, size = 0.5 * (positions.min(axis=0) + positions.max(axis=0)), np.ptp(positions, axis=0)
     half = _BEYOND * 0.5 * (max(size / _BOX) or 1.0) * _BOX
-    figure = Plot.of_plan(middle - half, middle + half)
-    figure.path(positions[rows], color_of(0))
+    figure = Plot.of_plan(middle - half, middle + half, has_grid=True)
+    figure.line(positions[rows], color_of(0))
     figure.marks(positions[:1], "o", color_of(0), 5.0)
-    figure.has_grid = True
     return figure.svg()

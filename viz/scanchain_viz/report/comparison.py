@@ -15,10 +15,9 @@ from scanchain.comparison.table import Row as TableRow
 from scanchain.comparison.table import Table, read_table
 from scanchain.maps import read_ply
 from scanchain.trajectory import read_tum
-from scanchain_viz.pictures import trajectory_figures as figures
-from scanchain_viz.pictures.compared_trajectories import read_trajectories
-from scanchain_viz.pictures.map_figures import map_picture, surroundings
-from scanchain_viz.pictures.trajectory_figures import DrawnTrajectory, Floats
+from scanchain_viz.pictures.figure import Floats
+from scanchain_viz.pictures.maps import map_picture, surroundings
+from scanchain_viz.pictures.trajectories import DrawnTrajectory, frame, trajectories_of_comparison
 from scanchain_viz.report import page, sections
 
 _VERDICT = page.Head(
@@ -30,29 +29,10 @@ _NEARLY = 1.25  # thickness of a map over that of the sharpest, up to which it f
 
 def write_compare_report(directory: Path) -> None:
     """Draw and write the page."""
-    table, trajectories = read_table(directory), read_trajectories(directory)
-    truth_file = directory / TRUTH_FILE
+    table, trajectories = read_table(directory), trajectories_of_comparison(directory)
+    truth_file, made = directory / TRUTH_FILE, table.provenance
     truth = read_tum(truth_file).poses[:, :3, 3] if truth_file.exists() else None
-    whole = page.Page(
-        title=f"Comparison on {Path(table.log.split(', ')[0]).name}",
-        subtitle=_subtitle(table),
-        facts=_facts(table),
-        warnings=tuple(_warnings(table)),
-        notes=tuple(table.notes),
-        sections=tuple(_sections(directory, table, trajectories, truth)),
-        collapsibles=tuple(_collapsibles(directory, table)),
-    )
-    page.write_page(directory / page.REPORT_FILE, whole)
-
-
-def _subtitle(table: Table) -> str:
-    how = "through every method, each in its own process"
-    return f"The same {table.scans:,} decoded scans {how}. {table.against}"
-
-
-def _facts(table: Table) -> tuple[tuple[str, str], ...]:
-    made = table.provenance
-    return (
+    facts = (
         ("log", table.log),
         ("topic", table.topic),
         ("scans", f"{table.scans:,} of {table.points_per_scan:,.0f} points, {table.dimension}D"),
@@ -60,6 +40,17 @@ def _facts(table: Table) -> tuple[tuple[str, str], ...]:
         ("machine", f"{made.platform}, {made.cores} cores"),
         ("made", f"{datetime.fromisoformat(made.started):%Y-%m-%d %H:%M} UTC, in {made.duration_s:.0f} s"),
     )
+    how = "through every method, each in its own process"
+    whole = page.Page(
+        title=f"Comparison on {Path(table.log.split(', ')[0]).name}",
+        subtitle=f"The same {table.scans:,} decoded scans {how}. {table.against}",
+        facts=facts,
+        warnings=list(_warnings(table)),
+        notes=table.notes,
+        sections=list(_sections(directory, table, trajectories, truth)),
+        collapsibles=list(_collapsibles(directory, table)),
+    )
+    page.write_page(directory, whole)
 
 
 def _warnings(table: Table) -> Iterator[str]:
@@ -99,19 +90,15 @@ def _grid(
     shown = [dict(zip((row.name for row in table.rows), c.cells(table.figures), strict=True)) for c in columns]
     lines = []
     for row in rows:
-        cells = tuple(page.Cell(each[row.name].text, each[row.name].is_best) for each in shown)
+        cells = [page.Cell(each[row.name].text, "best" if each[row.name].is_best else "") for each in shown]
         if has_verdicts:
-            cells += (page.verdict_cell(row.verdict, row.vouched),)
+            cells.append(page.verdict_cell(row.verdict, row.vouched))
         if row.status is not Status.OK:
-            cells = (page.Cell(f"{row.status}: {row.reason}", is_wide=True),)
+            cells = [page.Cell(f"{row.status}: {row.reason}", "wide")]
         lines.append(page.Row(row.name, cells, chips.get(row.name)))
-    heads = (
-        page.Head("method"),
-        *(page.Head(column.head, column.unit, column.definition) for column in columns),
-        *((_VERDICT,) if has_verdicts else ()),
-    )
-    notes = tuple(f"{column.heading}: {column.definition}" for column in columns)
-    return page.Grid(heads, tuple(lines), notes)
+    heads = [page.Head("method"), *(page.Head(column.head, column.unit, column.definition) for column in columns)]
+    heads += [_VERDICT] if has_verdicts else []
+    return page.Grid(heads, lines, [f"{column.heading}: {column.definition}" for column in columns])
 
 
 def _sections(
@@ -119,32 +106,27 @@ def _sections(
 ) -> Iterator[page.Section]:
     yield from _figures(table, trajectories)
     is_planar = table.dimension == 2
-    drawn = [trajectory for trajectory in trajectories if len(trajectory.positions)]
-    if drawn:
-        framing = _sharpest(table, drawn)
-        text = "All start at the same pose."
+    if trajectories:
+        framing, text = _sharpest(table, trajectories), "All start at the same pose."
         if truth is not None:
             text = (
                 "Each is aligned to the ground truth as for the ATE; one that did not finish, by its first pose."
             )
-        if truth is None and len(framing) < len(drawn):
-            whole = {trajectory.name for trajectory in framing}
-            astray = ", ".join(trajectory.name for trajectory in drawn if trajectory.name not in whole)
+        elif len(framing) < len(trajectories):
+            framed = {each.name for each in framing}
+            astray = ", ".join(each.name for each in trajectories if each.name not in framed)
             text += f" The axes frame the sharper maps; {astray} may leave them."
-        yield sections.trajectories_section(drawn, framing, truth, is_planar=is_planar, text=text)
-        yield from sections.error_section(drawn, table.truth)
-        yield from sections.relation_section(drawn)
-        yield from sections.time_section(drawn)
-        yield from sections.uncertainty_section(drawn, is_planar=is_planar)
-        yield from _map_section(directory, drawn, framing, figures.frame(framing, truth), table.dimension)
+        yield sections.trajectories_section(trajectories, framing, truth, is_planar=is_planar, text=text)
+        yield from sections.error_section(trajectories, table.truth)
+        yield from sections.relation_section(trajectories)
+        yield from sections.time_section(trajectories)
+        yield from sections.uncertainty_section(trajectories, is_planar=is_planar)
+        yield from _map_section(directory, trajectories, framing, frame(framing, truth), table.dimension)
     settings = {row.name: row.settings for row in table.rows}
-    for trajectory in trajectories:
-        yield from sections.loop_section(
-            trajectory,
-            method_folder(directory, trajectory.name) / CLOSURES_FILE,
-            f"Loop closures of {trajectory.name}",
-            float(settings[trajectory.name].get("loops", {}).get("min_travel_m", 0.0)),
-        )
+    for each in trajectories:
+        closures = sections.read_closures(method_folder(directory, each.name) / CLOSURES_FILE)
+        min_travel_m = float(settings[each.name].get("loops", {}).get("min_travel_m", 0.0))
+        yield from sections.loop_section(each, closures, f"Loop closures of {each.name}", min_travel_m)
     if len(table.rows) > 1:
         yield _disagreement(table)
 
@@ -168,12 +150,11 @@ def _map_section(
     maps = [(trajectory, read_ply(file)) for trajectory, file in files if file.exists()]
     if not maps:
         return
-    whole = {trajectory.name for trajectory in framing}
-    corners = surroundings(*box, [points for trajectory, points in maps if trajectory.name in whole])
-    drawings = tuple(
-        page.Drawing(trajectory.name, "", map_picture(points, *corners), sections.chip(trajectory))
-        for trajectory, points in maps
-    )
+    whole = {each.name for each in framing}
+    corners = surroundings(*box, [points for each, points in maps if each.name in whole])
+    drawings = [
+        page.Drawing(each.name, "", map_picture(points, *corners), sections.chip(each)) for each, points in maps
+    ]
     text = "The same points of the same scans, placed by the poses of each method."
     text += " Dark is low, bright is high." if dimension == 3 else ""
     yield page.Section("Maps", text, drawings=drawings, is_small=True)
@@ -182,27 +163,22 @@ def _map_section(
 def _disagreement(table: Table) -> page.Section:
     names = [row.name for row in table.rows]
     rows = [
-        page.Row(name, tuple(page.figure(value, 1e3, 1) for value in values))
+        page.Row(name, [page.figure(value, 1e3, 1) for value in values])
         for name, values in zip(names, table.disagreement_m, strict=True)
     ]
-    return page.Section(
-        "Disagreement",
-        "Median distance between the motions that two methods find for a scan, in millimeters. "
-        "Not a measure of accuracy: two methods with the same error agree.",
-        grid=page.Grid((page.Head("mm"), *(page.Head(name) for name in names)), tuple(rows)),
+    text = (
+        "Median distance between the motions that two methods find for a scan, in millimeters. Not a measure of "
+        "accuracy: two methods with the same error agree."
     )
+    return page.Section("Disagreement", text, grid=page.Grid([page.Head("mm"), *map(page.Head, names)], rows))
 
 
 def _collapsibles(directory: Path, table: Table) -> Iterator[page.Collapsible]:
     yield from sections.provenance_sections(table.provenance, table.baselines)
-    yield page.Collapsible(
-        "Methods", "\n".join(f"{row.name}: {row.description or row.reason}" for row in table.rows)
-    )
+    methods = (f"{row.name}: {row.description or row.reason}" for row in table.rows)
+    yield page.Collapsible("Methods", "\n".join(methods))
     definitions = dict.fromkeys(definition for row in table.rows for definition in row.definitions)
     if definitions:
         yield page.Collapsible("Definitions of the errors", "\n\n".join(definitions))
-    yield page.Collapsible(
-        "Settings, in the form of --config",
-        (directory / SETTINGS_FILE).read_text(encoding="utf-8"),
-        is_long=True,
-    )
+    settings = (directory / SETTINGS_FILE).read_text(encoding="utf-8")
+    yield page.Collapsible("Settings, in the form of --config", settings, is_long=True)

@@ -22,23 +22,12 @@ from scanchain.sessions.localize import LocalizedLog
 from scanchain.sessions.localizer import MapState
 from scanchain.sessions.merging import MergeMetrics
 from scanchain.verdict import Judged
-from scanchain_viz.colors import hex_of
-from scanchain_viz.pictures.figure import INK, Plot
-from scanchain_viz.pictures.map_figures import (
-    DrawnMerge,
-    draw_points,
-    extent,
-    map_points,
-    merge_picture,
-    path_over_map,
-    read_merge,
-    surroundings,
-)
-from scanchain_viz.pictures.trajectory_figures import PathLine
-from scanchain_viz.recording.drawing import in_space
+from scanchain_viz.colors import CLOSURES, hex_of
+from scanchain_viz.pictures import maps
+from scanchain_viz.pictures.figure import INK, Line, Plot, broken
 from scanchain_viz.report import page
-from scanchain_viz.report.sections import provenance_sections
-from scanchain_viz.report.trajectory_map import SCRIPT, interactive_map
+from scanchain_viz.report.scene import SCRIPT, interactive_map
+from scanchain_viz.report.sections import chip, configuration, provenance_sections
 
 _HEADS = (
     page.Head("session"),
@@ -69,24 +58,17 @@ def write_merge_report(directory: Path) -> None:
     """Draw and write the page of a merge."""
     metrics = msgspec.json.decode((directory / "metrics.json").read_bytes(), type=MergeMetrics)
     made = msgspec.json.decode((directory / RUN_FILE).read_bytes(), type=Provenance)
-    summary = (directory / "summary.txt").read_text(encoding="utf-8")
-    drawn = read_merge(directory)
+    summary, drawn = (directory / "summary.txt").read_text(encoding="utf-8"), maps.read_merge(directory)
     whole = page.Page(
         title="Merged map",
         subtitle=summary.partition("\n")[0].removeprefix("merged").strip(),
-        facts=tuple(_merge_facts(metrics)),
+        facts=list(_merge_facts(metrics)),
         warnings=metrics.warnings,
-        notes=(),
         sections=(_merged_map(directory, drawn, metrics), _sessions(drawn, metrics)),
-        collapsibles=(
-            *provenance_sections(made, {}),
-            page.Collapsible(
-                "Configuration", (directory / "config.toml").read_text(encoding="utf-8"), is_long=True
-            ),
-        ),
+        collapsibles=(*provenance_sections(made, {}), configuration(directory)),
         script=SCRIPT,
     )
-    page.write_page(directory / page.REPORT_FILE, whole)
+    page.write_page(directory, whole)
 
 
 def _merge_facts(m: MergeMetrics) -> Iterator[tuple[str, str]]:
@@ -99,43 +81,32 @@ def _merge_facts(m: MergeMetrics) -> Iterator[tuple[str, str]]:
     yield "time", f"{m.run_s:.1f} s"
 
 
-def _merged_map(directory: Path, drawn: DrawnMerge, metrics: MergeMetrics) -> page.Section:
-    points = in_space(read_ply(directory / "map.ply")).astype(float)
-    low, high = surroundings(drawn.positions.min(axis=0), drawn.positions.max(axis=0), [points])
-    lines = [PathLine(each.positions, each.color, 1.4) for each in drawn.sessions]
+def _merged_map(directory: Path, drawn: maps.DrawnMerge, metrics: MergeMetrics) -> page.Section:
+    points = read_ply(directory / "map.ply").astype(float)
+    low, high = maps.surroundings(drawn.positions.min(axis=0), drawn.positions.max(axis=0), [points])
+    closures = Line("", broken(drawn.closures), CLOSURES[""][1], 0.5)
     is_flat = metrics.dimension == 2
     drawings = (
         page.Drawing(
             "Sessions over the map",
             "Seen from above; thin lines: closures in force between sessions.",
-            merge_picture(drawn, points, low, high),
+            maps.path_over_map(points, [closures, *drawn.sessions], low, high),
         ),
-        interactive_map(points, lines, low, high, grain_m=drawn.grain_m, is_flat=is_flat),
+        interactive_map(points, drawn.sessions, low, high, grain_m=drawn.grain_m, is_flat=is_flat),
     )
-    chips = tuple(page.Chip(each.name, each.color) for each in drawn.sessions)
-    return page.Section("Map", chips=chips, drawings=drawings)
+    return page.Section("Map", chips=list(map(chip, drawn.sessions)), drawings=drawings)
 
 
-def _sessions(drawn: DrawnMerge, metrics: MergeMetrics) -> page.Section:
-    rows = tuple(
-        page.Row(
-            each.name,
-            (
-                page.date(each.first_stamp_ns),
-                f"{each.keyframes:,}",
-                f"{each.closures:,}",
-                *([f"{each.removed_points:,}"] if metrics.updated else []),
-            ),
-            chip=page.Chip(each.name, line.color),
-        )
-        for each, line in zip(metrics.sessions, drawn.sessions, strict=True)
-    )
-    apart = tuple(
-        page.Row(name, (page.Cell(warning.partition(": ")[2], is_wide=True, is_bad=True),))
-        for group, warning in zip(metrics.apart, metrics.warnings, strict=False)  # of the map come last
-        for name in group
-    )
-    return page.Section("Sessions", grid=page.Grid((*_HEADS, _GONE) if metrics.updated else _HEADS, rows + apart))
+def _sessions(drawn: maps.DrawnMerge, metrics: MergeMetrics) -> page.Section:
+    rows = []
+    for each, line in zip(metrics.sessions, drawn.sessions, strict=True):
+        cells = [page.date(each.first_stamp_ns), f"{each.keyframes:,}", f"{each.closures:,}"]
+        cells += [f"{each.removed_points:,}"] if metrics.updated else []
+        rows.append(page.Row(each.name, cells, chip(line)))
+    for group, warning in zip(metrics.apart, metrics.warnings, strict=False):  # of the map come last
+        why = page.Cell(warning.partition(": ")[2], "wide bad")
+        rows += [page.Row(name, [why]) for name in group]
+    return page.Section("Sessions", grid=page.Grid((*_HEADS, _GONE) if metrics.updated else _HEADS, rows))
 
 
 def write_localization_report(folder: Path, localized: LocalizedLog) -> None:
@@ -152,81 +123,64 @@ def write_localization_report(folder: Path, localized: LocalizedLog) -> None:
         *([] if m.ground_truth is None else [("ATE", f"{m.ground_truth.optimized.ate_rmse_m:.4f} m (rmse)")]),
     )
     subtitle = f"{localized.path.name.split('.partial')[0]} in the map {localized.prior.name}"
-    sections, judged = tuple(_localized(localized)), Judged(m.verdict, m.reason)
-    whole = page.Page("Localization", subtitle, facts, m.warnings, (), sections, judged=judged)
-    page.write_page(folder / page.REPORT_FILE, whole)
+    sections, judged = list(_localized(localized)), Judged(m.verdict, m.reason)
+    page.write_page(folder, page.Page("Localization", subtitle, facts, m.warnings, (), sections, judged=judged))
 
 
 def _localized(localized: LocalizedLog) -> Iterator[page.Section]:
-    found, m = localized.localization, localized.metrics
-    yield page.Section(
-        "Path in the map",
-        "As known at the time; the place of the dashed part was found afterwards, by smoothing.",
-        chips=(
-            *(page.Chip(state, color) for state, color in _STATE_COLORS.items() if state in found.states),
-            page.Chip("placed afterwards", _PLACED_LATER, is_dashed=True),
-        ),
-        drawings=(_path_picture(localized),),
-    )
-    yield page.Section("State over the path", "", drawings=(_states_picture(localized),))
+    yield _path_section(localized)
+    yield page.Section("State over the path", drawings=[_states_picture(localized)])
     heads = (page.Head("kind"), page.Head("scans"), page.Head("time", "s"), page.Head("path", "m"))
     for title, is_doubtful in (("Stretches to check", True), ("Stretches without the map", False)):
-        rows = tuple(
-            page.Row(
-                part.kind,
-                (
-                    f"{part.first:,} to {part.last:,}",
-                    f"{part.start_s:.1f} to {part.end_s:.1f}",
-                    f"{part.length_m:.1f}",
-                ),
-            )
-            for part in m.parts
-            if part.is_doubtful is is_doubtful
-        )
+        rows = []
+        for part in localized.metrics.parts:
+            if part.is_doubtful is is_doubtful:
+                scans, times = f"{part.first:,} to {part.last:,}", f"{part.start_s:.1f} to {part.end_s:.1f}"
+                rows.append(page.Row(part.kind, (scans, times, f"{part.length_m:.1f}")))
         if rows:
             yield page.Section(title, grid=page.Grid(heads, rows))
-    sessions = tuple(
+    sessions = [
         page.Row(each.name, (f"{each.keyframes:,}", page.date(each.first_stamp_ns)))
         for each in localized.prior.sessions
-    )
+    ]
     heads = (page.Head("session"), page.Head("keyframes"), page.Head("begins", "UTC"))
     yield page.Section("The map", grid=page.Grid(heads, sessions))
 
 
-def _path_picture(localized: LocalizedLog) -> page.Drawing:
-    found, points = localized.localization, map_points(localized.prior)
+def _path_section(localized: LocalizedLog) -> page.Section:
+    found, points = localized.localization, maps.map_points(localized.prior)
     final, live = (lie.lift_points(poses[:, :-1, -1]) for poses in (found.trajectory.poses, found.live))
-    (low, high), lines, ends = extent(points), [], np.full((2, 3), np.nan)
+    (low, high), ends = maps.extent(points), None
+    later = found.is_placed & (found.states == MapState.SEARCHING)
+    path = np.where(later[:, None], final, np.nan)
+    lines = [Line("placed afterwards", path, _PLACED_LATER, 1.2, is_dashed=True)] if later.any() else []
     if found.is_placed.any():
-        later = found.is_placed & (found.states == MapState.SEARCHING)
-        lines.append(PathLine(np.where(later[:, None], final, np.nan), _PLACED_LATER, 1.2, is_dashed=True))
-        placed = final[found.is_placed]
-        low, high, ends = np.minimum(low, placed.min(axis=0)), np.maximum(high, placed.max(axis=0)), placed
+        ends = final[found.is_placed]
+        low, high = np.minimum(low, ends.min(axis=0)), np.maximum(high, ends.max(axis=0))
     for state, color in _STATE_COLORS.items():
-        lines.append(PathLine(np.where((found.states == state)[:, None], live, np.nan), color, 1.4))
+        if (is_in := found.states == state).any():
+            lines.append(Line(state, np.where(is_in[:, None], live, np.nan), color))
     margin = 0.02 * (high - low)
-    svg = path_over_map(points, ends, lines, low - margin, high + margin, is_wide=True)
-    return page.Drawing("Path over the map", "Circle: first scan placed; square: last.", svg, is_wide=True)
+    svg = maps.path_over_map(points, lines, low - margin, high + margin, ends, is_wide=True)
+    drawing = page.Drawing("Path over the map", "Circle: first scan placed; square: last.", svg, is_wide=True)
+    text = "As known at the time; the place of a dashed part was found afterwards, by smoothing."
+    return page.Section("Path in the map", text, list(map(chip, lines)), [drawing])
 
 
 def _states_picture(localized: LocalizedLog) -> page.Drawing:
     """Standard deviation of the position and state, over the path."""
     found = localized.localization
-    figure, runs = Plot(2.0, is_wide=True), np.flatnonzero(found.states[1:] != found.states[:-1]) + 1
+    figure = Plot("path [m]", "sigma [m]", height_inches=2.0, is_wide=True)
+    runs = np.flatnonzero(found.states[1:] != found.states[:-1]) + 1
     top = float(np.nanmax(found.sigma_m, initial=0.01)) if np.isfinite(found.sigma_m).any() else 1.0
     for run in np.split(np.arange(len(found.states)), runs):
         first_m, last_m = found.traveled_m[[run[0], min(run[-1] + 1, len(found.states) - 1)]].tolist()
         figure.span(first_m, last_m, _STATE_COLORS[MapState(str(found.states[run[0]]))], 0.25)
-    figure.line(found.traveled_m, found.sigma_m, INK, 0.9)
+    figure.line(np.stack([found.traveled_m, found.sigma_m], axis=1), INK, 0.9)
     figure.y.limit(0.0, 1.1 * top)
-    figure.x.label, figure.y.label = "path [m]", "sigma [m]"
     count = counted(len(found.closures), "match with the map", "matches with the map")
-    return page.Drawing(
-        "Standard deviation of the position",
-        f"Behind it the state, in the colors above; {count} tried.",
-        figure.svg(),
-        is_wide=True,
-    )
+    text = f"Behind it the state, in the colors above; {count} tried."
+    return page.Drawing("Standard deviation of the position", text, figure.svg(), is_wide=True)
 
 
 def write_changes_report(directory: Path, changes: Changes) -> None:
@@ -240,19 +194,18 @@ def write_changes_report(directory: Path, changes: Changes) -> None:
         *((label.name.lower(), f"{counts[label]:,} points") for label in _ORDER),
     )
     title = f"{changes.names[0]} and, later, {changes.names[1]}"
-    whole = page.Page("Changes", title, facts, (), (), tuple(_changed(changes)))
-    page.write_page(directory / page.REPORT_FILE, whole)
+    page.write_page(directory, page.Page("Changes", title, facts, sections=list(_changed(changes))))
 
 
 def _changed(changes: Changes) -> Iterator[page.Section]:
-    points = np.pad(changes.points, ((0, 0), (0, 3 - changes.dimension)))
-    chips = tuple(page.Chip(label.name.lower(), _HEX[label]) for label in _ORDER)
-    plan = _changes_picture(points, changes, *extent(points), is_wide=True)
+    points = lie.lift_points(changes.points)
+    chips = [page.Chip(label.name.lower(), _HEX[label]) for label in _ORDER]
+    plan = _changes_picture(points, changes, *maps.extent(points), is_wide=True)
     drawing = page.Drawing("Plan", "Seen from above; boxes around clusters.", plan, is_wide=True)
-    yield page.Section("Where", _HOW_TOLD, chips=chips, drawings=(drawing,))
+    yield page.Section("Where", _HOW_TOLD, chips, [drawing])
     if changes.clusters:
         yield page.Section("What changed", grid=_cluster_grid(changes))
-        drawings = tuple(_close_up(points, changes, cluster) for cluster in changes.clusters[:_CLOSE_UPS])
+        drawings = [_close_up(points, changes, cluster) for cluster in changes.clusters[:_CLOSE_UPS]]
         yield page.Section("The largest changes", drawings=drawings, is_small=True)
 
 
@@ -268,9 +221,9 @@ def _changes_picture(
     """Points (M, 3) in the colors of their labels, seen from above, and boxes of clusters."""
     figure = Plot.of_plan(low, high, is_wide=is_wide)
     for label in _ORDER:
-        draw_points(figure, points[changes.labels == label], low, high, (_HEX[label],))
+        maps.draw_points(figure, points[changes.labels == label], low, high, (_HEX[label],))
     for cluster in changes.clusters:
-        figure.path(_outline(cluster)[[0, 1, 2, 3, 0]], INK, 0.8)
+        figure.line(_outline(cluster)[[0, 1, 2, 3, 0]], INK, 0.8)
     return figure.svg()
 
 
@@ -282,23 +235,21 @@ def _outline(cluster: Cluster) -> Matrix:
 
 
 def _cluster_grid(changes: Changes) -> page.Grid:
-    axes = ("x", "y", "z")[: changes.dimension]
-    sizes = ("length", "width", "height")[: changes.dimension]
-    last = page.Head("volume", "m³") if changes.dimension == 3 else page.Head("area", "m²")
+    is_flat = changes.dimension == 2
+    meters = ("x", "y", "length", "width") if is_flat else ("x", "y", "z", "length", "width", "height")
     heads = (
         page.Head("number"),
         page.Head("kind", is_text=True),
-        *(page.Head(name, "m") for name in (*axes, *sizes)),
-        last,
+        *(page.Head(name, "m") for name in meters),
+        page.Head("area", "m²") if is_flat else page.Head("volume", "m³"),
         page.Head("points"),
         page.Head("counterpart", hint="what it became or was when it moved"),
     )
-    rows = tuple(page.Row(str(each.number), tuple(_cluster_cells(each))) for each in changes.clusters[:_ROWS])
+    rows = []
+    for each in changes.clusters[:_ROWS]:
+        numbers = [*each.center.tolist(), *each.size_m.tolist(), each.volume]
+        counterpart = str(each.counterpart) if each.counterpart else ""
+        cells = (each.kind, *(f"{number:.2f}" for number in numbers), f"{each.points:,}", counterpart)
+        rows.append(page.Row(str(each.number), cells))
     left = len(changes.clusters) - _ROWS
-    return page.Grid(heads, rows, (f"and {left:,} smaller ones: {TABLE_FILE}",) if left > 0 else ())
-
-
-def _cluster_cells(cluster: Cluster) -> list[str]:
-    numbers = [*cluster.center.tolist(), *cluster.size_m.tolist(), cluster.volume]
-    counterpart = str(cluster.counterpart) if cluster.counterpart else ""
-    return [cluster.kind, *(f"{number:.2f}" for number in numbers), f"{cluster.points:,}", counterpart]
+    return page.Grid(heads, rows, [f"and {left:,} smaller ones: {TABLE_FILE}"] if left > 0 else ())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from base64 import b64encode
+from collections.abc import Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from math import isfinite
@@ -30,16 +31,18 @@ class Chip:
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """A table's cell that is more than its text; ``is_wide`` stretches it to the end of its row.
+    """A table's cell that is more than its text.
 
-    ``is_bad`` marks a problem, ``is_doubted`` what may be one.
+    mark : "best", "bad" for a problem, "doubted" for what may be one, "wide" up to the end of its row; or several
     """
 
     text: str
-    is_best: bool = False
-    is_wide: bool = False
-    is_bad: bool = False
-    is_doubted: bool = False
+    mark: str = ""
+
+
+def bad_if(is_bad: bool, text: str) -> Cell:
+    """A cell that is marked as a problem where it is one."""
+    return Cell(text, "bad" if is_bad else "")
 
 
 def figure(value: float | None, scale: float, digits: int) -> str:
@@ -54,7 +57,8 @@ def date(stamp_ns: int) -> str:
 
 def verdict_cell(verdict: str, text: str = "") -> Cell:
     """A verdict in a table, in other words if there are any, in the color of its severity; empty for none."""
-    return Cell(text or verdict, is_bad=verdict == Verdict.NOT_TRUSTWORTHY, is_doubted=verdict == Verdict.CHECK)
+    marks: dict[str, str] = {Verdict.NOT_TRUSTWORTHY: "bad", Verdict.CHECK: "doubted"}
+    return Cell(text or verdict, marks.get(verdict, ""))
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +69,7 @@ class Row:
     """
 
     name: str
-    cells: tuple[Cell | str, ...]
+    cells: Sequence[Cell | str]
     chip: Chip | None = None
     link: str = ""
 
@@ -84,9 +88,9 @@ class Head:
 class Grid:
     """A table, and notes on its reading, a line each."""
 
-    heads: tuple[Head, ...]
-    rows: tuple[Row, ...]
-    notes: tuple[str, ...] = ()
+    heads: Sequence[Head]
+    rows: Sequence[Row]
+    notes: Sequence[str] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,11 +113,11 @@ class Section:
 
     title: str
     text: str = ""
-    chips: tuple[Chip, ...] = ()
-    drawings: tuple[Drawing, ...] = ()
+    chips: Sequence[Chip] = ()
+    drawings: Sequence[Drawing] = ()
     grid: Grid | None = None
     is_small: bool = False
-    facts: tuple[tuple[str, str], ...] = ()
+    facts: Sequence[tuple[str, str]] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,17 +138,17 @@ class Page:
 
     title: str
     subtitle: str
-    facts: tuple[tuple[str, str], ...]
-    warnings: tuple[str, ...]
-    notes: tuple[str, ...]
-    sections: tuple[Section, ...]
-    collapsibles: tuple[Collapsible, ...] = ()
+    facts: Sequence[tuple[str, str]] = ()
+    warnings: Sequence[str] = ()
+    notes: Sequence[str] = ()
+    sections: Sequence[Section] = ()
+    collapsibles: Sequence[Collapsible] = ()
     script: str = ""
     judged: Judged | None = None
 
 
-def write_page(path: Path, page: Page) -> None:
-    """Write a page; every text in it is escaped, and it may load nothing and run nothing but its own script."""
+def write_page(folder: Path, page: Page) -> None:
+    """Write report.html; all text in it is escaped, and it may load nothing and run nothing but its script."""
     environment = Environment(
         loader=FileSystemLoader(_TEMPLATES),
         autoescape=True,
@@ -156,4 +160,4 @@ def write_page(path: Path, page: Page) -> None:
     may_run = f"script-src 'sha256-{digest}'" if page.script else ""
     script = Markup(page.script)
     text = environment.get_template("report.html").render(page=page, may_run=may_run, script=script)
-    write_whole(path, text.encode())
+    write_whole(folder / REPORT_FILE, text.encode())

@@ -2,40 +2,52 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
-from scanchain import lie
-from scanchain.data import Matrix, Trajectory
+from scanchain.data import BACK_END, Points, State
 from scanchain.errors import counted
-from scanchain.evaluation import absolute_error_of_any_path, pair
-from scanchain.evaluation.absolute import path_length
 from scanchain.maps import read_ply
 from scanchain.runs.directory import RUN_FILE, TRUTH_FILE
-from scanchain.runs.metrics import VERDICT, Accuracy, GroundTruth, Metrics
+from scanchain.runs.metrics import VERDICT, GroundTruth, Metrics
 from scanchain.runs.provenance import Provenance
 from scanchain.runs.results import OVERLAY_FILE, read_overlay
-from scanchain.runs.step_table import STAGES, nees_of_steps
-from scanchain.runs.vouching import poses_of
+from scanchain.runs.step_table import STAGES
 from scanchain.settings import read_layer
 from scanchain.trajectory import read_tum
-from scanchain.verdict import VELOCITY_LIMIT, WHEEL_LIMIT, Kind
-from scanchain_viz.pictures.map_figures import AFTER, BEFORE, overlay_picture
-from scanchain_viz.pictures.trajectory_figures import DrawnTrajectory, Floats, color_of, innovations, window
+from scanchain.verdict import VELOCITY_LIMIT, WHEEL_LIMIT, Kind, Stretch
+from scanchain_viz.colors import STRETCH_COLORS, TRUTH, color_of
+from scanchain_viz.pictures.figure import Floats, Line
+from scanchain_viz.pictures.maps import AFTER, BEFORE, map_picture, overlay_picture, path_over_map, surroundings
+from scanchain_viz.pictures.trajectories import frame, trajectories_of_run
 from scanchain_viz.report import page, sections
-from scanchain_viz.report.trajectory_map import SCRIPT, Tables, trajectory_section
+from scanchain_viz.report.scene import SCRIPT, interactive_map
 
-_CURVES = {
-    "wheel_innovation": ("wheels", WHEEL_LIMIT),
-    "velocity_innovation": ("constant velocity", VELOCITY_LIMIT),
-}
+_CURVES = (  # a column of steps.parquet, its name, its limit
+    ("wheel_innovation", "wheels", WHEEL_LIMIT),
+    ("velocity_innovation", "constant velocity", VELOCITY_LIMIT),
+)
+_ACCURACY = (  # a column's head, the field of ``Accuracy``, the factor to the head's unit, digits
+    (page.Head("ATE", "m", "rmse"), "ate_rmse_m", 1.0, 4),
+    (page.Head("ATE mean", "m"), "ate_mean_m", 1.0, 4),
+    (page.Head("ATE max", "m"), "ate_max_m", 1.0, 4),
+    (page.Head("ATE/path", "%"), "ate_share_of_path", 100.0, 3),
+    (page.Head("ATE rot.", "deg", "rmse"), "ate_rotation_rmse_rad", np.degrees(1.0), 3),
+    (page.Head("KITTI", "%"), "kitti_translation_share", 100.0, 3),
+    (page.Head("KITTI rot.", "deg/m"), "kitti_rotation_rad_per_m", np.degrees(1.0), 4),
+)
 _SHADE = "#d6308f"
 _MAX_ROWS = 100  # largest number of stretches in the table; the longest
+_DISPUTED = "at closures rejected by the back end"
+_OVER_STATES = (Kind.OVERLAP, Kind.WHEELS, Kind.ACCELERATION, Kind.DISCONNECTED, Kind.COPIES)
+_MAX_SEGMENTS = 3000  # largest number of segments of a path; of longer ones the worst state of successive scans
 
 
 def write_run_report(directory: Path) -> None:
@@ -52,14 +64,12 @@ def write_run_report(directory: Path) -> None:
         sections=tuple(_sections(directory, metrics)),
         collapsibles=(
             *sections.provenance_sections(made, {}),
-            page.Collapsible(
-                "Configuration", (directory / "config.toml").read_text(encoding="utf-8"), is_long=True
-            ),
+            sections.configuration(directory),
         ),
         script=SCRIPT,
         judged=metrics.judged,
     )
-    page.write_page(directory / page.REPORT_FILE, whole)
+    page.write_page(directory, whole)
 
 
 def _summary_lines(directory: Path) -> list[str]:
@@ -78,10 +88,7 @@ def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:
     yield "state", f"{m.ok:,} ok, {m.contradicted:,} contradicted, {m.degenerate:,} degenerate, {m.lost:,} lost"
     yield "pose graph", m.fit
     yield "loop closures", m.closures
-    yield (
-        "matching",
-        f"{100.0 * m.median_inlier_share:.0f} % inliers, residual {m.residual} (medians)",
-    )
+    yield "matching", f"{100.0 * m.median_inlier_share:.0f} % inliers, residual {m.residual} (medians)"
     yield "map", counted(m.map_points, "point")
     yield "configuration", made.configuration
     yield "speed", f"{counted(round(m.scans_per_s), 'scan')}/s, {m.times_real_time:.1f} × real time{m.compiling}"
@@ -99,151 +106,167 @@ def _accuracy(m: Metrics) -> str:
 def _sections(directory: Path, metrics: Metrics) -> Iterator[page.Section]:
     """Accuracy, trajectory and map, closures, errors, uncertainty; time last."""
     steps = pq.ParquetFile(directory / "steps.parquet").read()  # read_table imports much more
-    truth_file, config = directory / TRUTH_FILE, read_layer(directory / "config.toml")
-    truth = read_tum(truth_file) if truth_file.exists() and metrics.ground_truth is not None else None
-    gap_s = None if metrics.ground_truth is None else metrics.ground_truth.max_gap_s
-    trajectories, true_path = _trajectories(steps, truth, gap_s)
-    if metrics.ground_truth is not None:
-        yield accuracy_section(metrics.ground_truth)
-    is_planar = metrics.dimension == 2
-    loops_file, points = directory / "loops.parquet", read_ply(directory / "map.ply")
-    grain_m = float(str(config["maps.voxel_size_m"]))
-    tables = Tables.read(steps, loops_file, metrics.stretches)
-    yield trajectory_section(trajectories[0], tables, true_path, points, grain_m)
+    config, accuracy, truth_file = (
+        read_layer(directory / "config.toml"),
+        metrics.ground_truth,
+        directory / TRUTH_FILE,
+    )
+    truth = read_tum(truth_file) if truth_file.exists() and accuracy is not None else None
+    gap_s = None if accuracy is None else accuracy.max_gap_s
+    trajectories, true_path = trajectories_of_run(steps, truth, gap_s)
+    optimized, closures = trajectories[0], sections.read_closures(directory / "loops.parquet")
+    if accuracy is not None:
+        yield accuracy_section(accuracy)
+    lines = trajectory_lines(optimized.positions, steps, closures, metrics.stretches, true_path)
+    low, high = frame([optimized], true_path)
+    yield map_section(lines, read_ply(directory / "map.ply"), low, high, float(str(config["maps.voxel_size_m"])))
     yield verdict_section(metrics, steps, directory / OVERLAY_FILE)
     if config["loops.enabled"]:
-        yield from sections.loop_section(
-            trajectories[0], loops_file, "Loop closures", float(str(config["loops.min_travel_m"]))
-        )
-    text = (
-        "Odometry and ground truth are aligned to the optimized trajectory as for the ATE."
-        if truth is not None
-        else ""
-    )
-    yield sections.trajectories_section(trajectories, trajectories, true_path, is_planar=is_planar, text=text)
-    if metrics.ground_truth is not None:
-        yield from sections.error_section(trajectories, metrics.ground_truth.source)
-    yield from sections.uncertainty_section(trajectories[:1], is_planar=is_planar)
-    yield from sections.time_section(trajectories[:1], _stages(metrics))
-
-
-def _trajectories(
-    steps: pa.Table, truth: Trajectory | None, gap_s: float | None
-) -> tuple[list[DrawnTrajectory], Floats | None]:
-    """Both trajectories and the (K, 3) true positions at scans that have one, in the frame of the map.
-
-    Errors are NaN where a scan has no true pose. More true positions would lengthen the path by their noise.
-    """
-    optimized, odometry = (
-        Trajectory(steps["stamp_ns"].to_numpy(), poses_of(steps, prefix=prefix)) for prefix in ("", "odom_")
-    )
-    unknown, T_world_estimate, true_path = np.full(len(steps), np.nan), lie.identity(3), None
-    errors_m, errors_before_m, nees = unknown.copy(), unknown.copy(), unknown
+        min_travel_m = float(str(config["loops.min_travel_m"]))
+        yield from sections.loop_section(optimized, closures, "Loop closures", min_travel_m)
+    is_planar, text = metrics.dimension == 2, ""
     if truth is not None:
-        after, before = (pair(each, truth, gap_s=gap_s) for each in (optimized, odometry))
-        ate, ate_before = absolute_error_of_any_path(after), absolute_error_of_any_path(before)
-        errors_m[after.places], errors_before_m[before.places] = ate.errors_m, ate_before.errors_m
-        nees = nees_of_steps(steps, odometry, truth, gap_s=gap_s)
-        T_world_truth = lie.inverse(ate.T_reference_estimate)
-        T_world_estimate = T_world_truth @ ate_before.T_reference_estimate
-        true_path = lie.transform(T_world_truth, after.reference[:, :3, 3])
-    seconds = np.sum([steps[f"{stage}_s"].to_numpy() for stage in STAGES[1:]], axis=0)  # without reading
-    observability = steps["observability"].to_numpy()
+        text = "Odometry and ground truth are aligned to the optimized trajectory as for the ATE."
+    yield sections.trajectories_section(trajectories, trajectories, true_path, is_planar=is_planar, text=text)
+    if accuracy is not None:
+        yield from sections.error_section(trajectories, accuracy.source)
+    yield from sections.uncertainty_section([optimized], is_planar=is_planar)
+    yield from sections.time_section([optimized], _stages(metrics))
 
-    def drawn(name: str, color: str, poses: Matrix, errors_m: Floats, *figures: Floats) -> DrawnTrajectory:
-        length_m, none = path_length(poses), np.empty(0)
-        return DrawnTrajectory(name, color, False, poses[:, :3, 3], length_m, errors_m, none, *figures)
 
-    return [
-        drawn("optimized", color_of(0), optimized.poses, errors_m, seconds, nees, observability),
-        drawn("odometry", color_of(3), T_world_estimate @ odometry.poses, errors_before_m, *[unknown] * 3),
-    ], true_path
+def map_section(lines: Sequence[Line], points: Points, low: Floats, high: Floats, grain_m: float) -> page.Section:
+    """The map (M, 3) of grains so far apart and lines, the trajectory first, which lie within corners."""
+    is_flat, path = not len(points) or not np.ptp(points[:, 2]), lines[0].positions
+    low, high = surroundings(low, high, [points])
+    above = "seen from above; dark is low, bright is high."
+    over_map = path_over_map(points, lines, low, high, path)
+    drawings = (
+        page.Drawing("Trajectory over the map", "Seen from above; circle: start, square: end.", over_map),
+        *(() if is_flat else (page.Drawing("Map", f"map.ply, {above}", map_picture(points, low, high)),)),
+        interactive_map(points, lines, low, high, grain_m=grain_m, is_flat=is_flat, is_wide=not is_flat),
+    )
+    return page.Section("Trajectory and map", chips=tuple(map(sections.chip, lines)), drawings=drawings)
+
+
+def trajectory_lines(
+    path: Floats, steps: pa.Table, closures: pa.Table | None, stretches: Sequence[Stretch], truth: Floats | None
+) -> list[Line]:
+    """The trajectory, closures by verdict, what is to check on it, a scan in several of them, and the truth."""
+    lines = [Line("trajectory", path, color_of(0), 1.2)]
+    for line in sections.closure_lines(path, closures) if closures is not None and len(closures) else ():
+        if len(line.positions):
+            lines.append(replace(line, name=f"closures {line.name}"))
+    states = np.array(steps["state"].to_pylist())
+    marks = [(_DISPUTED, _disputed(steps, closures), Kind.LOOPS)]
+    marks += [
+        (str(state), states == state, kind)
+        for state, kind in (
+            (State.DEGENERATE, Kind.DEGENERATE), (State.LOST, Kind.LOST), (State.CONTRADICTED, Kind.CONTRADICTED),
+        )
+    ]  # fmt: skip
+    for kind in _OVER_STATES:
+        parts = [slice(each.first, each.last + 1) for each in stretches if each.kind == kind]
+        marks.append((str(kind), _within(parts, len(steps)), kind))
+    for name, is_marked, kind in marks:  # the later are drawn on top
+        if is_marked.any():
+            name = f"{name}: {counted(int(is_marked.sum()), 'scan')}"
+            lines.append(Line(name, _marked_parts(path, is_marked), STRETCH_COLORS[kind], 2.6))
+    if truth is not None:
+        lines.append(Line("ground truth", truth, TRUTH, 0.9, is_dashed=True))
+    return lines
+
+
+def _disputed(steps: pa.Table, closures: pa.Table | None) -> NDArray[np.bool_]:
+    """(N,) scans from each keyframe of a closure that the back end rejected to the next keyframe."""
+    if closures is None or not len(closures):
+        return _within([], len(steps))
+    keyframes = np.append(np.flatnonzero(steps["keyframe"].to_numpy() >= 0), len(steps))
+    is_rejected = np.array(closures["rejected_by"].to_pylist()) == BACK_END
+    ends = np.stack([closures[name].to_numpy() for name in ("target_scan", "source_scan")])
+    firsts = np.unique(ends[:, is_rejected])
+    lasts = keyframes[np.searchsorted(keyframes, firsts, side="right")]
+    return _within([slice(*ends) for ends in zip(firsts.tolist(), lasts.tolist(), strict=True)], len(steps))
+
+
+def _within(parts: Sequence[slice], count: int) -> NDArray[np.bool_]:
+    """(N,) which of so many scans are in one of these parts."""
+    is_within = np.zeros(count, bool)
+    for part in parts:
+        is_within[part] = True
+    return is_within
+
+
+def _marked_parts(path: Floats, is_marked: NDArray[np.bool_]) -> Floats:
+    """The segments of the path that lead to a marked scan, NaN elsewhere."""
+    size = max(1, -(-len(path) // _MAX_SEGMENTS))
+    groups = [slice(k, k + size) for k in range(0, len(path), size)]
+    has_marked = np.array([bool(is_marked[group].any()) for group in groups])
+    positions = path[[min(group.stop, len(path)) - 1 for group in groups]].copy()
+    shown = has_marked | np.append(has_marked[1:], False)
+    positions[~shown] = np.nan
+    return positions
 
 
 def verdict_section(metrics: Metrics, steps: pa.Table, overlay_file: Path) -> page.Section:
     """Innovations along the log, two passes over the worst place if there is one, and every suspicious stretch."""
-    curves = {
-        name: (steps[column].to_numpy(zero_copy_only=False).astype(np.float64) / limit, color_of(place))
-        for place, (column, (name, limit)) in enumerate(_CURVES.items())
+    curves = [
+        (name, steps[column].to_numpy(zero_copy_only=False).astype(np.float64) / limit, color_of(place))
+        for place, (column, name, limit) in enumerate(_CURVES)
         if column in steps.column_names
-    }
+    ]
     shaded = [(each.first, each.last, _SHADE) for each in metrics.stretches if each.kind is not Kind.LOOPS]
-    chips = (
-        *(page.Chip(name, color) for name, (_, color) in curves.items()),
-        *((page.Chip("stretches to check", _SHADE),) if shaded else ()),
-    )
-    is_alone, size = not overlay_file.exists(), window(len(steps))
-    largest = f", largest of {size} neighboring scans" if size > 1 else ""
-    drawing = page.Drawing(
-        "Innovations",
-        f"Normalized innovations over their limits{largest}; above 1 (dotted) is a finding, or wheels that slip.",
-        innovations(curves, shaded, is_wide=is_alone),
-        is_wide=is_alone,
-    )
-    drawings = [drawing]
+    chips = [page.Chip(name, color) for name, _, color in curves]
+    chips += [page.Chip("stretches to check", _SHADE)] if shaded else []
+    is_alone = not overlay_file.exists()
+    drawings = [sections.innovations([curve[1:] for curve in curves], shaded, is_wide=is_alone)]
     if not is_alone:
         overlay = read_overlay(overlay_file)
-        chips += (page.Chip("scans before", BEFORE), page.Chip("scans after", AFTER))
+        chips += [page.Chip("scans before", BEFORE), page.Chip("scans after", AFTER)]
         caption = (
             f"{overlay.text}: the scans before it and after it, or of both passes of a loop, where the trajectory "
             "places them, seen from above. Where it is right, both show the same walls."
         )
         drawings.append(page.Drawing("Worst place", caption, overlay_picture(overlay)))
+    grid = _stretches(metrics.stretches) if metrics.stretches else None
+    return page.Section("Checks", "", tuple(chips), tuple(drawings), grid)
+
+
+def _stretches(stretches: Sequence[Stretch]) -> page.Grid:
+    """The longest stretches, in the order of the log."""
+    longest = sorted(stretches, key=lambda each: each.last - each.first, reverse=True)[:_MAX_ROWS]
+    rows = []
+    for each in sorted(longest, key=lambda each: each.first):
+        scans = [f"{number:,}" for number in (each.first, each.last, each.scans)]
+        times, size = (f"{each.start_s:.1f}", f"{each.end_s:.1f}"), page.figure(each.size_m, 1.0, 2)
+        rows.append(page.Row(str(each.kind), (*scans, *times, size)))
     heads = (
         *map(page.Head, ("finding", "first", "last", "scans")),
         page.Head("start", "s"), page.Head("end", "s"), page.Head("size", "m"),
     )  # fmt: skip
-    longest = sorted(metrics.stretches, key=lambda each: each.last - each.first, reverse=True)[:_MAX_ROWS]
-    rows = tuple(
-        page.Row(
-            str(each.kind),
-            (
-                *(f"{scan:,}" for scan in (each.first, each.last, each.scans)),
-                *(f"{time_s:.1f}" for time_s in (each.start_s, each.end_s)),
-                page.figure(each.size_m, 1.0, 2),
-            ),
-        )
-        for each in sorted(longest, key=lambda each: each.first)
-    )
-    return page.Section("Checks", "", chips, tuple(drawings), page.Grid(heads, rows) if rows else None)
+    return page.Grid(heads, tuple(rows))
 
 
 def accuracy_section(truth: GroundTruth) -> page.Section:
     """Accuracy of both trajectories."""
-    ate, *others = _figures(truth.optimized)
-    rows = (
-        page.Row("optimized", (page.Cell(ate, is_bad=bool(truth.complaint)), *others)),
-        page.Row("odometry", tuple(_figures(truth.odometry))),
-    )
-    heads = (
-        page.Head("trajectory"), page.Head("ATE", "m", "rmse"), page.Head("ATE mean", "m"),
-        page.Head("ATE max", "m"), page.Head("ATE/path", "%"), page.Head("ATE rot.", "deg", "rmse"),
-        page.Head("KITTI", "%"), page.Head("KITTI rot.", "deg/m"),
-    )  # fmt: skip
+    rows = []
+    for name, of in (("optimized", truth.optimized), ("odometry", truth.odometry)):
+        ate, *others = (page.figure(getattr(of, key), scale, digits) for _, key, scale, digits in _ACCURACY)
+        rows.append(page.Row(name, (page.bad_if(of is truth.optimized and bool(truth.complaint), ate), *others)))
     missing = f", {truth.optimized.missing}" if truth.optimized.missing else ""
     text = (
         f"Against {truth.source}, {truth.path_length_m:.1f} m: {counted(truth.optimized.pairs, 'scan')}{missing}."
     )
     definitions = (truth.optimized.definition, truth.optimized.kitti_definition)
-    return page.Section("Accuracy", text, grid=page.Grid(heads, rows, tuple(filter(None, definitions))))
+    heads = (page.Head("trajectory"), *(head for head, *_ in _ACCURACY))
+    return page.Section("Accuracy", text, grid=page.Grid(heads, tuple(rows), tuple(filter(None, definitions))))
 
 
 def _stages(metrics: Metrics) -> page.Grid:
     """Time of a scan by stage."""
-    heads = (page.Head("stage"), *(page.Head(stage, "ms") for stage in STAGES), page.Head("all but read", "ms"))
     names = (*STAGES, "all_but_read")
+    heads = (page.Head("stage"), *(page.Head(name.replace("_", " "), "ms") for name in names))
     rows = [
         page.Row(name, tuple(f"{figures_ms[stage]:.2f}" for stage in names))
         for name, figures_ms in (("median", metrics.median_ms), ("95th percentile", metrics.p95_ms))
     ]
     return page.Grid(heads, tuple(rows))
-
-
-def _figures(accuracy: Accuracy) -> Iterator[str]:
-    yield from (
-        page.figure(value, 1.0, 4) for value in (accuracy.ate_rmse_m, accuracy.ate_mean_m, accuracy.ate_max_m)
-    )
-    yield page.figure(accuracy.ate_share_of_path, 100.0, 3)
-    yield page.figure(accuracy.ate_rotation_rmse_rad, np.degrees(1.0), 3)
-    yield page.figure(accuracy.kitti_translation_share, 100.0, 3)
-    yield page.figure(accuracy.kitti_rotation_rad_per_m, np.degrees(1.0), 4)

@@ -3,32 +3,53 @@
 from __future__ import annotations
 
 import shlex
-from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
+from scipy.special import gammaincinv
 
 from scanchain.runs.provenance import Provenance
-from scanchain_viz.pictures import trajectory_figures as figures
-from scanchain_viz.pictures.map_figures import loops_picture
-from scanchain_viz.pictures.trajectory_figures import CLOSURES, TRUTH, DrawnTrajectory, Floats
-from scanchain_viz.report.page import Cell, Chip, Collapsible, Drawing, Grid, Head, Row, Section, figure
+from scanchain_viz.colors import CLOSURES, TRUTH, hex_of, palette_of
+from scanchain_viz.pictures.axis import Axis
+from scanchain_viz.pictures.figure import INK, Floats, Line, Plot, broken
+from scanchain_viz.pictures.maps import GRAY, path_over_map
+from scanchain_viz.pictures.trajectories import DrawnTrajectory, frame
+from scanchain_viz.report import page
+from scanchain_viz.report.page import Cell, Chip, Collapsible, Drawing, Grid, Head, Row, Section
 
-_TRUTH_CHIP = Chip("ground truth", TRUTH, is_dashed=True)
-_WITHOUT_CAUSES = "This run is older than the column cause; reasons are in loops.parquet, a sentence a closure."
+_MAX_POINTS = 1500  # largest number of points of a line
+_MAX_CLOSURES = 1500  # largest number of closures of a verdict that are drawn
+_WINDOWS = 250  # number of windows over which a value of each scan is averaged
+_SHOWN_SHARES = (0.5, 99.5)  # per cent of the values of a distribution
+_THIN, _DOTS = 0.8, (1.0, 1.5)  # width and dashes of a dotted line
+_LOWEST, _HIGHEST = 0.01, 1000.0  # range to which observability is clipped
+_BAR_INCHES = 0.65  # of a color bar and its numbers
+# a decade each, degenerate up to orange
+_WORST_TO_BEST = ("#7a0177", "#dd1c77", "#f2a03d", "#9fb8ad", "#41a6c4", "#1f6fd0")
+_MAX_DOTS = 3000
 
 
-def chip(trajectory: DrawnTrajectory) -> Chip:
-    """The trajectory in a legend."""
-    return Chip(trajectory.name, trajectory.color, trajectory.is_dashed)
+def chip(drawn: DrawnTrajectory | Line) -> Chip:
+    """The line in a legend."""
+    return Chip(drawn.name, drawn.color, drawn.is_dashed)
 
 
 def _legend(trajectories: Sequence[DrawnTrajectory]) -> tuple[Chip, ...]:
     """Legend of several trajectories; one needs none."""
-    return tuple(chip(trajectory) for trajectory in trajectories) if len(trajectories) > 1 else ()
+    return tuple(map(chip, trajectories)) if len(trajectories) > 1 else ()
+
+
+def _known(trajectories: Sequence[DrawnTrajectory], key: str) -> list[DrawnTrajectory]:
+    return [trajectory for trajectory in trajectories if np.isfinite(getattr(trajectory, key)).any()]
+
+
+def _draw(figure: Plot, trajectory: DrawnTrajectory, x: Floats, y: Floats, width: float = 1.2) -> None:
+    figure.line(np.stack([x, y], axis=1), trajectory.color, width, trajectory.dashes)
 
 
 def trajectories_section(
@@ -40,44 +61,50 @@ def trajectories_section(
     text: str,
 ) -> Section:
     """Trajectories from above, and their heights; ``framing`` are those that must fit in the axes."""
-    corners = figures.frame(framing, truth)
-    seen = figures.plan(trajectories, truth, *corners, is_wide=is_planar)
-    drawings = [Drawing("Plan", "Seen from above.", seen, is_wide=is_planar)]
+    low, high = frame(framing, truth)
+    plan, height = (
+        Plot.of_plan(low, high, is_wide=is_planar, has_grid=True),
+        Plot("distance traveled [m]", "z [m]"),
+    )
+    for each in reversed(trajectories):  # the first on top
+        rows = _some(len(each.positions))
+        plan.line(each.positions[rows], each.color, dashes=each.dashes)
+        _draw(height, each, each.distance_m[rows], each.positions[rows, 2])
+    chips = _legend(trajectories)
+    if truth is not None:
+        chips = (*map(chip, trajectories), Chip("ground truth", TRUTH, is_dashed=True))
+        traveled_m = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(truth, axis=0), axis=1)))
+        for figure, path in ((plan, truth), (height, np.stack([traveled_m, truth[:, 2]], axis=1))):
+            figure.line(path[_some(len(truth))], TRUTH, 0.9, (3.0, 3.0))
+    drawings = [Drawing("Plan", "Seen from above.", plan.svg(), is_wide=is_planar)]
     if not is_planar:
-        height = figures.height(trajectories, truth, *corners)
-        drawings.append(Drawing("Height", "Over the distance traveled.", height))
-    chips = _legend(trajectories) if truth is None else (*map(chip, trajectories), _TRUTH_CHIP)
+        height.y.limit(low[2], high[2])
+        height.x.limit(0.0, 1.05 * max(float(np.median([each.distance_m[-1] for each in trajectories])), 1.0))
+        drawings.append(Drawing("Height", "Over the distance traveled.", height.svg()))
     return Section("Trajectories", text, chips, tuple(drawings))
 
 
 def error_section(trajectories: Sequence[DrawnTrajectory], truth_name: str) -> Iterator[Section]:
-    """Position errors over distance and their distribution."""
-    known = _with(trajectories, "error_m")
+    """Position errors over the distance and their distribution."""
+    known = _known(trajectories, "error_m")
     if not known:
         return
-    yield Section(
-        "Error",
-        f"Distance of each position from the true one after rigid alignment, against {truth_name}.",
-        _legend(known),
-        (
-            Drawing(
-                "Over the distance", _of_neighbors("Medians", known, "error_m"), figures.error_over_distance(known)
-            ),
-            _distribution(known, "error_m", 1.0, "position error [m]", "scans with a smaller error"),
-        ),
+    figure = Plot("distance traveled [m]", "position error [m]", logarithmic="y")
+    for each in reversed(known):
+        finite = np.isfinite(each.error_m)
+        x, y = _windowed(each.distance_m[finite]), _windowed(each.error_m[finite], np.median)
+        _draw(figure, each, x, np.maximum(y, 1e-4))
+    drawings = (
+        Drawing("Over the distance", _of_neighbors("Medians", known, "error_m"), figure.svg()),
+        _distribution(known, "error_m", 1.0, "position error [m]", "scans with a smaller error"),
     )
-
-
-def _distribution(
-    known: Sequence[DrawnTrajectory], key: str, scale: float, label: str, those: str, *, is_wide: bool = False
-) -> Drawing:
-    svg = figures.distribution(known, key, scale, label, is_wide=is_wide)
-    return Drawing("Distribution", f"Share of the {those}.", svg, is_wide=is_wide)
+    text = f"Distance of each position from the true one after rigid alignment, against {truth_name}."
+    yield Section("Error", text, _legend(known), drawings)
 
 
 def relation_section(trajectories: Sequence[DrawnTrajectory]) -> Iterator[Section]:
     """Errors over manually verified relations."""
-    known = _with(trajectories, "relation_error_m")
+    known = _known(trajectories, "relation_error_m")
     if known:
         label, those = "error of a relation [m]", "relations with a smaller error"
         drawing = _distribution(known, "relation_error_m", 1.0, label, those, is_wide=True)
@@ -87,128 +114,209 @@ def relation_section(trajectories: Sequence[DrawnTrajectory]) -> Iterator[Sectio
 
 def time_section(trajectories: Sequence[DrawnTrajectory], stages: Grid | None = None) -> Iterator[Section]:
     """Time per scan by stage, along the log, and its distribution."""
-    known = _with(trajectories, "seconds")
-    if known:
-        along = figures.time_per_scan(known)
-        yield Section(
-            "Time per scan",
-            "",
-            _legend(known),
-            (
-                Drawing("Along the log", _of_neighbors("Medians", known, "seconds"), along),
-                _distribution(known, "seconds", 1e3, "time of a scan [ms]", "scans that took less"),
-            ),
-            stages,
-        )
+    known = _known(trajectories, "seconds")
+    if not known:
+        return
+    figure = Plot("scan", "time of a scan [ms]", logarithmic="y")
+    for each in reversed(known):
+        _draw(figure, each, *_over_scans(1e3 * each.seconds, np.median), width=0.9)
+    drawings = (
+        Drawing("Along the log", _of_neighbors("Medians", known, "seconds"), figure.svg()),
+        _distribution(known, "seconds", 1e3, "time of a scan [ms]", "scans that took less"),
+    )
+    yield Section("Time per scan", "", _legend(known), drawings, stages)
 
 
 def uncertainty_section(trajectories: Sequence[DrawnTrajectory], *, is_planar: bool) -> Iterator[Section]:
     """Consistency of the covariances with the errors, and observability."""
-    reported = _with(trajectories, "observability")
+    reported, estimated = _known(trajectories, "observability"), _known(trajectories, "nees")
     if not reported:
         return
-    estimated = _with(trajectories, "nees")
+    along = Plot("scan", "observability", logarithmic="y", is_wide=bool(estimated))
+    for each in reversed(reported):
+        _draw(along, each, *_over_scans(np.clip(each.observability, _LOWEST, _HIGHEST), np.min))
+    along.level(1.0, _THIN, _DOTS)
     least = _of_neighbors(" Least values", reported, "observability")
-    drawings = [
-        Drawing(
-            "Observability",
-            "Information along the least constrained direction over the minimum required; below 1 (dotted) a scan "
-            f"is degenerate.{least}",
-            figures.observability(reported, is_wide=bool(estimated)),
-            is_wide=bool(estimated),
-        )
-    ]
-    if estimated:
-        drawings.append(
-            Drawing(
-                "Covariance consistency",
-                "Squared error of each motion over its covariance. Dotted: exact covariances; to the left of it "
-                "they are too large, to the right too small.",
-                figures.consistency(estimated, 3 if is_planar else 6),
-            )
-        )
-    whose = f" of {reported[0].name}" if len(trajectories) > 1 else ""
-    drawings.append(
-        Drawing(
-            f"Observability{whose} on the trajectory",
-            "Seen from above, the least observable scans on top.",
-            figures.observability_plan(reported[0]),
-        )
+    text = (
+        "Information along the least constrained direction over the minimum required; below 1 (dotted) a scan is "
+        f"degenerate.{least}"
     )
+    drawings = [Drawing("Observability", text, along.svg(), is_wide=bool(estimated))]
+    if estimated:
+        drawings.append(_consistency(estimated, 3 if is_planar else 6))
+    whose = f" of {reported[0].name}" if len(trajectories) > 1 else ""
+    drawings.append(_observability_plan(reported[0], f"Observability{whose} on the trajectory"))
     yield Section("Uncertainty", "", _legend(reported), tuple(drawings))
 
 
-def loop_section(trajectory: DrawnTrajectory, path: Path, title: str, min_travel_m: float) -> Iterator[Section]:
+def innovations(
+    curves: Sequence[tuple[Floats, str]], stretches: Sequence[tuple[int, int, str]], *, is_wide: bool
+) -> Drawing:
+    """Innovations (N,) over their limits scan by scan, in their colors, over stretches in theirs."""
+    figure = Plot("scan", "innovation / limit", is_wide=is_wide)
+    for first, last, color in stretches:
+        figure.span(first - 0.5, last + 0.5, color, 0.2)
+    for values, color in curves:
+        x, y = _over_scans(np.clip(np.nan_to_num(values), _LOWEST, _HIGHEST), np.max)
+        figure.line(np.stack([x, y], axis=1), color, 0.9)
+    figure.level(1.0, _THIN, _DOTS)
+    size = max((_window(len(values)) for values, _ in curves), default=1)
+    largest = f", largest of {size} neighboring scans" if size > 1 else ""
+    text = (
+        f"Normalized innovations over their limits{largest}; above 1 (dotted) is a finding, or wheels that slip."
+    )
+    return Drawing("Innovations", text, figure.svg(), is_wide=is_wide)
+
+
+def _distribution(
+    known: Sequence[DrawnTrajectory], key: str, scale: float, label: str, those: str, *, is_wide: bool = False
+) -> Drawing:
+    """Cumulative distribution, shown up to the 99.5th percentile of the worst trajectory."""
+    figure, ends = Plot(label, "share below [%]", logarithmic="x", is_wide=is_wide), []
+    for each in reversed(known):
+        ends.append(np.percentile(_cumulative(figure, each, scale * getattr(each, key), 1e-6), _SHOWN_SHARES))
+    figure.x.limit(0.9 * np.min(ends), 1.1 * np.max(ends))
+    figure.y.limit(0.0, 100.0)
+    return Drawing("Distribution", f"Share of the {those}.", figure.svg(), is_wide=is_wide)
+
+
+def _consistency(estimated: Sequence[DrawnTrajectory], degrees_of_freedom: int) -> Drawing:
+    """Distribution of the NEES beside the one that exact covariances would give (dotted)."""
+    figure = Plot("squared error over covariance (1 is exact on average)", "motions below [%]", logarithmic="x")
+    for each in reversed(estimated):
+        _cumulative(figure, each, each.nees, 1e-4)
+    shares = np.linspace(0.001, 0.999, 200)
+    ideal = 2.0 * gammaincinv(0.5 * degrees_of_freedom, shares) / degrees_of_freedom  # quantiles of χ²
+    figure.line(np.stack([ideal, 100.0 * shares], axis=1), INK, _THIN, _DOTS)
+    figure.y.limit(0.0, 100.0)
+    text = (
+        "Squared error of each motion over its covariance. Dotted: exact covariances; to the left of it they are "
+        "too large, to the right too small."
+    )
+    return Drawing("Covariance consistency", text, figure.svg())
+
+
+def _observability_plan(trajectory: DrawnTrajectory, title: str) -> Drawing:
+    """Observability on the trajectory from above, the worst scans on top; of many the worst of successive ones."""
+    figure = Plot.of_plan(*frame([trajectory], None), spare_inches=_BAR_INCHES, has_grid=True)
+    values = np.nan_to_num(trajectory.observability, nan=_HIGHEST)
+    groups = np.array_split(np.arange(len(values)), min(len(values), _MAX_DOTS))
+    worst = np.array([group[np.argmin(values[group])] for group in groups])
+    axis, palette = Axis(is_logarithmic=True), palette_of(_WORST_TO_BEST)
+    axis.limit(_LOWEST, _HIGHEST, (_LOWEST, 1.0, _HIGHEST))
+    shades = np.rint(255.0 * axis.fractions(np.clip(values[worst], _LOWEST, _HIGHEST))).astype(int)
+    size = float(np.sqrt(np.clip(3000.0 / len(values), 4.0, 30.0)))
+    for shade in np.unique(shades)[::-1]:
+        positions = trajectory.positions[worst[shades == shade]]
+        figure.marks(positions, "o", hex_of(palette[shade, :3]), size)
+    figure.color_bar(palette, axis)
+    return Drawing(title, "Seen from above, the least observable scans on top.", figure.svg())
+
+
+def _cumulative(figure: Plot, trajectory: DrawnTrajectory, values: Floats, least: float) -> Floats:
+    """Draw per cent of the known values below each; returns these in order, none below the least."""
+    ordered = np.maximum(np.sort(values[np.isfinite(values)]), least)
+    rows = np.unique(_some(len(ordered)))
+    _draw(figure, trajectory, ordered[rows], np.linspace(0.0, 100.0, len(ordered))[rows])
+    return ordered
+
+
+def _some(count: int) -> NDArray[np.int64]:
+    """Rows of so many, the first and the last among them, that a line is drawn through."""
+    return np.linspace(0, count - 1, min(count, _MAX_POINTS)).astype(np.int64)
+
+
+def _window(count: int) -> int:
+    """Number of neighboring values, of so many, that make a point of a line."""
+    return max(1, -(-count // _WINDOWS))
+
+
+def _windowed(values: Floats, combine: Callable[..., Floats] = np.mean) -> Floats:
+    """Neighboring values put together so that a line of them can be read."""
+    size = _window(len(values))
+    count = len(values) // size * size
+    return combine(values[:count].reshape(-1, size), axis=1) if count else values
+
+
+def _over_scans(values: Floats, combine: Callable[..., Floats]) -> tuple[Floats, Floats]:
+    """Numbers of scans and their values, neighboring ones put together."""
+    return _windowed(np.arange(len(values), dtype=np.float64)), _windowed(values, combine)
+
+
+def _of_neighbors(what: str, trajectories: Sequence[DrawnTrajectory], key: str) -> str:
+    """The caption of lines whose points stand for several scans each; none where each is a scan."""
+    size = _window(max(int(np.isfinite(getattr(each, key)).sum()) for each in trajectories))
+    return f"{what} of {size} neighboring scans." if size > 1 else ""
+
+
+def read_closures(file: Path) -> pa.Table | None:
+    """A row a loop closure tried; None where loops were not sought."""
+    return pq.ParquetFile(file).read() if file.exists() else None  # read_table imports much more
+
+
+def closure_lines(path: Floats, closures: pa.Table) -> list[Line]:
+    """Closures by verdict with their numbers, as lines over a path (N, 3); of many every n-th is drawn."""
+    ends = np.stack([closures["target_scan"].to_numpy(), closures["source_scan"].to_numpy()], axis=1)
+    rejected_by, lines = np.array(closures["rejected_by"].to_pylist()), []
+    for by, (name, color) in CLOSURES.items():
+        chosen = ends[rejected_by == by]
+        drawn = chosen[:: max(1, -(-len(chosen) // _MAX_CLOSURES))]
+        lines.append(Line(f"{name}: {len(chosen):,}", broken(path[drawn]), color, 0.9))
+    return lines
+
+
+def loop_section(
+    trajectory: DrawnTrajectory, closures: pa.Table | None, title: str, min_travel_m: float
+) -> Iterator[Section]:
     """Every loop closure tried, and the number of each verdict; ``min_travel_m`` is ``loops.min_travel_m``."""
-    if not path.exists():
+    if closures is None:
         return
-    table = pq.ParquetFile(path).read()  # read_table imports much more
-    if not table.num_rows:
+    if not closures.num_rows:
         length_m = float(trajectory.distance_m[-1])
         reason = f"the trajectory did not return to a place visited more than {min_travel_m:g} m before"
         if length_m <= min_travel_m:
             reason = f"the trajectory is {length_m:.1f} m long, and a loop has more than {min_travel_m:g} m"
         yield Section(title, f"None was tried: {reason} (loops.min_travel_m).")
         return
-    ends = np.stack([table["target_scan"].to_numpy(), table["source_scan"].to_numpy()], axis=1)
-    rejected_by = np.array(table["rejected_by"].to_pylist())
-    counts = Counter(rejected_by.tolist())
-    low, high = figures.frame([trajectory], None)
-    picture = loops_picture(trajectory, trajectory.positions[ends], rejected_by, low, high)
-    yield Section(
-        title,
-        f"{len(ends):,} tried; each is a row of loops.parquet.",
-        tuple(Chip(f"{name}: {counts[by]:,}", color) for by, (name, color) in CLOSURES.items()),
-        (Drawing("On the trajectory", "Seen from above; circle: start.", picture, is_wide=True),),
-        _verdict_grid(table),
+    path, lines = trajectory.positions, closure_lines(trajectory.positions, closures)
+    svg = path_over_map(
+        np.empty((0, 3)), [Line("", path, GRAY, 0.7), *lines], *frame([trajectory], None), path, is_wide=True
     )
+    drawing = Drawing("On the trajectory", "Seen from above; circle: start, square: end.", svg, is_wide=True)
+    text = f"{closures.num_rows:,} tried; each is a row of loops.parquet."
+    yield Section(title, text, tuple(map(chip, lines)), (drawing,), _verdict_grid(closures))
 
 
 def _verdict_grid(closures: pa.Table) -> Grid:
-    """Closures by verdict and cause, most frequent first; by verdict alone where a run has no causes."""
-    has_causes = "cause" in closures.column_names
-    causes = closures["cause"].to_pylist() if has_causes else [""] * closures.num_rows
+    """Closures by verdict and cause, most frequent first."""
     groups: defaultdict[tuple[str, str], list[int]] = defaultdict(list)
-    for place, (by, cause) in enumerate(zip(closures["rejected_by"].to_pylist(), causes, strict=True)):
+    for place, (by, cause) in enumerate(
+        zip(*(closures[name].to_pylist() for name in ("rejected_by", "cause")), strict=True)
+    ):
         groups[CLOSURES[by][0], cause].append(place)
     overlap, residual_m = closures["overlap"].to_numpy(), closures["residual_m"].to_numpy()
+    rows = []
+    for (verdict, cause), places in sorted(groups.items(), key=lambda group: -len(group[1])):
+        residual = page.figure(float(np.median(residual_m[places])), 1e3, 0)
+        share = f"{100.0 * np.median(overlap[places]):.0f}"
+        rows.append(Row(verdict, (f"{len(places):,}", share, residual, Cell(cause, "wide"))))
     heads = (
         Head("verdict"), Head("closures"), Head("overlap", "%", "median"), Head("residual", "mm", "median"),
-        *((Head("cause", is_text=True),) if has_causes else ()),
+        Head("cause", is_text=True),
     )  # fmt: skip
-    rows = tuple(
-        Row(
-            verdict,
-            (
-                f"{len(places):,}",
-                f"{100.0 * np.median(overlap[places]):.0f}",
-                figure(float(np.median(residual_m[places])), 1e3, 0),
-                *((Cell(cause, is_wide=True),) if has_causes else ()),
-            ),
-        )
-        for (verdict, cause), places in sorted(groups.items(), key=lambda group: -len(group[1]))
-    )
-    return Grid(heads, rows, () if has_causes else (_WITHOUT_CAUSES,))
-
-
-def _of_neighbors(what: str, trajectories: Sequence[DrawnTrajectory], key: str) -> str:
-    """The caption of lines whose points stand for several scans each; none where each is a scan."""
-    count = max(int(np.isfinite(getattr(each, key)).sum()) for each in trajectories)
-    size = figures.window(count)
-    return f"{what} of {size} neighboring scans." if size > 1 else ""
-
-
-def _with(trajectories: Sequence[DrawnTrajectory], key: str) -> list[DrawnTrajectory]:
-    return [trajectory for trajectory in trajectories if np.isfinite(getattr(trajectory, key)).any()]
+    return Grid(heads, tuple(rows))
 
 
 def provenance_sections(made: Provenance, others: dict[str, str]) -> Iterator[Collapsible]:
     """The command, and the versions of its packages."""
     yield Collapsible("Command", shlex.join(made.command))
     versions = {"python": made.python} | made.versions | others
-    yield Collapsible(
-        "Versions", "\n".join(f"{name} {number or 'not installed'}" for name, number in versions.items())
-    )
-    yield Collapsible(
-        "Log files", "\n".join(f"{log.path}  {log.size_bytes:,} bytes  sha256 {log.sha256}" for log in made.logs)
-    )
+    lines = (f"{name} {number or 'not installed'}" for name, number in versions.items())
+    yield Collapsible("Versions", "\n".join(lines))
+    logs = (f"{log.path}  {log.size_bytes:,} bytes  sha256 {log.sha256}" for log in made.logs)
+    yield Collapsible("Log files", "\n".join(logs))
+
+
+def configuration(directory: Path) -> Collapsible:
+    """The whole configuration of a run or a merge."""
+    return Collapsible("Configuration", (directory / "config.toml").read_text(encoding="utf-8"), is_long=True)

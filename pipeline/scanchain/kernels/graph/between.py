@@ -1,4 +1,4 @@
-"""Between factors in SE(2) and SE(3): residuals and Jacobians of e = log(Z⁻¹ T_i⁻¹ T_j), compiled."""
+"""Between factors in SE(2) and SE(3): residuals e = log(Z⁻¹ T_i⁻¹ T_j), Jacobians, normal equations; compiled."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,87 +11,53 @@ _SMALL = 1e-4  # rad; below this angle the series replaces the closed form
 
 
 @njit(nogil=True)
-def chart_blocks(
-    T_i: _Array,
-    T_j: _Array,
-    Z: _Array,
-    r: _Array,
-    A: _Array,
-    B: _Array,
-) -> None:
-    """Residual in coordinates and its blocks with respect to (t_i, θ_i) and (t_j, θ_j).
-
-        r = [R_zᵀ (R_iᵀ (t_j − t_i) − t_z),  θ_j − θ_i − θ_z]     angle in (−π, π]
-        A = ∂r/∂(t_i, θ_i) = [−R_zᵀ R_iᵀ, R_zᵀ (∂R_iᵀ/∂θ_i)(t_j − t_i); 0, −1]
-        B = ∂r/∂(t_j, θ_j) = [R_zᵀ R_iᵀ, 0; 0, 1]                 (Grisetti et al. 2010, eq. 31-33)
-
-    r is also the translation and the angle of E = Z⁻¹ T_i⁻¹ T_j, the argument of the logarithm.
-
-    T_i, T_j, Z : (3, 3) poses, meters; Z maps frame j to frame i
-    r (3,), A (3, 3), B (3, 3) : filled
-    """
-    c_i, s_i, c_z, s_z = T_i[0, 0], T_i[1, 0], Z[0, 0], Z[1, 0]
-    dx, dy = T_j[0, 2] - T_i[0, 2], T_j[1, 2] - T_i[1, 2]
-    c, s = c_z * c_i - s_z * s_i, s_z * c_i + c_z * s_i  # of R_i R_z
-    r[0] = c * dx + s * dy - c_z * Z[0, 2] - s_z * Z[1, 2]
-    r[1] = -s * dx + c * dy + s_z * Z[0, 2] - c_z * Z[1, 2]
-    r[2] = np.arctan2(c * T_j[1, 0] - s * T_j[0, 0], c * T_j[0, 0] + s * T_j[1, 0])
-    B[0, 0], B[0, 1], B[0, 2] = c, s, 0.0
-    B[1, 0], B[1, 1], B[1, 2] = -s, c, 0.0
-    B[2, 0], B[2, 1], B[2, 2] = 0.0, 0.0, 1.0
-    A[0, 0], A[0, 1], A[0, 2] = -c, -s, -s * dx + c * dy
-    A[1, 0], A[1, 1], A[1, 2] = s, -c, -c * dx - s * dy
-    A[2, 0], A[2, 1], A[2, 2] = 0.0, 0.0, -1.0
-
-
-@njit(nogil=True)
-def residuals_2d(
-    poses: _Array,
-    edges: NDArray[np.int64],
-    measurements: _Array,
-    errors: _Array,
-) -> None:
-    """Fill e = log(Z⁻¹ T_i⁻¹ T_j) of every edge: V(θ)⁻¹ applied to the coordinates of ``chart_blocks``.
+def residuals_2d(poses: _Array, edges: NDArray[np.int64], measurements: _Array, errors: _Array) -> None:
+    """Fill e = log(Z⁻¹ T_i⁻¹ T_j) of every edge: V(θ)⁻¹ applied to translation and angle of the argument.
 
     poses (K, 3, 3), edges (E, 2) pose indices (i, j), measurements (E, 3, 3) Z, errors (E, 3) filled: m, m, rad
     """
-    r, A, B = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     for e in range(edges.shape[0]):
-        chart_blocks(poses[edges[e, 0]], poses[edges[e, 1]], measurements[e], r, A, B)
-        cotangent, half = _half_cotangent(r[2]), 0.5 * r[2]
-        errors[e, 0] = cotangent * r[0] + half * r[1]
-        errors[e, 1] = -half * r[0] + cotangent * r[1]
-        errors[e, 2] = r[2]
+        x, y, theta, _, _ = _mismatch_2d(poses[edges[e, 0]], poses[edges[e, 1]], measurements[e])
+        cotangent, half = _half_cotangent(theta), 0.5 * theta
+        errors[e, 0] = cotangent * x + half * y
+        errors[e, 1] = -half * x + cotangent * y
+        errors[e, 2] = theta
 
 
 @njit(nogil=True)
-def jacobians_2d(
-    poses: _Array,
-    edges: NDArray[np.int64],
-    measurements: _Array,
-    jacobian: _Array,
-) -> None:
+def jacobians_2d(poses: _Array, edges: NDArray[np.int64], measurements: _Array, jacobian: _Array) -> None:
     """Fill ∂e/∂ξ_j for left twists, T_j ← exp(ξ_j) T_j; ∂e/∂ξ_i is its negative.
 
-    Chain of the logarithm, the block B of ``chart_blocks`` and the left twist, δ(t, θ) = [I, S t; 0, 1] ξ with
-    S t = (−t_y, t_x). Moving i and j by one and the same left twist leaves T_i⁻¹ T_j as it is, hence the sign.
+    Chain of the logarithm, of the translation Rᵀ(t_j − …), R = R_i R_z, and of the left twist,
+    δ(t, θ) = [I, S t; 0, 1] ξ with S t = (−t_y, t_x). Moving i and j by one and the same left twist leaves
+    T_i⁻¹ T_j as it is, hence the sign.
 
     poses (K, 3, 3), edges (E, 2), measurements (E, 3, 3), jacobian (E, 3, 3) filled
     """
-    r, A, B = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     for e in range(edges.shape[0]):
-        T_j = poses[edges[e, 1]]
-        chart_blocks(poses[edges[e, 0]], T_j, measurements[e], r, A, B)
-        B[0, 2] = -B[0, 0] * T_j[1, 2] + B[0, 1] * T_j[0, 2]
-        B[1, 2] = -B[1, 0] * T_j[1, 2] + B[1, 1] * T_j[0, 2]
-        cotangent, half, slope = _half_cotangent(r[2]), 0.5 * r[2], _half_cotangent_slope(r[2])
-        J = jacobian[e]
-        for c in range(3):
-            J[0, c] = cotangent * B[0, c] + half * B[1, c]
-            J[1, c] = -half * B[0, c] + cotangent * B[1, c]
-            J[2, c] = B[2, c]
-        J[0, 2] += slope * r[0] + 0.5 * r[1]
-        J[1, 2] += -0.5 * r[0] + slope * r[1]
+        T_j, J = poses[edges[e, 1]], jacobian[e]
+        x, y, theta, c, s = _mismatch_2d(poses[edges[e, 0]], T_j, measurements[e])
+        turned_x, turned_y = -c * T_j[1, 2] + s * T_j[0, 2], s * T_j[1, 2] + c * T_j[0, 2]
+        cotangent, half, slope = _half_cotangent(theta), 0.5 * theta, _half_cotangent_slope(theta)
+        J[0, 0], J[0, 1] = cotangent * c + half * -s, cotangent * s + half * c
+        J[1, 0], J[1, 1] = -half * c + cotangent * -s, -half * s + cotangent * c
+        J[0, 2] = cotangent * turned_x + half * turned_y + (slope * x + 0.5 * y)
+        J[1, 2] = -half * turned_x + cotangent * turned_y + (-0.5 * x + slope * y)
+        J[2, 0], J[2, 1], J[2, 2] = 0.0, 0.0, 1.0
+
+
+@njit(nogil=True)
+def _mismatch_2d(T_i: _Array, T_j: _Array, Z: _Array) -> tuple[float, float, float, float, float]:
+    """Translation and angle in (−π, π] of Z⁻¹ T_i⁻¹ T_j, and cosine and sine of R_i R_z.
+
+    [R_zᵀ (R_iᵀ (t_j − t_i) − t_z), θ_j − θ_i − θ_z]  (Grisetti et al. 2010, eq. 31)
+    """
+    c_i, s_i, c_z, s_z = T_i[0, 0], T_i[1, 0], Z[0, 0], Z[1, 0]
+    dx, dy = T_j[0, 2] - T_i[0, 2], T_j[1, 2] - T_i[1, 2]
+    c, s = c_z * c_i - s_z * s_i, s_z * c_i + c_z * s_i
+    x = c * dx + s * dy - c_z * Z[0, 2] - s_z * Z[1, 2]
+    y = -s * dx + c * dy + s_z * Z[0, 2] - c_z * Z[1, 2]
+    return x, y, np.arctan2(c * T_j[1, 0] - s * T_j[0, 0], c * T_j[0, 0] + s * T_j[1, 0]), c, s
 
 
 @njit(nogil=True)
@@ -231,3 +197,90 @@ def _multiply(A: _Array, B: _Array, out: _Array) -> None:
     for a in range(3):
         for b in range(3):
             out[a, b] = A[a, 0] * B[0, b] + A[a, 1] * B[1, b] + A[a, 2] * B[2, b]
+
+
+@njit(nogil=True)
+def squared_norms(errors: _Array, information: _Array, chi2: _Array) -> None:
+    """Fill χ² = eᵀ Ω e of every factor; errors (E, k), information (E, k, k), chi2 (E,)."""
+    k = errors.shape[1]
+    for f in range(errors.shape[0]):
+        e, omega = errors[f], information[f]
+        total = 0.0
+        for a in range(k):
+            row = 0.0
+            for b in range(k):
+                row += omega[a, b] * e[b]
+            total += e[a] * row
+        chi2[f] = total
+
+
+@njit(nogil=True)
+def scatter_between(
+    jacobian: _Array,
+    errors: _Array,
+    information: _Array,
+    weights: _Array,
+    slots: NDArray[np.int64],
+    blocks: _Array,
+    gradient: _Array,
+) -> None:
+    """Add every between factor to H = Σ w JᵀΩJ and g = Σ w JᵀΩe.
+
+    With left twists ∂e/∂ξ_i = −∂e/∂ξ_j, so a factor adds M = w JᵀΩJ to both diagonal blocks and −M to the block
+    that joins them; M is symmetric, so the order of the pair does not matter.
+
+    jacobian (E, k, k) ∂e/∂ξ_j, errors (E, k), information (E, k, k), weights (E,)
+    slots (E, 3) : block of i, block of j, block of the pair; -1 where the pose is fixed
+    blocks (B, k, k), gradient (n, k) : added to
+    """
+    k = errors.shape[1]
+    whitened, M, g = np.empty((k, k)), np.empty((k, k)), np.empty(k)
+    for f in range(errors.shape[0]):
+        _weigh(jacobian[f], errors[f], information[f], weights[f], whitened, M, g)
+        i, j, pair = slots[f, 0], slots[f, 1], slots[f, 2]
+        if i >= 0:
+            _add(blocks[i], M, 1.0)
+            _add_row(gradient[i], g, -1.0)
+        if j >= 0:
+            _add(blocks[j], M, 1.0)
+            _add_row(gradient[j], g, 1.0)
+        if pair >= 0:
+            _add(blocks[pair], M, -1.0)
+
+
+@njit(nogil=True)
+def _add(block: _Array, M: _Array, sign: float) -> None:
+    """Add ±M to a block."""
+    for a in range(M.shape[0]):
+        for b in range(M.shape[1]):
+            block[a, b] += sign * M[a, b]
+
+
+@njit(nogil=True)
+def _add_row(row: _Array, g: _Array, sign: float) -> None:
+    """Add ±g to a row of the gradient."""
+    for a in range(g.size):
+        row[a] += sign * g[a]
+
+
+@njit(nogil=True)
+def _weigh(J: _Array, e: _Array, omega: _Array, weight: float, whitened: _Array, M: _Array, g: _Array) -> None:
+    """Fill whitened = w Ω J, M = Jᵀ w Ω J and g = (w Ω J)ᵀ e of one factor."""
+    k = e.size
+    whitened.fill(0.0)
+    M.fill(0.0)
+    g.fill(0.0)
+    for a in range(k):
+        for c in range(k):
+            scale = weight * omega[a, c]
+            if scale != 0.0:
+                for b in range(k):
+                    whitened[a, b] += scale * J[c, b]
+        for b in range(k):
+            g[b] += whitened[a, b] * e[a]
+    for c in range(k):
+        for a in range(k):
+            scale = J[c, a]
+            if scale != 0.0:
+                for b in range(k):
+                    M[a, b] += scale * whitened[c, b]

@@ -1,4 +1,4 @@
-"""Layout of the frontal matrices of a multifrontal Cholesky factorization, done once per pattern; compiled."""
+"""Layout of the frontal matrices of a multifrontal Cholesky factorization, done once per pattern."""
 
 from typing import NamedTuple
 
@@ -57,83 +57,39 @@ class Blocks(NamedTuple):
     turned: _Index
 
 
-@njit(nogil=True)
 def lay_out_fronts(groups: _Index, begin: _Index, rows: _Index, sizes: _Index) -> Fronts:
     """Expand fronts of blocks to scalars.
 
     groups (F + 1,) first block position of every front; begin, rows : structure of every block column;
     sizes (n,) : scalars of the block at each position
     """
-    count, n = groups.size - 1, sizes.size
-    scalar = np.zeros(n + 1, np.int64)
-    for j in range(n):
-        scalar[j + 1] = scalar[j] + sizes[j]
-    front_of = np.empty(n, np.int64)
-    row_start, factor_start = np.zeros(count + 1, np.int64), np.zeros(count + 1, np.int64)
-    pivots, parent = np.zeros(count, np.int64), np.full(count, -1, np.int64)
-    for f in range(count):
-        last = groups[f + 1] - 1
-        front_of[groups[f] : groups[f + 1]] = f
-        pivots[f] = scalar[groups[f + 1]] - scalar[groups[f]]
-        height = pivots[f]
-        for q in range(begin[last], begin[last + 1]):
-            height += sizes[rows[q]]
-        row_start[f + 1] = row_start[f] + height
-        factor_start[f + 1] = factor_start[f] + triangle(height) - triangle(height - pivots[f])
-    scalar_rows, place = np.empty(row_start[count], np.int64), np.full(row_start[count], -1, np.int64)
-    children = np.zeros(count, np.int64)
-    for f in range(count):
-        last = groups[f + 1] - 1
-        at = row_start[f]
-        for i in range(scalar[groups[f]], scalar[groups[f + 1]]):
-            scalar_rows[at] = i
-            at += 1
-        for q in range(begin[last], begin[last + 1]):
-            for i in range(scalar[rows[q]], scalar[rows[q] + 1]):
-                scalar_rows[at] = i
-                at += 1
-        if begin[last] < begin[last + 1]:
-            parent[f] = front_of[rows[begin[last]]]
-            children[parent[f]] += 1
-    widest, stack_size = _walk(row_start, scalar_rows, pivots, children, parent, place)
+    scalar = np.concatenate([[0], np.cumsum(sizes)])
+    pivots, last = np.diff(scalar[groups]), groups[1:] - 1
+    own, others = np.diff(groups), begin[groups[1:]] - begin[last]
+    starts = np.stack([groups[:-1], len(sizes) + begin[last]], axis=1).ravel()
+    blocks = np.concatenate([np.arange(len(sizes)), rows])[ranges(starts, np.stack([own, others], axis=1).ravel())]
+    scalar_rows = ranges(scalar[blocks], sizes[blocks])
+    of_front = np.repeat(np.arange(len(pivots)), own + others)
+    heights = np.bincount(of_front, sizes[blocks], len(pivots)).astype(np.int64)
+    row_start = np.concatenate([[0], np.cumsum(heights)])
+    factor_start = np.concatenate([[0], np.cumsum(pivots * heights - pivots * (pivots - 1) // 2)])
+    parent = np.full(len(pivots), -1)
+    parent[others > 0] = np.repeat(np.arange(len(pivots)), own)[rows[begin[last[others > 0]]]]
+    has_parent = parent >= 0
+    children = np.bincount(parent[has_parent], minlength=len(pivots))
+    row_front = np.repeat(np.arange(len(pivots)), heights)
+    is_update = ~_leading(pivots, heights)
+    place = np.full(len(scalar_rows), -1)
+    place[is_update] = _index_in_front(
+        row_start, scalar_rows, parent[row_front[is_update]], scalar_rows[is_update]
+    )
+    handed_on = (heights - pivots) * (heights - pivots + 1) // 2
+    taken = np.bincount(parent[has_parent], handed_on[has_parent], len(pivots)).astype(np.int64)
+    stack_size = int(np.cumsum(handed_on - taken).max(initial=0))
+    widest = int(heights.max(initial=0))
     return Fronts(row_start, scalar_rows, pivots, factor_start, parent, children, place, stack_size, widest)
 
 
-@njit(nogil=True)
-def _walk(
-    row_start: _Index, rows: _Index, pivots: _Index, children: _Index, parent: _Index, place: _Index
-) -> tuple[int, int]:
-    """Fill ``place``; return the rows of the widest front and the deepest stack of update matrices."""
-    count = pivots.size
-    waiting, top = np.zeros(count + 1, np.int64), 0
-    widest, deepest, depth = 0, 0, 0
-    for f in range(count):
-        height = row_start[f + 1] - row_start[f]
-        widest = max(widest, height)
-        for _ in range(children[f]):
-            top -= 1
-            depth -= waiting[top]
-        waiting[top] = triangle(height - pivots[f])
-        depth += waiting[top]
-        top += 1
-        deepest = max(deepest, depth)
-        if parent[f] == -1:
-            continue
-        at = row_start[parent[f]]
-        for q in range(row_start[f] + pivots[f], row_start[f + 1]):
-            while rows[at] != rows[q]:
-                at += 1
-            place[q] = at - row_start[parent[f]]
-    return widest, deepest
-
-
-@njit(nogil=True)
-def triangle(size: int) -> int:
-    """Number of scalars on and above the diagonal of a square matrix."""
-    return size * (size + 1) // 2
-
-
-@njit(nogil=True)
 def lay_out_blocks(
     fronts: Fronts, scalar_start: _Index, sizes: _Index, block_rows: _Index, block_columns: _Index
 ) -> Blocks:
@@ -143,44 +99,39 @@ def lay_out_blocks(
     sizes (n,) : scalars of every variable
     block_rows, block_columns (B,) : variables of every block, kept one after the other, row-major
     """
-    count = fronts.pivots.size
-    front_of = np.empty(sizes.sum(), np.int64)
-    for f in range(count):
-        for q in range(fronts.row_start[f], fronts.row_start[f] + fronts.pivots[f]):
-            front_of[fronts.rows[q]] = f
-    blocks = block_rows.size
-    start = np.zeros(count + 1, np.int64)
-    owner = np.empty(blocks, np.int64)
-    for b in range(blocks):
-        owner[b] = front_of[min(scalar_start[block_rows[b]], scalar_start[block_columns[b]])]
-        start[owner[b] + 1] += 1
-    for f in range(count):
-        start[f + 1] += start[f]
-    following = start.copy()
-    offset, height, width = np.empty(blocks, np.int64), np.empty(blocks, np.int64), np.empty(blocks, np.int64)
-    top, left, turned = np.empty(blocks, np.int64), np.empty(blocks, np.int64), np.empty(blocks, np.int64)
-    kept = 0
-    for b in range(blocks):
-        at, f = following[owner[b]], owner[b]
-        following[f] += 1
-        row, column = scalar_start[block_rows[b]], scalar_start[block_columns[b]]
-        rows = fronts.rows[fronts.row_start[f] : fronts.row_start[f + 1]]
-        offset[at], height[at], width[at] = kept, sizes[block_rows[b]], sizes[block_columns[b]]
-        top[at] = _index_of(min(row, column), rows)
-        left[at] = _index_of(max(row, column), rows)
-        turned[at] = 1 if row > column else 0
-        kept += height[at] * width[at]
-    return Blocks(start, offset, height, width, top, left, turned)
+    count = len(fronts.pivots)
+    row, column = scalar_start[block_rows], scalar_start[block_columns]
+    first = np.minimum(row, column)
+    owner = np.repeat(np.arange(count), fronts.pivots)[first]
+    order = np.argsort(owner, kind="stable")
+    start = np.searchsorted(owner[order], np.arange(count + 1))
+    height, width = sizes[block_rows], sizes[block_columns]
+    offset = np.cumsum(height * width) - height * width
+    top, left = (
+        _index_in_front(fronts.row_start, fronts.rows, owner, at) for at in (first, np.maximum(row, column))
+    )
+    turned = (row > column).astype(np.int64)
+    return Blocks(start, *(each[order] for each in (offset, height, width, top, left, turned)))
+
+
+def _index_in_front(row_start: _Index, rows: _Index, front: _Index, row: _Index) -> _Index:
+    """Index of rows (n,) among those, ascending, of their fronts (n,)."""
+    size = rows.max(initial=0) + 1
+    keys = np.repeat(np.arange(len(row_start) - 1), np.diff(row_start)) * size + rows
+    return np.searchsorted(keys, front * size + row) - row_start[front]
+
+
+def _leading(counts: _Index, lengths: _Index) -> NDArray[np.bool_]:
+    """True for the first so many of each of the ranges of these lengths, one after the other."""
+    return ranges(np.zeros_like(lengths), lengths) < np.repeat(counts, lengths)
+
+
+def ranges(starts: _Index, counts: _Index) -> _Index:
+    """The numbers from each start on, so many, one range after the other."""
+    return np.repeat(starts - np.cumsum(counts) + counts, counts) + np.arange(int(counts.sum()))
 
 
 @njit(nogil=True)
-def _index_of(row: int, rows: _Index) -> int:
-    """Index of a row among rows in ascending order."""
-    low, high = 0, rows.size
-    while low < high:
-        middle = (low + high) // 2
-        if rows[middle] < row:
-            low = middle + 1
-        else:
-            high = middle
-    return low
+def triangle(size: int) -> int:
+    """Number of scalars on and above the diagonal of a square matrix."""
+    return size * (size + 1) // 2

@@ -73,12 +73,18 @@ def postorder(parent: _Index) -> _Index:
     return result
 
 
-@njit(nogil=True)
 def column_structures(start: _Index, neighbors: _Index, order: _Index, parent: _Index) -> tuple[_Index, _Index]:
     """Positions below the diagonal in every block column of the factor, ascending: (start (n + 1,), rows).
 
     struct(j) = adjacent(j) ∪ struct(children of j), without j and what precedes it. ``order`` is a postorder.
     """
+    begin, rows = _structures(start, neighbors, order, parent)
+    return begin, rows[np.lexsort((rows, np.repeat(np.arange(order.size), np.diff(begin))))]
+
+
+@njit(nogil=True)
+def _structures(start: _Index, neighbors: _Index, order: _Index, parent: _Index) -> tuple[_Index, _Index]:
+    """The same, not in order."""
     n = order.size
     place = np.empty(n, np.int64)
     for k in range(n):
@@ -97,9 +103,7 @@ def column_structures(start: _Index, neighbors: _Index, order: _Index, parent: _
             end = _join(rows[begin[child] : begin[child + 1]], j, mark, rows, end)
             child = sibling[child]
         begin[j + 1] = end
-    rows = rows[: begin[n]]
-    _sort_columns(begin, rows)
-    return begin, rows
+    return begin, rows[: begin[n]]
 
 
 @njit(nogil=True)
@@ -111,28 +115,6 @@ def _join(members: _Index, j: int, mark: _Index, rows: _Index, end: int) -> int:
             rows[end] = i
             end += 1
     return end
-
-
-@njit(nogil=True)
-def _sort_columns(begin: _Index, rows: _Index):
-    """Bring the rows of every column into ascending order: a list of the columns of every row, read row by row."""
-    n = begin.size - 1
-    following, columns = np.zeros(n + 1, np.int64), np.empty(rows.size, np.int64)
-    for q in range(rows.size):
-        following[rows[q] + 1] += 1
-    for i in range(n):
-        following[i + 1] += following[i]
-    for j in range(n):
-        for q in range(begin[j], begin[j + 1]):
-            columns[following[rows[q]]] = j
-            following[rows[q]] += 1
-    at = begin.copy()
-    q = 0
-    for i in range(n):
-        while q < following[i]:
-            rows[at[columns[q]]] = i
-            at[columns[q]] += 1
-            q += 1
 
 
 @njit(nogil=True)

@@ -1,1 +1,60 @@
 """Logs that are no MCAP: each file or folder as an index whose messages are made when they are read."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from scanchain.logs.mcap.records import Block, Channel, Entry, FileIndex
+from scanchain.logs.writer import schema_text
+
+
+def add_channel(index: FileIndex, topic: str, type_name: str) -> Channel:
+    """A new channel of the index, its messages in CDR; ``type_name`` is package/msg/Type."""
+    number = len(index.channels) + 1
+    definition = schema_text(type_name)
+    channel = Channel((index.number, number), topic, "cdr", number, type_name, "ros2msg", definition)
+    index.channels[number] = channel
+    return channel
+
+
+def add_block(
+    index: FileIndex, offset: int, size: int, times_ns: Sequence[int], counts: dict[Channel, int]
+) -> None:
+    """Append a block: ``index.make`` finds it by ``offset``; ``size`` is about its number of bytes."""
+    entries = tuple(Entry(channel.key[1], -1, count) for channel, count in counts.items() if count)
+    index.blocks.append(
+        Block(index.number, offset, size, "", size, 0, min(times_ns), max(times_ns), entries, is_chunk=False)
+    )
+    for entry in entries:
+        index.counts[entry.channel] = index.counts.get(entry.channel, 0) + entry.messages
+
+
+def on_demand_index(path: Path, number: int) -> FileIndex:
+    """An index without channels or blocks; the format sets ``index.make``, which converts a block."""
+    return FileIndex(path, number, b"", is_counted=True)
+
+
+def natural_order(path: Path) -> tuple[tuple[int, ...], str]:
+    """Sort key by which log_2 comes before log_10."""
+    return tuple(int(digits) for digits in re.findall(r"\d+", path.stem)), path.name
+
+
+def left_out(folder: Path, taken: str, suffixes: Sequence[str]) -> list[str]:
+    """A note on the files of a folder that hold scans, too, but are of another kind than those read."""
+    counts = Counter(file.suffix.lower() for file in folder.iterdir() if file.is_file())
+    others = ", ".join(f"{counts[each]:,} {each}" for each in suffixes if counts[each] and each != taken)
+    if not others:
+        return []
+    return [f"{folder}: only its {taken} files are read, left out are {others}; give those a folder of their own"]
+
+
+class UnknownFormatError(Exception):
+    """A file or folder that is no log of the assumed format: the expected contents, and what is missing."""
+
+    def __init__(self, text: bytes, lack: str) -> None:
+        super().__init__(lack)
+        self.text = text
+        self.lack = lack

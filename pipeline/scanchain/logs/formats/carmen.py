@@ -22,9 +22,9 @@ import numpy as np
 
 from scanchain.errors import InputError, counted
 from scanchain.files import Source
-from scanchain.logs.formats.on_demand import UnknownFormatError, add_block, add_channel, on_demand_index
+from scanchain.logs.formats import UnknownFormatError, add_block, add_channel, on_demand_index
 from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
-from scanchain.logs.writing.pack import LATEST_NS, Link, Place, pack_laser_scan, pack_odometry, pack_transforms
+from scanchain.logs.writer import LATEST_NS, Link, Place, pack_laser_scan, pack_odometry, pack_transforms
 
 _LINES_A_BLOCK = 512
 _LEAST_STEP_NS = 100_000  # least step between the log times of two scans
@@ -53,112 +53,98 @@ def index_carmen(path: Path, number: int) -> FileIndex:
     text, damage = read_text(path)
     index = on_demand_index(path, number)
     index.damage += [damage] if damage else []
-    if not _Carmen(index, text).lines:
+    malformed: list[int] = []
+    parameters: dict[bytes, float] = {}
+    others = Counter[bytes]()
+    lines = list(_lines(text, parameters, malformed, others))
+    if not lines:
         absent = f"text without a line of {b', '.join(KINDS).decode()}"
         raise UnknownFormatError(text, damage.removeprefix(f"{path}: ") or absent)
+    index.damage += [_complaint(path, malformed)] if malformed else []
+    if others:
+        listed = ", ".join(f"{count} {kind.decode('ascii', 'replace')}" for kind, count in others.items())
+        index.notes.append(f"{path}: lines of kinds that are not read: {listed}")
+    _add_lines(index, lines, parameters)
     return index
 
 
+def _add_lines(index: FileIndex, lines: list[Line], parameters: dict[bytes, float]) -> None:
+    """Add blocks of lines, and how they are made messages."""
+    scan = add_channel(index, "/scan", "sensor_msgs/msg/LaserScan")
+    odometry = add_channel(index, "/odom", "nav_msgs/msg/Odometry")
+    mounting = add_channel(index, "/tf_static", "tf2_msgs/msg/TFMessage")
+    truth = add_channel(index, "/ground_truth", "nav_msgs/msg/Odometry")
+    first_scan = next((line.number for line in lines if line.kind in SCANS), -1)
+    for begin in range(0, len(lines), _LINES_A_BLOCK):
+        block = lines[begin : begin + _LINES_A_BLOCK]
+        kinds = Counter(line.kind for line in block)
+        scans = sum(kinds[kind] for kind in SCANS)
+        counts = {mounting: int(any(line.number == first_scan for line in block))}
+        counts |= {odometry: scans + kinds[b"ODOM"], scan: scans, truth: kinds[b"TRUEPOS"]}
+        size = sum(len(line.text) for line in block)
+        add_block(index, begin, size, [line.log_time_ns for line in block], counts)
+    index.channels = {number: c for number, c in index.channels.items() if index.counts.get(number)}
+
+    def messages(line: Line) -> Iterator[tuple[Channel, bytes]]:
+        words = line.text.split()
+        if line.kind in SCANS:
+            packed, robot, laser = read_scan(words, line.stamp_ns, parameters)
+            if line.number == first_scan:
+                yield mounting, pack_transforms(line.stamp_ns, Link("base_link", "laser", laser))
+            yield odometry, pack_odometry(line.stamp_ns, "odom", "base_link", robot)
+            yield scan, packed
+        else:
+            channel, frame = (odometry, "odom") if line.kind == b"ODOM" else (truth, "world")
+            yield channel, pack_odometry(line.stamp_ns, frame, "base_link", planar(*_numbers(words[1:], 3)))
+
+    def make(block: Block, _: AbstractSet[int] | None) -> Contents:
+        made: list[Message] = []
+        malformed: list[int] = []
+        for line in lines[block.offset : block.offset + _LINES_A_BLOCK]:
+            try:
+                said = list(messages(line))
+                made += [Message(channel, line.log_time_ns, memoryview(data)) for channel, data in said]
+            except (ValueError, IndexError):
+                malformed.append(line.number)
+        return Contents(made, _complaint(index.path, malformed))
+
+    index.make = make
+
+
 class Line(NamedTuple):
-    """Offset of a line in the text, its kind, and its log time."""
+    """A line of a known kind, its number, stamp and log time."""
 
     kind: bytes
-    begin: int
-    end: int
+    text: bytes
     number: int
     stamp_ns: int
     log_time_ns: int
 
 
-class _Carmen:
-    """The text of a log, its lines and its channels."""
-
-    def __init__(self, index: FileIndex, text: bytes) -> None:
-        self.index = index
-        self.text = text
-        self.parameters: dict[bytes, float] = {}
-        self.others: Counter[bytes] = Counter()
-        self.malformed: list[int] = []
-        self.lines = list(self._find())
-        self.first_scan = next((place for place, line in enumerate(self.lines) if line.kind in SCANS), -1)
-        self.scan = add_channel(index, "/scan", "sensor_msgs/msg/LaserScan")
-        self.odometry = add_channel(index, "/odom", "nav_msgs/msg/Odometry")
-        self.mounting = add_channel(index, "/tf_static", "tf2_msgs/msg/TFMessage")
-        self.truth = add_channel(index, "/ground_truth", "nav_msgs/msg/Odometry")
-        for begin in range(0, len(self.lines), _LINES_A_BLOCK):
-            lines = self.lines[begin : begin + _LINES_A_BLOCK]
-            kinds = Counter(line.kind for line in lines)
-            scans = sum(kinds[kind] for kind in SCANS)
-            counts = {
-                self.mounting: int(0 <= self.first_scan - begin < len(lines)),
-                self.odometry: scans + kinds[b"ODOM"],
-                self.scan: scans,
-                self.truth: kinds[b"TRUEPOS"],
-            }
-            size = lines[-1].end - lines[0].begin
-            add_block(index, begin, size, [line.log_time_ns for line in lines], counts)
-        index.channels = {number: c for number, c in index.channels.items() if index.counts.get(number)}
-        index.make = self.make
-        if self.malformed:
-            index.note_damage(_complaint(index.path, self.malformed))
-        if self.others:
-            listed = ", ".join(f"{count} {kind.decode('ascii', 'replace')}" for kind, count in self.others.items())
-            index.notes.append(f"{index.path}: lines of kinds that are not read: {listed}")
-
-    def make(self, block: Block, wanted: AbstractSet[int] | None) -> Contents:
-        """The messages of a block of lines."""
-        messages: list[Message] = []
-        malformed: list[int] = []
-        for place, line in enumerate(self.lines[block.offset : block.offset + _LINES_A_BLOCK]):
-            try:
-                said = self._messages(line, is_first=block.offset + place == self.first_scan)
-                messages += [Message(channel, line.log_time_ns, memoryview(data)) for channel, data in said]
-            except (ValueError, IndexError):
-                malformed.append(line.number)
-        if wanted is not None:
-            messages = [message for message in messages if message.channel.key[1] in wanted]
-        return Contents(messages, _complaint(self.index.path, malformed))
-
-    def _messages(self, line: Line, *, is_first: bool) -> Iterator[tuple[Channel, bytes]]:
-        words = self.text[line.begin : line.end].split()
-        if line.kind in SCANS:
-            offset_m, reach_m = (self.parameters.get(name, 0.0) for name in _PARAMETERS)
-            stated = read_scan(words, line.stamp_ns, reach_m, offset_m)
-            if is_first:
-                yield self.mounting, pack_transforms(line.stamp_ns, Link("base_link", "laser", stated.mounting))
-            yield self.odometry, stated.odometry
-            yield self.scan, stated.scan
-        else:
-            channel, frame = (self.odometry, "odom") if line.kind == b"ODOM" else (self.truth, "world")
-            pose = planar(*_numbers(words[1:], 3))
-            yield channel, pack_odometry(line.stamp_ns, frame, "base_link", pose)
-
-    def _find(self) -> Iterator[Line]:
-        """Every line of a known kind, in the order of the file."""
-        begin, log_ns = 0, 0
-        for number, raw in enumerate(io.BytesIO(self.text), start=1):
-            kind = raw[:16].split(maxsplit=1)[0] if raw[:16].strip() else b"#"
-            end = begin + len(raw)
-            if kind in KINDS:
-                try:  # the stamp is the third word from behind, a double like in CARMEN
-                    stamp_ns = int(float(raw.rsplit(maxsplit=3)[-3]) * 1e9)
-                except (ValueError, IndexError, OverflowError):
-                    stamp_ns = -1
-                if not 0 <= stamp_ns < LATEST_NS:
-                    self.malformed.append(number)
-                else:
-                    line_ns = max(stamp_ns, log_ns)
-                    if kind in SCANS:
-                        line_ns = log_ns = max(stamp_ns, log_ns + _LEAST_STEP_NS)
-                    yield Line(kind, begin, end, number, stamp_ns, line_ns)
-            elif kind == b"PARAM":
-                words = raw.split()
-                if len(words) > 2 and words[1] in _PARAMETERS:
-                    with suppress(ValueError):
-                        self.parameters[words[1]] = float(words[2])
-            elif not kind.startswith(b"#"):
-                self.others[kind] += 1
-            begin = end
+def _lines(
+    text: bytes, parameters: dict[bytes, float], malformed: list[int], others: Counter[bytes]
+) -> Iterator[Line]:
+    """Every line of a known kind, in the order of the file; what the others hold is added to the rest."""
+    log_ns = 0
+    for number, raw in enumerate(io.BytesIO(text), start=1):
+        kind = raw[:16].split(maxsplit=1)[0] if raw[:16].strip() else b"#"
+        if kind in KINDS:
+            try:  # the stamp is the third word from behind, a double like in CARMEN
+                stamp_ns = int(float(raw.rsplit(maxsplit=3)[-3]) * 1e9)
+            except (ValueError, IndexError, OverflowError):
+                stamp_ns = -1
+            if not 0 <= stamp_ns < LATEST_NS:
+                malformed.append(number)
+                continue
+            line_ns = max(stamp_ns, log_ns)
+            if kind in SCANS:
+                line_ns = log_ns = max(stamp_ns, log_ns + _LEAST_STEP_NS)
+            yield Line(kind, raw, number, stamp_ns, line_ns)
+        elif kind == b"PARAM" and len(words := raw.split()) > 2 and words[1] in _PARAMETERS:
+            with suppress(ValueError):
+                parameters[words[1]] = float(words[2])
+        elif not kind.startswith((b"#", b"PARAM")):
+            others[kind] += 1
 
 
 def _complaint(path: Source, malformed: list[int]) -> str:
@@ -167,34 +153,30 @@ def _complaint(path: Source, malformed: list[int]) -> str:
     return f"{path}: {counted(len(malformed), 'malformed line')} left out (the first: line {malformed[0]})"
 
 
-class CarmenScan(NamedTuple):
-    """A laser line: the scan and the robot's pose, each as a message; ``mounting`` is the laser on the robot."""
+def read_scan(words: list[bytes], stamp_ns: int, parameters: dict[bytes, float]) -> tuple[bytes, Place, Place]:
+    """A FLASER or ROBOTLASER1 line as a message, the robot's pose, and that of the laser on the robot.
 
-    scan: bytes
-    odometry: bytes
-    mounting: Place
-
-
-def read_scan(words: list[bytes], stamp_ns: int, max_range_m: float, offset_m: float) -> CarmenScan:
-    """A FLASER or ROBOTLASER1 line. Raises ValueError or IndexError where words are missing or no numbers.
-
-    max_range_m, offset_m : the scanner's reach and its place ahead of the robot's center, as the log's PARAM
-        lines set them for FLASER; ROBOTLASER1 states both itself
+    parameters : the scanner's reach and its place ahead of the robot's center, as the log's PARAM lines set them
+        for FLASER; ROBOTLASER1 states both itself
+    Raises ValueError or IndexError where words are missing or no numbers.
     """
+    offset_m, max_range_m = (parameters.get(name, 0.0) for name in _PARAMETERS)
     if words[0] == b"FLASER":
         count = int(words[1])
         poses = _numbers(words[2 + count :], 6)
         step_rad = _STEPS_RAD.get(count, _HALF_TURN / max(count - 1, 1))
         first_rad = -0.5 * step_rad * (count - 1) if count == 401 else -0.5 * _HALF_TURN
         ranges_m = _numbers(words[2:], count)
-        mounting, robot = Place(offset_m, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), poses[3:]
+        mounting = Place(offset_m, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
     else:
         first_rad, opening_rad, step_rad, max_range_m = _numbers(words[2:], 4)
         count = int(words[8])
         ranges_m = _numbers(words[9:], count)
         poses = _numbers(words[10 + count + int(words[9 + count]) :], 6)
         step_rad = step_rad if step_rad > 0.0 else opening_rad / max(count - 1, 1)
-        mounting, robot = _mounting(poses[:3], poses[3:]), poses[3:]
+        dx, dy, dyaw = (laser - robot for laser, robot in zip(poses[:3], poses[3:], strict=True))
+        cosine, sine = math.cos(poses[5]), math.sin(poses[5])
+        mounting = planar(cosine * dx + sine * dy, cosine * dy - sine * dx, dyaw)
     scan = pack_laser_scan(
         stamp_ns,
         "laser",
@@ -204,7 +186,7 @@ def read_scan(words: list[bytes], stamp_ns: int, max_range_m: float, offset_m: f
         range_min_m=0.0,
         range_max_m=min(max_range_m, _LEAST_CODE_M) if max_range_m > 0.0 else _LEAST_CODE_M,
     )
-    return CarmenScan(scan, pack_odometry(stamp_ns, "odom", "base_link", planar(*robot)), mounting)
+    return scan, planar(*poses[3:]), mounting
 
 
 def planar(x_m: float, y_m: float, yaw_rad: float) -> Place:
@@ -216,13 +198,6 @@ def _numbers(words: list[bytes], count: int) -> list[float]:
     if not 0 <= count <= len(words):
         raise ValueError(f"{count} numbers are stated, {len(words)} words follow")
     return [float(word) for word in words[:count]]
-
-
-def _mounting(laser: list[float], robot: list[float]) -> Place:
-    """The laser's pose in the robot's frame."""
-    dx, dy, dyaw = (a - b for a, b in zip(laser, robot, strict=True))
-    cosine, sine = math.cos(robot[2]), math.sin(robot[2])
-    return planar(cosine * dx + sine * dy, cosine * dy - sine * dx, dyaw)
 
 
 def read_text(path: Path) -> tuple[bytes, str]:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from collections.abc import Set as AbstractSet
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +15,10 @@ from numpy.linalg import LinAlgError
 from scanchain import lie
 from scanchain.data import Matrix, Pose
 from scanchain.errors import InputError, counted
-from scanchain.logs.formats.cloud_file import XYZI, CloudFileError, read_raw
-from scanchain.logs.formats.on_demand import add_block, add_channel, natural_order, on_demand_index
+from scanchain.logs.formats import add_block, add_channel, natural_order, on_demand_index
+from scanchain.logs.formats.clouds import XYZI, contents_of, read_raw
 from scanchain.logs.mcap.records import Block, Contents, FileIndex, Message
-from scanchain.logs.writing.pack import LATEST_NS, pack_cloud, pack_odometry, place
+from scanchain.logs.writer import LATEST_NS, pack_odometry, place
 
 _TRUTH = -1  # index of the block of the ground truth
 _POSE_BYTES = 720
@@ -44,8 +43,7 @@ def index_kitti_raw(folder: Path, number: int) -> FileIndex:
     """A drive of the raw recordings (``..._sync``); truth is its GPS/INS, moved to the lidar."""
     files = _sweeps(folder / "velodyne_points" / "data")
     times_ns = read_times(folder / "velodyne_points" / "timestamps.txt")
-    index = on_demand_index(folder, number)
-    return _index(index, files, times_ns, _truth_or_none(index, lambda: _raw_truth(index, folder)))
+    return _index(on_demand_index(folder, number), files, times_ns, lambda index: _raw_truth(index, folder))
 
 
 def index_kitti_odometry(folder: Path, number: int) -> FileIndex:
@@ -53,7 +51,7 @@ def index_kitti_odometry(folder: Path, number: int) -> FileIndex:
     files = _sweeps(folder / "velodyne")
     times_ns = read_seconds(folder / "times.txt")
     index = on_demand_index(folder, number)
-    return _index(index, files, times_ns, _truth_or_none(index, lambda: _benchmark_truth(index, folder, times_ns)))
+    return _index(index, files, times_ns, lambda index: _benchmark_truth(index, folder, times_ns))
 
 
 def _raw_truth(index: FileIndex, folder: Path) -> Truth:
@@ -67,7 +65,9 @@ def _raw_truth(index: FileIndex, folder: Path) -> Truth:
         )
         return []
     times_ns = read_times(folder / "oxts" / "timestamps.txt")
-    poses = read_oxts(folder / "oxts" / "data", read_calibration(calibration))
+    T_lidar_imu = np.eye(4)
+    T_lidar_imu[:3, :3], T_lidar_imu[:3, 3] = _entry(calibration, "R", (3, 3)), _entry(calibration, "T", (3,))
+    poses = read_oxts(folder / "oxts" / "data", T_lidar_imu)
     if len(poses) != len(times_ns):
         raise InputError(
             f"{folder / 'oxts'}: has {counted(len(poses), 'reading')} and {counted(len(times_ns), 'time')}; "
@@ -77,21 +77,11 @@ def _raw_truth(index: FileIndex, folder: Path) -> Truth:
 
 
 def _benchmark_truth(index: FileIndex, folder: Path, times_ns: Sequence[int]) -> Truth:
-    name = folder.resolve().name
-    file = folder.resolve().parent.parent / "poses" / f"{name}.txt"
+    file = folder.resolve().parent.parent / "poses" / f"{folder.resolve().name}.txt"
     if not file.is_file():
         index.notes.append(f"{file}: is absent, so there is no ground truth")
         return []
     return list(zip(times_ns, read_camera_poses(file, folder / "calib.txt"), strict=False))
-
-
-def _truth_or_none(index: FileIndex, read: Callable[[], Truth]) -> Truth:
-    """The ground truth; none where its files are damaged, as the sweeps do not need it."""
-    try:
-        return read()
-    except (InputError, LinAlgError) as error:
-        index.note_damage(f"{error}; until then there is no ground truth")
-        return []
 
 
 def _sweeps(folder: Path) -> list[Path]:
@@ -101,8 +91,15 @@ def _sweeps(folder: Path) -> list[Path]:
     return files
 
 
-def _index(index: FileIndex, files: Sequence[Path], times_ns: Sequence[int], truth: Truth) -> FileIndex:
-    """/velodyne_points from the files, whose names count the times, and /ground_truth."""
+def _index(
+    index: FileIndex, files: Sequence[Path], times_ns: Sequence[int], read_truth: Callable[[FileIndex], Truth]
+) -> FileIndex:
+    """/velodyne_points from the files, whose names count the times, and /ground_truth where it can be read."""
+    try:
+        truth = read_truth(index)
+    except (InputError, LinAlgError) as error:
+        index.note_damage(f"{error}; until then there is no ground truth")
+        truth = []
     numbers = [int(file.stem) for file in files if file.stem.isdigit()]
     if len(numbers) < len(files) or max(numbers) >= len(times_ns):
         raise InputError(
@@ -117,19 +114,14 @@ def _index(index: FileIndex, files: Sequence[Path], times_ns: Sequence[int], tru
             index, _TRUTH, _POSE_BYTES * len(truth), [stamp_ns for stamp_ns, _ in truth], {poses: len(truth)}
         )
 
-    def make(block: Block, wanted: AbstractSet[int] | None) -> Contents:
+    def make(block: Block, _: AbstractSet[int] | None) -> Contents:
         channel = index.channels[block.entries[0].channel]
-        if wanted is not None and channel.key[1] not in wanted:
-            return Contents([], "")
         if block.offset == _TRUTH:
             said = [(each, pack_odometry(each, "world", "velodyne", place(T))) for each, T in truth]
             return Contents([Message(channel, each, memoryview(data)) for each, data in said], "")
-        file, stamp_ns = files[block.offset], block.start_ns
-        try:
-            data = pack_cloud(stamp_ns, "velodyne", read_raw(file, XYZI))
-        except (CloudFileError, OSError) as error:
-            return Contents([], f"{file}: {error}; it was left out")
-        return Contents([Message(channel, stamp_ns, memoryview(data))], "")
+        return contents_of(
+            files[block.offset], channel, block.start_ns, lambda file: read_raw(file, XYZI), "velodyne"
+        )
 
     index.make = make
     return index
@@ -137,17 +129,14 @@ def _index(index: FileIndex, files: Sequence[Path], times_ns: Sequence[int], tru
 
 def read_times(file: Path) -> list[int]:
     """Nanoseconds of each line ``2011-09-26 13:02:25.594360375``, which is taken as UTC."""
-    times_ns = []
+    times_ns: list[int] = []
     for number, line in enumerate(map(str.strip, _lines(file)), start=1):
         try:
-            whole, _, fraction = line.partition(".")
-            moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
-            stamp_ns = int(moment.timestamp()) * _NS + int(fraction.ljust(9, "0")[:9])
-            if not 0 <= stamp_ns < LATEST_NS:
+            times_ns.append(int(np.datetime64(line, "ns").astype(np.int64)))
+            if not 0 <= times_ns[-1] < LATEST_NS:
                 raise ValueError("before 1970 or after 2038")
         except ValueError as error:
             raise InputError(f"{file}: line {number} is no time ({line!r}); download it again") from error
-        times_ns.append(stamp_ns)
     return times_ns
 
 
@@ -157,13 +146,6 @@ def read_seconds(file: Path) -> list[int]:
     if not all(0.0 <= each * _NS < LATEST_NS for each in seconds):
         raise InputError(f"{file}: has times that are not between 0 and {LATEST_NS / _NS:g} s; download it again")
     return [round(each * _NS) for each in seconds]
-
-
-def read_calibration(file: Path) -> Pose:
-    """The (4, 4) transform of a ``calib_*_to_*.txt`` with its lines ``R:`` and ``T:``."""
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = _entry(file, "R", (3, 3)), _entry(file, "T", (3,))
-    return T
 
 
 def _entry(file: Path, name: str, shape: tuple[int, ...]) -> Matrix:
@@ -220,17 +202,13 @@ def _turn(angles_rad: Matrix, axis: int) -> Matrix:
 
 def _table(file: Path, columns: int) -> Matrix:
     """The first columns of a file of numbers, all of them finite."""
-    words = [line.split() for line in _lines(file)]
-    few = next((number for number, row in enumerate(words, start=1) if len(row) < columns), 0)
-    if few:
-        raise InputError(
-            f"{file}: line {few} has {counted(len(words[few - 1]), 'column')}, {columns} are needed; "
-            "download it again"
-        )
+    lines = _lines(file)
     try:
-        rows = np.array([row[:columns] for row in words], np.float64).reshape(-1, columns)
+        rows = np.loadtxt(lines, comments=None, usecols=range(columns), ndmin=2) if lines else np.empty(0)
     except ValueError as error:
-        raise InputError(f"{file}: is no table of numbers ({error}); download it again") from error
+        raise InputError(
+            f"{file}: is no table of {columns} numbers a line ({error}); download it again"
+        ) from error
     if not len(rows) or not np.isfinite(rows).all():
         raise InputError(f"{file}: is empty, or holds numbers that are not finite; download it again")
     return rows

@@ -13,28 +13,26 @@ from collections import Counter
 from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scanchain.errors import InputError, counted
 from scanchain.logs.mcap.index import is_plausible_size
 from scanchain.logs.mcap.records import Block, Channel, Contents, Entry, FileIndex, Message, unpack
-from scanchain.logs.mcap.selection import messages_of
+from scanchain.logs.mcap.stream import messages_of
 
 MAGIC = b"#ROSBAG V2.0\n"
-MESSAGE, HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
-T = TypeVar("T", int, NDArray[np.int64])
+MESSAGE, HEADER, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 5, 6, 7
 Data = mmap.mmap | memoryview | bytes
 _LENGTH = struct.Struct("<I")
+_POSITION = struct.Struct("<Q")
 _TIME = struct.Struct("<II")  # seconds, nanoseconds
 _LONGEST_HEAD = 1 << 16  # longest head in bytes; a longer one is damage
-_OPCODE = re.compile(rb"\x04\0\0\0op=[\x04\x05\x07]")  # opcode of an index, a chunk, a connection
+_OPCODE = re.compile(rb"\x04\0\0\0op=[\x05\x07]")  # opcode of a chunk, a connection
 _MOST_BEFORE = 256  # largest number of bytes of a head before its opcode
-
-_INDEX_TIMES = np.dtype([("s", "<u4"), ("ns", "<u4"), ("offset", "<u4")])
 
 
 class Record(NamedTuple):
@@ -52,45 +50,42 @@ class Record(NamedTuple):
 
     def time_ns(self, name: bytes) -> int:
         """A field that is a time. Raises struct.error where it is absent or of another size."""
-        return as_ns(*_TIME.unpack(self.fields.get(name, b"")))
+        seconds, nanoseconds = _TIME.unpack(self.fields.get(name, b""))
+        return seconds * 1_000_000_000 + nanoseconds
 
     def text(self, name: bytes) -> str:
         """A field that is text, empty where it is absent."""
         return self.fields.get(name, b"").decode("utf-8", "replace")
 
 
-def as_ns(seconds: T, nanoseconds: T) -> T:
-    """Times of ROS in nanoseconds."""
-    return seconds * 1_000_000_000 + nanoseconds
-
-
 def read_record(data: Data, offset: int) -> Record | None:
     """The record that begins at the offset, None where none does."""
-    head = _sized(data, offset)
-    if head is None or head.end + _LENGTH.size > len(data) or head.end - head.begin > _LONGEST_HEAD:
+    begin = offset + _LENGTH.size
+    length = _LENGTH.unpack_from(data, offset)[0] if begin <= len(data) else _LONGEST_HEAD + 1
+    end = begin + length
+    if end + _LENGTH.size > len(data) or length > _LONGEST_HEAD:
         return None
-    fields = _read_fields(bytes(data[head.begin : head.end]))
-    (size,) = _LENGTH.unpack_from(data, head.end)
+    fields = _read_fields(bytes(data[begin:end]))
     if fields is None or len(fields.get(b"op", b"")) != 1:
         return None
-    begin = head.end + _LENGTH.size
-    return Record(fields[b"op"][0], fields, offset, begin, begin + size)
+    data_begin = end + _LENGTH.size
+    return Record(fields[b"op"][0], fields, offset, data_begin, data_begin + _LENGTH.unpack_from(data, end)[0])
 
 
-def channel_of(file: int, record: Record, data: Data) -> Channel:
-    """The channel that a connection record defines. Raises struct.error for one without its fields."""
+def _define(index: FileIndex, record: Record, data: Data) -> None:
+    """Add the channel of a connection unless it is known. Raises struct.error for one without its fields."""
     stated = _read_fields(bytes(data[record.begin : record.end]))
     if stated is None or b"message_definition" not in stated:
         raise struct.error("connection without its fields")
     number = record.number(b"conn")
     topic, type_name = record.text(b"topic"), stated.get(b"type", b"").decode("utf-8", "replace")
     definition = stated[b"message_definition"]
-    return Channel((file, number), topic, "ros1", number + 1, type_name, "ros1msg", definition)
+    channel = Channel((index.number, number), topic, "ros1", number + 1, type_name, "ros1msg", definition)
+    index.channels.setdefault(number, channel)
 
 
-def whole_records(data: Data) -> Iterator[Record]:
+def whole_records(data: Data, offset: int = 0) -> Iterator[Record]:
     """One record after the other. Raises struct.error at bytes that are no record, or not all of one."""
-    offset = 0
     while offset < len(data):
         record = read_record(data, offset)
         if record is None or record.end > len(data):
@@ -120,28 +115,13 @@ def _read_fields(head: bytes) -> dict[bytes, bytes] | None:
     fields: dict[bytes, bytes] = {}
     offset = 0
     while offset < len(head):
-        field = _sized(head, offset)
-        if field is None or field.end > len(head):
-            return None
-        name, equals, value = head[field.begin : field.end].partition(b"=")
-        if not equals:
+        begin = offset + _LENGTH.size
+        offset = begin + int.from_bytes(head[offset:begin], "little")
+        name, equals, value = head[begin:offset].partition(b"=")
+        if not equals or offset > len(head):
             return None
         fields[name] = value
-        offset = field.end
     return fields
-
-
-class _Span(NamedTuple):
-    begin: int
-    end: int
-
-
-def _sized(data: Data, offset: int) -> _Span | None:
-    """Span of the bytes behind their own length."""
-    if offset + _LENGTH.size > len(data):
-        return None
-    begin = offset + _LENGTH.size
-    return _Span(begin, begin + _LENGTH.unpack_from(data, offset)[0])
 
 
 def claims_ros1_bag(_: Path, head: bytes) -> bool:
@@ -154,152 +134,132 @@ def index_ros1_bag(path: Path, number: int) -> FileIndex:
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise InputError(f"{path}: is a bag of an old version; rosbag migrate makes one of version 2.0 of it")
-        index = FileIndex(path, number, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
-    bag = _Bag(index)
-    index.make = bag.make
-    bag.walk()
-    bag.finish()
+        data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    index = _new_index(path, number, data)
+    if not _take_summary(index):
+        index = _new_index(path, number, data)
+        _walk(index)
+        index.blocks = [_counted(index, block) for block in index.blocks]
+    index.counts = dict(index.indexed_counts())
+    index.channels = {number: c for number, c in index.channels.items() if index.counts.get(number)}
     return index
 
 
-class _Bag:
-    """Sorts the records of a bag into its index; a chunk waits for the indexes that follow it."""
+def _new_index(path: Path, number: int, data: mmap.mmap) -> FileIndex:
+    index = FileIndex(path, number, data, is_counted=True)
+    index.make = partial(_contents, index)
+    return index
 
-    def __init__(self, index: FileIndex) -> None:
-        self.index = index
-        self.chunk: Block | None = None
-        self.entries: list[Entry] = []
-        self.times_ns: list[int] = []
-        self.is_sure = True  # of the entries
-        self.stated: Counter[int] = Counter()  # messages by connection, as the bag itself counts them
 
-    def walk(self) -> None:
-        """Take in one record after the other, and go on behind damage."""
-        data, offset = self.index.data, len(MAGIC)
-        while offset < len(data):
-            record = read_record(data, offset)
-            if record is not None and (record.end == len(data) or read_record(data, record.end) is not None):
-                self._take(record)
-                offset = record.end
-                continue
-            behind = next_record(data, offset, offset if record is None else record.end)
-            limit = len(data) if behind is None else behind.offset
-            if record is not None and (record.end <= limit or (behind is None and record.opcode == CHUNK)):
-                self._take(record)
-            self._close(complete=False)
-            if behind is None:
-                self.index.damage.append(f"{self.index.path}: cut off, or damaged to its end, at byte {offset}")
-                return
-            self.index.damage.append(
-                f"{self.index.path}: the record at byte {offset} is damaged; "
-                f"reading went on at byte {behind.offset}"
-            )
-            offset = behind.offset
-        self._close(complete=True)
-
-    def finish(self) -> None:
-        """Count the messages, opening the chunks without a complete index."""
-        index = self.index
-        is_inconsistent = bool(self.stated) and self.stated != index.indexed_counts()
-        index.blocks = [
-            self._unpacked(block) if is_inconsistent or not self._is_known(block) else block
-            for block in index.blocks
-        ]
-        index.counts = dict(index.indexed_counts())
-        index.channels = {number: c for number, c in index.channels.items() if index.counts.get(number)}
-        index.is_counted = True
-
-    def make(self, block: Block, wanted: AbstractSet[int] | None) -> Contents:
-        """The messages of a chunk; connections found there join the index."""
-        name = f"{self.index.path}: the chunk at byte {block.offset}"
-        messages: list[Message] = []
-        undefined = 0
-        try:
-            payload = unpack(self.index, block)
-            for record in whole_records(payload):
-                if record.opcode == CONNECTION:
-                    self._define(channel_of(self.index.number, record, payload))
-                elif record.opcode == MESSAGE:
-                    number, time_ns = record.number(b"conn"), record.time_ns(b"time")
-                    channel = self.index.channels.get(number)
-                    undefined += channel is None
-                    if channel is not None and (wanted is None or number in wanted):
-                        messages.append(Message(channel, time_ns, payload[record.begin : record.end]))
-        except struct.error:
-            damage = f"{name}: a record in it is malformed; what follows was left out"
-            return Contents(messages, "" if block.is_cut else damage)
-        return Contents(
-            messages, f"{name}: {counted(undefined, 'message')} of no known connection" if undefined else ""
+def _take_summary(index: FileIndex) -> bool:
+    """Fill the index by the records at the end of a finished bag; False where they do not give every message."""
+    data, head = index.data, read_record(index.data, len(MAGIC))
+    if head is None or head.opcode != HEADER:
+        return False
+    if head.text(b"encryptor"):
+        raise InputError(f"{index.path}: is encrypted ({head.text(b'encryptor')}); decrypt it first")
+    try:
+        (begin,) = _POSITION.unpack(head.fields.get(b"index_pos", b""))
+        for record in whole_records(data, begin or len(data)):
+            if record.opcode == CONNECTION:
+                _define(index, record, data)
+            elif record.opcode == CHUNK_INFO:
+                index.blocks.append(_stated_chunk(index, record))
+        is_complete = (head.number(b"chunk_count"), head.number(b"conn_count")) == (
+            len(index.blocks),
+            len(index.channels),
         )
+    except (struct.error, ValueError):
+        return False
+    return is_complete and begin > 0 and index.indexed_counts().keys() <= index.channels.keys()
 
-    def _is_known(self, block: Block) -> bool:
-        """True if the counts of a chunk are known, and all its connections are."""
-        return bool(block.entries) and all(entry.channel in self.index.channels for entry in block.entries)
 
-    def _take(self, record: Record) -> None:
-        try:
-            self._sort(record)
-        except (struct.error, ValueError):
-            self.index.damage.append(
-                f"{self.index.path}: the record at byte {record.offset} is malformed and was left out"
-            )
-            self.is_sure = False
+def _stated_chunk(index: FileIndex, info: Record) -> Block:
+    """The chunk that a CHUNK_INFO describes. Raises struct.error or ValueError where there is none."""
+    (offset,) = _POSITION.unpack(info.fields.get(b"chunk_pos", b""))
+    record = read_record(index.data, offset)
+    if record is None or record.opcode != CHUNK or record.end > len(index.data):
+        raise struct.error("no chunk")
+    pairs = np.frombuffer(index.data, "<u4", 2 * info.number(b"count"), info.begin).reshape(-1, 2).tolist()
+    return replace(
+        _chunk(index, record),
+        start_ns=info.time_ns(b"start_time"),
+        end_ns=info.time_ns(b"end_time"),
+        entries=tuple(Entry(number, -1, count) for number, count in pairs),
+    )
 
-    def _sort(self, record: Record) -> None:
-        if record.opcode == INDEX:
-            self._index(record)
+
+def _walk(index: FileIndex) -> None:
+    """Take in the chunks and connections one after the other, and go on behind damage."""
+    data, offset = index.data, len(MAGIC)
+    while offset < len(data):
+        record = read_record(data, offset)
+        if record is not None and (record.end == len(data) or read_record(data, record.end) is not None):
+            _take(index, record)
+            offset = record.end
+            continue
+        behind = next_record(data, offset, offset if record is None else record.end)
+        limit = len(data) if behind is None else behind.offset
+        if record is not None and (record.end <= limit or (behind is None and record.opcode == CHUNK)):
+            _take(index, record)
+        if behind is None:
+            index.damage.append(f"{index.path}: cut off, or damaged to its end, at byte {offset}")
             return
-        self._close(complete=True)
-        if record.opcode == CHUNK:
-            self._chunk(record)
-        elif record.opcode == CONNECTION:
-            self._define(channel_of(self.index.number, record, memoryview(self.index.data)))
-        elif record.opcode == CHUNK_INFO:
-            pairs = np.frombuffer(self.index.data, "<u4", 2 * record.number(b"count"), record.begin)
-            for number, count in pairs.reshape(-1, 2).tolist():
-                self.stated[number] += count
-        elif record.opcode == HEADER and record.text(b"encryptor"):
-            raise InputError(f"{self.index.path}: is encrypted ({record.text(b'encryptor')}); decrypt it first")
+        index.damage.append(
+            f"{index.path}: the record at byte {offset} is damaged; reading went on at byte {behind.offset}"
+        )
+        offset = behind.offset
 
-    def _chunk(self, record: Record) -> None:
-        index, end = self.index, len(self.index.data)
-        size, claimed = min(record.end, end) - record.begin, record.number(b"size")
-        if not is_plausible_size(size, claimed):
-            index.damage.append(
-                f"{index.path}: the chunk at byte {record.offset} claims to unpack from {size} to {claimed} "
-                "bytes, more than is accepted, and was left out"
-            )
-            return
-        name = record.text(b"compression")
-        compression = "" if name == "none" else name
-        is_cut = record.end > end
-        self.chunk = Block(index.number, record.begin, size, compression, claimed, 0, 0, 0, is_cut=is_cut)
 
-    def _index(self, record: Record) -> None:
-        """Add the number and times of a connection's messages in the chunk before."""
-        times = np.frombuffer(self.index.data, _INDEX_TIMES, record.number(b"count"), record.begin)
-        if len(times) and self.chunk is not None:
-            self.entries.append(Entry(record.number(b"conn"), -1, len(times)))
-            times_ns = as_ns(times["s"].astype(np.int64), times["ns"])
-            self.times_ns += [int(times_ns.min()), int(times_ns.max())]
+def _take(index: FileIndex, record: Record) -> None:
+    try:
+        if record.opcode == CONNECTION:
+            _define(index, record, index.data)
+        elif record.opcode == CHUNK:
+            index.blocks.append(_chunk(index, record))
+    except (struct.error, ValueError) as error:
+        what = str(error) if isinstance(error, ValueError) else "is malformed"
+        index.damage.append(f"{index.path}: the record at byte {record.offset} {what} and was left out")
 
-    def _define(self, channel: Channel) -> None:
-        self.index.channels.setdefault(channel.key[1], channel)
 
-    def _close(self, *, complete: bool) -> None:
-        """End the chunk; an index that does not cover all of its messages is discarded."""
-        if self.chunk is not None:
-            block = self.chunk
-            if complete and self.is_sure and self.entries:
-                first_ns, last_ns = min(self.times_ns), max(self.times_ns)
-                block = replace(block, start_ns=first_ns, end_ns=last_ns, entries=tuple(self.entries))
-            self.index.blocks.append(block)
-        self.chunk, self.entries, self.times_ns, self.is_sure = None, [], [], True
+def _chunk(index: FileIndex, record: Record) -> Block:
+    """A chunk, its messages not counted. Raises struct.error or ValueError where its fields are none."""
+    end = len(index.data)
+    size, claimed = min(record.end, end) - record.begin, record.number(b"size")
+    if not is_plausible_size(size, claimed):
+        raise ValueError(f"claims to unpack from {size} to {claimed} bytes, more than is accepted,")
+    name = record.text(b"compression")
+    is_cut = record.end > end
+    return Block(index.number, record.begin, size, "" if name == "none" else name, claimed, 0, 0, 0, is_cut=is_cut)
 
-    def _unpacked(self, block: Block) -> Block:
-        """A chunk whose messages have been counted by unpacking it."""
-        messages = messages_of(self.index, block)
-        counts = Counter(message.channel.key[1] for message in messages)
-        times_ns = [message.log_time_ns for message in messages] or [0]
-        entries = tuple(Entry(number, -1, count) for number, count in counts.items())
-        return replace(block, start_ns=min(times_ns), end_ns=max(times_ns), entries=entries)
+
+def _counted(index: FileIndex, block: Block) -> Block:
+    """A chunk whose messages have been counted by unpacking it."""
+    messages = messages_of(index, block)
+    counts = Counter(message.channel.key[1] for message in messages)
+    times_ns = [message.log_time_ns for message in messages] or [0]
+    entries = tuple(Entry(number, -1, count) for number, count in counts.items())
+    return replace(block, start_ns=min(times_ns), end_ns=max(times_ns), entries=entries)
+
+
+def _contents(index: FileIndex, block: Block, _: AbstractSet[int] | None) -> Contents:
+    """The messages of a chunk; connections found there join the index."""
+    name = f"{index.path}: the chunk at byte {block.offset}"
+    messages: list[Message] = []
+    undefined = 0
+    try:
+        payload = unpack(index, block)
+        for record in whole_records(payload):
+            if record.opcode == CONNECTION:
+                _define(index, record, payload)
+            elif record.opcode == MESSAGE:
+                number, time_ns = record.number(b"conn"), record.time_ns(b"time")
+                channel = index.channels.get(number)
+                undefined += channel is None
+                if channel is not None:
+                    messages.append(Message(channel, time_ns, payload[record.begin : record.end]))
+    except struct.error:
+        damage = f"{name}: a record in it is malformed; what follows was left out"
+        return Contents(messages, "" if block.is_cut else damage)
+    lost = f"{name}: {counted(undefined, 'message')} of no known connection" if undefined else ""
+    return Contents(messages, lost)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Set as AbstractSet
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from scanchain.errors import InputError, counted, one_line
 from scanchain.logs.files import size_of
-from scanchain.logs.formats.on_demand import on_demand_index
+from scanchain.logs.formats import on_demand_index
 from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
-from scanchain.logs.writing.pack import schema_text
+from scanchain.logs.writer import schema_text
 
 _BLOCK_BYTES = 8_000_000  # size of a block in bytes of the file, about
 _MOST_BLOCKS = 4096
@@ -25,12 +27,34 @@ def claims_ros2_bag(path: Path, head: bytes) -> bool:
 
 
 def index_ros2_bag(path: Path, number: int) -> FileIndex:
-    """The topics of a .db3 or the folder of a ROS 2 bag. Raises InputError for what is none."""
-    index, reader = on_demand_index(path, number), _open(path)
-    if not all(_is_valid(connection) for connection in reader.connections):
-        raise InputError(f"{path}: its metadata.yaml is damaged; ros2 bag reindex makes a new one")
-    bag = _Bag(index, reader)
-    index.make = bag.make
+    """The topics of a .db3 or the folder of a ROS 2 bag; blocks are spans of time. Raises InputError for none."""
+    from rosbags import rosbag2
+
+    try:
+        reader = rosbag2.Reader(path)
+        reader.open()
+    except Exception as error:  # whatever a damaged file makes the libraries below raise
+        raise InputError(
+            f"{path}: cannot be read as a ROS bag ({_reason(error)}); "
+            "ros2 bag reindex mends the folder of a ROS 2 bag"
+        ) from error
+    index = on_demand_index(path, number)
+    connections: dict[int, Any] = {}
+    for id_, each in enumerate(reader.connections, start=1):
+        encoding = each.ext.serialization_format
+        are_texts = all(isinstance(text, str) for text in (each.topic, each.msgtype, encoding))
+        if not (are_texts and isinstance(each.msgcount, int)):
+            raise InputError(f"{path}: its metadata.yaml is damaged; ros2 bag reindex makes a new one")
+        if each.msgcount:
+            language = "ros2idl" if each.msgdef.format.name == "IDL" else "ros2msg"
+            definition = each.msgdef.data.encode() or schema_text(each.msgtype)
+            index.channels[id_] = Channel(
+                (number, id_), each.topic, encoding, id_, each.msgtype, language, definition
+            )
+            index.counts[id_], connections[id_] = each.msgcount, each
+    if connections:
+        _cut(index, reader.start_time, reader.end_time)
+    index.make = partial(_contents, index, reader, connections, threading.Lock())
     return index
 
 
@@ -50,92 +74,55 @@ def parts_of_bag(folder: Path) -> list[Path]:
     return parts if is_mcap and not is_packed else [folder]
 
 
-class _Bag:
-    """A reader of rosbags, which one thread at a time may use; blocks are spans of time."""
-
-    def __init__(self, index: FileIndex, reader: Any) -> None:
-        self.index = index
-        self.reader = reader
-        self.lock = threading.Lock()
-        self.connections = {number: c for number, c in enumerate(reader.connections, start=1) if c.msgcount}
-        for number, connection in self.connections.items():
-            index.channels[number] = _channel((index.number, number), connection)
-            index.counts[number] = connection.msgcount
-        self.numbers = {id(connection): number for number, connection in self.connections.items()}
-        if self.connections:
-            self._cut()
-
-    def make(self, block: Block, wanted: AbstractSet[int] | None) -> Contents:
-        """The messages of a span of time; one that cannot be read is halved until what is damaged stands alone."""
-        chosen = [c for number, c in self.connections.items() if wanted is None or number in wanted]
-        messages: list[Message] = []
-        lost, first_ns, reason = 0, 0, ""
-        spans, tries = [self._ends(block)] if chosen else [], _MOST_TRIES
-        with self.lock:
-            while spans:
-                start_ns, stop_ns = spans.pop()
-                try:
-                    found = list(self.reader.messages(chosen, start_ns, stop_ns))
-                except Exception as error:  # whatever a damaged file makes the libraries below raise
-                    middle_ns, tries = (start_ns + stop_ns) // 2, tries - 1
-                    if start_ns < middle_ns and tries > 0:
-                        spans += [(middle_ns, stop_ns), (start_ns, middle_ns)]
-                    else:
-                        first_ns, reason = first_ns or start_ns, reason or _reason(error)
-                        lost += 1
-                    continue
-                messages += [
-                    Message(self.index.channels[self.numbers[id(connection)]], time_ns, memoryview(data))
-                    for connection, time_ns, data in found
-                ]
-        what = f"at least {counted(lost, 'message')} from {first_ns * 1e-9:.3f} s on cannot be read ({reason})"
-        return Contents(messages, f"{self.index.path}: {what}" if lost else "")
-
-    def _ends(self, block: Block) -> tuple[int, int]:
-        """First and last time of a block; the first and the last reach as far as time, whatever the metadata."""
-        is_first, is_last = block.offset == 0, block.offset == len(self.index.blocks) - 1
-        return 0 if is_first else block.start_ns, _LATEST_NS if is_last else block.end_ns + 1
-
-    def _cut(self) -> None:
-        """Spans of time of one length, so many that each holds a few megabytes on average."""
-        begin_ns, end_ns = self.reader.start_time, self.reader.end_time  # the end is not in it
-        size = size_of(self.index.path)
-        count = min(max(size // _BLOCK_BYTES, 1), _MOST_BLOCKS, max(end_ns - begin_ns, 1))
-        edges_ns = [begin_ns + (end_ns - begin_ns) * place // count for place in range(count + 1)]
-        for place in range(count):
-            start_ns, last_ns = edges_ns[place], edges_ns[place + 1] - 1
-            share = size // count
-            block = Block(self.index.number, place, share, "", share, 0, start_ns, last_ns, is_chunk=False)
-            self.index.blocks.append(block)
+def _cut(index: FileIndex, begin_ns: int, end_ns: int) -> None:
+    """Add spans of time of one length up to the end, so many that each holds a few megabytes on average."""
+    size = size_of(index.path)
+    count = min(max(size // _BLOCK_BYTES, 1), _MOST_BLOCKS, max(end_ns - begin_ns, 1))
+    edges_ns = [begin_ns + (end_ns - begin_ns) * place // count for place in range(count + 1)]
+    for place, (start_ns, stop_ns) in enumerate(pairwise(edges_ns)):
+        share = size // count
+        index.blocks.append(Block(index.number, place, share, "", share, 0, start_ns, stop_ns - 1, is_chunk=False))
 
 
-def _open(path: Path) -> Any:
-    from rosbags import rosbag2
+def _contents(
+    index: FileIndex,
+    reader: Any,
+    connections: dict[int, Any],
+    lock: threading.Lock,
+    block: Block,
+    wanted: AbstractSet[int] | None,
+) -> Contents:
+    """The messages of a span of time; one that cannot be read is halved until what is damaged stands alone.
 
-    try:
-        reader = rosbag2.Reader(path)
-        reader.open()
-    except Exception as error:  # whatever a damaged file makes the libraries below raise
-        raise InputError(
-            f"{path}: cannot be read as a ROS bag ({_reason(error)}); "
-            "ros2 bag reindex mends the folder of a ROS 2 bag"
-        ) from error
-    return reader
+    One thread at a time may use the reader of rosbags.
+    """
+    chosen = [each for number, each in connections.items() if wanted is None or number in wanted]
+    numbers = {id(each): number for number, each in connections.items()}
+    last = len(index.blocks) - 1  # the first and the last reach as far as time, whatever the metadata
+    begin_ns = 0 if block.offset == 0 else block.start_ns
+    spans = [(begin_ns, _LATEST_NS if block.offset == last else block.end_ns + 1)] if chosen else []
+    messages: list[Message] = []
+    lost, first_ns, reason, tries = 0, 0, "", _MOST_TRIES
+    with lock:
+        while spans:
+            start_ns, stop_ns = spans.pop()
+            try:
+                found = list(reader.messages(chosen, start_ns, stop_ns))
+            except Exception as error:  # whatever a damaged file makes the libraries below raise
+                middle_ns, tries = (start_ns + stop_ns) // 2, tries - 1
+                if start_ns < middle_ns and tries > 0:
+                    spans += [(middle_ns, stop_ns), (start_ns, middle_ns)]
+                else:
+                    first_ns, reason = first_ns or start_ns, reason or _reason(error)
+                    lost += 1
+                continue
+            messages += [
+                Message(index.channels[numbers[id(each)]], time_ns, memoryview(data))
+                for each, time_ns, data in found
+            ]
+    what = f"at least {counted(lost, 'message')} from {first_ns * 1e-9:.3f} s on cannot be read ({reason})"
+    return Contents(messages, f"{index.path}: {what}" if lost else "")
 
 
 def _reason(error: Exception) -> str:
     return one_line(error) or type(error).__name__
-
-
-def _is_valid(connection: Any) -> bool:
-    """True if the metadata of a topic is of the right types."""
-    texts = connection.topic, connection.msgtype, connection.ext.serialization_format
-    return all(isinstance(text, str) for text in texts) and isinstance(connection.msgcount, int)
-
-
-def _channel(key: tuple[int, int], connection: Any) -> Channel:
-    stated = connection.msgdef
-    encoding = connection.ext.serialization_format
-    language = "ros2idl" if stated.format.name == "IDL" else "ros2msg"
-    definition = stated.data.encode() or schema_text(connection.msgtype)
-    return Channel(key, connection.topic, encoding, key[1], connection.msgtype, language, definition)

@@ -19,8 +19,7 @@ from scanchain.errors import InputError, counted, one_line, shown
 from scanchain.files import Source
 from scanchain.logs.mcap.index import index_file
 from scanchain.logs.mcap.records import FileIndex
-from scanchain.logs.writing.pack import LATEST_NS
-from scanchain.logs.writing.writer import LogWriter
+from scanchain.logs.writer import LATEST_NS, LogWriter
 
 _TOPIC, _FRAME = "/points", "lidar"
 

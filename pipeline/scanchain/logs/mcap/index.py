@@ -11,8 +11,7 @@ from __future__ import annotations
 import mmap
 import struct
 import zlib
-from collections import Counter, deque
-from collections.abc import Callable
+from collections import Counter
 from dataclasses import replace
 from functools import lru_cache
 from io import BytesIO
@@ -22,7 +21,7 @@ import numpy as np
 from mcap.records import Channel, ChunkIndex, Schema, Statistics
 from mcap.stream_reader import StreamReader
 
-from scanchain.errors import InputError, counted
+from scanchain.errors import InputError
 from scanchain.files import Source
 from scanchain.logs.files import RemoteFile
 from scanchain.logs.mcap.records import (
@@ -43,7 +42,6 @@ from scanchain.logs.mcap.records import (
 )
 
 HEADER, FOOTER, ATTACHMENT, METADATA, DATA_END = 1, 2, 9, 12, 15
-_PRIVATE = 0x80  # opcodes from here on are those of applications
 _LEAST_BYTES = {HEADER: 8, MESSAGE: MESSAGE_HEAD.size, ATTACHMENT: 36, METADATA: 8}  # of a record's body
 _DATA_END = RECORD.pack(DATA_END, 4)
 _FOOTER_BYTES = RECORD.size + 20 + len(MAGIC)  # the closing magic included
@@ -67,10 +65,22 @@ def index_file(path: Path, number: int, source: Source | None = None) -> FileInd
 
     source : the original of a copy, named in messages; None for itself
     """
-    data = _map(path)
+    try:
+        with path.open("rb") as file:
+            data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: no such file; check the path") from error
+    except ValueError as error:
+        raise InputError(f"{path}: is empty (0 bytes); record or copy it again") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
+    if data[: len(MAGIC)] != MAGIC:
+        raise InputError(f"{path}: is not an MCAP file (starts with {data[:8]!r}); see scanchain convert --help")
     index = FileIndex(source or path, number, data)
-    summary = _summary(lambda offset, size: data[offset : offset + size], len(data), needs_crc=True)
-    return index if _take_summary(index, summary, len(data)) else walked(FileIndex(index.path, number, data))
+    if not _take_summary(index, len(data), needs_crc=True):
+        index = FileIndex(source or path, number, data, is_consistent=False)
+        Walk(index).walk()
+    return index
 
 
 def index_by_summary(file: RemoteFile, number: int) -> FileIndex | None:
@@ -79,67 +89,22 @@ def index_by_summary(file: RemoteFile, number: int) -> FileIndex | None:
     Any other file has to be walked, which takes all its bytes.
     """
     index = FileIndex(file.address, number, b"", lru_cache(_REPEATED)(file.read))
-    summary = _summary(file.read, file.size, needs_crc=False)
-    return index if _take_summary(index, summary, file.size) else None
+    return index if _take_summary(index, file.size, needs_crc=False) else None
 
 
-def walked(index: FileIndex) -> FileIndex:
-    """The index, filled by walking the records of its file."""
-    data, walk = index.data, _Walk(index)
-    index.is_consistent = False
-    sought: tuple[int, ...] = ()
-    chunk = 0  # the last one; records behind it may be none, met by a length that is wrong
-    offset, end = len(MAGIC), _record_end(index, len(MAGIC))
-    while end or not _is_whole_summary(index, offset):
-        following = _record_end(index, end) if end else 0
-        if end and (following or _is_end(data, end)) and not walk.is_shortened(offset, end):
-            walk.take(offset, end)
-            chunk = offset if data[offset] == CHUNK else chunk
-            offset, end = end, following
-            continue
-        is_chunk = _chunk_at(index, offset) is not None
-        sought = sought or _sought(index)
-        searched = 1 + (chunk if sought == (CHUNK,) and not is_chunk else offset)
-        resumed = _next_record(index, searched, sought) or max(data.rfind(_DATA_END, offset + 1), 0)
-        if end and (is_chunk or not 0 < resumed < end):
-            walk.take(offset, end)
-            offset = end
-        if not resumed:
-            walk.cut_off(offset)
-            break
-        if resumed != offset:  # which is that of a chunk that is cut off
-            where = min(offset, resumed)
-            index.damage.append(
-                f"{index.path}: the record at byte {where} is damaged; reading went on at byte {resumed}"
-            )
-            walk.close(where, complete=False)
-        chunk = offset = resumed
-        end = _record_end(index, offset)
-    walk.close(offset, complete=True)
-    if walk.private:
-        index.damage.append(
-            f"{index.path}: passed over {counted(len(walk.private), 'record')} of unknown kinds, "
-            f"the first at byte {walk.private[0]}"
-        )
-    return index
-
-
-def _summary(read: Callable[[int, int], bytes], size: int, *, needs_crc: bool) -> bytes:
-    """The summary of a file of this size, to its end; empty where there is none or its CRC is wrong."""
-    tail = read(max(size - _TAIL_BYTES, 0), min(size, _TAIL_BYTES))
+def _take_summary(index: FileIndex, size: int, *, needs_crc: bool) -> bool:
+    """Fill the index by the summary of a file of this size; False where that does not give every message."""
+    tail = bytes(index.bytes_at(max(size - _TAIL_BYTES, 0), min(size, _TAIL_BYTES)))
     footer = tail[-_FOOTER_BYTES:]
     if len(footer) < _FOOTER_BYTES or not footer.endswith(MAGIC) or footer[0] != FOOTER:
-        return b""
+        return False
     begin, _, crc = struct.unpack_from("<QQI", footer, RECORD.size)
     if not 0 < begin <= size - len(footer) or (needs_crc and not crc):
-        return b""
+        return False
     missing = size - len(tail) - begin
-    summary = read(begin, missing) + tail if missing > 0 else tail[-missing:]
-    return summary if not crc or zlib.crc32(summary[: -len(MAGIC) - 4]) == crc else b""
-
-
-def _take_summary(index: FileIndex, summary: bytes, size: int) -> bool:
-    """Fill the index by the summary of a file of this size; False where that does not give every message."""
+    summary = bytes(index.bytes_at(begin, missing)) + tail if missing > 0 else tail[-missing:]
+    if crc and zlib.crc32(summary[: -len(MAGIC) - 4]) != crc:
+        return False
     try:
         statistics = _fill(index, summary)
     except MALFORMED:
@@ -185,120 +150,85 @@ def _indexed(chunk: ChunkIndex, file: int) -> Block:
     return Block(file, end - size, size, chunk.compression, chunk.uncompressed_size, None, *times_ns, entries)
 
 
-def _is_whole_summary(index: FileIndex, offset: int) -> bool:
-    """True if the data end here and a summary ends the file; its channels are taken in as a last resort."""
-    if not _is_end(index.data, offset):
-        return False
-    uncertain = FileIndex(index.path, index.number, b"", channels=index.uncertain_channels)
-    try:
-        _fill(uncertain, index.data[offset:])
-    except MALFORMED:
-        return False
-    return True
-
-
-def _map(path: Path) -> mmap.mmap:
-    try:
-        with path.open("rb") as file:
-            data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file; check the path") from error
-    except ValueError as error:
-        raise InputError(f"{path}: is empty (0 bytes); record or copy it again") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
-    if data[: len(MAGIC)] != MAGIC:
-        raise InputError(f"{path}: is not an MCAP file (starts with {data[:8]!r}); see scanchain convert --help")
-    return data
-
-
-class _Walk:
+class Walk:
     """Sorts records into an index; a chunk waits for its message index, loose messages for each other."""
 
     def __init__(self, index: FileIndex) -> None:
         self.index = index
+        self.data = index.data
         self.chunk: Block | None = None
         self.entries: list[Entry] = []
-        self.private: list[int] = []  # offsets of records of some application, or of damaged messages
-        self.loose_from = -1
-        self.loose_times: list[int] = []
-        self.loose_counts: Counter[int] = Counter()
-        self.loose_sizes: deque[int] = deque(maxlen=8)  # of the records met last
+        self.loose: list[tuple[int, int]] = []  # channel and log time of messages outside of chunks
+        self.loose_from = 0
 
-    def take(self, offset: int, end: int) -> None:
+    def walk(self) -> None:
+        """Take in every record, and note what is damaged or missing."""
+        index, data = self.index, self.data
+        sought: tuple[int, ...] = ()
+        offset, end = len(MAGIC), _record_end(index, len(MAGIC))
+        while end or not self._takes_summary(offset):
+            following = _record_end(index, end) if end else 0
+            if end and (following or _is_end(data, end)):
+                self._take(offset, end)
+                offset, end = end, following
+                continue
+            sought = sought or _sought(index)
+            resumed = _next_record(index, offset + 1, sought) or max(data.rfind(_DATA_END, offset + 1), 0)
+            if end and (_chunk_at(index, offset) or not 0 < resumed < end):
+                self._take(offset, end)
+                offset = end
+            if not resumed:
+                self._cut_off(offset)
+                break
+            if resumed != offset:  # which is that of a chunk that is cut off
+                where = min(offset, resumed)
+                index.damage.append(
+                    f"{index.path}: the record at byte {where} is damaged; reading went on at byte {resumed}"
+                )
+                self._close(where, complete=False)
+            offset, end = resumed, _record_end(index, resumed)
+        self._close(offset, complete=True)
+
+    def _takes_summary(self, offset: int) -> bool:
+        """True if the data end here and a summary ends the file; its channels are taken in as a last resort."""
+        if not _is_end(self.data, offset):
+            return False
+        uncertain = FileIndex(self.index.path, self.index.number, b"", channels=self.index.uncertain_channels)
+        try:
+            _fill(uncertain, self.data[offset:])
+        except MALFORMED:
+            return False
+        return True
+
+    def _take(self, offset: int, end: int) -> None:
         """Sort in the record of these bytes."""
-        data, opcode, body = self.index.data, self.index.data[offset], offset + RECORD.size
-        chunk = _chunk_at(self.index, offset)
+        index, body = self.index, offset + RECORD.size
+        opcode, chunk = self.data[offset], _chunk_at(index, offset)
         if chunk is not None:
-            self.close(offset, complete=True)
+            self._close(offset, complete=True)
             self._take_chunk(chunk, offset)
         elif opcode == MESSAGE:
             self._take_message(offset, end)
         elif opcode == MESSAGE_INDEX and self.chunk is None:
-            self.index.note_damage(
-                f"{self.index.path}: the chunk before the message index at byte {offset} is missing"
-            )
+            index.note_damage(f"{index.path}: the chunk before the message index at byte {offset} is missing")
         elif opcode == MESSAGE_INDEX and end - body > 6:
-            (channel,) = struct.unpack_from("<H", data, body)
+            (channel,) = struct.unpack_from("<H", self.data, body)
             self.entries.append(Entry(channel, body + 6, (end - body - 6) // 16))
         elif opcode in (SCHEMA, CHANNEL):
-            self.index.define(read_definition(opcode, data[body:end]))
+            index.define(read_definition(opcode, self.data[body:end]))
         else:
-            self.close(offset, complete=True)
-            self.private += [offset] if opcode >= _PRIVATE else []
-
-    def is_shortened(self, offset: int, end: int) -> bool:
-        """True if a loose message ends in a whole one of a size met lately: so many bytes of it are missing."""
-        data, sizes = self.index.data, [size for size in self.loose_sizes if size < end - offset]
-        return data[offset] == MESSAGE and any(
-            RECORD.unpack_from(data, end - size) == (MESSAGE, size - RECORD.size) for size in sizes
-        )
-
-    def cut_off(self, offset: int) -> None:
-        """End the walk at the record that is not all there; of a chunk the beginning is retained."""
-        index, size, is_end = self.index, len(self.index.data), _is_end(self.index.data, offset)
-        self.close(offset, complete=is_end)
-        where = f", inside the record at byte {offset}" if offset + RECORD.size <= size else ""
-        index.damage.append(
-            f"{index.path}: the summary at byte {offset} is damaged or cut off"
-            if is_end
-            else f"{index.path}: cut off at byte {size}{where}, without the closing magic"
-        )
-        chunk = _chunk_at(index, offset)
-        if chunk is not None:
-            self._take_chunk(chunk, offset)
-            self.close(size, complete=False)
-
-    def close(self, offset: int, *, complete: bool) -> None:
-        """End the chunk or the run of loose messages at this byte; incomplete entries are discarded."""
-        if self.chunk is not None:
-            self.index.blocks.append(replace(self.chunk, entries=tuple(self.entries) if complete else ()))
-        if self.loose_times:
-            first, last = min(self.loose_times), max(self.loose_times)
-            size = offset - self.loose_from
-            entries = tuple(Entry(channel, -1, count) for channel, count in self.loose_counts.items())
-            self.index.blocks.append(
-                Block(self.index.number, self.loose_from, size, "", size, 0, first, last, entries, is_chunk=False)
-            )
-        self.chunk, self.entries = None, []
-        self.loose_from, self.loose_times, self.loose_counts = -1, [], Counter()
+            self._close(offset, complete=True)
 
     def _take_message(self, offset: int, end: int) -> None:
-        if self.chunk is not None:
-            self.close(offset, complete=True)
-        channel, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(self.index.data, offset + RECORD.size)
-        if self.loose_from < 0:
-            self.loose_from = offset
-        if end - offset not in self.loose_sizes:
-            self.loose_sizes.append(end - offset)
-        self.loose_times.append(log_time_ns)
-        self.loose_counts[channel] += 1
-        if end - self.loose_from > _LOOSE_BYTES:
-            self.close(end, complete=True)
+        if self.chunk is not None or end - self.loose_from > _LOOSE_BYTES:
+            self._close(offset, complete=True)
+        channel, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(self.data, offset + RECORD.size)
+        self.loose_from = self.loose_from if self.loose else offset
+        self.loose.append((channel, log_time_ns))
 
     def _take_chunk(self, chunk: Block, offset: int) -> None:
         name = f"{self.index.path}: the chunk at byte {offset}"
-        if self.index.data[offset] != CHUNK:
+        if self.data[offset] != CHUNK:
             self.index.damage.append(f"{name} is marked as another record; it was read all the same")
         if is_plausible_size(chunk.size, chunk.uncompressed_size):
             self.chunk = chunk
@@ -307,6 +237,34 @@ class _Walk:
             f"{name} claims to unpack from {chunk.size} to {chunk.uncompressed_size} bytes, more than is "
             "accepted, and was left out"
         )
+
+    def _cut_off(self, offset: int) -> None:
+        """End the walk at the record that is not all there; of a chunk the beginning is retained."""
+        path, size, is_end = self.index.path, len(self.data), _is_end(self.data, offset)
+        self._close(offset, complete=is_end)
+        where = f", inside the record at byte {offset}" if offset + RECORD.size <= size else ""
+        self.index.damage.append(
+            f"{path}: the summary at byte {offset} is damaged or cut off"
+            if is_end
+            else f"{path}: cut off at byte {size}{where}, without the closing magic"
+        )
+        chunk = _chunk_at(self.index, offset)
+        if chunk is not None:
+            self._take_chunk(chunk, offset)
+            self._close(size, complete=False)
+
+    def _close(self, offset: int, *, complete: bool) -> None:
+        """End the chunk or the run of loose messages at this byte; incomplete entries are discarded."""
+        if self.chunk is not None:
+            self.index.blocks.append(replace(self.chunk, entries=tuple(self.entries) if complete else ()))
+        if self.loose:
+            times_ns = [log_time_ns for _, log_time_ns in self.loose]
+            counts = Counter(channel for channel, _ in self.loose)
+            entries = tuple(Entry(channel, -1, count) for channel, count in counts.items())
+            begin, size, span = self.loose_from, offset - self.loose_from, (min(times_ns), max(times_ns))
+            block = Block(self.index.number, begin, size, "", size, 0, *span, entries, is_chunk=False)
+            self.index.blocks.append(block)
+        self.chunk, self.entries, self.loose = None, [], []
 
 
 def is_plausible_size(size: int, uncompressed: int) -> bool:
@@ -338,7 +296,7 @@ def _record_end(index: FileIndex, offset: int) -> int:
         except MALFORMED:
             return 0
         return end
-    return end if opcode >= _PRIVATE or length >= _LEAST_BYTES.get(opcode, len(data)) else 0
+    return end if length >= _LEAST_BYTES.get(opcode, len(data)) else 0
 
 
 def _chunk_at(index: FileIndex, offset: int) -> Block | None:

@@ -115,7 +115,7 @@ class FileIndex:
     ----------
     number : its place among the files of the log
     data : the bytes of an MCAP file; ``fetch`` reads those of a remote one, by offset and size; of another
-        format ``make`` makes the contents of a block, of all channels or of those wanted
+        format ``make`` makes the contents of a block, at least of the channels that are wanted, None for all
     counts : messages by channel id; ``is_counted`` once they are complete
     uncertain_channels : those of a summary that was not accepted, for channels defined nowhere else
     is_consistent : whether the channels that blocks state were checked
@@ -131,7 +131,6 @@ class FileIndex:
     channels: dict[int, Channel] = field(default_factory=dict)
     counts: dict[int, int] = field(default_factory=dict)
     is_counted: bool = False
-    takes_rate: bool = False
     is_consistent: bool = True
     uncertain_channels: dict[int, Channel] = field(default_factory=dict)
     damage: list[str] = field(default_factory=list)
@@ -220,7 +219,8 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
     Raises DamagedBlockError where a whole block does not unpack to what its header says.
     """
     if index.make is not None:
-        return index.make(block, wanted)
+        made = index.make(block, wanted)
+        return made._replace(messages=[m for m in made.messages if wanted is None or m.channel.key[1] in wanted])
     payload = unpack(index, block)
     messages: list[Message] = []
     met = undefined = 0

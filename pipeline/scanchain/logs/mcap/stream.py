@@ -1,4 +1,4 @@
-"""Messages of a log, decoded: all of them in the order of log time, or a sample before the log is read.
+"""Messages of a log: the part that is read by log time, how many they are, and all of them, decoded in order.
 
 Chunks and files may overlap; they are unpacked and decoded ahead in threads.
 """
@@ -6,16 +6,245 @@ Chunks and files may overlap; they are unpacked and decoded ahead in threads.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from heapq import heappop, heappush
 from itertools import pairwise
+from math import inf
 from typing import NamedTuple, TypeVar
 
-from scanchain.logs.mcap.records import Block, Channel, DamagedBlockError, FileIndex, Message, read_block, release
-from scanchain.logs.mcap.selection import EVERYTHING, Span, messages_of
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain.config import LogConfig
+from scanchain.errors import InputError, duration
+from scanchain.logs.mcap.records import (
+    Block,
+    Channel,
+    DamagedBlockError,
+    FileIndex,
+    Message,
+    damage_of,
+    name_of,
+    read_block,
+    release,
+)
 from scanchain.logs.messages.ros import MalformedMessageError
 from scanchain.threads import threads
+
+
+class Span(NamedTuple):
+    """Log times in nanoseconds, both ends included."""
+
+    begin_ns: int
+    end_ns: int
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds from one end to the other."""
+        return (self.end_ns - self.begin_ns) * 1e-9
+
+    def meets(self, block: Block) -> bool:
+        """True if the block may hold messages of the span."""
+        return block.may_be_empty or (block.end_ns >= self.begin_ns and block.start_ns <= self.end_ns)
+
+    def covers(self, block: Block) -> bool:
+        """True if all messages of the block lie in the span."""
+        return self.begin_ns <= block.start_ns <= block.end_ns <= self.end_ns
+
+
+_LONG_GAP_NS = 60_000_000_000  # without any message
+_LONGEST_GAP_NS = 86_400_000_000_000  # without any message between two files of one log
+
+EVERYTHING = Span(0, (1 << 64) - 1)
+
+
+def whole_span(indexes: Sequence[FileIndex]) -> Span:
+    """From the first message of all topics to the last, (0, 0) where there is none."""
+    blocks = _timed(indexes)
+    begin_ns = min((block.start_ns for block in blocks), default=0)
+    return Span(begin_ns, max((block.end_ns for block in blocks), default=0))
+
+
+def chosen_span(whole: Span, config: LogConfig) -> Span:
+    """From ``log.start_s`` to ``log.end_s``, counted from the first message; everything where neither is set."""
+    if config.start_s == 0.0 and config.end_s == inf:
+        return EVERYTHING
+    begin_ns = whole.begin_ns + round(config.start_s * 1e9)
+    end_s = min(config.end_s, whole.duration_s)
+    return Span(begin_ns, whole.end_ns if end_s == whole.duration_s else whole.begin_ns + round(end_s * 1e9))
+
+
+class Gap(NamedTuple):
+    """A part of a log without any message, and the numbers of the files before and behind it."""
+
+    span: Span
+    before: int
+    behind: int
+
+
+def notes_on(indexes: Sequence[FileIndex], config: LogConfig) -> list[str]:
+    """Warnings about the chosen part: an end beyond that of the log, long gaps within it."""
+    whole_s = whole_span(indexes).duration_s
+    is_beyond = whole_s < config.end_s < inf
+    beyond = f"--end {config.end_s:g} s has no effect: the log ends at {whole_s:.1f} s"
+    return [*([beyond] if is_beyond else []), *gap_notes(indexes, config)]
+
+
+def gap_notes(indexes: Sequence[FileIndex], config: LogConfig) -> list[str]:
+    """Warnings about gaps of more than a minute in the chosen part."""
+    whole, notes = whole_span(indexes), []
+    for gap in _long_gaps(indexes, config):
+        files = [indexes[number].path.name for number in (gap.before, gap.behind)]
+        where = f" between {files[0]} and {files[1]}" if gap.before != gap.behind else ""
+        notes.append(
+            f"no message for {duration(gap.span.duration_s)} from "
+            f"{1e-9 * (gap.span.begin_ns - whole.begin_ns):.1f} s on{where}: read as one log all the same; "
+            "--start and --end choose a part"
+        )
+    return notes
+
+
+def check_one_log(indexes: Sequence[FileIndex], scanned: Collection[int], config: LogConfig) -> None:
+    """Refuse files with scans that lie too far apart in time to be parts of one log. Raises InputError.
+
+    scanned : numbers of the files with scans; others, as of a calibration, may be of any time
+    """
+    for gap in _long_gaps(indexes, config, scanned):
+        if gap.before != gap.behind and gap.span.end_ns - gap.span.begin_ns > _LONGEST_GAP_NS:
+            before, behind = (indexes[number].path for number in (gap.before, gap.behind))
+            raise InputError(
+                f"{before} ends {duration(gap.span.duration_s)} before {behind} begins: they are not parts of one "
+                "log; run each by itself, or all of them with scanchain batch"
+            )
+
+
+def are_parts(indexes: Sequence[FileIndex], is_lidar: Callable[[Channel], bool]) -> bool:
+    """True if no two files hold the same lidar's scans of one time, and none begins a minute after the others."""
+    last: dict[str, int] = {}
+    for index in sorted(indexes, key=lambda index: whole_span([index])):
+        span = whole_span([index])
+        for topic in {channel.topic for channel in index.channels.values() if is_lidar(channel)}:
+            if span.begin_ns < last.get(topic, 0):
+                return False
+            last[topic] = span.end_ns
+    return not any(gap.before != gap.behind for gap in _long_gaps(indexes, LogConfig()))
+
+
+def _long_gaps(
+    indexes: Sequence[FileIndex], config: LogConfig, files: Collection[int] | None = None
+) -> Iterator[Gap]:
+    """Gaps of more than a minute in the chosen part, or in that of some files."""
+    span = chosen_span(whole_span(indexes), config)
+    end_ns, before = None, 0
+    for block in sorted(_timed(indexes), key=lambda block: block.start_ns):
+        if not span.meets(block) or (files is not None and block.file not in files):
+            continue
+        if end_ns is not None and block.start_ns - end_ns > _LONG_GAP_NS:
+            yield Gap(Span(end_ns, block.start_ns), before, block.file)
+        if end_ns is None or block.end_ns > end_ns:
+            end_ns, before = block.end_ns, block.file
+
+
+def _timed(indexes: Sequence[FileIndex]) -> list[Block]:
+    """Blocks that hold messages; all of them if none is known to."""
+    blocks = [block for index in indexes for block in index.blocks]
+    return [block for block in blocks if not block.may_be_empty] or blocks
+
+
+def count_messages(indexes: Sequence[FileIndex], topic: str, span: Span) -> int:
+    """Number of messages of a topic in the span."""
+    count = 0
+    for index in indexes:
+        for number in index.numbers_of(topic):
+            for block in filter(span.meets, index.blocks):
+                if block.entries and span.covers(block):
+                    count += sum(entry.messages for entry in block.entries if entry.channel == number)
+                    continue
+                times_ns = log_times(index, block, number)
+                count += int(np.count_nonzero((times_ns >= span.begin_ns) & (times_ns <= span.end_ns)))
+    return count
+
+
+def count_scans(indexes: Sequence[FileIndex], topic: str, whole: Span, config: LogConfig) -> int:
+    """Number of scans of the topic in the chosen part, every n-th. Raises InputError where there is none."""
+    name, span = name_of(indexes), chosen_span(whole, config)
+    total = sum(index.counts.get(number, 0) for index in indexes for number in index.numbers_of(topic))
+    if not total:
+        remedy = damage_of(indexes) or "; scanchain info lists what there is"
+        raise InputError(f"{name}: topic {topic} has no messages{remedy}")
+    chosen = total if span == EVERYTHING else count_messages(indexes, topic, span)
+    if not chosen:
+        raise nothing_in_part(f"{name}: no scan of {topic}", whole, config)
+    return -(-chosen // config.every)
+
+
+def nothing_in_part(what: str, whole: Span, config: LogConfig) -> InputError:
+    """Error of a part that holds nothing."""
+    start, end = f"--start {config.start_s:g} s", f"--end {config.end_s:g} s"
+    part = f"between {start} and {end}" if config.start_s else f"before {end}"
+    part = f"after {start}" if config.end_s == inf else part
+    return InputError(f"{what} lies {part}; the log is {whole.duration_s:.1f} s long")
+
+
+def complete(index: FileIndex) -> None:
+    """Add the channels and counts that a file without a full summary has inside its chunks."""
+    counts = index.indexed_counts()
+    unknown = {number for number in {*index.counts, *counts} if not index.knows(number)}
+    for block in sorted(
+        index.blocks, key=lambda each: unknown.isdisjoint(entry.channel for entry in each.entries)
+    ):
+        if unknown or not (block.entries or index.is_counted):
+            messages = messages_of(index, block)
+            counts.update(message.channel.key[1] for message in messages if not block.entries)
+            unknown = {number for number in unknown if not index.knows(number)}
+    index.channels |= {k: channel for k, channel in index.uncertain_channels.items() if k in unknown}
+    if not index.is_counted:
+        index.counts = dict(counts)
+        index.is_counted = True
+
+
+def times_of(indexes: Sequence[FileIndex], topic: str) -> tuple[int, int, int]:
+    """Number of messages of a topic, and log times of the first and the last of them; 0, 0 where unknown.
+
+    Exact where a file has a message index, else as exact as its chunks.
+    """
+    messages, ends_ns = 0, list[int]()
+    for index in indexes:
+        for number in index.numbers_of(topic):
+            messages += index.counts.get(number, 0)
+            holding = [block for block in index.blocks if any(entry.channel == number for entry in block.entries)]
+            for block in holding[:1] + holding[1:][-1:]:
+                has_times = any(entry.channel == number and entry.offset >= 0 for entry in block.entries)
+                times_ns = log_times(index, block, number) if has_times else ()
+                found = len(times_ns) > 0
+                ends_ns += [int(min(times_ns)), int(max(times_ns))] if found else [block.start_ns, block.end_ns]
+    return messages, min(ends_ns, default=0), max(ends_ns, default=0)
+
+
+def messages_of(index: FileIndex, block: Block) -> list[Message]:
+    """The messages of a block, none where it is damaged, which is noted in the index."""
+    try:
+        return read_block(index, block).messages
+    except DamagedBlockError as error:
+        index.note_damage(f"{error}; it was left out")
+        return []
+
+
+def log_times(index: FileIndex, block: Block, channel: int) -> NDArray[np.uint64]:
+    """Log times of a channel's messages in a block, from the message index where there is one."""
+    for entry in block.entries:
+        if entry.channel == channel and entry.offset >= 0:
+            return np.frombuffer(index.bytes_at(entry.offset, 16 * entry.messages), "<u8")[::2]
+        if entry.channel == channel and index.make is not None and block.start_ns == block.end_ns:
+            return np.full(entry.messages, block.start_ns, np.uint64)
+    if block.entries and all(entry.channel != channel for entry in block.entries):
+        return np.empty(0, np.uint64)
+    messages = messages_of(index, block)
+    times = [message.log_time_ns for message in messages if message.channel.key[1] == channel]
+    return np.array(times, np.uint64)
+
 
 Decoders = Mapping[str, Callable[[memoryview], object]]
 _BLOCKS_AHEAD = 4  # that wait decoded, at most
@@ -44,7 +273,10 @@ def decoded_messages(
     wanted = [{number for topic in decoders for number in index.numbers_of(topic)} for index in indexes]
 
     def decode(block: Block) -> tuple[list[Decoded], str]:
-        contents = read_block(indexes[block.file], block, wanted[block.file])
+        try:
+            contents = read_block(indexes[block.file], block, wanted[block.file])
+        except DamagedBlockError as error:
+            return [], f"{error}; it was left out"
         decoded = [
             Decoded(message.channel, message.log_time_ns, _decode(decoders[message.channel.topic], message))
             for message in contents.messages
@@ -53,13 +285,7 @@ def decoded_messages(
         release(indexes[block.file], block)
         return decoded, contents.damage
 
-    blocks = [
-        block
-        for index in indexes
-        for block in index.blocks
-        if span.meets(block) and index.may_hold(block, wanted[block.file])
-    ]
-    blocks.sort(key=lambda block: (block.start_ns, block.file, block.offset))
+    blocks = _blocks_of(indexes, wanted, span)
     waiting: list[tuple[int, int, int, int, Decoded]] = []
     is_remote = any(index.fetch is not None for index in indexes)
     ahead *= _REMOTE_TIMES if is_remote else 1
@@ -70,6 +296,12 @@ def decoded_messages(
             heappush(waiting, (message.log_time_ns, block.file, block.offset, place, message))
         while waiting and (following is None or waiting[0][0] < following.start_ns):
             yield heappop(waiting)[-1]
+
+
+def _blocks_of(indexes: Sequence[FileIndex], wanted: Sequence[set[int]], span: Span) -> list[Block]:
+    """Those that may hold messages of the wanted channels of each file, by time."""
+    found = [block for index in indexes for block in index.blocks if index.may_hold(block, wanted[block.file])]
+    return sorted(filter(span.meets, found), key=lambda block: (block.start_ns, block.file, block.offset))
 
 
 def _decode(decoder: Callable[[memoryview], object], message: Message) -> object:
@@ -94,64 +326,32 @@ def _ahead(
     size = 0
     pool = ThreadPoolExecutor(workers, thread_name_prefix="scanchain-read")
     try:
-        for block in blocks:
-            running.append((block, pool.submit(decode, block)))
-            size += block.uncompressed_size
-            while len(running) > ahead or (size > _MOST_BYTES_AHEAD and len(running) > 1):
+        for block in (*blocks, None):
+            if block is not None:
+                running.append((block, pool.submit(decode, block)))
+                size += block.uncompressed_size
+            while len(running) > (0 if block is None else ahead) or (
+                size > _MOST_BYTES_AHEAD and len(running) > 1
+            ):
                 done, future = running.popleft()
                 size -= done.uncompressed_size
-                yield _result(future, damage)
-        while running:
-            yield _result(running.popleft()[1], damage)
+                messages, lost = future.result()
+                damage += [lost] if lost and lost not in damage else []
+                yield messages
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def _result(future: Future[tuple[list[Decoded], str]], damage: list[str]) -> list[Decoded]:
-    try:
-        messages, incomplete = future.result()
-    except DamagedBlockError as error:
-        line = f"{error}; it was left out"
-        damage += [] if line in damage else [line]
-        return []
-    if incomplete and incomplete not in damage:
-        damage.append(incomplete)
-    return messages
-
-
-def first_messages(indexes: Sequence[FileIndex], topic: str, decode: Callable[[memoryview], T]) -> Iterator[T]:
-    """Decoded messages of a topic's first blocks; malformed ones are passed over."""
-    yield from _decoded_in(indexes, _blocks_of(indexes, topic)[:_SAMPLED_BLOCKS], topic, decode, EVERYTHING)
-
-
-def spread_messages(
-    indexes: Sequence[FileIndex], topic: str, decode: Callable[[memoryview], T], span: Span
+def sampled_messages(
+    indexes: Sequence[FileIndex], topic: str, decode: Callable[[memoryview], T], span: Span | None = None
 ) -> Iterator[T]:
-    """Decoded messages of a topic in blocks from all over a span; malformed ones are passed over."""
-    blocks = [block for block in _blocks_of(indexes, topic) if span.meets(block)]
-    spread = sorted({k * (len(blocks) - 1) // (_SAMPLED_BLOCKS - 1) for k in range(_SAMPLED_BLOCKS)})
-    yield from _decoded_in(indexes, [blocks[k] for k in spread if blocks], topic, decode, span)
-
-
-def _blocks_of(indexes: Sequence[FileIndex], topic: str) -> list[Block]:
-    """Those that may hold messages of the topic, by time."""
-    blocks = [
-        block for index in indexes for block in index.blocks if index.may_hold(block, set(index.numbers_of(topic)))
-    ]
-    return sorted(blocks, key=lambda block: block.start_ns)
-
-
-def _decoded_in(
-    indexes: Sequence[FileIndex],
-    blocks: Sequence[Block],
-    topic: str,
-    decode: Callable[[memoryview], T],
-    span: Span,
-) -> Iterator[T]:
-    for block in blocks:
+    """Decoded messages in a topic's first blocks, or in some from all over a span; malformed ones are left out."""
+    chosen = EVERYTHING if span is None else span
+    blocks = _blocks_of(indexes, [set(index.numbers_of(topic)) for index in indexes], chosen)
+    if span is not None and len(blocks) > _SAMPLED_BLOCKS:
+        blocks = [blocks[k * (len(blocks) - 1) // (_SAMPLED_BLOCKS - 1)] for k in range(_SAMPLED_BLOCKS)]
+    for block in blocks[:_SAMPLED_BLOCKS]:
         for message in messages_of(indexes[block.file], block):
-            if message.channel.topic == topic and span.begin_ns <= message.log_time_ns <= span.end_ns:
-                try:
+            if message.channel.topic == topic and chosen.begin_ns <= message.log_time_ns <= chosen.end_ns:
+                with suppress(MalformedMessageError):
                     yield decode(message.data)
-                except MalformedMessageError:
-                    continue

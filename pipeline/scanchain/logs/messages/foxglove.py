@@ -100,10 +100,8 @@ def laser_scan(message: _LaserScan) -> LaserScanMessage:
         stamp_ns=_stamp_ns(message.timestamp),
         frame=message.frame_id,
         first_rad=message.start_angle,
-        last_rad=message.end_angle,
         step_rad=step_rad,
         beam_s=0.0,
-        scan_s=0.0,
         range_min_m=0.0,
         range_max_m=0.0,
         ranges_m=ranges_m,
@@ -116,9 +114,7 @@ def point_cloud(message: _PointCloud) -> PointCloudMessage:
     if not message.point_stride:
         raise MalformedMessageError("point_stride is zero")
     count = len(message.data) // message.point_stride
-    fields = tuple(
-        PointField(field.name, field.offset, _POINT_FIELD.get(field.type, 0), 1) for field in message.fields
-    )
+    fields = tuple(PointField(each.name, each.offset, _POINT_FIELD.get(each.type, 0)) for each in message.fields)
     return PointCloudMessage(
         stamp_ns=_stamp_ns(message.timestamp),
         frame=message.frame_id,

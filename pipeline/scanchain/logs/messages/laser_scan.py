@@ -28,10 +28,8 @@ class LaserScanMessage(NamedTuple):
     stamp_ns: int
     frame: str
     first_rad: float
-    last_rad: float
     step_rad: float
     beam_s: float
-    scan_s: float
     range_min_m: float
     range_max_m: float
     ranges_m: NDArray[np.float32]
@@ -44,10 +42,8 @@ def read_laser_scan(message: Any) -> LaserScanMessage:
         stamp_ns=stamp_ns(message),
         frame=message.header.frame_id,
         first_rad=message.angle_min,
-        last_rad=message.angle_max,
         step_rad=message.angle_increment,
         beam_s=message.time_increment,
-        scan_s=message.scan_time,
         range_min_m=message.range_min,
         range_max_m=message.range_max,
         ranges_m=message.ranges,
@@ -89,7 +85,10 @@ class LaserScanDecoder:
         not positive are taken as unknown. Negative angle increments are as good as positive ones.
         """
         ranges_m = message.ranges_m
-        low_m, high_m = self.limits_of(message)
+        low_m = max(message.range_min_m if message.range_min_m > 0.0 else 0.0, self.limits.min_m, _NEAREST_M)
+        high_m = min(
+            message.range_max_m if message.range_max_m > 0.0 else _FARTHEST_M, self.limits.max_m, _FARTHEST_M
+        )
         geometry = self._geometry(message)
         valid = ((ranges_m >= low_m) & (ranges_m < high_m)).nonzero()[0]
         if len(valid) == len(ranges_m):
@@ -101,12 +100,6 @@ class LaserScanDecoder:
         points = moved(points, message.T_frame_scan).astype(np.float32, copy=False)
         why = "" if len(valid) else _why_none(ranges_m, low_m, high_m)
         return Returns(message.stamp_ns, points, times_s, len(ranges_m) - len(valid), why)
-
-    def limits_of(self, message: LaserScanMessage) -> tuple[float, float]:
-        """The least valid range, and the one from which on none is valid."""
-        low_m = message.range_min_m if message.range_min_m > 0.0 else 0.0
-        high_m = message.range_max_m if message.range_max_m > 0.0 else _FARTHEST_M
-        return max(low_m, self.limits.min_m, _NEAREST_M), min(high_m, self.limits.max_m, _FARTHEST_M)
 
     def _geometry(self, message: LaserScanMessage) -> Geometry:
         key = (message.first_rad, message.step_rad, message.beam_s, len(message.ranges_m))

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from scanchain.data import Pose
 from scanchain.errors import one_line
 from scanchain.kernels.cloud_fields import keep_valid
-from scanchain.logs.messages.point_times import NAMES, PointTimes
-from scanchain.logs.messages.returns import NO_TIMES, RangeLimits, Returns, moved
+from scanchain.logs.messages.returns import NAMES, NO_TIMES, PointTimes, RangeLimits, Returns, moved
 from scanchain.logs.messages.ros import MalformedMessageError, stamp_ns
 
 _FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
@@ -32,14 +31,13 @@ class PointField(NamedTuple):
     name: str
     offset: int
     datatype: int
-    repeats: int
 
 
 _LIVOX_FIELDS = (
-    PointField("offset_time", 0, 6, 1),
-    PointField("x", 4, 7, 1),
-    PointField("y", 8, 7, 1),
-    PointField("z", 12, 7, 1),
+    PointField("offset_time", 0, 6),
+    PointField("x", 4, 7),
+    PointField("y", 8, 7),
+    PointField("z", 12, 7),
 )
 
 
@@ -65,7 +63,7 @@ def read_point_cloud(message: Any) -> PointCloudMessage:
     """A sensor_msgs/PointCloud2."""
     if len(message.fields) > _MOST_FIELDS:
         raise MalformedMessageError(f"it has {len(message.fields)} fields; at most {_MOST_FIELDS} are accepted")
-    fields = tuple(PointField(each.name, each.offset, each.datatype, each.count) for each in message.fields)
+    fields = tuple(PointField(each.name, each.offset, each.datatype) for each in message.fields)
     return PointCloudMessage(
         stamp_ns=stamp_ns(message),
         frame=message.header.frame_id,
@@ -108,23 +106,6 @@ def read_livox(data: memoryview, encoding: str) -> PointCloudMessage:
 
 
 ReadPointCloud = Callable[[memoryview], PointCloudMessage]
-
-
-def column(message: PointCloudMessage, name: str) -> NDArray[np.generic] | None:
-    """One field of all points (N,), None where the cloud does not have it."""
-    for field in message.fields:
-        if field.name == name and field.datatype in _FORMATS:
-            number = np.dtype((">" if message.is_bigendian else "<") + _FORMATS[field.datatype])
-            if field.offset + number.itemsize > message.point_step:
-                return None
-            point = np.dtype({
-                "names": [name],
-                "formats": [number.str],
-                "offsets": [field.offset],
-                "itemsize": message.point_step,
-            })  # fmt: skip
-            return _rows(message, point)[name]
-    return None
 
 
 class Layout(NamedTuple):

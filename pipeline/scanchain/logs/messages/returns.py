@@ -1,4 +1,4 @@
-"""Valid returns of a scan message, and the range limits within which a return is valid."""
+"""Valid returns of a scan message and their times, whatever a driver's name and unit for these."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from scanchain.config import LogConfig
 from scanchain.data import Pose, RawPoints
 
 
@@ -41,3 +42,87 @@ def moved(points: RawPoints, T_frame_cloud: Pose | None) -> RawPoints:
         return points
     d = points.shape[1]
     return (points @ T_frame_cloud[:d, :d].T + T_frame_cloud[:d, 3]).astype(np.float32)
+
+
+NAMES = ("t", "time", "timestamp", "offset_time", "time_offset", "timeOffset", "time_stamp")
+
+UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_NONE = "no point times: every scan counts as measured at once"
+_SHORTEST_SCAN_NS = 500_000  # span of a scan's whole numbers, below which they are micro- or milliseconds
+_LONGEST_SCAN = 1e4  # span in milliseconds, above which floats are micro- or nanoseconds
+_NEAR_S = 1.0  # largest time between the stamp of a scan and its beginning
+_ABSOLUTE_S = 3600.0  # least absolute time in seconds
+
+
+class PointTimes:
+    """Seconds after the stamp for the points of scans, in any order and from any thread.
+
+    The unit is that of ``log.point_times`` or, where that is ``auto``, the one that a scan's values suggest.
+    ``assumed`` describes the interpretation of one of the first scans that have times.
+    """
+
+    def __init__(self, config: LogConfig) -> None:
+        self.config = config
+        self.unit = config.point_times if config.point_times in UNITS_S else ""
+        self.by_azimuth = config.point_times in ("clockwise", "counterclockwise")
+        self.assumed = _NONE
+
+    def wants(self, field: str) -> bool:
+        """True if times are taken from a field of this name."""
+        return field in NAMES and not self.by_azimuth and self.config.point_times != "none"
+
+    def from_azimuth(self, points: RawPoints) -> NDArray[np.float32]:
+        """Times (N,) of points (N, 3) by the lidar's turn since its start, which is at the stamp."""
+        config = self.config
+        sense = -1.0 if config.point_times == "clockwise" else 1.0
+        turned = sense * (np.arctan2(points[:, 1], points[:, 0]) - config.revolution_start_rad)
+        direction = (
+            f"{config.point_times} from {config.revolution_start_rad:.3g} rad, {config.revolution_s:g} s a turn"
+        )
+        self.assumed = f"point times by the azimuth: {direction} (log.point_times)"
+        return (turned % (2.0 * np.pi) * (config.revolution_s / (2.0 * np.pi))).astype(np.float32)
+
+    def from_field(self, name: str, stamp_ns: int, values: NDArray[np.generic]) -> NDArray[np.float32]:
+        """Times (N,) of raw values (N,); (0,) where not finite or all the same.
+
+        Whole numbers are nanoseconds, or the next unit, micro- or milliseconds, in which the whole scan is not
+        shorter than half a millisecond. Floats are seconds where they span up to 10, else milli-, micro- or
+        nanoseconds by their span. Values within a second of the stamp are absolute, others count from it; those of
+        another clock, the sensor's own or one that is off by the leap seconds, count from the first point.
+        """
+        if not len(values):
+            return NO_TIMES
+        is_whole, kind = values.dtype.kind in "iu", values.dtype.name
+        values = values.astype(np.int64 if is_whole else np.float64)
+        first, last = values.min(), values.max()  # NaN where one of the values is
+        if not np.isfinite([first, last]).all():
+            return NO_TIMES
+        span = float(last - first)
+        if span == 0.0:  # as where a float32 holds an absolute time
+            return NO_TIMES
+        unit = self.unit or _likely_unit(span, is_whole=is_whole)
+        unit_s = UNITS_S[unit]
+        per_second = round(1.0 / unit_s)
+        stamp = stamp_ns * per_second // 1_000_000_000 if is_whole else stamp_ns * 1e-9 * per_second
+        origin = "after the stamp"
+        if abs(float(first) - float(stamp)) * unit_s < _NEAR_S and float(first) * unit_s > _ABSOLUTE_S:
+            values -= stamp
+            origin = "since the epoch"
+        elif abs(float(first)) * unit_s > _NEAR_S:
+            values -= first
+            origin = "of another clock, counted from the first point"
+        if self.assumed == _NONE:
+            taken = f"field {name} ({kind}) taken as {unit} {origin}"
+            self.assumed = f"point times: {taken} (log.point_times)"
+        times_s = np.empty(len(values), np.float32)
+        return np.multiply(values, unit_s, out=times_s, dtype=np.float64, casting="unsafe")
+
+
+def _likely_unit(span: float, *, is_whole: bool) -> str:
+    if is_whole:
+        return "ns" if span >= _SHORTEST_SCAN_NS else "us" if 1e3 * span >= _SHORTEST_SCAN_NS else "ms"
+    if span <= 10.0:
+        return "s"
+    if span <= _LONGEST_SCAN:
+        return "ms"
+    return "us" if span <= 1e3 * _LONGEST_SCAN else "ns"

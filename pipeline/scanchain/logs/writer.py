@@ -1,16 +1,22 @@
-"""ROS 2 messages packed in CDR, and the definitions (schema encoding ros2msg) that a log carries beside them."""
+"""ROS 2 messages packed in CDR, and the MCAP logs that they are written to, without ROS."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cache
-from typing import Any, NamedTuple
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Literal, NamedTuple, Self
 
 import numpy as np
+from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.data import Matrix, Pose
+from scanchain.errors import InputError
+from scanchain.logs.mcap.records import Channel
 from scanchain.logs.messages.ros import new, packed, typestore
 
 LATEST_NS = (1 << 31) * 1_000_000_000  # largest stamp of ROS
@@ -153,3 +159,105 @@ def schema_text(name: str) -> bytes:
         return typestore().generate_msgdef(name, ros_version=2)[0].encode()
     except TypesysError:
         return b""
+
+
+CHUNK_BYTES = 4 * 1024 * 1024
+
+
+class LogWriter:
+    """A new log; a context manager. It takes its name only when complete, an exception leaves nothing behind.
+
+    Messages are recorded at ``log_time_ns``, by default their own stamp.
+    """
+
+    def __init__(self, destination: Path, *, force: bool = False, profile: str = "ros2") -> None:
+        if destination.is_dir():
+            raise InputError(f"{destination}: is a directory; give the name of a file to write")
+        if destination.exists() and not force:
+            raise InputError(f"{destination}: exists; choose another name or pass --force to replace it")
+        self.destination = destination
+        self._partial = destination.with_name(f".{destination.name}.partial")
+        try:
+            destination.parent.mkdir(parents=True, exist_ok=True)
+            self._stream: IO[bytes] = self._partial.open("wb")
+        except OSError as error:
+            raise InputError(f"{destination}: not writable ({error.strerror}); choose another place") from error
+        self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._writer.start(profile=profile, library="scanchain")
+        self._numbers: dict[tuple[str | bytes, ...], int] = {}  # of schemas and of channels
+        self._sequence = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
+    ) -> None:
+        try:
+            if kind is None:
+                self._writer.finish()
+                self._stream.close()
+                self._partial.replace(self.destination)
+        except OSError as failure:
+            error = failure
+            raise
+        finally:
+            if isinstance(error, OSError) and error.filename is None:
+                error.filename = str(self.destination)
+            with suppress(OSError):  # what is buffered still, on a full disk
+                self._stream.close()
+            self._partial.unlink(missing_ok=True)
+
+    def point_cloud(
+        self,
+        topic: str,
+        stamp_ns: int,
+        frame: str,
+        points: NDArray[np.floating],
+        *,
+        times_s: NDArray[np.floating] | None = None,
+        time_field: Literal["t", "time"] = "t",
+        ring: NDArray[np.integer] | None = None,
+        log_time_ns: int | None = None,
+    ) -> None:
+        """Append a sensor_msgs/PointCloud2 of one row.
+
+        points : (N, 3) meters
+        times_s : (N,) seconds after ``stamp_ns``; written as ``t`` (uint32 ns, from 0 up) or ``time`` (float32 s)
+        ring : (N,) written as uint16
+        """
+        columns: dict[str, tuple[str, NDArray[np.number]]] = {
+            name: ("<f4", points[:, axis]) for axis, name in enumerate("xyz")
+        }
+        if times_s is not None:
+            columns[time_field] = ("<f4", times_s) if time_field == "time" else ("<u4", _whole_ns(times_s))
+        if ring is not None:
+            columns["ring"] = ("<u2", ring)
+        rows = np.empty(len(points), dtype=[(name, code) for name, (code, _) in columns.items()])
+        for name, (_, values) in columns.items():
+            rows[name] = values
+        self.append(topic, "sensor_msgs/msg/PointCloud2", pack_cloud(stamp_ns, frame, rows), stamp_ns, log_time_ns)
+
+    def append(self, topic: str, schema: str, data: bytes, stamp_ns: int, log_time_ns: int | None = None) -> None:
+        """Append a packed message of the type ``schema``, pkg/msg/Type."""
+        channel = Channel((0, 0), topic, "cdr", 0, schema, "ros2msg", schema_text(schema))
+        self.copy(channel, stamp_ns if log_time_ns is None else log_time_ns, data)
+
+    def copy(self, channel: Channel, log_time_ns: int, data: bytes) -> None:
+        """Append a message of another log as it is, with its topic, type, encoding and definition."""
+        schema = (channel.type_name, channel.schema_encoding, channel.definition)
+        key = (channel.topic, channel.encoding, *schema)
+        if key not in self._numbers:
+            is_known = bool(channel.type_name or channel.definition)  # 0 stands for none
+            if is_known and schema not in self._numbers:
+                self._numbers[schema] = self._writer.register_schema(*schema)
+            number = self._numbers[schema] if is_known else 0
+            self._numbers[key] = self._writer.register_channel(channel.topic, channel.encoding, number)
+        self._writer.add_message(self._numbers[key], log_time_ns, data, log_time_ns, self._sequence)
+        self._sequence += 1
+
+
+def _whole_ns(times_s: NDArray[np.floating]) -> NDArray[np.int64]:
+    if len(times_s) and times_s.min() < 0.0:
+        raise InputError(f"point time {times_s.min():.6f} s is before the stamp; use time_field='time'")
+    return np.rint(np.asarray(times_s, dtype=np.float64) * 1e9).astype(np.int64)

@@ -1,4 +1,4 @@
-"""Pictures of pose graphs and landmark problems, before and after optimization, and the sparsity of factors."""
+"""Pictures of pose graphs and landmark problems, before and after optimization, and the page of the latter."""
 
 from __future__ import annotations
 
@@ -10,10 +10,14 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.data import GraphState, Matrix
+from scanchain.errors import InputError
 from scanchain.graph.optimization import GraphChange, fit
 from scanchain.landmarks.compare import MethodResult
+from scanchain.landmarks.results import accuracy_lines, file_stem, size_of, table_of
 from scanchain.landmarks.study import Estimate, Study
-from scanchain_viz.pictures.figure import INK, Plot, broken, palette_of, write_png
+from scanchain_viz.colors import palette_of
+from scanchain_viz.pictures.figure import INK, Plot, broken, write_png
+from scanchain_viz.report import page
 
 _CHAIN, _LOOP, _REJECTED = "#1f5fd0", "#8a8f98", "#d03030"
 _SEEN_FROM = np.array([[0.80, 0.60, 0.0], [-0.30, 0.40, 0.866]])  # rows: right and up of an oblique view, in 3D
@@ -23,6 +27,12 @@ _PIXELS = 500  # largest width in pixels of a picture of a factor
 _ELLIPSE = 2.4477  # standard deviations that hold 95 % of a Gaussian in the plane
 _ELLIPSE_POINTS = 37
 _BLUES = ("f7fbff", "deebf7", "c6dbef", "9dcae1", "6aaed6", "4191c6", "2070b4", "08509b", "08306b")
+_TIMES = (
+    "Times are medians; each method solves from scratch with what it needs to know about the pattern (again: with "
+    "that kept)."
+)
+_DIFFERS = "Differs by is the largest difference of an unknown from the first method."
+_PINV = "Entries of (AᵀA)⁻¹ stand for the factor that pinv does not have."
 
 
 def draw_graph(change: GraphChange, path: Path) -> None:
@@ -55,44 +65,30 @@ def _graph(state: GraphState) -> Plot:
         (state.is_rejected, _REJECTED, width, "rejected"),
     ):
         if chosen.any():
-            figure.path(broken(seen[state.edges[chosen]]), color, thickness, name=name)
+            figure.line(broken(seen[state.edges[chosen]]), color, thickness, name=name)
     return figure
 
 
-def draw_estimate(path: Path, study: Study) -> None:
-    """Draw both estimates of a landmark problem side by side, over the truth, to a PNG. Raises OSError."""
-    panels = []
-    for when, plot in (("before", plot_before(study)), ("after", plot_after(study))):
-        off_m = (study.before if when == "before" else study.after).accuracy.poses_m
-        error = f": poses {off_m:.3g} m off" if np.isfinite(off_m) else ""
-        panels.append((f"{study.name}, {when}{error}", plot))
-    write_png(path, panels, width_inches=5.5, columns=2)
-
-
-def plot_before(study: Study) -> Plot:
-    """Trajectory and landmarks before optimization, over the truth, in its frame where there is one."""
-    return _plot(study, study.before, BEFORE, "before")
-
-
-def plot_after(study: Study) -> Plot:
-    """The same after it, landmarks with their 95 % ellipses."""
-    figure = _plot(study, study.after, AFTER, "after")
+def _estimates(study: Study) -> tuple[Plot, Plot]:
+    """Trajectory and landmarks before and after optimization, those after it with their 95 % ellipses."""
+    before, after = _plot(study, study.before, BEFORE, "before"), _plot(study, study.after, AFTER, "after")
     axes_m, angles_rad = ellipses(study)
     around = np.linspace(0.0, 2.0 * np.pi, _ELLIPSE_POINTS)
     along = axes_m[:, None] * np.stack([np.cos(around), np.sin(around)], axis=-1)
     c, s = np.cos(angles_rad), np.sin(angles_rad)
     outlines = along @ np.stack([c, s, -s, c], axis=-1).reshape(-1, 2, 2) + _in_truth(study.after)[1][:, None]
-    figure.path(broken(outlines), AFTER, 0.6, opacity=0.5, name="95 % ellipse of a landmark")
-    return figure
+    after.line(broken(outlines), AFTER, 0.6, opacity=0.5, name="95 % ellipse of a landmark")
+    return before, after
 
 
 def _plot(study: Study, estimate: Estimate, color: str, when: str) -> Plot:
+    """An estimate over the truth, in its frame where there is one."""
     points = [study.true_poses, study.true_landmarks, *_in_truth(study.before), *_in_truth(study.after)]
     figure = Plot.of_plan(*_with_margin(np.concatenate(points)))
     poses, landmarks = _in_truth(estimate)
     if len(study.true_poses):
-        figure.path(study.true_poses, INK, 1.1, (4.0, 2.0), name="true trajectory")
-    figure.path(poses, color, opacity=0.85, name=f"trajectory {when}")
+        figure.line(study.true_poses, INK, 1.1, (4.0, 2.0), name="true trajectory")
+    figure.line(poses, color, opacity=0.85, name=f"trajectory {when}")
     if np.isfinite(study.true_landmarks).any():
         figure.marks(study.true_landmarks, "+", INK, 7.0, line=0.9, name="true landmarks")
     figure.marks(landmarks, "o", color, 4.0, line=0.9, name=f"landmarks {when}")
@@ -121,7 +117,7 @@ def ellipses(study: Study) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return axes_m, np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
 
 
-def plot_factor(method: MethodResult) -> Plot:
+def _factor(method: MethodResult) -> Plot:
     """Nonzero entries of a method's factor, dark; a pixel of many entries is as dark as they are dense."""
     matrix, size = method.factor.matrix.tocoo(), len(method.factor.order)
     there, pixels = matrix.data != 0.0, min(size, _PIXELS)
@@ -139,7 +135,7 @@ def plot_factor(method: MethodResult) -> Plot:
     return figure
 
 
-def draw_factors(path: Path, studies: Sequence[Study]) -> None:
+def _draw_factors(path: Path, studies: Sequence[Study]) -> None:
     """Draw every method's factor to a PNG; several problems stand side by side. Raises OSError.
 
     The place of a method that a problem was not solved by stays empty.
@@ -150,6 +146,67 @@ def draw_factors(path: Path, studies: Sequence[Study]) -> None:
         for study, methods in zip(studies, solved, strict=True):
             problem, method = f"{study.name}\n" if len(studies) > 1 else "", methods.get(name)
             title = "" if method is None else f"{problem}{name}: {method.factor.name}"
-            panels.append((title, None if method is None else plot_factor(method)))
+            panels.append((title, None if method is None else _factor(method)))
     columns = len(studies) * max(1, min(_ACROSS, len(panels)) // len(studies))
     write_png(path, panels, width_inches=2.9, columns=columns, font=9.0)
+
+
+def write_report(directory: Path, studies: Sequence[Study]) -> None:
+    """Write a PNG of every estimate and of the factors, and report.html.
+
+    With several problems their factors stand side by side in one more picture.
+    """
+    sections: list[page.Section] = []
+    try:
+        for study in studies:
+            plots, panels = _estimates(study), []
+            for plot, when, estimate in zip(plots, ("before", "after"), (study.before, study.after), strict=True):
+                off_m = estimate.accuracy.poses_m
+                error = f": poses {off_m:.3g} m off" if np.isfinite(off_m) else ""
+                panels.append((f"{study.name}, {when}{error}", plot))
+            write_png(directory / f"{file_stem(study.name)}.png", panels, width_inches=5.5, columns=2)
+            _draw_factors(directory / f"{file_stem(study.name)}_factors.png", [study])
+            sections += [_estimate_section(study, *plots), _solver_section(study)]
+        if len(studies) > 1:
+            _draw_factors(directory / "factors.png", studies)
+        title = f"Landmark problem{'s' if len(studies) > 1 else ''}"
+        names = ", ".join(study.name for study in studies)
+        definitions = dict.fromkeys(study.after.accuracy.definition for study in studies)
+        fold = page.Collapsible("Definition of the errors", "\n\n".join(definitions))
+        page.write_page(directory, page.Page(title, names, sections=sections, collapsibles=[fold]))
+    except OSError as error:
+        raise InputError(f"{directory}: not writable ({error.strerror}); choose another --out") from error
+
+
+def _estimate_section(study: Study, before: Plot, after: Plot) -> page.Section:
+    (_, error_before), (_, error_after), _ = accuracy_lines(study)
+    facts = [("error before, rmse", error_before), ("error after, rmse", error_after)]
+    facts += [(fact.label, fact.value) for fact in study.facts]
+    chips, marks = [page.Chip("before", BEFORE), page.Chip("after", AFTER)], "Circles: landmarks"
+    if len(study.true_poses) or np.isfinite(study.true_landmarks).any():
+        chips.append(page.Chip("truth", INK, is_dashed=True))
+        marks += "; crosses: true ones"
+    drawings = (
+        page.Drawing("Before optimization", f"{marks}.", before.svg()),
+        page.Drawing("After optimization", f"{marks}; ellipses: 95 %.", after.svg()),
+    )
+    return page.Section(study.name, facts=facts, chips=chips, drawings=drawings)
+
+
+def _solver_section(study: Study) -> page.Section:
+    factors = [
+        page.Drawing(f"{method.method}: {method.factor.name}", "", _factor(method).svg())
+        for method in study.methods
+    ]
+    text = f"The Jacobian A has {size_of(study)}. Drawn is where the factor of every method is not zero."
+    title = f"Linear solvers on {study.name}"
+    return page.Section(title, text, grid=_grid(study), drawings=factors, is_small=True)
+
+
+def _grid(study: Study) -> page.Grid:
+    headings, *rows = table_of(study)
+    split = [heading.partition(" ms") for heading in headings]
+    heads = [page.Head(name, unit.strip()) for name, unit, _ in split]
+    notes = [_TIMES, _DIFFERS if len(rows) > 1 else "--methods all compares the linear solvers."]
+    notes += [_PINV] if any(method.method == "pinv" for method in study.methods) else []
+    return page.Grid(heads, [page.Row(name, cells) for name, *cells in rows], notes)

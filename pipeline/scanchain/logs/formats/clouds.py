@@ -1,4 +1,4 @@
-"""One cloud in a file, PCD, PLY, .npy or raw numbers, as an array of points with named fields.
+"""A folder of PCD, PLY, .npy or raw .bin files, one a scan; stamps by their names, or at a rate.
 
 PCD: https://pointclouds.org/documentation/tutorials/pcd_file_format.html. PLY: Turk 1994.
 """
@@ -6,8 +6,10 @@ PCD: https://pointclouds.org/documentation/tutorials/pcd_file_format.html. PLY: 
 from __future__ import annotations
 
 import os
+import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Set as AbstractSet
 from itertools import islice
 from pathlib import Path
 from typing import IO
@@ -15,6 +17,15 @@ from typing import IO
 import lzf
 import numpy as np
 from numpy.typing import NDArray
+
+from scanchain.errors import InputError, counted
+from scanchain.logs.formats import add_block, add_channel, left_out, natural_order, on_demand_index
+from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
+from scanchain.logs.writer import LATEST_NS, pack_cloud
+
+_UNITS_NS = {19: 1, 16: 1_000, 13: 1_000_000}  # nanoseconds of a stamp's unit, by its number of digits since 2001
+_FIRST_FILES = 3  # number of files of which one has to be readable
+_NS = 1_000_000_000
 
 SUFFIXES = (".pcd", ".ply", ".npy", ".bin")
 _MOST_COLUMNS = 16
@@ -221,3 +232,107 @@ def _ply_lines(file: IO[bytes]) -> Iterator[list[str]]:
             return
         yield words
     raise CloudFileError("is no PLY: its header does not end")
+
+
+def claims_clouds(path: Path, _: bytes) -> bool:
+    """True for a folder with such files."""
+    return path.is_dir() and any(entry.suffix.lower() in SUFFIXES for entry in path.iterdir())
+
+
+def index_clouds(folder: Path, number: int, rate_hz: float = 0.0, bin_columns: int = 4) -> FileIndex:
+    """The files of a folder as the scans of /points.
+
+    rate_hz : at which they come, from the epoch on; 0 takes the stamps from the names
+    bin_columns : float32 numbers of a point in .bin files
+    Raises InputError where names hold no stamps, or files no such points.
+    """
+    files = _files(folder)
+    stamps_ns = [round(k * _NS / rate_hz) for k in range(len(files))] if rate_hz else _stamps(folder, files)
+    index = on_demand_index(folder, number)
+    raw = point_of_columns(np.dtype("<f4"), bin_columns)
+    if files[0].suffix.lower() == ".bin":
+        _check_size(files, bin_columns)
+    index.notes += [*_found(folder, files, raw), *left_out(folder, files[0].suffix.lower(), SUFFIXES)]
+    channel = add_channel(index, "/points", "sensor_msgs/msg/PointCloud2")
+    for place, (file, stamp_ns) in enumerate(zip(files, stamps_ns, strict=True)):
+        add_block(index, place, file.stat().st_size, [stamp_ns], {channel: 1})
+
+    def make(block: Block, _: AbstractSet[int] | None) -> Contents:
+        return contents_of(files[block.offset], channel, block.start_ns, lambda file: read_cloud_file(file, raw))
+
+    index.make = make
+    return index
+
+
+def contents_of(
+    file: Path, channel: Channel, stamp_ns: int, read: Callable[[Path], NDArray[np.void]], frame: str = "lidar"
+) -> Contents:
+    """A cloud file as the one message of a block; a malformed one where it cannot be read."""
+    try:
+        data = pack_cloud(stamp_ns, frame, read(file))
+    except (CloudFileError, OSError) as error:
+        unreadable = Message(channel, stamp_ns, memoryview(b""), f"{file.name} {error}")
+        return Contents([unreadable], f"{file}: {error}; it was left out")
+    return Contents([Message(channel, stamp_ns, memoryview(data))], "")
+
+
+def _found(folder: Path, files: Sequence[Path], raw: np.dtype[np.void]) -> list[str]:
+    """Fields of the files, by the first that can be read."""
+    for file in files[:_FIRST_FILES]:
+        try:
+            points = read_cloud_file(file, raw)
+        except (CloudFileError, OSError):
+            continue
+        kinds = ", ".join(dict.fromkeys(points.dtype[name].name for name in points.dtype.names or ()))
+        names = " ".join(points.dtype.names or ())
+        suffix = file.suffix.lower()
+        guess = " (log.bin_columns)" if suffix == ".bin" else ""
+        held = f"{names}, {kinds}{guess}; {counted(len(points), 'point')} in {file.name}"
+        return [f"{folder}: {counted(len(files), f'{suffix} file')} of {held}"]
+    return []
+
+
+def stamp_of_name(stem: str) -> int | None:
+    """The stamp in nanoseconds in a file's name, None where there is none.
+
+    Understood are nanoseconds, micro- and milliseconds since the epoch as 19, 16 and 13 digits, seconds with a
+    fraction (``12.375``), and seconds and nanoseconds apart (``cloud_1583836591_182590976``).
+    """
+    stamp_ns = LATEST_NS
+    if match := re.search(r"(?<!\d)(\d{1,10})\.(\d{1,9})$", stem):
+        stamp_ns = int(match[1]) * _NS + int(match[2].ljust(9, "0"))
+    elif match := re.search(r"(?<!\d)(\d{9,10})[_-](\d{1,9})$", stem):
+        stamp_ns = int(match[1]) * _NS + int(match[2])
+    elif match := re.search(r"(?<!\d)([1-9]\d*)$", stem):
+        stamp_ns = int(match[1]) * _UNITS_NS.get(len(match[1]), LATEST_NS)
+    return stamp_ns if stamp_ns < LATEST_NS else None
+
+
+def _files(folder: Path) -> list[Path]:
+    """The files of the first kind that the folder has."""
+    found = [file for file in folder.iterdir() if file.is_file()]
+    for suffix in SUFFIXES:
+        files = sorted((file for file in found if file.suffix.lower() == suffix), key=natural_order)
+        if files:
+            return files
+    raise InputError(f"{folder}: has no {', '.join(SUFFIXES)} file; name the folder that holds them")
+
+
+def _stamps(folder: Path, files: Sequence[Path]) -> list[int]:
+    stamps_ns = [stamp for file in files if (stamp := stamp_of_name(file.stem)) is not None]
+    if len(stamps_ns) < len(files) or len(set(stamps_ns)) < len(files):
+        raise InputError(
+            f"{folder}: names such as {files[0].name} hold no stamp; set the rate of the scans, "
+            "as in --log.rate_hz 10"
+        )
+    return stamps_ns
+
+
+def _check_size(files: Sequence[Path], columns: int) -> None:
+    """Refuse .bin files, headerless float32, most of which are no rows of so many columns; some may be damaged."""
+    whole = sum(file.stat().st_size % (4 * columns) == 0 for file in files)
+    if 2 * whole < len(files):
+        raise InputError(
+            f"{files[0]}: has {files[0].stat().st_size} bytes, no rows of {columns} float32 numbers; set "
+            "their number, as in --log.bin_columns 5, or save clouds as .npy, PCD or PLY"
+        )

@@ -1,32 +1,26 @@
-"""Messages of every kind in MCAP, recorded by other people's writers."""
+"""Logs as other people's writers record them: messages of every kind in MCAP, bags of ROS 1 and 2, their parts."""
+
+import shutil
+import struct
 
 import numpy as np
 import pytest
 from foxglove import Channel, Schema
 from foxglove import messages as fox
 from foxglove.channels import FrameTransformsChannel, PoseInFrameChannel
-from mcap.reader import make_reader
 from mcap.writer import Writer
-from mcap_ros1.decoder import DecoderFactory
 
 from scanchain import lie
-from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.logs import open_log
 from tests.support import recorders
-from tests.support.recorders import ROS1, ROS2, SECOND, STAMP_NS, Ros, assert_clouds, assert_planar
-
-
-def read(path, **config):
-    log = open_log(path, LogConfig(**config))
-    scans = list(log.scans())
-    assert log.damage == []
-    return log, scans
+from tests.support.naive_logs import office, write
+from tests.support.recorders import ROS1, ROS2, SECOND, STAMP_NS, Ros, assert_clouds, assert_planar, read_undamaged
 
 
 @pytest.mark.parametrize("store", [ROS1, ROS2], ids=["ros1", "ros2"])
 def test_a_planar_drive_of_either_ros_has_its_scans_wheels_and_mounting(tmp_path, store):
-    log, scans = read(recorders.mcap_of(tmp_path / "a.mcap", Ros(store), Ros(store).drive()))
+    log, scans = read_undamaged(recorders.mcap_of(tmp_path / "a.mcap", Ros(store), Ros(store).drive()))
     assert_planar(scans)
     assert (log.dimension, log.topic, log.odometry_topic) == (2, "/scan", "/odom")
     np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(0.25, 0.0, 0.5), atol=1e-12)
@@ -36,17 +30,9 @@ def test_a_planar_drive_of_either_ros_has_its_scans_wheels_and_mounting(tmp_path
 
 @pytest.mark.parametrize("store", [ROS1, ROS2], ids=["ros1", "ros2"])
 def test_clouds_of_either_ros_keep_every_point_and_its_time(tmp_path, store):
-    log, scans = read(recorders.mcap_of(tmp_path / "a.mcap", Ros(store), Ros(store).sweeps()))
+    log, scans = read_undamaged(recorders.mcap_of(tmp_path / "a.mcap", Ros(store), Ros(store).sweeps()))
     assert log.dimension == 3
     assert_clouds(scans)
-
-
-def test_what_rosbags_writes_as_ros_1_is_what_mcap_ros1_support_reads(tmp_path):
-    path = recorders.mcap_of(tmp_path / "a.mcap", Ros(ROS1), Ros(ROS1).drive())
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        scans = [decoded for _, channel, _, decoded in reader.iter_decoded_messages() if channel.topic == "/scan"]
-    assert scans[0].header.frame_id == "laser" and scans[0].ranges[1] == recorders.planar()[0].ranges[1]
 
 
 @pytest.mark.parametrize("store", [ROS1, ROS2], ids=["ros1", "ros2"])
@@ -54,7 +40,7 @@ def test_what_rosbags_writes_as_ros_1_is_what_mcap_ros1_support_reads(tmp_path):
 def test_a_livox_custom_message_is_a_cloud_with_times(tmp_path, store, package):
     ros = Ros(store)
     told = [("/livox", f"{package}/msg/CustomMsg", c.stamp_ns, ros.livox(c, package)) for c in recorders.clouds()]
-    log, scans = read(recorders.mcap_of(tmp_path / "a.mcap", ros, told))
+    log, scans = read_undamaged(recorders.mcap_of(tmp_path / "a.mcap", ros, told))
     assert log.dimension == 3 and "offset_time" in " ".join(log.notes)
     assert_clouds(scans)
 
@@ -63,7 +49,7 @@ def test_a_livox_custom_message_is_a_cloud_with_times(tmp_path, store, package):
 def test_a_multi_echo_scan_is_that_of_its_first_echoes(tmp_path, store):
     ros, kind = Ros(store), "sensor_msgs/msg/MultiEchoLaserScan"
     told = [("/echoes", kind, scan.stamp_ns, ros.multi_echo(scan)) for scan in recorders.planar()]
-    log, scans = read(recorders.mcap_of(tmp_path / "a.mcap", ros, told))
+    log, scans = read_undamaged(recorders.mcap_of(tmp_path / "a.mcap", ros, told))
     assert log.dimension == 2
     assert_planar(scans)
 
@@ -76,14 +62,14 @@ def foxglove_logs(folder, said):
 
 def test_foxglove_laser_scans_are_the_same_in_protobuf_and_json(tmp_path):
     for path in foxglove_logs(tmp_path, recorders.planar()):
-        log, scans = read(path, min_range_m=0.25, max_range_m=30.0)  # Foxglove tells no limits
+        log, scans = read_undamaged(path, min_range_m=0.25, max_range_m=30.0)  # Foxglove tells no limits
         assert (log.dimension, log.topic) == (2, "/lidar")
         assert_planar(scans)
 
 
 def test_foxglove_clouds_are_the_same_in_protobuf_and_json(tmp_path):
     for path in foxglove_logs(tmp_path, recorders.clouds()):
-        log, scans = read(path)
+        log, scans = read_undamaged(path)
         assert (log.dimension, log.topic) == (3, "/lidar")
         assert_clouds(scans)
 
@@ -93,13 +79,13 @@ def test_a_foxglove_cloud_is_moved_to_where_its_pose_says(tmp_path):
     pose = fox.Pose(
         position=fox.Vector3(x=1.0, y=2.0, z=3.0), orientation=fox.Quaternion(x=0, y=0, z=half, w=half)
     )
-    _, scans = read(recorders.foxglove_protobuf(tmp_path / "a.mcap", recorders.clouds(), pose))
+    _, scans = read_undamaged(recorders.foxglove_protobuf(tmp_path / "a.mcap", recorders.clouds(), pose))
     for scan, cloud in zip(scans, recorders.clouds(), strict=True):
         rows = cloud.rows[1:]
         expected = np.column_stack([1.0 - rows["y"], 2.0 + rows["x"], 3.0 + rows["z"]])
         np.testing.assert_allclose(scan.points, expected, atol=1e-5)
-    _, scans = read(recorders.foxglove_protobuf(tmp_path / "b.mcap", recorders.planar(), pose))
-    _, plain = read(recorders.foxglove_protobuf(tmp_path / "c.mcap", recorders.planar()))
+    _, scans = read_undamaged(recorders.foxglove_protobuf(tmp_path / "b.mcap", recorders.planar(), pose))
+    _, plain = read_undamaged(recorders.foxglove_protobuf(tmp_path / "c.mcap", recorders.planar()))
     expected = np.column_stack([1.0 - plain[0].points[:, 1], 2.0 + plain[0].points[:, 0]])
     np.testing.assert_allclose(scans[0].points, expected, atol=1e-5)
 
@@ -133,7 +119,7 @@ def test_foxglove_poses_and_transforms_are_wheels_and_mounting(tmp_path, form):
             told = {"timestamp": stamp, "parent_frame_id": "base_link", "child_frame_id": "laser"}
             told |= {"translation": place, "rotation": turn}
             json_channel("foxglove.FrameTransform", "/tf_static", context).log(told, log_time=STAMP_NS)
-    log, (scan,) = read(path, odometry_topic="/wheels")
+    log, (scan,) = read_undamaged(path, odometry_topic="/wheels")
     np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(0.25, 0.0, 0.5), atol=1e-12)
     np.testing.assert_allclose(scan.T_odom_base, lie.pose_2d(0.25, 0.0, 0.5), atol=1e-12)
 
@@ -159,7 +145,7 @@ def test_every_foxglove_number_type_has_its_own_code(tmp_path):
     context = recorders.Context()
     with recorders.open_mcap(tmp_path / "a.mcap", context=context):
         recorders.PointCloudChannel("/c", context=context).log(cloud, log_time=5 * SECOND)
-    (scan,) = read(tmp_path / "a.mcap", point_times="us")[1]
+    (scan,) = read_undamaged(tmp_path / "a.mcap", point_times="us")[1]
     np.testing.assert_array_equal(scan.points, [[-100, 200, -30000], [100, 250, 30000]])
     np.testing.assert_allclose(scan.times_s, [0.06, 0.0])
 
@@ -234,3 +220,183 @@ def test_a_message_cut_at_any_byte_is_malformed_and_nothing_else(tmp_path, store
             assert "malformed" in str(error) or "no valid point" in str(error)
             cut_off += 1
     assert 0.5 * len(whole) < cut_off <= len(whole)
+
+
+def assert_drive(log, scans):
+    assert_planar(scans)
+    assert (log.dimension, log.topic, log.odometry_topic, log.scan_count) == (2, "/scan", "/odom", 3)
+    np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(0.25, 0.0, 0.5), atol=1e-12)
+    for k, scan in enumerate(scans):
+        assert scan.log_time_ns == scan.stamp_ns
+        np.testing.assert_allclose(scan.T_odom_base, lie.pose_2d(0.1 * k, 0.0, 0.01 * k), atol=1e-12)
+
+
+@pytest.mark.parametrize("compression", [None, "BZ2", "LZ4"])
+def test_a_ros_1_bag_is_a_log(tmp_path, compression):
+    drive = Ros(recorders.ROS1).drive()
+    assert_drive(*read_undamaged(recorders.bag1_of(tmp_path / "a.bag", drive, compression)))
+    sweeps = Ros(recorders.ROS1).sweeps()
+    log, scans = read_undamaged(recorders.bag1_of(tmp_path / "b.bag", sweeps, compression))
+    assert_clouds(scans)
+    assert log.dimension == 3
+
+
+@pytest.mark.parametrize("plugin", ["SQLITE3", "MCAP"])
+@pytest.mark.parametrize("compression", ["NONE", "FILE", "MESSAGE"])
+def test_the_folder_of_a_ros_2_bag_is_a_log(tmp_path, plugin, compression):
+    drive = Ros(recorders.ROS2).drive()
+    assert_drive(*read_undamaged(recorders.bag2_of(tmp_path / "a", drive, plugin=plugin, compression=compression)))
+
+
+def test_a_db3_alone_is_a_log(tmp_path):
+    folder = recorders.bag2_of(tmp_path / "a", Ros(recorders.ROS2).drive())
+    assert_drive(*read_undamaged(folder / "a.db3"))
+
+
+def test_parts_in_a_folder_are_one_log_in_natural_order(tmp_path):
+    drive = list(Ros(recorders.ROS1).drive())
+    folder = tmp_path / "parts"
+    folder.mkdir()
+    for name, part in (("run_2.bag", drive[:3]), ("run_10.bag", drive[3:])):
+        recorders.bag1_of(folder / name, part)
+    log, scans = read_undamaged(folder)
+    assert_drive(log, scans)
+    assert [path.name for path in log.paths] == ["run_2.bag", "run_10.bag"]
+
+
+def test_mcap_and_db3_parts_in_a_folder_are_one_log(tmp_path):
+    said = office(20)
+    folder = tmp_path / "mcap"
+    folder.mkdir()
+    write(folder / "0.mcap", said[:21])
+    write(folder / "1.mcap", said[21:])
+    assert len(read_undamaged(folder)[1]) == 20
+    drive = list(Ros(recorders.ROS2).drive())
+    for number, part in enumerate((drive[:3], drive[3:])):
+        recorders.bag2_of(tmp_path / f"part_{number}", part)
+        (tmp_path / "db3").mkdir(exist_ok=True)
+        shutil.move(tmp_path / f"part_{number}" / f"part_{number}.db3", tmp_path / "db3")
+    assert_drive(*read_undamaged(tmp_path / "db3"))
+
+
+@pytest.mark.parametrize("compression", [None, "BZ2", "LZ4"])
+def test_a_bag_of_many_chunks_gives_each_scan_once_in_order(tmp_path, compression):
+    path, sweeps = many_chunks(tmp_path, compression)
+    log, scans = read_undamaged(path)
+    assert len(log.indexes[0].blocks) > 10
+    assert_clouds(scans, sweeps)
+    log, scans = read_undamaged(path, start_s=2.0, end_s=3.0)
+    assert log.scan_count == len(scans) == 9
+    assert_clouds(scans, sweeps[16:25])
+
+
+def many_chunks(folder, compression=None):
+    """Sixty sweeps, a few in each chunk."""
+    sweeps, ros = recorders.clouds(60), Ros(recorders.ROS1)
+    told = [("/points", "sensor_msgs/msg/PointCloud2", c.stamp_ns, ros.point_cloud(c)) for c in sweeps]
+    return recorders.bag1_of(folder / "a.bag", told, compression, chunk_bytes=3000), sweeps
+
+
+def test_a_db3_of_many_blocks_gives_each_scan_once_in_order(tmp_path, monkeypatch):
+    monkeypatch.setattr("scanchain.logs.formats.ros2_bag._BLOCK_BYTES", 4000)
+    sweeps, ros = recorders.clouds(60), Ros(recorders.ROS2)
+    told = [("/points", "sensor_msgs/msg/PointCloud2", c.stamp_ns, ros.point_cloud(c)) for c in sweeps]
+    log, scans = read_undamaged(recorders.bag2_of(tmp_path / "a", told))
+    assert len(log.indexes[0].blocks) > 10
+    assert_clouds(scans, sweeps)
+
+
+def test_an_empty_bag_says_so(tmp_path):
+    with pytest.raises(InputError, match="no lidar topic"):
+        read_undamaged(recorders.bag1_of(tmp_path / "a.bag", []))
+
+
+@pytest.mark.parametrize("compression", [None, "BZ2", "LZ4"])
+def test_a_bag_that_was_cut_off_is_read_up_to_the_cut(tmp_path, compression):
+    path, sweeps = many_chunks(tmp_path, compression)
+    whole, counts = path.read_bytes(), []
+    for length in range(9000, len(whole), 1511):
+        path.write_bytes(whole[:length])
+        log = open_log(path)
+        scans = list(log.scans())
+        assert_clouds(scans, sweeps[: len(scans)])
+        assert "cut off" in log.damage[0] and f"{len(scans)} scans of /points were recovered" in log.damage[-1]
+        counts.append(len(scans))
+    assert counts == sorted(counts) and counts[0] < 9 and counts[-1] == 60
+
+
+def test_a_bag_whose_recording_never_ended_is_read_whole(tmp_path):
+    path, sweeps = many_chunks(tmp_path)
+    whole = path.read_bytes()
+    (index_at,) = struct.unpack_from("<Q", whole, whole.index(b"index_pos=") + 10)
+    path.write_bytes(whole[:index_at].replace(struct.pack("<Q", index_at), bytes(8), 1))  # as in a .bag.active
+    assert_clouds(read_undamaged(path)[1], sweeps)
+
+
+def test_a_damaged_chunk_of_a_bag_is_left_out_and_told(tmp_path):
+    path, sweeps = many_chunks(tmp_path, "BZ2")
+    content = bytearray(path.read_bytes())
+    content[content.index(b"compression=bz2", len(content) // 2) + 300] ^= 1
+    path.write_bytes(content)
+    log = open_log(path)
+    scans = list(log.scans())
+    assert 55 <= len(scans) < 60 and len(log.damage) == 2
+    assert "the chunk at byte" in log.damage[0] and "it was left out" in log.damage[0]
+    assert {scan.stamp_ns for scan in scans} <= {cloud.stamp_ns for cloud in sweeps}
+
+
+def test_a_chunk_of_a_bag_that_claims_to_be_huge_is_not_believed(tmp_path):
+    path, _ = many_chunks(tmp_path, "BZ2")
+    content = bytearray(path.read_bytes())
+    place = content.index(b"size=", 5000) + 5
+    content[place : place + 4] = struct.pack("<I", 2**32 - 1)
+    path.write_bytes(content)
+    log = open_log(path)
+    assert 50 <= len(list(log.scans())) < 60 and "4294967295 bytes, more than is accepted" in log.damage[0]
+
+
+def test_an_encrypted_bag_says_so(tmp_path):
+    path, _ = many_chunks(tmp_path)
+    content = path.read_bytes()
+    field = struct.pack("<I", 21) + b"encryptor=rosbag/aes\0"
+    (size,) = struct.unpack_from("<I", content, 13)
+    head = struct.pack("<I", size + len(field)) + field
+    path.write_bytes(content[:13] + head + content[17:])
+    with pytest.raises(InputError, match="is encrypted"):
+        read_undamaged(path)
+
+
+def test_of_a_db3_only_the_messages_that_are_damaged_are_lost(tmp_path):
+    sweeps, ros = recorders.clouds(30), Ros(recorders.ROS2)
+    told = [("/points", "sensor_msgs/msg/PointCloud2", c.stamp_ns, ros.point_cloud(c)) for c in sweeps]
+    folder = recorders.bag2_of(tmp_path / "a", told, compression="MESSAGE")
+    path = folder / "a.db3"
+    frames = path.read_bytes().split(b"\x28\xb5\x2f\xfd")  # each begins with the magic of zstd
+    assert len(frames) == 31
+    damaged = b"\x28\xb5\x2f\xfd".join(frames[:12]) + b"\0\0\0\0" + b"\x28\xb5\x2f\xfd".join(frames[12:])
+    path.write_bytes(damaged)
+    log = open_log(folder)
+    scans = list(log.scans())
+    stamps = {scan.stamp_ns for scan in scans}
+    assert len(scans) == 29
+    assert_clouds(scans, [sweep for sweep in sweeps if sweep.stamp_ns in stamps])
+    assert "at least 1 message from" in log.damage[0] and "29 scans" in log.damage[1]
+
+
+def test_metadata_that_is_no_yaml_or_lacks_its_files_is_told(tmp_path):
+    (tmp_path / "metadata.yaml").write_text("a: [")
+    with pytest.raises(InputError, match=r"metadata\.yaml: is not that of a ROS 2 bag"):
+        read_undamaged(tmp_path)
+    folder = recorders.bag2_of(tmp_path / "bag", Ros(recorders.ROS2).drive())
+    (folder / "bag.db3").unlink()
+    with pytest.raises(InputError, match="database files are missing"):
+        read_undamaged(folder)
+
+
+def test_a_path_in_metadata_leads_nowhere_else(tmp_path):
+    folder = recorders.bag2_of(tmp_path / "bag", Ros(recorders.ROS2).drive(), plugin="MCAP")
+    outside = write(tmp_path / "outside.mcap", office(2))
+    text = (folder / "metadata.yaml").read_text()
+    (folder / "metadata.yaml").write_text(text.replace("bag.mcap", f"../{outside.name}"))
+    with pytest.raises(InputError):
+        read_undamaged(folder)

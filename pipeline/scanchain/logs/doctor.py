@@ -8,32 +8,35 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import groupby
+from typing import NamedTuple
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from scanchain.config import Config, LogConfig, PreprocessConfig
-from scanchain.data import MOST_COPIES
+from scanchain.data import MOST_COPIES, RawPoints, Scan
 from scanchain.errors import counted
 from scanchain.files import Source
 from scanchain.logs.bad_scans import are_millimeters, most_bad_scans
-from scanchain.logs.doctor.statistics import Survey, survey
-from scanchain.logs.log import open_log
-from scanchain.logs.messages.point_times import UNITS_S
+from scanchain.logs.log import Log, open_log
+from scanchain.logs.mcap.stream import whole_span
 from scanchain.logs.messages.readers import is_scan
+from scanchain.logs.messages.returns import UNITS_S
 
 _GAP_PERIODS = 2.5
 _LONG_GAP_S, _LONG_GAP_ON_WHEELS_S = 0.5, 10.0
-_OTHER_CLOCK_S = 1.0
 _PART_OF_SCAN, _MORE_THAN_SCAN = 0.3, 1.2  # shares of the period outside which a unit of time is implausible
 _SPINS_AT_S = (0.04, 0.25)
 _SURE = 0.9  # least share of the scans that turn alike, and least agreement of their starts
 _FASTEST_M_S = 100.0  # speed by the wheels above which their unit is another
 _LEAST_STEP_M = 1e-3  # length of a step between two readings from which on the wheels turn
-_NEAR_NS = 500_000_000  # largest distance from a scan's stamp of a wheel reading that a run uses
 _MANY_UNUSED = 0.3  # share of unused returns, from which on a wider range is recommended
 _STUCK_SHARE = 0.01  # share of beams at one farthest range that is reported
 _FEW_POINTS = 50
+_SAME_M = 1e-4  # largest difference of ranges that are one number: rounding of float32
+_NEXT_RAD = 0.2  # largest angle from one point to the next, usually, where their order is that of firing
+_ONE_TURN_RAD = (1.5 * np.pi, 2.5 * np.pi)  # one revolution; clouds stored ring by ring turn many times
 
 
 class Severity(StrEnum):
@@ -79,29 +82,119 @@ def examine(
     sources: Sequence[Source],
     config_of: Callable[[int], Config],
     log_config: LogConfig,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None],
 ) -> Diagnosis:
     """Diagnosis from every scan of a log. Raises InputError where a run could not open it either.
 
     config_of : what a run would use for a log of this dimension
     """
-    log = open_log(sources, log_config)
+    log = open_log(sources, replace(log_config, max_bad_scans_percent=100.0))
     notes = tuple(log.notes)
-    seen = survey(log, progress)
-    found = list(_check(seen, config_of(log.dimension)))
+    seen = Survey(log)
+    for scan in log.scans():
+        seen.take(scan)
+        progress(len(seen.log_times_ns), log.scan_count)
+    config = config_of(log.dimension)
+    found = list(_check(seen, config, most_bad_scans(seen.messages, log_config)))
     ordered = tuple(finding for grade in reversed(Severity) for finding in found if finding.severity is grade)
     return Diagnosis(tuple(map(str, log.paths)), log.topic, log.dimension, ordered, notes)
 
 
-def _check(seen: Survey, config: Config) -> Iterator[Finding]:
-    """Every finding about a log. ``config`` is what a run of it would use."""
+class Facts(NamedTuple):
+    """Statistics of the returns of one scan.
+
+    Attributes
+    ----------
+    kept, dropped : number of valid returns, and of the others
+    farthest_m, at_farthest : the largest range and the number of returns with just that one
+    ranges_m : (101,) percentiles of the ranges
+    time_span_s : of the per-point times, NaN where there are none
+    turn : 1 if the points, in their order, go around once counter-clockwise, −1 if clockwise, else 0
+    start_rad : azimuth of the first point
+    is_copy : the points are those of the scan before, to the last bit
+    """
+
+    kept: int
+    dropped: int
+    farthest_m: float
+    at_farthest: int
+    ranges_m: NDArray[np.float32]
+    time_span_s: float
+    turn: int
+    start_rad: float
+    is_copy: bool
+
+
+class Survey:
+    """Facts of the readable scans of a log and their times; stamps and wheels' positions (d,) where known."""
+
+    def __init__(self, log: Log) -> None:
+        self.log = log
+        self.scans: list[Facts] = []
+        self.log_times_ns: list[int] = []
+        self.stamps_ns: list[int] = []
+        self.wheels: list[tuple[int, NDArray[np.float64]]] = []
+
+    def take(self, scan: Scan) -> None:
+        """Take in the next scan."""
+        self.log_times_ns.append(scan.log_time_ns)
+        self.stamps_ns.append(scan.stamp_ns)
+        if scan.T_odom_base is not None:
+            self.wheels.append((scan.stamp_ns, scan.T_odom_base[:-1, -1]))
+        points = scan.points
+        ranges_m = np.sort(np.sqrt(np.sum(np.square(points), axis=1)))
+        turn, start_rad = _turning(points)
+        self.scans.append(
+            Facts(
+                kept=len(points),
+                dropped=scan.dropped,
+                farthest_m=round(float(ranges_m[-1]), 4),
+                at_farthest=int(np.count_nonzero(ranges_m > ranges_m[-1] - _SAME_M)),
+                ranges_m=ranges_m[np.linspace(0, len(points) - 1, 101).astype(int)],
+                time_span_s=float(np.ptp(scan.times_s)) if len(scan.times_s) else math.nan,
+                turn=turn,
+                start_rad=start_rad,
+                is_copy=scan.is_copy,
+            )
+        )
+
+    @property
+    def messages(self) -> int:
+        """Number of scans, those that are not readable included."""
+        return len(self.scans) + self.log.bad_scans
+
+    @property
+    def period_s(self) -> float:
+        """Median time between two scans, by their stamps or, where those do not move, by log time; 0 if alone."""
+        for times_ns in (self.stamps_ns, self.log_times_ns):
+            steps_s = np.diff(times_ns) * 1e-9
+            if len(steps_s) and np.median(steps_s) > 0.0:
+                return float(np.median(steps_s))
+        return 0.0
+
+    def into_log_s(self, place: int) -> float:
+        """Seconds from the log's first message to a scan, as ``--start`` and ``--end`` count."""
+        return (self.log_times_ns[place] - whole_span(self.log.indexes).begin_ns) * 1e-9
+
+
+def _turning(points: RawPoints) -> tuple[int, float]:
+    """Direction in which the points turn, 0 where they make no single turn, and their first azimuth."""
+    if len(points) < 2:
+        return 0, math.nan
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    steps = (np.diff(azimuth) + np.pi) % (2.0 * np.pi) - np.pi
+    turned = float(steps.sum())
+    is_turn = _ONE_TURN_RAD[0] < abs(turned) < _ONE_TURN_RAD[1] and float(np.median(np.abs(steps))) < _NEXT_RAD
+    return int(np.sign(turned)) * is_turn, float(azimuth[0])
+
+
+def _check(seen: Survey, config: Config, most_bad: float) -> Iterator[Finding]:
+    """Every finding about a log. ``config`` is what a run of it would use; ``most_bad`` scans it may lack."""
     yield _gaps(seen, bool(seen.wheels) and config.odometry.prior != "constant-velocity")
-    yield _order(seen)
-    yield _clock(seen)
     yield _wheels(seen)
     if not is_scan(seen.log.lidar):
         yield _point_times(seen)
-    yield _damage(seen, config.preprocess)
+    yield _damage(seen, config.preprocess, most_bad)
     yield _returns(seen)
     yield _no_return(seen)
     yield _ranges(seen, config.preprocess)
@@ -109,12 +202,12 @@ def _check(seen: Survey, config: Config) -> Iterator[Finding]:
 
 
 def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:
-    steps_s = np.diff(seen.log_ns) * 1e-9
+    steps_s = np.diff(seen.log_times_ns) * 1e-9
     gaps = np.flatnonzero(steps_s > _GAP_PERIODS * seen.period_s) if seen.period_s else np.empty(0, np.int64)
     if not len(gaps):
         return Finding("gaps", Severity.OK, f"none longer than {_GAP_PERIODS:g} periods")
-    longest = gaps[np.argmax(steps_s[gaps])]
-    at_s = seen.into_log_s(int(seen.log_ns[longest]))
+    longest = int(gaps[np.argmax(steps_s[gaps])])
+    at_s = seen.into_log_s(longest)
     found = (
         f"{len(gaps):,} longer than {_GAP_PERIODS:g} periods, the longest {steps_s[longest]:.3g} s, "
         f"{at_s:.1f} s into the log"
@@ -130,65 +223,32 @@ def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:
     return Finding("gaps", Severity.WARNING, found, effect, f"--end {until_s:g}")
 
 
-def _order(seen: Survey) -> Finding:
-    steps_ns = np.diff(seen.stamps_ns)
-    backwards, repeated = int(np.count_nonzero(steps_ns < 0)), int(np.count_nonzero(steps_ns == 0))
-    if not backwards and not repeated:
-        return Finding("stamp order", Severity.OK, "header stamps rise from scan to scan")
-    found = f"{counted(backwards, 'step')} back in the header stamps, {repeated:,} repeated"
-    effect = "scans are taken in the order of log time; poses in the results hold at stamps that are not in order"
-    if repeated < len(steps_ns):
-        return Finding("stamp order", Severity.WARNING, found, effect)
-    effect += "; record with stamps: the driver left them out"
-    return Finding("stamp order", Severity.PROBLEM, found, effect)
-
-
-def _clock(seen: Survey) -> Finding:
-    """Header stamp against log time."""
-    late_s = (seen.log_ns - seen.stamps_ns) * 1e-9
-    least, median, most = (float(value) for value in np.percentile(late_s, [0.0, 50.0, 100.0]))
-    found = f"logged {median:.4g} s after the header stamp (from {least:.4g} to {most:.4g} s)"
-    if abs(median) > _OTHER_CLOCK_S:
-        effect = (
-            "header stamps are of another clock than log times: --start and --end count by log time, results by "
-        )
-        effect += "header stamps, and wheels or ground truth of the recorder's clock do not meet the scans"
-        return Finding("clock", Severity.WARNING, found, effect)
-    return Finding("clock", Severity.OK, found)
-
-
 def _wheels(seen: Survey) -> Finding:
-    if not seen.log.odometry_topic:
+    log, scans = seen.log, counted(len(seen.scans), "scan")
+    if not log.odometry_topic:
         effect = "the motion is predicted from the scans alone"
         return Finding("wheels", Severity.OK, "no wheel odometry", effect)
-    stamps_ns = np.sort(np.array([pose.stamp_ns for pose in seen.wheels], np.int64))
-    topic = seen.log.odometry_topic
-    if not len(stamps_ns):
-        return Finding("wheels", Severity.WARNING, f"{topic} has no readable pose", "it is as if there were none")
-    after = np.searchsorted(stamps_ns, seen.stamps_ns)
-    before_ns = np.abs(seen.stamps_ns - stamps_ns[np.maximum(after - 1, 0)])
-    after_ns = np.abs(stamps_ns[np.minimum(after, len(stamps_ns) - 1)] - seen.stamps_ns)
-    scans = counted(len(seen.scans), "scan")
-    missed = int(np.count_nonzero(np.minimum(before_ns, after_ns) > _NEAR_NS))
-    found = f"{topic}: {counted(len(stamps_ns), 'reading')}, {missed} of {scans} without one within 0.5 s"
+    missed = len(seen.scans) - len(seen.wheels)
+    found = f"{log.odometry_topic}: {missed} of {scans} without a reading within 0.5 s"
+    without = "--odometry.prior constant-velocity"
     if (speed_m_s := _wheel_speed_m_s(seen)) > _FASTEST_M_S:
         found += f"; by them the robot moves at {speed_m_s:.3g} m/s"
         effect = "no vehicle does: millimeters, or jumps? Scans are predicted where the robot never was"
-        return Finding("wheels", Severity.PROBLEM, found, effect, "--odometry.prior constant-velocity")
+        return Finding("wheels", Severity.PROBLEM, found, effect, without)
     if missed:
         return Finding("wheels", Severity.WARNING, found, "the motion of those is predicted from the scans alone")
-    if unmounted := next((line for line in seen.log.notes if line.startswith("no static transform")), ""):
+    if unmounted := next((line for line in log.notes if line.startswith("no static transform")), ""):
         effect = "the wheels' turns are taken about the lidar instead of the robot; record /tf_static"
-        return Finding(
-            "wheels", Severity.WARNING, f"{found}; {unmounted}", effect, "--odometry.prior constant-velocity"
-        )
+        return Finding("wheels", Severity.WARNING, f"{found}; {unmounted}", effect, without)
     return Finding("wheels", Severity.OK, found)
 
 
 def _wheel_speed_m_s(seen: Survey) -> float:
     """Median speed by the wheels while they turn; 0 where they stand still."""
-    stamps_ns, order = np.unique([pose.stamp_ns for pose in seen.wheels], return_index=True)
-    positions = np.array([seen.wheels[k].T_parent_child[:-1, -1] for k in order])
+    if not seen.wheels:
+        return 0.0
+    stamps_ns, order = np.unique([stamp_ns for stamp_ns, _ in seen.wheels], return_index=True)
+    positions = np.array([seen.wheels[k][1] for k in order])
     steps_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     moving = steps_m > _LEAST_STEP_M
     return float(np.median(steps_m[moving] / (1e-9 * np.diff(stamps_ns)[moving]))) if moving.any() else 0.0
@@ -200,14 +260,14 @@ def _point_times(seen: Survey) -> Finding:
     if not len(spans_s):
         effect = "scans are not freed of the lidar's own motion, which bends them unless the driver did it"
         return Finding("point times", Severity.NOTE, "none", effect, _by_azimuth(seen))
-    span_s = float(np.median(spans_s))
-    found = f"{seen.point_times.removeprefix('point times: ')}; a scan lasts {1e3 * span_s:.4g} ms"
+    assumed, span_s = seen.log.assumed_point_times(), float(np.median(spans_s))
+    found = f"{assumed.removeprefix('point times: ')}; a scan lasts {1e3 * span_s:.4g} ms"
     part = span_s / seen.period_s if seen.period_s else 1.0
     if _PART_OF_SCAN < part < _MORE_THAN_SCAN:
         return Finding("point times", Severity.OK, found)
     found += f", {part:.2g} of the period"
     effect = "if that is the wrong unit, deskewing bends every scan instead of straightening it"
-    return Finding("point times", Severity.WARNING, found, effect, _other_unit(seen, part))
+    return Finding("point times", Severity.WARNING, found, effect, _other_unit(assumed, part))
 
 
 def _by_azimuth(seen: Survey) -> str:
@@ -226,12 +286,12 @@ def _by_azimuth(seen: Survey) -> str:
     )
 
 
-def _other_unit(seen: Survey, part: float) -> str:
+def _other_unit(assumed: str, part: float) -> str:
     """The flag for the unit in which scans last about a period; where none fits times too long, that for none.
 
     part : of the period that scans last in the unit that was taken
     """
-    taken = next((unit for unit in UNITS_S if f"taken as {unit} " in seen.point_times), "")
+    taken = next((unit for unit in UNITS_S if f"taken as {unit} " in assumed), "")
     if not taken:
         return ""
     for unit, unit_s in UNITS_S.items():
@@ -240,25 +300,19 @@ def _other_unit(seen: Survey, part: float) -> str:
     return "--log.point_times none" if part > _MORE_THAN_SCAN else ""
 
 
-def _damage(seen: Survey, preprocess: PreprocessConfig) -> Finding:
-    empty = sum(scan.kept == 0 for scan in seen.scans)
+def _damage(seen: Survey, preprocess: PreprocessConfig, most_bad: float) -> Finding:
     low_m, high_m = preprocess.min_range_m, preprocess.max_range_m
     outside = sum(bool(scan.ranges_m[0] > high_m or scan.ranges_m[-1] < low_m) for scan in seen.scans)
-    bad = len(seen.malformed) + empty + outside
-    lines = list(seen.damage)
-    if seen.malformed:
-        lines.append(f"{counted(len(seen.malformed), 'malformed scan')} (the first: {seen.malformed[0]})")
-    if empty:
-        lines.append(f"{counted(empty, 'scan')} without a valid point")
+    bad, lines = seen.log.bad_scans + outside, list(seen.log.damage)
     if outside:
         limits = f"preprocess.min_range_m ({low_m:g}) and preprocess.max_range_m ({high_m:g})"
         lines.append(f"{counted(outside, 'scan')} without a point between {limits}")
     if not lines:
         return Finding("damage", Severity.OK, f"{counted(len(seen.scans), 'scan')}, all readable and with points")
-    messages = len(seen.scans) + len(seen.malformed)
-    if bad > most_bad_scans(messages, seen.log.config):
+    if bad > most_bad:
         effect = "a run stops: these are more bad scans than log.max_bad_scans_percent allows"
-        remedy = f"--log.max_bad_scans_percent {math.ceil(100 * bad / messages)}" if bad < messages else ""
+        percent = math.ceil(100 * bad / seen.messages)
+        remedy = f"--log.max_bad_scans_percent {percent}" if bad < seen.messages else ""
         return Finding("damage", Severity.PROBLEM, "; ".join(lines), effect, remedy)
     effect = "what was damaged is left out, the rest is used"
     return Finding("damage", Severity.WARNING, "; ".join(lines), effect)
@@ -282,15 +336,15 @@ def _without_ends(seen: Survey, poor: NDArray[np.bool_]) -> str:
     good = np.flatnonzero(~poor)
     if not len(good) or poor[good[0] : good[-1] + 1].any():
         return ""
-    start_s, end_s = (seen.into_log_s(int(seen.log_ns[place])) for place in (good[0], good[-1]))
+    start_s, end_s = (seen.into_log_s(place) for place in (good[0], good[-1]))
     flags = [f"--start {math.floor(1e3 * start_s) / 1e3:g}"] if poor[0] else []
     return " ".join([*flags, *([f"--end {math.ceil(1e3 * end_s) / 1e3:g}"] if poor[-1] else [])])
 
 
 def _no_return(seen: Survey) -> Finding:
     """Finding on beams that all have one farthest range, as of scanners that write a number for no return."""
-    values = Counter(scan.farthest_m for scan in seen.scans if scan.kept)
-    farthest_m = max(values, default=0.0)
+    values = Counter(scan.farthest_m for scan in seen.scans)
+    farthest_m = max(values)
     stuck = sum(scan.at_farthest for scan in seen.scans if scan.farthest_m == farthest_m)
     share = stuck / max(sum(scan.kept + scan.dropped for scan in seen.scans), 1)
     if share < _STUCK_SHARE:
@@ -302,8 +356,8 @@ def _no_return(seen: Survey) -> Finding:
 
 
 def _ranges(seen: Survey, preprocess: PreprocessConfig) -> Finding:
-    ranges_m = np.array([scan.ranges_m for scan in seen.scans if scan.kept], np.float64)
-    near_m, far_m = np.median(ranges_m[:, [1, 99]], axis=0).tolist() if len(ranges_m) else (np.nan, np.nan)
+    ranges_m = np.array([scan.ranges_m for scan in seen.scans], np.float64)
+    near_m, far_m = np.median(ranges_m[:, [1, 99]], axis=0).tolist()
     found = f"98 % of the returns lie between {near_m:.3g} and {far_m:.4g} m (medians)"
     low_m, high_m = preprocess.min_range_m, preprocess.max_range_m
     if far_m > high_m:
@@ -322,17 +376,17 @@ def _ranges(seen: Survey, preprocess: PreprocessConfig) -> Finding:
 
 
 def _duplicates(seen: Survey) -> Finding:
-    digests = [scan.digest for scan in seen.scans]
-    runs = [len(list(copies)) for _, copies in groupby(digests)]
-    same = len(digests) - len(runs)
+    copies = [scan.is_copy for scan in seen.scans]
+    same = sum(copies)
     if not same:
         return Finding("duplicates", Severity.OK, "no scan is the one before once more")
-    found = f"{same} of {len(digests):,} scans are the one before once more, to the last bit"
-    if max(runs) > MOST_COPIES:
-        found += f", {max(runs):,} of them in a row"
+    in_a_row = 1 + max(len(list(run)) for is_copy, run in groupby(copies) if is_copy)
+    found = f"{same} of {len(copies):,} scans are the one before once more, to the last bit"
+    if in_a_row > MOST_COPIES:
+        found += f", {in_a_row:,} of them in a row"
         effect = "the driver was stuck, or a simulation without noise at rest: the trajectory stands still there"
         return Finding("duplicates", Severity.WARNING, found, effect)
     effect = "a copy looks like a stop: the prediction at constant velocity stands still, then has to catch up"
-    every = round(len(digests) / (len(digests) - same))
+    every = round(len(copies) / (len(copies) - same))
     remedy = f"--every {every}" if every > 1 else ""
     return Finding("duplicates", Severity.WARNING, found, effect, remedy)

@@ -1,4 +1,4 @@
-"""Maps as small pictures: trajectories, loop closures and the sessions of a merge on them."""
+"""Maps as small pictures, with trajectories, loop closures and the sessions of a merge on them."""
 
 from __future__ import annotations
 
@@ -15,11 +15,10 @@ from scanchain.config import Config
 from scanchain.data import Points
 from scanchain.maps import SavedMap, open_saved_map
 from scanchain.runs.results import Overlay
-from scanchain_viz.pictures.figure import INK, Floats, Plot, broken, palette_of
-from scanchain_viz.pictures.trajectory_figures import CLOSURES, DrawnTrajectory, PathLine, color_of
+from scanchain_viz.colors import color_of, height_shares, palette_of
+from scanchain_viz.pictures.figure import INK, Floats, Line, Plot
 
-_POINTS = "#808893"
-_GRAY = (_POINTS,)
+GRAY = "#808893"  # of points of a map beneath lines
 _MAX_POINTS = 120_000
 _SAMPLE = 200_000  # points taken of a map's keyframes
 _PIXELS_A_POINT, _WIDTHS = 2.0, (200.0, 700.0)  # of a map's picture: per root of the points; pixels
@@ -67,21 +66,26 @@ def map_picture(points: Points, low: Floats, high: Floats) -> Markup:
 
 
 def path_over_map(
-    points: Points, path: Floats, lines: Sequence[PathLine], low: Floats, high: Floats, *, is_wide: bool = False
+    points: Points,
+    lines: Sequence[Line],
+    low: Floats,
+    high: Floats,
+    path: Floats | None = None,
+    *,
+    is_wide: bool = False,
 ) -> Markup:
-    """Lines over the map (gray), seen from above, within corners; ring and square begin and end the path."""
+    """Lines over the map (gray), seen from above, within corners.
+
+    path : (N, 3) its begin and end have outlines, circle and square, however short it is: it is drawn over them
+    """
     figure = Plot.of_plan(low, high, is_wide=is_wide)
     draw_points(figure, points, low, high)
-    mark_ends(figure, path)
+    if path is not None:
+        figure.marks(path[:1], "o", INK, 7.0, line=1.0)
+        figure.marks(path[-1:], "s", INK, 7.0, line=1.0)
     for line in lines:
-        figure.path(line.positions, line.color, line.width, (3.0, 3.0) if line.is_dashed else ())
+        figure.line(line.positions, line.color, line.width, (3.0, 3.0) if line.is_dashed else ())
     return figure.svg()
-
-
-def mark_ends(figure: Plot, path: Floats, ends: Sequence[tuple[int, str]] = ((0, "o"), (-1, "s"))) -> None:
-    """Outlines around begin and end of a path (N, 3), however short it is: it is drawn over them."""
-    for place, shape in ends:
-        figure.marks(path[place, None, :2], shape, INK, 7.0, line=1.0)
 
 
 BEFORE, AFTER = "#1aa179", "#a55bd6"  # colors of two passes
@@ -100,7 +104,7 @@ def overlay_picture(overlay: Overlay) -> Markup:
     figure = Plot.of_plan(low, high)
     for points, path, color in ((before, overlay.path_before, BEFORE), (after, overlay.path_after, AFTER)):
         draw_points(figure, points, low, high, (color,))
-        figure.path(path, color, 1.4)
+        figure.line(path, color, 1.4)
     return figure.svg()
 
 
@@ -115,14 +119,13 @@ def draw_points(
     points: Points,
     low: Floats,
     high: Floats,
-    colors: Sequence[str] = (_POINTS,),
-    detail: float = 1.0,
+    colors: Sequence[str] = (GRAY,),
 ) -> None:
     """Draw points (M, 3) as seen from above, within corners, in one color, or in several by height, if any."""
     shown = points[:: max(1, -(-len(points) // _MAX_POINTS))]
     inside = ((shown[:, :2] > low[:2]) & (shown[:, :2] < high[:2])).all(axis=1)
     if inside.any():
-        colors = colors if len(colors) == 1 or np.ptp(shown[inside, 2]) else _GRAY
+        colors = colors if len(colors) == 1 or np.ptp(shown[inside, 2]) else (GRAY,)
         pixels, palette, edge_m = _image(shown[inside], low, high, colors)
         figure.image(pixels, palette, low, low[:2] + edge_m * np.array(pixels.shape[::-1]))
 
@@ -140,40 +143,17 @@ def _image(
     counts = np.minimum(np.bincount(pixel, minlength=rows * columns), _SHADES)
     shades, highest = palette_of(colors, _HEIGHTS if len(colors) > 1 else 1), np.zeros(rows * columns, int)
     if len(shades) > 1:
-        bottom, top = np.percentile(points[:, 2], (2.0, 98.0))
-        share = np.clip((points[:, 2] - bottom) / max(top - bottom, 1e-9), 0.0, 1.0)
-        np.maximum.at(highest, pixel, np.rint((len(shades) - 1) * share).astype(int))
+        np.maximum.at(highest, pixel, np.rint((len(shades) - 1) * height_shares(points[:, 2])).astype(int))
     palette = np.repeat(shades, _SHADES + 1, axis=0)
     palette[:, 3] = np.tile(np.rint(255.0 * (1.0 - (1.0 - opacity) ** np.arange(_SHADES + 1))), len(shades))
     return (highest * (_SHADES + 1) + counts).reshape(rows, columns).astype(np.uint8), palette, edge_m
-
-
-def loops_picture(
-    trajectory: DrawnTrajectory, edges: Floats, rejected_by: NDArray[np.str_], low: Floats, high: Floats
-) -> Markup:
-    """The trajectory (gray) and its closures (E, 2, 3) in the colors of ``CLOSURES``, over the whole page."""
-    figure = Plot.of_plan(low, high, is_wide=True)
-    mark_ends(figure, trajectory.positions, ((0, "o"),))
-    figure.path(trajectory.positions, _POINTS, 0.7)
-    for by, (_, color) in CLOSURES.items():
-        figure.path(broken(edges[rejected_by == by]), color, 0.9)
-    return figure.svg()
-
-
-@dataclass(frozen=True, slots=True)
-class DrawnSession:
-    """A session: its name, color, and the positions (K, 3) of its keyframes."""
-
-    name: str
-    color: str
-    positions: Floats
 
 
 @dataclass(frozen=True, slots=True)
 class DrawnMerge:
     """Sessions of a merged map, ends (E, 2, 3) of the closures between them, and the spacing of its points."""
 
-    sessions: tuple[DrawnSession, ...]
+    sessions: tuple[Line, ...]
     closures: Floats
     dimension: int
     grain_m: float
@@ -189,19 +169,9 @@ def read_merge(directory: Path) -> DrawnMerge:
     saved = open_saved_map(directory)
     positions = lie.lift(saved.poses)[:, :3, 3]
     sessions = tuple(
-        DrawnSession(each.name, color_of(number), positions[saved.session == number])
+        Line(each.name, positions[saved.session == number], color_of(number))
         for number, each in enumerate(saved.sessions)
     )
     ends: NDArray[np.int64] = saved.session[saved.edges.pairs]
     between = saved.edges.pairs[ends[:, 0] != ends[:, 1]]
     return DrawnMerge(sessions, positions[between], saved.dimension, Config().maps.voxel_size_m)
-
-
-def merge_picture(drawn: DrawnMerge, points: Points, low: Floats, high: Floats) -> Markup:
-    """Paths and closures over the map (M, 3), seen from above, within corners."""
-    figure = Plot.of_plan(low, high)
-    draw_points(figure, points, low, high)
-    figure.path(broken(drawn.closures), CLOSURES[""][1], 0.5)
-    for session in drawn.sessions:
-        figure.path(session.positions, session.color)
-    return figure.svg()

@@ -11,18 +11,19 @@ from scanchain.config import LogConfig
 from scanchain.errors import InputError, grouped
 from scanchain.files import Source
 from scanchain.logs.mcap.records import FileIndex, name_of
-from scanchain.logs.mcap.selection import (
+from scanchain.logs.mcap.stream import (
     EVERYTHING,
+    Decoded,
     chosen_span,
     count_messages,
+    decoded_messages,
     notes_on,
     nothing_in_part,
     whole_span,
 )
-from scanchain.logs.mcap.stream import Decoded, decoded_messages
 from scanchain.logs.opening import AUTO, index_files
 from scanchain.logs.topics import find_lidar, is_lidar, topics_of
-from scanchain.logs.writing.writer import LogWriter
+from scanchain.logs.writer import LogWriter
 
 _DEFAULTS = LogConfig()
 _WHOLE = (_DEFAULTS.topic, _DEFAULTS.start_s, _DEFAULTS.end_s, _DEFAULTS.every)
@@ -67,7 +68,9 @@ def convert(
     ):
         raise nothing_in_part(f"{name_of(indexes)}: no message", whole_span(indexes), config)
     damage = [line for index in indexes for line in index.damage]
-    with LogWriter(destination, force=force, profile=_profile(indexes)) as log:
+    encodings = {channel.encoding for index in indexes for channel in index.channels.values()}
+    profile = "ros2" if encodings == {"cdr"} else "ros1" if encodings == {"ros1"} else ""
+    with LogWriter(destination, force=force, profile=profile) as log:
         for message in _messages(indexes, counts, config, damage):
             assert isinstance(message.value, bytes)
             log.copy(message.channel, message.log_time_ns, message.value)
@@ -80,8 +83,6 @@ def convert(
                 f"{'; '.join(grouped(damage)) or 'it is empty'}"
             )
     notes = (*(line for index in indexes for line in index.notes), *notes_on(indexes, config))
-    if config.rate_hz and not any(index.takes_rate for index in indexes):
-        notes += (f"log.rate_hz {config.rate_hz:g} has no effect: the log has its own stamps",)
     return Converted(destination, counts, notes, tuple(grouped(damage)))
 
 
@@ -112,9 +113,3 @@ def _chosen(indexes: Sequence[FileIndex], topic: str) -> list[str]:
     lidar = find_lidar(indexes, topic) if topic else None
     channels = topics_of(indexes)
     return [name for name in channels if lidar is None or name == topic or not is_lidar(channels[name])]
-
-
-def _profile(indexes: Sequence[FileIndex]) -> str:
-    """The convention that all channels keep, empty where they differ."""
-    encodings = {channel.encoding for index in indexes for channel in index.channels.values()}
-    return {frozenset({"cdr"}): "ros2", frozenset({"ros1"}): "ros1"}.get(frozenset(encodings), "")

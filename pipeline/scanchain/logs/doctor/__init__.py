@@ -1,1 +1,0 @@
-"""Faults of a log: severity, effect, fix."""

@@ -1,1 +1,0 @@
-"""Messages packed and written as MCAP."""

@@ -1,0 +1,179 @@
+"""The landmark problems of the course report by every linear solver, and an MRCLAM log against GTSAM.
+
+    python -m tests.benchmarks.landmarks linear [--repeats 9]
+    python -m tests.benchmarks.landmarks log [--robot 1] [--repeats 9]
+
+linear: each round solves every problem by every method in turn; times are medians of whole solutions of A x = b,
+a new solver each time; "again" is with the same solver once more, which keeps what it found out about the
+pattern. The report's seconds are of another machine (and its QR is SuiteSparseQR): ratios within a column
+compare.
+
+log: a batch in GTSAM gets the same dead reckoning and guess, Huber weights (k = 1.345), noise of 0.03 rad and
+0.12 m, and the odometry's noise as it is thought to be beforehand. Its time is that of building the graph and of
+its optimizer, with the covariance of every pose and landmark where it says so. "ours as given" does just the
+same, "ours" the whole estimate: dead reckoning, guess, the robot's own errors, all noise, all covariances.
+Methods take turns.
+"""
+
+import time
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+
+from scanchain.graph.losses import RobustLoss
+from scanchain.landmarks.compare import compare_linear
+from scanchain.landmarks.estimate import from_odometry, minimize
+from scanchain.landmarks.files import read_landmark_data, read_mrclam
+from scanchain.landmarks.problem import BearingRangeProblem, Values, linear_system, no_calibration
+from scanchain.landmarks.ranges import OWN, LogModel, OdometryNoise, solve_range_log
+from scanchain.landmarks.solvers import METHODS, create_solver
+from scanchain.landmarks.study import against_truth, truth_at
+from tests.benchmarks.harness import DATA, command_line
+
+OF_THE_REPORT = ("default", "pinv", "lu", "lu_colamd", "qr", "qr_colamd")
+REPORT_S = {
+    "2d_linear": (0.04870, 1.1802, 0.0260, 0.1152, 0.3671, 0.2509),
+    "2d_linear_loop": (0.0054, 0.1629, 0.0295, 0.0087, 0.2487, 0.0190),
+}
+AGREEMENT = 1e-8
+
+
+def with_suitesparse():
+    try:
+        import sparseqr  # noqa: F401
+    except ImportError:
+        return METHODS
+    return (*METHODS, "spqr", "spqr_colamd")
+
+
+def report(name, results):
+    published = dict(zip(OF_THE_REPORT, REPORT_S[name], strict=True))
+    print(f"\n{name}")
+    print(f"  {'method':12} {'report s':>9} {'total ms':>9} {'build':>8} {'factor':>8} {'solve':>7}"
+          f" {'again ms':>9} {'nnz factor':>11} {'differs by':>10}")  # fmt: skip
+    for result in results:
+        told = f"{published[result.method]:9.4f}" if result.method in published else f"{'-':>9}"
+        build, factor, solve, again = (
+            1e3 * seconds for seconds in (result.build_s, result.factor_s, result.solve_s, result.again_s)
+        )
+        print(f"  {result.method:12} {told} {1e3 * result.total_s:9.2f} {build:8.2f} {factor:8.2f} {solve:7.2f}"
+              f" {again:9.2f} {result.factor.nnz:11,} {result.difference:10.1e}")  # fmt: skip
+    spread = max(float(np.abs(a.x - b.x).max()) for a in results for b in results)
+    print(f"  all agree to {spread:.1e}" + ("" if spread <= AGREEMENT else f": MORE THAN {AGREEMENT:g}"))
+    fastest = min((result for result in results if result.method in OF_THE_REPORT), key=lambda r: r.total_s)
+    for result in results:
+        if result.method in ("cholesky", "schur"):
+            print(f"  {result.method}: {fastest.total_s / result.total_s:.1f} × as fast as {fastest.method},"
+                  f" {fastest.total_s / result.again_s:.1f} × with its analysis kept")  # fmt: skip
+
+
+def linear(options):
+    for name in REPORT_S:
+        system = linear_system(read_landmark_data(DATA / "landmarks" / f"{name}.npz"))
+        report(name, compare_linear(system, with_suitesparse(), options.repeats))
+
+
+# ---------------------------------------------------------------- the log
+
+
+HUBER = 1.345
+SIGMAS = np.array([0.03, 0.12])
+LANDMARK = 10_000_000  # first key of a landmark
+
+
+def measurements_of(log):
+    model = LogModel(log)
+    variances = np.concatenate([OdometryNoise().densities, SIGMAS**2])
+    given = model.measurements(model.reckoned(np.zeros(len(OWN))), variances)
+    return replace(given, calibration=no_calibration(given.motion))
+
+
+def as_given(log):
+    given = measurements_of(log)
+    begin = time.perf_counter()
+    found = minimize(
+        BearingRangeProblem(given), from_odometry(given), create_solver("schur"),
+        loss=RobustLoss("huber", HUBER, 1.0), tolerance=1e-6, first_damping=1e-10,
+    )  # fmt: skip
+    return time.perf_counter() - begin, found.state
+
+
+def ours(log):
+    begin = time.perf_counter()
+    solution = solve_range_log(log, None)
+    return time.perf_counter() - begin, solution.minimum.state
+
+
+def with_gtsam(log, optimizer, parameters, *, covariances=False):
+    given = measurements_of(log)
+    guess = from_odometry(given)
+    begin = time.perf_counter()
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    anchor = gtsam.noiseModel.Isotropic.Sigma(3, 1e-4)
+    graph.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(), anchor))
+    for k, (move, covariance) in enumerate(zip(given.motion, given.motion_covariance, strict=True)):
+        noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
+        graph.add(gtsam.BetweenFactorPose2(k, k + 1, gtsam.Pose2(*move), noise))
+    noise = gtsam.noiseModel.Robust.Create(
+        gtsam.noiseModel.mEstimator.Huber.Create(HUBER), gtsam.noiseModel.Diagonal.Sigmas(SIGMAS)
+    )
+    for (pose, landmark), (bearing, reach) in zip(given.observed.tolist(), given.measured, strict=True):
+        key = LANDMARK + landmark
+        graph.add(gtsam.BearingRangeFactor2D(pose, key, gtsam.Rot2(bearing), reach, noise))
+    for k, pose in enumerate(guess.poses):
+        values.insert(k, gtsam.Pose2(*pose))
+    for k, position in enumerate(guess.landmarks):
+        values.insert(LANDMARK + k, position)
+    found = optimizer(graph, values, parameters).optimize()
+    if covariances:
+        marginals = gtsam.Marginals(graph, found)
+        for key in found.keys():  # noqa: SIM118
+            marginals.marginalCovariance(key)
+    seconds = time.perf_counter() - begin
+    poses = [found.atPose2(k) for k in range(len(guess.poses))]
+    landmarks = np.array([found.atPoint2(LANDMARK + k) for k in range(len(guess.landmarks))])
+    return seconds, Values(np.array([[pose.x(), pose.y(), pose.theta()] for pose in poses]), landmarks)
+
+
+OF_THE_LOG = {
+    "ours": ours,
+    "ours as given": as_given,
+    "gtsam LM": lambda log: with_gtsam(log, gtsam.LevenbergMarquardtOptimizer, gtsam.LevenbergMarquardtParams()),
+    "gtsam LM, covariances": lambda log: with_gtsam(
+        log, gtsam.LevenbergMarquardtOptimizer, gtsam.LevenbergMarquardtParams(), covariances=True
+    ),
+    "gtsam GN": lambda log: with_gtsam(log, gtsam.GaussNewtonOptimizer, gtsam.GaussNewtonParams()),
+}
+
+
+def real_log(options):
+    log = read_mrclam(DATA / "landmarks" / "utias_mrclam6", options.robot)
+    model = LogModel(log)
+    truth = truth_at(log, model.nodes_s, model.landmarks)
+    seconds = {name: [] for name in OF_THE_LOG}
+    for method in OF_THE_LOG.values():
+        method(log)  # compiles
+    for _ in range(options.repeats):
+        for name, method in OF_THE_LOG.items():
+            spent, state = method(log)
+            seconds[name].append((spent, state))
+    print(f"{log.name}: {'method':22} {'median ms':>10} {'min ms':>8} {'ATE m':>8} {'landmarks m':>12}")
+    for name, runs in seconds.items():
+        accuracy, _ = against_truth(runs[-1][1], model.nodes_s, truth)
+        spent = 1e3 * np.array([run[0] for run in runs])
+        print(f"{log.name}: {name:22} {np.median(spent):10.1f} {spent.min():8.1f} {accuracy.poses_m:8.4f}"
+              f" {accuracy.landmarks_m:12.4f}")  # fmt: skip
+
+
+def main():
+    parser = command_line(__doc__, cache=False)
+    parser.add_argument("which", choices=("linear", "log"))
+    parser.add_argument("--robot", type=int, default=1)
+    parser.add_argument("--repeats", type=int, default=9)
+    options = parser.parse_args()
+    {"linear": linear, "log": real_log}[options.which](options)
+
+
+if __name__ == "__main__":
+    main()

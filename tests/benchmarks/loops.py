@@ -1,0 +1,177 @@
+"""Loop closure with drift turned up: revisits that are found, closures that are false, what the trajectory gains.
+
+    python -m tests.benchmarks.loops 2d [--logs intel mit_csail ...] [--drifts 0.01,0.002 ...] [--false 0.3]
+    python -m tests.benchmarks.loops 3d [--worlds rounds] [--sensors vlp-16,...] [--drifts ...] [--false 0.3]
+
+Every motion of the odometry is made longer by a share of itself and turned left by so much a meter (in space up,
+too, by a quarter of that) before the rest of the chain sees it. The reference is the truth of a simulated log in
+space; of a planar one it is the log as it is, without added drift.
+
+A closure is false where its relative pose is more than 0.5 m, in space 2 m or 3°, from the reference (drift
+bends the local maps, too). A keyframe is a revisit where the reference has it within 5 m of an older one that
+lies 100 m or more of the way back, and an opposite one where all those were driven the other way (headings 135°
+apart or more). It is found where an accepted closure starts within 10 m of the way from it. ATE is over all
+scans, after rigid alignment, with drift and after closure. With --false, wrong closures make up so large a share
+of those that go into the last optimization; "named" is the share of them that end as rejected.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import compress
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain import lie
+from scanchain.data import BACK_END, Closure, ClosureVerdict, Matrix, Pose, Proposal, Trajectory
+from scanchain.logs import open_log
+from scanchain.runs.closures import final_verdicts
+from scanchain.settings import load_settings
+from tests.benchmarks.harness import (
+    DATA,
+    ate_m,
+    choose_sequences,
+    command_line,
+    drive_of,
+    in_fresh_process,
+    traveled_m,
+)
+from tests.support import made
+from tests.support.drifting import drifting_slam, off_by, stretched
+from tests.support.false_loops import MADE_UP, false_closures
+
+NEAR_M, BACK_M, OPPOSITE_RAD, ALONG_M = 5.0, 100.0, np.radians(135.0), 10.0
+TRUE = {2: (0.5, np.inf), 3: (2.0, np.radians(3.0))}
+DRIFTS = {2: ("0.01,0.002", "0.01,-0.005", "-0.03,0.01"), 3: ("0.01,0.0002",)}
+HEAD = "| log | drift | ATE | accepted | by place | false | overruled | revisits | opposite | named | s | loops |"
+
+Drifted = Callable[[Pose], Pose]
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """Share of the way by which motions are longer, and radians a meter by which they turn."""
+
+    longer: float
+    turn_rad_m: float
+
+    def of(self, dimension: int) -> Drifted:
+        """What becomes of a motion."""
+        if dimension == 2:
+            return stretched(self.longer, self.turn_rad_m)
+        return off_by(np.array([self.longer, 0.0, 0.0, 0.0, -0.25 * self.turn_rad_m, self.turn_rad_m]))
+
+    def __str__(self) -> str:
+        return f"{100.0 * self.longer:g} %, {1e3 * self.turn_rad_m:g} mrad/m"
+
+
+def undrifted(path: Path) -> Trajectory:
+    """The reference of a log: the truth in space, the log as it is in the plane."""
+    log = open_log(path)
+    if log.dimension == 3:
+        truth = log.ground_truth()
+        assert truth is not None
+        return truth
+    slam = drifting_slam(load_settings(2).config, log.T_base_lidar, stretched(0.0, 0.0))
+    for scan in log.scans():
+        slam.process(scan)
+    return slam.finish().trajectory
+
+
+def row(path: Path, drift: Drift, truth: Trajectory, false_share: float) -> str:
+    """The line of a log."""
+    log = open_log(path)
+    slam = drifting_slam(load_settings(log.dimension).config, log.T_base_lidar, drift.of(log.dimension))
+    started = perf_counter()
+    loops_s = sum(step.timing.loops_s for step in map(slam.process, log.scans()))
+    spent_s = perf_counter() - started
+    if false_share:
+        slam.placement.take(false_closures(slam, false_share))
+    result = slam.finish()
+    everything = final_verdicts(result.closures, result.state)
+    is_made_up = [tried.reason == MADE_UP for tried in result.closures]
+    made_up = [each.verdict is ClosureVerdict.REJECTED for each in compress(everything, is_made_up)]
+    judged = [each for each, is_wrong in zip(everything, is_made_up, strict=True) if not is_wrong]
+    accepted = [each for each in judged if each.verdict is ClosureVerdict.ACCEPTED]
+    by_place = sum(each.proposed_by is Proposal.PLACE for each in accepted)
+    overruled = sum(each.rejected_by == BACK_END for each in judged)
+    poses = true_poses(log.dimension, truth, result.keyframes)
+    false = sum(not is_true(each, poses) for each in accepted)
+    path_m = traveled_m(poses)
+    sources_m = path_m[[each.source for each in accepted]]
+    found = np.any(np.abs(path_m[:, None] - sources_m) <= ALONG_M, axis=1)
+    shares = " | ".join(_share(found[which]) for which in revisits(poses, path_m))
+    ate = f"{ate_m(result.odometry, truth):.2f} to {ate_m(result.trajectory, truth):.2f} m"
+    return (
+        f"| {path.stem} | {drift} | {ate} | {len(accepted)} | {by_place} | {false} | {overruled} | {shares} "
+        f"| {_share(made_up)} | {spent_s:.1f} | {loops_s:.1f} |"
+    )
+
+
+def true_poses(dimension: int, truth: Trajectory, keyframes) -> Matrix:
+    """Those of the keyframes; the stamps of real planar logs are not in order."""
+    if dimension == 2:
+        return truth.poses[[keyframe.scan_index for keyframe in keyframes]]
+    return truth.poses[np.searchsorted(truth.stamps_ns, [keyframe.stamp_ns for keyframe in keyframes])]
+
+
+def revisits(poses: Matrix, path_m: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which of the keyframes (K,) return to a place, and which of these only the other way than before."""
+    revisit, opposite = np.zeros((2, len(poses)), np.bool_)
+    for k, T in enumerate(poses):
+        old = poses[: np.searchsorted(path_m, path_m[k] - BACK_M)]
+        near = old[np.linalg.norm(old[:, :-1, -1] - T[:-1, -1], axis=1) <= NEAR_M]
+        revisit[k] = len(near) > 0
+        opposite[k] = revisit[k] and bool(np.all(near[:, :-1, 0] @ T[:-1, 0] <= np.cos(OPPOSITE_RAD)))
+    return revisit, opposite
+
+
+def is_true(closure: Closure, poses: Matrix) -> bool:
+    """Whether a closure says what the reference says."""
+    off_m, off_rad = lie.apart(
+        lie.between(poses[closure.target], poses[closure.source]), closure.match.T_target_source
+    )
+    largest_m, largest_rad = TRUE[len(poses[0]) - 1]
+    return off_m <= largest_m and off_rad <= largest_rad
+
+
+def _share(chosen) -> str:
+    return f"{100.0 * np.mean(chosen):.1f} % of {len(chosen)}" if len(chosen) else "–"
+
+
+def planar_log(name: str, cache: Path) -> Path:
+    return (
+        DATA / "2d" / f"{name}.mcap" if (DATA / "2d" / f"{name}.mcap").exists() else made.log(name, folder=cache)
+    )
+
+
+def main() -> None:
+    parser = command_line(__doc__)
+    parser.add_argument("kind", choices=("2d", "3d"))
+    parser.add_argument("--logs", nargs="+", default=("intel", "mit_csail", "identical"), help="real or simulated")
+    choose_sequences(parser, worlds=("rounds",), scans=1600)
+    parser.add_argument("--drifts", nargs="+", help="share of the way, radians a meter")
+    parser.add_argument("--false", type=float, default=0.0, help="share of wrong closures, default: %(default)s")
+    options = parser.parse_args()
+    drifts = [Drift(*map(float, each.split(","))) for each in options.drifts or DRIFTS[int(options.kind[0])]]
+    print(HEAD + "\n" + "|---" * (HEAD.count("|") - 1) + "|")
+    for path in paths(options):
+        truth = undrifted(path)
+        for drift in drifts:
+            print(in_fresh_process(row, path, drift, truth, options.false), flush=True)
+
+
+def paths(options: argparse.Namespace) -> list[Path]:
+    if options.kind == "2d":
+        return [planar_log(name, options.cache) for name in options.logs]
+    pairs = [(world, sensor) for world in options.worlds.split(",") for sensor in options.sensors.split(",")]
+    return [drive_of(*pair, options.scans, options.cache) for pair in pairs]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,278 @@
+"""Whole logs in maps of other places, or in maps that they enter later: the states of all scans and the verdict.
+
+    python -m tests.benchmarks.places [--kind 2d 3d] [--places NAME ...] [--own] [--from SHARE] [--half] [--seed N]
+        [--set KEY=VALUE ...] [--cache DIR]
+    python -m tests.benchmarks.places --late [--kind 2d 3d] [--places NAME ...] [--seed N] [--set KEY=VALUE ...]
+
+A map is made of each place by ``run``, and every log of another place is localized in it, from its first scan to
+its last: all ordered pairs. --own localizes a log of the same place instead: another day, another start or
+another part of it. --from begins logs at a share of their duration, --half ends them at half of it, --set
+changes the configuration of localization (``--set log.every=2 log.wheels=``).
+
+  refused   "not from this place", and none of its scans has ever had a pose in the map
+  held      refused in the end, but scans had a pose in the map for a while
+  followed  placed in the map in the end
+  error     anything else that ended it
+
+The two rooms of motion capture are one place, and so are offices, identical corridors or towns of different
+seeds.
+
+--late: a map is made of a part of a drive, and another part is localized in it that begins elsewhere. A scan is
+inside where its true position lies within 5 m (in space 10 m) of a keyframe of the map. Prints, for each case:
+path outside before it enters, and inside; path inside until it is found (negative: before it entered), the poses
+that were given inside at their time and are wrong, the median error in the end, NEES then and in the end, the
+verdict. Truth of a simulated world is the simulator's; of a real log it is the trajectory of the whole log, with
+its loops.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import process_time
+
+import numpy as np
+
+import scanchain as sc
+from scanchain import lie
+from scanchain.data import Trajectory
+from scanchain.errors import ScanchainError
+from scanchain.logs import open_log
+from scanchain.maps import open_saved_map
+from scanchain.sessions.localizer import MapState
+from scanchain.trajectory import read_tum
+from tests.benchmarks.harness import DATA, command_line, poses_at, run_of, settings_of, true_in_map
+from tests.support import made
+
+Options = dict[str, object]
+
+PLANAR: Options = {"sensor": "lms-270"}  # a world of space, driven through with a planar scanner
+SPATIAL: Options = {"sensor": "vlp-16"}
+LONG: Options = {"sensor": "vlp-16", "seconds": 25.0}
+INSIDE_M = {2: 5.0, 3: 10.0}
+WRONG_M = {2: 1.0, 3: 2.0}  # error from which on a pose is wrong
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A real log, or a simulated world, and what its map and its log are made of.
+
+    ``mapped`` and ``again`` are options of ``run`` and ``localize``, or of ``simulate``, for the map and for the
+    log that is localized in its own place; ``options`` are those of both. Those of one ``site`` are one place.
+    """
+
+    kind: str
+    log: str = ""
+    world: str = ""
+    other: str = ""
+    options: Options = field(default_factory=dict)
+    again: Options = field(default_factory=dict)
+    mapped: Options = field(default_factory=dict)
+    site: str = ""
+
+
+def _real(log: str, end_s: float, **options: object) -> Place:
+    """A log whose first seconds are the map of its own place, and the rest is localized in it."""
+    return Place(log[:2], log, options=options, again={"log__start_s": end_s}, mapped={"log__end_s": end_s})
+
+
+PLACES = {
+    "intel": _real("2d/intel.mcap", 1400.0),
+    "aces": _real("2d/aces.mcap", 700.0),
+    "csail": _real("2d/mit_csail.mcap", 212.0),
+    "mocap": Place("2d", "2d/mocap_room_1.bag", other="2d/mocap_room_2.bag", site="mocap"),
+    "mocap-2": Place("2d", "2d/mocap_room_2.bag", other="2d/mocap_room_1.bag", site="mocap"),
+    "office": Place("2d", world="office", again={"changed": 1, "start_m": 20.0}),
+    "identical": Place("2d", world="identical", again={"reverse": True, "start_m": 15.0}),
+    "streets": Place("2d", world="town", options=PLANAR, again={"changed": 1, "start_m": 100.0}),
+    "passage": Place("2d", world="corridor", options=PLANAR, again={"start_m": 30.0}),
+    "pillars": Place("2d", world="hall", options=PLANAR, again={"start_m": 20.0}),
+    "trunks": Place("2d", world="forest", options=PLANAR, again={"reverse": True}),
+    "yard": Place("2d", world="turns", options=PLANAR),
+    "town": Place("3d", world="town", options=LONG, again={"changed": 1, "start_m": 60.0}),
+    "highway": Place("3d", world="highway", options=LONG),
+    "corridor": Place("3d", world="corridor", options=LONG, again={"start_m": 10.0}),
+    "field": Place("3d", world="field", options=LONG, again={"start_m": 30.0}),
+    "forest": Place("3d", world="forest", options=LONG, again={"reverse": True}),
+    "staircase": Place("3d", world="staircase", options=LONG, again={"reverse": True}),
+    "hall": Place("3d", world="hall", options=LONG, again={"start_m": 20.0}),
+    "turns": Place("3d", world="turns", options=LONG),
+    "kitti-1": _real("3d/kitti_0001_first54.mcap", 3.0),
+    "kitti-5": _real("3d/kitti_0005_first60.mcap", 3.0),
+    "pandaset": _real("3d/pandaset_002_sweeps30to55.mcap", 1.5, log__topic="/pandar64/points"),
+}
+
+
+def log_of(name: str, seed: int, cache: Path, *, again: bool) -> Path:
+    """The log of a place; again: of another drive there."""
+    place = PLACES[name]
+    if not place.world:
+        return DATA / (place.other if again and place.other else place.log)
+    return made.log(place.world, folder=cache, seed=seed, **place.options, **(place.again if again else {}))
+
+
+def outcome(guest: str, host: str, options: argparse.Namespace) -> tuple[str, str]:
+    """What becomes of a log in a map: a word and a line."""
+    place, home, again = PLACES[guest], PLACES[host], guest == host
+    mapped = log_of(host, options.seed, options.cache, again=False)
+    part = home.mapped if again else {}
+    name = f"{host}_{options.seed}{'_part' if part else ''}"
+    prior = run_of(mapped, options.cache, name, **(home.options | part if home.log else {}))
+    log = log_of(guest, options.seed, options.cache, again=again)
+    chosen = (place.options | (place.again if again else {}) if place.log else {}) | settings_of(options.set)
+    if options.share or options.half:
+        duration_s = open_log(log).duration_s
+        chosen |= {"log__start_s": options.share * duration_s} if options.share else {}
+        chosen |= {"log__end_s": 0.5 * duration_s} if options.half else {}
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            metrics = sc.localize(log, prior, Path(folder) / "out", recording=False, **chosen).metrics
+        except ScanchainError as error:
+            return "error", str(error)
+    known = metrics.scans - metrics.states[MapState.SEARCHING]
+    word = "followed" if metrics.placed else "held" if known else "refused"
+    counts = f"{known:,} of {metrics.scans:,} scans had a pose, {metrics.placed:,} in the end"
+    return word, f"{metrics.sentence} ({counts})"
+
+
+def all_pairs(options: argparse.Namespace) -> None:
+    """A line a pair."""
+    counts: Counter[str] = Counter()
+    for kind in options.kind:
+        sites = {name: place.site or name for name, place in PLACES.items() if place.kind == kind}
+        for guest in options.places or sites:
+            if guest not in sites:
+                continue
+            for host in [guest] if options.own else [name for name in sites if sites[name] != sites[guest]]:
+                began_s = process_time()
+                word, line = outcome(guest, host, options)
+                counts[word] += 1
+                print(f"{guest} in {host}: {word}, {process_time() - began_s:.0f} s: {line}", flush=True)
+    print(f"{sum(counts.values())} pairs: " + ", ".join(f"{count} {word}" for word, count in counts.items()))
+
+
+# ---------------------------------------------------------------- late entry
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A drive, real or simulated, and its parts in seconds or in meters along the route."""
+
+    log: str
+    mapped: tuple[float, float]  # real: begin and end in s; simulated: begin in m and duration in s
+    entering: tuple[float, float]
+    options: Options = field(default_factory=dict)
+    changed: int | None = None
+
+    @property
+    def dimension(self) -> int:
+        return 3 if self.options == SPATIAL else 2
+
+
+ENTRIES = {
+    "csail-204": Entry("csail", (18.0, 71.0), (124.0, 424.0)),
+    "csail-149": Entry("csail", (53.0, 124.0), (159.0, 424.0)),
+    "csail-76": Entry("csail", (194.0, 300.0), (53.0, 194.0)),
+    "aces-140": Entry("aces", (1081.0, 1252.0), (0.0, 1081.0)),
+    "aces-113": Entry("aces", (0.0, 228.0), (284.0, 1366.0)),
+    "intel-170": Entry("intel", (785.0, 1121.0), (1234.0, 2691.0)),
+    "intel-114": Entry("intel", (673.0, 1121.0), (1234.0, 2691.0)),
+    "intel-76": Entry("intel", (2355.0, 2691.0), (897.0, 2355.0)),
+    "office": Entry("office", (60.0, 60.0), (0.0, 100.0)),
+    "streets": Entry("town", (190.0, 10.0), (280.0, 45.0), PLANAR),
+    "streets-changed": Entry("town", (90.0, 10.0), (180.0, 45.0), PLANAR, changed=1),
+    "town": Entry("town", (190.0, 10.0), (280.0, 45.0), SPATIAL),
+    "town-changed": Entry("town", (90.0, 10.0), (180.0, 45.0), SPATIAL, changed=1),
+    "forest": Entry("forest", (100.0, 20.0), (0.0, 60.0), SPATIAL),
+    "highway": Entry("highway", (300.0, 10.0), (0.0, 25.0), SPATIAL),
+}
+REAL = ("csail", "aces", "intel")
+
+
+def whole_of(name: str, cache: Path) -> Path:
+    """The run of a whole real log, whose poses are the truth of its parts."""
+    return run_of(DATA / PLACES[name].log, cache, f"{name}_whole")
+
+
+def prepared(name: str, seed: int, cache: Path) -> tuple[Path, Path, Options, Trajectory, Trajectory]:
+    """Map, log, options of the log, and the truth of both."""
+    entry = ENTRIES[name]
+    out = f"late_{name}_{seed}"
+    (map_begin, map_end), (begin, end) = entry.mapped, entry.entering
+    if entry.log in REAL:
+        log = DATA / PLACES[entry.log].log
+        truth = read_tum(whole_of(entry.log, cache) / "trajectory.tum")
+        prior = run_of(log, cache, out, log__start_s=map_begin, log__end_s=map_end)
+        return prior, log, {"log__start_s": begin, "log__end_s": end}, truth, truth
+    drive = {"folder": cache, "seed": seed, **entry.options}
+    mapped = made.log(entry.log, start_m=map_begin, seconds=map_end, **drive)
+    day = {} if entry.changed is None else {"changed": entry.changed}
+    log = made.log(entry.log, start_m=begin, seconds=end, **day, **drive)
+    return run_of(mapped, cache, out), log, {}, *(read_tum(each.with_suffix(".tum")) for each in (mapped, log))
+
+
+def entering(name: str, options: argparse.Namespace) -> str:
+    """The row of a case."""
+    d = ENTRIES[name].dimension
+    out, log, of_log, map_truth, truth = prepared(name, options.seed, options.cache)
+    began_s = process_time()
+    with tempfile.TemporaryDirectory() as folder:
+        result = sc.localize(log, out, Path(folder) / "out", recording=False, **of_log, **settings_of(options.set))
+        found, metrics = result.localization, result.metrics
+    spent_s = process_time() - began_s
+    true = poses_at(truth, found.trajectory.stamps_ns)
+    expected, away_m = true_in_map(open_saved_map(out), map_truth, true)
+    live_m, final_m = (
+        np.linalg.norm((lie.lift(poses) - expected)[:, :3, 3], axis=1)
+        for poses in (found.live, found.trajectory.poses)
+    )
+    inside = away_m < INSIDE_M[d]
+    known, placed = inside & np.isfinite(live_m), inside & found.is_placed
+    nees = [
+        float(np.mean((off_m[chosen] / sigma_m[chosen]) ** 2)) / d if chosen.any() else np.nan
+        for off_m, sigma_m, chosen in ((live_m, found.sigma_m, known), (final_m, found.final_sigma_m, placed))
+    ]
+    path_m, first, entry = found.traveled_m, found.found_at, int(inside.argmax())
+    inside_m = np.cumsum(np.diff(path_m, prepend=path_m[0]) * inside)
+    early_m = path_m[entry] - path_m[first] if first < entry else 0.0
+    after = "never" if first < 0 else f"{inside_m[first] - early_m:.1f}"
+    error = f"{np.median(final_m[placed]):.3f}" if placed.any() else "none"
+    wrong = f"{(live_m[known] > WRONG_M[d]).sum()} of {known.sum()}"
+    return (
+        f"| {name} | {path_m[entry]:.0f} | {inside_m[-1]:.0f} | {after} | {wrong} | {error} | "
+        f"{metrics.median_sigma_m:.3f}, {metrics.median_final_sigma_m:.3f} | {nees[0]:.2f}, {nees[1]:.2f} | "
+        f"{spent_s:.0f} | {metrics.sentence.split(':')[0]} |"
+    )
+
+
+def main() -> None:
+    parser = command_line(__doc__)
+    parser.add_argument("--kind", nargs="+", choices=("2d", "3d"), default=["2d", "3d"])
+    parser.add_argument(
+        "--places", nargs="+", help="of the logs, maps are those of all; --late: names of its cases"
+    )
+    parser.add_argument("--own", action="store_true")
+    parser.add_argument("--late", action="store_true")
+    parser.add_argument("--seed", type=int, default=0, help="of the worlds")
+    parser.add_argument("--from", dest="share", type=float, default=0.0)
+    parser.add_argument("--half", action="store_true")
+    parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE")
+    options = parser.parse_args()
+    options.cache.mkdir(parents=True, exist_ok=True)
+    if not options.late:
+        all_pairs(options)
+        return
+    print(
+        "| log | outside | inside | found after | wrong poses | error | σ then, final | NEES | CPU s | verdict |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|")
+    for name in options.places or ENTRIES:
+        if f"{ENTRIES[name].dimension}d" in options.kind:
+            print(entering(name, options), flush=True)
+
+
+if __name__ == "__main__":
+    main()

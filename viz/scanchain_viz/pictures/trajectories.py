@@ -1,0 +1,133 @@
+"""Trajectories with figures of their scans, from the tables of a run or of a comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from scanchain import lie
+from scanchain.comparison.results import RELATIONS_FILE, SCANS_FILE
+from scanchain.comparison.table import Row, read_table
+from scanchain.data import Matrix, Trajectory
+from scanchain.evaluation import absolute_error_of_any_path, pair
+from scanchain.evaluation.absolute import path_length
+from scanchain.runs.step_table import STAGES, nees_of_steps
+from scanchain.runs.vouching import poses_of
+from scanchain_viz.colors import color_of
+from scanchain_viz.pictures.figure import Floats
+
+_MARGIN = 0.25
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnTrajectory:
+    """A trajectory to draw, with figures of its N scans; unknown ones are NaN.
+
+    Attributes
+    ----------
+    name : for legends outside the drawings
+    color, is_dashed : how its line is drawn
+    positions : (N, 3) meters, in one frame with the other trajectories
+    distance_m : (N,) traveled
+    error_m : (N,) distance from the true position
+    relation_error_m : (K,) the same of K relations, none where there are no relations
+    seconds : (N,) what each scan took
+    nees : (N,) squared error over covariance, 1 on average if exact
+    observability : (N,) information along the least constrained direction over the required minimum
+    """
+
+    name: str
+    color: str
+    is_dashed: bool
+    positions: Floats
+    distance_m: Floats
+    error_m: Floats
+    relation_error_m: Floats
+    seconds: Floats
+    nees: Floats
+    observability: Floats
+
+    @property
+    def dashes(self) -> tuple[float, ...]:
+        """Of its line, in widths."""
+        return (3.0, 1.5) if self.is_dashed else ()
+
+
+def frame(trajectories: Sequence[DrawnTrajectory], truth: Floats | None) -> tuple[Floats, Floats]:
+    """Corners (3,) of the axes: the ground truth if there is one, else the trajectories, with a margin."""
+    paths = [truth] if truth is not None else [trajectory.positions for trajectory in trajectories]
+    low = np.min([path.min(axis=0) for path in paths], axis=0)
+    high = np.max([path.max(axis=0) for path in paths], axis=0)
+    size = high - low
+    margin = np.array([max(0.08 * size[:2].max(), 1.0)] * 2 + [max(_MARGIN * size[2], 0.1)])
+    return low - margin, high + margin
+
+
+def trajectories_of_run(
+    steps: pa.Table, truth: Trajectory | None, gap_s: float | None
+) -> tuple[list[DrawnTrajectory], Floats | None]:
+    """Both trajectories and the (K, 3) true positions at scans that have one, in the frame of the map.
+
+    Errors are NaN where a scan has no true pose. More true positions would lengthen the path by their noise.
+    """
+    optimized, odometry = (
+        Trajectory(steps["stamp_ns"].to_numpy(), poses_of(steps, prefix=prefix)) for prefix in ("", "odom_")
+    )
+    unknown, T_world_estimate, true_path = np.full(len(steps), np.nan), lie.identity(3), None
+    errors_m, errors_before_m, nees = unknown.copy(), unknown.copy(), unknown
+    if truth is not None:
+        after, before = (pair(each, truth, gap_s=gap_s) for each in (optimized, odometry))
+        ate, ate_before = absolute_error_of_any_path(after), absolute_error_of_any_path(before)
+        errors_m[after.places], errors_before_m[before.places] = ate.errors_m, ate_before.errors_m
+        nees = nees_of_steps(steps, odometry, truth, gap_s=gap_s)
+        T_world_truth = lie.inverse(ate.T_reference_estimate)
+        T_world_estimate = T_world_truth @ ate_before.T_reference_estimate
+        true_path = lie.transform(T_world_truth, after.reference[:, :3, 3])
+    seconds = np.sum([_column(steps, f"{stage}_s") for stage in STAGES[1:]], axis=0)  # without reading
+    observability = _column(steps, "observability")
+
+    def drawn(name: str, color: str, poses: Matrix, errors_m: Floats, *figures: Floats) -> DrawnTrajectory:
+        length_m, none = path_length(poses), np.empty(0)
+        return DrawnTrajectory(name, color, False, poses[:, :3, 3], length_m, errors_m, none, *figures)
+
+    return [
+        drawn("optimized", color_of(0), optimized.poses, errors_m, seconds, nees, observability),
+        drawn("odometry", color_of(3), T_world_estimate @ odometry.poses, errors_before_m, *[unknown] * 3),
+    ], true_path
+
+
+def trajectories_of_comparison(directory: Path) -> list[DrawnTrajectory]:
+    """Trajectory of each method that began, in the order of the table, of its longest run."""
+    scans, file = pq.read_table(directory / SCANS_FILE), directory / RELATIONS_FILE
+    relations = pq.read_table(file) if file.exists() else None
+    rows = enumerate(read_table(directory).rows)
+    trajectories = [_of_method(row, color_of(place), scans, relations) for place, row in rows]
+    return [trajectory for trajectory in trajectories if len(trajectory.positions)]
+
+
+def _of_method(row: Row, color: str, scans: pa.Table, relations: pa.Table | None) -> DrawnTrajectory:
+    """Of several runs the one with most scans, the first of those."""
+
+    def chosen(table: pa.Table, column: str, value: object) -> pa.Table:
+        return table.filter(pa.array(np.array(table[column].to_pylist(), object) == value))
+
+    runs = chosen(scans, "method", row.name)
+    if len(runs):
+        runs = chosen(runs, "repeat", int(np.argmax(np.bincount(runs["repeat"].to_numpy()))))
+    known = (_column(runs, name) for name in ("seconds", "nees", "observability"))
+    errors_m = np.empty(0) if relations is None else _column(chosen(relations, "method", row.name), "error_m")
+    positions = np.stack([_column(runs, f"aligned_{axis}") for axis in "xyz"], axis=1)
+    distance_m, is_dashed = _column(runs, "distance_m"), "+loops" in row.base
+    return DrawnTrajectory(
+        row.name, color, is_dashed, positions, distance_m, _column(runs, "error_m"), errors_m, *known
+    )
+
+
+def _column(table: pa.Table, name: str) -> Floats:
+    """A column as floats, NaN for null."""
+    return table[name].to_numpy(zero_copy_only=False).astype(np.float64)

@@ -1,0 +1,301 @@
+"""Recordings of complete results: comparisons, maps, localized logs, pose graphs and landmark problems.
+
+Each function writes one .rrd file, whole or not at all, and raises OSError.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from scanchain import lie
+from scanchain.comparison.results import MAP_FILE, SCANS_FILE, TRUTH_FILE, method_folder
+from scanchain.comparison.table import read_table
+from scanchain.data import ClosureVerdict, GraphState
+from scanchain.graph.optimization import GraphChange
+from scanchain.landmarks.results import file_stem
+from scanchain.landmarks.study import Estimate, Study
+from scanchain.maps import read_ply
+from scanchain.runs.directory import RECORDING_FILE
+from scanchain.sessions.change_run import COLORS, SUMMARY_FILE
+from scanchain.sessions.changes import Changes, Label
+from scanchain.sessions.localize import LocalizedLog
+from scanchain.sessions.localizer import MapState
+from scanchain.trajectory import read_tum
+from scanchain_viz.colors import rgb
+from scanchain_viz.pictures.maps import DrawnMerge, map_points, read_merge
+from scanchain_viz.pictures.trajectories import DrawnTrajectory, trajectories_of_comparison
+from scanchain_viz.recording import drawing, entities
+from scanchain_viz.recording.blueprint import scene, up_to_now, whole_log, with_panels
+from scanchain_viz.recording.drawing import Message, Times
+from scanchain_viz.recording.sinks import write_recording
+from scanchain_viz.report.problems import ellipses
+
+_MAP_POINTS = 300_000
+_COMPARED_POINTS = 60_000  # of the map of a method
+_HEADROOM = 1.2  # factor over the 99th percentile at which a plot ends
+_PLOTS = {"error": "position error [m]", "time": "time of a scan [ms]"}
+_BOX_M, _ELLIPSE_M = 0.02, 1e-4  # heights of what is flat
+_RADII = {Label.SAME: 0.75, Label.UNKNOWN: 1.0, Label.APPEARED: 2.0, Label.VANISHED: 2.0}
+_FINAL, _SIGMA = "world/final", "plots/sigma"
+_MATCHED, _UNMATCHED = "world/matches/accepted", "world/matches/rejected"
+_STATE_COLORS = {
+    MapState.SEARCHING: entities.GRAY,
+    MapState.LOCALIZED: entities.GREEN,
+    MapState.UNMATCHED: entities.ORANGE,
+    MapState.OUTSIDE: entities.VIOLET,
+    MapState.LOST: entities.RED,
+}
+_MAX_SCAN_POINTS = 5_000
+
+
+def record_comparison(directory: Path) -> None:
+    """Write compare.rrd: trajectories and maps of all methods on one timeline, to toggle one by one."""
+    table, trajectories = read_table(directory), trajectories_of_comparison(directory)
+    names = [rr.escape_entity_path_part(each.name) for each in trajectories]
+    overrides: dict[Any, Any] = {f"world/{name}/trajectory": [up_to_now()] for name in names}
+    overrides |= {f"world/{name}/map": [rrb.EntityBehavior(visible=False)] for name in names[1:]}
+    seen = trajectories[0].positions if trajectories else None
+    world = scene("trajectories and maps", table.dimension, seen, overrides)
+    views = rrb.Vertical(world, rrb.Horizontal(*_plots(trajectories)), row_shares=[2, 1])
+    layout = with_panels(views, scans=table.scans, has_toggles=True)
+    path, name = directory / "compare.rrd", Path(table.log.split(", ")[0]).name
+    write_recording(path, name, table.dimension, layout, _compared(directory, trajectories), kind="comparison")
+
+
+def _compared(directory: Path, trajectories: Sequence[DrawnTrajectory]) -> Iterator[Message]:
+    truth_file, stamps_ns = directory / TRUTH_FILE, _stamps(directory)
+    if truth_file.exists():
+        path = drawing.positions(read_tum(truth_file).poses)
+        yield Message(entities.GROUND_TRUTH, drawing.lines([path], entities.WHITE, 0.75))
+    for each in trajectories:
+        yield from _of_method(each, method_folder(directory, each.name) / MAP_FILE, stamps_ns)
+
+
+def _of_method(trajectory: DrawnTrajectory, map_file: Path, stamps_ns: NDArray[np.int64]) -> Iterator[Message]:
+    """The trajectory in segments, the lidar on it, the map, and the plots."""
+    name = rr.escape_entity_path_part(trajectory.name)
+    color, positions = rgb(trajectory.color), trajectory.positions.astype(np.float32)
+    times = Times(np.arange(len(positions)), stamps_ns[: len(positions)])
+    segments = np.stack([np.concatenate([positions[:1], positions[:-1]]), positions], axis=1)
+    places = rr.Points3D.columns(positions=positions).partition([1] * len(positions))
+    yield Message(f"world/{name}/trajectory", drawing.lines(color=color, radius=1.5))
+    yield Message(f"world/{name}/trajectory", rr.LineStrips3D.columns(strips=segments), times)
+    yield Message(f"world/{name}/lidar", drawing.dots(color=color, radius=5.0))
+    yield Message(f"world/{name}/lidar", places, times)
+    if map_file.exists():
+        points = drawing.at_most(read_ply(map_file), _COMPARED_POINTS)
+        red, green, blue = ((value + shade) // 2 for value, shade in zip(color, entities.GRAY, strict=True))
+        yield Message(f"world/{name}/map", drawing.dots(points, (red, green, blue), 0.5))
+    for plot, values in _series(trajectory).items():
+        if (known := np.isfinite(values)).any():
+            series = rr.SeriesLines(colors=[color], names=[trajectory.name], widths=[1.0])
+            yield Message(f"plots/{plot}/{name}", series)
+            yield Message(f"plots/{plot}/{name}", rr.Scalars.columns(scalars=values[known]), times[known])
+
+
+def _series(trajectory: DrawnTrajectory) -> dict[str, NDArray[np.float64]]:
+    """Scan by scan, by plot."""
+    return {"error": trajectory.error_m, "time": 1e3 * trajectory.seconds}
+
+
+def _plots(trajectories: Sequence[DrawnTrajectory]) -> list[rrb.TimeSeriesView]:
+    """Plots of the known values with one legend, scaled so that a single slow scan leaves the rest visible."""
+    views = []
+    for plot, name in _PLOTS.items():
+        values = np.concatenate([np.empty(0), *(_series(trajectory)[plot] for trajectory in trajectories)])
+        if np.isfinite(values).any():
+            highest = _HEADROOM * float(np.nanpercentile(values, 99.0))
+            legend = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=plot == "time")
+            axes = {"axis_x": whole_log(), "axis_y": rrb.ScalarAxis(range=(0.0, highest))}
+            views.append(rrb.TimeSeriesView(origin=f"plots/{plot}", name=name, plot_legend=legend, **axes))
+    return views
+
+
+def _stamps(directory: Path) -> NDArray[np.int64]:
+    """(N,) of all scans, from the method with the most."""
+    table = pq.read_table(directory / SCANS_FILE, columns=["index", "stamp_ns"])
+    indices, first = np.unique(table["index"].to_numpy(), return_index=True)
+    return table["stamp_ns"].to_numpy()[first] if len(indices) else np.empty(0, np.int64)
+
+
+def record_merge(directory: Path) -> None:
+    """Write recording.rrd into a merge's directory: map, every session to toggle, the closures between them."""
+    drawn = read_merge(directory)
+    layout = with_panels(scene("sessions over the map", drawn.dimension, drawn.positions), has_toggles=True)
+    path, messages = directory / RECORDING_FILE, _merge(directory, drawn)
+    write_recording(path, directory.name, drawn.dimension, layout, messages, kind="merge")
+
+
+def _merge(directory: Path, drawn: DrawnMerge) -> Iterator[Message]:
+    points = drawing.at_most(read_ply(directory / "map.ply"), _MAP_POINTS)
+    yield Message(entities.MAP, drawing.dots(points, entities.GRAY, 0.75))
+    yield Message(entities.ACCEPTED, drawing.lines(drawn.closures.astype(np.float32), entities.GREEN, 0.75))
+    for session in drawn.sessions:
+        color, name = rgb(session.color), rr.escape_entity_path_part(session.name)
+        path = session.positions.astype(np.float32)
+        yield Message(f"world/sessions/{name}/trajectory", drawing.lines([path], color, 1.5))
+        yield Message(f"world/sessions/{name}/keyframes", drawing.dots(path, color, 2.5))
+
+
+def record_changes(directory: Path, changes: Changes) -> None:
+    """Write recording.rrd beside summary.txt: points by label, boxes around clusters, arrows."""
+    world = scene("changes", changes.dimension, drawing.in_space(changes.points))
+    text = rrb.TextDocumentView(origin="summary", name="summary")
+    layout = with_panels(rrb.Horizontal(world, text, column_shares=[3, 1]))
+    path, messages = directory / RECORDING_FILE, _changes(changes, (directory / SUMMARY_FILE).read_text("utf-8"))
+    write_recording(path, directory.name, changes.dimension, layout, messages, kind="changes")
+
+
+def _changes(changes: Changes, summary: str) -> Iterator[Message]:
+    yield Message("summary", rr.TextDocument(summary))
+    for label, radius in _RADII.items():
+        points = drawing.in_space(changes.points[changes.labels == label])
+        yield Message(f"world/{label.name.lower()}", drawing.dots(points, COLORS[label], radius))
+    for label in (Label.APPEARED, Label.VANISHED):
+        chosen = [cluster for cluster in changes.clusters if cluster.kind == label.name.lower()]
+        sizes = np.full((len(chosen), 3), _BOX_M)
+        sizes[:, : changes.dimension] = np.array([each.size_m for each in chosen]).reshape(-1, changes.dimension)
+        boxes = rr.Boxes3D(
+            centers=_centers(changes, [each.number for each in chosen]),
+            half_sizes=0.5 * sizes,
+            quaternions=_upright([each.yaw_rad for each in chosen]),
+            colors=[COLORS[label]],
+            labels=[str(each.number) for each in chosen],
+            show_labels=False,
+        )
+        yield Message(f"world/clusters/{label.name.lower()}", boxes)
+    moved = [each for each in changes.clusters if each.kind == "vanished" and each.counterpart]
+    starts, ends = (_centers(changes, [getattr(m, key) for m in moved]) for key in ("number", "counterpart"))
+    yield Message("world/clusters/moved", rr.Arrows3D(origins=starts, vectors=ends - starts))
+
+
+def _centers(changes: Changes, numbers: Sequence[int]) -> drawing.Floats:
+    """Centers (N, 3) of clusters by their numbers, which count from 1."""
+    centers = np.array([changes.clusters[number - 1].center for number in numbers])
+    return drawing.in_space(centers.reshape(-1, changes.dimension))
+
+
+def _upright(angles_rad: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
+    """Quaternions x, y, z, w (N, 4) of turns about z."""
+    half, zeros = 0.5 * np.asarray(angles_rad), np.zeros(len(angles_rad))
+    return np.stack([zeros, zeros, np.sin(half), np.cos(half)], axis=1)
+
+
+def record_localization(path: Path, localized: LocalizedLog) -> None:
+    """Write map, live pose, hypotheses while searching, state and final path."""
+    prior, points = localized.prior, drawing.in_space(map_points(localized.prior))
+    side = rrb.Vertical(
+        rrb.TextDocumentView(origin=entities.VERDICT, name="verdict"),
+        rrb.TimeSeriesView(origin=_SIGMA, name="standard deviation of the position", axis_x=whole_log()),
+        rrb.StateTimelineView(origin=entities.STATE, name="state", time_view=whole_log()),
+    )
+    views = rrb.Horizontal(scene("map", prior.dimension, points), side, column_shares=[5, 2])
+    layout = with_panels(views, scans=len(localized.localization.states))
+    names, colors = list(MapState), list(_STATE_COLORS.values())
+    messages = [
+        Message(entities.MAP, drawing.dots(points, entities.height_colors(points), 1.0)),
+        Message(entities.LIDAR, rr.TransformAxes3D(axis_length=0.5 if prior.dimension == 2 else 2.0)),
+        Message(entities.SCAN, drawing.dots(color=entities.YELLOW, radius=2.0)),
+        Message(entities.VERDICT, rr.TextDocument(localized.metrics.sentence)),
+        Message(_SIGMA, rr.SeriesLines(names=["sigma [m]"], colors=[entities.BLUE])),
+        Message(entities.STATE, rr.StateConfiguration(values=names, labels=names, colors=colors)),
+        *_localized(localized),
+    ]
+    write_recording(path, localized.path.name, prior.dimension, layout, messages, kind="localization")
+
+
+def _localized(localized: LocalizedLog) -> Iterator[Message]:
+    """States, poses as known at the time of each scan, keyframes from when their place is known, and matches."""
+    found, keyframes = localized.localization, localized.localization.result.keyframes
+    stamps_ns = found.trajectory.stamps_ns
+    times = Times(np.arange(len(stamps_ns), dtype=np.int64), stamps_ns)
+    changed = np.concatenate([[True], found.states[1:] != found.states[:-1]])
+    yield Message(entities.STATE, rr.StateChange.columns(state=found.states[changed].tolist()), times[changed])
+    known = np.isfinite(found.sigma_m)
+    yield Message(_SIGMA, rr.Scalars.columns(scalars=found.sigma_m[known]), times[known])
+    placed = np.isfinite(found.live[:, 0, 0])
+    if placed.any():
+        yield Message(entities.LIDAR, drawing.transforms(found.live[placed]), times[placed])
+    for keyframe in keyframes[len(localized.prior.keyframes) :]:
+        if placed[keyframe.scan_index]:
+            points = drawing.at_most(keyframe.points, _MAX_SCAN_POINTS)
+            yield Message(entities.SCAN, drawing.dots(points), times[np.array([keyframe.scan_index])])
+    for closure in found.closures:  # hypotheses while it searches, matches then
+        T_map_target = keyframes[closure.target].T_odom_lidar
+        ends = drawing.positions(np.stack([T_map_target, T_map_target @ closure.match.T_target_source]))
+        is_accepted = closure.verdict is ClosureVerdict.ACCEPTED
+        line = drawing.lines([ends], entities.GREEN if is_accepted else entities.RED, 2.0)
+        when = times[np.array([keyframes[closure.source].scan_index])]
+        yield Message(_MATCHED if is_accepted else _UNMATCHED, line, when)
+    if found.is_placed.any():
+        path = drawing.positions(found.trajectory.poses[found.is_placed])
+        yield Message(_FINAL, drawing.lines([path], entities.CYAN, 1.0))
+
+
+def record_graph(change: GraphChange, path: Path) -> None:
+    """Write a pose graph, its edges colored by verdict; ``scan`` is 0 before optimization and 1 after."""
+    grid = rrb.LineGrid3D(visible=False)
+    layout = with_panels(rrb.Spatial3DView(origin=entities.WORLD, name="graph", line_grid=grid))
+    messages = [*_graph(change.before, 0), *_graph(change.after, 1)]
+    write_recording(path, change.name, change.after.poses.shape[-1] - 1, layout, messages, kind="graph")
+
+
+def _graph(state: GraphState, when: int) -> Iterator[Message]:
+    """Nodes, chain, loops and rejected edges at one instant."""
+    times, nodes = Times.at(when, when), drawing.positions(state.poses)
+    rejected, skips = state.is_rejected, np.abs(state.edges[:, 0] - state.edges[:, 1]) != 1
+    yield Message(entities.KEYFRAMES, drawing.dots(nodes, entities.VIOLET, 1.5), times)
+    for entity, chosen, color in (
+        (entities.ODOMETRY_EDGES, ~skips & ~rejected, entities.GRAY),
+        (entities.ACCEPTED, skips & ~rejected, entities.GREEN),
+        (entities.REJECTED, rejected, entities.RED),
+    ):
+        yield Message(entity, drawing.lines(nodes[state.edges[chosen]], color, 0.75), times)
+
+
+def record_landmarks(studies: Sequence[Study], path: Path) -> None:
+    """Write a view of each landmark problem; ``scan`` is 0 before optimization and 1 after.
+
+    All is in the frame of the truth where there is one; landmarks after optimization carry their 95 % ellipses.
+    """
+    roots = {f"{entities.WORLD}/{file_stem(study.name)}": study for study in studies}
+    views = [rrb.Spatial3DView(origin=root, name=study.name) for root, study in roots.items()]
+    messages = [message for root, study in roots.items() for message in _study(root, study)]
+    name = ", ".join(study.name for study in studies)
+    write_recording(path, name, 2, with_panels(rrb.Grid(*views)), messages, kind="landmarks")
+
+
+def _study(root: str, study: Study) -> Iterator[Message]:
+    """The true trajectory and landmarks for ever, the estimates at their instants."""
+    known = study.true_landmarks[np.isfinite(study.true_landmarks).all(axis=1)]
+    path = drawing.lines([drawing.in_space(study.true_poses)], entities.GRAY, 1.0)
+    yield Message(root, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+    yield Message(f"{root}/truth/trajectory", path)
+    yield Message(f"{root}/truth/landmarks", drawing.dots(drawing.in_space(known), entities.GRAY, 4.0))
+    yield from _estimate(root, study.before, Times.at(0, 0), entities.ORANGE)
+    yield from _estimate(root, study.after, Times.at(1, 1), entities.BLUE)
+    axes_m, angles_rad = ellipses(study)
+    drawn = rr.Ellipsoids3D.from_fields(
+        centers=drawing.in_space(lie.transform(study.after.T_truth_estimate, study.after.state.landmarks)),
+        half_sizes=np.pad(axes_m, ((0, 0), (0, 1)), constant_values=_ELLIPSE_M),
+        quaternions=_upright(angles_rad),
+        colors=entities.BLUE,
+    )
+    yield Message(f"{root}/ellipses", drawn, Times.at(1, 1))
+
+
+def _estimate(root: str, estimate: Estimate, times: Times, color: drawing.Color) -> Iterator[Message]:
+    """Trajectory and landmarks at one instant."""
+    T = estimate.T_truth_estimate
+    path = drawing.in_space(lie.transform(T, estimate.state.poses[:, :2]))
+    points = drawing.in_space(lie.transform(T, estimate.state.landmarks))
+    yield Message(f"{root}/trajectory", drawing.lines([path], color, 1.5), times)
+    yield Message(f"{root}/landmarks", drawing.dots(points, color, 3.0), times)
