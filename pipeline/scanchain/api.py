@@ -61,7 +61,7 @@ class SlamResult(core.SlamResult):
 
     def cloud(self) -> Points:
         """(M, d) points of the map, moving objects removed, as in the map.ply of a run."""
-        return cloud_of(self, self.config).points
+        return cloud_of(self.keyframes, self.T_world_keyframes, self.config).points
 
     def verdict(self) -> Judged:
         """The verdict on the trajectory, with reasons and stretches, as a run is judged."""

@@ -7,6 +7,7 @@ coordinates in frame b to frame a. The dimension d of a log is 2 or 3; a twist h
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sized
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -303,14 +304,18 @@ class Proposal(StrEnum):
     PLACE = "place"
 
 
+VERIFICATION, BACK_END = "verification", "back end"  # either may reject a closure
+
+
 @dataclass(frozen=True, slots=True)
 class Closure:
     """A proposed loop closure: the later keyframe ``source`` seen from the earlier ``target``.
 
     ``match.T_target_source`` is the pose of keyframe ``source`` in the frame of keyframe ``target``.
-    ``overlap`` is the share of source points that lie on the target's surfaces after matching. ``chi2_before`` is
-    its χ² in the graph as it was before it became an edge, NaN if it never did. ``cause`` is the reason without
-    its figures, the same for all closures of its kind.
+    ``overlap`` is the share of source points that lie on the target's surfaces after matching. ``cause`` is the
+    reason without its figures, the same for all closures of its kind. ``chi2_before`` is its χ² in the graph as it
+    was before it became an edge, NaN if it never did; ``weight`` and ``chi2_after`` are what the optimizer left to
+    the edge in the end: 0 and NaN if there is none, 1 and NaN until it is optimized.
     """
 
     __repr__ = brief
@@ -323,6 +328,15 @@ class Closure:
     proposed_by: Proposal = Proposal.POSITION
     chi2_before: float = float("nan")
     cause: str = ""
+    weight: float = 0.0
+    chi2_after: float = float("nan")
+
+    @property
+    def rejected_by(self) -> str:
+        """Verification by matching, or the back end where it contradicts the graph; empty if accepted."""
+        if self.verdict is ClosureVerdict.ACCEPTED:
+            return ""
+        return VERIFICATION if math.isnan(self.chi2_after) else BACK_END
 
     def rejected(self, problem: Problem) -> Closure:
         """The same, rejected."""

@@ -20,6 +20,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import compress
 from pathlib import Path
 from time import perf_counter
 
@@ -27,9 +28,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.data import ClosureVerdict, Matrix, Pose, Proposal, Trajectory
+from scanchain.data import BACK_END, Closure, ClosureVerdict, Matrix, Pose, Proposal, Trajectory
 from scanchain.logs import open_log
-from scanchain.runs.closures import FinalClosure, final_verdicts
+from scanchain.runs.closures import final_verdicts
 from scanchain.settings import load_settings
 from tests.benchmarks.harness import (
     DATA,
@@ -93,15 +94,16 @@ def row(path: Path, drift: Drift, truth: Trajectory, false_share: float) -> str:
         slam.placement.take(false_closures(slam, false_share))
     result = slam.finish()
     everything = final_verdicts(result.closures, result.state)
-    made_up = [each.verdict is ClosureVerdict.REJECTED for each in everything if each.closure.reason == MADE_UP]
-    judged = [each for each in everything if each.closure.reason != MADE_UP]
+    is_made_up = [tried.reason == MADE_UP for tried in result.closures]
+    made_up = [each.verdict is ClosureVerdict.REJECTED for each in compress(everything, is_made_up)]
+    judged = [each for each, is_wrong in zip(everything, is_made_up, strict=True) if not is_wrong]
     accepted = [each for each in judged if each.verdict is ClosureVerdict.ACCEPTED]
-    by_place = sum(each.closure.proposed_by is Proposal.PLACE for each in accepted)
-    overruled = sum(each.verdict is not each.closure.verdict for each in judged)
+    by_place = sum(each.proposed_by is Proposal.PLACE for each in accepted)
+    overruled = sum(each.rejected_by == BACK_END for each in judged)
     poses = true_poses(log.dimension, truth, result.keyframes)
     false = sum(not is_true(each, poses) for each in accepted)
     path_m = traveled_m(poses)
-    sources_m = path_m[[each.closure.source for each in accepted]]
+    sources_m = path_m[[each.source for each in accepted]]
     found = np.any(np.abs(path_m[:, None] - sources_m) <= ALONG_M, axis=1)
     shares = " | ".join(_share(found[which]) for which in revisits(poses, path_m))
     ate = f"{ate_m(result.odometry, truth):.2f} to {ate_m(result.trajectory, truth):.2f} m"
@@ -129,9 +131,8 @@ def revisits(poses: Matrix, path_m: NDArray[np.float64]) -> tuple[NDArray[np.boo
     return revisit, opposite
 
 
-def is_true(item: FinalClosure, poses: Matrix) -> bool:
+def is_true(closure: Closure, poses: Matrix) -> bool:
     """Whether a closure says what the reference says."""
-    closure = item.closure
     off_m, off_rad = lie.apart(
         lie.between(poses[closure.target], poses[closure.source]), closure.match.T_target_source
     )

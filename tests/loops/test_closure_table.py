@@ -44,7 +44,7 @@ def same(a, b):
 
 @pytest.mark.parametrize("k", [3, 6])
 def test_closures_come_back_bit_by_bit_and_in_their_types(k):
-    given = [replace(each, chi2_before=float(each.source)) for each in closures(k)]
+    given = [replace(each, chi2_before=float(each.source), chi2_after=1.0) for each in closures(k)]
     table = ClosureTable()
     table.extend(given[:17])
     table.extend(given[17:])

@@ -95,7 +95,7 @@ def test_drift_is_closed_to_a_fifth_and_no_loop_is_wrong(undrifted, longer, turn
     assert before > 2.0
     assert after < before / 5.0
     judged = final_verdicts(drifted.closures, drifted.state)
-    accepted = [item.closure for item in judged if item.verdict is ClosureVerdict.ACCEPTED]
+    accepted = [item for item in judged if item.verdict is ClosureVerdict.ACCEPTED]
     assert len(accepted) > 50
     true = truth.poses[[keyframe.scan_index for keyframe in drifted.keyframes]]
     for closure in accepted:

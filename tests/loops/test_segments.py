@@ -247,10 +247,9 @@ def test_a_robot_that_was_carried_elsewhere_is_found_again():
     assert before > 5.0
     assert after < 0.5
     across = [
-        item.closure.proposed_by
+        item.proposed_by
         for item in final_verdicts(holed.closures, holed.state)
-        if item.verdict is ClosureVerdict.ACCEPTED
-        and item.closure.target < slam.closer.segments.starts[1] <= item.closure.source
+        if item.verdict is ClosureVerdict.ACCEPTED and item.target < slam.closer.segments.starts[1] <= item.source
     ]
     assert len(across) > 10
 

@@ -1,5 +1,6 @@
 """A run may be killed at any moment: it goes on to the same result."""
 
+import json
 import os
 import pickle
 import random
@@ -14,14 +15,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from scanchain.data import Scan
 from scanchain.errors import InputError
 from scanchain.files import write_whole
 from scanchain.logs import open_log
-from scanchain.preprocess import Resolution
 from scanchain.runs.directory import POINTS_FILE, RECORDING_FILE
 from scanchain.runs.resume import Checkpoints, read_checkpoint
-from scanchain.runs.run import few_at_once
 from scanchain.runs.step_table import StepTable
 from scanchain.simulation import simulate
 from scanchain.slam import Slam
@@ -96,11 +94,8 @@ def test_interrupted_again_and_again_a_run_goes_on_to_the_same_result_and_record
 
 def test_killed_at_any_moment_a_run_leaves_files_that_open_and_goes_on_to_the_same_result(undisturbed, tmp_path):
     log, whole = undisturbed
-    began = time.perf_counter()
-    assert start(log, tmp_path / "warm", *RECORDED).wait() == 0
-    seed = random.randrange(1000)
+    seed, longest_s = random.randrange(1000), json.loads((whole / "run.json").read_text())["duration_s"] + 1.0
     print(f"seed {seed}; python -m tests.benchmarks.kills kills as often as wanted")
-    longest_s = time.perf_counter() - began
     killed = list(kill_at_random(log, RECORDED, tmp_path, whole, kills=3, seed=seed, longest_s=longest_s))
     assert len(killed) == 3
 
@@ -155,7 +150,7 @@ def test_a_run_recorded_from_the_middle_on_says_so_and_draws_the_whole_graph(off
     "name, count, changes",
     [
         ("office", 300, {"loops.min_travel_m": 3.0, "loops.min_radius_m": 15.0}),
-        ("2d/intel.mcap", 400, {"matching.matcher": "svd", "loops.enabled": False}),
+        ("2d/intel.mcap", 200, {"matching.matcher": "svd", "loops.enabled": False}),
         ("3d/kitti_0001_first54.mcap", 54, {"loops.min_travel_m": 3.0, "loops.place_radius_m": 4.0}),
     ],
 )
@@ -225,18 +220,16 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-def test_a_run_that_was_stopped_goes_on_where_it_stopped(office, whole, tmp_path):
+def test_ctrl_c_ends_a_run_in_good_order_with_exit_code_1(office, tmp_path):
     out = tmp_path / "run"
-    child = start(office, out, *LIVELY, stderr=subprocess.PIPE)
+    child = start(office, out, *RECORDED, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     wait_for_steps(child, out, 30)
     child.send_signal(signal.SIGINT)
-    errors = child.communicate(timeout=60)[1].decode()
-    assert child.returncode == 1 and errors.startswith("error: stopped by the user after ")
-    stopped_after = len(read_tum(partial(out) / "trajectory.tum"))
-    child = start(office, out, *LIVELY, "--resume", stderr=subprocess.PIPE)
-    errors = child.communicate()[1].decode()
-    assert child.returncode == 0 and f"resuming after {stopped_after} scans" in errors
-    same_result(out, whole)
+    output, errors = (text.decode() for text in child.communicate(timeout=60))
+    assert child.returncode == 1 and errors.count("\n") == 1 and "PARTIAL" in output
+    assert errors.startswith("error: stopped by the user after ") and str(partial(out)) in errors
+    assert errors.endswith(f"to resume: scanchain run {office} --out {out} {' '.join(RECORDED)} --resume\n")
+    assert 30 <= assert_readable(partial(out)) < 300
 
 
 def test_ctrl_c_twice_ends_a_run_at_once_and_it_can_go_on(office, whole, tmp_path):
@@ -292,14 +285,7 @@ def test_resuming_is_refused_where_something_else_was_run(office, tmp_path):
     assert "is not whole" in refusal(office)
 
 
-def test_without_anything_to_go_on_with_a_run_begins_at_the_beginning(office, whole, tmp_path):
-    assert start(office, tmp_path / "run", *LIVELY, "--resume").wait() == 0
-    same_result(tmp_path / "run", whole)
-
-
-@pytest.mark.parametrize(
-    ("limit_kib", "words"), [(64, LIVELY), pytest.param(400, LIVELY, marks=pytest.mark.slow), (400, RECORDED)]
-)
+@pytest.mark.parametrize(("limit_kib", "words"), [(64, LIVELY), (400, RECORDED)])
 def test_a_full_disk_is_an_error_and_what_is_on_it_is_whole(office, tmp_path, limit_kib, words):
     full = f"""
 import resource, signal, sys
@@ -354,18 +340,3 @@ def test_a_checkpoint_that_names_code_or_another_configuration_is_not_resumed(of
     slam.config = slam.front_end.odometry.config = config
     Checkpoints(tmp_path, 10.0).write(slam, StepTable())
     assert read_checkpoint(tmp_path, config).slam.config == config
-
-
-def test_scans_that_were_read_before_an_error_are_processed():
-    config = configured(2)
-    nothing, points = np.empty(0, np.float32), np.ones((9, 2), np.float32)
-
-    def scans():
-        yield from (Scan(index, index, index, points, nothing, 0, None) for index in range(20))
-        raise InputError("too many bad scans")
-
-    seen = []
-    with pytest.raises(InputError, match="too many"):
-        for prepared in few_at_once(scans(), Resolution(config.preprocess, config.local_map.voxel_size_m)):
-            seen.append(prepared.scan.index)
-    assert seen == list(range(20))

@@ -1,6 +1,5 @@
 """results.mcap as other people's readers see it."""
 
-import msgspec
 import numpy as np
 import pytest
 from mcap.reader import make_reader
@@ -123,9 +122,3 @@ def test_a_covariance_turns_with_the_lidar_and_is_zero_where_it_is_unknown():
     assert not ros_covariance(None, np.eye(3)).any()
     spread = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
     np.testing.assert_allclose(ros_covariance(spread, np.eye(4)), spread)
-
-
-def test_it_is_written_only_where_asked_for():
-    from scanchain.config import Config
-
-    assert not Config().outputs.mcap and msgspec.structs.fields(Config().outputs)[0].name == "mcap"

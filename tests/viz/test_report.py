@@ -25,7 +25,7 @@ from scanchain.comparison.table import read_table
 from scanchain.logs.writer import ORIGIN, LogWriter, pack_laser_scan, pack_odometry
 from scanchain.maps import read_ply
 from scanchain.runs.metrics import Metrics
-from scanchain.runs.overlay import OVERLAY_FILE
+from scanchain.runs.results import OVERLAY_FILE
 from scanchain.simulation import simulate
 from scanchain.verdict import Judged, Kind, Stretch, Verdict
 from scanchain_viz.pictures.figure import Line

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain.runs.closures import BACK_END, VERIFICATION
+from scanchain.data import BACK_END, VERIFICATION
 from scanchain.verdict import Kind
 
 STRETCH_COLORS = {

@@ -51,7 +51,7 @@ class Task(Struct, frozen=True):
     key : of its identity and all that decides about the result
     out : the batch's directory
     arguments : for ``scanchain run``
-    time_s, memory_mib : limits of its process
+    limits : of its process
     retries : further tries of one that crashed
     """
 
@@ -60,8 +60,7 @@ class Task(Struct, frozen=True):
     key: str
     out: str
     arguments: tuple[str, ...]
-    time_s: float
-    memory_mib: float
+    limits: Limits
     retries: int
 
     @property
@@ -143,7 +142,7 @@ def _tried(task: Task, stop: Event | None) -> Row:
     output = output_file(Path(task.out), task.key)
     output.parent.mkdir(parents=True, exist_ok=True)
     ending = run_within(
-        Limits(task.time_s, task.memory_mib),
+        task.limits,
         "scanchain.processes",
         ["scanchain", "run", "--out", str(task.run), "--force", *task.arguments, "--", task.log],
         os.environ | dict.fromkeys(_THREADS, "1"),  # a process a core: threads would only get in each other's way
@@ -151,7 +150,9 @@ def _tried(task: Task, stop: Event | None) -> Row:
         interval_s=_LOOK_S,
         stop=stop,
     )
-    state, reason = _verdict(task, ending)
+    text = output.read_text(encoding="utf-8", errors="replace")
+    own = _own_ending(ending, task, text.splitlines()) if ending.killed_for is KilledFor.NOTHING else None
+    state, reason = own or (_state_of(ending), ending.reason(task.limits, text))
     run, sha256, metrics = "", "", None
     if state.has_result:
         run, metrics = task.run.name, _metrics(task)
@@ -164,17 +165,11 @@ def _metrics(task: Task) -> Metrics:
     return msgspec.json.decode((task.run / METRICS_FILE).read_bytes(), type=Metrics)
 
 
-def _verdict(task: Task, ending: Ending) -> tuple[State, str]:
-    """End state, and the reason if it failed."""
-    output = output_file(Path(task.out), task.key).read_text(encoding="utf-8", errors="replace")
-    if ending.killed_for is KilledFor.STOP:
-        return State.NOT_RUN, "stopped by the user"
-    if ending.killed_for is KilledFor.NOTHING and (own := _own_ending(ending, task, output.splitlines())):
-        return own
-    state = State.OUT_OF_MEMORY if ending.ran_out_of_memory else State.CRASHED
-    if ending.killed_for is KilledFor.TIME:
-        state = State.TIMED_OUT
-    return state, ending.reason(Limits(task.time_s, task.memory_mib), output)
+def _state_of(ending: Ending) -> State:
+    """End state of a process that was killed or crashed."""
+    if ending.ran_out_of_memory:
+        return State.OUT_OF_MEMORY
+    return {KilledFor.STOP: State.NOT_RUN, KilledFor.TIME: State.TIMED_OUT}.get(ending.killed_for, State.CRASHED)
 
 
 def _own_ending(ending: Ending, task: Task, output: list[str]) -> tuple[State, str] | None:

@@ -138,7 +138,7 @@ def check(
 
         judged = judge_run(sources[0])
     else:
-        from scanchain.runs.foreign import judge_trajectory
+        from scanchain.runs.vouching import judge_trajectory
 
         judged, missing = judge_trajectory(trajectory, sources, overrides)
         if missing:

@@ -97,7 +97,8 @@ def compare(comparison: Comparison, present: Callable[[Path], None], progress: P
     )
     directory = RunDirectory(comparison.out, force=comparison.force)
     provenance = describe_start(comparison.command, comparison.logs, ", ".join(method.name for method in methods))
-    with directory, Hashing(comparison.logs) as hashing:
+    hashing = Hashing(comparison.logs)
+    with directory:
         shared = directory.path / _SHARED
         shared.mkdir()
         decoded = progress.track(log.scans(settings.config.preprocess), log.scan_count)

@@ -1,7 +1,8 @@
-"""An array that grows at its end, with room kept in reserve so that appending costs little on average."""
+"""Arrays that grow at their end, with room kept in reserve so that appending costs little on average."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -50,3 +51,32 @@ class GrowingArray:
         """Put these in place of all rows; views handed out before keep the old ones."""
         self._room = np.array(rows, self._room.dtype)
         self._count = len(rows)
+
+
+class Columns:
+    """Records of one kind in growing columns, texts as numbers: a fraction of the memory of their objects."""
+
+    def __init__(self) -> None:
+        self._columns: dict[str, GrowingArray] = {}
+        self._numbers: dict[str, int] = {}
+
+    def __len__(self) -> int:
+        return len(next(iter(self._columns.values()), ()))
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        """View of a column, (n, ...), not to be written to."""
+        return self._columns[name].rows if self._columns else np.empty(0)
+
+    @property
+    def texts(self) -> list[str]:
+        """Texts by their numbers."""
+        return list(self._numbers)
+
+    def append(self, record: Mapping[str, Any]) -> None:
+        """Append a record: numbers, texts, and arrays that have the same shape in every record."""
+        for name, value in record.items():
+            if isinstance(value, str):
+                value = self._numbers.setdefault(str(value), len(self._numbers))
+            if name not in self._columns:
+                self._columns[name] = GrowingArray(np.shape(value), np.asarray(value).dtype)
+            self._columns[name].append(value)

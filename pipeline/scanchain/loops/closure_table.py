@@ -9,33 +9,32 @@ from typing import Any, overload
 import numpy as np
 
 from scanchain.data import Closure, ClosureVerdict, Match, Problem, Proposal
-from scanchain.graph.growing_array import GrowingArray
+from scanchain.graph.growing_array import Columns
 
-_TEXTS = {"reason": str, "cause": str, "verdict": ClosureVerdict, "proposed_by": Proposal}  # kept as numbers
+_TEXTS = {"reason": str, "cause": str, "verdict": ClosureVerdict, "proposed_by": Proposal}
+_OF_MATCH = [field.name for field in fields(Match)]
+_OF_CLOSURE = [field.name for field in fields(Closure) if field.name != "match"]
 
 
 class ClosureTable(Sequence[Closure]):
     """Closures in a fifth of the memory of their objects, which are made where they are asked for."""
 
     def __init__(self) -> None:
-        self._closures: dict[str, GrowingArray] = {}
-        self._matches: dict[str, GrowingArray] = {}
-        self._codes: dict[str, int] = {}
-        self._texts: list[str] = []
+        self._closures, self._matches = Columns(), Columns()
 
     def __len__(self) -> int:
-        return len(self._closures["target"]) if self._closures else 0
+        return len(self._closures)
 
     def extend(self, closures: Iterable[Closure]) -> None:
         """Append closures."""
         for closure in closures:
-            self._append(self._closures, closure)
-            self._append(self._matches, closure.match)
+            self._closures.append({name: getattr(closure, name) for name in _OF_CLOSURE})
+            self._matches.append({name: getattr(closure.match, name) for name in _OF_MATCH})
 
     def reject(self, chosen: Callable[[Closure], bool], problem: Problem) -> None:
         """Reject closures that were accepted."""
         kept = [each.rejected(problem) if chosen(each) else each for each in self]
-        self._closures, self._matches = {}, {}
+        self._closures, self._matches = Columns(), Columns()
         self.extend(kept)
 
     @overload
@@ -48,28 +47,13 @@ class ClosureTable(Sequence[Closure]):
             return [self[each] for each in range(*index.indices(len(self)))]
         if not -len(self) <= index < len(self):
             raise IndexError(f"closure {index} of {len(self)}")
-        return Closure(match=Match(**self._row(self._matches, index)), **self._row(self._closures, index))
+        match = Match(**_record(self._matches, _OF_MATCH, index))
+        return Closure(match=match, **_record(self._closures, _OF_CLOSURE, index))
 
-    def _append(self, columns: dict[str, GrowingArray], record: Closure | Match) -> None:
-        for field in fields(record):
-            name, value = field.name, getattr(record, field.name)
-            if name == "match":
-                continue
-            if name in _TEXTS:
-                value = self._code(str(value))
-            if name not in columns:
-                columns[name] = GrowingArray(np.shape(value), np.asarray(value).dtype.type)
-            columns[name].append(value)
 
-    def _code(self, text: str) -> int:
-        if text not in self._codes:
-            self._codes[text] = len(self._texts)
-            self._texts.append(text)
-        return self._codes[text]
-
-    def _row(self, columns: dict[str, GrowingArray], index: int) -> dict[str, Any]:
-        row = {name: column.rows[index] for name, column in columns.items()}
-        return {
-            name: _TEXTS[name](self._texts[value]) if name in _TEXTS else value if np.ndim(value) else value.item()
-            for name, value in row.items()
-        }
+def _record(columns: Columns, names: Sequence[str], index: int) -> dict[str, Any]:
+    values = {name: columns[name][index] for name in names}
+    return {
+        name: _TEXTS[name](columns.texts[value]) if name in _TEXTS else value if np.ndim(value) else value.item()
+        for name, value in values.items()
+    }

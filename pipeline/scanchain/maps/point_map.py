@@ -27,17 +27,9 @@ class PointMap:
     dimension : 2 or 3, of the points
     """
 
-    def __init__(
-        self,
-        dimension: int,
-        voxel_size_m: float,
-        *,
-        max_range_m: float = float("inf"),
-        max_voxels: int = MAX_VOXELS,
-    ) -> None:
+    def __init__(self, dimension: int, voxel_size_m: float, *, max_voxels: int = MAX_VOXELS) -> None:
         self.dimension = dimension
         self.voxel_size_m = voxel_size_m
-        self.max_range_m = max_range_m
         self.max_voxels = max_voxels
         self.used = 0
         self.center_m = np.zeros(3)
@@ -47,7 +39,7 @@ class PointMap:
         return self.used
 
     def insert(self, T_world_lidar: Pose, points: NDArray[np.floating]) -> None:
-        """Add one scan: points (N, d), meters, lidar frame; those beyond ``max_range_m`` are left out."""
+        """Add one scan: points (N, d), meters, lidar frame."""
         if not np.abs(T_world_lidar).max() < LARGEST:
             raise InputError("a scan added to the map has a pose that is not finite")
         if not self.used:
@@ -55,7 +47,7 @@ class PointMap:
         done = 0
         while done < len(points):
             self.used, count = kernels.add_points(
-                T_world_lidar, points[done:], self.max_range_m, self.voxel_size_m, self.center_m,
+                T_world_lidar, points[done:], np.inf, self.voxel_size_m, self.center_m,
                 self.slots, self.cells, self.sums, self.counts, self.used,
             )  # fmt: skip
             done += count
@@ -87,14 +79,10 @@ class PointMap:
 
 
 def build_point_map(
-    scans: Iterable[tuple[Pose, NDArray[np.floating]]],
-    *,
-    dimension: int,
-    voxel_size_m: float,
-    max_range_m: float = float("inf"),
+    scans: Iterable[tuple[Pose, NDArray[np.floating]]], *, dimension: int, voxel_size_m: float
 ) -> PointMap:
     """The map of (T_world_lidar, points) pairs; only one scan is in memory at a time."""
-    result = PointMap(dimension, voxel_size_m, max_range_m=max_range_m)
+    result = PointMap(dimension, voxel_size_m)
     for T_world_lidar, points in scans:
         result.insert(T_world_lidar, points)
     return result

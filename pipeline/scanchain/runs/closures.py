@@ -4,61 +4,34 @@ from __future__ import annotations
 
 from collections import defaultdict, deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scanchain.data import REJECTED_WEIGHT, Closure, ClosureVerdict, GraphState, Keyframe
+from scanchain.data import REJECTED_WEIGHT, Closure, ClosureVerdict, GraphState, Keyframe, Problem
 from scanchain.runs.step_table import pose_columns
 
 if TYPE_CHECKING:
     import pyarrow as pa
 
-VERIFICATION, BACK_END = "verification", "back end"  # either may reject a closure
 
-
-@dataclass(frozen=True, slots=True)
-class FinalClosure:
-    """A closure with its final verdict, by the matcher or by the graph.
-
-    ``weight`` and ``chi2_after`` are what the optimizer left to its edge: 0 and NaN if it never became one, 1 and
-    NaN until it is optimized.
-    """
-
-    closure: Closure
-    verdict: ClosureVerdict
-    cause: str
-    reason: str
-    weight: float
-    chi2_after: float
-
-    @property
-    def rejected_by(self) -> str:
-        """Verification by matching, or the back end where it contradicts the graph; empty if accepted."""
-        if self.verdict is ClosureVerdict.ACCEPTED:
-            return ""
-        return BACK_END if self.closure.verdict is ClosureVerdict.ACCEPTED else VERIFICATION
-
-
-def final_verdicts(closures: Sequence[Closure], state: GraphState) -> tuple[FinalClosure, ...]:
-    """Every closure with its final verdict; those the graph contradicts are rejected.
+def final_verdicts(closures: Sequence[Closure], state: GraphState) -> tuple[Closure, ...]:
+    """Every closure with its final verdict, weight and χ²; those the graph contradicts are rejected.
 
     A closure accepted since the optimization that ``state`` comes from stays accepted.
     """
-    edges = _loop_edges(state)
-    final = []
+    edges, final = _loop_edges(state), []
     for closure in closures:
-        verdict, cause, reason, weight, chi2 = closure.verdict, closure.cause, closure.reason, 0.0, float("nan")
-        if verdict is ClosureVerdict.ACCEPTED:
+        if closure.verdict is ClosureVerdict.ACCEPTED:
             between = edges[closure.target, closure.source]
             weight, chi2 = between.popleft() if between else (1.0, float("nan"))
+            closure = replace(closure, weight=weight, chi2_after=chi2)
             if weight < REJECTED_WEIGHT:
-                verdict = ClosureVerdict.REJECTED
                 cause = "contradicts the rest of the graph"
-                reason = f"{cause}, χ² {chi2:.4g}"
-        final.append(FinalClosure(closure, verdict, cause, reason, weight, chi2))
+                closure = closure.rejected(Problem(cause, f"{cause}, χ² {chi2:.4g}"))
+        final.append(closure)
     return tuple(final)
 
 
@@ -71,16 +44,14 @@ def _loop_edges(state: GraphState) -> defaultdict[tuple[int, int], deque[tuple[f
     return edges
 
 
-def write_closures(
-    path: Path, final: Sequence[FinalClosure], keyframes: Sequence[Keyframe], dimension: int
-) -> None:
+def write_closures(path: Path, closures: Sequence[Closure], keyframes: Sequence[Keyframe], dimension: int) -> None:
     """Write the table of ``closures_table``."""
     import pyarrow.parquet as pq
 
-    pq.write_table(closures_table(final, keyframes, dimension), path, compression="zstd")
+    pq.write_table(closures_table(closures, keyframes, dimension), path, compression="zstd")
 
 
-def closures_table(final: Sequence[FinalClosure], keyframes: Sequence[Keyframe], dimension: int) -> pa.Table:
+def closures_table(closures: Sequence[Closure], keyframes: Sequence[Keyframe], dimension: int) -> pa.Table:
     """Every closure tried, with its final verdict and the robust weight that the optimizer left to it."""
     import pyarrow as pa
 
@@ -91,7 +62,6 @@ def closures_table(final: Sequence[FinalClosure], keyframes: Sequence[Keyframe],
 
     k = 3 if dimension == 2 else 6
     whole, number, text = pa.int64(), pa.float64(), pa.string()
-    closures = [item.closure for item in final]
     matches = [closure.match for closure in closures]
     ends = {name: [keyframes[getattr(closure, name)] for closure in closures] for name in ("target", "source")}
     poses = np.array([match.T_target_source for match in matches]).reshape(-1, dimension + 1, dimension + 1)
@@ -99,11 +69,9 @@ def closures_table(final: Sequence[FinalClosure], keyframes: Sequence[Keyframe],
         **of(closures, whole, "target", "source"),
         **{f"{end}_scan": pa.array([each.scan_index for each in ends[end]], whole) for end in ends},
         **{f"{end}_stamp_ns": pa.array([each.stamp_ns for each in ends[end]], whole) for end in ends},
-        **of(closures, text, "proposed_by"),
-        **of(final, text, "verdict", "rejected_by", "cause", "reason"),
-        **of(final, number, "weight"),
-        **of(closures, number, "chi2_before", null_nan=True),
-        **of(final, number, "chi2_after", null_nan=True),
+        **of(closures, text, "proposed_by", "verdict", "rejected_by", "cause", "reason"),
+        **of(closures, number, "weight"),
+        **of(closures, number, "chi2_before", "chi2_after", null_nan=True),
         **{name: pa.array(values, number) for name, values in pose_columns(poses).items()},
         "information": pa.array(
             [match.information.ravel().tolist() for match in matches], pa.list_(number, k * k)

@@ -126,6 +126,12 @@ def left_behind(destination: Path) -> Path | None:
     return max(checkpoints, key=lambda file: file.stat().st_mtime_ns).parent if checkpoints else None
 
 
+def stopped_run(destination: Path) -> Path | None:
+    """The same, None where another process still writes to it."""
+    left = left_behind(destination)
+    return left if left is not None and not writer_of(left) else None
+
+
 def writer_of(partial: Path) -> int:
     """Number of another process that still writes to a directory marked partial, 0 if none does.
 
@@ -164,7 +170,7 @@ def _check(destination: Path, force: bool) -> None:
         whole, mark, _ = destination.name.rpartition(".partial-")
         if mark and (destination / CHECKPOINT_FILE).is_file():
             resume = f"; it is what a stopped run left: --out {destination.with_name(whole)} --resume continues it"
-        elif (left := left_behind(destination)) is not None and not writer_of(left):
+        elif left := stopped_run(destination):
             resume = f"; {left.name} is of a run that was stopped: --force --resume continues it"
         raise InputError(f"{destination}: exists; choose another --out or pass --force to replace it{resume}")
     if any(destination.iterdir()) and not (destination / RUN_FILE).is_file():

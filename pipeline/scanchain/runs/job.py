@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -10,7 +9,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 from scanchain.data import Scan
-from scanchain.errors import InputError
 from scanchain.files import Source
 from scanchain.settings import Override
 
@@ -48,12 +46,6 @@ class Job:
     resume: bool = False
     checkpoint_s: float = 10.0
     command: tuple[str, ...] = ()
-
-    def check_logs(self) -> None:
-        """Refuse a file named twice: each of its scans would come twice. Raises InputError."""
-        for source, count in Counter(source.resolve() for source in self.logs).items():
-            if count > 1:
-                raise InputError(f"{source}: is named {count} times; name each file of a log once")
 
 
 class Progress:

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from scanchain.data import State, Trajectory, fit_text
+from scanchain.data import BACK_END, VERIFICATION, State, Trajectory, fit_text
 from scanchain.errors import InputError, counted
 from scanchain.evaluation import (
     ExpectedError,
@@ -21,7 +21,6 @@ from scanchain.evaluation import (
     pair,
 )
 from scanchain.evaluation.absolute import far_off, path_length
-from scanchain.runs.closures import BACK_END, VERIFICATION
 from scanchain.runs.results import Results
 from scanchain.runs.step_table import STAGES, StepTable, inlier_shares
 from scanchain.slam import SlamResult

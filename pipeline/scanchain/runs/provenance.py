@@ -19,7 +19,6 @@ from scanchain.files import Source, without_keys, write_whole
 from scanchain.logs.files import RemoteFile, files_of, size_of
 
 _PACKAGES = ("scanchain", "numpy", "numba", "scipy", "pyarrow", "mcap", "msgspec", "rerun-sdk")
-_BLOCK = 1 << 22
 
 
 class LogFile(Struct, frozen=True):
@@ -87,46 +86,33 @@ def _log_file(source: Source) -> LogFile:
 
 
 class Hashing:
-    """SHA-256 of files, computed in a thread beside the run; a context manager."""
+    """SHA-256 of files, computed in a thread beside the run, which an end of the program does not wait for."""
 
     def __init__(self, sources: Sequence[Source]) -> None:
-        self._sources = tuple(sources)
-        self._digests: dict[Source, str] = {}
-        self._cancelled = threading.Event()
+        self._sources, self._digests = tuple(sources), list[str]()
         self._thread = threading.Thread(target=self._work, name="log hash", daemon=True)
-
-    def __enter__(self) -> Hashing:
         self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._cancelled.set()
-        self._thread.join()
 
     def digests(self) -> list[str]:
         """The hashes, in the order of the sources, waited for; those of remote files are empty."""
         self._thread.join()
-        return [self._digests.get(source, "") for source in self._sources]
+        return self._digests
 
     def _work(self) -> None:
         for source in self._sources:
-            if isinstance(source, Path):
-                self._digests[source] = sha256_of(source, self._cancelled)
+            self._digests.append(_sha256_of(source) if isinstance(source, Path) else "")
 
 
-def sha256_of(path: Path, cancelled: threading.Event | None = None) -> str:
-    """SHA-256 of a file, or of a folder as of a ``LogFile``; empty where it cannot be read or was cancelled."""
+def _sha256_of(path: Path) -> str:
+    """SHA-256 of a file, or of a folder as of a ``LogFile``; empty where it cannot be read."""
     digest = hashlib.sha256()
     try:
         for file in files_of(path):
             if path.is_dir():
                 digest.update(os.fsencode(file.relative_to(path).as_posix()) + b"\0")
             with file.open("rb") as stream:
-                while block := stream.read(_BLOCK):
-                    if cancelled is not None and cancelled.is_set():
-                        return ""
-                    digest.update(block)
-    except OSError:
+                hashlib.file_digest(stream, lambda: digest)
+    except (OSError, InputError):
         return ""
     return digest.hexdigest()
 

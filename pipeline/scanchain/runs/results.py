@@ -1,13 +1,12 @@
-"""Results of a run: the table of its output files and their writers, and the maps made from the keyframes."""
+"""Results of a run: its output files, and the maps made from the keyframes."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, Protocol
 
 import msgspec
 import numpy as np
@@ -15,9 +14,10 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import Config, MapsConfig
-from scanchain.data import Keyframe, Matrix, Points, Pose, Trajectory
+from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import ExpectedErrors, expected_errors
+from scanchain.evaluation.absolute import path_length
 from scanchain.graph.g2o import rejected_path, write_g2o
 from scanchain.logs import Log
 from scanchain.loops import level_of, outline_of
@@ -38,14 +38,18 @@ from scanchain.maps import (
     write_ply,
     write_saved_map,
 )
-from scanchain.runs.closures import FinalClosure, write_closures
+from scanchain.runs.closures import write_closures
 from scanchain.runs.job import Recorder
 from scanchain.runs.results_mcap import write_results_mcap
 from scanchain.runs.step_table import StepTable
 from scanchain.slam import SlamResult
 from scanchain.trajectory import write_kitti, write_tum, write_wide_tum
+from scanchain.verdict import Kind, WorstPlace
 
 GRAPH_FILE = "graph.g2o"  # the edges in force; rejected ones go to graph_rejected.g2o, if there are any
+OVERLAY_FILE = "overlay.npz"
+_REACH_M = {2: 6.0, 3: 15.0}  # path of a pass by dimension
+_MAX_POINTS = 60_000
 _TILTED_RAD = math.radians(5.0)  # tilt of the lidar's first frame to the ground from which on it is said
 
 
@@ -69,7 +73,7 @@ class Results:
     config: Config
     steps: StepTable
     result: SlamResult
-    final: tuple[FinalClosure, ...]
+    final: tuple[Closure, ...]
     drawn: Future[Cloud]
     grid: OccupancyGrid
     expected: ExpectedErrors | None
@@ -92,34 +96,6 @@ class Results:
         )
 
 
-class Output(NamedTuple):
-    """A file of a run directory: name, writer, and the condition on the configuration."""
-
-    file: str
-    write: Callable[[Path, Results], None]
-    is_wanted: Callable[[Config], bool] = lambda config: True
-
-
-def _write_graph(path: Path, results: Results) -> None:
-    graph = results.result.graph
-    write_g2o(path, graph)
-    if graph.is_rejected.any():
-        write_g2o(rejected_path(path), graph, edges="rejected")
-
-
-def _write_keyframes(path: Path, results: Results) -> None:
-    """Poses and covariances of the keyframes, where these are known."""
-    if results.expected is not None:
-        write_wide_tum(path, results.result.keyframe_trajectory, results.expected.covariances)
-
-
-def _write_base(path: Path, results: Results) -> None:
-    """The robot's trajectory, in the frame of the lidar's; none where the log does not state the mounting."""
-    log, trajectory = results.log, results.result.trajectory
-    if log.mounting.base and log.mounting.motion is None:
-        write_tum(path, Trajectory(trajectory.stamps_ns, trajectory.poses @ lie.inverse(log.T_base_lidar)))
-
-
 def _write_saved_map(path: Path, results: Results) -> None:
     """The map of the largest piece of the log."""
     result, graph = results.result, results.result.graph
@@ -135,42 +111,17 @@ def _write_saved_map(path: Path, results: Results) -> None:
         outline_of(path, open_saved_map(path).keyframes, results.config.local_map)
 
 
-OUTPUTS = (  # a new format: a function of path and Results in a file of its own, and a line here
-    Output("trajectory.tum", lambda path, r: write_tum(path, r.result.trajectory)),
-    Output("keyframes.tum", _write_keyframes),
-    Output("trajectory_base.tum", _write_base),
-    Output("odometry.tum", lambda path, r: write_tum(path, r.result.odometry)),
-    Output("trajectory.kitti.txt", lambda path, r: write_kitti(path, r.result.trajectory)),
-    Output(GRAPH_FILE, _write_graph),
-    Output("map.pgm", lambda path, r: write_map(path.parent, r.grid)),  # with map.yaml
-    Output(
-        "loops.parquet",
-        lambda path, r: write_closures(path, r.final, r.result.keyframes, r.result.trajectory.dimension),
-    ),
-    Output("steps.parquet", lambda path, r: r.steps.write(path, r.result.trajectory, r.log.T_base_lidar)),
-    Output(MAP_FOLDER, _write_saved_map, lambda config: config.outputs.map),
-    Output("map.ply", lambda path, r: write_ply(path, r.cloud.points)),
-    Output("map.pcd", lambda path, r: write_pcd(path, r.cloud.points), lambda config: config.maps.write_pcd),
-    Output("map.laz", lambda path, r: write_laz(path, r.cloud.points), lambda config: config.maps.write_laz),
-    Output(  # after the maps, which it reads
-        "results.mcap",
-        lambda path, r: write_results_mcap(path, r.log, r.steps, r.result, r.T_world_level),
-        lambda config: config.outputs.mcap,
-    ),
-)
-
-
 def results_of(
-    log: Log, config: Config, steps: StepTable, result: SlamResult, final: tuple[FinalClosure, ...]
+    log: Log, config: Config, steps: StepTable, result: SlamResult, final: tuple[Closure, ...]
 ) -> Results:
     """The results of a log with the maps made from its keyframes."""
     beside = ThreadPoolExecutor(1, thread_name_prefix="scanchain-cloud")
-    drawn = beside.submit(cloud_of, result, config)
+    drawn = beside.submit(cloud_of, result.keyframes, result.T_world_keyframes, config)
     beside.shutdown(wait=False)
     T_world_level = lie.identity(log.dimension)
     if log.dimension == 3:
         T_world_level = level_of(result.keyframes, result.T_world_keyframes, config.local_map)
-    grid = grid_of(result, config.maps, lie.inverse(T_world_level))
+    grid = grid_of(result.keyframes, lie.inverse(T_world_level) @ result.T_world_keyframes, config.maps)
     return Results(log, config, steps, result, final, drawn, grid, expected_of(result, config), T_world_level)
 
 
@@ -187,10 +138,33 @@ def expected_of(result: SlamResult, config: Config) -> ExpectedErrors | None:
 
 
 def write_results(folder: Path, results: Results) -> None:
-    """Write every requested output into a run directory."""
-    for output in OUTPUTS:
-        if output.is_wanted(results.config):
-            output.write(folder / output.file, results)
+    """Write every requested output into a run directory; a new format is a writer, and a line here."""
+    log, config, result = results.log, results.config, results.result
+    trajectory, graph, expected = result.trajectory, result.graph, results.expected
+    write_tum(folder / "trajectory.tum", trajectory)
+    write_kitti(folder / "trajectory.kitti.txt", trajectory)
+    write_tum(folder / "odometry.tum", result.odometry)
+    if expected is not None:
+        write_wide_tum(folder / "keyframes.tum", result.keyframe_trajectory, expected.covariances)
+    if log.mounting.base and log.mounting.motion is None:  # the robot's, in the frame of the lidar's
+        poses = trajectory.poses @ lie.inverse(log.T_base_lidar)
+        write_tum(folder / "trajectory_base.tum", Trajectory(trajectory.stamps_ns, poses))
+    write_g2o(folder / GRAPH_FILE, graph)
+    if graph.is_rejected.any():
+        write_g2o(rejected_path(folder / GRAPH_FILE), graph, edges="rejected")
+    write_closures(folder / "loops.parquet", results.final, result.keyframes, trajectory.dimension)
+    results.steps.write(folder / "steps.parquet", trajectory, log.T_base_lidar)
+    write_map(folder, results.grid)
+    if config.outputs.map:
+        _write_saved_map(folder / MAP_FOLDER, results)
+    points = results.cloud.points
+    write_ply(folder / "map.ply", points)
+    if config.maps.write_pcd:
+        write_pcd(folder / "map.pcd", points)
+    if config.maps.write_laz:
+        write_laz(folder / "map.laz", points)
+    if config.outputs.mcap:  # after the maps, which it reads
+        write_results_mcap(folder / "results.mcap", log, results.steps, result, results.T_world_level)
 
 
 def record_results(recording: Recorder, results: Results) -> None:
@@ -210,41 +184,81 @@ def occupancy(grid: OccupancyGrid) -> NDArray[np.int8]:
     return np.where(grid.drawn > 0, np.rint(100.0 * grid.probability()), -1.0).astype(np.int8)
 
 
-class Posed(Protocol):
-    """Keyframes and their final poses, (K, d+1, d+1)."""
-
-    @property
-    def keyframes(self) -> Sequence[Keyframe]:
-        """In order."""
-        ...
-
-    @property
-    def T_world_keyframes(self) -> Matrix:
-        """Their poses."""
-        ...
-
-
-def cloud_of(result: Posed, config: Config) -> Cloud:
-    """The cloud of all keyframes, without moving objects if so configured."""
-    dimension = result.T_world_keyframes.shape[-1] - 1
-    scans = zip(result.T_world_keyframes, (keyframe.points for keyframe in result.keyframes), strict=True)
-    built = build_point_map(scans, dimension=dimension, voxel_size_m=config.maps.voxel_size_m)
+def cloud_of(keyframes: Sequence[Keyframe], poses: Matrix, config: Config) -> Cloud:
+    """The cloud of keyframes at their final poses (K, d+1, d+1), without moving objects if so configured."""
+    scans = ((T, keyframe.points) for T, keyframe in zip(poses, keyframes, strict=True))
+    built = build_point_map(scans, dimension=poses.shape[-1] - 1, voxel_size_m=config.maps.voxel_size_m)
     points = built.points()
     if not config.maps.remove_moving:
         return Cloud(points, 0)
     views = (
-        View(pose, keyframe.points, keyframe.scale * config.preprocess.map_voxel_m)
-        for pose, keyframe in zip(result.T_world_keyframes, result.keyframes, strict=True)
+        View(T, keyframe.points, keyframe.scale * config.preprocess.map_voxel_m)
+        for T, keyframe in zip(poses, keyframes, strict=True)
     )
     gone = moved(points, built.voxel_size_m, views)
     return Cloud(points[~gone], int(gone.sum()))
 
 
-def grid_of(result: Posed, config: MapsConfig, T_grid_world: Pose | None = None) -> OccupancyGrid:
-    """The grid of all keyframes, in a frame or the world, coarser than configured where that is too large."""
-    poses = result.T_world_keyframes if T_grid_world is None else T_grid_world @ result.T_world_keyframes
+def grid_of(keyframes: Sequence[Keyframe], poses: Matrix, config: MapsConfig) -> OccupancyGrid:
+    """The grid of keyframes at poses (K, d+1, d+1), coarser than configured where that is too large."""
     max_range_m = config.grid_max_range_m
     resolution_m = fitting_resolution(poses, resolution_m=config.grid_resolution_m, max_range_m=max_range_m)
     fitting = msgspec.structs.replace(config, grid_resolution_m=resolution_m)
-    scans = ((pose, keyframe.points) for pose, keyframe in zip(poses, result.keyframes, strict=True))
+    scans = ((T, keyframe.points) for T, keyframe in zip(poses, keyframes, strict=True))
     return draw_grid(scans, fitting, max_range_m=max_range_m)
+
+
+@dataclass(frozen=True, slots=True)
+class Overlay:
+    """Points (M, d) of two passes and the positions (N, d) of their scans, as the trajectory places them.
+
+    ``text`` : the stretch in words; ``place`` (d,) : position of the second pass
+    """
+
+    text: str
+    before: Points
+    after: Points
+    path_before: Points
+    path_after: Points
+    place: NDArray[np.float64]
+
+
+def write_overlay(path: Path, worst: WorstPlace, result: SlamResult) -> None:
+    """Write the points of the keyframes before and after a contradiction, or of both passes of a loop."""
+    poses = result.trajectory.poses
+    path_m = path_length(poses)
+    reach_m = _REACH_M[result.trajectory.dimension]
+    is_loop = worst.stretch.kind is Kind.LOOPS
+    arrays: dict[str, NDArray[np.floating] | str] = {
+        "text": worst.stretch.text,
+        "place": poses[worst.after, :-1, -1],
+    }
+    for name, scan, low_m, high_m in (
+        ("before", worst.before, -reach_m, reach_m if is_loop else 0.0),
+        ("after", worst.after, -reach_m if is_loop else 0.0, reach_m),
+    ):
+        away_m = path_m - path_m[scan]
+        is_near = (away_m >= low_m) & (away_m <= high_m)
+        if not is_loop:  # where the lidar stands, one place belongs to the scans of both sides
+            numbers = np.arange(len(poses))
+            is_near &= numbers <= scan if name == "before" else numbers >= scan
+        arrays[name] = _points(result, is_near, scan)
+        arrays[f"path_{name}"] = poses[is_near, :-1, -1]
+    np.savez_compressed(path, **arrays)  # pyright: ignore[reportArgumentType]
+
+
+def read_overlay(path: Path) -> Overlay:
+    """Read what ``write_overlay`` wrote."""
+    with np.load(path) as file:
+        clouds = (file[name] for name in ("before", "after", "path_before", "path_after", "place"))
+        return Overlay(str(file["text"]), *clouds)
+
+
+def _points(result: SlamResult, is_near: NDArray[np.bool_], scan: int) -> NDArray[np.float32]:
+    """Points (M, d) of the keyframes among these scans, of the nearest one where there is none."""
+    chosen = [k for k, keyframe in enumerate(result.keyframes) if is_near[keyframe.scan_index]]
+    if not chosen:
+        chosen = [int(np.argmin([abs(keyframe.scan_index - scan) for keyframe in result.keyframes]))]
+    poses = result.T_world_keyframes
+    points = np.concatenate([lie.transform(poses[k], result.keyframes[k].points) for k in chosen])
+    return points[:: max(1, -(-len(points) // _MAX_POINTS))].astype(np.float32)

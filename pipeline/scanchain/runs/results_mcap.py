@@ -72,8 +72,10 @@ def ros_covariance(covariance: Matrix | None, T: Pose) -> NDArray[np.float64]:
 def _write_motion(writer: LogWriter, moving: MovingFrame, steps: StepTable, poses: Matrix) -> None:
     T_lidar_frame = moving.T_lidar_frame
     adjoint = lie.adjoint(lie.inverse(T_lidar_frame))
-    for step, T_world_lidar, covariance in zip(steps.columns, poses, steps.covariances(), strict=True):
-        stamp_ns, log_time_ns, T_odom_lidar = int(step["stamp_ns"]), int(step["log_time_ns"]), step["T_odom_lidar"]
+    stamps_ns, log_times_ns = (steps.columns[name].tolist() for name in ("stamp_ns", "log_time_ns"))
+    odometry, covariances = steps.columns["T_odom_lidar"], steps.covariances()
+    rows = zip(stamps_ns, log_times_ns, odometry, poses, covariances, strict=True)
+    for stamp_ns, log_time_ns, T_odom_lidar, T_world_lidar, covariance in rows:
         T_odom_frame = T_odom_lidar @ T_lidar_frame
         T_world_odom = T_world_lidar @ lie.inverse(T_odom_lidar)
         here = place(T_odom_frame)

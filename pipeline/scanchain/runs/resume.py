@@ -22,7 +22,7 @@ from scanchain.clock import working_s
 from scanchain.config import Config
 from scanchain.data import Scan
 from scanchain.errors import InputError, ScanchainError, counted, remedy_of
-from scanchain.files import without_keys
+from scanchain.files import without_keys, write_whole
 from scanchain.point_store import PointStore
 from scanchain.registration.matcher import CheckedMatcher, Matcher, create_matcher
 from scanchain.runs.directory import (
@@ -70,13 +70,13 @@ class Checkpoint:
 class Checkpoints:
     """Writer of checkpoints, at an interval at which they take at most 5 % of the time."""
 
-    def __init__(self, folder: Path, every_s: float, *, run_s: float = 0.0, process: int = 0) -> None:
-        """run_s : seconds that the ``process`` earlier processes took up to the checkpoint."""
+    def __init__(self, folder: Path, every_s: float, left: Checkpoint | None = None) -> None:
+        """Left : the checkpoint of the processes before, whose work counts as this one's."""
         self.path = folder / CHECKPOINT_FILE
         self.version = _version()
-        self.process = process
+        self.process = 0 if left is None else left.process + 1
         self.every_s = every_s
-        self.began_s = working_s() - run_s
+        self.began_s = working_s() - (0.0 if left is None else left.run_s)
         self.next_s = perf_counter() + every_s
 
     def are_due(self) -> bool:
@@ -90,18 +90,11 @@ class Checkpoints:
         """
         started = perf_counter()
         slam.points.flush()
-        state = working_s() - self.began_s, self.process, recorded_bytes, slam, steps
-        new = self.path.with_name(f"{self.path.name}.new")
-        try:
-            with new.open("wb") as file:
-                summed = _Summed(file)
-                summed.write(self.version)
-                _Pickler(summed, slam.config).dump(state)
-                file.write(summed.crc.to_bytes(_CRC_BYTES, "little"))
-            new.replace(self.path)
-        except BaseException:
-            new.unlink(missing_ok=True)
-            raise
+        file = io.BytesIO(self.version)
+        file.seek(0, os.SEEK_END)
+        _Pickler(file, slam.config).dump((working_s() - self.began_s, self.process, recorded_bytes, slam, steps))
+        file.write(zlib.crc32(file.getvalue()).to_bytes(_CRC_BYTES, "little"))
+        write_whole(self.path, file.getvalue())
         now = perf_counter()
         self.next_s = now + max(self.every_s, _LEISURE * (now - started))
 
@@ -135,21 +128,10 @@ def _version() -> bytes:
     return f"scanchain {package_version('scanchain')} (code {zlib.crc32(code):08x})\n".encode()
 
 
-class _Summed:
-    """A file, and the CRC-32 of what was written to it."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self.file, self.crc = file, 0
-
-    def write(self, data: bytes) -> int:
-        self.crc = zlib.crc32(data, self.crc)
-        return self.file.write(data)
-
-
 class _Pickler(pickle.Pickler):
     """Leaves out what lies in a file beside it, what runs in a thread, and objects of the user's own classes."""
 
-    def __init__(self, file: _Summed, config: Config) -> None:
+    def __init__(self, file: BinaryIO, config: Config) -> None:
         super().__init__(file, protocol=5)
         self.own = set(flatten(config).values())  # among them any MODULE:CLASS
 
@@ -214,9 +196,8 @@ def find_left(out: Path, config: Config) -> Checkpoint | None:
 
 def after(left: Checkpoint, scans: Generator[Scan, None, None]) -> Generator[Scan, None, None]:
     """The scans that follow those already done. Raises InputError where these were not the same."""
-    for index, *known in left.steps.columns[
-        ["index", "stamp_ns", "log_time_ns", "scan_points", "dropped"]
-    ].tolist():
+    names = ("index", "stamp_ns", "log_time_ns", "scan_points", "dropped")
+    for index, *known in zip(*(left.steps.columns[name].tolist() for name in names), strict=True):
         scan = next(scans, None)
         if scan is None or [scan.stamp_ns, scan.log_time_ns, len(scan.points), scan.dropped] != known:
             raise InputError(f"{left.folder}: scan {index} of the log is not the one that was run; {_REMEDY}")

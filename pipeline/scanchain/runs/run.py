@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, suppress
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from time import perf_counter
 
@@ -22,7 +22,7 @@ from scanchain.files import write_whole
 from scanchain.logs import Log, open_log
 from scanchain.logs.mounting import turned_by
 from scanchain.logs.topics import other_sensors
-from scanchain.preprocess import Prepared, Resolution, prepare, prepare_ahead
+from scanchain.preprocess import prepare_ahead
 from scanchain.runs.closures import final_verdicts
 from scanchain.runs.directory import (
     CHECKPOINT_FILE,
@@ -31,9 +31,8 @@ from scanchain.runs.directory import (
     RUN_FILE,
     TRUTH_FILE,
     RunDirectory,
-    left_behind,
     partial_runs,
-    writer_of,
+    stopped_run,
 )
 from scanchain.runs.job import Job, OpenRecorder, Progress, Recorder
 from scanchain.runs.metrics import (
@@ -45,9 +44,8 @@ from scanchain.runs.metrics import (
     measure,
     summary,
 )
-from scanchain.runs.overlay import OVERLAY_FILE, write_overlay
 from scanchain.runs.provenance import Hashing, describe_start
-from scanchain.runs.results import Results, record_results, results_of, write_results
+from scanchain.runs.results import OVERLAY_FILE, Results, record_results, results_of, write_overlay, write_results
 from scanchain.runs.resume import Checkpoints, after, find_left, rescued, resume_recording, set_aside
 from scanchain.runs.step_table import StepTable
 from scanchain.runs.vouching import evidence_of_run
@@ -58,7 +56,6 @@ from scanchain.trajectory import write_tum
 from scanchain.verdict import Judged, judge, worst_place
 
 _FEW_SCANS = 2  # scans whose trajectory shows at most one motion
-_TOGETHER = 16  # largest number of scans that are read together
 TruePoses = Callable[[NDArray[np.int64]], Trajectory | None]  # of scans with these stamps; may raise InputError
 _FOR_RESUMING = (CHECKPOINT_FILE, POINTS_FILE)
 
@@ -90,26 +87,20 @@ def run(
 
     Raises InputError for bad input, which leaves nothing behind unless scans were processed before it was met.
     """
-    job.check_logs()
-    with Hashing(job.logs) as hashing:  # from the beginning on: while the log is opened a core is idle
-        this = _Run(job, progress)
-        with (
-            this.directory,
-            announcing_compilation(progress.say, ("scanchain.runs.warm_up", str(this.log.dimension))),
-        ):
-            this.provenance.write(this.directory.path / RUN_FILE)
-            write_whole(this.directory.path / "config.toml", dump(this.config).encode())
-            try:
-                slam, scans, checkpoints = this.begin()
-                with this.recording(record) as recording:
-                    result = this.process(slam, scans, checkpoints, recording)
-                    results, judged = this.write(result, recording)
-                    slam.points.close()
-                    held_s = this.hold(recording)
-                metrics, text = this.judge(results, judged, recording.warnings, held_s)
-                return this.complete(metrics, text, hashing, report)
-            except (Exception, KeyboardInterrupt) as error:
-                raise rescued(error, this.directory, this.steps, this.provenance) from error
+    this = _Run(job, progress)
+    compiling = announcing_compilation(progress.say, ("scanchain.runs.warm_up", str(this.log.dimension)))
+    with this.directory, compiling:
+        try:
+            slam, scans = this.begin()
+            with this.recording(record) as recording:
+                result = this.process(slam, scans, recording)
+                results, judged = this.write(result, recording)
+                slam.points.close()
+                held_s = this.hold(recording)
+            metrics, text = this.judge(results, judged, recording.warnings, held_s)
+            return this.complete(metrics, text, report)
+        except (Exception, KeyboardInterrupt) as error:
+            raise rescued(error, this.directory, this.steps, this.provenance) from error
 
 
 class _Run:
@@ -118,24 +109,24 @@ class _Run:
     def __init__(self, job: Job, progress: Progress) -> None:
         """Open the log, and what a stopped run left. Raises InputError where either does not fit the job."""
         self.began_s, self.compiled_before_s = working_s(), compiled_s()
+        self.hashing = Hashing(job.logs)  # from the beginning on: while the log is opened a core is idle
         self.job, self.progress = job, progress
         self.log, settings, self.truth_file = opened(job)
         self.config, self.source = settings.config, settings.source
-        self.left = find_left(job.out, self.config) if job.resume else None
-        self.directory = RunDirectory(job.out, force=job.force, left=self.left and self.left.folder)
+        self.provenance = describe_start(job.command, job.logs, self.source)
+        self.steps, self.notes = StepTable(), list[str]()
+        self.left = left = find_left(job.out, self.config) if job.resume else None
+        self.directory = RunDirectory(job.out, force=job.force, left=left and left.folder)
+        self.checkpoints = Checkpoints(self.directory.path, job.checkpoint_s, left)
         log = self.log
-        _check_prior(log, self.config)
         progress.say(f"{log.topic}: {log.dimension}D, {counted(log.scan_count, 'scan')}; {self.source}")
         for gap in log.gaps:
             progress.announce(f"warning: {gap}")
-        self.provenance = describe_start(job.command, job.logs, self.source)
-        self.notes: list[str] = []
-        self.steps = StepTable()
-        if self.left is not None:
-            self.steps = self.left.steps
-            self.began_s -= self.left.run_s
-            progress.announce(f"resuming after {counted(len(self.steps), 'scan')} of {self.left.folder.name}")
-        elif (idle := left_behind(job.out)) is not None and not writer_of(idle):
+        if left is not None:
+            self.steps = left.steps
+            self.began_s -= left.run_s
+            progress.announce(f"resuming after {counted(len(self.steps), 'scan')} of {left.folder.name}")
+        elif idle := stopped_run(job.out):
             progress.announce(
                 f"{idle.name} is of a run that was stopped; --resume would continue it, this run starts over and "
                 "removes it once complete"
@@ -144,20 +135,18 @@ class _Run:
             names = ", ".join(path.name for path in begun)
             progress.announce(f"{names}: no checkpoint to resume from, this run starts over")
 
-    def begin(self) -> tuple[Slam, Generator[Scan, None, None], Checkpoints]:
-        """SLAM, new or as of the checkpoint, the scans that follow, and the writer of checkpoints."""
-        folder, every_s, left = self.directory.path, self.job.checkpoint_s, self.left
+    def begin(self) -> tuple[Slam, Generator[Scan, None, None]]:
+        """SLAM, new or as of the checkpoint, and the scans that follow; the directory states what is run in it."""
+        folder, left = self.directory.path, self.left
+        self.provenance.write(folder / RUN_FILE)
+        write_whole(folder / "config.toml", dump(self.config).encode())
         scans = self.log.scans(self.config.preprocess)
         if left is None:
-            return (
-                Slam(self.config, self.log.T_base_lidar, folder / POINTS_FILE),
-                scans,
-                Checkpoints(folder, every_s),
-            )
+            return Slam(self.config, self.log.T_base_lidar, folder / POINTS_FILE), scans
         left.slam.points.reopen(folder / POINTS_FILE)
         scans = after(left, scans)
         set_aside(folder, left)
-        return left.slam, scans, Checkpoints(folder, every_s, run_s=left.run_s, process=left.process + 1)
+        return left.slam, scans
 
     def recording(self, record: OpenRecorder) -> AbstractContextManager[Recorder]:
         """The recording, to be entered before the first scan."""
@@ -169,17 +158,18 @@ class _Run:
             config=self.config.recording,
         )
 
-    def process(
-        self, slam: Slam, scans: Generator[Scan, None, None], checkpoints: Checkpoints, recording: Recorder
-    ) -> SlamResult:
+    def process(self, slam: Slam, scans: Generator[Scan, None, None], recording: Recorder) -> SlamResult:
         """Place every scan, from the first on or from the checkpoint."""
+        checkpoints = self.checkpoints
         if recording.web_address:
             self.progress.announce(f"viewer: {recording.web_address}")
         if self.left is not None:
             self.notes.append(resume_recording(self.directory.path, self.left, recording, checkpoints))
         with closing(scans):  # what it left out is counted then, also if the run was stopped
             tracked = self.progress.track(self._previewed(scans, recording), self.log.scan_count - len(self.steps))
-            for scan in _ahead(tracked, slam):
+            if slam.dimension == 3 and threads() > 1:
+                tracked = prepare_ahead(tracked, slam.front_end.odometry.resolution)
+            for scan in tracked:
                 step = slam.place(slam.front_end.locate(scan))
                 self.steps.append(step)
                 recording.log(step)
@@ -248,12 +238,12 @@ class _Run:
             (folder / "summary.txt").write_text(text, encoding="utf-8")
         return metrics, text
 
-    def complete(self, metrics: Metrics, text: str, hashing: Hashing, report: Callable[[Path], None]) -> Finished:
+    def complete(self, metrics: Metrics, text: str, report: Callable[[Path], None]) -> Finished:
         """Add the report and give a complete run its name; a stopped one stays marked partial."""
         directory, stopped, warnings = self.directory, metrics.stopped, metrics.warnings
         if stopped:
             directory.worth_keeping()
-        made = self.provenance if stopped else self.provenance.hashed(hashing)
+        made = self.provenance if stopped else self.provenance.hashed(self.hashing)
         made = msgspec.structs.replace(
             made, complete=not stopped, stopped=stopped, duration_s=metrics.run_s + metrics.compile_s
         )
@@ -273,53 +263,30 @@ class _Run:
         return true_poses(self.log, self.truth_file, self.progress, stamps_ns)
 
 
-def _ahead(scans: Iterator[Scan], slam: Slam) -> Iterator[Scan | Prepared]:
-    """The scans, clouds prepared in a thread beside; laser scans a few at once, which is quicker than either."""
-    resolution = slam.front_end.odometry.resolution
-    if slam.dimension == 3 and threads() > 1:
-        yield from prepare_ahead(scans, resolution)
-    elif resolution.is_fixed:
-        yield from few_at_once(scans, resolution)
-    else:
-        yield from scans
-
-
-def few_at_once(scans: Iterator[Scan], resolution: Resolution) -> Iterator[Prepared]:
-    """Scans, a few read and prepared together; those before an error come before this."""
-    while True:
-        some: list[Prepared] = []
-        try:
-            some.extend(prepare(scan, resolution) for scan in islice(scans, _TOGETHER))
-        except BaseException:  # of the log, or the user's wish to end
-            yield from some
-            raise
-        if not some:
-            return
-        yield from some
-
-
 def opened(job: Job) -> tuple[Log, Settings, TruthFile | None]:
-    """The log of a job, the settings for it, and the ground truth if a file is named. Raises InputError."""
+    """The log of a job, the settings for it, and the ground truth if a file is named.
+
+    Raises InputError for what does not fit together, before anything is processed.
+    """
+    for source, count in Counter(source.resolve() for source in job.logs).items():
+        if count > 1:
+            raise InputError(f"{source}: is named {count} times; name each file of a log once")
     truth_file = None if job.ground_truth is None else read_truth(job.ground_truth)
     early = load_settings(file=job.config_file, overrides=job.overrides)
     RunDirectory(job.out, force=job.force)  # refused before the log is read
     log = open_log(job.logs, early.config.log)
     settings = load_settings(log.dimension, file=job.config_file, overrides=job.overrides)
-    _check_truth(job, log, truth_file)
-    return log, settings, truth_file
-
-
-def _check_prior(log: Log, config: Config) -> None:
-    """Refuse a prior that the log does not have before anything is processed."""
-    if config.odometry.prior == "wheel" and not log.has_odometry:
+    if settings.config.odometry.prior == "wheel" and not log.has_odometry:
         raise InputError(
             f"{log.name}: odometry.prior is 'wheel', but the log has no wheel odometry that is known; "
             "set log.odometry_topic, or odometry.prior to 'auto'"
         )
+    _check_truth(job, log, truth_file)
+    return log, settings, truth_file
 
 
 def _check_truth(job: Job, log: Log, file: TruthFile | None) -> None:
-    """Refuse a ground truth that was named and has no time in common with the scans before they are processed."""
+    """Refuse a ground truth that was named and has no time in common with the scans."""
     if file is not None:
         file.check(log.expected_stamps(log.topic), log.scan_count)
         return

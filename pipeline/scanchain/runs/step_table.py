@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix, Pose, State, Step, Trajectory
 from scanchain.evaluation import motion_nees, pair
-from scanchain.graph.growing_array import GrowingArray
+from scanchain.graph.growing_array import Columns
 from scanchain.verdict import check_overlap, check_velocity, check_wheels
 
 if TYPE_CHECKING:
@@ -26,60 +26,38 @@ class StepTable:
     """Figures of all steps in columns, without their points: a step takes microseconds, and under a kilobyte."""
 
     def __init__(self) -> None:
-        self._steps: GrowingArray | None = None
-        self._texts: dict[str, int] = {}
+        self.columns = Columns()
 
     def __len__(self) -> int:
-        return 0 if self._steps is None else len(self._steps)
+        return len(self.columns)
 
     def append(self, step: Step) -> None:
         """Keep one step."""
-        scan, match, timing = step.scan, step.match, step.timing
-        if self._steps is None:
-            self._steps = GrowingArray((), _layout(len(step.T_odom_lidar), len(match.information)))
-        row = {
-            "index": scan.index,
-            "stamp_ns": scan.stamp_ns,
-            "log_time_ns": scan.log_time_ns,
+        scan, match = step.scan, step.match
+        unknown = np.full_like(step.T_odom_lidar, np.nan)
+        self.columns.append({
             "scan_points": len(scan.points),
-            "dropped": scan.dropped,
-            "keyframe": step.keyframe,
-            "state": self._code(str(step.state)),
-            "reason": self._code(step.reason),
-            "match_reason": self._code(match.reason),
+            "match_reason": match.reason,
             "has_wheels": scan.T_odom_base is not None,
-            "starts_segment": step.starts_segment,
-            "is_copy": scan.is_copy,
-            "T_odom_lidar": step.T_odom_lidar,
-            "T_world_lidar": step.T_world_lidar,
-            "T_odom_base": np.nan if scan.T_odom_base is None else scan.T_odom_base,
-            "timing": [getattr(timing, f"{stage}_s") for stage in STAGES],
-            **{name: getattr(match, _FIELDS.get(name, name)) for name in _OF_MATCH},
-        }
-        self._steps.append(tuple(row[name] for name in self._steps.rows.dtype.names or ()))
-
-    @property
-    def columns(self) -> NDArray[np.void]:
-        """(N,) the steps as a structured array; ``texts`` has what state and reasons refer to."""
-        return np.empty(0, _layout(3, 3)) if self._steps is None else self._steps.rows
+            "T_odom_base": unknown if scan.T_odom_base is None else scan.T_odom_base,
+            "timing": [getattr(step.timing, f"{stage}_s") for stage in STAGES],
+            "cost_m2": match.cost,
+            **{name: getattr(scan, name) for name in _OF_SCAN},
+            **{name: getattr(step, name) for name in _OF_STEP},
+            **{name: getattr(match, name) for name in _OF_MATCH},
+        })  # fmt: skip
 
     @property
     def last_state(self) -> State:
         """State of the last step."""
-        return State(list(self._texts)[self.columns["state"][-1]])
+        return State(self.columns.texts[self.columns["state"][-1]])
 
-    def texts(self, codes: NDArray[np.int64]) -> pa.DictionaryArray:
-        """Texts (N,) of these codes."""
+    def texts(self, name: str) -> pa.DictionaryArray:
+        """Texts (N,) of a column, in the order in which they occur."""
         import pyarrow as pa
 
-        used, places = np.unique(codes, return_inverse=True)
-        first = np.unique(codes, return_index=True)[1]
-        order = np.argsort(first)  # as they occur
-        names = list(self._texts)
-        return pa.DictionaryArray.from_arrays(
-            pa.array(np.argsort(order)[places].astype(np.int32)),
-            pa.array([names[used[k]] for k in order.tolist()]),
-        )
+        names = self.columns.texts
+        return pa.array([names[code] for code in self.columns[name].tolist()], pa.string()).dictionary_encode()
 
     @property
     def odometry(self) -> Trajectory:
@@ -104,9 +82,8 @@ class StepTable:
 
     def states(self) -> Counter[State]:
         """Number of steps in each state."""
-        codes, counts = np.unique(self.columns["state"], return_counts=True)
-        names = list(self._texts)
-        return Counter({State(names[code]): count for code, count in zip(codes, counts.tolist(), strict=True)})
+        names = self.columns.texts
+        return Counter(State(names[code]) for code in self.columns["state"].tolist())
 
     def write(self, path: Path, trajectory: Trajectory, T_base_lidar: Pose | None = None) -> None:
         """Write the table; ``trajectory`` has the final pose of each step, ``T_base_lidar`` is for the wheels."""
@@ -126,14 +103,13 @@ class StepTable:
             **{f"odom_{name}": values for name, values in pose_columns(steps["T_odom_lidar"]).items()},
             **self._checks(steps, trajectory, T_base_lidar),
             "covariance": _lists(covariances, ~is_sound),
-            **{name: steps[name] for name in ("scan_points", "dropped", *_OF_MATCH[:6])},
-            "converged": steps["converged"],
-            "match_reason": self.texts(steps["match_reason"]),
+            **{name: steps[name] for name in ("scan_points", "dropped", *_OF_MATCH[:5], "cost_m2", "converged")},
+            "match_reason": self.texts("match_reason"),
             "degeneracy_eigenvalue": steps["degeneracy_eigenvalue"],
             "observability": steps["observability"],
             "degeneracy_direction": _lists(steps["degeneracy_direction"]),
-            "state": self.texts(steps["state"]),
-            "reason": self.texts(steps["reason"]),
+            "state": self.texts("state"),
+            "reason": self.texts("reason"),
             "starts_segment": steps["starts_segment"],
             "is_copy": steps["is_copy"],
             "keyframe": steps["keyframe"],
@@ -145,12 +121,7 @@ class StepTable:
         }
         return pa.table(arrays).replace_schema_metadata(_NOTES)
 
-    def _code(self, text: str) -> int:
-        return self._texts.setdefault(text, len(self._texts))
-
-    def _checks(
-        self, steps: NDArray[np.void], trajectory: Trajectory, T_base_lidar: Pose | None
-    ) -> dict[str, object]:
+    def _checks(self, steps: Columns, trajectory: Trajectory, T_base_lidar: Pose | None) -> dict[str, object]:
         """Poses by the wheels, and normalized innovations of the independent checks, null where there are none."""
         import pyarrow as pa
 
@@ -171,17 +142,17 @@ class StepTable:
         return Trajectory(steps["stamp_ns"].copy(), steps[name].copy())
 
 
-def inlier_shares(steps: NDArray[np.void]) -> NDArray[np.float64]:
+def inlier_shares(steps: Columns) -> NDArray[np.float64]:
     """``Match.inlier_share`` of steps (N,) in columns."""
     return steps["inliers"] / np.maximum(steps["points"], 1)
 
 
-_OF_MATCH = (  # as columns; all of a match but its reason
-    "points", "inliers", "iterations", "residual_m", "fit", "cost_m2", "converged", "at_minimum",
-    "degeneracy_eigenvalue", "observability", "degeneracy_direction", "information", "T_target_source",
-    "variance_factor",
+_OF_SCAN = ("index", "stamp_ns", "log_time_ns", "dropped", "is_copy")
+_OF_STEP = ("keyframe", "state", "reason", "starts_segment", "T_odom_lidar", "T_world_lidar")
+_OF_MATCH = (
+    "points", "inliers", "iterations", "residual_m", "fit", "converged", "degeneracy_eigenvalue", "observability",
+    "degeneracy_direction", "information", "variance_factor",
 )  # fmt: skip
-_FIELDS = {"cost_m2": "cost"}  # of a match, where the column has another name
 STAGES = ("read", "preprocess", "match", "map", "loops")
 _NOTES = {
     "x y z qx qy qz qw": "T_world_lidar after optimization, meters; odom_*: T_odom_lidar before it; "
@@ -197,25 +168,6 @@ _NOTES = {
     "overlap_ratio": "share of the points with a correspondence over its median in the scans before",
     "keyframe": "number in the graph, -1 if none was made",
 }
-
-
-def _layout(size: int, k: int) -> np.dtype[np.void]:
-    """Columns of steps with poses (size, size) and twists (k,)."""
-    pose = (np.float64, (size, size))
-    whole = dict.fromkeys(("index", "stamp_ns", "log_time_ns", "scan_points", "dropped", "keyframe"), np.int64)
-    codes = dict.fromkeys(("state", "reason", "match_reason"), np.int32)
-    flags = dict.fromkeys(("has_wheels", "starts_segment", "is_copy", "converged", "at_minimum"), np.bool_)
-    counts = dict.fromkeys(("points", "inliers", "iterations"), np.int64)
-    numbers = dict.fromkeys(
-        ("residual_m", "fit", "cost_m2", "degeneracy_eigenvalue", "observability", "variance_factor"), np.float64
-    )
-    arrays = {
-        **dict.fromkeys(("T_odom_lidar", "T_world_lidar", "T_target_source", "T_odom_base"), pose),
-        "information": (np.float64, (k, k)),
-        "degeneracy_direction": (np.float64, (k,)),
-        "timing": (np.float64, (len(STAGES),)),
-    }
-    return np.dtype(list((whole | counts | codes | flags | numbers | arrays).items()))
 
 
 def _lists(rows: Matrix, is_null: NDArray[np.bool_] | None = None) -> pa.FixedSizeListArray:
@@ -244,7 +196,7 @@ def _wheel_columns(poses: Matrix) -> dict[str, object]:
     return {f"wheel_{name}": pa.array(values, mask=~known) for name, values in columns.items()}
 
 
-def _covariances(steps: NDArray[np.void]) -> tuple[Matrix, NDArray[np.bool_]]:
+def _covariances(steps: Columns) -> tuple[Matrix, NDArray[np.bool_]]:
     """Covariances (N, k, k) of the matches of steps in columns, and True where there is one (N,)."""
     informations = steps["information"]
     finite = np.atleast_1d(np.isfinite(informations).all(axis=(1, 2)))

@@ -149,8 +149,8 @@ def localize(
             "the same kind"
         )
     progress.say(f"{log.topic}: {counted(log.scan_count, 'scan')}; map {prior.name}")
-    provenance = describe_start(job.command, job.logs, settings.source)
-    with RunDirectory(job.out, force=job.force) as directory, Hashing(job.logs) as hashing:
+    provenance, hashing = describe_start(job.command, job.logs, settings.source), Hashing(job.logs)
+    with RunDirectory(job.out, force=job.force) as directory:
         provenance.write(directory.path / RUN_FILE)
         write_whole(directory.path / "config.toml", dump(config).encode())
         localizer = _followed(log, prior, config, initial, directory.path / POINTS_FILE, progress)

@@ -17,13 +17,13 @@ from scipy.spatial import KDTree
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import REJECTED_WEIGHT, Keyframe, KeyframePoints, Matrix, Points, Trajectory
+from scanchain.data import REJECTED_WEIGHT, Closure, Keyframe, KeyframePoints, Matrix, Points, Trajectory
 from scanchain.errors import InputError
 from scanchain.graph.g2o import write_g2o
 from scanchain.loops import refined, spread
 from scanchain.maps import MAP_FOLDER, SavedMap, Session, write_map, write_ply, write_saved_map
 from scanchain.point_store import PointStore
-from scanchain.runs.closures import FinalClosure, final_verdicts, write_closures
+from scanchain.runs.closures import final_verdicts, write_closures
 from scanchain.runs.directory import directory_name
 from scanchain.runs.results import GRAPH_FILE, Cloud, grid_of
 from scanchain.sessions.changes import Label, Part, changes_between
@@ -119,7 +119,7 @@ def merged_map(
     return updated(merged, config) if update else merged
 
 
-def final_closures(merged: MergedMap) -> tuple[FinalClosure, ...]:
+def final_closures(merged: MergedMap) -> tuple[Closure, ...]:
     """Every closure tried between maps with its final verdict."""
     state, edges = graph_of(merged.joined).state(), merged.joined.edges
     order = np.argsort(edges.is_loop, kind="stable")  # of the state: odometry first
@@ -127,9 +127,7 @@ def final_closures(merged: MergedMap) -> tuple[FinalClosure, ...]:
     return final_verdicts(merged.joined.closures, replace(state, is_loop=between, weight=edges.weight[order]))
 
 
-def write_merged(
-    folder: Path, merged: MergedMap, cloud: Cloud, final: Sequence[FinalClosure], config: Config
-) -> None:
+def write_merged(folder: Path, merged: MergedMap, cloud: Cloud, final: Sequence[Closure], config: Config) -> None:
     """Write map, trajectories, point cloud, grid, graph and closures into a directory."""
     edges, keyframes, poses = merged.joined.edges, merged.keyframes, merged.T_world_keyframes
     in_force = edges.where(edges.weight >= REJECTED_WEIGHT)
@@ -139,7 +137,7 @@ def write_merged(
         write_tum(folder / f"{session.name}.tum", trajectory, force=True)
     write_ply(folder / "map.ply", cloud.points)
     if merged.joined.dimension == 2:
-        write_map(folder, grid_of(merged, config.maps))
+        write_map(folder, grid_of(keyframes, poses, config.maps))
     write_g2o(folder / GRAPH_FILE, graph_of(replace(merged.joined, edges=in_force)))
     write_closures(folder / "loops.parquet", final, merged.keyframes, merged.joined.dimension)
 

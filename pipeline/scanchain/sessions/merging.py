@@ -11,12 +11,11 @@ import msgspec
 
 from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.config import Config
-from scanchain.data import REJECTED_WEIGHT, ClosureVerdict, brief
+from scanchain.data import REJECTED_WEIGHT, Closure, ClosureVerdict, brief
 from scanchain.errors import InputError, ScanchainError, counted
 from scanchain.files import write_whole
 from scanchain.graph.optimization import fit
 from scanchain.maps import SavedMap, Session, open_saved_map
-from scanchain.runs.closures import FinalClosure
 from scanchain.runs.directory import RUN_FILE, RunDirectory
 from scanchain.runs.job import Progress
 from scanchain.runs.provenance import Hashing, describe_start
@@ -121,14 +120,14 @@ def merge(
     config, held, folders = settings.config, 0 if fixed else -1, [saved.folder for saved in maps]
     order = _canonical(maps, held)
     names = session_names(maps, order)
-    provenance = describe_start(command, folders, settings.source)
-    with directory, announcing_compilation(progress.say), Hashing(folders) as hashing:
+    provenance, hashing = describe_start(command, folders, settings.source), Hashing(folders)
+    with directory, announcing_compilation(progress.say):
         firsts = [names[number, 0] for number in range(len(maps))]
         groups, uncertain = join_all(maps, order, firsts, config, held, progress.say)
         joined = _chosen(groups, held, maps, uncertain)
         progress.say(f"making the map of {counted(len(joined.keyframes), 'keyframe')}")
         merged = merged_map(joined, maps, names, config, first=min(joined.maps), held=held, update=update)
-        cloud, final = cloud_of(merged, config), final_closures(merged)
+        cloud, final = cloud_of(merged.keyframes, merged.T_world_keyframes, config), final_closures(merged)
         write_merged(directory.path, merged, cloud, final, config)
         apart = tuple(
             tuple(names[number, k] for number in group.maps for k in range(len(maps[number].sessions)))
@@ -233,7 +232,7 @@ def _changed_text(name: str, share: float) -> str:
 
 
 def _measured(
-    merged: MergedMap, cloud: Cloud, final: Sequence[FinalClosure], config: Config, held: int
+    merged: MergedMap, cloud: Cloud, final: Sequence[Closure], config: Config, held: int
 ) -> MergeMetrics:
     """The metrics of a map but for what joined it."""
     graph = graph_of(merged.joined, held)

@@ -21,7 +21,7 @@ from scanchain.evaluation import on_the_estimate
 from scanchain.evaluation.absolute import path_length
 from scanchain.maps import SavedMap, open_saved_map, read_map, read_ply
 from scanchain.runs.directory import TRUTH_FILE
-from scanchain.runs.overlay import Overlay
+from scanchain.runs.results import Overlay
 from scanchain.trajectory import read_tum
 from scanchain.verdict import Kind, Stretch
 from scanchain_viz.colors import STRETCH_COLORS, TRUTH, color_of, height_shares, palette_of

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
@@ -11,7 +12,7 @@ import rerun as rr
 
 from scanchain import lie
 from scanchain.data import Closure, ClosureVerdict, GraphState, Matrix, State, Step
-from scanchain.runs.closures import FinalClosure, final_verdicts
+from scanchain.runs.closures import final_verdicts
 from scanchain.runs.step_table import STAGES, StepTable
 from scanchain_viz.recording import drawing, entities
 from scanchain_viz.recording.drawing import Floats, Message, Times
@@ -30,7 +31,8 @@ class KeyframeGraph:
 
     def __init__(self) -> None:
         self.positions: list[Floats] = []
-        self.closures: list[FinalClosure] = []
+        self.tried: list[Closure] = []  # with the verdicts of the matcher alone
+        self.closures: list[Closure] = []
         self.graph: GraphState | None = None
         self.counts = (0, 0)  # of closures accepted and rejected
         self.drawn = 0
@@ -43,21 +45,21 @@ class KeyframeGraph:
             self.is_current = False
         news: list[str] = []
         if step.closures:
-            found = [FinalClosure(c, c.verdict, c.cause, c.reason, 1.0, math.nan) for c in step.closures]
-            news += self._update([*self.closures, *found])  # verdicts of the matcher alone
+            self.tried += step.closures
+            news += self._update([*self.closures, *(replace(each, weight=1.0) for each in step.closures)])
         if step.graph is not None:
             self.graph = step.graph
-            news += self._update(final_verdicts([item.closure for item in self.closures], step.graph))
+            news += self._update(final_verdicts(self.tried, step.graph))
         return news
 
-    def settle(self, closures: Sequence[FinalClosure], graph: GraphState) -> list[str]:
+    def settle(self, closures: Sequence[Closure], graph: GraphState) -> list[str]:
         """Take in the final graph with every closure tried."""
         self.graph, self.is_current = graph, False
         return self._update(closures)
 
     def restore(self, positions: Floats, closures: Sequence[Closure], graph: GraphState) -> None:
         """Restore the state after keyframes at these positions from the closures and the graph at that time."""
-        self.graph = graph
+        self.graph, self.tried = graph, list(closures)
         self._update(final_verdicts(closures, graph))
         for position in positions:
             self.positions.append(position)
@@ -78,8 +80,8 @@ class KeyframeGraph:
         if self.graph is not None:
             nodes[: len(self.graph.poses)] = drawing.positions(self.graph.poses)
 
-        def edges(closures: list[FinalClosure]) -> Floats:
-            pairs = [(item.closure.target, item.closure.source) for item in closures]
+        def edges(closures: list[Closure]) -> Floats:
+            pairs = [(item.target, item.source) for item in closures]
             return nodes[np.array(pairs, np.int64).reshape(-1, 2)]
 
         accepted = self._of(ClosureVerdict.ACCEPTED)
@@ -91,16 +93,16 @@ class KeyframeGraph:
             Message(entities.REJECTED, drawing.lines(edges(self._of(ClosureVerdict.REJECTED))), times),
         ]
 
-    def _of(self, verdict: ClosureVerdict) -> list[FinalClosure]:
+    def _of(self, verdict: ClosureVerdict) -> list[Closure]:
         return [item for item in self.closures if item.verdict is verdict]
 
-    def _update(self, closures: Sequence[FinalClosure]) -> list[str]:
+    def _update(self, closures: Sequence[Closure]) -> list[str]:
         """Store the verdicts; a line for each new one, the number being the closure's row in loops.parquet."""
         before = [item.verdict for item in self.closures]
         self.closures = list(closures)
         self.counts = len(self._of(ClosureVerdict.ACCEPTED)), len(self._of(ClosureVerdict.REJECTED))
         return [
-            f"closure {number} ({item.closure.target} to {item.closure.source}) {item.verdict}: {item.reason}"
+            f"closure {number} ({item.target} to {item.source}) {item.verdict}: {item.reason}"
             for number, item in enumerate(closures)
             if number >= len(before) or item.verdict is not before[number]
         ]
@@ -178,7 +180,7 @@ class Batcher:
             *self._counts(counts, times),
         ]
 
-    def settled(self, closures: Sequence[FinalClosure], graph: GraphState, times: Times) -> list[Message]:
+    def settled(self, closures: Sequence[Closure], graph: GraphState, times: Times) -> list[Message]:
         """All that is left, and the final verdicts at ``times``, of the last step; their numbers in any case."""
         messages, news, self.last_counts = self.messages(), self.graph.settle(closures, graph), None
         told = events([[(_INFORMATION, text) for text in news]], times)

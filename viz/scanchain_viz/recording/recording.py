@@ -21,7 +21,6 @@ from rerun.error_utils import catch_and_log_exceptions
 from scanchain.config import RecordingConfig
 from scanchain.data import Closure, GraphState, Matrix, Scan, Step, Trajectory
 from scanchain.errors import InputError
-from scanchain.runs.closures import FinalClosure
 from scanchain.runs.job import SinkName
 from scanchain.runs.step_table import StepTable
 from scanchain.verdict import Judged, Kind
@@ -160,7 +159,7 @@ class Recording:
         yield Message(entities.OPTIMIZED_LIDAR, drawing.transforms(poses_optimized), times)
 
     @_recorded
-    def log_closures(self, closures: Sequence[FinalClosure], graph: GraphState) -> Iterable[Message]:
+    def log_closures(self, closures: Sequence[Closure], graph: GraphState) -> Iterable[Message]:
         """Record the final graph and the final verdict on every closure, at the last scan."""
         return self.batcher.settled(closures, graph, self.now)
 

@@ -11,7 +11,7 @@ from urllib.parse import quote
 import numpy as np
 from markupsafe import Markup
 
-from scanchain.batch.table import totals
+from scanchain.batch.batch import totals
 from scanchain.batch.task import Row, State, output_file
 from scanchain.errors import counted
 from scanchain.files import source_of, without_keys

@@ -12,14 +12,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from scanchain.data import Points, State
+from scanchain.data import BACK_END, Points, State
 from scanchain.errors import counted
 from scanchain.maps import read_ply
-from scanchain.runs.closures import BACK_END
 from scanchain.runs.directory import RUN_FILE, TRUTH_FILE
 from scanchain.runs.metrics import VERDICT, GroundTruth, Metrics
-from scanchain.runs.overlay import OVERLAY_FILE, read_overlay
 from scanchain.runs.provenance import Provenance
+from scanchain.runs.results import OVERLAY_FILE, read_overlay
 from scanchain.runs.step_table import STAGES
 from scanchain.settings import read_layer
 from scanchain.trajectory import read_tum
