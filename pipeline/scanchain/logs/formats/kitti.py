@@ -29,16 +29,6 @@ _MOST_LATITUDE = 89.0  # largest latitude in degrees; Mercator's projection has 
 _NS = 1_000_000_000
 
 
-def claims_kitti_raw(path: Path, _: bytes) -> bool:
-    """True for the folder of a drive."""
-    return (path / "velodyne_points").is_dir()
-
-
-def claims_kitti_odometry(path: Path, _: bytes) -> bool:
-    """True for the folder of a sequence."""
-    return (path / "velodyne").is_dir() and (path / "times.txt").is_file()
-
-
 def index_kitti_raw(folder: Path, number: int) -> FileIndex:
     """A drive of the raw recordings (``..._sync``); truth is its GPS/INS, moved to the lidar."""
     files = _sweeps(folder / "velodyne_points" / "data")

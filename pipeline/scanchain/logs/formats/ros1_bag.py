@@ -124,11 +124,6 @@ def _read_fields(head: bytes) -> dict[bytes, bytes] | None:
     return fields
 
 
-def claims_ros1_bag(_: Path, head: bytes) -> bool:
-    """True if a file begins as a bag of any version does."""
-    return head.startswith(b"#ROSBAG")
-
-
 def index_ros1_bag(path: Path, number: int) -> FileIndex:
     """Index of a bag. Raises InputError for one that is empty, encrypted or of an old version."""
     with path.open("rb") as file:

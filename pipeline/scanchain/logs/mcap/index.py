@@ -55,11 +55,6 @@ _LOOSE_BYTES = 1 << 20  # messages outside chunks are read in blocks of about th
 _WINDOW = 1 << 20  # bytes searched at once
 
 
-def claims_mcap(path: Path, head: bytes) -> bool:
-    """True if a file begins as MCAP does, or is empty, which is refused as a file of MCAP."""
-    return head.startswith(MAGIC) or not (head or path.is_dir())
-
-
 def index_file(path: Path, number: int, source: Source | None = None) -> FileIndex:
     """Index of one file, the ``number``-th of a log. Raises InputError for what is no MCAP file at all.
 
