@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from collections.abc import Set as AbstractSet
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -122,7 +123,9 @@ def read_times(file: Path) -> list[int]:
     times_ns: list[int] = []
     for number, line in enumerate(map(str.strip, _lines(file)), start=1):
         try:
-            times_ns.append(int(np.datetime64(line, "ns").astype(np.int64)))
+            whole, _, fraction = line.partition(".")
+            moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
+            times_ns.append(int(moment.timestamp()) * _NS + int(fraction.ljust(9, "0")[:9]))
             if not 0 <= times_ns[-1] < LATEST_NS:
                 raise ValueError("before 1970 or after 2038")
         except ValueError as error:
