@@ -13,19 +13,14 @@ from scanchain.errors import InputError
 from scanchain.files import Source
 from scanchain.logs.files import RemoteFile, fetch_whole, misspelled
 from scanchain.logs.formats import UnknownFormatError, left_out, natural_order
-from scanchain.logs.formats.carmen import claims_carmen, index_carmen
-from scanchain.logs.formats.clouds import SUFFIXES, claims_clouds, index_clouds
-from scanchain.logs.formats.kitti import (
-    claims_kitti_odometry,
-    claims_kitti_raw,
-    index_kitti_odometry,
-    index_kitti_raw,
-)
-from scanchain.logs.formats.ros1_bag import claims_ros1_bag, index_ros1_bag
-from scanchain.logs.formats.ros2_bag import claims_ros2_bag, index_ros2_bag, parts_of_bag
+from scanchain.logs.formats.carmen import index_carmen, is_carmen
+from scanchain.logs.formats.clouds import SUFFIXES, index_clouds
+from scanchain.logs.formats.kitti import index_kitti_odometry, index_kitti_raw
+from scanchain.logs.formats.ros1_bag import index_ros1_bag
+from scanchain.logs.formats.ros2_bag import index_ros2_bag, parts_of_bag
 from scanchain.logs.formats.user import index_scans, load_format
-from scanchain.logs.mcap.index import claims_mcap, index_by_summary, index_file
-from scanchain.logs.mcap.records import FileIndex
+from scanchain.logs.mcap.index import index_by_summary, index_file
+from scanchain.logs.mcap.records import MAGIC, FileIndex
 from scanchain.logs.mcap.stream import are_parts, complete
 from scanchain.logs.topics import is_lidar
 
@@ -46,18 +41,34 @@ class LogFormat:
     index: Callable[..., FileIndex]
 
 
-FORMATS: dict[str, LogFormat] = {  # the first that claims a path reads it
-    "mcap": LogFormat("MCAP", claims_mcap, index_file),
-    "ros1": LogFormat("a ROS 1 .bag", claims_ros1_bag, index_ros1_bag),
-    "ros2": LogFormat("a ROS 2 .db3 or the folder of a ROS 2 bag", claims_ros2_bag, index_ros2_bag),
-    "carmen": LogFormat("a CARMEN .log or .clf (also .bz2, .gz)", claims_carmen, index_carmen),
-    "kitti-raw": LogFormat("a KITTI raw drive", claims_kitti_raw, index_kitti_raw),
-    "kitti-odometry": LogFormat("a KITTI odometry sequence", claims_kitti_odometry, index_kitti_odometry),
-    "clouds": LogFormat("a folder of PCD, PLY, .npy or .bin files", claims_clouds, index_clouds),
+FORMATS: dict[str, LogFormat] = {  # the first that claims a path reads it; an empty file is refused as MCAP
+    "mcap": LogFormat(
+        "MCAP", lambda path, head: head.startswith(MAGIC) or not (head or path.is_dir()), index_file
+    ),
+    "ros1": LogFormat("a ROS 1 .bag", lambda _, head: head.startswith(b"#ROSBAG"), index_ros1_bag),
+    "ros2": LogFormat(
+        "a ROS 2 .db3 or the folder of a ROS 2 bag",
+        lambda path, head: head.startswith(b"SQLite format 3\0") or (path / _BAG_FILE).is_file(),
+        index_ros2_bag,
+    ),
+    "carmen": LogFormat("a CARMEN .log or .clf (also .bz2, .gz)", lambda _, head: is_carmen(head), index_carmen),
+    "kitti-raw": LogFormat(
+        "a KITTI raw drive", lambda path, _: (path / "velodyne_points").is_dir(), index_kitti_raw
+    ),
+    "kitti-odometry": LogFormat(
+        "a KITTI odometry sequence",
+        lambda path, _: (path / "velodyne").is_dir() and (path / "times.txt").is_file(),
+        index_kitti_odometry,
+    ),
+    "clouds": LogFormat(
+        "a folder of PCD, PLY, .npy or .bin files",
+        lambda path, _: path.is_dir() and any(each.suffix.lower() in SUFFIXES for each in path.iterdir()),
+        index_clouds,
+    ),
 }
 AUTO = "auto"  # value of log.format: the format that claims the path
 
-_RUN_FILE = "run.json"
+_RUN_FILE, _BAG_FILE = "run.json", "metadata.yaml"
 _PART_SUFFIXES = (".mcap", ".bag", ".db3")
 _LOG_SUFFIXES = (*_PART_SUFFIXES, ".log", ".clf", ".bz2", ".gz")
 _POSE_GRAPH = re.compile(rb"^\s*(VERTEX|EDGE)(2|3|_\w+)?(:QUAT)?\s", re.MULTILINE)  # of g2o or TORO
@@ -185,7 +196,7 @@ def _parts(source: Source) -> Sequence[Source]:
     if not isinstance(source, Path) or not source.is_dir():
         return [source]
     path = source
-    if (path / "metadata.yaml").is_file():
+    if (path / _BAG_FILE).is_file():
         return parts_of_bag(path)
     for suffix in _PART_SUFFIXES:
         parts = sorted(path.glob(f"*{suffix}"), key=natural_order)
@@ -197,6 +208,6 @@ def _parts(source: Source) -> Sequence[Source]:
 def _other_parts(source: Source) -> list[str]:
     """A note on files beside the parts of a log that are no part."""
     parts = _parts(source)
-    if not isinstance(source, Path) or source in parts or (source / "metadata.yaml").is_file():
+    if not isinstance(source, Path) or source in parts or (source / _BAG_FILE).is_file():
         return []
     return left_out(source, Path(parts[0].name).suffix, (*_PART_SUFFIXES, *SUFFIXES))

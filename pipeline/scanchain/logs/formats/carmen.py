@@ -41,7 +41,7 @@ _MOST_RATIO, _LEAST_BYTES = 1000, 1 << 24  # largest ratio of packing, beyond so
 _AT_ONCE = 256  # bytes of text that are unpacked at once, of which damage loses all
 
 
-def claims_carmen(_: Path, head: bytes) -> bool:
+def is_carmen(head: bytes) -> bool:
     """True if a file is packed, or begins with a comment or a word in capitals and digits, as its lines do."""
     word = head.split(maxsplit=1)[0] if head.strip() else b""
     is_word = word.isascii() and word.replace(b"_", b"").isalnum() and word.isupper()

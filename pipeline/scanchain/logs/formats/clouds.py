@@ -234,11 +234,6 @@ def _ply_lines(file: IO[bytes]) -> Iterator[list[str]]:
     raise CloudFileError("is no PLY: its header does not end")
 
 
-def claims_clouds(path: Path, _: bytes) -> bool:
-    """True for a folder with such files."""
-    return path.is_dir() and any(entry.suffix.lower() in SUFFIXES for entry in path.iterdir())
-
-
 def index_clouds(folder: Path, number: int, rate_hz: float = 0.0, bin_columns: int = 4) -> FileIndex:
     """The files of a folder as the scans of /points.
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from collections.abc import Set as AbstractSet
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -27,16 +28,6 @@ Truth = list[tuple[int, Pose]]  # stamps in nanoseconds, and T_world_lidar
 _EARTH_M = 6378137.0
 _MOST_LATITUDE = 89.0  # largest latitude in degrees; Mercator's projection has no poles
 _NS = 1_000_000_000
-
-
-def claims_kitti_raw(path: Path, _: bytes) -> bool:
-    """True for the folder of a drive."""
-    return (path / "velodyne_points").is_dir()
-
-
-def claims_kitti_odometry(path: Path, _: bytes) -> bool:
-    """True for the folder of a sequence."""
-    return (path / "velodyne").is_dir() and (path / "times.txt").is_file()
 
 
 def index_kitti_raw(folder: Path, number: int) -> FileIndex:
@@ -132,7 +123,9 @@ def read_times(file: Path) -> list[int]:
     times_ns: list[int] = []
     for number, line in enumerate(map(str.strip, _lines(file)), start=1):
         try:
-            times_ns.append(int(np.datetime64(line, "ns").astype(np.int64)))
+            whole, _, fraction = line.partition(".")
+            moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
+            times_ns.append(int(moment.timestamp()) * _NS + int(fraction.ljust(9, "0")[:9]))
             if not 0 <= times_ns[-1] < LATEST_NS:
                 raise ValueError("before 1970 or after 2038")
         except ValueError as error:

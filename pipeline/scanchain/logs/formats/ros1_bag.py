@@ -1,6 +1,6 @@
 """ROS 1 bags: finished or cut off, indexed or not; their messages stay as they are.
 
-The records are walked as those of an MCAP file are, and what is damaged is passed over likewise.
+A finished bag is indexed by the records at its end; others are walked as MCAP files are, chunk by chunk.
 Format: https://wiki.ros.org/Bags/Format/2.0
 """
 
@@ -124,11 +124,6 @@ def _read_fields(head: bytes) -> dict[bytes, bytes] | None:
     return fields
 
 
-def claims_ros1_bag(_: Path, head: bytes) -> bool:
-    """True if a file begins as a bag of any version does."""
-    return head.startswith(b"#ROSBAG")
-
-
 def index_ros1_bag(path: Path, number: int) -> FileIndex:
     """Index of a bag. Raises InputError for one that is empty, encrypted or of an old version."""
     with path.open("rb") as file:
@@ -165,13 +160,11 @@ def _take_summary(index: FileIndex) -> bool:
                 _define(index, record, data)
             elif record.opcode == CHUNK_INFO:
                 index.blocks.append(_stated_chunk(index, record))
-        is_complete = (head.number(b"chunk_count"), head.number(b"conn_count")) == (
-            len(index.blocks),
-            len(index.channels),
-        )
+        stated = head.number(b"chunk_count"), head.number(b"conn_count")
     except (struct.error, ValueError):
         return False
-    return is_complete and begin > 0 and index.indexed_counts().keys() <= index.channels.keys()
+    is_complete = begin > 0 and stated == (len(index.blocks), len(index.channels))
+    return is_complete and index.indexed_counts().keys() <= index.channels.keys()
 
 
 def _stated_chunk(index: FileIndex, info: Record) -> Block:

@@ -21,17 +21,12 @@ _MOST_TRIES = 400  # largest number of tries to read parts of a damaged block
 _LATEST_NS = (1 << 63) - 1
 
 
-def claims_ros2_bag(path: Path, head: bytes) -> bool:
-    """True for an SQLite file, or a folder with a bag's metadata."""
-    return head.startswith(b"SQLite format 3\0") or (path / "metadata.yaml").is_file()
-
-
 def index_ros2_bag(path: Path, number: int) -> FileIndex:
     """The topics of a .db3 or the folder of a ROS 2 bag; blocks are spans of time. Raises InputError for none."""
     from rosbags import rosbag2
 
     try:
-        reader = rosbag2.Reader(path)
+        reader: Any = rosbag2.Reader(path)
         reader.open()
     except Exception as error:  # whatever a damaged file makes the libraries below raise
         raise InputError(

@@ -11,7 +11,7 @@ from __future__ import annotations
 import mmap
 import struct
 import zlib
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import replace
 from functools import lru_cache
 from io import BytesIO
@@ -53,11 +53,6 @@ _MODEST_CHUNK = 1 << 25  # size in bytes up to which a chunk's stated size is ac
 _MOST_TIMES = 20  # largest ratio of the unpacked to the stored size of a larger chunk
 _LOOSE_BYTES = 1 << 20  # messages outside chunks are read in blocks of about this size
 _WINDOW = 1 << 20  # bytes searched at once
-
-
-def claims_mcap(path: Path, head: bytes) -> bool:
-    """True if a file begins as MCAP does, or is empty, which is refused as a file of MCAP."""
-    return head.startswith(MAGIC) or not (head or path.is_dir())
 
 
 def index_file(path: Path, number: int, source: Source | None = None) -> FileIndex:
@@ -160,6 +155,7 @@ class Walk:
         self.entries: list[Entry] = []
         self.loose: list[tuple[int, int]] = []  # channel and log time of messages outside of chunks
         self.loose_from = 0
+        self.loose_sizes: deque[int] = deque(maxlen=8)  # of the records met last
 
     def walk(self) -> None:
         """Take in every record, and note what is damaged or missing."""
@@ -168,7 +164,7 @@ class Walk:
         offset, end = len(MAGIC), _record_end(index, len(MAGIC))
         while end or not self._takes_summary(offset):
             following = _record_end(index, end) if end else 0
-            if end and (following or _is_end(data, end)):
+            if end and (following or _is_end(data, end)) and not self._is_shortened(offset, end):
                 self._take(offset, end)
                 offset, end = end, following
                 continue
@@ -225,6 +221,16 @@ class Walk:
         channel, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(self.data, offset + RECORD.size)
         self.loose_from = self.loose_from if self.loose else offset
         self.loose.append((channel, log_time_ns))
+        if end - offset not in self.loose_sizes:
+            self.loose_sizes.append(end - offset)
+
+    def _is_shortened(self, offset: int, end: int) -> bool:
+        """True if a loose message ends in a whole one of a size met lately: so many bytes of it are missing."""
+        return self.data[offset] == MESSAGE and any(
+            RECORD.unpack_from(self.data, end - size) == (MESSAGE, size - RECORD.size)
+            for size in self.loose_sizes
+            if size < end - offset
+        )
 
     def _take_chunk(self, chunk: Block, offset: int) -> None:
         name = f"{self.index.path}: the chunk at byte {offset}"

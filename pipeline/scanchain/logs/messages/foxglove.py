@@ -190,21 +190,18 @@ def protobuf_parser(channel: Channel) -> Callable[[memoryview], Any]:
     from mcap_protobuf.decoder import DecoderFactory
 
     schema = Schema(data=channel.definition, encoding="protobuf", id=1, name=channel.type_name)
+    decode, broken = None, ""
     try:
         decode = DecoderFactory().decoder_for("protobuf", schema)
     except (McapError, DecodeError, TypeError, KeyError, RecursionError) as error:
-        reason = f"its schema {channel.type_name} is broken: {' '.join(str(error).split())}"
-        return lambda _: _complain(reason)
-    assert decode is not None
+        broken = f"its schema {channel.type_name} is broken: {' '.join(str(error).split())}"
 
     def parse(data: memoryview) -> Any:
+        if decode is None:
+            raise MalformedMessageError(broken)
         try:
             return decode(bytes(data))
         except DecodeError as error:
             raise MalformedMessageError(f"it is no Protobuf of its schema: {error}") from error
 
     return parse
-
-
-def _complain(reason: str) -> None:
-    raise MalformedMessageError(reason)
