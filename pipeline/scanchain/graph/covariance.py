@@ -18,18 +18,6 @@ from scanchain.graph.between import BetweenProblem, turns
 _NAMES = {3: ("x", "y", "yaw"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
 
 
-def own_covariances(problem: BetweenProblem) -> Matrix:
-    """Covariance (K, k, k) of every pose's twist in its own frame, T exp(ξ); the fixed ones zero, a point's 2 × 2.
-
-    By the selected inverse of H over such twists, which the problem's solver has factored. Twists are
-    (translation, rotation), so the units are m², m rad, rad².
-    """
-    k = problem.freedom
-    result = np.zeros((len(problem.variable), k, k))
-    result[problem.free] = problem.packing.blocks(problem.cholesky.inverse_blocks())[: len(problem.free)]
-    return result
-
-
 def relative_covariance(problem: BetweenProblem, poses: Matrix, i: int, j: int) -> Matrix:
     """Covariance (k, k) of a right twist on T_i⁻¹ T_j, Ad(T_j⁻¹) Cov(ξ_j − ξ_i) Ad(T_j⁻¹)ᵀ."""
     adjoint = lie.adjoint(lie.inverse(poses[j]))

@@ -136,17 +136,14 @@ def hanging(
 
 def weak_text(names: NDArray[np.int64]) -> str:
     """Poses that hang on weak edges as one line of text."""
-    return f"{_group(names)} by edges of less than a millionth of the usual information"
+    group = f"pose {names[0]}" if len(names) == 1 else f"poses {listed(names)} ({len(names):,})"
+    return f"{group} by edges of less than a millionth of the usual information"
 
 
 def lost_text(names: NDArray[np.int64]) -> str:
     """Poses that hang on edges of too little information as one line of text."""
-    hang = "hangs" if len(names) == 1 else "hang"
-    return f"{_group(names)} {hang} on edges of next to no information, {LOST:.0e} of the usual or less"
-
-
-def _group(names: NDArray[np.int64]) -> str:
-    return f"pose {names[0]}" if len(names) == 1 else f"poses {listed(names)} ({len(names):,})"
+    group = f"pose {names[0]} hangs" if len(names) == 1 else f"poses {listed(names)} ({len(names):,}) hang"
+    return f"{group} on edges of next to no information, {LOST:.0e} of the usual or less"
 
 
 def _shares(information: Matrix) -> Matrix:

@@ -15,7 +15,7 @@ from scanchain.errors import InputError, counted
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.certificate import Certificate, certify
 from scanchain.graph.cholesky import SingularMatrixError
-from scanchain.graph.covariance import own_covariances, pose_errors, relative_covariance
+from scanchain.graph.covariance import inverse_blocks, pose_errors, relative_covariance
 from scanchain.graph.edge_checks import (
     LOST,
     WEAK,
@@ -401,7 +401,8 @@ class PoseGraph:
     def covariances(self) -> Matrix:
         """Covariance (K, k, k) of every pose's right twist, T exp(ξ), by the edges in force, at the poses of now.
 
-        Raises InputError where these leave poses free, or as good as free.
+        By the selected inverse of H over such twists; zero for fixed poses, 2 × 2 for points: m², m rad, rad².
+        Raises InputError where the edges leave poses free, or as good as free.
         """
         problem, undetermined = self._prepared(), self._undetermined()
         if undetermined:
@@ -412,7 +413,9 @@ class PoseGraph:
             problem.cholesky.factorize(own_equations(problem, self.poses, information))
         except SingularMatrixError as error:
             raise self._singular(error, problem.free) from error
-        return own_covariances(problem)
+        result = np.zeros((len(self), self.freedom, self.freedom))
+        result[problem.free] = inverse_blocks(problem)[: len(problem.free)]
+        return result
 
     def pose_errors(self, count: int, seed: int = 0) -> NDArray[np.float64]:
         """Errors (count, K, k) of all poses, drawn from their joint distribution by the edges in force.
