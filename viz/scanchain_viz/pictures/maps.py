@@ -215,7 +215,11 @@ def draw_map(
     """
     drawn = (optimized, odometry, ground_truth, *(poses for _, poses in sessions))
     paths = [path for path in drawn if path is not None and len(path)]
-    low, high = _frame(paths, points, grid)
+    seen = np.empty((0, 2)) if points is None else points[:, :2]
+    if grid is not None:
+        cells, resolution_m, origin_m = grid
+        seen = np.array(origin_m) + resolution_m * np.argwhere(cells > 0)[:, ::-1]
+    low, high = _frame(paths, seen)
     figure = Plot.of_plan(low, high)
     if grid is not None:
         _draw_grid(figure, grid, low, high)
@@ -236,17 +240,11 @@ def draw_map(
     write_png(path, [(title, figure)], width_inches=_PNG_INCHES)
 
 
-def _frame(paths: list[Matrix], points: NDArray[np.floating] | None, grid: Grid | None) -> tuple[Floats, Floats]:
-    """Corners of the required view: every trajectory, the map without outliers, and a margin."""
+def _frame(paths: list[Matrix], seen: NDArray[np.floating]) -> tuple[Floats, Floats]:
+    """Corners of the required view: every trajectory, the map (M, 2) without outliers, and a margin."""
     corners: list[NDArray[np.floating]] = [path[:, :2, -1] for path in paths]
-    if points is not None and len(points):
-        corners.append(np.array(extent(points[:, :2])))
-    elif grid is not None:
-        cells, resolution_m, origin_m = grid
-        rows, columns = np.nonzero(cells > 0)
-        if len(rows):
-            seen = np.array(extent(np.stack([columns, rows], axis=-1).astype(np.float64)))
-            corners.append(np.array(origin_m) + resolution_m * seen)
+    if len(seen):
+        corners.append(np.array(extent(seen)))
     known = np.concatenate(corners) if corners else np.zeros((1, 2))
     low, high = known.min(axis=0), known.max(axis=0)
     margin = max(0.04 * float((high - low).max()), 1.0)

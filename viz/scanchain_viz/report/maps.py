@@ -26,7 +26,7 @@ from scanchain_viz.colors import CLOSURES, hex_of
 from scanchain_viz.pictures import maps
 from scanchain_viz.pictures.figure import INK, Line, Plot, broken
 from scanchain_viz.report import page
-from scanchain_viz.report.sections import chip, configuration, provenance_sections
+from scanchain_viz.report.sections import chip, configuration, provenance_sections, when
 
 _HEADS = (
     page.Head("session"),
@@ -61,7 +61,7 @@ def write_merge_report(directory: Path) -> None:
     whole = page.Page(
         title="Merged map",
         subtitle=summary.partition("\n")[0].removeprefix("merged").strip(),
-        facts=list(_merge_facts(metrics)),
+        facts=[*_merge_facts(metrics), ("made", when(made))],
         warnings=metrics.warnings,
         sections=(_merged_map(directory, drawn, metrics), _sessions(drawn, metrics)),
         collapsibles=(*provenance_sections(made, {}), configuration(directory)),
@@ -198,7 +198,8 @@ def write_changes_report(directory: Path, changes: Changes) -> None:
 def _changed(changes: Changes) -> Iterator[page.Section]:
     points = lie.lift_points(changes.points)
     chips = [page.Chip(label.name.lower(), _HEX[label]) for label in _ORDER]
-    plan = _changes_picture(points, changes, *maps.extent(points), is_wide=True)
+    corners = maps.surroundings(*maps.extent(points), [points])
+    plan = _changes_picture(points, changes, *corners, is_wide=True)
     drawing = page.Drawing("Plan", "Seen from above; boxes around clusters.", plan, is_wide=True)
     yield page.Section("Where", _HOW_TOLD, chips, [drawing])
     if changes.clusters:
