@@ -16,7 +16,7 @@ from scanchain.data import Matrix, Trajectory
 from scanchain.errors import InputError
 from scanchain.logs.writer import Link, LogWriter, pack_laser_scan, pack_odometry, pack_transforms, place
 from scanchain.simulation.another_day import Change, another_day, write_changes
-from scanchain.simulation.motion import Motion, wheel_odometry
+from scanchain.simulation.motion import Motion, begun_at, laps, pivots, wheel_odometry
 from scanchain.simulation.sensors import SENSORS, Sensor, Sweep, take_sweep
 from scanchain.simulation.solids import Solids
 from scanchain.simulation.worlds import WORLDS, World
@@ -87,13 +87,12 @@ def plan(
     if isinstance(scene.route, tuple) and (reverse or start_m):
         raise InputError(f"{world} is no route round which one could drive; leave reverse and start_m out")
     solids = scene.build(random_numbers(seed, PLACE))
-    motion = scene.motion(
-        solids,
-        duration_s=length_s + lidar.period_ns * 1e-9,
-        rng=random_numbers(seed, DEVIATION, changed),
-        reverse=reverse,
-        start_m=start_m,
-    )
+    rng, driven_s = random_numbers(seed, DEVIATION, changed), length_s + lidar.period_ns * 1e-9
+    if isinstance(scene.route, tuple):
+        motion = pivots(scene.route, scene.vehicle, solids, duration_s=driven_s, rng=rng)
+    else:
+        route = begun_at(scene.route[::-1] if reverse else scene.route, start_m)
+        motion = laps(route, scene.vehicle, solids, duration_s=driven_s, rng=rng)
     changes: tuple[Change, ...] = ()
     if changed is not None:
         path = motion.base(np.arange(0.0, length_s, _PATH_STEP_S))[:, :2, 3]
