@@ -190,6 +190,25 @@ def simulate(
 
     Returns the truth, SE(2) for a laser scanner and SE(3) for a lidar.
     """
+    drive = plan(world, seed=seed, changed=changed, **options)
+    return record(
+        drive, destination, seed=seed, changed=changed, drift=drift, wheels_slip=wheels_slip, force=force,
+        progress=progress,
+    )  # fmt: skip
+
+
+def record(
+    drive: Drive,
+    destination: str | Path,
+    *,
+    seed: int = 0,
+    changed: int | None = None,
+    drift: float = 1.0,
+    wheels_slip: Slip = NO_SLIP,
+    force: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Trajectory:
+    """Write a log of any drive, as ``simulate`` does of one that is planned, and what lies beside it."""
     check_range("drift", drift, 0.0, 100.0)
     start_s, end_s, size_m = wheels_slip
     if not (0.0 <= start_s < end_s < np.inf and np.isfinite(size_m)):
@@ -201,28 +220,6 @@ def simulate(
     for file in (destination.with_suffix(".tum"), *(() if changed is None else (changes_file,))):
         if file.exists() and not force:
             raise InputError(f"{file}: exists; choose another name or pass --force to replace it")
-    drive = plan(world, seed=seed, changed=changed, **options)
-    truth = record(
-        drive, destination, seed=seed, changed=changed, drift=drift, wheels_slip=wheels_slip, force=force,
-        progress=progress,
-    )  # fmt: skip
-    if changed is not None:
-        write_changes(changes_file, drive.changes)
-    return truth
-
-
-def record(
-    drive: Drive,
-    destination: Path,
-    *,
-    seed: int = 0,
-    changed: int | None = None,
-    drift: float = 1.0,
-    wheels_slip: Slip = NO_SLIP,
-    force: bool = False,
-    progress: Callable[[int, int], None] | None = None,
-) -> Trajectory:
-    """Write a log of any drive, as ``simulate`` does of one that is planned; the truth, beside it as well."""
     truth = drive.truth()
     period_ns = drive.sensor.period_ns
     with LogWriter(destination, force=force) as log:
@@ -240,6 +237,8 @@ def record(
             if progress is not None:
                 progress(done + 1, len(truth))
     write_tum(destination.with_suffix(".tum"), truth, force=True)
+    if changed is not None:
+        write_changes(changes_file, drive.changes)
     return truth
 
 
