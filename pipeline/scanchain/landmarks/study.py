@@ -33,7 +33,7 @@ from scanchain.landmarks.problem import (
 )
 from scanchain.landmarks.ranges import OWN, OWN_UNITS, OdometryNoise, RangeSolution, solve_range_log
 from scanchain.landmarks.solvers import LinearSolver, MethodResult, compare, create_solver, methods_for
-from scanchain.landmarks.solvers.elimination import Covariance
+from scanchain.landmarks.solvers.direct import Covariance
 
 _WIDEST_GAP_S = 0.5  # between motion-capture poses that are interpolated
 

@@ -16,7 +16,7 @@ from scanchain.data import Matrix, Trajectory
 from scanchain.errors import InputError
 from scanchain.logs.writer import Link, LogWriter, pack_laser_scan, pack_odometry, pack_transforms, place
 from scanchain.simulation.another_day import Change, another_day, write_changes
-from scanchain.simulation.motion import Motion, wheel_odometry
+from scanchain.simulation.motion import Motion, begun_at, laps, pivots, wheel_odometry
 from scanchain.simulation.sensors import SENSORS, Sensor, Sweep, take_sweep
 from scanchain.simulation.solids import Solids
 from scanchain.simulation.worlds import WORLDS, World
@@ -87,13 +87,12 @@ def plan(
     if isinstance(scene.route, tuple) and (reverse or start_m):
         raise InputError(f"{world} is no route round which one could drive; leave reverse and start_m out")
     solids = scene.build(random_numbers(seed, PLACE))
-    motion = scene.motion(
-        solids,
-        duration_s=length_s + lidar.period_ns * 1e-9,
-        rng=random_numbers(seed, DEVIATION, changed),
-        reverse=reverse,
-        start_m=start_m,
-    )
+    rng, driven_s = random_numbers(seed, DEVIATION, changed), length_s + lidar.period_ns * 1e-9
+    if isinstance(scene.route, tuple):
+        motion = pivots(scene.route, scene.vehicle, solids, duration_s=driven_s, rng=rng)
+    else:
+        route = begun_at(scene.route[::-1] if reverse else scene.route, start_m)
+        motion = laps(route, scene.vehicle, solids, duration_s=driven_s, rng=rng)
     changes: tuple[Change, ...] = ()
     if changed is not None:
         path = motion.base(np.arange(0.0, length_s, _PATH_STEP_S))[:, :2, 3]
@@ -191,6 +190,25 @@ def simulate(
 
     Returns the truth, SE(2) for a laser scanner and SE(3) for a lidar.
     """
+    drive = plan(world, seed=seed, changed=changed, **options)
+    return record(
+        drive, destination, seed=seed, changed=changed, drift=drift, wheels_slip=wheels_slip, force=force,
+        progress=progress,
+    )  # fmt: skip
+
+
+def record(
+    drive: Drive,
+    destination: str | Path,
+    *,
+    seed: int = 0,
+    changed: int | None = None,
+    drift: float = 1.0,
+    wheels_slip: Slip = NO_SLIP,
+    force: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Trajectory:
+    """Write a log of any drive, as ``simulate`` does of one that is planned, and what lies beside it."""
     check_range("drift", drift, 0.0, 100.0)
     start_s, end_s, size_m = wheels_slip
     if not (0.0 <= start_s < end_s < np.inf and np.isfinite(size_m)):
@@ -202,28 +220,6 @@ def simulate(
     for file in (destination.with_suffix(".tum"), *(() if changed is None else (changes_file,))):
         if file.exists() and not force:
             raise InputError(f"{file}: exists; choose another name or pass --force to replace it")
-    drive = plan(world, seed=seed, changed=changed, **options)
-    truth = record(
-        drive, destination, seed=seed, changed=changed, drift=drift, wheels_slip=wheels_slip, force=force,
-        progress=progress,
-    )  # fmt: skip
-    if changed is not None:
-        write_changes(changes_file, drive.changes)
-    return truth
-
-
-def record(
-    drive: Drive,
-    destination: Path,
-    *,
-    seed: int = 0,
-    changed: int | None = None,
-    drift: float = 1.0,
-    wheels_slip: Slip = NO_SLIP,
-    force: bool = False,
-    progress: Callable[[int, int], None] | None = None,
-) -> Trajectory:
-    """Write a log of any drive, as ``simulate`` does of one that is planned; the truth, beside it as well."""
     truth = drive.truth()
     period_ns = drive.sensor.period_ns
     with LogWriter(destination, force=force) as log:
@@ -241,6 +237,8 @@ def record(
             if progress is not None:
                 progress(done + 1, len(truth))
     write_tum(destination.with_suffix(".tum"), truth, force=True)
+    if changed is not None:
+        write_changes(changes_file, drive.changes)
     return truth
 
 

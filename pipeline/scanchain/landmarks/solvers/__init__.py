@@ -12,13 +12,14 @@ from scanchain.errors import InputError
 from scanchain.landmarks.problem import Layout, LinearSystem, Pattern
 from scanchain.landmarks.solvers.direct import (
     PINV_BELOW,
+    CholeskyMethod,
     Factor,
     LinearSolver,
+    SchurMethod,
     ScipyMethod,
     UndeterminedError,
     check_pinv,
 )
-from scanchain.landmarks.solvers.elimination import CholeskyMethod, SchurMethod
 from scanchain.landmarks.solvers.qr import QrMethod, SuiteSparseQrMethod
 
 __all__ = [

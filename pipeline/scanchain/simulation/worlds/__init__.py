@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scanchain.data import Matrix
-from scanchain.simulation.motion import Motion, Pivot, Vehicle, begun_at, laps, pivots
+from scanchain.simulation.motion import Pivot, Vehicle
 from scanchain.simulation.solids import Solids
 from scanchain.simulation.worlds import indoor, outdoor
 
@@ -32,24 +32,6 @@ class World:
     duration_s: float
     sight_m: float = np.inf
     dropouts: tuple[tuple[float, float], ...] = ()
-
-    def motion(
-        self,
-        solids: Solids,
-        *,
-        duration_s: float,
-        rng: np.random.Generator,
-        reverse: bool = False,
-        start_m: float = 0.0,
-    ) -> Motion:
-        """The drive; ``rng`` draws its deviations and its sway.
-
-        reverse : drive the route the other way round; start_m : begin so far along it
-        """
-        if isinstance(self.route, tuple):
-            return pivots(self.route, self.vehicle, solids, duration_s=duration_s, rng=rng)
-        route = begun_at(self.route[::-1] if reverse else self.route, start_m)
-        return laps(route, self.vehicle, solids, duration_s=duration_s, rng=rng)
 
 
 _GAPS = ((0.0, 40.0), (25.0, 0.0))  # a crossing that is turned at, the middle of a street
