@@ -69,14 +69,23 @@ LEFT_OUT = [
     {"chunk_size": 10_000_000},
     {"enable_data_crcs": True},
 ]
+
+
+def _ros1_name(kind):
+    return kind.replace("/msg/", "/")
+
+
 NAMES = [
-    {"encoding": encoding, "rename": rename}
-    for encoding in ("ros2msg", "ros2idl")
-    for rename in (str, lambda kind: kind.replace("/msg/", "/"))
+    {"encoding": encoding, "rename": rename} for encoding in ("ros2msg", "ros2idl") for rename in (str, _ros1_name)
 ]
 
 
-@pytest.mark.parametrize("options", [*CONTAINERS, *LEFT_OUT, *NAMES], ids=str)
+def _named(options):
+    """A name that is the same in every process."""
+    return " ".join(f"{key}={getattr(value, '__name__', value)}" for key, value in options.items())
+
+
+@pytest.mark.parametrize("options", [*CONTAINERS, *LEFT_OUT, *NAMES], ids=_named)
 @pytest.mark.parametrize("chunked", [True, False])
 def test_every_container_gives_the_same_scans(tmp_path, chunked, options):
     log, scans = read(write(tmp_path / "a.mcap", office(), chunked=chunked, **options))
