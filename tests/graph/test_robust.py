@@ -33,11 +33,19 @@ def with_false_loops(name, share, seed=0):
     return graph, true, np.arange(len(graph.edges)) >= real
 
 
+def in_order_of_addition(graph, values):
+    result = np.empty(len(values), values.dtype)
+    result[np.argsort(graph.is_loop, kind="stable")] = values
+    return result
+
+
 def position_error_m(graph, true):
     return float(np.sqrt(((graph.poses[:, :2, 2] - true.poses[:, :2, 2]) ** 2).sum(axis=1).mean()))
 
 
-@pytest.mark.parametrize(("name", "share"), [("intel", 0.1), ("intel", 0.5), ("manhattan", 0.5)])
+@pytest.mark.parametrize(
+    ("name", "share"), [("intel", 0.1), ("intel", 0.3), ("intel", 0.5), ("manhattan", 0.1), ("manhattan", 0.5)]
+)
 def test_a_tenth_to_a_half_of_wrong_loops_leave_the_trajectory_as_it_is_without_them(name, share):
     outcome = try_wrong_loops(shared_data(f"graphs/{name}.g2o"), share, "nearby", seed=0)
     assert outcome.wrong_rejected >= 0.99 and outcome.true_rejected <= 0.01
@@ -171,8 +179,9 @@ class Scalar(Welsch):
 
 def test_a_loss_of_the_users_is_minimized():
     graph, _, is_false = with_false_loops("intel", 0.03)
-    graph.optimize(GraphConfig(robust=f"{__name__}:Welsch"))
-    assert np.median(graph.weight[is_false]) < 1e-3 < 0.5 < np.median(graph.weight[~is_false])
+    answer = graph.optimize(GraphConfig(robust=f"{__name__}:Welsch"))
+    weight = in_order_of_addition(graph, answer.state.weight)
+    assert np.median(weight[is_false]) < 1e-3 < 0.5 < np.median(weight[~is_false])
 
 
 @pytest.mark.parametrize(("name", "fault"), [("OtherSlope", "slope of loss"), ("Scalar", "fails for")])
@@ -233,7 +242,7 @@ def test_loops_that_agree_show_a_slip_of_odometry_instead_of_being_rejected(writ
         rf"corrected by loop closures: a slip of (.*) m between scans {first:,} and {last:,}", line
     )
     assert float(said[1]) == pytest.approx(-1.5, abs=0.3)
-    assert np.abs(graph.poses - true)[:, :2, 2].max() < 1.0  # within the slip, between closures
+    assert np.abs(graph.poses - true)[:, :2, 2].max() < 0.7
 
 
 @WRITTEN

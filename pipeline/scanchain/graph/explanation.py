@@ -25,7 +25,6 @@ from scanchain.graph.odometry_errors import (
     changed,
     cost_of,
     direction,
-    log_ratios,
     odometry_of,
     prior,
     spread,
@@ -39,7 +38,7 @@ _SETTLED = 0.1  # share of the price of a loop edge below which a change gains n
 _MOST_LEFT_OUT = 30  # largest number of loop edges that are looked at
 _MOST_ENTRIES = 4_000_000  # largest number of covariances between these and odometry, 32 MB
 _CURVATURE = 0.3  # share of a change by a drift that its linearization may be off by
-_SLIP_LENGTHS = (1, 2, 4, 8, 16, 32, 64)  # number of edges of the stretches that are tried
+_SLIP_LENGTHS = (4, 16, 64)  # number of edges of the stretches that are tried
 _MOST_STRETCHES = 100  # largest number of stretches that are looked at more closely
 _DRIFT_ROUNDS, _STRETCH_ROUNDS = 5, 3  # of the least squares over the loop edges that one explains
 
@@ -303,11 +302,7 @@ def next_loosened(
     learned = _means(own - pull_t @ left_out.predicted @ pull, first, count)
     A = unit + (learned if is_jump else np.minimum(learned, claimed))
     b = _means(pull_t @ left_out.errors[left_out.odometry][..., None], first, count)[..., 0]
-    costs = np.empty(len(tried))
-    for length in np.unique(count):
-        of = count == length
-        ratio = length * _means(log_ratios(own / length), first[of], count[of])
-        costs[of] = cost_of(ratio, is_jump=is_jump, price=price, nominal=nominal)
+    costs = cost_of(claimed, is_jump=is_jump, price=price, nominal=nominal)
     e, price = left_out.errors[left_out.edges], left_out.stride * price
     M = np.asarray(left_out.stride * np.linalg.inv(left_out.covariances), np.float64)
     alone = (b * np.linalg.solve(A, b[..., None])[..., 0]).sum(axis=1) / len(e)  # without any of them explained

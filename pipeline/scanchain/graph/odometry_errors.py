@@ -16,7 +16,6 @@ FEWEST = 3  # least number of loop edges left out, none near another, that a dri
 _SCALE_SIGMA, _TURN_SIGMA_RAD_M = 0.03, 0.01  # prior standard deviations, of the scale and of the turn a meter
 _SLIP_SIGMA_M, _JUMP_SIGMAS = 1.0, (1.0, 0.2)  # standard deviations, m or (m, rad)
 _SLIP_PROBABILITY, _JUMP_PROBABILITY = 1e-3, 1e-4  # of one that begins at an edge
-_PAID = 0.5  # share of the errors of a slip that closures measure
 _WEAKER = 2.0  # factor between the least and the largest information of a translation from which on one is weak
 _MOVES = 3.0  # least length of a motion that may slip, in its standard deviations
 
@@ -97,9 +96,8 @@ class Explanation:
         result += FEWEST * price if self.drift.any() else 0.0
         for stretch in self.loosened:
             B = stretch.spread(measured, information)
-            claimed = stretch.count * np.swapaxes(B, 1, 2) @ information[stretch.edges] @ B
-            ratio = log_ratios(claimed).sum()
-            result += float(cost_of(ratio, is_jump=stretch.is_jump, price=price, nominal=nominal))
+            claimed = (np.swapaxes(B, 1, 2) @ information[stretch.edges] @ B).sum(axis=0)
+            result += float(cost_of(claimed, is_jump=stretch.is_jump, price=price, nominal=nominal))
         return result
 
     def lines(
@@ -188,25 +186,16 @@ def _loosened(information: Matrix, twists: Matrix) -> Matrix:
     return information - pull @ np.linalg.solve(inner, np.swapaxes(pull, 1, 2))
 
 
-def log_ratios(claimed: Matrix) -> Vector:
-    """Logarithms, log |1 + BᵀΩB|, of what errors B multiply the determinants of the covariances of edges by, (n,).
+def cost_of(claimed: Matrix, *, is_jump: bool, price: float, nominal: float) -> Vector:
+    """Cost of stretches in χ², −2 log of the likelihood over that of none: 2 log(1/p) + log |1 + Σ BᵀΩB|.
 
-    claimed : (n, p, p) BᵀΩB, what the edges say of the errors, in their standard deviations
-    """
-    return np.linalg.slogdet(np.eye(claimed.shape[-1]) + claimed)[1]
+    The better the edges are measured, the less likely an error was missed. A jump also costs three loop edges left
+    out, and its likelihood is scaled as their price is.
 
-
-def cost_of(log_ratio: Vector, *, is_jump: bool, price: float, nominal: float) -> Vector:
-    """Cost of stretches in χ², −2 log of the likelihood over that of none: 2 log(1/p) + Σ log |1 + BᵀΩB|.
-
-    The better edges are measured, the less likely an error was missed; and each edge of a stretch may be off by an
-    error of its own, with which it could fit a wrong loop edge. A slip pays half of these: an error that nothing
-    measures changes no likelihood. A jump also costs three loop edges left out, and its likelihood is scaled as
-    their price is.
-
-    log_ratio : sums over the edges of the stretches
+    claimed : (..., p, p) Σ BᵀΩB, what the edges say of the errors, in their standard deviations
     price, nominal : of a loop edge left out, and what it is where the noise model is right
     """
+    log_ratio = np.linalg.slogdet(np.eye(claimed.shape[-1]) + claimed)[1]
     if not is_jump:
-        return _PAID * log_ratio - 2.0 * np.log(_SLIP_PROBABILITY)
+        return log_ratio - 2.0 * np.log(_SLIP_PROBABILITY)
     return FEWEST * price + (price / nominal) * (log_ratio - 2.0 * np.log(_JUMP_PROBABILITY))
