@@ -562,13 +562,14 @@ def test_a_simulated_sequence_is_made_once(tmp_path, monkeypatch):
     assert catalog.prepare("demo-office", tmp_path).stat().st_mtime_ns == written
 
 
-def test_an_unknown_sequence_and_a_misspelt_key_are_refused(tmp_path):
+def test_an_unknown_sequence_and_a_misspelt_key_are_refused(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="demo-office, demo-town"):
         catalog.load("mars")
     text = (shipped("sequences") / "office.toml").read_text()
     (tmp_path / "office.toml").write_text(text.replace("seed", "sede"))
+    monkeypatch.setattr(catalog, "shipped", lambda folder: tmp_path)
     with pytest.raises(InputError, match="sede"):
-        catalog.read(tmp_path / "office.toml")
+        catalog.load("office")
 
 
 def test_another_day_changes_movable_objects_alone_and_keeps_the_path_free():
