@@ -130,7 +130,7 @@ def at_its_fit(voxel_map, points):
     k, settings = d * (d + 1) // 2, settings_of(LIMITS, voxel_map, wide=False)
     T = lie.exp(np.array([0.02, -0.01, 0.03] if d == 2 else [0.02, -0.01, 0.03, 0.001, 0.002, -0.003]))
     problem = icp.problem_of(voxel_map.voxels, points, T, np.zeros((k, k)), settings)
-    icp.align(problem, T, np.zeros(k), settings.first_scale_m)
+    icp.judged(problem, T, icp.align(problem, T, np.zeros(k), settings.first_scale_m))
     return problem, T, settings
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import LEAST_FIT, KeyframeErrors, Matrix, Points, Pose, Scan, State
+from scanchain.kernels.matrices import definite_inverse
 from scanchain.odometry.odometry import Odometry
 from scanchain.odometry.tracked import Tracked
 from scanchain.preprocess import Prepared
@@ -88,19 +89,21 @@ class FrontEnd:
         if not self.has_wheels:
             self.covariance = None
         T_last, self.T_odom_last = self.T_odom_last, tracked.T_odom_lidar
-        n = self.since_keyframe
-        Ad = lie.adjoint(lie.inverse(lie.between(T_last, tracked.T_odom_lidar)))
-        if self.odometry.dimension == 3:
+        is_planar = self.odometry.dimension == 2
+        if self.covariance is None and is_planar:
+            return of_match
+        n, Ad = self.since_keyframe, lie.adjoint(lie.between(tracked.T_odom_lidar, T_last))
+        if not is_planar:
             self.doubt = Ad @ self.doubt @ Ad.T + _doubt_of(tracked)
         if self.covariance is None:
             return self._doubted(of_match)
         predicted = n * prior.covariance
         if n > 1:
             predicted = predicted + (n / (n - 1) * Ad).dot(self.covariance).dot(Ad.T)
-        information = np.asarray(np.linalg.inv(predicted), np.float64)
+        information = definite_inverse(predicted)
         if tracked.state is not State.LOST:
             information += of_match
-        self.covariance = np.asarray(np.linalg.inv(information), np.float64)
+        self.covariance = definite_inverse(information)
         return self._doubted(information)
 
     def _doubted(self, information: Matrix) -> Matrix:

@@ -46,7 +46,7 @@ class Fit(NamedTuple):
 
     H (k, k) : Σ w JᵀJ over planes and lines, twists about the problem's origin, map axes; the mean of a voxel
         without a shape constrains a pose in every direction, whether the surface there does or not
-    unweighted (k, k) : the same without robust weights
+    unweighted (k, k) : the same without robust weights; zeros until it is ``judged``
     cost : robust cost in m², every point without a correspondence at its limit ½s²
     total_weight, squares : Σ w and Σ w r² (m²)
     pairs, iterations, ending : correspondences, linearizations, one of the codes above
@@ -118,8 +118,8 @@ def align(problem, T, offset, first_scale_m: float):
     orthonormalize(T)
     cost = now.sums[_COST] - _prior_cost(problem.prior, now.offset)
     cost += 0.5 * settings.scale_m**2 * (problem.points.shape[0] - pairs)
-    H, unweighted = shape_information(problem, T)
-    return Fit(H, unweighted, cost, now.sums[_WEIGHT], now.sums[_SQUARES], pairs, iterations, ending)
+    H = shape_information(problem, T, settings.scale_m)
+    return Fit(H, np.zeros((k, k)), cost, now.sums[_WEIGHT], now.sums[_SQUARES], pairs, iterations, ending)
 
 
 @njit(nogil=True)
@@ -128,8 +128,27 @@ def fit_at(problem, T, fit):
     settings = problem.settings
     pairs = correspond(problem, T, settings.last_reach, settings.last_distance_m)
     _, total_weight, squares = robust_sums(problem, T, settings.scale_m)
-    H, unweighted = shape_information(problem, T)
-    return Fit(H, unweighted, fit.cost, total_weight, squares, pairs, fit.iterations, fit.ending)
+    H = shape_information(problem, T, settings.scale_m)
+    return judged(problem, T, Fit(H, H, fit.cost, total_weight, squares, pairs, fit.iterations, fit.ending))
+
+
+@njit(nogil=True)
+def judged(problem, T, fit):
+    """``fit`` with the information without robust weights; the gradients of sectors are filled as well.
+
+    Sectors lie ahead or behind, left or right, nearer or farther than the problem's range: calibration, motion
+    within the scan and surfaces that repeat shift the points of one together.
+    """
+    points, sector = problem.points, np.empty(problem.points.shape[0], np.int32)
+    for i in range(points.shape[0]):
+        squared = 0.0
+        for axis in range(points.shape[1]):
+            squared += points[i, axis] * points[i, axis]
+        sector[i] = (points[i, 0] > 0.0) + 2 * (points[i, 1] > 0.0) + 4 * (squared > problem.range_m**2)
+    problem.gradients.fill(0.0)
+    gradients_by_group(problem, T, problem.settings.scale_m, sector, problem.gradients)
+    unweighted = shape_information(problem, T, WITHOUT_KERNEL_M)
+    return Fit(fit.H, unweighted, fit.cost, fit.total_weight, fit.squares, fit.pairs, fit.iterations, fit.ending)
 
 
 @njit(nogil=True)
@@ -144,27 +163,16 @@ def correspond(problem, T, reach: int, max_distance_m: float):
 
 
 @njit(nogil=True)
-def shape_information(problem, T):
-    """Information (k, k) of planes and lines at the pose T, with and without robust weights.
-
-    Correspondences with a voxel that has no shape lose their weight. Filled as well are the gradients of sectors,
-    ahead or behind, left or right, nearer or farther than the problem's range: calibration, motion within the
-    scan and surfaces that repeat shift the points of a sector together.
-    """
-    k, points, sector = problem.prior.shape[0], problem.points, np.empty(problem.points.shape[0], np.int32)
-    for i in range(points.shape[0]):
-        voxel, squared = problem.correspondence[i], 0.0
+def shape_information(problem, T, scale_m: float):
+    """Information (k, k) of planes and lines at the pose T; voxels that have no shape lose their weight."""
+    k = problem.prior.shape[0]
+    for i in range(problem.points.shape[0]):
+        voxel = problem.correspondence[i]
         if voxel >= 0 and problem.voxels.cells[voxel, SHAPE] == POINT:
             problem.weight[i] = 0.0
-        for axis in range(points.shape[1]):
-            squared += points[i, axis] * points[i, axis]
-        sector[i] = (points[i, 0] > 0.0) + 2 * (points[i, 1] > 0.0) + 4 * (squared > problem.range_m**2)
-    H, unweighted, b = np.empty((k, k)), np.empty((k, k)), np.empty(k)
-    normal_equations(problem, T, problem.settings.scale_m, 0.0, H, b)
-    normal_equations(problem, T, WITHOUT_KERNEL_M, 0.0, unweighted, b)
-    problem.gradients.fill(0.0)
-    gradients_by_group(problem, T, problem.settings.scale_m, sector, problem.gradients)
-    return H, unweighted
+    H, b = np.empty((k, k)), np.empty(k)
+    normal_equations(problem, T, scale_m, 0.0, H, b)
+    return H
 
 
 @njit(nogil=True)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scanchain.kernels.compiling import njit
 from scanchain.kernels.geometry import adjoint, between, centered, inverse, twist_2d, twist_3d
 from scanchain.kernels.matrices import congruent, definite_inverse, factorize, substitute
-from scanchain.kernels.registration.icp import NO_CORRESPONDENCES, align, fit_at, problem_of
+from scanchain.kernels.registration.icp import NO_CORRESPONDENCES, align, fit_at, judged, problem_of
 from scanchain.kernels.registration.observability import (
     WEAK,
     add_signals,
@@ -91,9 +91,10 @@ def match(voxels, points, T_first, expected, settings):
                 prior[i, j] += remapped[i, j]
         T = T_first.copy()
     spread = _spread(problem, T, fit)
-    last = fit
     if settings.reach != settings.last_reach or settings.max_distance_m != settings.last_distance_m:
         last = fit_at(problem, T, fit)
+    else:
+        last = judged(problem, T, fit)
     if points.shape[1] == 2 and not is_fused:
         add_signals(problem, T, spectrum)
     if is_fused:
