@@ -43,6 +43,7 @@ from scanchain.errors import ScanchainError
 from scanchain.logs import open_log
 from scanchain.maps import open_saved_map
 from scanchain.sessions.localizer import MapState
+from scanchain.settings import load_settings, overrides_of
 from scanchain.trajectory import read_tum
 from tests.benchmarks.harness import DATA, command_line, poses_at, run_of, settings_of, true_in_map
 from tests.support import made
@@ -124,7 +125,7 @@ def outcome(guest: str, host: str, options: argparse.Namespace) -> tuple[str, st
     log = log_of(guest, options.seed, options.cache, again=again)
     chosen = (place.options | (place.again if again else {}) if place.log else {}) | settings_of(options.set)
     if options.share or options.half:
-        duration_s = open_log(log).duration_s
+        duration_s = open_log(log, load_settings(overrides=overrides_of(chosen)).config.log).duration_s
         chosen |= {"log__start_s": options.share * duration_s} if options.share else {}
         chosen |= {"log__end_s": 0.5 * duration_s} if options.half else {}
     with tempfile.TemporaryDirectory() as folder:
