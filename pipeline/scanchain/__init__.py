@@ -45,37 +45,43 @@ if TYPE_CHECKING:  # "as" says that the name is public here
     from scanchain.trajectory import write_tum as write_tum
 
     __version__: str
-    __all__: list[str]
 
-
-def _homes() -> dict[str, str]:
-    """Module of each public name, from the imports above, as lazy_loader reads them (SPEC 1)."""
-    import re
-    from pathlib import Path
-
-    source = Path(__file__).read_text(encoding="utf-8")
-    return {name: module for module, name in re.findall(r"    from (scanchain[\w.]*) import (\w+) as", source)}
+_MODULES = {
+    "api": "Slam SlamResult changes compare downsample localize merge optimize run",
+    "config": "Config",
+    "data": "Match Scan State Step Trajectory",
+    "errors": "InputError ScanchainError",
+    "evaluation.metrics": "evaluate",
+    "graph.g2o": "read_g2o write_g2o",
+    "graph.pose_graph": "PoseGraph",
+    "logs": "open_log",
+    "odometry": "Odometry",
+    "registration": "VoxelMap create_matcher rigid_transform",
+    "registration.align": "align",
+    "sessions.localizer": "Localizer",
+    "settings": "load_settings",
+    "simulation": "simulate",
+    "trajectory": "read_tum write_tum",
+}
+_HOMES = {name: module for module, names in _MODULES.items() for name in names.split()}
+__all__ = sorted(_HOMES)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __dir__() -> list[str]:
-    return [*(name for name in globals() if name.startswith("__")), "__version__", "__all__", *_homes()]
+    return [*(name for name in globals() if name.startswith("__")), "__version__", "evaluation", "lie", *__all__]
 
 
 def __getattr__(name: str) -> Any:
     import sys
     from importlib import import_module, metadata
 
-    homes = _homes()
     if name == "__version__":
         return metadata.version("scanchain")
-    if name == "__all__":
-        return sorted(name for name, module in homes.items() if module != "scanchain")
-    if name not in homes:
-        raise AttributeError(f"module 'scanchain' has no attribute {name!r}")
-    module = homes[name]
-    if module == "scanchain":
+    if name in ("evaluation", "lie"):
         return import_module(f"scanchain.{name}")
-    value = getattr(import_module(module), name)
+    if name not in _HOMES:
+        raise AttributeError(f"module 'scanchain' has no attribute {name!r}")
+    value = getattr(import_module(f"scanchain.{_HOMES[name]}"), name)
     if "numba" in sys.modules:  # it may be compiled when it is called
         import_module("scanchain.clock").warn_of_compilation()
     return globals().setdefault(name, value)

@@ -144,22 +144,19 @@ class Placement:
         older = [each for each in closures if each.target < start <= each.source]
         evidence.note(older)
         components = self.closer.segments.components(self.graph, with_assumed=False)
-
-        def joins(closure: Closure) -> bool:
-            is_older = closure.target < start <= closure.source
-            return is_older and bool(components[closure.target] != components[-1])
-
-        known = [each for each in older if components[each.target] == components[-1]]
+        is_joined = (components == components[-1]).tolist()
+        known = [each for each in older if is_joined[each.target]]
         if known and not evidence.is_gathering and not evidence.follow(known, *world):
             return self._withdrawn(closures)
-        tested = [each for each in closures if joins(each)]
+        tested = [each for each in older if not is_joined[each.target]]
         was_gathering = evidence.is_gathering
         joining = evidence.collect(tested, *world)
         if evidence.is_gathering and not was_gathering:
             self._move_to(evidence.waiting[0])
             self.follow_graph()
         alone = [each.rejected(_TOO_FEW) if each.verdict is ClosureVerdict.ACCEPTED else each for each in tested]
-        return (*(each for each in closures if not joins(each)), *(joining or alone))
+        others = [each for each in closures if each.source < start or is_joined[each.target]]
+        return (*others, *(joining or alone))
 
     def _withdrawn(self, closures: tuple[Closure, ...]) -> tuple[Closure, ...]:
         """The newest segment is not where it was joined to older ones: take back all of that; search again."""

@@ -35,7 +35,7 @@ def log(world: str, into: Path | None = None, *, folder: Path = _FOLDER, **optio
 
 def recorded(name: str, write: Callable[[Path], object], folder: Path = _FOLDER) -> Path:
     """A log that a function of the simulator writes."""
-    path = _current(folder, "simulation", "kernels/raycast", "logs/writing") / f"{name}.mcap"
+    path = _current(folder, "simulation", "kernels/raycast.py", "logs/writer.py") / f"{name}.mcap"
     if not path.exists():
         draft = path.with_name(f"{os.getpid()}_{path.name}")  # another process may be making the same
         write(draft)
@@ -82,7 +82,8 @@ def _current(folder: Path, *parts: str) -> Path:
 
 @cache
 def version(*parts: str) -> str:
-    """A name for some folders of the code as they are now, or for all of it."""
+    """A name for some files and folders of the code as they are now, or for all of it."""
     root = Path(scanchain.__file__).parent
-    files = sorted(file for part in parts or ("",) for file in (root / part).rglob("*.py"))
+    places = [root / part for part in parts or ("",)]
+    files = sorted(file for each in places for file in (each.rglob("*.py") if each.suffix == "" else [each]))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:8]

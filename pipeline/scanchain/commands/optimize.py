@@ -162,7 +162,7 @@ def _writers(
     png: Path | None,
     recording: Path | None,
 ) -> dict[Path, Callable[[], None]]:
-    """What writes each of the files."""
+    """Writer of each requested file."""
     from scanchain.graph.covariance import chosen_poses, write_covariances
     from scanchain.graph.g2o import rejected_path, write_g2o
 

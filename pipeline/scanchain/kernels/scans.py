@@ -1,4 +1,4 @@
-"""What is done to the points of a scan: valid ones kept, one chosen a voxel, and deskewed."""
+"""Preprocessing of a scan: valid points, one of each voxel, deskewed."""
 
 import math
 

@@ -100,7 +100,7 @@ class LoopCloser:
 
         keyframes : all so far; graph : their best known poses, and how they are connected
         """
-        is_tested = self.segments.assumed >= 0
+        is_tested = self.segments.is_assumed
         if self.map_search is not None and not is_tested and self.map_search.has_just_matched(keyframes):
             self.places.skip(keyframes)
             return ()
@@ -177,7 +177,7 @@ class ProximityCloser:
         self.target = target if closure.verdict is ClosureVerdict.ACCEPTED else -1
         if closure.verdict is ClosureVerdict.ACCEPTED or self.search is None:
             return (closure,)
-        if self.submaps.segments.assumed >= 0 or not self.search.is_due(keyframes):
+        if self.submaps.segments.is_assumed or not self.search.is_due(keyframes):
             return (closure,)
         if uncertainty_m is None:
             near, uncertainty_m = self._near(graph, old, connected)

@@ -25,6 +25,11 @@ class Segments:
         """Start a new segment at this keyframe."""
         self.starts.append(keyframe)
 
+    @property
+    def is_assumed(self) -> bool:
+        """True while the pose of the newest segment is being tested."""
+        return self.assumed >= 0
+
     def assume(self, target: int) -> None:
         """Count the newest segment as joined to that of a keyframe."""
         self.assumed = int(self.of(np.array(target)))
@@ -52,7 +57,7 @@ class Segments:
         for pair in np.unique(ends[:, 0] * count + ends[:, 1]).tolist():
             i, j = divmod(pair, count)
             number[number == number[j]] = number[i]
-        if with_assumed and self.assumed >= 0:
+        if with_assumed and self.is_assumed:
             number[number == number[-1]] = number[self.assumed]
         return np.unique(number, return_inverse=True)[1].astype(np.int64)[segment]
 

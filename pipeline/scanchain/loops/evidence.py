@@ -106,7 +106,7 @@ class PlaceTest:
     @property
     def is_gathering(self) -> bool:
         """True while a pose is being tested."""
-        return self.segments.assumed >= 0
+        return self.segments.is_assumed
 
     @property
     def bound(self) -> float:
@@ -161,7 +161,7 @@ class PlaceTest:
         """Note closures that were tried at the pose where their keyframes lie."""
         for each in filter(_is_there, closures):
             known = self.tried.get(each.source)
-            if known is None or _rank(each) > _rank(known):
+            if known is None or rank_of(each) > rank_of(known):
                 self.tried[each.source] = each
 
     @property
@@ -265,12 +265,13 @@ def _best_of_each(closures: Sequence[Closure]) -> list[Closure]:
     """Of the closures of each keyframe, the best."""
     best: dict[int, Closure] = {}
     for each in closures:
-        if each.source not in best or _rank(each) > _rank(best[each.source]):
+        if each.source not in best or rank_of(each) > rank_of(best[each.source]):
             best[each.source] = each
     return list(best.values())
 
 
-def _rank(closure: Closure) -> tuple[bool, float]:
+def rank_of(closure: Closure) -> tuple[bool, float]:
+    """By which the best of several closures is the greatest: accepted ones first, then by overlap."""
     return closure.verdict is ClosureVerdict.ACCEPTED, closure.overlap
 
 

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import MapsConfig
-from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Points, Pose, Problem, Proposal
+from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Problem, Proposal
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.kernels.search import FREE, NEAR, UNKNOWN
 from scanchain.loops.connectivity import Segments
+from scanchain.loops.evidence import rank_of
 from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.loops.verification import Verifier
 from scanchain.maps.occupancy_grid import OccupancyGrid, fitting_resolution
@@ -249,7 +250,7 @@ class Relocalizer:
             self._aligned(source, find.moved_to(source, keyframes), anchors, keyframes, T_world)
             for source in sources.tolist()
         ]
-        return tuple(sorted((each for each in closures if each is not None), key=_rank, reverse=True))
+        return tuple(sorted((each for each in closures if each is not None), key=rank_of, reverse=True))
 
     def _aligned(
         self,
@@ -272,7 +273,7 @@ class Relocalizer:
             is_off = off_m > _AGREE_M or off_rad > _AGREE_RAD
             far = Problem("far from where the path was found", f"{off_m:.1f} m from where the path was found")
             closure = verified.closure(anchor, source, Proposal.PLACE, problem=far if is_off else None)
-            if best is None or (_rank(closure) > _rank(best)):
+            if best is None or (rank_of(closure) > rank_of(best)):
                 best = closure
         return best
 
@@ -325,7 +326,3 @@ def _agree(a: Find, b: Find, keyframes: Sequence[Keyframe]) -> bool:
     """True if two finds imply the same pose of the later keyframe."""
     off_m, off_rad = lie.apart(a.moved_to(b.source, keyframes), b.T_world_source)
     return a.target == b.target and off_m < _AGREE_M and off_rad < _AGREE_RAD
-
-
-def _rank(closure: Closure) -> tuple[bool, float]:
-    return closure.verdict is ClosureVerdict.ACCEPTED, closure.overlap

@@ -118,7 +118,7 @@ def align(problem, T, offset, first_scale_m: float):
     orthonormalize(T)
     cost = now.sums[_COST] - _prior_cost(problem.prior, now.offset)
     cost += 0.5 * settings.scale_m**2 * (problem.points.shape[0] - pairs)
-    H = shape_information(problem, T, settings.scale_m)
+    H = shape_information(problem, T)
     return Fit(H, np.zeros((k, k)), cost, now.sums[_WEIGHT], now.sums[_SQUARES], pairs, iterations, ending)
 
 
@@ -128,7 +128,7 @@ def fit_at(problem, T, fit):
     settings = problem.settings
     pairs = correspond(problem, T, settings.last_reach, settings.last_distance_m)
     _, total_weight, squares = robust_sums(problem, T, settings.scale_m)
-    H = shape_information(problem, T, settings.scale_m)
+    H = shape_information(problem, T)
     return judged(problem, T, Fit(H, H, fit.cost, total_weight, squares, pairs, fit.iterations, fit.ending))
 
 
@@ -147,7 +147,8 @@ def judged(problem, T, fit):
         sector[i] = (points[i, 0] > 0.0) + 2 * (points[i, 1] > 0.0) + 4 * (squared > problem.range_m**2)
     problem.gradients.fill(0.0)
     gradients_by_group(problem, T, problem.settings.scale_m, sector, problem.gradients)
-    unweighted = shape_information(problem, T, WITHOUT_KERNEL_M)
+    unweighted, b = np.empty_like(fit.H), np.empty(fit.H.shape[0])
+    normal_equations(problem, T, WITHOUT_KERNEL_M, 0.0, unweighted, b)
     return Fit(fit.H, unweighted, fit.cost, fit.total_weight, fit.squares, fit.pairs, fit.iterations, fit.ending)
 
 
@@ -163,7 +164,7 @@ def correspond(problem, T, reach: int, max_distance_m: float):
 
 
 @njit(nogil=True)
-def shape_information(problem, T, scale_m: float):
+def shape_information(problem, T):
     """Information (k, k) of planes and lines at the pose T; voxels that have no shape lose their weight."""
     k = problem.prior.shape[0]
     for i in range(problem.points.shape[0]):
@@ -171,7 +172,7 @@ def shape_information(problem, T, scale_m: float):
         if voxel >= 0 and problem.voxels.cells[voxel, SHAPE] == POINT:
             problem.weight[i] = 0.0
     H, b = np.empty((k, k)), np.empty(k)
-    normal_equations(problem, T, scale_m, 0.0, H, b)
+    normal_equations(problem, T, problem.settings.scale_m, 0.0, H, b)
     return H
 
 

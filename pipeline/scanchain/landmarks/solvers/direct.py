@@ -45,7 +45,7 @@ class Factor:
 
 
 class Factored(NamedTuple):
-    """What a method factored: ``solve`` gives x (n,), ``factor`` puts the factor together as a matrix."""
+    """A factorization: ``solve`` gives x (n,), ``factor`` puts the factor together as a matrix."""
 
     solve: Callable[[], NDArray[np.float64]]
     factor: Callable[[], Factor]
@@ -59,7 +59,7 @@ class Method(Protocol):
     """
 
     def build(self, system: LinearSystem) -> Any:
-        """What is factored: AᵀA and Aᵀb, or the rows of A in their order."""
+        """The matrices to factorize: AᵀA and Aᵀb, or the rows of A in their order."""
         ...
 
     def factorize(self, system: LinearSystem, built: Any) -> Factored:
