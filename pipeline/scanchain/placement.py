@@ -63,7 +63,7 @@ class Placement:
 
     def close(self, *, is_keyframe: bool) -> tuple[Closure, ...]:
         """Closures by what the scan completes, and of the newest keyframe if the scan is one."""
-        if self.evidence.is_in_vain:
+        if self.evidence.is_in_vain(self.keyframes[-1]):
             self.give_up()
         closures = self.take(self.closer.advance(self.keyframes, self.graph))
         if is_keyframe:

@@ -14,7 +14,7 @@ from scanchain.kernels.free_space import FAR, compare_ranges, nearest_ranges
 from scanchain.loops import LoopCloser, outline_of
 from scanchain.loops.connectivity import Segments
 from scanchain.loops.descriptor import SIZE, DescriptorDatabase, compare, describe, heights_of
-from scanchain.loops.map_search import PLACES_FILE
+from scanchain.loops.map_search import PLACES_FILE, UprightMap
 from scanchain.loops.submaps import VoxelSubmaps, level_frame, submap_around
 from scanchain.loops.verification import Verifier, free_space_agreement
 from scanchain.registration import VoxelMap
@@ -315,7 +315,7 @@ def test_a_search_over_many_scans_finds_what_one_in_a_single_scan_finds(tmp_path
     monkeypatch.setattr("scanchain.registration.search._STEPS", 500)
     closer, keyframes = begun_live(mapped, log[0], tmp_path)
     found, scans = closer.close(keyframes, graph_of(keyframes)), 1
-    while closer.map_search.search is not None:
+    while closer.search.underway is not None:
         found, scans = closer.advance(keyframes, graph_of(keyframes)), scans + 1
     assert scans > 3 and [each.target for each in found] == [each.target for each in at_once]
     np.testing.assert_array_equal(found[0].match.T_target_source, at_once[0].match.T_target_source)
@@ -325,8 +325,8 @@ def test_a_search_that_the_end_of_the_log_interrupts_is_completed(tmp_path, monk
     monkeypatch.setattr("scanchain.registration.search._STEPS", 500)
     mapped, log = passage(street()), passage(street(4.0, True)[4:5])
     closer, keyframes = begun_live(mapped, log[0], tmp_path)
-    assert not closer.close(keyframes, graph_of(keyframes)) and closer.map_search.search is not None
-    assert closer.finish(keyframes, graph_of(keyframes)) and closer.map_search.search is None
+    assert not closer.close(keyframes, graph_of(keyframes)) and closer.search.underway is not None
+    assert closer.finish(keyframes, graph_of(keyframes)) and closer.search.underway is None
 
 
 def test_a_log_of_elsewhere_is_found_nowhere_in_a_map(tmp_path):
@@ -345,8 +345,8 @@ def test_of_two_places_that_are_the_same_none_is_said_to_be_it(tmp_path):
     closures, _ = sought([*there, *again], passage(street(4.0, True)[4:7]), tmp_path)
     reasons = {closure.reason for closure in sum(closures, ())}
     assert reasons == {"another place of the map is as similar"}
-    assert begun_live([*there, *again], there[0], tmp_path)[0].map_search.is_repeated(10, [*there, *again])
-    assert not begun_live(there, there[0], tmp_path)[0].map_search.is_repeated(10, there)
+    assert UprightMap([*there, *again], configured(3)).is_repeated(there[1:11])
+    assert not UprightMap(there, configured(3)).is_repeated(there[1:11])
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.3])

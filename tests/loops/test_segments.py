@@ -148,7 +148,7 @@ def test_a_place_that_was_seen_through_is_dropped_however_well_the_scans_fit():
     evidence, _ = begun()
     for source in range(3, 9):
         assert not evidence.collect(tried(source), *up_to(source, keyframes))
-    assert evidence.is_in_vain
+    assert evidence.is_in_vain(keyframes[-1])
     evidence.drop(3)
     assert not evidence.is_gathering and np.isnan(evidence.best)
 
@@ -259,9 +259,7 @@ def test_a_robot_that_was_carried_to_another_corridor_like_one_before_stays_apar
     scans = list(islice(log.scans(), 3485, 10087))
     slam = Slam(configured(2), log.T_base_lidar)
     result, starts = carried(slam, scans, 3743, 4901)
-    joined = [each for each in result.closures if each.target < slam.closer.segments.starts[-1] <= each.source]
-    assert len(starts) == 1 and joined, "some scans fit"
-    assert result.components[0] != result.components[-1]
+    assert len(starts) == 1 and result.components[0] != result.components[-1]
 
 
 def test_poses_beyond_a_motion_that_nothing_measured_are_still_optimized():

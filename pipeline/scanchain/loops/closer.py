@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +14,9 @@ from scanchain.config import Config, LoopsConfig
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Points, Pose, Proposal
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Drift, Segments
-from scanchain.loops.map_search import MapSearch
-from scanchain.loops.planar_map_search import Relocalizer
+from scanchain.loops.map_search import UprightFinder
+from scanchain.loops.place_search import PlaceSearch
+from scanchain.loops.planar_map_search import PlanarFinder
 from scanchain.loops.recognizer import PlaceCloser
 from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.loops.verification import Verifier
@@ -55,10 +55,10 @@ class LoopCloser:
         self.segments = Segments()
         submaps = VoxelSubmaps(dimension, _SUBMAP_KEYFRAMES, config.local_map, self.segments)
         verifier = Verifier(config)
-        search = PlanarSearch(submaps) if dimension == 2 else None
-        self.near = ProximityCloser(config.loops, submaps, verifier, search)
-        self.map_search: MapSearch | None = None
-        self.relocalizer = None if search is None else Relocalizer(submaps, verifier, self.segments)
+        is_planar = dimension == 2
+        self.near = ProximityCloser(config.loops, submaps, verifier, PlanarSearch(submaps) if is_planar else None)
+        finder = PlanarFinder(submaps, verifier) if is_planar else UprightFinder(config)
+        self.search = PlaceSearch(finder, config.loops, self.segments)
         self.places = PlaceCloser(config, dimension, submaps, verifier)
 
     def begin_in(
@@ -66,69 +66,56 @@ class LoopCloser:
     ) -> float:
         """Take the keyframes of a map, which loops close to first; where the path of the log begins, in meters.
 
-        folder : of a map on disk, which keeps its outline; without one, places are recognized by descriptors
+        folder : of a map on disk, which keeps its outline
         is_final : whether they stay where they are; else only those of one pass make a submap
         """
         self.near.of_map = len(keyframes)
         if is_final:
             self.near.submaps.begin_in(keyframes)
-        if self.relocalizer is not None and self.config.loops.enabled:
-            self.relocalizer.begin_in(keyframes, np.array([each.T_odom_lidar for each in keyframes]))
-        if folder is not None and self.relocalizer is None and self.config.loops.enabled:
-            self.map_search = MapSearch(self.config, self.segments, keyframes, folder)
-        return self.places.begin_in(keyframes, are_added=self.map_search is None)
+        if self.config.loops.enabled:
+            self.search.begin_in(keyframes, folder)
+        return self.places.begin_in(keyframes, are_added=self.near.search is not None)
 
     def start_segment(self, keyframe: int) -> None:
         """Start a new segment at this keyframe: the motion to it from the one before is unknown."""
         self.segments.start(keyframe)
+        self.search.search_again()
 
     def search_again(self) -> None:
         """Forget where the newest segment was matched in the map: it is not there."""
         self.near.target_in_map = -1
         self.near.drift = Drift(self.config.loops.drift)
-        if self.map_search is not None:
-            self.map_search.matched_m = -math.inf
+        self.search.search_again()
 
     def advance(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
         """Closures by a search that is under way, which goes on with every scan, in slices of equal work."""
-        if self.map_search is not None:
-            return self.map_search.advance(keyframes, graph)
-        return () if self.relocalizer is None else self.relocalizer.advance(keyframes, graph)
+        return self.search.advance(keyframes, graph)
 
     def close(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
         """Closures of the newest keyframe, and of submaps that are complete by now; accepted or not.
 
         keyframes : all so far; graph : their best known poses, and how they are connected
         """
-        is_tested = self.segments.is_assumed
-        if self.map_search is not None and not is_tested and self.map_search.has_just_matched(keyframes):
+        if not self.segments.is_assumed and self.search.has_just_matched(keyframes):
             self.places.skip(keyframes)
             return ()
         components = self.segments.components(graph)
         connected = components == components[-1]
         closures = self.near.close(keyframes, graph, connected)
-        if self.relocalizer is not None:
-            closures += self.relocalizer.close(keyframes, graph, components)
-            if not self.is_live:
-                closures += self.relocalizer.finish(keyframes, graph)
-        if self.map_search is not None:
-            self.map_search.take(keyframes, closures)
-            if self.map_search.is_tracking(keyframes):
-                self.places.skip(keyframes)
-                return closures
-            closures += self.map_search.close(keyframes, graph, components)
-            if not self.is_live:
-                closures += self.map_search.finish(keyframes, graph, components)
+        self.search.take(keyframes, closures)
+        if self.search.is_tracking(keyframes):
+            self.places.skip(keyframes)
+            return closures
+        closures += self.search.close(keyframes, graph, components)
+        if not self.is_live:
+            closures += self.search.finish(keyframes, graph)
         return closures + self.places.close(keyframes, graph, connected)
 
     def finish(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
         """Closures of the submaps and searches that the end of the log leaves incomplete."""
         components = self.segments.components(graph)
-        closures = () if self.relocalizer is None else self.relocalizer.finish(keyframes, graph)
-        closures += self.places.close(keyframes, graph, components == components[-1], finish=True)
-        if self.map_search is not None:
-            closures += self.map_search.finish(keyframes, graph, components)
-        return closures
+        closures = self.search.finish(keyframes, graph)
+        return closures + self.places.close(keyframes, graph, components == components[-1], finish=True)
 
 
 class ProximityCloser:

@@ -23,7 +23,9 @@ _RISK = 1e-3  # that a pose is taken up which is wrong
 _DROPPED = -3.0  # log-odds down to which a pose is tested
 _RESERVE = 5.0  # log-odds above that bound that are kept: what was right for long may turn out wrong
 _FINAL = math.log(10.0)  # log-odds more in the end, when nothing that is seen later can withdraw a pose
-_FOLLOWED_M = 50.0  # path since the last match, up to which keyframes without one speak against the place
+_FOLLOWED_M = (
+    50.0  # path since the last match, up to which keyframes speak against the place, and which it is tested for
+)
 LARGEST_RATIO = 2.0  # of one keyframe, as a logarithm
 WEIGHTS = (2.8, -0.4, -4.9)  # of fit, no fit and contradiction in the evidence of a keyframe
 _OF_FIND = {2: 4.0, 3: 5.0}  # log-odds of a find by a search: of most right places, of others in 0.004 and 0.001
@@ -131,12 +133,12 @@ class PlaceTest:
             agrees = not self.waiting or self._agrees(each, keyframes, T_world)
             if each.verdict is ClosureVerdict.ACCEPTED and agrees:
                 self.waiting.append(each)
+                self.matched_m = keyframes[each.source].traveled_m
             ratio = self._ratio(each, keyframes, T_world) if agrees else -LARGEST_RATIO
             self.log_odds += self._weight(keyframes[each.source]) * ratio
         if self.log_odds < self.bound or not self.waiting:
             return ()
         joining = tuple(self.waiting)
-        self.matched_m = max(keyframes[each.source].traveled_m for each in joining)
         self.reset()
         return joining
 
@@ -164,10 +166,10 @@ class PlaceTest:
             if known is None or rank_of(each) > rank_of(known):
                 self.tried[each.source] = each
 
-    @property
-    def is_in_vain(self) -> bool:
-        """True if the pose that is being tested is wrong."""
-        return self.is_gathering and self.log_odds <= _DROPPED
+    def is_in_vain(self, newest: Keyframe) -> bool:
+        """True if the pose that is being tested is wrong, or nothing has matched there for a while."""
+        since_m = newest.traveled_m - self.matched_m
+        return self.is_gathering and (self.log_odds <= _DROPPED or since_m > _FOLLOWED_M * newest.scale)
 
     def reset(self) -> None:
         """Nothing waits, and no pose is being tested."""

@@ -1,4 +1,4 @@
-"""Search for a 3D log in a map: upright structure of both, correlated as seen from above, verified in space."""
+"""Search of a whole map in space: its upright structure and that of a path, correlated as seen from above."""
 
 from __future__ import annotations
 
@@ -17,16 +17,14 @@ from scanchain.config import Config, LocalMapConfig
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Points, Pose, Problem, Proposal
 from scanchain.errors import InputError
 from scanchain.files import write_whole
-from scanchain.graph.pose_graph import PoseGraph
-from scanchain.loops.connectivity import Segments
-from scanchain.loops.evidence import pose_by
+from scanchain.loops.place_search import Underway
 from scanchain.loops.submaps import Submap, level_frame, upright_frame
 from scanchain.loops.verification import Verifier
 from scanchain.maps.saved_map import read_arrays
 from scanchain.registration import SearchGrid, Wanted, Window, find
 from scanchain.registration.search import Found, Search, evenly, upright_columns
 
-_MEMBERS = 10  # number of the newest keyframes that are sought together
+MEMBERS = 10  # number of the newest keyframes that are sought together
 _RADIUS = 1.5  # radii of a submap, up to which structure around the lidar is sought
 _COLUMNS = 150  # number of columns that are scored, evenly spread
 _COARSE, _COARSE_COLUMNS, _COARSE_SEEDS = 2.0, 100, 12  # cells, in fine ones, and numbers of the first search
@@ -42,13 +40,7 @@ _MIN_AGREEMENT = 0.8  # least agreement about free space with a map of another d
 _REACH = 0.5  # radii of a submap from the map's keyframes, beyond which nothing is verified
 _LEVEL_M = 2.0  # least difference in height of two stories
 _MAX_LEVELS = 3  # number of stories that are tried
-_STEP_M = 1.0  # least path between two searches
-_BACKOFF = 0.1  # path between two searches, as a share of what was searched so far
-_INTERVAL_M = 5.0  # largest path between two searches
 _AGREE_M, _AGREE_RAD = 1.0, 0.05  # largest difference between the poses that two finds imply
-_MATCH_M = 3.5  # path between two matches with the map, at full scale
-_TRACKED_M = 20.0  # path since the last match with the map, up to which it is not searched
-_DRIFT = 0.1  # largest distance from the prediction, as a share of the path since the last match
 PLACES_FILE = "places.npz"
 VERSION = 1
 _TOGETHER = 10  # number of keyframes whose points are seen together; drift between more would raise the ground
@@ -72,160 +64,52 @@ class Outline:
     size_m: float
 
 
-class MapSearch:
-    """Search for the newest keyframes in a map, as long as no closure joins them or none has for a while.
+class UprightMap:
+    """Keyframes where they lie in the world, and their upright structure, in which poses are sought."""
 
-    In a large map a search goes on over several scans: each does a bounded part of it, by counts and not by the
-    clock, so that a live log is not held up and results are the same on any machine.
-    """
-
-    def __init__(self, config: Config, segments: Segments, keyframes: Sequence[Keyframe], folder: Path) -> None:
-        """Take the keyframes of a map; the outline is kept in its folder."""
-        self.config = config
-        self.segments = segments
-        self.verifier = Verifier(config)
-        self.of_map = len(keyframes)
+    def __init__(self, keyframes: Sequence[Keyframe], config: Config, folder: Path | None = None) -> None:
+        """See keyframes from above; what is seen is kept in the folder of a map."""
+        self.config, self.keyframes, self.verifier = config, keyframes, Verifier(config)
         self.radius_m = config.loops.place_radius_m * float(np.median([each.scale for each in keyframes]))
         outline = outline_of(folder, keyframes, config.local_map)
-        self.T_map_keyframes = np.array([each.T_odom_lidar for each in keyframes])
-        self.T_level_keyframes = lie.inverse(outline.T_map_level) @ self.T_map_keyframes
+        self.T_world = np.array([each.T_odom_lidar for each in keyframes])
+        self.T_level = lie.inverse(outline.T_map_level) @ self.T_world
         self.size_m, self.columns = outline.size_m, outline.columns
         self.grid: SearchGrid | None = None  # drawn when first searched
-        self.search: Generator[None, None, Closure | None] | None = None  # the one that is under way
-        self.has_advanced = False  # in the present scan
-        self.next_m = 0.0
-        self.matched_m = -math.inf  # path up to the last match with the map
 
-    def has_just_matched(self, keyframes: Sequence[Keyframe]) -> bool:
-        """True while the last match with the map lies so little behind the newest keyframe that none is due."""
-        newest = keyframes[-1]
-        since_m = newest.traveled_m - self.matched_m
-        return since_m < _MATCH_M * newest.scale and self.segments.starts[-1] != newest.index
+    def found(self, members: Sequence[Keyframe]) -> Generator[None, None, Closure | None]:
+        """The closure of the last one of some keyframes with the map's; None where nothing is alike."""
+        newest = members[-1]
+        T_newest_level = level_frame(newest, self.config.local_map)
+        seeds = yield from self.seeds(_together(members, lie.inverse(T_newest_level)))
+        source = Submap(newest, members, self.radius_m)
+        tried: list[tuple[Closure, Pose]] = []  # and T_world_newest by it
+        for seed in seeds:
+            for k in self.stories(seed.T_target_source[:2, 2]):
+                if len(tried) % _VERIFIED == 0:
+                    yield
+                T_first = self.on_ground(k, seed.T_target_source) @ lie.inverse(T_newest_level)
+                verified = self.verifier.submap(source, self.submap(k), T_first, min_agreement=_MIN_AGREEMENT)
+                closure = verified.closure(self.keyframes[k].index, newest.index, Proposal.PLACE)
+                tried.append((closure, self.T_world[k] @ closure.match.T_target_source))
+        accepted = [each for each in tried if each[0].verdict is ClosureVerdict.ACCEPTED]
+        if not accepted:
+            return tried[0][0] if tried else None
+        best, T_best = max(accepted, key=lambda each: each[0].overlap)
+        off_m, off_rad = np.array([lie.apart(T_best, T) for _, T in accepted]).T
+        return best if (off_m < _AGREE_M).all() and (off_rad < _AGREE_RAD).all() else best.rejected(_ALIKE)
 
-    def take(self, keyframes: Sequence[Keyframe], closures: Sequence[Closure]) -> None:
-        """Remember whether the newest keyframe, of these closures, matches the map; then no search goes on."""
-        if any(each.verdict is ClosureVerdict.ACCEPTED and each.target < self.of_map for each in closures):
-            self.matched_m = keyframes[-1].traveled_m
-            self.search = None
-
-    def is_tracking(self, keyframes: Sequence[Keyframe]) -> bool:
-        """True while the last match with the map lies little behind the newest keyframe."""
-        return keyframes[-1].traveled_m - self.matched_m <= _TRACKED_M
-
-    def close(
-        self, keyframes: Sequence[Keyframe], graph: PoseGraph, components: NDArray[np.int64]
-    ) -> tuple[Closure, ...]:
-        """Closures of the newest keyframe with the map; the first that agree with each other are accepted.
-
-        components : (K,) of ``Segments.components``
-        """
-        newest, start = keyframes[-1], self.segments.starts[-1]
-        if newest.index == start:
-            self.search = None  # of keyframes that the newest is not joined to
-        is_due = newest.traveled_m >= self.next_m or newest.index == start
-        if self.search is None and is_due:
-            begun_m = self._begun_m(keyframes, components)
-            self.next_m = newest.traveled_m + min(
-                max(_BACKOFF * (newest.traveled_m - begun_m), _STEP_M), _INTERVAL_M
-            )
-            members = keyframes[max(start, len(keyframes) - _MEMBERS) :]
-            self.search = self._found(members, keyframes)
-        return () if self.has_advanced else self._go_on(keyframes, graph, components)
-
-    def advance(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
-        """Closures, as of ``close``, of the search that is under way, which does its part of a new scan."""
-        self.has_advanced = self.search is not None
-        if self.search is None:
-            return ()
-        return self._go_on(keyframes, graph, self.segments.components(graph))
-
-    def finish(
-        self, keyframes: Sequence[Keyframe], graph: PoseGraph, components: NDArray[np.int64]
-    ) -> tuple[Closure, ...]:
-        """Complete the search that is under way, if any."""
-        closures: tuple[Closure, ...] = ()
-        while self.search is not None:
-            closures = self._go_on(keyframes, graph, components)
-        return closures
-
-    def _go_on(
-        self, keyframes: Sequence[Keyframe], graph: PoseGraph, components: NDArray[np.int64]
-    ) -> tuple[Closure, ...]:
-        if self.search is None:
-            return ()
-        try:
-            next(self.search)
-        except StopIteration as over:
-            self.search = None
-            return self._judged(over.value, keyframes, graph, components)
-        return ()
-
-    def _begun_m(self, keyframes: Sequence[Keyframe], components: NDArray[np.int64]) -> float:
-        """Path up to where the search began: the last match with the map, or the begin of the segment."""
-        is_joined = components[-1] == components[0]
-        return self.matched_m if is_joined else keyframes[self.segments.starts[-1]].traveled_m
-
-    def _judged(
-        self,
-        closure: Closure | None,
-        keyframes: Sequence[Keyframe],
-        graph: PoseGraph,
-        components: NDArray[np.int64],
-    ) -> tuple[Closure, ...]:
-        """Closures by the result of a search, accepted where another find agrees."""
-        if closure is None or closure.verdict is ClosureVerdict.REJECTED:
-            return () if closure is None else (closure,)
-        self.next_m = keyframes[-1].traveled_m + _STEP_M
-        if components[-1] == components[0]:
-            gone_m = keyframes[closure.source].traveled_m - self.matched_m
-            problem = self._contradiction(closure, keyframes, graph.poses, gone_m)
-            if problem:
-                return (closure.rejected(problem),)
-        return (closure,)
-
-    def is_repeated(self, newest: int, keyframes: Sequence[Keyframe]) -> bool:
-        """True if what keyframes of the map up to one of them show is elsewhere in the map as well."""
-        search = self._found(keyframes[max(newest + 1 - _MEMBERS, 0) : newest + 1], keyframes)
+    def is_repeated(self, members: Sequence[Keyframe]) -> bool:
+        """True if what some keyframes show is in several places of the map."""
+        search = self.found(members)
         while True:
             try:
                 next(search)
             except StopIteration as over:
                 return over.value is not None and over.value.cause == _ALIKE.cause
 
-    def _found(
-        self, members: Sequence[Keyframe], keyframes: Sequence[Keyframe]
-    ) -> Generator[None, None, Closure | None]:
-        """The closure of the newest of the members with the map, verified or not; None where nothing is alike.
-
-        Yields where the work of one scan is done.
-        """
-        newest = members[-1]
-        T_newest_level = level_frame(newest, self.config.local_map)
-        seeds = yield from self._seeds(_together(members, lie.inverse(T_newest_level)))
-        source = Submap(newest, members, self.radius_m)
-        tried: list[Closure] = []
-        for seed in seeds:
-            for target in self._stories(seed.T_target_source[:2, 2]):
-                if len(tried) % _VERIFIED == 0:
-                    yield
-                T_level_source = self._on_ground(keyframes[target], seed.T_target_source) @ lie.inverse(
-                    T_newest_level
-                )
-                T_first = lie.inverse(self.T_level_keyframes[target]) @ T_level_source
-                verified = self.verifier.submap(
-                    source, self._submap(target, keyframes), T_first, min_agreement=_MIN_AGREEMENT
-                )
-                tried.append(verified.closure(target, newest.index, Proposal.PLACE))
-        accepted = [each for each in tried if each.verdict is ClosureVerdict.ACCEPTED]
-        if not accepted:
-            return tried[0] if tried else None
-        best = max(accepted, key=lambda each: each.overlap)
-        poses = [pose_by(each, newest.index, keyframes, self.T_map_keyframes) for each in (best, *accepted)]
-        off_m, off_rad = np.array([lie.apart(poses[0], each) for each in poses]).T
-        return best if (off_m < _AGREE_M).all() and (off_rad < _AGREE_RAD).all() else best.rejected(_ALIKE)
-
-    def _seeds(self, points: Points) -> Generator[None, None, Sequence[Found]]:
-        """The best poses (3, 3) in the map's level frame, sought coarsely, then refined."""
+    def seeds(self, points: Points) -> Generator[None, None, Sequence[Found]]:
+        """The best poses (3, 3) of points in the level frame of the map, sought coarsely, then refined."""
         near = points[np.abs(points[:, :2]).max(axis=1, initial=0.0) < _RADIUS * self.radius_m]
         columns = evenly(upright_columns(near, self.size_m), _COLUMNS)
         if len(columns) < _MIN_COLUMNS or not len(self.columns):
@@ -248,9 +132,37 @@ class MapSearch:
         best_first = sorted(seeds, key=lambda each: -each.share)[:_SEEDS]
         return [each for each in best_first if each.share >= _RIVAL * best_first[0].share]
 
+    def stories(self, place: NDArray[np.float64]) -> list[int]:
+        """Which keyframes are nearest to a place (2,), one on each story."""
+        positions = self.T_level[:, :3, 3]
+        away_m = np.linalg.norm(positions[:, :2] - place, axis=1)
+        chosen: list[int] = []
+        for k in np.argsort(away_m, kind="stable").tolist():
+            if away_m[k] > _REACH * self.radius_m or len(chosen) == _MAX_LEVELS:
+                break
+            if (np.abs(positions[chosen, 2] - positions[k, 2]) > _LEVEL_M).all():
+                chosen.append(k)
+        return chosen
+
+    def on_ground(self, k: int, T_plane_source: Pose) -> Pose:
+        """T_target_source of a level source at a place, on the plane of the ground around the k-th keyframe."""
+        T_level_target = self.T_level[k]
+        up = T_level_target[:3, :3] @ level_frame(self.keyframes[k], self.config.local_map)[:3, 2]
+        T = upright_frame(up, np.append(T_plane_source[:2, 0], 0.0))
+        aside = T_plane_source[:2, 2] - T_level_target[:2, 3]
+        T[:2, 3] = T_plane_source[:2, 2]
+        T[2, 3] = T_level_target[2, 3] - float(aside @ up[:2]) / float(up[2])
+        return lie.inverse(T_level_target) @ T
+
+    def submap(self, k: int) -> Submap:
+        """The keyframes around the k-th one, whichever path they lie on."""
+        away_m = np.linalg.norm(self.T_level[:, :3, 3] - self.T_level[k, :3, 3], axis=1)
+        members = [self.keyframes[index] for index in np.flatnonzero(away_m < self.radius_m).tolist()]
+        return Submap(self.keyframes[k], members, self.radius_m)
+
     def _drawn(self) -> SearchGrid:
         """The coarse grid of the map; poses that it finds may be a cell farther off than those verified."""
-        positions = self.T_level_keyframes[:, :2, 3]
+        positions = self.T_level[:, :2, 3]
         reach_m = _REACH * self.radius_m + _COARSE * self.size_m
         extent = np.vstack([self.columns, positions - reach_m, positions + reach_m])
         area_m2 = float(np.ptp(extent, axis=0).prod())
@@ -261,69 +173,46 @@ class MapSearch:
             reach_m=reach_m,
         )
 
-    def _stories(self, place: NDArray[np.float64]) -> list[int]:
-        """Keyframes of the map nearest to a place (2,), one on each story."""
-        positions = self.T_level_keyframes[:, :3, 3]
-        away_m = np.linalg.norm(positions[:, :2] - place, axis=1)
-        chosen: list[int] = []
-        for index in np.argsort(away_m, kind="stable").tolist():
-            if away_m[index] > _REACH * self.radius_m or len(chosen) == _MAX_LEVELS:
-                break
-            if (np.abs(positions[chosen, 2] - positions[index, 2]) > _LEVEL_M).all():
-                chosen.append(index)
-        return chosen
 
-    def _on_ground(self, target: Keyframe, T_plane_source: Pose) -> Pose:
-        """T_level_source of a level source at a place, on the plane of the ground around the target."""
-        T_level_target = self.T_level_keyframes[target.index]
-        up = T_level_target[:3, :3] @ level_frame(target, self.config.local_map)[:3, 2]
-        T = upright_frame(up, np.append(T_plane_source[:2, 0], 0.0))
-        aside = T_plane_source[:2, 2] - T_level_target[:2, 3]
-        T[:2, 3] = T_plane_source[:2, 2]
-        T[2, 3] = T_level_target[2, 3] - float(aside @ up[:2]) / float(up[2])
-        return T
+class UprightFinder:
+    """The last keyframes of a path, sought together in older ones as seen from above; then verified in space."""
 
-    def _submap(self, target: int, keyframes: Sequence[Keyframe]) -> Submap:
-        """The keyframes of the map around one of them, whichever path they lie on."""
-        away_m = np.linalg.norm(self.T_level_keyframes[:, :3, 3] - self.T_level_keyframes[target, :3, 3], axis=1)
-        members = [keyframes[index] for index in np.flatnonzero(away_m < self.radius_m).tolist()]
-        return Submap(keyframes[target], members, self.radius_m)
+    first_m, least_m, most_m = 0.0, 1.0, 3.0
+    follows = True
 
-    def _contradiction(
-        self, closure: Closure, keyframes: Sequence[Keyframe], T_world: Matrix, traveled_m: float
-    ) -> Problem | None:
-        """Why a find contradicts the prediction since the last match, None if it does not."""
-        T_found = pose_by(closure, closure.source, keyframes, T_world)
-        moved_m = lie.apart(T_world[closure.source], T_found)[0]
-        if moved_m <= max(_DRIFT * traveled_m, self.config.loops.min_radius_m):
-            return None
-        limit = f"from the prediction, more than {100.0 * _DRIFT:g} % of the path between"
-        return Problem(f"far {limit}", f"{moved_m:.1f} m {limit}")
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self.drawn: UprightMap | None = None
+
+    def begin_in(self, keyframes: Sequence[Keyframe], folder: Path | None = None) -> None:
+        """Take the keyframes of a map; their outline is kept in its folder."""
+        self.drawn = UprightMap(keyframes, self.config, folder)
+
+    def find(self, keyframes: Sequence[Keyframe], start: int, old: Sequence[Keyframe]) -> Underway:
+        """The closure of the newest keyframe with the older ones, verified or not; see ``Finder``."""
+        T_world = np.array([each.T_odom_lidar for each in old])
+        if self.drawn is None or not np.array_equal(self.drawn.T_world, T_world):
+            self.drawn = UprightMap(old, self.config)
+        closure = yield from self.drawn.found(keyframes[max(start, len(keyframes) - MEMBERS) :])
+        return () if closure is None else (closure,)
 
 
-def outline_of(folder: Path, keyframes: Sequence[Keyframe], config: LocalMapConfig) -> Outline:
-    """The outline of a map in this folder, which holds it from the first time on where it can be written to.
+def outline_of(folder: Path | None, keyframes: Sequence[Keyframe], config: LocalMapConfig) -> Outline:
+    """The outline of keyframes; a map's folder holds it from the first time on where it can be written to.
 
     keyframes : of the map; their ``T_odom_lidar`` is T_map_lidar
     """
-    path = folder / PLACES_FILE
-    stored = _stored(path, len(keyframes))
+    stored = None if folder is None else _stored(folder / PLACES_FILE, len(keyframes))
     if stored is not None:
         return stored
     size_m = config.voxel_size_m * float(np.median([keyframe.scale for keyframe in keyframes]))
     T_map_level = level_of(keyframes, [keyframe.T_odom_lidar for keyframe in keyframes], config)
     columns = _columns(keyframes, lie.inverse(T_map_level), size_m).astype(np.float32)  # as it is stored
-    data = io.BytesIO()
-    np.savez(
-        data,
-        version=VERSION,
-        keyframes=len(keyframes),
-        T_map_level=T_map_level,
-        columns=columns,
-        size_m=size_m,
-    )
-    with suppress(OSError):  # a map that cannot be written to is searched all the same
-        write_whole(path, data.getvalue())
+    if folder is not None:
+        data, count = io.BytesIO(), len(keyframes)
+        np.savez(data, version=VERSION, keyframes=count, T_map_level=T_map_level, columns=columns, size_m=size_m)
+        with suppress(OSError):  # a map that cannot be written to is searched all the same
+            write_whole(folder / PLACES_FILE, data.getvalue())
     return Outline(T_map_level, columns.astype(np.float64), size_m)
 
 

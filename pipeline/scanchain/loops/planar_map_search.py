@@ -1,22 +1,21 @@
-"""Relocalization in the plane: search of a whole map for the points along the path of a new segment."""
+"""Search of a whole planar map for the points along a path, by its surfaces and its free space."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import MapsConfig
 from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Problem, Proposal
-from scanchain.graph.pose_graph import PoseGraph
 from scanchain.kernels.search import FREE, NEAR, UNKNOWN
-from scanchain.loops.connectivity import Segments
 from scanchain.loops.evidence import rank_of
+from scanchain.loops.place_search import Underway
 from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.loops.verification import Verifier
 from scanchain.maps.occupancy_grid import OccupancyGrid, fitting_resolution
@@ -28,17 +27,13 @@ _CERTAIN = 0.6  # log-odds of occupancy, from which on a cell is a surface, and 
 _POINTS, _MORE_POINTS = 120, 800  # number of points that poses are searched with and compared with
 _APART_M, _APART_RAD = 1.0, 0.2  # least distance of two distinct poses
 _ANSWERS = 12  # largest number of poses that are compared
-_RIVAL = 0.75  # share of the best score, from which on other poses are compared with it
+_RIVAL = 0.75  # share of the best score, from which on a pose elsewhere makes it ambiguous
 LEAST_SHARE = 0.35  # of the highest score: wrong poses of long paths come up to it
 _CHANCE = 2.0  # what a search over all poses finds by chance: that much over the root of the number of points more
-_AMBIGUOUS = 0.8  # share of the best score, from which on a pose elsewhere makes it ambiguous
+_CERTAINLY = 0.06  # share above that, from which on a place is taken for found
 
-_FIRST_M = 1.0  # distance traveled in a new segment before the first search of the whole map
-_BACKOFF = 0.2  # share of the distance searched in vain that is traveled before the next search
-_LEAST_INTERVAL_M = 0.5  # least distance traveled between two searches
-_INTERVAL_M = 3.0  # largest distance traveled between two searches
 _PATH_M = 8.0  # length of the path whose points are searched for: over it odometry drifts less than a cell or two
-_AGREE_M, _AGREE_RAD = 0.5, 0.1  # largest difference between two results that confirm each other
+_AGREE_M, _AGREE_RAD = 0.5, 0.1  # largest distance of an aligned scan from where its path was found
 _SOURCES, _SUBMAPS = 4, 6  # keyframes of the path that are aligned, and submaps that are tried for each
 _NEAR_M = 8.0  # largest distance of such a submap's anchor
 
@@ -58,12 +53,21 @@ class Hypothesis:
     @property
     def is_likely(self) -> bool:
         """True if the pose fits better than any does by chance."""
-        return self.share >= LEAST_SHARE + _CHANCE / math.sqrt(self.points)
+        return self.share >= self._by_chance
+
+    @property
+    def _by_chance(self) -> float:
+        return LEAST_SHARE + _CHANCE / math.sqrt(self.points)
+
+    @property
+    def is_certain(self) -> bool:
+        """True if the pose fits far better than any does by chance, and nothing else nearly as well."""
+        return self.share >= self._by_chance + _CERTAINLY and not self.is_ambiguous
 
     @property
     def is_ambiguous(self) -> bool:
         """True if the points fit nearly as well elsewhere."""
-        return self.rival > _AMBIGUOUS * self.share
+        return self.rival > _RIVAL * self.share
 
 
 class PlanarMapSearch:
@@ -137,175 +141,71 @@ class WholeSearch:
         return Hypothesis(best.T_target_source, best.share, max(apart, default=0.0), self.count)
 
 
-class Relocalizer:
-    """Search for a new segment in the older ones, as long as no loop joins it to them.
+class PlanarFinder:
+    """Points of the last part of a path, sought in the drawing of older keyframes; then scans are aligned there.
 
-    All points of its path so far are searched for in the whole map, again and again as it travels. A pose is
-    taken once it fits better than chance, no pose elsewhere fits nearly as well, an earlier search found the same
-    one, and scans align there. A search in a large map goes on over several scans.
+    A pose is taken where it fits better than chance and no pose elsewhere fits nearly as well.
     """
 
-    def __init__(self, submaps: VoxelSubmaps, verifier: Verifier, segments: Segments) -> None:
+    first_m, least_m, most_m = 1.0, 0.5, 3.0
+    follows = False  # the search within the drift does that
+
+    def __init__(self, submaps: VoxelSubmaps, verifier: Verifier) -> None:
         self.submaps = submaps
         self.verifier = verifier
-        self.segments = segments
-        self.next_m = 0.0
-        self.turn = 0
-        self.found: list[Find] = []
-        self.searched: PlanarMapSearch | None = None
-        self.searched_poses = np.empty((0, 3, 3))
-        self.underway: Search | None = None
+        self.drawn: PlanarMapSearch | None = None
+        self.T_drawn = np.empty((0, 3, 3))
 
-    def begin_in(self, keyframes: Sequence[Keyframe], T_map_lidar: Matrix) -> None:
-        """Draw a map, with keyframes at their poses (K, 3, 3), before its first search."""
-        self._draw(keyframes, T_map_lidar)
+    def begin_in(self, keyframes: Sequence[Keyframe], folder: Path | None = None) -> None:
+        """Draw a map before its first search."""
+        self._draw(keyframes)
 
-    def advance(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
-        """Go on with the search that is under way, for a scan; closures once it is done, as of ``close``."""
-        if self.underway is None:
-            return ()
-        self.underway.search.advance()
-        return self._found(keyframes, graph.poses) if self.underway.search.is_done else ()
-
-    def close(
-        self, keyframes: Sequence[Keyframe], graph: PoseGraph, components: NDArray[np.int64]
-    ) -> tuple[Closure, ...]:
-        """Closures of keyframes of the newest segment to older segments; accepted where two finds agree.
-
-        components : (K,) of ``Segments.components``
-        """
-        start = self.segments.starts[-1]
-        unknown = np.flatnonzero(components != components[-1])
-        if not len(unknown) or (self.underway is not None and self.underway.source < start):
-            self.underway = None
-        if not len(unknown) or self.underway is not None or not self._is_due(start, keyframes):
-            return ()
-        self._begin(start, self._next_component(unknown, components), keyframes, graph.poses)
-        return self.advance(keyframes, graph)
-
-    def finish(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
-        """Closures by the search that the end of the log left under way."""
-        closures: tuple[Closure, ...] = ()
-        while self.underway is not None:
-            closures = self.advance(keyframes, graph)
-        return closures
-
-    def _found(self, keyframes: Sequence[Keyframe], T_world: Matrix) -> tuple[Closure, ...]:
-        """Closures by the search that is done, where it agrees with another one of the newest segment."""
-        assert self.underway is not None
-        old, find = self.underway.old, self.underway.find()
-        self.underway = None
-        if find is None:
-            return ()
-        start = self.segments.starts[-1]
-        self.found = [each for each in self.found if each.source >= start]
-        agreeing = any(_agree(other, find, keyframes) for other in self.found)
-        self.found.append(find)
-        if not agreeing:
-            return ()
-        path = np.arange(_path_begin(keyframes, start), len(keyframes))
-        return self._verified(find, path, old, keyframes, T_world)
-
-    def _next_component(self, unknown: NDArray[np.int64], components: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Keyframes of the next component, in rotation: two may show the same location."""
-        numbers = np.unique(components[unknown])
-        self.turn += 1
-        return unknown[components[unknown] == numbers[self.turn % len(numbers)]]
-
-    def _is_due(self, start: int, keyframes: Sequence[Keyframe]) -> bool:
-        """True if the newest segment has gone far enough for the next search, which sets the distance after it."""
-        traveled_m = keyframes[-1].traveled_m - keyframes[start].traveled_m
-        if traveled_m < _FIRST_M or keyframes[-1].traveled_m < self.next_m:
-            return False
-        self.next_m = keyframes[-1].traveled_m + min(max(_BACKOFF * traveled_m, _LEAST_INTERVAL_M), _INTERVAL_M)
-        return True
-
-    def _begin(self, start: int, old: NDArray[np.int64], keyframes: Sequence[Keyframe], T_world: Matrix) -> None:
-        """Begin a search for the end of the newest segment among older keyframes."""
+    def find(self, keyframes: Sequence[Keyframe], start: int, old: Sequence[Keyframe]) -> Underway:
+        """Closures of keyframes of the path with older ones; see ``Finder``."""
         path = keyframes[_path_begin(keyframes, start) :]
         T_newest_odom = lie.inverse(path[-1].T_odom_lidar)
         points = np.vstack([lie.transform(T_newest_odom @ member.T_odom_lidar, member.points) for member in path])
-        target = self._draw([keyframes[k] for k in old.tolist()], T_world[old])
-        self.underway = Search(path[-1].index, old, WholeSearch(target, points, LEAST_SHARE))
-
-    def _draw(self, keyframes: Sequence[Keyframe], T_world: Matrix) -> PlanarMapSearch:
-        """The map of keyframes at their poses; the last one where these are the same."""
-        if self.searched is None or not np.array_equal(self.searched_poses, T_world):
-            self.searched = PlanarMapSearch(keyframes, T_world, self.submaps.config.voxel_size_m)
-            self.searched_poses = T_world
-        return self.searched
-
-    def _verified(
-        self,
-        find: Find,
-        path: NDArray[np.int64],
-        old: NDArray[np.int64],
-        keyframes: Sequence[Keyframe],
-        T_world: Matrix,
-    ) -> tuple[Closure, ...]:
-        """Closures of some keyframes of the path, from where the find puts them."""
-        sources = path[:: -max(len(path) // _SOURCES, 1)][:_SOURCES]
-        anchors = old[old % self.submaps.half_width == 0]
+        search = WholeSearch(self._draw(old), points, LEAST_SHARE)
+        search.advance()
+        while not search.is_done:
+            yield
+            search.advance()
+        best = search.best()
+        if best is None or not best.is_certain:
+            return ()
+        anchors = [each for each in old if each.index % self.submaps.half_width == 0]
         closures = [
-            self._aligned(source, find.moved_to(source, keyframes), anchors, keyframes, T_world)
-            for source in sources.tolist()
+            self._aligned(source, best.T_map_lidar @ T_newest_odom @ source.T_odom_lidar, anchors, keyframes)
+            for source in path[:: -max(len(path) // _SOURCES, 1)][:_SOURCES]
         ]
-        return tuple(sorted((each for each in closures if each is not None), key=rank_of, reverse=True))
+        return sorted((each for each in closures if each is not None), key=rank_of, reverse=True)
+
+    def _draw(self, keyframes: Sequence[Keyframe]) -> PlanarMapSearch:
+        """The map of keyframes; the last one where they lie as they did."""
+        T_world = np.array([each.T_odom_lidar for each in keyframes])
+        if self.drawn is None or not np.array_equal(self.T_drawn, T_world):
+            self.drawn = PlanarMapSearch(keyframes, T_world, self.submaps.config.voxel_size_m)
+            self.T_drawn = T_world
+        return self.drawn
 
     def _aligned(
-        self,
-        source: int,
-        T_world_source: Pose,
-        anchors: NDArray[np.int64],
-        keyframes: Sequence[Keyframe],
-        T_world: Matrix,
+        self, source: Keyframe, T_world_source: Pose, anchors: Sequence[Keyframe], keyframes: Sequence[Keyframe]
     ) -> Closure | None:
         """The closure of a keyframe to the submap near by that it overlaps most; None where there is none."""
-        away_m = np.linalg.norm(T_world[anchors, :2, 2] - T_world_source[:2, 2], axis=1)
-        near = anchors[np.argsort(away_m)[:_SUBMAPS]]
-        near = near[np.linalg.norm(T_world[near, :2, 2] - T_world_source[:2, 2], axis=1) <= _NEAR_M]
+        positions = np.array([each.T_odom_lidar[:2, 2] for each in anchors]).reshape(-1, 2)
+        away_m = np.linalg.norm(positions - T_world_source[:2, 2], axis=1)
         best: Closure | None = None
-        for anchor in near.tolist():
-            T_first = lie.between(T_world[anchor], T_world_source)
-            submap = self.submaps.around(anchor, keyframes, len(keyframes) - 1)
-            verified = self.verifier.scan(keyframes[source], submap, T_first)
+        for anchor in (anchors[k] for k in np.argsort(away_m)[:_SUBMAPS].tolist() if away_m[k] <= _NEAR_M):
+            T_first = lie.between(anchor.T_odom_lidar, T_world_source)
+            submap = self.submaps.around(anchor.index, keyframes, len(keyframes) - 1)
+            verified = self.verifier.scan(source, submap, T_first)
             off_m, off_rad = lie.apart(T_first, verified.match.T_target_source)
             is_off = off_m > _AGREE_M or off_rad > _AGREE_RAD
             far = Problem("far from where the path was found", f"{off_m:.1f} m from where the path was found")
-            closure = verified.closure(anchor, source, Proposal.PLACE, problem=far if is_off else None)
+            closure = verified.closure(anchor.index, source.index, Proposal.PLACE, problem=far if is_off else None)
             if best is None or (rank_of(closure) > rank_of(best)):
                 best = closure
         return best
-
-
-@dataclass(frozen=True, slots=True)
-class Search:
-    """A search under way, for keyframe ``source`` among the older keyframes ``old``."""
-
-    source: int
-    old: NDArray[np.int64]
-    search: WholeSearch
-
-    def find(self) -> Find | None:
-        """The pose that the search found; None where there is none, or an ambiguous one."""
-        best = self.search.best()
-        if best is None or best.is_ambiguous or not best.is_likely:
-            return None
-        return Find(self.source, int(self.old[0]), best.T_map_lidar)
-
-
-@dataclass(frozen=True, slots=True)
-class Find:
-    """The pose of keyframe ``source`` among older keyframes, by a search; ``target`` is the first of them."""
-
-    source: int
-    target: int
-    T_world_source: Pose
-
-    def moved_to(self, keyframe: int, keyframes: Sequence[Keyframe]) -> Pose:
-        """T_world_keyframe of another keyframe of the segment, by odometry."""
-        odom = keyframes[self.source].T_odom_lidar
-        return self.T_world_source @ lie.between(odom, keyframes[keyframe].T_odom_lidar)
 
 
 def _are_apart(T: Pose, T_other: Pose) -> bool:
@@ -320,9 +220,3 @@ def _path_begin(keyframes: Sequence[Keyframe], start: int) -> int:
     while first > start and keyframes[-1].traveled_m - keyframes[first - 1].traveled_m <= _PATH_M:
         first -= 1
     return first
-
-
-def _agree(a: Find, b: Find, keyframes: Sequence[Keyframe]) -> bool:
-    """True if two finds imply the same pose of the later keyframe."""
-    off_m, off_rad = lie.apart(a.moved_to(b.source, keyframes), b.T_world_source)
-    return a.target == b.target and off_m < _AGREE_M and off_rad < _AGREE_RAD

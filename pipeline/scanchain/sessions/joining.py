@@ -19,7 +19,7 @@ from scanchain.errors import counted
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
 from scanchain.loops.evidence import PlaceTest, compared, contradiction
-from scanchain.loops.map_search import MapSearch
+from scanchain.loops.map_search import MEMBERS, UprightMap
 from scanchain.loops.planar_map_search import PlanarMapSearch
 from scanchain.maps import Edges, SavedMap
 from scanchain.placement import loop_information
@@ -285,9 +285,9 @@ def doubt_about(joined: Joined, old: int, config: Config) -> str:
         repeated, paths = repeated_paths(joined.keyframes[:old], guest, in_force - old, config)
     else:
         some = in_force[:: -(-len(in_force) // _SOUGHT)].tolist()
-        with TemporaryDirectory() as folder:
-            search = MapSearch(config, Segments(), joined.keyframes, Path(folder))
-        repeated, paths = sum(search.is_repeated(each, joined.keyframes) for each in some), len(some)
+        ends = [joined.keyframes[max(k + 1 - MEMBERS, 0) : k + 1] for k in some]
+        everything = UprightMap(joined.keyframes, config)
+        repeated, paths = sum(map(everything.is_repeated, ends)), len(some)
     if repeated > MAX_REPEATED * paths:
         return f"{repeated} of {counted(paths, 'path')} that agree look like other places, too"
     return "" if paths >= _MIN_PATHS else _SHORT

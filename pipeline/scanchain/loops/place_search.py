@@ -1,0 +1,160 @@
+"""Search for the newest keyframes in a map, or in older segments of a log, as long as nothing joins them there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain import lie
+from scanchain.config import LoopsConfig
+from scanchain.data import Closure, ClosureVerdict, Keyframe, Problem
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.loops.connectivity import Segments
+from scanchain.loops.evidence import pose_by
+
+_BACKOFF = 0.2  # path between two searches, as a share of what was searched in vain
+_MATCH_M = 3.5  # path between two matches with a map that a log is followed in, at full scale
+_TRACKED_M = 20.0  # path since the last match with the map, up to which it is not searched
+_DRIFT = 0.1  # largest distance from the prediction, as a share of the path since the last match
+
+Underway = Generator[None, None, Sequence[Closure]]
+
+
+class Finder(Protocol):
+    """Where keyframes of a path lie among older ones, in the plane or in space.
+
+    Attributes
+    ----------
+    first_m, least_m, most_m : path of a segment before its first search, and least and largest between two
+    follows : whether a log that is joined to a map is sought there again after a while without a match
+    """
+
+    first_m: float
+    least_m: float
+    most_m: float
+    follows: bool
+
+    def begin_in(self, keyframes: Sequence[Keyframe], folder: Path | None) -> None:
+        """Take the keyframes of a map; what a search makes of them may be kept in its folder."""
+        ...
+
+    def find(self, keyframes: Sequence[Keyframe], start: int, old: Sequence[Keyframe]) -> Underway:
+        """Closures of the newest keyframes, of the segment from ``start`` on, with older ones.
+
+        ``T_odom_lidar`` of these is where they lie in the world. Yields where the work of one scan is done: by
+        counts and not by the clock, so that results are the same on any machine.
+        """
+        ...
+
+
+class PlaceSearch:
+    """When the newest segment is sought in a map or in older segments, one search after the other.
+
+    In a large map a search goes on over several scans.
+    """
+
+    def __init__(self, finder: Finder, config: LoopsConfig, segments: Segments) -> None:
+        self.finder, self.config, self.segments = finder, config, segments
+        self.of_map = 0  # number of the first keyframes that belong to a map
+        self.turn = 0
+        self.next_m = 0.0
+        self.matched_m = -math.inf  # path up to the last match with a map that the log is followed in
+        self.underway: Underway | None = None
+
+    def begin_in(self, keyframes: Sequence[Keyframe], folder: Path | None) -> None:
+        """Take the keyframes of a map."""
+        self.of_map = len(keyframes)
+        self.finder.begin_in(keyframes, folder)
+
+    def search_again(self) -> None:
+        """Forget the last match: the newest segment is not there, or has just begun."""
+        self.matched_m = -math.inf
+
+    def has_just_matched(self, keyframes: Sequence[Keyframe]) -> bool:
+        """True while the last match with the map lies so little behind the newest keyframe that none is due."""
+        return self._since_m(keyframes) < _MATCH_M * keyframes[-1].scale
+
+    def is_tracking(self, keyframes: Sequence[Keyframe]) -> bool:
+        """True while the last match with the map lies little behind the newest keyframe."""
+        return self._since_m(keyframes) <= _TRACKED_M
+
+    def take(self, keyframes: Sequence[Keyframe], closures: Sequence[Closure]) -> None:
+        """Remember whether the newest keyframe, of these closures, matches the map; then no search goes on."""
+        accepted = (each for each in closures if each.verdict is ClosureVerdict.ACCEPTED)
+        if self.finder.follows and any(each.target < self.of_map for each in accepted):
+            self.matched_m, self.underway = keyframes[-1].traveled_m, None
+
+    def close(
+        self, keyframes: Sequence[Keyframe], graph: PoseGraph, components: NDArray[np.int64]
+    ) -> tuple[Closure, ...]:
+        """Closures by a search for the newest keyframe, if one is due.
+
+        components : (K,) of ``Segments.components``
+        """
+        newest, start = keyframes[-1], self.segments.starts[-1]
+        if newest.index == start:
+            self.underway, self.next_m = None, newest.traveled_m + self.finder.first_m
+        old = self._sought(components)
+        if not len(old):
+            self.underway = None
+        if not len(old) or self.underway is not None or newest.traveled_m < self.next_m:
+            return ()
+        is_joined = components[-1] == components[old[0]]
+        begun_m = self.matched_m if is_joined else keyframes[start].traveled_m
+        step_m = max(_BACKOFF * (newest.traveled_m - begun_m), self.finder.least_m)
+        self.next_m = newest.traveled_m + min(step_m, self.finder.most_m)
+        self.turn += 1
+        placed = [replace(keyframes[k], T_odom_lidar=graph.poses[k]) for k in old.tolist()]
+        self.underway = self.finder.find(keyframes[: newest.index + 1], start, placed)
+        return self.advance(keyframes, graph)
+
+    def advance(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
+        """Go on with the search that is under way, for a scan; closures once it is done."""
+        if self.underway is None:
+            return ()
+        try:
+            next(self.underway)
+        except StopIteration as over:
+            self.underway = None
+            return tuple(self._checked(each, keyframes, graph) for each in over.value)
+        return ()
+
+    def finish(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
+        """Complete the search that is under way, if any."""
+        closures: tuple[Closure, ...] = ()
+        while self.underway is not None:
+            closures = self.advance(keyframes, graph)
+        return closures
+
+    def _sought(self, components: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Keyframes among which the newest are sought: those of one of the components that they are not joined to.
+
+        Components take turns: two may show the same location.
+        """
+        unknown = np.flatnonzero(components != components[-1])
+        if not len(unknown):
+            return np.arange(self.of_map if self.finder.follows else 0)
+        numbers = np.unique(components[unknown])
+        return unknown[components[unknown] == numbers[self.turn % len(numbers)]]
+
+    def _since_m(self, keyframes: Sequence[Keyframe]) -> float:
+        return keyframes[-1].traveled_m - self.matched_m
+
+    def _checked(self, closure: Closure, keyframes: Sequence[Keyframe], graph: PoseGraph) -> Closure:
+        """A closure; rejected where it contradicts the prediction since the last match."""
+        components = self.segments.components(graph)
+        if closure.verdict is ClosureVerdict.REJECTED or components[closure.target] != components[-1]:
+            return closure
+        T_found = pose_by(closure, closure.source, keyframes, graph.poses)
+        moved_m = lie.apart(graph.poses[closure.source], T_found)[0]
+        traveled_m = keyframes[closure.source].traveled_m - self.matched_m
+        if moved_m <= max(_DRIFT * traveled_m, self.config.min_radius_m):
+            return closure
+        limit = f"from the prediction, more than {100.0 * _DRIFT:g} % of the path between"
+        return closure.rejected(Problem(f"far {limit}", f"{moved_m:.1f} m {limit}"))
