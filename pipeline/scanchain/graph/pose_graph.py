@@ -17,17 +17,13 @@ from scanchain.graph.certificate import Certificate, certify
 from scanchain.graph.cholesky import SingularMatrixError
 from scanchain.graph.covariance import inverse_blocks, pose_errors, relative_covariance
 from scanchain.graph.edge_checks import (
-    LOST,
-    WEAK,
-    FreePose,
     check_connected,
     check_edges,
     free_poses,
     free_text,
-    hanging,
-    lost_text,
     own_equations,
     ranks,
+    weakly_joined,
 )
 from scanchain.graph.explanation import Explained, Explainer
 from scanchain.graph.graduation import Rejection, Since
@@ -367,14 +363,16 @@ class PoseGraph:
         """Certificate of the global minimum of χ², edges weighed as the last optimization left them."""
         return certify(self._prepared(), self.poses, self._weight_in_force, self._undetermined(), self.names)
 
-    def free_poses(self) -> tuple[FreePose, ...]:
-        """Poses that the edges in force leave free in some direction, at the poses of now."""
+    def free_poses(self) -> NDArray[np.int64]:
+        """Names of the poses that the edges in force leave free in some direction, at the poses of now."""
         self._factor_is_now = False
         return free_poses(self._prepared(), self.poses, self._weight_in_force, self._rank.rows, self.names)
 
     def weakly_joined(self) -> NDArray[np.int64]:
         """Names of the poses that hang on edges in force of next to no information."""
-        return self.names[hanging(*self._edges_in_force, self.fixed, WEAK)]
+        kept = ~self.is_rejected
+        information = self.weight[kept, None, None] * self.information[kept]
+        return self.names[weakly_joined(self.edges[kept], information, self.fixed)]
 
     def state(self) -> GraphState:
         """The graph as it is, for files and recordings; odometry edges first."""
@@ -474,25 +472,17 @@ class PoseGraph:
         return explanation.applied(self.edges, self._measurements.rows, self._information.rows, self.is_loop)
 
     def _undetermined(self) -> str:
-        """Unobservable directions, with which nothing can be computed, as text; empty without any."""
-        names = self.names[hanging(*self._edges_in_force, self.fixed, LOST)]
-        free = () if len(names) else self.free_poses()
-        return lost_text(names) if len(names) else free_text(free) if free else ""
+        """Free poses, with which nothing can be computed, as text; empty without any."""
+        free = self.free_poses()
+        return free_text(free) if len(free) else ""
 
     def _singular(self, error: SingularMatrixError, free: NDArray[np.int64]) -> InputError:
         """The error for poses that their edges leave free, or as good as free, of the free ones (n,)."""
-        name = int(self.names[free[error.variable]])
-        return _refused(self._undetermined() or free_text([FreePose(name, ("next to no information",))]))
+        return _refused(self._undetermined() or free_text(self.names[free[[error.variable]]]))
 
     @property
     def _weight_in_force(self) -> NDArray[np.float64]:
         return self.weight * ~self.is_rejected
-
-    @property
-    def _edges_in_force(self) -> tuple[NDArray[np.int64], Matrix]:
-        """Edges in force (E', 2), and w Ω of them."""
-        kept = ~self.is_rejected
-        return self.edges[kept], self.weight[kept, None, None] * self.information[kept]
 
     def _in_force(self, chi2: NDArray[np.float64]) -> float:
         """The sum of w χ² over the edges in force, of χ² (E,)."""
