@@ -37,10 +37,11 @@ _MAX_STEPS = 20  # largest number of changes of an explanation in one optimizati
 _SETTLED = 0.1  # share of the price of a loop edge below which a change gains nothing
 _MOST_LEFT_OUT = 30  # largest number of loop edges that are looked at
 _MOST_ENTRIES = 4_000_000  # largest number of covariances between these and odometry, 32 MB
-_CURVATURE = 0.3  # share of a change by a drift that its linearization may be off by
 _SLIP_LENGTHS = (4, 16, 64)  # number of edges of the stretches that are tried
 _MOST_STRETCHES = 100  # largest number of stretches that are looked at more closely
-_DRIFT_ROUNDS, _STRETCH_ROUNDS = 5, 3  # of the least squares over the loop edges that one explains
+_CURVATURE = 0.3  # share of a change by a drift that its linearization may be off by
+_DRIFT_ROUNDS = 3  # of which each knows better how far off it is
+_ROUNDS = 3  # of the least squares over the loop edges that one explains
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +69,7 @@ class Explainer:
     information: Matrix
     is_loop: NDArray[np.bool_]
     config: GraphConfig
-    jumps: bool = False
+    jumps: bool
 
     def solve(self, explanation: Explanation, poses: Matrix, initialize: Initialization) -> Explained:
         """The minimum, from these poses and this explanation."""
@@ -182,6 +183,16 @@ class LeftOut:
             moved = responses(self.factored, *problem.edges[edge])
             self.joint[place] = moved[end] - moved[begin]
 
+    def weighed(self, spread: Matrix | float = 0.0) -> tuple[Matrix, Matrix]:
+        """Residuals (L, k) of these loop edges, and their information (L, k, k), each for all it stands for.
+
+        spread : further standard deviations (L, k)
+        """
+        k = self.errors.shape[1]
+        noise = self.covariances + np.square(spread)[..., None] * np.eye(k)
+        information = np.asarray(self.stride * np.linalg.inv(noise), np.float64)
+        return self.errors[self.edges], information
+
     def shifts(self, twists: Matrix, among: slice = slice(None)) -> Iterator[Matrix]:
         """∂e (n, k, p) of each of these loop edges, by right twists (n, k, p) on some edges of odometry."""
         problem, odometry = self.problem, self.odometry[among]
@@ -222,8 +233,7 @@ class LeftOut:
 def drift_step(left_out: LeftOut, sign: Vector, drift: Vector, price: float) -> tuple[float, Vector]:
     """The fall of the cost by a change of the drift, to first order, and this change.
 
-    Every loop edge left out gives a candidate, refined by least squares over the edges that it explains; the one
-    with the least cost Σ min(χ², price) is chosen.
+    Each round counts the error of the linearization, a share of the change that the last round found, as noise.
     """
     odometry = left_out.odometry
     twists = lie.log(left_out.problem.measurements[odometry])
@@ -231,42 +241,17 @@ def drift_step(left_out: LeftOut, sign: Vector, drift: Vector, price: float) -> 
     d = twists.shape[1] - len(drift) + 1
     B[:, :d, 0] += left_out.errors[odometry, :d]  # the noise grows with the scale
     slope, curvature = left_out.quadratic(B)
-    V = np.array([shift.sum(axis=0) for shift in left_out.shifts(B)])
-    slope, curvature = slope - prior(len(drift)) * drift, curvature + np.diag(prior(len(drift)))
-    errors, noise = left_out.errors[left_out.edges], left_out.covariances
-    best, most = np.zeros(len(drift)), 0.0
-    if drift.any():
-        best = np.asarray(np.linalg.solve(curvature, slope), np.float64)
-        most = float(slope @ best)
-
-    def solved(members: NDArray[np.int64], weight: Matrix) -> Vector:
-        A = curvature + np.einsum("eap,eab,ebq->pq", V[members], weight, V[members])
-        return np.asarray(
-            np.linalg.solve(A, slope - np.einsum("eap,eab,eb->p", V[members], weight, errors[members])), np.float64
-        )
-
-    def fitting(change: Vector) -> tuple[Vector, Matrix]:
-        size_2 = (V @ change) ** 2
-        for part in (size_2[:, :d], size_2[:, d:]):
-            part[:] = part.sum(axis=1, keepdims=True)
-        spread = _CURVATURE**2 * size_2[:, :, None] * np.eye(errors.shape[1])
-        weight = np.asarray(np.linalg.inv(noise + spread), np.float64)
-        left = errors + V @ change
-        return np.einsum("ea,eab,eb->e", left, weight, left), weight
-
-    for start in range(len(errors)):
-        members = np.array([start])
-        change = solved(members, np.asarray(np.linalg.inv(noise[[start]]), np.float64))
-        for _ in range(_DRIFT_ROUNDS):
-            chi2, weight = fitting(change)
-            members = np.flatnonzero(chi2 < price)
-            change = solved(members, weight[members])
-        chi2, _ = fitting(change)
-        explained = price - chi2[chi2 < price]
-        gain = float(explained.sum() + 2.0 * slope @ change - change @ curvature @ change)
-        if gain > most and (drift.any() or len(explained) >= FEWEST):
-            best, most = change, gain
-    return most, best
+    V, own = np.array([shift.sum(axis=0) for shift in left_out.shifts(B)]), prior(len(drift))
+    A, b, price = curvature + np.diag(own), slope - own * drift, left_out.stride * price
+    alone = np.asarray(np.linalg.solve(A, b), np.float64)
+    fall, change = float(b @ alone) * drift.any(), alone * drift.any()
+    for _ in range(_DRIFT_ROUNDS):
+        moved = V @ change
+        lengths = [np.linalg.norm(part, axis=1) for part in (moved[:, :d], moved[:, d:])]
+        spread = _CURVATURE * np.repeat(np.stack(lengths, axis=1), (d, moved.shape[1] - d), axis=1)
+        found = _largest_fall(A, b, *left_out.weighed(spread), V, price)
+        fall, change = max((fall, change), found, key=lambda each: each[0])
+    return fall, change
 
 
 def next_loosened(
@@ -303,8 +288,7 @@ def next_loosened(
     A = unit + (learned if is_jump else np.minimum(learned, claimed))
     b = _means(pull_t @ left_out.errors[left_out.odometry][..., None], first, count)[..., 0]
     costs = cost_of(claimed, is_jump=is_jump, price=price, nominal=nominal)
-    e, price = left_out.errors[left_out.edges], left_out.stride * price
-    M = np.asarray(left_out.stride * np.linalg.inv(left_out.covariances), np.float64)
+    e, M, price = *left_out.weighed(np.zeros(1)), left_out.stride * price
     alone = (b * np.linalg.solve(A, b[..., None])[..., 0]).sum(axis=1) / len(e)  # without any of them explained
     hoped = -costs
     for error, weight, shift in zip(e, M, left_out.shifts(B), strict=True):
@@ -327,14 +311,14 @@ def next_loosened(
 
 
 def _largest_fall(A: Matrix, b: Vector, e: Matrix, M: Matrix, V: Matrix, price: float) -> tuple[float, Vector]:
-    """Largest fall of the cost by errors (p,) of one stretch that explain a loop edge, and the errors.
+    """Largest fall of the cost by errors (p,) of odometry that explain a loop edge, and the errors.
 
-    A (p, p), b (p,) : of the stretch; e, M, V : (L, ...) of the loop edges
+    A (p, p), b (p,) : of these errors, prior included; e, M, V : (L, ...) of the loop edges
     """
     VM = np.swapaxes(V, 1, 2) @ M
     VMV, VMe = VM @ V, (VM @ e[..., None])[..., 0]
     chosen, largest, best = np.eye(len(e)), 0.0, np.zeros(len(b))
-    for _ in range(_STRETCH_ROUNDS):
+    for _ in range(_ROUNDS):
         t = np.linalg.solve(A + np.einsum("cl,lab->cab", chosen, VMV), (b - chosen @ VMe)[..., None])[..., 0]
         left = e + np.einsum("lab,cb->cla", V, t)
         saved = np.maximum(price - np.einsum("cla,lab,clb->cl", left, M, left), 0.0)

@@ -59,6 +59,7 @@ class PoseGraph:
         self._explanation = Explanation.none(k)
         self._problem: BetweenProblem | None = None
         self._factor_is_now = False
+        self._is_end = False  # of a longer graph, in whose odometry jumps are looked for, and no drift
 
     def __len__(self) -> int:
         return len(self._poses)
@@ -278,7 +279,7 @@ class PoseGraph:
         try:
             explained = self._explained(problem, config, initialize, rejection)
         except SingularMatrixError as error:
-            raise self._singular(error, problem.free) from error
+            raise self._singular(error) from error
         self._problem, self._explanation = explained.problem, explained.explanation
         minimum = explained.minimum
         self._poses.replace(minimum.estimate.poses)
@@ -305,29 +306,19 @@ class PoseGraph:
         rejection : as in ``optimize``; what is judged is also explained by jumps of odometry there
         """
         chosen = np.flatnonzero((self.edges >= first).any(axis=1))
-        edges, is_loop = self.edges[chosen], self.is_loop[chosen]
+        is_loop, before = self.is_loop[chosen], int((~self.is_loop).sum())
         measured, information = (each[chosen - chosen[0]] for each in self.added_since(int(chosen[0])))
-        is_held = (np.arange(len(self)) < first) | self.fixed
-
-        def problem_of(further: Explanation) -> BetweenProblem:
-            return BetweenProblem(
-                edges, *further.applied(edges, measured, information, is_loop), is_held, self.is_point
-            )
-
-        none = Explanation.none(self.freedom)
-        try:
-            if rejection == "update":
-                minimum = solve(problem_of(none), self.poses, is_loop, config, "given", Since(0, 0))
-            else:
-                explainer = Explainer(problem_of, measured, information, is_loop, config, jumps=True)
-                explained = explainer.solve(none, self.poses, "given")
-                minimum, before = explained.minimum, int((~self.is_loop).sum() - (~is_loop).sum())
-                self._explanation = self._explanation.with_later(explained.explanation, before)
-        except SingularMatrixError as error:
-            raise self._singular(error, np.flatnonzero(~is_held)) from error
+        end = PoseGraph(self.dimension, self._names)
+        for column in ("_poses", "_stamps_ns", "_is_point"):
+            getattr(end, column).extend(getattr(self, column).rows)
+        end._fixed = set(np.flatnonzero((np.arange(len(self)) < first) | self.fixed).tolist())
+        end._add_edges(self.edges[chosen], measured, information, is_loop)
+        end._is_end = True
+        end.optimize(config, initialize="given", rejection=rejection)
+        self._explanation = self._explanation.with_later(end._explanation, before - int((~is_loop).sum()))
         weight = self.weight.copy()
-        weight[chosen] = minimum.weights
-        self._poses.replace(minimum.estimate.poses)
+        weight[chosen] = end.weight
+        self._poses.replace(end.poses)
         self._weight.replace(weight)
         self._changed()
 
@@ -410,7 +401,7 @@ class PoseGraph:
             information = self._weight_in_force[:, None, None] * self.information
             problem.cholesky.factorize(own_equations(problem, self.poses, information))
         except SingularMatrixError as error:
-            raise self._singular(error, problem.free) from error
+            raise self._singular(error) from error
         result = np.zeros((len(self), self.freedom, self.freedom))
         result[problem.free] = inverse_blocks(problem)[: len(problem.free)]
         return result
@@ -438,7 +429,7 @@ class PoseGraph:
             try:
                 problem.cholesky.factorize(equations.values)
             except SingularMatrixError as error:
-                raise self._singular(error, problem.free) from error
+                raise self._singular(error) from error
             self._factor_is_now = True
         return problem
 
@@ -450,7 +441,7 @@ class PoseGraph:
             minimum = solve(problem, self.poses, self.is_loop, config, initialize, self.since)
             return Explained(problem, minimum, self._explanation)
         measured, information = self._measurements.rows, self._information.rows
-        explainer = Explainer(self._problem_of, measured, information, self.is_loop, config)
+        explainer = Explainer(self._problem_of, measured, information, self.is_loop, config, self._is_end)
         return explainer.solve(self._explanation, self.poses, initialize)
 
     def _prepared(self) -> BetweenProblem:
@@ -476,9 +467,10 @@ class PoseGraph:
         free = self.free_poses()
         return free_text(free) if len(free) else ""
 
-    def _singular(self, error: SingularMatrixError, free: NDArray[np.int64]) -> InputError:
-        """The error for poses that their edges leave free, or as good as free, of the free ones (n,)."""
-        return _refused(self._undetermined() or free_text(self.names[free[[error.variable]]]))
+    def _singular(self, error: SingularMatrixError) -> InputError:
+        """The error for poses that their edges leave free, or as good as free."""
+        variable = self._prepared().free[[error.variable]]
+        return _refused(self._undetermined() or free_text(self.names[variable]))
 
     @property
     def _weight_in_force(self) -> NDArray[np.float64]:
