@@ -21,7 +21,6 @@ _GIVEN_UP = (0.0, 1e-6, 1e-4, 1e-2)  # shares of χ² by which the bound is lowe
 _SLOPE = 0.9311  # largest norm of V(φ)⁻¹ for rotations up to π: (π²/16 + 1/4)^½
 _BEND = 0.72  # loss of curvature of κ‖φ‖² at an angle θ*, as a factor of θ*², up to 1 rad
 _FARTHEST = 1.0  # largest θ*, rad, of an edge that is bounded
-_STRETCH = 0.25 * np.pi**2  # largest ratio of ‖ρ − ρ*‖² to ‖z‖²
 _ROUNDING = 1e-9  # share by which the isotropic information stays below the smallest eigenvalue
 _TINY = 1e-30  # in place of no information at all, so that nothing is divided by zero
 _PAID_FROM_TAU = (1.0, 2.0, 4.0)  # factors on the part paid from τ, tried one after the other
@@ -80,8 +79,9 @@ def certify(
         χ² ≥ χ²* − tr(rᵀ S⁻¹ r),   r = S X*, which vanishes where X* is a minimum to the last digit.
     Where S is not, μ I is added to its rotations, which lowers the bound. Definite means that the Cholesky
     factorization goes through, so the claim holds to the rounding of that. A few edges too far from their
-    measurements for such a function are bounded by zero instead: their χ² is part of the gap. What leaves
-    poses ``undetermined``, in words, leaves nothing to certify. ``names`` (K,) are what the poses are called.
+    measurements for such a function, or without information in some direction, are bounded by zero instead: their
+    χ² is part of the gap. What leaves poses ``undetermined``, in words, leaves nothing to certify. ``names`` (K,)
+    are what the poses are called.
     """
     begin = working_s()
     kept = weights > 0.0
@@ -103,16 +103,12 @@ def certify(
     rest = problem.edges[kept & ~loose]
     if loose.any() and (given_up > _GIVEN_UP[-1] * chi2 or not is_connected(rest, problem.variable < 0)):
         i, j = names[problem.edges[loose][0]]
-        reason = f"{counted(int(loose.sum()), 'edge')} too far from what was measured to be bounded, first {i}-{j}"
+        edges = counted(int(loose.sum()), "edge")
+        reason = f"{edges} too far from what was measured, or too little informative, to be bounded, first {i}-{j}"
         return Certificate(False, chi2, chi2, reason, working_s() - begin)
     gap = _gap(problem, minorants, kept & ~loose, chi2)
     if gap is None:
         reason = "the dual matrix is not positive definite, as at a local minimum"
-        borrowing = kept & ((minorants.tau < 0.0) | (minorants.kappa < 0.0))
-        if borrowing.any():
-            i, j = names[problem.edges[borrowing][0]]
-            edges = counted(int(borrowing.sum()), "edge")
-            reason += f", or where Ω has little information about some direction, first at {i}-{j} of {edges}"
         return Certificate(False, chi2, chi2, reason, working_s() - begin)
     return Certificate(True, min(gap + given_up, chi2), chi2, "", working_s() - begin)
 
@@ -180,8 +176,8 @@ class Minorants:
     leap : (E, d) l, from pose i to pose j at the estimate, m
     force : (E, d) f, slope of χ² with the position of j
     torque : (E, d, d) [g]×, slope of χ² with the rotation of j, its position held
-    tau : (E,) m⁻², negative where borrowed
-    kappa : (E,) rad⁻², negative where borrowed; NaN where the edge is too far from its measurement for any bound
+    tau : (E,) m⁻²
+    kappa : (E,) rad⁻²; NaN of an edge too far from its measurement, or too little informative, for any bound
     """
 
     leap: Matrix
@@ -209,11 +205,7 @@ def minorize(problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64
     excess = _length(torque - 2.0 * kappa[:, None] * turned)
     rho, theta = _length(errors[:, :d]), _length(errors[:, d:])
     tau, kappa = _paid(tau, kappa, rho, theta, _length(pull[:, :d]), 0.5 * _length(force), excess)
-    short = np.setdiff1d(np.flatnonzero(~(kappa > 0.0) & (theta < _FARTHEST)), seen)
-    if len(short):
-        parts = (information, errors, pull, force, torque, turned)
-        tau[short], kappa[short] = _borrowed(*(part[short] for part in parts))
-    kappa[theta >= _FARTHEST] = np.nan
+    kappa[~(kappa > 0.0) | (theta >= _FARTHEST)] = np.nan
     tau[seen], kappa[seen] = of_seen, 0.0
     return Minorants(poses[j, :d, d] - poses[i, :d, d], force, _cross_matrix(torque), tau, kappa)
 
@@ -243,44 +235,6 @@ def _paid(
         kappa_left[:] = np.where(theta < 1.0, (1.0 - 0.5 * _BEND * theta**2) * rest, -1.0)
     best = np.minimum(left[:, 0] / tau, left[:, 1] / kappa).argmax(axis=0)
     return left[best, :, np.arange(len(tau))].T
-
-
-def _borrowed(
-    information: Matrix, errors: Matrix, pull: Matrix, force: Matrix, torque: Matrix, turned: Matrix
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """τ and κ, (E,), of edges that cannot pay for their bounds, negative as far as they borrow."""
-    d = force.shape[1]
-    rho, theta = _length(errors[:, :d]), _length(errors[:, d:])
-    tau, kappa, tau_mean, kappa_mean = _isotropic_of_singular(information, d)
-    rate = np.sqrt(tau_mean / kappa_mean)
-    slope = _SLOPE * _length(pull[:, :d])
-    loan = slope * rate + _TINY
-    left = tau - loan
-    bent = np.clip(0.5 * rho * rate, 1e-12, 1.0)
-    has = left >= 0.0
-    tau = left * np.where(has, 1.0 / (1.0 + bent), _STRETCH * (1.0 + bent))
-    cost = 0.25 * rho**2 * left * np.where(has, 1.0, -_STRETCH * (1.0 + bent)) / bent
-    cost += slope**2 / loan + 0.5 * _length(force) * rho / 3.0
-    cost += 0.5 * _length(torque - 2.0 * np.maximum(kappa, 0.0)[:, None] * turned) + np.maximum(-kappa, 0.0)
-    kappa = np.maximum(kappa, 0.0) - cost / (1.0 - theta)
-    far = (0.5 * (np.pi + theta) / np.cos(0.5 * theta)) ** 2
-    return tau, kappa * np.where(kappa > 0.0, 1.0 - 0.5 * _BEND * theta**2, (1.0 - theta) * far)
-
-
-def _isotropic_of_singular(information: Matrix, d: int) -> tuple[NDArray[np.float64], ...]:
-    """τ and κ, (E,), with diag(τ I, κ I) ⪯ Ω, one of them negative if need be; mean eigenvalues of both blocks."""
-    k = information.shape[-1]
-    translation, coupling, rotation = information[:, :d, :d], information[:, :d, d:], information[:, d:, d:]
-    tau_mean = np.maximum(np.trace(translation, axis1=1, axis2=2) / d, _TINY)
-    kappa_mean = np.maximum(np.trace(rotation, axis1=1, axis2=2) / (k - d), _TINY)
-    least = np.linalg.eigvalsh(rotation)[:, 0]
-    half = np.where(least > 1e-6 * kappa_mean, 0.5 * least, -1e-3 * kappa_mean)
-    is_coupled = coupling.any(axis=(1, 2))
-    kappa = np.where(is_coupled, half, least - _ROUNDING * kappa_mean)
-    rest = rotation - np.where(is_coupled, kappa, -1.0)[:, None, None] * np.eye(k - d)
-    schur = translation - coupling @ np.linalg.solve(rest, np.swapaxes(coupling, 1, 2))
-    tau = np.linalg.eigvalsh(0.5 * (schur + np.swapaxes(schur, 1, 2)))[:, 0] - _ROUNDING * tau_mean
-    return tau, kappa, tau_mean, kappa_mean
 
 
 def _isotropic(information: Matrix, d: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
