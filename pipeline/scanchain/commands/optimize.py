@@ -39,7 +39,7 @@ _HALF = 0.5  # robust weight below which an edge is contradicted by the rest, re
     "--optimizer",
     "graph.optimizer",
     metavar="NAME",
-    help="levenberg-marquardt, gauss-newton, dogleg, newton or gradient-descent; short for --graph.optimizer.",
+    help="levenberg-marquardt, gauss-newton, dogleg or gradient-descent; short for --graph.optimizer.",
 )
 @click.option(
     "--initialize",
