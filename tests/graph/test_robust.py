@@ -33,12 +33,6 @@ def with_false_loops(name, share, seed=0):
     return graph, true, np.arange(len(graph.edges)) >= real
 
 
-def in_order_of_addition(graph, values):
-    result = np.empty(len(values), values.dtype)
-    result[np.argsort(graph.is_loop, kind="stable")] = values
-    return result
-
-
 def position_error_m(graph, true):
     return float(np.sqrt(((graph.poses[:, :2, 2] - true.poses[:, :2, 2]) ** 2).sum(axis=1).mean()))
 
@@ -114,17 +108,6 @@ def test_a_robust_loss_hardly_moves_a_graph_whose_loops_are_true(robust):
     assert position_error_m(graph, true) < 0.02
 
 
-@pytest.mark.parametrize("robust", ["huber", "cauchy"])
-def test_a_minimum_of_the_robust_loss_is_flat(robust):
-    """The weights belong to the loss: at the answer Σ w JᵀΩe vanishes."""
-    graph, _, _ = with_false_loops("intel", 0.01)
-    graph.optimize(GraphConfig(robust=robust, tolerance=1e-12, max_iterations=300))
-    problem = graph._prepared()
-    equations = problem.linearize(graph.poses, problem.errors(graph.poses), graph.weight)
-    diagonal = equations.values[problem.pattern.diagonal]
-    assert np.abs(equations.gradient / np.sqrt(diagonal)).max() < 1e-3
-
-
 def test_false_edges_stay_in_force_where_a_pose_would_be_loose_without_them():
     """Two loops hold the last pose, and each claims another place."""
     poses, measured = ([lie.pose_2d(x, 0.0, 0.0) for x in xs] for xs in ((0.0, 1.0, 3.0), (1.0, 2.0, 3.0)))
@@ -175,13 +158,6 @@ class Scalar(Welsch):
 
     def loss(self, chi2, s, mu):
         return s**2 * -math.expm1(-chi2 / s**2)
-
-
-def test_a_loss_of_the_users_is_minimized():
-    graph, _, is_false = with_false_loops("intel", 0.03)
-    answer = graph.optimize(GraphConfig(robust=f"{__name__}:Welsch"))
-    weight = in_order_of_addition(graph, answer.state.weight)
-    assert np.median(weight[is_false]) < 1e-3 < 0.5 < np.median(weight[~is_false])
 
 
 @pytest.mark.parametrize(("name", "fault"), [("OtherSlope", "slope of loss"), ("Scalar", "fails for")])
