@@ -23,7 +23,7 @@ _BEND = 0.72  # loss of curvature of κ‖φ‖² at an angle θ*, as a factor o
 _FARTHEST = 1.0  # largest θ*, rad, of an edge that is bounded
 _ROUNDING = 1e-9  # share by which the isotropic information stays below the smallest eigenvalue
 _TINY = 1e-30  # in place of no information at all, so that nothing is divided by zero
-_PAID_FROM_TAU = (1.0, 2.0, 4.0)  # factors on the part paid from τ, tried one after the other
+_PAID_FROM_TAU = 2.0  # factor on the part of the cost that is paid from τ: the more, the more of κ is left
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,23 +218,19 @@ def _paid(
     pull: NDArray[np.float64],
     force: NDArray[np.float64],
     excess: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """τ and κ (2, E) less the cost of the bounds, of which as much is paid from τ as leaves the most of both.
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """τ and κ, (E,), less the cost of the bounds, most of it paid from κ.
 
     tau, kappa : isotropic information; rho, theta : residuals ‖ρ*‖ and θ*; pull : ‖y_t‖; force : ‖V⁻ᵀy_t‖;
     excess : the rotational slope beside 2κφ*; each (E,)
     """
-    left = np.empty((len(_PAID_FROM_TAU), 2, len(tau)))
-    for share, (tau_left, kappa_left) in zip(_PAID_FROM_TAU, left, strict=True):
-        bent = share * 0.5 * rho * np.sqrt(tau / kappa) + 1e-12
-        turned = np.minimum(share * _SLOPE * pull / np.sqrt(tau * kappa) + 1e-12, 0.5)
-        tau_left[:] = tau * (1.0 - turned) / (1.0 + bent)
-        cost = 0.25 * tau_left * (1.0 + 1.0 / bent) * rho**2 + (_SLOPE * pull) ** 2 / (turned * tau)
-        cost += force * rho / 3.0 + 0.5 * excess
-        rest = kappa - cost / np.maximum(1.0 - theta, 1e-12)
-        kappa_left[:] = np.where(theta < 1.0, (1.0 - 0.5 * _BEND * theta**2) * rest, -1.0)
-    best = np.minimum(left[:, 0] / tau, left[:, 1] / kappa).argmax(axis=0)
-    return left[best, :, np.arange(len(tau))].T
+    bent = _PAID_FROM_TAU * 0.5 * rho * np.sqrt(tau / kappa) + 1e-12
+    turned = np.minimum(_PAID_FROM_TAU * _SLOPE * pull / np.sqrt(tau * kappa) + 1e-12, 0.5)
+    left = tau * (1.0 - turned) / (1.0 + bent)
+    cost = 0.25 * left * (1.0 + 1.0 / bent) * rho**2 + (_SLOPE * pull) ** 2 / (turned * tau)
+    cost += force * rho / 3.0 + 0.5 * excess
+    rest = kappa - cost / np.maximum(1.0 - theta, 1e-12)
+    return left, np.where(theta < 1.0, (1.0 - 0.5 * _BEND * theta**2) * rest, -1.0)
 
 
 def _isotropic(information: Matrix, d: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
