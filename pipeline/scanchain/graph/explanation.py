@@ -288,7 +288,7 @@ def next_loosened(
     A = unit + (learned if is_jump else np.minimum(learned, claimed))
     b = _means(pull_t @ left_out.errors[left_out.odometry][..., None], first, count)[..., 0]
     costs = cost_of(claimed, is_jump=is_jump, price=price, nominal=nominal)
-    e, M, price = *left_out.weighed(np.zeros(1)), left_out.stride * price
+    e, M, price = *left_out.weighed(), left_out.stride * price
     alone = (b * np.linalg.solve(A, b[..., None])[..., 0]).sum(axis=1) / len(e)  # without any of them explained
     hoped = -costs
     for error, weight, shift in zip(e, M, left_out.shifts(B), strict=True):

@@ -17,6 +17,7 @@ from scanchain.graph.minimizer import Evaluation, Limits, Minimizer, Minimum
 
 Rejection = Literal["update", "judge"]
 
+_CRISP = 1e-6  # distance of a weight from 0 or 1 up to which it is that
 _MAX_ROUNDS = 50  # largest number of rounds of refining the inlier set
 _MAX_FAILED = 4  # largest number of groups tried in a row without success
 _FEWER, _FEWEST = 0.3, 1e-3  # share of the changes tried after a round that does not help: at first, at least
@@ -29,7 +30,7 @@ def minimize(minimizer: Minimizer, poses: Matrix, loss: RobustLoss, *, groups: b
     """
     now, used = minimizer.evaluate(poses, loss), 0
     if len(minimizer.loops):
-        now, loss, used = _graduate(minimizer, now, loss.relaxed(now.chi2[minimizer.loops]))
+        now, loss, used = _graduate(minimizer, now, loss)
     if loss.kernel == "truncated" and len(minimizer.loops):
         minimum = _refine(minimizer, now, loss, groups=groups)
     else:
@@ -50,13 +51,19 @@ def settle(minimizer: Minimizer, start: Evaluation, inliers: InlierSet) -> Minim
 
 
 def _graduate(minimizer: Minimizer, now: Evaluation, loss: RobustLoss) -> tuple[Evaluation, RobustLoss, int]:
-    """Follow the minimum from the convex loss to the loss itself, one step for each level."""
-    used, focus = 0, Focus(minimizer)
-    while not loss.is_final(now.chi2[minimizer.loops]):
-        chosen = focus.on(minimizer.weights(now.chi2, loss))
+    """Follow the minimum from the convex loss to the loss itself, one step for each between.
+
+    A loss that sharpens is as good as itself once its weights are all 0 or 1.
+    """
+    used, focus, final = 0, Focus(minimizer), loss
+    for loss in final.graduated(now.chi2[minimizer.loops]):
+        weights = minimizer.weights(now.chi2, loss)
+        is_crisp = np.isinf(final.control) and np.all((weights < _CRISP) | (weights > 1.0 - _CRISP))
+        if loss == final or is_crisp:
+            break
+        chosen = focus.on(weights)
         minimum = chosen.descend(chosen.evaluate(now.poses, loss), loss, Limits(1, 0.0))
         now, used = minimizer.evaluate(minimum.estimate.poses, loss), used + minimum.iterations
-        loss = loss.tightened()
     return minimizer.reweighed(now, loss), loss, used
 
 
