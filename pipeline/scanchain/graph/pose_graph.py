@@ -26,11 +26,10 @@ from scanchain.graph.edge_checks import (
     weakly_joined,
 )
 from scanchain.graph.explanation import Explained, Explainer
-from scanchain.graph.graduation import Rejection, Since
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.initialize import Initialization
 from scanchain.graph.odometry_errors import Explanation, Loosened, corrected, odometry_of
-from scanchain.graph.optimization import Optimization, solve
+from scanchain.graph.optimization import Optimization, Rejection, Since, solve
 
 
 class PoseGraph:
