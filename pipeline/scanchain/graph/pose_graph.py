@@ -366,7 +366,7 @@ class PoseGraph:
 
     def state(self) -> GraphState:
         """The graph as it is, for files and recordings; odometry edges first."""
-        order, problem = self._order(), self._prepared()
+        order, problem = np.argsort(self.is_loop, kind="stable"), self._prepared()
         chi2 = problem.chi2(problem.errors(self.poses))
         return GraphState(
             poses=self.poses.copy(),
@@ -376,7 +376,7 @@ class PoseGraph:
             weight=self.weight[order],
             chi2=self._in_force(chi2),
             edge_chi2=chi2[order],
-            degrees_of_freedom=self._degrees_of_freedom(problem),
+            degrees_of_freedom=max(int(self._rank.rows[~self.is_rejected].sum()) - problem.pattern.scalars, 0),
         )
 
     def relative_covariance(self, i: int, j: int) -> Matrix:
@@ -478,13 +478,6 @@ class PoseGraph:
     def _in_force(self, chi2: NDArray[np.float64]) -> float:
         """The sum of w χ² over the edges in force, of χ² (E,)."""
         return float((self.weight * chi2)[~self.is_rejected].sum())
-
-    def _degrees_of_freedom(self, problem: BetweenProblem) -> int:
-        return max(int(self._rank.rows[~self.is_rejected].sum()) - problem.pattern.scalars, 0)
-
-    def _order(self) -> NDArray[np.int64]:
-        """Edges with odometry first, otherwise as they were added."""
-        return np.argsort(self.is_loop, kind="stable")
 
     def _changed(self) -> None:
         self._problem, self._factor_is_now = None, False
