@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from scanchain import lie
 from scanchain.clock import working_s
 from scanchain.data import Matrix
 from scanchain.errors import counted
-from scanchain.graph.between import BetweenProblem
+from scanchain.graph.between import BetweenProblem, turns
 from scanchain.graph.cholesky import BlockPattern, Packing, SingularMatrixError, SparseCholesky
 from scanchain.graph.edge_checks import is_connected
 
@@ -188,49 +189,32 @@ class Minorants:
 
 
 def minorize(problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64]) -> Minorants:
-    """Bounds that touch the χ² of every edge, times its weight (E,), at these poses."""
+    """Bounds that touch the χ² of every edge, times its weight (E,), at these poses.
+
+    They cost a part of its isotropic information, most of it of κ.
+    """
     d = poses.shape[-1] - 1
     i, j = problem.edges.T
-    errors = problem.errors(poses)
+    errors, norm = problem.errors(poses), partial(np.linalg.norm, axis=-1)
     information = weights[:, None, None] * problem.information
-    pull = (information @ errors[..., None])[..., 0]
+    pull = (information @ errors[..., None])[..., 0]  # y
     slope = 2.0 * (np.swapaxes(problem.jacobians(poses, errors), 1, 2) @ pull[..., None])[..., 0]
     force = slope[:, :d]
-    torque = slope[:, d:] - _moment(poses[j, :d, d], force)
+    torque = slope[:, d:] - (force[:, None] @ turns(poses[j, :d, d]))[:, 0]
     turned = errors[:, d:] if d == 2 else (poses[j, :3, :3] @ errors[:, 3:, None])[..., 0]
     tau, kappa = _isotropic(information, d)
-    seen = problem.sightings  # of points: quadratic in the position of the point, and nothing else
-    of_seen = np.linalg.eigvalsh(information[seen, :d, :d])[:, 0]
-    tau[seen], kappa[seen] = np.maximum(of_seen, _TINY), _TINY
-    excess = _length(torque - 2.0 * kappa[:, None] * turned)
-    rho, theta = _length(errors[:, :d]), _length(errors[:, d:])
-    tau, kappa = _paid(tau, kappa, rho, theta, _length(pull[:, :d]), 0.5 * _length(force), excess)
-    kappa[~(kappa > 0.0) | (theta >= _FARTHEST)] = np.nan
-    tau[seen], kappa[seen] = of_seen, 0.0
-    return Minorants(poses[j, :d, d] - poses[i, :d, d], force, _cross_matrix(torque), tau, kappa)
-
-
-def _paid(
-    tau: NDArray[np.float64],
-    kappa: NDArray[np.float64],
-    rho: NDArray[np.float64],
-    theta: NDArray[np.float64],
-    pull: NDArray[np.float64],
-    force: NDArray[np.float64],
-    excess: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """τ and κ, (E,), less the cost of the bounds, most of it paid from κ.
-
-    tau, kappa : isotropic information; rho, theta : residuals ‖ρ*‖ and θ*; pull : ‖y_t‖; force : ‖V⁻ᵀy_t‖;
-    excess : the rotational slope beside 2κφ*; each (E,)
-    """
+    rho, theta = norm(errors[:, :d]), norm(errors[:, d:])
+    slide = _SLOPE * norm(pull[:, :d])
     bent = _PAID_FROM_TAU * 0.5 * rho * np.sqrt(tau / kappa) + 1e-12
-    turned = np.minimum(_PAID_FROM_TAU * _SLOPE * pull / np.sqrt(tau * kappa) + 1e-12, 0.5)
-    left = tau * (1.0 - turned) / (1.0 + bent)
-    cost = 0.25 * left * (1.0 + 1.0 / bent) * rho**2 + (_SLOPE * pull) ** 2 / (turned * tau)
-    cost += force * rho / 3.0 + 0.5 * excess
-    rest = kappa - cost / np.maximum(1.0 - theta, 1e-12)
-    return left, np.where(theta < 1.0, (1.0 - 0.5 * _BEND * theta**2) * rest, -1.0)
+    paid = np.minimum(_PAID_FROM_TAU * slide / np.sqrt(tau * kappa) + 1e-12, 0.5)
+    left = tau * (1.0 - paid) / (1.0 + bent)
+    cost = 0.25 * left * (1.0 + 1.0 / bent) * rho**2 + slide**2 / (paid * tau) + norm(force) * rho / 6.0
+    cost += 0.5 * norm(torque - 2.0 * kappa[:, None] * turned)
+    kappa = (1.0 - 0.5 * _BEND * theta**2) * (kappa - cost / np.maximum(1.0 - theta, 1e-12))
+    kappa[~(kappa > 0.0) | (theta >= _FARTHEST)] = np.nan
+    seen = problem.sightings  # of points: quadratic in the position of the point, and nothing else
+    left[seen], kappa[seen] = np.linalg.eigvalsh(information[seen, :d, :d])[:, 0], 0.0
+    return Minorants(poses[j, :d, d] - poses[i, :d, d], force, _cross_matrix(torque), left, kappa)
 
 
 def _isotropic(information: Matrix, d: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -240,21 +224,9 @@ def _isotropic(information: Matrix, d: int) -> tuple[NDArray[np.float64], NDArra
     k = information.shape[-1]
     scale = np.maximum(np.repeat(np.stack([tau, kappa], axis=1), (d, k - d), axis=1), _TINY) ** -0.5
     least = np.linalg.eigvalsh(scale[:, :, None] * information * scale[:, None, :])[:, 0]
-    least = np.clip(least, 1e-12, 1.0) * (1.0 - _ROUNDING)
-    return (least * np.maximum(tau, _TINY)).astype(np.float64), (least * np.maximum(kappa, _TINY)).astype(
-        np.float64
-    )
-
-
-def _length(vectors: Matrix) -> NDArray[np.float64]:
-    return np.sqrt((vectors * vectors).sum(axis=-1))
-
-
-def _moment(arm: Matrix, force: Matrix) -> Matrix:
-    """Moments (E, 1 or 3) of forces (E, d)."""
-    if arm.shape[1] == 3:
-        return np.cross(arm, force)
-    return (arm[:, :1] * force[:, 1:] - arm[:, 1:] * force[:, :1]).astype(np.float64, copy=False)
+    share = np.asarray(np.clip(least, 1e-12, 1.0) * (1.0 - _ROUNDING), np.float64)
+    tau, kappa = (np.asarray(np.maximum(each, _TINY), np.float64) for each in (tau, kappa))
+    return share * tau, share * kappa
 
 
 def _cross_matrix(torque: Matrix) -> Matrix:
