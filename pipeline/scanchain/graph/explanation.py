@@ -86,36 +86,33 @@ class Explainer:
 
     def _better(self, best: Explained) -> Iterator[Explained]:
         """Explanations under which the cost is lower, those that promise most first."""
-        price = best.minimum.price
-        for explanation, poses in self._candidates(best):
+        price, poses = best.minimum.price, best.minimum.estimate.poses
+        for explanation in self._candidates(best):
             trial = self._solved(explanation, poses, "given", groups=not self._is_large)
             if self._cost(trial, price) < self._cost(best, price) - _SETTLED * price:
                 yield trial
 
-    def _candidates(self, best: Explained) -> list[tuple[Explanation, Matrix]]:
-        """Explanations, and poses to begin with."""
+    def _candidates(self, best: Explained) -> list[Explanation]:
+        """Explanations that may lower the cost, those that promise most first."""
         problem, now, price = best.problem, best.explanation, best.minimum.price
-        poses = best.minimum.estimate.poses
         kept = best.minimum.weights > REJECTED_WEIGHT
         rejected = np.flatnonzero(~kept)
         if len(rejected) < _FEWEST or len(apart(problem.edges, rejected)) < _FEWEST:
             return []
         odometry = odometry_of(problem.edges, self.is_loop)
-        left_out = LeftOut(problem, poses, odometry, kept)
-        found: list[tuple[float, Explanation, Matrix]] = []
+        left_out = LeftOut(problem, best.minimum.estimate.poses, odometry, kept)
+        found: list[tuple[float, Explanation]] = []
         if not self.jumps and (now.drift.any() or len(rejected) > FEWEST):
             gain, change = drift_step(left_out, direction(problem.edges[odometry]), now.drift, price)
             gain -= 0.0 if now.drift.any() else FEWEST * price
-            found.append((gain, replace(now, drift=now.drift + change), poses))
+            found.append((gain, replace(now, drift=now.drift + change)))
         for is_jump in (False, True)[: 1 + self.jumps]:
             measured, costs = self.measured[odometry], (price, self._nominal)
-            next_one = next_loosened(left_out, measured, now.loosened, *costs, is_jump=is_jump)
-            if next_one is not None:
-                gain, stretch, twists = next_one
-                start = left_out.moved(poses, twists, stretch.edges)
-                found.append((gain, replace(now, loosened=(*now.loosened, stretch)), start))
+            gain, stretch = next_loosened(left_out, measured, now.loosened, *costs, is_jump=is_jump)
+            if stretch is not None:
+                found.append((gain, replace(now, loosened=(*now.loosened, stretch))))
         found.sort(key=lambda each: -each[0])
-        return [(explanation, start) for gain, explanation, start in found if gain > _SETTLED * price]
+        return [explanation for gain, explanation in found if gain > _SETTLED * price]
 
     def _solved(
         self, explanation: Explanation, poses: Matrix, initialize: Initialization, *, groups: bool
@@ -213,12 +210,6 @@ class LeftOut:
         b = np.einsum("oap,oa->p", weighted, self.errors[odometry])
         return b, A
 
-    def moved(self, poses: Matrix, twists: Matrix, among: slice) -> Matrix:
-        """These poses after right twists (n, k) on the measurements of some edges of odometry."""
-        odometry = self.odometry[among]
-        weighted = self.problem.information[odometry] @ twists[..., None]
-        return self.problem.moved(poses, self.factored.cholesky.solve(self._pull(weighted, odometry))[:, 0])
-
     def _pull(self, weighted: Matrix, edges: NDArray[np.int64]) -> Matrix:
         """Σ JᵀΩτ of the poses, (scalars, p), of Ωτ (n, k, p) of some edges."""
         problem = self.problem
@@ -262,8 +253,8 @@ def next_loosened(
     nominal: float,
     *,
     is_jump: bool,
-) -> tuple[float, Loosened, Matrix] | None:
-    """The fall of the cost by one more slip or jump, to first order, it, and the twists (n, k) of its edges.
+) -> tuple[float, Loosened | None]:
+    """The fall of the cost by one more slip or jump, to first order, and this; None where none lowers it.
 
     measured : (O, d+1, d+1) as odometry has it, in the order of ``left_out.odometry``
     Errors t, in standard deviations, change the cost by tᵀA t − 2 bᵀt, prior included, and by what each loop edge
@@ -276,7 +267,7 @@ def next_loosened(
     """
     tried = _stretches(len(measured), others, is_jump=is_jump)
     if not tried:
-        return None
+        return 0.0, None
     first, count = np.array([(stretch.first, stretch.count) for stretch in tried]).T
     information = left_out.problem.information[left_out.odometry]
     B = spread(measured, information, is_jump=is_jump)
@@ -297,17 +288,17 @@ def next_loosened(
         H = A / len(e) + np.swapaxes(V, 1, 2) @ weight @ V
         fall = (g * np.linalg.solve(H, g[..., None])[..., 0]).sum(axis=1) + price - error @ weight @ error
         hoped += np.maximum(fall, alone)
-    best, most = None, 0.0
+    most, best = 0.0, None
     for index in np.argsort(-hoped, kind="stable")[:_MOST_STRETCHES]:
         if not hoped[index] > most:
             break
         stretch, twists = tried[index], B[tried[index].edges] / count[index]
         slope, curvature = left_out.quadratic(twists, stretch.edges)
         V = np.stack([shift.sum(axis=0) for shift in left_out.shifts(twists, stretch.edges)])
-        fall, t = _largest_fall(unit + curvature, slope, e, M, V, price)
+        fall, _ = _largest_fall(unit + curvature, slope, e, M, V, price)
         if fall - costs[index] > most:
-            best, most = (stretch, twists @ t), fall - float(costs[index])
-    return None if best is None else (most, *best)
+            most, best = fall - float(costs[index]), stretch
+    return most, best
 
 
 def _largest_fall(A: Matrix, b: Vector, e: Matrix, M: Matrix, V: Matrix, price: float) -> tuple[float, Vector]:
