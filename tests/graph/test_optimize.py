@@ -49,18 +49,6 @@ def test_every_optimizer_ends_in_the_same_minimum_of_a_ring(dimension):
     assert np.allclose(list(chi2.values()), chi2["levenberg-marquardt"], rtol=1e-5)
 
 
-@pytest.mark.parametrize("optimizer", ["levenberg-marquardt", "dogleg", "gradient-descent"])
-def test_no_step_of_a_guarded_optimizer_raises_chi2(optimizer):
-    graph = published("smallGrid3D")
-    before = np.inf
-    for _ in range(6):
-        answer = graph.optimize(
-            GraphConfig(optimizer=optimizer, max_iterations=1, robust="none"), initialize="given"
-        )
-        assert answer.chi2_after <= min(before, answer.chi2_before) * (1.0 + 1e-12)
-        before = answer.chi2_after
-
-
 def test_a_poor_guess_is_replaced_by_the_chordal_one_and_a_good_one_kept():
     assert published("MIT").optimize(PLAIN).initialization == "chordal"
     assert published("intel").optimize(PLAIN).initialization == "given"
@@ -245,12 +233,7 @@ def test_a_pose_that_stands_for_many_scans_weighs_as_many_in_the_expected_ate():
         (-1, 1, np.eye(3), "edge -1-1 joins a pose that is not there"),
         (1, 1, np.eye(3), "joins a pose to itself"),
         (0, 1, np.diag([1.0, 1.0, -1.0]), "not symmetric positive semidefinite"),
-        (
-            0,
-            1,
-            np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
-            "not symmetric positive semidefinite",
-        ),
+        (0, 1, np.eye(3) + np.eye(3, k=1), "not symmetric positive semidefinite"),
         (0, 1, np.diag([1.0, 1e300, 1.0]), r"edge 0-1: information of 1e\+300, over 1e\+50; give meters"),
         (0, 1, np.full((3, 3), np.nan), "information holds NaN or infinite values"),
     ],

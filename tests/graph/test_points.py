@@ -77,13 +77,6 @@ def test_covariances_of_points_equal_the_dense_inverse():
     assert np.allclose(found[7], adjoint @ P[18:21, 18:21] @ adjoint.T, rtol=1e-8, atol=1e-12)
 
 
-@pytest.mark.parametrize("initialize", ["auto", "given", "odometry", "spanning-tree", "chordal"])
-def test_every_way_to_start_places_the_points_too(initialize):
-    best = field().optimize(PLAIN).chi2_after
-    graph = field()
-    assert graph.optimize(PLAIN, initialize=initialize).chi2_after == pytest.approx(best, rel=1e-6)
-
-
 @pytest.mark.parametrize("turns", [0, 1])
 def test_a_ring_with_a_point_is_certified_unless_it_is_wound_up(turns):
     edges = [(index, (index + 1) % 30) for index in range(30)]

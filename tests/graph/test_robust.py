@@ -38,21 +38,17 @@ def position_error_m(graph, true):
 
 
 @pytest.mark.parametrize(
-    ("name", "share"), [("intel", 0.1), ("intel", 0.3), ("intel", 0.5), ("manhattan", 0.1), ("manhattan", 0.5)]
+    ("name", "share", "kind", "seed"),
+    [
+        *((name, share, "nearby", 0) for name in ("intel", "manhattan") for share in (0.1, 0.5)),
+        *(("intel", 0.3 / 0.7, "groups of 10", seed) for seed in (0, 2)),
+    ],
 )
-def test_a_tenth_to_a_half_of_wrong_loops_leave_the_trajectory_as_it_is_without_them(name, share):
-    outcome = try_wrong_loops(shared_data(f"graphs/{name}.g2o"), share, "nearby", seed=0)
+def test_a_tenth_to_a_half_of_wrong_loops_leave_the_trajectory_as_it_is_without_them(name, share, kind, seed):
+    outcome = try_wrong_loops(shared_data(f"graphs/{name}.g2o"), share, kind, seed)
     assert outcome.wrong_rejected >= 0.99 and outcome.true_rejected <= 0.01
     assert outcome.ate_m <= 1.1 * outcome.ate_clean_m + 1e-3
     assert outcome.certified
-
-
-@pytest.mark.parametrize("seed", [0, 2])
-def test_groups_of_ten_wrong_loops_that_agree_are_rejected_as_groups(seed):
-    share = 0.3 / 0.7  # of the true ones: 30 % of all
-    outcome = try_wrong_loops(shared_data("graphs/intel.g2o"), share, "groups of 10", seed)
-    assert outcome.wrong_rejected >= 0.99 and outcome.true_rejected <= 0.01
-    assert outcome.ate_m <= 1.1 * outcome.ate_clean_m + 1e-3
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
