@@ -15,7 +15,6 @@ from scanchain.graph.cholesky import BlockPattern, Packing, SparseCholesky, anal
 from scanchain.kernels.graph import between
 
 WASTE = 0.1  # share of edges without weight that is worth a new analysis
-_FEW = 0.03  # the same where H⁻¹ is wanted too, which fill-in slows down more
 
 
 class Between:
@@ -138,13 +137,6 @@ class BetweenProblem:
         sparse = self.restricted(kept)
         sparse.cholesky.factorize(sparse.linearize(poses, errors[kept], np.ones(int(kept.sum()))).values)
         return sparse
-
-    def weighed(self, poses: Matrix, errors: Matrix, kept: NDArray[np.bool_]) -> BetweenProblem:
-        """As ``factored``; where few edges are left out, these weigh nothing, which takes no new analysis."""
-        if kept.mean() < 1.0 - _FEW:
-            return self.factored(poses, errors, kept)
-        self.cholesky.factorize(self.linearize(poses, errors, kept.astype(np.float64)).values)
-        return self
 
     def errors(self, poses: Matrix) -> Matrix:
         """Residuals e (E, k) at these poses (K, d+1, d+1)."""
