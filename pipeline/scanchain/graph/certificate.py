@@ -86,40 +86,40 @@ def certify(
     """
     begin = working_s()
     kept = weights > 0.0
+    if not kept.all():
+        problem, weights = problem.restricted(kept), weights[kept]
     of_edges = weights * problem.chi2(problem.errors(poses))
     chi2 = float(of_edges.sum())
     is_zero = chi2 <= _ZERO_CHI2 * min(float(problem.information.max(initial=0.0)), 1.0)
-    if undetermined:
-        return Certificate(False, chi2, chi2, undetermined, working_s() - begin, is_zero)
-    if is_zero:
-        return Certificate(True, chi2, chi2, "", working_s() - begin, is_zero)
-    if len(poses) - len(problem.free) > 1:
-        reason = f"{len(poses) - len(problem.free)} poses are fixed; the bound is for one"
-        return Certificate(False, chi2, chi2, reason, working_s() - begin)
+    gap, reason = chi2, undetermined
+    if not undetermined and not is_zero:
+        gap, reason = _gap(problem, poses, weights, of_edges, names)
+    return Certificate(not reason, gap, chi2, reason, working_s() - begin, is_zero)
+
+
+def _gap(
+    problem: BetweenProblem,
+    poses: Matrix,
+    weights: NDArray[np.float64],
+    of_edges: NDArray[np.float64],
+    names: NDArray[np.int64],
+) -> tuple[float, str]:
+    """χ² less its lower bound; where there is none, all of it and why. ``of_edges`` (E,) make up χ²."""
+    chi2, n, d = float(of_edges.sum()), len(problem.free), poses.shape[-1] - 1
+    if len(poses) - n > 1:
+        return chi2, f"{len(poses) - n} poses are fixed; the bound is for one"
     centered = poses.copy()
     centered[:, :-1, -1] -= centered[:, :-1, -1].mean(axis=0)
     minorants = minorize(problem, centered, weights)
-    loose = kept & np.isnan(minorants.kappa)
+    loose = np.isnan(minorants.kappa)
     given_up = float(of_edges[loose].sum())
-    rest = problem.edges[kept & ~loose]
-    if loose.any() and (given_up > _GIVEN_UP[-1] * chi2 or not is_connected(rest, problem.variable < 0)):
+    is_apart = not is_connected(problem.edges[~loose], problem.variable < 0)
+    if loose.any() and (given_up > _GIVEN_UP[-1] * chi2 or is_apart):
         i, j = names[problem.edges[loose][0]]
-        edges = counted(int(loose.sum()), "edge")
-        reason = f"{edges} too far from what was measured, or too little informative, to be bounded, first {i}-{j}"
-        return Certificate(False, chi2, chi2, reason, working_s() - begin)
-    gap = _gap(problem, minorants, kept & ~loose, chi2)
-    if gap is None:
-        reason = "the dual matrix is not positive definite, as at a local minimum"
-        return Certificate(False, chi2, chi2, reason, working_s() - begin)
-    return Certificate(True, min(gap + given_up, chi2), chi2, "", working_s() - begin)
-
-
-def _gap(problem: BetweenProblem, minorants: Minorants, kept: NDArray[np.bool_], chi2: float) -> float | None:
-    """χ² less the best bound that a few shifts of the dual matrix give, None where none gives any."""
-    n, d = len(problem.free), minorants.leap.shape[1]
-    blocks, residual = dual_matrix(problem, minorants, kept)
-    sizes = np.where(problem.is_point[problem.free], 1, d + 1)
-    pattern = BlockPattern(sizes, problem.pattern.pairs)
+        far = f"{counted(int(loose.sum()), 'edge')} too far from what was measured, or too little informative"
+        return chi2, f"{far}, to be bounded, first {i}-{j}"
+    blocks, residual = dual_matrix(problem, minorants, ~loose)
+    pattern = BlockPattern(np.where(problem.is_point[problem.free], 1, d + 1), problem.pattern.pairs)
     packing = Packing(pattern, d + 1, at_end=True)
     factor = SparseCholesky(pattern, problem.cholesky.analysis)
     rotation = np.diag([1.0] * d + [0.0])
@@ -132,8 +132,8 @@ def _gap(problem: BetweenProblem, minorants: Minorants, kept: NDArray[np.bool_],
         except SingularMatrixError:
             continue
         right = packing.rows(residual + shift * rotation[:, :d])
-        return float((right * factor.solve(right)).sum())
-    return None
+        return min(float((right * factor.solve(right)).sum()) + given_up, chi2), ""
+    return chi2, "the dual matrix is not positive definite, as at a local minimum"
 
 
 def dual_matrix(problem: BetweenProblem, bound: Minorants, kept: NDArray[np.bool_]) -> tuple[Matrix, Matrix]:
