@@ -25,7 +25,7 @@ from scanchain.graph.edge_checks import (
     ranks,
     weakly_joined,
 )
-from scanchain.graph.explanation import Explained, Explainer
+from scanchain.graph.explanation import Explainer
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.initialize import Initialization
 from scanchain.graph.odometry_errors import Explanation, Loosened, corrected, odometry_of
@@ -276,17 +276,22 @@ class PoseGraph:
         problem = self._prepared()
         chi2_before = self._in_force(problem.chi2(problem.errors(self.poses)))
         try:
-            explained = self._explained(problem, config, initialize, rejection)
+            if rejection == "update" and config.robust == "truncated":
+                minimum = solve(problem, self.poses, self.is_loop, config, initialize, self.since)
+            else:
+                arrays = self._measurements.rows, self._information.rows, self.is_loop
+                explainer = Explainer(self._problem_of, *arrays, config, self._is_end)
+                explained = explainer.solve(self._explanation, self.poses, initialize)
+                problem, minimum = explained.problem, explained.minimum
+                self._problem, self._explanation = problem, explained.explanation
         except SingularMatrixError as error:
             raise self._singular(error) from error
-        self._problem, self._explanation = explained.problem, explained.explanation
-        minimum = explained.minimum
         self._poses.replace(minimum.estimate.poses)
         self._weight.replace(minimum.weights)
         self._factor_is_now = False
         edges = len(self.edges)
         self.since = Since(self.since.judged if rejection == "update" else edges, edges)
-        self.work = self._problem.cholesky.work * minimum.iterations
+        self.work = problem.cholesky.work * minimum.iterations
         return Optimization(
             state=self.state(),
             chi2_before=chi2_before,
@@ -431,17 +436,6 @@ class PoseGraph:
                 raise self._singular(error) from error
             self._factor_is_now = True
         return problem
-
-    def _explained(
-        self, problem: BetweenProblem, config: GraphConfig, initialize: Initialization, rejection: Rejection
-    ) -> Explained:
-        """The minimum, with the errors of odometry that explain loop edges; those at hand for an update."""
-        if rejection == "update" and config.robust == "truncated":
-            minimum = solve(problem, self.poses, self.is_loop, config, initialize, self.since)
-            return Explained(problem, minimum, self._explanation)
-        measured, information = self._measurements.rows, self._information.rows
-        explainer = Explainer(self._problem_of, measured, information, self.is_loop, config, self._is_end)
-        return explainer.solve(self._explanation, self.poses, initialize)
 
     def _prepared(self) -> BetweenProblem:
         """The least-squares problem; rebuilt after the graph has grown."""
