@@ -7,6 +7,7 @@ from scanchain.errors import InputError
 from scanchain.graph.edge_checks import nearest_semidefinite, positive_semidefinite, ranks
 from scanchain.graph.g2o import read_g2o, write_g2o
 from scanchain.graph.pose_graph import PoseGraph
+from tests.support.graphs import graph_of
 from tests.support.scenes import shared_data
 
 SQUARE = """\
@@ -116,29 +117,19 @@ def test_a_quaternion_edge_keeps_its_order_and_its_information(read):
 
 
 def test_information_is_of_a_rotation_vector_or_as_the_comment_says_of_a_quaternion(tmp_path):
-    """g2o's own error is the vector part of the quaternion of Z⁻¹ Tᵢ⁻¹ Tⱼ; χ² of both conventions is the same."""
-    graph, turn = PoseGraph(3), lie.exp(np.array([0.0, 0.0, 0.0, 0.02, -0.01, 0.03]))
-    Z = lie.exp(np.array([1.0, 0.2, 0.0, 0.1, 0.0, 0.4]))
+    """g2o's own error is the vector part of the unit quaternion, which is half the rotation vector."""
+    path, Z = tmp_path / "x.g2o", lie.exp(np.array([1.0, 0.2, 0.0, 0.1, 0.0, 0.4]))
     root = np.random.default_rng(0).normal(size=(6, 6))
-    for k, pose in enumerate((np.eye(4), Z @ turn)):
-        graph.add_pose(pose, k)
-    graph.add_edge(0, 1, Z, root @ root.T)
-    first, chi2 = {}, graph.state().chi2
-    for rotation in ("vector", "quaternion"):
-        path = tmp_path / f"{rotation}.g2o"
-        write_g2o(path, graph, rotation=rotation)
-        first[rotation], *_, edge = path.read_text().splitlines()
-        information = np.zeros((6, 6))
-        information[np.triu_indices(6)] = [float(word) for word in edge.split()[-21:]]
-        information += np.triu(information, 1).T
-        error = np.zeros(6)
-        error[3:] = lie.log(turn)[3:] if rotation == "vector" else lie.to_quaternion(turn[None, :3, :3])[0, :3]
-        assert error @ information @ error == pytest.approx(chi2, rel=1e-3)
+    graph = graph_of([np.eye(4), Z], [(0, 1)], [Z], root @ root.T)
+    for rotation, unit in (("rotation vector", 1.0), ("unit quaternion", 2.0)):
+        write_g2o(path, graph, rotation=rotation.split()[1], force=True)
+        comment, *_, edge = path.read_text().splitlines()
+        units = lie.by_component(6, 1.0, unit)
+        upper = (np.outer(units, units) * graph.information[0])[np.triu_indices(6)]
+        assert rotation in comment and np.allclose([float(word) for word in edge.split()[-21:]], upper)
         back = read_g2o(path)
-        np.testing.assert_allclose(back.graph.information, graph.information, rtol=1e-12)
-        assert back.other_lines == ()
-    assert "rotation vector" in first["vector"] and "unit quaternion" in first["quaternion"]
-    as_vector = read_g2o(tmp_path / "quaternion.g2o", rotation="vector").graph.information[0]
+        assert np.allclose(back.graph.information, graph.information, rtol=1e-12) and back.other_lines == ()
+    as_vector = read_g2o(path, rotation="vector").graph.information[0]
     np.testing.assert_allclose(as_vector[3:, 3:], 4.0 * graph.information[0, 3:, 3:], rtol=1e-12)
     with pytest.raises(InputError, match="exists; choose another name or pass force=True"):
         write_g2o(path, graph)

@@ -14,8 +14,6 @@ from scanchain.data import Matrix
 from scanchain.graph.cholesky import BlockPattern, Packing, SparseCholesky, analyze
 from scanchain.kernels.graph import between
 
-WASTE = 0.1  # share of edges without weight that is worth a new analysis
-
 
 class Between:
     """e = log(Z⁻¹ T_i⁻¹ T_j): the twist that the relative pose is off by on its right, T_i⁻¹ T_j = Z exp(e).

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scanchain.config import GraphConfig
 from scanchain.data import REJECTED_WEIGHT, GraphState, Matrix, brief, fit_text
 from scanchain.errors import counted
-from scanchain.graph.between import WASTE, BetweenProblem
+from scanchain.graph.between import BetweenProblem
 from scanchain.graph.consistency import Consistency, agreeing_groups
 from scanchain.graph.edge_checks import has_loop, is_connected
 from scanchain.graph.initialize import Initialization, first_guess
@@ -20,6 +20,7 @@ from scanchain.graph.minimizer import Evaluation, Limits, Minimizer, Minimum
 
 Rejection = Literal["update", "judge"]
 
+_WASTE = 0.1  # share of edges without weight that is worth a new analysis
 _CRISP = 1e-6  # distance of a weight from 0 or 1 up to which it is that
 _MAX_ROUNDS = 50  # largest number of rounds of refining the inlier set
 _MAX_FAILED = 4  # largest number of groups tried in a row without success
@@ -208,7 +209,7 @@ class Focus:
         """A minimizer of the edges with weight, (E,), and of hardly any other."""
         wanted = weights > 0.0
         wasted = 1.0 - wanted.sum() / self._kept.sum()
-        if self._is_free and ((wanted & ~self._kept).any() or wasted > WASTE):
+        if self._is_free and ((wanted & ~self._kept).any() or wasted > _WASTE):
             self._kept, self._chosen = wanted, self._whole.restricted(wanted)
         return self._chosen
 
