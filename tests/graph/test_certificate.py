@@ -24,20 +24,6 @@ def minorant_values(bound, chi2, G_i, G_j, leap):
     return chi2 + stretch + turned @ bound.force[0] + bound.kappa[0] * (d - np.trace(between.T)) + torsion
 
 
-def some_information(dimension, silence, rng):
-    """Information that says nothing along some direction, or of all of them."""
-    k = 3 if dimension == 2 else 6
-    A = rng.normal(size=(k, k))
-    omega = 0.1 * A @ A.T + np.eye(k)
-    if silence == "any direction":
-        values, V = np.linalg.eigh(omega)
-        return (V * [0.0, *values[1:]]) @ V.T
-    if silence:
-        part = {"position": slice(0, dimension), "rotation": slice(dimension, k), "x": 0, "yaw": k - 1}[silence]
-        omega[part], omega[:, part] = 0.0, 0.0
-    return omega
-
-
 def everywhere(problem, T_i, T_j):
     """χ² (N,) of the only edge of a problem with its ends at each of these poses."""
     count = len(T_i)
@@ -48,15 +34,18 @@ def everywhere(problem, T_i, T_j):
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("silence", ["", "position", "rotation", "x", "yaw", "any direction"])
-def test_the_bound_of_an_edge_touches_its_chi2_and_is_nowhere_above_it(dimension, silence):
+@pytest.mark.parametrize("is_of_position", [False, True])
+def test_the_bound_of_an_edge_touches_its_chi2_and_is_nowhere_above_it(dimension, is_of_position):
     rng = np.random.default_rng(1)
-    k, bounded, borrowed = (3, 6)[dimension - 2], 0, 0
+    k, bounded = (3, 6)[dimension - 2], 0
     for _ in range(60):
         noise = rng.choice([0.01, 0.1, 0.3])
         poses = lie.exp(rng.normal(size=(2, k)))
         Z = lie.inverse(poses[0]) @ poses[1] @ lie.inverse(lie.exp(noise * rng.normal(size=k)))
-        omega = some_information(dimension, silence, rng) / noise**2
+        A = rng.normal(size=(k, k))
+        omega = (0.1 * A @ A.T + np.eye(k)) / noise**2
+        if is_of_position:
+            omega[dimension:], omega[:, dimension:] = 0.0, 0.0
         problem = BetweenProblem(np.array([[0, 1]]), Z[None], omega[None], np.array([True, False]))
         bound = minorize(problem, poses, np.ones(1))
         if np.isnan(bound.kappa[0]):
@@ -71,9 +60,7 @@ def test_the_bound_of_an_edge_touches_its_chi2_and_is_nowhere_above_it(dimension
         values = minorant_values(bound, at_estimate, G_i, G_j, T_j[:, :-1, -1] - T_i[:, :-1, -1])
         assert np.all(values <= chi2 + 1e-9 * (chi2 + at_estimate) + 1e-11)
         bounded += 1
-        borrowed += bound.kappa[0] < 0.0 or bound.tau[0] < 0.0
     assert bounded >= 20
-    assert borrowed > 10 or silence in ("", "rotation") or (silence, dimension) == ("yaw", 2)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -83,7 +70,7 @@ def test_the_dual_matrix_is_the_sum_of_the_bounds_of_the_edges(dimension):
     k, count = (3, 6)[dimension - 2], 5
     poses = lie.exp(rng.normal(size=(count, k)))
     edges = np.array([[0, 1], [2, 1], [2, 3], [4, 3], [4, 0], [1, 3]])
-    measured = lie.inverse(poses[edges[:, 0]]) @ poses[edges[:, 1]] @ lie.exp(0.05 * rng.normal(size=(6, k)))
+    measured = lie.inverse(poses[edges[:, 0]]) @ poses[edges[:, 1]] @ lie.exp(0.005 * rng.normal(size=(6, k)))
     A = rng.normal(size=(6, k, k))
     problem = BetweenProblem(edges, measured, A @ np.swapaxes(A, 1, 2) + np.eye(k), np.zeros(count, bool))
     bound = minorize(problem, poses, np.ones(6))
@@ -126,41 +113,9 @@ def test_the_two_numbers_that_the_bound_rests_on():
         assert (gained - (2.0 - 0.72 * start**2) * (1.0 - np.cos(delta))).min() >= -1e-12
 
 
-def test_the_two_numbers_that_borrowing_rests_on():
-    """‖V⁻¹‖ is at most ½π; ‖Δ‖² is no more than said over 2(1 − cos δ), for θ* up to 1 rad, in all directions."""
-    for theta in np.linspace(1e-2, np.pi, 50):
-        assert np.linalg.norm(_inverse_v(np.array([0.0, 0.0, theta])), 2) <= 0.5 * np.pi + 1e-9
-    size = np.linspace(1e-3, np.pi, 800)[:, None]
-    cosine = np.linspace(-1.0, 1.0, 401)
-    for start in np.linspace(0.0, 1.0, 21):
-        half = np.cos(start / 2) * np.cos(size / 2) + np.sin(start / 2) * np.sin(size / 2) * cosine
-        apart = size**2 + start**2 - 2.0 * size * start * cosine
-        far = (0.5 * (np.pi + start) / np.cos(0.5 * start)) ** 2
-        assert (apart - far * 4.0 * (1.0 - half**2)).max() <= 1e-9
-
-
 def _inverse_v(phi):
     columns = [lie.exp(np.array([*axis, *phi]))[:3, 3] for axis in np.eye(3)]
     return np.linalg.inv(np.array(columns).T)
-
-
-def disturbed(name, seed):
-    """A published graph whose poses are anywhere."""
-    source = published(name)
-    rng = np.random.default_rng(seed)
-    anywhere = lie.exp(rng.normal(size=(len(source), source.freedom)) * 3.0)
-    return graph_of(anywhere, source.edges, source.measurements, source.information, source.is_loop)
-
-
-@pytest.mark.parametrize("name", ["intel", "smallGrid3D"])
-def test_a_local_minimum_from_a_bad_guess_is_not_certified(name):
-    best = published(name).optimize(PLAIN).chi2_after
-    graph = disturbed(name, 1)
-    answer = graph.optimize(GraphConfig(robust="none", max_iterations=300), initialize="given")
-    assert answer.chi2_after > 1.5 * best
-    certificate = graph.certify()
-    assert not certificate.certified and certificate.gap == certificate.chi2
-    assert certificate.verdict.startswith("not certified: ")
 
 
 def closed_ring(dimension, count, turns, noise=0.0):
@@ -221,16 +176,6 @@ def test_an_unfinished_answer_has_a_wider_gap():
     assert 0.0 < early.chi2_after - best <= certificate.gap < 0.01 * best
 
 
-def test_edges_that_were_rejected_do_not_count():
-    graph = closed_ring(2, 30, 0, noise=0.01)
-    graph.add_edge(3, 20, lie.pose_2d(7.0, -2.0, 2.5), 100.0 * np.eye(3), is_loop=True)
-    answer = graph.optimize(GraphConfig(robust="truncated"))
-    assert answer.rejected.sum() == 1
-    certificate = graph.certify()
-    assert certificate.certified and certificate.chi2 == pytest.approx(answer.chi2_after)
-    assert certificate.chi2 < 0.5 * answer.state.edge_chi2.sum()
-
-
 def test_what_the_bound_cannot_do_is_said():
     graph = closed_ring(2, 30, 0, noise=0.01)
     graph.fix(0)
@@ -240,7 +185,9 @@ def test_what_the_bound_cannot_do_is_said():
     graph = closed_ring(2, 4, 0)
     graph.add_edge(0, 2, lie.pose_2d(0.0, 0.0, 3.0), 1e-6 * np.eye(3))
     graph.optimize(PLAIN)
-    assert graph.certify().reason == "1 edge too far from what was measured to be bounded, first 0-2"
+    assert graph.certify().reason == (
+        "1 edge too far from what was measured, or too little informative, to be bounded, first 0-2"
+    )
 
 
 def test_an_edge_that_cannot_be_bounded_costs_its_chi2_and_no_more():
@@ -260,39 +207,24 @@ def test_an_edge_that_cannot_be_bounded_costs_its_chi2_and_no_more():
     assert 0.9 * price < certificate.gap < 0.01 * certificate.chi2
 
 
-def silenced(name, share, of_loops, silence):
-    """A published graph some of whose edges say nothing about a part of the motion."""
+def silenced(name, share):
+    """A published graph some of whose loops say nothing about rotations."""
     source = published(name)
     chosen = np.random.default_rng(0).random(len(source.edges)) < share
-    chosen &= (np.abs(np.diff(source.edges, axis=1)[:, 0]) != 1) | (not of_loops)
-    information = source.information.copy()
-    d = source.dimension
-    part = slice(d, None) if silence == "rotation" else slice(0, d)
-    information[chosen, part] = 0.0
-    information[chosen, :, part] = 0.0
+    chosen &= np.abs(np.diff(source.edges, axis=1)[:, 0]) != 1
+    information, d = source.information.copy(), source.dimension
+    information[chosen, d:] = 0.0
+    information[chosen, :, d:] = 0.0
     return graph_of(source.poses, source.edges, source.measurements, information, source.is_loop)
 
 
-@pytest.mark.parametrize("silence", ["rotation", "position"])
 @pytest.mark.parametrize("name", ["intel", "smallGrid3D", "sphere2500"])
-def test_loops_of_position_alone_and_of_rotation_alone_are_certified(name, silence):
-    graph = silenced(name, 0.3, True, silence)
+def test_loops_of_position_alone_are_certified(name):
+    graph = silenced(name, 0.3)
     answer = graph.optimize(PLAIN)
     certificate = graph.certify()
     assert certificate.certified and certificate.relative_gap < 1e-6
     assert certificate.chi2 == pytest.approx(answer.chi2_after, rel=1e-9)
-
-
-def test_edges_of_position_alone_may_have_any_rotation_in_their_measurement():
-    """It is not known; whatever is written there has no say, in the answer or in its certificate."""
-    graph = silenced("smallGrid3D", 0.3, True, "rotation")  # whose information of positions has no direction
-    of_position = ~graph.information[:, 3:].any(axis=(1, 2))
-    any_rotation = lie.exp(np.random.default_rng(0).normal(size=(of_position.sum(), 6)) * [0, 0, 0, 1, 1, 1])
-    measurements = graph.measurements.copy()
-    measurements[of_position, :3, :3] = any_rotation[:, :3, :3]
-    other = graph_of(graph.poses, graph.edges, measurements, graph.information, graph.is_loop)
-    assert other.optimize(PLAIN).chi2_after == pytest.approx(graph.optimize(PLAIN).chi2_after, rel=1e-9)
-    assert other.certify().certified
 
 
 @pytest.mark.parametrize("dimension", [2, 3])

@@ -71,21 +71,6 @@ def test_wide_fronts_are_eliminated_in_panels_and_tiles(size):
     assert np.allclose(A @ cholesky.solve(b), b, atol=1e-10)
 
 
-def test_a_grid_fills_in_far_less_than_a_dense_factor():
-    side = 40
-    index = np.arange(side * side).reshape(side, side)
-    pairs = np.concatenate(
-        [
-            np.stack([index[1:], index[:-1]], -1).reshape(-1, 2),
-            np.stack([index[:, 1:], index[:, :-1]], -1).reshape(-1, 2),
-        ]
-    )
-    pattern = BlockPattern(np.full(side * side, 3, np.int64), pairs)
-    cholesky = SparseCholesky(pattern, analyze(pattern))
-    n = 3 * side * side
-    assert cholesky._fronts.factor_start[-1] < 0.03 * n * (n + 1)
-
-
 @pytest.mark.parametrize(
     ("sizes", "values", "words"),
     [([2, 2, 2], [1, 0, 0, 1, 2, 0, 0, 2, 1, 0, 0, 0, 0, 0, 0, 0], "variable 2"), ([1, 1], [1, 1, 2], "variable")],

@@ -8,11 +8,11 @@ from scanchain.config import GraphConfig
 from scanchain.data import Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import absolute_error, expected_ate, pair
-from scanchain.graph.minimizer import Evaluation, Optimizer, full_curvature
+from scanchain.graph.minimizer import Optimizer
 from scanchain.graph.odometry_errors import Explanation, Loosened
 from scanchain.graph.pose_graph import PoseGraph
 from tests.support.graphs import graph_of, published, ring
-from tests.support.naive_graph import dense, normal_equations
+from tests.support.naive_graph import normal_equations
 
 PLAIN = GraphConfig(robust="none")
 BEST_HALF_CHI2 = {
@@ -36,14 +36,6 @@ def test_the_published_graphs_reach_the_best_known_chi2_from_their_files_and_are
     assert certificate.relative_gap < 1e-6
 
 
-@pytest.mark.parametrize("name", ["intel", "smallGrid3D"])
-@pytest.mark.parametrize("optimizer", ["gauss-newton", "dogleg", "newton"])
-def test_other_optimizers_reach_the_same_minimum(name, optimizer):
-    answer = published(name).optimize(GraphConfig(optimizer=optimizer, robust="none"))
-    reference = published(name).optimize(PLAIN)
-    assert answer.converged and answer.chi2_after == pytest.approx(reference.chi2_after, rel=2e-5)
-
-
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_every_optimizer_ends_in_the_same_minimum_of_a_ring(dimension):
     """Gradient descent too, only that it takes its time."""
@@ -55,38 +47,6 @@ def test_every_optimizer_ends_in_the_same_minimum_of_a_ring(dimension):
         assert answer.converged, (optimizer, answer.reason)
         chi2[optimizer] = answer.chi2_after
     assert np.allclose(list(chi2.values()), chi2["levenberg-marquardt"], rtol=1e-5)
-
-
-@pytest.mark.parametrize("optimizer", ["levenberg-marquardt", "dogleg", "newton", "gradient-descent"])
-def test_no_step_of_a_guarded_optimizer_raises_chi2(optimizer):
-    graph = published("smallGrid3D")
-    before = np.inf
-    for _ in range(6):
-        answer = graph.optimize(
-            GraphConfig(optimizer=optimizer, max_iterations=1, robust="none"), initialize="given"
-        )
-        assert answer.chi2_after <= min(before, answer.chi2_before) * (1.0 + 1e-12)
-        before = answer.chi2_after
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_newtons_curvature_equals_second_differences_of_the_cost(dimension):
-    graph, _ = ring(dimension, count=4, noise=0.2)
-    problem, poses = graph._prepared(), graph.poses
-    weights = np.array([1.0, 0.5, 1.0, 0.7])
-    errors = problem.errors(poses)
-    now = Evaluation(poses, errors, problem.chi2(errors), 0.0)
-    values = full_curvature(problem, now, problem.linearize(poses, errors, weights))
-    n, step = problem.pattern.scalars, 1e-3
-
-    def cost(a, b):
-        return 0.5 * weights @ problem.chi2(problem.errors(problem.moved(poses, step * (a + b))))
-
-    axes = np.eye(n)
-    expected = [
-        [(cost(a, b) - cost(a, -b) - cost(-a, b) + cost(-a, -b)) / (4.0 * step**2) for a in axes] for b in axes
-    ]
-    assert np.allclose(dense(problem.pattern, values), expected, rtol=1e-4, atol=1e-4 * np.abs(expected).max())
 
 
 def test_a_poor_guess_is_replaced_by_the_chordal_one_and_a_good_one_kept():
@@ -175,22 +135,6 @@ def test_every_reason_to_stop_is_reported():
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_a_graph_grown_between_optimizations_equals_one_built_at_once(dimension):
-    whole, _ = ring(dimension, count=60, noise=0.03)
-    grown = PoseGraph(dimension)
-    for index, pose in enumerate(whole.poses):
-        assert grown.add_pose(pose, 10 * index) == index
-        for edge in np.flatnonzero(whole.edges.max(axis=1) == index):
-            i, j = whole.edges[edge]
-            grown.add_edge(i, j, whole.measurements[edge], whole.information[edge], bool(whole.is_loop[edge]))
-        if index % 20 == 19:
-            grown.optimize(PLAIN)
-    whole.optimize(PLAIN)
-    assert np.allclose(grown.poses, whole.poses, atol=1e-6)
-    assert grown.stamps_ns.tolist() == [10 * index for index in range(60)]
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_covariances_are_those_of_right_twists_as_the_information_of_edges_is(dimension):
     """A chain of edges, each drawn 20,000 times with the covariance of its right twist."""
     rng = np.random.default_rng(0)
@@ -229,35 +173,6 @@ def test_covariances_equal_the_dense_inverse(dimension):
         expected = adjoint[j] @ joint @ adjoint[j].T
         assert np.allclose(graph.relative_covariance(i, j), expected, rtol=1e-5, atol=1e-9)
         assert i or np.allclose(found[j], expected, rtol=1e-5, atol=1e-9)
-
-
-@pytest.mark.parametrize("name", ["intel", "smallGrid3D"])
-def test_covariances_equal_those_of_gtsam(name):
-    gtsam = pytest.importorskip("gtsam")
-    graph = published(name)
-    graph.optimize(PLAIN)
-    flat = graph.dimension == 2
-    factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for index, T in enumerate(graph.poses):
-        values.insert(index, gtsam.Pose2(*T[:2, 2], float(lie.yaw(T))) if flat else gtsam.Pose3(T))
-    order = np.arange(3) if flat else np.array([3, 4, 5, 0, 1, 2])  # GTSAM's rotation comes first in space
-    for (i, j), Z, omega in zip(graph.edges.tolist(), graph.measurements, graph.information, strict=True):
-        noise = gtsam.noiseModel.Gaussian.Information(omega[np.ix_(order, order)])
-        if flat:
-            factors.add(gtsam.BetweenFactorPose2(i, j, gtsam.Pose2(*Z[:2, 2], float(lie.yaw(Z))), noise))
-        else:
-            factors.add(gtsam.BetweenFactorPose3(i, j, gtsam.Pose3(Z), noise))
-    held = gtsam.noiseModel.Diagonal.Sigmas(np.full(graph.freedom, 1e-6))
-    prior = gtsam.PriorFactorPose2 if flat else gtsam.PriorFactorPose3
-    factors.add(prior(0, values.atPose2(0) if flat else values.atPose3(0), held))
-    marginals = gtsam.Marginals(factors, values)
-    found = graph.covariances()
-    for pose in (1, len(graph) // 2, len(graph) - 1):
-        theirs = marginals.marginalCovariance(pose)
-        spread = np.sqrt(np.diag(theirs))
-        ours = found[pose][np.ix_(order, order)]
-        # GTSAM linearizes its residual in another chart where the residual is large, hence a few thousandths
-        assert np.abs((ours - theirs) / np.outer(spread, spread)).max() < (1e-3 if flat else 0.05)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -311,13 +226,6 @@ def test_a_pose_that_stands_for_many_scans_weighs_as_many_in_the_expected_ate():
     assert among_many.mean == pytest.approx(sigma_m * mean_m * np.sqrt(0.01 * 0.99), rel=0.1)
 
 
-def test_odometry_alone_adds_up_the_covariances_of_its_steps():
-    poses, step = [lie.pose_2d(x_m, 0.0, 0.0) for x_m in range(4)], lie.pose_2d(1.0, 0.0, 0.0)
-    graph = graph_of(poses, [(0, 1), (1, 2), (2, 3)], [step] * 3, np.diag([100.0, 100.0, 1e9]))
-    assert np.allclose(np.diag(graph.relative_covariance(0, 3))[:2], 0.03, rtol=1e-4)
-    assert np.allclose(graph.relative_covariance(1, 1), 0.0)
-
-
 @pytest.mark.parametrize(
     ("i", "j", "information", "words"),
     [
@@ -325,12 +233,7 @@ def test_odometry_alone_adds_up_the_covariances_of_its_steps():
         (-1, 1, np.eye(3), "edge -1-1 joins a pose that is not there"),
         (1, 1, np.eye(3), "joins a pose to itself"),
         (0, 1, np.diag([1.0, 1.0, -1.0]), "not symmetric positive semidefinite"),
-        (
-            0,
-            1,
-            np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
-            "not symmetric positive semidefinite",
-        ),
+        (0, 1, np.eye(3) + np.eye(3, k=1), "not symmetric positive semidefinite"),
         (0, 1, np.diag([1.0, 1e300, 1.0]), r"edge 0-1: information of 1e\+300, over 1e\+50; give meters"),
         (0, 1, np.full((3, 3), np.nan), "information holds NaN or infinite values"),
     ],

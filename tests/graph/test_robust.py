@@ -33,32 +33,22 @@ def with_false_loops(name, share, seed=0):
     return graph, true, np.arange(len(graph.edges)) >= real
 
 
-def in_order_of_addition(graph, values):
-    result = np.empty(len(values), values.dtype)
-    result[np.argsort(graph.is_loop, kind="stable")] = values
-    return result
-
-
 def position_error_m(graph, true):
     return float(np.sqrt(((graph.poses[:, :2, 2] - true.poses[:, :2, 2]) ** 2).sum(axis=1).mean()))
 
 
 @pytest.mark.parametrize(
-    ("name", "share"), [("intel", 0.1), ("intel", 0.3), ("intel", 0.5), ("manhattan", 0.1), ("manhattan", 0.5)]
+    ("name", "share", "kind", "seed"),
+    [
+        *((name, share, "nearby", 0) for name in ("intel", "manhattan") for share in (0.1, 0.5)),
+        *(("intel", 0.3 / 0.7, "groups of 10", seed) for seed in (0, 2)),
+    ],
 )
-def test_a_tenth_to_a_half_of_wrong_loops_leave_the_trajectory_as_it_is_without_them(name, share):
-    outcome = try_wrong_loops(shared_data(f"graphs/{name}.g2o"), share, "nearby", seed=0)
+def test_a_tenth_to_a_half_of_wrong_loops_leave_the_trajectory_as_it_is_without_them(name, share, kind, seed):
+    outcome = try_wrong_loops(shared_data(f"graphs/{name}.g2o"), share, kind, seed)
     assert outcome.wrong_rejected >= 0.99 and outcome.true_rejected <= 0.01
     assert outcome.ate_m <= 1.1 * outcome.ate_clean_m + 1e-3
     assert outcome.certified
-
-
-@pytest.mark.parametrize("seed", [0, 2])
-def test_groups_of_ten_wrong_loops_that_agree_are_rejected_as_groups(seed):
-    share = 0.3 / 0.7  # of the true ones: 30 % of all
-    outcome = try_wrong_loops(shared_data("graphs/intel.g2o"), share, "groups of 10", seed)
-    assert outcome.wrong_rejected >= 0.99 and outcome.true_rejected <= 0.01
-    assert outcome.ate_m <= 1.1 * outcome.ate_clean_m + 1e-3
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -114,17 +104,6 @@ def test_a_robust_loss_hardly_moves_a_graph_whose_loops_are_true(robust):
     assert position_error_m(graph, true) < 0.02
 
 
-@pytest.mark.parametrize("robust", ["huber", "cauchy"])
-def test_a_minimum_of_the_robust_loss_is_flat(robust):
-    """The weights belong to the loss: at the answer Σ w JᵀΩe vanishes."""
-    graph, _, _ = with_false_loops("intel", 0.01)
-    graph.optimize(GraphConfig(robust=robust, tolerance=1e-12, max_iterations=300))
-    problem = graph._prepared()
-    equations = problem.linearize(graph.poses, problem.errors(graph.poses), graph.weight)
-    diagonal = equations.values[problem.pattern.diagonal]
-    assert np.abs(equations.gradient / np.sqrt(diagonal)).max() < 1e-3
-
-
 def test_false_edges_stay_in_force_where_a_pose_would_be_loose_without_them():
     """Two loops hold the last pose, and each claims another place."""
     poses, measured = ([lie.pose_2d(x, 0.0, 0.0) for x in xs] for xs in ((0.0, 1.0, 3.0), (1.0, 2.0, 3.0)))
@@ -175,13 +154,6 @@ class Scalar(Welsch):
 
     def loss(self, chi2, s, mu):
         return s**2 * -math.expm1(-chi2 / s**2)
-
-
-def test_a_loss_of_the_users_is_minimized():
-    graph, _, is_false = with_false_loops("intel", 0.03)
-    answer = graph.optimize(GraphConfig(robust=f"{__name__}:Welsch"))
-    weight = in_order_of_addition(graph, answer.state.weight)
-    assert np.median(weight[is_false]) < 1e-3 < 0.5 < np.median(weight[~is_false])
 
 
 @pytest.mark.parametrize(("name", "fault"), [("OtherSlope", "slope of loss"), ("Scalar", "fails for")])

@@ -49,12 +49,6 @@ class Laps:
         self.schedule.note(source, float(np.linalg.norm(error[:2])), chi2, **options)
 
 
-def test_a_graph_without_closures_is_never_optimized():
-    laps = Laps()
-    laps.grow(200, closes=False)
-    assert laps.optimized == []
-
-
 def test_closures_that_fit_wait_until_the_graph_has_grown_by_a_share():
     laps = Laps()
     laps.grow(400)

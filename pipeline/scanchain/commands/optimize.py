@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
     from scanchain.config import GraphConfig
     from scanchain.graph.certificate import Certificate
-    from scanchain.graph.edge_checks import FreePose
     from scanchain.graph.g2o import G2oFile, Indefinite
     from scanchain.graph.initialize import Initialization
     from scanchain.graph.optimization import GraphChange, Optimization
@@ -40,7 +39,7 @@ _HALF = 0.5  # robust weight below which an edge is contradicted by the rest, re
     "--optimizer",
     "graph.optimizer",
     metavar="NAME",
-    help="levenberg-marquardt, gauss-newton, dogleg, newton or gradient-descent; short for --graph.optimizer.",
+    help="levenberg-marquardt, gauss-newton, dogleg or gradient-descent; short for --graph.optimizer.",
 )
 @click.option(
     "--initialize",
@@ -194,7 +193,7 @@ class _Report:
     file: G2oFile
     change: GraphChange
     optimization: Optimization
-    free: tuple[FreePose, ...]
+    free: NDArray[np.int64]
     weak: NDArray[np.int64]
     certificate: Certificate
 
@@ -228,7 +227,7 @@ class _Report:
             ("chi2", self._chi2),
             ("iterations", f"{done.iterations:,} in {1e3 * done.time_s:.0f} ms; {ending}"),
             *robust,
-            *([("free", free_text(self.free))] if self.free else []),
+            *([("free", free_text(self.free))] if len(self.free) else []),
             *([("weakly joined", weak_text(self.weak))] if len(self.weak) else []),
             ("certificate", f"{certified}; {1e3 * self.certificate.time_s:.0f} ms"),
         ]
@@ -289,7 +288,7 @@ class _Report:
             "reason": done.reason,
             "initialization": done.initialization,
             "time_s": done.time_s,
-            "free": self.free,
+            "free": self.free.tolist(),
             "weakly_joined": self.weak.tolist(),
             "certificate": asdict(self.certificate) | {"relative_gap": self.certificate.relative_gap},
         }

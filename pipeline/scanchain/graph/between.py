@@ -14,9 +14,6 @@ from scanchain.data import Matrix
 from scanchain.graph.cholesky import BlockPattern, Packing, SparseCholesky, analyze
 from scanchain.kernels.graph import between
 
-WASTE = 0.1  # share of edges without weight that is worth a new analysis
-_FEW = 0.03  # the same where H⁻¹ is wanted too, which fill-in slows down more
-
 
 class Between:
     """e = log(Z⁻¹ T_i⁻¹ T_j): the twist that the relative pose is off by on its right, T_i⁻¹ T_j = Z exp(e).
@@ -68,14 +65,10 @@ FACTORS = {"between": Between(), "position": Position()}
 
 @dataclass(frozen=True, slots=True)
 class NormalEquations:
-    """H = Σ w JᵀΩJ as block values of the problem's pattern, and g = Σ w JᵀΩe; the step solves H ξ = −g.
-
-    ``weights`` (E,) are the robust weights w that went into them.
-    """
+    """H = Σ w JᵀΩJ as block values of the problem's pattern, and g = Σ w JᵀΩe; the step solves H ξ = −g."""
 
     values: NDArray[np.float64]
     gradient: NDArray[np.float64]
-    weights: NDArray[np.float64]
 
 
 class BetweenProblem:
@@ -143,23 +136,12 @@ class BetweenProblem:
         sparse.cholesky.factorize(sparse.linearize(poses, errors[kept], np.ones(int(kept.sum()))).values)
         return sparse
 
-    def weighed(self, poses: Matrix, errors: Matrix, kept: NDArray[np.bool_]) -> BetweenProblem:
-        """As ``factored``; where few edges are left out, these weigh nothing, which takes no new analysis."""
-        if kept.mean() < 1.0 - _FEW:
-            return self.factored(poses, errors, kept)
-        self.cholesky.factorize(self.linearize(poses, errors, kept.astype(np.float64)).values)
-        return self
-
     def errors(self, poses: Matrix) -> Matrix:
         """Residuals e (E, k) at these poses (K, d+1, d+1)."""
-        return self._errors(poses, self.edges)
-
-    def between(self, T_i: Matrix, T_j: Matrix) -> tuple[Matrix, Matrix]:
-        """Residuals (E, k) and ∂e/∂ξ_j (E, k, k) with ends (E, d+1, d+1) given edge by edge."""
-        poses = np.concatenate([T_i, T_j])
-        edges = np.arange(2 * len(T_i)).reshape(2, -1).T.copy()
-        errors = self._errors(poses, edges)
-        return errors, self._jacobians(poses, edges, errors)
+        errors = np.empty((len(self.edges), self.freedom))
+        for factor, of in self._factors:
+            errors[of] = factor.residual(poses, self.edges[of], self.measurements[of])
+        return errors
 
     def chi2(self, errors: Matrix) -> NDArray[np.float64]:
         """Return eᵀΩe of every edge, (E,)."""
@@ -169,7 +151,10 @@ class BetweenProblem:
 
     def jacobians(self, poses: Matrix, errors: Matrix) -> Matrix:
         """∂e/∂ξ_j (E, k, k); ∂e/∂ξ_i is its negative."""
-        return self._jacobians(poses, self.edges, errors)
+        jacobian = np.empty((*errors.shape, self.freedom))
+        for factor, of in self._factors:
+            jacobian[of] = factor.linearize(poses, self.edges[of], self.measurements[of], errors[of])
+        return jacobian
 
     def linearize(self, poses: Matrix, errors: Matrix, weights: NDArray[np.float64]) -> NormalEquations:
         """Normal equations at these poses, with these residuals and robust weights (E,)."""
@@ -177,7 +162,7 @@ class BetweenProblem:
         gradient = np.zeros((len(self.free), self.freedom))
         jacobian = self.jacobians(poses, errors)
         between.scatter_between(jacobian, errors, self.information, weights, self.slots, blocks, gradient)
-        return NormalEquations(self.packing.values(blocks), self.packing.rows(gradient), weights)
+        return NormalEquations(self.packing.values(blocks), self.packing.rows(gradient))
 
     def scattered(self, of_i: Matrix, of_j: Matrix, coupling: Matrix) -> Matrix:
         """Blocks (B, b, b) of the pattern, of what every edge adds (E, b, b): to those of i, of j and of the pair.
@@ -196,18 +181,6 @@ class BetweenProblem:
         result = poses.copy()
         result[self.free] = lie.exp(self.packing.spread_rows(step)) @ poses[self.free]
         return result
-
-    def _errors(self, poses: Matrix, edges: NDArray[np.int64]) -> Matrix:
-        errors = np.empty((len(edges), self.freedom))
-        for factor, of in self._factors:
-            errors[of] = factor.residual(poses, edges[of], self.measurements[of])
-        return errors
-
-    def _jacobians(self, poses: Matrix, edges: NDArray[np.int64], errors: Matrix) -> Matrix:
-        jacobian = np.empty((len(edges), self.freedom, self.freedom))
-        for factor, of in self._factors:
-            jacobian[of] = factor.linearize(poses, edges[of], self.measurements[of], errors[of])
-        return jacobian
 
 
 def turns(positions: Matrix) -> Matrix:

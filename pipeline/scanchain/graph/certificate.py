@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from scanchain import lie
 from scanchain.clock import working_s
 from scanchain.data import Matrix
 from scanchain.errors import counted
-from scanchain.graph.between import BetweenProblem
+from scanchain.graph.between import BetweenProblem, turns
 from scanchain.graph.cholesky import BlockPattern, Packing, SingularMatrixError, SparseCholesky
 from scanchain.graph.edge_checks import is_connected
 
@@ -21,10 +22,9 @@ _GIVEN_UP = (0.0, 1e-6, 1e-4, 1e-2)  # shares of χ² by which the bound is lowe
 _SLOPE = 0.9311  # largest norm of V(φ)⁻¹ for rotations up to π: (π²/16 + 1/4)^½
 _BEND = 0.72  # loss of curvature of κ‖φ‖² at an angle θ*, as a factor of θ*², up to 1 rad
 _FARTHEST = 1.0  # largest θ*, rad, of an edge that is bounded
-_STRETCH = 0.25 * np.pi**2  # largest ratio of ‖ρ − ρ*‖² to ‖z‖²
 _ROUNDING = 1e-9  # share by which the isotropic information stays below the smallest eigenvalue
 _TINY = 1e-30  # in place of no information at all, so that nothing is divided by zero
-_PAID_FROM_TAU = (1.0, 2.0, 4.0)  # factors on the part paid from τ, tried one after the other
+_PAID_FROM_TAU = 2.0  # factor on the part of the cost that is paid from τ: the more, the more of κ is left
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,49 +80,46 @@ def certify(
         χ² ≥ χ²* − tr(rᵀ S⁻¹ r),   r = S X*, which vanishes where X* is a minimum to the last digit.
     Where S is not, μ I is added to its rotations, which lowers the bound. Definite means that the Cholesky
     factorization goes through, so the claim holds to the rounding of that. A few edges too far from their
-    measurements for such a function are bounded by zero instead: their χ² is part of the gap. What leaves
-    poses ``undetermined``, in words, leaves nothing to certify. ``names`` (K,) are what the poses are called.
+    measurements for such a function, or without information in some direction, are bounded by zero instead: their
+    χ² is part of the gap. What leaves poses ``undetermined``, in words, leaves nothing to certify. ``names`` (K,)
+    are what the poses are called.
     """
     begin = working_s()
     kept = weights > 0.0
+    if not kept.all():
+        problem, weights = problem.restricted(kept), weights[kept]
     of_edges = weights * problem.chi2(problem.errors(poses))
     chi2 = float(of_edges.sum())
     is_zero = chi2 <= _ZERO_CHI2 * min(float(problem.information.max(initial=0.0)), 1.0)
-    if undetermined:
-        return Certificate(False, chi2, chi2, undetermined, working_s() - begin, is_zero)
-    if is_zero:
-        return Certificate(True, chi2, chi2, "", working_s() - begin, is_zero)
-    if len(poses) - len(problem.free) > 1:
-        reason = f"{len(poses) - len(problem.free)} poses are fixed; the bound is for one"
-        return Certificate(False, chi2, chi2, reason, working_s() - begin)
+    gap, reason = chi2, undetermined
+    if not undetermined and not is_zero:
+        gap, reason = _gap(problem, poses, weights, of_edges, names)
+    return Certificate(not reason, gap, chi2, reason, working_s() - begin, is_zero)
+
+
+def _gap(
+    problem: BetweenProblem,
+    poses: Matrix,
+    weights: NDArray[np.float64],
+    of_edges: NDArray[np.float64],
+    names: NDArray[np.int64],
+) -> tuple[float, str]:
+    """χ² less its lower bound; where there is none, all of it and why. ``of_edges`` (E,) make up χ²."""
+    chi2, n, d = float(of_edges.sum()), len(problem.free), poses.shape[-1] - 1
+    if len(poses) - n > 1:
+        return chi2, f"{len(poses) - n} poses are fixed; the bound is for one"
     centered = poses.copy()
     centered[:, :-1, -1] -= centered[:, :-1, -1].mean(axis=0)
     minorants = minorize(problem, centered, weights)
-    loose = kept & np.isnan(minorants.kappa)
+    loose = np.isnan(minorants.kappa)
     given_up = float(of_edges[loose].sum())
-    rest = problem.edges[kept & ~loose]
-    if loose.any() and (given_up > _GIVEN_UP[-1] * chi2 or not is_connected(rest, problem.variable < 0)):
+    is_apart = not is_connected(problem.edges[~loose], problem.variable < 0)
+    if loose.any() and (given_up > _GIVEN_UP[-1] * chi2 or is_apart):
         i, j = names[problem.edges[loose][0]]
-        reason = f"{counted(int(loose.sum()), 'edge')} too far from what was measured to be bounded, first {i}-{j}"
-        return Certificate(False, chi2, chi2, reason, working_s() - begin)
-    gap = _gap(problem, minorants, kept & ~loose, chi2)
-    if gap is None:
-        reason = "the dual matrix is not positive definite, as at a local minimum"
-        borrowing = kept & ((minorants.tau < 0.0) | (minorants.kappa < 0.0))
-        if borrowing.any():
-            i, j = names[problem.edges[borrowing][0]]
-            edges = counted(int(borrowing.sum()), "edge")
-            reason += f", or where Ω has little information about some direction, first at {i}-{j} of {edges}"
-        return Certificate(False, chi2, chi2, reason, working_s() - begin)
-    return Certificate(True, min(gap + given_up, chi2), chi2, "", working_s() - begin)
-
-
-def _gap(problem: BetweenProblem, minorants: Minorants, kept: NDArray[np.bool_], chi2: float) -> float | None:
-    """χ² less the best bound that a few shifts of the dual matrix give, None where none gives any."""
-    n, d = len(problem.free), minorants.leap.shape[1]
-    blocks, residual = dual_matrix(problem, minorants, kept)
-    sizes = np.where(problem.is_point[problem.free], 1, d + 1)
-    pattern = BlockPattern(sizes, problem.pattern.pairs)
+        far = f"{counted(int(loose.sum()), 'edge')} too far from what was measured, or too little informative"
+        return chi2, f"{far}, to be bounded, first {i}-{j}"
+    blocks, residual = dual_matrix(problem, minorants, ~loose)
+    pattern = BlockPattern(np.where(problem.is_point[problem.free], 1, d + 1), problem.pattern.pairs)
     packing = Packing(pattern, d + 1, at_end=True)
     factor = SparseCholesky(pattern, problem.cholesky.analysis)
     rotation = np.diag([1.0] * d + [0.0])
@@ -135,8 +132,8 @@ def _gap(problem: BetweenProblem, minorants: Minorants, kept: NDArray[np.bool_],
         except SingularMatrixError:
             continue
         right = packing.rows(residual + shift * rotation[:, :d])
-        return float((right * factor.solve(right)).sum())
-    return None
+        return min(float((right * factor.solve(right)).sum()) + given_up, chi2), ""
+    return chi2, "the dual matrix is not positive definite, as at a local minimum"
 
 
 def dual_matrix(problem: BetweenProblem, bound: Minorants, kept: NDArray[np.bool_]) -> tuple[Matrix, Matrix]:
@@ -180,8 +177,8 @@ class Minorants:
     leap : (E, d) l, from pose i to pose j at the estimate, m
     force : (E, d) f, slope of χ² with the position of j
     torque : (E, d, d) [g]×, slope of χ² with the rotation of j, its position held
-    tau : (E,) m⁻², negative where borrowed
-    kappa : (E,) rad⁻², negative where borrowed; NaN where the edge is too far from its measurement for any bound
+    tau : (E,) m⁻²
+    kappa : (E,) rad⁻²; NaN of an edge too far from its measurement, or too little informative, for any bound
     """
 
     leap: Matrix
@@ -192,95 +189,32 @@ class Minorants:
 
 
 def minorize(problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64]) -> Minorants:
-    """Bounds that touch the χ² of every edge, times its weight (E,), at these poses."""
+    """Bounds that touch the χ² of every edge, times its weight (E,), at these poses.
+
+    They cost a part of its isotropic information, most of it of κ.
+    """
     d = poses.shape[-1] - 1
     i, j = problem.edges.T
-    errors = problem.errors(poses)
+    errors, norm = problem.errors(poses), partial(np.linalg.norm, axis=-1)
     information = weights[:, None, None] * problem.information
-    pull = (information @ errors[..., None])[..., 0]
+    pull = (information @ errors[..., None])[..., 0]  # y
     slope = 2.0 * (np.swapaxes(problem.jacobians(poses, errors), 1, 2) @ pull[..., None])[..., 0]
     force = slope[:, :d]
-    torque = slope[:, d:] - _moment(poses[j, :d, d], force)
+    torque = slope[:, d:] - (force[:, None] @ turns(poses[j, :d, d]))[:, 0]
     turned = errors[:, d:] if d == 2 else (poses[j, :3, :3] @ errors[:, 3:, None])[..., 0]
     tau, kappa = _isotropic(information, d)
+    rho, theta = norm(errors[:, :d]), norm(errors[:, d:])
+    slide = _SLOPE * norm(pull[:, :d])
+    bent = _PAID_FROM_TAU * 0.5 * rho * np.sqrt(tau / kappa) + 1e-12
+    paid = np.minimum(_PAID_FROM_TAU * slide / np.sqrt(tau * kappa) + 1e-12, 0.5)
+    left = tau * (1.0 - paid) / (1.0 + bent)
+    cost = 0.25 * left * (1.0 + 1.0 / bent) * rho**2 + slide**2 / (paid * tau) + norm(force) * rho / 6.0
+    cost += 0.5 * norm(torque - 2.0 * kappa[:, None] * turned)
+    kappa = (1.0 - 0.5 * _BEND * theta**2) * (kappa - cost / np.maximum(1.0 - theta, 1e-12))
+    kappa[~(kappa > 0.0) | (theta >= _FARTHEST)] = np.nan
     seen = problem.sightings  # of points: quadratic in the position of the point, and nothing else
-    of_seen = np.linalg.eigvalsh(information[seen, :d, :d])[:, 0]
-    tau[seen], kappa[seen] = np.maximum(of_seen, _TINY), _TINY
-    excess = _length(torque - 2.0 * kappa[:, None] * turned)
-    rho, theta = _length(errors[:, :d]), _length(errors[:, d:])
-    tau, kappa = _paid(tau, kappa, rho, theta, _length(pull[:, :d]), 0.5 * _length(force), excess)
-    short = np.setdiff1d(np.flatnonzero(~(kappa > 0.0) & (theta < _FARTHEST)), seen)
-    if len(short):
-        parts = (information, errors, pull, force, torque, turned)
-        tau[short], kappa[short] = _borrowed(*(part[short] for part in parts))
-    kappa[theta >= _FARTHEST] = np.nan
-    tau[seen], kappa[seen] = of_seen, 0.0
-    return Minorants(poses[j, :d, d] - poses[i, :d, d], force, _cross_matrix(torque), tau, kappa)
-
-
-def _paid(
-    tau: NDArray[np.float64],
-    kappa: NDArray[np.float64],
-    rho: NDArray[np.float64],
-    theta: NDArray[np.float64],
-    pull: NDArray[np.float64],
-    force: NDArray[np.float64],
-    excess: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """τ and κ (2, E) less the cost of the bounds, of which as much is paid from τ as leaves the most of both.
-
-    tau, kappa : isotropic information; rho, theta : residuals ‖ρ*‖ and θ*; pull : ‖y_t‖; force : ‖V⁻ᵀy_t‖;
-    excess : the rotational slope beside 2κφ*; each (E,)
-    """
-    left = np.empty((len(_PAID_FROM_TAU), 2, len(tau)))
-    for share, (tau_left, kappa_left) in zip(_PAID_FROM_TAU, left, strict=True):
-        bent = share * 0.5 * rho * np.sqrt(tau / kappa) + 1e-12
-        turned = np.minimum(share * _SLOPE * pull / np.sqrt(tau * kappa) + 1e-12, 0.5)
-        tau_left[:] = tau * (1.0 - turned) / (1.0 + bent)
-        cost = 0.25 * tau_left * (1.0 + 1.0 / bent) * rho**2 + (_SLOPE * pull) ** 2 / (turned * tau)
-        cost += force * rho / 3.0 + 0.5 * excess
-        rest = kappa - cost / np.maximum(1.0 - theta, 1e-12)
-        kappa_left[:] = np.where(theta < 1.0, (1.0 - 0.5 * _BEND * theta**2) * rest, -1.0)
-    best = np.minimum(left[:, 0] / tau, left[:, 1] / kappa).argmax(axis=0)
-    return left[best, :, np.arange(len(tau))].T
-
-
-def _borrowed(
-    information: Matrix, errors: Matrix, pull: Matrix, force: Matrix, torque: Matrix, turned: Matrix
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """τ and κ, (E,), of edges that cannot pay for their bounds, negative as far as they borrow."""
-    d = force.shape[1]
-    rho, theta = _length(errors[:, :d]), _length(errors[:, d:])
-    tau, kappa, tau_mean, kappa_mean = _isotropic_of_singular(information, d)
-    rate = np.sqrt(tau_mean / kappa_mean)
-    slope = _SLOPE * _length(pull[:, :d])
-    loan = slope * rate + _TINY
-    left = tau - loan
-    bent = np.clip(0.5 * rho * rate, 1e-12, 1.0)
-    has = left >= 0.0
-    tau = left * np.where(has, 1.0 / (1.0 + bent), _STRETCH * (1.0 + bent))
-    cost = 0.25 * rho**2 * left * np.where(has, 1.0, -_STRETCH * (1.0 + bent)) / bent
-    cost += slope**2 / loan + 0.5 * _length(force) * rho / 3.0
-    cost += 0.5 * _length(torque - 2.0 * np.maximum(kappa, 0.0)[:, None] * turned) + np.maximum(-kappa, 0.0)
-    kappa = np.maximum(kappa, 0.0) - cost / (1.0 - theta)
-    far = (0.5 * (np.pi + theta) / np.cos(0.5 * theta)) ** 2
-    return tau, kappa * np.where(kappa > 0.0, 1.0 - 0.5 * _BEND * theta**2, (1.0 - theta) * far)
-
-
-def _isotropic_of_singular(information: Matrix, d: int) -> tuple[NDArray[np.float64], ...]:
-    """τ and κ, (E,), with diag(τ I, κ I) ⪯ Ω, one of them negative if need be; mean eigenvalues of both blocks."""
-    k = information.shape[-1]
-    translation, coupling, rotation = information[:, :d, :d], information[:, :d, d:], information[:, d:, d:]
-    tau_mean = np.maximum(np.trace(translation, axis1=1, axis2=2) / d, _TINY)
-    kappa_mean = np.maximum(np.trace(rotation, axis1=1, axis2=2) / (k - d), _TINY)
-    least = np.linalg.eigvalsh(rotation)[:, 0]
-    half = np.where(least > 1e-6 * kappa_mean, 0.5 * least, -1e-3 * kappa_mean)
-    is_coupled = coupling.any(axis=(1, 2))
-    kappa = np.where(is_coupled, half, least - _ROUNDING * kappa_mean)
-    rest = rotation - np.where(is_coupled, kappa, -1.0)[:, None, None] * np.eye(k - d)
-    schur = translation - coupling @ np.linalg.solve(rest, np.swapaxes(coupling, 1, 2))
-    tau = np.linalg.eigvalsh(0.5 * (schur + np.swapaxes(schur, 1, 2)))[:, 0] - _ROUNDING * tau_mean
-    return tau, kappa, tau_mean, kappa_mean
+    left[seen], kappa[seen] = np.linalg.eigvalsh(information[seen, :d, :d])[:, 0], 0.0
+    return Minorants(poses[j, :d, d] - poses[i, :d, d], force, _cross_matrix(torque), left, kappa)
 
 
 def _isotropic(information: Matrix, d: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -290,21 +224,9 @@ def _isotropic(information: Matrix, d: int) -> tuple[NDArray[np.float64], NDArra
     k = information.shape[-1]
     scale = np.maximum(np.repeat(np.stack([tau, kappa], axis=1), (d, k - d), axis=1), _TINY) ** -0.5
     least = np.linalg.eigvalsh(scale[:, :, None] * information * scale[:, None, :])[:, 0]
-    least = np.clip(least, 1e-12, 1.0) * (1.0 - _ROUNDING)
-    return (least * np.maximum(tau, _TINY)).astype(np.float64), (least * np.maximum(kappa, _TINY)).astype(
-        np.float64
-    )
-
-
-def _length(vectors: Matrix) -> NDArray[np.float64]:
-    return np.sqrt((vectors * vectors).sum(axis=-1))
-
-
-def _moment(arm: Matrix, force: Matrix) -> Matrix:
-    """Moments (E, 1 or 3) of forces (E, d)."""
-    if arm.shape[1] == 3:
-        return np.cross(arm, force)
-    return (arm[:, :1] * force[:, 1:] - arm[:, 1:] * force[:, :1]).astype(np.float64, copy=False)
+    share = np.asarray(np.clip(least, 1e-12, 1.0) * (1.0 - _ROUNDING), np.float64)
+    tau, kappa = (np.asarray(np.maximum(each, _TINY), np.float64) for each in (tau, kappa))
+    return share * tau, share * kappa
 
 
 def _cross_matrix(torque: Matrix) -> Matrix:

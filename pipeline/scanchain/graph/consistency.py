@@ -32,7 +32,7 @@ class Consistency:
         self._problem, self._kept = problem, kept
         self._errors = problem.errors(poses)
         self._jacobians = problem.jacobians(poses, self._errors)
-        self._sparse = problem.weighed(poses, self._errors, kept)
+        self._sparse = problem.factored(poses, self._errors, kept)
 
     def of_each(self, price: float) -> NDArray[np.float64]:
         """The distance of every edge, (E,), from all others.
@@ -42,8 +42,6 @@ class Consistency:
         """
         problem, kept, every = self._problem, self._kept, np.arange(len(self._kept))
         blocks = inverse_blocks(self._sparse)
-        if self._sparse is problem:
-            return self._distances(every, edge_covariances(problem, blocks))
         i, j = problem.variable[problem.edges].T
         joint = 2.0 * (blocks[i] + blocks[j])
         joint[kept] = edge_covariances(self._sparse, blocks)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
@@ -17,41 +14,17 @@ from scanchain.errors import InputError, counted
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.cholesky import SingularMatrixError
 
-_AXES = {3: ("x", "y", "yaw"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
 _MOST = 100  # largest number of directions of the null space that are computed
 _MOVES = 1e-6  # share of the largest component of a null vector below which a pose stays where it is
-_NAMED = 1e-2  # component of a direction from which its axis is named
 _NOTHING = 1e-20  # share of the largest entry up to which a diagonal entry is rounding noise
 _FREE = 1e-11  # share of the information of a pose alone up to which what is left of it beside the others is none
-WEAK = 1e-6  # share of the median information up to which an edge is a weak one
-LOST = 1e-10  # share up to which too few digits of an edge are left beside the others to determine a pose
+_WEAK = 1e-6  # share of the median information up to which an edge is a weak one
+_LOST = 1e-10  # share up to which too few digits of an edge are left beside the others to determine a pose
 
 
-@dataclass(frozen=True, slots=True)
-class FreePose:
-    """A pose that moves without any change of χ².
-
-    Attributes
-    ----------
-    name : what the pose is called: its vertex id, or its index
-    axes : the axes of its own frame, as "x" or "yaw", along which or about which it may move
-    followers : the other poses that move with it as one rigid body
-    """
-
-    name: int
-    axes: tuple[str, ...]
-    followers: tuple[int, ...] = ()
-
-    def __str__(self) -> str:
-        names = listed(np.array([self.name, *self.followers]))
-        return f"{names} ({', '.join(self.axes)}){' as one body' if self.followers else ''}"
-
-
-def free_text(free: Sequence[FreePose]) -> str:
-    """Number of free poses, and the directions of the first, as one line of text."""
-    shown = ", ".join(map(str, free[:8])) + (", ..." if len(free) > 8 else "")
-    count = sum(1 + len(pose.followers) for pose in free)
-    return f"the edges leave {counted(count, 'pose')} free: {shown}"
+def free_text(names: NDArray[np.int64]) -> str:
+    """Number and names of free poses as one line of text."""
+    return f"the edges leave {counted(len(names), 'pose')} free: {listed(names)}"
 
 
 def free_poses(
@@ -60,42 +33,24 @@ def free_poses(
     weights: NDArray[np.float64],
     ranks: NDArray[np.int64],
     names: NDArray[np.int64],
-) -> tuple[FreePose, ...]:
-    """Poses with directions of their own frames that no edge constrains, at these poses and weights (E,).
+) -> NDArray[np.int64]:
+    """Names of the poses that move in some direction without any change of χ², at these poses and weights (E,).
 
     ranks (E,) are those of the information matrices. Where edges of full rank, weak along no axis, join every pose
-    to a fixed one, nothing is free. Else those that move together in the null space of H, without the axes along
-    which an edge says next to nothing.
+    to a fixed one, nothing is free. Else those that move in the null space of H, without the axes along which an
+    edge says next to nothing.
     """
-    fixed, axes = problem.variable < 0, _AXES[problem.freedom]
-    kept, shares = weights > 0.0, _shares(problem.information)
-    is_strong = kept & (ranks == problem.freedom) & (shares.min(axis=1) > WEAK)
+    fixed, kept, shares = problem.variable < 0, weights > 0.0, _shares(problem.information)
+    is_strong = kept & (ranks == problem.freedom) & (shares.min(axis=1) > _WEAK)
     if is_connected(problem.edges[is_strong], fixed):
-        return ()
+        return names[:0]
     apart = loose(problem.edges[kept & (ranks > 0)], fixed)
-    found = [FreePose(int(names[i]), axes[: 2 if problem.is_point[i] else None]) for i in apart.tolist()]
-    measured = np.where(shares > LOST, np.sqrt(weights * kept)[:, None], 0.0)
+    measured = np.where(shares > _LOST, np.sqrt(weights * kept)[:, None], 0.0)
     information = measured[:, :, None] * problem.information * measured[:, None, :]
     null = _null_space(problem, poses, information, problem.variable[apart])
-    for body in _bodies(problem, poses, null):
-        first, *followers = problem.free[body].tolist()
-        reach = np.abs(null[body[0]]).max(axis=1)
-        along = tuple(axis for axis, size in zip(axes, reach, strict=True) if size > _NAMED * reach.max())
-        found.append(FreePose(int(names[first]), along, tuple(names[followers].tolist())))
-    place = {name: index for index, name in enumerate(names.tolist())}
-    return tuple(sorted(found, key=lambda pose: place[pose.name]))
-
-
-def _bodies(problem: BetweenProblem, poses: Matrix, null: Matrix) -> list[NDArray[np.int64]]:
-    """Variables that move in the null space (n, k, m), those together that have the same twists in the world."""
-    moving = np.flatnonzero((np.abs(null) > _MOVES).any(axis=(1, 2)))
-    of_moving = problem.free[moving]
-    centered = poses[of_moving]
-    centered[:, :-1, -1] -= poses[problem.free, :-1, -1].mean(axis=0)
-    twists = (lie.adjoint(centered) @ null[moving]).reshape(len(moving), null.shape[1] * null.shape[2])
-    _, body = np.unique(np.round(twists / np.abs(twists).max(initial=1e-300), 6), axis=0, return_inverse=True)
-    body = np.where(problem.is_point[of_moving], len(moving) + np.arange(len(moving)), body.reshape(-1))
-    return [moving[body == one] for one in np.unique(body)]
+    is_free = np.isin(np.arange(len(poses)), apart)
+    is_free[problem.free] |= (np.abs(null) > _MOVES).any(axis=(1, 2))
+    return names[is_free]
 
 
 def _null_space(problem: BetweenProblem, poses: Matrix, information: Matrix, apart: NDArray[np.int64]) -> Matrix:
@@ -127,23 +82,15 @@ def _null_space(problem: BetweenProblem, poses: Matrix, information: Matrix, apa
     return null / np.abs(null).max(axis=(0, 1), initial=0.0)
 
 
-def hanging(
-    edges: NDArray[np.int64], information: Matrix, fixed: NDArray[np.bool_], share: float
-) -> NDArray[np.int64]:
-    """Poses joined to a fixed one only by edges of at most this share of the median information."""
-    return loose(edges[_shares(information).max(axis=1, initial=0.0) > share], fixed)
+def weakly_joined(edges: NDArray[np.int64], information: Matrix, fixed: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Poses joined to a fixed one only by edges of less than a millionth of the median information."""
+    return loose(edges[_shares(information).max(axis=1, initial=0.0) > _WEAK], fixed)
 
 
 def weak_text(names: NDArray[np.int64]) -> str:
     """Poses that hang on weak edges as one line of text."""
     group = f"pose {names[0]}" if len(names) == 1 else f"poses {listed(names)} ({len(names):,})"
     return f"{group} by edges of less than a millionth of the usual information"
-
-
-def lost_text(names: NDArray[np.int64]) -> str:
-    """Poses that hang on edges of too little information as one line of text."""
-    group = f"pose {names[0]} hangs" if len(names) == 1 else f"poses {listed(names)} ({len(names):,}) hang"
-    return f"{group} on edges of next to no information, {LOST:.0e} of the usual or less"
 
 
 def _shares(information: Matrix) -> Matrix:

@@ -37,10 +37,11 @@ _MAX_STEPS = 20  # largest number of changes of an explanation in one optimizati
 _SETTLED = 0.1  # share of the price of a loop edge below which a change gains nothing
 _MOST_LEFT_OUT = 30  # largest number of loop edges that are looked at
 _MOST_ENTRIES = 4_000_000  # largest number of covariances between these and odometry, 32 MB
-_CURVATURE = 0.3  # share of a change by a drift that its linearization may be off by
 _SLIP_LENGTHS = (4, 16, 64)  # number of edges of the stretches that are tried
 _MOST_STRETCHES = 100  # largest number of stretches that are looked at more closely
-_DRIFT_ROUNDS, _STRETCH_ROUNDS = 5, 3  # of the least squares over the loop edges that one explains
+_CURVATURE = 0.3  # share of a change by a drift that its linearization may be off by
+_DRIFT_ROUNDS = 3  # of which each knows better how far off it is
+_ROUNDS = 3  # of the least squares over the loop edges that one explains
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +69,7 @@ class Explainer:
     information: Matrix
     is_loop: NDArray[np.bool_]
     config: GraphConfig
-    jumps: bool = False
+    jumps: bool
 
     def solve(self, explanation: Explanation, poses: Matrix, initialize: Initialization) -> Explained:
         """The minimum, from these poses and this explanation."""
@@ -85,36 +86,33 @@ class Explainer:
 
     def _better(self, best: Explained) -> Iterator[Explained]:
         """Explanations under which the cost is lower, those that promise most first."""
-        price = best.minimum.price
-        for explanation, poses in self._candidates(best):
+        price, poses = best.minimum.price, best.minimum.estimate.poses
+        for explanation in self._candidates(best):
             trial = self._solved(explanation, poses, "given", groups=not self._is_large)
             if self._cost(trial, price) < self._cost(best, price) - _SETTLED * price:
                 yield trial
 
-    def _candidates(self, best: Explained) -> list[tuple[Explanation, Matrix]]:
-        """Explanations, and poses to begin with."""
+    def _candidates(self, best: Explained) -> list[Explanation]:
+        """Explanations that may lower the cost, those that promise most first."""
         problem, now, price = best.problem, best.explanation, best.minimum.price
-        poses = best.minimum.estimate.poses
         kept = best.minimum.weights > REJECTED_WEIGHT
         rejected = np.flatnonzero(~kept)
         if len(rejected) < _FEWEST or len(apart(problem.edges, rejected)) < _FEWEST:
             return []
         odometry = odometry_of(problem.edges, self.is_loop)
-        left_out = LeftOut(problem, poses, odometry, kept)
-        found: list[tuple[float, Explanation, Matrix]] = []
+        left_out = LeftOut(problem, best.minimum.estimate.poses, odometry, kept)
+        found: list[tuple[float, Explanation]] = []
         if not self.jumps and (now.drift.any() or len(rejected) > FEWEST):
             gain, change = drift_step(left_out, direction(problem.edges[odometry]), now.drift, price)
             gain -= 0.0 if now.drift.any() else FEWEST * price
-            found.append((gain, replace(now, drift=now.drift + change), poses))
+            found.append((gain, replace(now, drift=now.drift + change)))
         for is_jump in (False, True)[: 1 + self.jumps]:
             measured, costs = self.measured[odometry], (price, self._nominal)
-            next_one = next_loosened(left_out, measured, now.loosened, *costs, is_jump=is_jump)
-            if next_one is not None:
-                gain, stretch, twists = next_one
-                start = left_out.moved(poses, twists, stretch.edges)
-                found.append((gain, replace(now, loosened=(*now.loosened, stretch)), start))
+            gain, stretch = next_loosened(left_out, measured, now.loosened, *costs, is_jump=is_jump)
+            if stretch is not None:
+                found.append((gain, replace(now, loosened=(*now.loosened, stretch))))
         found.sort(key=lambda each: -each[0])
-        return [(explanation, start) for gain, explanation, start in found if gain > _SETTLED * price]
+        return [explanation for gain, explanation in found if gain > _SETTLED * price]
 
     def _solved(
         self, explanation: Explanation, poses: Matrix, initialize: Initialization, *, groups: bool
@@ -182,6 +180,16 @@ class LeftOut:
             moved = responses(self.factored, *problem.edges[edge])
             self.joint[place] = moved[end] - moved[begin]
 
+    def weighed(self, spread: Matrix | float = 0.0) -> tuple[Matrix, Matrix]:
+        """Residuals (L, k) of these loop edges, and their information (L, k, k), each for all it stands for.
+
+        spread : further standard deviations (L, k)
+        """
+        k = self.errors.shape[1]
+        noise = self.covariances + np.square(spread)[..., None] * np.eye(k)
+        information = np.asarray(self.stride * np.linalg.inv(noise), np.float64)
+        return self.errors[self.edges], information
+
     def shifts(self, twists: Matrix, among: slice = slice(None)) -> Iterator[Matrix]:
         """∂e (n, k, p) of each of these loop edges, by right twists (n, k, p) on some edges of odometry."""
         problem, odometry = self.problem, self.odometry[among]
@@ -202,12 +210,6 @@ class LeftOut:
         b = np.einsum("oap,oa->p", weighted, self.errors[odometry])
         return b, A
 
-    def moved(self, poses: Matrix, twists: Matrix, among: slice) -> Matrix:
-        """These poses after right twists (n, k) on the measurements of some edges of odometry."""
-        odometry = self.odometry[among]
-        weighted = self.problem.information[odometry] @ twists[..., None]
-        return self.problem.moved(poses, self.factored.cholesky.solve(self._pull(weighted, odometry))[:, 0])
-
     def _pull(self, weighted: Matrix, edges: NDArray[np.int64]) -> Matrix:
         """Σ JᵀΩτ of the poses, (scalars, p), of Ωτ (n, k, p) of some edges."""
         problem = self.problem
@@ -222,8 +224,7 @@ class LeftOut:
 def drift_step(left_out: LeftOut, sign: Vector, drift: Vector, price: float) -> tuple[float, Vector]:
     """The fall of the cost by a change of the drift, to first order, and this change.
 
-    Every loop edge left out gives a candidate, refined by least squares over the edges that it explains; the one
-    with the least cost Σ min(χ², price) is chosen.
+    Each round counts the error of the linearization, a share of the change that the last round found, as noise.
     """
     odometry = left_out.odometry
     twists = lie.log(left_out.problem.measurements[odometry])
@@ -231,42 +232,17 @@ def drift_step(left_out: LeftOut, sign: Vector, drift: Vector, price: float) -> 
     d = twists.shape[1] - len(drift) + 1
     B[:, :d, 0] += left_out.errors[odometry, :d]  # the noise grows with the scale
     slope, curvature = left_out.quadratic(B)
-    V = np.array([shift.sum(axis=0) for shift in left_out.shifts(B)])
-    slope, curvature = slope - prior(len(drift)) * drift, curvature + np.diag(prior(len(drift)))
-    errors, noise = left_out.errors[left_out.edges], left_out.covariances
-    best, most = np.zeros(len(drift)), 0.0
-    if drift.any():
-        best = np.asarray(np.linalg.solve(curvature, slope), np.float64)
-        most = float(slope @ best)
-
-    def solved(members: NDArray[np.int64], weight: Matrix) -> Vector:
-        A = curvature + np.einsum("eap,eab,ebq->pq", V[members], weight, V[members])
-        return np.asarray(
-            np.linalg.solve(A, slope - np.einsum("eap,eab,eb->p", V[members], weight, errors[members])), np.float64
-        )
-
-    def fitting(change: Vector) -> tuple[Vector, Matrix]:
-        size_2 = (V @ change) ** 2
-        for part in (size_2[:, :d], size_2[:, d:]):
-            part[:] = part.sum(axis=1, keepdims=True)
-        spread = _CURVATURE**2 * size_2[:, :, None] * np.eye(errors.shape[1])
-        weight = np.asarray(np.linalg.inv(noise + spread), np.float64)
-        left = errors + V @ change
-        return np.einsum("ea,eab,eb->e", left, weight, left), weight
-
-    for start in range(len(errors)):
-        members = np.array([start])
-        change = solved(members, np.asarray(np.linalg.inv(noise[[start]]), np.float64))
-        for _ in range(_DRIFT_ROUNDS):
-            chi2, weight = fitting(change)
-            members = np.flatnonzero(chi2 < price)
-            change = solved(members, weight[members])
-        chi2, _ = fitting(change)
-        explained = price - chi2[chi2 < price]
-        gain = float(explained.sum() + 2.0 * slope @ change - change @ curvature @ change)
-        if gain > most and (drift.any() or len(explained) >= FEWEST):
-            best, most = change, gain
-    return most, best
+    V, own = np.array([shift.sum(axis=0) for shift in left_out.shifts(B)]), prior(len(drift))
+    A, b, price = curvature + np.diag(own), slope - own * drift, left_out.stride * price
+    alone = np.asarray(np.linalg.solve(A, b), np.float64)
+    fall, change = float(b @ alone) * drift.any(), alone * drift.any()
+    for _ in range(_DRIFT_ROUNDS):
+        moved = V @ change
+        lengths = [np.linalg.norm(part, axis=1) for part in (moved[:, :d], moved[:, d:])]
+        spread = _CURVATURE * np.repeat(np.stack(lengths, axis=1), (d, moved.shape[1] - d), axis=1)
+        found = _largest_fall(A, b, *left_out.weighed(spread), V, price)
+        fall, change = max((fall, change), found, key=lambda each: each[0])
+    return fall, change
 
 
 def next_loosened(
@@ -277,8 +253,8 @@ def next_loosened(
     nominal: float,
     *,
     is_jump: bool,
-) -> tuple[float, Loosened, Matrix] | None:
-    """The fall of the cost by one more slip or jump, to first order, it, and the twists (n, k) of its edges.
+) -> tuple[float, Loosened | None]:
+    """The fall of the cost by one more slip or jump, to first order, and this; None where none lowers it.
 
     measured : (O, d+1, d+1) as odometry has it, in the order of ``left_out.odometry``
     Errors t, in standard deviations, change the cost by tᵀA t − 2 bᵀt, prior included, and by what each loop edge
@@ -291,7 +267,7 @@ def next_loosened(
     """
     tried = _stretches(len(measured), others, is_jump=is_jump)
     if not tried:
-        return None
+        return 0.0, None
     first, count = np.array([(stretch.first, stretch.count) for stretch in tried]).T
     information = left_out.problem.information[left_out.odometry]
     B = spread(measured, information, is_jump=is_jump)
@@ -303,8 +279,7 @@ def next_loosened(
     A = unit + (learned if is_jump else np.minimum(learned, claimed))
     b = _means(pull_t @ left_out.errors[left_out.odometry][..., None], first, count)[..., 0]
     costs = cost_of(claimed, is_jump=is_jump, price=price, nominal=nominal)
-    e, price = left_out.errors[left_out.edges], left_out.stride * price
-    M = np.asarray(left_out.stride * np.linalg.inv(left_out.covariances), np.float64)
+    e, M, price = *left_out.weighed(), left_out.stride * price
     alone = (b * np.linalg.solve(A, b[..., None])[..., 0]).sum(axis=1) / len(e)  # without any of them explained
     hoped = -costs
     for error, weight, shift in zip(e, M, left_out.shifts(B), strict=True):
@@ -313,28 +288,28 @@ def next_loosened(
         H = A / len(e) + np.swapaxes(V, 1, 2) @ weight @ V
         fall = (g * np.linalg.solve(H, g[..., None])[..., 0]).sum(axis=1) + price - error @ weight @ error
         hoped += np.maximum(fall, alone)
-    best, most = None, 0.0
+    most, best = 0.0, None
     for index in np.argsort(-hoped, kind="stable")[:_MOST_STRETCHES]:
         if not hoped[index] > most:
             break
         stretch, twists = tried[index], B[tried[index].edges] / count[index]
         slope, curvature = left_out.quadratic(twists, stretch.edges)
         V = np.stack([shift.sum(axis=0) for shift in left_out.shifts(twists, stretch.edges)])
-        fall, t = _largest_fall(unit + curvature, slope, e, M, V, price)
+        fall, _ = _largest_fall(unit + curvature, slope, e, M, V, price)
         if fall - costs[index] > most:
-            best, most = (stretch, twists @ t), fall - float(costs[index])
-    return None if best is None else (most, *best)
+            most, best = fall - float(costs[index]), stretch
+    return most, best
 
 
 def _largest_fall(A: Matrix, b: Vector, e: Matrix, M: Matrix, V: Matrix, price: float) -> tuple[float, Vector]:
-    """Largest fall of the cost by errors (p,) of one stretch that explain a loop edge, and the errors.
+    """Largest fall of the cost by errors (p,) of odometry that explain a loop edge, and the errors.
 
-    A (p, p), b (p,) : of the stretch; e, M, V : (L, ...) of the loop edges
+    A (p, p), b (p,) : of these errors, prior included; e, M, V : (L, ...) of the loop edges
     """
     VM = np.swapaxes(V, 1, 2) @ M
     VMV, VMe = VM @ V, (VM @ e[..., None])[..., 0]
     chosen, largest, best = np.eye(len(e)), 0.0, np.zeros(len(b))
-    for _ in range(_STRETCH_ROUNDS):
+    for _ in range(_ROUNDS):
         t = np.linalg.solve(A + np.einsum("cl,lab->cab", chosen, VMV), (b - chosen @ VMe)[..., None])[..., 0]
         left = e + np.einsum("lab,cb->cla", V, t)
         saved = np.maximum(price - np.einsum("cla,lab,clb->cl", left, M, left), 0.0)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import warnings
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,8 +32,7 @@ _LARGEST_ID = 2**63 - 1  # int64
 _WHOLE_TURN = 2.0 * np.pi + 1e-3  # rad, above which an angle is a turn too many, or degrees
 
 
-@dataclass(frozen=True, slots=True)
-class Tag:
+class Tag(NamedTuple):
     """Kind of a line.
 
     Attributes
@@ -61,8 +61,9 @@ TAGS = {
     "VERTEX2": Tag(2, 1, (0, 1, 2), is_toro=True),
     "EDGE2": Tag(2, 2, (0, 1, 2, 3, 4, 6, 8, 5, 7), is_toro=True),  # Ω as xx xy yy θθ xθ yθ
     "VERTEX3": Tag(3, 1, tuple(range(6)), is_toro=True),
-    "EDGE3": Tag(3, 2, tuple(range(27)), is_toro=True),
+    "EDGE3": Tag(3, 2, (*range(6), *range(7, 28)), is_toro=True),
 }
+_WIDTHS = {(2, 1): 3, (2, 2): 9, (3, 1): 7, (3, 2): 28}  # numbers of a whole line, by dimension and ids
 
 
 def write_lines(
@@ -73,7 +74,7 @@ def write_lines(
     Every number is the shortest that reads back as the same.
     """
     if is_toro and dimension == 3:
-        numbers = np.hstack([numbers[:, :3], to_angles(numbers[:, 3:7]), numbers[:, 7:]])
+        numbers = np.hstack([numbers[:, :3], to_angles(numbers[:, 3:7]), numbers[:, 6:]])
     tags = {
         tag.is_point: (name, tag.columns)
         for name, tag in TAGS.items()
@@ -84,11 +85,6 @@ def write_lines(
         name, columns = tags[point]
         lines.append(" ".join([name, *map(repr, names), *(repr(row[column]) for column in columns)]))
     return lines
-
-
-def from_angles(angles: Matrix) -> Matrix:
-    """Quaternions xyzw (n, 4) of roll, pitch and yaw (n, 3), Rz(yaw) Ry(pitch) Rx(roll)."""
-    return Turn.from_euler("ZYX", angles[:, ::-1]).as_quat()
 
 
 def to_angles(quat_xyzw: Matrix) -> Matrix:
@@ -134,23 +130,21 @@ class Lines:
         self.path, self.dimension = path, 0
         self.rotation: Rotation = "vector"
         self.others, self.turns = list[str](), list[tuple[int, float]]()
-        by_tag = defaultdict[str, list[tuple[int, list[int], list[float]]]](list)
         comments: dict[str, Rotation] = {comment: name for name, comment in ROTATION_COMMENT.items()}
-        fixed = list[tuple[int, int]]()
+        fixed, rows = list[tuple[int, int]](), list[tuple[int, Tag, list[int], list[float]]]()
         for number, line in enumerate(self._text().splitlines(), start=1):
             words = line.split()
-            tag = TAGS.get(words[0]) if words else None
             if words[:1] == ["FIX"]:
                 fixed += [(number, self._vertex_id(number, "FIX", word)) for word in words[1:]]
             elif line in comments:
                 self.rotation = comments[line]
-            elif tag is not None:
-                by_tag[words[0]].append((number, *self._parsed(number, tag, words)))
+            elif words and words[0] in TAGS:
+                rows.append((number, TAGS[words[0]], *self._parsed(number, words)))
             elif words:
                 self.others.append(line)
         self.fixed = np.array(fixed, np.int64).reshape(-1, 2)
-        rows = {name: self._rows(name, lines) for name, lines in by_tag.items()}
-        self.vertices, self.edges = (_joined([rows[name] for name in rows if TAGS[name].ids == n]) for n in (1, 2))
+        rows.sort(key=lambda row: row[1].is_point)
+        self.vertices, self.edges = (self._whole([row for row in rows if row[1].ids == n], n) for n in (1, 2))
         if not len(self.edges.lines):
             raise InputError(f"{path}: holds no EDGE_SE2 and no EDGE_SE3:QUAT line; is it a g2o pose graph?")
 
@@ -207,19 +201,30 @@ class Lines:
                 f"{self.path}: cannot be read as g2o: {reason}; give a text file of vertices and edges"
             ) from error
 
-    def _parsed(self, line: int, tag: Tag, words: list[str]) -> tuple[list[int], list[float]]:
+    def _parsed(self, line: int, words: list[str]) -> tuple[list[int], list[float]]:
         """Vertex ids and numbers of a line."""
+        name, tag = words[0], TAGS[words[0]]
         if self.dimension not in (0, tag.dimension):
-            raise self.error(line, f"{words[0]} in an SE({self.dimension}) graph; keep to one dimension a file")
+            raise self.error(line, f"{name} in an SE({self.dimension}) graph; keep to one dimension a file")
         self.dimension = tag.dimension
         if len(words) != 1 + tag.ids + len(tag.columns):
             count, wanted = counted(len(words) - 1, "value"), tag.ids + len(tag.columns)
-            raise self.error(line, f"{words[0]} has {count}, needs {wanted}")
-        ids = [self._vertex_id(line, words[0], word) for word in words[1 : 1 + tag.ids]]
+            raise self.error(line, f"{name} has {count}, needs {wanted}")
+        ids = [self._vertex_id(line, name, word) for word in words[1 : 1 + tag.ids]]
         try:
-            return ids, list(map(float, words[1 + tag.ids :]))
+            numbers = list(map(float, words[1 + tag.ids :]))
         except ValueError as error:
-            raise self.error(line, f"{words[0]}: {error}") from error
+            raise self.error(line, f"{name}: {error}") from error
+        if not all(map(math.isfinite, numbers)):
+            raise self.error(line, f"{name} has a value that is not finite; remove or mend the line")
+        largest = max(numbers, key=abs)
+        if abs(largest) > LARGEST:
+            raise self.error(
+                line,
+                f"{' '.join([name, *map(str, ids)])} has the value {largest:g}, over {LARGEST:g}; "
+                "write meters and radians, and an inverse covariance of these",
+            )
+        return ids, numbers
 
     def _vertex_id(self, line: int, tag: str, word: str) -> int:
         try:
@@ -231,42 +236,24 @@ class Lines:
             raise self.error(line, f"{tag}: vertex id {shown(word)} is too large; the limit is {_LARGEST_ID}")
         return value
 
-    def _rows(self, name: str, lines: list[tuple[int, list[int], list[float]]]) -> Rows:
-        """Lines of one tag as arrays, checked; angles beyond a turn are added to ``turns``."""
-        tag = TAGS[name]
-        places, ids, numbers = (np.array(column) for column in zip(*lines, strict=True))
-        for row in np.flatnonzero(~np.isfinite(numbers).all(axis=1))[:1]:
-            raise self.error(places[row], f"{name} has a value that is not finite; remove or mend the line")
-        for row, column in np.argwhere(np.abs(numbers) > LARGEST)[:1]:
-            start = " ".join([name, *map(str, ids[row].tolist())])
-            raise self.error(
-                places[row],
-                f"{start} has the value {numbers[row, column]:g}, over {LARGEST:g}; "
-                "write meters and radians, and an inverse covariance of these",
-            )
-        if not tag.is_point and (tag.dimension == 2 or tag.is_toro):
-            largest = np.abs(numbers[:, 3:6] if tag.dimension == 3 else numbers[:, 2:3]).max(axis=1)
-            beyond = largest > _WHOLE_TURN
-            self.turns += zip(places[beyond].tolist(), largest[beyond].tolist(), strict=True)
-        whole = numbers
-        if tag.dimension == 2:
-            whole = np.zeros((len(numbers), 3 if tag.ids == 1 else 9))
-            whole[:, tag.columns] = numbers
-        elif tag.is_toro:
-            whole = np.hstack([numbers[:, :3], from_angles(numbers[:, 3:6]), numbers[:, 6:]])
-        return Rows(places, ids, whole, np.full(len(numbers), tag.is_point))
-
-
-def _joined(parts: list[Rows]) -> Rows:
-    """Rows of several tags, or none."""
-    if not parts:
-        return Rows(np.empty(0, np.int64), np.empty((0, 1), np.int64), np.empty((0, 0)), np.empty(0, np.bool_))
-
-    def column(index: int) -> NDArray[Any]:
-        return np.concatenate([part[index] for part in parts])
-
-    order = np.lexsort((column(0), column(3)))
-    return Rows(column(0)[order], column(1)[order], column(2)[order], column(3)[order])
+    def _whole(self, rows: list[tuple[int, Tag, list[int], list[float]]], ids: int) -> Rows:
+        """Vertices or edges as whole lines; angles beyond a turn are added to ``turns``."""
+        numbers = np.zeros((len(rows), _WIDTHS.get((self.dimension, ids), 0)))
+        for tag in {row[1] for row in rows}:
+            of_tag = [place for place, row in enumerate(rows) if row[1] is tag]
+            numbers[np.ix_(of_tag, tag.columns)] = [rows[place][3] for place in of_tag]
+        lines = np.array([line for line, *_ in rows], np.int64)
+        is_point = np.array([tag.is_point for _, tag, *_ in rows], np.bool_)
+        if self.dimension == 2:
+            angles, has_angles = numbers[:, 2:3], ~is_point
+        else:
+            angles, has_angles = numbers[:, 3:6], np.array([tag.is_toro for _, tag, *_ in rows], np.bool_)
+        largest = np.abs(angles).max(axis=1, initial=0.0) * has_angles
+        beyond = largest > _WHOLE_TURN
+        self.turns += zip(lines[beyond].tolist(), largest[beyond].tolist(), strict=True)
+        if self.dimension == 3 and has_angles.any():  # Rz(yaw) Ry(pitch) Rx(roll)
+            numbers[has_angles, 3:7] = Turn.from_euler("ZYX", angles[has_angles, ::-1]).as_quat()
+        return Rows(lines, np.array([row[2] for row in rows], np.int64).reshape(-1, ids), numbers, is_point)
 
 
 TORO_SUFFIXES = (".graph", ".toro")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
@@ -26,26 +26,12 @@ _MARGIN = 6.0  # factor over the share of a pessimistic noise model: residuals h
 _FEWEST = 10  # least number of inlier edges from which a noise model is estimated
 
 
-@dataclass(frozen=True, slots=True)
-class Schedule:
-    """Graduated non-convexity (Yang et al. 2020, remark 5) as a sequence of controls μ.
-
-    Attributes
-    ----------
-    first : the convex end, from 2 χ²/s² of the largest residual
-    following : the next, less convex control
-    is_over : whether the loss itself is reached, from μ and the weights (N,)
-    """
-
-    first: Callable[[float], float]
-    following: Callable[[float], float]
-    is_over: Callable[[float, Array], bool]
-
-
 class Kernel(Protocol):
     """A loss by its functions of χ² (N,), the scale s, and the control μ of its graduation.
 
-    One that is not convex may have an attribute ``schedule``; without it, it is minimized as it is, with μ = 1.
+    One that is not convex may have a method ``schedule(ratio)``: the controls of graduated non-convexity (Yang et
+    al. 2020, remark 5), from the convex end, by the ratio 2 χ²/s² of the largest residual, to that of the loss
+    itself. Without it, it is minimized as it is, with μ = 1.
     """
 
     def weight(self, chi2: Array, s: float, mu: float) -> Array:
@@ -57,22 +43,23 @@ class Kernel(Protocol):
         ...
 
 
-def _sharpened(mu: float) -> float:
-    """The next control of truncated least squares."""
-    factor = _FACTOR if mu > _FLAT else _LONG_FACTOR
-    return mu * factor if mu < _SHARP else np.inf
+def _widened(ratio: float) -> Iterator[float]:
+    """Controls μ ≥ 1 that widen s²: ∞ is convex, 1 the loss itself."""
+    mu = max(1.0, ratio)
+    while mu > 1.0:
+        yield mu
+        mu = max(1.0, mu / _FACTOR)
+    yield 1.0
 
 
-_WIDENED = Schedule(  # μ ≥ 1 widens s²: ∞ is convex, 1 the loss itself
-    first=lambda ratio: max(1.0, ratio),
-    following=lambda mu: max(1.0, mu / _FACTOR),
-    is_over=lambda mu, weight: mu <= 1.0,
-)
-_SURROGATE = Schedule(  # of truncated least squares: 0 is convex, ∞ the loss itself
-    first=lambda ratio: np.inf if ratio <= 2.0 else 1.0 / (ratio - 1.0),
-    following=_sharpened,
-    is_over=lambda mu, weight: bool(np.all((weight < 1e-6) | (weight > 1.0 - 1e-6))),
-)
+def _sharpened(ratio: float) -> Iterator[float]:
+    """Controls of truncated least squares: 0 is convex, ∞ the loss itself."""
+    mu = np.inf if ratio <= 2.0 else 1.0 / (ratio - 1.0)
+    while mu < np.inf:
+        yield mu
+        factor = _FACTOR if mu > _FLAT else _LONG_FACTOR
+        mu = mu * factor if mu < _SHARP else np.inf
+    yield np.inf
 
 
 class Quadratic:
@@ -115,7 +102,7 @@ class Cauchy:
 class GemanMcClure:
     """Geman and McClure 1985: bounded by s²."""
 
-    schedule = _WIDENED
+    schedule = staticmethod(_widened)
 
     def weight(self, chi2: Array, s: float, mu: float) -> Array:
         """Weight w = (μ s² / (μ s² + χ²))²."""
@@ -129,7 +116,7 @@ class GemanMcClure:
 class Tukey:
     """Biweight of Beaton and Tukey 1974: constant above √μ s."""
 
-    schedule = _WIDENED
+    schedule = staticmethod(_widened)
 
     def weight(self, chi2: Array, s: float, mu: float) -> Array:
         """Weight w = (1 − χ²/(μ s²))² or 0."""
@@ -144,7 +131,7 @@ class Tukey:
 class Truncated:
     """Truncated least squares by its surrogates (Yang et al. 2020, eq. 14): constant above s."""
 
-    schedule = _SURROGATE
+    schedule = staticmethod(_sharpened)
 
     def weight(self, chi2: Array, s: float, mu: float) -> Array:
         """Weight w = 1 or 0, and s √(μ (μ + 1))/χ − μ between."""
@@ -185,22 +172,12 @@ class RobustLoss:
         """ρ(χ²), equal to χ² near zero."""
         return _kernel(self.kernel).loss(chi2, self.scale, self.control)
 
-    def relaxed(self, chi2: Array) -> RobustLoss:
-        """The convex end of its graduation, for residuals that begin at these χ²; itself where it has none."""
+    def graduated(self, chi2: Array) -> Iterator[RobustLoss]:
+        """From the convex end of its graduation, for residuals that begin at these χ², to itself."""
+        schedule = getattr(_kernel(self.kernel), "schedule", None)
         ratio = 2.0 * float(chi2.max(initial=0.0)) / self.scale**2
-        return replace(self, control=self._schedule.first(ratio)) if self._schedule else self
-
-    def tightened(self) -> RobustLoss:
-        """The next, less convex loss."""
-        return replace(self, control=self._schedule.following(self.control)) if self._schedule else self
-
-    def is_final(self, chi2: Array) -> bool:
-        """True at the end of the graduation: the loss itself, or weights that are all 0 or 1."""
-        return self._schedule is None or self._schedule.is_over(self.control, self.weight(chi2))
-
-    @property
-    def _schedule(self) -> Schedule | None:
-        return getattr(_kernel(self.kernel), "schedule", None)
+        for control in schedule(ratio) if schedule else (self.control,):
+            yield replace(self, control=control)
 
 
 def rejection_limit(scale: float, degrees: int) -> float:

@@ -1,4 +1,4 @@
-"""Minimizers by name: Levenberg-Marquardt, Gauss-Newton, dogleg, Newton, gradient descent."""
+"""Minimizers by name: Levenberg-Marquardt, Gauss-Newton, dogleg, gradient descent."""
 
 from __future__ import annotations
 
@@ -11,15 +11,13 @@ from typing import Generic, Literal, NamedTuple, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.errors import counted
-from scanchain.graph.between import BetweenProblem, NormalEquations
+from scanchain.graph.between import BetweenProblem
 from scanchain.graph.cholesky import SingularMatrixError
 from scanchain.graph.initialize import Initialization
 from scanchain.graph.losses import InlierSet, RobustLoss
 
-_STEP = 1e-6  # step, m or rad, of the central differences
 Loss = RobustLoss | InlierSet
 
 
@@ -54,37 +52,6 @@ class Minimum:
     reason: str
     price: float = 0.0
     initialization: Initialization = "given"
-
-
-def full_curvature(problem: BetweenProblem, now: Evaluation, equations: NormalEquations) -> NDArray[np.float64]:
-    """∂²(½ Σ w eᵀΩe)/∂ξ² as block values of the problem's pattern, the weights held.
-
-    Gauss-Newton leaves out eᵀΩ ∂²e/∂ξ². Here the slope JᵀwΩe of every edge is differentiated by central
-    differences over left twists of both ends; a second derivative in exponential coordinates is symmetric.
-    """
-    k, count = problem.freedom, len(problem.edges)
-    turned = np.empty((2, k, count, k))
-    for end in range(2):
-        for axis in range(k):
-            twist = np.zeros(k)
-            twist[axis] = _STEP
-            ahead, back = (_slopes(problem, now.poses, equations.weights, end, sign * twist) for sign in (1, -1))
-            turned[end, axis] = (ahead - back) / (2.0 * _STEP)
-    by_i, by_j = turned.transpose(0, 2, 1, 3)  # (E, k, k): row is the axis moved, column that of the slope at j
-    coupling = 0.5 * (by_i - np.swapaxes(by_j, 1, 2))
-    of_i, of_j = (0.5 * (block + np.swapaxes(block, 1, 2)) for block in (-by_i, by_j))
-    return problem.packing.values(problem.scattered(of_i, of_j, coupling))
-
-
-def _slopes(
-    problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64], end: int, twist: NDArray[np.float64]
-) -> Matrix:
-    """Slope (E, k) of every edge's ½ w χ² with a left twist of j, after one of its ends has moved."""
-    ends = [poses[problem.edges[:, 0]], poses[problem.edges[:, 1]]]
-    ends[end] = lie.exp(twist) @ ends[end]
-    errors, jacobian = problem.between(*ends)
-    pull = weights[:, None, None] * problem.information @ errors[..., None]
-    return (np.swapaxes(jacobian, 1, 2) @ pull)[..., 0]
 
 
 class Minimizer:
@@ -130,15 +97,13 @@ class Minimizer:
         return Minimum(descent.end, weights, descent.iterations, descent.converged, descent.reason)
 
     def _model(self, loss: Loss, now: Evaluation) -> LocalModel:
-        """H = Σ w JᵀΩJ and the curvature that steps are solved with: H, or the second derivative for Newton."""
+        """The model with H = Σ w JᵀΩJ."""
         problem = self.problem
         equations = problem.linearize(now.poses, now.errors, self.weights(now.chi2, loss))
-        is_full = self.optimizer == "newton"
-        curvature = full_curvature(problem, now, equations) if is_full else equations.values
         diagonal = equations.values[problem.pattern.diagonal]
 
         def solve(damping: float) -> Vector:
-            damped = curvature.copy()
+            damped = equations.values.copy()
             damped[problem.pattern.diagonal] += damping * np.where(diagonal > 0.0, diagonal, 1.0)
             problem.cholesky.factorize(damped)
             return problem.cholesky.solve(-equations.gradient)
@@ -152,7 +117,7 @@ class Minimizer:
         return float(chi2.sum() - loops.sum() + loss.loss(loops).sum())
 
 
-Optimizer = Literal["gauss-newton", "levenberg-marquardt", "dogleg", "newton", "gradient-descent"]
+Optimizer = Literal["gauss-newton", "levenberg-marquardt", "dogleg", "gradient-descent"]
 Vector = NDArray[np.float64]
 
 _MOST_DAMPING = 1e12
@@ -181,7 +146,7 @@ class LocalModel:
     Attributes
     ----------
     gradient, diagonal : (n,) g and diag H
-    solve : −(C + λ diag H)⁻¹ g for a damping λ, C the curvature of choice; raises SingularMatrixError
+    solve : −(H + λ diag H)⁻¹ g for a damping λ; raises SingularMatrixError
     bend : H ξ of a step ξ (n,)
     """
 
@@ -205,7 +170,7 @@ class GaussNewton:
 
 
 class Damped:
-    """x ← x − (C + λ diag H)⁻¹ g (Marquardt 1963), λ by the gain ratio (Nielsen 1999)."""
+    """x ← x − (H + λ diag H)⁻¹ g (Marquardt 1963), λ by the gain ratio (Nielsen 1999)."""
 
     def __init__(self, first_damping: float) -> None:
         self._first, self._damping, self._growth = first_damping, first_damping, _GROWTH
@@ -277,10 +242,10 @@ StepRule = GaussNewton | Damped | Dogleg | GradientDescent
 
 
 def step_rule(optimizer: Optimizer, first_damping: float = _FIRST_DAMPING) -> StepRule:
-    """The rule by its name; Newton is damped as Levenberg-Marquardt is, on a model with the full curvature."""
+    """The rule by its name."""
     if optimizer == "gauss-newton":
         return GaussNewton()
-    if optimizer in ("levenberg-marquardt", "newton"):
+    if optimizer == "levenberg-marquardt":
         return Damped(first_damping)
     return Dogleg() if optimizer == "dogleg" else GradientDescent()
 

@@ -1,21 +1,40 @@
-"""Optimization of a pose graph from its first guess to the minimum, and its result."""
+"""Optimization of a pose graph: graduated non-convexity, and loop edges judged anew or updated; its result."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.config import GraphConfig
-from scanchain.data import GraphState, Matrix, brief, fit_text
+from scanchain.data import REJECTED_WEIGHT, GraphState, Matrix, brief, fit_text
 from scanchain.errors import counted
 from scanchain.graph.between import BetweenProblem
-from scanchain.graph.edge_checks import has_loop
-from scanchain.graph.graduation import LIMITS, Since, minimize, update
+from scanchain.graph.consistency import Consistency, agreeing_groups
+from scanchain.graph.edge_checks import has_loop, is_connected
 from scanchain.graph.initialize import Initialization, first_guess
-from scanchain.graph.losses import robust_loss
-from scanchain.graph.minimizer import Limits, Minimizer, Minimum
+from scanchain.graph.losses import InlierSet, RobustLoss, fair_price, rejection_limit, robust_loss
+from scanchain.graph.minimizer import Evaluation, Limits, Minimizer, Minimum
+
+Rejection = Literal["update", "judge"]
+
+_WASTE = 0.1  # share of edges without weight that is worth a new analysis
+_CRISP = 1e-6  # distance of a weight from 0 or 1 up to which it is that
+_MAX_ROUNDS = 50  # largest number of rounds of refining the inlier set
+_MAX_FAILED = 4  # largest number of groups tried in a row without success
+_FEWER, _FEWEST = 0.3, 1e-3  # share of the changes tried after a round that does not help: at first, at least
+# a few steps with one set of edges, until the poses have settled roughly; the next update goes on
+_LIMITS = Limits(max_iterations=3, tolerance=1e-3)
+
+
+@dataclass(frozen=True, slots=True)
+class Since:
+    """Number of edges at the last graduation, which judged all of them, and at the last update."""
+
+    judged: int
+    updated: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +112,7 @@ def solve(
     guess[:, :-1, -1] -= shift
     loss = robust_loss(config.robust, config.robust_scale, problem.freedom)
     if since is not None:
-        minimum = update(Minimizer(problem, is_loop, config.optimizer, LIMITS), guess, loss, since)
+        minimum = update(Minimizer(problem, is_loop, config.optimizer, _LIMITS), guess, loss, since)
     else:
         limits = Limits(config.max_iterations, config.tolerance)
         minimum = minimize(Minimizer(problem, is_loop, config.optimizer, limits), guess, loss, groups=groups)
@@ -110,3 +129,226 @@ def _orthonormal(poses: Matrix) -> Matrix:
     R = poses[:, :d, :d]
     result[:, :d, :d] = R @ (1.5 * np.eye(d) - 0.5 * np.swapaxes(R, 1, 2) @ R)
     return result
+
+
+def minimize(minimizer: Minimizer, poses: Matrix, loss: RobustLoss, *, groups: bool) -> Minimum:
+    """Minimize from these poses; a kernel that is not convex is graduated first (Yang et al. 2020).
+
+    Truncated edges are judged by how much each contradicts the others, with ``groups`` also by groups that agree.
+    """
+    now, used = minimizer.evaluate(poses, loss), 0
+    if len(minimizer.loops):
+        now, loss, used = _graduate(minimizer, now, loss)
+    if loss.kernel == "truncated" and len(minimizer.loops):
+        minimum = _refine(minimizer, now, loss, groups=groups)
+    else:
+        minimum = minimizer.descend(now, loss)
+        if loss.kernel != "none":
+            minimum = _settle_without_outliers(minimizer, minimum, loss)
+    return replace(minimum, iterations=used + minimum.iterations)
+
+
+def settle(minimizer: Minimizer, start: Evaluation, inliers: InlierSet) -> Minimum:
+    """The minimum with these inliers."""
+    weights = minimizer.weights(start.chi2, inliers)
+    chosen = Focus(minimizer).on(weights)
+    kept = inliers.kept
+    inner = InlierSet(kept if chosen is minimizer else kept[kept], inliers.price)
+    minimum = chosen.descend(chosen.evaluate(start.poses, inner), inner)
+    return replace(minimum, estimate=minimizer.evaluate(minimum.estimate.poses, inliers), weights=weights)
+
+
+def _graduate(minimizer: Minimizer, now: Evaluation, loss: RobustLoss) -> tuple[Evaluation, RobustLoss, int]:
+    """Follow the minimum from the convex loss to the loss itself, one step for each between.
+
+    A loss that sharpens is as good as itself once its weights are all 0 or 1.
+    """
+    used, focus, final = 0, Focus(minimizer), loss
+    for loss in final.graduated(now.chi2[minimizer.loops]):
+        weights = minimizer.weights(now.chi2, loss)
+        is_crisp = np.isinf(final.control) and np.all((weights < _CRISP) | (weights > 1.0 - _CRISP))
+        if loss == final or is_crisp:
+            break
+        chosen = focus.on(weights)
+        minimum = chosen.descend(chosen.evaluate(now.poses, loss), loss, Limits(1, 0.0))
+        now, used = minimizer.evaluate(minimum.estimate.poses, loss), used + minimum.iterations
+    return minimizer.reweighed(now, loss), loss, used
+
+
+def _settle_without_outliers(minimizer: Minimizer, minimum: Minimum, loss: RobustLoss) -> Minimum:
+    """The minimum without the edges that this one shows to be false, whose weight becomes 0.
+
+    A loss that does not cut edges off leaves them some weight. They keep it where poses would be loose without.
+    """
+    problem, limit = minimizer.problem, rejection_limit(loss.scale, minimizer.problem.freedom)
+    rejected = minimizer.is_loop & ((minimum.estimate.chi2 > limit) | (minimum.weights < REJECTED_WEIGHT))
+    if not rejected.any() or not is_connected(problem.edges[~rejected], problem.variable < 0):
+        return minimum
+    rest = minimizer.restricted(~rejected)
+    settled = rest.descend(rest.evaluate(minimum.estimate.poses, loss), loss)
+    weights = np.zeros(len(rejected))
+    weights[~rejected] = settled.weights
+    return replace(
+        settled,
+        estimate=minimizer.evaluate(settled.estimate.poses, loss),
+        weights=weights,
+        iterations=minimum.iterations + settled.iterations,
+    )
+
+
+class Focus:
+    """Leaves out edges of weight zero, which fill in the factor for nothing: soon most of the wrong ones."""
+
+    def __init__(self, minimizer: Minimizer) -> None:
+        self._whole = self._chosen = minimizer
+        self._kept = np.ones(len(minimizer.is_loop), np.bool_)
+        problem = minimizer.problem
+        self._is_free = is_connected(problem.edges[~minimizer.is_loop], problem.variable < 0)
+
+    def on(self, weights: NDArray[np.float64]) -> Minimizer:
+        """A minimizer of the edges with weight, (E,), and of hardly any other."""
+        wanted = weights > 0.0
+        wasted = 1.0 - wanted.sum() / self._kept.sum()
+        if self._is_free and ((wanted & ~self._kept).any() or wasted > _WASTE):
+            self._kept, self._chosen = wanted, self._whole.restricted(wanted)
+        return self._chosen
+
+
+def _refine(minimizer: Minimizer, now: Evaluation, loss: RobustLoss, *, groups: bool) -> Minimum:
+    """The minimum with the present inliers, and then with those that the other edges do not contradict."""
+    kept, nominal = loss.weight(now.chi2[minimizer.loops]) > 0.5, loss.scale**2
+    minimum = settle(minimizer, now, InlierSet(kept, nominal))
+    problem = minimizer.problem
+    if not is_connected(problem.edges[minimum.weights > 0.5], problem.variable < 0):
+        return minimum
+    against = _against(minimizer, minimum, nominal)
+    price = fair_price(against[kept], nominal, problem.freedom)
+    minimum = replace(minimum, estimate=minimizer.reweighed(minimum.estimate, InlierSet(kept, price)))
+    minimum = _refine_edges(minimizer, minimum, against, price)
+    if groups:
+        minimum = _refine_groups(minimizer, minimum, price, nominal)
+    return replace(minimum, price=price)
+
+
+def _refine_edges(minimizer: Minimizer, minimum: Minimum, against: NDArray[np.float64], price: float) -> Minimum:
+    """The minimum after rounds of changes of single edges, as long as the cost falls; ``against`` (L,) them."""
+    kept, share = minimum.weights[minimizer.loops] > 0.5, 1.0
+    for _ in range(_MAX_ROUNDS):
+        gain = np.where(kept, against - price, price - against)
+        if share < _FEWEST or not (gain > 0.0).any():
+            break
+        inliers = InlierSet(kept ^ (gain > (1.0 - share) * gain.max()), price)
+        trial = settle(minimizer, minimum.estimate, inliers)
+        used = minimum.iterations + trial.iterations
+        if not trial.estimate.cost < minimum.estimate.cost:
+            minimum, share = replace(minimum, iterations=used), _FEWER * share
+            continue
+        minimum, kept, share = replace(trial, iterations=used), inliers.kept, 1.0
+        against = _against(minimizer, minimum, price)
+    return minimum
+
+
+def _refine_groups(minimizer: Minimizer, minimum: Minimum, price: float, limit: float) -> Minimum:
+    """The minimum after changes of groups of edges that agree, each followed by those of single ones.
+
+    Wrong edges that agree shield each other: without any one of them, the others predict it. So do the true ones
+    that they push out.
+    """
+    tried: set[tuple[int, ...]] = set()
+    failed = 0
+    while failed < _MAX_FAILED:
+        group = _next_group(minimizer, minimum, price, limit, tried)
+        if not len(group):
+            break
+        tried.add(tuple(group.tolist()))
+        kept = minimum.weights > 0.5
+        kept[group] ^= True
+        inliers = InlierSet(kept[minimizer.loops], price)
+        trial = settle(minimizer, minimum.estimate, inliers)
+        against = _against(minimizer, trial, price)
+        trial = _refine_edges(minimizer, trial, against, price)
+        used = minimum.iterations + trial.iterations
+        is_better = trial.estimate.cost < minimum.estimate.cost
+        failed = 0 if is_better else failed + 1
+        minimum = replace(trial if is_better else minimum, iterations=used)
+    return minimum
+
+
+def _next_group(
+    minimizer: Minimizer, minimum: Minimum, price: float, limit: float, tried: set[tuple[int, ...]]
+) -> NDArray[np.int64]:
+    """The group whose change promises the largest fall of the cost; none where no group of edges is left out."""
+    problem, poses, is_loop = minimizer.problem, minimum.estimate.poses, minimizer.is_loop
+    kept = minimum.weights > 0.5
+    best, most = np.empty(0, np.int64), 0.0
+    out = agreeing_groups(problem, poses, is_loop, is_loop & ~kept, limit)
+    if not out:
+        return best
+    consistency = Consistency(problem, poses, kept)
+    against = consistency.of_each(price)
+    for group in (*out, *agreeing_groups(problem, poses, is_loop, is_loop & kept, limit)):
+        is_kept, worth, rest = bool(kept[group[0]]), price * len(group), kept.copy()
+        rest[group] = False
+        if tuple(group.tolist()) in tried or (not is_kept and against[group].max() > worth):
+            continue
+        if is_kept and not is_connected(problem.edges[rest], problem.variable < 0):
+            continue
+        rise = worth - consistency.of_group(group)
+        gain = -rise if is_kept else rise
+        if gain > most:
+            best, most = group, gain
+    return best
+
+
+def _against(minimizer: Minimizer, minimum: Minimum, price: float) -> NDArray[np.float64]:
+    """Cost of every loop edge in the χ² of the others, (L,)."""
+    kept = minimum.weights > 0.5
+    return Consistency(minimizer.problem, minimum.estimate.poses, kept).of_each(price)[minimizer.loops]
+
+
+def update(minimizer: Minimizer, poses: Matrix, loss: RobustLoss, since: Since) -> Minimum:
+    """The minimum of the truncated loss near these poses.
+
+    The graph predicts a revisit the less surely, the longer the path since the last: an edge with a large residual
+    may agree with it all the same. New ones and groups of them that do are taken in where the cost falls.
+    """
+    minimum = _descend(minimizer, minimizer.evaluate(poses, loss), loss)
+    left_out = minimizer.is_loop & (minimum.weights < 0.5)
+    problem = minimizer.problem
+    if not left_out[since.updated :].any() or not is_connected(problem.edges[~left_out], problem.variable < 0):
+        return minimum
+    promising = _promising(minimizer, minimum, loss.scale**2, since)
+    if not promising:
+        return minimum
+    kept = ~left_out
+    kept[np.concatenate(promising)] = True
+    inliers = InlierSet(kept[minimizer.loops], loss.scale**2)
+    trial = settle(minimizer, minimum.estimate, inliers)
+    used = minimum.iterations + trial.iterations
+    trial = _descend(minimizer, minimizer.reweighed(trial.estimate, loss), loss)
+    best = trial if trial.estimate.cost < minimum.estimate.cost else minimum
+    return replace(best, iterations=used + trial.iterations)
+
+
+def _descend(minimizer: Minimizer, now: Evaluation, loss: RobustLoss) -> Minimum:
+    """The minimum near these poses."""
+    chosen = Focus(minimizer).on(minimizer.weights(now.chi2, loss))
+    minimum = chosen.descend(chosen.evaluate(now.poses, loss), loss)
+    estimate = minimizer.evaluate(minimum.estimate.poses, loss)
+    return replace(minimum, estimate=estimate, weights=minimizer.weights(estimate.chi2, loss))
+
+
+def _promising(minimizer: Minimizer, minimum: Minimum, limit: float, since: Since) -> list[NDArray[np.int64]]:
+    """New edges left out with which the cost falls to first order, alone or as groups that agree."""
+    problem, poses, kept = minimizer.problem, minimum.estimate.poses, minimum.weights > 0.5
+    left_out = minimizer.is_loop & ~kept
+    left_out[: since.judged] = False
+    groups = agreeing_groups(problem, poses, minimizer.is_loop, left_out, limit)
+    for group in groups:
+        left_out[group] = False
+    consistency = Consistency(problem, poses, kept)
+    return [
+        group
+        for group in (*groups, *np.flatnonzero(left_out)[:, None])
+        if group.max() >= since.updated and consistency.of_group(group) < limit * len(group)
+    ]

@@ -17,24 +17,19 @@ from scanchain.graph.certificate import Certificate, certify
 from scanchain.graph.cholesky import SingularMatrixError
 from scanchain.graph.covariance import inverse_blocks, pose_errors, relative_covariance
 from scanchain.graph.edge_checks import (
-    LOST,
-    WEAK,
-    FreePose,
     check_connected,
     check_edges,
     free_poses,
     free_text,
-    hanging,
-    lost_text,
     own_equations,
     ranks,
+    weakly_joined,
 )
-from scanchain.graph.explanation import Explained, Explainer
-from scanchain.graph.graduation import Rejection, Since
+from scanchain.graph.explanation import Explainer
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.initialize import Initialization
 from scanchain.graph.odometry_errors import Explanation, Loosened, corrected, odometry_of
-from scanchain.graph.optimization import Optimization, solve
+from scanchain.graph.optimization import Optimization, Rejection, Since, solve
 
 
 class PoseGraph:
@@ -63,6 +58,7 @@ class PoseGraph:
         self._explanation = Explanation.none(k)
         self._problem: BetweenProblem | None = None
         self._factor_is_now = False
+        self._is_end = False  # of a longer graph, in whose odometry jumps are looked for, and no drift
 
     def __len__(self) -> int:
         return len(self._poses)
@@ -280,17 +276,22 @@ class PoseGraph:
         problem = self._prepared()
         chi2_before = self._in_force(problem.chi2(problem.errors(self.poses)))
         try:
-            explained = self._explained(problem, config, initialize, rejection)
+            if rejection == "update" and config.robust == "truncated":
+                minimum = solve(problem, self.poses, self.is_loop, config, initialize, self.since)
+            else:
+                arrays = self._measurements.rows, self._information.rows, self.is_loop
+                explainer = Explainer(self._problem_of, *arrays, config, self._is_end)
+                explained = explainer.solve(self._explanation, self.poses, initialize)
+                problem, minimum = explained.problem, explained.minimum
+                self._problem, self._explanation = problem, explained.explanation
         except SingularMatrixError as error:
-            raise self._singular(error, problem.free) from error
-        self._problem, self._explanation = explained.problem, explained.explanation
-        minimum = explained.minimum
+            raise self._singular(error) from error
         self._poses.replace(minimum.estimate.poses)
         self._weight.replace(minimum.weights)
         self._factor_is_now = False
         edges = len(self.edges)
         self.since = Since(self.since.judged if rejection == "update" else edges, edges)
-        self.work = self._problem.cholesky.work * minimum.iterations
+        self.work = problem.cholesky.work * minimum.iterations
         return Optimization(
             state=self.state(),
             chi2_before=chi2_before,
@@ -309,29 +310,19 @@ class PoseGraph:
         rejection : as in ``optimize``; what is judged is also explained by jumps of odometry there
         """
         chosen = np.flatnonzero((self.edges >= first).any(axis=1))
-        edges, is_loop = self.edges[chosen], self.is_loop[chosen]
+        is_loop, before = self.is_loop[chosen], int((~self.is_loop).sum())
         measured, information = (each[chosen - chosen[0]] for each in self.added_since(int(chosen[0])))
-        is_held = (np.arange(len(self)) < first) | self.fixed
-
-        def problem_of(further: Explanation) -> BetweenProblem:
-            return BetweenProblem(
-                edges, *further.applied(edges, measured, information, is_loop), is_held, self.is_point
-            )
-
-        none = Explanation.none(self.freedom)
-        try:
-            if rejection == "update":
-                minimum = solve(problem_of(none), self.poses, is_loop, config, "given", Since(0, 0))
-            else:
-                explainer = Explainer(problem_of, measured, information, is_loop, config, jumps=True)
-                explained = explainer.solve(none, self.poses, "given")
-                minimum, before = explained.minimum, int((~self.is_loop).sum() - (~is_loop).sum())
-                self._explanation = self._explanation.with_later(explained.explanation, before)
-        except SingularMatrixError as error:
-            raise self._singular(error, np.flatnonzero(~is_held)) from error
+        end = PoseGraph(self.dimension, self._names)
+        for column in ("_poses", "_stamps_ns", "_is_point"):
+            getattr(end, column).extend(getattr(self, column).rows)
+        end._fixed = set(np.flatnonzero((np.arange(len(self)) < first) | self.fixed).tolist())
+        end._add_edges(self.edges[chosen], measured, information, is_loop)
+        end._is_end = True
+        end.optimize(config, initialize="given", rejection=rejection)
+        self._explanation = self._explanation.with_later(end._explanation, before - int((~is_loop).sum()))
         weight = self.weight.copy()
-        weight[chosen] = minimum.weights
-        self._poses.replace(minimum.estimate.poses)
+        weight[chosen] = end.weight
+        self._poses.replace(end.poses)
         self._weight.replace(weight)
         self._changed()
 
@@ -367,18 +358,20 @@ class PoseGraph:
         """Certificate of the global minimum of χ², edges weighed as the last optimization left them."""
         return certify(self._prepared(), self.poses, self._weight_in_force, self._undetermined(), self.names)
 
-    def free_poses(self) -> tuple[FreePose, ...]:
-        """Poses that the edges in force leave free in some direction, at the poses of now."""
+    def free_poses(self) -> NDArray[np.int64]:
+        """Names of the poses that the edges in force leave free in some direction, at the poses of now."""
         self._factor_is_now = False
         return free_poses(self._prepared(), self.poses, self._weight_in_force, self._rank.rows, self.names)
 
     def weakly_joined(self) -> NDArray[np.int64]:
         """Names of the poses that hang on edges in force of next to no information."""
-        return self.names[hanging(*self._edges_in_force, self.fixed, WEAK)]
+        kept = ~self.is_rejected
+        information = self.weight[kept, None, None] * self.information[kept]
+        return self.names[weakly_joined(self.edges[kept], information, self.fixed)]
 
     def state(self) -> GraphState:
         """The graph as it is, for files and recordings; odometry edges first."""
-        order, problem = self._order(), self._prepared()
+        order, problem = np.argsort(self.is_loop, kind="stable"), self._prepared()
         chi2 = problem.chi2(problem.errors(self.poses))
         return GraphState(
             poses=self.poses.copy(),
@@ -388,7 +381,7 @@ class PoseGraph:
             weight=self.weight[order],
             chi2=self._in_force(chi2),
             edge_chi2=chi2[order],
-            degrees_of_freedom=self._degrees_of_freedom(problem),
+            degrees_of_freedom=max(int(self._rank.rows[~self.is_rejected].sum()) - problem.pattern.scalars, 0),
         )
 
     def relative_covariance(self, i: int, j: int) -> Matrix:
@@ -412,7 +405,7 @@ class PoseGraph:
             information = self._weight_in_force[:, None, None] * self.information
             problem.cholesky.factorize(own_equations(problem, self.poses, information))
         except SingularMatrixError as error:
-            raise self._singular(error, problem.free) from error
+            raise self._singular(error) from error
         result = np.zeros((len(self), self.freedom, self.freedom))
         result[problem.free] = inverse_blocks(problem)[: len(problem.free)]
         return result
@@ -440,20 +433,9 @@ class PoseGraph:
             try:
                 problem.cholesky.factorize(equations.values)
             except SingularMatrixError as error:
-                raise self._singular(error, problem.free) from error
+                raise self._singular(error) from error
             self._factor_is_now = True
         return problem
-
-    def _explained(
-        self, problem: BetweenProblem, config: GraphConfig, initialize: Initialization, rejection: Rejection
-    ) -> Explained:
-        """The minimum, with the errors of odometry that explain loop edges; those at hand for an update."""
-        if rejection == "update" and config.robust == "truncated":
-            minimum = solve(problem, self.poses, self.is_loop, config, initialize, self.since)
-            return Explained(problem, minimum, self._explanation)
-        measured, information = self._measurements.rows, self._information.rows
-        explainer = Explainer(self._problem_of, measured, information, self.is_loop, config)
-        return explainer.solve(self._explanation, self.poses, initialize)
 
     def _prepared(self) -> BetweenProblem:
         """The least-squares problem; rebuilt after the graph has grown."""
@@ -474,36 +456,22 @@ class PoseGraph:
         return explanation.applied(self.edges, self._measurements.rows, self._information.rows, self.is_loop)
 
     def _undetermined(self) -> str:
-        """Unobservable directions, with which nothing can be computed, as text; empty without any."""
-        names = self.names[hanging(*self._edges_in_force, self.fixed, LOST)]
-        free = () if len(names) else self.free_poses()
-        return lost_text(names) if len(names) else free_text(free) if free else ""
+        """Free poses, with which nothing can be computed, as text; empty without any."""
+        free = self.free_poses()
+        return free_text(free) if len(free) else ""
 
-    def _singular(self, error: SingularMatrixError, free: NDArray[np.int64]) -> InputError:
-        """The error for poses that their edges leave free, or as good as free, of the free ones (n,)."""
-        name = int(self.names[free[error.variable]])
-        return _refused(self._undetermined() or free_text([FreePose(name, ("next to no information",))]))
+    def _singular(self, error: SingularMatrixError) -> InputError:
+        """The error for poses that their edges leave free, or as good as free."""
+        variable = self._prepared().free[[error.variable]]
+        return _refused(self._undetermined() or free_text(self.names[variable]))
 
     @property
     def _weight_in_force(self) -> NDArray[np.float64]:
         return self.weight * ~self.is_rejected
 
-    @property
-    def _edges_in_force(self) -> tuple[NDArray[np.int64], Matrix]:
-        """Edges in force (E', 2), and w Ω of them."""
-        kept = ~self.is_rejected
-        return self.edges[kept], self.weight[kept, None, None] * self.information[kept]
-
     def _in_force(self, chi2: NDArray[np.float64]) -> float:
         """The sum of w χ² over the edges in force, of χ² (E,)."""
         return float((self.weight * chi2)[~self.is_rejected].sum())
-
-    def _degrees_of_freedom(self, problem: BetweenProblem) -> int:
-        return max(int(self._rank.rows[~self.is_rejected].sum()) - problem.pattern.scalars, 0)
-
-    def _order(self) -> NDArray[np.int64]:
-        """Edges with odometry first, otherwise as they were added."""
-        return np.argsort(self.is_loop, kind="stable")
 
     def _changed(self) -> None:
         self._problem, self._factor_is_now = None, False

@@ -109,7 +109,6 @@ class Prediction(msgspec.Struct, frozen=True):
     is_guess : whether scans are missing before this one, so that the pose may be far off
     velocity : (k,) twist per second at the last scan, lidar frame
     T_odom_last, T_previous_current : pose of the last scan, (d+1, d+1), and its motion since the one before
-    motion_before : (k,) that motion as a twist
     interval_s, last_s, usual_s : since the last scan, before that one, and as a rule; 0 where unknown
     silence_s : since the last scan by stamps that the log confirms, else 0
     lost_s : for how long scans have been lost
@@ -123,7 +122,6 @@ class Prediction(msgspec.Struct, frozen=True):
     velocity: NDArray[np.float64]
     T_odom_last: Pose
     T_previous_current: Pose
-    motion_before: NDArray[np.float64]
     interval_s: float
     last_s: float
     usual_s: float
@@ -207,7 +205,7 @@ class Prediction(msgspec.Struct, frozen=True):
         mean = motion / lasted_s
         if not 0.0 < lasted_s < _EVEN * before_s < _EVEN**2 * lasted_s:
             return mean
-        return mean + lasted_s / (lasted_s + before_s) * (mean - self.motion_before / before_s)
+        return mean + lasted_s / (lasted_s + before_s) * (mean - lie.log(self.T_previous_current) / before_s)
 
     def deskewing_error(self, T_odom_lidar: Pose, duration_s: float) -> NDArray[np.float64]:
         """(k,) approximate error of a scan of this duration after deskewing at constant velocity.
@@ -218,13 +216,11 @@ class Prediction(msgspec.Struct, frozen=True):
         if self.lasted_s <= 0.0 or self.is_second:
             return np.zeros(len(self.velocity))
         mean = lie.log(lie.between(self.T_odom_last, T_odom_lidar)) / self.lasted_s
-        return (mean - self.motion_before / self.before_s) / self.lasted_s * duration_s**2 / 24.0
+        return (mean - lie.log(self.T_previous_current) / self.before_s) / self.lasted_s * duration_s**2 / 24.0
 
 
 class Predictor:
     """The last pose, the last motion and the last wheel reading, with their uncertainties.
-
-    ``motion`` (k,) is the twist of ``T_previous_current``.
 
     Without wheels the motion goes on as it was, by a filter whose noise is that of the errors of its predictions.
     Where a scan constrains nothing along a direction, the motion there goes on and its variance grows.
@@ -236,7 +232,7 @@ class Predictor:
         self.T_odom_lidar = lie.identity(T_base_lidar.shape[0] - 1)
         self.T_previous_current = self.T_odom_lidar
         k = lie.twist_size(T_base_lidar)
-        self.motion = self.velocity = np.zeros(k)
+        self.velocity = np.zeros(k)
         self.by_velocity = ErrorStatistics(lie.by_component(k, config.velocity_sigma_m, config.velocity_sigma_rad))
         self.by_wheels = ErrorStatistics(lie.by_component(k, config.wheel_sigma_m, config.wheel_sigma_rad))
         self.filter = MotionFilter(np.diag(self.by_velocity.first_sigma**2))
@@ -269,7 +265,6 @@ class Predictor:
             velocity=self.velocity,
             T_odom_last=self.T_odom_lidar,
             T_previous_current=self.T_previous_current,
-            motion_before=self.motion,
             interval_s=interval_s,
             last_s=times.last_s,
             usual_s=times.usual_s,
@@ -306,8 +301,7 @@ class Predictor:
         self.lost_s = self.lost_s + prediction.interval_s if state is State.LOST else 0.0
         if self.intervals.last_scan is not None:
             self.T_previous_current = lie.between(prediction.T_odom_last, T_odom_lidar)
-            self.motion = lie.log(self.T_previous_current)
-            self.velocity = prediction.velocity_by(self.motion)
+            self.velocity = prediction.velocity_by(lie.log(self.T_previous_current))
             self._update(prediction, match, state)
         self.intervals.take(scan, prediction.interval_s)
         T_odom_base = None if self.is_contradicted else scan.T_odom_base
@@ -320,7 +314,7 @@ class Predictor:
             self.filter.begin(self.T_previous_current)
         elif prediction.is_guess:
             share = self.intervals.usual_s / prediction.interval_s
-            self.filter.begin(lie.exp(share * self.motion))
+            self.filter.begin(lie.exp(share * lie.log(self.T_previous_current)))
         else:
             innovation = lie.log(lie.between(prediction.T_odom_lidar, match.T_target_source))
             if prediction.statistics is self.by_velocity:
