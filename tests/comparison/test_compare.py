@@ -15,11 +15,10 @@ import pytest
 
 from scanchain.__main__ import main
 from scanchain.comparison.compare import Compared, Comparison, compare
-from scanchain.comparison.figures import COLUMNS
 from scanchain.comparison.methods import OURS, default_names, resolve
 from scanchain.comparison.processes import EndReport, Outcome, Status, run_all, store
 from scanchain.comparison.results import method_folder
-from scanchain.comparison.table import Row, Table, markdown, read_table, text
+from scanchain.comparison.table import COLUMNS, Row, Table, markdown, read_table, text
 from scanchain.data import Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import absolute_error, pair

@@ -20,15 +20,7 @@ from scanchain.settings import Override, load_settings
 
 _ANY = "matcher"  # ours with the matcher that the settings name
 OURS = (*MATCHERS, *(f"{name}+loops" for name in MATCHERS), _ANY, f"{_ANY}+loops")
-_ON_REQUEST = (
-    *(
-        name
-        for name in OURS
-        if name.partition("+")[0] == _ANY or (name.endswith("+loops") and name != "plicp+loops")
-    ),
-    "genz-icp-indoor",
-    "genz-icp-kitti",
-)
+_ON_REQUEST = ("genz-icp-indoor", "genz-icp-kitti")
 _BASE = "method"  # the key of a table that names the method it is a variant of
 _KINDS = ("matching.matcher", "loops.enabled")  # keys that tell ours apart
 _SECTIONS = Config.__struct_fields__
@@ -58,13 +50,9 @@ class Method(Struct, frozen=True):
 
 def default_names(dimension: int) -> tuple[str, ...]:
     """Methods that apply to logs of this dimension."""
-    ours = [name for name in OURS if name not in _ON_REQUEST]
-    others = [
-        name
-        for name, entry in BASELINES.items()
-        if name not in _ON_REQUEST and (dimension == 3 or entry.planar is not None)
-    ]
-    return (*ours, *others)
+    others = [name for name in BASELINES if name not in _ON_REQUEST]
+    planar = [name for name in others if BASELINES[name].planar is not None]
+    return (*MATCHERS, "plicp+loops", *(others if dimension == 3 else planar))
 
 
 def resolve(

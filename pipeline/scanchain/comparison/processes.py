@@ -82,7 +82,8 @@ def store(scans: Iterable[Scan], T_base_lidar: Pose, path: Path) -> StoredScans:
             pickle.dump(scan, file, pickle.HIGHEST_PROTOCOL)
             rows.append((len(scan.points), scan.stamp_ns, scan.log_time_ns))
             wheels.append(unknown if scan.T_odom_base is None else scan.T_odom_base)
-    return StoredScans(path, *np.array(rows, np.int64).T.copy(), np.array(wheels), T_base_lidar)
+    points, stamps_ns, log_times_ns = np.array(rows, np.int64).T.copy()
+    return StoredScans(path, points, stamps_ns, log_times_ns, np.array(wheels), T_base_lidar)
 
 
 class Status(StrEnum):

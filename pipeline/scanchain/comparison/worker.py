@@ -14,7 +14,7 @@ from contextlib import nullcontext, suppress
 from itertools import islice
 from pathlib import Path
 from time import perf_counter, process_time
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -36,30 +36,15 @@ from scanchain.comparison.processes import (
 from scanchain.data import Pose, Scan, Trajectory
 from scanchain.errors import MissingExtraError, ScanchainError, shown
 from scanchain.processes import die_first, die_with_parent, peak_mib
-from scanchain.runs.job import Progress
+
+if TYPE_CHECKING:
+    from scanchain.comparison.ours import Ours
 
 _WARM_UP_SCANS = 4
 _MAX_CHARACTERS = 300  # largest length of the message of an error raised by other code
 
 
-class Runner(Protocol):
-    """Scans in, poses out."""
-
-    @property
-    def description(self) -> str:
-        """Method and settings."""
-        ...
-
-    def track(self, scan: Scan) -> Pose:
-        """T_odom_lidar (d+1, d+1) at the scan's stamp."""
-        ...
-
-    def finish(self, odometry: Trajectory, folder: Path) -> Trajectory:
-        """The final trajectory; other results go into files of the folder."""
-        ...
-
-
-def start(method: Method, T_base_lidar: Pose) -> Runner:
+def start(method: Method, T_base_lidar: Pose) -> Ours | _Others:
     """The method before its first scan. Raises MissingExtraError where its package is not installed."""
     if not method.is_ours:
         return _Others(method, len(T_base_lidar) - 1)
@@ -69,6 +54,8 @@ def start(method: Method, T_base_lidar: Pose) -> Runner:
 
 
 class _Others:
+    """A baseline or a class of the user as ``Ours``: scans in, poses out."""
+
     def __init__(self, method: Method, dimension: int) -> None:
         if method.base in BASELINES:
             entry = BASELINES[method.base]
@@ -131,20 +118,11 @@ def main() -> None:
 def run(folder: Path) -> None:
     """Run the task of a folder and write the report."""
     method, scans = pickle.loads((folder / TASK_FILE).read_bytes())
-    compiler = _Compiler()
-    with announcing_compilation(compiler.say) if method.is_ours else nullcontext():
+    compiled: list[str] = []
+    with announcing_compilation(compiled.append) if method.is_ours else nullcontext():
         report = _report(scans, method, folder)
-    report = msgspec.structs.replace(report, peak_mib=peak_mib(), has_compiled=compiler.has_compiled)
+    report = msgspec.structs.replace(report, peak_mib=peak_mib(), has_compiled=bool(compiled))
     (folder / REPORT_FILE).write_bytes(msgspec.json.encode(report))
-
-
-class _Compiler(Progress):
-    """Notices compilation."""
-
-    has_compiled = False
-
-    def say(self, line: str) -> None:
-        self.has_compiled = True
 
 
 def _report(scans: StoredScans, method: Method, folder: Path) -> EndReport:
