@@ -23,7 +23,7 @@ from scanchain.evaluation import (
     relative_error_over_frames,
     relative_error_over_time,
 )
-from scanchain.evaluation.absolute import path_length
+from scanchain.evaluation.errors import path_length
 from scanchain.evaluation.pairing import nearest
 from scanchain.logs import open_log
 from scanchain.odometry import Odometry

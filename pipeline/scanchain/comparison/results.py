@@ -35,7 +35,7 @@ from scanchain.evaluation import (
     sampling_step,
     sharpness,
 )
-from scanchain.evaluation.absolute import path_length
+from scanchain.evaluation.errors import path_length
 from scanchain.logs import Log
 from scanchain.maps import write_ply
 from scanchain.processes import Limits
