@@ -8,7 +8,6 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from types import ModuleType
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -22,6 +21,14 @@ from scanchain.data import Pose, RawPoints
 from scanchain.errors import InputError, MissingExtraError
 
 _DISTORTED = 2  # it deskews by the motion before, and has none for its first two scans
+
+
+def _imported(module: str, package: str) -> Any:
+    """A module of a package that only an extra installs."""
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise MissingExtraError(package, "baselines") from None
 
 
 class KissSettings(Struct, frozen=True, forbid_unknown_fields=True):
@@ -43,12 +50,8 @@ class KissIcp:
     """KISS-ICP: point-to-point, scan to map, adaptive threshold."""
 
     def __init__(self, settings: KissSettings = KISS) -> None:
-        try:
-            from kiss_icp.config.parser import load_config
-            from kiss_icp.kiss_icp import KissICP
-        except ImportError:
-            raise MissingExtraError("kiss-icp", "baselines") from None
-        config = load_config(None)
+        library = _imported("kiss_icp.kiss_icp", "kiss-icp")
+        config = _imported("kiss_icp.config.parser", "kiss-icp").load_config(None)
         config.data.min_range, config.data.max_range = settings.min_range_m, settings.max_range_m
         config.mapping.voxel_size = settings.voxel_size_m
         config.mapping.max_points_per_voxel = settings.max_points_per_voxel
@@ -59,7 +62,7 @@ class KissIcp:
             f"voxels of {settings.voxel_size_m:g} m, {settings.threads or 'all'} threads, its own deskewing where "
             "the log has times"
         )
-        self.odometry = KissICP(config)
+        self.odometry = library.KissICP(config)
         self.at_stamp = AtStamp()
         self.scans = 0
 
@@ -98,12 +101,8 @@ class GenzIcp:
 
     def __init__(self, settings: GenzSettings = GENZ) -> None:
         preset = settings.preset
-        try:
-            from genz_icp.config import load_config
-            from genz_icp.genz_icp import GenZICP
-        except ImportError:
-            raise MissingExtraError("genz-icp", "baselines") from None
-        config = load_config(None)
+        library = _imported("genz_icp.genz_icp", "genz-icp")
+        config = _imported("genz_icp.config", "genz-icp").load_config(None)
         config.data = config.data.model_copy(update={"deskew": True} | _DATA[preset])
         config.mapping = config.mapping.model_copy(update=_MAPPING[preset])
         self.description = (
@@ -112,7 +111,7 @@ class GenzIcp:
             f"{config.mapping.desired_num_voxelized_points} points a scan, all threads; its own deskewing, off in "
             "that file, on where the log has times"
         )
-        self.odometry = GenZICP(config)
+        self.odometry = library.GenZICP(config)
         self.at_stamp = AtStamp()
 
     def track(self, points: RawPoints, times_s: NDArray[np.float32], stamp_ns: int) -> Pose:
@@ -153,23 +152,17 @@ class SmallGicpModel:
     """Scan to a map of Gaussian voxels (VGICP), started at constant velocity."""
 
     def __init__(self, settings: VgicpSettings = VGICP) -> None:
-        self.library = _import_small_gicp()
+        self.library = _imported("small_gicp", "small-gicp")
         self.settings = settings
         self.threads = settings.threads or os.cpu_count() or 1
         self.map: Any = self.library.GaussianVoxelMap(settings.voxel_size_m)
         self.map.set_lru(horizon=settings.horizon, clear_cycle=_CLEAR_CYCLE)
         self.started = False
-        self.T_odom_lidar = np.eye(4)
-        self.T_previous_current = np.eye(4)
+        self.T_odom_lidar, self.T_previous_current = np.eye(4), np.eye(4)
         self.at_stamp = AtStamp()
-
-    @property
-    def description(self) -> str:
-        """Method and parameters."""
-        return (
-            f"small_gicp VGICP, scan to map, downsampled to {self.settings.downsampling_m:g} m, voxels of "
-            f"{self.settings.voxel_size_m:g} m, "
-            f"{self.threads} threads, constant velocity, no deskewing"
+        self.description = (
+            f"small_gicp VGICP, scan to map, downsampled to {settings.downsampling_m:g} m, voxels of "
+            f"{settings.voxel_size_m:g} m, {self.threads} threads, constant velocity, no deskewing"
         )
 
     def track(self, points: RawPoints, times_s: NDArray[np.float32], stamp_ns: int) -> Pose:
@@ -192,8 +185,7 @@ class _Pairs:
 
     def __init__(self) -> None:
         self.previous: Any = None
-        self.T_odom_lidar = np.eye(4)
-        self.T_previous_current = np.eye(4)
+        self.T_odom_lidar, self.T_previous_current = np.eye(4), np.eye(4)
         self.at_stamp = AtStamp()
 
     def track(self, points: RawPoints, times_s: NDArray[np.float32], stamp_ns: int) -> Pose:
@@ -220,17 +212,12 @@ class SmallGicpPairs(_Pairs):
 
     def __init__(self, settings: GicpSettings = GICP) -> None:
         super().__init__()
-        self.library = _import_small_gicp()
+        self.library = _imported("small_gicp", "small-gicp")
         self.settings = settings
         self.threads = settings.threads or os.cpu_count() or 1
-
-    @property
-    def description(self) -> str:
-        """Method and parameters."""
-        return (
-            f"small_gicp GICP, scan to scan, downsampled to {self.settings.downsampling_m:g} m, "
-            f"correspondences within {self.settings.max_distance_m:g} m, {self.threads} threads, "
-            "constant velocity, no deskewing"
+        self.description = (
+            f"small_gicp GICP, scan to scan, downsampled to {settings.downsampling_m:g} m, correspondences within "
+            f"{settings.max_distance_m:g} m, {self.threads} threads, constant velocity, no deskewing"
         )
 
     def _prepared(self, points: NDArray[np.float64]) -> Any:
@@ -250,7 +237,7 @@ class SmallGicpPairs(_Pairs):
 
 
 def _preprocessed(
-    library: ModuleType, points: NDArray[np.float64], settings: GicpSettings | VgicpSettings, threads: int
+    library: Any, points: NDArray[np.float64], settings: GicpSettings | VgicpSettings, threads: int
 ) -> tuple[Any, Any]:
     """Downsampled points with covariances, and their tree."""
     return library.preprocess_points(
@@ -259,13 +246,6 @@ def _preprocessed(
         num_neighbors=settings.neighbors,
         num_threads=threads,
     )
-
-
-def _import_small_gicp() -> ModuleType:
-    try:
-        return importlib.import_module("small_gicp")
-    except ImportError:
-        raise MissingExtraError("small-gicp", "baselines") from None
 
 
 Residual = Literal["point-to-plane", "point-to-point", "plane-to-plane"]
@@ -304,40 +284,27 @@ class Open3dPairs(_Pairs):
         register, estimation = _REGISTRATIONS[residual]
         self.register, self.estimation = getattr(registration, register), getattr(registration, estimation)()
         self.criteria: Any = registration.ICPConvergenceCriteria(max_iteration=settings.max_iterations)
-
-    @property
-    def description(self) -> str:
-        """Method and parameters."""
-        return (
-            f"Open3D {self.register.__name__}, {self.residual}, scan to scan, voxels of "
-            f"{self.settings.voxel_size_m:g} m, correspondences within {self.settings.max_distance_m:g} m, "
-            f"{self.settings.max_iterations} iterations, constant velocity, no deskewing"
+        self.description = (
+            f"Open3D {register}, {residual}, scan to scan, voxels of {settings.voxel_size_m:g} m, correspondences "
+            f"within {settings.max_distance_m:g} m, {settings.max_iterations} iterations, constant velocity, no "
+            "deskewing"
         )
 
     def _registered(self, cloud: Any) -> Pose:
-        result = self.register(
-            cloud,
-            self.previous,
-            self.settings.max_distance_m,
-            self.T_previous_current,
-            self.estimation,
-            self.criteria,
-        )
+        distance_m, guess = self.settings.max_distance_m, self.T_previous_current
+        result = self.register(cloud, self.previous, distance_m, guess, self.estimation, self.criteria)
         return np.array(result.transformation)
 
     def _prepared(self, points: NDArray[np.float64]) -> Any:
         cloud = self.open3d.geometry.PointCloud(self.open3d.utility.Vector3dVector(points))
         cloud = cloud.voxel_down_sample(self.settings.voxel_size_m)
         if self.residual != "point-to-point":
-            cloud.estimate_normals(
-                self.open3d.geometry.KDTreeSearchParamHybrid(
-                    self.settings.normal_radius_m, self.settings.normal_neighbors
-                )
-            )
+            radius_m, neighbors = self.settings.normal_radius_m, self.settings.normal_neighbors
+            cloud.estimate_normals(self.open3d.geometry.KDTreeSearchParamHybrid(radius_m, neighbors))
         return cloud
 
 
-def _import_open3d() -> ModuleType:
+def _import_open3d() -> Any:
     """Open3D, with the libusb it needs, which slim machines lack, loaded from the package that ships it."""
     try:
         libusb = importlib.import_module("libusb_package")
@@ -346,10 +313,7 @@ def _import_open3d() -> ModuleType:
         path = None
     if path is not None:
         ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
-    try:
-        open3d = importlib.import_module("open3d")
-    except ImportError:
-        raise MissingExtraError("open3d, or the libusb-package that it needs,", "baselines") from None
+    open3d = _imported("open3d", "open3d, or the libusb-package that it needs,")
     open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
     return open3d
 
@@ -376,14 +340,10 @@ class Entry:
     forgets: bool = True
 
 
-def _open3d(residual: Residual, planar: Struct | None, *, is_raised: bool = False) -> Entry:
-    return Entry(partial(Open3dPairs, residual), "open3d", OPEN3D, planar, is_raised)
-
-
 BASELINES: dict[str, Entry] = {
-    "open3d-p2p": _open3d("point-to-point", PLANAR_OPEN3D),
-    "open3d-p2l": _open3d("point-to-plane", None),
-    "open3d-gicp": _open3d("plane-to-plane", PLANAR_OPEN3D, is_raised=True),
+    "open3d-p2p": Entry(partial(Open3dPairs, "point-to-point"), "open3d", OPEN3D, PLANAR_OPEN3D),
+    "open3d-p2l": Entry(partial(Open3dPairs, "point-to-plane"), "open3d", OPEN3D, None),
+    "open3d-gicp": Entry(partial(Open3dPairs, "plane-to-plane"), "open3d", OPEN3D, PLANAR_OPEN3D, is_raised=True),
     "kiss-icp": Entry(KissIcp, "kiss-icp", KISS, PLANAR_KISS),
     "small-gicp": Entry(SmallGicpPairs, "small-gicp", GICP, PLANAR_GICP, is_raised=True),
     "small-vgicp": Entry(SmallGicpModel, "small-gicp", VGICP, PLANAR_VGICP, is_raised=True),
