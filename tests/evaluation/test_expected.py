@@ -30,7 +30,7 @@ WITHOUT_WHEELS = (Override("odometry.prior", "constant-velocity", "this test"),)
 DRIVES = [
     ("office", "lms-270", 20.0),
     ("identical", "lms-270", 20.0),
-    ("town", "vlp-16", 8.0),
+    ("town", "vlp-16", 5.0),
     ("hall", "os1-32", 12.0),
 ]
 
