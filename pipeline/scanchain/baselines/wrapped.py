@@ -18,7 +18,7 @@ from scanchain import lie
 from scanchain.baselines.baseline import AtStamp, Baseline, finite, middle
 from scanchain.config import Count, NonNegative, Positive
 from scanchain.data import Pose, RawPoints
-from scanchain.errors import InputError, MissingExtraError
+from scanchain.errors import MissingExtraError
 
 _DISTORTED = 2  # it deskews by the motion before, and has none for its first two scans
 
@@ -351,10 +351,3 @@ BASELINES: dict[str, Entry] = {
     "genz-icp-indoor": Entry(GenzIcp, "genz-icp", GenzSettings("indoor"), None, forgets=False),
     "genz-icp-kitti": Entry(GenzIcp, "genz-icp", GenzSettings("kitti"), None, forgets=False),
 }
-
-
-def create(name: str) -> Baseline:
-    """A fresh baseline for 3D scans, as its authors recommend it. Raises InputError for an unknown name."""
-    if name not in BASELINES:
-        raise InputError(f"there is no baseline {name!r}; choose among {', '.join(BASELINES)}")
-    return BASELINES[name].make(BASELINES[name].settings)
