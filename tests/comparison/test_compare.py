@@ -116,30 +116,17 @@ def good(office, tmp_path_factory):
 # one that is bad
 
 
-@pytest.fixture(scope="module")
-def bad(office, tmp_path_factory):
-    """Bad methods around a good one, each in its process, by the command line: the exit code and the directory.
-
-    The clock of the time limit stands still until one hangs, so that a slow machine ends no other.
-    """
-    folder, names = tmp_path_factory.mktemp("bad"), ("Hangs", "Eats", "Dies", "DiesEarly")
-    hanging, settings = folder / "hanging", classes(folder / "bad.toml", *names)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", f"{SUPPORT}:{ROOT}", prepend=":")
-        patch.setenv("HANGS_FILE", str(hanging))
-        patch.setattr("scanchain.processes.monotonic", lambda: 1000.0 * hanging.exists())
-        code = main(
-            [
-                "compare", str(office), "--out", str(folder / "out"), "--settings", str(settings),
-                "--methods", ",".join(["hangs", "eats", "plicp", "dies", "diesearly"]),
-                "--time-limit", "20", "--memory-limit", "1",
-            ]
-        )  # fmt: skip
-    return code, folder / "out"
-
-
-def test_one_that_hangs_or_kills_its_process_is_a_row_that_says_how_it_ended_and_the_others_finish(bad):
-    code, folder = bad
+@pytest.mark.usefixtures("own_processes")
+def test_one_that_hangs_or_kills_its_process_is_a_row_that_says_how_it_ended_and_the_others_finish(
+    office, tmp_path, monkeypatch
+):
+    """The clock of the time limit stands still until one hangs, so that a slow machine ends no other."""
+    hanging, folder = tmp_path / "hanging", tmp_path / "out"
+    settings = classes(tmp_path / "bad.toml", "Hangs", "Eats", "Dies", "DiesEarly")
+    monkeypatch.setenv("HANGS_FILE", str(hanging))
+    monkeypatch.setattr("scanchain.processes.monotonic", lambda: 1000.0 * hanging.exists())
+    words = ["--methods", "hangs,eats,plicp,dies,diesearly", "--time-limit", "20", "--memory-limit", "1"]
+    code = main(["compare", str(office), "--out", str(folder), "--settings", str(settings), *words])
     table = read_table(folder)
     for name, status, reason in (
         ("hangs", Status.TIMED_OUT, "at scan 10: took longer than --time-limit (20 s)"),
@@ -245,16 +232,6 @@ def test_every_verdict_names_the_error_that_its_checks_resolve(good):
             assert each.vouched in text(table) and each.vouched in markdown(table)
         elif each.name not in ours:
             assert each.figures["ate_m"] < 1.05 * float(others[0])
-
-
-def test_one_that_failed_is_best_at_nothing():
-    made = Provenance(True, "", [], "", 0.0, [], "", "", "", 2, {})
-    rows = [
-        Row(name, name, status, "", "", {}, {"peak_mib": mib, "ate_m": mib}, [])
-        for name, status, mib in (("a", Status.OK, 30.0), ("b", Status.CRASHED, 1.0), ("c", Status.OK, 20.0))
-    ]
-    table = Table("log", "/scan", 2, 60, 180.0, 1, "truth", "", rows, [], [], made, {})
-    assert "| c | **20.0** | **20** |" in markdown(table) and "1.0" not in text(table)
 
 
 def test_a_run_that_compiled_kernels_is_run_anew(monkeypatch, tmp_path):
@@ -481,6 +458,16 @@ def test_the_best_of_a_column_is_marked_as_it_is_shown():
     assert best(ate, rows[2:]) == best(ate, rows[:2]) == [False, False]
 
 
+def test_one_that_failed_is_best_at_nothing():
+    made = Provenance(True, "", [], "", 0.0, [], "", "", "", 2, {})
+    rows = [
+        Row(name, name, status, "", "", {}, {"peak_mib": mib, "ate_m": mib}, [])
+        for name, status, mib in (("a", Status.OK, 30.0), ("b", Status.CRASHED, 1.0), ("c", Status.OK, 20.0))
+    ]
+    table = Table("log", "/scan", 2, 60, 180.0, 1, "truth", "", rows, [], [], made, {})
+    assert "| c | **20.0** | **20** |" in markdown(table) and "1.0" not in text(table)
+
+
 def test_a_column_has_the_digits_that_its_smallest_figure_needs():
     time = next(column for column in COLUMNS if column.key == "median_s")
     for seconds, texts in (
@@ -492,7 +479,7 @@ def test_a_column_has_the_digits_that_its_smallest_figure_needs():
         assert [cell.text for cell in time.cells([{"median_s": each} for each in seconds])] == texts
 
 
-def test_the_tables_say_the_same(good):
+def test_the_tables_say_the_same_and_stages_add_up(good):
     table, folder = good
     said = json.loads((folder / "table.json").read_text())
     with (folder / "table.csv").open() as file:
@@ -506,10 +493,8 @@ def test_the_tables_say_the_same(good):
     assert row(table, "plicp").figures["median_s"] == pytest.approx(ours[ours["index"] > 0].seconds.median())
     assert row(table, "plicp").figures["ate_m"] == pytest.approx(np.sqrt((ours.error_m**2).mean()))
 
-
-def test_the_time_of_the_first_scan_stands_apart_and_stages_add_up(good):
     for name in ("plicp", "svd+loops"):
-        figures = row(good[0], name).figures
+        figures = row(table, name).figures
         stages_s = figures["preprocess_s"] + figures["match_s"] + figures["map_s"]
         assert 0.3 * figures["median_s"] < stages_s < 1.2 * figures["median_s"]
         assert figures["first_s"] > 0.0 and figures["p95_s"] >= figures["median_s"]
