@@ -46,9 +46,10 @@ from scanchain_viz.report.page import (
 from scanchain_viz.report.run import map_section, trajectory_lines, write_run_report
 from scanchain_viz.report.sections import loop_section, trajectories_section
 from tests.support.browser import find_browser, look
-from tests.support.in_process import here
+from tests.support.scenes import ROOT
 
 EVIL = "<script>alert(1)</script>"
+SUPPORT = ROOT / "tests" / "support"
 BOTH = pytest.mark.parametrize("which", ["comparison", "one_run"])
 
 
@@ -84,7 +85,7 @@ def comparison(evil, tmp_path_factory):
         f'["{EVIL}"]\nmethod = "bad_odometries:Shifted"\n[raises]\nmethod = "bad_odometries:Raises"\n'
     )
     with pytest.MonkeyPatch.context() as patch:
-        here(patch)
+        patch.setenv("PYTHONPATH", f"{SUPPORT}:{ROOT}", prepend=":")
         code = main(
             [
                 "compare", str(evil), "--out", str(folder / "out"), "--settings", str(folder / "a.toml"),
