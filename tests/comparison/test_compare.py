@@ -389,16 +389,21 @@ def test_methods_of_like_names_have_folders_of_their_own(tmp_path):
 
 
 @pytest.mark.usefixtures("in_process")
-def test_errors_are_those_of_evaluate_against_the_log_a_tum_or_a_kitti_file(office, tmp_path):
+def test_errors_are_those_of_evaluate_against_the_log_a_tum_or_a_kitti_file_and_relations(office, tmp_path):
     truth = read_tum(office.with_suffix(".tum"))
     write_kitti(tmp_path / "truth.txt", truth)
-    file = classes(tmp_path / "a.toml", "Shifted")
+    file, stamps = classes(tmp_path / "a.toml", "Shifted"), [f"{ns / 1e9:.6f}" for ns in truth.stamps_ns.tolist()]
+    one = toml(tmp_path / "a.relations", f"{stamps[0]} {stamps[20]} 0.5 0 0 0 0 0\n")  # the method's own are 2 m
     for reference in (None, office.with_suffix(".tum"), tmp_path / "truth.txt"):
-        table = run(office, tmp_path, "shifted", ground_truth=reference, config_file=file, force=True)
+        truths = {"ground_truth": reference, "relations": one}
+        table = run(office, tmp_path, "shifted", config_file=file, force=True, **truths)
         estimate = read_tum(tmp_path / "out" / "methods" / "shifted" / "trajectory.tum")
         error_m = absolute_error(pair(estimate, truth)).translation_m.rmse
         assert table.rows[0].figures["ate_m"] == pytest.approx(error_m, abs=1e-8)
         assert table.rows[0].figures["paired_share"] == 1.0
+        assert table.rows[0].figures["relations_m"] == pytest.approx(1.5, abs=1e-9)
+        relations = pq.read_table(tmp_path / "out" / "per_relation.parquet").to_pylist()
+        assert [(each["method"], each["relation"]) for each in relations] == [("shifted", 0)]
 
 
 @pytest.mark.usefixtures("in_process")
