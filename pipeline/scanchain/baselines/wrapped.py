@@ -148,40 +148,8 @@ GICP, PLANAR_GICP = GicpSettings(), GicpSettings(downsampling_m=0.05, max_distan
 VGICP, PLANAR_VGICP = VgicpSettings(), VgicpSettings(downsampling_m=0.05, voxel_size_m=0.3)
 
 
-class SmallGicpModel:
-    """Scan to a map of Gaussian voxels (VGICP), started at constant velocity."""
-
-    def __init__(self, settings: VgicpSettings = VGICP) -> None:
-        self.library = _imported("small_gicp", "small-gicp")
-        self.settings = settings
-        self.threads = settings.threads or os.cpu_count() or 1
-        self.map: Any = self.library.GaussianVoxelMap(settings.voxel_size_m)
-        self.map.set_lru(horizon=settings.horizon, clear_cycle=_CLEAR_CYCLE)
-        self.started = False
-        self.T_odom_lidar, self.T_previous_current = np.eye(4), np.eye(4)
-        self.at_stamp = AtStamp()
-        self.description = (
-            f"small_gicp VGICP, scan to map, downsampled to {settings.downsampling_m:g} m, voxels of "
-            f"{settings.voxel_size_m:g} m, {self.threads} threads, constant velocity, no deskewing"
-        )
-
-    def track(self, points: RawPoints, times_s: NDArray[np.float32], stamp_ns: int) -> Pose:
-        """Register one scan against the map, then add it."""
-        frame, times = finite(points, times_s)
-        cloud, _ = _preprocessed(self.library, frame, self.settings, self.threads)
-        if self.started:
-            guess = self.T_odom_lidar @ self.T_previous_current
-            result = self.library.align(self.map, cloud, guess, num_threads=self.threads)
-            T_odom_lidar = lie.normalize(np.array(result.T_target_source))
-            self.T_previous_current = lie.between(self.T_odom_lidar, T_odom_lidar)
-            self.T_odom_lidar = T_odom_lidar
-        self.map.insert(cloud, self.T_odom_lidar)
-        self.started = True
-        return self.at_stamp.move(self.T_odom_lidar, stamp_ns, middle(times))
-
-
-class _Pairs:
-    """Registration of each scan to the one before, started at constant velocity."""
+class _Chained:
+    """Registration of each scan to those before, started at constant velocity."""
 
     def __init__(self) -> None:
         self.previous: Any = None
@@ -189,7 +157,7 @@ class _Pairs:
         self.at_stamp = AtStamp()
 
     def track(self, points: RawPoints, times_s: NDArray[np.float32], stamp_ns: int) -> Pose:
-        """Register one scan against the last and chain the motions."""
+        """Register one scan and chain the motions."""
         frame, times = finite(points, times_s)
         cloud = self._prepared(frame)
         if self.previous is not None:
@@ -207,21 +175,33 @@ class _Pairs:
         raise NotImplementedError
 
 
-class SmallGicpPairs(_Pairs):
-    """GICP from each scan to the one before."""
-
-    def __init__(self, settings: GicpSettings = GICP) -> None:
+class _SmallGicp(_Chained):
+    def __init__(self, settings: GicpSettings | VgicpSettings) -> None:
         super().__init__()
         self.library = _imported("small_gicp", "small-gicp")
         self.settings = settings
         self.threads = settings.threads or os.cpu_count() or 1
+
+    def _prepared(self, points: NDArray[np.float64]) -> Any:
+        """Downsampled points with covariances, and their tree."""
+        return self.library.preprocess_points(
+            points,
+            downsampling_resolution=self.settings.downsampling_m,
+            num_neighbors=self.settings.neighbors,
+            num_threads=self.threads,
+        )
+
+
+class SmallGicpPairs(_SmallGicp):
+    """GICP from each scan to the one before."""
+
+    def __init__(self, settings: GicpSettings = GICP) -> None:
+        super().__init__(settings)
+        self.max_distance_m = settings.max_distance_m
         self.description = (
             f"small_gicp GICP, scan to scan, downsampled to {settings.downsampling_m:g} m, correspondences within "
             f"{settings.max_distance_m:g} m, {self.threads} threads, constant velocity, no deskewing"
         )
-
-    def _prepared(self, points: NDArray[np.float64]) -> Any:
-        return _preprocessed(self.library, points, self.settings, self.threads)
 
     def _registered(self, cloud: Any) -> Pose:
         (target, target_tree), (source, _) = self.previous, cloud
@@ -230,22 +210,29 @@ class SmallGicpPairs(_Pairs):
             source,
             target_tree,
             self.T_previous_current,
-            max_correspondence_distance=self.settings.max_distance_m,
+            max_correspondence_distance=self.max_distance_m,
             num_threads=self.threads,
         )
         return np.array(result.T_target_source)
 
 
-def _preprocessed(
-    library: Any, points: NDArray[np.float64], settings: GicpSettings | VgicpSettings, threads: int
-) -> tuple[Any, Any]:
-    """Downsampled points with covariances, and their tree."""
-    return library.preprocess_points(
-        points,
-        downsampling_resolution=settings.downsampling_m,
-        num_neighbors=settings.neighbors,
-        num_threads=threads,
-    )
+class SmallGicpModel(_SmallGicp):
+    """Scan to a map of Gaussian voxels (VGICP), into which the last scan is put first."""
+
+    def __init__(self, settings: VgicpSettings = VGICP) -> None:
+        super().__init__(settings)
+        self.map: Any = self.library.GaussianVoxelMap(settings.voxel_size_m)
+        self.map.set_lru(horizon=settings.horizon, clear_cycle=_CLEAR_CYCLE)
+        self.description = (
+            f"small_gicp VGICP, scan to map, downsampled to {settings.downsampling_m:g} m, voxels of "
+            f"{settings.voxel_size_m:g} m, {self.threads} threads, constant velocity, no deskewing"
+        )
+
+    def _registered(self, cloud: Any) -> Pose:
+        self.map.insert(self.previous[0], self.T_odom_lidar)
+        guess = self.T_odom_lidar @ self.T_previous_current
+        result = self.library.align(self.map, cloud[0], guess, num_threads=self.threads)
+        return lie.between(self.T_odom_lidar, lie.normalize(np.array(result.T_target_source)))
 
 
 Residual = Literal["point-to-plane", "point-to-point", "plane-to-plane"]
@@ -272,7 +259,7 @@ OPEN3D = Open3dSettings()
 PLANAR_OPEN3D = Open3dSettings(voxel_size_m=0.05, max_distance_m=0.5, normal_radius_m=0.5)
 
 
-class Open3dPairs(_Pairs):
+class Open3dPairs(_Chained):
     """Scan-to-scan ICP on downsampled clouds."""
 
     def __init__(self, residual: Residual, settings: Open3dSettings = OPEN3D) -> None:
