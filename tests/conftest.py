@@ -1,10 +1,13 @@
 """What every test may use. Kernels compile when first called, which is no reason for a property test to fail."""
 
+import os
+
 import pytest
 from hypothesis import settings
 
 from scanchain.__main__ import main
 
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as in a comparison: threads of baselines spin otherwise
 settings.register_profile("compiling", deadline=None)
 settings.load_profile("compiling")
 

@@ -13,7 +13,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from enum import Enum, auto
+from enum import Enum
 from pathlib import Path
 from threading import Event
 from time import monotonic
@@ -91,12 +91,12 @@ class Limits:
 
 
 class KilledFor(Enum):
-    """Reason why a process was killed."""
+    """Reason why a process was killed, by what it is called then."""
 
-    NOTHING = auto()
-    TIME = auto()
-    MEMORY = auto()
-    STOP = auto()
+    NOTHING = "crashed"
+    TIME = "timed out"
+    MEMORY = "out of memory"
+    STOP = "not run"
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,10 +113,10 @@ class Ending:
     duration_s: float
 
     @property
-    def ran_out_of_memory(self) -> bool:
-        """True if it was killed for its memory, here or by the system."""
+    def how(self) -> str:
+        """How a process ended that did not come to its own end: out of memory, timed out, not run or crashed."""
         by_system = self.killed_for is KilledFor.NOTHING and self.code == _SYSTEM_KILL
-        return by_system or self.killed_for is KilledFor.MEMORY
+        return KilledFor.MEMORY.value if by_system else self.killed_for.value
 
     def reason(self, limits: Limits, output: str) -> str:
         """The limit that it was killed for, else signal or exit code with the last of its output."""
@@ -124,7 +124,7 @@ class Ending:
             return f"took longer than --time-limit ({limits.time_s:.3g} s)"
         if self.killed_for is KilledFor.MEMORY:
             return f"took more than --memory-limit ({limits.memory_mib / 1024.0:.3g} GiB)"
-        if self.ran_out_of_memory:
+        if self.how == KilledFor.MEMORY.value:
             return "killed, as the system does when memory runs out"
         how = signal.Signals(-self.code).name if self.code < 0 else f"exit code {self.code}"
         last = " ".join(output.split())[-_LAST_CHARACTERS:]

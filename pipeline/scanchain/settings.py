@@ -8,6 +8,7 @@ import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import tomli_w
@@ -127,10 +128,10 @@ def load_settings(
     return Settings(msgspec.convert(tree, Config), source)
 
 
-def read_layer(file: Path) -> dict[str, Value]:
-    """The keys that a TOML file sets, checked one by one."""
+def read_toml(file: Path) -> dict[str, Any]:
+    """The tree of a TOML file that a user named."""
     try:
-        tree = tomllib.loads(file.read_text(encoding="utf-8"))
+        return tomllib.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise InputError(f"{file}: no such file; check --config") from None
     except OSError as error:
@@ -138,8 +139,12 @@ def read_layer(file: Path) -> dict[str, Value]:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         reason = one_line(error)
         raise InputError(f"{file}: is not TOML: {reason}; scanchain config dump prints one that is") from None
+
+
+def read_layer(file: Path) -> dict[str, Value]:
+    """The keys that a TOML file sets, checked one by one."""
     layer: dict[str, Value] = {}
-    for name, value in _leaves(tree):
+    for name, value in _leaves(read_toml(file)):
         key = find_key(name, str(file))
         layer[key.name] = key.check(value, str(file))
     return layer

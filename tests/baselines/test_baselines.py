@@ -1,15 +1,16 @@
 """Baselines: each tracks a real drive; what they lack is said, what would crash them is kept from them."""
 
 import sys
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from scanchain import baselines, lie
+from scanchain import lie
+from scanchain.baselines import BASELINES
 from scanchain.baselines.baseline import AtStamp, finite
 from scanchain.data import Trajectory
-from scanchain.errors import InputError, MissingExtraError
+from scanchain.errors import MissingExtraError
 from scanchain.evaluation import absolute_error, pair
 from scanchain.simulation import plan
 from scanchain.simulation.motion import Motion
@@ -17,24 +18,13 @@ from scanchain.simulation.sensors import take_sweep
 from scanchain.trajectory import read_tum
 from tests.support.scenes import kitti_scans, shared_data
 
-PACKAGES = {
-    "kiss-icp": "kiss_icp",
-    "small-vgicp": "small_gicp",
-    "small-gicp": "small_gicp",
-    "genz-icp": "genz_icp",
-    "genz-icp-indoor": "genz_icp",
-    "genz-icp-kitti": "genz_icp",
-    "open3d-p2l": "open3d",
-    "open3d-p2p": "open3d",
-    "open3d-gicp": "open3d",
-}
+PACKAGES = {name: entry.package.replace("-", "_") for name, entry in BASELINES.items()}
 FAST = [name for name in PACKAGES if name != "genz-icp-indoor"]  # which does not keep up with a car
 NO_TIMES = np.empty(0, np.float32)
 SWEEP_S = 0.1
 
 
-@dataclass(frozen=True)
-class Distorted:
+class Distorted(NamedTuple):
     """A sweep taken on the move: points, their seconds after its start, its start, and the motion."""
 
     points: np.ndarray
@@ -64,14 +54,9 @@ def drive():
 
 def create(name):
     try:
-        return baselines.create(name)
+        return BASELINES[name].make(BASELINES[name].settings)
     except MissingExtraError as error:
         pytest.skip(str(error))
-
-
-def track(name, drive, times=NO_TIMES):
-    baseline = create(name)
-    return np.array([baseline.track(scan.points, times, scan.stamp_ns) for scan in drive])
 
 
 def ate_m(name, sweeps, stamp_share, with_times=True):
@@ -88,19 +73,15 @@ def ate_m(name, sweeps, stamp_share, with_times=True):
     return absolute_error(pairs).translation_m.rmse
 
 
-def test_the_names_are_those_known_here():
-    assert set(baselines.BASELINES) == set(PACKAGES)
-
-
 # Point-to-point from scan to scan clings to the rings, which move with the car, and starts slowly.
 @pytest.mark.parametrize("name", FAST)
 def test_a_baseline_tracks_a_real_drive(name, drive):
     limit_m = 0.4 if name == "open3d-p2p" else 0.1
-    poses = track(name, drive)
+    baseline = create(name)
+    poses = np.array([baseline.track(scan.points, NO_TIMES, scan.stamp_ns) for scan in drive])
     truth = read_tum(shared_data("3d/kitti_0001_first54.tum")).poses[:8]
-    motion = lie.inverse(poses[:-1]) @ poses[1:]
-    true_motion = lie.inverse(truth[:-1]) @ truth[1:]
-    error = lie.inverse(true_motion) @ motion
+    motion, true_motion = (lie.between(each[:-1], each[1:]) for each in (poses, truth))
+    error = lie.between(true_motion, motion)
     np.testing.assert_allclose(poses[0], np.eye(4), atol=1e-6)
     assert np.linalg.norm(true_motion[:, :3, 3], axis=1).min() > 1.0
     assert np.median(np.linalg.norm(error[:, :3, 3], axis=1)) < limit_m
@@ -113,12 +94,7 @@ def test_a_missing_package_is_named_with_its_extra(name, monkeypatch):
         monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, PACKAGES[name], None)
     with pytest.raises(MissingExtraError, match=r"pip install 'scanchain\[baselines\]'"):
-        baselines.create(name)
-
-
-def test_an_unknown_baseline_is_refused_with_the_names_there_are():
-    with pytest.raises(InputError, match="kiss-icp, small-gicp, small-vgicp"):
-        baselines.create("kissicp")
+        BASELINES[name].make(BASELINES[name].settings)
 
 
 def test_invalid_points_go_together_with_their_times():
@@ -127,13 +103,10 @@ def test_invalid_points_go_together_with_their_times():
     assert kept.tolist() == [[1, 2, 3], [7, 8, 9]]
     np.testing.assert_allclose(times, [0.0, 0.3], atol=1e-6)
     assert kept.dtype == np.float64
-
-
-def test_times_that_are_all_equal_count_as_none():
-    points = np.ones((3, 3), np.float32)
-    assert len(finite(points, np.full(3, 0.5, np.float32))[1]) == 0
-    assert len(finite(points, NO_TIMES)[1]) == 0
-    assert finite(points[:0], NO_TIMES)[0].shape == (0, 3)
+    ones = np.ones((3, 3), np.float32)
+    for some, times in ((ones, np.full(3, 0.5, np.float32)), (ones, NO_TIMES), (ones[:0], NO_TIMES)):
+        kept, none = finite(some, times)  # times that are all equal count as none
+        assert kept.shape == some.shape and not len(none)
 
 
 def test_poses_of_a_steady_motion_are_moved_to_the_stamp_exactly_across_gaps_too():

@@ -41,8 +41,8 @@ from scanchain.evaluation import (
     pair,
     read_relations,
 )
-from scanchain.evaluation.absolute import path_length
 from scanchain.evaluation.consistency import with_map_errors
+from scanchain.evaluation.errors import path_length
 from scanchain.evaluation.pairing import nearest
 from scanchain.logs import open_log
 from scanchain.settings import Override, load_settings

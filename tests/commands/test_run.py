@@ -11,6 +11,7 @@ from scanchain.data import Trajectory
 from scanchain.logs.writer import LogWriter
 from scanchain.settings import flatten
 from scanchain.trajectory import read_tum, write_kitti, write_tum
+from tests.support.in_process import here
 from tests.support.messages import says
 from tests.support.naive_logs import SECOND, STAMP_NS, laser_scan, odometry, odometry_said, scan_said, write
 from tests.support.scenes import configured
@@ -88,7 +89,8 @@ def test_start_end_and_every_choose_scans(office, ran):
     assert [chosen.config[f"log.{key}"] for key in ("start_s", "end_s", "every")] == [1.0, 3.0, 2]
 
 
-def test_info_and_compare_take_the_part_that_run_takes(call, tmp_path, office):
+def test_info_and_compare_take_the_part_that_run_takes(call, tmp_path, office, monkeypatch):
+    here(monkeypatch)
     part = ("--topic", "/scan", "--start", "1", "--end", "3", "--every", "2")
     says(call("info", office, *part)[1], "/scan: 2D, 11 scans")
     code, output, _ = call("compare", office, *part, "--methods", "plicp", "--out", tmp_path / "c", "--json")

@@ -1,4 +1,4 @@
-"""Expected errors against the truth of simulated logs, and as smfeval judges them."""
+"""Expected errors against the truth of simulated logs, and as smfeval judges them; NEES; maps without a truth."""
 
 import io
 import re
@@ -10,19 +10,27 @@ import numpy as np
 import pytest
 
 from scanchain import lie
-from scanchain.data import State
-from scanchain.evaluation import absolute_error_of_any_path, expected_errors, motion_nees, pair
+from scanchain.data import State, Trajectory
+from scanchain.evaluation import (
+    absolute_error_of_any_path,
+    disagreement,
+    expected_errors,
+    motion_nees,
+    pair,
+    sampled_map,
+    sharpness,
+)
 from scanchain.logs import open_log
 from scanchain.settings import Override, load_settings
 from scanchain.slam import Slam
-from scanchain.trajectory import write_tum, write_wide_tum
+from scanchain.trajectory import read_tum, write_tum, write_wide_tum
 from tests.support import made
 
 WITHOUT_WHEELS = (Override("odometry.prior", "constant-velocity", "this test"),)
 DRIVES = [
     ("office", "lms-270", 20.0),
     ("identical", "lms-270", 20.0),
-    ("town", "vlp-16", 8.0),
+    ("town", "vlp-16", 5.0),
     ("hall", "os1-32", 12.0),
 ]
 
@@ -84,3 +92,49 @@ def test_a_wide_tum_file_has_the_pose_and_the_lower_triangle_of_its_covariance(t
         covariance[np.ix_([0, 1, 5], [0, 1, 5])], np.tril(expected.covariances[5]), rtol=1e-5
     )
     assert np.linalg.eigvalsh(expected.covariances[5])[0] > 0.0
+
+
+def test_a_shaken_way_makes_a_duller_map():
+    office = made.log("office", seconds=6)
+    log = open_log(office)
+    scans, truth = list(log.scans()), read_tum(office.with_suffix(".tum"))
+    exact = Trajectory(truth.stamps_ns, lie.flatten(truth.poses))
+    noise = np.random.default_rng(0).normal(scale=[0.03, 0.03, 0.01], size=(len(truth), 3))
+    shaken = Trajectory(exact.stamps_ns, exact.poses @ lie.exp(noise))
+    sharp, dull = sharpness([sampled_map(scans, way, 1) for way in (exact, shaken)])
+    assert sharp.thickness_m < 0.7 * dull.thickness_m
+    assert sharp.mean_map_entropy < dull.mean_map_entropy
+
+
+def test_a_map_that_has_fallen_apart_spoils_no_other():
+    wall = np.random.default_rng(0).uniform(size=(20_000, 3)) * [10.0, 0.05, 3.0]
+    scattered = np.random.default_rng(1).uniform(-5e3, 5e3, (20_000, 3))
+    alone, (beside, lost) = sharpness([wall]), sharpness([wall, scattered])
+    assert lost is None and beside == alone[0]
+
+
+def test_disagreement_is_the_distance_of_motions_not_of_positions():
+    steps = np.tile(lie.exp(np.array([1.0, 0.0, 0.1])), (30, 1, 1))
+    way = np.array([np.linalg.matrix_power(steps[0], k) for k in range(30)])
+    turned = lie.exp(np.array([5.0, 2.0, 1.0])) @ way
+    longer = np.array([np.linalg.matrix_power(lie.exp(np.array([1.01, 0.0, 0.1])), k) for k in range(30)])
+    apart_m = disagreement([way, turned, longer, way[:0]])
+    assert apart_m[0, 1] == pytest.approx(0.0, abs=1e-12)
+    assert apart_m[0, 2] == pytest.approx(0.01, rel=0.01)
+    assert np.isnan(apart_m[3]).all() and np.isnan(apart_m[:, 3]).all()
+
+
+@pytest.mark.parametrize("k", [3, 6])
+def test_errors_drawn_from_the_covariances_have_a_nees_of_one(k):
+    rng = np.random.default_rng(k)
+    count = 4000
+    truth = lie.exp(rng.normal(scale=0.3, size=(count, k)))
+    roots = 0.01 * rng.normal(size=(count, k, k))
+    covariances = roots @ np.swapaxes(roots, 1, 2) + 1e-6 * np.eye(k)
+    errors = np.einsum("nij,nj->ni", np.linalg.cholesky(covariances), rng.normal(size=(count, k)))
+    nees = motion_nees(truth @ lie.exp(errors), covariances, truth)
+    assert nees.mean() == pytest.approx(1.0, abs=0.06)
+    twice = motion_nees(truth @ lie.exp(errors), 4.0 * covariances, truth)
+    np.testing.assert_allclose(twice, 0.25 * nees)
+    covariances[7] = np.nan
+    assert np.flatnonzero(np.isnan(motion_nees(truth, covariances, truth))).tolist() == [6, 7]

@@ -60,7 +60,8 @@ class Spawns(StandsStill):
     def misbehave(self):
         if self.scans == 11:
             child = subprocess.Popen(["sleep", "600"], start_new_session=self.is_away)
-            Path(os.environ["SPAWNED_FILE"]).write_text(str(child.pid))
+            with Path(os.environ["SPAWNED_FILE"]).open("a") as file:
+                print(child.pid, file=file)
             time.sleep(0.5)
 
 

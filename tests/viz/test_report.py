@@ -20,8 +20,7 @@ from mcap.writer import Writer
 from rerun.chunk import RrdReader
 
 from scanchain.__main__ import main
-from scanchain.comparison.figures import COLUMNS
-from scanchain.comparison.table import read_table
+from scanchain.comparison.table import COLUMNS, read_table
 from scanchain.logs.writer import ORIGIN, LogWriter, pack_laser_scan, pack_odometry
 from scanchain.maps import read_ply
 from scanchain.runs.metrics import Metrics

@@ -9,4 +9,3 @@ from scanchain.baselines.baseline import Baseline as Baseline
 from scanchain.baselines.baseline import InPlane as InPlane
 from scanchain.baselines.wrapped import BASELINES as BASELINES
 from scanchain.baselines.wrapped import Entry as Entry
-from scanchain.baselines.wrapped import create as create

@@ -91,13 +91,8 @@ class InPlane:
     def __init__(self, baseline: Baseline, *, is_raised: bool) -> None:
         self.baseline = baseline
         self.heights_m = _STEP_M * (np.arange(_LEVELS) - _LEVELS // 2) if is_raised else np.zeros(1)
-
-    @property
-    def description(self) -> str:
-        """Method and parameters, and how 2D scans are given to it."""
-        levels = len(self.heights_m)
-        how = f"{levels} copies {_STEP_M:g} m above each other" if levels > 1 else "at z = 0"
-        return f"{self.baseline.description}; 2D scans {how}"
+        how = f"{_LEVELS} copies {_STEP_M:g} m above each other" if is_raised else "at z = 0"
+        self.description = f"{baseline.description}; 2D scans {how}"
 
     def track(self, points: RawPoints, times_s: NDArray[np.float32], stamp_ns: int) -> Pose:
         """T_odom_lidar (3, 3) of points (N, 2)."""

@@ -8,7 +8,6 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from types import ModuleType
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -19,9 +18,17 @@ from scanchain import lie
 from scanchain.baselines.baseline import AtStamp, Baseline, finite, middle
 from scanchain.config import Count, NonNegative, Positive
 from scanchain.data import Pose, RawPoints
-from scanchain.errors import InputError, MissingExtraError
+from scanchain.errors import MissingExtraError
 
 _DISTORTED = 2  # it deskews by the motion before, and has none for its first two scans
+
+
+def _imported(module: str, package: str) -> Any:
+    """A module of a package that only an extra installs."""
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise MissingExtraError(package, "baselines") from None
 
 
 class KissSettings(Struct, frozen=True, forbid_unknown_fields=True):
@@ -43,12 +50,8 @@ class KissIcp:
     """KISS-ICP: point-to-point, scan to map, adaptive threshold."""
 
     def __init__(self, settings: KissSettings = KISS) -> None:
-        try:
-            from kiss_icp.config.parser import load_config
-            from kiss_icp.kiss_icp import KissICP
-        except ImportError:
-            raise MissingExtraError("kiss-icp", "baselines") from None
-        config = load_config(None)
+        library = _imported("kiss_icp.kiss_icp", "kiss-icp")
+        config = _imported("kiss_icp.config.parser", "kiss-icp").load_config(None)
         config.data.min_range, config.data.max_range = settings.min_range_m, settings.max_range_m
         config.mapping.voxel_size = settings.voxel_size_m
         config.mapping.max_points_per_voxel = settings.max_points_per_voxel
@@ -59,7 +62,7 @@ class KissIcp:
             f"voxels of {settings.voxel_size_m:g} m, {settings.threads or 'all'} threads, its own deskewing where "
             "the log has times"
         )
-        self.odometry = KissICP(config)
+        self.odometry = library.KissICP(config)
         self.at_stamp = AtStamp()
         self.scans = 0
 
@@ -98,12 +101,8 @@ class GenzIcp:
 
     def __init__(self, settings: GenzSettings = GENZ) -> None:
         preset = settings.preset
-        try:
-            from genz_icp.config import load_config
-            from genz_icp.genz_icp import GenZICP
-        except ImportError:
-            raise MissingExtraError("genz-icp", "baselines") from None
-        config = load_config(None)
+        library = _imported("genz_icp.genz_icp", "genz-icp")
+        config = _imported("genz_icp.config", "genz-icp").load_config(None)
         config.data = config.data.model_copy(update={"deskew": True} | _DATA[preset])
         config.mapping = config.mapping.model_copy(update=_MAPPING[preset])
         self.description = (
@@ -112,7 +111,7 @@ class GenzIcp:
             f"{config.mapping.desired_num_voxelized_points} points a scan, all threads; its own deskewing, off in "
             "that file, on where the log has times"
         )
-        self.odometry = GenZICP(config)
+        self.odometry = library.GenZICP(config)
         self.at_stamp = AtStamp()
 
     def track(self, points: RawPoints, times_s: NDArray[np.float32], stamp_ns: int) -> Pose:
@@ -149,55 +148,16 @@ GICP, PLANAR_GICP = GicpSettings(), GicpSettings(downsampling_m=0.05, max_distan
 VGICP, PLANAR_VGICP = VgicpSettings(), VgicpSettings(downsampling_m=0.05, voxel_size_m=0.3)
 
 
-class SmallGicpModel:
-    """Scan to a map of Gaussian voxels (VGICP), started at constant velocity."""
-
-    def __init__(self, settings: VgicpSettings = VGICP) -> None:
-        self.library = _import_small_gicp()
-        self.settings = settings
-        self.threads = settings.threads or os.cpu_count() or 1
-        self.map: Any = self.library.GaussianVoxelMap(settings.voxel_size_m)
-        self.map.set_lru(horizon=settings.horizon, clear_cycle=_CLEAR_CYCLE)
-        self.started = False
-        self.T_odom_lidar = np.eye(4)
-        self.T_previous_current = np.eye(4)
-        self.at_stamp = AtStamp()
-
-    @property
-    def description(self) -> str:
-        """Method and parameters."""
-        return (
-            f"small_gicp VGICP, scan to map, downsampled to {self.settings.downsampling_m:g} m, voxels of "
-            f"{self.settings.voxel_size_m:g} m, "
-            f"{self.threads} threads, constant velocity, no deskewing"
-        )
-
-    def track(self, points: RawPoints, times_s: NDArray[np.float32], stamp_ns: int) -> Pose:
-        """Register one scan against the map, then add it."""
-        frame, times = finite(points, times_s)
-        cloud, _ = _preprocessed(self.library, frame, self.settings, self.threads)
-        if self.started:
-            guess = self.T_odom_lidar @ self.T_previous_current
-            result = self.library.align(self.map, cloud, guess, num_threads=self.threads)
-            T_odom_lidar = lie.normalize(np.array(result.T_target_source))
-            self.T_previous_current = lie.between(self.T_odom_lidar, T_odom_lidar)
-            self.T_odom_lidar = T_odom_lidar
-        self.map.insert(cloud, self.T_odom_lidar)
-        self.started = True
-        return self.at_stamp.move(self.T_odom_lidar, stamp_ns, middle(times))
-
-
-class _Pairs:
-    """Registration of each scan to the one before, started at constant velocity."""
+class _Chained:
+    """Registration of each scan to those before, started at constant velocity."""
 
     def __init__(self) -> None:
         self.previous: Any = None
-        self.T_odom_lidar = np.eye(4)
-        self.T_previous_current = np.eye(4)
+        self.T_odom_lidar, self.T_previous_current = np.eye(4), np.eye(4)
         self.at_stamp = AtStamp()
 
     def track(self, points: RawPoints, times_s: NDArray[np.float32], stamp_ns: int) -> Pose:
-        """Register one scan against the last and chain the motions."""
+        """Register one scan and chain the motions."""
         frame, times = finite(points, times_s)
         cloud = self._prepared(frame)
         if self.previous is not None:
@@ -215,26 +175,33 @@ class _Pairs:
         raise NotImplementedError
 
 
-class SmallGicpPairs(_Pairs):
-    """GICP from each scan to the one before."""
-
-    def __init__(self, settings: GicpSettings = GICP) -> None:
+class _SmallGicp(_Chained):
+    def __init__(self, settings: GicpSettings | VgicpSettings) -> None:
         super().__init__()
-        self.library = _import_small_gicp()
+        self.library = _imported("small_gicp", "small-gicp")
         self.settings = settings
         self.threads = settings.threads or os.cpu_count() or 1
 
-    @property
-    def description(self) -> str:
-        """Method and parameters."""
-        return (
-            f"small_gicp GICP, scan to scan, downsampled to {self.settings.downsampling_m:g} m, "
-            f"correspondences within {self.settings.max_distance_m:g} m, {self.threads} threads, "
-            "constant velocity, no deskewing"
+    def _prepared(self, points: NDArray[np.float64]) -> Any:
+        """Downsampled points with covariances, and their tree."""
+        return self.library.preprocess_points(
+            points,
+            downsampling_resolution=self.settings.downsampling_m,
+            num_neighbors=self.settings.neighbors,
+            num_threads=self.threads,
         )
 
-    def _prepared(self, points: NDArray[np.float64]) -> Any:
-        return _preprocessed(self.library, points, self.settings, self.threads)
+
+class SmallGicpPairs(_SmallGicp):
+    """GICP from each scan to the one before."""
+
+    def __init__(self, settings: GicpSettings = GICP) -> None:
+        super().__init__(settings)
+        self.max_distance_m = settings.max_distance_m
+        self.description = (
+            f"small_gicp GICP, scan to scan, downsampled to {settings.downsampling_m:g} m, correspondences within "
+            f"{settings.max_distance_m:g} m, {self.threads} threads, constant velocity, no deskewing"
+        )
 
     def _registered(self, cloud: Any) -> Pose:
         (target, target_tree), (source, _) = self.previous, cloud
@@ -243,29 +210,29 @@ class SmallGicpPairs(_Pairs):
             source,
             target_tree,
             self.T_previous_current,
-            max_correspondence_distance=self.settings.max_distance_m,
+            max_correspondence_distance=self.max_distance_m,
             num_threads=self.threads,
         )
         return np.array(result.T_target_source)
 
 
-def _preprocessed(
-    library: ModuleType, points: NDArray[np.float64], settings: GicpSettings | VgicpSettings, threads: int
-) -> tuple[Any, Any]:
-    """Downsampled points with covariances, and their tree."""
-    return library.preprocess_points(
-        points,
-        downsampling_resolution=settings.downsampling_m,
-        num_neighbors=settings.neighbors,
-        num_threads=threads,
-    )
+class SmallGicpModel(_SmallGicp):
+    """Scan to a map of Gaussian voxels (VGICP), into which the last scan is put first."""
 
+    def __init__(self, settings: VgicpSettings = VGICP) -> None:
+        super().__init__(settings)
+        self.map: Any = self.library.GaussianVoxelMap(settings.voxel_size_m)
+        self.map.set_lru(horizon=settings.horizon, clear_cycle=_CLEAR_CYCLE)
+        self.description = (
+            f"small_gicp VGICP, scan to map, downsampled to {settings.downsampling_m:g} m, voxels of "
+            f"{settings.voxel_size_m:g} m, {self.threads} threads, constant velocity, no deskewing"
+        )
 
-def _import_small_gicp() -> ModuleType:
-    try:
-        return importlib.import_module("small_gicp")
-    except ImportError:
-        raise MissingExtraError("small-gicp", "baselines") from None
+    def _registered(self, cloud: Any) -> Pose:
+        self.map.insert(self.previous[0], self.T_odom_lidar)
+        guess = self.T_odom_lidar @ self.T_previous_current
+        result = self.library.align(self.map, cloud[0], guess, num_threads=self.threads)
+        return lie.between(self.T_odom_lidar, lie.normalize(np.array(result.T_target_source)))
 
 
 Residual = Literal["point-to-plane", "point-to-point", "plane-to-plane"]
@@ -292,7 +259,7 @@ OPEN3D = Open3dSettings()
 PLANAR_OPEN3D = Open3dSettings(voxel_size_m=0.05, max_distance_m=0.5, normal_radius_m=0.5)
 
 
-class Open3dPairs(_Pairs):
+class Open3dPairs(_Chained):
     """Scan-to-scan ICP on downsampled clouds."""
 
     def __init__(self, residual: Residual, settings: Open3dSettings = OPEN3D) -> None:
@@ -304,40 +271,27 @@ class Open3dPairs(_Pairs):
         register, estimation = _REGISTRATIONS[residual]
         self.register, self.estimation = getattr(registration, register), getattr(registration, estimation)()
         self.criteria: Any = registration.ICPConvergenceCriteria(max_iteration=settings.max_iterations)
-
-    @property
-    def description(self) -> str:
-        """Method and parameters."""
-        return (
-            f"Open3D {self.register.__name__}, {self.residual}, scan to scan, voxels of "
-            f"{self.settings.voxel_size_m:g} m, correspondences within {self.settings.max_distance_m:g} m, "
-            f"{self.settings.max_iterations} iterations, constant velocity, no deskewing"
+        self.description = (
+            f"Open3D {register}, {residual}, scan to scan, voxels of {settings.voxel_size_m:g} m, correspondences "
+            f"within {settings.max_distance_m:g} m, {settings.max_iterations} iterations, constant velocity, no "
+            "deskewing"
         )
 
     def _registered(self, cloud: Any) -> Pose:
-        result = self.register(
-            cloud,
-            self.previous,
-            self.settings.max_distance_m,
-            self.T_previous_current,
-            self.estimation,
-            self.criteria,
-        )
+        distance_m, guess = self.settings.max_distance_m, self.T_previous_current
+        result = self.register(cloud, self.previous, distance_m, guess, self.estimation, self.criteria)
         return np.array(result.transformation)
 
     def _prepared(self, points: NDArray[np.float64]) -> Any:
         cloud = self.open3d.geometry.PointCloud(self.open3d.utility.Vector3dVector(points))
         cloud = cloud.voxel_down_sample(self.settings.voxel_size_m)
         if self.residual != "point-to-point":
-            cloud.estimate_normals(
-                self.open3d.geometry.KDTreeSearchParamHybrid(
-                    self.settings.normal_radius_m, self.settings.normal_neighbors
-                )
-            )
+            radius_m, neighbors = self.settings.normal_radius_m, self.settings.normal_neighbors
+            cloud.estimate_normals(self.open3d.geometry.KDTreeSearchParamHybrid(radius_m, neighbors))
         return cloud
 
 
-def _import_open3d() -> ModuleType:
+def _import_open3d() -> Any:
     """Open3D, with the libusb it needs, which slim machines lack, loaded from the package that ships it."""
     try:
         libusb = importlib.import_module("libusb_package")
@@ -346,10 +300,7 @@ def _import_open3d() -> ModuleType:
         path = None
     if path is not None:
         ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
-    try:
-        open3d = importlib.import_module("open3d")
-    except ImportError:
-        raise MissingExtraError("open3d, or the libusb-package that it needs,", "baselines") from None
+    open3d = _imported("open3d", "open3d, or the libusb-package that it needs,")
     open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
     return open3d
 
@@ -376,14 +327,10 @@ class Entry:
     forgets: bool = True
 
 
-def _open3d(residual: Residual, planar: Struct | None, *, is_raised: bool = False) -> Entry:
-    return Entry(partial(Open3dPairs, residual), "open3d", OPEN3D, planar, is_raised)
-
-
 BASELINES: dict[str, Entry] = {
-    "open3d-p2p": _open3d("point-to-point", PLANAR_OPEN3D),
-    "open3d-p2l": _open3d("point-to-plane", None),
-    "open3d-gicp": _open3d("plane-to-plane", PLANAR_OPEN3D, is_raised=True),
+    "open3d-p2p": Entry(partial(Open3dPairs, "point-to-point"), "open3d", OPEN3D, PLANAR_OPEN3D),
+    "open3d-p2l": Entry(partial(Open3dPairs, "point-to-plane"), "open3d", OPEN3D, None),
+    "open3d-gicp": Entry(partial(Open3dPairs, "plane-to-plane"), "open3d", OPEN3D, PLANAR_OPEN3D, is_raised=True),
     "kiss-icp": Entry(KissIcp, "kiss-icp", KISS, PLANAR_KISS),
     "small-gicp": Entry(SmallGicpPairs, "small-gicp", GICP, PLANAR_GICP, is_raised=True),
     "small-vgicp": Entry(SmallGicpModel, "small-gicp", VGICP, PLANAR_VGICP, is_raised=True),
@@ -391,10 +338,3 @@ BASELINES: dict[str, Entry] = {
     "genz-icp-indoor": Entry(GenzIcp, "genz-icp", GenzSettings("indoor"), None, forgets=False),
     "genz-icp-kitti": Entry(GenzIcp, "genz-icp", GenzSettings("kitti"), None, forgets=False),
 }
-
-
-def create(name: str) -> Baseline:
-    """A fresh baseline for 3D scans, as its authors recommend it. Raises InputError for an unknown name."""
-    if name not in BASELINES:
-        raise InputError(f"there is no baseline {name!r}; choose among {', '.join(BASELINES)}")
-    return BASELINES[name].make(BASELINES[name].settings)

@@ -152,7 +152,7 @@ def _tried(task: Task, stop: Event | None) -> Row:
     )
     text = output.read_text(encoding="utf-8", errors="replace")
     own = _own_ending(ending, task, text.splitlines()) if ending.killed_for is KilledFor.NOTHING else None
-    state, reason = own or (_state_of(ending), ending.reason(task.limits, text))
+    state, reason = own or (State(ending.how), ending.reason(task.limits, text))
     run, sha256, metrics = "", "", None
     if state.has_result:
         run, metrics = task.run.name, _metrics(task)
@@ -163,13 +163,6 @@ def _tried(task: Task, stop: Event | None) -> Row:
 
 def _metrics(task: Task) -> Metrics:
     return msgspec.json.decode((task.run / METRICS_FILE).read_bytes(), type=Metrics)
-
-
-def _state_of(ending: Ending) -> State:
-    """End state of a process that was killed or crashed."""
-    if ending.ran_out_of_memory:
-        return State.OUT_OF_MEMORY
-    return {KilledFor.STOP: State.NOT_RUN, KilledFor.TIME: State.TIMED_OUT}.get(ending.killed_for, State.CRASHED)
 
 
 def _own_ending(ending: Ending, task: Task, output: list[str]) -> tuple[State, str] | None:

@@ -13,7 +13,7 @@ from scanchain.commands.options import PATH
 from scanchain.errors import InputError
 
 if TYPE_CHECKING:
-    from scanchain.evaluation.metrics import Result, Results
+    from scanchain.evaluation.metrics import Results
 
 
 @click.command()
@@ -133,13 +133,15 @@ def _text(evaluated: dict[str, Results]) -> str:
 def _table(evaluated: dict[str, Results]) -> str:
     """A row an estimate, and below it the definitions of its columns."""
     computed = dict.fromkeys(key for each in evaluated.values() for key in (*each.found, *each.missing))
-    keys = sorted(computed, key=lambda key: key in ("kitti", "relations"))
-    units = ["%" if key == "kitti" else "mean m" if key == "relations" else "rmse m" for key in keys]
+    keys = sorted(computed, key=lambda key: key in _FIGURES)
+    units, figures = zip(*(_FIGURES.get(key, _RMSE) for key in keys), strict=True)
     rows = [["estimate", "paired", "offset s", "scale", *(key.replace("_", " ") for key in keys)]]
     rows.append([*[""] * 4, *units])
     for name, each in evaluated.items():
-        figures = [_figure(each.found[key]) if key in each.found else "-" for key in keys]
-        rows.append([name, f"{len(each.aligned):,}", f"{each.time_offset_s:.4f}", f"{each.scale:.5g}", *figures])
+        row = [name, f"{len(each.aligned):,}", f"{each.time_offset_s:.4f}", f"{each.scale:.5g}"]
+        for key, figure in zip(keys, figures, strict=True):
+            row.append(f"{figure(each.found[key]):.4f}" if key in each.found else "-")
+        rows.append(row)
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]
     definitions = dict.fromkeys(
@@ -148,13 +150,11 @@ def _table(evaluated: dict[str, Results]) -> str:
     return "\n".join([*lines, *definitions])
 
 
-def _figure(result: Result) -> str:
-    """The one figure of a metric for a table."""
-    from scanchain.evaluation import KittiError, RelationError
-
-    if isinstance(result, KittiError):
-        return f"{100.0 * result.translation_share:.4f}"
-    return f"{result.translation_m.mean if isinstance(result, RelationError) else result.translation_m.rmse:.4f}"
+_RMSE = ("rmse m", lambda error: error.translation_m.rmse)
+_FIGURES = {  # the unit and the one figure of a metric for a table
+    "kitti": ("%", lambda error: 100.0 * error.translation_share),
+    "relations": ("mean m", lambda error: error.translation_m.mean),
+}
 
 
 def _tree(results: Results) -> dict[str, object]:

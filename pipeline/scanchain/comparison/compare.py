@@ -12,11 +12,10 @@ import msgspec
 import numpy as np
 
 from scanchain import lie
-from scanchain.comparison.figures import assess
 from scanchain.comparison.methods import default_names, resolve, shared_settings
 from scanchain.comparison.processes import StoredScans, limits_for, run_all, store
-from scanchain.comparison.results import Reference, Results, write_results
-from scanchain.comparison.table import Table, maps_of, summarize, write_table
+from scanchain.comparison.results import Reference, results_of, summarize, write_results
+from scanchain.comparison.table import Table, write_table
 from scanchain.config import NO_TRUTH
 from scanchain.data import Trajectory, brief
 from scanchain.errors import InputError, counted
@@ -102,7 +101,7 @@ def compare(comparison: Comparison, present: Callable[[Path], None], progress: P
         shared = directory.path / _SHARED
         shared.mkdir()
         decoded = progress.track(log.scans(settings.config.preprocess), log.scan_count)
-        scans = store(decoded, log.T_base_lidar, shared)
+        scans = store(decoded, log.T_base_lidar, shared / "scans")
         stopped = (
             f"the user stopped the reading: {counted(len(scans), 'scan')} compared" if progress.stopped else ""
         )
@@ -110,11 +109,7 @@ def compare(comparison: Comparison, present: Callable[[Path], None], progress: P
         limits = limits_for(len(scans), comparison.time_s, comparison.memory_mib)
         outcomes = run_all(methods, scans, shared, repeat=comparison.repeat, limits=limits, progress=progress)
         progress.announce("evaluating and drawing")
-        assessed = {
-            name: assess(runs, scans.stamps_ns, reference.truth, reference.relations)
-            for name, runs in outcomes.items()
-        }
-        results = Results(methods, scans, outcomes, assessed, maps_of(scans, outcomes), reference)
+        results = results_of(methods, scans, outcomes, reference)
         write_results(directory.path, results)
         provenance = msgspec.structs.replace(
             provenance.hashed(hashing), complete=True, stopped=stopped, duration_s=perf_counter() - began

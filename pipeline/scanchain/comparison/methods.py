@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,19 +15,11 @@ from scanchain.config import MATCHERS, Config
 from scanchain.errors import InputError
 from scanchain.plugins import is_class_name
 from scanchain.registration import create_matcher
-from scanchain.settings import Override, load_settings
+from scanchain.settings import Override, load_settings, read_toml
 
 _ANY = "matcher"  # ours with the matcher that the settings name
 OURS = (*MATCHERS, *(f"{name}+loops" for name in MATCHERS), _ANY, f"{_ANY}+loops")
-_ON_REQUEST = (
-    *(
-        name
-        for name in OURS
-        if name.partition("+")[0] == _ANY or (name.endswith("+loops") and name != "plicp+loops")
-    ),
-    "genz-icp-indoor",
-    "genz-icp-kitti",
-)
+_ON_REQUEST = ("genz-icp-indoor", "genz-icp-kitti")
 _BASE = "method"  # the key of a table that names the method it is a variant of
 _KINDS = ("matching.matcher", "loops.enabled")  # keys that tell ours apart
 _SECTIONS = Config.__struct_fields__
@@ -58,13 +49,9 @@ class Method(Struct, frozen=True):
 
 def default_names(dimension: int) -> tuple[str, ...]:
     """Methods that apply to logs of this dimension."""
-    ours = [name for name in OURS if name not in _ON_REQUEST]
-    others = [
-        name
-        for name, entry in BASELINES.items()
-        if name not in _ON_REQUEST and (dimension == 3 or entry.planar is not None)
-    ]
-    return (*ours, *others)
+    others = [name for name in BASELINES if name not in _ON_REQUEST]
+    planar = [name for name in others if BASELINES[name].planar is not None]
+    return (*MATCHERS, "plicp+loops", *(others if dimension == 3 else planar))
 
 
 def resolve(
@@ -105,39 +92,40 @@ def resolve(
             raise InputError(
                 f"{override.flag} distinguishes plicp, svd and +loops; choose by --methods or --matcher"
             )
-    return tuple(_method(name, tables.get(name, {}), dimension, file, overrides) for name in names)
+    ours = (shared_settings(file), overrides)
+    return tuple(_method(name, tables.get(name, {}), dimension, f"{file}: [{name}]", *ours) for name in names)
 
 
 def shared_settings(file: Path | None) -> tuple[Override, ...]:
     """The keys that the sections of a file set for the log and all of ours, but for those that tell them apart."""
     sections = {name: table for name, table in _tables(file).items() if name in _SECTIONS}
-    return tuple(
-        Override(key, str(value), f"{file}: {key}")
-        for section, keys in sections.items()
-        for key, value in _by_key(section, keys).items()
-        if key not in _KINDS
-    )
+    return tuple(each for each in _overrides(sections, f"{file}:") if each.key not in _KINDS)
 
 
 def _method(
-    name: str, table: Mapping[str, Any], dimension: int, file: Path | None, overrides: Sequence[Override]
+    name: str,
+    table: Mapping[str, Any],
+    dimension: int,
+    where: str,
+    shared: Sequence[Override],
+    overrides: Sequence[Override],
 ) -> Method:
+    """The method of a name with its table, which ``where`` names in errors."""
     base, own = str(table.get(_BASE, name)), {key: value for key, value in table.items() if key != _BASE}
-    where = f"{file}: [{name}]"
     if name.startswith("."):
         raise InputError(f"{name!r} cannot be a folder's name; let the method's begin with a letter")
     if base in OURS:
-        return Method(name, base, _our_settings(base, own, dimension, where, shared_settings(file), overrides))
-    if base in BASELINES:
-        return Method(name, base, _their_settings(name, base, own, dimension, where))
-    if is_class_name(base):
-        return Method(name, base, own)
-    known, word = (*OURS, *BASELINES), base.lower()
-    near = [each for each in known if word in each] or difflib.get_close_matches(word, known) or known
-    raise InputError(
-        f"there is no method {base!r}; choose among {', '.join(near)}, or say in --config what [{name}] is a "
-        "variant of"
-    )
+        own = _our_settings(base, _overrides(own, where), dimension, shared, overrides)
+    elif base in BASELINES:
+        own = _their_settings(name, base, own, dimension, where)
+    elif not is_class_name(base):
+        known, word = (*OURS, *BASELINES), base.lower()
+        near = [each for each in known if word in each] or difflib.get_close_matches(word, known) or known
+        raise InputError(
+            f"there is no method {base!r}; choose among {', '.join(near)}, or say in --config what [{name}] is a "
+            "variant of"
+        )
+    return Method(name, base, own)
 
 
 def _spelled_out(name: str, dimension: int) -> Sequence[str]:
@@ -164,9 +152,8 @@ def _their_settings(name: str, base: str, own: Mapping[str, Any], dimension: int
 
 def _our_settings(
     base: str,
-    own: Mapping[str, Any],
+    own: Sequence[Override],
     dimension: int,
-    where: str,
     shared: Sequence[Override],
     overrides: Sequence[Override],
 ) -> dict[str, Any]:
@@ -175,38 +162,28 @@ def _our_settings(
     kind = {"loops.enabled": str("+" in base).lower()}
     if base.partition("+")[0] != _ANY:
         kind["matching.matcher"] = base.partition("+")[0]
-    table = [
-        Override(key, str(value), f"{where} {key}")
-        for section, keys in own.items()
-        for key, value in _by_key(section, keys).items()
-    ]
-    for each in table:
+    for each in own:
         if each.key.partition(".")[0] in _SHARED:
             raise InputError(f"{each.flag} holds for all methods; give it as --{each.key}")
         if each.text.lower() != kind.get(each.key, each.text.lower()):
             raise InputError(f"{each.flag} is {each.text}, but {base} has {kind[each.key]}; choose another method")
     fixed = [Override(key, text, "scanchain compare") for key, text in kind.items()]
-    config = load_settings(dimension, overrides=(wheels, *shared, *table, *overrides, *fixed)).config
+    config = load_settings(dimension, overrides=(wheels, *shared, *own, *overrides, *fixed)).config
     create_matcher(config.matching)  # raises InputError where a user's class cannot be loaded
     return {name: keys for name, keys in msgspec.to_builtins(config).items() if name not in _SHARED}
 
 
-def _by_key(section: str, keys: Any) -> dict[str, Any]:
-    """The values of a table, or of what should have been one, by the keys of the configuration."""
-    return (
-        {f"{section}.{key}": value for key, value in keys.items()} if isinstance(keys, dict) else {section: keys}
-    )
+def _overrides(sections: Mapping[str, Any], where: str) -> list[Override]:
+    """The keys of sections, or of what should have been some, as if set on the command line."""
+    found: dict[str, Any] = {}
+    for section, table in sections.items():
+        is_table = isinstance(table, dict)
+        found |= {f"{section}.{key}": value for key, value in table.items()} if is_table else {section: table}
+    return [Override(key, str(value), f"{where} {key}") for key, value in found.items()]
 
 
 def _tables(file: Path | None) -> dict[str, dict[str, Any]]:
-    if file is None:
-        return {}
-    try:
-        tree = tomllib.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read ({error.strerror}); --config takes a TOML file") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: is not TOML: {' '.join(str(error).split())}") from None
+    tree = {} if file is None else read_toml(file)
     for name, table in tree.items():
         if not isinstance(table, dict):
             raise InputError(f"{file}: {name} is no table; write [METHOD] above the keys of a method")

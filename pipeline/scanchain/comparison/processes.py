@@ -7,8 +7,9 @@ memory of a method would grow with the log. Straight after decoding the files li
 from __future__ import annotations
 
 import os
+import pickle
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 
@@ -23,9 +24,7 @@ from scanchain.errors import counted
 from scanchain.processes import KilledFor, Limits, available_mib, run_within
 from scanchain.runs.job import Progress
 
-_ARRAYS, _TABLE = "points_and_times.npy", "scans.npz"
-POSES_FILE, SECONDS_FILE, CPU_FILE = "poses.npy", "seconds.npy", "cpu_seconds.npy"
-METHOD_FILE, TRAJECTORY_FILE, REPORT_FILE = "method.msgpack", "trajectory.npy", "end.json"
+TASK_FILE, TRACK_FILE, TRAJECTORY_FILE, REPORT_FILE = "task.pickle", "track.npy", "trajectory.npy", "end.json"
 STEPS_FILE, CLOSURES_FILE = "steps.parquet", "loops.parquet"
 
 _LEAST_S, _SCAN_S = 300.0, 1.0  # default time limit, seconds: at least, and for each scan
@@ -35,22 +34,20 @@ _INTERVAL_S = 0.02  # between two readings of a process's memory
 
 @dataclass(frozen=True, slots=True)
 class StoredScans:
-    """The scans of a folder, row by row.
+    """Scans in a file, one behind the other, and what is known of all of them.
 
     Attributes
     ----------
-    folder : where their points and times lie
     points : (N,) numbers of points of each scan
-    stamps_ns, log_times_ns, dropped : (N,) as in ``Scan``
+    stamps_ns, log_times_ns : (N,) as in ``Scan``
     wheels : (N, d+1, d+1) T_odom_base, NaN where the log has none
     T_base_lidar : (d+1, d+1)
     """
 
-    folder: Path
+    file: Path
     points: NDArray[np.int64]
     stamps_ns: NDArray[np.int64]
     log_times_ns: NDArray[np.int64]
-    dropped: NDArray[np.int64]
     wheels: NDArray[np.float64]
     T_base_lidar: Pose
 
@@ -62,42 +59,31 @@ class StoredScans:
         """2 or 3."""
         return len(self.T_base_lidar) - 1
 
+    @property
+    def track_type(self) -> np.dtype[np.void]:
+        """A row of the file that a method's process writes scan by scan."""
+        size = self.dimension + 1
+        return np.dtype([("pose", np.float64, (size, size)), ("seconds", np.float64), ("cpu_seconds", np.float64)])
+
     def scans(self) -> Iterator[Scan]:
         """The scans as they were decoded."""
-        with (self.folder / _ARRAYS).open("rb") as arrays:
-            for index, wheels in enumerate(self.wheels):
-                yield Scan(
-                    index=index,
-                    stamp_ns=int(self.stamps_ns[index]),
-                    log_time_ns=int(self.log_times_ns[index]),
-                    points=np.load(arrays),
-                    times_s=np.load(arrays),
-                    dropped=int(self.dropped[index]),
-                    T_odom_base=wheels if np.isfinite(wheels).all() else None,
-                )
+        with self.file.open("rb") as file:
+            for _ in range(len(self)):
+                yield pickle.load(file)
 
 
-def store(scans: Iterable[Scan], T_base_lidar: Pose, folder: Path) -> StoredScans:
-    """Write scans into an empty folder."""
+def store(scans: Iterable[Scan], T_base_lidar: Pose, path: Path) -> StoredScans:
+    """Write scans into a file."""
     rows: list[tuple[int, ...]] = []
     wheels: list[Pose] = []
     unknown = np.full(T_base_lidar.shape, np.nan)
-    with (folder / _ARRAYS).open("wb") as arrays:
+    with path.open("wb") as file:
         for scan in scans:
-            rows.append((len(scan.points), scan.stamp_ns, scan.log_time_ns, scan.dropped))
+            pickle.dump(scan, file, pickle.HIGHEST_PROTOCOL)
+            rows.append((len(scan.points), scan.stamp_ns, scan.log_time_ns))
             wheels.append(unknown if scan.T_odom_base is None else scan.T_odom_base)
-            np.save(arrays, np.ascontiguousarray(scan.points, np.float32))
-            np.save(arrays, np.ascontiguousarray(scan.times_s, np.float32))
-    np.savez(folder / _TABLE, rows=np.array(rows, np.int64), wheels=np.array(wheels), T_base_lidar=T_base_lidar)
-    return open_store(folder)
-
-
-def open_store(folder: Path) -> StoredScans:
-    """The scans that ``store`` wrote."""
-    with np.load(folder / _TABLE) as table:
-        points, stamps_ns, log_times_ns, dropped = table["rows"].T.copy()
-        wheels, T_base_lidar = table["wheels"], table["T_base_lidar"]
-    return StoredScans(folder, points, stamps_ns, log_times_ns, dropped, wheels, T_base_lidar)
+    points, stamps_ns, log_times_ns = np.array(rows, np.int64).T.copy()
+    return StoredScans(path, points, stamps_ns, log_times_ns, np.array(wheels), T_base_lidar)
 
 
 class Status(StrEnum):
@@ -163,17 +149,14 @@ class Outcome:
         return self.report.status is Status.OK
 
 
-def read_outcome(folder: Path, report: EndReport, stamps_ns: NDArray[np.int64], dimension: int) -> Outcome:
+def read_outcome(folder: Path, report: EndReport, scans: StoredScans) -> Outcome:
     """Outcome of a run from its folder, complete or not."""
-    size = dimension + 1
-    empty = np.full((len(stamps_ns), size, size), np.nan)
-    odometry = np.load(folder / POSES_FILE) if (folder / POSES_FILE).exists() else empty
-    seconds, cpu_seconds = (
-        np.load(folder / file) if (folder / file).exists() else empty[:, 0, 0] for file in (SECONDS_FILE, CPU_FILE)
-    )
-    is_whole = report.status is Status.OK
-    poses = np.load(folder / TRAJECTORY_FILE) if is_whole else empty[:0]
-    return Outcome(report, odometry, Trajectory(stamps_ns[: len(poses)], poses), seconds, cpu_seconds, folder)
+    is_written = (folder / TRACK_FILE).exists()
+    track = np.load(folder / TRACK_FILE) if is_written else np.full(len(scans), np.nan, scans.track_type)
+    odometry, seconds, cpu_seconds = (np.ascontiguousarray(track[name]) for name in scans.track_type.names or ())
+    poses = np.load(folder / TRAJECTORY_FILE) if report.status is Status.OK else odometry[:0]
+    trajectory = Trajectory(scans.stamps_ns[: len(poses)], poses)
+    return Outcome(report, odometry, trajectory, seconds, cpu_seconds, folder)
 
 
 def limits_for(scans: int, time_s: float | None, memory_mib: float | None) -> Limits:
@@ -204,52 +187,36 @@ def run_all(
 
 
 def _run(method: Method, scans: StoredScans, folder: Path, limits: Limits) -> Outcome:
+    """A run in a process of its own; its folder takes what it writes and prints."""
     folder.mkdir()
-    report = run_watched(method, scans.folder, folder, limits)
-    return read_outcome(folder, report, scans.stamps_ns, scans.dimension)
+    (folder / TASK_FILE).write_bytes(pickle.dumps((method, scans)))
+    # small_gicp's threads spin by default: where somebody else has a core, they spin away the other thread's time
+    environment = os.environ | {"OMP_WAIT_POLICY": os.environ.get("OMP_WAIT_POLICY", "PASSIVE")}
+    output, own = folder / "output.txt", folder / REPORT_FILE
+    ending = run_within(
+        limits, "scanchain.comparison.worker", [str(folder)], environment, output=output, interval_s=_INTERVAL_S
+    )
+    if ending.killed_for is KilledFor.NOTHING and own.exists():
+        report = msgspec.json.decode(own.read_bytes(), type=EndReport)
+    else:
+        reason = ending.reason(limits, output.read_text(errors="replace"))
+        report = EndReport(Status(ending.how), reason, peak_mib=ending.peak_mib)
+    outcome = read_outcome(folder, report, scans)
+    if not report.status.is_failure:
+        return outcome
+    return replace(outcome, report=msgspec.structs.replace(report, reason=f"{_where(outcome)}: {report.reason}"))
+
+
+def _where(outcome: Outcome) -> str:
+    """Stage at which it ended."""
+    if not (outcome.folder / TRACK_FILE).exists():
+        return "while starting or warming up"
+    tracked = int(np.isfinite(outcome.seconds).sum())
+    return f"at scan {tracked}" if tracked < len(outcome.seconds) else "after the last scan"
 
 
 def _progress_line(name: str, turn: int, repeat: int, outcome: Outcome) -> str:
     which = f" {turn + 1}/{repeat}" if repeat > 1 else ""
-    if outcome.report.status is Status.OK:
+    if outcome.is_whole:
         return f"{name}{which}: {counted(len(outcome.seconds), 'scan')} in {outcome.seconds.sum():.1f} s"
     return f"{name}{which}: {outcome.report.status}: {outcome.report.reason}"
-
-
-def run_watched(method: Method, scans: Path, folder: Path, limits: Limits) -> EndReport:
-    """Run a method over stored scans; its own folder takes what it writes and prints."""
-    (folder / METHOD_FILE).write_bytes(msgspec.msgpack.encode(method))
-    # small_gicp's threads spin by default: where somebody else has a core, they spin away the other thread's time
-    environment = os.environ | {"OMP_WAIT_POLICY": os.environ.get("OMP_WAIT_POLICY", "PASSIVE")}
-    ending = run_within(
-        limits,
-        "scanchain.comparison.worker",
-        [str(scans), str(folder)],
-        environment,
-        output=folder / "output.txt",
-        interval_s=_INTERVAL_S,
-    )
-    if ending.killed_for is KilledFor.NOTHING and (folder / REPORT_FILE).exists():
-        return _own_report(folder)
-    status = Status.OUT_OF_MEMORY if ending.ran_out_of_memory else Status.CRASHED
-    if ending.killed_for is KilledFor.TIME:
-        status = Status.TIMED_OUT
-    reason = ending.reason(limits, (folder / "output.txt").read_text(errors="replace"))
-    return EndReport(status, f"{_where(folder)}: {reason}", peak_mib=ending.peak_mib)
-
-
-def _own_report(folder: Path) -> EndReport:
-    """Report of the process itself, with the scan at which it failed."""
-    report = msgspec.json.decode((folder / REPORT_FILE).read_bytes(), type=EndReport)
-    if not report.status.is_failure:
-        return report
-    return msgspec.structs.replace(report, reason=f"{_where(folder)}: {report.reason}")
-
-
-def _where(folder: Path) -> str:
-    """Stage at which it ended."""
-    if not (folder / SECONDS_FILE).exists():
-        return "while starting or warming up"
-    seconds = np.load(folder / SECONDS_FILE)
-    tracked = int(np.isfinite(seconds).sum())
-    return f"at scan {tracked}" if tracked < len(seconds) else "after the last scan"

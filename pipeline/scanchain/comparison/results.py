@@ -1,4 +1,4 @@
-"""Results of a comparison, and its files beside the table: tables of scans and relations, a folder a method."""
+"""Results of a comparison: figures of its methods, tables of scans and relations, a folder for each method."""
 
 from __future__ import annotations
 
@@ -15,20 +15,42 @@ import tomli_w
 from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.comparison.figures import Assessed, assess, observability, representative
+from scanchain.baselines import BASELINES
 from scanchain.comparison.methods import Method
-from scanchain.comparison.processes import CLOSURES_FILE, STEPS_FILE, Outcome, StoredScans
-from scanchain.data import Matrix, Points, Trajectory
-from scanchain.evaluation import Relations, during
-from scanchain.evaluation.absolute import path_length
+from scanchain.comparison.processes import CLOSURES_FILE, STEPS_FILE, Outcome, Status, StoredScans
+from scanchain.comparison.table import COLUMNS, Row, Table
+from scanchain.data import Points, Pose, Trajectory
+from scanchain.errors import InputError
+from scanchain.evaluation import (
+    KittiError,
+    RelationError,
+    Relations,
+    absolute_error_of_any_path,
+    disagreement,
+    during,
+    pair,
+    relation_error,
+    relative_errors,
+    sampled_map,
+    sampling_step,
+    sharpness,
+)
+from scanchain.evaluation.errors import path_length
+from scanchain.logs import Log
 from scanchain.maps import write_ply
-from scanchain.runs.step_table import pose_columns
+from scanchain.processes import Limits
+from scanchain.runs.provenance import Provenance, package_version
+from scanchain.runs.step_table import COLUMNS as NEES_COLUMNS
+from scanchain.runs.step_table import nees_of_steps, pose_columns
+from scanchain.runs.vouching import evidence_of_trajectory, expected_of_run, judge_run
 from scanchain.trajectory import write_tum
+from scanchain.verdict import Judged, Verdict, apart_m, judge
 
 SCANS_FILE, RELATIONS_FILE = "per_scan.parquet", "per_relation.parquet"
 SETTINGS_FILE, TRUTH_FILE = "settings.toml", "ground_truth.tum"
-_PICTURE_POINTS = 150_000
 METHODS_FOLDER, MAP_FILE, TRAJECTORY_FILE = "methods", "map.ply", "trajectory.tum"
+_PICTURE_POINTS = 150_000
+_INTERVALS = ((1.0, "s"), (10.0, "m"), (100.0, "m"))  # of the RPE
 _NOTES = {
     "x y z qx qy qz qw": "final T_world_lidar of the method",
     "aligned_*": "the same position in the frame of the ground truth, as for the ATE",
@@ -50,6 +72,125 @@ class Reference:
 
 
 @dataclass(frozen=True, slots=True)
+class Assessed:
+    """Figures of a method over the N scans, by key of ``COLUMNS``, and scan by scan.
+
+    Attributes
+    ----------
+    T_reference_estimate : (4, 4) the alignment of the ATE; the true first pose of one that did not come to its
+        end; the identity without truth
+    by_scan : (N,) ``error_m``, ``error_rad`` and ``nees``, NaN where a scan has no true pose beside it
+    relations : the error over relations; None without any, or after a failure
+    definitions : of the figures, as text
+    """
+
+    figures: dict[str, float | None]
+    T_reference_estimate: Pose
+    by_scan: dict[str, NDArray[np.float64]]
+    relations: RelationError | None
+    definitions: list[str]
+
+
+def assess(outcomes: Sequence[Outcome], stamps_ns: NDArray[np.int64], reference: Reference) -> Assessed:
+    """Figures of a method's runs over scans of these stamps: errors of the first whole one, times of all."""
+    outcome, truth = representative(outcomes), reference.truth
+    by_scan = {name: np.full(len(stamps_ns), np.nan) for name in ("error_m", "error_rad", "nees")}
+    if not outcome.is_whole:
+        return Assessed(_speed(outcomes), _start(stamps_ns, truth), by_scan, None, [])
+    figures: dict[str, float | None] = _speed(outcomes) | {"repeats_apart_m": _apart_m(outcomes)}
+    error, definitions = None, []
+    if reference.relations is not None:
+        error = relation_error(outcome.trajectory, reference.relations)
+        figures |= {"relations_m": error.translation_m.mean, "relations_rad": error.rotation_rad.mean}
+        definitions.append(error.definition)
+    pairs = None if truth is None else pair(outcome.trajectory, truth)
+    if truth is None or pairs is None or len(pairs) < 2:  # one pose has no error after alignment
+        return Assessed(figures, np.eye(4), by_scan, error, definitions)
+    ate = absolute_error_of_any_path(pairs)
+    by_scan["error_m"][pairs.places], by_scan["error_rad"][pairs.places] = ate.errors_m, ate.errors_rad
+    if (steps := _steps(outcome, *NEES_COLUMNS)) is not None:
+        by_scan["nees"] = nees_of_steps(steps, Trajectory(stamps_ns, outcome.odometry), truth)
+    nees = by_scan["nees"]
+    figures |= {
+        "ate_m": ate.translation_m.rmse,
+        "ate_share": ate.share_of_path,
+        "ate_rotation_rad": ate.rotation_rad.rmse,
+        "paired_share": pairs.share,
+        "nees": float(np.nanmean(nees)) if np.isfinite(nees).any() else None,
+    }
+    relative, _ = relative_errors(pairs, _INTERVALS)
+    for name, each in relative.items():
+        if isinstance(each, KittiError):
+            figures |= {"kitti_share": each.translation_share, "kitti_rad_per_m": each.rotation_rad_per_m}
+        else:
+            figures[f"{name}_m"] = each.translation_m.rmse
+    definitions += [each.definition for each in (ate, *relative.values())]
+    return Assessed(
+        figures, ate.T_reference_estimate, by_scan, error, [*definitions, f"Paired: {pairs.description}"]
+    )
+
+
+def representative(outcomes: Sequence[Outcome]) -> Outcome:
+    """The first whole run, else the first."""
+    return next((outcome for outcome in outcomes if outcome.is_whole), outcomes[0])
+
+
+def _steps(outcome: Outcome, *columns: str) -> pa.Table | None:
+    """Columns of the table that only our methods write."""
+    path = outcome.folder / STEPS_FILE
+    return pq.read_table(path, columns=list(columns)) if path.exists() else None
+
+
+def _start(stamps_ns: NDArray[np.int64], truth: Trajectory | None) -> Pose:
+    """True first pose of a method that begins with the identity."""
+    if truth is None:
+        return np.eye(4)
+    try:
+        return pair(Trajectory(stamps_ns[:1], np.eye(4)[None]), truth).reference[0]
+    except InputError:  # the truth begins later
+        return np.eye(4)
+
+
+def _speed(outcomes: Sequence[Outcome]) -> dict[str, float | None]:
+    """From all runs that came to their end; the first scan of each stands apart."""
+    whole = [outcome for outcome in outcomes if outcome.is_whole]
+    if not whole:
+        peak = max(outcome.report.peak_mib for outcome in outcomes)
+        return {"peak_mib": peak} if outcomes[0].report.status.is_failure and peak else {}
+    first = min(1, len(whole[0].seconds) - 1)
+    rest = np.concatenate([outcome.seconds[first:] for outcome in whole])
+    cpu = np.concatenate([outcome.cpu_seconds[first:] for outcome in whole])
+    return {
+        "median_s": float(np.median(rest)),
+        "p95_s": float(np.percentile(rest, 95.0)),
+        "cpu_s": float(np.median(cpu)),
+        "first_s": float(np.median([outcome.seconds[0] for outcome in whole])),
+        "scans_per_s": float(len(rest) / rest.sum()),
+        **_stages(whole[0]),
+        "start_s": float(np.median([outcome.report.start_s for outcome in whole])),
+        "finish_s": float(np.median([outcome.report.finish_s for outcome in whole])),
+        "peak_mib": max(outcome.report.peak_mib for outcome in whole),
+    }
+
+
+def _stages(outcome: Outcome) -> dict[str, float]:
+    """Seconds by stage of a method that reports them; the mean for loops, most scans of which take nothing."""
+    table = _steps(outcome, "preprocess_s", "match_s", "map_s", "loops_s")
+    if table is None or len(table) < 2:
+        return {}
+    seconds = {name: table[name].to_numpy()[1:] for name in table.column_names}
+    loops = seconds.pop("loops_s")
+    medians = {name: float(np.median(each)) for name, each in seconds.items()}
+    return medians | ({"loops_s": float(loops.mean())} if loops.any() else {})
+
+
+def _apart_m(outcomes: Sequence[Outcome]) -> float | None:
+    """Largest distance between the positions of a scan in two runs."""
+    first, *others = (outcome.trajectory.poses[:, :-1, -1] for outcome in outcomes if outcome.is_whole)
+    return max((float(np.linalg.norm(each - first, axis=1).max()) for each in others), default=None)
+
+
+@dataclass(frozen=True, slots=True)
 class Results:
     """All runs of all methods by name, the figures of each, and the map (M, d) of each finished one."""
 
@@ -59,6 +200,20 @@ class Results:
     assessed: Mapping[str, Assessed]
     maps: Mapping[str, Points]
     reference: Reference
+
+
+def results_of(
+    methods: Sequence[Method], scans: StoredScans, outcomes: Mapping[str, list[Outcome]], reference: Reference
+) -> Results:
+    """Figures and maps of all methods."""
+    assessed = {name: assess(runs, scans.stamps_ns, reference) for name, runs in outcomes.items()}
+    step, chosen = sampling_step(int(scans.points.sum())), map(representative, outcomes.values())
+    maps = {
+        name: sampled_map(scans.scans(), outcome.trajectory, step)
+        for name, outcome in zip(outcomes, chosen, strict=True)
+        if outcome.is_whole
+    }
+    return Results(methods, scans, outcomes, assessed, maps, reference)
 
 
 def write_results(folder: Path, results: Results) -> None:
@@ -79,12 +234,14 @@ def method_folder(folder: Path, name: str) -> Path:
 
 
 def _write_method(own: Path, results: Results, name: str) -> None:
-    outcome, assessed = representative(results.outcomes[name]), results.assessed[name]
+    outcome, T = representative(results.outcomes[name]), results.assessed[name].T_reference_estimate
     own.mkdir(parents=True)
     if outcome.is_whole:
         write_tum(own / TRAJECTORY_FILE, outcome.trajectory)
     if name in results.maps:
-        write_ply(own / MAP_FILE, _picture_points(results.maps[name], assessed))
+        points = results.maps[name]
+        some = points[:: max(1, -(-len(points) // _PICTURE_POINTS))]
+        write_ply(own / MAP_FILE, lie.transform(lie.flatten(T) if points.shape[1] == 2 else T, some))
     for file in (STEPS_FILE, CLOSURES_FILE, "output.txt"):
         source = outcome.folder / file
         if source.exists() and source.stat().st_size:
@@ -95,18 +252,6 @@ def _write_tables(path: Path, tables: Sequence[pa.Table], notes: Mapping[str, st
     """Write tables one below the other, where there are any."""
     if tables:
         pq.write_table(pa.concat_tables(tables).replace_schema_metadata(notes), path, compression="zstd")
-
-
-def _scans(results: Results) -> list[pa.Table]:
-    """The scans of all runs, each with its own errors, those that failed up to where they came."""
-    stamps_ns, truth = results.scans.stamps_ns, results.reference.truth
-    tables = []
-    for name, outcomes in results.outcomes.items():
-        for repeat, outcome in enumerate(outcomes):
-            is_representative = outcome is representative(outcomes)
-            assessed = results.assessed[name] if is_representative else assess([outcome], stamps_ns, truth, None)
-            tables.append(_table(name, repeat, outcome, assessed, stamps_ns))
-    return tables
 
 
 def _relations(assessed: Mapping[str, Assessed]) -> list[pa.Table]:
@@ -125,45 +270,121 @@ def _relations(assessed: Mapping[str, Assessed]) -> list[pa.Table]:
     ]
 
 
-def _final_poses(outcome: Outcome) -> Matrix:
-    """(M, 4, 4) the final poses, or what there is of a run that failed."""
-    poses = outcome.trajectory.poses if len(outcome.trajectory) else outcome.odometry
-    broken = np.flatnonzero(~np.isfinite(poses).reshape(len(poses), -1).all(axis=1))
-    return lie.lift(poses[: broken[0]] if len(broken) else poses)
+def _scans(results: Results) -> list[pa.Table]:
+    """The scans of all runs, each with its own errors, those that failed up to where they came."""
+    tables = []
+    for name, outcomes in results.outcomes.items():
+        for repeat, outcome in enumerate(outcomes):
+            assessed = results.assessed[name]
+            if outcome is not representative(outcomes):
+                assessed = assess([outcome], results.scans.stamps_ns, results.reference)
+            tables.append(_table(name, repeat, outcome, assessed, results.scans.stamps_ns))
+    return tables
 
 
 def _table(name: str, repeat: int, outcome: Outcome, assessed: Assessed, stamps_ns: NDArray[np.int64]) -> pa.Table:
-    poses = _final_poses(outcome)
+    """The scans of a run with their final poses, or with what there is of one that failed."""
+    poses = outcome.trajectory.poses if len(outcome.trajectory) else outcome.odometry
+    broken = np.flatnonzero(~np.isfinite(poses).reshape(len(poses), -1).all(axis=1))
+    poses = lie.lift(poses[: broken[0]] if len(broken) else poses)
     count = len(poses)
     aligned = (assessed.T_reference_estimate @ poses)[:, :3, 3]
-    known = observability(outcome)
-    known = known[:count] if len(known) else np.full(count, np.nan)
-    traveled_m = path_length(poses) if count else np.empty(0)
+    steps = _steps(outcome, "observability")
+    observability = np.full(count, np.nan) if steps is None else steps["observability"].to_numpy()
     numbers = {
-        "seconds": outcome.seconds[:count],
-        "cpu_seconds": outcome.cpu_seconds[:count],
+        "seconds": outcome.seconds,
+        "cpu_seconds": outcome.cpu_seconds,
         **pose_columns(poses),
         **{f"aligned_{axis}": aligned[:, place] for place, axis in enumerate("xyz")},
-        "distance_m": traveled_m,
-        "error_m": assessed.errors_m[:count],
-        "error_rad": assessed.errors_rad[:count],
-        "nees": assessed.nees[:count],
-        "observability": known,
+        "distance_m": path_length(poses) if count else np.empty(0),
+        **assessed.by_scan,
+        "observability": observability,
     }
     columns = {
         "method": pa.array([name] * count, pa.string()),
         "repeat": pa.array([repeat] * count, pa.int64()),
         "index": pa.array(np.arange(count)),
         "stamp_ns": pa.array(stamps_ns[:count]),
-        **{name: pa.array(values, pa.float64(), from_pandas=True) for name, values in numbers.items()},
+        **{key: pa.array(values[:count], pa.float64(), from_pandas=True) for key, values in numbers.items()},
     }
     return pa.table(columns)
 
 
-def _picture_points(points: Points, assessed: Assessed) -> Points:
-    """Some of a map's points (M, 3), in the frame of the ground truth where there is one."""
-    downsampled = points[:: max(1, -(-len(points) // _PICTURE_POINTS))]
-    T = assessed.T_reference_estimate
-    if points.shape[1] == 2:
-        T = lie.flatten(T)
-    return lie.transform(T, downsampled)
+def judged(outcomes: Mapping[str, Outcome], scans: StoredScans) -> dict[str, Judged]:
+    """The verdict on each whole run: on ours by all that is known, on others by wheels and constant velocity.
+
+    The error of others is bounded by the wheels, and by each of ours that is trustworthy.
+    """
+    whole = {name: outcome for name, outcome in outcomes.items() if outcome.is_whole}
+    found = {name: judge_run(each.folder) for name, each in whole.items() if (each.folder / STEPS_FILE).exists()}
+    expected = {name: expected_of_run(whole[name].folder) for name in found}
+    positions = {name: each.trajectory.poses[:, :-1, -1] for name, each in whole.items()}
+    wheels = scans.wheels @ scans.T_base_lidar
+    for name in [name for name in whole if name not in found]:
+        bounds_m = {
+            ours: apart_m(positions[name], positions[ours]) + error.high
+            for ours, error in expected.items()
+            if error is not None and found[ours].verdict is Verdict.TRUSTWORTHY
+        }
+        trajectory = whole[name].trajectory
+        found[name] = judge(evidence_of_trajectory(trajectory, scans.log_times_ns, wheels, scans.points, bounds_m))
+    return found
+
+
+def summarize(results: Results, log: Log, limits: Limits, provenance: Provenance) -> Table:
+    """Every method's row, with figures that depend on all of them: sharpness and disagreement."""
+    scans, maps = results.scans, results.maps
+    chosen = {method.name: representative(results.outcomes[method.name]) for method in results.methods}
+    apart_m = disagreement([each.trajectory.poses for each in chosen.values()])
+    more: dict[str, dict[str, float | None]] = {name: {} for name in chosen}
+    for name, sharp in zip(maps, sharpness(list(maps.values())) if maps else (), strict=True):
+        if sharp is not None:
+            more[name] |= {"thickness_m": sharp.thickness_m, "entropy": sharp.mean_map_entropy}
+    for place, name in enumerate(chosen):
+        others_m = np.delete(apart_m[place], place)
+        if np.isfinite(others_m).any():
+            more[name]["disagreement_m"] = float(np.nanmedian(others_m))
+    judgments = judged(chosen, scans)
+    rows = [_row(results, method, more[method.name], judgments.get(method.name)) for method in results.methods]
+    packages = sorted({BASELINES[method.base].package for method in results.methods if method.base in BASELINES})
+    return Table(
+        log=", ".join(str(path) for path in log.paths),
+        topic=log.topic,
+        dimension=scans.dimension,
+        scans=len(scans),
+        points_per_scan=float(scans.points.mean()),
+        repeats=max(len(runs) for runs in results.outcomes.values()),
+        truth=results.reference.source,
+        truth_note=results.reference.note,
+        rows=rows,
+        disagreement_m=[[value if np.isfinite(value) else None for value in row] for row in apart_m.tolist()],
+        notes=[
+            f"every run may take {limits.time_s:,.0f} s and {limits.memory_mib / 1024.0:.1f} GiB",
+            *log.notes,
+            *log.damage,
+        ],
+        provenance=provenance,
+        baselines={  # a package may be installed as its variant without CUDA
+            name: package_version(name) or package_version(f"{name}-cpu") for name in packages
+        },
+    )
+
+
+def _row(results: Results, method: Method, more: dict[str, float | None], judgment: Judged | None) -> Row:
+    outcomes, assessed = results.outcomes[method.name], results.assessed[method.name]
+    ended = [outcome.report for outcome in outcomes]
+    end = next((report for report in ended if report.status is not Status.OK), ended[0])
+    figures = assessed.figures | more
+    return Row(
+        name=method.name,
+        base=method.base,
+        status=end.status,
+        reason=end.reason,
+        description=representative(outcomes).report.description,
+        settings=method.settings,
+        figures={column.key: figures.get(column.key) for column in COLUMNS},
+        definitions=assessed.definitions,
+        verdict="" if judgment is None else str(judgment.verdict),
+        verdict_reason="" if judgment is None else judgment.reason,
+        verdict_error="" if judgment is None else judgment.error,
+    )

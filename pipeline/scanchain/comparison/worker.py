@@ -1,11 +1,12 @@
-"""``python -m scanchain.comparison.worker SCANS FOLDER``: one method over all scans, in this process alone.
+"""``python -m scanchain.comparison.worker FOLDER``: one method over all scans, in this process alone.
 
-FOLDER holds method.msgpack; poses and times are written into it scan by scan: those until a crash are there. SCANS
-lies in the directory of the comparison, which is removed where its process is killed.
+FOLDER holds the task; poses and times are written into it scan by scan: those until a crash are there. It lies in
+the directory of the comparison, which is removed where its process is killed.
 """
 
 from __future__ import annotations
 
+import pickle
 import sys
 import traceback
 from collections.abc import Iterable
@@ -13,7 +14,7 @@ from contextlib import nullcontext, suppress
 from itertools import islice
 from pathlib import Path
 from time import perf_counter, process_time
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -24,44 +25,26 @@ from scanchain.baselines import BASELINES, InPlane
 from scanchain.clock import announcing_compilation
 from scanchain.comparison.methods import Method
 from scanchain.comparison.processes import (
-    CPU_FILE,
-    METHOD_FILE,
-    POSES_FILE,
     REPORT_FILE,
-    SECONDS_FILE,
+    TASK_FILE,
+    TRACK_FILE,
     TRAJECTORY_FILE,
     EndReport,
     Status,
     StoredScans,
-    open_store,
 )
 from scanchain.data import Pose, Scan, Trajectory
 from scanchain.errors import MissingExtraError, ScanchainError, shown
 from scanchain.processes import die_first, die_with_parent, peak_mib
-from scanchain.runs.job import Progress
+
+if TYPE_CHECKING:
+    from scanchain.comparison.ours import Ours
 
 _WARM_UP_SCANS = 4
 _MAX_CHARACTERS = 300  # largest length of the message of an error raised by other code
 
 
-class Runner(Protocol):
-    """Scans in, poses out."""
-
-    @property
-    def description(self) -> str:
-        """Method and settings."""
-        ...
-
-    def track(self, scan: Scan) -> Pose:
-        """T_odom_lidar (d+1, d+1) at the scan's stamp."""
-        ...
-
-    def finish(self, odometry: Trajectory, folder: Path) -> Trajectory:
-        """The final trajectory; other results go into files of the folder."""
-        ...
-
-
-def start(method: Method, T_base_lidar: Pose) -> Runner:
+def start(method: Method, T_base_lidar: Pose) -> Ours | _Others:
     """The method before its first scan. Raises MissingExtraError where its package is not installed."""
     if not method.is_ours:
         return _Others(method, len(T_base_lidar) - 1)
@@ -71,6 +54,8 @@ def start(method: Method, T_base_lidar: Pose) -> Runner:
 
 
 class _Others:
+    """A baseline or a class of the user as ``Ours``: scans in, poses out."""
+
     def __init__(self, method: Method, dimension: int) -> None:
         if method.base in BASELINES:
             entry = BASELINES[method.base]
@@ -94,22 +79,20 @@ def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
     warm_up(scans.scans(), method, scans.T_base_lidar)
     runner = start(method, scans.T_base_lidar)
     start_s = perf_counter() - began
-    size = scans.dimension + 1
-    poses = open_memmap(folder / POSES_FILE, "w+", np.float64, (len(scans), size, size))
-    seconds = open_memmap(folder / SECONDS_FILE, "w+", np.float64, (len(scans),))
-    cpu_seconds = open_memmap(folder / CPU_FILE, "w+", np.float64, (len(scans),))
-    poses[:], seconds[:], cpu_seconds[:] = np.nan, np.nan, np.nan
+    track = open_memmap(folder / TRACK_FILE, "w+", scans.track_type, (len(scans),))
+    track[:] = np.nan
+    wanted = scans.T_base_lidar.shape
     for scan in scans.scans():
         began_s, cpu_began_s = perf_counter(), process_time()
         pose = runner.track(scan)
         took_s, cpu_took_s = perf_counter() - began_s, process_time() - cpu_began_s
-        if np.shape(pose) != (size, size):
-            raise ValueError(f"track returned {shown(pose)}; wanted a pose ({size}, {size})")
+        if np.shape(pose) != wanted:
+            raise ValueError(f"track returned {shown(pose)}; wanted a pose {wanted}")
         if not np.isfinite(pose).all():
             raise ValueError("a pose that is not finite")
-        seconds[scan.index], cpu_seconds[scan.index], poses[scan.index] = took_s, cpu_took_s, pose
+        track[scan.index] = pose, took_s, cpu_took_s
     ended = perf_counter()
-    trajectory = runner.finish(Trajectory(scans.stamps_ns, np.array(poses)), folder)
+    trajectory = runner.finish(Trajectory(scans.stamps_ns, np.array(track["pose"])), folder)
     np.save(folder / TRAJECTORY_FILE, trajectory.poses)
     return EndReport(Status.OK, "", runner.description, start_s, perf_counter() - ended)
 
@@ -125,25 +108,21 @@ def warm_up(scans: Iterable[Scan], method: Method, T_base_lidar: Pose) -> None:
 
 
 def main() -> None:
-    """Run the method and write the report."""
-    store, folder = Path(sys.argv[1]), Path(sys.argv[2])
+    """Run the task of a folder as a process of its own."""
+    folder = Path(sys.argv[1])
     die_first()
-    die_with_parent(leftover=store.parent)
-    method = msgspec.msgpack.decode((folder / METHOD_FILE).read_bytes(), type=Method)
-    compiler = _Compiler()
-    with announcing_compilation(compiler.say) if method.is_ours else nullcontext():
-        report = _report(open_store(store), method, folder)
-    report = msgspec.structs.replace(report, peak_mib=peak_mib(), has_compiled=compiler.has_compiled)
+    die_with_parent(leftover=folder.parents[1])
+    run(folder)
+
+
+def run(folder: Path) -> None:
+    """Run the task of a folder and write the report."""
+    method, scans = pickle.loads((folder / TASK_FILE).read_bytes())
+    compiled: list[str] = []
+    with announcing_compilation(compiled.append) if method.is_ours else nullcontext():
+        report = _report(scans, method, folder)
+    report = msgspec.structs.replace(report, peak_mib=peak_mib(), has_compiled=bool(compiled))
     (folder / REPORT_FILE).write_bytes(msgspec.json.encode(report))
-
-
-class _Compiler(Progress):
-    """Notices compilation."""
-
-    has_compiled = False
-
-    def say(self, line: str) -> None:
-        self.has_compiled = True
 
 
 def _report(scans: StoredScans, method: Method, folder: Path) -> EndReport:

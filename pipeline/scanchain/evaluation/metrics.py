@@ -13,14 +13,18 @@ import numpy as np
 from scanchain import checks
 from scanchain.data import Matrix, Trajectory
 from scanchain.errors import InputError
-from scanchain.evaluation.absolute import AbsoluteError, Alignment, absolute_error, align
-from scanchain.evaluation.pairing import Pairs, pair, read_truth
-from scanchain.evaluation.relative import (
+from scanchain.evaluation.errors import (
+    AbsoluteError,
+    Alignment,
     KittiError,
     RelationError,
     RelativeError,
+    absolute_error,
+    align,
+    far_off,
     relative_errors,
 )
+from scanchain.evaluation.pairing import Pairs, pair, read_truth
 from scanchain.trajectory import read_tum
 
 _FARTHEST_S, _STEP_S = 1.0, 0.05  # offsets that are tried: the largest, and from one to the next
@@ -175,7 +179,8 @@ def evaluate(
     factor = scale_of(pairs) if scale else 1.0
     pairs = scaled(pairs, factor)
     ate = absolute_error(pairs, Alignment(align))
-    warnings = [*filter(None, [ate.complaint]), *pairs.warnings]
+    complaint = far_off(ate.translation_m.rmse, ate.share_of_path, ate.path_length_m)
+    warnings = [*filter(None, [complaint]), *pairs.warnings]
     aligned = ate.T_reference_estimate @ pairs.estimate
     errors, missing = relative_errors(pairs, intervals)
     found: dict[str, Result] = {"ate": ate, **errors}

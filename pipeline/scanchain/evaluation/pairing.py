@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,8 +20,6 @@ _SAME_S = 1e-6  # largest error of a stamp that was a floating-point number of s
 _ROUNDED_S = 5e-4  # largest error of a stamp written in milliseconds
 _FEW = 10  # number of poses below which their error has little meaning
 _ROUNDING_SHARE = 0.1  # share of the reference's median interval that either error is at most
-
-
 _KITTI_FIELDS = 12
 _SLACK_NS = 1_000_000_000  # largest error of the expected stamps of a log's scans
 
@@ -67,7 +64,12 @@ class Pairs:
     @property
     def missing(self) -> str:
         """Number of estimated poses without a reference pose, with the reason; empty where all have one."""
-        reasons = ", ".join(self._reasons())
+        counts = {
+            "before the truth begins": self.early,
+            "after it ends": self.late,
+            f"in gaps of it wider than {self.gap_s:.3g} s": self.in_gap,
+        }
+        reasons = ", ".join(f"{count:,} {where}" for where, count in counts.items() if count)
         return f"{self.estimate_count - len(self):,} without a true pose: {reasons}" if reasons else ""
 
     @property
@@ -101,14 +103,6 @@ class Pairs:
                 f"true poses are up to {self.widest_s:.3g} s apart, and the path between them is taken as straight"
             )
         return lines
-
-    def _reasons(self) -> Iterator[str]:
-        if self.early:
-            yield f"{self.early:,} before the truth begins"
-        if self.late:
-            yield f"{self.late:,} after it ends"
-        if self.in_gap:
-            yield f"{self.in_gap:,} in gaps of it wider than {self.gap_s:.3g} s"
 
 
 def pair(estimate: Trajectory, reference: Trajectory, *, gap_s: float | None = None) -> Pairs:

@@ -20,7 +20,7 @@ from scanchain.evaluation import (
     kitti_error_of_any_path,
     pair,
 )
-from scanchain.evaluation.absolute import far_off, path_length
+from scanchain.evaluation.errors import far_off, path_length
 from scanchain.runs.results import Results
 from scanchain.runs.step_table import STAGES, StepTable, inlier_shares
 from scanchain.slam import SlamResult

@@ -17,7 +17,7 @@ from scanchain.config import Config, MapsConfig
 from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import ExpectedErrors, expected_errors
-from scanchain.evaluation.absolute import path_length
+from scanchain.evaluation.errors import path_length
 from scanchain.graph.g2o import rejected_path, write_g2o
 from scanchain.logs import Log
 from scanchain.loops import level_of, outline_of

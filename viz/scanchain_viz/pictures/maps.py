@@ -18,7 +18,7 @@ from scanchain.config import Config
 from scanchain.data import Matrix, Points
 from scanchain.errors import InputError
 from scanchain.evaluation import on_the_estimate
-from scanchain.evaluation.absolute import path_length
+from scanchain.evaluation.errors import path_length
 from scanchain.maps import SavedMap, open_saved_map, read_map, read_ply
 from scanchain.runs.directory import TRUTH_FILE
 from scanchain.runs.results import Overlay

@@ -15,7 +15,7 @@ from scanchain.comparison.results import RELATIONS_FILE, SCANS_FILE
 from scanchain.comparison.table import Row, read_table
 from scanchain.data import Matrix, Trajectory
 from scanchain.evaluation import absolute_error_of_any_path, pair
-from scanchain.evaluation.absolute import path_length
+from scanchain.evaluation.errors import path_length
 from scanchain.runs.step_table import STAGES, nees_of_steps
 from scanchain.runs.vouching import poses_of
 from scanchain_viz.colors import color_of

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from scanchain.comparison.figures import Column, columns_of
 from scanchain.comparison.processes import CLOSURES_FILE, Status
 from scanchain.comparison.results import MAP_FILE, SETTINGS_FILE, TRUTH_FILE, method_folder
+from scanchain.comparison.table import Column, Table, columns_of, read_table
 from scanchain.comparison.table import Row as TableRow
-from scanchain.comparison.table import Table, read_table
 from scanchain.maps import read_ply
 from scanchain.trajectory import read_tum
 from scanchain_viz.pictures.figure import Floats
