@@ -18,7 +18,7 @@ from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.g2o import read_g2o, write_g2o
-from tests.benchmarks.harness import DATA, command_line
+from tests.benchmarks.harness import DATA, command_line, table
 
 SHORT = (("LM", "levenberg-marquardt"), ("GN", "gauss-newton"))
 GRAPHS = ("manhattan", "intel", "MIT", "smallGrid3D", "sphere2500", "torus3D")
@@ -118,17 +118,15 @@ def compare(path, repeats):
 def report(name, runs):
     best = min(run.half_chi2 for run in runs.values() if run.seconds)
     print(f"\n{name}: best known ½χ² {BEST.get(name, '-')}")
-    print(f"  {'method':22} {'median ms':>10} {'min ms':>9} {'iterations':>10} {'½χ²':>14}")
+    row = table("method", "median ms", "min ms", "iterations", "½χ²", "")
     for method, run in runs.items():
         if run.failure:
-            print(f"  {method:22} failed: {run.failure}")
+            row(method, f"failed: {run.failure}")
             continue
         milliseconds = 1e3 * np.array(run.seconds)
-        note = "" if run.half_chi2 <= best * (1.0 + 1e-4) else "  not the minimum"
-        print(
-            f"  {method:22} {np.median(milliseconds):10.1f} {milliseconds.min():9.1f} {run.iterations:10d}"
-            f" {run.half_chi2:14.4f}{note}"
-        )
+        note = "" if run.half_chi2 <= best * (1.0 + 1e-4) else "not the minimum"
+        times = f"{np.median(milliseconds):.1f}", f"{milliseconds.min():.1f}"
+        row(method, *times, run.iterations, f"{run.half_chi2:.4f}", note)
     right = [
         r for m, r in runs.items() if m.startswith("gtsam") and r.seconds and r.half_chi2 <= best * (1 + 1e-4)
     ]
