@@ -133,16 +133,16 @@ def test_lines_that_are_malformed_or_of_other_kinds_are_counted(tmp_path):
 
 def test_a_packed_log_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path):
     rng = np.random.default_rng(0)
-    lines = [flaser(k, rng.uniform(1.0, 9.0, 180).round(2)) for k in range(2000)]
+    lines = [flaser(k, rng.uniform(1.0, 9.0, 180).round(2)) for k in range(1000)]
     packed = gzip.compress(save(tmp_path / "a.log", *lines).read_bytes())
     (tmp_path / "a.log.gz").write_bytes(packed[: len(packed) // 2])
     log, scans = read(tmp_path / "a.log.gz")
-    assert 500 < len(scans) < 1500 and "does not unpack" in log.damage[0]
+    assert 250 < len(scans) < 750 and "does not unpack" in log.damage[0]
 
 
 @pytest.mark.parametrize("text", [b"\0", b"FLASER 0\n"], ids=["zeros", "lines"])
 def test_a_bomb_takes_no_more_memory_than_a_log_of_its_size_could(tmp_path, text):
-    (tmp_path / "bomb.clf").write_bytes(bz2.compress(text * ((100 << 20) // len(text))))
+    (tmp_path / "bomb.clf").write_bytes(100 * bz2.compress(text * ((1 << 20) // len(text))))
     tracemalloc.start()
     with pytest.raises(InputError, match=r"bomb.clf: unpacks to more than [\d,]+ bytes"):
         open_log(tmp_path / "bomb.clf")
