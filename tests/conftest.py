@@ -4,9 +4,16 @@ import pytest
 from hypothesis import settings
 
 from scanchain.__main__ import main
+from tests.support import made
 
 settings.register_profile("compiling", deadline=None)
 settings.load_profile("compiling")
+
+
+@pytest.fixture(scope="session")
+def office():
+    """Six seconds in the simulated office, 60 scans, with the truth beside it; shared, so it is only read."""
+    return made.log("office", seconds=6)
 
 
 @pytest.fixture

@@ -26,7 +26,6 @@ from scanchain.runs import results, warm_up
 from scanchain.runs.job import Job, Progress
 from scanchain.runs.run import run
 from scanchain.settings import load_settings
-from scanchain.simulation import simulate
 from scanchain.slam import Slam
 from scanchain_viz.recording.recording import Recording
 
@@ -118,13 +117,6 @@ def test_the_clock_stands_still_while_a_kernel_and_those_it_calls_are_compiled()
     assert work_s + compile_s == pytest.approx(took_s, abs=1e-3)
     outer(3)
     assert compiled_s() - before_s == compile_s
-
-
-@pytest.fixture(scope="module")
-def office(tmp_path_factory):
-    path = tmp_path_factory.mktemp("log") / "office.mcap"
-    simulate("office", path, duration_s=3.0)
-    return path
 
 
 def test_a_run_tells_compilation_apart_from_work(office, tmp_path, monkeypatch):
