@@ -191,13 +191,6 @@ def test_scans_that_would_stop_a_run_are_a_problem_with_a_flag(tmp_path):
         assert finding.severity == "warning" and "left out" in finding.effect
 
 
-def test_a_log_that_was_cut_off_is_told(tmp_path):
-    path = saved(tmp_path, drive())
-    path.write_bytes(path.read_bytes()[:-1500])
-    finding = diagnose(path)["damage"]
-    assert finding.severity == "warning" and "cut off" in finding.found
-
-
 # Clouds
 
 ROW = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("time", "<f4"), ("ring", "<u2")])

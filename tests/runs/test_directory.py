@@ -104,16 +104,6 @@ def test_force_replaces_a_run_only_once_the_new_one_is_complete(tmp_path):
     assert names(tmp_path) == ["a"] and names(old) == ["new.txt"]
 
 
-def test_what_came_to_be_in_the_meantime_is_not_overwritten(tmp_path):
-    with pytest.raises(InputError, match="exists"), RunDirectory(tmp_path / "a", force=False) as directory:
-        directory.worth_keeping()
-        (directory.path / "mine").touch()
-        an_old_run(tmp_path / "a")
-        directory.complete()
-    assert names(tmp_path / "a") == ["old.txt", "run.json"]
-    assert names(directory.path) == ["mine"]
-
-
 # whole runs
 
 
@@ -216,16 +206,6 @@ def test_an_interrupt_a_full_disk_and_bad_input_keep_the_scans_if_any_without_a_
         run(job(office, tmp_path / "a"), open_recorder, Watcher(20, error))
     folder = partial_in(tmp_path)
     assert "traceback.txt" not in names(folder) and len(np.loadtxt(folder / "odometry.tum")) == 20
-
-
-def test_a_bug_before_the_first_scan_leaves_its_traceback_alone(tmp_path, office):
-    with pytest.raises(
-        PartialRunError, match=r"ZeroDivisionError: boom; traceback.txt and the 0 scans until then are in"
-    ):
-        run(job(office, tmp_path / "a"), open_recorder, Watcher(0, ZeroDivisionError("boom")))
-    folder = partial_in(tmp_path)
-    assert "ZeroDivisionError" in (folder / "traceback.txt").read_text()
-    assert not run_file(folder)["complete"]
 
 
 def test_of_two_runs_into_one_directory_the_second_keeps_its_results_beside(tmp_path, office):
