@@ -130,6 +130,7 @@ sys.exit(main(sys.argv[1:]))
     same_result(out, whole)
 
 
+@pytest.mark.slow
 def test_a_run_recorded_from_the_middle_on_says_so_and_draws_the_whole_graph(office, whole, tmp_path):
     out = tmp_path / "run"
     left_after(150, office, out, *LIVELY)

@@ -47,18 +47,9 @@ class Cdr:
 
 
 def laser_scan(
-    stamp_ns,
-    ranges,
-    *,
-    first=-1.0,
-    step=0.01,
-    beam_s=0.0,
-    low=0.1,
-    high=30.0,
-    frame="laser",
-    order="<",
+    stamp_ns, ranges, *, first=-1.0, step=0.01, beam_s=0.0, low=0.1, high=30.0, frame="laser", order="<",
     declared=None,
-):
+):  # fmt: skip
     cdr = Cdr(order).header(stamp_ns, frame)
     cdr.put("f", first, first + step * (len(ranges) - 1), step, beam_s, 0.1, low, high)
     cdr.put("I", len(ranges) if declared is None else declared).put("f", *ranges)
@@ -66,18 +57,9 @@ def laser_scan(
 
 
 def point_cloud(
-    stamp_ns,
-    rows,
-    *,
-    frame="lidar",
-    order="<",
-    height=1,
-    padding=0,
-    fields=None,
-    step=None,
-    data=None,
+    stamp_ns, rows, *, frame="lidar", order="<", height=1, padding=0, fields=None, step=None, data=None,
     row_step=None,
-):
+):  # fmt: skip
     """A cloud of a structured array; ``padding`` bytes behind each row; other arguments tell lies."""
     codes = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
     big = any(rows.dtype[name].byteorder == ">" for name in rows.dtype.names)
@@ -140,29 +122,13 @@ def transforms_said(log_ns, data, topic="/tf_static"):
 
 
 def write(
-    path,
-    messages,
-    *,
-    chunked=True,
-    compression="zstd",
-    summary=True,
-    chunk_size=2000,
-    crcs=True,
-    encoding="ros2msg",
-    rename=lambda kind: kind,
-    message_encoding="cdr",
-    announced=(),
-    **options,
-):
+    path, messages, *, chunked=True, compression="zstd", summary=True, chunk_size=2000, crcs=True,
+    encoding="ros2msg", rename=lambda kind: kind, message_encoding="cdr", announced=(), **options,
+):  # fmt: skip
     """Write messages in the given order; ``announced`` are topics registered without any message."""
     if not summary:
-        options |= {
-            "index_types": IndexType.NONE,
-            "repeat_channels": False,
-            "repeat_schemas": False,
-            "use_statistics": False,
-            "use_summary_offsets": False,
-        }
+        left_out = ("repeat_channels", "repeat_schemas", "use_statistics", "use_summary_offsets")
+        options |= {"index_types": IndexType.NONE, **dict.fromkeys(left_out, False)}
     with path.open("wb") as stream:
         writer = Writer(
             stream,
@@ -184,14 +150,14 @@ def write(
     return path
 
 
-def office(count=40, *, topic="/scan", every_ns=SECOND // 10, beams=31, begin_ns=STAMP_NS):
+def office(count=40, *, begin_ns=STAMP_NS):
     """A mounting, then ``count`` pairs of odometry and scan of one stamp; scan k sees ranges from 1 + k/100."""
     said = [transforms_said(begin_ns, transforms(("base_link", "laser", 0.2, 0.1, 0.3, 0.0)))]
     for k in range(count):
-        stamp_ns = begin_ns + k * every_ns
-        ranges = 1.0 + k / 100 + 0.05 * np.arange(beams)
+        stamp_ns = begin_ns + k * SECOND // 10
+        ranges = 1.0 + k / 100 + 0.05 * np.arange(31)
         said.append(odometry_said(stamp_ns, odometry(stamp_ns, 0.1 * k, 0.0, 0.01 * k)))
-        said.append(scan_said(stamp_ns, laser_scan(stamp_ns, ranges), topic))
+        said.append(scan_said(stamp_ns, laser_scan(stamp_ns, ranges)))
     return said
 
 
