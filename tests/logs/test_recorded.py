@@ -306,6 +306,20 @@ def test_a_db3_of_many_blocks_gives_each_scan_once_in_order(tmp_path, monkeypatc
     assert_clouds(scans, sweeps)
 
 
+@pytest.mark.parametrize("compression", [None, "BZ2", "LZ4"])
+def test_a_bag_that_was_cut_off_is_read_up_to_the_cut(tmp_path, compression):
+    path, sweeps = many_chunks(tmp_path, compression)
+    whole, counts = path.read_bytes(), []
+    for length in range(9000, len(whole), 1511):
+        path.write_bytes(whole[:length])
+        log = open_log(path)
+        scans = list(log.scans())
+        assert_clouds(scans, sweeps[: len(scans)])
+        assert "cut off" in log.damage[0] and f"{len(scans)} scans of /points were recovered" in log.damage[-1]
+        counts.append(len(scans))
+    assert counts == sorted(counts) and counts[0] < 9 and counts[-1] == 60
+
+
 def test_a_bag_whose_recording_never_ended_is_read_whole(tmp_path):
     path, sweeps = many_chunks(tmp_path)
     whole = path.read_bytes()
@@ -324,6 +338,16 @@ def test_a_damaged_chunk_of_a_bag_is_left_out_and_told(tmp_path):
     assert 55 <= len(scans) < 60 and len(log.damage) == 2
     assert "the chunk at byte" in log.damage[0] and "it was left out" in log.damage[0]
     assert {scan.stamp_ns for scan in scans} <= {cloud.stamp_ns for cloud in sweeps}
+
+
+def test_a_chunk_of_a_bag_that_claims_to_be_huge_is_not_believed(tmp_path):
+    path, _ = many_chunks(tmp_path, "BZ2")
+    content = bytearray(path.read_bytes())
+    place = content.index(b"size=", 5000) + 5
+    content[place : place + 4] = struct.pack("<I", 2**32 - 1)
+    path.write_bytes(content)
+    log = open_log(path)
+    assert 50 <= len(list(log.scans())) < 60 and "4294967295 bytes, more than is accepted" in log.damage[0]
 
 
 def test_an_encrypted_bag_says_so(tmp_path):
