@@ -7,8 +7,6 @@ import struct
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 
 from scanchain.__main__ import main
 from scanchain.logs import open_log
@@ -17,6 +15,7 @@ from tests.support.naive_logs import (
     SECOND,
     Said,
     cloud_said,
+    decoded,
     laser_scan,
     odometry,
     odometry_said,
@@ -32,11 +31,9 @@ TOUCHED = {"/scan", "/points", "/ground_truth"}
 def said_in(path):
     """(number within its topic, message, decoded) of every message."""
     numbers = {}
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        for schema, channel, message, decoded in reader.iter_decoded_messages():
-            number = numbers[channel.topic] = numbers.get(channel.topic, -1) + 1
-            yield number, Said(channel.topic, schema.name, message.log_time, message.data), decoded
+    for schema, channel, message, contents in decoded(path):
+        number = numbers[channel.topic] = numbers.get(channel.topic, -1) + 1
+        yield number, Said(channel.topic, schema.name, message.log_time, message.data), contents
 
 
 def clouds(path, change, *, fields=ROW, scale=1.0, count=80, every=1):
@@ -81,9 +78,9 @@ def a_gap():
 
 def wheels_far_from_an_unmounted_lidar():
     """Three meters behind it, scans at 1.7 Hz."""
-    for number, said, decoded in said_in(made.log("office", seconds=40)):
+    for number, said, contents in said_in(made.log("office", seconds=40)):
         if said.topic == "/odom":
-            pose = decoded.pose.pose
+            pose = contents.pose.pose
             yaw = 2.0 * math.atan2(pose.orientation.z, pose.orientation.w)
             x, y = pose.position.x - 3.0 * math.cos(yaw), pose.position.y - 3.0 * math.sin(yaw)
             yield odometry_said(said.log_ns, odometry(stamp_of(said.data), x, y, yaw))
@@ -107,13 +104,13 @@ def a_wide_world():
 
 def a_blind_start():
     """Of the first 25 scans three beams are left; the wheels are left out."""
-    for number, said, decoded in said_in(made.log("office", seconds=20)):
+    for number, said, contents in said_in(made.log("office", seconds=20)):
         if said.topic == "/scan" and number < 25:
-            ranges = np.array(decoded.ranges, np.float32)
+            ranges = np.array(contents.ranges, np.float32)
             ranges[3:] = np.nan
             data = laser_scan(
-                stamp_of(said.data), ranges, first=decoded.angle_min, step=decoded.angle_increment,
-                beam_s=decoded.time_increment, low=decoded.range_min, high=0.0, frame="lidar",
+                stamp_of(said.data), ranges, first=contents.angle_min, step=contents.angle_increment,
+                beam_s=contents.time_increment, low=contents.range_min, high=0.0, frame="lidar",
             )  # fmt: skip
             yield scan_said(said.log_ns, data)
         elif said.topic != "/odom":

@@ -7,9 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 from mcap.writer import IndexType
-from mcap_ros2.decoder import DecoderFactory
 
 from scanchain import lie
 from scanchain.__main__ import main
@@ -24,6 +22,7 @@ from tests.support.naive_logs import (
     SECOND,
     STAMP_NS,
     cloud_said,
+    decoded,
     laser_points,
     laser_scan,
     odometry,
@@ -183,12 +182,12 @@ def test_files_more_than_a_day_apart_are_not_read_as_one_log(tmp_path):
 def test_opening_decodes_no_scan_twice(tmp_path, monkeypatch):
     rows = np.array([(1, 2, 3), (2, 3, 5)], dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
     said = [cloud_said(STAMP_NS + k, point_cloud(STAMP_NS + k, rows)) for k in range(5)]
-    path, decoded = write(tmp_path / "a.mcap", said), []
+    path, counted = write(tmp_path / "a.mcap", said), []
     real = PointCloudDecoder.decode
-    monkeypatch.setattr(PointCloudDecoder, "decode", lambda *args: decoded.append(1) or real(*args))
+    monkeypatch.setattr(PointCloudDecoder, "decode", lambda *args: counted.append(1) or real(*args))
     log = open_log(path)
     assert log.assumed_point_times().startswith("no point times")
-    assert len(decoded) == 1
+    assert len(counted) == 1
 
 
 def test_the_reader_runs_only_a_few_chunks_ahead(tmp_path, monkeypatch):
@@ -587,25 +586,23 @@ def test_intel_is_read_whole_in_log_time_order_with_a_prior_on_every_scan():
 def test_intel_scans_equal_an_independent_decoders():
     path = shared_data("2d/intel.mcap")
     _, scans = read(path, end_s=60.0)
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        latest = {}
-        checked = 0
-        for _, channel, _, message in reader.iter_decoded_messages(["/scan", "/odom"]):
-            latest[channel.topic] = message
-            if channel.topic != "/scan":
-                continue
-            if checked == len(scans):
-                break
-            scan = scans[checked]
-            ranges = np.array(message.ranges)
-            angles = message.angle_min + message.angle_increment * np.arange(len(ranges))
-            valid = (ranges > message.range_min) & (ranges < message.range_max)
-            points = (ranges[:, None] * np.column_stack([np.cos(angles), np.sin(angles)]))[valid]
-            np.testing.assert_allclose(scan.points, points, atol=1e-5)
-            position = latest["/odom"].pose.pose.position
-            np.testing.assert_allclose(scan.T_odom_base[:2, 2], [position.x, position.y])
-            checked += 1
+    latest = {}
+    checked = 0
+    for _, channel, _, message in decoded(path, ["/scan", "/odom"]):
+        latest[channel.topic] = message
+        if channel.topic != "/scan":
+            continue
+        if checked == len(scans):
+            break
+        scan = scans[checked]
+        ranges = np.array(message.ranges)
+        angles = message.angle_min + message.angle_increment * np.arange(len(ranges))
+        valid = (ranges > message.range_min) & (ranges < message.range_max)
+        points = (ranges[:, None] * np.column_stack([np.cos(angles), np.sin(angles)]))[valid]
+        np.testing.assert_allclose(scan.points, points, atol=1e-5)
+        position = latest["/odom"].pose.pose.position
+        np.testing.assert_allclose(scan.T_odom_base[:2, 2], [position.x, position.y])
+        checked += 1
     assert checked == len(scans) > 100
 
 
@@ -613,13 +610,11 @@ def test_kitti_clouds_equal_an_independent_decoders_bit_for_bit():
     path = shared_data("3d/kitti_0005_first60.mcap")
     log = open_log([path], LogConfig())
     assert (log.dimension, log.scan_count) == (3, 60)
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        for (_, _, message, cloud), scan in zip(reader.iter_decoded_messages(), log.scans(), strict=True):
-            rows = np.frombuffer(cloud.data, np.float32).reshape(-1, cloud.point_step // 4)[:, :3]
-            rows = rows[np.isfinite(rows).all(axis=1) & rows.any(axis=1)]
-            assert message.log_time == scan.log_time_ns
-            assert np.array_equal(scan.points.view(np.uint32), rows.copy().view(np.uint32))
+    for (_, _, message, cloud), scan in zip(decoded(path), log.scans(), strict=True):
+        rows = np.frombuffer(cloud.data, np.float32).reshape(-1, cloud.point_step // 4)[:, :3]
+        rows = rows[np.isfinite(rows).all(axis=1) & rows.any(axis=1)]
+        assert message.log_time == scan.log_time_ns
+        assert np.array_equal(scan.points.view(np.uint32), rows.copy().view(np.uint32))
 
 
 def test_the_mounting_of_a_real_lidar_on_its_imu_is_read():

@@ -4,7 +4,9 @@ import struct
 from dataclasses import dataclass
 
 import numpy as np
+from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
+from mcap_ros2.decoder import DecoderFactory
 
 from scanchain.logs.writer import schema_text
 
@@ -148,6 +150,13 @@ def write(
                 writer.add_message(channels[said.topic], said.log_ns, said.data, said.log_ns)
         writer.finish()
     return path
+
+
+def decoded(path, topics=None):
+    """(schema, channel, message, contents) of every message, read by the mcap packages."""
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        yield from reader.iter_decoded_messages(topics)
 
 
 def office(count=40, *, begin_ns=STAMP_NS):
