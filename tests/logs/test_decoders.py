@@ -9,9 +9,9 @@ from scanchain.errors import InputError
 from scanchain.logs import open_log
 from scanchain.simulation import simulate
 from tests.support.naive_logs import (
+    ROS,
     SECOND,
     STAMP_NS,
-    Cdr,
     Said,
     cloud_said,
     laser_points,
@@ -304,11 +304,12 @@ def test_the_azimuth_of_a_spinning_lidar_tells_its_times_and_what_was_assumed_is
 @pytest.mark.parametrize("kind", ["PoseStamped", "PoseWithCovarianceStamped"])
 def test_stamped_poses_lead_where_they_are_asked_for(tmp_path, kind):
     """Of the robot's base: the static transform from base_link says where the lidar is."""
-    covariance = [0.0] * 36 * (kind == "PoseWithCovarianceStamped")
-    pose = bytes(Cdr("<").header(STAMP_NS, "map").pose(3.0, 4.0, 0.5, 6.0).put("d", *covariance))
+    pose, name = ROS.pose(3.0, 4.0, 0.5, 6.0), f"geometry_msgs/msg/{kind}"
+    pose = ROS.with_covariance(pose) if "Covariance" in kind else pose
+    data = ROS.serialize(ROS.new(name, header=ROS.header(STAMP_NS, "map"), pose=pose), name)
     said = [
         transforms_said(STAMP_NS, transforms(("base_link", "lidar", 1.0, 2.0, 0.3, 0.1))),
-        Said("/gps", f"geometry_msgs/msg/{kind}", STAMP_NS, pose),
+        Said("/gps", name, STAMP_NS, data),
         cloud_said(STAMP_NS, point_cloud(STAMP_NS, random_rows(XYZ))),
     ]
     path = write(tmp_path / "a.mcap", said)

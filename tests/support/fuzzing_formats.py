@@ -31,21 +31,17 @@ def seeds(folder):
 
 
 def _bags(folder):
-    ros1, ros2 = recorders.Ros(recorders.ROS1), recorders.Ros(recorders.ROS2)
+    said = recorders.clouds(SCANS)
+    sweeps = [[*recorders.Ros(store).sweeps(said)] for store in (recorders.ROS1, recorders.ROS2)]
     for compression in (None, "BZ2", "LZ4"):
         inside = made(folder / f"bag_{compression}")
-        path = recorders.bag1_of(inside / "a.bag", _sweeps(ros1), compression, chunk_bytes=2000)
+        path = recorders.bag1_of(inside / "a.bag", sweeps[0], compression, chunk_bytes=2000)
         yield Seed(f"bag {compression}", inside, path, _by_chunk(path))
     for compression in ("NONE", "FILE", "MESSAGE"):
-        inside = recorders.bag2_of(folder / f"bag2_{compression}", _sweeps(ros2), compression=compression)
+        inside = recorders.bag2_of(folder / f"bag2_{compression}", sweeps[1], compression=compression)
         yield Seed(f"ROS 2 bag {compression}", inside, inside, _nothing)
-    inside = recorders.bag2_of(folder / "db3", _sweeps(ros2))
+    inside = recorders.bag2_of(folder / "db3", sweeps[1])
     yield Seed("db3", inside, inside / "db3.db3", _nothing)
-
-
-def _sweeps(ros):
-    for cloud in recorders.clouds(SCANS):
-        yield "/points", "sensor_msgs/msg/PointCloud2", cloud.stamp_ns, ros.point_cloud(cloud)
 
 
 def _by_chunk(path):
