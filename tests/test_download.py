@@ -15,8 +15,7 @@ from scanchain.download import DownloadError, fetch
 from scanchain.errors import InputError
 from scanchain.logs import open_log
 from tests.support import recorders
-from tests.support.carmen_text import flaser, save
-from tests.support.folders import kitti_raw
+from tests.support.sensor_files import flaser, kitti_raw, save
 from tests.support.web_server import serving
 
 CONTENT = np.random.default_rng(0).bytes(3_000_000)

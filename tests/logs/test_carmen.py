@@ -11,9 +11,9 @@ import pytest
 from scanchain import lie
 from scanchain.errors import InputError
 from scanchain.logs import open_log
-from tests.support.carmen_text import BEGIN_S, flaser, odom, robotlaser, save
 from tests.support.recorders import read
 from tests.support.scenes import shared_data
+from tests.support.sensor_files import BEGIN_S, flaser, odom, robotlaser, save
 
 
 def points(ranges, first=-np.pi / 2, step=np.pi / 180):

@@ -13,9 +13,8 @@ from scanchain.__main__ import main
 from scanchain.config import LogConfig
 from scanchain.logs import open_log
 from tests.support import recorders
-from tests.support.carmen_text import flaser, odom, save
-from tests.support.folders import kitti_odometry, kitti_raw, xyzi
 from tests.support.naive_logs import office, write
+from tests.support.sensor_files import flaser, kitti_odometry, kitti_raw, odom, save, xyzi
 
 
 def carmen(folder):

@@ -9,8 +9,8 @@ from scanchain.logs import open_log
 from scanchain.logs.formats.clouds import stamp_of_name
 from scanchain.simulation import simulate
 from tests.support import recorders
-from tests.support.folders import PCD, PLY, camera, kitti_odometry, kitti_raw, xyzi
 from tests.support.recorders import SECOND, STAMP_NS, assert_clouds, read
+from tests.support.sensor_files import PCD, PLY, camera, kitti_odometry, kitti_raw, xyzi
 
 
 def assert_points(scans, said):

@@ -12,9 +12,8 @@ from rosbags import rosbag1
 
 from scanchain.logs import open_log
 from tests.support import recorders
-from tests.support.carmen_text import BEGIN_S, flaser, odom, robotlaser
-from tests.support.folders import PCD, PLY, kitti_odometry, kitti_raw, xyzi
 from tests.support.fuzzing import Seed, made
+from tests.support.sensor_files import BEGIN_S, PCD, PLY, flaser, kitti_odometry, kitti_raw, odom, robotlaser, xyzi
 
 SCANS = 12
 UNPACKED_AT_ONCE = 64  # bytes of packed text, which are lost with those that are damaged
