@@ -208,6 +208,16 @@ def test_an_interrupt_a_full_disk_and_bad_input_keep_the_scans_if_any_without_a_
     assert "traceback.txt" not in names(folder) and len(np.loadtxt(folder / "odometry.tum")) == 20
 
 
+def test_a_bug_before_the_first_scan_leaves_its_traceback_alone(tmp_path, office):
+    with pytest.raises(
+        PartialRunError, match=r"ZeroDivisionError: boom; traceback.txt and the 0 scans until then are in"
+    ):
+        run(job(office, tmp_path / "a"), open_recorder, Watcher(0, ZeroDivisionError("boom")))
+    folder = partial_in(tmp_path)
+    assert "ZeroDivisionError" in (folder / "traceback.txt").read_text()
+    assert not run_file(folder)["complete"]
+
+
 def test_of_two_runs_into_one_directory_the_second_keeps_its_results_beside(tmp_path, office):
     class Slow(Progress):
         def track(self, scans, count):
