@@ -22,7 +22,6 @@ from scanchain.files import Address
 from scanchain.logs.writer import ORIGIN, LogWriter, pack_laser_scan, pack_odometry
 from scanchain.processes import resident_mib
 from scanchain.runs.directory import directory_name
-from scanchain.simulation import simulate
 from scanchain_viz.report.batch import names_of
 from tests.support import made
 from tests.support.browser import look
@@ -245,19 +244,19 @@ def test_logs_are_named_by_path_pattern_and_list_each_once(tmp_path):
 
 
 def test_a_folder_is_the_logs_in_it_unless_they_are_the_parts_of_one(tmp_path):
-    simulate("office", tmp_path / "whole.mcap", duration_s=4.0)
+    whole = made.log("office", seconds=6)
     for place, name in enumerate(("part_0", "part_1")):
         (tmp_path / name.partition("_")[0]).mkdir(exist_ok=True)
         part = str(tmp_path / "part" / f"{name}.mcap")
         cut = ["--start", str(2 * place), "--end", str(2 * place + 1.95)]
-        assert main(["convert", str(tmp_path / "whole.mcap"), part, *cut]) == 0
+        assert main(["convert", str(whole), part, *cut]) == 0
     several = tmp_path / "several"
     (several / "clouds").mkdir(parents=True)
     (several / "clouds" / "1.pcd").touch()
     (several / "truth.txt").touch()
     shutil.copytree(tmp_path / "part", several / "part")
     for seed in (1, 2):  # of the same time, by the clock of the simulation
-        simulate("office", several / f"{seed}.mcap", duration_s=2.0, seed=seed)
+        shutil.copyfile(made.log("office", seconds=2, seed=seed), several / f"{seed}.mcap")
     assert collect([tmp_path / "part"], []) == (tmp_path / "part",)
     assert {path.name for path in collect([several], [])} == {"1.mcap", "2.mcap", "clouds", "part"}
     (several / "clouds" / "1.pcd").unlink()

@@ -17,7 +17,7 @@ from scanchain.logs import open_log
 from scanchain.logs.info import describe
 from scanchain.logs.messages.point_cloud import PointCloudDecoder
 from scanchain.logs.opening import index_files
-from scanchain.simulation import simulate
+from tests.support import made
 from tests.support.naive_logs import (
     SECOND,
     STAMP_NS,
@@ -205,10 +205,9 @@ def test_the_reader_runs_only_a_few_chunks_ahead(tmp_path, monkeypatch):
 
 @pytest.mark.skipif(not Path("/proc/self/smaps").exists(), reason="needs Linux to say what is in memory")
 def test_what_has_been_read_of_a_file_does_not_stay_in_memory(tmp_path):
-    path = tmp_path / "town.mcap"
-    simulate("town", path, duration_s=2.0, sensor="os1-32")
+    path = made.log("town", tmp_path, seconds=3, sensor="os1-32")
     log = open_log(path)
-    assert sum(1 for _ in log.scans()) == 20
+    assert sum(1 for _ in log.scans()) == 30
     assert resident_bytes(path) < 0.2 * path.stat().st_size
 
 
