@@ -6,10 +6,17 @@ import pytest
 from hypothesis import settings
 
 from scanchain.__main__ import main
+from tests.support import made
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as in a comparison: threads of baselines spin otherwise
 settings.register_profile("compiling", deadline=None)
 settings.load_profile("compiling")
+
+
+@pytest.fixture(scope="session")
+def office():
+    """Six seconds in the simulated office, 60 scans, with the truth beside it; shared, so it is only read."""
+    return made.log("office", seconds=6)
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 import hashlib
 import io
 import json
-import re
 import zipfile
 
 import msgspec
@@ -16,51 +15,16 @@ from scanchain.download import DownloadError, fetch
 from scanchain.errors import InputError
 from scanchain.logs import open_log
 from tests.support import recorders
-from tests.support.carmen_text import flaser, save
-from tests.support.folders import kitti_raw
-from tests.support.web_server import Site, serving
+from tests.support.sensor_files import flaser, kitti_raw, save
+from tests.support.web_server import serving
 
 CONTENT = np.random.default_rng(0).bytes(3_000_000)
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
 
 
-class BreakingSite(Site):
-    """``cuts`` are the numbers of bytes after which the next answers break off; it knows If-Range."""
-
-    cuts = ()
-    tells_length = True
-
-    def answer(self, handler, *, is_head):
-        body = self.files.get(handler.path)
-        wanted = handler.headers.get("Range")
-        self.asked.append(wanted)
-        if body is None:
-            return handler.send_error(404)
-        begin = 0
-        is_same = handler.headers.get("If-Range") in (None, self.etag)
-        if wanted and self.has_ranges and is_same:
-            begin = int(re.fullmatch(r"bytes=(\d+)-", wanted)[1])
-            if begin >= len(body):
-                handler.send_response(416)
-                return handler.end_headers()
-            handler.send_response(206)
-            handler.send_header("Content-Range", f"bytes {begin}-{len(body) - 1}/{len(body)}")
-        else:
-            handler.send_response(200)
-        if self.etag:
-            handler.send_header("ETag", self.etag)
-        if self.tells_length:
-            handler.send_header("Content-Length", str(len(body) - begin))
-        handler.end_headers()
-        end = begin + self.cuts.pop(0) if self.cuts else len(body)
-        handler.wfile.write(body[begin:end])
-        self.sent += len(body[begin:end])
-        return None
-
-
 @pytest.fixture
 def site():
-    with serving({"/file.bin": CONTENT}, BreakingSite) as served:
+    with serving({"/file.bin": CONTENT}) as served:
         yield served
 
 

@@ -342,7 +342,17 @@ def assert_same(a, b):
     assert tables[0].equals(tables[1])
 
 
-@pytest.mark.parametrize("threads", ["1", "8", pytest.param("2", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("drive", "threads"),
+    [
+        pytest.param(world, threads, marks=[] if is_quick else [pytest.mark.slow])
+        for world, threads, is_quick in (
+            ("office", "1", True), ("office", "2", False), ("office", "8", False),
+            ("town", "1", False), ("town", "2", False), ("town", "8", True),
+        )
+    ],
+    indirect=["drive"],
+)  # fmt: skip
 def test_the_same_run_in_another_process_is_bit_equal_whatever_the_threads(drive, tmp_path, threads):
     words = [sys.executable, "-m", "scanchain", "run", drive.log, "--out", tmp_path / "again", *drive.flags]
     names = ("SCANCHAIN_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")

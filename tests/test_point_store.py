@@ -8,7 +8,7 @@ import pickle
 import numpy as np
 import pytest
 
-from scanchain import Slam, open_log, simulate
+from scanchain import Slam, open_log
 from scanchain.errors import InputError
 from scanchain.point_store import PointStore
 from scanchain.processes import resident_mib
@@ -29,10 +29,9 @@ def test_every_scan_comes_back_as_it_went_in_and_several_at_once():
 
 
 @pytest.mark.parametrize("copied", [copy.deepcopy, lambda value: pickle.loads(pickle.dumps(value))])
-def test_a_result_is_pickled_with_its_points_and_lives_without_the_first(tmp_path, copied):
-    simulate("office", tmp_path / "office.mcap", duration_s=6.0)
+def test_a_result_is_pickled_with_its_points_and_lives_without_the_first(office, copied):
     slam = Slam(dimension=2)
-    for scan in open_log(tmp_path / "office.mcap").scans():
+    for scan in open_log(office).scans():
         slam.process(scan)
     result = slam.finish()
     again = copied(result)

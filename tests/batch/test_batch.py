@@ -22,8 +22,8 @@ from scanchain.files import Address
 from scanchain.logs.writer import ORIGIN, LogWriter, pack_laser_scan, pack_odometry
 from scanchain.processes import resident_mib
 from scanchain.runs.directory import directory_name
-from scanchain.simulation import simulate
 from scanchain_viz.report.batch import names_of
+from tests.support import made
 from tests.support.browser import look
 from tests.support.killing import processes_about, wait_until
 from tests.support.scenes import ROOT
@@ -46,11 +46,10 @@ if "-m" in sys.orig_argv and "hungry" in words:
 
 @pytest.fixture(scope="module")
 def drawers(tmp_path_factory):
-    """Six logs of two seconds each, no two alike; two of them are poison."""
+    """Four logs of two seconds each, no two alike, and two that are poison."""
     folder = tmp_path_factory.mktemp("logs")
-    names = [f"log_{k:02}" for k in range(4)] + ["crashing", "hungry"]
-    for seed, name in enumerate(names):
-        simulate("office", folder / f"{name}.mcap", duration_s=2.0, seed=seed)
+    for seed, name in enumerate((*(f"log_{k:02}" for k in range(4)), "crashing", "hungry")):
+        shutil.copyfile(made.log("office", seconds=2, seed=seed), folder / f"{name}.mcap")
     return folder
 
 
@@ -66,21 +65,22 @@ def table(folder):
     return {row["log"].rsplit("/", 1)[1]: row for row in pq.read_table(folder / "batch.parquet").to_pylist()}
 
 
-def made(folder):
+def runs_of(folder):
     """When each run directory came to be."""
     return {path.parent: path.stat().st_mtime_ns for path in folder.glob("*/run.json")}
 
 
-def test_of_6_logs_two_are_poison_and_4_have_results_and_a_second_call_runs_only_the_rest(
+def test_of_4_logs_two_are_poison_and_2_have_results_and_a_second_call_runs_only_the_rest(
     drawers, poisoned, tmp_path, capfd
 ):
     out = tmp_path / "out"
-    words = ["batch", f"{drawers}/*.mcap", "--out", str(out), "--memory-limit", "1.5", "--workers", "2"]
+    logs = [str(drawers / f"{name}.mcap") for name in ("log_00", "log_01", "crashing", "hungry")]
+    words = ["batch", *logs, "--out", str(out), "--memory-limit", "1.5", "--workers", "2"]
     assert main(words) == 1
     output, errors = capfd.readouterr()
-    rows, first = table(out), made(out)
+    rows, first = table(out), runs_of(out)
     done = {name: row for name, row in rows.items() if row["state"] == "done"}
-    assert len(rows) == 6 and len(done) == len(first) == 4
+    assert len(rows) == 4 and len(done) == len(first) == 2
     assert (rows["crashing.mcap"]["state"], rows["crashing.mcap"]["reason"]) == ("crashed", "ended by SIGSEGV")
     assert (rows["crashing.mcap"]["tries"], rows["hungry.mcap"]["tries"]) == (2, 1)
     assert rows["hungry.mcap"]["state"] == "out of memory"
@@ -91,11 +91,11 @@ def test_of_6_logs_two_are_poison_and_4_have_results_and_a_second_call_runs_only
         assert row["scans"] == metrics["scans"] == 20 and row["ate_rmse_m"] < 0.1
         assert (out / row["run"] / "recording.rrd").exists()  # as of scanchain run
         assert row["ate_rmse_m"] == metrics["ground_truth"]["optimized"]["ate_rmse_m"]
-    assert "6: 4 done, 1 crashed, 1 out of memory" in output
-    assert errors == f"error: 2 of 6 logs have no result; {out}/summary.txt has the reason\n"
+    assert "4: 2 done, 1 crashed, 1 out of memory" in output
+    assert errors == f"error: 2 of 4 logs have no result; {out}/summary.txt has the reason\n"
 
     assert main(words) == 1  # only the two are tried again
-    assert made(out) == first and "4 results from before" in capfd.readouterr()[0]
+    assert runs_of(out) == first and "2 results from before" in capfd.readouterr()[0]
 
 
 def test_logs_of_the_longest_names_have_directories_of_their_own():
@@ -107,21 +107,21 @@ def test_logs_of_the_longest_names_have_directories_of_their_own():
 def test_what_is_done_is_done_until_the_file_or_the_configuration_changes(drawers, tmp_path, capfd):
     log, out = tmp_path / "log.mcap", tmp_path / "out"
     log.write_bytes((drawers / "log_00.mcap").read_bytes())
-    words = ["batch", str(log), "--out", str(out)]
+    words = ["batch", str(log), "--out", str(out), "--rerun", "off"]
     assert main(words) == 0
-    first = made(out)
+    first = runs_of(out)
     (row,) = table(out).values()
     assert row["sha256"] == hashlib.sha256(log.read_bytes()).hexdigest()
-    assert main(["batch", f"{log.parent}/../{log.parent.name}/log.mcap", "--out", str(out)]) == 0
-    assert made(out) == first and "1 result from before" in capfd.readouterr()[0].splitlines()[-1]
+    assert main(["batch", f"{log.parent}/../{log.parent.name}/log.mcap", *words[2:]]) == 0
+    assert runs_of(out) == first and "1 result from before" in capfd.readouterr()[0].splitlines()[-1]
     (run,) = first
     (run / "metrics.json").unlink()  # a result that was thrown away is missing
     assert main(words) == 0 and (run / "metrics.json").exists()
     assert main([*words, "--matching.matcher", "svd"]) == 0
-    assert len(made(out)) == 2
+    assert len(runs_of(out)) == 2
     log.write_bytes((drawers / "log_01.mcap").read_bytes())
     assert main(words) == 0
-    assert len(made(out)) == 3 and "0 results from before" in capfd.readouterr()[0].splitlines()[-1]
+    assert len(runs_of(out)) == 3 and "0 results from before" in capfd.readouterr()[0].splitlines()[-1]
 
 
 def test_a_log_most_of_whose_scans_are_lost_is_a_row_that_says_so_and_is_not_run_again(drawers, tmp_path, capfd):
@@ -133,14 +133,14 @@ def test_a_log_most_of_whose_scans_are_lost_is_a_row_that_says_so_and_is_not_run
     words = ["batch", str(radar), str(drawers / "log_03.mcap"), "--out", str(out)]
     assert main(words) == 1
     output, errors = capfd.readouterr()
-    rows, first = table(out), made(out)
+    rows, first = table(out), runs_of(out)
     assert (rows["radar.mcap"]["state"], rows["log_03.mcap"]["state"]) == ("not trustworthy", "done")
     assert "degenerate" in rows["radar.mcap"]["reason"] and rows["radar.mcap"]["scans"] == 20
     assert len(first) == 2 and "2: 1 done, 1 not trustworthy" in output
     assert errors == f"error: 1 of 2 logs are not trustworthy; {out}/summary.txt has the reason\n"
     assert f"{radar} is not trustworthy" in (out / "report.html").read_text()
     assert main(words) == 1
-    assert made(out) == first and "2 results from before" in capfd.readouterr()[0]
+    assert runs_of(out) == first and "2 results from before" in capfd.readouterr()[0]
 
 
 def test_logs_that_are_damaged_absent_or_slow_are_rows_with_a_reason_each(drawers, tmp_path):
@@ -217,8 +217,8 @@ def test_ctrl_c_kills_what_runs_and_the_table_says_what_was_not_run(drawers, tmp
 
 
 def test_what_a_killed_batch_started_ends_with_it(tmp_path):
-    simulate("office", tmp_path / "long.mcap", duration_s=120.0)
-    words = ["batch", str(tmp_path / "long.mcap"), "--out", str(tmp_path / "out")]
+    long = made.log("office", tmp_path, seconds=120)
+    words = ["batch", str(long), "--out", str(tmp_path / "out")]
     child = subprocess.Popen(
         [sys.executable, "-m", "scanchain", *words], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
@@ -244,19 +244,19 @@ def test_logs_are_named_by_path_pattern_and_list_each_once(tmp_path):
 
 
 def test_a_folder_is_the_logs_in_it_unless_they_are_the_parts_of_one(tmp_path):
-    simulate("office", tmp_path / "whole.mcap", duration_s=4.0)
+    whole = made.log("office", seconds=6)
     for place, name in enumerate(("part_0", "part_1")):
         (tmp_path / name.partition("_")[0]).mkdir(exist_ok=True)
         part = str(tmp_path / "part" / f"{name}.mcap")
         cut = ["--start", str(2 * place), "--end", str(2 * place + 1.95)]
-        assert main(["convert", str(tmp_path / "whole.mcap"), part, *cut]) == 0
+        assert main(["convert", str(whole), part, *cut]) == 0
     several = tmp_path / "several"
     (several / "clouds").mkdir(parents=True)
     (several / "clouds" / "1.pcd").touch()
     (several / "truth.txt").touch()
     shutil.copytree(tmp_path / "part", several / "part")
     for seed in (1, 2):  # of the same time, by the clock of the simulation
-        simulate("office", several / f"{seed}.mcap", duration_s=2.0, seed=seed)
+        shutil.copyfile(made.log("office", seconds=2, seed=seed), several / f"{seed}.mcap")
     assert collect([tmp_path / "part"], []) == (tmp_path / "part",)
     assert {path.name for path in collect([several], [])} == {"1.mcap", "2.mcap", "clouds", "part"}
     (several / "clouds" / "1.pcd").unlink()
@@ -329,10 +329,10 @@ def test_the_report_shows_every_log_and_names_no_key_of_an_address(drawers, tmp_
         monkeypatch.setattr(sys, "argv", ["scanchain", *words])
         assert main(words) == 1
         assert table(out)["far.mcap"]["reason"] == table(out)["log_03.mcap"]["reason"] == ""
-        first = made(out)
-        assert main(words) == 1 and made(out) == first
+        first = runs_of(out)
+        assert main(words) == 1 and runs_of(out) == first
         site.etag = '"two"'
-        assert main(words) == 1 and len(made(out)) == len(first) + 1 == 3
+        assert main(words) == 1 and len(runs_of(out)) == len(first) + 1 == 3
     rows = table(out)
     assert rows["far.mcap"]["log"] == f"{site.url}/far.mcap" and rows["far.mcap"]["scans"] == 20
     page = (out / "report.html").read_text()
@@ -385,12 +385,8 @@ def test_the_report_on_a_phone_shows_figures_beside_long_names_and_links_to_ever
     assert len(links) == 3 and all((out / unquote(link)).is_file() for link in links)
     assert links[0].endswith("/report.html") and links[2].startswith("rows/")
     seen = look(out / "report.html", tmp_path, width=390)
-    assert (
-        0.0 < seen["reasons"] <= 390
-        and seen["names"] < 0.45 * 390
-        and seen["wide"] <= seen["width"]
-        and seen["outside"] == []
-    )
+    assert 0.0 < seen["reasons"] <= 390 and seen["names"] < 0.45 * 390
+    assert seen["wide"] <= seen["width"] and seen["outside"] == []
 
 
 def test_of_remote_logs_a_pattern_names_those_that_match(monkeypatch):

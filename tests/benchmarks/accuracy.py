@@ -27,7 +27,7 @@ from scanchain.odometry import Odometry
 from scanchain.settings import load_settings, overrides_of
 from scanchain.slam import Slam, SlamResult
 from scanchain.trajectory import read_tum
-from tests.benchmarks.harness import DATA, command_line
+from tests.benchmarks.harness import DATA, command_line, table
 from tests.support import made
 from tests.support.standing import standing
 
@@ -83,24 +83,22 @@ def error(trajectory: Trajectory, reference: Path) -> str:
 
 
 def moving(options: argparse.Namespace) -> None:
-    print("| log | matcher | before loops | after loops | ms a scan |")
-    print("|---|---|---|---|---|")
+    row = table("log", "matcher", "before loops", "after loops", "ms a scan")
     for case in cases(options.cache):
         if options.only not in case.name:
             continue
         if not case.log.exists():
-            print(f"| {case.name} | | absent: {case.log} | | |")
+            row(case.name, "", f"absent: {case.log}", "", "")
             continue
         for matcher in MATCHERS:
             result, seconds = run(case, matcher)
             reference = case.log.with_suffix(case.suffix)
             before, after = (error(each, reference) for each in (result.odometry, result.trajectory))
-            print(f"| {case.name} | {matcher} | {before} | {after} | {1e3 * seconds:.2f} |", flush=True)
+            row(case.name, matcher, before, after, f"{1e3 * seconds:.2f}")
 
 
 def standing_still(options: argparse.Namespace) -> None:
-    print("| world | sensor | seed | last | rms | held |")
-    print("|---|---|---|---|---|---|")
+    row = table("world", "sensor", "seed", "last", "rms", "held")
     for world, sensor in STANDING:
         for seed in options.seeds:
             odometry = Odometry(dimension=3)
@@ -109,10 +107,7 @@ def standing_still(options: argparse.Namespace) -> None:
             off_mm = 1e3 * np.linalg.norm(places, axis=1)
             held = 100.0 * np.mean(np.ptp(np.diff(places, axis=0), axis=1) == 0.0)
             rms_mm = np.sqrt((off_mm**2).mean())
-            print(
-                f"| {world} | {sensor} | {seed} | {off_mm[-1]:.1f} mm | {rms_mm:.1f} mm | {held:.0f} % |",
-                flush=True,
-            )
+            row(world, sensor, seed, f"{off_mm[-1]:.1f} mm", f"{rms_mm:.1f} mm", f"{held:.0f} %")
 
 
 def main() -> None:

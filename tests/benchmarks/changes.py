@@ -56,9 +56,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float)
     parser.add_argument("--later-seconds", type=float)
     parser.add_argument("--unchanged", action="store_true")
-    parser.add_argument("--verbose", action="store_true")
     options = parser.parse_args()
-    options.cache.mkdir(parents=True, exist_ok=True)
     scores = [score_of(options, seed) for seed in options.seeds]
     total = Score(*(sum(getattr(score, name) for score in scores) for name in Score.__slots__))
     for name, score in (*zip(map(str, options.seeds), scores, strict=True), ("all", total)):
@@ -83,7 +81,7 @@ def score_of(options: argparse.Namespace, seed: int) -> Score:
     config = load_settings(a.dimension).config
     aligned = align_maps(a, b, config)
     found = changes_between(Part("a", a.keyframes, a.poses), Part("b", b.keyframes, aligned.poses), config)
-    return _score(found, first, second, a, b, verbose=options.verbose)
+    return _score(found, first, second, a, b)
 
 
 def _mapped(drive: Drive, name: str, cache: Path, seed: int, changed: int | None) -> SavedMap:
@@ -93,7 +91,7 @@ def _mapped(drive: Drive, name: str, cache: Path, seed: int, changed: int | None
     return open_saved_map(run_of(made.recorded(name, write, cache), cache, name))
 
 
-def _score(found: Changes, first: Drive, second: Drive, a: SavedMap, b: SavedMap, *, verbose: bool) -> Score:
+def _score(found: Changes, first: Drive, second: Drive, a: SavedMap, b: SavedMap) -> Score:
     d, points = a.dimension, _in_world(found.points, first, a)
     count = len(found.clusters) + 1
     size = np.bincount(found.of_cluster, minlength=count)
@@ -115,15 +113,7 @@ def _score(found: Changes, first: Drive, second: Drive, a: SavedMap, b: SavedMap
             if change.size_m[:d].max() < LEAST_M or rays[change.owner] < LEAST_RAYS[d]:
                 continue
             events += 1
-            is_hit = bool((covers | (is_kind & (mine > 0.2 * on.sum()))).any())
-            hits += is_hit
-            if verbose and not is_hit:
-                labels = np.bincount(found.labels[on], minlength=4)
-                print(f"  missed {change.kind} {kind} {change.size_m.round(2)} {rays[change.owner]} rays {labels}")
-    if verbose:
-        for each in found.clusters:
-            if not right[each.number]:
-                print("  wrong", each.kind, each.center.round(1), each.size_m.round(2), each.points)
+            hits += bool((covers | (is_kind & (mine > 0.2 * on.sum()))).any())
     moved = [cluster for cluster in found.clusters if cluster.kind == "vanished" and cluster.counterpart]
     matched = sum(0 <= owner[each.number] == owner[each.counterpart] for each in moved)
     return Score(events, hits, len(found.clusters), int(right[1:].sum()), len(moved), matched)

@@ -35,25 +35,14 @@ def main():
     return 1 if bad else 0
 
 
-def _mcap(folder, rng, cases):
-    """Damaged files, and every cut at a record beside them."""
-    seeds = list(fuzzing.seeds(folder))
-    for seed in seeds:
-        for damaged, wrong in fuzzing.file_complaints(seed, rng, cases // len(seeds)):
-            yield f"{seed.name}: {damaged.what}: {wrong}", damaged.data
+def _files(seeds):
+    def complaints(folder, rng, cases):
+        made = list(seeds(folder))
+        for seed in made:
+            for name, damaged, wrong in fuzzing.complaints(seed, rng, cases // len(made)):
+                yield f"{seed.name}: {name}: {damaged.what}: {wrong}", damaged.data
 
-
-def _formats(folder, rng, cases):
-    seeds = list(fuzzing_formats.seeds(folder))
-    for seed in seeds:
-        for name, damaged, wrong in fuzzing_formats.complaints(seed, rng, cases // len(seeds)):
-            yield f"{seed.name}: {name}: {damaged.what}: {wrong}", damaged.data
-
-
-def _real(folder, rng, cases):
-    for log in fuzzing.REAL:
-        for damaged, wrong in fuzzing.real_complaints(log, folder, rng, cases // len(fuzzing.REAL)):
-            yield f"{log}: {damaged.what}: {wrong}", damaged.data
+    return complaints
 
 
 def _messages(folder, rng, cases):
@@ -61,7 +50,10 @@ def _messages(folder, rng, cases):
         yield wrong, None
 
 
-KINDS = {"mcap": _mcap, "formats": _formats, "real": _real, "messages": _messages}
+KINDS = {
+    "mcap": _files(fuzzing.seeds), "formats": _files(fuzzing_formats.seeds), "real": _files(fuzzing.real_seeds),
+    "messages": _messages,
+}  # fmt: skip
 
 if __name__ == "__main__":
     raise SystemExit(main())

@@ -1,17 +1,11 @@
 """Pose-graph optimization against GTSAM on the published graphs, interleaved.
 
-    python -m tests.benchmarks.graphs [GRAPH ...] [--repeats 5] [--large]
+    python -m tests.benchmarks.graphs [GRAPH ...] [--repeats 5]
 
 Each method optimizes what it has read; reading is not timed, building the problem and the first guess are. GTSAM
 runs from the file's guess and from its own (chordal in 3D; LAGO in 2D, which takes diagonal information only and
 gets the diagonal), with Gauss-Newton and with Levenberg-Marquardt. All ½χ² are evaluated by the same code:
 ½ Σ eᵀΩe with e = log(Z⁻¹ T_i⁻¹ T_j).
-
---large: simulated graphs as large as the largest published ones instead.
-"city": 10,000 poses of a Manhattan grid, most places passed several times, loops between poses near each other.
-"storys": 5,750 poses in space through the storys of a building, with ramps between them; information matrices
-that differ from edge to edge by up to a factor of 100, translation and rotation coupled. Both are drawn with the
-very noise that their information matrices state, so that ½χ² at the minimum is near half the degrees of freedom.
 """
 
 import time
@@ -19,20 +13,17 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from scipy.spatial import KDTree
 
 from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.g2o import read_g2o, write_g2o
-from scanchain.graph.pose_graph import PoseGraph
-from tests.benchmarks.harness import DATA, command_line
+from tests.benchmarks.harness import DATA, command_line, table
 
 SHORT = (("LM", "levenberg-marquardt"), ("GN", "gauss-newton"))
 GRAPHS = ("manhattan", "intel", "MIT", "smallGrid3D", "sphere2500", "torus3D")
 BEST = {"manhattan": 1774.5205, "intel": 22.5021, "MIT": 20.6035, "sphere2500": 675.701, "torus3D": 12117.6}
 SLOW_S = 2.0  # of a method that is run once only
-SIGHT_M, MOST_LOOPS = 2.1, 11_000  # how far apart two poses may be that see each other, and how many pairs do
 
 
 @dataclass
@@ -127,17 +118,15 @@ def compare(path, repeats):
 def report(name, runs):
     best = min(run.half_chi2 for run in runs.values() if run.seconds)
     print(f"\n{name}: best known ½χ² {BEST.get(name, '-')}")
-    print(f"  {'method':22} {'median ms':>10} {'min ms':>9} {'iterations':>10} {'½χ²':>14}")
+    row = table("method", "median ms", "min ms", "iterations", "½χ²", "")
     for method, run in runs.items():
         if run.failure:
-            print(f"  {method:22} failed: {run.failure}")
+            row(method, f"failed: {run.failure}")
             continue
         milliseconds = 1e3 * np.array(run.seconds)
-        note = "" if run.half_chi2 <= best * (1.0 + 1e-4) else "  not the minimum"
-        print(
-            f"  {method:22} {np.median(milliseconds):10.1f} {milliseconds.min():9.1f} {run.iterations:10d}"
-            f" {run.half_chi2:14.4f}{note}"
-        )
+        note = "" if run.half_chi2 <= best * (1.0 + 1e-4) else "not the minimum"
+        times = f"{np.median(milliseconds):.1f}", f"{milliseconds.min():.1f}"
+        row(method, *times, run.iterations, f"{run.half_chi2:.4f}", note)
     right = [
         r for m, r in runs.items() if m.startswith("gtsam") and r.seconds and r.half_chi2 <= best * (1 + 1e-4)
     ]
@@ -164,96 +153,13 @@ def certify(path):
     )
 
 
-# ---------------------------------------------------------------- simulated graphs
-
-
-def city_poses(rng, count=10_000, blocks=40):
-    """Steps of 1 m along streets, turning at crossings every 3 m, inside a square of so many crossings."""
-    poses, at, heading = [], np.zeros(2), 0
-    for k in range(count):
-        poses.append(lie.pose_2d(*at, heading * np.pi / 2))
-        if k % 3 == 0:
-            heading = turned(rng, at, heading, 3.0 * blocks / 2)
-        at = at + np.round([np.cos(heading * np.pi / 2), np.sin(heading * np.pi / 2)])
-    return np.array(poses)
-
-
-def turned(rng, at, heading, half_m):
-    """Straight on twice as often as left or right, and never out of the square."""
-    for turn in [*rng.permutation([0, 0, 1, -1]).tolist(), 2]:
-        there = at + 3.0 * np.array([np.cos((heading + turn) * np.pi / 2), np.sin((heading + turn) * np.pi / 2)])
-        if np.abs(there).max() <= half_m:
-            return heading + turn
-    return heading + 2
-
-
-def story_poses(rng, count=5750, storys=5):
-    """The same in each story, 4 m above each other, with ramps between them and a sensor that sways."""
-    flat = city_poses(rng, count, 12)
-    poses = lie.lift(flat)
-    climb = np.linspace(0.0, storys, count)
-    poses[:, 2, 3] = 4.0 * (np.floor(climb) + np.clip((climb % 1.0 - 0.9) / 0.1, 0.0, 1.0))
-    sway = np.zeros((count, 6))
-    sway[:, 3:5] = 0.1 * rng.normal(size=(count, 2))
-    return poses @ lie.exp(sway)
-
-
-def pairs_in_sight(poses, rng):
-    """Poses within sight of each other that do not follow each other, drawn at random where they are too many."""
-    pairs = KDTree(poses[:, :-1, -1]).query_pairs(SIGHT_M, output_type="ndarray")
-    pairs = pairs[np.abs(pairs[:, 0] - pairs[:, 1]) > 10]
-    return np.sort(rng.permutation(pairs)[:MOST_LOOPS], axis=1)
-
-
-def informations(dimension, count, rng):
-    """Ω of every edge: in the plane all alike; in space uneven, and with translation and rotation coupled."""
-    if dimension == 2:
-        return np.tile(np.diag([1 / 0.05**2, 1 / 0.05**2, 1 / 0.02**2]), (count, 1, 1))
-    root = rng.normal(size=(count, 6, 6)) * 0.15 + np.eye(6)
-    sigma = np.array([0.05, 0.05, 0.05, 0.01, 0.01, 0.01]) * 10.0 ** rng.uniform(-0.5, 0.5, (count, 1))
-    root = root / sigma[:, None, :]
-    return np.swapaxes(root, 1, 2) @ root
-
-
-def simulated(truth, loops, rng, path):
-    """Write the graph of these poses, measured with noise, with the odometry as its guess."""
-    dimension, count = truth.shape[-1] - 1, len(truth)
-    chain = np.stack([np.arange(count - 1), np.arange(1, count)], axis=1)
-    edges = np.concatenate([chain, loops])
-    omega = informations(dimension, len(edges), rng)
-    noise = rng.normal(size=(len(edges), omega.shape[-1], 1))
-    off = np.linalg.solve(np.swapaxes(np.linalg.cholesky(omega), 1, 2), noise)[..., 0]
-    measured = lie.inverse(truth[edges[:, 0]]) @ truth[edges[:, 1]] @ lie.exp(off)
-    graph, pose = PoseGraph(dimension), lie.identity(dimension)
-    for k in range(count):
-        graph.add_pose(pose, k)
-        if k + 1 < count:
-            pose = pose @ measured[k]
-    graph.add_edges(edges, measured, omega, np.zeros(len(edges), bool))
-    write_g2o(path, graph)
-    return len(edges)
-
-
-def make(folder):
-    """The two files, the same each time."""
-    rng = np.random.default_rng(0)
-    city, storys = city_poses(rng), story_poses(rng)
-    for name, truth in (("city", city), ("storys", storys)):
-        path = folder / f"{name}.g2o"
-        edges = simulated(truth, pairs_in_sight(truth, rng), rng, path)
-        print(f"{path}: {len(truth):,} poses, {edges:,} edges", flush=True)
-        yield path
-
-
 def main():
     parser = command_line(__doc__)
     parser.add_argument("graphs", nargs="*", default=GRAPHS)
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--large", action="store_true")
     options = parser.parse_args()
     options.cache.mkdir(parents=True, exist_ok=True)
-    paths = make(options.cache) if options.large else (DATA / "graphs" / f"{name}.g2o" for name in options.graphs)
-    for path in paths:
+    for path in (DATA / "graphs" / f"{name}.g2o" for name in options.graphs):
         for _, warm in SHORT:
             graph = read_g2o(path).graph
             graph.optimize(GraphConfig(optimizer=warm))

@@ -48,6 +48,12 @@ def choose_sequences(parser: argparse.ArgumentParser, *, worlds: Iterable[str] =
     parser.add_argument("--scans", type=int, default=scans, help="at most, default: %(default)s")
 
 
+def table(*heads: str) -> Callable[..., None]:
+    """Print the head of a Markdown table; a function that prints a row of these cells."""
+    print(f"| {' | '.join(heads)} |\n|{'---|' * len(heads)}", flush=True)
+    return lambda *cells: print(f"| {' | '.join(map(str, cells))} |", flush=True)
+
+
 def settings_of(words: Iterable[str]) -> dict[str, object]:
     """``log.every=2`` as the keyword of a function of the library."""
     return {key.replace(".", "__"): value for key, _, value in (word.partition("=") for word in words)}

@@ -28,7 +28,7 @@ from scanchain.landmarks.problem import BearingRangeProblem, Values, linear_syst
 from scanchain.landmarks.ranges import OWN, LogModel, OdometryNoise, solve_range_log
 from scanchain.landmarks.solvers import METHODS, compare, create_solver
 from scanchain.landmarks.study import against_truth, truth_at
-from tests.benchmarks.harness import DATA, command_line
+from tests.benchmarks.harness import DATA, command_line, table
 
 OF_THE_REPORT = ("default", "pinv", "lu", "lu_colamd", "qr", "qr_colamd")
 REPORT_S = {
@@ -49,15 +49,14 @@ def with_suitesparse():
 def report(name, results):
     published = dict(zip(OF_THE_REPORT, REPORT_S[name], strict=True))
     print(f"\n{name}")
-    print(f"  {'method':12} {'report s':>9} {'total ms':>9} {'build':>8} {'factor':>8} {'solve':>7}"
-          f" {'again ms':>9} {'nnz factor':>11} {'differs by':>10}")  # fmt: skip
+    row = table(
+        "method", "report s", "total ms", "build", "factor", "solve", "again ms", "nnz factor", "differs by"
+    )
     for result in results:
-        told = f"{published[result.method]:9.4f}" if result.method in published else f"{'-':>9}"
-        build, factor, solve, again = (
-            1e3 * seconds for seconds in (result.build_s, result.factor_s, result.solve_s, result.again_s)
-        )
-        print(f"  {result.method:12} {told} {1e3 * result.total_s:9.2f} {build:8.2f} {factor:8.2f} {solve:7.2f}"
-              f" {again:9.2f} {result.factor.nnz:11,} {result.difference:10.1e}")  # fmt: skip
+        spent_s = result.total_s, result.build_s, result.factor_s, result.solve_s, result.again_s
+        spent = [f"{1e3 * seconds:.2f}" for seconds in spent_s]
+        row(result.method, published.get(result.method, "-"), *spent, f"{result.factor.nnz:,}",
+            f"{result.difference:.1e}")  # fmt: skip
     spread = max(float(np.abs(a.x - b.x).max()) for a in results for b in results)
     print(f"  all agree to {spread:.1e}" + ("" if spread <= AGREEMENT else f": MORE THAN {AGREEMENT:g}"))
     fastest = min((result for result in results if result.method in OF_THE_REPORT), key=lambda r: r.total_s)
@@ -157,12 +156,12 @@ def real_log(options):
         for name, method in OF_THE_LOG.items():
             spent, state = method(log)
             seconds[name].append((spent, state))
-    print(f"{log.name}: {'method':22} {'median ms':>10} {'min ms':>8} {'ATE m':>8} {'landmarks m':>12}")
+    row = table(log.name, "median ms", "min ms", "ATE m", "landmarks m")
     for name, runs in seconds.items():
         accuracy = against_truth(runs[-1][1], model.nodes_s, truth)
         spent = 1e3 * np.array([run[0] for run in runs])
-        print(f"{log.name}: {name:22} {np.median(spent):10.1f} {spent.min():8.1f} {accuracy.poses_m:8.4f}"
-              f" {accuracy.landmarks_m:12.4f}")  # fmt: skip
+        errors = f"{accuracy.poses_m:.4f}", f"{accuracy.landmarks_m:.4f}"
+        row(name, f"{np.median(spent):.1f}", f"{spent.min():.1f}", *errors)
 
 
 def main():

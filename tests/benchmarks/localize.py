@@ -1,13 +1,12 @@
 """Localization in a map from nowhere: how soon, how surely, how accurately, and what it costs.
 
-    python -m tests.benchmarks.localize [--cases intel,vlp-16,...] [--starts 200] [--half 0|1] [--whole]
+    python -m tests.benchmarks.localize [--cases intel,vlp-16,...] [--starts 200] [--whole]
     python -m tests.benchmarks.localize --cases city [--km 10] [--sensor vlp-16] [--every 2] [--live] [--memory]
 
 From each start a log begins anew, in the map of another drive or of an earlier part of its own, and is processed
 until it is found and 3 m farther, or until it has traveled 15 m (in space 40 m, in the city 60 m). Logs of other
 places are run whole by ``tests.benchmarks.places``. Starts are evenly spread; those of planar logs over places
-that the map has seen: of the scans of the next 5 m 60 % of the points lie on its points. --half takes every
-second.
+that the map has seen: of the scans of the next 5 m 60 % of the points lie on its points.
 
   found     travel until the state is no longer ``searching``
   wrong     a pose from there on is more than 0.5 m or 5° off the reference, in space 1 m or 3°
@@ -51,7 +50,7 @@ from scanchain.settings import load_settings
 from scanchain.simulation.drive import Drive, plan, record
 from scanchain.simulation.worlds import WORLDS, outdoor
 from scanchain.trajectory import read_tum
-from tests.benchmarks.harness import DATA, command_line, in_fresh_process, run_of, traveled_m, true_in_map
+from tests.benchmarks.harness import DATA, command_line, in_fresh_process, run_of, table, traveled_m, true_in_map
 from tests.support import made
 
 SEEN_M, SEEN_SHARE, ON_MAP_M = 5.0, 0.6, 0.2
@@ -59,8 +58,8 @@ GIVE_UP_M, AFTER_M, WARM_UP = {2: 15.0, 3: 40.0}, 3.0, 3
 WRONG = {2: (0.5, np.radians(5.0)), 3: (1.0, np.radians(3.0))}
 WITHIN_M = (5.0, 10.0)
 STREET_M, BLOCK_M, CITY_SPEED_M_S = 1000.0, (50.0, 40.0), 8.7  # bends included
-HEAD = "| case | starts | within 5 m | 10 m | ever | wrong | error | time | longest |"
-WHOLE = " ATE | at the time | time | opening | memory |"
+HEAD = "case", "starts", "within 5 m", "10 m", "ever", "wrong", "error", "time", "longest"
+WHOLE = "ATE", "at the time", "time", "opening", "memory"
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,7 +244,7 @@ def localized(case: Case, scans: Iterable[Scan], *, is_live: bool) -> Outcome:
     return Outcome(found_m, np.array(errors).reshape(-1, 2), seconds, odometry_s)
 
 
-def whole(case: Case, scans: Iterable[Scan]) -> str:
+def whole(case: Case, scans: Iterable[Scan]) -> tuple[str, ...]:
     """The whole log in the map, and odometry alone scan by scan beside it: both timed under the same load."""
     config, T_base_lidar = load_settings(case.prior.dimension).config, open_log(case.log).T_base_lidar
     held, started = psutil.Process().memory_info().rss, perf_counter()
@@ -266,37 +265,33 @@ def whole(case: Case, scans: Iterable[Scan]) -> str:
     true, known = case.T_map_lidar[:, :3, 3], np.isfinite(found.live[:, 0, 0])
     live_m = _rmse(lie.lift(found.live[known])[:, :3, 3] - true[known])
     ate_m = _rmse(lie.lift(found.trajectory.poses)[:, :3, 3] - true)
-    figures = f"{ate_m:.4f} m | {live_m:.4f} m | {1e3 * scan_s:.0f} ms, {scan_s / odometry_s:.2f}"
-    return f"{figures} | {opening_s:.2f} s | {grown_mib:.0f} MiB |"
+    spent = f"{1e3 * scan_s:.0f} ms, {scan_s / odometry_s:.2f}"
+    return f"{ate_m:.4f} m", f"{live_m:.4f} m", spent, f"{opening_s:.2f} s", f"{grown_mib:.0f} MiB"
 
 
 def _rmse(off: Matrix) -> float:
     return float(np.sqrt(np.mean(np.sum(off**2, axis=1)))) if len(off) else np.nan
 
 
-def row(name: str, options: argparse.Namespace) -> str:
-    """The line of the table for one case."""
+def row(name: str, options: argparse.Namespace) -> tuple[object, ...]:
+    """The cells of one case."""
     case = CASES[name](options)
     d, log = case.prior.dimension, open_log(case.log)
     scans = [] if name == "city" else list(log.scans(load_settings(d).config.preprocess))
     outcomes = []
-    for start in starts_of(case, scans, options.starts)[options.half :: 1 if options.half is None else 2]:
+    for start in starts_of(case, scans, options.starts):
         following = scans[start:] or islice(log.scans(load_settings(d).config.preprocess), start, None)
         outcomes.append(localized(case, following, is_live=options.live))
-        if options.verbose:
-            last = outcomes[-1]
-            worst = np.round(last.errors.max(axis=0, initial=0.0), 3).tolist()
-            print(f"start {start}: {last.found_m:.1f} m {worst}{' WRONG' * last.is_wrong(d)}", flush=True)
     found_m = np.array([each.found_m for each in outcomes])
     errors = np.vstack([each.errors for each in outcomes if not each.is_wrong(d)])
     m, rad = np.median(errors, axis=0) if len(errors) else (np.nan, np.nan)
     ratio = sum(sum(each.seconds) for each in outcomes) / max(sum(each.odometry_s for each in outcomes), 1e-9)
     longest_s = max(max(each.seconds[WARM_UP:], default=0.0) for each in outcomes[1:] or outcomes)
-    shares = " | ".join(f"{100.0 * np.mean(found_m <= limit):.1f} %" for limit in (*WITHIN_M, 1e9))
+    shares = [f"{100.0 * np.mean(found_m <= limit):.1f} %" for limit in (*WITHIN_M, 1e9)]
     wrong = sum(each.is_wrong(d) for each in outcomes)
     error = f"{1e3 * m:.0f} mm, {np.degrees(rad):.2f}°"
-    line = f"| {name} | {len(outcomes)} | {shares} | {wrong} | {error} | {ratio:.2f} | {1e3 * longest_s:.0f} ms |"
-    return line + (f" {whole(case, scans)}" if options.whole and case.T_map_lidar is not None else "")
+    cells = name, len(outcomes), *shares, wrong, error, f"{ratio:.2f}", f"{1e3 * longest_s:.0f} ms"
+    return *cells, *(whole(case, scans) if options.whole and case.T_map_lidar is not None else ())
 
 
 def main() -> None:
@@ -305,20 +300,16 @@ def main() -> None:
         "--cases", default="intel,aces,identical,vlp-16,os1-32,changed", help="default: %(default)s"
     )
     parser.add_argument("--starts", type=int, default=200)
-    parser.add_argument("--half", type=int, choices=(0, 1))
     parser.add_argument("--whole", action="store_true")
     parser.add_argument("--live", action="store_true")
-    parser.add_argument("--verbose", action="store_true", help="print a line for each start")
     parser.add_argument("--km", type=float, default=10.0, help="of streets, default: %(default)s")
     parser.add_argument("--sensor", default="vlp-16", help="of the city, default: %(default)s")
     parser.add_argument("--every", type=int, default=2, help="sweeps a scan, default: %(default)s")
     parser.add_argument("--memory", action="store_true")
     options = parser.parse_args()
-    options.cache.mkdir(parents=True, exist_ok=True)
-    print(HEAD + (WHOLE if options.whole else ""))
-    print("|---" * (HEAD + (WHOLE if options.whole else "")).count(" |") + "|")
+    line = table(*HEAD, *(WHOLE if options.whole else ()))
     for name in options.cases.split(","):
-        print(in_fresh_process(row, name, options), flush=True)
+        line(*in_fresh_process(row, name, options))
 
 
 if __name__ == "__main__":

@@ -39,6 +39,7 @@ from tests.benchmarks.harness import (
     command_line,
     drive_of,
     in_fresh_process,
+    table,
     traveled_m,
 )
 from tests.support import made
@@ -48,7 +49,7 @@ from tests.support.false_loops import MADE_UP, false_closures
 NEAR_M, BACK_M, OPPOSITE_RAD, ALONG_M = 5.0, 100.0, np.radians(135.0), 10.0
 TRUE = {2: (0.5, np.inf), 3: (2.0, np.radians(3.0))}
 DRIFTS = {2: ("0.01,0.002", "0.01,-0.005", "-0.03,0.01"), 3: ("0.01,0.0002",)}
-HEAD = "| log | drift | ATE | accepted | by place | false | overruled | revisits | opposite | named | s | loops |"
+HEAD = "log,drift,ATE,accepted,by place,false,overruled,revisits,opposite,named,s,loops"
 
 Drifted = Callable[[Pose], Pose]
 
@@ -83,8 +84,8 @@ def undrifted(path: Path) -> Trajectory:
     return slam.finish().trajectory
 
 
-def row(path: Path, drift: Drift, truth: Trajectory, false_share: float) -> str:
-    """The line of a log."""
+def row(path: Path, drift: Drift, truth: Trajectory, false_share: float) -> tuple[object, ...]:
+    """The cells of a log."""
     log = open_log(path)
     slam = drifting_slam(load_settings(log.dimension).config, log.T_base_lidar, drift.of(log.dimension))
     started = perf_counter()
@@ -105,12 +106,10 @@ def row(path: Path, drift: Drift, truth: Trajectory, false_share: float) -> str:
     path_m = traveled_m(poses)
     sources_m = path_m[[each.source for each in accepted]]
     found = np.any(np.abs(path_m[:, None] - sources_m) <= ALONG_M, axis=1)
-    shares = " | ".join(_share(found[which]) for which in revisits(poses, path_m))
+    shares = [_share(found[which]) for which in revisits(poses, path_m)]
     ate = f"{ate_m(result.odometry, truth):.2f} to {ate_m(result.trajectory, truth):.2f} m"
-    return (
-        f"| {path.stem} | {drift} | {ate} | {len(accepted)} | {by_place} | {false} | {overruled} | {shares} "
-        f"| {_share(made_up)} | {spent_s:.1f} | {loops_s:.1f} |"
-    )
+    counts = len(accepted), by_place, false, overruled
+    return path.stem, drift, ate, *counts, *shares, _share(made_up), f"{spent_s:.1f}", f"{loops_s:.1f}"
 
 
 def true_poses(dimension: int, truth: Trajectory, keyframes) -> Matrix:
@@ -145,9 +144,8 @@ def _share(chosen) -> str:
 
 
 def planar_log(name: str, cache: Path) -> Path:
-    return (
-        DATA / "2d" / f"{name}.mcap" if (DATA / "2d" / f"{name}.mcap").exists() else made.log(name, folder=cache)
-    )
+    real = DATA / "2d" / f"{name}.mcap"
+    return real if real.exists() else made.log(name, folder=cache)
 
 
 def main() -> None:
@@ -159,11 +157,11 @@ def main() -> None:
     parser.add_argument("--false", type=float, default=0.0, help="share of wrong closures, default: %(default)s")
     options = parser.parse_args()
     drifts = [Drift(*map(float, each.split(","))) for each in options.drifts or DRIFTS[int(options.kind[0])]]
-    print(HEAD + "\n" + "|---" * (HEAD.count("|") - 1) + "|")
+    line = table(*HEAD.split(","))
     for path in paths(options):
         truth = undrifted(path)
         for drift in drifts:
-            print(in_fresh_process(row, path, drift, truth, options.false), flush=True)
+            line(*in_fresh_process(row, path, drift, truth, options.false))
 
 
 def paths(options: argparse.Namespace) -> list[Path]:

@@ -12,7 +12,7 @@ Prints a Markdown table.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import combinations
 from pathlib import Path
 
@@ -26,7 +26,7 @@ from scanchain.evaluation import read_relations, relation_error
 from scanchain.runs.metrics import Metrics
 from scanchain.sessions.merging import Merged
 from scanchain.trajectory import read_tum
-from tests.benchmarks.harness import DATA, ate_m, command_line, run_of
+from tests.benchmarks.harness import DATA, ate_m, command_line, run_of, table
 from tests.support import made
 
 INTEL, ACES, CSAIL = (DATA / f"2d/{name}.mcap" for name in ("intel", "aces", "mit_csail"))
@@ -49,16 +49,14 @@ def trajectory(merged: Merged) -> Trajectory:
     return Trajectory(np.concatenate([p.stamps_ns for p in parts]), np.concatenate([p.poses for p in parts]))
 
 
-def show(name: str, runs: Sequence[Path], merged: Merged, error: str = "") -> None:
-    """A row of the table."""
+def cells(name: str, runs: Sequence[Path], merged: Merged, error: str = "") -> tuple[str, ...]:
+    """Of a row of the table."""
     metrics = merged.metrics
     apart = ", ".join(" + ".join(group) for group in metrics.apart) or "none"
     certified = "yes" if metrics.certified else "no"
-    print(
-        f"| {name} | {len(metrics.sessions)} of {len(runs)} | {apart} | {metrics.closures_in_force:,} of "
-        f"{metrics.closures_tried:,} | {certified} | {error} | {run_s(runs):.1f} s | {metrics.run_s:.1f} s |",
-        flush=True,
-    )
+    closures = f"{metrics.closures_in_force:,} of {metrics.closures_tried:,}"
+    spent = f"{run_s(runs):.1f} s", f"{metrics.run_s:.1f} s"
+    return name, f"{len(metrics.sessions)} of {len(runs)}", apart, closures, certified, error, *spent
 
 
 def over_relations(log: Path, merged: Merged, whole: Trajectory) -> str:
@@ -68,32 +66,32 @@ def over_relations(log: Path, merged: Merged, whole: Trajectory) -> str:
     return f"relations {1e3 * found:.1f} mm, uncut {1e3 * known:.1f} mm ({100.0 * (found / known - 1.0):+.1f} %)"
 
 
-def intel(cache: Path, folder: Path) -> None:
+def intel(cache: Path, folder: Path, row: Callable[..., None]) -> None:
     quarter_s = LENGTH_S / 4.0
     parts = [run(cache, f"intel-{k + 1}", INTEL, k * quarter_s, (k + 1) * quarter_s) for k in range(4)]
     whole = read_tum(run(cache, "intel", INTEL) / "trajectory.tum")
     merged = sc.merge(parts, folder / "intel")
-    show("Intel in four parts", parts, merged, over_relations(INTEL, merged, whole))
+    row(*cells("Intel in four parts", parts, merged, over_relations(INTEL, merged, whole)))
     parts.append(run(cache, "csail", CSAIL))
-    show("the same, and CSAIL", parts, sc.merge(parts, folder / "csail"))
+    row(*cells("the same, and CSAIL", parts, sc.merge(parts, folder / "csail")))
 
 
-def eight(cache: Path, folder: Path) -> None:
+def eight(cache: Path, folder: Path, row: Callable[..., None]) -> None:
     long_s = LENGTH_S * SCANS / 13_631
     starts_s = np.linspace(0.0, LENGTH_S - long_s, 8).tolist()
     parts = [run(cache, f"eighth-{k + 1}", INTEL, at_s, at_s + long_s) for k, at_s in enumerate(starts_s)]
-    show("eight parts of Intel of 2,000 scans", parts, sc.merge(parts, folder / "eight"))
+    row(*cells("eight parts of Intel of 2,000 scans", parts, sc.merge(parts, folder / "eight")))
 
 
-def town(cache: Path, folder: Path) -> None:
+def town(cache: Path, folder: Path, row: Callable[..., None]) -> None:
     log = made.log("town", folder=cache, seed=1, seconds=60.0)
     parts = [run(cache, "town-1", log, end_s=32.0), run(cache, "town-2", log, start_s=28.0)]
     merged = sc.merge(parts, folder / "town")
     error_m = ate_m(trajectory(merged), read_tum(log.with_suffix(".tum")))
-    show("town, two sessions", parts, merged, f"ATE {error_m:.4f} m")
+    row(*cells("town, two sessions", parts, merged, f"ATE {error_m:.4f} m"))
 
 
-def cut(cache: Path, folder: Path) -> None:
+def cut(cache: Path, folder: Path, row: Callable[..., None]) -> None:
     stairs = made.log("staircase", folder=cache, seed=1)
     for name, log in (("aces", ACES), ("csail", CSAIL), ("staircase", stairs)):
         whole = read_tum(run(cache, name, log) / "trajectory.tum")
@@ -104,13 +102,13 @@ def cut(cache: Path, folder: Path) -> None:
             try:
                 merged = sc.merge(parts, folder / f"{name}-{count}")
             except sc.ScanchainError as error:
-                print(f"| {name} in {count} parts | none: {error} |", flush=True)
+                row(f"{name} in {count} parts", f"none: {error}")
                 continue
             error = over_relations(log, merged, whole) if name == "aces" else ""
-            show(f"{name} in {count} parts", parts, merged, error)
+            row(*cells(f"{name} in {count} parts", parts, merged, error))
 
 
-def look_alikes(cache: Path, folder: Path) -> None:
+def look_alikes(cache: Path, folder: Path, row: Callable[..., None]) -> None:
     log = made.log("identical", folder=cache)
     truth = read_tum(log.with_suffix(".tum"))
     true = Trajectory(truth.stamps_ns, lie.lift(truth.poses))
@@ -134,12 +132,10 @@ def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("--only", nargs="+", choices=list(PARTS), default=list(PARTS))
     options = parser.parse_args()
-    options.cache.mkdir(parents=True, exist_ok=True)
-    print("| sessions | in the map | apart | closures in force | certified | error | runs | merge |")
-    print("|---|---|---|---|---|---|---|---|")
+    row = table("sessions", "in the map", "apart", "closures in force", "certified", "error", "runs", "merge")
     with tempfile.TemporaryDirectory() as folder:
         for name in options.only:
-            PARTS[name](options.cache, Path(folder))
+            PARTS[name](options.cache, Path(folder), row)
 
 
 if __name__ == "__main__":

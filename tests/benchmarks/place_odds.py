@@ -27,7 +27,7 @@ from scanchain.loops import LoopCloser, evidence
 from scanchain.loops.planar_map_search import PlanarMapSearch, WholeSearch
 from scanchain.maps import SavedMap, open_saved_map
 from scanchain.settings import load_settings
-from tests.benchmarks.harness import command_line, poses_at, true_in_map
+from tests.benchmarks.harness import command_line, poses_at, table, true_in_map
 from tests.benchmarks.places import ENTRIES, REAL, prepared, whole_of
 
 NEAR_M, AROUND = 5.0, 12
@@ -100,17 +100,16 @@ def wrong(guest: SavedMap, host: SavedMap) -> Iterator[tuple[float, float, float
             yield from [] if found is None else [found]
 
 
-def told(name: str, weights: NDArray[np.float64], ours: Matrix, others: Matrix) -> str:
-    """A row of the table."""
+def told(weights: NDArray[np.float64], ours: Matrix, others: Matrix) -> tuple[str, ...]:
+    """Cells of some weights."""
     odds = [np.clip(part @ weights, -evidence.LARGEST_RATIO, evidence.LARGEST_RATIO) for part in (ours, others)]
     ordered = (odds[0][:, None] > odds[1]).mean() + 0.5 * (odds[0][:, None] == odds[1]).mean()
     shown = ", ".join(f"{each:.1f}" for each in weights.tolist())
-    return f"| {name} | {shown} | {100.0 * ordered:.1f} % | {odds[0].mean():+.2f} | {odds[1].mean():+.2f} |"
+    return shown, f"{100.0 * ordered:.1f} %", f"{odds[0].mean():+.2f}", f"{odds[1].mean():+.2f}"
 
 
 def main() -> None:
     cache = command_line(__doc__).parse_args().cache
-    cache.mkdir(parents=True, exist_ok=True)
     runs = {log: whole_of(log, cache) for log in REAL}
     maps = {log: open_saved_map(run) for log, run in runs.items()}
     ours = np.array([each for name, entry in ENTRIES.items() if entry.log in REAL for each in right(name, cache)])
@@ -120,10 +119,9 @@ def main() -> None:
     rows = np.vstack([ours, others])
     fitted = minimize(lambda w: float(shares @ np.logaddexp(0.0, -signs * (rows @ w))), np.zeros(3)).x
     print(f"{len(ours):,} keyframes at right poses, {len(others):,} at wrong ones\n")
-    print("| weights | fit, no fit, contradiction | ordered rightly | right, mean | wrong, mean |")
-    print("|---|---|---|---|---|")
-    print(told("fitted", fitted, ours, others))
-    print(told("in use", np.array(evidence.WEIGHTS), ours, others))
+    row = table("weights", "fit, no fit, contradiction", "ordered rightly", "right, mean", "wrong, mean")
+    row("fitted", *told(fitted, ours, others))
+    row("in use", *told(np.array(evidence.WEIGHTS), ours, others))
 
 
 if __name__ == "__main__":

@@ -1,13 +1,11 @@
 """Whole logs in maps of other places, or in maps that they enter later: the states of all scans and the verdict.
 
-    python -m tests.benchmarks.places [--kind 2d 3d] [--places NAME ...] [--own] [--from SHARE] [--half] [--seed N]
-        [--set KEY=VALUE ...] [--cache DIR]
+    python -m tests.benchmarks.places [--kind 2d 3d] [--places NAME ...] [--own] [--seed N] [--set KEY=VALUE ...]
     python -m tests.benchmarks.places --late [--kind 2d 3d] [--places NAME ...] [--seed N] [--set KEY=VALUE ...]
 
 A map is made of each place by ``run``, and every log of another place is localized in it, from its first scan to
 its last: all ordered pairs. --own localizes a log of the same place instead: another day, another start or
-another part of it. --from begins logs at a share of their duration, --half ends them at half of it, --set
-changes the configuration of localization (``--set log.every=2 log.wheels=``).
+another part of it. --set changes the configuration of localization (``--set log.every=2 log.wheels=``).
 
   refused   "not from this place", and none of its scans has ever had a pose in the map
   held      refused in the end, but scans had a pose in the map for a while
@@ -40,12 +38,10 @@ import scanchain as sc
 from scanchain import lie
 from scanchain.data import Trajectory
 from scanchain.errors import ScanchainError
-from scanchain.logs import open_log
 from scanchain.maps import open_saved_map
 from scanchain.sessions.localizer import MapState
-from scanchain.settings import load_settings, overrides_of
 from scanchain.trajectory import read_tum
-from tests.benchmarks.harness import DATA, command_line, poses_at, run_of, settings_of, true_in_map
+from tests.benchmarks.harness import DATA, command_line, poses_at, run_of, settings_of, table, true_in_map
 from tests.support import made
 
 Options = dict[str, object]
@@ -55,6 +51,7 @@ SPATIAL: Options = {"sensor": "vlp-16"}
 LONG: Options = {"sensor": "vlp-16", "seconds": 25.0}
 INSIDE_M = {2: 5.0, 3: 10.0}
 WRONG_M = {2: 1.0, 3: 2.0}  # error from which on a pose is wrong
+HEAD = "log|outside|inside|found after|wrong poses|error|σ then, final|NEES|CPU s|verdict"
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,10 +121,6 @@ def outcome(guest: str, host: str, options: argparse.Namespace) -> tuple[str, st
     prior = run_of(mapped, options.cache, name, **(home.options | part if home.log else {}))
     log = log_of(guest, options.seed, options.cache, again=again)
     chosen = (place.options | (place.again if again else {}) if place.log else {}) | settings_of(options.set)
-    if options.share or options.half:
-        duration_s = open_log(log, load_settings(overrides=overrides_of(chosen)).config.log).duration_s
-        chosen |= {"log__start_s": options.share * duration_s} if options.share else {}
-        chosen |= {"log__end_s": 0.5 * duration_s} if options.half else {}
     with tempfile.TemporaryDirectory() as folder:
         try:
             metrics = sc.localize(log, prior, Path(folder) / "out", recording=False, **chosen).metrics
@@ -215,8 +208,8 @@ def prepared(name: str, seed: int, cache: Path) -> tuple[Path, Path, Options, Tr
     return run_of(mapped, cache, out), log, {}, *(read_tum(each.with_suffix(".tum")) for each in (mapped, log))
 
 
-def entering(name: str, options: argparse.Namespace) -> str:
-    """The row of a case."""
+def entering(name: str, options: argparse.Namespace) -> tuple[str, ...]:
+    """The cells of a case."""
     d = ENTRIES[name].dimension
     out, log, of_log, map_truth, truth = prepared(name, options.seed, options.cache)
     began_s = process_time()
@@ -242,11 +235,9 @@ def entering(name: str, options: argparse.Namespace) -> str:
     after = "never" if first < 0 else f"{inside_m[first] - early_m:.1f}"
     error = f"{np.median(final_m[placed]):.3f}" if placed.any() else "none"
     wrong = f"{(live_m[known] > WRONG_M[d]).sum()} of {known.sum()}"
-    return (
-        f"| {name} | {path_m[entry]:.0f} | {inside_m[-1]:.0f} | {after} | {wrong} | {error} | "
-        f"{metrics.median_sigma_m:.3f}, {metrics.median_final_sigma_m:.3f} | {nees[0]:.2f}, {nees[1]:.2f} | "
-        f"{spent_s:.0f} | {metrics.sentence.split(':')[0]} |"
-    )
+    sigmas = f"{metrics.median_sigma_m:.3f}, {metrics.median_final_sigma_m:.3f}"
+    found_there = f"{path_m[entry]:.0f}", f"{inside_m[-1]:.0f}", after, wrong, error, sigmas
+    return name, *found_there, f"{nees[0]:.2f}, {nees[1]:.2f}", f"{spent_s:.0f}", metrics.sentence.split(":")[0]
 
 
 def main() -> None:
@@ -258,21 +249,15 @@ def main() -> None:
     parser.add_argument("--own", action="store_true")
     parser.add_argument("--late", action="store_true")
     parser.add_argument("--seed", type=int, default=0, help="of the worlds")
-    parser.add_argument("--from", dest="share", type=float, default=0.0)
-    parser.add_argument("--half", action="store_true")
     parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE")
     options = parser.parse_args()
-    options.cache.mkdir(parents=True, exist_ok=True)
     if not options.late:
         all_pairs(options)
         return
-    print(
-        "| log | outside | inside | found after | wrong poses | error | σ then, final | NEES | CPU s | verdict |"
-    )
-    print("|---|---|---|---|---|---|---|---|---|---|")
+    row = table(*HEAD.split("|"))
     for name in options.places or ENTRIES:
         if f"{ENTRIES[name].dimension}d" in options.kind:
-            print(entering(name, options), flush=True)
+            row(*entering(name, options))
 
 
 if __name__ == "__main__":

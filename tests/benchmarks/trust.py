@@ -49,7 +49,7 @@ from scanchain.settings import Override, load_settings
 from scanchain.simulation import SENSORS, WORLDS
 from scanchain.slam import Slam, SlamResult
 from scanchain.trajectory import write_tum, write_wide_tum
-from tests.benchmarks.harness import DATA, PLACES, choose_sequences, command_line, drive_of
+from tests.benchmarks.harness import DATA, PLACES, choose_sequences, command_line, drive_of, table
 
 WARM_UP_SCANS = 3
 NO_WHEELS = (Override("odometry.prior", "constant-velocity", "this benchmark"),)
@@ -85,11 +85,11 @@ class Line:
     def is_covered(self) -> bool:
         return self.low_m <= self.true_m <= self.high_m
 
-    def __str__(self) -> str:
+    @property
+    def cells(self) -> tuple[str, ...]:
         bounds = f"{self.expected_m:.4f} ({self.low_m:.4f} to {self.high_m:.4f})"
-        mark = " " if self.is_covered else "*"
-        figures = f"{self.ratio:8.2f}{mark}{self.nees:9.2f}{self.gap:9.2f}"
-        return f"{self.name:26}{self.true_m:9.4f} {bounds:>29}{figures}"
+        ratio = f"{self.ratio:.2f}{'' if self.is_covered else '*'}"
+        return self.name, f"{self.true_m:.4f}", bounds, ratio, f"{self.nees:.2f}", f"{self.gap:.2f}"
 
 
 def placed(
@@ -165,12 +165,8 @@ def relations_line(name: str) -> Line:
     first, last = (np.searchsorted(keyframes, scans, side="right") - 1 for scans in (a, b))
     chosen = np.flatnonzero((length_m > LONG_M) & (first != last))
     graph, own = with_map_errors(result.graph, result.map_errors, load_settings(2).config)
-    covariance = noise + np.array(
-        [
-            graph.relative_covariance(i, j) + own[i] + own[j]
-            for i, j in zip(first[chosen].tolist(), last[chosen].tolist(), strict=True)
-        ]
-    )
+    ends = zip(first[chosen].tolist(), last[chosen].tolist(), strict=True)
+    covariance = noise + np.array([graph.relative_covariance(i, j) + own[i] + own[j] for i, j in ends])
     poses = result.trajectory.poses
     error = lie.log(lie.between(true, lie.between(poses[a], poses[b])))[chosen]
     nees = float(np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error).mean()) / 3.0
@@ -215,7 +211,7 @@ def main() -> None:
     parser.add_argument("--seeds", default="1,2,3")
     parser.add_argument("--real", action="store_true", help="the real logs alone")
     arguments = parser.parse_args()
-    print(f"{'sequence':26}{'ATE m':>9} {'expected':>29}{'over':>8} {'NEES/k':>9}{'k':>9}")
+    row = table("sequence", "ATE m", "expected", "over", "NEES/k", "k")
     lines = []
     for world in [] if arguments.real else arguments.worlds.split(","):
         is_planar = SENSORS[WORLDS[world].sensor].dimension == 2
@@ -223,12 +219,13 @@ def main() -> None:
             for seed in map(int, arguments.seeds.split(",")):
                 path = drive_of(world, sensor, arguments.scans, arguments.cache, seed)
                 lines.append(line(f"{world} {sensor} {seed}", path))
-                print(lines[-1], flush=True)
+                row(*lines[-1].cells)
     if lines:
         summary("simulated", lines)
     lines = [line(name, DATA / file, (), **of_log) for name, (file, of_log) in REAL.items()]
     lines += [relations_line(name) for name in ("intel", "aces")]
-    print(*lines, sep="\n")
+    for each in lines:
+        row(*each.cells)
     summary("real", lines)
 
 

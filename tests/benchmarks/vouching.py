@@ -29,7 +29,6 @@ import argparse
 import shutil
 import sys
 import traceback
-from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
@@ -46,8 +45,8 @@ from scanchain.evaluation import absolute_error, pair, read_relations, relation_
 from scanchain.evaluation.pairing import nearest
 from scanchain.runs.vouching import evidence_of
 from scanchain.trajectory import read_tum
-from scanchain.verdict import Judged, judge
-from tests.benchmarks.harness import command_line
+from scanchain.verdict import judge
+from tests.benchmarks import harness
 from tests.benchmarks.vouching_logs import WHEELS, Case, LogSpec, cases
 from tests.support import made
 
@@ -130,20 +129,17 @@ def judged(case: Case, cache: Path, out: Path) -> Row:
         flags[stretch.first : stretch.last + 1] = True
     wrong, flagged = _is_wrong(motions, steps, evidence.poses, case.log), _any(flags, motions)
     is_open = _is_open(case.log.open_shares(cache), trajectory.stamps_ns, motions)
-    silent = wrong & ~flagged
     quality = "good but wrong motions" if quality[0] == "good" and wrong.any() else quality[0], quality[1]
     return {
         "name": case.name, "kind": case.kind, "half": case.half, "dimension": case.log.dimension,
         "wheels": case.wheels, "quality": quality[0], "error_m": quality[1], "is_open": bool(is_open.any()),
         "verdict": str(verdict.verdict), "reason": verdict.reason,
         "counts": {
-            "wrong flagged": int((wrong & flagged).sum()), "wrong silent": int(silent.sum()),
+            "wrong flagged": int((wrong & flagged).sum()), "wrong silent": int((wrong & ~flagged).sum()),
             "right flagged": int((~wrong & flagged & ~is_open).sum()),
             "right ok": int((~wrong & ~flagged & ~is_open).sum()),
             "open flagged": int((~wrong & flagged & is_open).sum()), "open": int((~wrong & is_open).sum()),
         },
-        "silent": _silent(silent, motions, evidence.seconds),
-        "right flagged by": _causes(~wrong & flagged & ~is_open, steps, verdict, motions),
         "checks": _checks(steps, motions, wrong, is_open),
     }  # fmt: skip
 
@@ -216,33 +212,12 @@ def _any(flags: NDArray[np.bool_], motions: Motions) -> NDArray[np.bool_]:
     return total[motions.last + 1] > total[motions.first]
 
 
-def _causes(chosen: NDArray[np.bool_], steps: Any, verdict: Judged, motions: Motions) -> Row:
-    """Number of the chosen motions by what flags them; one may be flagged by several."""
-    states = np.array(steps["state"].to_pylist())
-    flags = {state: states == state for state in np.unique(states[states != "ok"]).tolist()}
-    for stretch in verdict.stretches:
-        marked = flags.setdefault(f"stretch: {stretch.kind}", np.zeros(len(states), np.bool_))
-        marked[stretch.first : stretch.last + 1] = True
-    return {cause: int((_any(marked, motions) & chosen).sum()) for cause, marked in flags.items()}
-
-
 def _is_open(shares: Matrix | None, stamps_ns: NDArray[np.int64], motions: Motions) -> NDArray[np.bool_]:
     """(M,) motions during which the true geometry leaves a direction open."""
     if shares is None:
         return np.zeros(len(motions.first), np.bool_)
     seen = nearest(stamps_ns, shares[:, 0].astype(np.int64))[0]
     return _any(shares[seen, 1] < OPEN_SHARE, motions)
-
-
-def _silent(is_silent: NDArray[np.bool_], motions: Motions, seconds: Floats) -> list[float]:
-    """Of the silent wrong motions: seconds of the first begin and the last end, largest meters and degrees."""
-    errors = motions.errors[is_silent]
-    if not len(errors):
-        return []
-    size_m = np.linalg.norm(errors[:, :-1, -1], axis=1).max()
-    size_deg = np.degrees(lie.rotation_angle(lie.lift(errors)).max())
-    span_s = seconds[motions.first[is_silent]].min(), seconds[motions.last[is_silent]].max()
-    return [round(float(each), 2) for each in (*span_s, size_m, size_deg)]
 
 
 def _checks(steps: Any, motions: Motions, wrong: NDArray[np.bool_], is_open: NDArray[np.bool_]) -> Row:
@@ -265,59 +240,37 @@ def _checks(steps: Any, motions: Motions, wrong: NDArray[np.bool_], is_open: NDA
 
 def table(rows: Sequence[Row]) -> None:
     """Counts by kind, totals by half against the bars, and the failures by name."""
-    print("| kind | runs | wrong, flagged | right, flagged | open, flagged | bad, trustworthy | good, doubted |")
-    print("|---|---|---|---|---|---|---|")
+    line = harness.table(
+        "kind", "runs", "wrong, flagged", "right, flagged", "open, flagged", "bad, trustworthy", "good, doubted"
+    )
     done = [row for row in rows if "failed" not in row]
-    for kind in sorted({row["kind"] for row in done}):
-        _line(kind, [row for row in done if row["kind"] == kind])
-    for wheels in WHEELS:
-        _line(wheels, [row for row in done if row["wheels"] == wheels])
-    for half in (0, 1):
-        _line(f"**half {half + 1}**", [row for row in done if row["half"] == half])
-    _line("**all**", done)
+    groups = {kind: [row for row in done if row["kind"] == kind] for kind in sorted({row["kind"] for row in done})}
+    groups |= {wheels: [row for row in done if row["wheels"] == wheels] for wheels in WHEELS}
+    groups |= {f"**half {half + 1}**": [row for row in done if row["half"] == half] for half in (0, 1)}
+    for name, group in (groups | {"**all**": done}).items():
+        if group:
+            line(name, len(group), *_cells(group))
     print(f"\n{BARS}\n")
-    _failures(done)
+    for row in done:
+        if _is_missed(row) or _is_doubted(row):
+            word = "bad but trustworthy" if _is_missed(row) else "good but doubted"
+            print(f"{word}: {row['name']}: {row['error_m']:.3f} m; half {row['half'] + 1}; {row['reason'][:160]}")
     for row in rows:
         if "failed" in row:
             print(f"failed: {row['name']}: {row['failed']}")
 
 
-def _failures(done: Sequence[Row]) -> None:
-    """What flags right motions, and the cases with silent wrong motions or wrong verdicts."""
-    causes = Counter[str]()
-    for row in done:
-        causes.update(row["right flagged by"])
-    print(
-        f"right motions flagged by: {', '.join(f'{cause} {count:,}' for cause, count in causes.most_common())}\n"
-    )
-    for row in sorted(done, key=lambda row: -row["counts"]["wrong silent"]):
-        if row["silent"]:
-            begin_s, end_s, size_m, size_deg = row["silent"]
-            wrong = row["counts"]["wrong silent"] + row["counts"]["wrong flagged"]
-            print(
-                f"silent: {row['name']}: {row['counts']['wrong silent']} of {wrong}, within {begin_s:.1f} to "
-                f"{end_s:.1f} s, up to {size_m:.2f} m, {size_deg:.1f}°; half {row['half'] + 1}, "
-                f"error {row['error_m']:.2f} m, {row['verdict']}"
-            )
-    for row in done:
-        if _is_missed(row) or _is_doubted(row):
-            word = "bad but trustworthy" if _is_missed(row) else "good but doubted"
-            print(f"{word}: {row['name']}: {row['error_m']:.3f} m; half {row['half'] + 1}; {row['reason'][:160]}")
-
-
-def _line(name: str, rows: Sequence[Row]) -> None:
-    if not rows:
-        return
+def _cells(rows: Sequence[Row]) -> tuple[str, ...]:
+    """Shares of motions and of runs."""
     counts = {key: sum(row["counts"][key] for row in rows) for key in rows[0]["counts"]}
     wrong = counts["wrong flagged"] + counts["wrong silent"]
     right = counts["right flagged"] + counts["right ok"]
     bad, good = ([row for row in rows if row["quality"] == quality] for quality in ("bad", "good"))
-    cells = (
+    return (
         _share(counts["wrong flagged"], wrong), _share(counts["right flagged"], right),
         _share(counts["open flagged"], counts["open"]), _share(sum(map(_is_missed, bad)), len(bad)),
         _share(sum(map(_is_doubted, good)), len(good)),
     )  # fmt: skip
-    print(f"| {name} | {len(rows)} | {' | '.join(cells)} |", flush=True)
 
 
 def _share(part: int, whole: int) -> str:
@@ -368,7 +321,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
 
 
 def main() -> None:
-    parser = command_line(__doc__)
+    parser = harness.command_line(__doc__)
     parser.add_argument("--quick", action="store_true", help=f"every {QUICK}th case")
     parser.add_argument("--only", default="", help="cases whose names hold all of these words")
     parser.add_argument("--jobs", type=int, default=1)

@@ -8,6 +8,7 @@ wrong. The trajectory is compared with the optimum of the graph without them.
 """
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.data import Trajectory
 from scanchain.graph.g2o import read_g2o
-from tests.benchmarks.harness import DATA, ate_m, command_line
+from tests.benchmarks.harness import DATA, ate_m, command_line, table
 
 KINDS = {"anywhere": 1, "nearby": 1, "groups": 5, "groups of 10": 10}  # how many agree with each other
 
@@ -97,20 +98,12 @@ def main():
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--robust", default="truncated")
     options = parser.parse_args()
-    print(
-        f"{'graph':12} {'kind':12} {'added':>6} {'seed':>4} {'wrong rejected':>15} {'true rejected':>14} "
-        f"{'ATE m':>9} {'without':>9} {'time s':>7}"
-    )
-    for name in options.graphs:
-        for kind in options.kinds:
-            for share in options.shares:
-                for seed in range(options.seeds):
-                    o = try_wrong_loops(DATA / "graphs" / f"{name}.g2o", share, kind, seed, options.robust)
-                    print(
-                        f"{name:12} {kind:12} {100 * share:5.0f}% {seed:4d} {100 * o.wrong_rejected:14.2f}% "
-                        f"{100 * o.true_rejected:13.2f}% {o.ate_m:9.4f} {o.ate_clean_m:9.4f} {o.time_s:7.2f}",
-                        flush=True,
-                    )
+    row = table("graph", "kind", "added", "seed", "wrong rejected", "true rejected", "ATE m", "without", "time s")
+    for name, kind, share, seed in product(options.graphs, options.kinds, options.shares, range(options.seeds)):
+        found = try_wrong_loops(DATA / "graphs" / f"{name}.g2o", share, kind, seed, options.robust)
+        rejected = f"{100 * found.wrong_rejected:.2f} %", f"{100 * found.true_rejected:.2f} %"
+        ate = f"{found.ate_m:.4f}", f"{found.ate_clean_m:.4f}"
+        row(name, kind, f"{100 * share:.0f} %", seed, *rejected, *ate, f"{found.time_s:.2f}")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A log, and commands that are run on it: successful ones with their directory, refused ones with their line."""
+"""Commands: successful ones with their directory, refused ones with their line."""
 
 import json
 import re
@@ -8,17 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from scanchain.simulation import simulate
-
 FULL = "the disk is full; free some space on it, or write to another one"
-
-
-@pytest.fixture(scope="package")
-def office(tmp_path_factory):
-    """Six seconds in the simulated office, 60 scans, with the truth beside it."""
-    path = tmp_path_factory.mktemp("log") / "office.mcap"
-    simulate("office", path, duration_s=6.0)
-    return path
 
 
 @pytest.fixture

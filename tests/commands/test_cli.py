@@ -18,7 +18,7 @@ from mcap.reader import make_reader
 
 from scanchain.__main__ import scanchain
 from scanchain.settings import flatten
-from tests.commands.conftest import FULL, flat
+from tests.commands.conftest import FULL
 from tests.support.messages import says
 from tests.support.naive_logs import SECOND, STAMP_NS, laser_scan, odometry, odometry_said, scan_said, write
 from tests.support.scenes import ROOT, configured
@@ -175,15 +175,6 @@ def test_config_show_as_json_has_value_unit_range_default_and_description(call, 
     assert next(row for row in rows if row["key"] == "log.end_s")["value"] is None
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_what_config_dump_prints_can_be_given_back(call, tmp_path, dimension):
-    _, output, _ = call("config", "dump", "--lidar", f"{dimension}d", "--matching.matcher", "svd")
-    expected = configured(dimension, {"matching.matcher": "svd"})
-    assert flat(output) == flatten(expected)
-    (tmp_path / "mine.toml").write_text(output)
-    assert call("config", "dump", "--config", tmp_path / "mine.toml")[1] == output
-
-
 def test_sequence_list_knows_every_file_of_the_catalog(call):
     known = sorted(path.stem for path in (ROOT / "sequences").glob("*.toml"))
     code, output, errors = call("sequence", "list")
@@ -191,14 +182,6 @@ def test_sequence_list_knows_every_file_of_the_catalog(call):
     assert [line.split()[0] for line in output.splitlines()] == known
     tree = json.loads(call("sequence", "list", "--json")[1])
     assert list(tree) == known and tree["demo-office"]["source"]["world"] == "office"
-
-
-def test_sequence_get_does_not_make_again_what_is_there(call, tmp_path):
-    (tmp_path / "demo-office.mcap").write_bytes(b"there")
-    code, output, errors = call("sequence", "get", "demo-office", "--out", tmp_path, "--json")
-    assert (code, errors) == (0, "")
-    assert json.loads(output) == {"name": "demo-office", "path": str(tmp_path / "demo-office.mcap")}
-    assert (tmp_path / "demo-office.mcap").read_bytes() == b"there"
 
 
 def test_simulate_writes_a_log_and_its_truth_once_with_the_sensor_named(call, refused, tmp_path):
@@ -219,20 +202,6 @@ def test_simulate_writes_a_log_and_its_truth_once_with_the_sensor_named(call, re
 
 
 # as a program
-
-
-def program(*words):
-    return subprocess.run(
-        [sys.executable, "-m", "scanchain", *map(str, words)], cwd=ROOT, capture_output=True, text=True, timeout=60
-    )
-
-
-def test_it_runs_as_a_module_with_its_exit_codes(tmp_path):
-    good = program("config", "show", "--json")
-    assert (good.returncode, good.stderr) == (0, "") and json.loads(good.stdout)
-    bad = program("info", tmp_path / "absent.mcap")
-    assert (bad.returncode, bad.stdout) == (2, "")
-    assert re.fullmatch(r"error: .*absent\.mcap: no such file; check the path\n", bad.stderr)
 
 
 def test_a_reader_that_goes_away_is_no_error_to_talk_about():

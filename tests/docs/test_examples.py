@@ -24,6 +24,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 GIVEN = {  # what a page takes as done
     "results.md": ("simulate office log.mcap --duration 20", "run log.mcap --out runs/log --rerun off")
 }
+LONG = ("extending.md", "maps.md")
 FENCE = re.compile(r"^(`{3,})(\w+)\n(.*?)^\1$", re.DOTALL | re.MULTILINE)
 FILE = re.compile(r"# (\w+\.\w+)\n")
 NUMBER = re.compile(r"[-+]?\d[\d,]*(?:\.\d*)?(?:e[-+]?\d+)?", re.IGNORECASE)
@@ -99,7 +100,7 @@ def folder(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     "page",
-    [pytest.param(page, marks=[pytest.mark.slow] * (page.name == "extending.md")) for page in PAGES],
+    [pytest.param(page, marks=[pytest.mark.slow] * (page.name in LONG)) for page in PAGES],
     ids=lambda page: page.name,
 )
 def test_every_example_prints_what_the_page_says(page, folder, capsys):

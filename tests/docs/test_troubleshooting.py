@@ -5,6 +5,7 @@ import re
 import pytest
 
 import scanchain
+from tests.support import made
 from tests.support.scenes import ROOT
 
 TEXT = (ROOT / "docs" / "results.md").read_text(encoding="utf-8")
@@ -33,10 +34,8 @@ def numbers_of(pattern):
 
 
 @pytest.fixture(scope="module")
-def office(tmp_path_factory):
-    path = tmp_path_factory.mktemp("logs") / "office.mcap"
-    scanchain.simulate("office", path, duration_s=120.0)
-    return path
+def office():
+    return made.log("office", seconds=120)
 
 
 def test_loops_hardly_change_an_office_that_odometry_tracks_well(office, tmp_path):
@@ -72,8 +71,7 @@ def test_turns_outside_of_the_window_are_contradicted_and_not_lost(row, override
 
 @pytest.mark.slow
 def test_wheels_hold_the_poses_along_corridors_that_a_short_range_leaves_degenerate(tmp_path):
-    log = tmp_path / "identical.mcap"
-    scanchain.simulate("identical", log, duration_s=120.0)  # of the 300 s of the page
+    log = made.log("identical", seconds=120)  # of the 300 s of the page
     without, with_wheels = (
         metrics_of(log, tmp_path / prior, preprocess__max_range_m=4.0, odometry__prior=prior)
         for prior in ("constant-velocity", "auto")

@@ -11,9 +11,9 @@ import pytest
 from scanchain import lie
 from scanchain.errors import InputError
 from scanchain.logs import open_log
-from tests.support.carmen_text import BEGIN_S, flaser, odom, robotlaser, save
 from tests.support.recorders import read
 from tests.support.scenes import shared_data
+from tests.support.sensor_files import BEGIN_S, flaser, odom, robotlaser, save
 
 
 def points(ranges, first=-np.pi / 2, step=np.pi / 180):
@@ -131,27 +131,12 @@ def test_lines_that_are_malformed_or_of_other_kinds_are_counted(tmp_path):
     assert "2 SYNC" in " ".join(log.notes)
 
 
-def test_a_packed_log_that_was_cut_off_is_read_as_far_as_it_goes(tmp_path):
-    rng = np.random.default_rng(0)
-    lines = [flaser(k, rng.uniform(1.0, 9.0, 180).round(2)) for k in range(2000)]
-    packed = gzip.compress(save(tmp_path / "a.log", *lines).read_bytes())
-    (tmp_path / "a.log.gz").write_bytes(packed[: len(packed) // 2])
-    log, scans = read(tmp_path / "a.log.gz")
-    assert 500 < len(scans) < 1500 and "does not unpack" in log.damage[0]
-
-
 @pytest.mark.parametrize("text", [b"\0", b"FLASER 0\n"], ids=["zeros", "lines"])
 def test_a_bomb_takes_no_more_memory_than_a_log_of_its_size_could(tmp_path, text):
-    (tmp_path / "bomb.clf").write_bytes(bz2.compress(text * ((100 << 20) // len(text))))
+    (tmp_path / "bomb.clf").write_bytes(100 * bz2.compress(text * ((1 << 20) // len(text))))
     tracemalloc.start()
     with pytest.raises(InputError, match=r"bomb.clf: unpacks to more than [\d,]+ bytes"):
         open_log(tmp_path / "bomb.clf")
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 50 << 20
-
-
-def test_a_packed_file_that_is_no_carmen_log_says_so(tmp_path):
-    (tmp_path / "b.bz2").write_bytes(b"BZh9 and no more")
-    with pytest.raises(InputError, match=r"b\.bz2"):
-        open_log(tmp_path / "b.bz2")

@@ -13,9 +13,8 @@ from scanchain.__main__ import main
 from scanchain.config import LogConfig
 from scanchain.logs import open_log
 from tests.support import recorders
-from tests.support.carmen_text import flaser, odom, save
-from tests.support.folders import kitti_odometry, kitti_raw, xyzi
 from tests.support.naive_logs import office, write
+from tests.support.sensor_files import flaser, kitti_odometry, kitti_raw, odom, save, xyzi
 
 
 def carmen(folder):
@@ -111,31 +110,23 @@ def test_a_rate_gives_stamps_to_files_that_are_only_numbered(tmp_path, capfd):
     assert_same_log(open_log(tmp_path / "out.mcap"), direct)
 
 
-def test_a_part_of_a_log_is_written_by_the_keys_that_a_run_takes(tmp_path, capfd):
+@pytest.mark.parametrize(
+    ("keys", "flags"),
+    [
+        (
+            {"topic": "/rear", "start_s": 0.5, "end_s": 1.5, "every": 3},
+            ["--log.topic=/rear", "--log.start_s=0.5", "--log.end_s=1.5", "--log.every=3"],
+        ),
+        ({"topic": "/scan", "start_s": 1.0, "every": 2}, ["--topic", "/scan", "--start", "1", "--every", "2"]),
+    ],
+)
+def test_a_part_of_a_log_is_written_by_the_keys_that_a_run_takes(tmp_path, capfd, keys, flags):
     said = [*office(20), *(replace(each, topic="/rear") for each in office(20) if each.topic == "/scan")]
-    source = write(tmp_path / "in.mcap", sorted(said, key=lambda each: each.log_ns))
-    keys = {"topic": "/rear", "start_s": 0.5, "end_s": 1.5, "every": 3}
-    flags = [f"--log.{key}={value}" for key, value in keys.items()]
-    assert main(["convert", str(source), str(tmp_path / "out.mcap"), *flags]) == 0
-    assert "/scan" not in capfd.readouterr().out
-    assert_same_log(open_log(tmp_path / "out.mcap"), open_log(source, LogConfig(**keys)))
-
-
-def test_keys_that_mean_nothing_to_convert_are_refused(tmp_path, capfd):
-    words = ["convert", str(tmp_path), str(tmp_path / "out.mcap"), "--log.min_range_m", "1"]
-    assert main(words) == 2
-    assert (
-        "--log.min_range_m has no meaning for convert; its keys are log.format, log.rate_hz"
-        in capfd.readouterr().err
-    )
-
-
-def test_an_mcap_file_is_cut_by_the_short_flags(tmp_path, capfd):
-    source, cut = write(tmp_path / "in.mcap", office(40)), tmp_path / "out.mcap"
-    assert main(["convert", str(source), str(cut), "--start", "1", "--end", "2", "--every", "2"]) == 0
-    chosen = open_log(source, LogConfig(start_s=1.0, end_s=2.0, every=2)).scans()
-    assert [scan.stamp_ns for scan in open_log(cut).scans()] == [scan.stamp_ns for scan in chosen]
-    before, _ = cut.read_bytes(), capfd.readouterr()
+    source, cut = write(tmp_path / "in.mcap", sorted(said, key=lambda each: each.log_ns)), tmp_path / "out.mcap"
+    assert main(["convert", str(source), str(cut), *flags]) == 0
+    assert ("/rear" in capfd.readouterr().out) == (keys["topic"] == "/rear")
+    assert_same_log(open_log(cut), open_log(source, LogConfig(**keys)))
+    before = cut.read_bytes()
     assert main(["convert", str(source), str(cut), "--start", "99", "--force"]) == 2
     assert "no message lies after --start 99 s; the log is " in capfd.readouterr().err
     assert cut.read_bytes() == before
@@ -158,6 +149,10 @@ def test_what_could_not_be_read_is_told_and_the_rest_is_converted(tmp_path, capf
         (["empty", "out.mcap"], "is a folder without a recognized log"),
         (["a.log", "taken.mcap"], "exists"),
         (["bad.log", "out.mcap"], "no message that could be read"),
+        (
+            ["a.log", "out.mcap", "--log.min_range_m", "1"],
+            "--log.min_range_m has no meaning for convert; its keys are log.format, log.rate_hz",
+        ),
     ],
 )
 def test_what_cannot_be_converted_is_one_line_and_leaves_nothing(tmp_path, capfd, monkeypatch, words, complaint):

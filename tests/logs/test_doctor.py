@@ -10,7 +10,7 @@ from scanchain.config import Config, LogConfig
 from scanchain.errors import InputError
 from scanchain.logs import open_log
 from scanchain.logs.doctor import examine
-from scanchain.simulation import simulate
+from tests.support import made
 from tests.support.naive_logs import (
     SECOND,
     STAMP_NS,
@@ -98,9 +98,9 @@ def test_a_log_without_a_point_in_range_names_the_settings_and_the_ranges_seen(c
     assert "lie at 0.2 to 0.2 m" in errors
 
 
-def test_the_scans_looked_at_are_those_that_a_run_would_take(tmp_path):
-    simulate("town", tmp_path / "town.mcap", duration_s=3.0, sensor="vlp-16")
-    assert diagnose(tmp_path / "town.mcap", every=4)["damage"].found.startswith("8 scans")
+def test_the_scans_looked_at_are_those_that_a_run_would_take():
+    town = made.log("town", seconds=3, sensor="vlp-16")
+    assert diagnose(town, every=4)["damage"].found.startswith("8 scans")
 
 
 def test_a_gap_is_found_where_it_is(tmp_path):
@@ -189,13 +189,6 @@ def test_scans_that_would_stop_a_run_are_a_problem_with_a_flag(tmp_path):
     for percent in (5.0, LogConfig().max_bad_scans_percent):
         finding = diagnose(path, max_bad_scans_percent=percent)["damage"]
         assert finding.severity == "warning" and "left out" in finding.effect
-
-
-def test_a_log_that_was_cut_off_is_told(tmp_path):
-    path = saved(tmp_path, drive())
-    path.write_bytes(path.read_bytes()[:-1500])
-    finding = diagnose(path)["damage"]
-    assert finding.severity == "warning" and "cut off" in finding.found
 
 
 # Clouds

@@ -9,9 +9,8 @@ from scanchain.logs import open_log
 from scanchain.logs.formats.clouds import stamp_of_name
 from scanchain.simulation import simulate
 from tests.support import recorders
-from tests.support.folders import PCD, PLY, camera, kitti_odometry, kitti_raw, xyzi
 from tests.support.recorders import SECOND, STAMP_NS, assert_clouds, read
-from tests.support.scenes import shared_data
+from tests.support.sensor_files import PCD, PLY, camera, kitti_odometry, kitti_raw, xyzi
 
 
 def assert_points(scans, said):
@@ -118,17 +117,6 @@ def test_a_kitti_folder_whose_parts_do_not_fit_says_so(tmp_path):
     (sequence / "times.txt").write_text("noon\n")
     with pytest.raises(InputError, match=r"times\.txt: is no table of 1 numbers"):
         read(sequence)
-
-
-def test_real_kitti_sweeps_are_the_same_out_of_a_folder(tmp_path):
-    mcap = open_log(shared_data("3d/kitti_0001_first54.mcap"))
-    scans = [scan for scan, _ in zip(mcap.scans(), range(3), strict=False)]
-    for scan in scans:
-        rows = np.column_stack([scan.points, np.zeros(len(scan.points))]).astype("<f4")
-        rows.tofile(tmp_path / f"{scan.stamp_ns}.bin")
-    _, again = read(tmp_path)
-    for ours, theirs in zip(again, scans, strict=True):
-        assert ours.stamp_ns == theirs.stamp_ns and ours.points.tobytes() == theirs.points.tobytes()
 
 
 # PCD and PLY

@@ -2,7 +2,6 @@
 
 import json
 import os
-import subprocess
 import sys
 
 import numpy as np
@@ -113,20 +112,6 @@ def test_run_info_and_convert_take_the_flag(own, tmp_path, capsys):
     rows = np.loadtxt(out / "trajectory.tum")
     assert len(rows) == 12
     assert rows[-1, 1] - rows[0, 1] == pytest.approx(0.55, abs=0.05)
-
-
-def test_compare_finds_the_class_in_the_working_directory_where_python_leaves_it_out(own, tmp_path):
-    path = write_text(tmp_path / "drive.txt", clouds_of(8))
-    words = ["compare", str(path), "--log.format", own, "--methods", "plicp", "--out", str(tmp_path / "compared")]
-    done = subprocess.run(
-        [sys.executable, "-P", "-m", "scanchain", *words],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "plicp" in done.stdout
 
 
 def test_a_known_format_can_be_named(tmp_path, own):

@@ -21,7 +21,7 @@ from scanchain.logs.mcap.stream import complete
 from scanchain.logs.opening import index_files
 from scanchain.runs.provenance import Provenance, identity_of
 from scanchain.simulation import simulate
-from tests.support.carmen_text import flaser, save
+from tests.support.sensor_files import flaser, save
 from tests.support.web_server import serving
 
 pytest.importorskip("fsspec", reason="the extra remote is not installed")

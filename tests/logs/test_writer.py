@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 
 from scanchain import lie
 from scanchain.errors import InputError
@@ -16,15 +14,9 @@ from scanchain.logs.writer import (
     place,
     schema_text,
 )
+from tests.support.naive_logs import decoded
 
 STAMP_NS = 1_700_000_000_123_456_789
-
-
-def read_back(path):
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        assert reader.get_header().profile == "ros2"
-        return list(reader.iter_decoded_messages())
 
 
 def append_mounting(log, T):
@@ -55,7 +47,7 @@ def test_a_laser_scan_survives_any_length_of_frame_name(tmp_path, frame):
             scan_time_s=0.1,
         )  # fmt: skip
         log.append("/scan", "sensor_msgs/msg/LaserScan", data, STAMP_NS)
-    ((schema, channel, message, scan),) = read_back(tmp_path / "a.mcap")
+    ((schema, channel, message, scan),) = decoded(tmp_path / "a.mcap")
     assert (schema.name, schema.encoding) == ("sensor_msgs/msg/LaserScan", "ros2msg")
     assert (channel.topic, channel.message_encoding) == ("/scan", "cdr")
     assert message.log_time == nanoseconds(scan) == STAMP_NS
@@ -83,7 +75,7 @@ def test_a_cloud_survives_with_its_times_and_rings(tmp_path, time_field):
             ring=ring,
             log_time_ns=STAMP_NS + 5,
         )
-    ((_, _, message, cloud),) = read_back(tmp_path / "a.mcap")
+    ((_, _, message, cloud),) = decoded(tmp_path / "a.mcap")
     assert message.log_time == STAMP_NS + 5 and nanoseconds(cloud) == STAMP_NS
     assert (cloud.height, cloud.width, cloud.is_bigendian, cloud.is_dense) == (1, 1000, False, True)
     assert cloud.row_step == cloud.point_step * 1000 == len(cloud.data)
@@ -97,7 +89,7 @@ def test_a_cloud_survives_with_its_times_and_rings(tmp_path, time_field):
 def test_a_bare_cloud_has_coordinates_only(tmp_path):
     with LogWriter(tmp_path / "a.mcap") as log:
         log.point_cloud("/points", STAMP_NS, "lidar", np.zeros((0, 3)))
-    ((_, _, _, cloud),) = read_back(tmp_path / "a.mcap")
+    ((_, _, _, cloud),) = decoded(tmp_path / "a.mcap")
     assert [field.name for field in cloud.fields] == ["x", "y", "z"]
     assert cloud.width == 0 and len(cloud.data) == 0
 
@@ -110,7 +102,7 @@ def test_poses_of_either_dimension_survive_as_odometry_and_static_transform(tmp_
         append_mounting(log, flat)
         data = pack_odometry(STAMP_NS, "odom", "base_link", place(solid), covariance)
         log.append("/odom", "nav_msgs/msg/Odometry", data, STAMP_NS)
-    static, odometry = (decoded for *_, decoded in read_back(tmp_path / "a.mcap"))
+    static, odometry = (contents for *_, contents in decoded(tmp_path / "a.mcap"))
 
     (transform,) = static.transforms
     assert (transform.header.frame_id, transform.child_frame_id) == ("base_link", "lidar")
@@ -153,7 +145,7 @@ def test_an_existing_file_is_replaced_only_on_demand(tmp_path):
     assert path.read_bytes() == b"precious"
     with LogWriter(path, force=True) as log:
         append_mounting(log, np.eye(4))
-    assert len(read_back(path)) == 1
+    assert len(list(decoded(path))) == 1
 
 
 def test_a_directory_is_not_a_destination(tmp_path):

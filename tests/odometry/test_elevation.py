@@ -13,9 +13,8 @@ from scanchain.kernels.registration.plane_adjustment import plane_equations, pla
 from scanchain.logs import open_log
 from scanchain.odometry import Odometry
 from scanchain.odometry.elevation import ElevationCalibration, _combined, adjusted, raised
-from scanchain.simulation import simulate
 from scanchain.trajectory import read_tum
-from tests.support import naive
+from tests.support import made, naive
 from tests.support.scenes import configured, kitti_scans, shared_data
 
 POSES = np.stack([lie.exp(np.array([2.0 * k, 0.1 * k, 0.0, 0.0, 0.01 * k, 0.02 * k])) for k in range(8)])
@@ -162,10 +161,8 @@ def test_the_offset_does_not_depend_on_the_voxels_of_the_map():
 
 
 @pytest.mark.parametrize("offset_deg", [-0.1, 0.3])
-def test_the_offset_is_found_on_a_straight_fast_road(offset_deg, tmp_path):
-    path = tmp_path / "highway.mcap"
-    simulate("highway", path, duration_s=4.0, sensor="os1-32")
-    log = open_log(path)
+def test_the_offset_is_found_on_a_straight_fast_road(offset_deg):
+    log = open_log(made.log("highway", seconds=4, sensor="os1-32"))
     scans = [
         replace(scan, points=raised(scan.points.astype(float), -math.radians(offset_deg)).astype(np.float32))
         for scan in log.scans()

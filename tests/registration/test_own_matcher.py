@@ -16,7 +16,7 @@ from scanchain.config import LocalMapConfig, MatchingConfig
 from scanchain.errors import InputError
 from scanchain.registration import VoxelMap, create_matcher
 from scanchain.runs.directory import CHECKPOINT_FILE
-from scanchain.simulation import simulate
+from tests.support import made
 from tests.support.killing import same_result
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "extending.md"
@@ -27,9 +27,7 @@ NAME = "my_matcher:PointToPoint"
 @pytest.fixture(scope="module")
 def office(tmp_path_factory):
     """Half a minute in the simulated office, 300 scans."""
-    path = tmp_path_factory.mktemp("log") / "office.mcap"
-    simulate("office", path, duration_s=30.0)
-    return path
+    return made.log("office", tmp_path_factory.mktemp("log"), seconds=30)
 
 
 @pytest.fixture

@@ -21,10 +21,10 @@ from scanchain.logs import open_log
 from scanchain.runs.directory import POINTS_FILE, RECORDING_FILE
 from scanchain.runs.resume import Checkpoints, read_checkpoint
 from scanchain.runs.step_table import StepTable
-from scanchain.simulation import simulate
 from scanchain.slam import Slam
 from scanchain.trajectory import read_tum
 from scanchain_viz.recording import entities
+from tests.support import made
 from tests.support.killing import (
     assert_readable,
     config_of,
@@ -46,9 +46,7 @@ LIVELY = (*RECORDED, "--rerun", "off")
 @pytest.fixture(scope="module")
 def office(tmp_path_factory):
     """Half a minute in the simulated office, 300 scans."""
-    path = tmp_path_factory.mktemp("log") / "office.mcap"
-    simulate("office", path, duration_s=30.0)
-    return path
+    return made.log("office", tmp_path_factory.mktemp("log"), seconds=30)
 
 
 @pytest.fixture(scope="module")
@@ -64,10 +62,17 @@ def undisturbed(request, office, whole, tmp_path_factory):
     """A log and its run."""
     if request.param == "2D":
         return office, whole
-    log, out = (tmp_path_factory.mktemp("town") / name for name in ("town.mcap", "run"))
-    simulate("town", log, duration_s=18.0, sensor="vlp-16")
+    log, out = made.log("town", seconds=18, sensor="vlp-16"), tmp_path_factory.mktemp("town") / "run"
     assert start(log, out, *RECORDED).wait() == 0
     return log, out
+
+
+def left_after(steps, log, out, *words):
+    """Kill a run of a log once it has so many steps in its checkpoint."""
+    child = start(log, out, *words)
+    wait_for_steps(child, out, steps)
+    child.kill()
+    child.wait()
 
 
 def test_interrupted_again_and_again_a_run_goes_on_to_the_same_result_and_recording(undisturbed, tmp_path):
@@ -100,22 +105,15 @@ def test_killed_at_any_moment_a_run_leaves_files_that_open_and_goes_on_to_the_sa
     assert len(killed) == 3
 
 
-@pytest.mark.parametrize(
-    "module, kind, method",
-    [
+def test_killed_while_it_takes_up_the_recording_a_run_goes_on_to_the_same_one(office, whole, tmp_path):
+    out = tmp_path / "run"
+    left_after(100, office, out, *RECORDED)
+    words = ["run", str(office), "--out", str(out), *RECORDED, "--resume"]
+    for module, kind, method in (
         ("scanchain_viz.recording.recording", "Recording", "resume"),
         ("scanchain.runs.resume", "Checkpoints", "write"),
-    ],
-)
-def test_killed_while_it_takes_up_the_recording_a_run_goes_on_to_the_same_one(
-    office, whole, tmp_path, module, kind, method
-):
-    out = tmp_path / "run"
-    child = start(office, out, *RECORDED)
-    wait_for_steps(child, out, 100)
-    child.kill()
-    child.wait()
-    dying = f"""
+    ):
+        dying = f"""
 import os, signal, sys
 from scanchain.__main__ import main
 from {module} import {kind}
@@ -126,19 +124,16 @@ def dying(self, *values):
 {kind}.{method} = dying
 sys.exit(main(sys.argv[1:]))
 """
-    words = ["run", str(office), "--out", str(out), *RECORDED, "--resume"]
-    assert subprocess.run([sys.executable, "-c", dying, *words], cwd=ROOT).returncode == -signal.SIGKILL
-    assert list(partial(out).glob("recording.part_*.rrd"))
+        assert subprocess.run([sys.executable, "-c", dying, *words], cwd=ROOT).returncode == -signal.SIGKILL
+        assert list(partial(out).glob("recording.part_*.rrd"))
     assert start(office, out, *RECORDED, "--resume").wait() == 0
     same_result(out, whole)
 
 
+@pytest.mark.slow
 def test_a_run_recorded_from_the_middle_on_says_so_and_draws_the_whole_graph(office, whole, tmp_path):
     out = tmp_path / "run"
-    child = start(office, out, *LIVELY)
-    wait_for_steps(child, out, 150)
-    child.kill()
-    child.wait()
+    left_after(150, office, out, *LIVELY)
     assert start(office, out, *RECORDED, "--resume").wait() == 0
     assert "the recording begins there" in (out / "summary.txt").read_text()
     assert "the recording lacks something" not in (out / "summary.txt").read_text()
@@ -256,16 +251,14 @@ def test_ctrl_c_twice_ends_a_run_at_once_and_it_can_go_on(office, whole, tmp_pat
     same_result(out, whole)
 
 
-def test_resuming_is_refused_where_something_else_was_run(office, tmp_path):
-    out, other = tmp_path / "run", tmp_path / "other.mcap"
-    simulate("office", other, duration_s=30.0, seed=5)
+def test_resuming_is_refused_where_something_else_was_run(office, call, tmp_path):
+    out, other = tmp_path / "run", made.log("office", seconds=3, seed=5)
     child = start(office, out, *LIVELY)
     wait_for_steps(child, out, 1)
 
     def refusal(log, *words):
-        refused = start(log, out, *LIVELY, "--resume", *words, stderr=subprocess.PIPE)
-        errors = refused.communicate()[1].decode()
-        assert refused.returncode == 2 and errors.count("error: ") == 1
+        code, _, errors = call("run", log, "--out", out, *LIVELY, "--resume", *words)
+        assert code == 2 and errors.count("error: ") == 1
         return errors
 
     child.send_signal(signal.SIGSTOP)

@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 
 from scanchain import lie
 from scanchain.__main__ import main
@@ -11,17 +9,16 @@ from scanchain.logs import open_log
 from scanchain.maps import read_map, read_ply
 from scanchain.runs.results_mcap import ros_covariance
 from scanchain.trajectory import read_tum
-from tests.support.naive_logs import SECOND, STAMP_NS, laser_scan, scan_said, transforms, transforms_said, write
-
-
-def decoded(path):
-    """Messages by topic: (log time, message)."""
-    told = {}
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        for _, channel, message, value in reader.iter_decoded_messages():
-            told.setdefault(channel.topic, []).append((message.log_time, value))
-    return told
+from tests.support.naive_logs import (
+    SECOND,
+    STAMP_NS,
+    decoded,
+    laser_scan,
+    scan_said,
+    transforms,
+    transforms_said,
+    write,
+)
 
 
 def pose_of(pose):
@@ -60,7 +57,10 @@ def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("results")
     log = room(folder)
     assert main(["run", str(log), "--out", str(folder / "run"), "--rerun", "off", "--outputs.mcap", "true"]) == 0
-    return log, folder / "run", decoded(folder / "run" / "results.mcap")
+    told = {}  # messages by topic: (log time, message)
+    for _, channel, message, value in decoded(folder / "run" / "results.mcap"):
+        told.setdefault(channel.topic, []).append((message.log_time, value))
+    return log, folder / "run", told
 
 
 def test_every_topic_is_there_and_has_its_schema(finished):

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import resource
+import shutil
 import signal
-import tempfile
 import traceback
-from collections import Counter
+import warnings
 from contextlib import contextmanager
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from mcap.reader import make_reader
@@ -31,7 +30,18 @@ from scanchain.logs.messages.readers import (
 from scanchain.logs.messages.returns import PointTimes, RangeLimits
 from scanchain.logs.messages.ros import MalformedMessageError
 from tests.support import recorders
-from tests.support.mutations import CHUNK, Seed, cut_and_flipped, cut_at, mutant, mutated_message
+from tests.support.mutations import (
+    CHUNK,
+    DATA_END,
+    MESSAGE,
+    STATISTICS,
+    any_mutant,
+    cut_and_flipped,
+    cut_at,
+    mutant,
+    mutated_message,
+    records_of,
+)
 from tests.support.naive_logs import STAMP_NS, cloud_said, odometry, odometry_said, office, point_cloud, write
 from tests.support.scenes import shared_data
 
@@ -40,8 +50,116 @@ LONGEST_WAIT_S = 120.0
 MOST_BYTES = 500_000_000
 
 
+REAL = {
+    "2d/intel.mcap": 900_000,
+    "2d/mit_csail.mcap": 700_000,
+    "3d/kitti_0001_first54.mcap": 10_000_000,
+    "3d/kitti_0005_first60.mcap": 10_000_000,
+}  # and how many bytes of them are read
+
+
 class Hang(BaseException):
     """A case that took too long."""
+
+
+class Seed:
+    """A healthy log: the folder it lies in, what of it is opened, its files, and its scans by time.
+
+    ``untouched`` tells from a damaged file, by its path in the folder, which scans must still be there.
+    """
+
+    key = "stamp_ns"  # by which its scans are told apart
+
+    def __init__(self, name, folder, opened, untouched, *, rate_hz=0.0):
+        self.name, self.folder, self.opened, self.rate_hz = name, folder, opened, rate_hz
+        self.untouched = untouched
+        scans, told = read(self)
+        assert told == [], told
+        self.scans = dict(scans)
+        files = (path for path in sorted(folder.rglob("*")) if path.is_file())
+        self.files = {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+    def mutants(self, rng, count):
+        """So many damaged files: (which one, what became of it)."""
+        names = list(self.files)
+        for _ in range(count):
+            name = names[rng.integers(len(names))]
+            yield name, any_mutant(self.files[name], rng)
+
+    def suspicion(self, damaged, scans, told):
+        """What is wrong with scans that were read, or with what was told, though nothing untouched is missing."""
+        return ""
+
+
+class McapSeed(Seed):
+    """A healthy MCAP file, whose records tell which scans a damage has touched."""
+
+    key = "log_time_ns"
+
+    def __init__(self, name, path, *, has_crcs):
+        super().__init__(name, path.parent, path, self._untouched)
+        self.has_crcs, self.data = has_crcs, self.files[path.name]
+        self.records = list(records_of(self.data, open_log(path).lidar.key[1]))
+
+    @property
+    def is_summarized(self):
+        return any(record.opcode == STATISTICS for record in self.records)
+
+    def mutants(self, rng, count):
+        """Cuts at every boundary of its records and beside them, then random ones."""
+        for record in self.records:
+            for length in (record.begin, record.begin + 1, record.begin + 9, record.end - 1):
+                yield self.opened.name, cut_at(self.data, length)
+        for _ in range(count):
+            yield self.opened.name, mutant(self, rng)
+
+    def _untouched(self, _, damaged):
+        """Log times of the scans that lie in records, and are described by others, which nothing has touched."""
+        if not self._is_described(damaged.touched):
+            return set()
+        whole = [r for r in self.records if r.opcode in (CHUNK, MESSAGE) and not r.is_touched(damaged.touched)]
+        return {time_ns for record in whole for time_ns in record.times_ns} & set(self.scans)
+
+    def _is_described(self, touched):
+        """Whether the channels are told in the summary or the data, and no other telling can be false unseen."""
+        end = next(r.begin for r in self.records if r.opcode == DATA_END)
+        groups = (
+            [r for r in self.records if r.defines and r.begin < end],
+            [r for r in self.records if r.begin >= end],
+        )
+        sound = [not any(r.is_touched(touched) for r in group) for group in groups]
+        told = [any(r.defines for r in group) for group in groups]
+        said = [good for good, there in zip(sound, told, strict=True) if there]
+        return any(said) if self.has_crcs and any(r.opcode == CHUNK for r in self.records) else all(said)
+
+    def suspicion(self, damaged, scans, told):
+        if not self.has_crcs:
+            return ""
+        invented = [time_ns for time_ns, content in scans if self.scans.get(time_ns) != content]
+        if invented and not self._is_cut_inside_damage(damaged):
+            return f"{len(invented)} scans are not those of the file ({invented[:3]}); told: {told}"
+        lost = self.scans.items() - scans
+        if lost and not told and not damaged.is_seamless:
+            return f"{len(lost)} scans are missing or changed and nothing is told"
+        return ""
+
+    def _is_cut_inside_damage(self, damaged):
+        """Whether the chunk that the file ends in, whose CRC cannot be checked, was changed before its cut."""
+        end = len(damaged.data)
+        cut_chunk = next((r for r in self.records if r.opcode == CHUNK and r.begin < end < r.end), None)
+        return cut_chunk is not None and cut_chunk.is_touched([t for t in damaged.touched if t[0] < end])
+
+
+class RealSeed(McapSeed):
+    """A real log, of whose mutants so many bytes are left at most, with bits flipped before the cut."""
+
+    def __init__(self, name, path, longest):
+        super().__init__(name, path, has_crcs=True)
+        self.longest = longest
+
+    def mutants(self, rng, count):
+        for _ in range(count):
+            yield self.opened.name, cut_and_flipped(self.data, rng, self.longest)
 
 
 def seeds(folder):
@@ -58,48 +176,42 @@ def seeds(folder):
     makes += [("loose", office(12), {"chunked": False, "summary": summary}) for summary in (True, False)]
     makes += [("clouds", clouds, {"compression": compression}) for compression in ("none", "zstd")]
     for number, (name, said, options) in enumerate(makes):
-        path = write(folder / f"{name}_{number}.mcap", said, chunk_size=1500, **options)
-        yield seed_of(path, f"{name} {options}", has_crcs=options.get("crcs", name != "loose"))
+        path = made(folder / f"{name}_{number}") / "a.mcap"
+        write(path, said, chunk_size=1500, **options)
+        yield McapSeed(f"{name} {options}", path, has_crcs=options.get("crcs", name != "loose"))
 
 
-REAL = {
-    "2d/intel.mcap": 900_000,
-    "2d/mit_csail.mcap": 700_000,
-    "3d/kitti_0001_first54.mcap": 10_000_000,
-    "3d/kitti_0005_first60.mcap": 10_000_000,
-}  # and how many bytes of them are read
+def real_seeds(folder, names=None):
+    """Copies of real logs."""
+    for name in names or REAL:
+        path = made(folder / name.replace("/", "_")) / "a.mcap"
+        shutil.copyfile(shared_data(name), path)
+        yield RealSeed(name, path, REAL[name])
 
 
-def real_complaints(name, folder, rng, count):
-    """Real logs cut off, with bits flipped before the cut: (what was done, what is wrong)."""
-    seed = seed_of(shared_data(name), name, has_crcs=True)
-    for _ in range(count):
-        damaged = cut_and_flipped(seed.data, rng, REAL[name])
-        wrong = complaint(seed, damaged, folder / "damaged.mcap")
+def complaints(seed, rng, count):
+    """Each damaged log that is read badly: (the file, what was done to it, what is wrong)."""
+    for name, damaged in seed.mutants(rng, count):
+        path = seed.folder / name
+        path.write_bytes(damaged.data)
+        wrong = _complaint(seed, name, damaged)
+        if len(seed.files) > 1:
+            path.write_bytes(seed.files[name])
         if wrong:
-            yield damaged, wrong
+            yield name, damaged, wrong
 
 
-def seed_of(path, name, *, has_crcs):
-    log = open_log(path)
-    scans = {scan.log_time_ns: _content(scan) for scan in log.scans()}
-    return Seed(name, path.read_bytes(), scans, log.lidar.key[1], has_crcs)
-
-
-def mutants(seed, rng, count):
-    """Cuts at every boundary of its records and beside them, then ``count`` random ones."""
-    for record in seed.records:
-        for length in (record.begin, record.begin + 1, record.begin + 9, record.end - 1):
-            yield cut_at(seed.data, length)
-    for _ in range(count):
-        yield mutant(seed, rng)
-
-
-def complaint(seed, damaged, path):
-    """What is wrong with how a damaged file is read, empty where nothing is."""
-    path.write_bytes(damaged.data)
-    problem, answer = within_bounds(lambda: read(path))
-    return problem or _verdict(seed, damaged, *answer)
+def _complaint(seed, name, damaged):
+    """What is wrong with how a damaged log is read, empty where nothing is."""
+    problem, answer = within_bounds(partial(read, seed))
+    if problem:
+        return problem
+    scans, told = answer
+    read_well, untouched = set(scans), seed.untouched(name, damaged)
+    missing = sorted(time_ns for time_ns in untouched if (time_ns, seed.scans[time_ns]) not in read_well)
+    if missing:
+        return f"{len(missing)} of {len(untouched)} untouched scans are missing ({missing[:3]}); told: {told}"
+    return seed.suspicion(damaged, read_well, told)
 
 
 def within_bounds(act):
@@ -116,39 +228,23 @@ def within_bounds(act):
     return (f"took {more >> 20} MB more" if more > MOST_BYTES else ""), answer
 
 
-def read(path):
-    """The scans recovered, as (stamp, points), and the lines told about what was not."""
+def read(seed):
+    """The scans recovered, as (time, content), and the lines told about what was not; no warning is heard."""
     scans = []
-    try:
-        log = open_log(path, LogConfig(max_bad_scans_percent=100.0))
-        for scan in log.scans():
-            scans.append((scan.log_time_ns, _content(scan)))
-    except InputError as error:
-        assert "\n" not in str(error) and str(path) in str(error), f"no line of ours: {error}"
-        return scans, [str(error)]
-    return scans, log.damage
-
-
-def _verdict(seed, damaged, scans, told):
-    expected = seed.expected(damaged.touched)
-    counted = Counter(scans)
-    missing = sorted(time_ns for time_ns in expected if not counted[time_ns, seed.scans[time_ns]])
-    if missing:
-        return f"{len(missing)} of {len(expected)} untouched scans are missing ({missing[:3]}); told: {told}"
-    invented = [time_ns for time_ns, content in counted if seed.scans.get(time_ns) != content]
-    if invented and seed.has_crcs and not _is_cut_inside_damage(seed, damaged):
-        return f"{len(invented)} scans are not those of the file ({invented[:3]}); told: {told}"
-    lost = [time_ns for time_ns, content in seed.scans.items() if not counted[time_ns, content]]
-    if lost and not told and seed.has_crcs and not damaged.is_seamless:
-        return f"{len(lost)} scans are missing or changed and nothing is told"
-    return ""
-
-
-def _is_cut_inside_damage(seed, damaged):
-    """Whether the chunk that the file ends in, whose CRC cannot be checked, was changed before its cut."""
-    end = len(damaged.data)
-    cut_chunk = next((r for r in seed.records if r.opcode == CHUNK and r.begin < end < r.end), None)
-    return cut_chunk is not None and cut_chunk.is_touched([t for t in damaged.touched if t[0] < end])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.simplefilter("ignore", ResourceWarning)
+        try:
+            log = open_log(seed.opened, LogConfig(max_bad_scans_percent=100.0, rate_hz=seed.rate_hz))
+            for scan in log.scans():
+                scans.append((getattr(scan, seed.key), (scan.stamp_ns, scan.points.tobytes())))
+            log.ground_truth()
+            told = log.damage
+        except InputError as error:
+            assert str(seed.opened) in str(error), f"no line of ours: {error}"
+            told = [str(error)]
+    assert not [line for line in told if "\n" in line], told
+    return scans, told
 
 
 def payload_complaints(folder, rng, count):
@@ -233,18 +329,11 @@ def at_most(seconds):
             signal.signal(number, before[number])
 
 
-def _content(scan):
-    return scan.stamp_ns, scan.points.tobytes()
-
-
 def peak_bytes():
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
-def file_complaints(seed, rng, count):
-    """Each damaged file that is read badly: (what was done, what is wrong)."""
-    with tempfile.TemporaryDirectory() as folder:
-        for damaged in mutants(seed, rng, count):
-            wrong = complaint(seed, damaged, Path(folder) / "damaged.mcap")
-            if wrong:
-                yield damaged, wrong
+def made(folder):
+    """A new folder."""
+    folder.mkdir(parents=True)
+    return folder

@@ -2,56 +2,21 @@
 
 import bz2
 import gzip
-import shutil
 import struct
-import warnings
 import zlib
-from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import lzf
 import numpy as np
 from rosbags import rosbag1
 
-from scanchain.config import LogConfig
-from scanchain.errors import InputError
 from scanchain.logs import open_log
 from tests.support import recorders
-from tests.support.carmen_text import BEGIN_S, flaser, odom, robotlaser
-from tests.support.folders import PCD, PLY, kitti_odometry, kitti_raw, xyzi
-from tests.support.fuzzing import within_bounds
-from tests.support.mutations import Mutant, any_mutant
+from tests.support.fuzzing import Seed, made
+from tests.support.sensor_files import BEGIN_S, PCD, PLY, flaser, kitti_odometry, kitti_raw, odom, robotlaser, xyzi
 
 SCANS = 12
 UNPACKED_AT_ONCE = 64  # bytes of packed text, which are lost with those that are damaged
-Expect = Callable[[str, Mutant], set[int]]
-
-
-@dataclass
-class Seed:
-    """A healthy log: the folder it lies in, what of it is opened, and its scans, as (stamp, points).
-
-    ``untouched`` tells from a damaged file, by its path in the folder, which scans must still be there.
-    """
-
-    name: str
-    folder: Path
-    opened: Path
-    untouched: Callable[[str, Mutant], set[int]]
-    rate_hz: float = 0.0
-
-    def __post_init__(self):
-        scans, told = read(self.opened, self.rate_hz)
-        assert told == [], told
-        self.scans = dict(scans)
-        assert len(self.scans) == SCANS, self.name
-        self.files = {
-            str(path.relative_to(self.folder)): path.read_bytes()
-            for path in sorted(self.folder.rglob("*"))
-            if path.is_file()
-        }
 
 
 def seeds(folder):
@@ -61,72 +26,21 @@ def seeds(folder):
     yield from _kitti(folder / "kitti")
 
 
-def complaints(seed, rng, count):
-    """Each damaged log that is read badly: (the file, what was done to it, what is wrong)."""
-    names = list(seed.files)
-    for _ in range(count):
-        name = names[rng.integers(len(names))]
-        damaged = any_mutant(seed.files[name], rng)
-        path = seed.folder / name
-        path.write_bytes(damaged.data)
-        wrong = _complaint(seed, seed.untouched(name, damaged))
-        path.write_bytes(seed.files[name])
-        if wrong:
-            yield name, damaged, wrong
-
-
-def read(path, rate_hz):
-    """The scans recovered, as (stamp, points), and the lines told about what was not."""
-    scans = []
-    try:
-        log = open_log(path, LogConfig(max_bad_scans_percent=100.0, rate_hz=rate_hz))
-        for scan in log.scans():
-            scans.append((scan.stamp_ns, scan.points.tobytes()))
-        log.ground_truth()
-    except InputError as error:
-        assert "\n" not in str(error) and str(path) in str(error), f"no line of ours: {error}"
-        return scans, [str(error)]
-    assert not [line for line in log.damage if "\n" in line], log.damage
-    return scans, log.damage
-
-
-def _complaint(seed, untouched):
-    def quietly():
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            warnings.simplefilter("ignore", ResourceWarning)
-            return read(seed.opened, seed.rate_hz)
-
-    problem, answer = within_bounds(quietly)
-    if problem:
-        return problem
-    scans, told = answer
-    counted = Counter(scans)
-    missing = sorted(stamp_ns for stamp_ns in untouched if not counted[stamp_ns, seed.scans[stamp_ns]])
-    if missing:
-        return f"{len(missing)} of {len(untouched)} untouched scans are missing ({missing[:3]}); told: {told}"
-    return ""
-
-
 # bags
 
 
 def _bags(folder):
-    ros1, ros2 = recorders.Ros(recorders.ROS1), recorders.Ros(recorders.ROS2)
+    said = recorders.clouds(SCANS)
+    sweeps = [[*recorders.Ros(store).sweeps(said)] for store in (recorders.ROS1, recorders.ROS2)]
     for compression in (None, "BZ2", "LZ4"):
-        inside = _made(folder / f"bag_{compression}")
-        path = recorders.bag1_of(inside / "a.bag", _sweeps(ros1), compression, chunk_bytes=2000)
+        inside = made(folder / f"bag_{compression}")
+        path = recorders.bag1_of(inside / "a.bag", sweeps[0], compression, chunk_bytes=2000)
         yield Seed(f"bag {compression}", inside, path, _by_chunk(path))
     for compression in ("NONE", "FILE", "MESSAGE"):
-        inside = recorders.bag2_of(folder / f"bag2_{compression}", _sweeps(ros2), compression=compression)
+        inside = recorders.bag2_of(folder / f"bag2_{compression}", sweeps[1], compression=compression)
         yield Seed(f"ROS 2 bag {compression}", inside, inside, _nothing)
-    inside = recorders.bag2_of(folder / "db3", _sweeps(ros2))
+    inside = recorders.bag2_of(folder / "db3", sweeps[1])
     yield Seed("db3", inside, inside / "db3.db3", _nothing)
-
-
-def _sweeps(ros):
-    for cloud in recorders.clouds(SCANS):
-        yield "/points", "sensor_msgs/msg/PointCloud2", cloud.stamp_ns, ros.point_cloud(cloud)
 
 
 def _by_chunk(path):
@@ -167,11 +81,11 @@ def _nothing(_name, _damaged):
 def _carmen(folder):
     lines = ["# CARMEN", "PARAM robot_frontlaser_offset 0.2 nohost 0"]
     for k in range(SCANS):
-        made = flaser(k) if k % 3 else robotlaser(k, np.linspace(1, 9, 12), (0.1, 0, 0), (0, 0, 0))
-        lines += [odom(k, 0.1 * k), made]
+        scan = flaser(k) if k % 3 else robotlaser(k, np.linspace(1, 9, 12), (0.1, 0, 0), (0, 0, 0))
+        lines += [odom(k, 0.1 * k), scan]
     text = "\n".join([*lines, ""]).encode()
     for name, pack in (("a.log", bytes), ("a.log.bz2", bz2.compress), ("a.log.gz", gzip.compress)):
-        inside = _made(folder / name.rpartition(".")[2])
+        inside = made(folder / name.rpartition(".")[2])
         (inside / name).write_bytes(pack(text))
         yield Seed(f"CARMEN {name}", inside, inside / name, _by_line(text, name))
 
@@ -211,15 +125,17 @@ def _clouds(folder):
     kinds["ply"] = PLY, ("ascii", "binary_little_endian", "binary_big_endian")
     for suffix, (head, forms) in kinds.items():
         for form in forms:
-            inside = _made(folder / f"{suffix}_{form}")
+            inside = made(folder / f"{suffix}_{form}")
             stamps = {f"{cloud.stamp_ns}.{suffix}": cloud.stamp_ns for cloud in said}
             for name, cloud in zip(stamps, said, strict=True):
                 (inside / name).write_bytes(_cloud(cloud, suffix, head, form))
             yield Seed(f"{suffix} {form}", inside, inside, _by_file(stamps))
-    inside = _made(folder / "numbered")
+    inside = made(folder / "numbered")
     for k, cloud in enumerate(said):
         xyzi(cloud).tofile(inside / f"{k:04d}.bin")
-    yield Seed("numbered", inside, inside, _by_file({f"{k:04d}.bin": k * 10**8 for k in range(SCANS)}), 10.0)
+    yield Seed(
+        "numbered", inside, inside, _by_file({f"{k:04d}.bin": k * 10**8 for k in range(SCANS)}), rate_hz=10.0
+    )
 
 
 def _cloud(cloud, suffix, head, form):
@@ -247,17 +163,17 @@ def _cloud(cloud, suffix, head, form):
 
 def _kitti(folder):
     said = recorders.clouds(SCANS)
-    raw = kitti_raw(_made(folder / "raw"), said)
+    raw = kitti_raw(made(folder / "raw"), said)
     yield Seed("KITTI raw", folder / "raw", raw, _by_sweep(raw, "timestamps"))
-    sequence = kitti_odometry(_made(folder / "odometry"), said)
+    sequence = kitti_odometry(made(folder / "odometry"), said)
     yield Seed("KITTI odometry", folder / "odometry", sequence, _by_sweep(sequence, "times"))
 
 
 def _by_sweep(opened, times):
     """As ``_by_file``; the sweeps' own times govern all of them, whatever tells the truth none."""
-    scans, _ = read(opened, 0.0)
+    stamps = (scan.stamp_ns for scan in open_log(opened).scans())
     files = [path.name for path in sorted(opened.rglob("*.bin"))]
-    by_file = _by_file(dict(zip(files, (stamp_ns for stamp_ns, _ in scans), strict=True)))
+    by_file = _by_file(dict(zip(files, stamps, strict=True)))
 
     def untouched(name, damaged):
         path = Path(name)
@@ -268,9 +184,3 @@ def _by_sweep(opened, times):
 
 def _by_file(stamps):
     return lambda name, _: {stamp_ns for file, stamp_ns in stamps.items() if file != Path(name).name}
-
-
-def _made(folder):
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    return folder

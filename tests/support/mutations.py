@@ -33,44 +33,6 @@ class Record:
 
 
 @dataclass
-class Seed:
-    """A healthy file: its bytes, its records, and the scans in it by log time."""
-
-    name: str
-    data: bytes
-    scans: dict[int, tuple[int, bytes]]
-    lidar: int
-    has_crcs: bool
-    records: list[Record] = field(default_factory=list)
-
-    def __post_init__(self):
-        self.records = list(_records(self.data, self.lidar))
-
-    @property
-    def is_summarized(self):
-        return any(record.opcode == STATISTICS for record in self.records)
-
-    def expected(self, touched):
-        """Log times of the scans that lie in records, and are described by others, which nothing has touched."""
-        if not self._is_described(touched):
-            return set()
-        whole = [r for r in self.records if r.opcode in (CHUNK, MESSAGE) and not r.is_touched(touched)]
-        return {time_ns for record in whole for time_ns in record.times_ns} & set(self.scans)
-
-    def _is_described(self, touched):
-        """Whether the channels are told in the summary or the data, and no other telling can be false unseen."""
-        end = next(r.begin for r in self.records if r.opcode == DATA_END)
-        groups = (
-            [r for r in self.records if r.defines and r.begin < end],
-            [r for r in self.records if r.begin >= end],
-        )
-        sound = [not any(r.is_touched(touched) for r in group) for group in groups]
-        told = [any(r.defines for r in group) for group in groups]
-        said = [good for good, there in zip(sound, told, strict=True) if there]
-        return any(said) if self.has_crcs and any(r.opcode == CHUNK for r in self.records) else all(said)
-
-
-@dataclass
 class Mutant:
     """A damaged file, what was done to it, and the bytes of the healthy one that were touched.
 
@@ -250,7 +212,8 @@ def mutated_message(data, rng):
     return bytes(changed)
 
 
-def _records(data, lidar):
+def records_of(data, lidar):
+    """The records of a file; ``lidar`` is the channel of its scans."""
     offset = len(MAGIC)
     while offset < len(data) - len(MAGIC):
         opcode, length = struct.unpack_from("<BQ", data, offset)

@@ -1,116 +1,133 @@
-"""Logs written by the mcap package, packed by hand in either byte order: independent of scanchain.logs."""
+"""Logs as others write them: messages of ROS by rosbags, in either byte order, in MCAP by the mcap package."""
 
 import struct
 from dataclasses import dataclass
 
 import numpy as np
+from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType, Writer
-
-from scanchain.logs.writer import schema_text
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 SECOND = 1_000_000_000
 STAMP_NS = 1_700_000_000 * SECOND
 COMPRESSIONS = {"none": CompressionType.NONE, "lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD}
 
+ROS1 = get_typestore(Stores.ROS1_NOETIC)
+ROS2 = get_typestore(Stores.ROS2_HUMBLE)
+ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", "tf2_msgs/msg/TFMessage"))
 
-class Cdr:
-    """A message in CDR, little ("<") or big (">") endian."""
 
-    def __init__(self, order="<"):
-        self.order = order
-        self.body = bytearray()
+class Ros:
+    """Messages of ROS 1 or 2 as rosbags builds and serializes them."""
 
-    def put(self, code, *values):
-        for value in values:
-            size = struct.calcsize(code)
-            while len(self.body) % size:
-                self.body.append(0xAA)  # padding is not always zero
-            self.body += struct.pack(self.order + code, value)
-        return self
+    def __init__(self, store):
+        self.store = store
+        self.is_ros1 = store is ROS1
+        self.encoding, self.language = ("ros1", "ros1msg") if self.is_ros1 else ("cdr", "ros2msg")
 
-    def string(self, text):
-        raw = text.encode() + b"\0"
-        self.put("I", len(raw))
-        self.body += raw
-        return self
+    def serialize(self, message, type_name, order="<"):
+        if self.is_ros1:
+            return bytes(self.store.serialize_ros1(message, type_name))
+        return bytes(self.store.serialize_cdr(message, type_name, little_endian=order == "<"))
+
+    def definition(self, type_name):
+        return self.store.generate_msgdef(type_name, ros_version=1 if self.is_ros1 else 2)[0].encode()
+
+    def new(self, type_name, **fields):
+        return self.store.types[type_name](**fields)
 
     def header(self, stamp_ns, frame):
-        return self.put("i", stamp_ns // SECOND).put("I", stamp_ns % SECOND).string(frame)
+        stamp = self.new("builtin_interfaces/msg/Time", sec=stamp_ns // SECOND, nanosec=stamp_ns % SECOND)
+        sequence = {"seq": 7} if self.is_ros1 else {}
+        return self.new("std_msgs/msg/Header", stamp=stamp, frame_id=frame, **sequence)
 
-    def pose(self, x, y, yaw=0.0, z=0.0, roll=0.0):
-        """Position, then the quaternion of Rz(yaw) Rx(roll)."""
+    def pose(self, x, y=0.0, yaw=0.0, z=0.0, roll=0.0):
+        """Position, and the quaternion of Rz(yaw) Rx(roll)."""
         cy, sy, cr, sr = np.cos(yaw / 2), np.sin(yaw / 2), np.cos(roll / 2), np.sin(roll / 2)
-        return self.put("d", x, y, z, cy * sr, sy * sr, sy * cr, cy * cr)
+        turn = self.new("geometry_msgs/msg/Quaternion", x=cy * sr, y=sy * sr, z=sy * cr, w=cy * cr)
+        position = self.new("geometry_msgs/msg/Point", x=x, y=y, z=z)
+        return self.new("geometry_msgs/msg/Pose", position=position, orientation=turn)
 
-    def __bytes__(self):
-        return bytes([0, 1 if self.order == "<" else 0, 0, 0]) + bytes(self.body)
+    def with_covariance(self, pose):
+        return self.new("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36))
+
+    def laser_scan(
+        self, stamp_ns, ranges, *, first=-1.0, step=0.01, beam_s=0.0, low=0.1, high=30.0, frame="laser",
+        kind="LaserScan",
+    ):  # fmt: skip
+        return self.new(
+            f"sensor_msgs/msg/{kind}", header=self.header(stamp_ns, frame), angle_min=first,
+            angle_max=first + step * (len(ranges) - 1), angle_increment=step, time_increment=beam_s, scan_time=0.1,
+            range_min=low, range_max=high, ranges=ranges,
+            intensities=np.zeros(0, "f4") if kind == "LaserScan" else [],
+        )  # fmt: skip
+
+    def point_cloud(
+        self, stamp_ns, rows, *, frame="lidar", height=1, padding=0, fields=None, step=None, data=None,
+        row_step=None,
+    ):  # fmt: skip
+        """A cloud of a structured array; ``padding`` bytes behind each row; other arguments tell lies."""
+        codes = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+        names, width = rows.dtype.names, len(rows) // height
+        if fields is None:
+            fields = [(name, rows.dtype.fields[name][1], codes[rows.dtype[name].str[1:]], 1) for name in names]
+        if data is None:
+            data = b"".join(part.tobytes() + b"\xff" * padding for part in rows.reshape(height, width))
+        keys = ("name", "offset", "datatype", "count")
+        fields = [self.new("sensor_msgs/msg/PointField", **dict(zip(keys, each, strict=True))) for each in fields]
+        size = rows.dtype.itemsize
+        return self.new(
+            "sensor_msgs/msg/PointCloud2", header=self.header(stamp_ns, frame), height=height, width=width,
+            fields=fields, is_bigendian=any(rows.dtype[name].byteorder == ">" for name in names),
+            point_step=size if step is None else step, data=np.frombuffer(data, np.uint8), is_dense=False,
+            row_step=width * size + padding if row_step is None else row_step,
+        )  # fmt: skip
+
+    def odometry(self, stamp_ns, x, y=0.0, yaw=0.0, *, z=0.0, frame="odom", child="base_link"):
+        vector = self.new("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+        twist = self.new("geometry_msgs/msg/Twist", linear=vector, angular=vector)
+        return self.new(
+            "nav_msgs/msg/Odometry", header=self.header(stamp_ns, frame), child_frame_id=child,
+            pose=self.with_covariance(self.pose(x, y, yaw, z)),
+            twist=self.new("geometry_msgs/msg/TwistWithCovariance", covariance=np.zeros(36), twist=twist),
+        )  # fmt: skip
+
+    def transforms(self, *entries, stamp_ns=0):
+        """A TFMessage of (parent, child, x, y, yaw, roll), half a meter above the parent."""
+        told = []
+        for parent, child, x, y, yaw, roll in entries:
+            turn = self.pose(x, y, yaw, 0.5, roll).orientation
+            move = self.new("geometry_msgs/msg/Vector3", x=x, y=y, z=0.5)
+            moved = self.new("geometry_msgs/msg/Transform", translation=move, rotation=turn)
+            head = self.header(stamp_ns, parent)
+            told.append(
+                self.new("geometry_msgs/msg/TransformStamped", header=head, child_frame_id=child, transform=moved)
+            )
+        return self.new("tf2_msgs/msg/TFMessage", transforms=told)
 
 
-def laser_scan(
-    stamp_ns,
-    ranges,
-    *,
-    first=-1.0,
-    step=0.01,
-    beam_s=0.0,
-    low=0.1,
-    high=30.0,
-    frame="laser",
-    order="<",
-    declared=None,
-):
-    cdr = Cdr(order).header(stamp_ns, frame)
-    cdr.put("f", first, first + step * (len(ranges) - 1), step, beam_s, 0.1, low, high)
-    cdr.put("I", len(ranges) if declared is None else declared).put("f", *ranges)
-    return bytes(cdr.put("I", 0))
+ROS = Ros(ROS2)
 
 
-def point_cloud(
-    stamp_ns,
-    rows,
-    *,
-    frame="lidar",
-    order="<",
-    height=1,
-    padding=0,
-    fields=None,
-    step=None,
-    data=None,
-    row_step=None,
-):
-    """A cloud of a structured array; ``padding`` bytes behind each row; other arguments tell lies."""
-    codes = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
-    big = any(rows.dtype[name].byteorder == ">" for name in rows.dtype.names)
-    width = len(rows) // height
-    if fields is None:
-        fields = [
-            (name, rows.dtype.fields[name][1], codes[rows.dtype[name].str[1:]], 1) for name in rows.dtype.names
-        ]
-    if data is None:
-        parts = rows.reshape(height, width)
-        data = b"".join(part.tobytes() + b"\xff" * padding for part in parts)
-    cdr = Cdr(order).header(stamp_ns, frame).put("I", height, width, len(fields))
-    for name, offset, kind, count in fields:
-        cdr.string(name).put("I", offset).put("B", kind).put("I", count)
-    cdr.put("B", big)
-    cdr.put("I", rows.dtype.itemsize if step is None else step)
-    cdr.put("I", width * rows.dtype.itemsize + padding if row_step is None else row_step)
-    cdr.put("I", len(data))
-    cdr.body += data
-    return bytes(cdr.put("B", 0))
+def laser_scan(stamp_ns, ranges, *, order="<", declared=None, **told):
+    ranges = np.asarray(ranges, np.float32)
+    data = bytearray(ROS.serialize(ROS.laser_scan(stamp_ns, ranges, **told), "sensor_msgs/msg/LaserScan", order))
+    if declared is not None:  # another number of ranges than there are
+        struct.pack_into(f"{order}I", data, len(data) - 4 * len(ranges) - 8, declared)
+    return bytes(data)
 
 
-def odometry(stamp_ns, x, y, yaw=0.0, *, z=0.0, frame="odom", child="base_link", order="<"):
-    cdr = Cdr(order).header(stamp_ns, frame).string(child).pose(x, y, yaw, z)
-    return bytes(cdr.put("d", *[0.0] * (36 + 6 + 36)))
+def point_cloud(stamp_ns, rows, *, order="<", **told):
+    return ROS.serialize(ROS.point_cloud(stamp_ns, rows, **told), "sensor_msgs/msg/PointCloud2", order)
+
+
+def odometry(*words, order="<", **told):
+    return ROS.serialize(ROS.odometry(*words, **told), "nav_msgs/msg/Odometry", order)
 
 
 def transforms(*entries, order="<", stamp_ns=0):
-    """A TFMessage of (parent, child, x, y, yaw, roll)."""
-    cdr = Cdr(order).put("I", len(entries))
-    for parent, child, x, y, yaw, roll in entries:
-        cdr.header(stamp_ns, parent).string(child).pose(x, y, yaw, 0.5, roll)
-    return bytes(cdr)
+    return ROS.serialize(ROS.transforms(*entries, stamp_ns=stamp_ns), "tf2_msgs/msg/TFMessage", order)
 
 
 @dataclass
@@ -140,29 +157,13 @@ def transforms_said(log_ns, data, topic="/tf_static"):
 
 
 def write(
-    path,
-    messages,
-    *,
-    chunked=True,
-    compression="zstd",
-    summary=True,
-    chunk_size=2000,
-    crcs=True,
-    encoding="ros2msg",
-    rename=lambda kind: kind,
-    message_encoding="cdr",
-    announced=(),
-    **options,
-):
+    path, messages, *, chunked=True, compression="zstd", summary=True, chunk_size=2000, crcs=True,
+    encoding="ros2msg", rename=lambda kind: kind, message_encoding="cdr", announced=(), **options,
+):  # fmt: skip
     """Write messages in the given order; ``announced`` are topics registered without any message."""
     if not summary:
-        options |= {
-            "index_types": IndexType.NONE,
-            "repeat_channels": False,
-            "repeat_schemas": False,
-            "use_statistics": False,
-            "use_summary_offsets": False,
-        }
+        left_out = ("repeat_channels", "repeat_schemas", "use_statistics", "use_summary_offsets")
+        options |= {"index_types": IndexType.NONE, **dict.fromkeys(left_out, False)}
     with path.open("wb") as stream:
         writer = Writer(
             stream,
@@ -176,7 +177,7 @@ def write(
         channels = {}
         for said in (*announced, *messages):
             if said.topic not in channels:
-                schema = writer.register_schema(rename(said.kind), encoding, schema_text(said.kind))
+                schema = writer.register_schema(rename(said.kind), encoding, ROS.definition(said.kind))
                 channels[said.topic] = writer.register_channel(said.topic, message_encoding, schema)
             if said.data:
                 writer.add_message(channels[said.topic], said.log_ns, said.data, said.log_ns)
@@ -184,14 +185,21 @@ def write(
     return path
 
 
-def office(count=40, *, topic="/scan", every_ns=SECOND // 10, beams=31, begin_ns=STAMP_NS):
+def decoded(path, topics=None):
+    """(schema, channel, message, contents) of every message, read by the mcap packages."""
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        yield from reader.iter_decoded_messages(topics)
+
+
+def office(count=40, *, begin_ns=STAMP_NS):
     """A mounting, then ``count`` pairs of odometry and scan of one stamp; scan k sees ranges from 1 + k/100."""
     said = [transforms_said(begin_ns, transforms(("base_link", "laser", 0.2, 0.1, 0.3, 0.0)))]
     for k in range(count):
-        stamp_ns = begin_ns + k * every_ns
-        ranges = 1.0 + k / 100 + 0.05 * np.arange(beams)
+        stamp_ns = begin_ns + k * SECOND // 10
+        ranges = 1.0 + k / 100 + 0.05 * np.arange(31)
         said.append(odometry_said(stamp_ns, odometry(stamp_ns, 0.1 * k, 0.0, 0.01 * k)))
-        said.append(scan_said(stamp_ns, laser_scan(stamp_ns, ranges), topic))
+        said.append(scan_said(stamp_ns, laser_scan(stamp_ns, ranges)))
     return said
 
 

@@ -10,13 +10,13 @@ from foxglove import messages as fox
 from foxglove.channels import LaserScanChannel, PointCloudChannel
 from mcap.writer import Writer
 from rosbags import rosbag1, rosbag2
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys import get_types_from_msg
 
 from scanchain.config import LogConfig
 from scanchain.logs import open_log
+from tests.support import naive_logs
+from tests.support.naive_logs import ROS1, ROS2, SECOND, STAMP_NS
 
-SECOND = 1_000_000_000
-STAMP_NS = 1_700_000_000 * SECOND
 FIRST_RAD, STEP_RAD = np.float32(-1.0), np.float32(0.03125)  # exact in binary, so that other formats can tell them
 RANGE_MIN_M, RANGE_MAX_M = np.float32(0.25), np.float32(30.0)
 POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("t", "<u4")])
@@ -103,45 +103,20 @@ def assert_clouds(scans, said=None, *, timed=True, stamps=True):
 
 # ROS, by rosbags
 
-ROS1 = get_typestore(Stores.ROS1_NOETIC)
-ROS2 = get_typestore(Stores.ROS2_HUMBLE)
 _CUSTOM_POINT = "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\nuint8 tag\nuint8 line\n"
 _CUSTOM = "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\n"
-ROS1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", "tf2_msgs/msg/TFMessage"))
 for store in (ROS1, ROS2):
     for package in ("livox_ros_driver2", "livox_ros_driver"):
         store.register(get_types_from_msg(_CUSTOM_POINT, f"{package}/msg/CustomPoint"))
         store.register(get_types_from_msg(_CUSTOM + "CustomPoint[] points\n", f"{package}/msg/CustomMsg"))
 
 
-class Ros:
-    """Messages of ROS 1 or 2 as rosbags builds and serializes them."""
+class Ros(naive_logs.Ros):
+    """The scans and clouds as messages."""
 
-    def __init__(self, store):
-        self.store = store
-        self.is_ros1 = store is ROS1
-        self.encoding, self.language = ("ros1", "ros1msg") if self.is_ros1 else ("cdr", "ros2msg")
-
-    def serialize(self, message, type_name):
-        pack = self.store.serialize_ros1 if self.is_ros1 else self.store.serialize_cdr
-        return bytes(pack(message, type_name))
-
-    def new(self, type_name, **fields):
-        return self.store.types[type_name](**fields)
-
-    def header(self, stamp_ns, frame):
-        stamp = self.new("builtin_interfaces/msg/Time", sec=stamp_ns // SECOND, nanosec=stamp_ns % SECOND)
-        sequence = {"seq": 7} if self.is_ros1 else {}
-        return self.new("std_msgs/msg/Header", stamp=stamp, frame_id=frame, **sequence)
-
-    def laser_scan(self, scan, kind="LaserScan", **fields):
-        told = {"ranges": scan.ranges, "intensities": np.zeros(0, "f4")} | fields
-        return self.new(
-            f"sensor_msgs/msg/{kind}",
-            header=self.header(scan.stamp_ns, "laser"),
-            angle_min=FIRST_RAD, angle_max=FIRST_RAD + STEP_RAD * (len(scan.ranges) - 1), angle_increment=STEP_RAD,
-            time_increment=0.0, scan_time=0.0, range_min=RANGE_MIN_M, range_max=RANGE_MAX_M, **told,
-        )  # fmt: skip
+    def scan(self, scan, ranges=None, kind="LaserScan"):
+        given = {"first": FIRST_RAD, "step": STEP_RAD, "low": RANGE_MIN_M, "high": RANGE_MAX_M, "kind": kind}
+        return self.laser_scan(scan.stamp_ns, scan.ranges if ranges is None else ranges, **given)
 
     def multi_echo(self, scan):
         """One, two or no echo a beam; the first is the range that was told."""
@@ -149,19 +124,7 @@ class Ros:
         for beam, value in enumerate(scan.ranges):
             echo = np.array([value, value + 1.0][: 1 + beam % 2] if np.isfinite(value) else [], "f4")
             echoes.append(self.new("sensor_msgs/msg/LaserEcho", echoes=echo))
-        return self.laser_scan(scan, "MultiEchoLaserScan", ranges=echoes, intensities=[])
-
-    def point_cloud(self, cloud):
-        fields = [
-            self.new("sensor_msgs/msg/PointField", name=name, offset=4 * k, datatype=code, count=1)
-            for k, (name, code) in enumerate([("x", 7), ("y", 7), ("z", 7), ("t", 6)])
-        ]
-        data = np.frombuffer(cloud.rows.tobytes(), np.uint8)
-        return self.new(
-            "sensor_msgs/msg/PointCloud2", header=self.header(cloud.stamp_ns, "lidar"), height=1,
-            width=len(cloud.rows), fields=fields, is_bigendian=False, point_step=16, row_step=len(data), data=data,
-            is_dense=False,
-        )  # fmt: skip
+        return self.scan(scan, echoes, "MultiEchoLaserScan")
 
     def livox(self, cloud, package):
         points = [
@@ -176,46 +139,20 @@ class Ros:
             point_num=len(points), lidar_id=1, rsvd=np.zeros(3, np.uint8), points=points,
         )  # fmt: skip
 
-    def odometry(self, stamp_ns, x, yaw):
-        vector = self.new("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
-        pose = self._pose(x, yaw)
-        return self.new(
-            "nav_msgs/msg/Odometry", header=self.header(stamp_ns, "odom"), child_frame_id="base_link",
-            pose=self.new("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36)),
-            twist=self.new(
-                "geometry_msgs/msg/TwistWithCovariance", covariance=np.zeros(36),
-                twist=self.new("geometry_msgs/msg/Twist", linear=vector, angular=vector),
-            ),
-        )  # fmt: skip
-
-    def transforms(self, stamp_ns, x, yaw, child="laser"):
-        pose = self._pose(x, yaw)
-        move = self.new("geometry_msgs/msg/Vector3", x=x, y=0.0, z=0.0)
-        transform = self.new(
-            "geometry_msgs/msg/TransformStamped", header=self.header(stamp_ns, "base_link"), child_frame_id=child,
-            transform=self.new("geometry_msgs/msg/Transform", translation=move, rotation=pose.orientation),
-        )  # fmt: skip
-        return self.new("tf2_msgs/msg/TFMessage", transforms=[transform])
-
-    def _pose(self, x, yaw):
-        turn = {"x": 0.0, "y": 0.0, "z": np.sin(yaw / 2), "w": np.cos(yaw / 2)}
-        return self.new(
-            "geometry_msgs/msg/Pose", position=self.new("geometry_msgs/msg/Point", x=x, y=0.0, z=0.0),
-            orientation=self.new("geometry_msgs/msg/Quaternion", **turn),
-        )  # fmt: skip
-
     def drive(self):
         """The planar scans with wheels and mounting: (topic, type, log time, message)."""
-        yield "/tf_static", "tf2_msgs/msg/TFMessage", STAMP_NS, self.transforms(STAMP_NS, 0.25, 0.5)
+        mounting = self.transforms(("base_link", "laser", 0.25, 0.0, 0.5, 0.0), stamp_ns=STAMP_NS)
+        yield "/tf_static", "tf2_msgs/msg/TFMessage", STAMP_NS, mounting
         for k, scan in enumerate(planar()):
-            odometry = self.odometry(scan.stamp_ns, 0.1 * k, 0.01 * k)
+            odometry = self.odometry(scan.stamp_ns, 0.1 * k, yaw=0.01 * k)
             yield "/odom", "nav_msgs/msg/Odometry", scan.stamp_ns, odometry
-            yield "/scan", "sensor_msgs/msg/LaserScan", scan.stamp_ns, self.laser_scan(scan)
+            yield "/scan", "sensor_msgs/msg/LaserScan", scan.stamp_ns, self.scan(scan)
 
-    def sweeps(self):
-        """The clouds: (topic, type, log time, message)."""
-        for cloud in clouds():
-            yield "/points", "sensor_msgs/msg/PointCloud2", cloud.stamp_ns, self.point_cloud(cloud)
+    def sweeps(self, told=None):
+        """Clouds: (topic, type, log time, message)."""
+        for cloud in clouds() if told is None else told:
+            message = self.point_cloud(cloud.stamp_ns, cloud.rows)
+            yield "/points", "sensor_msgs/msg/PointCloud2", cloud.stamp_ns, message
 
 
 def mcap_of(path, ros, told):
@@ -226,9 +163,8 @@ def mcap_of(path, ros, told):
         channels = {}
         for topic, type_name, time_ns, message in told:
             if topic not in channels:
-                text = ros.store.generate_msgdef(type_name, ros_version=1 if ros.is_ros1 else 2)[0]
                 name = type_name.replace("/msg/", "/") if ros.is_ros1 else type_name
-                schema = writer.register_schema(name, ros.language, text.encode())
+                schema = writer.register_schema(name, ros.language, ros.definition(type_name))
                 channels[topic] = writer.register_channel(topic, ros.encoding, schema)
             writer.add_message(channels[topic], time_ns, ros.serialize(message, type_name), time_ns)
         writer.finish()

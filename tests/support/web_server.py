@@ -3,28 +3,26 @@
 import http.server
 import re
 import threading
-import time
 from contextlib import contextmanager
 
 
 class Site:
     """Files to serve by their path.
 
-    has_ranges : whether it honors Range; etag : what it calls their version; delay_s : before each answer
+    has_ranges : whether it honors Range; etag : what it calls their version; tells_length : of its answers
     failures : statuses of the next GET answers, 0 for one that breaks off in the middle
+    cuts : numbers of bytes after which the next answers break off
     asked : the ranges asked for, None for the whole; sent : bytes of bodies
     """
 
     def __init__(self, files):
         self.files = files
-        self.has_ranges, self.etag, self.delay_s = True, '"one"', 0.0
-        self.failures = []
-        self.asked = []
+        self.has_ranges, self.etag, self.tells_length = True, '"one"', True
+        self.failures, self.cuts, self.asked = [], [], []
         self.sent = 0
         self.lock = threading.Lock()
 
     def answer(self, handler, *, is_head):
-        time.sleep(self.delay_s)
         body = self.files.get(handler.path)
         if body is None:
             return handler.send_error(404)
@@ -34,21 +32,26 @@ class Site:
             return handler.send_error(failure)
         wanted = re.fullmatch(r"bytes=(\d+)-(\d*)", handler.headers.get("Range") or "")
         begin, end = 0, len(body)
-        if wanted and self.has_ranges:
+        is_same = handler.headers.get("If-Range") in (None, self.etag)
+        if wanted and self.has_ranges and is_same:
             begin, end = int(wanted[1]), min(int(wanted[2] or end) + 1, end)
+            if begin >= len(body):
+                return handler.send_error(416)
             handler.send_response(206)
             handler.send_header("Content-Range", f"bytes {begin}-{end - 1}/{len(body)}")
         else:
             handler.send_response(200)
         if self.etag:
             handler.send_header("ETag", self.etag)
-        handler.send_header("Content-Length", str(end - begin))
+        if self.tells_length:
+            handler.send_header("Content-Length", str(end - begin))
         handler.end_headers()
         if is_head:
             return None
-        part = body[begin : (begin + end) // 2 if failure == 0 else end]
         with self.lock:
-            self.asked.append((begin, end) if wanted else None)
+            cut = begin + self.cuts.pop(0) if self.cuts else end
+            part = body[begin : (begin + end) // 2 if failure == 0 else cut]
+            self.asked.append(handler.headers.get("Range"))
             self.sent += len(part)
         handler.wfile.write(part)
         handler.close_connection = True
@@ -56,9 +59,9 @@ class Site:
 
 
 @contextmanager
-def serving(files, kind=Site):
+def serving(files):
     """A site on this machine; ``site.url`` is its address."""
-    site = kind(files)
+    site = Site(files)
 
     class Handler(http.server.BaseHTTPRequestHandler):
         def do_GET(self):
