@@ -96,7 +96,7 @@ class LogSpec:
             play_backward(self.file, self.reference, path)
             return
         drive = self.drive()
-        record(drive, path, seed=self.seed, force=True)
+        record(drive, path, force=True)
         np.save(path.with_suffix(".npy"), _open_shares(drive))
 
     def drive(self) -> Drive:

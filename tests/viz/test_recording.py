@@ -452,10 +452,7 @@ def test_the_viewer_opens_on_observability_residual_and_loops_in_the_dark_and_ti
 def test_the_verdict_is_recorded_as_text_with_its_stretches_as_lines_and_events(tmp_path):
     steps, log = STEPS[2], tmp_path / "a.rrd"
     path = Trajectory(np.array([s.scan.stamp_ns for s in steps]), np.array([s.T_world_lidar for s in steps]))
-    stretches = (
-        Stretch(Kind.LOOPS, 5, 50, 4, 0.5, 5.0, 2.0),
-        Stretch(Kind.WHEELS, 20, 30, 9, 2.0, 3.0, 1.5),
-    )
+    stretches = (Stretch(Kind.LOOPS, 5, 50, 4, 0.5, 5.0, 2.0), Stretch(Kind.WHEELS, 20, 30, 9, 2.0, 3.0, 1.5))
     judged = Judged(Verdict.CHECK, "; ".join(each.text for each in stretches), stretches, "ATE below 1 m")
     with opened(log) as recording:
         for step in steps:

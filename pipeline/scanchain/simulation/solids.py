@@ -36,6 +36,25 @@ class Solids:
     ground: NDArray[np.float64]
     owner: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
 
+    @property
+    def groups(self) -> tuple[Matrix, Matrix, Matrix]:
+        """Boxes, cylinders, ellipsoids."""
+        return self.boxes, self.cylinders, self.ellipsoids
+
+    def part(self, chosen: NDArray[np.bool_]) -> Solids:
+        """Some of the solids, chosen by (B + C + E,)."""
+        of_group = np.split(chosen, np.cumsum([len(rows) for rows in self.groups[:2]]))
+        groups = (rows[each] for rows, each in zip(self.groups, of_group, strict=True))
+        return Solids(*groups, ground=self.ground, owner=self.owner[chosen])
+
+    def with_object(self, thing: Solids, owner: int) -> Solids:
+        """These and those of one object, of that number."""
+        groups = [np.vstack(both) for both in zip(self.groups, thing.groups, strict=True)]
+        owners = np.split(self.owner, np.cumsum([len(rows) for rows in self.groups[:2]]))
+        numbers = (np.full(len(rows), owner) for rows in thing.groups)
+        of_both = [each for both in zip(owners, numbers, strict=True) for each in both]
+        return Solids(*groups, ground=self.ground, owner=np.concatenate(of_both))
+
     def ground_height(self, xy: Matrix) -> NDArray[np.float64]:
         """Height of the ground at (..., 2) positions."""
         return _height(self.ground, xy)

@@ -131,13 +131,7 @@ def _above_ground(points: Points) -> Points:
     return points[points[:, 2] > np.percentile(points[:, 2], _LOWEST) + _GROUND_M]
 
 
-def draw_points(
-    figure: Plot,
-    points: Points,
-    low: Floats,
-    high: Floats,
-    colors: Sequence[str] = (GRAY,),
-) -> None:
+def draw_points(figure: Plot, points: Points, low: Floats, high: Floats, colors: Sequence[str] = (GRAY,)) -> None:
     """Draw points (M, 3) as seen from above, within corners, in one color, or in several by height, if any."""
     shown = points[:: max(1, -(-len(points) // _MAX_POINTS))]
     inside = ((shown[:, :2] > low[:2]) & (shown[:, :2] < high[:2])).all(axis=1)

@@ -61,10 +61,7 @@ def write_run_report(directory: Path) -> None:
         warnings=tuple(line for line in (made.stopped, *metrics.warnings) if line),
         notes=tuple(notes),
         sections=tuple(_sections(directory, metrics)),
-        collapsibles=(
-            *sections.provenance_sections(made, {}),
-            sections.configuration(directory),
-        ),
+        collapsibles=(*sections.provenance_sections(made, {}), sections.configuration(directory)),
         judged=metrics.judged,
     )
     page.write_page(directory, whole)

@@ -165,11 +165,7 @@ def _house(
 
 
 def _street(
-    scenery: Scenery,
-    start: NDArray[np.float64],
-    end: NDArray[np.float64],
-    parked: float,
-    rng: np.random.Generator,
+    scenery: Scenery, start: NDArray[np.float64], end: NDArray[np.float64], parked: float, rng: np.random.Generator
 ) -> None:
     """Both sides of one street between two crossings: parked cars, trees, lamps, signs, bins."""
     length = float(np.linalg.norm(end - start))
@@ -201,9 +197,9 @@ def rounds(rng: np.random.Generator) -> Solids:
     lanes = np.vstack([np.linspace(a, b, 100) for a, b in pairwise([*ROUNDS_ROUTE, ROUNDS_ROUTE[0]])])
     gap = np.abs(lanes[:, None] - solids.boxes[:, :2]) - solids.boxes[:, 2:4]
     distance_m = np.linalg.norm(np.maximum(gap, 0.0), axis=2).min(axis=0)
-    kept = distance_m > _LANE_FREE_M
-    owner = np.concatenate([solids.owner[: len(kept)][kept], solids.owner[len(kept) :]])
-    return replace(solids, boxes=solids.boxes[kept], owner=owner)
+    is_kept = np.ones(len(solids.owner), bool)
+    is_kept[: len(distance_m)] = distance_m > _LANE_FREE_M
+    return solids.part(is_kept)
 
 
 def _lanes() -> Matrix:
