@@ -22,8 +22,8 @@ from scanchain.files import Address
 from scanchain.logs.writer import ORIGIN, LogWriter, pack_laser_scan, pack_odometry
 from scanchain.processes import resident_mib
 from scanchain.runs.directory import directory_name
-from scanchain.simulation import simulate
 from scanchain_viz.report.batch import names_of
+from tests.support import made
 from tests.support.browser import look
 from tests.support.killing import processes_about, wait_until
 from tests.support.scenes import ROOT
@@ -50,7 +50,7 @@ def drawers(tmp_path_factory):
     folder = tmp_path_factory.mktemp("logs")
     names = [f"log_{k:02}" for k in range(4)] + ["crashing", "hungry"]
     for seed, name in enumerate(names):
-        simulate("office", folder / f"{name}.mcap", duration_s=2.0, seed=seed)
+        shutil.copy(made.log("office", seconds=2, seed=seed), folder / f"{name}.mcap")
     return folder
 
 
@@ -66,7 +66,7 @@ def table(folder):
     return {row["log"].rsplit("/", 1)[1]: row for row in pq.read_table(folder / "batch.parquet").to_pylist()}
 
 
-def made(folder):
+def made_at(folder):
     """When each run directory came to be."""
     return {path.parent: path.stat().st_mtime_ns for path in folder.glob("*/run.json")}
 
@@ -78,7 +78,7 @@ def test_of_6_logs_two_are_poison_and_4_have_results_and_a_second_call_runs_only
     words = ["batch", f"{drawers}/*.mcap", "--out", str(out), "--memory-limit", "1.5", "--workers", "2"]
     assert main(words) == 1
     output, errors = capfd.readouterr()
-    rows, first = table(out), made(out)
+    rows, first = table(out), made_at(out)
     done = {name: row for name, row in rows.items() if row["state"] == "done"}
     assert len(rows) == 6 and len(done) == len(first) == 4
     assert (rows["crashing.mcap"]["state"], rows["crashing.mcap"]["reason"]) == ("crashed", "ended by SIGSEGV")
@@ -95,7 +95,7 @@ def test_of_6_logs_two_are_poison_and_4_have_results_and_a_second_call_runs_only
     assert errors == f"error: 2 of 6 logs have no result; {out}/summary.txt has the reason\n"
 
     assert main(words) == 1  # only the two are tried again
-    assert made(out) == first and "4 results from before" in capfd.readouterr()[0]
+    assert made_at(out) == first and "4 results from before" in capfd.readouterr()[0]
 
 
 def test_logs_of_the_longest_names_have_directories_of_their_own():
@@ -109,38 +109,19 @@ def test_what_is_done_is_done_until_the_file_or_the_configuration_changes(drawer
     log.write_bytes((drawers / "log_00.mcap").read_bytes())
     words = ["batch", str(log), "--out", str(out)]
     assert main(words) == 0
-    first = made(out)
+    first = made_at(out)
     (row,) = table(out).values()
     assert row["sha256"] == hashlib.sha256(log.read_bytes()).hexdigest()
     assert main(["batch", f"{log.parent}/../{log.parent.name}/log.mcap", "--out", str(out)]) == 0
-    assert made(out) == first and "1 result from before" in capfd.readouterr()[0].splitlines()[-1]
+    assert made_at(out) == first and "1 result from before" in capfd.readouterr()[0].splitlines()[-1]
     (run,) = first
     (run / "metrics.json").unlink()  # a result that was thrown away is missing
     assert main(words) == 0 and (run / "metrics.json").exists()
     assert main([*words, "--matching.matcher", "svd"]) == 0
-    assert len(made(out)) == 2
+    assert len(made_at(out)) == 2
     log.write_bytes((drawers / "log_01.mcap").read_bytes())
     assert main(words) == 0
-    assert len(made(out)) == 3 and "0 results from before" in capfd.readouterr()[0].splitlines()[-1]
-
-
-def test_a_log_most_of_whose_scans_are_lost_is_a_row_that_says_so_and_is_not_run_again(drawers, tmp_path, capfd):
-    radar, out = tmp_path / "radar.mcap", tmp_path / "out"
-    rng = np.random.default_rng(0)
-    with LogWriter(radar) as log:
-        for k in range(20):
-            log.point_cloud("/radar", 10**18 + k * 10**8, "radar", rng.uniform(-40.0, 40.0, (12, 3)))
-    words = ["batch", str(radar), str(drawers / "log_03.mcap"), "--out", str(out)]
-    assert main(words) == 1
-    output, errors = capfd.readouterr()
-    rows, first = table(out), made(out)
-    assert (rows["radar.mcap"]["state"], rows["log_03.mcap"]["state"]) == ("not trustworthy", "done")
-    assert "degenerate" in rows["radar.mcap"]["reason"] and rows["radar.mcap"]["scans"] == 20
-    assert len(first) == 2 and "2: 1 done, 1 not trustworthy" in output
-    assert errors == f"error: 1 of 2 logs are not trustworthy; {out}/summary.txt has the reason\n"
-    assert f"{radar} is not trustworthy" in (out / "report.html").read_text()
-    assert main(words) == 1
-    assert made(out) == first and "2 results from before" in capfd.readouterr()[0]
+    assert len(made_at(out)) == 3 and "0 results from before" in capfd.readouterr()[0].splitlines()[-1]
 
 
 def test_logs_that_are_damaged_absent_or_slow_are_rows_with_a_reason_each(drawers, tmp_path):
@@ -165,19 +146,17 @@ def test_logs_that_are_damaged_absent_or_slow_are_rows_with_a_reason_each(drawer
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names are bytes there")
 def test_a_name_that_is_not_utf_8_is_a_failed_row_and_one_line_of_run(drawers, tmp_path, capfd):
-    content = (drawers / "log_00.mcap").read_bytes()
-    bad = tmp_path / os.fsdecode(b"bad\xff.mcap")
-    bad.write_bytes(content)
-    (tmp_path / os.fsdecode(b"parts\xff")).mkdir()
-    (tmp_path / os.fsdecode(b"parts\xff") / "part.mcap").write_bytes(content)
-    for name in (bad, bad.with_name(os.fsdecode(b"parts\xff"))):
-        assert main(["run", str(name), "--out", str(tmp_path / "run"), "--rerun", "off"]) == 2
+    bad, folder = (tmp_path / os.fsdecode(name) for name in (b"bad\xff.mcap", b"parts\xff"))
+    folder.mkdir()
+    for log in (bad, folder / "part.mcap"):
+        shutil.copy(drawers / "log_00.mcap", log)
+    for log in (bad, folder):
+        assert main(["run", str(log), "--out", str(tmp_path / "run"), "--rerun", "off"]) == 2
+        shown = str(log).encode(errors="surrogateescape").decode(errors="backslashreplace")
         errors = capfd.readouterr()[1]
-        assert errors.startswith(f"error: {tmp_path}/") and errors.count("\n") == 1
-        assert "\\xff" in errors and errors.endswith(": the name is not UTF-8; rename it\n")
+        assert errors.startswith(f"error: {shown}") and errors.endswith(": the name is not UTF-8; rename it\n")
     out = tmp_path / "out"
-    logs = [str(bad), str(bad.with_name(os.fsdecode(b"parts\xff"))), str(drawers / "log_01.mcap")]
-    assert main(["batch", *logs, "--out", str(out)]) == 1
+    assert main(["batch", str(bad), str(folder), str(drawers / "log_01.mcap"), "--out", str(out)]) == 1
     rows = table(out)
     assert [row["state"] for row in rows.values()] == ["failed", "failed", "done"]
     assert rows["bad\\xff.mcap"]["reason"] == f"{tmp_path}/bad\\xff.mcap: the name is not UTF-8; rename it"
@@ -185,18 +164,15 @@ def test_a_name_that_is_not_utf_8_is_a_failed_row_and_one_line_of_run(drawers, t
 
 
 def test_a_damaged_log_is_done_with_its_warnings_counted_and_told(drawers, tmp_path, capfd):
-    content = (drawers / "log_00.mcap").read_bytes()
     cut, out = tmp_path / "cut.mcap", tmp_path / "out"
-    cut.write_bytes(content[:-20])
+    cut.write_bytes((drawers / "log_00.mcap").read_bytes()[:-20])
     assert main(["batch", str(cut), str(drawers / "log_01.mcap"), "--out", str(out)]) == 0
     rows, (output, _) = table(out), capfd.readouterr()
-    metrics = json.loads((out / rows["cut.mcap"]["run"] / "metrics.json").read_text())
-    assert rows["cut.mcap"]["warnings"] == len(metrics["warnings"]) > 0 == rows["log_01.mcap"]["warnings"]
-    first = metrics["warnings"][0].replace(f"{cut}: ", "")
-    assert f"warned         {cut}: {first}" in output and "in 1 log" in output
-    assert str(cut) in metrics["warnings"][0] and str(cut) not in first
-    page = (out / "report.html").read_text(encoding="utf-8")
-    assert f'<td class="bad">{len(metrics["warnings"])}</td>' in page
+    told = json.loads((out / rows["cut.mcap"]["run"] / "metrics.json").read_text())["warnings"]
+    assert rows["cut.mcap"]["warnings"] == len(told) > 0 == rows["log_01.mcap"]["warnings"]
+    first = told[0].replace(f"{cut}: ", "")
+    assert f"warned         {cut}: {first}" in output and "in 1 log" in output and first != told[0]
+    assert f'<td class="bad">{len(told)}</td>' in (out / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs signals")
@@ -217,11 +193,9 @@ def test_ctrl_c_kills_what_runs_and_the_table_says_what_was_not_run(drawers, tmp
 
 
 def test_what_a_killed_batch_started_ends_with_it(tmp_path):
-    simulate("office", tmp_path / "long.mcap", duration_s=120.0)
-    words = ["batch", str(tmp_path / "long.mcap"), "--out", str(tmp_path / "out")]
-    child = subprocess.Popen(
-        [sys.executable, "-m", "scanchain", *words], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
+    log = made.log("office", tmp_path, seconds=120)
+    command = [sys.executable, "-m", "scanchain", "batch", str(log), "--out", str(tmp_path / "out")]
+    child = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     wait_until(lambda: list((tmp_path / "out").glob("*.partial-*/points.store")))
     assert processes_about(tmp_path)
     child.kill()
@@ -244,19 +218,18 @@ def test_logs_are_named_by_path_pattern_and_list_each_once(tmp_path):
 
 
 def test_a_folder_is_the_logs_in_it_unless_they_are_the_parts_of_one(tmp_path):
-    simulate("office", tmp_path / "whole.mcap", duration_s=4.0)
-    for place, name in enumerate(("part_0", "part_1")):
-        (tmp_path / name.partition("_")[0]).mkdir(exist_ok=True)
-        part = str(tmp_path / "part" / f"{name}.mcap")
+    whole, several = made.log("office", seconds=4), tmp_path / "several"
+    for place in range(2):
+        part = tmp_path / "part" / f"part_{place}.mcap"
+        part.parent.mkdir(exist_ok=True)
         cut = ["--start", str(2 * place), "--end", str(2 * place + 1.95)]
-        assert main(["convert", str(tmp_path / "whole.mcap"), part, *cut]) == 0
-    several = tmp_path / "several"
+        assert main(["convert", str(whole), str(part), *cut]) == 0
     (several / "clouds").mkdir(parents=True)
     (several / "clouds" / "1.pcd").touch()
     (several / "truth.txt").touch()
     shutil.copytree(tmp_path / "part", several / "part")
     for seed in (1, 2):  # of the same time, by the clock of the simulation
-        simulate("office", several / f"{seed}.mcap", duration_s=2.0, seed=seed)
+        shutil.copy(made.log("office", seconds=2, seed=seed), several / f"{seed}.mcap")
     assert collect([tmp_path / "part"], []) == (tmp_path / "part",)
     assert {path.name for path in collect([several], [])} == {"1.mcap", "2.mcap", "clouds", "part"}
     (several / "clouds" / "1.pcd").unlink()
@@ -291,31 +264,18 @@ def test_a_batch_is_not_written_among_logs_nor_into_a_run_nor_with_a_wrong_key(
     assert not (out / "rows").exists()
 
 
-def stands_still(path, ranges, angles, topics, *, noise_m=0.0, truth=False):
-    """A log of two seconds of a lidar that stands still."""
+def stands_still(path, ranges_m, angles):
+    """A log of two seconds of two lidars that stand still, and of their true pose."""
     random = np.random.default_rng(0)
     with LogWriter(path) as writer:
         for stamp_ns in range(0, 2_000_000_000, 100_000_000):
-            if truth:
-                pose = pack_odometry(stamp_ns, "world", "lidar", ORIGIN)
-                writer.append("/ground_truth", "nav_msgs/msg/Odometry", pose, stamp_ns)
-            measured = ranges + noise_m * random.standard_normal(len(ranges))
-            scan = pack_laser_scan(
-                stamp_ns, "lidar", angles[0], angles[1] - angles[0], measured, range_min_m=0.1, range_max_m=20.0
-            )
-            for topic in topics:
+            pose = pack_odometry(stamp_ns, "world", "lidar", ORIGIN)
+            writer.append("/ground_truth", "nav_msgs/msg/Odometry", pose, stamp_ns)
+            first = stamp_ns, "lidar", angles[0], angles[1] - angles[0]
+            measured_m = ranges_m + 1e-3 * random.standard_normal(len(ranges_m))
+            scan = pack_laser_scan(*first, measured_m, range_min_m=0.1, range_max_m=20.0)
+            for topic in ("/front", "/rear"):
                 writer.append(topic, "sensor_msgs/msg/LaserScan", scan, stamp_ns)
-
-
-def test_a_robot_that_stands_still_has_a_result_that_is_found_again(tmp_path, capfd):
-    log, out, angles = tmp_path / "still.mcap", tmp_path / "out", np.radians(np.arange(360.0))
-    ranges = 4.0 / np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles)))  # a square room
-    stands_still(log, ranges, angles, ["/scan"], truth=True)
-    assert main(["batch", str(log), "--out", str(out)]) == 0
-    assert main(["batch", str(log), "--out", str(out)]) == 0
-    (row,) = table(out).values()
-    assert (row["state"], row["scans"], row["ate_share_of_path"]) == ("done", 20, None)
-    assert "1 result from before" in capfd.readouterr()[0].splitlines()[-1]
 
 
 def test_the_report_shows_every_log_and_names_no_key_of_an_address(drawers, tmp_path, monkeypatch):
@@ -329,10 +289,10 @@ def test_the_report_shows_every_log_and_names_no_key_of_an_address(drawers, tmp_
         monkeypatch.setattr(sys, "argv", ["scanchain", *words])
         assert main(words) == 1
         assert table(out)["far.mcap"]["reason"] == table(out)["log_03.mcap"]["reason"] == ""
-        first = made(out)
-        assert main(words) == 1 and made(out) == first
+        first = made_at(out)
+        assert main(words) == 1 and made_at(out) == first
         site.etag = '"two"'
-        assert main(words) == 1 and len(made(out)) == len(first) + 1 == 3
+        assert main(words) == 1 and len(made_at(out)) == len(first) + 1 == 3
     rows = table(out)
     assert rows["far.mcap"]["log"] == f"{site.url}/far.mcap" and rows["far.mcap"]["scans"] == 20
     page = (out / "report.html").read_text()
@@ -349,48 +309,55 @@ def two_lidars(tmp_path):
     angles = np.radians(np.arange(-90.0, 90.5, 0.5))
     wall = 3.0 / np.maximum(np.cos(angles), 1e-3)
     room = np.minimum(wall, 4.0 / np.maximum(np.abs(np.sin(angles)), 1e-3))
-    for log, ranges in zip(logs, (wall, room), strict=True):
-        stands_still(log, ranges, angles, ["/front", "/rear"], noise_m=1e-3)
+    for log, ranges_m in zip(logs, (wall, room), strict=True):
+        stands_still(log, ranges_m, angles)
     return logs
 
 
-def test_logs_with_several_lidars_are_run_with_the_short_flags_of_run(two_lidars, tmp_path):
-    words = ["batch", *map(str, two_lidars), "--out", str(tmp_path / "out")]
+def test_logs_with_several_lidars_take_the_flags_of_run_and_one_that_is_not_sure_is_a_row_that_says_so(
+    two_lidars, tmp_path, capfd
+):
+    out = tmp_path / "out"
+    words = ["batch", *map(str, two_lidars), "--out", str(out)]
     assert main(words) == 1
-    assert all("choose one with --topic" in row["reason"] for row in table(tmp_path / "out").values())
-    assert main([*words, "--topic", "/rear", "--every", "2", "--no-loops"]) == 1  # beside one wall nothing is sure
-    assert [row["state"] for row in table(tmp_path / "out").values()] == ["not trustworthy", "done"]
-    rows = table(tmp_path / "out")
-    assert [row["scans"] for row in rows.values()] == [10, 10]
-    for row in rows.values():
-        config = (tmp_path / "out" / row["run"] / "config.toml").read_text()
+    assert all("choose one with --topic" in row["reason"] for row in table(out).values())
+    words += ["--topic", "/rear", "--every", "2", "--no-loops"]
+    capfd.readouterr()
+    assert main(words) == 1  # beside one wall nothing is sure
+    output, errors = capfd.readouterr()
+    wall, room = table(out).values()
+    assert (wall["state"], room["state"]) == ("not trustworthy", "done") and "degenerate" in wall["reason"]
+    assert "2: 1 done, 1 not trustworthy" in output
+    assert errors == f"error: 1 of 2 logs are not trustworthy; {out}/summary.txt has the reason\n"
+    assert f"{two_lidars[0]} is not trustworthy" in (out / "report.html").read_text()
+    assert room["ate_share_of_path"] is None  # it stood still
+    for row in (wall, room):
+        config = (out / row["run"] / "config.toml").read_text()
+        assert row["scans"] == 10
         assert 'topic = "/rear"' in config and "every = 2" in config and "enabled = false" in config
+    first = made_at(out)
+    assert main(words) == 1 and made_at(out) == first and "2 results from before" in capfd.readouterr()[0]
     assert main([*words, "--gt", "truth.tum"]) == 2
 
 
 @pytest.mark.slow
 def test_the_report_on_a_phone_shows_figures_beside_long_names_and_links_to_every_run(two_lidars, tmp_path):
-    out = tmp_path / "out"
-    (tmp_path / "bad.mcap").write_bytes(b"no log at all")
-    logs = [*map(str, two_lidars), str(tmp_path / "bad.mcap")]
-    assert main(["batch", *logs, "--out", str(out), "--topic", "/front"]) == 1
-    rows = table(out)
-    page = (out / "report.html").read_text(encoding="utf-8")
-    cells = {row["log"]: re.search(f"{name}</a>.*?</tr>", page, re.DOTALL)[0] for name, row in rows.items()}
-    blind, fine, _ = (re.findall(r"<td([^>]*)>([^<]*)</td>", each) for each in cells.values())
+    out, bad = tmp_path / "out", tmp_path / "bad.mcap"
+    bad.write_bytes(b"no log at all")
+    assert main(["batch", *map(str, (*two_lidars, bad)), "--out", str(out), "--topic", "/front"]) == 1
+    rows, page = table(out), (out / "report.html").read_text(encoding="utf-8")
+    lines = [re.search(f"{name}</a>.*?</tr>", page, re.DOTALL)[0] for name in rows]
+    blind, fine, _ = (re.findall(r"<td([^>]*)>([^<]*)</td>", each) for each in lines)
+    degenerate = rows[two_lidars[0].name]["degenerate"]
     assert blind[:2] == [(' class="bad"', "not trustworthy"), ("", "20")] and fine[0][1] == "trustworthy"
-    assert blind[3] == (' class="bad"', str(rows[two_lidars[0].name]["degenerate"]))
-    assert fine[2] == fine[3] == fine[4] == ("", "0") and rows[two_lidars[0].name]["degenerate"] > 10
+    assert blind[3] == (' class="bad"', str(degenerate)) and degenerate > 10
+    assert fine[2] == fine[3] == fine[4] == ("", "0")
     links = re.findall(r'<a href="([^"]+)">', page)
     assert len(links) == 3 and all((out / unquote(link)).is_file() for link in links)
     assert links[0].endswith("/report.html") and links[2].startswith("rows/")
     seen = look(out / "report.html", tmp_path, width=390)
-    assert (
-        0.0 < seen["reasons"] <= 390
-        and seen["names"] < 0.45 * 390
-        and seen["wide"] <= seen["width"]
-        and seen["outside"] == []
-    )
+    assert 0.0 < seen["reasons"] <= 390 and seen["names"] < 0.45 * 390
+    assert seen["wide"] <= seen["width"] and seen["outside"] == []
 
 
 def test_of_remote_logs_a_pattern_names_those_that_match(monkeypatch):

@@ -221,12 +221,15 @@ def test_the_worst_place_of_a_run_is_drawn_and_lies_where_its_points_are(one_run
     assert "20" in shown and "30" in shown
 
 
-@pytest.mark.parametrize(("which", "write"), [("one_run", "write_report"), ("comparison", "present_comparison")])
+@pytest.mark.parametrize(
+    ("which", "write"), [("one_run", "run.write_run_report"), ("comparison", "comparison.write_compare_report")]
+)
 def test_the_same_directory_gives_the_same_page_without_matplotlib(which, write, pages):
+    module, name = write.split(".")
     program = f"""
 import sys
 from pathlib import Path
-from scanchain.api import {write} as write
+from scanchain_viz.report.{module} import {name} as write
 write(Path(sys.argv[1]))
 assert "matplotlib" not in sys.modules
 """
