@@ -72,8 +72,7 @@ def test_one_solver_runs_unless_more_are_asked_for(call, small, tmp_path):
 
 
 def test_pinv_is_left_out_of_all_above_its_limit_and_refused_by_name(call, small, tmp_path, monkeypatch):
-    for module in ("solvers", "solvers.direct"):
-        monkeypatch.setattr(f"scanchain.landmarks.{module}.PINV_BELOW", 70)
+    monkeypatch.setattr("scanchain.landmarks.solvers.PINV_BELOW", 70)
     words = ["landmarks", small, "--repeat", "1", "--out", tmp_path / "out", "--methods"]
     code, _, errors = call(*words, "lu,pinv")
     assert code == 2 and "70 unknowns" in errors and "name other --methods" in errors

@@ -177,11 +177,10 @@ def test_utias_6_robot_1_is_as_accurate_as_a_batch_in_gtsam_or_better_and_noise_
     study = study_log(folder, ALONE)
     assert study.before.poses_m == pytest.approx(2.06, abs=0.01)
     assert study.after.poses_m <= 0.113
-    facts = {fact.label: fact.value for fact in study.facts}
-    assert facts["left out"].startswith("407 of other robots, 1 of unknown barcodes, 0 ")
-    assert facts["odometry noise"].endswith("fits") and facts["sensor noise"].endswith("fits")
+    assert study.facts["left out"].startswith("407 of other robots, 1 of unknown barcodes, 0 ")
+    assert study.facts["odometry noise"].endswith("fits") and study.facts["sensor noise"].endswith("fits")
     stated = study_log(folder, replace(ALONE, noise=OdometryNoise(0.003, 0.001, 0.005, 0.01)))
-    assert "off by a factor" in {fact.label: fact.value for fact in stated.facts}["odometry noise"]
+    assert "off by a factor" in stated.facts["odometry noise"]
 
 
 def test_the_estimate_of_the_noise_hardly_depends_on_where_it_begins(monkeypatch):

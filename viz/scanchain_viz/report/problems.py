@@ -181,7 +181,7 @@ def write_report(directory: Path, studies: Sequence[Study]) -> None:
 def _estimate_section(study: Study, before: Plot, after: Plot) -> page.Section:
     (_, error_before), (_, error_after), _ = accuracy_lines(study)
     facts = [("error before, rmse", error_before), ("error after, rmse", error_after)]
-    facts += [(fact.label, fact.value) for fact in study.facts]
+    facts += study.facts.items()
     chips, marks = [page.Chip("before", BEFORE), page.Chip("after", AFTER)], "Circles: landmarks"
     if len(study.true_poses) or np.isfinite(study.true_landmarks).any():
         chips.append(page.Chip("truth", INK, is_dashed=True))
