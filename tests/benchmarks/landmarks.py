@@ -25,9 +25,9 @@ from scanchain.graph.losses import RobustLoss
 from scanchain.landmarks.estimate import from_odometry, minimize
 from scanchain.landmarks.files import read_landmark_data, read_mrclam
 from scanchain.landmarks.problem import BearingRangeProblem, Values, linear_system, no_calibration
-from scanchain.landmarks.ranges import OWN, LogModel, OdometryNoise, solve_range_log
+from scanchain.landmarks.ranges import OWN, OdometryNoise, reckon, solve_range_log
 from scanchain.landmarks.solvers import METHODS, compare, create_solver
-from scanchain.landmarks.study import against_truth, truth_at
+from scanchain.landmarks.study import against_truth
 from tests.benchmarks.harness import DATA, command_line
 
 OF_THE_REPORT = ("default", "pinv", "lu", "lu_colamd", "qr", "qr_colamd")
@@ -82,10 +82,12 @@ LANDMARK = 10_000_000  # first key of a landmark
 
 
 def measurements_of(log):
-    model = LogModel(log)
-    variances = np.concatenate([OdometryNoise().densities, SIGMAS**2])
-    given = model.measurements(model.reckoned(np.zeros(len(OWN))), variances)
-    return replace(given, calibration=no_calibration(given.motion))
+    solved = solve_range_log(log, None)
+    reckoning = reckon(log, solved.nodes_s, np.zeros(len(OWN)))
+    return replace(
+        solved.problem.measurements, motion=reckoning.motion, calibration=no_calibration(reckoning.motion),
+        motion_covariance=reckoning.covariance(OdometryNoise().densities), measured_covariance=np.diag(SIGMAS**2),
+    )  # fmt: skip
 
 
 def as_given(log):
@@ -148,8 +150,7 @@ OF_THE_LOG = {
 
 def real_log(options):
     log = read_mrclam(DATA / "landmarks" / "utias_mrclam6", options.robot)
-    model = LogModel(log)
-    truth = truth_at(log, model.nodes_s, model.landmarks)
+    nodes_s, landmarks = np.unique(log.seen_s), np.unique(log.subjects)
     seconds = {name: [] for name in OF_THE_LOG}
     for method in OF_THE_LOG.values():
         method(log)  # compiles
@@ -159,7 +160,7 @@ def real_log(options):
             seconds[name].append((spent, state))
     print(f"{log.name}: {'method':22} {'median ms':>10} {'min ms':>8} {'ATE m':>8} {'landmarks m':>12}")
     for name, runs in seconds.items():
-        accuracy = against_truth(runs[-1][1], model.nodes_s, truth)
+        ((accuracy,), *_) = against_truth((runs[-1][1],), nodes_s, landmarks, log)
         spent = 1e3 * np.array([run[0] for run in runs])
         print(f"{log.name}: {name:22} {np.median(spent):10.1f} {spent.min():8.1f} {accuracy.poses_m:8.4f}"
               f" {accuracy.landmarks_m:12.4f}")  # fmt: skip

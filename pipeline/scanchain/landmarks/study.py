@@ -66,13 +66,16 @@ def of_positions(state: Values, data: LandmarkData) -> Estimate:
     return Estimate(state, lie.identity(2), poses_m, _rms(state.landmarks - data.true_landmarks), definition)
 
 
-def _against_truth(
-    states: Sequence[Values], nodes_s: NDArray[np.float64], log: RangeLog, surveyed: Matrix
-) -> tuple[list[Estimate], Matrix]:
-    """ATE of the poses of each state after rigid alignment, landmarks by the same one; true positions (k, 2).
+def against_truth(
+    states: Sequence[Values], nodes_s: NDArray[np.float64], landmarks: NDArray[np.int64], log: RangeLog
+) -> tuple[list[Estimate], Matrix, Matrix]:
+    """ATE of the poses of each state after rigid alignment, landmarks by the same one, against motion capture.
 
-    surveyed : (L, 2), NaN where a landmark was not
+    nodes_s, landmarks : (K,) times of the poses, (L,) numbers of the landmarks
+    Returns also true positions (k, 2), and those of the landmarks (L, 2), NaN where one was not surveyed.
     """
+    place, unknown = dict(zip(log.true_subjects.tolist(), log.true_landmarks, strict=True)), np.full(2, np.nan)
+    surveyed = np.array([place.get(subject, unknown) for subject in landmarks.tolist()])
     estimates, positions, truth = [], np.empty((0, 2)), _trajectory(log.true_s, log.true_poses)
     for state in states:
         try:
@@ -85,7 +88,7 @@ def _against_truth(
         landmarks_m = _rms(lie.transform(T_truth_estimate, state.landmarks) - surveyed)
         definition = f"{error.definition}, over {error.pairing}"
         estimates.append(Estimate(state, T_truth_estimate, error.translation_m.rmse, landmarks_m, definition))
-    return estimates, positions
+    return estimates, positions, surveyed
 
 
 def _trajectory(nodes_s: NDArray[np.float64], poses: Matrix) -> Trajectory:
@@ -243,12 +246,11 @@ def study_log(folder: Path, options: Options) -> Study:
     names, left_out = methods_for(options.methods, system.pattern.shape[1])
     facts = _facts(log, solution, is_stated=options.noise is not None) | left_out
     minimum, nodes_s = solution.minimum, solution.nodes_s
-    place, unknown = dict(zip(log.true_subjects.tolist(), log.true_landmarks, strict=True)), np.full(2, np.nan)
-    surveyed = np.array([place.get(subject, unknown) for subject in system.pattern.layout.landmarks.tolist()])
-    (before, after), true_poses = _against_truth((solution.reckoned, minimum.state), nodes_s, log, surveyed)
+    states, landmarks = (solution.reckoned, minimum.state), system.pattern.layout.landmarks
+    (before, after), true_poses, surveyed = against_truth(states, nodes_s, landmarks, log)
     return Study(
-        log.name, facts, before, after, minimum.converged, solution.covariance, true_poses, surveyed, system,
-        build_s, compare(lambda solver: solver.solve(system), names, options.repeats),
+        log.name, facts, before, after, minimum.converged, solution.covariance, true_poses, surveyed, system, build_s,
+        compare(lambda solver: solver.solve(system), names, options.repeats),
         _trajectory(nodes_s, minimum.state.poses),
     )  # fmt: skip
 
