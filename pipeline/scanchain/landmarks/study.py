@@ -249,8 +249,8 @@ def study_log(folder: Path, options: Options) -> Study:
     states, landmarks = (solution.reckoned, minimum.state), system.pattern.layout.landmarks
     (before, after), true_poses, surveyed = against_truth(states, nodes_s, landmarks, log)
     return Study(
-        log.name, facts, before, after, minimum.converged, solution.covariance, true_poses, surveyed, system, build_s,
-        compare(lambda solver: solver.solve(system), names, options.repeats),
+        log.name, facts, before, after, minimum.converged, solution.covariance, true_poses, surveyed, system,
+        build_s, compare(lambda solver: solver.solve(system), names, options.repeats),
         _trajectory(nodes_s, minimum.state.poses),
     )  # fmt: skip
 
