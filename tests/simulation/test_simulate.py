@@ -110,19 +110,6 @@ def test_the_drive_starts_from_standstill_within_the_limits_of_the_vehicle(name)
     assert np.ptp(poses[:, 2, 3]) > 0.3 or name == "office"
 
 
-@pytest.mark.parametrize("name", ["demo-office", "demo-town", "office", "town"])
-def test_a_sequence_comes_back_to_where_it_was(name):
-    source = catalog.load(name).source
-    motion = plan(source.world, seed=source.seed, duration_s=source.duration_s).motion
-    poses = lie.flatten(motion.lidar(np.arange(0.0, source.duration_s, 0.1)))
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :2, 2], axis=0), axis=1))])
-    gap = np.linalg.norm(poses[:, None, :2, 2] - poses[None, :, :2, 2], axis=-1)
-    turn = np.abs(lie.wrap(lie.yaw(poses)[:, None] - lie.yaw(poses)[None]))
-    again = (gap < 1.5) & (turn < 0.3) & (arc[:, None] - arc[None] > 20.0)
-    revisited_m = np.diff(arc, prepend=0.0)[again.any(axis=1)].sum()
-    assert revisited_m > 20.0
-
-
 @pytest.mark.parametrize("name", WORLDS)
 def test_the_motion_is_smooth(name):
     motion, step = planned(name, "vlp-16").motion, 1e-3
@@ -130,17 +117,6 @@ def test_the_motion_is_smooth(name):
     rates = lie.log(lie.inverse(poses[:-1]) @ poses[1:]) / step
     change = np.abs(np.diff(rates, axis=0)).max(axis=0)  # within a millisecond
     assert change[:3].max() < 0.01 and change[3:].max() < 0.02
-
-
-@pytest.mark.parametrize("sensor", LIDARS)
-@pytest.mark.parametrize("name", [name for name in WORLDS if name != "office"])
-def test_every_lidar_sees_something_everywhere(name, sensor):
-    drive = planned(name, sensor)
-    fewest = {"hdl-64": 90_000, "os1-32": 13_000, "vlp-16": 11_000, "rosette": 3_000}[sensor]
-    if (name, sensor) == ("identical", "hdl-64"):
-        fewest = 60_000  # where its walls are nearer than it can see
-    for index in drive.scans[[0, len(drive.scans) // 2, -1]].tolist():
-        assert swept(drive, index).returned.sum() > fewest
 
 
 def test_the_rounds_pass_streets_again_in_both_directions_and_in_the_other_lane():
@@ -213,30 +189,20 @@ def test_the_staircase_is_climbed_with_a_swaying_hand():
         assert naive_raycast.distance_to_surface(places, path.solids).min() > 0.3
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_the_gap_lacks_one_second_in_a_bend_and_one_on_a_straight(seed):
-    drive = planned("gap", "vlp-16", seed)
-    stamps = drive.truth().stamps_ns
-    steps = np.diff(stamps)
-    holes = np.flatnonzero(steps > 100_000_000)
-    assert steps[holes].tolist() == [1_100_000_000] * 2 and set(np.delete(steps, holes)) == {100_000_000}
-    yaw_rates = []
-    for hole in holes:
-        begin_s = (drive.scans[hole] + 1) * 0.1
-        times = np.linspace(begin_s, begin_s + 1.0, 101)
-        yaw_rates.append(np.diff(np.unwrap(lie.yaw(drive.motion.base(times)))) / 0.01)
-    assert np.abs(yaw_rates[0]).min() > 0.4 and np.abs(yaw_rates[1]).max() < 0.05
-
-
-def test_wheel_odometry_goes_on_in_a_gap_and_log_time_never_steps_back(tmp_path):
-    truth = simulate("gap", tmp_path / "a.mcap", duration_s=16.0, sensor="lms-270")
-    assert len(truth) == 150
-    with (tmp_path / "a.mcap").open("rb") as stream:
+def test_the_gap_lacks_one_second_twice_while_wheel_odometry_goes_on_and_log_time_never_steps_back(tmp_path):
+    path = tmp_path / "a.mcap"
+    truth = simulate("gap", path, sensor="lms-270")
+    steps_ns = np.diff(truth.stamps_ns)
+    gaps = np.flatnonzero(steps_ns > 100_000_000)
+    assert steps_ns[gaps].tolist() == [1_100_000_000] * 2 and set(np.delete(steps_ns, gaps)) == {100_000_000}
+    turns_rad = np.abs(lie.wrap(np.diff(lie.yaw(truth.poses))))[gaps]
+    assert turns_rad[0] > 0.4 and turns_rad[1] < 0.05  # one in a bend, one on a straight
+    with path.open("rb") as stream:
         times = [message.log_time for _, _, message in make_reader(stream).iter_messages(log_time_order=False)]
     assert times == sorted(times)
-    stamps = [nanoseconds(odometry) for _, odometry in messages(tmp_path / "a.mcap", "/odom")]
-    assert set(np.diff(stamps)) == {20_000_000} and stamps[-1] - stamps[0] == 16_000_000_000
-    assert [nanoseconds(scan) for _, scan in messages(tmp_path / "a.mcap", "/scan")] == truth.stamps_ns.tolist()
+    stamps_ns = [nanoseconds(odometry) for _, odometry in messages(path, "/odom")]
+    assert set(np.diff(stamps_ns)) == {20_000_000} and stamps_ns[-1] - stamps_ns[0] == 30_000_000_000
+    assert [nanoseconds(scan) for _, scan in messages(path, "/scan")] == truth.stamps_ns.tolist()
 
 
 def seen_from(drive, index, twists):
