@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import redirect_stderr, redirect_stdout
 from urllib.parse import unquote
 
 import numpy as np
@@ -16,11 +17,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from scanchain.__main__ import main
+from scanchain.batch import batch, task
 from scanchain.batch.batch import collect
 from scanchain.errors import InputError
 from scanchain.files import Address
 from scanchain.logs.writer import ORIGIN, LogWriter, pack_laser_scan, pack_odometry
-from scanchain.processes import resident_mib
+from scanchain.processes import Ending, KilledFor, resident_mib
 from scanchain.runs.directory import directory_name
 from scanchain_viz.report.batch import names_of
 from tests.support import made
@@ -60,6 +62,19 @@ def poisoned(tmp_path, monkeypatch):
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "sitecustomize.py").write_text(POISON)
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path / 'site'}:{ROOT}")
+
+
+@pytest.fixture
+def in_this_process(monkeypatch):
+    """Logs are run one after the other in this process, not each in one of its own."""
+
+    def run_within(limits, module, words, environment, *, output, **_):
+        with output.open("w") as file, redirect_stdout(file), redirect_stderr(file):
+            code = main(words[1:])
+        return Ending(code, KilledFor.NOTHING, 100.0, 1.0)
+
+    monkeypatch.setattr(task, "run_within", run_within)
+    monkeypatch.setattr(batch, "_local", lambda workers: lambda tasks: map(task.attempt, tasks))
 
 
 def table(folder):
@@ -104,6 +119,7 @@ def test_logs_of_the_longest_names_have_directories_of_their_own():
     assert names[0] != names[1] and all(len(os.fsencode(name)) <= 200 for name in names)
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_what_is_done_is_done_until_the_file_or_the_configuration_changes(drawers, tmp_path, capfd):
     log, out = tmp_path / "log.mcap", tmp_path / "out"
     log.write_bytes((drawers / "log_00.mcap").read_bytes())
@@ -145,6 +161,7 @@ def test_logs_that_are_damaged_absent_or_slow_are_rows_with_a_reason_each(drawer
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names are bytes there")
+@pytest.mark.usefixtures("in_this_process")
 def test_a_name_that_is_not_utf_8_is_a_failed_row_and_one_line_of_run(drawers, tmp_path, capfd):
     bad, folder = (tmp_path / os.fsdecode(name) for name in (b"bad\xff.mcap", b"parts\xff"))
     folder.mkdir()
@@ -163,6 +180,7 @@ def test_a_name_that_is_not_utf_8_is_a_failed_row_and_one_line_of_run(drawers, t
     assert "bad\\xff.mcap" in (out / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_damaged_log_is_done_with_its_warnings_counted_and_told(drawers, tmp_path, capfd):
     cut, out = tmp_path / "cut.mcap", tmp_path / "out"
     cut.write_bytes((drawers / "log_00.mcap").read_bytes()[:-20])
@@ -278,6 +296,7 @@ def stands_still(path, ranges_m, angles):
                 writer.append(topic, "sensor_msgs/msg/LaserScan", scan, stamp_ns)
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_the_report_shows_every_log_and_names_no_key_of_an_address(drawers, tmp_path, monkeypatch):
     pytest.importorskip("fsspec", reason="the extra remote is not installed")
     out = tmp_path / "out"
@@ -314,6 +333,7 @@ def two_lidars(tmp_path):
     return logs
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_logs_with_several_lidars_take_the_flags_of_run_and_one_that_is_not_sure_is_a_row_that_says_so(
     two_lidars, tmp_path, capfd
 ):
@@ -340,7 +360,7 @@ def test_logs_with_several_lidars_take_the_flags_of_run_and_one_that_is_not_sure
     assert main([*words, "--gt", "truth.tum"]) == 2
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("in_this_process")
 def test_the_report_on_a_phone_shows_figures_beside_long_names_and_links_to_every_run(two_lidars, tmp_path):
     out, bad = tmp_path / "out", tmp_path / "bad.mcap"
     bad.write_bytes(b"no log at all")
