@@ -17,10 +17,12 @@ import pytest
 from rerun.chunk import RrdReader
 
 from scanchain.__main__ import main
+from scanchain.comparison import processes, worker
 from scanchain.comparison.figures import COLUMNS
 from scanchain.comparison.table import read_table
 from scanchain.logs.writer import ORIGIN, LogWriter, pack_laser_scan, pack_odometry
 from scanchain.maps import read_ply
+from scanchain.processes import Ending, KilledFor
 from scanchain.runs.metrics import Metrics
 from scanchain.runs.results import OVERLAY_FILE
 from scanchain.verdict import Judged, Kind, Stretch, Verdict
@@ -60,20 +62,25 @@ def evil(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def comparison(evil, tmp_path_factory):
-    """The directory of a comparison of ours, a variant of an evil name, and one that raises evil words."""
+    """The directory of a comparison, in this process, of ours, a variant of an evil name, and one that raises."""
     folder = tmp_path_factory.mktemp("compared")
     (folder / "a.toml").write_text(
         f'["{EVIL}"]\nmethod = "bad_odometries:Shifted"\n[raises]\nmethod = "bad_odometries:Raises"\n'
     )
+
+    def run_within(limits, module, words, environment, **_):
+        with pytest.MonkeyPatch.context() as inner:
+            inner.setattr(sys, "argv", [module, *words])
+            worker.main()
+        return Ending(0, KilledFor.NOTHING, 100.0, 1.0)
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", f"{SUPPORT}:{ROOT}", prepend=":")
-        code = main(
-            [
-                "compare", str(evil), "--out", str(folder / "out"), "--settings", str(folder / "a.toml"),
-                "--methods", f"plicp,plicp+loops,{EVIL},raises",
-            ]
-        )  # fmt: skip
-    assert code == 1
+        patch.syspath_prepend(SUPPORT)
+        patch.setattr(processes, "run_within", run_within)
+        for name in ("die_first", "die_with_parent"):
+            patch.setattr(worker, name, lambda **_: None)
+        words = ["--settings", str(folder / "a.toml"), "--methods", f"plicp,plicp+loops,{EVIL},raises"]
+        assert main(["compare", str(evil), "--out", str(folder / "out"), *words]) == 1
     return folder / "out"
 
 
@@ -221,21 +228,19 @@ def test_the_worst_place_of_a_run_is_drawn_and_lies_where_its_points_are(one_run
     assert "20" in shown and "30" in shown
 
 
-@pytest.mark.parametrize(
-    ("which", "write"), [("one_run", "run.write_run_report"), ("comparison", "comparison.write_compare_report")]
-)
-def test_the_same_directory_gives_the_same_page_without_matplotlib(which, write, pages):
-    module, name = write.split(".")
-    program = f"""
+def test_the_same_directory_gives_the_same_page_without_matplotlib(pages):
+    program = """
 import sys
 from pathlib import Path
-from scanchain_viz.report.{module} import {name} as write
-write(Path(sys.argv[1]))
+from scanchain_viz.report.comparison import write_compare_report
+from scanchain_viz.report.run import write_run_report
+write_compare_report(Path(sys.argv[1]))
+write_run_report(Path(sys.argv[2]))
 assert "matplotlib" not in sys.modules
 """
-    before = pages[which].read_bytes()
-    subprocess.run([sys.executable, "-c", program, str(pages[which].parent)], check=True)
-    assert pages[which].read_bytes() == before
+    before = {page: page.read_bytes() for page in pages.values()}
+    subprocess.run([sys.executable, "-c", program, *(page.parent for page in before)], check=True)
+    assert {page: page.read_bytes() for page in before} == before
 
 
 def test_the_map_of_a_run_is_drawn_in_the_page_under_its_own_security_policy(one_run, tmp_path):
