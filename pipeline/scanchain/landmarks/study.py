@@ -55,6 +55,11 @@ class Estimate:
     landmarks_m: float
     definition: str
 
+    def in_truth(self) -> tuple[Matrix, Matrix]:
+        """Positions (K, 2) of the poses and (L, 2) of the landmarks in the truth's frame."""
+        T = self.T_truth_estimate
+        return lie.transform(T, self.state.poses[:, :2]), lie.transform(T, self.state.landmarks)
+
 
 def of_positions(state: Values, data: LandmarkData) -> Estimate:
     """Against the positions of an npz file, where it has them; both lie in one frame."""

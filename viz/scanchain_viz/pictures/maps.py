@@ -64,9 +64,9 @@ def extent(points: NDArray[np.floating]) -> tuple[Floats, Floats]:
     return low, high
 
 
-def map_points(prior: SavedMap, limit: int = _SAMPLE) -> Points:
+def map_points(prior: SavedMap) -> Points:
     """(N, 3) some points of all keyframes of a map, in its frame."""
-    each = max(limit // max(len(prior.keyframes), 1), 1)
+    each = max(_SAMPLE // max(len(prior.keyframes), 1), 1)
     clouds = [np.empty((0, 3))]
     for keyframe in prior.keyframes:
         points = keyframe.points

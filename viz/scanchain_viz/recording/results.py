@@ -15,7 +15,6 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from scanchain import lie
 from scanchain.comparison.results import MAP_FILE, SCANS_FILE, TRUTH_FILE, method_folder
 from scanchain.comparison.table import read_table
 from scanchain.data import ClosureVerdict, GraphState
@@ -291,7 +290,7 @@ def _study(root: str, study: Study) -> Iterator[Message]:
     yield from _estimate(root, study.after, Times.at(1, 1), entities.BLUE)
     axes_m, angles_rad = ellipses(study)
     drawn = rr.Ellipsoids3D.from_fields(
-        centers=drawing.in_space(lie.transform(study.after.T_truth_estimate, study.after.state.landmarks)),
+        centers=drawing.in_space(study.after.in_truth()[1]),
         half_sizes=np.pad(axes_m, ((0, 0), (0, 1)), constant_values=_ELLIPSE_M),
         quaternions=_upright(angles_rad),
         colors=entities.BLUE,
@@ -301,8 +300,6 @@ def _study(root: str, study: Study) -> Iterator[Message]:
 
 def _estimate(root: str, estimate: Estimate, times: Times, color: drawing.Color) -> Iterator[Message]:
     """Trajectory and landmarks at one instant."""
-    T = estimate.T_truth_estimate
-    path = drawing.in_space(lie.transform(T, estimate.state.poses[:, :2]))
-    points = drawing.in_space(lie.transform(T, estimate.state.landmarks))
+    path, points = map(drawing.in_space, estimate.in_truth())
     yield Message(f"{root}/trajectory", drawing.lines([path], color, 1.5), times)
     yield Message(f"{root}/landmarks", drawing.dots(points, color, 3.0), times)

@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain import lie
-from scanchain.data import GraphState, Matrix
+from scanchain.data import GraphState
 from scanchain.errors import InputError
 from scanchain.graph.optimization import GraphChange, fit
 from scanchain.landmarks.results import accuracy_lines, file_stem, size_of, table_of
@@ -76,16 +75,16 @@ def _estimates(study: Study) -> tuple[Plot, Plot]:
     around = np.linspace(0.0, 2.0 * np.pi, _ELLIPSE_POINTS)
     along = axes_m[:, None] * np.stack([np.cos(around), np.sin(around)], axis=-1)
     c, s = np.cos(angles_rad), np.sin(angles_rad)
-    outlines = along @ np.stack([c, s, -s, c], axis=-1).reshape(-1, 2, 2) + _in_truth(study.after)[1][:, None]
+    outlines = along @ np.stack([c, s, -s, c], axis=-1).reshape(-1, 2, 2) + study.after.in_truth()[1][:, None]
     after.line(broken(outlines), f"{AFTER}80", 0.6, name="95 % ellipse of a landmark")
     return before, after
 
 
 def _plot(study: Study, estimate: Estimate, color: str, when: str) -> Plot:
     """An estimate over the truth, in its frame where there is one."""
-    points = [study.true_poses, study.true_landmarks, *_in_truth(study.before), *_in_truth(study.after)]
+    points = [study.true_poses, study.true_landmarks, *study.before.in_truth(), *study.after.in_truth()]
     figure = Plot.of_plan(*_with_margin(np.concatenate(points)))
-    poses, landmarks = _in_truth(estimate)
+    poses, landmarks = estimate.in_truth()
     if len(study.true_poses):
         figure.line(study.true_poses, INK, 1.1, (4.0, 2.0), name="true trajectory")
     figure.line(poses, f"{color}d9", name=f"trajectory {when}")
@@ -101,12 +100,6 @@ def _with_margin(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDAr
     low, high = known.min(axis=0), known.max(axis=0)
     margin = max(0.05 * float((high - low).max()), 1e-3)
     return low - margin, high + margin
-
-
-def _in_truth(estimate: Estimate) -> tuple[Matrix, Matrix]:
-    """Positions of poses and landmarks in the truth's frame."""
-    state, T = estimate.state, estimate.T_truth_estimate
-    return lie.transform(T, state.poses[:, :2]), lie.transform(T, state.landmarks)
 
 
 def ellipses(study: Study) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
