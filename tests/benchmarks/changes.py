@@ -178,9 +178,10 @@ def _rays_by_owner(drive: Drive, saved: SavedMap, solids: Solids) -> np.ndarray:
         start_s = (keyframe.stamp_ns - EPOCH_NS) * 1e-9
         rays = drive.sensor.rays(round(start_s / (drive.sensor.period_ns * 1e-9)))
         poses = drive.motion.lidar(start_s + rays.instants_ns * 1e-9)
-        _, solid = solids.strike(
-            poses, rays.instant_of_ray, rays.directions, min(drive.sensor.max_range_m, REACH_M[saved.dimension])
-        )
+        solid, reach_m = np.empty(len(rays.directions), np.int32), REACH_M[saved.dimension]
+        solids.cast(
+            poses, rays.instant_of_ray, rays.directions, min(drive.sensor.max_range_m, reach_m), solid
+        )  # fmt: skip
         owner = solids.owner[solid[(solid >= 0) & (solid < len(solids.owner))]]
         counts += np.bincount(owner[owner != FIXED], minlength=len(counts))
     return counts

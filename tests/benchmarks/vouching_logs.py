@@ -172,10 +172,6 @@ class Kidnapped:
     def _moved(self, times_s: NDArray[np.floating]) -> NDArray[np.floating]:
         return times_s + _AHEAD_S * self._is_after(times_s)
 
-    def speed_m_s(self, times_s: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Speed along the path, without the jump."""
-        return self._motion.speed_m_s(self._moved(times_s))
-
     def base(self, times_s: NDArray[np.floating]) -> Matrix:
         """T_world_base as the wheels roll."""
         poses = self._motion.base(self._moved(times_s))

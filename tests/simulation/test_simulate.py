@@ -99,10 +99,9 @@ def test_the_drive_starts_from_standstill_within_the_limits_of_the_vehicle(name)
     motion = planned(name, "vlp-16").motion
     vehicle, step = WORLDS[name].vehicle, 1e-3
     times = np.arange(0.0, 50.0, step)
-    poses, speed = motion.base(times), motion.speed_m_s(times)
-    assert speed[0] < 1e-3 and speed.max() < 1.01 * vehicle.speed_m_s
-    traveled = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)
-    assert np.allclose(traveled / step, 0.5 * (speed[1:] + speed[:-1]), atol=0.01 * vehicle.speed_m_s)
+    poses = motion.base(times)
+    speed = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1) / step
+    assert speed[0] < 1e-3 and 0.9 * vehicle.speed_m_s < speed.max() < 1.01 * vehicle.speed_m_s
     assert np.abs(np.diff(speed)).max() / step < 1.5 * vehicle.acceleration_m_s2
     assert np.abs(lie.wrap(np.diff(lie.yaw(poses)))).max() / step > 0.5  # it does turn
     above_m = poses[:, 2, 3] - planned(name, "vlp-16").solids.ground_height(poses[:, :2, 3])
@@ -173,7 +172,8 @@ def test_turns_are_made_on_the_spot_at_120_degrees_a_second():
     rate = np.rad2deg(lie.wrap(np.diff(lie.yaw(poses))) / 0.01)
     assert rate.max() == pytest.approx(120.0, abs=1.0) and rate.min() == pytest.approx(-120.0, abs=1.0)
     turning = np.abs(rate) > 5.0
-    assert turning.mean() > 0.25 and motion.speed_m_s(times[:-1])[turning].max() < 1e-6
+    moved_m = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)
+    assert turning.mean() > 0.25 and moved_m[turning].max() < 1e-6
     assert np.linalg.norm(poses[:, :2, 3], axis=1).max() < 5.0
 
 

@@ -70,27 +70,23 @@ class Solids:
         return np.stack([along_x, along_y], axis=-1)
 
     def cast(
-        self, T_world_sensor: Matrix, pose_of_ray: NDArray[np.int32], directions: Matrix, max_range_m: float
-    ) -> NDArray[np.float64]:
-        """Range to the first surface along each ray, inf beyond reach; poses (P, 4, 4), directions (N, 3)."""
-        return self.strike(T_world_sensor, pose_of_ray, directions, max_range_m)[0]
+        self, T_world_sensor: Matrix, pose_of_ray: NDArray[np.int32], directions: Matrix, max_range_m: float,
+        solid_of_ray: NDArray[np.int32] | None = None,
+    ) -> NDArray[np.float64]:  # fmt: skip
+        """Range to the first surface along each ray, inf beyond reach; poses (P, 4, 4), directions (N, 3).
 
-    def strike(
-        self, T_world_sensor: Matrix, pose_of_ray: NDArray[np.int32], directions: Matrix, max_range_m: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-        """Range along each ray as in ``cast``, and the index of the solid it hit, −1 where none.
-
-        Solids are counted through boxes, cylinders, ellipsoids, the ground last.
+        solid_of_ray : (N,) takes the number of the solid that each ray hits, −1 where none, counted through boxes,
+            cylinders, ellipsoids, the ground last
         """
         ranges_m = np.empty(len(directions))
-        solid_of_ray = np.empty(len(directions), dtype=np.int32)
+        solid_of_ray = np.empty(len(directions), np.int32) if solid_of_ray is None else solid_of_ray
         origins = np.ascontiguousarray(T_world_sensor[:, :3, 3])
         rotations = np.ascontiguousarray(T_world_sensor[:, :3, :3])
         cast_rays(
-            origins, rotations, pose_of_ray, directions,
-            self.boxes, self.cylinders, self.ellipsoids, self.ground, max_range_m, ranges_m, solid_of_ray,
+            origins, rotations, pose_of_ray, directions, *self.groups, self.ground, max_range_m, ranges_m,
+            solid_of_ray,
         )  # fmt: skip
-        return ranges_m, solid_of_ray
+        return ranges_m
 
     def clearance_m(self, xy: Matrix, below_m: float) -> NDArray[np.float64]:
         """Distance in the plane from (N, 2) positions to the nearest solid that begins below ``below_m``."""

@@ -53,7 +53,7 @@ def tree(scenery: Scenery, x: float, y: float, rng: np.random.Generator) -> None
 
 _STREETS_X_M = (-50.0, 0.0, 50.0, 100.0, 150.0)  # middles of the streets that run north
 _STREETS_Y_M = (-40.0, 0.0, 40.0, 80.0)  # and east
-_KERB_M, _PARKED_M, _LAMP_M, _TREE_M, _FRONT_M = 4.0, 3.1, 4.7, 5.2, 7.0  # from the middle of the street
+_PARKED_M, _LAMP_M, _TREE_M, _FRONT_M = 3.1, 4.7, 5.2, 7.0  # from the middle of the street
 
 TOWN_CAR = Vehicle(
     speed_m_s=9.0, acceleration_m_s2=2.5, lateral_acceleration_m_s2=4.0, corner_m=7.0, deviation_m=0.4,
@@ -92,7 +92,8 @@ def town(
     parked : share of the places at the kerb that have a car on them
     streets_x_m, streets_y_m : middles of the streets that run north, and east
     """
-    scenery = Scenery(_waves(rng))
+    phase_x, phase_y = rng.uniform(0.0, 2.0 * np.pi, 2)  # of waves of 0.5 m: slopes of 3 % at most
+    scenery = Scenery(np.array([0.0, 0.5, 2.0 * np.pi / 140.0, phase_x, 0.5, 2.0 * np.pi / 110.0, phase_y]))
     for west, east in pairwise(streets_x_m):
         for south, north in pairwise(streets_y_m):
             _block(scenery, west, east, south, north, rng)
@@ -103,13 +104,6 @@ def town(
         for south, north in pairwise(streets_y_m):
             _street(scenery, np.array([x, south]), np.array([x, north]), parked, rng)
     return scenery.finish()
-
-
-def _waves(rng: np.random.Generator) -> NDArray[np.float64]:
-    """Gentle waves of 0.5 m: slopes of 3 % at most."""
-    wave_x, wave_y = 2.0 * np.pi / 140.0, 2.0 * np.pi / 110.0
-    phase_x, phase_y = rng.uniform(0.0, 2.0 * np.pi, 2)
-    return np.array([0.0, 0.5, wave_x, phase_x, 0.5, wave_y, phase_y])
 
 
 def _block(
