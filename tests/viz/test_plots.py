@@ -64,18 +64,6 @@ def test_a_grid_lies_where_its_origin_says_with_row_0_at_the_bottom(drawn):
     assert (np.abs(pixels - 0.90) < 0.01).mean() > 0.15  # unknown is gray, not white
 
 
-def test_a_picture_that_cannot_be_drawn_leaves_the_old_one(tmp_path, monkeypatch, drawn):
-    def fail(figure, file, **_):
-        file.write(b"half")
-        raise OSError(28, "No space left on device")
-
-    (tmp_path / "a.png").write_bytes(b"old")
-    monkeypatch.setattr("matplotlib.figure.Figure.savefig", fail)
-    with pytest.raises(OSError, match="No space"):
-        drawn()
-    assert (tmp_path / "a.png").read_bytes() == b"old" and len(list(tmp_path.iterdir())) == 1
-
-
 @pytest.mark.parametrize("is_upright", [False, True])
 def test_ticks_are_round_numbers_where_they_belong_that_do_not_touch(is_upright):
     random, length = np.random.default_rng(4), 150.0 if is_upright else 260.0
