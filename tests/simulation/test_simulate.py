@@ -72,22 +72,22 @@ def test_the_kernel_equals_the_naive_ray_caster(seed, ground):
     rng = np.random.default_rng(seed)
     solids = random_solids(rng, ground)
     poses = lie.exp(np.column_stack([rng.uniform(-0.8, 0.8, (20, 3)), rng.normal(0.0, 0.1, (20, 3))]))
-    directions = rng.normal(size=(400, 3)) * [1.0, 1.0, 0.25]
+    directions = rng.normal(size=(250, 3)) * [1.0, 1.0, 0.25]
     directions[0], directions[1], directions[2] = [0, 0, 1], [0, 0, -1], [1, 0, 0]
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    pose_of_ray = rng.integers(0, 20, 400).astype(np.int32)
+    pose_of_ray = rng.integers(0, 20, 250).astype(np.int32)
     fast = solids.cast(poses, pose_of_ray, directions, 50.0)
     naive = np.array([
         naive_raycast.cast(poses[p, :3, 3], poses[p, :3, :3] @ d, solids, 50.0)
         for p, d in zip(pose_of_ray, directions, strict=True)
     ])  # fmt: skip
-    assert 100 < np.isfinite(naive).sum() < 400  # the test sees both hits and misses
+    assert 60 < np.isfinite(naive).sum() < 250  # the test sees both hits and misses
     assert np.array_equal(np.isfinite(fast), np.isfinite(naive))
     assert np.allclose(fast, naive, atol=1e-7, rtol=0.0)
 
 
 @pytest.mark.parametrize("name", [name for name in WORLDS if name not in ("staircase", "gap")])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_path_crosses_no_wall_and_no_furniture(name, seed):
     drive = plan(name, seed=seed, duration_s=120.0)
     places = drive.motion.base(np.arange(0.0, 120.0, 0.05 if name in ("office", "town") else 0.2))[:, :2, 3]
@@ -267,7 +267,7 @@ def test_undistorted_with_the_truth_every_point_lies_on_the_first_surface(world,
     some = random.choice(len(points), min(len(points), 1500), replace=False)
     assert len(points) > (0.4 if world == "field" else 0.5) * len(sweep.ranges_m)
     assert naive_raycast.distance_to_surface(points[some], drive.solids).max() < 1e-5
-    few, reach_m = random.choice(len(poses), 16, replace=False), drive.sensor.max_range_m
+    few, reach_m = random.choice(len(poses), 8, replace=False), drive.sensor.max_range_m
     naive = np.array([
         naive_raycast.cast(poses[k, :3, 3], poses[k, :3, :3] @ sweep.rays.directions[k], drive.solids, reach_m)
         for k in few
