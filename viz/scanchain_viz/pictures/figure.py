@@ -360,6 +360,14 @@ def broken(segments: NDArray[np.floating]) -> Floats:
     return np.concatenate([segments, gaps], axis=1).reshape(-1, segments.shape[-1])
 
 
+def around(points: NDArray[np.floating], share: float, least: float) -> tuple[Floats, Floats]:
+    """Corners (2,) of a view of the known of points (N, 2): a margin of a share of their extent, or the least."""
+    known = points[np.isfinite(points).all(axis=1)]
+    low, high = known.min(axis=0), known.max(axis=0)
+    margin = max(share * float((high - low).max()), least)
+    return low - margin, high + margin
+
+
 def write_png(
     path: Path,
     panels: Sequence[tuple[str, Plot | None]],

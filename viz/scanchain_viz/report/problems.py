@@ -15,12 +15,13 @@ from scanchain.landmarks.results import accuracy_lines, file_stem, size_of, tabl
 from scanchain.landmarks.solvers import MethodResult
 from scanchain.landmarks.study import Estimate, Study
 from scanchain_viz.colors import palette_of
-from scanchain_viz.pictures.figure import INK, Plot, broken, write_png
+from scanchain_viz.pictures.figure import INK, Plot, around, broken, write_png
 from scanchain_viz.report import page
 
 _CHAIN, _LOOP, _REJECTED = "#1f5fd0", "#8a8f98", "#d03030"
 _SEEN_FROM = np.array([[0.80, 0.60, 0.0], [-0.30, 0.40, 0.866]])  # rows: right and up of an oblique view, in 3D
 BEFORE, AFTER = "#e07b00", "#1f5fd0"
+_MARGIN = 0.05, 1e-3  # of a view: share of its extent, least
 _ACROSS = 4  # panels of factors in a row
 _PIXELS = 500  # largest width in pixels of a picture of a factor
 _ELLIPSE = 2.4477  # standard deviations that hold 95 % of a Gaussian in the plane
@@ -48,7 +49,7 @@ def _graph(state: GraphState) -> Plot:
     positions = state.poses[:, :-1, -1]
     is_flat = positions.shape[1] == 2
     seen = positions if is_flat else positions @ _SEEN_FROM.T
-    low, high = _with_margin(seen)
+    low, high = around(seen, *_MARGIN)
     center, half = 0.5 * (low + high), 0.5 * (high - low).max()
     low, high = center - half, center + half  # a square, since the panels stand side by side
     figure = Plot.of_plan(low, high)
@@ -83,7 +84,7 @@ def _estimates(study: Study) -> tuple[Plot, Plot]:
 def _plot(study: Study, estimate: Estimate, color: str, when: str) -> Plot:
     """An estimate over the truth, in its frame where there is one."""
     points = [study.true_poses, study.true_landmarks, *study.before.in_truth(), *study.after.in_truth()]
-    figure = Plot.of_plan(*_with_margin(np.concatenate(points)))
+    figure = Plot.of_plan(*around(np.concatenate(points), *_MARGIN))
     poses, landmarks = estimate.in_truth()
     if len(study.true_poses):
         figure.line(study.true_poses, INK, 1.1, (4.0, 2.0), name="true trajectory")
@@ -92,14 +93,6 @@ def _plot(study: Study, estimate: Estimate, color: str, when: str) -> Plot:
         figure.marks(study.true_landmarks, "+", INK, 7.0, line=0.9, name="true landmarks")
     figure.marks(landmarks, "o", color, 4.0, line=0.9, name=f"landmarks {when}")
     return figure
-
-
-def _with_margin(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Corners (2,) of a view of points (N, 2) that are known."""
-    known = points[np.isfinite(points).all(axis=1)]
-    low, high = known.min(axis=0), known.max(axis=0)
-    margin = max(0.05 * float((high - low).max()), 1e-3)
-    return low - margin, high + margin
 
 
 def ellipses(study: Study) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
