@@ -47,6 +47,96 @@ class Change:
     owner: int
 
 
+def another_day(
+    solids: Solids, path: Matrix, free_m: float, rng: np.random.Generator
+) -> tuple[Solids, tuple[Change, ...]]:
+    """The same place with changes, drawn from ``rng``, of its movable objects.
+
+    path : (N, 2) positions from which objects keep ``free_m`` and a little more
+    """
+    world, changes = _World(solids, path, free_m + _SPARE_M), []
+    objects = int(solids.owner.max(initial=FIXED)) + 1
+    for owner in range(objects):
+        thing, fate = world.take(owner), rng.random()
+        elsewhere = world.place_for(thing, rng) if _REMOVED < fate < _REMOVED + _MOVED + _ADDED else None
+        before, gone = _middle(thing), np.full(3, np.nan)
+        size_m = np.subtract(*_box(thing)[::-1])
+        if fate < _REMOVED:
+            changes.append(Change("removed", before, gone, size_m, owner))
+            continue
+        if elsewhere is None or fate > _REMOVED + _MOVED:
+            world.put(thing, owner)
+        if elsewhere is not None and fate <= _REMOVED + _MOVED:
+            world.put(elsewhere, owner)
+            changes.append(Change("moved", before, _middle(elsewhere), size_m, owner))
+        elif elsewhere is not None and world.is_free(elsewhere):
+            world.put(elsewhere, objects)
+            changes.append(Change("added", gone, _middle(elsewhere), size_m, objects))
+            objects += 1
+    return world.solids, tuple(changes)
+
+
+def write_changes(path: Path, changes: Sequence[Change]) -> None:
+    """Write a line for each change: kind, middle before and after, size; meters, empty where it is not there."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(_COLUMNS)
+        for change in changes:
+            numbers = np.concatenate([change.before, change.after, change.size_m])
+            writer.writerow([change.kind, *("" if np.isnan(x) else f"{x:.3f}" for x in numbers.tolist())])
+
+
+class _World:
+    """``solids``, of which objects are taken out and put down again, and a ``path`` (N, 2) that is kept free."""
+
+    def __init__(self, solids: Solids, path: Matrix, free_m: float) -> None:
+        self.solids = solids
+        self._path = path
+        self._free_m = free_m
+
+    def take(self, owner: int) -> Solids:
+        """Take an object out."""
+        is_of_it = self.solids.owner == owner
+        thing, self.solids = self.solids.part(is_of_it), self.solids.part(~is_of_it)
+        return thing
+
+    def put(self, thing: Solids, owner: int) -> None:
+        """Put down an object of that number."""
+        self.solids = self.solids.with_object(thing, owner)
+
+    def place_for(self, thing: Solids, rng: np.random.Generator) -> Solids | None:
+        """The object somewhere near, where it is free and nothing fixed stands between; None if none was found."""
+        here, fixed = _middle(thing), self.solids.part(self.solids.owner == FIXED)
+        for _ in range(_TRIES):
+            away_m, direction = rng.uniform(*_APART_M), rng.uniform(0.0, 2.0 * np.pi)
+            xy = away_m * np.array([np.cos(direction), np.sin(direction)])
+            turn_rad = 0.5 * np.pi * rng.integers(4) + rng.normal(0.0, _TURN_RAD)
+            rise = np.diff(fixed.ground_height(np.array([here[:2], here[:2] + xy])))
+            moved = _moved(thing, np.append(xy, rise), turn_rad)
+            line = here[:2] + np.linspace(0.0, 1.0, int(away_m / _SAMPLE_M) + 2)[:, None] * xy
+            if self.is_free(moved) and _clearance_m(fixed, line) > _ROOM_M:
+                return moved
+        return None
+
+    def is_free(self, thing: Solids) -> bool:
+        """True if it stands neither in another solid nor in the path."""
+        footprint, (low, high) = _footprint(thing), _box(thing)
+        near = self._path[
+            ((self._path > low[:2] - self._free_m) & (self._path < high[:2] + self._free_m)).all(axis=1)
+        ]
+        off_m = np.linalg.norm(footprint[:, None] - near, axis=2).min(initial=np.inf)
+        return bool(off_m > self._free_m) and _clearance_m(self.solids, footprint) > _ROOM_M
+
+
+def _clearance_m(solids: Solids, xy: Matrix) -> float:
+    """Least distance of positions (N, 2) from the solids around, inf where none is near."""
+    boxes, cylinders, ellipsoids = solids.groups
+    reach_m = np.concatenate([boxes[:, 2:4].max(axis=1), cylinders[:, 2], ellipsoids[:, 3:5].max(axis=1)])
+    places = np.concatenate([rows[:, :2] for rows in solids.groups])
+    near = np.linalg.norm(places - xy.mean(axis=0), axis=1) < _NEAR_M + 1.5 * reach_m
+    return float(solids.part(near).clearance_m(xy, _BELOW_M).min())
+
+
 def _box(thing: Solids) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Corners (3,) of the bounding box of an object along x, y and z."""
     boxes, cylinders, ellipsoids = thing.groups
@@ -89,92 +179,6 @@ def _moved(thing: Solids, shift: NDArray[np.float64], turn_rad: float) -> Solids
     cylinders[:, 3:5] += shift[2]
     ellipsoids[:, 2] += shift[2]
     return Solids(boxes, cylinders, ellipsoids, thing.ground, thing.owner)
-
-
-def another_day(
-    solids: Solids, path: Matrix, free_m: float, rng: np.random.Generator
-) -> tuple[Solids, tuple[Change, ...]]:
-    """The same place with changes, drawn from ``rng``, of its movable objects.
-
-    path : (N, 2) positions from which objects keep ``free_m`` and a little more
-    """
-    world, changes = _World(solids, path, free_m + _SPARE_M), []
-    objects = int(solids.owner.max(initial=FIXED)) + 1
-    for owner in range(objects):
-        thing, fate = world.take(owner), rng.random()
-        elsewhere = world.place_for(thing, rng) if _REMOVED < fate < _REMOVED + _MOVED + _ADDED else None
-        before, gone = _middle(thing), np.full(3, np.nan)
-        size_m = np.subtract(*_box(thing)[::-1])
-        if fate < _REMOVED:
-            changes.append(Change("removed", before, gone, size_m, owner))
-            continue
-        if elsewhere is None or fate > _REMOVED + _MOVED:
-            world.solids = world.solids.with_object(thing, owner)
-        if elsewhere is not None and fate <= _REMOVED + _MOVED:
-            world.solids = world.solids.with_object(elsewhere, owner)
-            changes.append(Change("moved", before, _middle(elsewhere), size_m, owner))
-        elif elsewhere is not None and world.is_free(elsewhere):
-            world.solids = world.solids.with_object(elsewhere, objects)
-            changes.append(Change("added", gone, _middle(elsewhere), size_m, objects))
-            objects += 1
-    return world.solids, tuple(changes)
-
-
-def write_changes(path: Path, changes: Sequence[Change]) -> None:
-    """Write a line for each change: kind, middle before and after, size; meters, empty where it is not there."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(_COLUMNS)
-        for change in changes:
-            numbers = np.concatenate([change.before, change.after, change.size_m])
-            writer.writerow([change.kind, *("" if np.isnan(x) else f"{x:.3f}" for x in numbers.tolist())])
-
-
-class _World:
-    """``solids``, of which objects are taken out and put down again, and a ``path`` (N, 2) that is kept free."""
-
-    def __init__(self, solids: Solids, path: Matrix, free_m: float) -> None:
-        self.solids = solids
-        self._path = path
-        self._free_m = free_m
-
-    def take(self, owner: int) -> Solids:
-        """Take an object out."""
-        is_of_it = self.solids.owner == owner
-        thing, self.solids = self.solids.part(is_of_it), self.solids.part(~is_of_it)
-        return thing
-
-    def place_for(self, thing: Solids, rng: np.random.Generator) -> Solids | None:
-        """The object somewhere near, where it is free and nothing fixed stands between; None if none was found."""
-        here, fixed = _middle(thing), self.solids.part(self.solids.owner == FIXED)
-        for _ in range(_TRIES):
-            away_m, direction = rng.uniform(*_APART_M), rng.uniform(0.0, 2.0 * np.pi)
-            xy = away_m * np.array([np.cos(direction), np.sin(direction)])
-            turn_rad = 0.5 * np.pi * rng.integers(4) + rng.normal(0.0, _TURN_RAD)
-            rise = np.diff(fixed.ground_height(np.array([here[:2], here[:2] + xy])))
-            moved = _moved(thing, np.append(xy, rise), turn_rad)
-            line = here[:2] + np.linspace(0.0, 1.0, int(away_m / _SAMPLE_M) + 2)[:, None] * xy
-            if self.is_free(moved) and _clearance_m(fixed, line) > _ROOM_M:
-                return moved
-        return None
-
-    def is_free(self, thing: Solids) -> bool:
-        """True if it stands neither in another solid nor in the path."""
-        footprint, (low, high) = _footprint(thing), _box(thing)
-        near = self._path[
-            ((self._path > low[:2] - self._free_m) & (self._path < high[:2] + self._free_m)).all(axis=1)
-        ]
-        off_m = np.linalg.norm(footprint[:, None] - near, axis=2).min(initial=np.inf)
-        return bool(off_m > self._free_m) and _clearance_m(self.solids, footprint) > _ROOM_M
-
-
-def _clearance_m(solids: Solids, xy: Matrix) -> float:
-    """Least distance of positions (N, 2) from the solids around, inf where none is near."""
-    boxes, cylinders, ellipsoids = solids.groups
-    reach_m = np.concatenate([boxes[:, 2:4].max(axis=1), cylinders[:, 2], ellipsoids[:, 3:5].max(axis=1)])
-    places = np.concatenate([rows[:, :2] for rows in solids.groups])
-    near = np.linalg.norm(places - xy.mean(axis=0), axis=1) < _NEAR_M + 1.5 * reach_m
-    return float(solids.part(near).clearance_m(xy, _BELOW_M).min())
 
 
 def _rectangle(box: NDArray[np.float64]) -> Matrix:

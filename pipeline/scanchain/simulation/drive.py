@@ -124,8 +124,10 @@ def plan(
         free_m = scene.vehicle.radius_m + scene.vehicle.deviation_m
         solids, changes = another_day(solids, path, free_m, _random(seed, _PLACE, changed))
     scans = _recorded(scene, motion, lidar, count)
-    T_base_lidar, of_wheels = scene.vehicle.T_base_lidar, (drift, wheels_slip)
-    return Drive(solids, motion, lidar, T_base_lidar, scans, seed, changed, *of_wheels, changes=changes)
+    return Drive(
+        solids, motion, lidar, scene.vehicle.T_base_lidar, scans, seed, changed, drift, wheels_slip,
+        changes=changes,
+    )  # fmt: skip
 
 
 def _random(seed: int, purpose: int, changed: int | None = None) -> np.random.Generator:
