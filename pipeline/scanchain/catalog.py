@@ -27,6 +27,9 @@ class Simulated(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind
     sensor: str
     seed: Annotated[int, Meta(ge=0)]
     duration_s: Annotated[float, Meta(gt=0.0)]
+    drift: Annotated[float, Meta(ge=0.0)] = 1.0
+    noise_m: Annotated[float, Meta(ge=0.0)] | None = None
+    dropout: Annotated[float, Meta(ge=0.0, le=1.0)] | None = None
 
 
 class Download(Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="download"):

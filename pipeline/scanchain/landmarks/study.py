@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.clock import working_s
 from scanchain.data import Matrix, Pose, Trajectory
-from scanchain.errors import FREEDOM, InputError, counted
+from scanchain.errors import FREEDOM, counted
 from scanchain.evaluation import Alignment, absolute_error, pair
 from scanchain.landmarks.estimate import (
     Minimum,
@@ -81,25 +81,36 @@ def against_truth(
     """
     place, unknown = dict(zip(log.true_subjects.tolist(), log.true_landmarks, strict=True)), np.full(2, np.nan)
     surveyed = np.array([place.get(subject, unknown) for subject in landmarks.tolist()])
-    estimates, positions, truth = [], np.empty((0, 2)), _trajectory(log.true_s, log.true_poses)
+    known, true_poses = _truth_at(log, nodes_s)
+    positions = true_poses[:, :2]
+    if np.count_nonzero(known) < 2:
+        why = "no motion capture at these times"
+        return [Estimate(each, lie.identity(2), np.nan, np.nan, why) for each in states], positions, surveyed
+    estimates, truth = [], _trajectory(nodes_s[known], true_poses)
     for state in states:
-        try:
-            pairs = pair(_trajectory(nodes_s, state.poses), truth, gap_s=_WIDEST_GAP_S)
-            error = absolute_error(pairs, Alignment.RIGID)
-        except InputError:
-            estimates.append(Estimate(state, lie.identity(2), np.nan, np.nan, "no motion capture at these times"))
-            continue
-        positions, T_truth_estimate = pairs.reference[:, :2, 3], lie.flatten(error.T_reference_estimate)
+        error = absolute_error(pair(_trajectory(nodes_s[known], state.poses[known]), truth), Alignment.RIGID)
+        T_truth_estimate = lie.flatten(error.T_reference_estimate)
         landmarks_m = _rms(lie.transform(T_truth_estimate, state.landmarks) - surveyed)
         definition = f"{error.definition}, over {error.pairing}"
         estimates.append(Estimate(state, T_truth_estimate, error.translation_m.rmse, landmarks_m, definition))
     return estimates, positions, surveyed
 
 
+def _truth_at(log: RangeLog, nodes_s: NDArray[np.float64]) -> tuple[NDArray[np.bool_], Matrix]:
+    """Times (K,) at which there is motion capture, and the poses (k, 3) there, interpolated."""
+    if len(log.true_s) < 2:
+        return np.zeros(len(nodes_s), np.bool_), np.empty((0, 3))
+    after = np.clip(np.searchsorted(log.true_s, nodes_s), 1, len(log.true_s) - 1)
+    inside = (nodes_s >= log.true_s[0]) & (nodes_s <= log.true_s[-1])
+    known = inside & (log.true_s[after] - log.true_s[after - 1] <= _WIDEST_GAP_S)
+    columns = (*log.true_poses[:, :2].T, np.unwrap(log.true_poses[:, 2]))
+    return known, np.stack([np.interp(nodes_s[known], log.true_s, column) for column in columns], axis=-1)
+
+
 def _trajectory(nodes_s: NDArray[np.float64], poses: Matrix) -> Trajectory:
     """Poses x, y, heading (K, 3) at times that were written with milliseconds."""
     stamps_ns = np.round(nodes_s * 1e3).astype(np.int64) * 1_000_000
-    return Trajectory(stamps_ns, np.array([lie.pose_2d(*pose) for pose in poses]).reshape(-1, 3, 3))
+    return Trajectory(stamps_ns, np.array([lie.pose_2d(*pose) for pose in poses]))
 
 
 def _rms(differences: Matrix) -> float:
