@@ -26,6 +26,7 @@ from scanchain.runs.directory import RECORDING_FILE
 from scanchain.sessions.change_run import COLORS, SUMMARY_FILE
 from scanchain.sessions.changes import Changes, Label
 from scanchain.sessions.localize import LocalizedLog
+from scanchain.sessions.localizer import MapState
 from scanchain.trajectory import read_tum
 from scanchain_viz.colors import rgb
 from scanchain_viz.pictures.maps import DrawnMerge, map_points, read_merge
@@ -35,12 +36,7 @@ from scanchain_viz.recording.drawing import Message, Times
 from scanchain_viz.recording.entities import scene, up_to_now, whole_log, with_panels
 from scanchain_viz.recording.sinks import write_recording
 from scanchain_viz.report.comparison import write_compare_report
-from scanchain_viz.report.maps import (
-    STATE_COLORS,
-    write_changes_report,
-    write_localization_report,
-    write_merge_report,
-)
+from scanchain_viz.report.maps import write_changes_report, write_localization_report, write_merge_report
 from scanchain_viz.report.problems import ellipses
 
 _MAP_POINTS = 300_000
@@ -51,6 +47,13 @@ _BOX_M, _ELLIPSE_M = 0.02, 1e-4  # heights of what is flat
 _RADII = {Label.SAME: 0.75, Label.UNKNOWN: 1.0, Label.APPEARED: 2.0, Label.VANISHED: 2.0}
 _FINAL, _SIGMA = "world/final", "plots/sigma"
 _MATCHED, _UNMATCHED = "world/matches/accepted", "world/matches/rejected"
+_STATE_COLORS = {
+    MapState.SEARCHING: entities.GRAY,
+    MapState.LOCALIZED: entities.GREEN,
+    MapState.UNMATCHED: entities.ORANGE,
+    MapState.OUTSIDE: entities.VIOLET,
+    MapState.LOST: entities.RED,
+}
 _MAX_SCAN_POINTS = 5_000
 
 
@@ -201,7 +204,7 @@ def present_localization(directory: Path, localized: LocalizedLog) -> None:
     )
     views = rrb.Horizontal(scene("map", prior.dimension, points), side, column_shares=[5, 2])
     layout = with_panels(views, scans=len(localized.localization.states))
-    names, colors = list(STATE_COLORS), list(map(rgb, STATE_COLORS.values()))
+    names, colors = list(MapState), list(_STATE_COLORS.values())
     messages = [
         Message(entities.MAP, drawing.dots(points, entities.height_colors(points), 1.0)),
         Message(entities.LIDAR, rr.TransformAxes3D(axis_length=0.5 if prior.dimension == 2 else 2.0)),
