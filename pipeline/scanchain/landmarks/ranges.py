@@ -243,7 +243,7 @@ class RangeSolution:
         return np.sqrt(self.variances).tolist()
 
 
-def solve_range_log(log: RangeLog, noise: OdometryNoise | None, method: str = ESTIMATOR) -> RangeSolution:
+def solve_range_log(log: RangeLog, noise: OdometryNoise | None) -> RangeSolution:
     """Estimate poses, landmarks, the robot's own errors and the noise of odometry and sensor together.
 
     noise : of the odometry; None for an estimate of it
@@ -253,7 +253,7 @@ def solve_range_log(log: RangeLog, noise: OdometryNoise | None, method: str = ES
     a while, by what the residuals show (``SightingPairs``): each sighting counts as a share of an independent one.
     Raises InputError where the observations are too few for that.
     """
-    begin, solver = working_s(), create_solver(method)
+    begin, solver = working_s(), create_solver(ESTIMATOR)
     nodes_s, node = np.unique(log.seen_s, return_inverse=True)
     landmarks, landmark = np.unique(log.subjects, return_inverse=True)
     observed, sightings = np.stack([node, landmark], axis=1), SightingPairs(log.seen_s, landmark)
