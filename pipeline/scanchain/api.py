@@ -140,10 +140,11 @@ def localize(
     Returns path, metrics and poses. Raises InputError for bad input.
     """
     from scanchain.sessions.localize import localize as localize_log
+    from scanchain_viz.recording.results import present_localization
 
     file, truth = _optional_path(config, "config"), _optional_path(ground_truth, "ground_truth")
     job = _job(log, out, recording, overrides, config_file=file, ground_truth=truth, force=force)
-    draw = draw_localization if recording else lambda folder, localized: None
+    draw = present_localization if recording else lambda folder, localized: None
     return localize_log(job, checks.path(prior, "prior"), Progress(), draw)
 
 
@@ -174,6 +175,7 @@ def merge(
     are named there. Raises InputError for bad input, ScanchainError where no two runs belong together.
     """
     from scanchain.sessions.merging import merge as merge_maps
+    from scanchain_viz.recording.results import present_merge
 
     return merge_maps(
         [checks.path(run, "runs") for run in runs],
@@ -208,6 +210,7 @@ def changes(
     Returns points, labels and clusters. Raises InputError for bad input, and for maps that are not of one place.
     """
     from scanchain.sessions.change_run import compare_maps
+    from scanchain_viz.recording.results import present_changes
 
     maps = [checks.path(earlier, "earlier"), _optional_path(later, "later")]
     return compare_maps(
@@ -239,6 +242,7 @@ def compare(
     """
     from scanchain.comparison.compare import Comparison
     from scanchain.comparison.compare import compare as run_comparison
+    from scanchain_viz.recording.results import present_comparison
 
     comparison = Comparison(
         logs=sources_of(log),
@@ -283,40 +287,3 @@ def write_report(directory: Path) -> None:
     from scanchain_viz.report.run import write_run_report
 
     write_run_report(directory)
-
-
-def draw_localization(folder: Path, localized: LocalizedLog) -> None:
-    """Add report.html and a recording to the directory of a localized log."""
-    from scanchain.runs.directory import RECORDING_FILE
-    from scanchain_viz.recording.results import record_localization
-    from scanchain_viz.report.maps import write_localization_report
-
-    write_localization_report(folder, localized)
-    record_localization(folder / RECORDING_FILE, localized)
-
-
-def present_merge(directory: Path) -> None:
-    """Add report.html and a recording to the directory of a merge."""
-    from scanchain_viz.recording.results import record_merge
-    from scanchain_viz.report.maps import write_merge_report
-
-    write_merge_report(directory)
-    record_merge(directory)
-
-
-def present_comparison(directory: Path) -> None:
-    """Add report.html and a recording to the directory of a comparison."""
-    from scanchain_viz.recording.results import record_comparison
-    from scanchain_viz.report.comparison import write_compare_report
-
-    write_compare_report(directory)
-    record_comparison(directory)
-
-
-def present_changes(directory: Path, found: Changes) -> None:
-    """Add report.html and a recording to the directory of changes."""
-    from scanchain_viz.recording.results import record_changes
-    from scanchain_viz.report.maps import write_changes_report
-
-    write_changes_report(directory, found)
-    record_changes(directory, found)

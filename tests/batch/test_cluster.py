@@ -6,7 +6,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from scanchain.batch.batch import Batch, run_batch
-from scanchain.simulation import simulate
+from tests.support import made
 from tests.support.scenes import ROOT
 
 pytest.importorskip("ray", reason="the extra cluster is not installed")
@@ -37,9 +37,7 @@ def test_of_two_nodes_one_dies_and_nothing_is_lost(tmp_path, monkeypatch):
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     for name, value in (("period_ms", 1000), ("timeout_ms", 2000), ("failure_threshold", 2)):
         monkeypatch.setenv(f"RAY_health_check_{name}", str(value))  # a dead node is noticed within seconds
-    logs = [tmp_path / f"log_{k}.mcap" for k in range(6)]
-    for seed, log in enumerate(logs):
-        simulate("office", log, duration_s=2.0, seed=seed)
+    logs = [made.log("office", seconds=2, seed=seed) for seed in range(6)]
     options = {"num_cpus": 1, "object_store_memory": 80 << 20}
     cluster = Cluster(initialize_head=True, head_node_args={**options, "include_dashboard": False})
     try:
@@ -53,4 +51,4 @@ def test_of_two_nodes_one_dies_and_nothing_is_lost(tmp_path, monkeypatch):
     assert batched.failures == "", batched.summary
     table = pq.read_table(tmp_path / "out" / "batch.parquet").to_pylist()
     assert [row["state"] for row in table] == ["done"] * 6 and [row["scans"] for row in table] == [20] * 6
-    assert len(list((tmp_path / "out").glob("log_*/metrics.json"))) == 6
+    assert len(list((tmp_path / "out").glob("*/metrics.json"))) == 6

@@ -13,7 +13,7 @@ drive sees a part of the first one's world only, with ``--unchanged`` nothing ch
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -73,20 +73,20 @@ def score_of(options: argparse.Namespace, seed: int) -> Score:
     first = plan(options.world, seed=seed, sensor=options.sensor, duration_s=options.seconds)
     second = plan(options.world, seed=seed, sensor=options.sensor, duration_s=later_s, changed=1)
     if options.unchanged:
-        second = Drive(first.solids, second.motion, second.sensor, second.T_base_lidar, second.scans)
+        second = replace(second, solids=first.solids, changes=())
     stem = f"{options.world}_{options.sensor or 'own'}_{seed}_{options.seconds or 'all'}"
     tail = f"_b{options.later_seconds or ''}{'_unchanged' if options.unchanged else ''}"
-    a = _mapped(first, f"{stem}_a", options.cache, seed, None)
-    b = _mapped(second, f"{stem}{tail}", options.cache, seed, 1)
+    a = _mapped(first, f"{stem}_a", options.cache)
+    b = _mapped(second, f"{stem}{tail}", options.cache)
     config = load_settings(a.dimension).config
     aligned = align_maps(a, b, config)
     found = changes_between(Part("a", a.keyframes, a.poses), Part("b", b.keyframes, aligned.poses), config)
     return _score(found, first, second, a, b)
 
 
-def _mapped(drive: Drive, name: str, cache: Path, seed: int, changed: int | None) -> SavedMap:
+def _mapped(drive: Drive, name: str, cache: Path) -> SavedMap:
     def write(draft: Path) -> None:
-        record(drive, draft, seed=seed, changed=changed, force=True)
+        record(drive, draft, force=True)
 
     return open_saved_map(run_of(made.recorded(name, write, cache), cache, name))
 
@@ -168,9 +168,10 @@ def _rays_by_owner(drive: Drive, saved: SavedMap, solids: Solids) -> np.ndarray:
         start_s = (keyframe.stamp_ns - EPOCH_NS) * 1e-9
         rays = drive.sensor.rays(round(start_s / (drive.sensor.period_ns * 1e-9)))
         poses = drive.motion.lidar(start_s + rays.instants_ns * 1e-9)
-        _, solid = solids.strike(
-            poses, rays.instant_of_ray, rays.directions, min(drive.sensor.max_range_m, REACH_M[saved.dimension])
-        )
+        solid, reach_m = np.empty(len(rays.directions), np.int32), REACH_M[saved.dimension]
+        solids.cast(
+            poses, rays.instant_of_ray, rays.directions, min(drive.sensor.max_range_m, reach_m), solid
+        )  # fmt: skip
         owner = solids.owner[solid[(solid >= 0) & (solid < len(solids.owner))]]
         counts += np.bincount(owner[owner != FIXED], minlength=len(counts))
     return counts

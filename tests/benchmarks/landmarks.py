@@ -25,9 +25,9 @@ from scanchain.graph.losses import RobustLoss
 from scanchain.landmarks.estimate import from_odometry, minimize
 from scanchain.landmarks.files import read_landmark_data, read_mrclam
 from scanchain.landmarks.problem import BearingRangeProblem, Values, linear_system, no_calibration
-from scanchain.landmarks.ranges import OWN, LogModel, OdometryNoise, solve_range_log
+from scanchain.landmarks.ranges import OWN, OdometryNoise, reckon, solve_range_log
 from scanchain.landmarks.solvers import METHODS, compare, create_solver
-from scanchain.landmarks.study import against_truth, truth_at
+from scanchain.landmarks.study import against_truth
 from tests.benchmarks.harness import DATA, command_line, table
 
 OF_THE_REPORT = ("default", "pinv", "lu", "lu_colamd", "qr", "qr_colamd")
@@ -81,10 +81,12 @@ LANDMARK = 10_000_000  # first key of a landmark
 
 
 def measurements_of(log):
-    model = LogModel(log)
-    variances = np.concatenate([OdometryNoise().densities, SIGMAS**2])
-    given = model.measurements(model.reckoned(np.zeros(len(OWN))), variances)
-    return replace(given, calibration=no_calibration(given.motion))
+    solved = solve_range_log(log, None)
+    reckoning = reckon(log, solved.nodes_s, np.zeros(len(OWN)))
+    return replace(
+        solved.problem.measurements, motion=reckoning.motion, calibration=no_calibration(reckoning.motion),
+        motion_covariance=reckoning.covariance(OdometryNoise().densities), measured_covariance=np.diag(SIGMAS**2),
+    )  # fmt: skip
 
 
 def as_given(log):
@@ -147,8 +149,7 @@ OF_THE_LOG = {
 
 def real_log(options):
     log = read_mrclam(DATA / "landmarks" / "utias_mrclam6", options.robot)
-    model = LogModel(log)
-    truth = truth_at(log, model.nodes_s, model.landmarks)
+    nodes_s, landmarks = np.unique(log.seen_s), np.unique(log.subjects)
     seconds = {name: [] for name in OF_THE_LOG}
     for method in OF_THE_LOG.values():
         method(log)  # compiles
@@ -158,7 +159,7 @@ def real_log(options):
             seconds[name].append((spent, state))
     row = table(log.name, "median ms", "min ms", "ATE m", "landmarks m")
     for name, runs in seconds.items():
-        accuracy = against_truth(runs[-1][1], model.nodes_s, truth)
+        ((accuracy,), *_) = against_truth((runs[-1][1],), nodes_s, landmarks, log)
         spent = 1e3 * np.array([run[0] for run in runs])
         errors = f"{accuracy.poses_m:.4f}", f"{accuracy.landmarks_m:.4f}"
         row(name, f"{np.median(spent):.1f}", f"{spent.min():.1f}", *errors)

@@ -110,7 +110,7 @@ def later_part(name: str, end_s: float, options: argparse.Namespace) -> Case:
 def driven_twice(world: str, options: argparse.Namespace) -> Case:
     """A simulated world, in the map of another drive through it."""
     drives = plan(world, seed=0), plan(world, seed=1)
-    logs = [_recorded(f"{world}_{k}", replace(drives[k], solids=drives[0].solids), options, k) for k in (0, 1)]
+    logs = [_recorded(f"{world}_{k}", replace(drives[k], solids=drives[0].solids), options) for k in (0, 1)]
     return _mapped(options, *logs)
 
 
@@ -138,7 +138,7 @@ def city(options: argparse.Namespace) -> Case:
         drive = plan(name, seed=1, sensor=options.sensor, duration_s=duration_s, **of_part)
         drive = replace(drive, scans=drive.scans[:: options.every])
         stem = f"{name}_{part}_{options.sensor}_{options.every}"
-        logs.append(_recorded(stem, drive, options, 1, of_part.get("changed")))
+        logs.append(_recorded(stem, drive, options))
     case = replace(_mapped(options, *logs), give_up_m=60.0)
     if options.memory:
         run, found = (str(options.cache / f"{name}.{command}") for command in ("run", "localize"))
@@ -147,9 +147,9 @@ def city(options: argparse.Namespace) -> Case:
     return case
 
 
-def _recorded(name: str, drive: Drive, options: argparse.Namespace, seed: int, changed: int | None = None) -> Path:
+def _recorded(name: str, drive: Drive, options: argparse.Namespace) -> Path:
     def write(draft: Path) -> None:
-        record(drive, draft, seed=seed, changed=changed, force=True)
+        record(drive, draft, force=True)
 
     return made.recorded(name, write, options.cache)
 

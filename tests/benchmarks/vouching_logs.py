@@ -96,7 +96,7 @@ class LogSpec:
             play_backward(self.file, self.reference, path)
             return
         drive = self.drive()
-        record(drive, path, seed=self.seed, force=True)
+        record(drive, path, force=True)
         np.save(path.with_suffix(".npy"), _open_shares(drive))
 
     def drive(self) -> Drive:
@@ -171,10 +171,6 @@ class Kidnapped:
 
     def _moved(self, times_s: NDArray[np.floating]) -> NDArray[np.floating]:
         return times_s + _AHEAD_S * self._is_after(times_s)
-
-    def speed_m_s(self, times_s: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Speed along the path, without the jump."""
-        return self._motion.speed_m_s(self._moved(times_s))
 
     def base(self, times_s: NDArray[np.floating]) -> Matrix:
         """T_world_base as the wheels roll."""

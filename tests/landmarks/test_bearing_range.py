@@ -1,4 +1,5 @@
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -89,30 +90,25 @@ def nonlinear():
     return data, problem, guess, minimize(problem, guess, create_solver("cholesky"))
 
 
-@pytest.mark.parametrize("guess", ["disturbed", "origin", "turned the other way"])
-@pytest.mark.parametrize("optimizer", ["levenberg-marquardt", "gauss-newton", "dogleg"])
-def test_2d_nonlinear_ends_in_the_same_minimum_from_poor_guesses(nonlinear, guess, optimizer):
+@pytest.mark.parametrize(
+    ("guess", "method", "optimizer"),
+    [
+        *(("odometry", method, "levenberg-marquardt") for method in METHODS),
+        *product(("disturbed", "origin"), ("schur",), ("levenberg-marquardt", "gauss-newton", "dogleg")),
+    ],
+)
+def test_2d_nonlinear_ends_in_the_same_minimum_from_poor_guesses(nonlinear, guess, method, optimizer):
     data, problem, good, best = nonlinear
     assert best.converged and best.cost == pytest.approx(1555.1896456, abs=1e-5)
     assert np.abs(best.state.poses - data.true_poses).max() < 0.05
     start = {
+        "odometry": good,
         "disturbed": guesses.disturbed(good, 1.0, 0.5),
-        "turned the other way": guesses.disturbed(good, -1.0, -0.5),
         "origin": Values(good.poses, np.zeros_like(good.landmarks)),
     }[guess]
-    minimum = minimize(problem, start, create_solver("schur"), optimizer=optimizer)
+    minimum = minimize(problem, start, create_solver(method), optimizer=optimizer)
     assert minimum.converged
-    assert np.abs(minimum.state.unknowns - best.state.unknowns).max() < 1e-5
-
-
-def test_gradient_descent_goes_downhill_and_says_that_it_did_not_arrive(nonlinear):
-    _, problem, guess, best = nonlinear
-    few, many = (
-        minimize(problem, guess, create_solver("schur"), optimizer="gradient-descent", max_iterations=steps)
-        for steps in (10, 100)
-    )
-    assert best.cost < many.cost < few.cost
-    assert not many.converged and many.reason == "100 iterations reached"
+    assert np.abs(minimum.state.unknowns - best.state.unknowns).max() < (1e-8 if guess == "odometry" else 1e-5)
 
 
 def test_an_unseen_landmark_is_named_by_gauss_newton_and_dogleg(nonlinear):
@@ -126,40 +122,34 @@ def test_an_unseen_landmark_is_named_by_gauss_newton_and_dogleg(nonlinear):
             minimize(blind, guess, create_solver("schur"), optimizer=optimizer)
 
 
-def test_all_methods_reach_the_same_minimum(nonlinear):
-    _, problem, guess, best = nonlinear
-    for method in METHODS:
-        found = minimize(problem, guess, create_solver(method)).state.unknowns
-        assert np.abs(found - best.state.unknowns).max() < 1e-8
-
-
 def measurements(seed=0, unit=1.0, outliers=0):
-    """A made-up drive of 40 poses past 6 landmarks, lengths in meters over ``unit``."""
-    rng = np.random.default_rng(seed)
-    motion = np.tile([0.3, 0.0, 0.16], (39, 1)) + rng.normal(size=(39, 3)) * [0.01, 0.005, 0.01]
-    poses = guesses.chain(np.zeros(3), np.tile([0.3, 0.0, 0.16], (39, 1)))
+    """A made-up drive of 40 poses past 6 landmarks, lengths in meters over ``unit``: truth and measurements."""
+    rng, sigma, scale = (
+        np.random.default_rng(seed),
+        np.array([0.01, 0.005, 0.01]),
+        np.array([1.0, 1.0, unit]) / unit,
+    )
+    step = np.array([0.3, 0.0, 0.16])
+    motion = step + rng.normal(size=(39, 3)) * sigma
+    poses = guesses.chain(np.zeros(3), np.tile(step, (39, 1)))
     landmarks = rng.uniform(-3.0, 3.0, (6, 2)) + np.array([0.0, 2.0])
     observed = np.stack(np.meshgrid(np.arange(40), np.arange(6), indexing="ij"), -1).reshape(-1, 2)
     away = landmarks[observed[:, 1]] - poses[observed[:, 0], :2]
     bearing = np.arctan2(away[:, 1], away[:, 0]) - poses[observed[:, 0], 2] + rng.normal(size=len(away)) * 0.02
     reach = np.linalg.norm(away, axis=1) + rng.normal(size=len(away)) * 0.05
     reach[:outliers] += 3.0
-    scale = np.array([1.0 / unit, 1.0 / unit, 1.0])
-    return (
-        poses,
-        landmarks,
-        Measurements(
-            first_pose=np.zeros(3),
-            first_covariance=1e-6 * np.diag(scale**2),
-            motion=motion * scale,
-            motion_covariance=np.tile(np.diag((np.array([0.01, 0.005, 0.01]) * scale) ** 2), (39, 1, 1)),
-            calibration=no_calibration(motion),
-            observed=observed,
-            measured=np.stack([naive_landmarks.wrapped(bearing), reach / unit], axis=1),
-            measured_covariance=np.diag([0.02**2, (0.05 / unit) ** 2]),
-            landmarks=np.arange(6),
-        ),
+    given = Measurements(
+        first_pose=np.zeros(3),
+        first_covariance=1e-6 * np.diag(scale**2),
+        motion=motion * scale,
+        motion_covariance=np.tile(np.diag((sigma * scale) ** 2), (39, 1, 1)),
+        calibration=no_calibration(motion),
+        observed=observed,
+        measured=np.stack([naive_landmarks.wrapped(bearing), reach / unit], axis=1),
+        measured_covariance=np.diag([0.02**2, (0.05 / unit) ** 2]),
+        landmarks=np.arange(6),
     )
+    return poses, landmarks, given
 
 
 def solve(given, loss):

@@ -138,15 +138,11 @@ def folder(tmp_path):
     return place
 
 
-def test_other_robots_unknown_barcodes_and_untimely_observations_are_counted(folder):
-    log = read_mrclam(folder, 1)
+def test_an_exact_drive_is_found_and_what_is_not_its_own_is_counted(folder):
+    log, after = read_mrclam(folder, 1), study_log(folder, ALONE).after
     assert (log.of_robots, log.unknown, log.outside) == (1, 1, 1)
     assert len(log.seen_s) == 8 and np.all(np.diff(log.seen_s) >= 0.0)
     assert set(log.subjects.tolist()) == {6, 7}
-
-
-def test_an_exact_drive_is_found_exactly_and_without_motion_capture_its_accuracy_is_unknown(folder):
-    after = study_log(folder, ALONE).after
     assert after.poses_m < 0.01 and after.landmarks_m < 0.01
     (folder / "Robot1_Groundtruth.dat").unlink()
     study = study_log(folder, ALONE)
@@ -160,39 +156,31 @@ def test_an_exact_drive_is_found_exactly_and_without_motion_capture_its_accuracy
         ("Robot1_Odometry.dat", "1.0 2.0 x\n", "is no table of 3 numbers"),
         ("Robot1_Odometry.dat", "", "is empty"),
         ("Robot1_Odometry.dat", "# time forward turn\n \n", "is empty"),
+        ("Robot1_Odometry.dat", None, "one of those logged there: none"),
+        ("Barcodes.dat", None, "is no MRCLAM folder"),
         ("Robot1_Measurement.dat", "1.0 63 nan 0.0\n", "row 1 is not finite"),
         ("Robot1_Measurement.dat", "11.0 14 1.0 0.0\n", "robot 1 saw no landmark"),
         ("Robot1_Measurement.dat", "11.0 63 2.1 74.5\n", r"dat: bearings reach 74.5: degrees\? give radians"),
+        ("Robot1_Measurement.dat", "11.0 63 2.06 1.3\n", "too seldom"),
     ],
 )
 @pytest.mark.filterwarnings("error")
 def test_every_damage_of_a_folder_is_one_line(folder, file, text, said):
-    (folder / file).write_text(text)
+    (folder / file).unlink() if text is None else (folder / file).write_text(text)
     with pytest.raises(InputError, match=said) as raised:
-        read_mrclam(folder, 1)
+        solve_range_log(read_mrclam(folder, 1), None)
     assert "\n" not in str(raised.value)
 
 
-def test_a_robot_that_is_not_there_and_a_folder_that_is_none_are_refused(folder, tmp_path):
-    with pytest.raises(InputError, match="one of those logged there: 1"):
-        read_mrclam(folder, 3)
-    with pytest.raises(InputError, match="is no MRCLAM folder"):
-        read_mrclam(tmp_path, 1)
-
-
-def test_a_log_too_short_to_tell_its_noise_is_refused(folder):
-    (folder / "Robot1_Measurement.dat").write_text("11.0 63 2.06 1.3\n")
-    with pytest.raises(InputError, match="too seldom"):
-        solve_range_log(read_mrclam(folder, 1), None)
-
-
-def test_utias_6_robot_1_is_as_accurate_as_a_batch_in_gtsam_or_better():
-    study = study_log(shared_data("landmarks/utias_mrclam6"), ALONE)
+def test_utias_6_robot_1_is_as_accurate_as_a_batch_in_gtsam_or_better_and_noise_that_is_stated_too_small_is_told():
+    folder = shared_data("landmarks/utias_mrclam6")
+    study = study_log(folder, ALONE)
     assert study.before.poses_m == pytest.approx(2.06, abs=0.01)
     assert study.after.poses_m <= 0.113
-    facts = {fact.label: fact.value for fact in study.facts}
-    assert facts["left out"].startswith("407 of other robots, 1 of unknown barcodes, 0 ")
-    assert facts["odometry noise"].endswith("fits") and facts["sensor noise"].endswith("fits")
+    assert study.facts["left out"].startswith("407 of other robots, 1 of unknown barcodes, 0 ")
+    assert study.facts["odometry noise"].endswith("fits") and study.facts["sensor noise"].endswith("fits")
+    stated = study_log(folder, replace(ALONE, noise=OdometryNoise(0.003, 0.001, 0.005, 0.01)))
+    assert "off by a factor" in stated.facts["odometry noise"]
 
 
 def test_the_estimate_of_the_noise_hardly_depends_on_where_it_begins(monkeypatch):
@@ -201,12 +189,6 @@ def test_the_estimate_of_the_noise_hardly_depends_on_where_it_begins(monkeypatch
     monkeypatch.setattr("scanchain.landmarks.ranges._SENSOR", np.square([0.02, 0.2]))
     second = solve_range_log(log, None)
     assert second.sigmas[3:] == pytest.approx(first.sigmas[3:], rel=0.1)
-
-
-def test_stated_odometry_noise_that_is_far_too_small_is_told():
-    noise = OdometryNoise(0.003, 0.001, 0.005, 0.01)
-    study = study_log(shared_data("landmarks/utias_mrclam6"), replace(ALONE, noise=noise))
-    assert "off by a factor" in {fact.label: fact.value for fact in study.facts}["odometry noise"]
 
 
 def test_bearings_in_degrees_are_refused_with_and_without_the_truth(tmp_path):

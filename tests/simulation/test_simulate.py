@@ -16,11 +16,12 @@ from scanchain import catalog, lie
 from scanchain.__main__ import main
 from scanchain.errors import InputError
 from scanchain.settings import shipped
-from scanchain.simulation import NO_SLIP, SENSORS, WORLDS, Slip, plan, simulate
+from scanchain.simulation import NO_SLIP, SENSORS, WORLDS, Slip, plan, record, simulate
 from scanchain.simulation.motion import wheel_odometry
 from scanchain.simulation.sensors import take_sweep
 from scanchain.simulation.solids import Solids
 from scanchain.simulation.worlds.indoor import CORRIDOR_M, CORRIDOR_SIGHT_M, CORRIDOR_STRUCTURE_M
+from scanchain.trajectory import read_tum
 from tests.support import naive_raycast
 
 LIDARS = [name for name, sensor in SENSORS.items() if sensor.dimension == 3]
@@ -30,20 +31,6 @@ LIDARS = [name for name, sensor in SENSORS.items() if sensor.dimension == 3]
 def planned(name, sensor, seed=0):
     """A drive of the world's usual length, without noise and losses."""
     return plan(name, sensor=sensor, seed=seed, noise_m=0.0, dropout=0.0)
-
-
-def in_reach(solids, place, reach_m):
-    """The solids that a sensor at a place could hit."""
-
-    def near(group, size):
-        return group[np.linalg.norm(group[:, :2] - place[:2], axis=1) - size < reach_m]
-
-    return replace(
-        solids,
-        boxes=near(solids.boxes, np.linalg.norm(solids.boxes[:, 2:4], axis=1)),
-        cylinders=near(solids.cylinders, solids.cylinders[:, 2]),
-        ellipsoids=near(solids.ellipsoids, solids.ellipsoids[:, 3:5].max(axis=1, initial=0.0)),
-    )
 
 
 def swept(drive, index):
@@ -60,9 +47,6 @@ def messages(path, topic):
 
 def nanoseconds(message):
     return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-
-
-# --- ray casting -----------------------------------------------------------------------------------------------
 
 
 SMOOTH = np.array([-3.0, 0.9, 0.08, 1.0, 0.7, 0.11, 2.0])
@@ -88,25 +72,22 @@ def test_the_kernel_equals_the_naive_ray_caster(seed, ground):
     rng = np.random.default_rng(seed)
     solids = random_solids(rng, ground)
     poses = lie.exp(np.column_stack([rng.uniform(-0.8, 0.8, (20, 3)), rng.normal(0.0, 0.1, (20, 3))]))
-    directions = rng.normal(size=(400, 3)) * [1.0, 1.0, 0.25]
+    directions = rng.normal(size=(250, 3)) * [1.0, 1.0, 0.25]
     directions[0], directions[1], directions[2] = [0, 0, 1], [0, 0, -1], [1, 0, 0]
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    pose_of_ray = rng.integers(0, 20, 400).astype(np.int32)
+    pose_of_ray = rng.integers(0, 20, 250).astype(np.int32)
     fast = solids.cast(poses, pose_of_ray, directions, 50.0)
     naive = np.array([
         naive_raycast.cast(poses[p, :3, 3], poses[p, :3, :3] @ d, solids, 50.0)
         for p, d in zip(pose_of_ray, directions, strict=True)
     ])  # fmt: skip
-    assert 100 < np.isfinite(naive).sum() < 400  # the test sees both hits and misses
+    assert 60 < np.isfinite(naive).sum() < 250  # the test sees both hits and misses
     assert np.array_equal(np.isfinite(fast), np.isfinite(naive))
     assert np.allclose(fast, naive, atol=1e-7, rtol=0.0)
 
 
-# --- worlds and motion -----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", [name for name in WORLDS if name not in ("staircase", "gap")])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_the_path_crosses_no_wall_and_no_furniture(name, seed):
     drive = plan(name, seed=seed, duration_s=120.0)
     places = drive.motion.base(np.arange(0.0, 120.0, 0.05 if name in ("office", "town") else 0.2))[:, :2, 3]
@@ -118,49 +99,14 @@ def test_the_drive_starts_from_standstill_within_the_limits_of_the_vehicle(name)
     motion = planned(name, "vlp-16").motion
     vehicle, step = WORLDS[name].vehicle, 1e-3
     times = np.arange(0.0, 50.0, step)
-    poses, speed = motion.base(times), motion.speed_m_s(times)
-    assert speed[0] < 1e-3 and speed.max() < 1.01 * vehicle.speed_m_s
-    traveled = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)
-    assert np.allclose(traveled / step, 0.5 * (speed[1:] + speed[:-1]), atol=0.01 * vehicle.speed_m_s)
+    poses = motion.base(times)
+    speed = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1) / step
+    assert speed[0] < 1e-3 and 0.9 * vehicle.speed_m_s < speed.max() < 1.01 * vehicle.speed_m_s
     assert np.abs(np.diff(speed)).max() / step < 1.5 * vehicle.acceleration_m_s2
     assert np.abs(lie.wrap(np.diff(lie.yaw(poses)))).max() / step > 0.5  # it does turn
-
-
-def test_the_car_follows_the_ground():
-    drive = planned("town", "vlp-16")
-    solids, poses = drive.solids, drive.motion.base(np.arange(0.0, 60.0, 0.1))
-    height = poses[:, 2, 3]
-    assert height.max() - height.min() > 0.3
-    assert np.abs(height - solids.ground_height(poses[:, :2, 3])).max() < 1.1 * WORLDS["town"].vehicle.heave_m
-    assert np.allclose(poses[:, :3, :3] @ np.swapaxes(poses[:, :3, :3], 1, 2), np.eye(3), atol=1e-12)
-
-
-@pytest.mark.parametrize("name", ["demo-office", "demo-town", "office", "town"])
-def test_a_sequence_comes_back_to_where_it_was(name):
-    source = catalog.load(name).source
-    motion = plan(source.world, seed=source.seed, duration_s=source.duration_s).motion
-    poses = lie.flatten(motion.lidar(np.arange(0.0, source.duration_s, 0.1)))
-    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :2, 2], axis=0), axis=1))])
-    gap = np.linalg.norm(poses[:, None, :2, 2] - poses[None, :, :2, 2], axis=-1)
-    turn = np.abs(lie.wrap(lie.yaw(poses)[:, None] - lie.yaw(poses)[None]))
-    again = (gap < 1.5) & (turn < 0.3) & (arc[:, None] - arc[None] > 20.0)
-    revisited_m = np.diff(arc, prepend=0.0)[again.any(axis=1)].sum()
-    assert revisited_m > 20.0
-
-
-# --- worlds that are hard on odometry ----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", WORLDS)
-def test_the_seed_alone_draws_the_place_and_the_motion(name):
-    first, same, other = (plan(name, seed=seed, duration_s=5.0) for seed in (3, 3, 4))
-    for kind in ("boxes", "cylinders", "ellipsoids", "ground"):
-        assert np.array_equal(getattr(first.solids, kind), getattr(same.solids, kind))
-    assert np.array_equal(first.truth().poses, same.truth().poses)
-    assert any(
-        not np.array_equal(getattr(first.solids, kind), getattr(other.solids, kind))
-        for kind in ("boxes", "cylinders")
-    )
+    above_m = poses[:, 2, 3] - planned(name, "vlp-16").solids.ground_height(poses[:, :2, 3])
+    assert np.abs(above_m).max() <= 1.1 * vehicle.heave_m
+    assert np.ptp(poses[:, 2, 3]) > 0.3 or name == "office"
 
 
 @pytest.mark.parametrize("name", WORLDS)
@@ -170,17 +116,6 @@ def test_the_motion_is_smooth(name):
     rates = lie.log(lie.inverse(poses[:-1]) @ poses[1:]) / step
     change = np.abs(np.diff(rates, axis=0)).max(axis=0)  # within a millisecond
     assert change[:3].max() < 0.01 and change[3:].max() < 0.02
-
-
-@pytest.mark.parametrize("sensor", LIDARS)
-@pytest.mark.parametrize("name", [name for name in WORLDS if name != "office"])
-def test_every_lidar_sees_something_everywhere(name, sensor):
-    drive = planned(name, sensor)
-    fewest = {"hdl-64": 90_000, "os1-32": 13_000, "vlp-16": 11_000, "rosette": 3_000}[sensor]
-    if (name, sensor) == ("identical", "hdl-64"):
-        fewest = 60_000  # where its walls are nearer than it can see
-    for index in drive.scans[[0, len(drive.scans) // 2, -1]].tolist():
-        assert swept(drive, index).returned.sum() > fewest
 
 
 def test_the_rounds_pass_streets_again_in_both_directions_and_in_the_other_lane():
@@ -222,31 +157,12 @@ def test_all_rooms_of_the_identical_floor_look_the_same():
     np.testing.assert_allclose(rooms[2], rooms[0], atol=1e-9)
 
 
-def test_the_highway_is_at_full_speed_from_the_first_scan():
-    drive = planned("highway", "vlp-16")
-    steps = np.linalg.norm(np.diff(drive.truth().poses[:, :3, 3], axis=0), axis=1)
+def test_the_highway_is_at_full_speed_from_the_first_scan_and_the_hall_at_half_a_meter_a_scan_after_two_seconds():
+    highway, hall = (planned(world, "vlp-16").truth().poses for world in ("highway", "hall"))
+    steps, of_hall = (np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1) for poses in (highway, hall))
     assert np.all(np.abs(steps - 2.5) < 0.02)
-    assert np.abs(np.diff(lie.yaw(drive.truth().poses))).max() > 0.007  # a bend of 300 m is part of it
-
-
-def test_the_hall_stands_still_for_two_seconds_then_moves_half_a_meter_a_scan():
-    poses = planned("hall", "vlp-16").truth().poses
-    steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    assert steps[:20].max() < 1e-6
-    assert np.all(np.abs(steps[47:85] - 0.5) < 1e-3)
-
-
-def test_rings_on_a_flat_floor_stay_where_they_are_while_the_lidar_moves():
-    drive = planned("hall", "vlp-16")
-    height = WORLDS["hall"].vehicle.T_base_lidar[2, 3]
-    for index in (5, 60):  # at rest, at 5 m/s
-        sweep = swept(drive, index)
-        points, ring = sweep.points(), sweep.rays.ring[sweep.returned]
-        floor = np.abs(points[:, 2] + height) < 1e-4
-        for lowest, elevation_deg in enumerate((-15.0, -13.0, -11.0)):
-            radius = np.hypot(*points[floor & (ring == lowest), :2].T)
-            assert len(radius) > 1000
-            assert np.allclose(radius, height / np.tan(np.deg2rad(-elevation_deg)), atol=1e-4)
+    assert np.abs(np.diff(lie.yaw(highway))).max() > 0.007  # a bend of 300 m is part of it
+    assert of_hall[:20].max() < 1e-6 and np.all(np.abs(of_hall[47:85] - 0.5) < 1e-3)
 
 
 def test_turns_are_made_on_the_spot_at_120_degrees_a_second():
@@ -256,7 +172,8 @@ def test_turns_are_made_on_the_spot_at_120_degrees_a_second():
     rate = np.rad2deg(lie.wrap(np.diff(lie.yaw(poses))) / 0.01)
     assert rate.max() == pytest.approx(120.0, abs=1.0) and rate.min() == pytest.approx(-120.0, abs=1.0)
     turning = np.abs(rate) > 5.0
-    assert turning.mean() > 0.25 and motion.speed_m_s(times[:-1])[turning].max() < 1e-6
+    moved_m = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)
+    assert turning.mean() > 0.25 and moved_m[turning].max() < 1e-6
     assert np.linalg.norm(poses[:, :2, 3], axis=1).max() < 5.0
 
 
@@ -272,33 +189,20 @@ def test_the_staircase_is_climbed_with_a_swaying_hand():
         assert naive_raycast.distance_to_surface(places, path.solids).min() > 0.3
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_the_gap_lacks_one_second_in_a_bend_and_one_on_a_straight(seed):
-    drive = planned("gap", "vlp-16", seed)
-    stamps = drive.truth().stamps_ns
-    steps = np.diff(stamps)
-    holes = np.flatnonzero(steps > 100_000_000)
-    assert steps[holes].tolist() == [1_100_000_000] * 2 and set(np.delete(steps, holes)) == {100_000_000}
-    yaw_rates = []
-    for hole in holes:
-        begin_s = (drive.scans[hole] + 1) * 0.1
-        times = np.linspace(begin_s, begin_s + 1.0, 101)
-        yaw_rates.append(np.diff(np.unwrap(lie.yaw(drive.motion.base(times)))) / 0.01)
-    assert np.abs(yaw_rates[0]).min() > 0.4 and np.abs(yaw_rates[1]).max() < 0.05
-
-
-def test_wheel_odometry_goes_on_in_a_gap_and_log_time_never_steps_back(tmp_path):
-    truth = simulate("gap", tmp_path / "a.mcap", duration_s=16.0, sensor="lms-270")
-    assert len(truth) == 150
-    with (tmp_path / "a.mcap").open("rb") as stream:
+def test_the_gap_lacks_one_second_twice_while_wheel_odometry_goes_on_and_log_time_never_steps_back(tmp_path):
+    path = tmp_path / "a.mcap"
+    truth = simulate("gap", path, sensor="lms-270")
+    steps_ns = np.diff(truth.stamps_ns)
+    gaps = np.flatnonzero(steps_ns > 100_000_000)
+    assert steps_ns[gaps].tolist() == [1_100_000_000] * 2 and set(np.delete(steps_ns, gaps)) == {100_000_000}
+    turns_rad = np.abs(lie.wrap(np.diff(lie.yaw(truth.poses))))[gaps]
+    assert turns_rad[0] > 0.4 and turns_rad[1] < 0.05  # one in a bend, one on a straight
+    with path.open("rb") as stream:
         times = [message.log_time for _, _, message in make_reader(stream).iter_messages(log_time_order=False)]
     assert times == sorted(times)
-    stamps = [nanoseconds(odometry) for _, odometry in messages(tmp_path / "a.mcap", "/odom")]
-    assert set(np.diff(stamps)) == {20_000_000} and stamps[-1] - stamps[0] == 16_000_000_000
-    assert [nanoseconds(scan) for _, scan in messages(tmp_path / "a.mcap", "/scan")] == truth.stamps_ns.tolist()
-
-
-# --- what moves without a trace --------------------------------------------------------------------------------
+    stamps_ns = [nanoseconds(odometry) for _, odometry in messages(path, "/odom")]
+    assert set(np.diff(stamps_ns)) == {20_000_000} and stamps_ns[-1] - stamps_ns[0] == 30_000_000_000
+    assert [nanoseconds(scan) for _, scan in messages(path, "/scan")] == truth.stamps_ns.tolist()
 
 
 def seen_from(drive, index, twists):
@@ -345,9 +249,6 @@ def test_place_and_heading_change_no_range_in_the_field_where_no_pole_is_in_sigh
     assert seen == {"none", "poles"}
 
 
-# --- sweeps ----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("world", "sensor"),
     [("office", "lms-270"), ("office", "utm-30"), ("office", "vlp-16"), ("town", "hdl-64"), ("town", "os1-32"),
@@ -366,10 +267,9 @@ def test_undistorted_with_the_truth_every_point_lies_on_the_first_surface(world,
     some = random.choice(len(points), min(len(points), 1500), replace=False)
     assert len(points) > (0.4 if world == "field" else 0.5) * len(sweep.ranges_m)
     assert naive_raycast.distance_to_surface(points[some], drive.solids).max() < 1e-5
-    solids = in_reach(drive.solids, poses[0, :3, 3], drive.sensor.max_range_m)
-    few, reach_m = random.choice(len(poses), 16, replace=False), drive.sensor.max_range_m
+    few, reach_m = random.choice(len(poses), 8, replace=False), drive.sensor.max_range_m
     naive = np.array([
-        naive_raycast.cast(poses[k, :3, 3], poses[k, :3, :3] @ sweep.rays.directions[k], solids, reach_m)
+        naive_raycast.cast(poses[k, :3, 3], poses[k, :3, :3] @ sweep.rays.directions[k], drive.solids, reach_m)
         for k in few
     ])  # fmt: skip
     naive[naive < drive.sensor.min_range_m] = np.inf
@@ -395,9 +295,6 @@ def test_noise_and_losses_are_as_large_as_asked_for():
     assert np.std(noisy.ranges_m[both] - clean.ranges_m[both]) == pytest.approx(0.05, rel=0.02)
 
 
-# --- wheels ----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", ["office", "town"])
 def test_wheel_odometry_is_the_planar_truth_without_drift_and_drifts_more_the_larger_the_drift(name):
     poses = planned(name, "vlp-16").motion.base(np.arange(0.0, 60.0, 0.02))
@@ -413,18 +310,15 @@ def test_wheel_odometry_is_the_planar_truth_without_drift_and_drifts_more_the_la
 
 
 def test_wheels_slip_once_between_two_seconds_and_nowhere_else(tmp_path):
-    logs = {}
+    steps_m = {}
     for name, slip in (("straight", NO_SLIP), ("slips", Slip(2.0, 3.0, 1.5)), ("stands", Slip(2.0, 3.0, -0.4))):
-        simulate("office", tmp_path / f"{name}.mcap", duration_s=5.0, drift=0.0, wheels_slip=slip)
+        simulate("office", tmp_path / f"{name}.mcap", duration_s=4.0, drift=0.0, wheels_slip=slip)
         places = [each.pose.pose.position for _, each in messages(tmp_path / f"{name}.mcap", "/odom")]
-        logs[name] = np.array([(place.x, place.y) for place in places])
-    steps_m = {name: np.linalg.norm(np.diff(each, axis=0), axis=1) for name, each in logs.items()}
+        steps_m[name] = np.hypot(*np.diff([(place.x, place.y) for place in places], axis=0).T)
     for name, size_m in (("slips", 1.5), ("stands", -0.4)):
         more_m = steps_m[name] - steps_m["straight"]
         assert more_m[100:150].sum() == pytest.approx(size_m, abs=0.05)
         assert np.abs(more_m[:99]).max() < 1e-6 and np.abs(more_m[151:]).max() < 1e-6
-    with pytest.raises(InputError, match="wheels_slip from 3 to 2 s"):
-        simulate("office", tmp_path / "a.mcap", wheels_slip=Slip(3.0, 2.0, 1.0))
 
 
 @pytest.mark.slow
@@ -443,30 +337,27 @@ def test_wheels_that_slip_are_named_and_doubt_no_run_that_closes_loops_around(tm
     assert "stretches of 10, 20, 40 m from every pose" in stated and stated in html.unescape(page)
 
 
-# --- the log ---------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("world", "duration_s"), [("office", 3.0), ("town", 0.3)])
-def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(tmp_path, world, duration_s):
+@pytest.mark.parametrize("world", WORLDS)
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(tmp_path, world):
     for name, seed in (("a", 7), ("b", 7), ("c", 8)):
-        simulate(world, tmp_path / f"{name}.mcap", seed=seed, duration_s=duration_s)
+        sensor = "lms-270" if world == "office" else "vlp-16"
+        simulate(world, tmp_path / f"{name}.mcap", seed=seed, duration_s=0.3, sensor=sensor)
     for suffix in (".mcap", ".tum"):
         first, same, other = ((tmp_path / f"{name}{suffix}").read_bytes() for name in "abc")
-        assert first == same
-        assert first != other
+        assert first == same and (
+            first != other or (suffix, world) == (".tum", "hall")
+        )  # where it stands at first
 
 
 def test_an_office_log_reads_back(tmp_path):
-    seen = []
-    path = tmp_path / "office.mcap"
-    truth = simulate(
-        "office", path, duration_s=4.0, noise_m=0.0, dropout=0.0, progress=lambda *done: seen.append(done)
-    )
+    seen, path = [], tmp_path / "office.mcap"
+    options = {"duration_s": 4.0, "noise_m": 0.0, "dropout": 0.0}
+    truth = simulate("office", path, progress=lambda *done: seen.append(done), **options)
     assert seen == [(count + 1, 40) for count in range(40)]
     assert truth.poses.shape == (40, 3, 3)
     scans, poses = messages(path, "/scan"), messages(path, "/ground_truth")
-    assert [nanoseconds(scan) for _, scan in scans] == truth.stamps_ns.tolist()
-    assert [nanoseconds(pose) for _, pose in poses] == truth.stamps_ns.tolist()
+    for read in (scans, poses):
+        assert [nanoseconds(each) for _, each in read] == truth.stamps_ns.tolist()
     assert [record.log_time - nanoseconds(scan) for record, scan in scans] == [100_000_000] * 40
     stated = [pose.pose.pose for _, pose in poses]
     flat = [(p.position.x, p.position.y, 2.0 * np.arctan2(p.orientation.z, p.orientation.w)) for p in stated]
@@ -479,11 +370,9 @@ def test_an_office_log_reads_back(tmp_path):
     assert scan.time_increment * 720 == pytest.approx(0.1)
     ranges = np.array(scan.ranges)
     flat = np.column_stack([ranges * np.cos(angles), ranges * np.sin(angles)])[np.isfinite(ranges)]
-    world = lie.transform(truth.poses[0], flat)
-    solids = WORLDS["office"].build(np.random.default_rng(np.random.SeedSequence(0, spawn_key=(0,))))
-    height = WORLDS["office"].vehicle.T_base_lidar[2, 3]
-    lifted = np.column_stack([world, np.full(len(world), height)])
-    assert naive_raycast.distance_to_surface(lifted, solids).max() < 2e-5
+    height_m = WORLDS["office"].vehicle.T_base_lidar[2, 3]
+    lifted = np.pad(lie.transform(truth.poses[0], flat), ((0, 0), (0, 1)), constant_values=height_m)
+    assert naive_raycast.distance_to_surface(lifted, plan("office").solids).max() < 2e-5
 
 
 def test_a_town_log_reads_back(tmp_path):
@@ -492,20 +381,21 @@ def test_a_town_log_reads_back(tmp_path):
     assert truth.poses.shape == (5, 4, 4)
     clouds = messages(path, "/points")
     assert [nanoseconds(cloud) for _, cloud in clouds] == truth.stamps_ns.tolist()
+    layout = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("t", "<u4"), ("ring", "<u2")])
     for _, cloud in clouds:
-        layout = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("t", "<u4"), ("ring", "<u2")])
         assert [field.name for field in cloud.fields] == list(layout.names) and cloud.point_step == layout.itemsize
         rows = np.frombuffer(cloud.data, dtype=layout)
-        assert rows["t"][0] < 1_000_000 and rows["t"].max() < 100_000_000 and rows["ring"].max() == 15
+        assert rows["t"][0] < 1_000_000 and rows["t"].max() < 100_000_000
+        elevation_deg = np.rad2deg(np.arctan2(rows["z"], np.hypot(rows["x"], rows["y"])))
+        assert np.allclose(elevation_deg, 2.0 * rows["ring"] - 15.0, atol=1e-3)
     ((_, static),) = messages(path, "/tf_static")
     assert static.transforms[0].transform.translation.z == 1.73
     stamps = [nanoseconds(odometry) for _, odometry in messages(path, "/odom")]
     assert stamps == list(range(truth.stamps_ns[0], truth.stamps_ns[0] + 500_000_001, 20_000_000))
-    lines = [line.split() for line in (tmp_path / "town.tum").read_text().splitlines()]
-    assert [int(stamp.replace(".", "")) for stamp, *_ in lines] == truth.stamps_ns.tolist()
-    values = np.array([[float(word) for word in words] for _, *words in lines])
-    assert np.allclose(values[:, :3], truth.poses[:, :3, 3], atol=1e-9)
-    assert np.allclose(lie.from_quaternion(values[:, 3:]), truth.poses[:, :3, :3], atol=1e-8)
+    written = read_tum(tmp_path / "town.tum")
+    assert np.array_equal(written.stamps_ns, truth.stamps_ns) and np.allclose(
+        written.poses, truth.poses, atol=1e-8
+    )
 
 
 @pytest.mark.parametrize(
@@ -522,6 +412,7 @@ def test_a_town_log_reads_back(tmp_path):
         ({"seed": -1}, "seed -1"),
         ({"start_m": -1.0}, "start_m -1 is out of range"),
         ({"world": "turns", "reverse": True}, "turns is no route"),
+        ({"wheels_slip": Slip(3.0, 2.0, 1.0)}, "wheels_slip from 3 to 2 s"),
     ],
 )
 def test_a_wrong_argument_is_one_line_and_leaves_no_file(tmp_path, arguments, message):
@@ -541,15 +432,19 @@ def test_nothing_is_overwritten_without_force(tmp_path, existing):
     simulate("office", tmp_path / "a.mcap", duration_s=0.2, force=True)
 
 
-# --- the catalog ---------------------------------------------------------------------------------------------
-
-
-def test_every_sequence_of_the_catalog_can_be_read():
+def test_every_sequence_of_the_catalog_can_be_read_and_others_or_a_misspelt_key_are_refused(tmp_path, monkeypatch):
     assert {"office", "town", "demo-office", "demo-town", "intel", "kitti"} <= set(catalog.names())
     for name in catalog.names():
         source = catalog.load(name).source
         if isinstance(source, catalog.Simulated):
             assert source.world in WORLDS and source.sensor in SENSORS
+    with pytest.raises(InputError, match="demo-office, demo-town"):
+        catalog.load("mars")
+    text = (shipped("sequences") / "office.toml").read_text()
+    (tmp_path / "office.toml").write_text(text.replace("seed", "sede"))
+    monkeypatch.setattr(catalog, "shipped", lambda folder: tmp_path)
+    with pytest.raises(InputError, match="sede"):
+        catalog.load("office")
 
 
 def test_a_simulated_sequence_is_made_once(tmp_path, monkeypatch):
@@ -562,32 +457,15 @@ def test_a_simulated_sequence_is_made_once(tmp_path, monkeypatch):
     assert catalog.prepare("demo-office", tmp_path).stat().st_mtime_ns == written
 
 
-def test_an_unknown_sequence_and_a_misspelt_key_are_refused(tmp_path, monkeypatch):
-    with pytest.raises(InputError, match="demo-office, demo-town"):
-        catalog.load("mars")
-    text = (shipped("sequences") / "office.toml").read_text()
-    (tmp_path / "office.toml").write_text(text.replace("seed", "sede"))
-    monkeypatch.setattr(catalog, "shipped", lambda folder: tmp_path)
-    with pytest.raises(InputError, match="sede"):
-        catalog.load("office")
-
-
-def test_another_day_changes_movable_objects_alone_and_keeps_the_path_free():
-    first, later = plan("office", seed=3, duration_s=20.0), plan("office", seed=3, duration_s=20.0, changed=1)
-    kinds = {change.kind for change in later.changes}
-    assert kinds == {"removed", "moved", "added"}
-    for name in ("boxes", "cylinders", "ellipsoids"):
-        rows = [{tuple(row) for row in getattr(drive.solids, name)} for drive in (first, later)]
-        assert rows[0] & rows[1]
-    fixed = [drive.solids.boxes[drive.solids.owner[: len(drive.solids.boxes)] < 0] for drive in (first, later)]
+def test_another_day_changes_movable_objects_alone_keeps_the_path_free_and_is_listed_beside_the_log(tmp_path):
+    first, later = (plan("office", seed=3, duration_s=20.0, changed=changed) for changed in (None, 1))
+    assert {change.kind for change in later.changes} == {"removed", "moved", "added"}
+    for kept, of_later in zip(first.solids.groups, later.solids.groups, strict=True):
+        assert set(map(tuple, kept)) & set(map(tuple, of_later))
+    fixed = [drive.solids.part(drive.solids.owner < 0).boxes for drive in (first, later)]
     assert np.array_equal(*fixed)
     path = later.motion.base(np.arange(0.0, 20.0, 0.1))[:, :2, 3]
     assert later.solids.clearance_m(path, 2.0).min() > 0.1
-    assert later.changes[0].owner == plan("office", seed=3, duration_s=20.0, changed=1).changes[0].owner
-
-
-def test_changes_of_another_day_are_listed_beside_the_log(tmp_path):
-    simulate("office", tmp_path / "later.mcap", seed=3, duration_s=1.0, changed=1)
+    record(replace(later, scans=later.scans[:10]), tmp_path / "later.mcap")
     lines = (tmp_path / "later.changes.csv").read_text().splitlines()
-    assert lines[0].startswith("kind,x_before,")
-    assert len(lines) > 10
+    assert lines[0].startswith("kind,x_before,") and len(lines) == 1 + len(later.changes)

@@ -68,21 +68,13 @@ def drive(count, dimension, points=180, seed=1):
 
 
 def graph_of(steps, last_keyframe):
-    poses = [step.T_world_lidar for step in steps[:-1] if step.keyframe >= 0] + [steps[-1][1]]
+    poses = np.array([step.T_world_lidar for step in steps[:-1] if step.keyframe >= 0] + [steps[-1][1]])
     loops = [(0, k) for k in range(4, last_keyframe + 1, 4)]
-    edges = [(i, i + 1) for i in range(last_keyframe)] + loops
-    is_loop = np.array([False] * last_keyframe + [True] * len(loops))
+    edges = np.array([(i, i + 1) for i in range(last_keyframe)] + loops)
+    is_loop = np.arange(len(edges)) >= last_keyframe
     weight = np.where(is_loop, 0.3, 1.0)
     weight[-1] = 0.9
-    return GraphState(
-        np.array(poses),
-        np.zeros(len(poses), np.int64),
-        np.array(edges),
-        is_loop,
-        weight,
-        1.0,
-        np.zeros(len(edges)),
-    )
+    return GraphState(poses, np.zeros(len(poses), np.int64), edges, is_loop, weight, 1.0, np.zeros(len(edges)))
 
 
 def opened(path, dimension=2, sinks=("save",), config=None, **ports):

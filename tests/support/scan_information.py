@@ -19,8 +19,9 @@ def information(solids: Solids, T_world_lidar: Pose, sensor: Sensor, *, index: i
     There is neither noise nor loss. H / σ² is the information where ranges are good to σ along the normals.
     """
     rays = sensor.rays(index)
-    standing = np.zeros(len(rays.directions), dtype=np.int32)
-    ranges_m, solid_of_ray = solids.strike(T_world_lidar[None], standing, rays.directions, sensor.max_range_m)
+    standing, solid_of_ray = np.zeros((2, len(rays.directions)), dtype=np.int32)
+    T = T_world_lidar[None]
+    ranges_m = solids.cast(T, standing, rays.directions, sensor.max_range_m, solid_of_ray)
     hit = np.isfinite(ranges_m) & (ranges_m >= sensor.min_range_m)
     points = rays.directions[hit] * ranges_m[hit, None]
     R, t = T_world_lidar[:3, :3], T_world_lidar[:3, 3]
@@ -55,7 +56,7 @@ def undetermined(information: Matrix, *, share: float = 1e-6) -> Matrix:
 def surface_normals(places: Matrix, solid_of_place: NDArray[np.int32], solids: Solids) -> Matrix:
     """Outward unit normals (N, 3), world frame, at points (N, 3) on the solids they lie on.
 
-    solid_of_place : (N,) as from ``Solids.strike``: counted through boxes, cylinders, ellipsoids, the ground last
+    solid_of_place : (N,) as from ``Solids.cast``: counted through boxes, cylinders, ellipsoids, the ground last
     """
     normals = np.empty(places.shape)
     begin = 0

@@ -23,13 +23,8 @@ def circle(radius_m, dimension=2):
     return lie.exp(twists) @ arm
 
 
-BLUE, AMBER, MAGENTA, PINK = (
-    (0.122, 0.373, 0.816),
-    (0.878, 0.482, 0.0),
-    (0.878, 0.149, 0.62),
-    (0.839, 0.188, 0.561),
-)
-WHITE = (1.0, 1.0, 1.0)
+BLUE, AMBER, MAGENTA = (0.122, 0.373, 0.816), (0.878, 0.482, 0.0), (0.878, 0.149, 0.62)
+PINK, WHITE = (0.839, 0.188, 0.561), (1.0, 1.0, 1.0)
 
 
 @pytest.fixture
@@ -54,12 +49,9 @@ def test_trajectories_and_stretches_to_check_are_drawn_in_their_colors_on_white(
     assert all(share_of(pixels, color) > 0.001 for color in (BLUE, AMBER, MAGENTA, PINK))
     assert share_of(pixels, WHITE) > 0.8
     assert [share_of(drawn(), color) for color in (AMBER, MAGENTA, PINK)] == [0.0, 0.0, 0.0]
-
-
-def test_one_far_outlier_does_not_shrink_the_map(drawn):
-    points = np.random.default_rng(2).uniform(-10.0, 10.0, (5000, 2))
-    near, far = (share_of(drawn(points=some), BLUE) for some in (points, np.vstack([points, [[4000.0, 0.0]]])))
-    assert far == pytest.approx(near, rel=0.1)
+    points = np.random.default_rng(3).uniform(-15.0, 15.0, (20_000, 3))
+    assert share_of(drawn(optimized=circle(10.0, dimension=3), points=points), WHITE) < 0.95
+    assert share_of(drawn(optimized=np.empty((0, 3, 3))), WHITE) > 0.9
 
 
 def test_a_grid_lies_where_its_origin_says_with_row_0_at_the_bottom(drawn):
@@ -70,27 +62,6 @@ def test_a_grid_lies_where_its_origin_says_with_row_0_at_the_bottom(drawn):
     dark_rows = np.nonzero((np.abs(pixels - 0.15) < 0.03).mean(axis=1) > 0.4)[0]
     assert dark_rows.min() > 0.5 * len(pixels)
     assert (np.abs(pixels - 0.90) < 0.01).mean() > 0.15  # unknown is gray, not white
-
-
-def test_a_3d_map_is_drawn_from_above(drawn):
-    points = np.random.default_rng(3).uniform(-15.0, 15.0, (20_000, 3))
-    assert share_of(drawn(optimized=circle(10.0, dimension=3), points=points), WHITE) < 0.95
-
-
-def test_a_run_without_any_scan_gives_an_empty_sheet_and_no_error(drawn):
-    assert share_of(drawn(optimized=np.empty((0, 3, 3))), WHITE) > 0.9
-
-
-def test_a_picture_that_cannot_be_drawn_leaves_the_old_one(tmp_path, monkeypatch, drawn):
-    def fail(figure, file, **_):
-        file.write(b"half")
-        raise OSError(28, "No space left on device")
-
-    (tmp_path / "a.png").write_bytes(b"old")
-    monkeypatch.setattr("matplotlib.figure.Figure.savefig", fail)
-    with pytest.raises(OSError, match="No space"):
-        drawn()
-    assert (tmp_path / "a.png").read_bytes() == b"old" and len(list(tmp_path.iterdir())) == 1
 
 
 @pytest.mark.parametrize("is_upright", [False, True])

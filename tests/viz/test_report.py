@@ -9,14 +9,11 @@ import sys
 from base64 import b64decode, b64encode
 from functools import cache
 from hashlib import sha256
-from types import SimpleNamespace
 
 import msgspec
 import numpy as np
 import pyarrow as pa
 import pytest
-from mcap.reader import make_reader
-from mcap.writer import Writer
 from rerun.chunk import RrdReader
 
 from scanchain.__main__ import main
@@ -25,10 +22,9 @@ from scanchain.logs.writer import ORIGIN, LogWriter, pack_laser_scan, pack_odome
 from scanchain.maps import read_ply
 from scanchain.runs.metrics import Metrics
 from scanchain.runs.results import OVERLAY_FILE
-from scanchain.simulation import simulate
 from scanchain.verdict import Judged, Kind, Stretch, Verdict
 from scanchain_viz.pictures.figure import Line
-from scanchain_viz.pictures.maps import AFTER, BEFORE, path_over_map, surroundings
+from scanchain_viz.pictures.maps import AFTER, BEFORE, surroundings
 from scanchain_viz.pictures.trajectories import DrawnTrajectory
 from scanchain_viz.report.page import (
     SCRIPT,
@@ -44,55 +40,34 @@ from scanchain_viz.report.page import (
     write_page,
 )  # fmt: skip
 from scanchain_viz.report.run import map_section, trajectory_lines, write_run_report
-from scanchain_viz.report.sections import loop_section, trajectories_section
+from scanchain_viz.report.sections import loop_section
+from tests.support import made
 from tests.support.browser import find_browser, look
-from tests.support.scenes import ROOT
+from tests.support.in_process import here
 
-EVIL = "<script>alert(1)</script>"
-SUPPORT = ROOT / "tests" / "support"
+EVIL = "<script>alert(1)"
 BOTH = pytest.mark.parametrize("which", ["comparison", "one_run"])
-
-
-def renamed(source, destination, old, new):
-    """A copy of a log with one topic called otherwise."""
-    with source.open("rb") as read, destination.open("wb") as written:
-        writer = Writer(written)
-        writer.start()
-        channels = {}
-        for schema, channel, message in make_reader(read).iter_messages():
-            if channel.id not in channels:
-                known = writer.register_schema(schema.name, schema.encoding, schema.data)
-                topic = new if channel.topic == old else channel.topic
-                channels[channel.id] = writer.register_channel(topic, channel.message_encoding, known)
-            writer.add_message(channels[channel.id], message.log_time, message.data, message.publish_time)
-        writer.finish()
 
 
 @pytest.fixture(scope="module")
 def evil(tmp_path_factory):
-    """Twelve seconds in the office, of a log whose lidar topic is a script."""
-    folder = tmp_path_factory.mktemp("log")
-    simulate("office", folder / "office.mcap", duration_s=12.0)
-    renamed(folder / "office.mcap", folder / "evil.mcap", "/scan", EVIL)
-    return folder / "evil.mcap"
+    """Twelve seconds in the office, in a log whose name begins a script."""
+    log = made.log("office", tmp_path_factory.mktemp("log"), seconds=12)
+    return log.rename(log.with_name(f"{EVIL}.mcap"))
 
 
 @pytest.fixture(scope="module")
 def comparison(evil, tmp_path_factory):
-    """The directory of a comparison of ours, a variant of an evil name, and one that raises evil words."""
+    """The directory of a comparison, in this process, of ours, a variant of an evil name, and one that raises."""
     folder = tmp_path_factory.mktemp("compared")
     (folder / "a.toml").write_text(
         f'["{EVIL}"]\nmethod = "bad_odometries:Shifted"\n[raises]\nmethod = "bad_odometries:Raises"\n'
     )
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", f"{SUPPORT}:{ROOT}", prepend=":")
-        code = main(
-            [
-                "compare", str(evil), "--out", str(folder / "out"), "--settings", str(folder / "a.toml"),
-                "--methods", f"plicp,plicp+loops,{EVIL},raises",
-            ]
-        )  # fmt: skip
-    assert code == 1
+        here(patch)
+        words = ["--settings", str(folder / "a.toml"), "--methods", f"plicp,plicp+loops,{EVIL},raises"]
+        assert main(["compare", str(evil), "--out", str(folder / "out"), *words]) == 1
     return folder / "out"
 
 
@@ -159,32 +134,26 @@ def test_a_comparison_shows_every_figure_and_a_row_for_every_method(comparison, 
             assert cell.text in page["text"], column.key
 
 
-@pytest.mark.parametrize(
-    ("length_m", "reason"),
-    [
-        (9.0, "the trajectory is 9.0 m long, and a loop has more than 30 m"),
-        (90.0, "the trajectory did not return to a place visited more than 30 m before"),
-    ],
-)
-def test_without_a_loop_closure_the_report_says_why_none_was_tried(tmp_path, length_m, reason):
-    none = pa.schema([("target_scan", pa.int64())]).empty_table()
-    trajectory = SimpleNamespace(distance_m=np.array([0.0, length_m]))
-    (section,) = loop_section(trajectory, none, "Loop closures", 30.0)
-    assert section.text == f"None was tried: {reason} (loops.min_travel_m)."
-
-
-def test_closures_are_counted_by_verdict_and_cause():
+def test_closures_are_counted_by_verdict_and_cause_and_where_none_was_tried_the_report_says_why():
     closures = pa.table({
         "target_scan": [0, 1, 2, 3], "source_scan": [5, 6, 7, 8],
         "rejected_by": ["", "verification", "verification", "verification"],
         "cause": ["verified", "small overlap", "few points", "small overlap"],
         "overlap": [0.9, 0.2, 0.8, 0.4], "residual_m": [0.01, 0.02, 0.03, 0.04],
     })  # fmt: skip
-    trajectory = course(np.random.default_rng(0).normal(size=(9, 3)))
-    (section,) = loop_section(trajectory, closures, "Loop closures", 30.0)
+    unknown, positions = np.full(9, np.nan), np.random.default_rng(0).normal(size=(9, 3))
+    path = DrawnTrajectory("a", "#2f7de1", False, positions, np.arange(9.0), *[unknown] * 5)
+    (section,) = loop_section(path, closures, "Loop closures", 30.0)
     assert [tuple(getattr(cell, "text", cell) for cell in row.cells) for row in section.grid.rows] == [
         ("2", "30", "30", "small overlap"), ("1", "90", "10", "verified"), ("1", "80", "30", "few points"),
     ]  # fmt: skip
+    assert "var(--ink)" in section.drawings[0].svg  # the color of its page
+    for limit_m, reason in (
+        (30.0, "the trajectory is 8.0 m long, and a loop has more than 30 m"),
+        (5.0, "the trajectory did not return to a place visited more than 5 m before"),
+    ):
+        (section,) = loop_section(path, closures[:0], "Loop closures", limit_m)
+        assert section.text == f"None was tried: {reason} (loops.min_travel_m)."
 
 
 def test_a_run_says_its_verdict_and_result_first_and_its_time_last(one_run, pages, seen):
@@ -231,16 +200,6 @@ def test_the_verdict_stands_at_the_head_in_its_color_with_its_error_and_a_line_a
     assert ("otherwise ATE" in page) is (verdict is Verdict.CHECK)
 
 
-def test_ends_of_a_path_are_outlines_beneath_it_so_that_the_shortest_is_seen():
-    path = np.array([[0.0, 0.0, 0.0], [0.001, 0.0, 0.0]])
-    low, high = np.array([-5.0, -5.0, 0.0]), np.array([5.0, 5.0, 1.0])
-    svg = path_over_map(np.empty((0, 3)), [Line("", path, "#123456", 1.2)], low, high, path)
-    styles = re.findall(r'<path d="[^"]*" style="([^"]*)"', svg.partition("</svg>")[0])
-    assert [("fill: var" in style, "#123456" in style) for style in styles[-3:]] == [
-        (False, False), (False, False), (False, True),
-    ]  # fmt: skip
-
-
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_the_worst_place_of_a_run_is_drawn_and_lies_where_its_points_are(one_run, tmp_path, dimension):
     assert "Worst place" not in (one_run / "report.html").read_text(encoding="utf-8")
@@ -256,18 +215,19 @@ def test_the_worst_place_of_a_run_is_drawn_and_lies_where_its_points_are(one_run
     assert "20" in shown and "30" in shown
 
 
-@pytest.mark.parametrize(("which", "write"), [("one_run", "write_report"), ("comparison", "present_comparison")])
-def test_the_same_directory_gives_the_same_page_without_matplotlib(which, write, pages):
-    program = f"""
+def test_the_same_directory_gives_the_same_page_without_matplotlib(pages):
+    program = """
 import sys
 from pathlib import Path
-from scanchain.api import {write} as write
-write(Path(sys.argv[1]))
+from scanchain_viz.report.comparison import write_compare_report
+from scanchain_viz.report.run import write_run_report
+write_compare_report(Path(sys.argv[1]))
+write_run_report(Path(sys.argv[2]))
 assert "matplotlib" not in sys.modules
 """
-    before = pages[which].read_bytes()
-    subprocess.run([sys.executable, "-c", program, str(pages[which].parent)], check=True)
-    assert pages[which].read_bytes() == before
+    before = {page: page.read_bytes() for page in pages.values()}
+    subprocess.run([sys.executable, "-c", program, *(page.parent for page in before)], check=True)
+    assert {page: page.read_bytes() for page in before} == before
 
 
 def test_the_map_of_a_run_is_drawn_in_the_page_under_its_own_security_policy(one_run, tmp_path):
@@ -369,7 +329,7 @@ def test_a_map_is_shown_whole_whatever_the_trajectory_but_for_outliers():
     assert (high > [129.9, 19.9, 7.9]).all() and (high < [136.0, 22.0, 9.0]).all()
 
 
-def test_lost_degenerate_and_contradicted_stretches_and_closures_by_verdict_are_told_apart():
+def test_stretches_and_closures_by_verdict_are_told_apart_and_a_scan_of_several_findings_counts_in_each():
     states = ["contradicted"] * 2 + ["ok"] * 8 + ["degenerate"] * 4 + ["ok"] * 5 + ["lost"] * 3 + ["ok"] * 18
     keyframes = [k // 5 if k % 5 == 0 else -1 for k in range(40)]
     steps = pa.table({"state": states, "keyframe": keyframes})
@@ -380,28 +340,20 @@ def test_lost_degenerate_and_contradicted_stretches_and_closures_by_verdict_are_
     )  # fmt: skip
     positions = np.stack([np.arange(40.0), np.zeros(40), np.zeros(40)], axis=1)
     points = np.random.default_rng(1).uniform(-5.0, 45.0, (300, 3))
-    lines = trajectory_lines(positions, steps, closures, (), positions + 0.1)
+    stretch = Stretch(Kind.ACCELERATION, 0, 3, 4, 0.3, 0.4, 0.5)
+    lines = trajectory_lines(positions, steps, closures, [stretch], positions + 0.1)
     section = map_section(lines, points, positions.min(axis=0), positions.max(axis=0), 0.2)
     assert [chip.name for chip in section.chips] == [
         "trajectory",
         "closures rejected by verification: 1", "closures rejected by the back end: 1", "closures accepted: 1",
         "at closures rejected by the back end: 10 scans",
-        "degenerate: 4 scans", "lost: 3 scans", "contradicted: 2 scans", "ground truth",
+        "degenerate: 4 scans", "lost: 3 scans", "contradicted: 2 scans", "impossible acceleration: 4 scans",
+        "ground truth",
     ]  # fmt: skip
     told = json.loads(html.unescape(re.search('data-scene="(.*?)"', section.drawings[-1].svg)[1]))
     assert len(told["lines"]) == len(section.chips) == len({chip.color for chip in section.chips})
     assert [line["color"] for line in told["lines"]] == [chip.color for chip in section.chips]
     assert all(chip.color in section.drawings[0].svg for chip in section.chips)
-
-
-def test_a_scan_of_several_findings_counts_in_each():
-    states = ["degenerate"] * 4 + ["contradicted"] * 3 + ["ok"] * 3
-    steps = pa.table({"state": states, "keyframe": [0] + [-1] * 9})
-    stretch = Stretch(Kind.ACCELERATION, 3, 4, 2, 0.3, 0.4, 0.5)
-    lines = trajectory_lines(np.arange(30.0).reshape(10, 3), steps, None, [stretch], None)
-    assert [line.name for line in lines[1:]] == [
-        "degenerate: 4 scans", "contradicted: 3 scans", "impossible acceleration: 2 scans",
-    ]  # fmt: skip
 
 
 def test_a_lidar_that_stands_still_without_loops_has_a_report_too(tmp_path):
@@ -422,7 +374,7 @@ def test_a_lidar_that_stands_still_without_loops_has_a_report_too(tmp_path):
 
 
 @BOTH
-def test_a_topic_that_is_a_script_is_shown_as_text_and_a_page_needs_nothing_but_itself(which, seen, pages):
+def test_a_log_that_is_called_a_script_is_shown_as_text_and_a_page_needs_nothing_but_itself(which, seen, pages):
     ours, text = (1 if which == "one_run" else 0), pages[which].read_text(encoding="utf-8")
     assert EVIL in seen(which)["text"] and html.escape(EVIL) in text
     assert text.count("<script") == ours and seen(which)["scripts"] == ours + 1  # and that of the probe
@@ -437,21 +389,6 @@ def test_a_recording_holds_way_map_and_plots_of_every_method_that_ended(comparis
         for part in ("world/{}/trajectory", "world/{}/lidar", "world/{}/map", "plots/error/{}", "plots/time/{}"):
             assert "/" + part.format(method) in entities
     assert "/world/ground_truth" in entities
-
-
-def course(positions, **known):
-    count = len(positions)
-    unknown = {key: np.full(count, np.nan) for key in ("error_m", "seconds", "nees", "observability")}
-    unknown["relation_error_m"] = np.empty(0)
-    return DrawnTrajectory("a", "#2f7de1", False, positions, np.arange(float(count)), **(unknown | known))
-
-
-def test_a_drawing_takes_the_colors_of_its_page():
-    positions = np.random.default_rng(0).normal(size=(50, 3)).cumsum(axis=0)
-    drawn = [course(positions)]
-    svg = trajectories_section(drawn, drawn, None, is_planar=True, text="").drawings[0].svg
-    assert "var(--ink)" in svg and "var(--line)" in svg
-    assert re.search(r"<svg[^>]* viewBox=", svg) and " width=" not in svg[: svg.index(">")]
 
 
 def test_every_text_of_a_page_is_escaped(tmp_path):

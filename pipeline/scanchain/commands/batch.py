@@ -22,12 +22,7 @@ _DAY_S = 86_400.0
 @click.argument("logs", metavar="LOG...", nargs=-1, type=LOG)
 @options.out("Directory to create, or to resume.")
 @click.option(
-    "--manifest",
-    "manifests",
-    multiple=True,
-    metavar="FILE",
-    type=PATH,
-    help="Text file with one log per line.",
+    "--manifest", "manifests", multiple=True, metavar="FILE", type=PATH, help="Text file with one log per line."
 )
 @options.config
 @options.part("each log")

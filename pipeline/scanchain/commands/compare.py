@@ -79,12 +79,12 @@ def compare(logs: tuple[Source, ...], methods: str | None, out: Path | None, as_
       scanchain compare log.mcap --methods plicp,Mine --matcher mine:Mine
       scanchain compare intel.mcap --relations intel.relations --memory-limit 2 --end 600
     """
-    from scanchain.api import present_comparison
     from scanchain.commands.terminal import Terminal
     from scanchain.comparison.compare import Comparison
     from scanchain.comparison.compare import compare as run_comparison
     from scanchain.comparison.table import TABLE_FILE, text
     from scanchain.runs.directory import directory_name
+    from scanchain_viz.recording.results import present_comparison
 
     comparison = Comparison(
         logs=logs,

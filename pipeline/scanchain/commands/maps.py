@@ -95,15 +95,15 @@ def localize(prior: Path, out: Path, initial: str | None, strict: bool, as_json:
       scanchain localize part_0.mcap part_1.mcap --map runs/sunday --out runs/monday --topic /points
     """
     options.collect_garbage_seldom()
-    from scanchain.api import draw_localization
     from scanchain.commands.terminal import Terminal
     from scanchain.runs.job import Job
     from scanchain.sessions.localize import localize as localize_log
+    from scanchain_viz.recording.results import present_localization
 
     job = Job(out=out, command=tuple(sys.argv), **given)
     first = None if initial is None else _initial(initial)
     with Terminal("scans") as terminal:
-        localized = localize_log(job, prior, terminal, draw_localization, initial=first)
+        localized = localize_log(job, prior, terminal, present_localization, initial=first)
     fails = localized.metrics.verdict.fails(strict=strict)
     if fails and not sys.stdout.isatty():
         click.echo(f"error: {out}: {localized.metrics.sentence}", err=True)
@@ -146,9 +146,9 @@ def merge(runs: tuple[Path, ...], out: Path, as_json: bool, **given: Any) -> Non
       scanchain merge runs/survey runs/today --fixed --out runs/extended
       scanchain merge runs/both runs/wednesday --update --out runs/week --json
     """
-    from scanchain.api import present_merge
     from scanchain.commands.terminal import Terminal
     from scanchain.sessions.merging import merge as merge_maps
+    from scanchain_viz.recording.results import present_merge
 
     with Terminal("maps") as terminal:
         merged = merge_maps(runs, out, terminal, present_merge, command=tuple(sys.argv), **given)
@@ -206,9 +206,9 @@ def changes(
       scanchain changes runs/merged --out runs/newest
       scanchain changes runs/a runs/b --transform 1.5,-0.2,180 --out runs/ab
     """
-    from scanchain.api import present_changes
     from scanchain.commands.terminal import Terminal
     from scanchain.sessions.change_run import SUMMARY_FILE, compare_maps
+    from scanchain_viz.recording.results import present_changes
 
     if aligned and transform is not None:
         raise click.UsageError("--aligned and --transform are both given; give one of them")

@@ -33,7 +33,7 @@ def from_odometry(measurements: Measurements) -> Values:
         poses = chain(measurements.first_pose, measurements.motion)
     else:
         poses = measurements.first_pose + np.cumsum(np.vstack([np.zeros(2), measurements.motion]), axis=0)
-    return Values(poses, _first_seen(measurements, poses)[0], measurements.calibration.value)
+    return Values(poses, _first_seen(measurements, poses), measurements.calibration.value)
 
 
 def of_relative_positions(data: LandmarkData) -> Values:
@@ -62,13 +62,14 @@ def growing(measurements: Measurements, solver: LinearSolver) -> Values:
     """
     count = len(measurements.motion) + 1
     poses, landmarks = measurements.first_pose[None], np.full((len(measurements.landmarks), 2), np.nan)
-    own, reach = measurements.calibration.mean, _FIRST
+    calibration, reach = measurements.calibration, _FIRST
+    own = calibration.mean
     while True:
         reach = min(reach, count)
-        motion = measurements.motion_at(own)
+        motion = measurements.motion + calibration.slope @ (own - calibration.value)  # to first order
         poses = np.vstack([poses, chain(poses[-1], motion[len(poses) - 1 : reach - 1])[1:]])
         part, known = _beginning(measurements, reach)
-        guess, _ = _first_seen(part, poses)
+        guess = _first_seen(part, poses)
         settled = np.isfinite(landmarks[known, 0])
         guess[settled] = landmarks[known[settled]]
         state = minimize(
@@ -96,13 +97,13 @@ def _beginning(measurements: Measurements, poses: int) -> tuple[Measurements, ND
     return part, known
 
 
-def _first_seen(measurements: Measurements, poses: Matrix) -> tuple[Matrix, NDArray[np.int64]]:
-    """Position (L, 2) of every landmark by its first observation, and the index of that observation, (L,)."""
+def _first_seen(measurements: Measurements, poses: Matrix) -> Matrix:
+    """Position (L, 2) of every landmark by its first observation."""
     _, first = np.unique(measurements.observed[:, 1], return_index=True)
     pose = poses[measurements.observed[first, 0]]
     bearing, reach = measurements.measured[first].T
     direction = bearing + (pose[:, 2] if poses.shape[1] == 3 else 0.0)
-    return pose[:, :2] + reach[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1), first
+    return pose[:, :2] + reach[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
 
 
 def chain(start: NDArray[np.float64], motion: Matrix) -> Matrix:

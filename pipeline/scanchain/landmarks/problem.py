@@ -282,10 +282,6 @@ class Measurements:
     measured_covariance: Matrix
     landmarks: NDArray[np.int64]
 
-    def motion_at(self, calibration: NDArray[np.float64]) -> Matrix:
-        """The motions with another calibration, to first order."""
-        return self.motion + self.calibration.slope @ (calibration - self.calibration.value)
-
 
 class BearingRangeProblem:
     """Prior on the first pose, motion from pose to pose, bearings and ranges; its pattern is found once.

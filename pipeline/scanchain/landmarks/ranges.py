@@ -209,35 +209,6 @@ _RECKONED = 2  # of them begin with a new dead reckoning, by the robot as it is 
 _MOST, _ROUGH, _FINE, _LITTLE = 50, 1e-2, 1e-5, 1e-10  # iterations; change of χ² that ends them; first damping
 
 
-class LogModel:
-    """The part of a log's problem independent of its noise: nodes, landmarks, observations."""
-
-    def __init__(self, log: RangeLog) -> None:
-        self._log = log
-        self.nodes_s, node = np.unique(log.seen_s, return_inverse=True)
-        self.landmarks, landmark = np.unique(log.subjects, return_inverse=True)
-        self.observed = np.stack([node, landmark], axis=1)
-        self.sighting_pairs = SightingPairs(log.seen_s, landmark)
-
-    def reckoned(self, own: NDArray[np.float64]) -> Reckoning:
-        """Dead reckoning from node to node by a robot with these errors of its own, (5,)."""
-        return reckon(self._log, self.nodes_s, own)
-
-    def measurements(self, reckoning: Reckoning, variances: NDArray[np.float64]) -> Measurements:
-        """The problem with these variances (6,), the odometry's first."""
-        return Measurements(
-            first_pose=np.zeros(3),
-            first_covariance=_ANCHOR * np.eye(3),
-            motion=reckoning.motion,
-            motion_covariance=reckoning.covariance(variances[:4]),
-            calibration=reckoning.calibration,
-            observed=self.observed,
-            measured=self._log.measured,
-            measured_covariance=np.diag(variances[4:]),
-            landmarks=self.landmarks,
-        )
-
-
 @dataclass(frozen=True, slots=True)
 class RangeSolution:
     """A minimum, the noise it was found for, and their consistency.
@@ -272,7 +243,7 @@ class RangeSolution:
         return np.sqrt(self.variances).tolist()
 
 
-def solve_range_log(log: RangeLog, noise: OdometryNoise | None, method: str = ESTIMATOR) -> RangeSolution:
+def solve_range_log(log: RangeLog, noise: OdometryNoise | None) -> RangeSolution:
     """Estimate poses, landmarks, the robot's own errors and the noise of odometry and sensor together.
 
     noise : of the odometry; None for an estimate of it
@@ -282,12 +253,29 @@ def solve_range_log(log: RangeLog, noise: OdometryNoise | None, method: str = ES
     a while, by what the residuals show (``SightingPairs``): each sighting counts as a share of an independent one.
     Raises InputError where the observations are too few for that.
     """
-    begin, model, solver = working_s(), LogModel(log), create_solver(method)
+    begin, solver = working_s(), create_solver(ESTIMATOR)
+    nodes_s, node = np.unique(log.seen_s, return_inverse=True)
+    landmarks, landmark = np.unique(log.subjects, return_inverse=True)
+    observed, sightings = np.stack([node, landmark], axis=1), SightingPairs(log.seen_s, landmark)
+
+    def measurements(reckoning: Reckoning, variances: NDArray[np.float64]) -> Measurements:
+        return Measurements(
+            first_pose=np.zeros(3),
+            first_covariance=_ANCHOR * np.eye(3),
+            motion=reckoning.motion,
+            motion_covariance=reckoning.covariance(variances[:4]),
+            calibration=reckoning.calibration,
+            observed=observed,
+            measured=log.measured,
+            measured_covariance=np.diag(variances[4:]),
+            landmarks=landmarks,
+        )
+
     stated = np.concatenate([(noise or OdometryNoise()).densities, _SENSOR])
-    reckoning = model.reckoned(np.zeros(len(OWN)))
-    problem = BearingRangeProblem(model.measurements(reckoning, stated))
+    reckoning = reckon(log, nodes_s, np.zeros(len(OWN)))
+    problem = BearingRangeProblem(measurements(reckoning, stated))
     reckoned, guess = from_odometry(problem.measurements), growing(problem.measurements, solver)
-    variances, loss = stated, StudentLoss(np.ones(len(model.observed)))
+    variances, loss = stated, StudentLoss(np.ones(len(observed)))
     minimum, covariance, found = _settled(problem, guess, loss, variances, reckoning, solver, _ROUGH)
     if not np.all(found.redundancy > _LEAST_FREEDOM):
         raise InputError("the landmarks were seen too seldom to estimate the sensor's noise; give a longer log")
@@ -299,18 +287,18 @@ def solve_range_log(log: RangeLog, noise: OdometryNoise | None, method: str = ES
         is_last = turn == _TURNS - 1 or bool(np.abs(np.sqrt(growth) - 1.0).max() < _CHANGE)
         variances = np.maximum(variances * growth, _LEAST)
         residuals = np.sqrt(minimum.weights / loss.share)[:, None] * minimum.at.observations
-        loss = StudentLoss(model.sighting_pairs.share(model.sighting_pairs.correlation(residuals)))
+        loss = StudentLoss(sightings.share(sightings.correlation(residuals)))
         state = minimum.state
         if turn < _RECKONED:
-            reckoning = model.reckoned(state.calibration)
-        problem = problem.of(model.measurements(reckoning, variances))
+            reckoning = reckon(log, nodes_s, state.calibration)
+        problem = problem.of(measurements(reckoning, variances))
         tolerance = _FINE if is_last else _ROUGH
         minimum, covariance, found = _settled(problem, state, loss, variances, reckoning, solver, tolerance)
         iterations += minimum.iterations
         if is_last:
             break
     return RangeSolution(
-        model.nodes_s, reckoned, problem, guess, minimum, variances, loss, covariance, found, iterations,
+        nodes_s, reckoned, problem, guess, minimum, variances, loss, covariance, found, iterations,
         working_s() - begin,
     )  # fmt: skip
 

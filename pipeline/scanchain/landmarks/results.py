@@ -45,7 +45,7 @@ def _row(method: MethodResult) -> tuple[str, ...]:
 
 def text_of(study: Study) -> str:
     """The whole study for a terminal."""
-    lines = [study.name, *(f"  {fact.label:<15}{fact.value}" for fact in study.facts)]
+    lines = [study.name, *(f"  {label:<15}{value}" for label, value in study.facts.items())]
     lines += [f"  {label:<15}{value}" for label, value in accuracy_lines(study)]
     lines.append(f"  {'A':<15}{size_of(study)}")
     rows = table_of(study)
@@ -81,7 +81,7 @@ def tree_of(study: Study) -> dict[str, object]:
     rows, columns = study.system.pattern.shape
     return {
         "name": study.name,
-        "facts": {fact.label: fact.value for fact in study.facts},
+        "facts": study.facts,
         "converged": study.converged,
         "before": _figures(study.before),
         "after": _figures(study.after),

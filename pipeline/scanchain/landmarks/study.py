@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,21 +55,10 @@ class Estimate:
     landmarks_m: float
     definition: str
 
-
-@dataclass(frozen=True, slots=True)
-class Truth:
-    """Motion capture at the times of an estimate.
-
-    Attributes
-    ----------
-    known : (K,) bool, poses of the estimate for which there is a truth
-    poses : (k, 3) x, y, heading of those
-    landmarks : (L, 2), NaN where a landmark was not surveyed
-    """
-
-    known: NDArray[np.bool_]
-    poses: Matrix
-    landmarks: Matrix
+    def in_truth(self) -> tuple[Matrix, Matrix]:
+        """Positions (K, 2) of the poses and (L, 2) of the landmarks in the truth's frame."""
+        T = self.T_truth_estimate
+        return lie.transform(T, self.state.poses[:, :2]), lie.transform(T, self.state.landmarks)
 
 
 def of_positions(state: Values, data: LandmarkData) -> Estimate:
@@ -81,37 +71,43 @@ def of_positions(state: Values, data: LandmarkData) -> Estimate:
     return Estimate(state, lie.identity(2), poses_m, _rms(state.landmarks - data.true_landmarks), definition)
 
 
-def truth_at(log: RangeLog, nodes_s: NDArray[np.float64], landmarks: NDArray[np.int64]) -> Truth:
-    """Motion capture interpolated to these times, surveyed positions of these landmarks."""
-    place = {
-        int(subject): position for subject, position in zip(log.true_subjects, log.true_landmarks, strict=True)
-    }
-    surveyed = np.array([place.get(int(subject), np.full(2, np.nan)) for subject in landmarks])
+def against_truth(
+    states: Sequence[Values], nodes_s: NDArray[np.float64], landmarks: NDArray[np.int64], log: RangeLog
+) -> tuple[list[Estimate], Matrix, Matrix]:
+    """ATE of the poses of each state after rigid alignment, landmarks by the same one, against motion capture.
+
+    nodes_s, landmarks : (K,) times of the poses, (L,) numbers of the landmarks
+    Returns also true positions (k, 2), and those of the landmarks (L, 2), NaN where one was not surveyed.
+    """
+    place, unknown = dict(zip(log.true_subjects.tolist(), log.true_landmarks, strict=True)), np.full(2, np.nan)
+    surveyed = np.array([place.get(subject, unknown) for subject in landmarks.tolist()])
+    known, true_poses = _truth_at(log, nodes_s)
+    positions = true_poses[:, :2]
+    if np.count_nonzero(known) < 2:
+        why = "no motion capture at these times"
+        return [Estimate(each, lie.identity(2), np.nan, np.nan, why) for each in states], positions, surveyed
+    estimates, truth = [], _trajectory(nodes_s[known], true_poses)
+    for state in states:
+        error = absolute_error(pair(_trajectory(nodes_s[known], state.poses[known]), truth), Alignment.RIGID)
+        T_truth_estimate = lie.flatten(error.T_reference_estimate)
+        landmarks_m = _rms(lie.transform(T_truth_estimate, state.landmarks) - surveyed)
+        definition = f"{error.definition}, over {error.pairing}"
+        estimates.append(Estimate(state, T_truth_estimate, error.translation_m.rmse, landmarks_m, definition))
+    return estimates, positions, surveyed
+
+
+def _truth_at(log: RangeLog, nodes_s: NDArray[np.float64]) -> tuple[NDArray[np.bool_], Matrix]:
+    """Times (K,) at which there is motion capture, and the poses (k, 3) there, interpolated."""
     if len(log.true_s) < 2:
-        return Truth(np.zeros(len(nodes_s), np.bool_), np.empty((0, 3)), surveyed)
+        return np.zeros(len(nodes_s), np.bool_), np.empty((0, 3))
     after = np.clip(np.searchsorted(log.true_s, nodes_s), 1, len(log.true_s) - 1)
     inside = (nodes_s >= log.true_s[0]) & (nodes_s <= log.true_s[-1])
     known = inside & (log.true_s[after] - log.true_s[after - 1] <= _WIDEST_GAP_S)
-    heading = np.unwrap(log.true_poses[:, 2])
-    columns = (log.true_poses[:, 0], log.true_poses[:, 1], heading)
-    poses = np.stack([np.interp(nodes_s[known], log.true_s, column) for column in columns], axis=-1)
-    return Truth(known, poses, surveyed)
+    columns = (*log.true_poses[:, :2].T, np.unwrap(log.true_poses[:, 2]))
+    return known, np.stack([np.interp(nodes_s[known], log.true_s, column) for column in columns], axis=-1)
 
 
-def against_truth(state: Values, nodes_s: NDArray[np.float64], truth: Truth) -> Estimate:
-    """ATE of the poses after rigid alignment, landmarks by the same alignment."""
-    if np.count_nonzero(truth.known) < 2:
-        return Estimate(state, lie.identity(2), np.nan, np.nan, "no motion capture at these times")
-    known_s = nodes_s[truth.known]
-    pairs = pair(trajectory_of(known_s, state.poses[truth.known]), trajectory_of(known_s, truth.poses))
-    error = absolute_error(pairs, Alignment.RIGID)
-    T_truth_estimate = lie.flatten(error.T_reference_estimate)
-    landmarks_m = _rms(lie.transform(T_truth_estimate, state.landmarks) - truth.landmarks)
-    definition = f"{error.definition}, over {error.pairing}"
-    return Estimate(state, T_truth_estimate, error.translation_m.rmse, landmarks_m, definition)
-
-
-def trajectory_of(nodes_s: NDArray[np.float64], poses: Matrix) -> Trajectory:
+def _trajectory(nodes_s: NDArray[np.float64], poses: Matrix) -> Trajectory:
     """Poses x, y, heading (K, 3) at times that were written with milliseconds."""
     stamps_ns = np.round(nodes_s * 1e3).astype(np.int64) * 1_000_000
     return Trajectory(stamps_ns, np.array([lie.pose_2d(*pose) for pose in poses]))
@@ -147,20 +143,13 @@ class Options:
     optimizer: Optimizer
 
 
-class Fact(NamedTuple):
-    """A line about a problem: label, and value as text."""
-
-    label: str
-    value: str
-
-
 @dataclass(frozen=True, slots=True)
 class Study:
     """Results of a study.
 
     Attributes
     ----------
-    name, facts : of the problem, and lines about it
+    name, facts : of the problem, and lines about it by label
     before, after : optimization
     converged : whether every iteration came to an end by itself
     covariance : of poses and landmarks after it
@@ -171,7 +160,7 @@ class Study:
     """
 
     name: str
-    facts: tuple[Fact, ...]
+    facts: dict[str, str]
     before: Estimate
     after: Estimate
     converged: bool
@@ -196,11 +185,8 @@ def _linear(data: LandmarkData, options: Options) -> Study:
     names, left_out = methods_for(options.methods, system.pattern.shape[1])
     methods = compare(lambda solver: solver.solve(system), names, options.repeats)
     chi2 = float(np.square(system.A @ methods[0].x - system.b).sum())
-    facts = (
-        Fact("problem", "linear: steps between poses, landmarks' positions relative to them"),
-        _chi2(chi2, system),
-        *_left_out(left_out),
-    )
+    problem = "linear: steps between poses, landmarks' positions relative to them"
+    facts = {"problem": problem, "χ²": _chi2(chi2, system), **left_out}
     poses, landmarks = (part.reshape(-1, 2) for part in np.split(methods[0].x, [system.pattern.layout.split]))
     before, after = (of_positions(each, data) for each in (of_relative_positions(data), Values(poses, landmarks)))
     return Study(
@@ -224,13 +210,13 @@ def _nonlinear(data: LandmarkData, options: Options) -> Study:
         return minimize(problem, guess, solver, optimizer=options.optimizer).state.unknowns
 
     after = f"after {counted(minimum.iterations, 'step')}: {minimum.reason}"
-    facts = (
-        Fact("problem", "nonlinear: steps between poses, bearing and range of landmarks; headings known"),
-        Fact("guess", options.guess),
-        Fact("iteration", f"{options.optimizer} {_ended(minimum)} {after}"),
-        _chi2(minimum.cost, system),
-        *_left_out(left_out),
-    )
+    facts = {
+        "problem": "nonlinear: steps between poses, bearing and range of landmarks; headings known",
+        "guess": options.guess,
+        "iteration": f"{options.optimizer} {_ended(minimum)} {after}",
+        "χ²": _chi2(minimum.cost, system),
+        **left_out,
+    }
     before, end = (of_positions(each, data) for each in (guess, minimum.state))
     return Study(
         data.name, facts, before, end, minimum.converged, Covariance(system), data.true_poses,
@@ -247,14 +233,14 @@ def _guess(problem: BearingRangeProblem, guess: Guess) -> Values:
     return state
 
 
-def _chi2(chi2: float, system: LinearSystem) -> Fact:
+def _chi2(chi2: float, system: LinearSystem) -> str:
     """χ² over its degrees of freedom, and its meaning."""
     rows, unknowns = system.pattern.shape
     freedom = max(rows - unknowns, 1)
     low, high = _FITS
     is_fit = low <= chi2 / freedom <= high
     verdict = "the noise model fits" if is_fit else "the noise model does not fit, or a poor minimum"
-    return Fact("χ²", f"{chi2:.4f} over {counted(freedom, *FREEDOM)}: {chi2 / freedom:.3f}; {verdict}")
+    return f"{chi2:.4f} over {counted(freedom, *FREEDOM)}: {chi2 / freedom:.3f}; {verdict}"
 
 
 def _ended(minimum: Minimum) -> str:
@@ -274,18 +260,18 @@ def study_log(folder: Path, options: Options) -> Study:
     system = solution.problem.system(at, solution.loss.weight(at.observation_chi2))
     build_s = working_s() - begin
     names, left_out = methods_for(options.methods, system.pattern.shape[1])
-    facts = (*_facts(log, solution, is_stated=options.noise is not None), *_left_out(left_out))
+    facts = _facts(log, solution, is_stated=options.noise is not None) | left_out
     minimum, nodes_s = solution.minimum, solution.nodes_s
-    truth = truth_at(log, nodes_s, system.pattern.layout.landmarks)
-    before, after = (against_truth(each, nodes_s, truth) for each in (solution.reckoned, minimum.state))
+    states, landmarks = (solution.reckoned, minimum.state), system.pattern.layout.landmarks
+    (before, after), true_poses, surveyed = against_truth(states, nodes_s, landmarks, log)
     return Study(
-        log.name, facts, before, after, minimum.converged, solution.covariance, truth.poses[:, :2],
-        truth.landmarks, system, build_s, compare(lambda solver: solver.solve(system), names, options.repeats),
-        trajectory_of(nodes_s, minimum.state.poses),
+        log.name, facts, before, after, minimum.converged, solution.covariance, true_poses, surveyed, system,
+        build_s, compare(lambda solver: solver.solve(system), names, options.repeats),
+        _trajectory(nodes_s, minimum.state.poses),
     )  # fmt: skip
 
 
-def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> tuple[Fact, ...]:
+def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> dict[str, str]:
     noise = solution.consistency
     count = len(log.seen_s)
     worth = f"count as {solution.loss.share.sum():.0f}, as errors of a landmark's successive sightings are alike"
@@ -301,23 +287,18 @@ def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> tuple[
     found = f"bearing {bearing_rad:.4f} rad, range {range_m:.4f} m (Student's t)"
     after = f"{_ended(solution.minimum)} after {counted(solution.iterations, 'step')}: {solution.minimum.reason}"
     downweighted = int(np.count_nonzero(solution.minimum.weights < _DOWNWEIGHTED * solution.loss.share))
-    return (
-        Fact("observations", seen),
-        Fact("left out", left),
-        Fact("estimate", f"{1e3 * solution.time_s:.0f} ms, {after}"),
-        Fact("robot", "estimated: " + ", ".join(f"{name} {value:+.3f}{unit}" for name, value, unit in own)),
-        Fact(
-            "odometry noise",
-            f"{'stated' if is_stated else 'estimated'}: {wheels}; {_verdict(noise.motion / noise.motion_freedom)}",
+    state, sensor = "stated" if is_stated else "estimated", float(np.mean(noise.sensor / noise.sensor_freedom))
+    return {
+        "observations": seen,
+        "left out": left,
+        "estimate": f"{1e3 * solution.time_s:.0f} ms, {after}",
+        "robot": "estimated: " + ", ".join(f"{name} {value:+.3f}{unit}" for name, value, unit in own),
+        "odometry noise": f"{state}: {wheels}; {_verdict(noise.motion / noise.motion_freedom)}",
+        "sensor noise": f"estimated: {found}; {_verdict(sensor)}",
+        "downweighted": (
+            f"{counted(downweighted, 'observation')} with less than {_DOWNWEIGHTED:g} of the weight of others"
         ),
-        Fact(
-            "sensor noise", f"estimated: {found}; {_verdict(float(np.mean(noise.sensor / noise.sensor_freedom)))}"
-        ),
-        Fact(
-            "downweighted",
-            f"{counted(downweighted, 'observation')} with less than {_DOWNWEIGHTED:g} of the weight of others",
-        ),
-    )
+    }
 
 
 def _verdict(chi2: float) -> str:
@@ -325,8 +306,3 @@ def _verdict(chi2: float) -> str:
     low, high = _FITS
     verdict = "fits" if low <= chi2 <= high else f"off by a factor {chi2**0.5:.2f}"
     return f"χ² per degree of freedom {chi2:.2f}: {verdict}"
-
-
-def _left_out(what: str) -> list[Fact]:
-    """The line about a method that was not compared, none where all were."""
-    return [Fact("not compared", what)] if what else []

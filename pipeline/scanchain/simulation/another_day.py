@@ -6,7 +6,7 @@ import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,59 +47,6 @@ class Change:
     owner: int
 
 
-class _Object(NamedTuple):
-    """The solids of one movable object; rows as in ``Solids``."""
-
-    boxes: Matrix
-    cylinders: Matrix
-    ellipsoids: Matrix
-
-    def box(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Corners (3,) of its bounding box along x, y and z."""
-        c, s = np.abs(self.boxes[:, 6]), np.abs(self.boxes[:, 7])
-        half = np.column_stack(
-            [c * self.boxes[:, 2] + s * self.boxes[:, 3], s * self.boxes[:, 2] + c * self.boxes[:, 3]]
-        )
-        parts = (
-            (self.boxes[:, :2], half, self.boxes[:, 4:6]),
-            (self.cylinders[:, :2], self.cylinders[:, [2, 2]], self.cylinders[:, 3:5]),
-            (
-                self.ellipsoids[:, :2],
-                self.ellipsoids[:, 3:5],
-                self.ellipsoids[:, 2:3] + self.ellipsoids[:, 5:6] * [-1.0, 1.0],
-            ),
-        )
-        low = [np.column_stack([xy - half, z[:, 0]]) for xy, half, z in parts]
-        high = [np.column_stack([xy + half, z[:, 1]]) for xy, half, z in parts]
-        return np.vstack(low).min(axis=0), np.vstack(high).max(axis=0)
-
-    def middle(self) -> NDArray[np.float64]:
-        """(3,) of its bounding box."""
-        low, high = self.box()
-        return 0.5 * (low + high)
-
-    def footprint(self) -> Matrix:
-        """Points (N, 2) all over what it covers of the ground."""
-        points = [_rectangle(row) for row in self.boxes]
-        points += [_disk(row[:2], row[2:3].repeat(2)) for row in self.cylinders]
-        points += [_disk(row[:2], row[3:5]) for row in self.ellipsoids]
-        return np.vstack(points)
-
-    def moved(self, shift: NDArray[np.float64], turn_rad: float) -> _Object:
-        """Turned about its middle, then shifted by (3,); ellipsoids keep their axes."""
-        middle = self.middle()[:2]
-        c, s = np.cos(turn_rad), np.sin(turn_rad)
-        turn = np.array([[c, -s], [s, c]])
-        boxes, cylinders, ellipsoids = thing = _Object(*(rows.copy() for rows in self))
-        for rows in thing:
-            rows[:, :2] = (rows[:, :2] - middle) @ turn.T + middle + shift[:2]
-        boxes[:, 6:8] = boxes[:, 6:8] @ turn.T
-        boxes[:, 4:6] += shift[2]
-        cylinders[:, 3:5] += shift[2]
-        ellipsoids[:, 2] += shift[2]
-        return thing
-
-
 def another_day(
     solids: Solids, path: Matrix, free_m: float, rng: np.random.Generator
 ) -> tuple[Solids, tuple[Change, ...]]:
@@ -107,25 +54,26 @@ def another_day(
 
     path : (N, 2) positions from which objects keep ``free_m`` and a little more
     """
-    world = _World(solids, path, free_m + _SPARE_M)
-    changes = []
-    for owner in range(int(solids.owner.max(initial=FIXED)) + 1):
-        thing, fate = world.taken(owner), rng.random()
+    world, changes = _World(solids, path, free_m + _SPARE_M), []
+    objects = int(solids.owner.max(initial=FIXED)) + 1
+    for owner in range(objects):
+        thing, fate = world.take(owner), rng.random()
         elsewhere = world.place_for(thing, rng) if _REMOVED < fate < _REMOVED + _MOVED + _ADDED else None
-        before, gone = thing.middle(), np.full(3, np.nan)
-        low, high = thing.box()
+        before, gone = _middle(thing), np.full(3, np.nan)
+        size_m = np.subtract(*_box(thing)[::-1])
         if fate < _REMOVED:
-            changes.append(Change("removed", before, gone, high - low, owner))
+            changes.append(Change("removed", before, gone, size_m, owner))
             continue
         if elsewhere is None or fate > _REMOVED + _MOVED:
             world.put(thing, owner)
         if elsewhere is not None and fate <= _REMOVED + _MOVED:
             world.put(elsewhere, owner)
-            changes.append(Change("moved", before, elsewhere.middle(), high - low, owner))
+            changes.append(Change("moved", before, _middle(elsewhere), size_m, owner))
         elif elsewhere is not None and world.is_free(elsewhere):
-            number = world.put(elsewhere)
-            changes.append(Change("added", gone, elsewhere.middle(), high - low, number))
-    return world.solids(), tuple(changes)
+            world.put(elsewhere, objects)
+            changes.append(Change("added", gone, _middle(elsewhere), size_m, objects))
+            objects += 1
+    return world.solids, tuple(changes)
 
 
 def write_changes(path: Path, changes: Sequence[Change]) -> None:
@@ -139,71 +87,98 @@ def write_changes(path: Path, changes: Sequence[Change]) -> None:
 
 
 class _World:
-    """Solids whose movable objects are taken out and put down again."""
+    """``solids``, of which objects are taken out and put down again, and a ``path`` (N, 2) that is kept free."""
 
     def __init__(self, solids: Solids, path: Matrix, free_m: float) -> None:
-        self._ground = solids.ground
-        self._rows = _Object(solids.boxes, solids.cylinders, solids.ellipsoids)
-        ends = np.cumsum([len(rows) for rows in self._rows])
-        self._owners = np.split(solids.owner, ends[:-1])  # of boxes, cylinders, ellipsoids
+        self.solids = solids
         self._path = path
         self._free_m = free_m
-        self._objects = int(solids.owner.max(initial=FIXED)) + 1
 
-    def solids(self) -> Solids:
-        """All that stands in it now."""
-        return Solids(*self._rows, ground=self._ground, owner=np.concatenate(self._owners))
-
-    def taken(self, owner: int) -> _Object:
+    def take(self, owner: int) -> Solids:
         """Take an object out."""
-        parts = list(zip(self._rows, self._owners, strict=True))
-        self._rows = _Object(*(rows[owners != owner] for rows, owners in parts))
-        self._owners = [owners[owners != owner] for owners in self._owners]
-        return _Object(*(rows[owners == owner] for rows, owners in parts))
+        is_of_it = self.solids.owner == owner
+        thing, self.solids = self.solids.part(is_of_it), self.solids.part(~is_of_it)
+        return thing
 
-    def put(self, thing: _Object, owner: int | None = None) -> int:
-        """Put an object down, as one that was there or, without a number, as a new one; returns its number."""
-        if owner is None:
-            owner, self._objects = self._objects, self._objects + 1
-        self._rows = _Object(*(np.vstack(both) for both in zip(self._rows, thing, strict=True)))
-        self._owners = [
-            np.append(owners, np.full(len(rows), owner)) for owners, rows in zip(self._owners, thing, strict=True)
-        ]
-        return owner
+    def put(self, thing: Solids, owner: int) -> None:
+        """Put down an object of that number."""
+        self.solids = self.solids.with_object(thing, owner)
 
-    def place_for(self, thing: _Object, rng: np.random.Generator) -> _Object | None:
+    def place_for(self, thing: Solids, rng: np.random.Generator) -> Solids | None:
         """The object somewhere near, where it is free and nothing fixed stands between; None if none was found."""
-        here = thing.middle()
+        here, fixed = _middle(thing), self.solids.part(self.solids.owner == FIXED)
         for _ in range(_TRIES):
             away_m, direction = rng.uniform(*_APART_M), rng.uniform(0.0, 2.0 * np.pi)
             xy = away_m * np.array([np.cos(direction), np.sin(direction)])
             turn_rad = 0.5 * np.pi * rng.integers(4) + rng.normal(0.0, _TURN_RAD)
-            rise = np.diff(self.solids().ground_height(np.array([here[:2], here[:2] + xy])))
-            moved = thing.moved(np.append(xy, rise), turn_rad)
+            rise = np.diff(fixed.ground_height(np.array([here[:2], here[:2] + xy])))
+            moved = _moved(thing, np.append(xy, rise), turn_rad)
             line = here[:2] + np.linspace(0.0, 1.0, int(away_m / _SAMPLE_M) + 2)[:, None] * xy
-            if self.is_free(moved) and self._clearance_m(line, only_fixed=True) > _ROOM_M:
+            if self.is_free(moved) and _clearance_m(fixed, line) > _ROOM_M:
                 return moved
         return None
 
-    def is_free(self, thing: _Object) -> bool:
+    def is_free(self, thing: Solids) -> bool:
         """True if it stands neither in another solid nor in the path."""
-        footprint = thing.footprint()
-        low, high = thing.box()
+        footprint, (low, high) = _footprint(thing), _box(thing)
         near = self._path[
             ((self._path > low[:2] - self._free_m) & (self._path < high[:2] + self._free_m)).all(axis=1)
         ]
         off_m = np.linalg.norm(footprint[:, None] - near, axis=2).min(initial=np.inf)
-        return bool(off_m > self._free_m) and self._clearance_m(footprint) > _ROOM_M
+        return bool(off_m > self._free_m) and _clearance_m(self.solids, footprint) > _ROOM_M
 
-    def _clearance_m(self, xy: Matrix, *, only_fixed: bool = False) -> float:
-        """Least distance of positions (N, 2) from the solids around, inf where none is near."""
-        boxes, cylinders, ellipsoids = self._rows
-        reaches_m = boxes[:, 2:4].max(axis=1), cylinders[:, 2], ellipsoids[:, 3:5].max(axis=1)
-        chosen = []
-        for rows, owners, reach_m in zip(self._rows, self._owners, reaches_m, strict=True):
-            near = np.linalg.norm(rows[:, :2] - xy.mean(axis=0), axis=1) < _NEAR_M + 1.5 * reach_m
-            chosen.append(rows[near & (owners == FIXED) if only_fixed else near])
-        return float(Solids(*chosen, ground=self._ground).clearance_m(xy, _BELOW_M).min())
+
+def _clearance_m(solids: Solids, xy: Matrix) -> float:
+    """Least distance of positions (N, 2) from the solids around, inf where none is near."""
+    boxes, cylinders, ellipsoids = solids.groups
+    reach_m = np.concatenate([boxes[:, 2:4].max(axis=1), cylinders[:, 2], ellipsoids[:, 3:5].max(axis=1)])
+    places = np.concatenate([rows[:, :2] for rows in solids.groups])
+    near = np.linalg.norm(places - xy.mean(axis=0), axis=1) < _NEAR_M + 1.5 * reach_m
+    return float(solids.part(near).clearance_m(xy, _BELOW_M).min())
+
+
+def _box(thing: Solids) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Corners (3,) of the bounding box of an object along x, y and z."""
+    boxes, cylinders, ellipsoids = thing.groups
+    c, s = np.abs(boxes[:, 6]), np.abs(boxes[:, 7])
+    half = np.column_stack([c * boxes[:, 2] + s * boxes[:, 3], s * boxes[:, 2] + c * boxes[:, 3]])
+    parts = (
+        (boxes[:, :2], half, boxes[:, 4:6]),
+        (cylinders[:, :2], cylinders[:, [2, 2]], cylinders[:, 3:5]),
+        (ellipsoids[:, :2], ellipsoids[:, 3:5], ellipsoids[:, 2:3] + ellipsoids[:, 5:6] * [-1.0, 1.0]),
+    )
+    low = [np.column_stack([xy - half, z[:, 0]]) for xy, half, z in parts]
+    high = [np.column_stack([xy + half, z[:, 1]]) for xy, half, z in parts]
+    return np.vstack(low).min(axis=0), np.vstack(high).max(axis=0)
+
+
+def _middle(thing: Solids) -> NDArray[np.float64]:
+    """(3,) of its bounding box."""
+    low, high = _box(thing)
+    return 0.5 * (low + high)
+
+
+def _footprint(thing: Solids) -> Matrix:
+    """Points (N, 2) all over what it covers of the ground."""
+    points = [_rectangle(row) for row in thing.boxes]
+    points += [_disk(row[:2], row[2:3].repeat(2)) for row in thing.cylinders]
+    points += [_disk(row[:2], row[3:5]) for row in thing.ellipsoids]
+    return np.vstack(points)
+
+
+def _moved(thing: Solids, shift: NDArray[np.float64], turn_rad: float) -> Solids:
+    """Turned about its middle, then shifted by (3,); ellipsoids keep their axes."""
+    middle = _middle(thing)[:2]
+    c, s = np.cos(turn_rad), np.sin(turn_rad)
+    turn = np.array([[c, -s], [s, c]])
+    boxes, cylinders, ellipsoids = groups = [rows.copy() for rows in thing.groups]
+    for rows in groups:
+        rows[:, :2] = (rows[:, :2] - middle) @ turn.T + middle + shift[:2]
+    boxes[:, 6:8] = boxes[:, 6:8] @ turn.T
+    boxes[:, 4:6] += shift[2]
+    cylinders[:, 3:5] += shift[2]
+    ellipsoids[:, 2] += shift[2]
+    return Solids(boxes, cylinders, ellipsoids, thing.ground, thing.owner)
 
 
 def _rectangle(box: NDArray[np.float64]) -> Matrix:

@@ -23,12 +23,23 @@ from scanchain.simulation.worlds import WORLDS, World
 from scanchain.trajectory import write_tum
 
 EPOCH_NS = 1_700_000_000_000_000_000  # stamp of the first scan
-PLACE, DEVIATION, WHEELS, RANGES = range(4)  # every purpose draws its own random numbers
+_PLACE, _DEVIATION, _WHEELS, _RANGES = range(4)  # every purpose draws its own random numbers
 _ODOMETRY_PERIOD_NS = 20_000_000
 _DROPOUT_S = 1.0
 _PATH_STEP_S = 0.1  # between the positions of a drive that objects must not be moved to
 _LONGEST_S = 36_000.0
 _FARTHEST_M = 1e5
+
+
+class Slip(NamedTuple):
+    """Distance that the wheels turn ahead without moving the vehicle, evenly between two seconds of the drive."""
+
+    start_s: float
+    end_s: float
+    size_m: float
+
+
+NO_SLIP = Slip(0.0, 1.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +51,8 @@ class Drive:
     sensor : its reach is what the world lets it see
     T_base_lidar : (4, 4)
     scans : (K,) int64, which scans are recorded, counted from the first instant; the others fall into dropouts
+    seed, changed : of all random numbers; ``changed`` is None on the first day
+    drift : multiplies the errors of the wheel odometry, which slips once by ``wheels_slip``
     solids_of_instant : the solids at the begin of a scan, where some of them move
     changes : of the world since the drive of the same seed on the first day
     """
@@ -49,12 +62,12 @@ class Drive:
     sensor: Sensor
     T_base_lidar: Matrix
     scans: NDArray[np.int64]
+    seed: int = 0
+    changed: int | None = None
+    drift: float = 1.0
+    wheels_slip: Slip = NO_SLIP
     solids_of_instant: Callable[[float], Solids] | None = None
     changes: tuple[Change, ...] = ()
-
-    def solids_at(self, time_s: float) -> Solids:
-        """The solids during the scan that begins then."""
-        return self.solids if self.solids_of_instant is None else self.solids_of_instant(time_s)
 
     def truth(self) -> Trajectory:
         """T_world_lidar at the stamp of every recorded scan: SE(2) for a laser scanner, SE(3) for a lidar."""
@@ -62,16 +75,22 @@ class Drive:
         poses = self.motion.lidar(starts_ns * 1e-9)
         return Trajectory(EPOCH_NS + starts_ns, lie.flatten(poses) if self.sensor.dimension == 2 else poses)
 
+    def random(self, purpose: int) -> np.random.Generator:
+        """Random numbers for one purpose."""
+        return _random(self.seed, purpose, self.changed)
+
 
 def plan(
     world: str,
     *,
     seed: int = 0,
+    changed: int | None = None,
     duration_s: float | None = None,
     sensor: str | None = None,
     noise_m: float | None = None,
     dropout: float | None = None,
-    changed: int | None = None,
+    drift: float = 1.0,
+    wheels_slip: Slip = NO_SLIP,
     reverse: bool = False,
     start_m: float = 0.0,
 ) -> Drive:
@@ -81,13 +100,19 @@ def plan(
     scene = WORLDS[world]
     lidar = _sensor(sensor or scene.sensor, noise_m, dropout, scene.sight_m)
     length_s = scene.duration_s if duration_s is None else duration_s
-    check_range("duration_s", length_s, lidar.period_ns * 1e-9, _LONGEST_S)
+    _check_range("duration_s", length_s, lidar.period_ns * 1e-9, _LONGEST_S)
     count = int(length_s * 1e9 / lidar.period_ns + 1e-6)
-    check_range("start_m", start_m, 0.0, _FARTHEST_M)
+    _check_range("start_m", start_m, 0.0, _FARTHEST_M)
+    _check_range("drift", drift, 0.0, 100.0)
+    start_s, end_s, size_m = wheels_slip
+    if not (0.0 <= start_s < end_s < np.inf and np.isfinite(size_m)):
+        raise InputError(
+            f"wheels_slip from {start_s:g} to {end_s:g} s by {size_m:g} m: begin at 0 s or later, end later"
+        )
     if isinstance(scene.route, tuple) and (reverse or start_m):
         raise InputError(f"{world} is no route round which one could drive; leave reverse and start_m out")
-    solids = scene.build(random_numbers(seed, PLACE))
-    rng, driven_s = random_numbers(seed, DEVIATION, changed), length_s + lidar.period_ns * 1e-9
+    solids = scene.build(_random(seed, _PLACE))
+    rng, driven_s = _random(seed, _DEVIATION, changed), length_s + lidar.period_ns * 1e-9
     if isinstance(scene.route, tuple):
         motion = pivots(scene.route, scene.vehicle, solids, duration_s=driven_s, rng=rng)
     else:
@@ -97,12 +122,15 @@ def plan(
     if changed is not None:
         path = motion.base(np.arange(0.0, length_s, _PATH_STEP_S))[:, :2, 3]
         free_m = scene.vehicle.radius_m + scene.vehicle.deviation_m
-        solids, changes = another_day(solids, path, free_m, random_numbers(seed, PLACE, changed))
+        solids, changes = another_day(solids, path, free_m, _random(seed, _PLACE, changed))
     scans = _recorded(scene, motion, lidar, count)
-    return Drive(solids, motion, lidar, scene.vehicle.T_base_lidar, scans, changes=changes)
+    return Drive(
+        solids, motion, lidar, scene.vehicle.T_base_lidar, scans, seed, changed, drift, wheels_slip,
+        changes=changes,
+    )  # fmt: skip
 
 
-def random_numbers(seed: int, purpose: int, changed: int | None = None) -> np.random.Generator:
+def _random(seed: int, purpose: int, changed: int | None = None) -> np.random.Generator:
     """Random numbers for one purpose of a drive, on the first day or another one."""
     for name, number in (("seed", seed), ("changed", changed or 0)):
         if number < 0:
@@ -111,7 +139,7 @@ def random_numbers(seed: int, purpose: int, changed: int | None = None) -> np.ra
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(purpose, *day)))
 
 
-def check_range(name: str, value: float, low: float, high: float) -> None:
+def _check_range(name: str, value: float, low: float, high: float) -> None:
     """Refuse a value outside its limits, or one that is not a number."""
     if not low <= value <= high:
         raise InputError(f"{name} {value:g} is out of range; choose one from {low:g} to {high:g}")
@@ -143,34 +171,15 @@ def _sensor(name: str, noise_m: float | None, dropout: float | None, sight_m: fl
         noise_m=sensor.noise_m if noise_m is None else noise_m,
         dropout=sensor.dropout if dropout is None else dropout,
     )
-    check_range("noise_m", sensor.noise_m, 0.0, 10.0)
-    check_range("dropout", sensor.dropout, 0.0, 1.0)
+    _check_range("noise_m", sensor.noise_m, 0.0, 10.0)
+    _check_range("dropout", sensor.dropout, 0.0, 1.0)
     return sensor
-
-
-class Slip(NamedTuple):
-    """Distance that the wheels turn ahead without moving the vehicle, evenly between two seconds of the drive."""
-
-    start_s: float
-    end_s: float
-    size_m: float
-
-    def slipped_m(self, times_s: NDArray[np.floating]) -> NDArray[np.floating]:
-        """(N,) up to each instant."""
-        return self.size_m * np.clip((times_s - self.start_s) / (self.end_s - self.start_s), 0.0, 1.0)
-
-
-NO_SLIP = Slip(0.0, 1.0, 0.0)
 
 
 def simulate(
     world: str,
     destination: str | Path,
     *,
-    seed: int = 0,
-    changed: int | None = None,
-    drift: float = 1.0,
-    wheels_slip: Slip = NO_SLIP,
     force: bool = False,
     progress: Callable[[int, int], None] | None = None,
     **options: Any,
@@ -181,43 +190,30 @@ def simulate(
     The log holds /scan or /points, /odom (50 Hz, T_odom_base, drifts), /ground_truth (T_world_lidar at the stamp
     of every scan, exact) and /tf_static (T_base_lidar); in the dropouts of a world, /odom alone goes on.
 
-    changed : a seed; it is another day: furniture or parked cars came, went and moved, as .changes.csv beside the
-        log lists, and the drive is repeated with other deviations and noise
-    drift : multiplies the errors of the wheel odometry, which slips once by ``wheels_slip``
+    force : whether files that exist are replaced
     progress : called with the scans done and in all
-    options : ``duration_s``; ``sensor``, by name; ``noise_m`` and ``dropout`` in place of the sensor's own;
-        ``reverse`` to drive the other way round, from ``start_m`` along that route
+    options : ``seed``, 0 if it is not given; ``duration_s``; ``sensor``, by name; ``noise_m`` and ``dropout`` in
+        place of the sensor's own; ``drift``, which multiplies the errors of the wheel odometry, and
+        ``wheels_slip``, by which it slips once; ``reverse`` to drive the other way round, from ``start_m`` along
+        that route; ``changed``, a seed, for another day: furniture or parked cars came, went and moved, as
+        .changes.csv beside the log lists, and the drive is repeated with other deviations and noise
 
     Returns the truth, SE(2) for a laser scanner and SE(3) for a lidar.
     """
-    drive = plan(world, seed=seed, changed=changed, **options)
-    return record(
-        drive, destination, seed=seed, changed=changed, drift=drift, wheels_slip=wheels_slip, force=force,
-        progress=progress,
-    )  # fmt: skip
+    return record(plan(world, **options), destination, force=force, progress=progress)
 
 
 def record(
     drive: Drive,
     destination: str | Path,
     *,
-    seed: int = 0,
-    changed: int | None = None,
-    drift: float = 1.0,
-    wheels_slip: Slip = NO_SLIP,
     force: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Trajectory:
     """Write a log of any drive, as ``simulate`` does of one that is planned, and what lies beside it."""
-    check_range("drift", drift, 0.0, 100.0)
-    start_s, end_s, size_m = wheels_slip
-    if not (0.0 <= start_s < end_s < np.inf and np.isfinite(size_m)):
-        raise InputError(
-            f"wheels_slip from {start_s:g} to {end_s:g} s by {size_m:g} m: begin at 0 s or later, end later"
-        )
     destination = checks.path(destination, "destination")
     changes_file = destination.with_suffix(".changes.csv")
-    for file in (destination.with_suffix(".tum"), *(() if changed is None else (changes_file,))):
+    for file in (destination.with_suffix(".tum"), *(() if drive.changed is None else (changes_file,))):
         if file.exists() and not force:
             raise InputError(f"{file}: exists; choose another name or pass --force to replace it")
     truth = drive.truth()
@@ -225,9 +221,8 @@ def record(
     with LogWriter(destination, force=force) as log:
         mounting = pack_transforms(EPOCH_NS, Link("base_link", "lidar", place(drive.T_base_lidar)))
         log.append("/tf_static", "tf2_msgs/msg/TFMessage", mounting, EPOCH_NS)
-        end_ns = int(truth.stamps_ns[-1]) - EPOCH_NS + period_ns
-        wheels = _Wheels(log, drive.motion, end_ns, drift, wheels_slip, random_numbers(seed, WHEELS, changed))
-        for done, sweep in enumerate(_sweeps(drive, random_numbers(seed, RANGES, changed))):
+        wheels = _Wheels(log, drive, int(truth.stamps_ns[-1]) + period_ns)
+        for done, sweep in enumerate(_sweeps(drive)):
             stamp_ns = int(truth.stamps_ns[done])
             wheels.write_until(stamp_ns - 1)  # in a dropout
             pose = pack_odometry(stamp_ns, "world", "lidar", place(truth.poses[done]))
@@ -237,17 +232,19 @@ def record(
             if progress is not None:
                 progress(done + 1, len(truth))
     write_tum(destination.with_suffix(".tum"), truth, force=True)
-    if changed is not None:
+    if drive.changed is not None:
         write_changes(changes_file, drive.changes)
     return truth
 
 
-def _sweeps(drive: Drive, rng: np.random.Generator) -> Iterator[Sweep]:
+def _sweeps(drive: Drive) -> Iterator[Sweep]:
     """All recorded scans in order; the next is cast in a thread while the last is written."""
+    rng = drive.random(_RANGES)
 
     def take(index: int) -> Sweep:
         start_s = index * drive.sensor.period_ns * 1e-9
-        return take_sweep(drive.solids_at(start_s), drive.motion, drive.sensor, index, start_s, rng)
+        solids = drive.solids if drive.solids_of_instant is None else drive.solids_of_instant(start_s)
+        return take_sweep(solids, drive.motion, drive.sensor, index, start_s, rng)
 
     with ThreadPoolExecutor(max_workers=1) as caster:
         upcoming = caster.submit(take, int(drive.scans[0]))
@@ -261,15 +258,15 @@ def _sweeps(drive: Drive, rng: np.random.Generator) -> Iterator[Sweep]:
 class _Wheels:
     """Writer of the wheel odometry up to the log's present time."""
 
-    def __init__(
-        self, log: LogWriter, motion: Motion, end_ns: int, drift: float, slip: Slip, rng: np.random.Generator
-    ) -> None:
+    def __init__(self, log: LogWriter, drive: Drive, last_ns: int) -> None:
         self._log = log
-        self._stamps_ns = EPOCH_NS + np.arange(0, end_ns + 1, _ODOMETRY_PERIOD_NS)
+        self._stamps_ns = np.arange(EPOCH_NS, last_ns + 1, _ODOMETRY_PERIOD_NS)
         times_s = (self._stamps_ns - EPOCH_NS) * 1e-9
-        slips_m = np.diff(slip.slipped_m(times_s))
-        self._poses = wheel_odometry(motion.base(times_s), drift=drift, rng=rng, slips_m=slips_m)
-        self._covariance = np.diag([1e-4, 1e-4, 1e-6, 1e-6, 1e-6, 1e-4]) * max(drift, 1e-3) ** 2
+        begin_s, end_s, size_m = drive.wheels_slip
+        slips_m = np.diff(size_m * np.clip((times_s - begin_s) / (end_s - begin_s), 0.0, 1.0))
+        poses, rng = drive.motion.base(times_s), drive.random(_WHEELS)
+        self._poses = wheel_odometry(poses, drift=drive.drift, rng=rng, slips_m=slips_m)
+        self._covariance = np.diag([1e-4, 1e-4, 1e-6, 1e-6, 1e-6, 1e-4]) * max(drive.drift, 1e-3) ** 2
         self._next = 0
 
     def write_until(self, time_ns: int) -> None:

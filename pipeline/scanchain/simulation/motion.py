@@ -88,10 +88,6 @@ class Motion:
         self._solids = solids
         self._phases = phases
 
-    def speed_m_s(self, times_s: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Speed along the path at (N,) instants; 0 while it turns on the spot."""
-        return self._course(times_s).speed_m_s
-
     def base(self, times_s: NDArray[np.floating]) -> Matrix:
         """T_world_base at (N,) instants, (N, 4, 4): x along the path, z normal to the ground."""
         place, forward, speed_m_s = self._course(times_s)

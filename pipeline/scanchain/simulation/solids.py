@@ -36,6 +36,25 @@ class Solids:
     ground: NDArray[np.float64]
     owner: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
 
+    @property
+    def groups(self) -> tuple[Matrix, Matrix, Matrix]:
+        """Boxes, cylinders, ellipsoids."""
+        return self.boxes, self.cylinders, self.ellipsoids
+
+    def part(self, chosen: NDArray[np.bool_]) -> Solids:
+        """Some of the solids, chosen by (B + C + E,)."""
+        of_group = np.split(chosen, np.cumsum([len(rows) for rows in self.groups[:2]]))
+        groups = (rows[each] for rows, each in zip(self.groups, of_group, strict=True))
+        return Solids(*groups, ground=self.ground, owner=self.owner[chosen])
+
+    def with_object(self, thing: Solids, owner: int) -> Solids:
+        """These and those of one object, of that number."""
+        groups = [np.vstack(both) for both in zip(self.groups, thing.groups, strict=True)]
+        owners = np.split(self.owner, np.cumsum([len(rows) for rows in self.groups[:2]]))
+        numbers = (np.full(len(rows), owner) for rows in thing.groups)
+        of_both = [each for both in zip(owners, numbers, strict=True) for each in both]
+        return Solids(*groups, ground=self.ground, owner=np.concatenate(of_both))
+
     def ground_height(self, xy: Matrix) -> NDArray[np.float64]:
         """Height of the ground at (..., 2) positions."""
         return _height(self.ground, xy)
@@ -51,27 +70,23 @@ class Solids:
         return np.stack([along_x, along_y], axis=-1)
 
     def cast(
-        self, T_world_sensor: Matrix, pose_of_ray: NDArray[np.int32], directions: Matrix, max_range_m: float
-    ) -> NDArray[np.float64]:
-        """Range to the first surface along each ray, inf beyond reach; poses (P, 4, 4), directions (N, 3)."""
-        return self.strike(T_world_sensor, pose_of_ray, directions, max_range_m)[0]
+        self, T_world_sensor: Matrix, pose_of_ray: NDArray[np.int32], directions: Matrix, max_range_m: float,
+        solid_of_ray: NDArray[np.int32] | None = None,
+    ) -> NDArray[np.float64]:  # fmt: skip
+        """Range to the first surface along each ray, inf beyond reach; poses (P, 4, 4), directions (N, 3).
 
-    def strike(
-        self, T_world_sensor: Matrix, pose_of_ray: NDArray[np.int32], directions: Matrix, max_range_m: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-        """Range along each ray as in ``cast``, and the index of the solid it hit, −1 where none.
-
-        Solids are counted through boxes, cylinders, ellipsoids, the ground last.
+        solid_of_ray : (N,) takes the number of the solid that each ray hits, −1 where none, counted through boxes,
+            cylinders, ellipsoids, the ground last
         """
         ranges_m = np.empty(len(directions))
-        solid_of_ray = np.empty(len(directions), dtype=np.int32)
+        solid_of_ray = np.empty(len(directions), np.int32) if solid_of_ray is None else solid_of_ray
         origins = np.ascontiguousarray(T_world_sensor[:, :3, 3])
         rotations = np.ascontiguousarray(T_world_sensor[:, :3, :3])
         cast_rays(
-            origins, rotations, pose_of_ray, directions,
-            self.boxes, self.cylinders, self.ellipsoids, self.ground, max_range_m, ranges_m, solid_of_ray,
+            origins, rotations, pose_of_ray, directions, *self.groups, self.ground, max_range_m, ranges_m,
+            solid_of_ray,
         )  # fmt: skip
-        return ranges_m, solid_of_ray
+        return ranges_m
 
     def clearance_m(self, xy: Matrix, below_m: float) -> NDArray[np.float64]:
         """Distance in the plane from (N, 2) positions to the nearest solid that begins below ``below_m``."""

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 INK, LINE = "var(--ink)", "var(--line)"  # the page's own colors
+THIN, DOTS = 0.8, (1.0, 1.5)  # width and dashes of a dotted line
 _INCH = 72.0  # points, the unit of the drawing
 _WIDTH, _WHOLE = 4.6, 9.6  # inches: of a figure beside another, and of one over the whole page, of equal text
 _LEFT, _RIGHT, _BOTTOM, _TOP = 0.8, 0.2, 0.45, 0.12  # inches around the axes: room for numbers and labels
@@ -199,10 +200,10 @@ class Plot:
 
         self._within.append(drawn)
 
-    def level(self, value: float, width: float, dashes: Sequence[float]) -> None:
-        """Draw a line at a value of y, from end to end."""
+    def level(self, value: float) -> None:
+        """Draw a dotted line at a value of y, from end to end."""
         self.y.include(np.array([value]))
-        style = f"stroke: {INK}; stroke-width: {width:g}; stroke-dasharray: {' '.join(map(str, dashes))}"
+        style = f"stroke: {INK}; stroke-width: {THIN:g}; stroke-dasharray: {' '.join(map(str, DOTS))}"
 
         def drawn() -> str:
             (place,) = self.extent[1] * (1.0 - self.y.fractions(np.array([value])))
@@ -357,6 +358,14 @@ def broken(segments: NDArray[np.floating]) -> Floats:
     """Segments (E, 2, d) as one line (3 E, d) that is broken between them."""
     gaps = np.full((len(segments), 1, segments.shape[-1]), np.nan)
     return np.concatenate([segments, gaps], axis=1).reshape(-1, segments.shape[-1])
+
+
+def around(points: NDArray[np.floating], share: float, least: float) -> tuple[Floats, Floats]:
+    """Corners (2,) of a view of the known of points (N, 2): a margin of a share of their extent, or the least."""
+    known = points[np.isfinite(points).all(axis=1)]
+    low, high = known.min(axis=0), known.max(axis=0)
+    margin = max(share * float((high - low).max()), least)
+    return low - margin, high + margin
 
 
 def write_png(

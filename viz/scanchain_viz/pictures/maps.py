@@ -25,7 +25,7 @@ from scanchain.runs.results import Overlay
 from scanchain.trajectory import read_tum
 from scanchain.verdict import Kind, Stretch
 from scanchain_viz.colors import STRETCH_COLORS, TRUTH, color_of, height_shares, palette_of
-from scanchain_viz.pictures.figure import INK, Floats, Line, Plot, write_png
+from scanchain_viz.pictures.figure import INK, Floats, Line, Plot, around, write_png
 
 Grid = tuple[NDArray[np.int8], float, tuple[float, float]]  # as ``read_map`` returns it
 
@@ -42,7 +42,7 @@ _VIRIDIS = (
 _OPAQUE, _OPACITIES = 40_000, (0.4, 1.0)  # points that each are drawn so; one among many shows less
 _BULK, _REACH = (0.5, 99.5), 0.5  # percentiles of a map; its sizes that a point may lie outside of these
 _ALL_BUT_FEW, _MARGIN = (0.05, 99.95), 0.02  # percentiles that are shown, and the share of their range around them
-_PNG_INCHES = 8.0  # width
+_PNG_INCHES, _PNG_MARGIN = 8.0, (0.04, 1.0)  # width; share of the extent and least meters
 _ODOMETRY, _OPTIMIZED = "#e07b00", "#1f5fd0"
 _INKS = ("#a9b1bd", "#747c88", "#14171b")  # of points in space, by height
 
@@ -64,9 +64,9 @@ def extent(points: NDArray[np.floating]) -> tuple[Floats, Floats]:
     return low, high
 
 
-def map_points(prior: SavedMap, limit: int = _SAMPLE) -> Points:
+def map_points(prior: SavedMap) -> Points:
     """(N, 3) some points of all keyframes of a map, in its frame."""
-    each = max(limit // max(len(prior.keyframes), 1), 1)
+    each = max(_SAMPLE // max(len(prior.keyframes), 1), 1)
     clouds = [np.empty((0, 3))]
     for keyframe in prior.keyframes:
         points = keyframe.points
@@ -131,13 +131,7 @@ def _above_ground(points: Points) -> Points:
     return points[points[:, 2] > np.percentile(points[:, 2], _LOWEST) + _GROUND_M]
 
 
-def draw_points(
-    figure: Plot,
-    points: Points,
-    low: Floats,
-    high: Floats,
-    colors: Sequence[str] = (GRAY,),
-) -> None:
+def draw_points(figure: Plot, points: Points, low: Floats, high: Floats, colors: Sequence[str] = (GRAY,)) -> None:
     """Draw points (M, 3) as seen from above, within corners, in one color, or in several by height, if any."""
     shown = points[:: max(1, -(-len(points) // _MAX_POINTS))]
     inside = ((shown[:, :2] > low[:2]) & (shown[:, :2] < high[:2])).all(axis=1)
@@ -214,12 +208,13 @@ def draw_map(
     ground_truth : already aligned to the estimate
     """
     drawn = (optimized, odometry, ground_truth, *(poses for _, poses in sessions))
-    paths = [path for path in drawn if path is not None and len(path)]
+    corners = [path[:, :2, -1] for path in drawn if path is not None and len(path)]
     seen = np.empty((0, 2)) if points is None else points[:, :2]
     if grid is not None:
         cells, resolution_m, origin_m = grid
         seen = np.array(origin_m) + resolution_m * np.argwhere(cells > 0)[:, ::-1]
-    low, high = _frame(paths, seen)
+    corners += [np.array(extent(seen))] if len(seen) else []
+    low, high = around(np.concatenate(corners) if corners else np.zeros((1, 2)), *_PNG_MARGIN)
     figure = Plot.of_plan(low, high)
     if grid is not None:
         _draw_grid(figure, grid, low, high)
@@ -238,17 +233,6 @@ def draw_map(
         if len(optimized):
             figure.marks(optimized[place, None, :2, -1], shape, _OPTIMIZED, 7.0, line=1.0, name=name)
     write_png(path, [(title, figure)], width_inches=_PNG_INCHES)
-
-
-def _frame(paths: list[Matrix], seen: NDArray[np.floating]) -> tuple[Floats, Floats]:
-    """Corners of the required view: every trajectory, the map (M, 2) without outliers, and a margin."""
-    corners: list[NDArray[np.floating]] = [path[:, :2, -1] for path in paths]
-    if len(seen):
-        corners.append(np.array(extent(seen)))
-    known = np.concatenate(corners) if corners else np.zeros((1, 2))
-    low, high = known.min(axis=0), known.max(axis=0)
-    margin = max(0.04 * float((high - low).max()), 1.0)
-    return low - margin, high + margin
 
 
 def _draw_grid(figure: Plot, grid: Grid, low: Floats, high: Floats) -> None:

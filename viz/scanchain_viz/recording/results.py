@@ -1,6 +1,6 @@
-"""Recordings of complete results: comparisons, maps, localized logs, pose graphs and landmark problems.
+"""Pages and recordings of complete results: comparisons, maps, localized logs; recordings of graphs and landmarks.
 
-Each function writes one .rrd file, whole or not at all, and raises OSError.
+Each .rrd file is written whole or not at all; OSError is raised.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
-from scanchain import lie
 from scanchain.comparison.results import MAP_FILE, SCANS_FILE, TRUTH_FILE, method_folder
 from scanchain.comparison.table import read_table
 from scanchain.data import ClosureVerdict, GraphState
@@ -36,6 +35,8 @@ from scanchain_viz.recording import drawing, entities
 from scanchain_viz.recording.drawing import Message, Times
 from scanchain_viz.recording.entities import scene, up_to_now, whole_log, with_panels
 from scanchain_viz.recording.sinks import write_recording
+from scanchain_viz.report.comparison import write_compare_report
+from scanchain_viz.report.maps import write_changes_report, write_localization_report, write_merge_report
 from scanchain_viz.report.problems import ellipses
 
 _MAP_POINTS = 300_000
@@ -56,8 +57,9 @@ _STATE_COLORS = {
 _MAX_SCAN_POINTS = 5_000
 
 
-def record_comparison(directory: Path) -> None:
-    """Write compare.rrd: trajectories and maps of all methods on one timeline, to toggle one by one."""
+def present_comparison(directory: Path) -> None:
+    """Write report.html and compare.rrd: trajectories and maps of all methods, to toggle one by one."""
+    write_compare_report(directory)
     table, trajectories = read_table(directory), trajectories_of_comparison(directory)
     names = [rr.escape_entity_path_part(each.name) for each in trajectories]
     overrides: dict[Any, Any] = {f"world/{name}/trajectory": [up_to_now()] for name in names}
@@ -126,8 +128,9 @@ def _stamps(directory: Path) -> NDArray[np.int64]:
     return table["stamp_ns"].to_numpy()[first] if len(indices) else np.empty(0, np.int64)
 
 
-def record_merge(directory: Path) -> None:
-    """Write recording.rrd into a merge's directory: map, every session to toggle, the closures between them."""
+def present_merge(directory: Path) -> None:
+    """Write report.html and recording.rrd: map, every session to toggle, the closures between them."""
+    write_merge_report(directory)
     drawn = read_merge(directory)
     layout = with_panels(scene("sessions over the map", drawn.dimension, drawn.positions), has_toggles=True)
     path, messages = directory / RECORDING_FILE, _merge(directory, drawn)
@@ -145,8 +148,9 @@ def _merge(directory: Path, drawn: DrawnMerge) -> Iterator[Message]:
         yield Message(f"world/sessions/{name}/keyframes", drawing.dots(path, color, 2.5))
 
 
-def record_changes(directory: Path, changes: Changes) -> None:
-    """Write recording.rrd beside summary.txt: points by label, boxes around clusters, arrows."""
+def present_changes(directory: Path, changes: Changes) -> None:
+    """Write report.html and recording.rrd beside summary.txt: points by label, boxes around clusters, arrows."""
+    write_changes_report(directory, changes)
     world = scene("changes", changes.dimension, drawing.in_space(changes.points))
     text = rrb.TextDocumentView(origin="summary", name="summary")
     layout = with_panels(rrb.Horizontal(world, text, column_shares=[3, 1]))
@@ -189,8 +193,9 @@ def _upright(angles_rad: Sequence[float] | NDArray[np.float64]) -> NDArray[np.fl
     return np.stack([zeros, zeros, np.sin(half), np.cos(half)], axis=1)
 
 
-def record_localization(path: Path, localized: LocalizedLog) -> None:
-    """Write map, live pose, hypotheses while searching, state and final path."""
+def present_localization(directory: Path, localized: LocalizedLog) -> None:
+    """Write report.html and recording.rrd: map, live pose, hypotheses while searching, state and final path."""
+    write_localization_report(directory, localized)
     prior, points = localized.prior, drawing.in_space(map_points(localized.prior))
     side = rrb.Vertical(
         rrb.TextDocumentView(origin=entities.VERDICT, name="verdict"),
@@ -209,6 +214,7 @@ def record_localization(path: Path, localized: LocalizedLog) -> None:
         Message(entities.STATE, rr.StateConfiguration(values=names, labels=names, colors=colors)),
         *_localized(localized),
     ]
+    path = directory / RECORDING_FILE
     write_recording(path, localized.path.name, prior.dimension, layout, messages, kind="localization")
 
 
@@ -284,7 +290,7 @@ def _study(root: str, study: Study) -> Iterator[Message]:
     yield from _estimate(root, study.after, Times.at(1, 1), entities.BLUE)
     axes_m, angles_rad = ellipses(study)
     drawn = rr.Ellipsoids3D.from_fields(
-        centers=drawing.in_space(lie.transform(study.after.T_truth_estimate, study.after.state.landmarks)),
+        centers=drawing.in_space(study.after.in_truth()[1]),
         half_sizes=np.pad(axes_m, ((0, 0), (0, 1)), constant_values=_ELLIPSE_M),
         quaternions=_upright(angles_rad),
         colors=entities.BLUE,
@@ -294,8 +300,6 @@ def _study(root: str, study: Study) -> Iterator[Message]:
 
 def _estimate(root: str, estimate: Estimate, times: Times, color: drawing.Color) -> Iterator[Message]:
     """Trajectory and landmarks at one instant."""
-    T = estimate.T_truth_estimate
-    path = drawing.in_space(lie.transform(T, estimate.state.poses[:, :2]))
-    points = drawing.in_space(lie.transform(T, estimate.state.landmarks))
+    path, points = map(drawing.in_space, estimate.in_truth())
     yield Message(f"{root}/trajectory", drawing.lines([path], color, 1.5), times)
     yield Message(f"{root}/landmarks", drawing.dots(points, color, 3.0), times)

@@ -38,27 +38,21 @@ def write_compare_report(directory: Path) -> None:
         ("machine", f"{made.platform}, {made.cores} cores"),
         ("made", sections.when(made)),
     )
+    warnings = [made.stopped] if made.stopped else []
+    for row in table.rows:
+        warnings += [f"{row.name} {row.status}: {row.reason}"] if row.status.is_failure else []
+        warnings += [f"{row.name}: {row.sentence}"] if row.is_doubted else []
     how = "through every method, each in its own process"
     whole = page.Page(
         title=f"Comparison on {Path(table.log.split(', ')[0]).name}",
         subtitle=f"The same {table.scans:,} decoded scans {how}. {table.against}",
         facts=facts,
-        warnings=list(_warnings(table)),
+        warnings=warnings,
         notes=table.notes,
         sections=list(_sections(directory, table, trajectories, truth)),
         collapsibles=list(_collapsibles(directory, table)),
     )
     page.write_page(directory, whole)
-
-
-def _warnings(table: Table) -> Iterator[str]:
-    if table.provenance.stopped:
-        yield table.provenance.stopped
-    for row in table.rows:
-        if row.status.is_failure:
-            yield f"{row.name} {row.status}: {row.reason}"
-        if row.is_doubted:
-            yield f"{row.name}: {row.sentence}"
 
 
 def _figures(table: Table, trajectories: Sequence[DrawnTrajectory]) -> Iterator[page.Section]:

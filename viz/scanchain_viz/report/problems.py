@@ -8,20 +8,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain import lie
-from scanchain.data import GraphState, Matrix
+from scanchain.data import GraphState
 from scanchain.errors import InputError
 from scanchain.graph.optimization import GraphChange, fit
 from scanchain.landmarks.results import accuracy_lines, file_stem, size_of, table_of
 from scanchain.landmarks.solvers import MethodResult
 from scanchain.landmarks.study import Estimate, Study
 from scanchain_viz.colors import palette_of
-from scanchain_viz.pictures.figure import INK, Plot, broken, write_png
+from scanchain_viz.pictures.figure import INK, Plot, around, broken, write_png
 from scanchain_viz.report import page
 
 _CHAIN, _LOOP, _REJECTED = "#1f5fd0", "#8a8f98", "#d03030"
 _SEEN_FROM = np.array([[0.80, 0.60, 0.0], [-0.30, 0.40, 0.866]])  # rows: right and up of an oblique view, in 3D
 BEFORE, AFTER = "#e07b00", "#1f5fd0"
+_MARGIN = 0.05, 1e-3  # of a view: share of its extent, least
 _ACROSS = 4  # panels of factors in a row
 _PIXELS = 500  # largest width in pixels of a picture of a factor
 _ELLIPSE = 2.4477  # standard deviations that hold 95 % of a Gaussian in the plane
@@ -49,7 +49,7 @@ def _graph(state: GraphState) -> Plot:
     positions = state.poses[:, :-1, -1]
     is_flat = positions.shape[1] == 2
     seen = positions if is_flat else positions @ _SEEN_FROM.T
-    low, high = _with_margin(seen)
+    low, high = around(seen, *_MARGIN)
     center, half = 0.5 * (low + high), 0.5 * (high - low).max()
     low, high = center - half, center + half  # a square, since the panels stand side by side
     figure = Plot.of_plan(low, high)
@@ -76,16 +76,16 @@ def _estimates(study: Study) -> tuple[Plot, Plot]:
     around = np.linspace(0.0, 2.0 * np.pi, _ELLIPSE_POINTS)
     along = axes_m[:, None] * np.stack([np.cos(around), np.sin(around)], axis=-1)
     c, s = np.cos(angles_rad), np.sin(angles_rad)
-    outlines = along @ np.stack([c, s, -s, c], axis=-1).reshape(-1, 2, 2) + _in_truth(study.after)[1][:, None]
+    outlines = along @ np.stack([c, s, -s, c], axis=-1).reshape(-1, 2, 2) + study.after.in_truth()[1][:, None]
     after.line(broken(outlines), f"{AFTER}80", 0.6, name="95 % ellipse of a landmark")
     return before, after
 
 
 def _plot(study: Study, estimate: Estimate, color: str, when: str) -> Plot:
     """An estimate over the truth, in its frame where there is one."""
-    points = [study.true_poses, study.true_landmarks, *_in_truth(study.before), *_in_truth(study.after)]
-    figure = Plot.of_plan(*_with_margin(np.concatenate(points)))
-    poses, landmarks = _in_truth(estimate)
+    points = [study.true_poses, study.true_landmarks, *study.before.in_truth(), *study.after.in_truth()]
+    figure = Plot.of_plan(*around(np.concatenate(points), *_MARGIN))
+    poses, landmarks = estimate.in_truth()
     if len(study.true_poses):
         figure.line(study.true_poses, INK, 1.1, (4.0, 2.0), name="true trajectory")
     figure.line(poses, f"{color}d9", name=f"trajectory {when}")
@@ -93,20 +93,6 @@ def _plot(study: Study, estimate: Estimate, color: str, when: str) -> Plot:
         figure.marks(study.true_landmarks, "+", INK, 7.0, line=0.9, name="true landmarks")
     figure.marks(landmarks, "o", color, 4.0, line=0.9, name=f"landmarks {when}")
     return figure
-
-
-def _with_margin(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Corners (2,) of a view of points (N, 2) that are known."""
-    known = points[np.isfinite(points).all(axis=1)]
-    low, high = known.min(axis=0), known.max(axis=0)
-    margin = max(0.05 * float((high - low).max()), 1e-3)
-    return low - margin, high + margin
-
-
-def _in_truth(estimate: Estimate) -> tuple[Matrix, Matrix]:
-    """Positions of poses and landmarks in the truth's frame."""
-    state, T = estimate.state, estimate.T_truth_estimate
-    return lie.transform(T, state.poses[:, :2]), lie.transform(T, state.landmarks)
 
 
 def ellipses(study: Study) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -181,7 +167,7 @@ def write_report(directory: Path, studies: Sequence[Study]) -> None:
 def _estimate_section(study: Study, before: Plot, after: Plot) -> page.Section:
     (_, error_before), (_, error_after), _ = accuracy_lines(study)
     facts = [("error before, rmse", error_before), ("error after, rmse", error_after)]
-    facts += [(fact.label, fact.value) for fact in study.facts]
+    facts += study.facts.items()
     chips, marks = [page.Chip("before", BEFORE), page.Chip("after", AFTER)], "Circles: landmarks"
     if len(study.true_poses) or np.isfinite(study.true_landmarks).any():
         chips.append(page.Chip("truth", INK, is_dashed=True))

@@ -53,28 +53,19 @@ def write_run_report(directory: Path) -> None:
     """Draw and write the page of a run directory."""
     metrics = msgspec.json.decode((directory / "metrics.json").read_bytes(), type=Metrics)
     made = msgspec.json.decode((directory / RUN_FILE).read_bytes(), type=Provenance)
-    heading, *notes = _summary_lines(directory)
+    lines = (directory / "summary.txt").read_text(encoding="utf-8").splitlines()
+    heading, *lines = [line for line in lines if not line.startswith(VERDICT)]
     whole = page.Page(
         title=f"Run of {', '.join(Path(log.path).name for log in made.logs)}",
         subtitle=heading,
         facts=tuple(_facts(metrics, made)),
         warnings=tuple(line for line in (made.stopped, *metrics.warnings) if line),
-        notes=tuple(notes),
+        notes=[line.removeprefix("note").strip() for line in lines if line.startswith("note")],
         sections=tuple(_sections(directory, metrics)),
-        collapsibles=(
-            *sections.provenance_sections(made, {}),
-            sections.configuration(directory),
-        ),
+        collapsibles=(*sections.provenance_sections(made, {}), sections.configuration(directory)),
         judged=metrics.judged,
     )
     page.write_page(directory, whole)
-
-
-def _summary_lines(directory: Path) -> list[str]:
-    """The summary's heading, then its notes."""
-    lines = (directory / "summary.txt").read_text(encoding="utf-8").splitlines()
-    heading, *lines = [line for line in lines if not line.startswith(VERDICT)]
-    return [heading, *(line.removeprefix("note").strip() for line in lines if line.startswith("note"))]
 
 
 def _facts(m: Metrics, made: Provenance) -> Iterator[tuple[str, str]]:

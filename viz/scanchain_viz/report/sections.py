@@ -17,7 +17,7 @@ from scipy.special import gammaincinv
 from scanchain.runs.provenance import Provenance
 from scanchain_viz.colors import CLOSURES, TRUTH, hex_of, palette_of
 from scanchain_viz.pictures.axis import Axis
-from scanchain_viz.pictures.figure import INK, Floats, Line, Plot, broken
+from scanchain_viz.pictures.figure import DOTS, INK, THIN, Floats, Line, Plot, broken
 from scanchain_viz.pictures.maps import GRAY, path_over_map
 from scanchain_viz.pictures.trajectories import DrawnTrajectory, frame
 from scanchain_viz.report import page
@@ -27,7 +27,6 @@ _MAX_POINTS = 1500  # largest number of points of a line
 _MAX_CLOSURES = 1500  # largest number of closures of a verdict that are drawn
 _WINDOWS = 250  # number of windows over which a value of each scan is averaged
 _SHOWN_SHARES = (0.5, 99.5)  # per cent of the values of a distribution
-_THIN, _DOTS = 0.8, (1.0, 1.5)  # width and dashes of a dotted line
 _LOWEST, _HIGHEST = 0.01, 1000.0  # range to which observability is clipped
 _BAR_INCHES = 0.65  # of a color bar and its numbers
 # a decade each, degenerate up to orange
@@ -136,7 +135,7 @@ def uncertainty_section(trajectories: Sequence[DrawnTrajectory], *, is_planar: b
     along = Plot("scan", "observability", logarithmic="y", is_wide=bool(estimated))
     for each in reversed(reported):
         _draw(along, each, *_over_scans(np.clip(each.observability, _LOWEST, _HIGHEST), np.min))
-    along.level(1.0, _THIN, _DOTS)
+    along.level(1.0)
     least = _of_neighbors(" Least values", reported, "observability")
     text = (
         "Information along the least constrained direction over the minimum required; below 1 (dotted) a scan is "
@@ -160,7 +159,7 @@ def innovations(
     for values, color in curves:
         x, y = _over_scans(np.clip(np.nan_to_num(values), _LOWEST, _HIGHEST), np.max)
         figure.line(np.stack([x, y], axis=1), color, 0.9)
-    figure.level(1.0, _THIN, _DOTS)
+    figure.level(1.0)
     size = max((_window(len(values)) for values, _ in curves), default=1)
     largest = f", largest of {size} neighboring scans" if size > 1 else ""
     text = (
@@ -188,7 +187,7 @@ def _consistency(estimated: Sequence[DrawnTrajectory], degrees_of_freedom: int) 
         _cumulative(figure, each, each.nees, 1e-4)
     shares = np.linspace(0.001, 0.999, 200)
     ideal = 2.0 * gammaincinv(0.5 * degrees_of_freedom, shares) / degrees_of_freedom  # quantiles of χ²
-    figure.line(np.stack([ideal, 100.0 * shares], axis=1), INK, _THIN, _DOTS)
+    figure.line(np.stack([ideal, 100.0 * shares], axis=1), INK, THIN, DOTS)
     figure.y.limit(0.0, 100.0)
     text = (
         "Squared error of each motion over its covariance. Dotted: exact covariances; to the left of it they are "

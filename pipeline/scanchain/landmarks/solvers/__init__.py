@@ -11,14 +11,12 @@ from numpy.typing import NDArray
 from scanchain.errors import InputError
 from scanchain.landmarks.problem import Layout, LinearSystem, Pattern
 from scanchain.landmarks.solvers.direct import (
-    PINV_BELOW,
     CholeskyMethod,
     Factor,
     LinearSolver,
     SchurMethod,
     ScipyMethod,
     UndeterminedError,
-    check_pinv,
 )
 from scanchain.landmarks.solvers.qr import QrMethod, SuiteSparseQrMethod
 
@@ -39,6 +37,7 @@ _MAKERS = {
     "spqr": lambda: SuiteSparseQrMethod("natural"),
     "spqr_colamd": lambda: SuiteSparseQrMethod("colamd"),
 }
+PINV_BELOW = 3_000  # largest number of unknowns: their inverse is all but dense, 110 MB, and takes seconds
 METHODS = tuple(name for name in _MAKERS if not name.startswith("spqr"))
 ESTIMATOR = "schur"  # the fastest: it estimates where no other is requested
 
@@ -62,19 +61,22 @@ def parse_methods(text: str) -> tuple[str, ...]:
     return tuple(names)
 
 
-def methods_for(requested: Sequence[str], unknowns: int) -> tuple[tuple[str, ...], str]:
-    """Methods to run on a problem of so many unknowns, and a note on one that "all" leaves out there.
+def methods_for(requested: Sequence[str], unknowns: int) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Methods to run on a problem of so many unknowns, and a fact about one that "all" leaves out there.
 
     "all" is every method of the default installation. Raises InputError where one is named that is too slow.
     """
-    if "pinv" in requested:
-        check_pinv(unknowns)
+    if "pinv" in requested and unknowns >= PINV_BELOW:
+        raise InputError(
+            f"pinv: the inverse of AᵀA would be all but dense for {unknowns:,} unknowns, its limit is"
+            f" {PINV_BELOW:,}; name other --methods"
+        )
     chosen = dict.fromkeys(method for name in requested for method in (METHODS if name == "all" else (name,)))
     if "pinv" not in chosen or unknowns < PINV_BELOW:
-        return tuple(chosen), ""
+        return tuple(chosen), {}
     del chosen["pinv"]
-    note = f"pinv, whose inverse is all but dense: {unknowns:,} unknowns, its limit is {PINV_BELOW:,}"
-    return tuple(chosen), note
+    why = f"pinv, whose inverse is all but dense: {unknowns:,} unknowns, its limit is {PINV_BELOW:,}"
+    return tuple(chosen), {"not compared": why}
 
 
 _SLOW_S = 1.0  # seconds of a solution above which it is not repeated

@@ -149,18 +149,6 @@ def check_pivots(pivots: NDArray[np.float64], whole: NDArray[np.float64]) -> Non
         raise SingularMatrixError(int(failed[0]), int(failed[0]))
 
 
-PINV_BELOW = 3_000  # largest number of unknowns: their inverse is all but dense, 110 MB, and takes seconds
-
-
-def check_pinv(unknowns: int) -> None:
-    """Refuse to invert a matrix of so many rows. Raises InputError."""
-    if unknowns >= PINV_BELOW:
-        raise InputError(
-            f"pinv: the inverse of AᵀA would be all but dense for {unknowns:,} unknowns, its limit is"
-            f" {PINV_BELOW:,}; name other --methods"
-        )
-
-
 def normal_equations(system: LinearSystem) -> tuple[csc_matrix, NDArray[np.float64]]:
     """AᵀA and Aᵀb."""
     A = system.A
@@ -186,7 +174,6 @@ class ScipyMethod:
             return Factored(lambda: np.asarray(spsolve(H, g)), lambda: _upper(splu(H, permc_spec="COLAMD")))
         diagonal = np.asarray(H.diagonal(), np.float64)
         if self._name == "pinv":
-            check_pinv(len(g))
             inverse = csc_matrix(inv(H))
             # the k-th pivot of an elimination that takes unknown k last is 1 / inverse[k, k]
             check_pivots(1.0 / np.asarray(inverse.diagonal(), np.float64), diagonal)

@@ -53,11 +53,8 @@ _ROOMS = (
 def office(rng: np.random.Generator) -> Solids:
     """The floor; walls and doorways stand where they stand, furniture and door leaves are drawn from ``rng``."""
     scenery = Scenery()
-    scenery.box(
-        (0.5 * _OFFICE_WIDTH_M, 0.5 * _OFFICE_DEPTH_M),
-        (_OFFICE_WIDTH_M + 1.0, _OFFICE_DEPTH_M + 1.0),
-        (CEILING_M, CEILING_M + 0.2),
-    )
+    middle, size = (0.5 * _OFFICE_WIDTH_M, 0.5 * _OFFICE_DEPTH_M), (_OFFICE_WIDTH_M + 1.0, _OFFICE_DEPTH_M + 1.0)
+    scenery.box(middle, size, (CEILING_M, CEILING_M + 0.2))
     for wall in _WALLS:
         build_wall(scenery, wall, rng)
     scenery.box((8.25, 9.0), (2.4, 5.88), (0.0, CEILING_M))  # lift shaft in the closed part of the core
@@ -116,13 +113,8 @@ def identical(rng: np.random.Generator) -> Solids:
     for y in _CORRIDORS_Y_M:
         for side in (-1.0, 1.0):
             for room in range(_ROOMS_A_SIDE):
-                _furnish_alike(
-                    scenery,
-                    (room + 0.5) * _ROOM_M,
-                    y + side * (_AISLE_HALF_M + 0.5 * _ROOM_DEPTH_M),
-                    side,
-                    furniture,
-                )
+                middle = (room + 0.5) * _ROOM_M, y + side * (_AISLE_HALF_M + 0.5 * _ROOM_DEPTH_M)
+                _furnish_alike(scenery, *middle, side, furniture)
     return scenery.finish()
 
 
@@ -242,14 +234,9 @@ def hall(rng: np.random.Generator) -> Solids:
     scenery.box(middle, (_HALL_LENGTH_M + 2.0, _HALL_WIDTH_M + 2.0), (_HALL_HEIGHT_M, _HALL_HEIGHT_M + 0.3))
     for side in (0.0, 1.0):
         outside = (2.0 * side - 1.0) * 0.5 * _HALL_WALL_M
-        scenery.box(
-            (middle[0], side * _HALL_WIDTH_M + outside),
-            (_HALL_LENGTH_M + 2.0 * _HALL_WALL_M, _HALL_WALL_M),
-            (0.0, _HALL_HEIGHT_M),
-        )
-        scenery.box(
-            (side * _HALL_LENGTH_M + outside, middle[1]), (_HALL_WALL_M, _HALL_WIDTH_M), (0.0, _HALL_HEIGHT_M)
-        )
+        along, across = (_HALL_LENGTH_M + 2.0 * _HALL_WALL_M, _HALL_WALL_M), (_HALL_WALL_M, _HALL_WIDTH_M)
+        scenery.box((middle[0], side * _HALL_WIDTH_M + outside), along, (0.0, _HALL_HEIGHT_M))
+        scenery.box((side * _HALL_LENGTH_M + outside, middle[1]), across, (0.0, _HALL_HEIGHT_M))
     for x, y in _PILLARS:
         scenery.box((x, y), (0.6, 0.6), (0.0, _HALL_HEIGHT_M))
     for x in rng.uniform([3.0, 22.0, 36.0, 54.0], [6.0, 27.0, 40.0, 57.0]):
@@ -263,11 +250,7 @@ def hall(rng: np.random.Generator) -> Solids:
 _FLIGHTS, _STEPS_A_FLIGHT = 8, 10
 _TREAD_M, _RISE_M = 0.29, 0.17
 _RUN_M, _FLIGHT_M = _STEPS_A_FLIGHT * _TREAD_M, _STEPS_A_FLIGHT * _RISE_M
-_LANE_M, _STAIR_HALF_M, _LANDING_M = (
-    0.8,
-    1.6,
-    1.7,
-)  # middle of a flight from the axis, half width, depth of a landing
+_LANE_M, _STAIR_HALF_M, _LANDING_M = 0.8, 1.6, 1.7  # of a flight's middle, half the width, depth of a landing
 _TOP_M = _FLIGHTS * _FLIGHT_M
 _ROOF_M = _TOP_M + 2.8
 

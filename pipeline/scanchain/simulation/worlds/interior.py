@@ -52,11 +52,8 @@ class Wall(NamedTuple):
 
 def build_wall(scenery: Scenery, wall: Wall, rng: np.random.Generator) -> None:
     """The segments of a wall between its doorways, lintels, and door leaves, open at 90 to 110 degrees."""
-    edges = [
-        0.0,
-        *(e for place in wall.doors for e in (place - 0.5 * _DOOR_M, place + 0.5 * _DOOR_M)),
-        wall.length_m,
-    ]
+    jambs = (edge for place in wall.doors for edge in (place - 0.5 * _DOOR_M, place + 0.5 * _DOOR_M))
+    edges = [0.0, *jambs, wall.length_m]
     for first, last in zip(edges[::2], edges[1::2], strict=True):
         size = (last - first + _WALL_M * (first == 0.0 or last == wall.length_m), _WALL_M)
         scenery.box(wall.at(0.5 * (first + last)), size, (0.0, CEILING_M), wall.yaw_rad)
@@ -65,9 +62,8 @@ def build_wall(scenery: Scenery, wall: Wall, rng: np.random.Generator) -> None:
         if wall.leaves:
             turn_rad = np.deg2rad(rng.uniform(90.0, 110.0))  # 0 is shut, hinged at the far jamb
             half = 0.5 * (_DOOR_M - 0.05)
-            middle = wall.at(
-                place + 0.53 * _DOOR_M - half * np.cos(turn_rad), wall.leaves * half * np.sin(turn_rad)
-            )
+            along_m, left_m = half * np.array([np.cos(turn_rad), np.sin(turn_rad)])
+            middle = wall.at(place + 0.53 * _DOOR_M - along_m, wall.leaves * left_m)
             scenery.box(middle, (2.0 * half, 0.04), (0.01, 2.1), wall.yaw_rad - wall.leaves * turn_rad)
 
 

@@ -53,7 +53,7 @@ def tree(scenery: Scenery, x: float, y: float, rng: np.random.Generator) -> None
 
 _STREETS_X_M = (-50.0, 0.0, 50.0, 100.0, 150.0)  # middles of the streets that run north
 _STREETS_Y_M = (-40.0, 0.0, 40.0, 80.0)  # and east
-_KERB_M, _PARKED_M, _LAMP_M, _TREE_M, _FRONT_M = 4.0, 3.1, 4.7, 5.2, 7.0  # from the middle of the street
+_PARKED_M, _LAMP_M, _TREE_M, _FRONT_M = 3.1, 4.7, 5.2, 7.0  # from the middle of the street
 
 TOWN_CAR = Vehicle(
     speed_m_s=9.0, acceleration_m_s2=2.5, lateral_acceleration_m_s2=4.0, corner_m=7.0, deviation_m=0.4,
@@ -92,7 +92,8 @@ def town(
     parked : share of the places at the kerb that have a car on them
     streets_x_m, streets_y_m : middles of the streets that run north, and east
     """
-    scenery = Scenery(_waves(rng))
+    phase_x, phase_y = rng.uniform(0.0, 2.0 * np.pi, 2)  # of waves of 0.5 m: slopes of 3 % at most
+    scenery = Scenery(np.array([0.0, 0.5, 2.0 * np.pi / 140.0, phase_x, 0.5, 2.0 * np.pi / 110.0, phase_y]))
     for west, east in pairwise(streets_x_m):
         for south, north in pairwise(streets_y_m):
             _block(scenery, west, east, south, north, rng)
@@ -103,13 +104,6 @@ def town(
         for south, north in pairwise(streets_y_m):
             _street(scenery, np.array([x, south]), np.array([x, north]), parked, rng)
     return scenery.finish()
-
-
-def _waves(rng: np.random.Generator) -> NDArray[np.float64]:
-    """Gentle waves of 0.5 m: slopes of 3 % at most."""
-    wave_x, wave_y = 2.0 * np.pi / 140.0, 2.0 * np.pi / 110.0
-    phase_x, phase_y = rng.uniform(0.0, 2.0 * np.pi, 2)
-    return np.array([0.0, 0.5, wave_x, phase_x, 0.5, wave_y, phase_y])
 
 
 def _block(
@@ -165,11 +159,7 @@ def _house(
 
 
 def _street(
-    scenery: Scenery,
-    start: NDArray[np.float64],
-    end: NDArray[np.float64],
-    parked: float,
-    rng: np.random.Generator,
+    scenery: Scenery, start: NDArray[np.float64], end: NDArray[np.float64], parked: float, rng: np.random.Generator
 ) -> None:
     """Both sides of one street between two crossings: parked cars, trees, lamps, signs, bins."""
     length = float(np.linalg.norm(end - start))
@@ -201,9 +191,9 @@ def rounds(rng: np.random.Generator) -> Solids:
     lanes = np.vstack([np.linspace(a, b, 100) for a, b in pairwise([*ROUNDS_ROUTE, ROUNDS_ROUTE[0]])])
     gap = np.abs(lanes[:, None] - solids.boxes[:, :2]) - solids.boxes[:, 2:4]
     distance_m = np.linalg.norm(np.maximum(gap, 0.0), axis=2).min(axis=0)
-    kept = distance_m > _LANE_FREE_M
-    owner = np.concatenate([solids.owner[: len(kept)][kept], solids.owner[len(kept) :]])
-    return replace(solids, boxes=solids.boxes[kept], owner=owner)
+    is_kept = np.ones(len(solids.owner), bool)
+    is_kept[: len(distance_m)] = distance_m > _LANE_FREE_M
+    return solids.part(is_kept)
 
 
 def _lanes() -> Matrix:
