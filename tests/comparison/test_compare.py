@@ -140,8 +140,10 @@ def test_one_that_hangs_or_kills_its_process_is_a_row_that_says_how_it_ended_and
     assert 50.0 < row(table, "plicp").figures["peak_mib"] < 2000.0
     written = {path.name for path in folder.iterdir()}
     assert {"report.html", "compare.rrd", "table.csv", "table.md", "run.json"} <= written
-    scans = pq.read_table(folder / "per_scan.parquet").to_pandas().groupby("method").size()
-    assert dict(scans) == {"hangs": 10, "eats": 10, "plicp": 60, "dies": 10}
+    scans = pq.read_table(folder / "per_scan.parquet").to_pandas().groupby("method")
+    assert dict(scans.size()) == {"hangs": 10, "eats": 10, "plicp": 60, "dies": 10}
+    begin = read_tum(office.with_suffix(".tum")).poses[0, :2, 3]
+    np.testing.assert_allclose(scans.get_group("dies")[["aligned_x", "aligned_y"]].iloc[0], begin, atol=1e-6)
 
 
 @pytest.mark.usefixtures("in_process")
@@ -498,8 +500,10 @@ def test_the_tables_say_the_same_and_stages_add_up(good):
     assert row(table, "plicp").figures["median_s"] == pytest.approx(ours[ours["index"] > 0].seconds.median())
     assert row(table, "plicp").figures["ate_m"] == pytest.approx(np.sqrt((ours.error_m**2).mean()))
 
+    assert row(table, "mine").figures["nees"] is None
     for name in ("plicp", "svd+loops"):
         figures = row(table, name).figures
+        assert 0.1 < figures["nees"] < 10.0
         stages_s = figures["preprocess_s"] + figures["match_s"] + figures["map_s"]
         assert 0.3 * figures["median_s"] < stages_s < 1.2 * figures["median_s"]
         assert figures["first_s"] > 0.0 and figures["p95_s"] >= figures["median_s"]
