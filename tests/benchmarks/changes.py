@@ -25,10 +25,9 @@ from scanchain.sessions.alignment import align_maps
 from scanchain.sessions.changes import Changes, Part, changes_between
 from scanchain.settings import load_settings
 from scanchain.simulation import Drive, plan
-from scanchain.simulation.drive import EPOCH_NS, record
+from scanchain.simulation.drive import EPOCH_NS
 from scanchain.simulation.solids import FIXED, Solids
-from tests.benchmarks.harness import command_line, run_of
-from tests.support import made
+from tests.benchmarks.harness import command_line, recorded, run_of
 
 LEAST_M = 0.3  # size of the objects that count
 LEAST_RAYS = {2: 10, 3: 40}  # of the keyframes' scans, for an object to be in sight
@@ -85,10 +84,7 @@ def score_of(options: argparse.Namespace, seed: int) -> Score:
 
 
 def _mapped(drive: Drive, name: str, cache: Path) -> SavedMap:
-    def write(draft: Path) -> None:
-        record(drive, draft, force=True)
-
-    return open_saved_map(run_of(made.recorded(name, write, cache), cache, name))
+    return open_saved_map(run_of(recorded(name, drive, cache), cache, name))
 
 
 def _score(found: Changes, first: Drive, second: Drive, a: SavedMap, b: SavedMap) -> Score:

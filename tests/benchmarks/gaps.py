@@ -27,7 +27,7 @@ from scanchain.data import Matrix, Scan
 from scanchain.logs import Log, open_log
 from scanchain.settings import load_settings
 from scanchain.slam import Slam
-from tests.benchmarks.harness import DATA, command_line, poses_at, traveled_m
+from tests.benchmarks.harness import DATA, command_line, poses_at, table, traveled_m
 
 RIGHT_M, IN_SIGHT_M, STEP = 1.5, 3.0, 20
 LOGS = tuple(DATA / name for name in ("2d/intel.mcap", "2d/aces.mcap", "2d/mit_csail.mcap"))
@@ -78,6 +78,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--paths", nargs=3, type=float, default=(120.0, 40.0, 60.0))
     options = parser.parse_args()
+    row = table("log", "case", "second stretch", "in sight", "after")
     for path in options.logs:
         log = open_log([path])
         scans = list(log.scans(load_settings(log.dimension).config.preprocess))
@@ -90,10 +91,8 @@ def main() -> None:
             stretches = range(first, gap), range(second, min(end, len(scans)))
             word, in_sight_m, after_m = outcome(log, scans, T, *stretches)
             ends[word] += 1
-            print(
-                f"{path.stem} {case}: {word}, {in_sight_m:.1f} m in sight, joined after {after_m:.1f}", flush=True
-            )
-        print(f"{path.stem}: {', '.join(f'{count} {word}' for word, count in sorted(ends.items()))}", flush=True)
+            row(path.stem, case, word, f"{in_sight_m:.1f}", f"{after_m:.1f}")
+        row(path.stem, "all", ", ".join(f"{count} {word}" for word, count in sorted(ends.items())), "", "")
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from scanchain import lie
 from scanchain.data import Matrix, Trajectory
 from scanchain.evaluation import absolute_error, pair
 from scanchain.maps import SavedMap
-from scanchain.simulation import SENSORS, WORLDS
+from scanchain.simulation import SENSORS, WORLDS, Drive, record
 from tests.support import made
 from tests.support.scenes import ROOT
 
@@ -63,6 +63,11 @@ def drive_of(world: str, sensor: str, scans: int, cache: Path, seed: int = 1) ->
     """The simulated log of the first scans of a world."""
     duration_s = min(WORLDS[world].duration_s, scans * SENSORS[sensor].period_ns * 1e-9)
     return made.log(world, folder=cache, seed=seed, seconds=duration_s, sensor=sensor)
+
+
+def recorded(name: str, drive: Drive, cache: Path) -> Path:
+    """The log of a drive, made once."""
+    return made.recorded(name, lambda draft: record(drive, draft, force=True), cache)
 
 
 def run_of(log: Path, cache: Path, name: str, **options: object) -> Path:

@@ -47,10 +47,19 @@ from scanchain.maps import SavedMap, open_saved_map
 from scanchain.odometry import Odometry
 from scanchain.sessions.localizer import Localizer
 from scanchain.settings import load_settings
-from scanchain.simulation.drive import Drive, plan, record
+from scanchain.simulation.drive import plan
 from scanchain.simulation.worlds import WORLDS, outdoor
 from scanchain.trajectory import read_tum
-from tests.benchmarks.harness import DATA, command_line, in_fresh_process, run_of, table, traveled_m, true_in_map
+from tests.benchmarks.harness import (
+    DATA,
+    command_line,
+    in_fresh_process,
+    recorded,
+    run_of,
+    table,
+    traveled_m,
+    true_in_map,
+)
 from tests.support import made
 
 SEEN_M, SEEN_SHARE, ON_MAP_M = 5.0, 0.6, 0.2
@@ -110,7 +119,7 @@ def later_part(name: str, end_s: float, options: argparse.Namespace) -> Case:
 def driven_twice(world: str, options: argparse.Namespace) -> Case:
     """A simulated world, in the map of another drive through it."""
     drives = plan(world, seed=0), plan(world, seed=1)
-    logs = [_recorded(f"{world}_{k}", replace(drives[k], solids=drives[0].solids), options) for k in (0, 1)]
+    logs = [recorded(f"{world}_{k}", replace(drives[k], solids=drives[0].solids), options.cache) for k in (0, 1)]
     return _mapped(options, *logs)
 
 
@@ -138,20 +147,13 @@ def city(options: argparse.Namespace) -> Case:
         drive = plan(name, seed=1, sensor=options.sensor, duration_s=duration_s, **of_part)
         drive = replace(drive, scans=drive.scans[:: options.every])
         stem = f"{name}_{part}_{options.sensor}_{options.every}"
-        logs.append(_recorded(stem, drive, options))
+        logs.append(recorded(stem, drive, options.cache))
     case = replace(_mapped(options, *logs), give_up_m=60.0)
     if options.memory:
         run, found = (str(options.cache / f"{name}.{command}") for command in ("run", "localize"))
         _print_peak("run", str(logs[0]), "--out", run, "--force")
         _print_peak("localize", str(logs[1]), "--map", run, "--out", found, "--force")
     return case
-
-
-def _recorded(name: str, drive: Drive, options: argparse.Namespace) -> Path:
-    def write(draft: Path) -> None:
-        record(drive, draft, force=True)
-
-    return made.recorded(name, write, options.cache)
 
 
 def _mapped(options: argparse.Namespace, mapped: Path, log: Path) -> Case:

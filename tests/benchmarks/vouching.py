@@ -26,7 +26,6 @@ not trustworthy. Cases are split in two halves by a hash of the log's name.
 from __future__ import annotations
 
 import argparse
-import shutil
 import sys
 import traceback
 from collections.abc import Sequence
@@ -38,7 +37,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-import scanchain
 from scanchain import lie
 from scanchain.data import Matrix, Trajectory
 from scanchain.evaluation import absolute_error, pair, read_relations, relation_error
@@ -48,9 +46,7 @@ from scanchain.trajectory import read_tum
 from scanchain.verdict import judge
 from tests.benchmarks import harness
 from tests.benchmarks.vouching_logs import WHEELS, Case, LogSpec, cases
-from tests.support import made
 
-Floats = NDArray[np.float64]
 Row = dict[str, Any]
 
 LIMIT_M, LIMIT_RAD, SIGMAS = {2: 0.1, 3: 0.2}, np.radians(1.0), 3.0
@@ -58,7 +54,6 @@ OPEN_SHARE, LONGEST_RELATION_S = 1e-3, 5.0
 GOOD_M, BAD_M, GOOD_RELATIONS_M = {2: 0.15, 3: 0.3}, 1.0, 0.1
 BARS = "Bars: ≥ 99 % of wrong motions flagged, ≤ 2 % of right ones, no bad run trustworthy, ≤ 3 % of good doubted"
 QUICK = 7  # every n-th case
-KEPT = ("steps.parquet", "loops.parquet", "trajectory.tum", "ground_truth.tum", "metrics.json")
 CHECKS = {  # operating points
     "fit": 0.6,
     "wheel_innovation": 8.0,
@@ -84,29 +79,23 @@ def measured(log_cases: Sequence[Case], cache: Path) -> list[Row]:
     """Rows of all cases of one log; a run that fails has a row that says so."""
     rows = []
     for case in log_cases:
-        out = cache / f"runs_{made.version()}" / case.name.replace(" ", "_").replace("/", "-").replace(",", "")
         try:
-            if not (out / "metrics.json").exists():
-                case.log.make(cache)
-                _process(case, cache, out)
-            rows.append(judged(case, cache, out))
+            rows.append(judged(case, cache, _run(case, cache)))
         except Exception as error:  # a case must not end the benchmark
             traceback.print_exc(file=sys.stderr)
             rows.append({"name": case.name, "kind": case.kind, "half": case.half, "failed": str(error)})
     return rows
 
 
-def _process(case: Case, cache: Path, out: Path) -> None:
+def _run(case: Case, cache: Path) -> Path:
+    case.log.make(cache)
     file, reference = case.log.paths(cache)
     options: dict[str, object] = {"log__every": case.every, **case.log.overrides}
     if case.wheels != "wheels":
         options["odometry__prior"] = "constant-velocity"
     is_tum = reference is not None and reference.suffix == ".tum"
-    shutil.rmtree(out, ignore_errors=True)  # what was left of a run that was killed
-    scanchain.run(file, out, recording=False, ground_truth=reference if is_tum else None, **options)
-    for path in out.iterdir():
-        if path.name not in KEPT:
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
+    name = case.name.replace(" ", "_").replace("/", "-").replace(",", "")
+    return harness.run_of(file, cache, name, ground_truth=reference if is_tum else None, **options)
 
 
 def judged(case: Case, cache: Path, out: Path) -> Row:

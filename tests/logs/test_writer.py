@@ -137,20 +137,16 @@ def test_a_failure_leaves_no_file_that_looks_complete(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_existing_file_is_replaced_only_on_demand(tmp_path):
+def test_an_existing_file_is_replaced_only_on_demand_and_a_directory_never(tmp_path):
     path = tmp_path / "a.mcap"
     path.write_bytes(b"precious")
-    with pytest.raises(InputError, match="exists"):
-        LogWriter(path)
+    for taken, words in ((path, "exists"), (tmp_path, "is a directory")):
+        with pytest.raises(InputError, match=words):
+            LogWriter(taken)
     assert path.read_bytes() == b"precious"
     with LogWriter(path, force=True) as log:
         append_mounting(log, np.eye(4))
     assert len(list(decoded(path))) == 1
-
-
-def test_a_directory_is_not_a_destination(tmp_path):
-    with pytest.raises(InputError, match="is a directory"):
-        LogWriter(tmp_path)
 
 
 def test_a_point_before_the_stamp_does_not_fit_an_unsigned_time(tmp_path):

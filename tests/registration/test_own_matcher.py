@@ -45,6 +45,7 @@ def started(folder, *words):
     return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
+@pytest.mark.slow
 def test_it_runs_is_stopped_and_goes_on_to_the_same_result(office, folder):
     words = ("run", office, "--matcher", NAME, "--rerun", "off", "--checkpoint", "0.1")
     whole = started(folder, *words, "--out", "whole")
