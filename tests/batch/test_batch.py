@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import redirect_stderr, redirect_stdout
 from urllib.parse import unquote
 
 import numpy as np
@@ -16,11 +17,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from scanchain.__main__ import main
+from scanchain.batch import batch, task
 from scanchain.batch.batch import collect
 from scanchain.errors import InputError
 from scanchain.files import Address
 from scanchain.logs.writer import ORIGIN, LogWriter, pack_laser_scan, pack_odometry
-from scanchain.processes import resident_mib
+from scanchain.processes import Ending, KilledFor, resident_mib
 from scanchain.runs.directory import directory_name
 from scanchain_viz.report.batch import names_of
 from tests.support import made
@@ -46,10 +48,11 @@ if "-m" in sys.orig_argv and "hungry" in words:
 
 @pytest.fixture(scope="module")
 def drawers(tmp_path_factory):
-    """Four logs of two seconds each, no two alike, and two that are poison."""
+    """Six logs of two seconds each, no two alike; two of them are poison."""
     folder = tmp_path_factory.mktemp("logs")
-    for seed, name in enumerate((*(f"log_{k:02}" for k in range(4)), "crashing", "hungry")):
-        shutil.copyfile(made.log("office", seconds=2, seed=seed), folder / f"{name}.mcap")
+    names = [f"log_{k:02}" for k in range(4)] + ["crashing", "hungry"]
+    for seed, name in enumerate(names):
+        shutil.copy(made.log("office", seconds=2, seed=seed), folder / f"{name}.mcap")
     return folder
 
 
@@ -61,11 +64,24 @@ def poisoned(tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path / 'site'}:{ROOT}")
 
 
+@pytest.fixture
+def in_this_process(monkeypatch):
+    """Logs are run one after the other in this process, not each in one of its own."""
+
+    def run_within(limits, module, words, environment, *, output, **_):
+        with output.open("w") as file, redirect_stdout(file), redirect_stderr(file):
+            code = main(words[1:])
+        return Ending(code, KilledFor.NOTHING, 100.0, 1.0)
+
+    monkeypatch.setattr(task, "run_within", run_within)
+    monkeypatch.setattr(batch, "_local", lambda workers: lambda tasks: map(task.attempt, tasks))
+
+
 def table(folder):
     return {row["log"].rsplit("/", 1)[1]: row for row in pq.read_table(folder / "batch.parquet").to_pylist()}
 
 
-def runs_of(folder):
+def made_at(folder):
     """When each run directory came to be."""
     return {path.parent: path.stat().st_mtime_ns for path in folder.glob("*/run.json")}
 
@@ -78,7 +94,7 @@ def test_of_4_logs_two_are_poison_and_2_have_results_and_a_second_call_runs_only
     words = ["batch", *logs, "--out", str(out), "--memory-limit", "1.5", "--workers", "2"]
     assert main(words) == 1
     output, errors = capfd.readouterr()
-    rows, first = table(out), runs_of(out)
+    rows, first = table(out), made_at(out)
     done = {name: row for name, row in rows.items() if row["state"] == "done"}
     assert len(rows) == 4 and len(done) == len(first) == 2
     assert (rows["crashing.mcap"]["state"], rows["crashing.mcap"]["reason"]) == ("crashed", "ended by SIGSEGV")
@@ -95,7 +111,7 @@ def test_of_4_logs_two_are_poison_and_2_have_results_and_a_second_call_runs_only
     assert errors == f"error: 2 of 4 logs have no result; {out}/summary.txt has the reason\n"
 
     assert main(words) == 1  # only the two are tried again
-    assert runs_of(out) == first and "2 results from before" in capfd.readouterr()[0]
+    assert made_at(out) == first and "2 results from before" in capfd.readouterr()[0]
 
 
 def test_logs_of_the_longest_names_have_directories_of_their_own():
@@ -104,99 +120,82 @@ def test_logs_of_the_longest_names_have_directories_of_their_own():
     assert names[0] != names[1] and all(len(os.fsencode(name)) <= 200 for name in names)
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_what_is_done_is_done_until_the_file_or_the_configuration_changes(drawers, tmp_path, capfd):
     log, out = tmp_path / "log.mcap", tmp_path / "out"
     log.write_bytes((drawers / "log_00.mcap").read_bytes())
-    words = ["batch", str(log), "--out", str(out), "--rerun", "off"]
+    words = ["batch", str(log), "--out", str(out)]
     assert main(words) == 0
-    first = runs_of(out)
+    first = made_at(out)
     (row,) = table(out).values()
     assert row["sha256"] == hashlib.sha256(log.read_bytes()).hexdigest()
-    assert main(["batch", f"{log.parent}/../{log.parent.name}/log.mcap", *words[2:]]) == 0
-    assert runs_of(out) == first and "1 result from before" in capfd.readouterr()[0].splitlines()[-1]
+    assert main(["batch", f"{log.parent}/../{log.parent.name}/log.mcap", "--out", str(out)]) == 0
+    assert made_at(out) == first and "1 result from before" in capfd.readouterr()[0].splitlines()[-1]
     (run,) = first
     (run / "metrics.json").unlink()  # a result that was thrown away is missing
     assert main(words) == 0 and (run / "metrics.json").exists()
     assert main([*words, "--matching.matcher", "svd"]) == 0
-    assert len(runs_of(out)) == 2
+    assert len(made_at(out)) == 2
     log.write_bytes((drawers / "log_01.mcap").read_bytes())
     assert main(words) == 0
-    assert len(runs_of(out)) == 3 and "0 results from before" in capfd.readouterr()[0].splitlines()[-1]
+    assert len(made_at(out)) == 3 and "0 results from before" in capfd.readouterr()[0].splitlines()[-1]
 
 
-def test_a_log_most_of_whose_scans_are_lost_is_a_row_that_says_so_and_is_not_run_again(drawers, tmp_path, capfd):
-    radar, out = tmp_path / "radar.mcap", tmp_path / "out"
-    rng = np.random.default_rng(0)
-    with LogWriter(radar) as log:
-        for k in range(20):
-            log.point_cloud("/radar", 10**18 + k * 10**8, "radar", rng.uniform(-40.0, 40.0, (12, 3)))
-    words = ["batch", str(radar), str(drawers / "log_03.mcap"), "--out", str(out)]
+def test_a_log_that_takes_too_long_is_a_row_with_the_reason(drawers, tmp_path):
+    words = ["batch", str(drawers / "log_03.mcap"), "--out", str(tmp_path / "out"), "--time-limit", "0.2"]
     assert main(words) == 1
-    output, errors = capfd.readouterr()
-    rows, first = table(out), runs_of(out)
-    assert (rows["radar.mcap"]["state"], rows["log_03.mcap"]["state"]) == ("not trustworthy", "done")
-    assert "degenerate" in rows["radar.mcap"]["reason"] and rows["radar.mcap"]["scans"] == 20
-    assert len(first) == 2 and "2: 1 done, 1 not trustworthy" in output
-    assert errors == f"error: 1 of 2 logs are not trustworthy; {out}/summary.txt has the reason\n"
-    assert f"{radar} is not trustworthy" in (out / "report.html").read_text()
-    assert main(words) == 1
-    assert runs_of(out) == first and "2 results from before" in capfd.readouterr()[0]
+    assert table(tmp_path / "out")["log_03.mcap"]["reason"] == "took longer than --time-limit (0.2 s)"
 
 
-def test_logs_that_are_damaged_absent_or_slow_are_rows_with_a_reason_each(drawers, tmp_path):
+@pytest.mark.usefixtures("in_this_process")
+def test_logs_that_are_damaged_or_absent_are_rows_with_a_reason_each(drawers, tmp_path):
     (tmp_path / "folder.mcap").mkdir()
     (tmp_path / "empty.mcap").touch()
     for name in ("a.mcap", "b.mcap"):
         (tmp_path / name).write_bytes(b"no log at all")
-    names = ("folder.mcap", "empty.mcap", "a.mcap", "b.mcap", "absent.mcap")
-    words = ["batch", *(str(tmp_path / name) for name in names), str(drawers / "log_03.mcap")]
-    out = tmp_path / "out"
-    assert main([*words, "--out", str(out), "--time-limit", "0.2"]) == 1
-    assert table(out)["log_03.mcap"]["reason"] == "took longer than --time-limit (0.2 s)"
-    assert main([*words, "--out", str(out)]) == 1
-    rows = table(out)
+    says = {"folder.mcap": "is a folder", "empty.mcap": "", "a.mcap": "is not a recognized log"}
+    says |= {"b.mcap": "is not a recognized log", "absent.mcap": "no such file"}
+    words = ["batch", *(str(tmp_path / name) for name in says), str(drawers / "log_03.mcap")]
+    assert main([*words, "--out", str(tmp_path / "out")]) == 1
+    rows = table(tmp_path / "out")
     assert rows.pop("log_03.mcap")["state"] == "done"
     assert {row["state"] for row in rows.values()} == {"failed"}
-    says = ("is a folder", "", "is not a recognized log", "is not a recognized log", "no such file")
-    for name, words in zip(names, says, strict=True):
+    for name, words in says.items():
         assert words in rows[name]["reason"] and (name == "absent.mcap" or name in rows[name]["reason"])
     assert "is a folder" not in rows["empty.mcap"]["reason"]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names are bytes there")
+@pytest.mark.usefixtures("in_this_process")
 def test_a_name_that_is_not_utf_8_is_a_failed_row_and_one_line_of_run(drawers, tmp_path, capfd):
-    content = (drawers / "log_00.mcap").read_bytes()
-    bad = tmp_path / os.fsdecode(b"bad\xff.mcap")
-    bad.write_bytes(content)
-    (tmp_path / os.fsdecode(b"parts\xff")).mkdir()
-    (tmp_path / os.fsdecode(b"parts\xff") / "part.mcap").write_bytes(content)
-    for name in (bad, bad.with_name(os.fsdecode(b"parts\xff"))):
-        assert main(["run", str(name), "--out", str(tmp_path / "run"), "--rerun", "off"]) == 2
+    bad, folder = (tmp_path / os.fsdecode(name) for name in (b"bad\xff.mcap", b"parts\xff"))
+    folder.mkdir()
+    for log in (bad, folder / "part.mcap"):
+        shutil.copy(drawers / "log_00.mcap", log)
+    for log in (bad, folder):
+        assert main(["run", str(log), "--out", str(tmp_path / "run"), "--rerun", "off"]) == 2
+        shown = str(log).encode(errors="surrogateescape").decode(errors="backslashreplace")
         errors = capfd.readouterr()[1]
-        assert errors.startswith(f"error: {tmp_path}/") and errors.count("\n") == 1
-        assert "\\xff" in errors and errors.endswith(": the name is not UTF-8; rename it\n")
+        assert errors.startswith(f"error: {shown}") and errors.endswith(": the name is not UTF-8; rename it\n")
     out = tmp_path / "out"
-    logs = [str(bad), str(bad.with_name(os.fsdecode(b"parts\xff"))), str(drawers / "log_01.mcap")]
-    assert main(["batch", *logs, "--out", str(out)]) == 1
+    assert main(["batch", str(bad), str(folder), str(drawers / "log_01.mcap"), "--out", str(out)]) == 1
     rows = table(out)
     assert [row["state"] for row in rows.values()] == ["failed", "failed", "done"]
     assert rows["bad\\xff.mcap"]["reason"] == f"{tmp_path}/bad\\xff.mcap: the name is not UTF-8; rename it"
     assert "bad\\xff.mcap" in (out / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_a_damaged_log_is_done_with_its_warnings_counted_and_told(drawers, tmp_path, capfd):
-    content = (drawers / "log_00.mcap").read_bytes()
     cut, out = tmp_path / "cut.mcap", tmp_path / "out"
-    cut.write_bytes(content[:-20])
+    cut.write_bytes((drawers / "log_00.mcap").read_bytes()[:-20])
     assert main(["batch", str(cut), str(drawers / "log_01.mcap"), "--out", str(out)]) == 0
     rows, (output, _) = table(out), capfd.readouterr()
-    metrics = json.loads((out / rows["cut.mcap"]["run"] / "metrics.json").read_text())
-    assert rows["cut.mcap"]["warnings"] == len(metrics["warnings"]) > 0 == rows["log_01.mcap"]["warnings"]
-    first = metrics["warnings"][0].replace(f"{cut}: ", "")
-    assert f"warned         {cut}: {first}" in output and "in 1 log" in output
-    assert str(cut) in metrics["warnings"][0] and str(cut) not in first
-    page = (out / "report.html").read_text(encoding="utf-8")
-    assert f'<td class="bad">{len(metrics["warnings"])}</td>' in page
+    told = json.loads((out / rows["cut.mcap"]["run"] / "metrics.json").read_text())["warnings"]
+    assert rows["cut.mcap"]["warnings"] == len(told) > 0 == rows["log_01.mcap"]["warnings"]
+    first = told[0].replace(f"{cut}: ", "")
+    assert f"warned         {cut}: {first}" in output and "in 1 log" in output and first != told[0]
+    assert f'<td class="bad">{len(told)}</td>' in (out / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs signals")
@@ -217,11 +216,9 @@ def test_ctrl_c_kills_what_runs_and_the_table_says_what_was_not_run(drawers, tmp
 
 
 def test_what_a_killed_batch_started_ends_with_it(tmp_path):
-    long = made.log("office", tmp_path, seconds=120)
-    words = ["batch", str(long), "--out", str(tmp_path / "out")]
-    child = subprocess.Popen(
-        [sys.executable, "-m", "scanchain", *words], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
+    log = made.log("office", tmp_path, seconds=120)
+    command = [sys.executable, "-m", "scanchain", "batch", str(log), "--out", str(tmp_path / "out")]
+    child = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     wait_until(lambda: list((tmp_path / "out").glob("*.partial-*/points.store")))
     assert processes_about(tmp_path)
     child.kill()
@@ -244,19 +241,18 @@ def test_logs_are_named_by_path_pattern_and_list_each_once(tmp_path):
 
 
 def test_a_folder_is_the_logs_in_it_unless_they_are_the_parts_of_one(tmp_path):
-    whole = made.log("office", seconds=6)
-    for place, name in enumerate(("part_0", "part_1")):
-        (tmp_path / name.partition("_")[0]).mkdir(exist_ok=True)
-        part = str(tmp_path / "part" / f"{name}.mcap")
+    whole, several = made.log("office", seconds=4), tmp_path / "several"
+    for place in range(2):
+        part = tmp_path / "part" / f"part_{place}.mcap"
+        part.parent.mkdir(exist_ok=True)
         cut = ["--start", str(2 * place), "--end", str(2 * place + 1.95)]
-        assert main(["convert", str(whole), part, *cut]) == 0
-    several = tmp_path / "several"
+        assert main(["convert", str(whole), str(part), *cut]) == 0
     (several / "clouds").mkdir(parents=True)
     (several / "clouds" / "1.pcd").touch()
     (several / "truth.txt").touch()
     shutil.copytree(tmp_path / "part", several / "part")
     for seed in (1, 2):  # of the same time, by the clock of the simulation
-        shutil.copyfile(made.log("office", seconds=2, seed=seed), several / f"{seed}.mcap")
+        shutil.copy(made.log("office", seconds=2, seed=seed), several / f"{seed}.mcap")
     assert collect([tmp_path / "part"], []) == (tmp_path / "part",)
     assert {path.name for path in collect([several], [])} == {"1.mcap", "2.mcap", "clouds", "part"}
     (several / "clouds" / "1.pcd").unlink()
@@ -291,33 +287,21 @@ def test_a_batch_is_not_written_among_logs_nor_into_a_run_nor_with_a_wrong_key(
     assert not (out / "rows").exists()
 
 
-def stands_still(path, ranges, angles, topics, *, noise_m=0.0, truth=False):
-    """A log of two seconds of a lidar that stands still."""
+def stands_still(path, ranges_m, angles):
+    """A log of two seconds of two lidars that stand still, and of their true pose."""
     random = np.random.default_rng(0)
     with LogWriter(path) as writer:
         for stamp_ns in range(0, 2_000_000_000, 100_000_000):
-            if truth:
-                pose = pack_odometry(stamp_ns, "world", "lidar", ORIGIN)
-                writer.append("/ground_truth", "nav_msgs/msg/Odometry", pose, stamp_ns)
-            measured = ranges + noise_m * random.standard_normal(len(ranges))
-            scan = pack_laser_scan(
-                stamp_ns, "lidar", angles[0], angles[1] - angles[0], measured, range_min_m=0.1, range_max_m=20.0
-            )
-            for topic in topics:
+            pose = pack_odometry(stamp_ns, "world", "lidar", ORIGIN)
+            writer.append("/ground_truth", "nav_msgs/msg/Odometry", pose, stamp_ns)
+            first = stamp_ns, "lidar", angles[0], angles[1] - angles[0]
+            measured_m = ranges_m + 1e-3 * random.standard_normal(len(ranges_m))
+            scan = pack_laser_scan(*first, measured_m, range_min_m=0.1, range_max_m=20.0)
+            for topic in ("/front", "/rear"):
                 writer.append(topic, "sensor_msgs/msg/LaserScan", scan, stamp_ns)
 
 
-def test_a_robot_that_stands_still_has_a_result_that_is_found_again(tmp_path, capfd):
-    log, out, angles = tmp_path / "still.mcap", tmp_path / "out", np.radians(np.arange(360.0))
-    ranges = 4.0 / np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles)))  # a square room
-    stands_still(log, ranges, angles, ["/scan"], truth=True)
-    assert main(["batch", str(log), "--out", str(out)]) == 0
-    assert main(["batch", str(log), "--out", str(out)]) == 0
-    (row,) = table(out).values()
-    assert (row["state"], row["scans"], row["ate_share_of_path"]) == ("done", 20, None)
-    assert "1 result from before" in capfd.readouterr()[0].splitlines()[-1]
-
-
+@pytest.mark.usefixtures("in_this_process")
 def test_the_report_shows_every_log_and_names_no_key_of_an_address(drawers, tmp_path, monkeypatch):
     pytest.importorskip("fsspec", reason="the extra remote is not installed")
     out = tmp_path / "out"
@@ -329,10 +313,10 @@ def test_the_report_shows_every_log_and_names_no_key_of_an_address(drawers, tmp_
         monkeypatch.setattr(sys, "argv", ["scanchain", *words])
         assert main(words) == 1
         assert table(out)["far.mcap"]["reason"] == table(out)["log_03.mcap"]["reason"] == ""
-        first = runs_of(out)
-        assert main(words) == 1 and runs_of(out) == first
+        first = made_at(out)
+        assert main(words) == 1 and made_at(out) == first
         site.etag = '"two"'
-        assert main(words) == 1 and len(runs_of(out)) == len(first) + 1 == 3
+        assert main(words) == 1 and len(made_at(out)) == len(first) + 1 == 3
     rows = table(out)
     assert rows["far.mcap"]["log"] == f"{site.url}/far.mcap" and rows["far.mcap"]["scans"] == 20
     page = (out / "report.html").read_text()
@@ -349,38 +333,50 @@ def two_lidars(tmp_path):
     angles = np.radians(np.arange(-90.0, 90.5, 0.5))
     wall = 3.0 / np.maximum(np.cos(angles), 1e-3)
     room = np.minimum(wall, 4.0 / np.maximum(np.abs(np.sin(angles)), 1e-3))
-    for log, ranges in zip(logs, (wall, room), strict=True):
-        stands_still(log, ranges, angles, ["/front", "/rear"], noise_m=1e-3)
+    for log, ranges_m in zip(logs, (wall, room), strict=True):
+        stands_still(log, ranges_m, angles)
     return logs
 
 
-def test_logs_with_several_lidars_are_run_with_the_short_flags_of_run(two_lidars, tmp_path):
-    words = ["batch", *map(str, two_lidars), "--out", str(tmp_path / "out")]
+@pytest.mark.usefixtures("in_this_process")
+def test_logs_with_several_lidars_take_the_flags_of_run_and_one_that_is_not_sure_is_a_row_that_says_so(
+    two_lidars, tmp_path, capfd
+):
+    out = tmp_path / "out"
+    words = ["batch", *map(str, two_lidars), "--out", str(out)]
     assert main(words) == 1
-    assert all("choose one with --topic" in row["reason"] for row in table(tmp_path / "out").values())
-    assert main([*words, "--topic", "/rear", "--every", "2", "--no-loops"]) == 1  # beside one wall nothing is sure
-    assert [row["state"] for row in table(tmp_path / "out").values()] == ["not trustworthy", "done"]
-    rows = table(tmp_path / "out")
-    assert [row["scans"] for row in rows.values()] == [10, 10]
-    for row in rows.values():
-        config = (tmp_path / "out" / row["run"] / "config.toml").read_text()
+    assert all("choose one with --topic" in row["reason"] for row in table(out).values())
+    words += ["--topic", "/rear", "--every", "2", "--no-loops"]
+    capfd.readouterr()
+    assert main(words) == 1  # beside one wall nothing is sure
+    output, errors = capfd.readouterr()
+    wall, room = table(out).values()
+    assert (wall["state"], room["state"]) == ("not trustworthy", "done") and "degenerate" in wall["reason"]
+    assert "2: 1 done, 1 not trustworthy" in output
+    assert errors == f"error: 1 of 2 logs are not trustworthy; {out}/summary.txt has the reason\n"
+    assert f"{two_lidars[0]} is not trustworthy" in (out / "report.html").read_text()
+    assert room["ate_share_of_path"] is None  # it stood still
+    for row in (wall, room):
+        config = (out / row["run"] / "config.toml").read_text()
+        assert row["scans"] == 10
         assert 'topic = "/rear"' in config and "every = 2" in config and "enabled = false" in config
+    first = made_at(out)
+    assert main(words) == 1 and made_at(out) == first and "2 results from before" in capfd.readouterr()[0]
     assert main([*words, "--gt", "truth.tum"]) == 2
 
 
-@pytest.mark.slow
+@pytest.mark.usefixtures("in_this_process")
 def test_the_report_on_a_phone_shows_figures_beside_long_names_and_links_to_every_run(two_lidars, tmp_path):
-    out = tmp_path / "out"
-    (tmp_path / "bad.mcap").write_bytes(b"no log at all")
-    logs = [*map(str, two_lidars), str(tmp_path / "bad.mcap")]
-    assert main(["batch", *logs, "--out", str(out), "--topic", "/front"]) == 1
-    rows = table(out)
-    page = (out / "report.html").read_text(encoding="utf-8")
-    cells = {row["log"]: re.search(f"{name}</a>.*?</tr>", page, re.DOTALL)[0] for name, row in rows.items()}
-    blind, fine, _ = (re.findall(r"<td([^>]*)>([^<]*)</td>", each) for each in cells.values())
+    out, bad = tmp_path / "out", tmp_path / "bad.mcap"
+    bad.write_bytes(b"no log at all")
+    assert main(["batch", *map(str, (*two_lidars, bad)), "--out", str(out), "--topic", "/front"]) == 1
+    rows, page = table(out), (out / "report.html").read_text(encoding="utf-8")
+    lines = [re.search(f"{name}</a>.*?</tr>", page, re.DOTALL)[0] for name in rows]
+    blind, fine, _ = (re.findall(r"<td([^>]*)>([^<]*)</td>", each) for each in lines)
+    degenerate = rows[two_lidars[0].name]["degenerate"]
     assert blind[:2] == [(' class="bad"', "not trustworthy"), ("", "20")] and fine[0][1] == "trustworthy"
-    assert blind[3] == (' class="bad"', str(rows[two_lidars[0].name]["degenerate"]))
-    assert fine[2] == fine[3] == fine[4] == ("", "0") and rows[two_lidars[0].name]["degenerate"] > 10
+    assert blind[3] == (' class="bad"', str(degenerate)) and degenerate > 10
+    assert fine[2] == fine[3] == fine[4] == ("", "0")
     links = re.findall(r'<a href="([^"]+)">', page)
     assert len(links) == 3 and all((out / unquote(link)).is_file() for link in links)
     assert links[0].endswith("/report.html") and links[2].startswith("rows/")
