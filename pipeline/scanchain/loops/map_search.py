@@ -177,7 +177,7 @@ class UprightMap:
 class UprightFinder:
     """The last keyframes of a path, sought together in older ones as seen from above; then verified in space."""
 
-    first_m, least_m, most_m = 0.0, 1.0, 3.0
+    first_m, least_m, most_m = 0.0, 1.0, 2.0
     follows = True
 
     def __init__(self, config: Config) -> None:

@@ -147,7 +147,7 @@ class PlanarFinder:
     A pose is taken where it fits better than chance and no pose elsewhere fits nearly as well.
     """
 
-    first_m, least_m, most_m = 1.0, 0.5, 3.0
+    first_m, least_m, most_m = 1.0, 0.5, 2.0
     follows = False  # the search within the drift does that
 
     def __init__(self, submaps: VoxelSubmaps, verifier: Verifier) -> None:
