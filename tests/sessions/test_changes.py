@@ -12,7 +12,7 @@ from scanchain.__main__ import main
 from scanchain.data import Keyframe
 from scanchain.errors import InputError
 from scanchain.logs.formats.clouds import read_ply
-from scanchain.maps import Edges, SavedPoints, Session, open_saved_map, write_saved_map
+from scanchain.maps import Edges, SavedPoints, Session, write_saved_map
 from scanchain.sessions.changes import Changes, Label, Part, changes_between
 from scanchain.sessions.joining import Joined
 from scanchain.sessions.merged_map import MergedMap, updated
@@ -169,48 +169,31 @@ def test_the_newest_session_of_a_merged_map_is_compared_with_those_before(tmp_pa
         (["A", "B", "--transform", "1,2"], "give X,Y,YAW"),
         (["A", "B", "--transform", "1,2,0", "--aligned"], "give one of them"),
         (["A", "none"], "holds no map"),
+        (["A", "empty"], "has no keyframe"),
+        (["A", "B", "--aligned", "--force", "--out", "A"], "is one of the maps"),
+        (["A", "B", "--aligned", "--force", "--out", "B"], "is one of the maps"),
     ],
 )
-def test_what_cannot_be_compared_is_refused_and_leaves_nothing(tmp_path, capsys, words, message):
+def test_what_cannot_be_compared_is_refused_and_leaves_the_maps_as_they_were(tmp_path, capsys, words, message):
     saved(tmp_path / "A", part("a", room(BOX), count=3))
     saved(tmp_path / "B", part("b", hall(), lie.pose_2d(70.0, 0.0, 1.0), count=3))
-    words = [str(tmp_path / word) if word in ("A", "B", "none") else word for word in words]
-    assert main(["changes", *words, "--out", str(tmp_path / "out")]) == 2
+    saved(tmp_path / "empty", Part("empty", [], np.empty((0, 3, 3))))
+    before = {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*")}
+    words = [str(tmp_path / word) if word in ("A", "B", "none", "empty") else word for word in words]
+    assert main(["changes", "--out", str(tmp_path / "out"), *words]) == 2
     assert message in capsys.readouterr().err
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["A", "B"]
+    assert before == {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*")}
 
 
-def test_no_map_is_replaced_by_the_comparison_and_both_are_named_in_it(tmp_path, capsys):
+def test_a_comparison_names_both_maps_and_is_no_run_to_check_or_draw(tmp_path, capsys):
     a, b = saved(tmp_path / "a", part("a", room(BOX))), saved(tmp_path / "b", part("b", room()))
-    for run in (a, b):
-        assert main(["changes", str(a), str(b), "--aligned", "--force", "--out", str(run)]) == 2
-        assert "is one of the maps" in capsys.readouterr().err
     scanchain.changes(a, b, tmp_path / "ab", T_earlier_later=lie.identity(2), recording=False)
     logs = json.loads((tmp_path / "ab" / "run.json").read_text())["logs"]
     assert [log["path"] for log in logs] == [str(a / "map"), str(b / "map")]
-
-
-def test_a_directory_that_is_no_run_is_not_checked_or_drawn_and_says_where_to_look(tmp_path, capsys):
-    a, b = saved(tmp_path / "a", part("a", room(BOX))), saved(tmp_path / "b", part("b", room()))
-    scanchain.changes(a, b, tmp_path / "ab", T_earlier_later=lie.identity(2), recording=False)
     assert main(["check", str(tmp_path / "ab")]) == 2
     assert "see summary.txt" in capsys.readouterr().err
     assert main(["view", str(tmp_path / "ab"), "--png", str(tmp_path / "ab.png")]) == 2
     assert "open report.html" in capsys.readouterr().err
-
-
-def test_a_map_without_keyframes_is_refused(tmp_path, capsys):
-    a, b = saved(tmp_path / "a", part("a", room(BOX))), saved(tmp_path / "b", Part("b", [], np.empty((0, 3, 3))))
-    assert main(["changes", str(a), str(b), "--out", str(tmp_path / "ab")]) == 2
-    assert "has no keyframe" in capsys.readouterr().err
-
-
-def test_maps_stay_as_they_were(tmp_path):
-    a, b = saved(tmp_path / "a", part("a", room(BOX))), saved(tmp_path / "b", part("b", room()))
-    before = {path: path.read_bytes() for folder in (a, b) for path in (folder / "map").iterdir()}
-    scanchain.changes(a, b, tmp_path / "ab", T_earlier_later=lie.identity(2), recording=False)
-    assert before == {path: path.read_bytes() for folder in (a, b) for path in (folder / "map").iterdir()}
-    assert open_saved_map(a).sessions[0].name == "a"
 
 
 def updated_rooms(*parts: Part):

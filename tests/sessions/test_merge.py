@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -13,14 +12,12 @@ from scanchain import lie
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Trajectory
 from scanchain.errors import InputError, ScanchainError
 from scanchain.evaluation import absolute_error, pair
-from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.evidence import contradiction
-from scanchain.loops.planar_map_search import WholeSearch
-from scanchain.loops.verification import Verifier
 from scanchain.maps import Edges, SavedPoints, open_saved_map, read_ply
 from scanchain.odometry.tracked import first_match
 from scanchain.runs.job import Progress
 from scanchain.sessions.joining import Joined, changed, doubt_about, graph_of
+from scanchain.sessions.merged_map import session_names
 from scanchain.sessions.merging import merge
 from scanchain.trajectory import read_tum
 from scanchain_viz.pictures.maps import draw_run
@@ -138,11 +135,10 @@ def test_a_merged_map_is_merged_further(runs, tmp_path):
     assert ate_m(three.path, truth, PARTS) < 0.02
 
 
-def test_runs_of_equal_names_get_names_that_differ(runs, tmp_path):
+def test_runs_of_equal_names_get_names_that_differ(runs):
     folder, _ = runs
-    shutil.copytree(folder / "morning", tmp_path / "noon")
-    out = quietly(folder / "noon", tmp_path / "noon", out=tmp_path / "out")
-    assert sorted(session.name for session in out.metrics.sessions) == ["noon", "noon-2"]
+    noon = open_saved_map(folder / "noon")
+    assert session_names([noon, noon], [1, 0]) == {(1, 0): "noon", (0, 0): "noon-2"}
 
 
 def test_nothing_that_belongs_together_is_an_error_of_one_line_and_leaves_nothing(runs, call, tmp_path):
@@ -166,16 +162,6 @@ def test_a_merge_that_is_killed_leaves_the_runs_as_they_were_and_nothing_else(ru
         merge([folder / "morning", folder / "noon"], tmp_path / "out", Progress(), interrupted)
     assert not list(tmp_path.iterdir())
     assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-def test_a_damaged_map_is_refused_by_name_before_anything_is_made(runs, tmp_path):
-    folder, _ = runs
-    points = shutil.copytree(folder / "noon", tmp_path / "copy") / "map" / "points.i16"
-    points.write_bytes(points.read_bytes()[:-2])
-    with pytest.raises(InputError, match="copy") as caught:
-        quietly(folder / "morning", tmp_path / "copy", out=tmp_path / "out")
-    assert "\n" not in str(caught.value)
-    assert [path.name for path in tmp_path.iterdir()] == ["copy"]
 
 
 def test_maps_that_cannot_be_merged_are_refused_before_the_search(runs, merged, tmp_path):
@@ -209,38 +195,11 @@ def updates(runs, tmp_path_factory):
     return out, sc.merge([folder / "morning", out / "later"], out / "updated", update=True)
 
 
-def test_an_updated_map_loses_what_the_newest_session_saw_through_and_nothing_else(updates):
-    folder, merged = updates
-    plain, new = open_saved_map(folder / "plain"), open_saved_map(merged.path)
-    assert np.array_equal(plain.poses, new.poses)
-    found = sc.changes(folder / "plain", None, folder / "found", recording=False)
-    removed = 0
-    for k, (before, after) in enumerate(zip(plain.keyframes, new.keyframes, strict=True)):
-        points = lie.transform(plain.poses[k], before.points)
-        remaining = {tuple(row) for row in np.rint(after.points / 0.001).astype(int).tolist()}
-        is_gone = np.array(
-            [tuple(row) not in remaining for row in np.rint(before.points / 0.001).astype(int).tolist()]
-        )
-        assert len(after.points) == len(before.points) - is_gone.sum()
-        for cluster in found.clusters:
-            if cluster.kind == "vanished":
-                on = found.points[found.of_cluster == cluster.number]
-                is_near = np.linalg.norm(points[:, None] - on, axis=2).min(axis=1) < 0.15
-                is_gone &= ~is_near
-                removed += is_near.sum()
-        assert not is_gone.any()
-    assert removed > 0
-    again = sc.changes(merged.path, None, folder / "again", recording=False)
-    kinds = [[cluster.kind for cluster in each.clusters] for each in (found, again)]
-    assert "vanished" not in kinds[1]
-    assert kinds[0].count("vanished") >= 3
-    assert kinds[0].count("appeared") == kinds[1].count("appeared")
-    assert len(read_ply(merged.path / "map.ply")) < len(read_ply(folder / "plain" / "map.ply"))
-
-
 def test_an_update_says_of_which_session_how_many_points_went_and_when_places_were_last_seen(updates):
     folder, merged = updates
     plain, new = open_saved_map(folder / "plain"), open_saved_map(merged.path)
+    assert np.array_equal(plain.poses, new.poses)
+    assert len(read_ply(merged.path / "map.ply")) < len(read_ply(folder / "plain" / "map.ply"))
     lost = [sum(len(k.points) for k in m.keyframes) for m in (plain, new)]
     sessions = {session.name: session.removed_points for session in merged.metrics.sessions}
     assert sessions == {"morning": lost[0] - lost[1], "later": 0}
@@ -378,30 +337,3 @@ def _corridor(x_m, index, depths_m):
     seen = is_wall.any(axis=1)
     points = ranges_m[is_wall.argmax(axis=1)][seen, None] * directions[seen]
     return Keyframe(index, index, index, SavedPoints(points, 1.0), lie.pose_2d(x_m, 0.0, 0.0), x_m)
-
-
-@pytest.mark.slow
-def test_merging_searches_and_aligns_no_more_than_runs_do(runs, tmp_path, monkeypatch):
-    folder, _ = runs
-    truth = read_tum(made.log("office", seed=2).with_suffix(".tum"))
-    quarter_s = float(np.ptp(truth.stamps_ns)) * 1e-9 / 4.0
-    parts = [tmp_path / f"part-{k}" for k in range(4)]
-    for k, part in enumerate(parts):
-        span = {"log__start_s": k * quarter_s, "log__end_s": (k + 1) * quarter_s}
-        made.run("office", tmp_path, seed=2, **span).rename(part)
-    work: Counter[str] = Counter()
-    for owner, name in ((WholeSearch, "__init__"), (Verifier, "scan"), (PoseGraph, "optimize")):
-        monkeypatch.setattr(owner, name, _counted(getattr(owner, name), owner.__name__, work))
-    merged = quietly(*parts, folder / "stranger", out=tmp_path / "out")
-    assert merged.metrics.apart == (("stranger",),)
-    assert work["WholeSearch"] < merged.metrics.keyframes / 4
-    assert work["Verifier"] < merged.metrics.keyframes
-    assert work["PoseGraph"] < merged.metrics.keyframes / 5
-
-
-def _counted(function, name, work):
-    def called(*args, **options):
-        work[name] += 1
-        return function(*args, **options)
-
-    return called
