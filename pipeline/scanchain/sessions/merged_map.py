@@ -66,27 +66,29 @@ class MergedMap:
         return self.joined.keyframes
 
 
-def session_names(maps: Sequence[SavedMap], order: Sequence[int]) -> dict[tuple[int, int], str]:
-    """Name of every session by the numbers of its map and of itself there.
+def session_names(maps: Sequence[SavedMap], order: Sequence[int]) -> list[list[str]]:
+    """Names of the sessions of each map.
 
     A run of one log is called by its directory; of equal names the later ones, in this order, get a number.
     """
-    names: dict[tuple[int, int], str] = {}
+    names: list[list[str]] = [[] for _ in maps]
+    taken = set[str]()
     for number in order:
         saved = maps[number]
-        for index, session in enumerate(saved.sessions):
+        for session in saved.sessions:
             stem = name = directory_name(saved.name if len(saved.sessions) == 1 else session.name)
             numbers = count(2)
-            while name in names.values():
+            while name in taken:
                 name = f"{stem}-{next(numbers)}"
-            names[number, index] = name
+            taken.add(name)
+            names[number].append(name)
     return names
 
 
 def merged_map(
     joined: Joined,
     maps: Sequence[SavedMap],
-    names: dict[tuple[int, int], str],
+    names: Sequence[Sequence[str]],
     config: Config,
     *,
     first: int,
@@ -95,7 +97,7 @@ def merged_map(
 ) -> MergedMap:
     """The map of joined maps, in the frame of the map ``first``: its first keyframe stays where it was.
 
-    names : of the sessions, by map and number; held : map whose poses stay as they are, or −1
+    names : of the sessions of each map; held : map whose poses stay as they are, or −1
     update : whether points that newer sessions saw through are removed
     """
     poses = _refined(joined, config, held)
@@ -111,7 +113,7 @@ def merged_map(
     for new, (number, index) in enumerate(chosen):
         of_session = np.flatnonzero(joined.of_map == number)[maps[number].session == index]
         session[of_session] = new
-        sessions.append(msgspec.structs.replace(maps[number].sessions[index], name=names[number, index]))
+        sessions.append(msgspec.structs.replace(maps[number].sessions[index], name=names[number][index]))
         trajectories.append(_trajectory(maps[number], index, poses[of_session]))
     last_seen_ns = np.concatenate([maps[number].last_seen_ns for number in joined.maps])
     removed = np.zeros(len(poses), np.int64)
