@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -19,7 +20,8 @@ from scanchain import (
     write_tum,
 )
 from scanchain.config import LogConfig
-from scanchain.maps import open_saved_map
+from scanchain.data import Keyframe
+from scanchain.maps import SavedMap, open_saved_map
 from scanchain.sessions.localize import measure, pose_near
 from scanchain.sessions.localizer import MapState
 from scanchain.settings import load_settings
@@ -167,6 +169,14 @@ def test_the_localizer_takes_scans_as_a_driver_has_them(office):
         localizer.track(first, 0.1)
 
 
-def test_a_heading_in_degrees_turns_the_pose_of_the_nearest_keyframe(office):
-    saved = open_saved_map(office / "map")
-    np.testing.assert_allclose(pose_near(1.0, 2.0, 90.0)(0, saved), lie.pose_2d(1.0, 2.0, np.pi / 2), atol=1e-12)
+def test_a_position_and_heading_take_height_and_tilt_of_the_nearest_keyframe():
+    poses = [lie.exp(np.array([x, 2.0, 3.0, 0.2, -0.1, 0.4])) for x in (1.0, 50.0)]
+    prior = SavedMap(Path("map"), 3, tuple(Keyframe(0, 0, 0, None, T, 0.0) for T in poses), None, (), None, None)
+    initial = pose_near(1.0, 2.0, 90.0)
+    T = initial(0, prior)
+    np.testing.assert_allclose(T[:3, 3], [1.0, 2.0, poses[0][2, 3]])
+    np.testing.assert_allclose(T[2, :3], poses[0][2, :3])
+    assert lie.yaw(lie.flatten(T)) == pytest.approx(np.pi / 2)
+    np.testing.assert_allclose(
+        initial(0, replace(prior, dimension=2)), lie.pose_2d(1.0, 2.0, np.pi / 2), atol=1e-9
+    )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -191,12 +191,14 @@ def cloud_of(keyframes: Sequence[Keyframe], poses: Matrix, config: Config) -> Cl
     points = built.points()
     if not config.maps.remove_moving:
         return Cloud(points, 0)
-    views = (
-        View(T, keyframe.points, keyframe.scale * config.preprocess.map_voxel_m)
-        for T, keyframe in zip(poses, keyframes, strict=True)
-    )
-    gone = moved(points, built.voxel_size_m, views)
+    gone = moved(points, built.voxel_size_m, views_of(keyframes, poses, config))
     return Cloud(points[~gone], int(gone.sum()))
+
+
+def views_of(keyframes: Sequence[Keyframe], poses: Matrix, config: Config) -> Iterator[View]:
+    """Free space of keyframes at their final poses (K, d+1, d+1)."""
+    for T, keyframe in zip(poses, keyframes, strict=True):
+        yield View(T, keyframe.points, keyframe.scale * config.preprocess.map_voxel_m)
 
 
 def grid_of(keyframes: Sequence[Keyframe], poses: Matrix, config: MapsConfig) -> OccupancyGrid:
