@@ -11,7 +11,7 @@ import pytest
 
 from scanchain.data import Keyframe
 from scanchain.errors import InputError
-from scanchain.maps import Edges, SavedPoints, Session, open_saved_map, write_saved_map
+from scanchain.maps import Edges, SavedMap, SavedPoints, Session, open_saved_map, write_saved_map
 
 
 @pytest.fixture
@@ -24,22 +24,22 @@ def written(tmp_path):
     ]
     pairs, eyes = np.array([[0, 1], [1, 2]]), np.tile(np.eye(3), (2, 1, 1))
     edges = Edges(pairs, eyes, 3.0 * eyes, np.array([False, True]), np.array([1.0, 0.5]))
-    poses = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
-    session = Session("made up", 0, 20, 3)
-    write_saved_map(tmp_path / "map", keyframes, poses, np.zeros(3, int), (session,), edges)
-    return tmp_path, keyframes, edges
+    session, numbers = Session("made up", 0, 20, 3), np.zeros(3, int)
+    saved = SavedMap(tmp_path / "map", 2, tuple(keyframes), numbers, (session,), edges, np.array([0, 10, 30]))
+    write_saved_map(saved)
+    return tmp_path, saved
 
 
 def test_a_saved_map_holds_its_keyframes_to_the_millimeter_and_the_poses_to_the_bit(written):
-    folder, keyframes, edges = written
-    saved = open_saved_map(folder)
-    assert saved.sessions == (Session("made up", 0, 20, 3),) and saved.last_seen_ns.tolist() == [0, 10, 20]
+    folder, before = written
+    saved, edges = open_saved_map(folder), before.edges
+    assert saved.sessions == (Session("made up", 0, 20, 3),) and saved.last_seen_ns.tolist() == [0, 10, 30]
     for name in Edges.__match_args__:
         assert np.array_equal(getattr(saved.edges, name), getattr(edges, name))
-    for before, after in zip(keyframes, saved.keyframes, strict=True):
-        np.testing.assert_allclose(after.points, before.points, atol=1e-3)  # one far return makes none coarse
-        assert np.array_equal(after.T_odom_lidar, before.T_odom_lidar)
-        assert replace(after, stored=None, T_odom_lidar=None) == replace(before, stored=None, T_odom_lidar=None)
+    for old, new in zip(before.keyframes, saved.keyframes, strict=True):
+        np.testing.assert_allclose(new.points, old.points, atol=1e-3)  # one far return makes none coarse
+        assert np.array_equal(new.T_odom_lidar, old.T_odom_lidar)
+        assert replace(new, stored=None, T_odom_lidar=None) == replace(old, stored=None, T_odom_lidar=None)
     assert edges.among(np.array([2, 1])).pairs.tolist() == [[1, 0]]
 
 

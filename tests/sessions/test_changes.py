@@ -12,7 +12,7 @@ from scanchain.__main__ import main
 from scanchain.data import Keyframe
 from scanchain.errors import InputError
 from scanchain.logs.formats.clouds import read_ply
-from scanchain.maps import Edges, SavedPoints, Session, write_saved_map
+from scanchain.maps import Edges, SavedMap, SavedPoints, Session, write_saved_map
 from scanchain.sessions.changes import Changes, Label, Part, changes_between
 from scanchain.sessions.joining import Joined
 from scanchain.sessions.merged_map import MergedMap, updated
@@ -71,11 +71,10 @@ def compared(before: Solids, after: Solids, **options) -> Changes:
 
 def saved(folder: Path, *parts: Part) -> Path:
     """A map of one or several sessions, as a run leaves it."""
-    keyframes = [keyframe for each in parts for keyframe in each.keyframes]
-    poses = np.concatenate([each.poses for each in parts])
+    keyframes = tuple(keyframe for each in parts for keyframe in each.keyframes)
     numbers = np.repeat(np.arange(len(parts)), [len(each.keyframes) for each in parts])
     sessions = tuple(Session(each.name, 0, 9, len(each.keyframes)) for each in parts)
-    write_saved_map(folder / "map", keyframes, poses, numbers, sessions, NO_EDGES)
+    write_saved_map(SavedMap(folder / "map", 2, keyframes, numbers, sessions, NO_EDGES, numbers))
     return folder
 
 

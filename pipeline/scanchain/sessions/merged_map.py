@@ -131,17 +131,20 @@ def final_closures(merged: MergedMap) -> tuple[Closure, ...]:
 
 def write_merged(folder: Path, merged: MergedMap, cloud: Cloud, final: Sequence[Closure], config: Config) -> None:
     """Write map, trajectories, point cloud, grid, graph and closures into a directory."""
-    edges, keyframes, poses = merged.joined.edges, merged.keyframes, merged.T_world_keyframes
-    in_force = edges.where(edges.weight >= REJECTED_WEIGHT)
-    of_sessions = merged.session, merged.sessions
-    write_saved_map(folder / MAP_FOLDER, keyframes, poses, *of_sessions, in_force, merged.last_seen_ns)
+    joined, poses = merged.joined, merged.T_world_keyframes
+    in_force = joined.edges.where(joined.edges.weight >= REJECTED_WEIGHT)
+    saved = SavedMap(
+        folder / MAP_FOLDER, joined.dimension, joined.placed(poses).keyframes, merged.session, merged.sessions,
+        in_force, merged.last_seen_ns,
+    )  # fmt: skip
+    write_saved_map(saved)
     for session, trajectory in zip(merged.sessions, merged.trajectories, strict=True):
         write_tum(folder / f"{session.name}.tum", trajectory, force=True)
     write_ply(folder / "map.ply", cloud.points)
-    if merged.joined.dimension == 2:
-        write_map(folder, grid_of(keyframes, poses, config.maps))
-    write_g2o(folder / GRAPH_FILE, graph_of(replace(merged.joined, edges=in_force)))
-    write_closures(folder / "loops.parquet", final, merged.keyframes, merged.joined.dimension)
+    if joined.dimension == 2:
+        write_map(folder, grid_of(merged.keyframes, poses, config.maps))
+    write_g2o(folder / GRAPH_FILE, graph_of(replace(joined, edges=in_force)))
+    write_closures(folder / "loops.parquet", final, merged.keyframes, joined.dimension)
 
 
 def _refined(joined: Joined, config: Config, held: int) -> Matrix:
