@@ -106,7 +106,7 @@ class SavedPoints:
 
 @dataclass(frozen=True, slots=True)
 class SavedMap:
-    """A map on disk.
+    """A map, as it is written to disk and opened from there.
 
     Attributes
     ----------
