@@ -203,11 +203,12 @@ def updated_rooms(*parts: Part):
         for k, keyframe in enumerate(each.keyframes)
     ]
     numbers = np.repeat(np.arange(len(parts)), [len(each.keyframes) for each in parts])
-    sessions = [Session(each.name, start, start + 9, 8) for start, each in zip((0, 100, 200), parts, strict=False)]
-    joined = Joined((0,), tuple(keyframes), np.zeros(len(keyframes), int), NO_EDGES)
-    none, poses = np.zeros(len(keyframes), np.int64), np.concatenate([each.poses for each in parts])
-    merged = MergedMap(joined, poses, tuple(sessions), numbers, (), none, none)
-    return keyframes, updated(merged, load_settings(2).config)
+    starts = zip((0, 100, 200), parts, strict=False)
+    sessions = tuple(Session(each.name, start, start + 9, 8) for start, each in starts)
+    none = np.zeros(len(keyframes), np.int64)
+    merged = SavedMap(Path("map"), 2, tuple(keyframes), numbers, sessions, NO_EDGES, none)
+    joined = Joined((0,), tuple(keyframes), none, NO_EDGES)
+    return keyframes, updated(MergedMap(joined, merged, (), none), load_settings(2).config)
 
 
 def in_world(keyframe: Keyframe) -> np.ndarray:
@@ -220,7 +221,7 @@ def on_box(points: np.ndarray) -> np.ndarray:
 
 def test_what_newer_sessions_saw_through_is_removed_from_older_ones_and_nothing_else():
     before, after = updated_rooms(part("monday", room(BOX)), part("tuesday", room(BOX)), part("friday", room()))
-    for k, (old, new) in enumerate(zip(before, after.keyframes, strict=True)):
+    for k, (old, new) in enumerate(zip(before, after.saved.keyframes, strict=True)):
         is_box = on_box(in_world(old)) & (k < 16)
         assert np.array_equal(new.points, old.points[~is_box])
         assert after.removed[k] == is_box.sum()
@@ -237,10 +238,10 @@ def test_what_came_stays_and_what_no_newer_session_saw_stays():
                  np.concatenate([hidden.poses, lie.pose_2d(*HIDDEN, 0.0)[None]]))  # fmt: skip
     before, after = updated_rooms(there, part("friday", room()))
     assert after.removed[8] == 0
-    assert len(after.keyframes[8].points) == 200
-    assert after.last_seen_ns[8] == before[8].stamp_ns == 8
-    assert (after.last_seen_ns[:8] >= 100).all()
-    assert (after.last_seen_ns >= [keyframe.stamp_ns for keyframe in before]).all()
+    assert len(after.saved.keyframes[8].points) == 200
+    assert after.saved.last_seen_ns[8] == before[8].stamp_ns == 8
+    assert (after.saved.last_seen_ns[:8] >= 100).all()
+    assert (after.saved.last_seen_ns >= [keyframe.stamp_ns for keyframe in before]).all()
 
 
 def test_a_session_that_shares_no_view_removes_nothing_and_is_named():

@@ -16,7 +16,7 @@ from scanchain.data import REJECTED_WEIGHT, Closure, ClosureVerdict, brief
 from scanchain.errors import InputError, ScanchainError, counted
 from scanchain.files import write_whole
 from scanchain.graph.optimization import fit
-from scanchain.maps import SavedMap, Session, open_saved_map
+from scanchain.maps import MAP_FOLDER, SavedMap, Session, open_saved_map
 from scanchain.runs.directory import RUN_FILE, RunDirectory
 from scanchain.runs.job import Job, Progress
 from scanchain.runs.provenance import Hashing, describe_start
@@ -109,8 +109,9 @@ def merge(
         groups, uncertain = join_all(maps, order, [each[0] for each in names], config, held, progress.say)
         joined = _chosen(groups, held, maps, uncertain)
         progress.say(f"making the map of {counted(len(joined.keyframes), 'keyframe')}")
-        merged = merged_map(joined, maps, names, config, first=min(joined.maps), held=held, update=update)
-        cloud, final = cloud_of(merged.keyframes, merged.T_world_keyframes, config), final_closures(merged)
+        first, folder = min(joined.maps), directory.path / MAP_FOLDER
+        merged = merged_map(joined, maps, names, config, folder=folder, first=first, held=held, update=update)
+        cloud, final = cloud_of(merged.saved.keyframes, merged.saved.poses, config), final_closures(merged)
         write_merged(directory.path, merged, cloud, final, config)
         others = (group.maps for group in groups if group is not joined)
         apart = tuple(tuple(name for number in group for name in names[number]) for group in others)
@@ -122,7 +123,7 @@ def merge(
             updated=update, run_s=run_s, compile_s=compile_s,
         )  # fmt: skip
         write_whole(directory.path / "metrics.json", msgspec.json.format(msgspec.json.encode(metrics)) + b"\n")
-        text = _summary(metrics, names[min(joined.maps)][0], settings.source, fixed=fixed)
+        text = _summary(metrics, names[first][0], settings.source, fixed=fixed)
         (directory.path / "summary.txt").write_text(text, encoding="utf-8")
         write_whole(directory.path / "config.toml", dump(config).encode())
         done = msgspec.structs.replace(provenance.hashed(hashing), complete=True, duration_s=run_s + compile_s)
@@ -209,22 +210,22 @@ def _measured(
     merged: MergedMap, cloud: Cloud, final: Sequence[Closure], config: Config, held: int, **of_merge: Any
 ) -> MergeMetrics:
     """The metrics of a map; ``of_merge`` are those of what joined it."""
-    joined, graph = merged.joined, graph_of(merged.joined, held)
+    joined, saved, graph = merged.joined, merged.saved, graph_of(merged.joined, held)
     state = graph.optimize(config.graph, initialize="given").state
     certificate = graph.certify()
-    ends = merged.session[joined.edges.pairs[joined.is_between & (joined.edges.weight >= REJECTED_WEIGHT)]]
+    ends = saved.session[joined.edges.pairs[joined.is_between & (joined.edges.weight >= REJECTED_WEIGHT)]]
     sessions = (
         SessionMetrics(
             *msgspec.structs.astuple(each),
             closures=int((ends == number).any(axis=1).sum()),
-            removed_points=int(merged.removed[merged.session == number].sum()),
+            removed_points=int(merged.removed[saved.session == number].sum()),
         )
-        for number, each in enumerate(merged.sessions)
+        for number, each in enumerate(saved.sessions)
     )
     return MergeMetrics(
         dimension=joined.dimension,
         sessions=tuple(sessions),
-        keyframes=len(merged.keyframes),
+        keyframes=len(saved.keyframes),
         closures_tried=len(final),
         closures_in_force=sum(item.verdict is ClosureVerdict.ACCEPTED for item in final),
         chi2=state.chi2,
