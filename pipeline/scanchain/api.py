@@ -177,17 +177,15 @@ def merge(
     from scanchain.sessions.merging import merge as merge_maps
     from scanchain_viz.recording.results import present_merge
 
-    return merge_maps(
-        [checks.path(run, "runs") for run in runs],
+    job = Job(
+        tuple(checks.path(run, "runs") for run in runs),
         checks.path(out, "out"),
-        Progress(),
-        present_merge,
-        config_file=_optional_path(config, "config"),
-        overrides=overrides_of(overrides),
-        fixed=checks.truth(fixed, "fixed"),
-        update=checks.truth(update, "update"),
+        _optional_path(config, "config"),
+        overrides_of(overrides),
         force=force,
     )
+    is_fixed, is_updated = checks.truth(fixed, "fixed"), checks.truth(update, "update")
+    return merge_maps(job, Progress(), present_merge, fixed=is_fixed, update=is_updated)
 
 
 def changes(

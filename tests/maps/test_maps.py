@@ -29,13 +29,9 @@ from scanchain.maps import (
 from scanchain.maps.occupancy_grid import _HIGH, _HIT, _LOW, _MISS, OCCUPIED_PROBABILITY
 from scanchain.runs.results import results_of
 from scanchain.runs.step_table import StepTable
-from scanchain.simulation import SENSORS
-from scanchain.simulation.solids import Scenery
 from scanchain.slam import Slam
-from scanchain.trajectory import read_tum
 from tests.support import made
 from tests.support import naive_maps as naive
-from tests.support.scenes import kitti_scans, shared_data
 
 RESOLUTION_M = 0.1
 CONFIG = MapsConfig(grid_resolution_m=RESOLUTION_M)
@@ -61,9 +57,14 @@ def hits(grid):
     return int((grid.log_odds == np.float32(_HIT)).sum())
 
 
-def test_drawn_beams_equal_naive():
+@pytest.mark.parametrize("batch", [1, 5])
+def test_drawn_beams_equal_naive(batch):
     poses, scans = random_scans()
-    grid = draw_grid(zip(poses, scans, strict=True), CONFIG)
+    grid = OccupancyGrid(CONFIG)
+    for first in range(0, len(scans), batch):
+        some = scans[first : first + batch]
+        grid.insert_batch(poses[first : first + batch], some.reshape(-1, 2), 80 * np.arange(len(some) + 1))
+    grid = grid.trimmed()
     beams = [
         [(T[:2, 2], lie.transform(T, point[None])[0]) for point in scan]
         for T, scan in zip(poses, scans, strict=True)
@@ -75,28 +76,6 @@ def test_drawn_beams_equal_naive():
     assert seen == set(expected)
     for (column, row), value in expected.items():
         assert grid.log_odds[row - corner[1], column - corner[0]] == pytest.approx(value, abs=1e-5)
-
-
-def test_a_batch_and_scan_after_scan_draw_the_same_grid():
-    poses, scans = random_scans()
-    single = draw_grid(zip(poses, scans, strict=True), CONFIG)
-    batch = OccupancyGrid(CONFIG)
-    batch.insert_batch(poses[:5], scans[:5].reshape(-1, 2), np.arange(6) * 80)
-    batch.insert_batch(poses[5:], scans[5:].reshape(-1, 2), np.arange(8) * 80)
-    batch = batch.trimmed()
-    np.testing.assert_array_equal(batch.log_odds, single.log_odds)
-    np.testing.assert_allclose(batch.origin_m, single.origin_m)
-
-
-def test_growing_moves_nothing():
-    grid = OccupancyGrid(CONFIG)
-    grid.insert(lie.identity(2), np.array([[1.05, 0.05]]))
-    before = cell(grid, 1.05, 0.05)
-    for x, y in ((-30.0, 2.0), (40.0, -50.0), (3.0, 60.0)):
-        grid.insert(lie.pose_2d(x, y, 0.0), np.array([[0.5, 0.0]]))
-    assert cell(grid, 1.05, 0.05) == before == np.float32(_HIT)
-    assert cell(grid, 0.55, 0.05) == np.float32(_MISS)
-    assert cell(grid, -29.45, 2.05) == np.float32(_HIT)
 
 
 def test_a_scan_counts_once_in_a_cell_and_its_end_outweighs_crossings():
@@ -137,42 +116,6 @@ def test_a_beam_is_drawn_only_where_it_runs_within_the_slice(low, high, z):
     grid = draw_grid([(lie.identity(3), np.array([[4.05, 0.05, z]]))], config)
     assert cell(grid, 3.0, 0.05) == np.float32(_MISS)
     assert grid.origin_m[0] == pytest.approx(2.0)
-
-
-def room_scans(west, south, east, north):
-    """A laser scanner that turns and moves about in an empty room between four walls; it measures exactly."""
-    scenery = Scenery()
-    for x, y, size in (
-        (west - 0.5, 0.5 * (south + north), (1.0, north - south + 2.0)),
-        (east + 0.5, 0.5 * (south + north), (1.0, north - south + 2.0)),
-        (0.5 * (west + east), south - 0.5, (east - west + 2.0, 1.0)),
-        (0.5 * (west + east), north + 0.5, (east - west + 2.0, 1.0)),
-    ):
-        scenery.box((x, y), size, (0.0, 2.0))
-    solids, rays = scenery.finish(), SENSORS["lms-270"].rays(0)
-    for share in np.linspace(0.2, 0.8, 25):
-        T = lie.pose_2d(west + share * (east - west), south + share**2 * (north - south), 20.0 * share)
-        raised = lie.lift(T)
-        raised[2, 3] = 1.0
-        ranges_m = solids.cast(raised[None], np.zeros(len(rays.directions), np.int32), rays.directions, 30.0)
-        yield T, (rays.directions * ranges_m[:, None])[:, :2]
-
-
-def test_nav2_reads_the_walls_of_a_known_room_to_one_cell(tmp_path):
-    west, south, east, north = -3.33, 1.27, 4.12, 5.58
-    write_map(tmp_path, draw_grid(room_scans(west, south, east, north), CONFIG))
-    cells, origin, resolution_m = naive.served_map(tmp_path)
-    assert resolution_m == RESOLUTION_M and origin[2] == 0.0
-    assert np.abs(origin[:2] - [west, south]).max() <= RESOLUTION_M
-    rows, columns = np.indices(cells.shape)
-    x, y = origin[0] + (columns + 0.5) * resolution_m, origin[1] + (rows + 0.5) * resolution_m
-    inwards_m = np.minimum.reduce([x - west, east - x, y - south, north - y])
-    walls = cells == 100
-    assert np.abs(inwards_m[walls]).max() <= RESOLUTION_M
-    assert (cells[inwards_m > RESOLUTION_M] == 0).all() and not (cells[inwards_m < -RESOLUTION_M] == 0).any()
-    for across, axis, places in ((x, 1, (west, east)), (y, 0, (south, north))):
-        for place in places:
-            assert (walls & (np.abs(across - place) <= RESOLUTION_M)).any(axis=axis).mean() > 0.95
 
 
 def test_nav2_reads_cell_0_0_at_the_origin_and_rows_upwards(tmp_path):
@@ -319,20 +262,6 @@ def test_open3d_reads_our_pcd(tmp_path):
     write_pcd(tmp_path / "a.pcd", points)
     read = np.asarray(library.io.read_point_cloud(str(tmp_path / "a.pcd")).points)
     np.testing.assert_allclose(read, points, atol=1e-6)
-
-
-def test_a_street_of_real_sweeps_becomes_a_map_with_walls_and_free_road():
-    sweeps = kitti_scans(10)
-    truth = read_tum(shared_data("3d/kitti_0001_first54.tum"))
-    scans = [(pose, sweep.points) for pose, sweep in zip(truth.poses, sweeps, strict=False)]
-    grid = draw_grid(scans, MapsConfig())
-    road = [cell(grid, *pose[:2, 3]) for pose in truth.poses[:10]]
-    assert max(road) < 0.0
-    probability = grid.probability()
-    assert 1000 < (probability > 0.65).sum() < 0.1 * (probability < 0.35).sum()
-    cloud = build_point_map(scans, dimension=3, voxel_size_m=0.2)
-    assert 50_000 < len(cloud) < 200_000
-    assert np.isfinite(cloud.points()).all()
 
 
 @pytest.mark.parametrize("tilt_deg", [0.0, 25.0])

@@ -1,7 +1,5 @@
 """What moved leaves the maps, what stands stays, and the kernel equals its slow twin."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -51,14 +49,6 @@ def test_traffic_leaves_the_cloud_but_for_what_is_close_to_the_ground_and_the_to
     ground_m = moving_worlds.ground_height(voxels[:, :2])
     high = near & (voxels[:, 2] > ground_m + 0.4)
     assert (moves & high).sum() > 5000 and gone[moves & high].mean() > 0.95
-
-
-@pytest.mark.slow
-def test_a_world_where_nothing_moves_loses_next_to_nothing(town, office):
-    for scans, voxel_m, spacing_m in ((town, 0.2, 0.5), (office, 0.05, 0.01)):
-        still = [replace(scan, points=scan.points[~scan.moves], moves=scan.moves[~scan.moves]) for scan in scans]
-        _, moves, gone = judged(still[::3], voxel_m, spacing_m)
-        assert not moves.any() and gone.mean() < 0.002
 
 
 def test_people_who_walk_about_leave_no_trace_in_the_grid(office):

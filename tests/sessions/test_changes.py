@@ -12,7 +12,7 @@ from scanchain.__main__ import main
 from scanchain.data import Keyframe
 from scanchain.errors import InputError
 from scanchain.logs.formats.clouds import read_ply
-from scanchain.maps import Edges, SavedPoints, Session, open_saved_map, write_saved_map
+from scanchain.maps import Edges, SavedMap, SavedPoints, Session, write_saved_map
 from scanchain.sessions.changes import Changes, Label, Part, changes_between
 from scanchain.sessions.joining import Joined
 from scanchain.sessions.merged_map import MergedMap, updated
@@ -71,11 +71,10 @@ def compared(before: Solids, after: Solids, **options) -> Changes:
 
 def saved(folder: Path, *parts: Part) -> Path:
     """A map of one or several sessions, as a run leaves it."""
-    keyframes = [keyframe for each in parts for keyframe in each.keyframes]
-    poses = np.concatenate([each.poses for each in parts])
+    keyframes = tuple(keyframe for each in parts for keyframe in each.keyframes)
     numbers = np.repeat(np.arange(len(parts)), [len(each.keyframes) for each in parts])
     sessions = tuple(Session(each.name, 0, 9, len(each.keyframes)) for each in parts)
-    write_saved_map(folder / "map", keyframes, poses, numbers, sessions, NO_EDGES)
+    write_saved_map(SavedMap(folder / "map", 2, keyframes, numbers, sessions, NO_EDGES, numbers))
     return folder
 
 
@@ -169,48 +168,31 @@ def test_the_newest_session_of_a_merged_map_is_compared_with_those_before(tmp_pa
         (["A", "B", "--transform", "1,2"], "give X,Y,YAW"),
         (["A", "B", "--transform", "1,2,0", "--aligned"], "give one of them"),
         (["A", "none"], "holds no map"),
+        (["A", "empty"], "has no keyframe"),
+        (["A", "B", "--aligned", "--force", "--out", "A"], "is one of the maps"),
+        (["A", "B", "--aligned", "--force", "--out", "B"], "is one of the maps"),
     ],
 )
-def test_what_cannot_be_compared_is_refused_and_leaves_nothing(tmp_path, capsys, words, message):
+def test_what_cannot_be_compared_is_refused_and_leaves_the_maps_as_they_were(tmp_path, capsys, words, message):
     saved(tmp_path / "A", part("a", room(BOX), count=3))
     saved(tmp_path / "B", part("b", hall(), lie.pose_2d(70.0, 0.0, 1.0), count=3))
-    words = [str(tmp_path / word) if word in ("A", "B", "none") else word for word in words]
-    assert main(["changes", *words, "--out", str(tmp_path / "out")]) == 2
+    saved(tmp_path / "empty", Part("empty", [], np.empty((0, 3, 3))))
+    before = {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*")}
+    words = [str(tmp_path / word) if word in ("A", "B", "none", "empty") else word for word in words]
+    assert main(["changes", "--out", str(tmp_path / "out"), *words]) == 2
     assert message in capsys.readouterr().err
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["A", "B"]
+    assert before == {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*")}
 
 
-def test_no_map_is_replaced_by_the_comparison_and_both_are_named_in_it(tmp_path, capsys):
+def test_a_comparison_names_both_maps_and_is_no_run_to_check_or_draw(tmp_path, capsys):
     a, b = saved(tmp_path / "a", part("a", room(BOX))), saved(tmp_path / "b", part("b", room()))
-    for run in (a, b):
-        assert main(["changes", str(a), str(b), "--aligned", "--force", "--out", str(run)]) == 2
-        assert "is one of the maps" in capsys.readouterr().err
     scanchain.changes(a, b, tmp_path / "ab", T_earlier_later=lie.identity(2), recording=False)
     logs = json.loads((tmp_path / "ab" / "run.json").read_text())["logs"]
     assert [log["path"] for log in logs] == [str(a / "map"), str(b / "map")]
-
-
-def test_a_directory_that_is_no_run_is_not_checked_or_drawn_and_says_where_to_look(tmp_path, capsys):
-    a, b = saved(tmp_path / "a", part("a", room(BOX))), saved(tmp_path / "b", part("b", room()))
-    scanchain.changes(a, b, tmp_path / "ab", T_earlier_later=lie.identity(2), recording=False)
     assert main(["check", str(tmp_path / "ab")]) == 2
     assert "see summary.txt" in capsys.readouterr().err
     assert main(["view", str(tmp_path / "ab"), "--png", str(tmp_path / "ab.png")]) == 2
     assert "open report.html" in capsys.readouterr().err
-
-
-def test_a_map_without_keyframes_is_refused(tmp_path, capsys):
-    a, b = saved(tmp_path / "a", part("a", room(BOX))), saved(tmp_path / "b", Part("b", [], np.empty((0, 3, 3))))
-    assert main(["changes", str(a), str(b), "--out", str(tmp_path / "ab")]) == 2
-    assert "has no keyframe" in capsys.readouterr().err
-
-
-def test_maps_stay_as_they_were(tmp_path):
-    a, b = saved(tmp_path / "a", part("a", room(BOX))), saved(tmp_path / "b", part("b", room()))
-    before = {path: path.read_bytes() for folder in (a, b) for path in (folder / "map").iterdir()}
-    scanchain.changes(a, b, tmp_path / "ab", T_earlier_later=lie.identity(2), recording=False)
-    assert before == {path: path.read_bytes() for folder in (a, b) for path in (folder / "map").iterdir()}
-    assert open_saved_map(a).sessions[0].name == "a"
 
 
 def updated_rooms(*parts: Part):
@@ -221,11 +203,12 @@ def updated_rooms(*parts: Part):
         for k, keyframe in enumerate(each.keyframes)
     ]
     numbers = np.repeat(np.arange(len(parts)), [len(each.keyframes) for each in parts])
-    sessions = [Session(each.name, start, start + 9, 8) for start, each in zip((0, 100, 200), parts, strict=False)]
-    joined = Joined((0,), tuple(keyframes), np.zeros(len(keyframes), int), NO_EDGES)
-    none, poses = np.zeros(len(keyframes), np.int64), np.concatenate([each.poses for each in parts])
-    merged = MergedMap(joined, poses, tuple(sessions), numbers, (), none, none)
-    return keyframes, updated(merged, load_settings(2).config)
+    starts = zip((0, 100, 200), parts, strict=False)
+    sessions = tuple(Session(each.name, start, start + 9, 8) for start, each in starts)
+    none = np.zeros(len(keyframes), np.int64)
+    merged = SavedMap(Path("map"), 2, tuple(keyframes), numbers, sessions, NO_EDGES, none)
+    joined = Joined((0,), tuple(keyframes), none, NO_EDGES)
+    return keyframes, updated(MergedMap(joined, merged, (), none), load_settings(2).config)
 
 
 def in_world(keyframe: Keyframe) -> np.ndarray:
@@ -238,7 +221,7 @@ def on_box(points: np.ndarray) -> np.ndarray:
 
 def test_what_newer_sessions_saw_through_is_removed_from_older_ones_and_nothing_else():
     before, after = updated_rooms(part("monday", room(BOX)), part("tuesday", room(BOX)), part("friday", room()))
-    for k, (old, new) in enumerate(zip(before, after.keyframes, strict=True)):
+    for k, (old, new) in enumerate(zip(before, after.saved.keyframes, strict=True)):
         is_box = on_box(in_world(old)) & (k < 16)
         assert np.array_equal(new.points, old.points[~is_box])
         assert after.removed[k] == is_box.sum()
@@ -255,10 +238,10 @@ def test_what_came_stays_and_what_no_newer_session_saw_stays():
                  np.concatenate([hidden.poses, lie.pose_2d(*HIDDEN, 0.0)[None]]))  # fmt: skip
     before, after = updated_rooms(there, part("friday", room()))
     assert after.removed[8] == 0
-    assert len(after.keyframes[8].points) == 200
-    assert after.last_seen_ns[8] == before[8].stamp_ns == 8
-    assert (after.last_seen_ns[:8] >= 100).all()
-    assert (after.last_seen_ns >= [keyframe.stamp_ns for keyframe in before]).all()
+    assert len(after.saved.keyframes[8].points) == 200
+    assert after.saved.last_seen_ns[8] == before[8].stamp_ns == 8
+    assert (after.saved.last_seen_ns[:8] >= 100).all()
+    assert (after.saved.last_seen_ns >= [keyframe.stamp_ns for keyframe in before]).all()
 
 
 def test_a_session_that_shares_no_view_removes_nothing_and_is_named():

@@ -130,7 +130,7 @@ def _initial(text: str) -> Callable[[int, SavedMap], Pose]:
 @click.option("--fixed", is_flag=True, help="Leave the poses of the first RUN as they are.")
 @click.option("--update", is_flag=True, help="Remove from older sessions what newer ones saw through.")
 @options.threads
-def merge(runs: tuple[Path, ...], out: Path, as_json: bool, **given: Any) -> None:
+def merge(runs: tuple[Path, ...], out: Path, fixed: bool, update: bool, as_json: bool, **given: Any) -> None:
     """Merge the maps of several runs into one map in one frame.
 
     RUN is a run directory, or that of an earlier merge; where each began need not be known. Loops are closed
@@ -147,11 +147,13 @@ def merge(runs: tuple[Path, ...], out: Path, as_json: bool, **given: Any) -> Non
       scanchain merge runs/both runs/wednesday --update --out runs/week --json
     """
     from scanchain.commands.terminal import Terminal
+    from scanchain.runs.job import Job
     from scanchain.sessions.merging import merge as merge_maps
     from scanchain_viz.recording.results import present_merge
 
+    job = Job(runs, out, command=tuple(sys.argv), **given)
     with Terminal("maps") as terminal:
-        merged = merge_maps(runs, out, terminal, present_merge, command=tuple(sys.argv), **given)
+        merged = merge_maps(job, terminal, present_merge, fixed=fixed, update=update)
     options.print_summary(out, merged.summary, as_json=as_json)
 
 

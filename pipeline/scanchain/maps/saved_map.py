@@ -14,10 +14,9 @@ Points stay on disk and are read keyframe by keyframe. Maps of version 1 had no 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -49,7 +48,7 @@ class _Index(msgspec.Struct, frozen=True):
     """Contents of map.json."""
 
     version: int
-    dimension: Literal[2, 3]
+    dimension: Annotated[int, msgspec.Meta(ge=2, le=3)]
     keyframes: int
     points: int
     sessions: tuple[Session, ...]
@@ -107,7 +106,7 @@ class SavedPoints:
 
 @dataclass(frozen=True, slots=True)
 class SavedMap:
-    """A map on disk.
+    """A map, as it is written to disk and opened from there.
 
     Attributes
     ----------
@@ -131,7 +130,8 @@ class SavedMap:
     @property
     def poses(self) -> Matrix:
         """(K, d+1, d+1) T_map_lidar of the keyframes."""
-        return np.array([keyframe.T_odom_lidar for keyframe in self.keyframes])
+        size = self.dimension + 1
+        return np.array([keyframe.T_odom_lidar for keyframe in self.keyframes]).reshape(-1, size, size)
 
     @property
     def name(self) -> str:
@@ -139,20 +139,9 @@ class SavedMap:
         return self.folder.parent.name if self.folder.name == MAP_FOLDER else self.folder.name
 
 
-def write_saved_map(
-    folder: Path,
-    keyframes: Sequence[Keyframe],
-    poses: Matrix,
-    session: NDArray[np.int64],
-    sessions: Sequence[Session],
-    edges: Edges,
-    last_seen_ns: NDArray[np.int64] | None = None,
-) -> None:
-    """Write a map of keyframes at these poses (K, d+1, d+1) into a new folder; map.json comes last.
-
-    session : (K,) number of each keyframe's session
-    last_seen_ns : (K,) as in ``SavedMap``; the keyframes' own stamps where left out
-    """
+def write_saved_map(saved: SavedMap) -> None:
+    """Write a map into its folder, which is new; map.json comes last."""
+    folder, keyframes = saved.folder, saved.keyframes
     folder.mkdir(parents=True)
     stored: list[tuple[int, float, bool]] = []
     with (folder / _POINTS).open("wb") as file:
@@ -165,24 +154,23 @@ def write_saved_map(
             file.write(np.rint(points / step_m).astype(number).tobytes())
             stored.append((len(points), step_m, is_wide))
     rows = np.array(stored, [("count", np.int64), ("step_m", np.float64), ("is_wide", np.bool_)])
-    stamps_ns = np.array([keyframe.stamp_ns for keyframe in keyframes], np.int64)
     np.savez(
         folder / _KEYFRAMES,
-        poses=poses,
-        session=session,
+        poses=saved.poses,
+        session=saved.session,
         count=rows["count"],
         step_m=rows["step_m"],
         is_wide=rows["is_wide"],
-        stamps_ns=stamps_ns,
-        last_seen_ns=stamps_ns if last_seen_ns is None else last_seen_ns,
+        stamps_ns=np.array([keyframe.stamp_ns for keyframe in keyframes], np.int64),
+        last_seen_ns=saved.last_seen_ns,
         scan_index=np.array([keyframe.scan_index for keyframe in keyframes], np.int64),
         traveled_m=np.array([keyframe.traveled_m for keyframe in keyframes]),
         scale=np.array([keyframe.scale for keyframe in keyframes]),
     )
-    np.savez(folder / _EDGES, **{name: getattr(edges, name) for name in _EDGE_ARRAYS})
+    np.savez(folder / _EDGES, **{name: getattr(saved.edges, name) for name in _EDGE_ARRAYS})
     crc32 = {name: _crc32(folder / name) for name in (_KEYFRAMES, _EDGES, _POINTS)}
-    dimension: Literal[2, 3] = 2 if poses.shape[-1] == 3 else 3
-    index = _Index(VERSION, dimension, len(keyframes), int(rows["count"].sum()), tuple(sessions), crc32)
+    points = int(rows["count"].sum())
+    index = _Index(VERSION, saved.dimension, len(keyframes), points, saved.sessions, crc32)
     write_whole(folder / _INDEX, msgspec.json.format(msgspec.json.encode(index)))
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgspec
@@ -25,6 +25,7 @@ from scanchain.maps import (
     MAP_FOLDER,
     Edges,
     OccupancyGrid,
+    SavedMap,
     Session,
     View,
     build_point_map,
@@ -100,13 +101,16 @@ def _write_saved_map(path: Path, results: Results) -> None:
     """The map of the largest piece of the log."""
     result, graph = results.result, results.result.graph
     chosen = np.flatnonzero(result.components == np.bincount(result.components).argmax())
-    keyframes = [result.keyframes[index] for index in chosen.tolist()]
+    keyframes = tuple(
+        replace(result.keyframes[k], T_odom_lidar=result.T_world_keyframes[k]) for k in chosen.tolist()
+    )
     edges = Edges(graph.edges, graph.measurements, graph.information, graph.is_loop, graph.weight)
     in_force = edges.where(~graph.is_rejected).among(chosen)
     stamps_ns = result.trajectory.stamps_ns
     session = Session(Path(results.log.name).name, int(stamps_ns[0]), int(stamps_ns[-1]), len(keyframes))
     numbers = np.zeros(len(keyframes), np.int64)
-    write_saved_map(path, keyframes, result.T_world_keyframes[chosen], numbers, (session,), in_force)
+    seen_ns = np.array([keyframe.stamp_ns for keyframe in keyframes], np.int64)
+    write_saved_map(SavedMap(path, graph.dimension, keyframes, numbers, (session,), in_force, seen_ns))
     if results.config.loops.enabled and graph.dimension == 3:
         outline_of(path, open_saved_map(path).keyframes, results.config.local_map)
 
@@ -191,12 +195,14 @@ def cloud_of(keyframes: Sequence[Keyframe], poses: Matrix, config: Config) -> Cl
     points = built.points()
     if not config.maps.remove_moving:
         return Cloud(points, 0)
-    views = (
-        View(T, keyframe.points, keyframe.scale * config.preprocess.map_voxel_m)
-        for T, keyframe in zip(poses, keyframes, strict=True)
-    )
-    gone = moved(points, built.voxel_size_m, views)
+    gone = moved(points, built.voxel_size_m, views_of(keyframes, poses, config))
     return Cloud(points[~gone], int(gone.sum()))
+
+
+def views_of(keyframes: Sequence[Keyframe], poses: Matrix, config: Config) -> Iterator[View]:
+    """Free space of keyframes at their final poses (K, d+1, d+1)."""
+    for T, keyframe in zip(poses, keyframes, strict=True):
+        yield View(T, keyframe.points, keyframe.scale * config.preprocess.map_voxel_m)
 
 
 def grid_of(keyframes: Sequence[Keyframe], poses: Matrix, config: MapsConfig) -> OccupancyGrid:

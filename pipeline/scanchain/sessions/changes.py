@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Literal
 
 import numpy as np
+from msgspec import structs
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
@@ -16,7 +17,8 @@ from scipy.spatial import KDTree
 from scanchain.config import Config
 from scanchain.data import Keyframe, Matrix, Points, brief
 from scanchain.errors import InputError
-from scanchain.maps import View, build_point_map, clearly_through, moved, reach_of, sightings
+from scanchain.maps import clearly_through, reach_of, sightings
+from scanchain.runs.results import cloud_of, views_of
 
 _SAME_VOXELS = 1.5  # distance, in voxels, within which the other map has the same surface
 _JOINED_VOXELS = {2: 4.0, 3: 3.0}  # distance within which changed points belong to one cluster
@@ -135,7 +137,9 @@ def changes_between(
     Raises InputError where the maps do not fit on each other.
     """
     size_m = config.maps.voxel_size_m if voxel_size_m is None else voxel_size_m
-    before, after = (_cloud(part, size_m, config) for part in (earlier, later))
+    maps = structs.replace(config.maps, voxel_size_m=size_m, remove_moving=True)
+    still = structs.replace(config, maps=maps)
+    before, after = (cloud_of(part.keyframes, part.poses, still).points for part in (earlier, later))
     labels_before = _labels(before, after, later, Label.VANISHED, size_m, config)
     labels_after = _labels(after, before, earlier, Label.APPEARED, size_m, config)
     counts = np.bincount(np.concatenate([labels_before, labels_after]), minlength=len(Label))
@@ -154,24 +158,11 @@ def changes_between(
     )
 
 
-def _cloud(part: Part, size_m: float, config: Config) -> Points:
-    """One point a voxel of what stood still while the map was made."""
-    dimension = part.poses.shape[-1] - 1
-    scans = ((pose, keyframe.points) for pose, keyframe in zip(part.poses, part.keyframes, strict=True))
-    points = build_point_map(scans, dimension=dimension, voxel_size_m=size_m).points()
-    return points[~moved(points, size_m, _views(part, config))]
-
-
-def _views(part: Part, config: Config) -> Iterator[View]:
-    for pose, keyframe in zip(part.poses, part.keyframes, strict=True):
-        yield View(pose, keyframe.points, keyframe.scale * config.preprocess.map_voxel_m)
-
-
 def _labels(
     points: Points, others: Points, other: Part, changed: Label, size_m: float, config: Config
 ) -> NDArray[np.uint8]:
     """Labels (N,) of points by the cloud of the other map and what its scans saw."""
-    seen, seen_through = sightings(points, size_m, _views(other, config))
+    seen, seen_through = sightings(points, size_m, views_of(other.keyframes, other.poses, config))
     distance_m = KDTree(others).query(points, distance_upper_bound=_SAME_VOXELS * size_m)[0]
     is_same = np.isfinite(distance_m)
     is_changed = clearly_through(seen, seen_through) & ~is_same

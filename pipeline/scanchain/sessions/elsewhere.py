@@ -19,7 +19,7 @@ from scanchain.data import Keyframe, Matrix, Points, Scan
 from scanchain.errors import InputError, counted
 from scanchain.kernels.free_space import nearest_ranges
 from scanchain.logs.formats.clouds import SUFFIXES, CloudFileError, read_cloud_file
-from scanchain.maps import MAP_FOLDER, Edges, SavedPoints, Session, write_saved_map
+from scanchain.maps import MAP_FOLDER, Edges, SavedMap, SavedPoints, Session, write_saved_map
 from scanchain.maps.occupancy_grid import MAX_CELLS
 from scanchain.preprocess import Resolution
 from scanchain.runs.directory import RUN_FILE, RunDirectory
@@ -88,11 +88,13 @@ def import_map(
                 f"{file}: a lidar {height_m:g} m above the ground sees {_LEAST_POINTS} points nowhere; give a "
                 "cloud in meters with z up, or another --height"
             )
-        poses = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
-        session, k = Session(file.name, 0, len(keyframes) - 1, len(keyframes)), lie.twist_size(poses[0])
-        edges = Edges(np.empty((0, 2), np.int64), poses[:0], np.empty((0, k, k)), np.empty(0, bool), np.empty(0))
-        numbers = np.zeros(len(keyframes), np.int64)
-        write_saved_map(directory.path / MAP_FOLDER, keyframes, poses, numbers, (session,), edges)
+        count, d, k = len(keyframes), dimension + 1, 3 * (dimension - 1)
+        session = Session(file.name, 0, count - 1, count)
+        none = Edges(
+            np.empty((0, 2), int), np.empty((0, d, d)), np.empty((0, k, k)), np.empty(0, bool), np.empty(0)
+        )
+        numbers, stamps_ns, folder = np.zeros(count, np.int64), np.arange(count), directory.path / MAP_FOLDER
+        write_saved_map(SavedMap(folder, dimension, keyframes, numbers, (session,), none, stamps_ns))
         provenance = describe_start(sys.argv, [file], "")
         msgspec.structs.replace(provenance, complete=True).write(directory.path / RUN_FILE)
         directory.complete()

@@ -353,26 +353,28 @@ def _summary(m: LocalizeMetrics, prior: SavedMap, log: Log) -> str:
     names = ", ".join(session.name for session in prior.sessions)
     states = ", ".join(f"{count:,} {state}" for state, count in m.states.items() if count)
     lines = [
-        ("verdict", m.sentence),
-        ("log", f"{', '.join(map(str, log.paths))} {log.topic}: {counted(m.scans, 'scan')} over {m.path_m:.1f} m"),
-        ("map", f"{prior.folder}: {counted(m.map_keyframes, 'keyframe')} of {names}"),
-        ("states", f"{states}; {m.placed:,} placed in the end"),
+        f"verdict        {m.sentence}",
+        f"log            {', '.join(map(str, log.paths))} {log.topic}: "
+        f"{counted(m.scans, 'scan')} over {m.path_m:.1f} m",
+        f"map            {prior.folder}: {counted(m.map_keyframes, 'keyframe')} of {names}",
+        f"states         {states}; {m.placed:,} placed in the end",
     ]
     if m.found_scan >= 0:
-        lines.append(
-            ("found", f"at scan {m.found_scan:,}, after {m.found_after_s:.1f} s and {m.found_after_m:.1f} m")
-        )
+        at = f"{m.found_after_s:.1f} s and {m.found_after_m:.1f} m"
+        lines.append(f"found          at scan {m.found_scan:,}, after {at}")
     if m.matches:
         left_out = f", {m.rejected:,} of them left out" if m.rejected else ""
-        lines.append(("matches", f"{m.matches:,} with the map{left_out}; overlap {m.median_overlap:.2f} (median)"))
-        sigmas = f"{m.median_sigma_m:.3f} m at its time, {m.median_final_sigma_m:.3f} m in the end"
-        lines.append(("sigma", f"{sigmas}: standard deviation of a position (median)"))
-    truth = [] if m.ground_truth is None else accuracy_lines(m.ground_truth)
-    lines += [(line[:15].strip(), line[15:]) for line in truth]
-    lines += [("stretch", part.text) for part in m.parts]
-    lines += [("warning", warning) for warning in m.warnings]
-    lines.append(("time", f"{m.time_s:.1f} s, {m.scans / max(m.time_s, 1e-9):,.0f} scans/s"))
-    return "".join(f"{name:<15}{text}\n" for name, text in lines)
+        lines += [
+            f"matches        {m.matches:,} with the map{left_out}; overlap {m.median_overlap:.2f} (median)",
+            f"sigma          {m.median_sigma_m:.3f} m at its time, {m.median_final_sigma_m:.3f} m in the end: "
+            "standard deviation of a position (median)",
+        ]
+    if m.ground_truth is not None:
+        lines += accuracy_lines(m.ground_truth)
+    lines += [f"stretch        {part.text}" for part in m.parts]
+    lines += [f"warning        {warning}" for warning in m.warnings]
+    lines.append(f"time           {m.time_s:.1f} s, {m.scans / max(m.time_s, 1e-9):,.0f} scans/s")
+    return "\n".join(lines) + "\n"
 
 
 def _write(folder: Path, localized: LocalizedLog) -> None:

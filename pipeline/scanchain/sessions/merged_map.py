@@ -21,7 +21,7 @@ from scanchain.data import REJECTED_WEIGHT, Closure, Keyframe, KeyframePoints, M
 from scanchain.errors import InputError
 from scanchain.graph.g2o import write_g2o
 from scanchain.loops import refined, spread
-from scanchain.maps import MAP_FOLDER, SavedMap, Session, write_map, write_ply, write_saved_map
+from scanchain.maps import SavedMap, write_map, write_ply, write_saved_map
 from scanchain.point_store import PointStore
 from scanchain.runs.closures import final_verdicts, write_closures
 from scanchain.runs.directory import directory_name
@@ -42,60 +42,53 @@ class MergedMap:
     Attributes
     ----------
     joined : the graph
-    T_world_keyframes : (K, d+1, d+1) final poses; in the plane finer than those of the graph
-    sessions : of all maps, with names that differ, in the order of time
-    session : (K,) number of each keyframe's session
+    saved : the map; its poses are in the plane finer than those of the graph, its sessions, of all maps, in the
+        order of time with names that differ
     trajectories : of the sessions; of all scans where a run has them, else of the keyframes
-    last_seen_ns : (K,) stamp of the newest keyframe known to have seen the surroundings of each
     removed : (K,) number of each keyframe's points that newer sessions saw through, where the map was updated
     warnings : of the update
     """
 
     joined: Joined
-    T_world_keyframes: Matrix
-    sessions: tuple[Session, ...]
-    session: NDArray[np.int64]
+    saved: SavedMap
     trajectories: tuple[Trajectory, ...]
-    last_seen_ns: NDArray[np.int64]
     removed: NDArray[np.int64]
     warnings: tuple[str, ...] = ()
 
-    @property
-    def keyframes(self) -> tuple[Keyframe, ...]:
-        """Keyframes of all sessions."""
-        return self.joined.keyframes
 
-
-def session_names(maps: Sequence[SavedMap], order: Sequence[int]) -> dict[tuple[int, int], str]:
-    """Name of every session by the numbers of its map and of itself there.
+def session_names(maps: Sequence[SavedMap], order: Sequence[int]) -> list[list[str]]:
+    """Names of the sessions of each map.
 
     A run of one log is called by its directory; of equal names the later ones, in this order, get a number.
     """
-    names: dict[tuple[int, int], str] = {}
+    names: list[list[str]] = [[] for _ in maps]
+    taken = set[str]()
     for number in order:
         saved = maps[number]
-        for index, session in enumerate(saved.sessions):
+        for session in saved.sessions:
             stem = name = directory_name(saved.name if len(saved.sessions) == 1 else session.name)
             numbers = count(2)
-            while name in names.values():
+            while name in taken:
                 name = f"{stem}-{next(numbers)}"
-            names[number, index] = name
+            taken.add(name)
+            names[number].append(name)
     return names
 
 
 def merged_map(
     joined: Joined,
     maps: Sequence[SavedMap],
-    names: dict[tuple[int, int], str],
+    names: Sequence[Sequence[str]],
     config: Config,
     *,
+    folder: Path,
     first: int,
     held: int,
     update: bool = False,
 ) -> MergedMap:
     """The map of joined maps, in the frame of the map ``first``: its first keyframe stays where it was.
 
-    names : of the sessions, by map and number; held : map whose poses stay as they are, or −1
+    names : of the sessions of each map; folder : where it will be; held : map whose poses stay as they are, or −1
     update : whether points that newer sessions saw through are removed
     """
     poses = _refined(joined, config, held)
@@ -111,11 +104,15 @@ def merged_map(
     for new, (number, index) in enumerate(chosen):
         of_session = np.flatnonzero(joined.of_map == number)[maps[number].session == index]
         session[of_session] = new
-        sessions.append(msgspec.structs.replace(maps[number].sessions[index], name=names[number, index]))
+        sessions.append(msgspec.structs.replace(maps[number].sessions[index], name=names[number][index]))
         trajectories.append(_trajectory(maps[number], index, poses[of_session]))
-    last_seen_ns = np.concatenate([maps[number].last_seen_ns for number in joined.maps])
-    removed = np.zeros(len(poses), np.int64)
-    merged = MergedMap(joined, poses, tuple(sessions), session, tuple(trajectories), last_seen_ns, removed)
+    keyframes, in_force = (
+        joined.placed(poses).keyframes,
+        joined.edges.where(joined.edges.weight >= REJECTED_WEIGHT),
+    )
+    seen_ns = np.concatenate([maps[number].last_seen_ns for number in joined.maps])
+    saved = SavedMap(folder, joined.dimension, keyframes, session, tuple(sessions), in_force, seen_ns)
+    merged = MergedMap(joined, saved, tuple(trajectories), np.zeros(len(poses), np.int64))
     return updated(merged, config) if update else merged
 
 
@@ -129,17 +126,15 @@ def final_closures(merged: MergedMap) -> tuple[Closure, ...]:
 
 def write_merged(folder: Path, merged: MergedMap, cloud: Cloud, final: Sequence[Closure], config: Config) -> None:
     """Write map, trajectories, point cloud, grid, graph and closures into a directory."""
-    edges, keyframes, poses = merged.joined.edges, merged.keyframes, merged.T_world_keyframes
-    in_force = edges.where(edges.weight >= REJECTED_WEIGHT)
-    of_sessions = merged.session, merged.sessions
-    write_saved_map(folder / MAP_FOLDER, keyframes, poses, *of_sessions, in_force, merged.last_seen_ns)
-    for session, trajectory in zip(merged.sessions, merged.trajectories, strict=True):
+    saved = merged.saved
+    write_saved_map(saved)
+    for session, trajectory in zip(saved.sessions, merged.trajectories, strict=True):
         write_tum(folder / f"{session.name}.tum", trajectory, force=True)
     write_ply(folder / "map.ply", cloud.points)
-    if merged.joined.dimension == 2:
-        write_map(folder, grid_of(keyframes, poses, config.maps))
-    write_g2o(folder / GRAPH_FILE, graph_of(replace(merged.joined, edges=in_force)))
-    write_closures(folder / "loops.parquet", final, merged.keyframes, merged.joined.dimension)
+    if saved.dimension == 2:
+        write_map(folder, grid_of(saved.keyframes, saved.poses, config.maps))
+    write_g2o(folder / GRAPH_FILE, graph_of(replace(merged.joined, edges=saved.edges)))
+    write_closures(folder / "loops.parquet", final, saved.keyframes, saved.dimension)
 
 
 def _refined(joined: Joined, config: Config, held: int) -> Matrix:
@@ -190,9 +185,9 @@ class RemainingPoints:
 
 def updated(merged: MergedMap, config: Config) -> MergedMap:
     """The map without what vanished from one session to the next; warns of sessions that fit on none before."""
-    session, poses = merged.session, merged.T_world_keyframes
-    result, removed, warnings = list(merged.keyframes), merged.removed.copy(), list(merged.warnings)
-    for number, newest in enumerate(merged.sessions[1:], 1):
+    saved, session, poses = merged.saved, merged.saved.session, merged.saved.poses
+    result, removed, warnings = list(saved.keyframes), merged.removed.copy(), list(merged.warnings)
+    for number, newest in enumerate(saved.sessions[1:], 1):
         older, newer = np.flatnonzero(session < number), np.flatnonzero(session == number)
         earlier, later = (
             Part("", [result[k] for k in chosen.tolist()], poses[chosen]) for chosen in (older, newer)
@@ -213,14 +208,9 @@ def updated(merged: MergedMap, config: Config) -> MergedMap:
             if gone.any():
                 removed[k] += gone.sum()
                 result[k] = replace(result[k], stored=RemainingPoints(result[k].stored, ~gone))
-    last_seen_ns = _last_seen(result, poses, _CELL_VOXELS * config.maps.voxel_size_m)
-    return replace(
-        merged,
-        joined=replace(merged.joined, keyframes=tuple(result)),
-        last_seen_ns=np.maximum(merged.last_seen_ns, last_seen_ns),
-        removed=removed,
-        warnings=tuple(warnings),
-    )
+    seen_ns = np.maximum(saved.last_seen_ns, _last_seen(result, poses, _CELL_VOXELS * config.maps.voxel_size_m))
+    saved = replace(saved, keyframes=tuple(result), last_seen_ns=seen_ns)
+    return replace(merged, saved=saved, removed=removed, warnings=tuple(warnings))
 
 
 def _last_seen(keyframes: Sequence[Keyframe], poses: Matrix, cell_m: float) -> NDArray[np.int64]:

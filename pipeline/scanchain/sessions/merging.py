@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -15,18 +16,18 @@ from scanchain.data import REJECTED_WEIGHT, Closure, ClosureVerdict, brief
 from scanchain.errors import InputError, ScanchainError, counted
 from scanchain.files import write_whole
 from scanchain.graph.optimization import fit
-from scanchain.maps import SavedMap, Session, open_saved_map
+from scanchain.maps import MAP_FOLDER, SavedMap, Session, open_saved_map
 from scanchain.runs.directory import RUN_FILE, RunDirectory
-from scanchain.runs.job import Progress
+from scanchain.runs.job import Job, Progress
 from scanchain.runs.provenance import Hashing, describe_start
 from scanchain.runs.results import Cloud, cloud_of
 from scanchain.sessions.joining import Doubt, Joined, changed, graph_of, join_all
 from scanchain.sessions.merged_map import MergedMap, final_closures, merged_map, session_names, write_merged
-from scanchain.settings import Override, dump, load_settings
+from scanchain.settings import dump, load_settings
 
 
-class SessionMetrics(msgspec.Struct, frozen=True):
-    """A session of the merged map.
+class SessionMetrics(Session, frozen=True):
+    """A session as it is in the merged map.
 
     Attributes
     ----------
@@ -34,10 +35,6 @@ class SessionMetrics(msgspec.Struct, frozen=True):
     removed_points : of its keyframes, that newer sessions saw through; 0 where the map was not updated
     """
 
-    name: str
-    first_stamp_ns: int
-    last_stamp_ns: int
-    keyframes: int
     closures: int
     removed_points: int = 0
 
@@ -89,65 +86,44 @@ class Merged:
 
 
 def merge(
-    runs: Sequence[Path],
-    out: Path,
-    progress: Progress,
-    report: Callable[[Path], None],
-    *,
-    config_file: Path | None = None,
-    overrides: tuple[Override, ...] = (),
-    fixed: bool = False,
-    update: bool = False,
-    force: bool = False,
-    command: tuple[str, ...] = (),
+    job: Job, progress: Progress, report: Callable[[Path], None], *, fixed: bool = False, update: bool = False
 ) -> Merged:
-    """Join the maps of runs, write the directory ``out``, to which ``report`` adds page and recording in the end.
+    """Join the maps of runs, write a directory, to which ``report`` adds page and recording in the end.
 
-    runs : run directories, or map folders; the first one's frame is that of the merged map
-    config_file : on top of the preset; overrides : on top of both
+    job : its ``logs`` are run directories, or map folders; the first one's frame is that of the merged map
     fixed : whether the keyframes of the first run stay where they are, to the bit
     update : whether points that newer sessions saw through are removed from the keyframes of older ones
-    force : whether a directory of that name is replaced
-    command : the command line, for run.json
     Raises InputError for bad input, and ScanchainError where no two maps belong together.
     """
     started, compiled_before_s = working_s(), compiled_s()
-    directory = RunDirectory(out, force=force)
-    maps = _opened(runs, out)
+    directory = RunDirectory(job.out, force=job.force)
+    maps = _opened([Path(str(run)) for run in job.logs], job.out)
     if update:
         _check_order([session for saved in maps for session in saved.sessions])
-    settings = load_settings(maps[0].dimension, file=config_file, overrides=overrides)
+    settings = load_settings(maps[0].dimension, file=job.config_file, overrides=job.overrides)
     config, held, folders = settings.config, 0 if fixed else -1, [saved.folder for saved in maps]
     order = _canonical(maps, held)
     names = session_names(maps, order)
-    provenance, hashing = describe_start(command, folders, settings.source), Hashing(folders)
+    provenance, hashing = describe_start(job.command, folders, settings.source), Hashing(folders)
     with directory, announcing_compilation(progress.say):
-        firsts = [names[number, 0] for number in range(len(maps))]
-        groups, uncertain = join_all(maps, order, firsts, config, held, progress.say)
+        groups, uncertain = join_all(maps, order, [each[0] for each in names], config, held, progress.say)
         joined = _chosen(groups, held, maps, uncertain)
         progress.say(f"making the map of {counted(len(joined.keyframes), 'keyframe')}")
-        merged = merged_map(joined, maps, names, config, first=min(joined.maps), held=held, update=update)
-        cloud, final = cloud_of(merged.keyframes, merged.T_world_keyframes, config), final_closures(merged)
+        first, folder = min(joined.maps), directory.path / MAP_FOLDER
+        merged = merged_map(joined, maps, names, config, folder=folder, first=first, held=held, update=update)
+        cloud, final = cloud_of(merged.saved.keyframes, merged.saved.poses, config), final_closures(merged)
         write_merged(directory.path, merged, cloud, final, config)
-        apart = tuple(
-            tuple(names[number, k] for number in group.maps for k in range(len(maps[number].sessions)))
-            for group in groups
-            if group is not joined
-        )
-        different = (_changed_text(names[number, 0], share) for number, share in changed(joined).items())
+        others = (group.maps for group in groups if group is not joined)
+        apart = tuple(tuple(name for number in group for name in names[number]) for group in others)
+        different = (_changed_text(names[number][0], share) for number, share in changed(joined).items())
         warnings = (*(_apart_text(each, uncertain) for each in apart), *different, *merged.warnings)
         compile_s, run_s = compiled_s() - compiled_before_s, working_s() - started
-        metrics = msgspec.structs.replace(
-            _measured(merged, cloud, final, config, held),
-            apart=apart,
-            run_s=run_s,
-            compile_s=compile_s,
-            warnings=warnings,
-            updated=update,
-            uncertain=tuple(uncertain),
-        )
+        metrics = _measured(
+            merged, cloud, final, config, held, apart=apart, uncertain=tuple(uncertain), warnings=warnings,
+            updated=update, run_s=run_s, compile_s=compile_s,
+        )  # fmt: skip
         write_whole(directory.path / "metrics.json", msgspec.json.format(msgspec.json.encode(metrics)) + b"\n")
-        text = _summary(metrics, names[min(joined.maps), 0], settings.source, fixed=fixed)
+        text = _summary(metrics, names[first][0], settings.source, fixed=fixed)
         (directory.path / "summary.txt").write_text(text, encoding="utf-8")
         write_whole(directory.path / "config.toml", dump(config).encode())
         done = msgspec.structs.replace(provenance.hashed(hashing), complete=True, duration_s=run_s + compile_s)
@@ -218,10 +194,9 @@ def _chosen(groups: Sequence[Joined], held: int, maps: Sequence[SavedMap], uncer
 
 
 def _apart_text(names: Sequence[str], uncertain: Sequence[Doubt]) -> str:
+    doubts = "; ".join(each.text for each in uncertain if {each.session, each.frame} & set(names))
     together = "; they belong together: merge them on their own" if len(names) > 1 else ""
-    doubts = [each.text for each in uncertain if {each.session, each.frame} & set(names)]
-    reason = "; ".join(doubts) if doubts else "too few closures agree"
-    return f"{', '.join(names)}: not in this map; {reason}{together}"
+    return f"{', '.join(names)}: not in this map; {doubts or 'too few closures agree'}{together}"
 
 
 def _changed_text(name: str, share: float) -> str:
@@ -232,29 +207,25 @@ def _changed_text(name: str, share: float) -> str:
 
 
 def _measured(
-    merged: MergedMap, cloud: Cloud, final: Sequence[Closure], config: Config, held: int
+    merged: MergedMap, cloud: Cloud, final: Sequence[Closure], config: Config, held: int, **of_merge: Any
 ) -> MergeMetrics:
-    """The metrics of a map but for what joined it."""
-    graph = graph_of(merged.joined, held)
+    """The metrics of a map; ``of_merge`` are those of what joined it."""
+    joined, saved, graph = merged.joined, merged.saved, graph_of(merged.joined, held)
     state = graph.optimize(config.graph, initialize="given").state
     certificate = graph.certify()
-    edges = merged.joined.edges
-    between = edges.where(merged.joined.is_between & (edges.weight >= REJECTED_WEIGHT))
-    ends = merged.session[between.pairs]
+    ends = saved.session[joined.edges.pairs[joined.is_between & (joined.edges.weight >= REJECTED_WEIGHT)]]
+    sessions = (
+        SessionMetrics(
+            *msgspec.structs.astuple(each),
+            closures=int((ends == number).any(axis=1).sum()),
+            removed_points=int(merged.removed[saved.session == number].sum()),
+        )
+        for number, each in enumerate(saved.sessions)
+    )
     return MergeMetrics(
-        dimension=merged.joined.dimension,
-        sessions=tuple(
-            SessionMetrics(
-                each.name,
-                each.first_stamp_ns,
-                each.last_stamp_ns,
-                int((merged.session == number).sum()),
-                int((ends == number).any(axis=1).sum()),
-                int(merged.removed[merged.session == number].sum()),
-            )
-            for number, each in enumerate(merged.sessions)
-        ),
-        keyframes=len(merged.keyframes),
+        dimension=joined.dimension,
+        sessions=tuple(sessions),
+        keyframes=len(saved.keyframes),
         closures_tried=len(final),
         closures_in_force=sum(item.verdict is ClosureVerdict.ACCEPTED for item in final),
         chi2=state.chi2,
@@ -264,6 +235,7 @@ def _measured(
         certificate=certificate.verdict,
         map_points=len(cloud.points),
         moving_points_removed=cloud.removed,
+        **of_merge,
     )
 
 

@@ -1,0 +1,121 @@
+"""A saved map: as exact as it says, and refused by its file where anything in it was changed."""
+
+import io
+import json
+import zipfile
+import zlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scanchain.data import Keyframe
+from scanchain.errors import InputError
+from scanchain.maps import Edges, SavedMap, SavedPoints, Session, open_saved_map, write_saved_map
+
+
+@pytest.fixture
+def written(tmp_path):
+    """A map of three keyframes with two edges, in the folder map; the second has a far return."""
+    near, far = np.array([[1.2345, -2.0], [0.0, 3.3333]]), np.array([[5e4, 0.0]])
+    keyframes = [
+        Keyframe(k, 4 * k, 10 * k, SavedPoints(points, 1.0), np.eye(3) * [1, 1, 1 + k / 3], 0.7 * k, 1.5)
+        for k, points in enumerate((near, np.vstack([near, far]), near))
+    ]
+    pairs, eyes = np.array([[0, 1], [1, 2]]), np.tile(np.eye(3), (2, 1, 1))
+    edges = Edges(pairs, eyes, 3.0 * eyes, np.array([False, True]), np.array([1.0, 0.5]))
+    session, numbers = Session("made up", 0, 20, 3), np.zeros(3, int)
+    saved = SavedMap(tmp_path / "map", 2, tuple(keyframes), numbers, (session,), edges, np.array([0, 10, 30]))
+    write_saved_map(saved)
+    return tmp_path, saved
+
+
+def test_a_saved_map_holds_its_keyframes_to_the_millimeter_and_the_poses_to_the_bit(written):
+    folder, before = written
+    saved, edges = open_saved_map(folder), before.edges
+    assert saved.sessions == (Session("made up", 0, 20, 3),) and saved.last_seen_ns.tolist() == [0, 10, 30]
+    for name in Edges.__match_args__:
+        assert np.array_equal(getattr(saved.edges, name), getattr(edges, name))
+    for old, new in zip(before.keyframes, saved.keyframes, strict=True):
+        np.testing.assert_allclose(new.points, old.points, atol=1e-3)  # one far return makes none coarse
+        assert np.array_equal(new.T_odom_lidar, old.T_odom_lidar)
+        assert replace(new, stored=None, T_odom_lidar=None) == replace(old, stored=None, T_odom_lidar=None)
+    assert edges.among(np.array([2, 1])).pairs.tolist() == [[1, 0]]
+
+
+@pytest.mark.parametrize("name", ["keyframes.npz", "edges.npz", "points.i16"])
+def test_a_file_that_is_cut_off_missing_or_has_a_flipped_bit_is_refused_by_its_name(written, name):
+    file = written[0] / "map" / name
+    whole = file.read_bytes()
+    flipped = np.random.default_rng(0).integers(len(whole), size=20).tolist()
+    for data in (whole[:-7], *(whole[:k] + bytes([whole[k] ^ 0x10]) + whole[k + 1 :] for k in flipped)):
+        file.write_bytes(data)
+        with pytest.raises(InputError, match=f"{name}: is damaged or cut off: .*; make the map again"):
+            open_saved_map(written[0])
+    file.unlink()
+    with pytest.raises(InputError, match=f"{name}: cannot be read"):
+        open_saved_map(written[0])
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "message"),
+    [
+        ('"version": 2', '"version": 1', r"is of version 1, this scanchain reads 2 .*; make the map again"),
+        ("{", "", r"map.json: cannot be read"),
+    ],
+)
+def test_an_index_of_another_version_or_without_sense_is_refused(written, before, after, message):
+    index = written[0] / "map" / "map.json"
+    index.write_text(index.read_text().replace(before, after))
+    with pytest.raises(InputError, match=message):
+        open_saved_map(written[0])
+
+
+def test_a_folder_without_a_map_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"holds no map \(map/map.json\); give the directory of a finished run"):
+        open_saved_map(tmp_path)
+
+
+def seal(folder, file):
+    """Make the checksum of a file as if it had been written so."""
+    index = json.loads((folder / "map.json").read_text())
+    index["crc32"][file] = zlib.crc32((folder / file).read_bytes())
+    (folder / "map.json").write_text(json.dumps(index))
+
+
+@pytest.mark.parametrize(
+    ("file", "name", "change", "message"),
+    [
+        ("keyframes", "count", lambda a: 3 * a, "keyframes.npz: holds other keyframes and points than map.json"),
+        ("keyframes", "poses", lambda a: np.zeros((3, 4, 4)), "keyframes.npz: holds other keyframes"),
+        ("keyframes", "stamps_ns", lambda a: a[2:], "map: is not as scanchain writes it"),
+        ("edges", "another", lambda a: np.zeros(3), "map: is not as scanchain writes it"),
+    ],
+)
+def test_a_saved_map_that_contradicts_itself_is_refused_with_its_file(written, file, name, change, message):
+    folder = written[0] / "map"
+    with np.load(folder / f"{file}.npz") as arrays:
+        np.savez(folder / f"{file}.npz", **(dict(arrays) | {name: change(arrays.get(name))}))
+    seal(folder, f"{file}.npz")
+    with pytest.raises(InputError, match=message):
+        open_saved_map(folder)
+
+
+def test_archives_that_no_reader_unpacks_are_refused_with_their_name(written):
+    file = written[0] / "map" / "keyframes.npz"
+    huge = io.BytesIO()
+    np.lib.format.write_array_header_1_0(huge, {"descr": "<f8", "fortran_order": False, "shape": (10**11, 3, 3)})
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("poses.npy", huge.getvalue())
+    claims = file.read_bytes()
+    np.savez_compressed(file, poses=np.random.default_rng(0).normal(size=(99, 3, 3)))
+    packed = bytearray(file.read_bytes())
+    packed[200:260] = bytes(60)
+    encrypted = bytearray(claims)
+    encrypted[6] |= 1
+    encrypted[encrypted.index(b"PK\x01\x02") + 8] |= 1
+    for data in (claims, packed, encrypted):
+        file.write_bytes(data)
+        seal(file.parent, file.name)
+        with pytest.raises(InputError, match=r"keyframes.npz: cannot be read"):
+            open_saved_map(file.parent)
