@@ -58,6 +58,22 @@ def test_a_kitti_drive_without_its_calibration_has_no_truth_and_says_so(tmp_path
     assert "calib_imu_to_velo.txt" in " ".join(log.notes)
 
 
+@pytest.mark.parametrize("number", ["-inf", "nan", "1e203", "x", ""])
+def test_a_calibration_that_is_no_motion_leaves_no_truth_and_one_line_of_damage(tmp_path, number):
+    drive, sequence = kitti_raw(tmp_path, recorders.clouds()), kitti_odometry(tmp_path, recorders.clouds())
+    for file, line in ((tmp_path / "calib_imu_to_velo.txt", "R: 0 -1"), (sequence / "calib.txt", "Tr: 0 -1")):
+        file.write_text(file.read_text().replace(line, f"{line[:-4]}{number} -1"))
+    for path, name in ((drive, "R"), (sequence, "Tr")):
+        log, scans = read(path)
+        assert len(scans) == 3 and log.ground_truth() is None
+        line, recovered = log.damage
+        assert (
+            "3 scans" in recovered
+            and f" line {name}: " in line
+            and "download it again; until then there is no ground truth" in line
+        )
+
+
 def test_a_sweep_that_a_kitti_drive_lacks_leaves_the_times_of_the_others(tmp_path):
     said = recorders.clouds()
     drive = kitti_raw(tmp_path, said)
