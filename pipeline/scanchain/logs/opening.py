@@ -22,7 +22,7 @@ from scanchain.logs.formats.user import index_scans, load_format
 from scanchain.logs.mcap.index import index_by_summary, index_file
 from scanchain.logs.mcap.records import MAGIC, FileIndex
 from scanchain.logs.mcap.stream import are_parts, complete
-from scanchain.logs.topics import is_lidar
+from scanchain.logs.messages.readers import is_lidar
 
 
 @dataclass(frozen=True, slots=True)
