@@ -289,16 +289,6 @@ def test_the_prior_is_the_wheels_pose_at_the_stamp(tmp_path, before, scan, behin
     assert prior_x(path) == (expected if expected is None else pytest.approx(expected))
 
 
-def test_the_prior_turns_the_short_way_round(tmp_path):
-    said = [
-        odometry_said(STAMP_NS, odometry(STAMP_NS, 0.0, 0.0, 3.1)),
-        one_scan(0.1, 0.1),
-        odometry_said(STAMP_NS + SECOND // 5, odometry(STAMP_NS + SECOND // 5, 0.0, 0.0, -3.1)),
-    ]
-    _, (scan,) = read(write(tmp_path / "a.mcap", said))
-    assert abs(lie.yaw(scan.T_odom_base)) == pytest.approx(np.pi)
-
-
 def test_a_scan_does_not_wait_for_ever_for_a_reading(tmp_path):
     said = [*wheels((0.0, 0.0, 4.0)), *(one_scan(0.01 * k, 0.01 * k) for k in range(1, 200))]
     _, scans = read(write(tmp_path / "a.mcap", said))
@@ -394,20 +384,6 @@ def test_many_copies_of_scans_are_a_warning_and_a_few_are_a_note(tmp_path, copie
         assert "6 of 20 scans of /scan are the one before once more" in log.copies[0]
     else:
         assert not log.copies and any("1 of 20 scans of /scan logged twice" in note for note in log.notes)
-
-
-def test_a_cloud_keeps_the_full_mounting(tmp_path):
-    rows = np.array([(1, 2, 3)], dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
-    said = [
-        transforms_said(STAMP_NS, transforms(("base_link", "lidar", 1.0, 2.0, 0.0, np.pi))),
-        *wheels((0.0, 0.0, 3.0)),
-        cloud_said(STAMP_NS, point_cloud(STAMP_NS, rows)),
-    ]
-    log, (scan,) = read(write(tmp_path / "a.mcap", said))
-    assert log.dimension == 3 and scan.T_odom_base.shape == (4, 4) and scan.T_odom_base[0, 3] == 3.0
-    np.testing.assert_allclose(log.T_base_lidar[:3, 3], [1.0, 2.0, 0.5])
-    np.testing.assert_allclose(log.T_base_lidar[:3, :3], np.diag([1.0, -1.0, -1.0]), atol=1e-12)
-    np.testing.assert_array_equal(scan.points, [[1, 2, 3]])
 
 
 # clouds of planar scanners
