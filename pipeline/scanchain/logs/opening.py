@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from scanchain.config import LogConfig
 from scanchain.errors import InputError
@@ -25,20 +25,12 @@ from scanchain.logs.mcap.stream import are_parts, complete
 from scanchain.logs.messages.readers import is_lidar
 
 
-@dataclass(frozen=True, slots=True)
-class LogFormat:
-    """A log format.
-
-    Attributes
-    ----------
-    description : as errors list it
-    claims : whether a path is of this format, by its first bytes (none of a folder) or what lies in it
-    index : index of a path as the n-th file of a log, see ``FileIndex``; it may raise UnknownFormatError
-    """
+class LogFormat(NamedTuple):
+    """A log format, described as errors list it."""
 
     description: str
-    claims: Callable[[Path, bytes], bool]
-    index: Callable[..., FileIndex]
+    claims: Callable[[Path, bytes], bool]  # by a path's first bytes (none of a folder) or what lies in it
+    index: Callable[..., FileIndex]  # of a path as the n-th file of a log; may raise UnknownFormatError
 
 
 FORMATS: dict[str, LogFormat] = {  # the first that claims a path reads it; an empty file is refused as MCAP
