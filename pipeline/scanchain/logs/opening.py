@@ -30,7 +30,7 @@ class LogFormat(NamedTuple):
 
     description: str
     claims: Callable[[Path, bytes], bool]  # by a path's first bytes (none of a folder) or what lies in it
-    index: Callable[..., FileIndex]  # of a path as the n-th file of a log; may raise UnknownFormatError
+    index_of: Callable[..., FileIndex]  # of a path as the n-th file of a log; may raise UnknownFormatError
 
 
 FORMATS: dict[str, LogFormat] = {  # the first that claims a path reads it; an empty file is refused as MCAP
@@ -101,7 +101,13 @@ def logs_in(folder: Path) -> list[Path]:
     if _is_claimed(folder):
         return [folder]
     found = [path for path in sorted(folder.iterdir(), key=natural_order) if _is_named_as_log(path)]
-    return [folder] if len(found) < 2 or (found == _parts(folder) and _is_one_log(found)) else found
+    if len(found) < 2:
+        return [folder]
+    try:  # in time they follow one another, or have no topic of a lidar in common
+        is_one = found == _parts(folder) and are_parts(index_files(found), is_lidar)
+    except InputError:
+        is_one = False
+    return [folder] if is_one else found
 
 
 def _is_named_as_log(path: Path) -> bool:
@@ -112,14 +118,6 @@ def _is_named_as_log(path: Path) -> bool:
 
 def _is_claimed(folder: Path) -> bool:
     return (folder / _RUN_FILE).is_file() or any(form.claims(folder, b"") for form in FORMATS.values())
-
-
-def _is_one_log(files: Sequence[Path]) -> bool:
-    """True if the files of a folder follow one another in time, or have no topic of a lidar in common."""
-    try:
-        return are_parts(index_files(files), is_lidar)
-    except InputError:
-        return False
 
 
 def _index(source: Source, number: int, config: LogConfig) -> FileIndex:
@@ -149,7 +147,7 @@ def _index_path(path: Path, number: int, config: LogConfig, address: Source | No
                 head = file.read(_HEAD_BYTES)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
-    index = (_claiming(path, head) if config.format == AUTO else FORMATS[config.format]).index
+    index = (_claiming(path, head) if config.format == AUTO else FORMATS[config.format]).index_of
     if index is index_clouds:
         index = partial(index, rate_hz=config.rate_hz, bin_columns=config.bin_columns)
     elif index is index_file:
