@@ -168,6 +168,7 @@ X, Y, Z = ("x", 0, 7, 1), ("y", 4, 7, 1), ("z", 8, 7, 1)
         (ROWS, {"fields": [X, Y, Z, ("t", 12, 6, 1)]}, ["t", "16", "point_step", "12"]),
         (ROWS, {"fields": [X, ("y", 4, 9, 1), Z]}, ["y", "9"]),
         (ROWS, {"step": 0}, ["point_step"]),
+        (ROWS, {"step": 1 << 31}, ["point_step", "2147483648"]),
         (UNDEFINED, {}, ["no valid point", "2", "4", "NaN"]),
         (ROWS[:0], {}, ["no valid point"]),
     ],

@@ -230,6 +230,7 @@ def test_files_that_are_only_numbered_need_a_rate(tmp_path):
         ("1.0.pcd", b"\0" * 500),
         ("1.0.pcd", PCD.format(count=1000, form="binary").encode()),
         ("1.0.pcd", PCD.format(count=1000, form="binary_compressed").encode() + b"\xff" * 9),
+        ("1.0.pcd", PCD.format(count=-1, form="binary").encode() + bytes(500)),
         ("1.0.pcd", PCD.format(count=3, form="ascii").encode() + b"1 2\n"),
         ("1.0.pcd", PCD.replace("x y z", "a b c").format(count=0, form="ascii").encode()),
         ("1.0.ply", b""),

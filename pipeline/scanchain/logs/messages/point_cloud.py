@@ -16,7 +16,7 @@ from scanchain.logs.messages.returns import NAMES, NO_TIMES, PointTimes, RangeLi
 from scanchain.logs.messages.ros import MalformedMessageError, stamp_ns
 
 _FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
-_MOST_FIELDS = 1024
+_MOST_FIELDS, _MOST_STEP = 1024, (1 << 31) - 1
 PLANAR_M = 5e-4  # largest distance from the plane of a point of a planar cloud: rounding of float32
 _FEWEST_POINTS, _ENOUGH_POINTS = 3, 1000  # least number of points of a cloud, and in all, that show a plane
 _SQUARE_OF_FARTHEST = float(np.finfo(np.float32).max)
@@ -179,6 +179,8 @@ def _as_float32(values: NDArray[np.generic]) -> NDArray[np.float32]:
 
 def _layout(message: PointCloudMessage, times: PointTimes) -> np.dtype[np.void]:
     """A point as a structured type: x, y, z and the time field, if any."""
+    if message.point_step > _MOST_STEP:
+        raise MalformedMessageError(f"point_step {message.point_step} is more than a point can have")
     wanted: dict[str, tuple[str, int]] = {}
     for field in message.fields:
         if field.name not in ("x", "y", "z") and not times.wants(field.name):
