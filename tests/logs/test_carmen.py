@@ -73,15 +73,16 @@ def test_the_codes_of_a_sick_for_no_return_are_dropped(tmp_path):
     assert scan.dropped == 90
 
 
-def test_the_wheels_are_the_raw_odometry_not_the_corrected_pose(tmp_path):
-    line = flaser(0, pose=(50.0, 60.0, 1.0), odometry=(1.0, 2.0, 0.5))
-    _, (scan,) = read(save(tmp_path / "a.log", line))
+def test_wheels_mounting_and_truth_of_a_log(tmp_path):
+    """Wheels are the raw odometry, not the corrected pose, that of lines between scans, too."""
+    scan = flaser(1, pose=(50.0, 60.0, 1.0), odometry=(1.0, 2.0, 0.5))
+    lines = ["PARAM robot_frontlaser_offset 0.35 nohost 0", odom(0, 7.0), scan, odom(2, 9.0)]
+    lines += [f"TRUEPOS {k}.5 2.0 0.25 0 0 0 {BEGIN_S + 0.25 * k:.6f} nohost 0" for k in range(3)]
+    log, (scan,) = read(save(tmp_path / "a.log", *lines))
     np.testing.assert_allclose(scan.T_odom_base, lie.pose_2d(1.0, 2.0, 0.5), atol=1e-12)
-
-
-def test_a_laser_ahead_of_the_robot_is_mounted_there(tmp_path):
-    log, _ = read(save(tmp_path / "a.log", "PARAM robot_frontlaser_offset 0.35 nohost 0", flaser(0)))
     np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(0.35, 0.0, 0.0), atol=1e-12)
+    assert log.indexes[0].counts[log.indexes[0].channels[2].key[1]] == 3
+    np.testing.assert_allclose(log.ground_truth().poses[:, 0, 2], [0.5, 1.5, 2.5])
 
 
 def test_a_robotlaser_line_tells_angles_reach_wheels_and_mounting_itself(tmp_path):
@@ -95,20 +96,6 @@ def test_a_robotlaser_line_tells_angles_reach_wheels_and_mounting_itself(tmp_pat
     np.testing.assert_allclose(scan.T_odom_base, robot, atol=1e-12)
     np.testing.assert_allclose(scan.points, points(ranges, -1.0, 0.25)[[0, 1, 3]], atol=1e-6)
     assert scan.dropped == 2
-
-
-def test_odom_lines_between_scans_join_the_wheels(tmp_path):
-    log, scans = read(save(tmp_path / "a.log", odom(0, 7.0), flaser(1), odom(2, 9.0)))
-    assert log.indexes[0].counts[log.indexes[0].channels[2].key[1]] == 3
-    np.testing.assert_allclose(scans[0].T_odom_base, lie.pose_2d(0.1, 0.02, 0.01), atol=1e-6)
-
-
-def test_the_true_poses_of_a_simulator_are_the_ground_truth(tmp_path):
-    lines = [f"TRUEPOS {k}.5 2.0 0.25 0 0 0 {BEGIN_S + 0.25 * k:.6f} nohost 0" for k in range(3)]
-    log, _ = read(save(tmp_path / "a.log", flaser(0), *lines))
-    truth = log.ground_truth()
-    assert truth is not None
-    np.testing.assert_allclose(truth.poses[:, 0, 2], [0.5, 1.5, 2.5])
 
 
 def test_scans_stay_in_the_order_of_the_file_where_stamps_step_back(tmp_path):

@@ -1,8 +1,6 @@
 """Bad input: one line that says what, where and what to do; damage: recovered, counted and told."""
 
-import cProfile
 import gzip
-import pstats
 import struct
 
 import numpy as np
@@ -170,6 +168,7 @@ X, Y, Z = ("x", 0, 7, 1), ("y", 4, 7, 1), ("z", 8, 7, 1)
         (ROWS, {"fields": [X, Y, Z, ("t", 12, 6, 1)]}, ["t", "16", "point_step", "12"]),
         (ROWS, {"fields": [X, ("y", 4, 9, 1), Z]}, ["y", "9"]),
         (ROWS, {"step": 0}, ["point_step"]),
+        (ROWS, {"step": 1 << 31}, ["point_step", "2147483648"]),
         (UNDEFINED, {}, ["no valid point", "2", "4", "NaN"]),
         (ROWS[:0], {}, ["no valid point"]),
     ],
@@ -256,22 +255,3 @@ def test_an_unknown_compression_is_named(tmp_path):
     path.write_bytes(path.read_bytes().replace(struct.pack("<I", 4) + b"zstd", struct.pack("<I", 4) + b"zlib"))
     _, damage = recover(path)
     says(" ".join(damage), "zlib")
-
-
-def test_malformed_messages_cost_no_more_than_good_ones(tmp_path):
-    rows = np.ones(1, [("x", "f4"), ("y", "f4"), ("z", "f4")])
-    good = point_cloud(STAMP_NS, rows)
-    paths = [
-        write(
-            tmp_path / f"{length}.mcap",
-            [cloud_said(STAMP_NS + k, good[: length if k else None]) for k in range(3000)],
-        )
-        for length in (len(good), 90)
-    ]
-    calls = []
-    for path in (*paths, *paths):  # the first time to import what is needed
-        with cProfile.Profile() as profile:
-            scans, _ = recover(path, max_bad_scans_percent=100.0)
-        calls.append(pstats.Stats(profile).total_calls)
-    assert len(scans) == 1
-    assert calls[3] < 1.5 * calls[2]

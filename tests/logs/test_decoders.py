@@ -165,18 +165,6 @@ def test_rows_may_be_padded_and_fields_lie_anywhere(tmp_path, rows, options):
     assert np.array_equal(cloud(tmp_path, rows, **options).points, xyz(rows))
 
 
-def test_a_channel_may_change_its_layout(tmp_path):
-    said, expected = [], []
-    for k in range(60):
-        rows = random_rows(XYZ if k % 2 else [("ring", "u2"), *XYZ, ("time", "f4")], count=5 + k, seed=k)
-        said.append(cloud_said(STAMP_NS + k, point_cloud(STAMP_NS + k, rows)))
-        expected.append(rows)
-    log = open_log([write(tmp_path / "a.mcap", said)], LogConfig())
-    for k, (scan, rows) in enumerate(zip(log.scans(), expected, strict=True)):
-        assert np.array_equal(scan.points, xyz(rows))
-        assert len(scan.times_s) == (0 if k % 2 else len(rows))
-
-
 def test_undefined_and_zero_points_are_dropped_with_their_times_and_counted(tmp_path):
     rows = random_rows([*XYZ, ("time", "f4")], count=8)
     rows["time"] = np.arange(8) * 0.01

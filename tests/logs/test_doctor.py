@@ -145,6 +145,11 @@ def mostly_lost(k):
     return ranges
 
 
+def blind_until(start, stop):
+    """The room, but for three beams alone at the start and none beyond the end."""
+    return lambda k: np.where(np.arange(100) < (3 if k < start else 2 if k >= stop else 100), room(k), np.nan)
+
+
 def at_times(k):
     return STAMP_NS + k * STEP_NS
 
@@ -168,6 +173,9 @@ IN_MILLIMETERS = [odometry_said(at_times(k), odometry(at_times(k), 100.0 * k, 0.
             "80 % of the beams without a valid return, 20 valid a",
             "",
         ),
+        (drive(ranges=blind_until(25, 40)), "returns", "warning", "3 valid a scan", "--start 2.5"),
+        (drive(ranges=blind_until(5, 30)), "returns", "warning", "100 valid a", "--start 0.5 --end 2.901"),
+        (drive(ranges=blind_until(0, 40)), "returns", "ok", "0 % of the beams", ""),
         (drive(ranges=lambda k: room(k // 2)), "duplicates", "warning", "20 of 40 scans", "--every 2"),
         (drive(ranges=lambda k: room(min(k, 20))), "duplicates", "warning", "20 of them in a row", ""),
     ],

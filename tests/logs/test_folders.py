@@ -58,23 +58,32 @@ def test_a_kitti_drive_without_its_calibration_has_no_truth_and_says_so(tmp_path
     assert "calib_imu_to_velo.txt" in " ".join(log.notes)
 
 
-def test_a_sweep_that_a_kitti_drive_lacks_leaves_the_times_of_the_others(tmp_path):
-    said = recorders.clouds()
+@pytest.mark.parametrize("number", ["-inf", "nan", "1e203", "x", ""])
+def test_a_calibration_that_is_no_motion_leaves_no_truth_and_one_line_of_damage(tmp_path, number):
+    drive, sequence = kitti_raw(tmp_path, recorders.clouds()), kitti_odometry(tmp_path, recorders.clouds())
+    for file, line in ((tmp_path / "calib_imu_to_velo.txt", "R: 0 -1"), (sequence / "calib.txt", "Tr: 0 -1")):
+        file.write_text(file.read_text().replace(line, f"{line[:-4]}{number} -1"))
+    for path, name in ((drive, "R"), (sequence, "Tr")):
+        log, scans = read(path)
+        assert len(scans) == 3 and log.ground_truth() is None
+        line, recovered = log.damage
+        assert (
+            "3 scans" in recovered
+            and f" line {name}: " in line
+            and "download it again; until then there is no ground truth" in line
+        )
+
+
+def test_sweeps_that_are_absent_or_cut_off_leave_the_times_of_the_others(tmp_path):
+    said = recorders.clouds(4)
     drive = kitti_raw(tmp_path, said)
     (drive / "velodyne_points/data/0000000001.bin").unlink()
-    _, scans = read(drive)
-    assert_points(scans, [said[0], said[2]])
-    assert scans[1].stamp_ns - scans[0].stamp_ns == 2_000_000
-
-
-def test_a_sweep_that_was_cut_off_is_left_out_and_told(tmp_path):
-    said = recorders.clouds()
-    drive = kitti_raw(tmp_path, said)
-    with (drive / "velodyne_points/data/0000000001.bin").open("ab") as file:
+    with (drive / "velodyne_points/data/0000000002.bin").open("ab") as file:
         file.write(b"xyz")
     log, scans = read(drive)
-    assert_points(scans, [said[0], said[2]])
-    assert "0000000001.bin" in log.damage[0] and "multiple of" in log.damage[0]
+    assert_points(scans, [said[0], said[3]])
+    assert scans[1].stamp_ns - scans[0].stamp_ns == 3_000_000
+    assert "0000000002.bin" in log.damage[0] and "multiple of" in log.damage[0]
 
 
 def test_a_kitti_odometry_sequence_begins_at_time_zero_and_knows_its_truth(tmp_path):
@@ -221,6 +230,7 @@ def test_files_that_are_only_numbered_need_a_rate(tmp_path):
         ("1.0.pcd", b"\0" * 500),
         ("1.0.pcd", PCD.format(count=1000, form="binary").encode()),
         ("1.0.pcd", PCD.format(count=1000, form="binary_compressed").encode() + b"\xff" * 9),
+        ("1.0.pcd", PCD.format(count=-1, form="binary").encode() + bytes(500)),
         ("1.0.pcd", PCD.format(count=3, form="ascii").encode() + b"1 2\n"),
         ("1.0.pcd", PCD.replace("x y z", "a b c").format(count=0, form="ascii").encode()),
         ("1.0.ply", b""),

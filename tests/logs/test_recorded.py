@@ -18,40 +18,45 @@ from tests.support.naive_logs import office, write
 from tests.support.recorders import ROS1, ROS2, SECOND, STAMP_NS, Ros, assert_clouds, assert_planar, read_undamaged
 
 
-@pytest.mark.parametrize("store", [ROS1, ROS2], ids=["ros1", "ros2"])
-def test_a_planar_drive_of_either_ros_has_its_scans_wheels_and_mounting(tmp_path, store):
-    log, scans = read_undamaged(recorders.mcap_of(tmp_path / "a.mcap", Ros(store), Ros(store).drive()))
+def assert_drive(log, scans):
     assert_planar(scans)
-    assert (log.dimension, log.topic, log.odometry_topic) == (2, "/scan", "/odom")
+    assert (log.dimension, log.topic, log.odometry_topic, log.scan_count) == (2, "/scan", "/odom", 3)
     np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(0.25, 0.0, 0.5), atol=1e-12)
     for k, scan in enumerate(scans):
+        assert scan.log_time_ns == scan.stamp_ns
         np.testing.assert_allclose(scan.T_odom_base, lie.pose_2d(0.1 * k, 0.0, 0.01 * k), atol=1e-12)
 
 
 @pytest.mark.parametrize("store", [ROS1, ROS2], ids=["ros1", "ros2"])
-def test_clouds_of_either_ros_keep_every_point_and_its_time(tmp_path, store):
-    log, scans = read_undamaged(recorders.mcap_of(tmp_path / "a.mcap", Ros(store), Ros(store).sweeps()))
+def test_scans_clouds_wheels_and_mounting_of_either_ros_are_read(tmp_path, store):
+    ros = Ros(store)
+    assert_drive(*read_undamaged(recorders.mcap_of(tmp_path / "drive.mcap", ros, ros.drive())))
+    log, scans = read_undamaged(recorders.mcap_of(tmp_path / "sweeps.mcap", ros, ros.sweeps()))
     assert log.dimension == 3
     assert_clouds(scans)
-
-
-@pytest.mark.parametrize("store", [ROS1, ROS2], ids=["ros1", "ros2"])
-@pytest.mark.parametrize("package", ["livox_ros_driver2", "livox_ros_driver"])
-def test_a_livox_custom_message_is_a_cloud_with_times(tmp_path, store, package):
-    ros = Ros(store)
-    told = [("/livox", f"{package}/msg/CustomMsg", c.stamp_ns, ros.livox(c, package)) for c in recorders.clouds()]
-    log, scans = read_undamaged(recorders.mcap_of(tmp_path / "a.mcap", ros, told))
-    assert log.dimension == 3 and "offset_time" in " ".join(log.notes)
-    assert_clouds(scans)
-
-
-@pytest.mark.parametrize("store", [ROS1, ROS2], ids=["ros1", "ros2"])
-def test_a_multi_echo_scan_is_that_of_its_first_echoes(tmp_path, store):
-    ros, kind = Ros(store), "sensor_msgs/msg/MultiEchoLaserScan"
+    for package in ("livox_ros_driver2", "livox_ros_driver"):
+        kind = f"{package}/msg/CustomMsg"
+        told = [("/livox", kind, cloud.stamp_ns, ros.livox(cloud, package)) for cloud in recorders.clouds()]
+        log, scans = read_undamaged(recorders.mcap_of(tmp_path / f"{package}.mcap", ros, told))
+        assert log.dimension == 3 and "offset_time" in " ".join(log.notes)
+        assert_clouds(scans)
+    kind = "sensor_msgs/msg/MultiEchoLaserScan"
     told = [("/echoes", kind, scan.stamp_ns, ros.multi_echo(scan)) for scan in recorders.planar()]
-    log, scans = read_undamaged(recorders.mcap_of(tmp_path / "a.mcap", ros, told))
-    assert log.dimension == 2
-    assert_planar(scans)
+    assert_planar(read_undamaged(recorders.mcap_of(tmp_path / "echoes.mcap", ros, told))[1])
+
+
+@pytest.mark.parametrize("compression", [None, "BZ2", "LZ4"])
+def test_a_ros_1_bag_is_a_log(tmp_path, compression):
+    assert_drive(*read_undamaged(recorders.bag1_of(tmp_path / "a.bag", Ros(ROS1).drive(), compression)))
+
+
+@pytest.mark.parametrize("plugin", ["SQLITE3", "MCAP"])
+@pytest.mark.parametrize("compression", ["NONE", "FILE", "MESSAGE"])
+def test_the_folder_of_a_ros_2_bag_and_its_db3_alone_are_logs(tmp_path, plugin, compression):
+    folder = recorders.bag2_of(tmp_path / "a", Ros(ROS2).drive(), plugin=plugin, compression=compression)
+    assert_drive(*read_undamaged(folder))
+    if (plugin, compression) == ("SQLITE3", "NONE"):
+        assert_drive(*read_undamaged(folder / "a.db3"))
 
 
 def foxglove_logs(folder, said):
@@ -199,62 +204,8 @@ def test_a_broken_protobuf_schema_is_told(tmp_path):
         list(open_log(path).scans())
 
 
-@pytest.mark.parametrize("store", [ROS1, ROS2], ids=["ros1", "ros2"])
-@pytest.mark.parametrize("kind", ["livox_ros_driver2/msg/CustomMsg", "sensor_msgs/msg/MultiEchoLaserScan"])
-def test_a_message_cut_at_any_byte_is_malformed_and_nothing_else(tmp_path, store, kind):
-    ros = Ros(store)
-    said = ros.livox(recorders.clouds(1, 6)[0], "livox_ros_driver2") if "livox" in kind else None
-    whole = ros.serialize(said or ros.multi_echo(recorders.planar(1, 13)[0]), kind)
-    name = kind.replace("/msg/", "/") if ros.is_ros1 else kind
-
-    def log_of(data):
-        return open_log(one_message(tmp_path / "a.mcap", name, ros.language, ros.encoding, data))
-
-    (expected,) = log_of(whole).scans()
-    cut_off = 0
-    for length in range(len(whole)):
-        try:
-            (scan,) = log_of(whole[:length]).scans()
-            np.testing.assert_array_equal(scan.points, expected.points)  # what was cut off is not read
-        except InputError as error:
-            assert "malformed" in str(error) or "no valid point" in str(error)
-            cut_off += 1
-    assert 0.5 * len(whole) < cut_off <= len(whole)
-
-
-def assert_drive(log, scans):
-    assert_planar(scans)
-    assert (log.dimension, log.topic, log.odometry_topic, log.scan_count) == (2, "/scan", "/odom", 3)
-    np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(0.25, 0.0, 0.5), atol=1e-12)
-    for k, scan in enumerate(scans):
-        assert scan.log_time_ns == scan.stamp_ns
-        np.testing.assert_allclose(scan.T_odom_base, lie.pose_2d(0.1 * k, 0.0, 0.01 * k), atol=1e-12)
-
-
-@pytest.mark.parametrize("compression", [None, "BZ2", "LZ4"])
-def test_a_ros_1_bag_is_a_log(tmp_path, compression):
-    drive = Ros(recorders.ROS1).drive()
-    assert_drive(*read_undamaged(recorders.bag1_of(tmp_path / "a.bag", drive, compression)))
-    sweeps = Ros(recorders.ROS1).sweeps()
-    log, scans = read_undamaged(recorders.bag1_of(tmp_path / "b.bag", sweeps, compression))
-    assert_clouds(scans)
-    assert log.dimension == 3
-
-
-@pytest.mark.parametrize("plugin", ["SQLITE3", "MCAP"])
-@pytest.mark.parametrize("compression", ["NONE", "FILE", "MESSAGE"])
-def test_the_folder_of_a_ros_2_bag_is_a_log(tmp_path, plugin, compression):
-    drive = Ros(recorders.ROS2).drive()
-    assert_drive(*read_undamaged(recorders.bag2_of(tmp_path / "a", drive, plugin=plugin, compression=compression)))
-
-
-def test_a_db3_alone_is_a_log(tmp_path):
-    folder = recorders.bag2_of(tmp_path / "a", Ros(recorders.ROS2).drive())
-    assert_drive(*read_undamaged(folder / "a.db3"))
-
-
 def test_parts_in_a_folder_are_one_log_in_natural_order(tmp_path):
-    drive = list(Ros(recorders.ROS1).drive())
+    drive = list(Ros(ROS1).drive())
     folder = tmp_path / "parts"
     folder.mkdir()
     for name, part in (("run_2.bag", drive[:3]), ("run_10.bag", drive[3:])):
@@ -271,7 +222,7 @@ def test_mcap_and_db3_parts_in_a_folder_are_one_log(tmp_path):
     write(folder / "0.mcap", said[:21])
     write(folder / "1.mcap", said[21:])
     assert len(read_undamaged(folder)[1]) == 20
-    drive = list(Ros(recorders.ROS2).drive())
+    drive = list(Ros(ROS2).drive())
     for number, part in enumerate((drive[:3], drive[3:])):
         recorders.bag2_of(tmp_path / f"part_{number}", part)
         (tmp_path / "db3").mkdir(exist_ok=True)
@@ -292,14 +243,14 @@ def test_a_bag_of_many_chunks_gives_each_scan_once_in_order(tmp_path, compressio
 
 def many_chunks(folder, compression=None):
     """Sixty sweeps, a few in each chunk."""
-    sweeps, ros = recorders.clouds(60), Ros(recorders.ROS1)
+    sweeps, ros = recorders.clouds(60), Ros(ROS1)
     told = ros.sweeps(sweeps)
     return recorders.bag1_of(folder / "a.bag", told, compression, chunk_bytes=3000), sweeps
 
 
 def test_a_db3_of_many_blocks_gives_each_scan_once_in_order(tmp_path, monkeypatch):
     monkeypatch.setattr("scanchain.logs.formats.ros2_bag._BLOCK_BYTES", 4000)
-    sweeps, ros = recorders.clouds(60), Ros(recorders.ROS2)
+    sweeps, ros = recorders.clouds(60), Ros(ROS2)
     told = ros.sweeps(sweeps)
     log, scans = read_undamaged(recorders.bag2_of(tmp_path / "a", told))
     assert len(log.indexes[0].blocks) > 10
@@ -362,7 +313,7 @@ def test_an_encrypted_bag_says_so(tmp_path):
 
 
 def test_of_a_db3_only_the_messages_that_are_damaged_are_lost(tmp_path):
-    sweeps, ros = recorders.clouds(30), Ros(recorders.ROS2)
+    sweeps, ros = recorders.clouds(30), Ros(ROS2)
     told = ros.sweeps(sweeps)
     folder = recorders.bag2_of(tmp_path / "a", told, compression="MESSAGE")
     path = folder / "a.db3"
@@ -382,14 +333,14 @@ def test_metadata_that_is_no_yaml_or_lacks_its_files_is_told(tmp_path):
     (tmp_path / "metadata.yaml").write_text("a: [")
     with pytest.raises(InputError, match=r"metadata\.yaml: is not that of a ROS 2 bag"):
         read_undamaged(tmp_path)
-    folder = recorders.bag2_of(tmp_path / "bag", Ros(recorders.ROS2).drive())
+    folder = recorders.bag2_of(tmp_path / "bag", Ros(ROS2).drive())
     (folder / "bag.db3").unlink()
     with pytest.raises(InputError, match="database files are missing"):
         read_undamaged(folder)
 
 
 def test_a_path_in_metadata_leads_nowhere_else(tmp_path):
-    folder = recorders.bag2_of(tmp_path / "bag", Ros(recorders.ROS2).drive(), plugin="MCAP")
+    folder = recorders.bag2_of(tmp_path / "bag", Ros(ROS2).drive(), plugin="MCAP")
     outside = write(tmp_path / "outside.mcap", office(2))
     text = (folder / "metadata.yaml").read_text()
     (folder / "metadata.yaml").write_text(text.replace("bag.mcap", f"../{outside.name}"))

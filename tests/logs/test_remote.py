@@ -205,18 +205,7 @@ def test_a_broken_line_is_tried_again(site, log_file, impatient):
 def test_a_line_that_stays_broken_is_an_error_that_names_the_byte_and_what_there_is_can_be_gone_on_with(
     site, log_file, tmp_path, impatient, capfd
 ):
-    words = [
-        "run",
-        site.log,
-        "--out",
-        str(tmp_path / "run"),
-        "--rerun",
-        "off",
-        "--end",
-        "20",
-        "--checkpoint",
-        "0.1",
-    ]
+    words = f"run {site.log} --out {tmp_path / 'run'} --rerun off --end 20 --checkpoint 0.1".split()
     answer = site.answer
     allowed = log_file.stat().st_size // 8
 

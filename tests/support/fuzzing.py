@@ -22,7 +22,7 @@ from scanchain.logs.messages.point_cloud import PointCloudDecoder
 from scanchain.logs.messages.readers import (
     has_poses,
     has_transforms,
-    is_cloud,
+    is_lidar,
     is_scan,
     pose_reader,
     reader,
@@ -284,7 +284,7 @@ def decoder_of(channel):
     limits = RangeLimits(0.0, float("inf"))
     if is_scan(channel):
         return LaserScanDecoder(limits, reader(channel)).decode
-    if is_cloud(channel):
+    if is_lidar(channel):
         return PointCloudDecoder(limits, PointTimes(LogConfig()), reader(channel)).decode
     if has_transforms(channel):
         return reader(channel)

@@ -58,8 +58,6 @@ def defect(message: Decoded, preprocess: PreprocessConfig | None) -> str:
 def _none_retained(points: RawPoints, config: PreprocessConfig) -> str:
     """Reason for which preprocessing retains none of the points (N, d); empty where it retains one."""
     low_m, high_m = config.min_range_m, config.max_range_m
-    if low_m * low_m <= math.fsum(x * x for x in points[len(points) // 2].tolist()) <= high_m * high_m:
-        return ""
     squares = np.empty(0)
     for part in (points[::_SAMPLE], points):
         squares = np.einsum("ij,ij->i", part, part, dtype=np.float64)

@@ -21,8 +21,9 @@ from scanchain.logs.mcap.stream import (
     nothing_in_part,
     whole_span,
 )
+from scanchain.logs.messages.readers import is_lidar
 from scanchain.logs.opening import AUTO, index_files
-from scanchain.logs.topics import find_lidar, is_lidar, topics_of
+from scanchain.logs.topics import find_lidar, topics_of
 from scanchain.logs.writer import LogWriter
 
 _DEFAULTS = LogConfig()

@@ -30,7 +30,7 @@ from scanchain.logs.mcap.stream import (
     whole_span,
 )
 from scanchain.logs.messages.laser_scan import LaserScanDecoder
-from scanchain.logs.messages.point_cloud import PlanarCloudDecoder, PointCloudDecoder, plane_height_m
+from scanchain.logs.messages.point_cloud import PointCloudDecoder, plane_height_m
 from scanchain.logs.messages.poses import RecordedPoses, StampedPose
 from scanchain.logs.messages.readers import is_scan, pose_reader, reader
 from scanchain.logs.messages.returns import PointTimes, RangeLimits, Returns
@@ -109,7 +109,9 @@ class Log:
         self.ground_truth_topic = "" if truth is None else truth.topic
         self.lidar = lidar
         self._sampled_times = PointTimes(config)
-        self.plane_height_m = None if is_scan(lidar) else self._plane_height_m()
+        self.plane_height_m: float | None = None
+        if not is_scan(lidar):
+            self.plane_height_m = self._plane_height_m()
         self.dimension = 3 if self.plane_height_m is None and not is_scan(lidar) else 2
         whole = whole_span(indexes)
         self.duration_s = whole.duration_s
@@ -287,15 +289,12 @@ class Log:
         limits = RangeLimits(self.config.min_range_m, self.config.max_range_m)
         if is_scan(self.lidar):
             return LaserScanDecoder(limits, reader(self.lidar))
-        if self.plane_height_m is None:
-            return PointCloudDecoder(limits, times, reader(self.lidar))
-        return PlanarCloudDecoder(limits, times, reader(self.lidar), self.plane_height_m)
+        return PointCloudDecoder(limits, times, reader(self.lidar), self.plane_height_m)
 
     def _plane_height_m(self) -> float | None:
         """Height of all points of the first clouds, None where they differ; samples their point times, too."""
-        limits = RangeLimits(self.config.min_range_m, self.config.max_range_m)
-        decoder = PointCloudDecoder(limits, self._sampled_times, reader(self.lidar))
-        height_m = plane_height_m(sampled_messages(self.indexes, self.topic, decoder.decode))
+        decode = self.decoder(self._sampled_times).decode
+        height_m = plane_height_m(sampled_messages(self.indexes, self.topic, decode))
         if height_m is not None:
             self.notes.append(
                 f"the clouds of {self.topic} are planar (z = {height_m:.3g} m everywhere): read as a 2D log"

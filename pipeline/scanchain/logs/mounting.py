@@ -13,12 +13,7 @@ from scanchain.data import Pose
 from scanchain.logs.mcap.records import Channel, FileIndex
 from scanchain.logs.mcap.stream import Span, sampled_messages
 from scanchain.logs.messages.poses import StampedPose, chain
-from scanchain.logs.messages.readers import (
-    has_transforms,
-    is_odometry,
-    pose_reader,
-    reader,
-)
+from scanchain.logs.messages.readers import has_transforms, is_odometry, pose_reader, reader
 from scanchain.logs.topics import topics_of
 
 _BASE_FRAMES = ("base_link", "base_footprint", "base")
@@ -78,14 +73,7 @@ class MovingFrame(NamedTuple):
 
 def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel | None, span: Span) -> Mounting:
     """The mounting of a lidar as the chosen part of a log shows it."""
-    fixed = _static_transforms(indexes)
-    topics = {
-        name: channel
-        for name, channel in topics_of(indexes).items()
-        if has_transforms(channel) and not name.endswith("tf_static")
-    }
-    if not fixed and not topics and wheels is None:
-        return Mounting("", "", np.eye(4))
+    fixed = _transforms(indexes, is_fixed=True)
     frame = _frame_of(indexes, lidar)
     stated = None
     if wheels is not None and is_odometry(wheels):
@@ -95,7 +83,9 @@ def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel 
         T_base_lidar = chain(fixed, base, frame)
         if T_base_lidar is not None:
             return Mounting(base, frame, T_base_lidar)
-    moving = _moving_transforms(indexes, topics, span)
+    moving: dict[Edge, list[StampedPose]] = {}
+    for each in _transforms(indexes, is_fixed=False, span=span):
+        moving.setdefault(_edge(each), []).append(each)
     worlds = {"" if stated is None else stated.parent.lstrip("/")}
     frames = {name for edge in (*moving, *map(_edge, fixed)) for name in edge}
     worlds |= {name for name in frames if _WORLD_WORDS & set(re.split(r"[/_]", name.lower()))}
@@ -142,25 +132,13 @@ def moving_frame(
     Transforms of /tf that join it to the base and do not change are as good as fixed ones.
     """
     frame = _frame_of(indexes, lidar) or "lidar"
-    transforms = _static_transforms(indexes)
+    transforms = _transforms(indexes, is_fixed=True)
     if mounting.base and mounting.motion is None and chain(transforms, mounting.base, frame) is None:
         transforms.append(StampedPose(0, mounting.base, frame, mounting.T_base_lidar))
     root = _root({child: parent for parent, child in map(_edge, transforms)}, frame)
     T_root_lidar = chain(transforms, root, frame)
     T_root_lidar = np.eye(4) if T_root_lidar is None else T_root_lidar
     return MovingFrame(root, lie.inverse(in_plane(T_root_lidar) if dimension == 2 else T_root_lidar))
-
-
-def _moving_transforms(
-    indexes: Sequence[FileIndex], topics: dict[str, Channel], span: Span
-) -> dict[Edge, list[StampedPose]]:
-    """Messages of each transform that may change, from parts of the log spread over it."""
-    found: dict[Edge, list[StampedPose]] = {}
-    for topic, channel in topics.items():
-        for transforms in sampled_messages(indexes, topic, reader(channel), span):
-            for each in transforms:
-                found.setdefault(_edge(each), []).append(each)
-    return found
 
 
 def _top(fixed: Sequence[StampedPose], moving: dict[Edge, list[StampedPose]], frame: str, worlds: set[str]) -> str:
@@ -210,12 +188,12 @@ def in_plane(T_base_lidar: Pose) -> Pose:
     return lie.flatten(T_base_lidar)
 
 
-def _static_transforms(indexes: Sequence[FileIndex]) -> list[StampedPose]:
-    """Every transform of the topics of fixed ones."""
+def _transforms(indexes: Sequence[FileIndex], *, is_fixed: bool, span: Span | None = None) -> list[StampedPose]:
+    """Transforms of the topics of fixed ones, or of those that may change, from parts spread over the span."""
     found: list[StampedPose] = []
     for topic, channel in topics_of(indexes).items():
-        if topic.endswith("tf_static") and has_transforms(channel):
-            for transforms in sampled_messages(indexes, topic, reader(channel)):
+        if has_transforms(channel) and topic.endswith("tf_static") == is_fixed:
+            for transforms in sampled_messages(indexes, topic, reader(channel), span):
                 found += transforms
     return found
 

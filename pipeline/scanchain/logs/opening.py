@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from scanchain.config import LogConfig
 from scanchain.errors import InputError
@@ -22,23 +22,15 @@ from scanchain.logs.formats.user import index_scans, load_format
 from scanchain.logs.mcap.index import index_by_summary, index_file
 from scanchain.logs.mcap.records import MAGIC, FileIndex
 from scanchain.logs.mcap.stream import are_parts, complete
-from scanchain.logs.topics import is_lidar
+from scanchain.logs.messages.readers import is_lidar
 
 
-@dataclass(frozen=True, slots=True)
-class LogFormat:
-    """A log format.
-
-    Attributes
-    ----------
-    description : as errors list it
-    claims : whether a path is of this format, by its first bytes (none of a folder) or what lies in it
-    index : index of a path as the n-th file of a log, see ``FileIndex``; it may raise UnknownFormatError
-    """
+class LogFormat(NamedTuple):
+    """A log format, described as errors list it."""
 
     description: str
-    claims: Callable[[Path, bytes], bool]
-    index: Callable[..., FileIndex]
+    claims: Callable[[Path, bytes], bool]  # by a path's first bytes (none of a folder) or what lies in it
+    index_of: Callable[..., FileIndex]  # of a path as the n-th file of a log; may raise UnknownFormatError
 
 
 FORMATS: dict[str, LogFormat] = {  # the first that claims a path reads it; an empty file is refused as MCAP
@@ -109,7 +101,13 @@ def logs_in(folder: Path) -> list[Path]:
     if _is_claimed(folder):
         return [folder]
     found = [path for path in sorted(folder.iterdir(), key=natural_order) if _is_named_as_log(path)]
-    return [folder] if len(found) < 2 or (found == _parts(folder) and _is_one_log(found)) else found
+    if len(found) < 2:
+        return [folder]
+    try:  # in time they follow one another, or have no topic of a lidar in common
+        is_one = found == _parts(folder) and are_parts(index_files(found), is_lidar)
+    except InputError:
+        is_one = False
+    return [folder] if is_one else found
 
 
 def _is_named_as_log(path: Path) -> bool:
@@ -120,14 +118,6 @@ def _is_named_as_log(path: Path) -> bool:
 
 def _is_claimed(folder: Path) -> bool:
     return (folder / _RUN_FILE).is_file() or any(form.claims(folder, b"") for form in FORMATS.values())
-
-
-def _is_one_log(files: Sequence[Path]) -> bool:
-    """True if the files of a folder follow one another in time, or have no topic of a lidar in common."""
-    try:
-        return are_parts(index_files(files), is_lidar)
-    except InputError:
-        return False
 
 
 def _index(source: Source, number: int, config: LogConfig) -> FileIndex:
@@ -157,7 +147,7 @@ def _index_path(path: Path, number: int, config: LogConfig, address: Source | No
                 head = file.read(_HEAD_BYTES)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
-    index = (_claiming(path, head) if config.format == AUTO else FORMATS[config.format]).index
+    index = (_claiming(path, head) if config.format == AUTO else FORMATS[config.format]).index_of
     if index is index_clouds:
         index = partial(index, rate_hz=config.rate_hz, bin_columns=config.bin_columns)
     elif index is index_file:

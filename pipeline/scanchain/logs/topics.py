@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from scanchain.config import NO_TRUTH
 from scanchain.errors import InputError
 from scanchain.logs.mcap.records import Channel, FileIndex, damage_of, name_of
-from scanchain.logs.messages.readers import LIDAR_TYPES, has_poses, is_cloud, is_odometry, is_scan, kind
+from scanchain.logs.messages.readers import LIDAR_TYPES, has_poses, is_lidar, is_odometry, kind
 
 _MOST_LISTED = 8
 _IMU = ("sensor_msgs/Imu",)
@@ -123,11 +123,6 @@ def files_with_scans(indexes: Sequence[FileIndex]) -> set[int]:
         for place, index in enumerate(indexes)
         if any(is_lidar(channel) and index.counts.get(number) for number, channel in index.channels.items())
     }
-
-
-def is_lidar(channel: Channel) -> bool:
-    """True if its messages are scans or clouds of a supported type."""
-    return is_scan(channel) or is_cloud(channel)
 
 
 def _listed(channels: Iterable[Channel], indexes: Sequence[FileIndex] = ()) -> str:

@@ -134,6 +134,8 @@ def read_pcd(path: Path) -> NDArray[np.void]:
         header = _pcd_header(file)
         try:
             point, count, form = _pcd_point(header), int(header["POINTS"][0]), header["DATA"][0]
+            if count < 0:
+                raise ValueError(f"how many points there are, but {count}")
         except (KeyError, IndexError, ValueError) as error:
             raise CloudFileError(f"is no PCD: its header does not state {error}") from error
         if form == "ascii":

@@ -27,6 +27,7 @@ Truth = list[tuple[int, Pose]]  # stamps in nanoseconds, and T_world_lidar
 
 _EARTH_M = 6378137.0
 _MOST_LATITUDE = 89.0  # largest latitude in degrees; Mercator's projection has no poles
+_MOST_CALIBRATION = 1e6  # largest number in a calibration; one beyond, infinite or no number is damage
 _NS = 1_000_000_000
 
 
@@ -145,10 +146,13 @@ def _entry(file: Path, name: str, shape: tuple[int, ...]) -> Matrix:
     """The numbers of the line ``name: numbers``."""
     entries = dict(line.split(":", 1) for line in _lines(file) if ":" in line)
     try:
-        return np.array(entries[name].split(), np.float64).reshape(shape)
+        numbers = np.array(entries[name].split(), np.float64).reshape(shape)
     except (KeyError, ValueError) as error:
         count = int(np.prod(shape))
         raise InputError(f"{file}: has no line {name}: of {count} numbers ({error}); download it again") from error
+    if not (np.abs(numbers) < _MOST_CALIBRATION).all():
+        raise InputError(f"{file}: its line {name}: holds {numbers.ravel().tolist()}; download it again")
+    return numbers
 
 
 def read_oxts(folder: Path, T_lidar_imu: Pose) -> Matrix:

@@ -67,8 +67,6 @@ def index_file(path: Path, number: int, source: Source | None = None) -> FileInd
         raise InputError(f"{path}: no such file; check the path") from error
     except ValueError as error:
         raise InputError(f"{path}: is empty (0 bytes); record or copy it again") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
     if data[: len(MAGIC)] != MAGIC:
         raise InputError(f"{path}: is not an MCAP file (starts with {data[:8]!r}); see scanchain convert --help")
     index = FileIndex(source or path, number, data)

@@ -237,8 +237,6 @@ def log_times(index: FileIndex, block: Block, channel: int) -> NDArray[np.uint64
     for entry in block.entries:
         if entry.channel == channel and entry.offset >= 0:
             return np.frombuffer(index.bytes_at(entry.offset, 16 * entry.messages), "<u8")[::2]
-        if entry.channel == channel and index.make is not None and block.start_ns == block.end_ns:
-            return np.full(entry.messages, block.start_ns, np.uint64)
     if block.entries and all(entry.channel != channel for entry in block.entries):
         return np.empty(0, np.uint64)
     messages = messages_of(index, block)

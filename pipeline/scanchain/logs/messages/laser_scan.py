@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from math import isfinite
 from typing import Any, NamedTuple
 
@@ -67,29 +68,25 @@ class Geometry(NamedTuple):
 
 
 class LaserScanDecoder:
-    """Decodes scans; directions are computed once for each geometry and shared, also between threads."""
+    """Decodes scans; directions are computed once for each geometry."""
 
     def __init__(self, limits: RangeLimits, read: ReadLaserScan) -> None:
         self.limits = limits
         self.read = read
-        self.geometries: dict[tuple[float, float, float, int], Geometry] = {}
 
     def decode(self, data: memoryview) -> Returns:
-        """Valid returns of a message's beams."""
-        return self.returns(self.read(data))
-
-    def returns(self, message: LaserScanMessage) -> Returns:
         """Points of the beams that came back: finite, at least range_min, below range_max.
 
         Scanners write range_max, or more, for a beam without return, and zero for an invalid one; limits that are
         not positive are taken as unknown. Negative angle increments are as good as positive ones.
         """
+        message = self.read(data)
         ranges_m = message.ranges_m
         low_m = max(message.range_min_m if message.range_min_m > 0.0 else 0.0, self.limits.min_m, _NEAREST_M)
         high_m = min(
             message.range_max_m if message.range_max_m > 0.0 else _FARTHEST_M, self.limits.max_m, _FARTHEST_M
         )
-        geometry = self._geometry(message)
+        geometry = _geometry(message.first_rad, message.step_rad, message.beam_s, len(ranges_m))
         valid = ((ranges_m >= low_m) & (ranges_m < high_m)).nonzero()[0]
         if len(valid) == len(ranges_m):
             points = geometry.directions * ranges_m[:, None]
@@ -101,16 +98,8 @@ class LaserScanDecoder:
         why = "" if len(valid) else _why_none(ranges_m, low_m, high_m)
         return Returns(message.stamp_ns, points, times_s, len(ranges_m) - len(valid), why)
 
-    def _geometry(self, message: LaserScanMessage) -> Geometry:
-        key = (message.first_rad, message.step_rad, message.beam_s, len(message.ranges_m))
-        geometry = self.geometries.get(key)
-        if geometry is None:
-            if len(self.geometries) >= _MOST_GEOMETRIES:
-                self.geometries = {}
-            geometry = self.geometries[key] = _geometry(*key)
-        return geometry
 
-
+@lru_cache(_MOST_GEOMETRIES)
 def _geometry(first_rad: float, step_rad: float, beam_s: float, count: int) -> Geometry:
     if not (isfinite(first_rad + step_rad * count) and abs(beam_s) * count < _FARTHEST_M):
         raise MalformedMessageError(

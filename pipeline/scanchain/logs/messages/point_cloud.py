@@ -9,15 +9,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain.data import Pose
+from scanchain.data import Pose, RawPoints
 from scanchain.errors import one_line
 from scanchain.kernels.scans import keep_valid
 from scanchain.logs.messages.returns import NAMES, NO_TIMES, PointTimes, RangeLimits, Returns, moved
 from scanchain.logs.messages.ros import MalformedMessageError, stamp_ns
 
 _FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
-_MOST_LAYOUTS = 64
-_MOST_FIELDS = 1024
+_MOST_FIELDS, _MOST_STEP = 1024, (1 << 31) - 1
 PLANAR_M = 5e-4  # largest distance from the plane of a point of a planar cloud: rounding of float32
 _FEWEST_POINTS, _ENOUGH_POINTS = 3, 1000  # least number of points of a cloud, and in all, that show a plane
 _SQUARE_OF_FARTHEST = float(np.finfo(np.float32).max)
@@ -108,74 +107,52 @@ def read_livox(data: memoryview, encoding: str) -> PointCloudMessage:
 ReadPointCloud = Callable[[memoryview], PointCloudMessage]
 
 
-class Layout(NamedTuple):
-    """Fields of a channel: a structured type, and the name of the time field, if any."""
-
-    point: np.dtype[np.void]
-    time: str
-
-
 class PointCloudDecoder:
-    """Decodes clouds; the offsets of the fields are computed once for each layout."""
+    """Decodes clouds; those of a planar scanner, all points of which lie at one height, to points in the plane."""
 
-    def __init__(self, limits: RangeLimits, times: PointTimes, read: ReadPointCloud) -> None:
-        self.read = read
+    def __init__(
+        self, limits: RangeLimits, times: PointTimes, read: ReadPointCloud, plane_m: float | None = None
+    ) -> None:
         self.limits = limits
         self.times = times
-        self.layouts: dict[tuple[tuple[PointField, ...], bool, int], Layout] = {}
+        self.read = read
+        self.plane_m = plane_m
 
     def decode(self, data: memoryview) -> Returns:
-        """Valid returns of a message's points."""
-        return self.returns(self.read(data))
-
-    def returns(self, message: PointCloudMessage) -> Returns:
         """Points that came back: finite, not the origin, within the limits; their times with them.
 
-        Rows may be padded, bytes in either order, x y z of any number type; other fields are passed over.
+        Rows may be padded, bytes in either order, x y z of any number type; other fields are passed over. Raises
+        MalformedMessageError, also where a point is not in the plane of the others.
         """
-        described = (message.fields, message.is_bigendian, message.point_step)
-        layout = self.layouts.get(described)
-        if layout is None:
-            if len(self.layouts) >= _MOST_LAYOUTS:
-                self.layouts = {}
-            layout = self.layouts[described] = _layout(message, self.times)
-        return self._filter(message, layout, _rows(message, layout.point))
-
-    def _filter(self, message: PointCloudMessage, layout: Layout, cloud: NDArray[np.void]) -> Returns:
+        message = self.read(data)
+        point = _layout(message, self.times)
+        cloud = _rows(message, point)
         points = np.empty((len(cloud), 3), np.float32)
         kept = np.empty(len(cloud), np.int32)
         x, y, z = (_as_float32(cloud[name]) for name in "xyz")
         high_square = min(self.limits.max_m * self.limits.max_m, _SQUARE_OF_FARTHEST)
         count = keep_valid(x, y, z, self.limits.min_m**2, high_square, points, kept)
         times_s = NO_TIMES
-        if layout.time:
-            times = cloud[layout.time]
-            times = times if count == len(cloud) else times[kept[:count]]
-            times_s = self.times.from_field(layout.time, message.stamp_ns, times)
-        elif self.times.by_azimuth:
+        for name in (point.names or ())[3:]:
+            times = cloud[name] if count == len(cloud) else cloud[name][kept[:count]]
+            times_s = self.times.from_field(name, message.stamp_ns, times)
+        if self.times.by_azimuth:
             times_s = self.times.from_azimuth(points[:count])
-        why = "" if count else _why_none(x, y, z)
-        kept_points = moved(points[:count], message.T_frame_cloud)
-        return Returns(message.stamp_ns, kept_points, times_s, len(cloud) - count, why)
+        points = moved(points[:count], message.T_frame_cloud)
+        if self.plane_m is not None:
+            points = _in_plane(points, self.plane_m)
+        return Returns(message.stamp_ns, points, times_s, len(cloud) - count, "" if count else _why_none(x, y, z))
 
 
-class PlanarCloudDecoder(PointCloudDecoder):
-    """Decodes clouds whose points all lie at one height, as of a planar scanner, to points in the plane."""
-
-    def __init__(self, limits: RangeLimits, times: PointTimes, read: ReadPointCloud, height_m: float) -> None:
-        super().__init__(limits, times, read)
-        self.height_m = height_m
-
-    def returns(self, message: PointCloudMessage) -> Returns:
-        """Points (N, 2) that came back. Raises MalformedMessageError where one is not in the plane."""
-        returns = super().returns(message)
-        off_m = np.abs(returns.points[:, 2] - self.height_m).max(initial=0.0)
-        if off_m > PLANAR_M:
-            raise MalformedMessageError(
-                f"a point lies {off_m:.3g} m off the plane z = {self.height_m:.3g} m, in which all points of the "
-                "first clouds lie"
-            )
-        return returns._replace(points=np.ascontiguousarray(returns.points[:, :2]))
+def _in_plane(points: RawPoints, height_m: float) -> RawPoints:
+    """Points (N, 2) of a plane at this height. Raises MalformedMessageError where one is not in it."""
+    off_m = np.abs(points[:, 2] - height_m).max(initial=0.0)
+    if off_m > PLANAR_M:
+        raise MalformedMessageError(
+            f"a point lies {off_m:.3g} m off the plane z = {height_m:.3g} m, in which all points of the "
+            "first clouds lie"
+        )
+    return np.ascontiguousarray(points[:, :2])
 
 
 def plane_height_m(clouds: Iterable[Returns]) -> float | None:
@@ -200,7 +177,10 @@ def _as_float32(values: NDArray[np.generic]) -> NDArray[np.float32]:
         return values.astype(np.float32)
 
 
-def _layout(message: PointCloudMessage, times: PointTimes) -> Layout:
+def _layout(message: PointCloudMessage, times: PointTimes) -> np.dtype[np.void]:
+    """A point as a structured type: x, y, z and the time field, if any."""
+    if message.point_step > _MOST_STEP:
+        raise MalformedMessageError(f"point_step {message.point_step} is more than a point can have")
     wanted: dict[str, tuple[str, int]] = {}
     for field in message.fields:
         if field.name not in ("x", "y", "z") and not times.wants(field.name):
@@ -222,13 +202,12 @@ def _layout(message: PointCloudMessage, times: PointTimes) -> Layout:
         raise MalformedMessageError(f"the cloud has no field {' '.join(missing)} (it has: {names})")
     time = next((name for name in NAMES if name in wanted), "")
     chosen = ["x", "y", "z", time] if time else ["x", "y", "z"]
-    point = np.dtype({
+    return np.dtype({
         "names": chosen,
         "formats": [wanted[name][0] for name in chosen],
         "offsets": [wanted[name][1] for name in chosen],
         "itemsize": message.point_step,
     })  # fmt: skip
-    return Layout(point, time)
 
 
 def _rows(message: PointCloudMessage, point: np.dtype[np.void]) -> NDArray[np.void]:

@@ -81,9 +81,9 @@ def is_scan(channel: Channel) -> bool:
     return role(channel) == Role.SCAN
 
 
-def is_cloud(channel: Channel) -> bool:
-    """True if its messages are clouds of a supported type."""
-    return role(channel) == Role.CLOUD
+def is_lidar(channel: Channel) -> bool:
+    """True if its messages are scans or clouds of a supported type."""
+    return role(channel) in (Role.SCAN, Role.CLOUD)
 
 
 def is_odometry(channel: Channel) -> bool:
