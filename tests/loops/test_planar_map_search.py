@@ -5,9 +5,11 @@ import pytest
 
 from scanchain import lie
 from scanchain.data import Keyframe
+from scanchain.loops import LoopCloser
 from scanchain.loops.planar_map_search import PlanarMapSearch, WholeSearch
 from scanchain.registration import search
-from tests.support.scenes import stored
+from tests.support.graphs import graph_of
+from tests.support.scenes import configured, stored
 
 CENTERS = (lie.pose_2d(0.0, 0.0, 0.0), lie.pose_2d(30.0, 0.0, 0.0))
 T_ROOM_LIDAR = lie.pose_2d(0.7, -0.4, 1.1)
@@ -27,12 +29,16 @@ def room(with_pillar):
     return ranges[:, None] * directions
 
 
-def rooms(pillars):
-    """The search in a map of a room with and one without a pillar, each seen twice: once may be by mistake."""
+def keyframes_in(pillars):
+    """A room with and one without a pillar, each seen twice: once may be by mistake."""
     poses = np.repeat(CENTERS, 2, axis=0)
     clouds = [stored(room(pillar)) for pillar in np.repeat(pillars, 2)]
-    keyframes = [Keyframe(k, k, k, cloud, poses[k], 30.0 * k) for k, cloud in enumerate(clouds)]
-    return PlanarMapSearch(keyframes, poses, 0.1)
+    return [Keyframe(k, k, k, cloud, poses[k], 30.0 * k) for k, cloud in enumerate(clouds)]
+
+
+def rooms(pillars):
+    """The search in a map of two rooms."""
+    return PlanarMapSearch(keyframes_in(pillars), np.repeat(CENTERS, 2, axis=0), 0.1)
 
 
 def seen(with_pillar):
@@ -74,3 +80,21 @@ def test_a_search_in_slices_finds_what_one_at_once_does(monkeypatch):
 def test_a_room_of_another_shape_is_nowhere():
     circle = np.stack([np.cos(a := np.linspace(-np.pi, np.pi, 720)), np.sin(a)], axis=1)
     assert rooms([True, False]).best(1.7 * circle, 0.3) is None
+
+
+def test_a_place_that_looked_like_another_is_believed_after_more_of_the_path_alone():
+    closer = LoopCloser(configured(2), 2)
+    closer.start_segment(4)
+
+    def found(old, traveled_m):
+        newest = Keyframe(4, 4, 4, stored(seen(with_pillar=True)), np.eye(3), traveled_m)
+        closer.search.underway = closer.search.finder.find([*two, newest], 4, old)
+        return closer.search.finish([*two, newest], graph_of([each.T_odom_lidar for each in (*two, newest)]))
+
+    two = keyframes_in([True, True])
+    assert found(two[:2], 200.0)
+    assert not found(two, 201.0)
+    assert not found(two[:2], 202.0)
+    (closure,) = found(two[:2], 203.5)
+    off_m, off_rad = lie.apart(closure.match.T_target_source, T_ROOM_LIDAR)
+    assert closure.target == 0 and off_m < 0.1 and off_rad < 0.03

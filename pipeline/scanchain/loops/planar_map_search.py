@@ -32,6 +32,7 @@ LEAST_SHARE = 0.35  # of the highest score: wrong poses of long paths come up to
 _CHANCE = 2.0  # what a search over all poses finds by chance: that much over the root of the number of points more
 _CERTAINLY = 0.06  # share above that, from which on a place is taken for found
 
+_CLEAR_M = 2.0  # path since a search that fitted several places, from which on a place is taken for found
 _PATH_M = 8.0  # length of the path whose points are searched for: over it odometry drifts less than a cell or two
 _AGREE_M, _AGREE_RAD = 0.5, 0.1  # largest distance of an aligned scan from where its path was found
 _SOURCES, _SUBMAPS = 4, 6  # keyframes of the path that are aligned, and submaps that are tried for each
@@ -61,8 +62,8 @@ class Hypothesis:
 
     @property
     def is_certain(self) -> bool:
-        """True if the pose fits far better than any does by chance, and nothing else nearly as well."""
-        return self.share >= self._by_chance + _CERTAINLY and not self.is_ambiguous
+        """True if the pose fits far better than any does by chance."""
+        return self.share >= self._by_chance + _CERTAINLY
 
     @property
     def is_ambiguous(self) -> bool:
@@ -155,6 +156,7 @@ class PlanarFinder:
         self.verifier = verifier
         self.drawn: PlanarMapSearch | None = None
         self.T_drawn = np.empty((0, 3, 3))
+        self.ambiguous_m = -math.inf  # path up to the last search that fitted several places
 
     def begin_in(self, keyframes: Sequence[Keyframe], folder: Path | None = None) -> None:
         """Draw a map before its first search."""
@@ -170,8 +172,10 @@ class PlanarFinder:
         while not search.is_done:
             yield
             search.advance()
-        best = search.best()
-        if best is None or not best.is_certain:
+        best, newest_m = search.best(), path[-1].traveled_m
+        if best is not None and best.is_likely and best.is_ambiguous:
+            self.ambiguous_m = newest_m
+        if best is None or not best.is_certain or newest_m - self.ambiguous_m < _CLEAR_M:
             return ()
         anchors = [each for each in old if each.index % self.submaps.half_width == 0]
         closures = [
