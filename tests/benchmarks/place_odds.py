@@ -80,8 +80,8 @@ def right(name: str, cache: Path) -> Iterator[tuple[float, float, float]]:
             yield from [] if found is None else [found]
 
 
-def wrong(guest: SavedMap, host: SavedMap) -> Iterator[tuple[float, float, float]]:
-    """Features at the best poses of paths of a log in the map of another building."""
+def wrong(guest: SavedMap, host: SavedMap, found: list[bool]) -> Iterator[tuple[float, float, float]]:
+    """Features at the best poses of paths of a log in the map of another building; which are taken for found."""
     shown, search = Shown(host), PlanarMapSearch(host.keyframes, host.poses, 0.1)
     traveled_m = np.array([each.traveled_m for each in guest.keyframes])
     for begin_m in np.arange(traveled_m[0], traveled_m[-1] - PATH_M, STEP_M).tolist():
@@ -93,11 +93,12 @@ def wrong(guest: SavedMap, host: SavedMap) -> Iterator[tuple[float, float, float
         while not sought.is_done:
             sought.advance()
         best = sought.best()
+        found.append(best is not None and best.is_certain and not best.is_ambiguous)
         if best is None:
             continue
         for each in guest.keyframes[max(middle.index - AROUND, 0) : middle.index + AROUND]:
-            found = shown.of(each, best.T_map_lidar @ T_middle_odom @ each.T_odom_lidar)
-            yield from [] if found is None else [found]
+            features = shown.of(each, best.T_map_lidar @ T_middle_odom @ each.T_odom_lidar)
+            yield from [] if features is None else [features]
 
 
 def told(weights: NDArray[np.float64], ours: Matrix, others: Matrix) -> tuple[str, ...]:
@@ -113,12 +114,14 @@ def main() -> None:
     runs = {log: whole_of(log, cache) for log in REAL}
     maps = {log: open_saved_map(run) for log, run in runs.items()}
     ours = np.array([each for name, entry in ENTRIES.items() if entry.log in REAL for each in right(name, cache)])
-    others = np.array([each for a, b in permutations(REAL, 2) for each in wrong(maps[a], maps[b])])
+    finds: list[bool] = []
+    others = np.array([each for a, b in permutations(REAL, 2) for each in wrong(maps[a], maps[b], finds)])
     counts = np.array([len(ours), len(others)])
     signs, shares = np.repeat([1.0, -1.0], counts), np.repeat(0.5 / counts, counts)
     rows = np.vstack([ours, others])
     fitted = minimize(lambda w: float(shares @ np.logaddexp(0.0, -signs * (rows @ w))), np.zeros(3)).x
-    print(f"{len(ours):,} keyframes at right poses, {len(others):,} at wrong ones\n")
+    print(f"{len(ours):,} keyframes at right poses, {len(others):,} at wrong ones")
+    print(f"{sum(finds):,} of {len(finds):,} paths in maps of other buildings are taken for found\n")
     row = table("weights", "fit, no fit, contradiction", "ordered rightly", "right, mean", "wrong, mean")
     row("fitted", *told(fitted, ours, others))
     row("in use", *told(np.array(evidence.WEIGHTS), ours, others))
