@@ -133,7 +133,7 @@ class PlaceTest:
             agrees = not self.waiting or self._agrees(each, keyframes, T_world)
             if each.verdict is ClosureVerdict.ACCEPTED and agrees:
                 self.waiting.append(each)
-                self.matched_m = keyframes[each.source].traveled_m
+                self.matched_m = max(keyframes[each.source].traveled_m, self.matched_m)
             ratio = self._ratio(each, keyframes, T_world) if agrees else -LARGEST_RATIO
             self.log_odds += self._weight(keyframes[each.source]) * ratio
         if self.log_odds < self.bound or not self.waiting:

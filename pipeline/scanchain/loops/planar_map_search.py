@@ -80,7 +80,7 @@ class PlanarMapSearch:
 
     def __init__(self, keyframes: Sequence[Keyframe], T_map_lidar: Matrix, resolution_m: float) -> None:
         """Draw keyframes at their poses (K, 3, 3)."""
-        clouds = [keyframe.points for keyframe in keyframes]
+        self.T_map_lidar, clouds = T_map_lidar, [keyframe.points for keyframe in keyframes]
         reach_m = max(float(np.abs(cloud).max(initial=0.0)) for cloud in clouds)
         self.resolution_m = fitting_resolution(
             T_map_lidar, resolution_m=resolution_m, max_range_m=reach_m, max_cells=_MAX_CELLS
@@ -145,7 +145,7 @@ class WholeSearch:
 class PlanarFinder:
     """Points of the last part of a path, sought in the drawing of older keyframes; then scans are aligned there.
 
-    A pose is taken where it fits better than chance and no pose elsewhere fits nearly as well.
+    A pose is taken where it fits far better than chance and none elsewhere nearly as well, nor did shortly before.
     """
 
     first_m, least_m, most_m = 1.0, 0.5, 2.0
@@ -155,7 +155,6 @@ class PlanarFinder:
         self.submaps = submaps
         self.verifier = verifier
         self.drawn: PlanarMapSearch | None = None
-        self.T_drawn = np.empty((0, 3, 3))
         self.ambiguous_m = -math.inf  # path up to the last search that fitted several places
 
     def begin_in(self, keyframes: Sequence[Keyframe], folder: Path | None = None) -> None:
@@ -187,9 +186,8 @@ class PlanarFinder:
     def _draw(self, keyframes: Sequence[Keyframe]) -> PlanarMapSearch:
         """The map of keyframes; the last one where they lie as they did."""
         T_world = np.array([each.T_odom_lidar for each in keyframes])
-        if self.drawn is None or not np.array_equal(self.T_drawn, T_world):
+        if self.drawn is None or not np.array_equal(self.drawn.T_map_lidar, T_world):
             self.drawn = PlanarMapSearch(keyframes, T_world, self.submaps.config.voxel_size_m)
-            self.T_drawn = T_world
         return self.drawn
 
     def _aligned(
