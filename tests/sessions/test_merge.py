@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,9 @@ from scanchain import lie
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Trajectory
 from scanchain.errors import InputError, ScanchainError
 from scanchain.evaluation import absolute_error, pair
+from scanchain.graph.pose_graph import PoseGraph
+from scanchain.loops.planar_map_search import WholeSearch
+from scanchain.loops.verification import Verifier
 from scanchain.maps import Edges, SavedPoints, open_saved_map, read_ply
 from scanchain.odometry.tracked import first_match
 from scanchain.runs.job import Job, Progress
@@ -317,3 +321,30 @@ def _corridor(x_m, index, depths_m):
     seen = is_wall.any(axis=1)
     points = ranges_m[is_wall.argmax(axis=1)][seen, None] * directions[seen]
     return Keyframe(index, index, index, SavedPoints(points, 1.0), lie.pose_2d(x_m, 0.0, 0.0), x_m)
+
+
+@pytest.mark.slow
+def test_merging_searches_and_aligns_no_more_than_runs_do(runs, tmp_path, monkeypatch):
+    folder, _ = runs
+    truth = read_tum(made.log("office", seed=2).with_suffix(".tum"))
+    quarter_s = float(np.ptp(truth.stamps_ns)) * 1e-9 / 4.0
+    parts = [tmp_path / f"part-{k}" for k in range(4)]
+    for k, part in enumerate(parts):
+        span = {"log__start_s": k * quarter_s, "log__end_s": (k + 1) * quarter_s}
+        made.run("office", tmp_path, seed=2, **span).rename(part)
+    work: Counter[str] = Counter()
+    for owner, name in ((WholeSearch, "__init__"), (Verifier, "scan"), (PoseGraph, "optimize")):
+        monkeypatch.setattr(owner, name, _counted(getattr(owner, name), owner.__name__, work))
+    merged = quietly(*parts, folder / "stranger", out=tmp_path / "out")
+    assert merged.metrics.apart == (("stranger",),)
+    assert work["WholeSearch"] < merged.metrics.keyframes / 4
+    assert work["Verifier"] < merged.metrics.keyframes
+    assert work["PoseGraph"] < merged.metrics.keyframes / 5
+
+
+def _counted(function, name, work):
+    def called(*args, **options):
+        work[name] += 1
+        return function(*args, **options)
+
+    return called
