@@ -114,7 +114,7 @@ class Ending:
 
     @property
     def how(self) -> str:
-        """How a process ended that did not come to its own end: out of memory, timed out, not run or crashed."""
+        """End state of a process that did not end by itself: out of memory, timed out, not run or crashed."""
         by_system = self.killed_for is KilledFor.NOTHING and self.code == _SYSTEM_KILL
         return KilledFor.MEMORY.value if by_system else self.killed_for.value
 

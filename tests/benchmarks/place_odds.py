@@ -82,7 +82,7 @@ def right(name: str, cache: Path) -> Iterator[tuple[float, float, float]]:
 
 def wrong(guest: SavedMap, host: SavedMap, found: list[bool]) -> Iterator[tuple[float, float, float]]:
     """Features at the best poses of paths of a log in the map of another building; which are taken for found."""
-    shown, search = Shown(host), PlanarMapSearch(host.keyframes, host.poses, 0.1)
+    shown, search = Shown(host), PlanarMapSearch(host.keyframes, 0.1)
     traveled_m = np.array([each.traveled_m for each in guest.keyframes])
     for begin_m in np.arange(traveled_m[0], traveled_m[-1] - PATH_M, STEP_M).tolist():
         first, end = np.searchsorted(traveled_m, (begin_m, begin_m + PATH_M)).tolist()

@@ -38,7 +38,7 @@ def keyframes_in(pillars):
 
 def rooms(pillars):
     """The search in a map of two rooms."""
-    return PlanarMapSearch(keyframes_in(pillars), np.repeat(CENTERS, 2, axis=0), 0.1)
+    return PlanarMapSearch(keyframes_in(pillars), 0.1)
 
 
 def seen(with_pillar):
@@ -88,7 +88,7 @@ def test_a_place_that_looked_like_another_is_believed_after_more_of_the_path_alo
 
     def found(old, traveled_m):
         newest = Keyframe(4, 4, 4, stored(seen(with_pillar=True)), np.eye(3), traveled_m)
-        closer.search.underway = closer.search.finder.find([*two, newest], 4, old)
+        closer.search.underway = closer.search.finder.find([*two, newest], 4, PlanarMapSearch(old, 0.1))
         return closer.search.finish([*two, newest], graph_of([each.T_odom_lidar for each in (*two, newest)]))
 
     two = keyframes_in([True, True])

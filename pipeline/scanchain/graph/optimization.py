@@ -1,4 +1,4 @@
-"""Optimization of a pose graph: graduated non-convexity, and loop edges judged anew or updated; its result."""
+"""Optimization of a pose graph by graduated non-convexity, all loop edges judged or only new ones; its result."""
 
 from __future__ import annotations
 

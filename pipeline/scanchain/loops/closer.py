@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,8 +58,11 @@ class LoopCloser:
         verifier = Verifier(config)
         is_planar = dimension == 2
         self.near = ProximityCloser(config.loops, submaps, verifier, PlanarSearch(submaps) if is_planar else None)
-        finder = PlanarFinder(submaps, verifier) if is_planar else UprightFinder(config)
-        self.search = PlaceSearch(finder, config.loops, self.segments)
+        self.search: PlaceSearch[Any] = (
+            PlaceSearch(PlanarFinder(submaps, verifier), config.loops, self.segments)
+            if is_planar
+            else PlaceSearch(UprightFinder(config), config.loops, self.segments)
+        )
         self.places = PlaceCloser(config, dimension, submaps, verifier)
 
     def begin_in(

@@ -132,10 +132,10 @@ class UprightMap:
         best_first = sorted(seeds, key=lambda each: -each.share)[:_SEEDS]
         return [each for each in best_first if each.share >= _RIVAL * best_first[0].share]
 
-    def stories(self, place: NDArray[np.float64]) -> list[int]:
-        """Which keyframes are nearest to a place (2,), one on each story."""
+    def stories(self, position: NDArray[np.float64]) -> list[int]:
+        """Numbers of the keyframes nearest to a position (2,), one on each story."""
         positions = self.T_level[:, :3, 3]
-        away_m = np.linalg.norm(positions[:, :2] - place, axis=1)
+        away_m = np.linalg.norm(positions[:, :2] - position, axis=1)
         chosen: list[int] = []
         for k in np.argsort(away_m, kind="stable").tolist():
             if away_m[k] > _REACH * self.radius_m or len(chosen) == _MAX_LEVELS:
@@ -182,18 +182,14 @@ class UprightFinder:
 
     def __init__(self, config: Config) -> None:
         self.config = config
-        self.drawn: UprightMap | None = None
 
-    def begin_in(self, keyframes: Sequence[Keyframe], folder: Path | None = None) -> None:
-        """Take the keyframes of a map; their outline is kept in its folder."""
-        self.drawn = UprightMap(keyframes, self.config, folder)
+    def draw(self, keyframes: Sequence[Keyframe], folder: Path | None = None) -> UprightMap:
+        """The upright structure of keyframes."""
+        return UprightMap(keyframes, self.config, folder)
 
-    def find(self, keyframes: Sequence[Keyframe], start: int, old: Sequence[Keyframe]) -> Underway:
+    def find(self, keyframes: Sequence[Keyframe], start: int, target: UprightMap) -> Underway:
         """The closure of the newest keyframe with the older ones, verified or not; see ``Finder``."""
-        T_world = np.array([each.T_odom_lidar for each in old])
-        if self.drawn is None or not np.array_equal(self.drawn.T_world, T_world):
-            self.drawn = UprightMap(old, self.config)
-        closure = yield from self.drawn.found(keyframes[max(start, len(keyframes) - MEMBERS) :])
+        closure = yield from target.found(keyframes[max(start, len(keyframes) - MEMBERS) :])
         return () if closure is None else (closure,)
 
 

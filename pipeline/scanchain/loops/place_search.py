@@ -6,14 +6,14 @@ import math
 from collections.abc import Generator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import LoopsConfig
-from scanchain.data import Closure, ClosureVerdict, Keyframe, Problem
+from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Problem
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
 from scanchain.loops.evidence import pose_by
@@ -23,11 +23,12 @@ _MATCH_M = 3.5  # path between two matches with a map that a log is followed in,
 _TRACKED_M = 20.0  # path since the last match with the map, up to which it is not searched
 _DRIFT = 0.1  # largest distance from the prediction, as a share of the path since the last match
 
+Map = TypeVar("Map")  # older keyframes as a search needs them
 Underway = Generator[None, None, Sequence[Closure]]
 
 
-class Finder(Protocol):
-    """Where keyframes of a path lie among older ones, in the plane or in space.
+class Finder(Protocol[Map]):
+    """Search for keyframes of a path among older ones, in the plane or in space.
 
     Attributes
     ----------
@@ -40,37 +41,39 @@ class Finder(Protocol):
     most_m: float
     follows: bool
 
-    def begin_in(self, keyframes: Sequence[Keyframe], folder: Path | None) -> None:
-        """Take the keyframes of a map; what a search makes of them may be kept in its folder."""
+    def draw(self, keyframes: Sequence[Keyframe], folder: Path | None = None) -> Map:
+        """Draw older keyframes, whose ``T_odom_lidar`` is T_world_lidar; the folder of a map may keep a part."""
         ...
 
-    def find(self, keyframes: Sequence[Keyframe], start: int, old: Sequence[Keyframe]) -> Underway:
-        """Closures of the newest keyframes, of the segment from ``start`` on, with older ones.
+    def find(self, keyframes: Sequence[Keyframe], start: int, target: Map) -> Underway:
+        """Closures of the newest keyframes, of the segment from ``start`` on, with older ones as drawn.
 
-        ``T_odom_lidar`` of these is where they lie in the world. Yields where the work of one scan is done: by
-        counts and not by the clock, so that results are the same on any machine.
+        Yields where the work of one scan is done: by counts and not by the clock, so that results are the same on
+        any machine.
         """
         ...
 
 
-class PlaceSearch:
-    """When the newest segment is sought in a map or in older segments, one search after the other.
+class PlaceSearch(Generic[Map]):
+    """Schedule of searches for the newest segment in a map or in older segments, one after the other.
 
     In a large map a search goes on over several scans.
     """
 
-    def __init__(self, finder: Finder, config: LoopsConfig, segments: Segments) -> None:
+    def __init__(self, finder: Finder[Map], config: LoopsConfig, segments: Segments) -> None:
         self.finder, self.config, self.segments = finder, config, segments
         self.of_map = 0  # number of the first keyframes that belong to a map
         self.turn = 0
         self.next_m = 0.0
         self.matched_m = -math.inf  # path up to the last match with a map that the log is followed in
         self.underway: Underway | None = None
+        self.drawn: dict[bool, tuple[Matrix, Map]] = {}  # poses and drawing of a map, and of those drawn last
 
     def begin_in(self, keyframes: Sequence[Keyframe], folder: Path | None) -> None:
-        """Take the keyframes of a map."""
+        """Take the keyframes of a map, and draw it before its first search."""
         self.of_map = len(keyframes)
-        self.finder.begin_in(keyframes, folder)
+        T_world = np.array([each.T_odom_lidar for each in keyframes])
+        self.drawn[True] = T_world, self.finder.draw(keyframes, folder)
 
     def search_again(self) -> None:
         """Forget the last match: the newest segment is not there, or has just begun."""
@@ -110,8 +113,8 @@ class PlaceSearch:
         step_m = max(_BACKOFF * (newest.traveled_m - begun_m), self.finder.least_m)
         self.next_m = newest.traveled_m + min(step_m, self.finder.most_m)
         self.turn += 1
-        placed = [replace(keyframes[k], T_odom_lidar=graph.poses[k]) for k in old.tolist()]
-        self.underway = self.finder.find(keyframes[: newest.index + 1], start, placed)
+        target = self._drawn(old, keyframes, graph.poses[old])
+        self.underway = self.finder.find(keyframes[: newest.index + 1], start, target)
         return self.advance(keyframes, graph)
 
     def advance(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
@@ -142,6 +145,15 @@ class PlaceSearch:
             return np.arange(self.of_map if self.finder.follows else 0)
         numbers = np.unique(components[unknown])
         return unknown[components[unknown] == numbers[self.turn % len(numbers)]]
+
+    def _drawn(self, old: NDArray[np.int64], keyframes: Sequence[Keyframe], T_world: Matrix) -> Map:
+        """Older keyframes as drawn at these poses; they are drawn once as long as they lie as they did."""
+        for T_drawn, target in self.drawn.values():
+            if np.array_equal(T_drawn, T_world):
+                return target
+        placed = [replace(keyframes[k], T_odom_lidar=T) for k, T in zip(old.tolist(), T_world, strict=True)]
+        self.drawn[False] = T_world, self.finder.draw(placed)
+        return self.drawn[False][1]
 
     def _since_m(self, keyframes: Sequence[Keyframe]) -> float:
         return keyframes[-1].traveled_m - self.matched_m

@@ -12,7 +12,7 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.config import MapsConfig
-from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Problem, Proposal
+from scanchain.data import Closure, Keyframe, Points, Pose, Problem, Proposal
 from scanchain.kernels.search import FREE, NEAR, UNKNOWN
 from scanchain.loops.evidence import rank_of
 from scanchain.loops.place_search import Underway
@@ -31,7 +31,6 @@ _RIVAL = 0.75  # share of the best score, from which on a pose elsewhere makes i
 LEAST_SHARE = 0.35  # of the highest score: wrong poses of long paths come up to it
 _CHANCE = 2.0  # what a search over all poses finds by chance: that much over the root of the number of points more
 _CERTAINLY = 0.06  # share above that, from which on a place is taken for found
-
 _CLEAR_M = 2.0  # path since a search that fitted several places, from which on a place is taken for found
 _PATH_M = 8.0  # length of the path whose points are searched for: over it odometry drifts less than a cell or two
 _AGREE_M, _AGREE_RAD = 0.5, 0.1  # largest distance of an aligned scan from where its path was found
@@ -78,9 +77,10 @@ class PlanarMapSearch:
     nothing, and the lidar itself stands in free space: a pose that fits walls but looks through others scores low.
     """
 
-    def __init__(self, keyframes: Sequence[Keyframe], T_map_lidar: Matrix, resolution_m: float) -> None:
-        """Draw keyframes at their poses (K, 3, 3)."""
-        self.T_map_lidar, clouds = T_map_lidar, [keyframe.points for keyframe in keyframes]
+    def __init__(self, keyframes: Sequence[Keyframe], resolution_m: float) -> None:
+        """Draw keyframes, whose ``T_odom_lidar`` is T_map_lidar."""
+        self.keyframes, clouds = keyframes, [keyframe.points for keyframe in keyframes]
+        T_map_lidar = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
         reach_m = max(float(np.abs(cloud).max(initial=0.0)) for cloud in clouds)
         self.resolution_m = fitting_resolution(
             T_map_lidar, resolution_m=resolution_m, max_range_m=reach_m, max_cells=_MAX_CELLS
@@ -154,19 +154,18 @@ class PlanarFinder:
     def __init__(self, submaps: VoxelSubmaps, verifier: Verifier) -> None:
         self.submaps = submaps
         self.verifier = verifier
-        self.drawn: PlanarMapSearch | None = None
         self.ambiguous_m = -math.inf  # path up to the last search that fitted several places
 
-    def begin_in(self, keyframes: Sequence[Keyframe], folder: Path | None = None) -> None:
-        """Draw a map before its first search."""
-        self._draw(keyframes)
+    def draw(self, keyframes: Sequence[Keyframe], folder: Path | None = None) -> PlanarMapSearch:
+        """Surfaces and free space of keyframes."""
+        return PlanarMapSearch(keyframes, self.submaps.config.voxel_size_m)
 
-    def find(self, keyframes: Sequence[Keyframe], start: int, old: Sequence[Keyframe]) -> Underway:
+    def find(self, keyframes: Sequence[Keyframe], start: int, target: PlanarMapSearch) -> Underway:
         """Closures of keyframes of the path with older ones; see ``Finder``."""
         path = keyframes[_path_begin(keyframes, start) :]
         T_newest_odom = lie.inverse(path[-1].T_odom_lidar)
         points = np.vstack([lie.transform(T_newest_odom @ member.T_odom_lidar, member.points) for member in path])
-        search = WholeSearch(self._draw(old), points, LEAST_SHARE)
+        search = WholeSearch(target, points, LEAST_SHARE)
         search.advance()
         while not search.is_done:
             yield
@@ -176,19 +175,12 @@ class PlanarFinder:
             self.ambiguous_m = newest_m
         if best is None or not best.is_certain or newest_m - self.ambiguous_m < _CLEAR_M:
             return ()
-        anchors = [each for each in old if each.index % self.submaps.half_width == 0]
+        anchors = [each for each in target.keyframes if each.index % self.submaps.half_width == 0]
         closures = [
             self._aligned(source, best.T_map_lidar @ T_newest_odom @ source.T_odom_lidar, anchors, keyframes)
             for source in path[:: -max(len(path) // _SOURCES, 1)][:_SOURCES]
         ]
         return sorted((each for each in closures if each is not None), key=rank_of, reverse=True)
-
-    def _draw(self, keyframes: Sequence[Keyframe]) -> PlanarMapSearch:
-        """The map of keyframes; the last one where they lie as they did."""
-        T_world = np.array([each.T_odom_lidar for each in keyframes])
-        if self.drawn is None or not np.array_equal(self.drawn.T_map_lidar, T_world):
-            self.drawn = PlanarMapSearch(keyframes, T_world, self.submaps.config.voxel_size_m)
-        return self.drawn
 
     def _aligned(
         self, source: Keyframe, T_world_source: Pose, anchors: Sequence[Keyframe], keyframes: Sequence[Keyframe]

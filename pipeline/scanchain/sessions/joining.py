@@ -305,10 +305,7 @@ def repeated_paths(
     agreeing : numbers of the guest's keyframes that agree with the host; both in one frame
     most : largest number of paths, evenly spread over those that agree
     """
-    searches = [
-        PlanarMapSearch(part, np.array([each.T_odom_lidar for each in part]), config.local_map.voxel_size_m)
-        for part in (host, guest)
-    ]
+    searches = [PlanarMapSearch(part, config.local_map.voxel_size_m) for part in (host, guest)]
     traveled_m = np.array([keyframe.traveled_m for keyframe in guest]) - guest[0].traveled_m
     length_m = max(min(_PATH_M, 0.5 * traveled_m[-1]), _STEP_M)
     step_m = max(_STEP_M, traveled_m[-1] / _MAX_PATHS)
