@@ -99,13 +99,15 @@ class RunDirectory:
             shutil.rmtree(folder, ignore_errors=True)
 
     def complete(self) -> None:
-        """Give the directory its name; one that had it before is removed only now.
+        """Give the directory its name, without what resuming needs; one that had it before is removed only now.
 
         Raises InputError where one that must not be replaced has come to be in the meantime.
         """
         _check(self.destination, self.force)
         if self.destination.exists():
             self.destination.rename(self.destination.with_name(f"{self.destination.name}.replaced-{os.getpid()}"))
+        for file in (CHECKPOINT_FILE, POINTS_FILE):  # not before: until here a kill leaves what --resume needs
+            (self.path / file).unlink(missing_ok=True)
         self.path.rename(self.destination)
         self.path = self.destination
         left = [path for path in partial_runs(self.destination) if not writer_of(path)]

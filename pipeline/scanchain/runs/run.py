@@ -57,7 +57,6 @@ from scanchain.verdict import Judged, judge, worst_place
 
 _FEW_SCANS = 2  # scans whose trajectory shows at most one motion
 TruePoses = Callable[[NDArray[np.int64]], Trajectory | None]  # of scans with these stamps; may raise InputError
-_FOR_RESUMING = (CHECKPOINT_FILE, POINTS_FILE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,8 +254,6 @@ class _Run:
             warnings += (f"no report.html: {type(error).__name__}: {error}",)
         if not stopped:
             directory.complete()
-            for file in _FOR_RESUMING:  # only now: until then a kill leaves what --resume needs
-                (directory.path / file).unlink(missing_ok=True)
         return Finished(directory.path, metrics, text, warnings, stopped)
 
     def _true_poses(self, stamps_ns: NDArray[np.int64]) -> Trajectory | None:
