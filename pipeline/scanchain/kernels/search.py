@@ -15,14 +15,18 @@ from scanchain.kernels.compiling import njit
 SURFACE, NEAR, UNKNOWN, FREE = 2, 1, 0, -2  # score of a point in a cell
 APART_RAD = 0.1  # least angle between two distinct poses
 _EARLY = 32  # points between two tests whether the rest can still reach the least score
+TURNS = 3  # headings that are scored at once: a cell more on each side is what points move by between two
 
 
 @njit(nogil=True)
 def score_windows(blocks, pyramid, room, has_room, spans, cells, first: int, least: float, rival: float, reached):
     """The largest windows whose bound is worth it, under some headings: (K, 5).
 
-    blocks : (2ˡ, 2ˡ, rows, columns) of the pyramid's last level l, by their place in its 2ˡ × 2ˡ blocks: points of
-        one scan in neighboring windows lie side by side, and many windows are scored at once
+    Only where the points under a heading score enough in wider windows are its own and those beside it scored.
+
+    blocks : (2ˡ, 2ˡ, rows, columns) of the best score in windows of the pyramid's last level l and one cell around
+        them, by their place in its 2ˡ × 2ˡ blocks: points of one scan in neighboring windows lie side by side, and
+        many windows are scored at once
     pyramid, room, least, rival : as in ``split_best``
     has_room : (rows, columns) of windows, those that hold a shift which is searched
     spans : (rows, 2) first of these in each row, and past the last
@@ -30,21 +34,25 @@ def score_windows(blocks, pyramid, room, has_room, spans, cells, first: int, lea
     reached : (1,) best score of a pose so far, of those in the best window of each heading; raised
     """
     level = pyramid.shape[0] - 1
-    size = 1 << level
+    size, turns = 1 << level, cells.shape[0]
     scores = np.empty(has_room.shape, np.int16)
     windows = [(0, 0, 0, 0, 0) for _ in range(0)]
-    for turn in range(cells.shape[0]):
-        _score_heading(blocks, level, has_room, spans, cells[turn], scores)
-        row, column = divmod(scores.argmax(), has_room.shape[1])
-        if scores[row, column] > reached[0]:
-            reached[0] = max(
-                reached[0], _best_of_window(pyramid[0], room, cells[turn], row * size, column * size, size)
-            )
-        limit = max(least, rival * reached[0])
-        for row in range(scores.shape[0]):
-            for column in range(spans[row, 0], spans[row, 1]):
-                if scores[row, column] >= limit:
-                    windows.append((-int(scores[row, column]), level, first + turn, column * size, row * size))
+    for begin in range(0, turns, TURNS):
+        end = min(begin + TURNS, turns)
+        _score_heading(blocks, level, has_room, spans, cells[(begin + end - 1) // 2], scores)
+        for turn in range(begin, end):
+            limit = max(least, rival * reached[0])
+            best, x, y = 0, 0, 0
+            for row in range(scores.shape[0]):
+                for column in range(spans[row, 0], spans[row, 1]):
+                    if scores[row, column] >= limit:
+                        bound = _score(pyramid[level], cells[turn], column * size, row * size, limit)
+                        if bound >= limit:
+                            windows.append((-bound, level, first + turn, column * size, row * size))
+                        if bound > best:
+                            best, x, y = bound, column * size, row * size
+            if best > reached[0]:
+                reached[0] = max(reached[0], _best_of_window(pyramid[0], room, cells[turn], y, x, size))
     return _array_of(windows)
 
 

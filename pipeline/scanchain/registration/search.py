@@ -13,14 +13,14 @@ from scipy.ndimage import distance_transform_edt
 
 from scanchain import lie
 from scanchain.data import Points, Pose
-from scanchain.kernels.search import NEAR, SURFACE, climb, score_windows, split_best
+from scanchain.kernels.search import NEAR, SURFACE, TURNS, climb, score_windows, split_best
 from scanchain.preprocess import downsample
 from scanchain.registration.voxel_map import VoxelMap
 
 _TOP = 2  # levels of the pyramid above the grid itself; windows start with 2² cells: larger ones rule out little
 _SIZE = 2**_TOP
 _MIN_RANGE = 10.0  # least median range, cells, that sets the step of the headings
-_ADDITIONS = 400_000_000  # of scores in one slice of a search, 20 to 40 ms
+_ADDITIONS = 250_000_000  # of scores in one slice of a search, 20 to 40 ms
 _STEPS = 150_000  # windows that are split in one slice
 _POINTS = 120  # of a planar scan that are scored, one a cell, evenly spread
 _TALL = 0.75  # cells between the lowest and the highest point of a column, from which on it is upright structure
@@ -81,7 +81,8 @@ class SearchGrid:
         self.pyramid[0] = layer
         for level in range(_TOP):
             self.pyramid[level + 1] = _best_of_four(self.pyramid[level], 1 << level)
-        self.blocks = np.ascontiguousarray(_in_blocks(self.pyramid[_TOP]).transpose(1, 3, 0, 2))
+        wider = np.roll(_best_of_four(self.pyramid[_TOP], _SIZE // 2), 1, axis=(0, 1))  # a cell on each side
+        self.blocks = np.ascontiguousarray(_in_blocks(wider).transpose(1, 3, 0, 2))
 
     @classmethod
     def of_points(
@@ -147,7 +148,7 @@ class Search:
         self.full = SURFACE * len(points)
         self.least = max(wanted.least * self.full, 1.0)
         additions = int(np.maximum(np.diff(self.spans), 0).sum()) * len(points)
-        self.headings = max(_ADDITIONS // max(additions, 1), 1)
+        self.headings = TURNS * max(_ADDITIONS // max(additions, 1), 1)
         self.turn = 0 if len(points) else turns
         self.reached = np.zeros(1)
         self.scored: list[NDArray[np.int64]] = [np.empty((0, 5), np.int64)]

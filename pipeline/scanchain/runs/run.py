@@ -25,7 +25,6 @@ from scanchain.logs.topics import other_sensors
 from scanchain.preprocess import prepare_ahead
 from scanchain.runs.closures import final_verdicts
 from scanchain.runs.directory import (
-    CHECKPOINT_FILE,
     POINTS_FILE,
     RECORDING_FILE,
     RUN_FILE,
