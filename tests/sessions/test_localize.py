@@ -171,7 +171,7 @@ def test_the_localizer_takes_scans_as_a_driver_has_them(office):
 
 def test_a_position_and_heading_take_height_and_tilt_of_the_nearest_keyframe():
     poses = [lie.exp(np.array([x, 2.0, 3.0, 0.2, -0.1, 0.4])) for x in (1.0, 50.0)]
-    prior = SavedMap(Path("map"), 3, tuple(Keyframe(0, 0, 0, None, T, 0.0) for T in poses), None, (), None, None)
+    prior = SavedMap(Path("map"), 3, tuple(Keyframe(0, 0, 0, None, T, 0.0) for T in poses), None, (), None)
     initial = pose_near(1.0, 2.0, 90.0)
     T = initial(0, prior)
     np.testing.assert_allclose(T[:3, 3], [1.0, 2.0, poses[0][2, 3]])

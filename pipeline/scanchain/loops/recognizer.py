@@ -19,6 +19,7 @@ from scanchain.loops.verification import Verification, Verifier
 
 RECOGNIZERS = {
     "descriptor": "scanchain.loops.descriptor:DescriptorRecognizer",
+    "outline": "scanchain.loops.outline:OutlineRecognizer",
 }
 _PLACE_DRIFT = 0.1  # largest distance from the prediction as a share of the path between
 _PLACE_SIGMAS = 3.0  # the same in standard deviations of the prediction by the graph, where these allow more

@@ -3,7 +3,7 @@
     map.json       version, dimension, number of keyframes and points, the sessions it was made of, and the CRC-32
                    of each of the other files
     keyframes.npz  poses (K, d+1, d+1) T_map_lidar; stamps_ns, scan_index, session, traveled_m, scale, count,
-                   step_m, is_wide and last_seen_ns (K,)
+                   step_m and is_wide (K,)
     edges.npz      pairs (E, 2), measurements (E, d+1, d+1), information (E, k, k), is_loop, weight (E,)
     points.i16     of one keyframe after the other the coordinates (count, d) as int16, where it is_wide as int32,
                    little-endian, times its step_m
@@ -116,7 +116,6 @@ class SavedMap:
     session : (K,) number of the session that each keyframe comes from
     sessions : in the order they joined
     edges : in force between the keyframes
-    last_seen_ns : (K,) stamp of the newest keyframe known to have seen the surroundings of each, its own at least
     """
 
     folder: Path
@@ -125,7 +124,6 @@ class SavedMap:
     session: NDArray[np.int64]
     sessions: tuple[Session, ...]
     edges: Edges
-    last_seen_ns: NDArray[np.int64]
 
     @property
     def poses(self) -> Matrix:
@@ -162,7 +160,6 @@ def write_saved_map(saved: SavedMap) -> None:
         step_m=rows["step_m"],
         is_wide=rows["is_wide"],
         stamps_ns=np.array([keyframe.stamp_ns for keyframe in keyframes], np.int64),
-        last_seen_ns=saved.last_seen_ns,
         scan_index=np.array([keyframe.scan_index for keyframe in keyframes], np.int64),
         traveled_m=np.array([keyframe.traveled_m for keyframe in keyframes]),
         scale=np.array([keyframe.scale for keyframe in keyframes]),
@@ -193,9 +190,7 @@ def open_saved_map(path: Path) -> SavedMap:
         if rows["poses"].shape != (K, d + 1, d + 1) or rows["count"].sum() != index.points:
             raise _damaged(folder / _KEYFRAMES, f"holds other keyframes and points than {_INDEX} says")
         keyframes = _keyframes(rows, folder / _POINTS, d)
-        return SavedMap(
-            folder, d, keyframes, rows["session"], index.sessions, Edges(**edges), rows["last_seen_ns"]
-        )
+        return SavedMap(folder, d, keyframes, rows["session"], index.sessions, Edges(**edges))
     except (LookupError, ValueError, TypeError) as error:  # written by something else, checksums included
         raise _damaged(folder, f"is not as scanchain writes it ({one_line(error)})") from error
 

@@ -109,8 +109,7 @@ def _write_saved_map(path: Path, results: Results) -> None:
     stamps_ns = result.trajectory.stamps_ns
     session = Session(Path(results.log.name).name, int(stamps_ns[0]), int(stamps_ns[-1]), len(keyframes))
     numbers = np.zeros(len(keyframes), np.int64)
-    seen_ns = np.array([keyframe.stamp_ns for keyframe in keyframes], np.int64)
-    write_saved_map(SavedMap(path, graph.dimension, keyframes, numbers, (session,), in_force, seen_ns))
+    write_saved_map(SavedMap(path, graph.dimension, keyframes, numbers, (session,), in_force))
     if results.config.loops.enabled and graph.dimension == 3:
         outline_of(path, open_saved_map(path).keyframes, results.config.local_map)
 

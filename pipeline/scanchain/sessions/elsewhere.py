@@ -93,8 +93,8 @@ def import_map(
         none = Edges(
             np.empty((0, 2), int), np.empty((0, d, d)), np.empty((0, k, k)), np.empty(0, bool), np.empty(0)
         )
-        numbers, stamps_ns, folder = np.zeros(count, np.int64), np.arange(count), directory.path / MAP_FOLDER
-        write_saved_map(SavedMap(folder, dimension, keyframes, numbers, (session,), none, stamps_ns))
+        folder = directory.path / MAP_FOLDER
+        write_saved_map(SavedMap(folder, dimension, keyframes, np.zeros(count, np.int64), (session,), none))
         provenance = describe_start(sys.argv, [file], "")
         msgspec.structs.replace(provenance, complete=True).write(directory.path / RUN_FILE)
         directory.complete()

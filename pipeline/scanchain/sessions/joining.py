@@ -180,9 +180,7 @@ def join(world: Joined, guest: Joined, config: Config, held: int = -1) -> Joined
     """Both in the frame of the world, at the minimum of χ²; None where the guest is not found in it."""
     old = len(world.keyframes)
     with TemporaryDirectory() as folder:  # for what a search makes of the world
-        target = SavedMap(
-            Path(folder), world.dimension, world.keyframes, world.of_map, (), world.edges, world.of_map
-        )
+        target = SavedMap(Path(folder), world.dimension, world.keyframes, world.of_map, (), world.edges)
         found = align(target, guest.keyframes, guest.edges, config, is_final=False)
     accepted = found.accepted
     if not accepted:

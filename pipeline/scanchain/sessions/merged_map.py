@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import REJECTED_WEIGHT, Closure, Keyframe, KeyframePoints, Matrix, Points, Trajectory
+from scanchain.data import REJECTED_WEIGHT, Closure, KeyframePoints, Matrix, Points, Trajectory
 from scanchain.errors import InputError
 from scanchain.graph.g2o import write_g2o
 from scanchain.loops import refined, spread
@@ -29,10 +29,6 @@ from scanchain.runs.results import GRAPH_FILE, Cloud, grid_of
 from scanchain.sessions.changes import Label, Part, changes_between
 from scanchain.sessions.joining import Joined, graph_of
 from scanchain.trajectory import read_tum, write_tum
-
-_SEEN_AGAIN = 0.3  # share of a keyframe's points near those of a later one, from which on it was seen again
-_CELL_VOXELS = 4.0  # edge of the cells, in voxels of the map, in which points are near each other
-_CELL_BITS = 21  # of each of their coordinates
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,8 +106,7 @@ def merged_map(
         joined.placed(poses).keyframes,
         joined.edges.where(joined.edges.weight >= REJECTED_WEIGHT),
     )
-    seen_ns = np.concatenate([maps[number].last_seen_ns for number in joined.maps])
-    saved = SavedMap(folder, joined.dimension, keyframes, session, tuple(sessions), in_force, seen_ns)
+    saved = SavedMap(folder, joined.dimension, keyframes, session, tuple(sessions), in_force)
     merged = MergedMap(joined, saved, tuple(trajectories), np.zeros(len(poses), np.int64))
     return updated(merged, config) if update else merged
 
@@ -208,25 +203,5 @@ def updated(merged: MergedMap, config: Config) -> MergedMap:
             if gone.any():
                 removed[k] += gone.sum()
                 result[k] = replace(result[k], stored=RemainingPoints(result[k].stored, ~gone))
-    seen_ns = np.maximum(saved.last_seen_ns, _last_seen(result, poses, _CELL_VOXELS * config.maps.voxel_size_m))
-    saved = replace(saved, keyframes=tuple(result), last_seen_ns=seen_ns)
+    saved = replace(saved, keyframes=tuple(result))
     return replace(merged, saved=saved, removed=removed, warnings=tuple(warnings))
-
-
-def _last_seen(keyframes: Sequence[Keyframe], poses: Matrix, cell_m: float) -> NDArray[np.int64]:
-    """(K,) stamp since which a share of each keyframe's points was seen, by any session; its own at least."""
-    stamps_ns = np.array([keyframe.stamp_ns for keyframe in keyframes], np.int64)
-    places = 1 << _CELL_BITS * np.arange(poses.shape[-1] - 1)  # of a cell's coordinates in one number
-    cells = []
-    for keyframe, pose in zip(keyframes, poses, strict=True):
-        coordinates = np.floor(lie.transform(pose, keyframe.points) / cell_m).astype(np.int64)
-        cells.append(np.unique((coordinates & ((1 << _CELL_BITS) - 1)) @ places))
-    number = np.unique(np.concatenate(cells), return_inverse=True)[1]
-    counts = np.array([len(each) for each in cells])
-    newest_ns = np.full(number.max(initial=-1) + 1, np.iinfo(np.int64).min)
-    np.maximum.at(newest_ns, number, np.repeat(stamps_ns, counts))
-    last_ns = stamps_ns.copy()
-    for k, seen in enumerate(np.split(newest_ns[number], np.cumsum(counts)[:-1])):
-        if len(seen):
-            last_ns[k] = np.sort(seen)[::-1][int(_SEEN_AGAIN * (len(seen) - 1))]
-    return last_ns

@@ -1,0 +1,132 @@
+"""The recognizer for 3D logs: the upright structure of a submap, sought in that of older ones within the drift."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from scanchain import lie
+from scanchain.config import Config
+from scanchain.data import Matrix, Points, Pose, Proposal
+from scanchain.errors import InputError
+from scanchain.loops.recognizer import Candidate, Query
+from scanchain.loops.submaps import Submap, level_frame, upright_frame
+from scanchain.registration import SearchGrid, Wanted, Window, find
+from scanchain.registration.search import Found, evenly, upright_columns
+
+_COLUMNS, _MIN_COLUMNS = 150, 30  # number of columns that are scored, evenly spread, and that are too few to see
+_REACH, _HEADING_RAD = 0.1, 0.5  # largest error of odometry: position, as a share of the path between, and heading
+_MAX_CELLS = 800  # along the window; a larger one has coarser cells
+_MIN_SHARE = 0.4  # least share of the columns that lie on older ones: from the other side half is hidden
+_POSES, _APART = 8, 4.0  # largest number of poses that are compared, and least distance of two, cells
+_RIVAL = 0.9  # share of the best score, from which on a pose elsewhere makes it ambiguous
+_MIN_APART = 0.25  # least distance in radii of a submap between two poses that are not the same
+_TARGETS, _VERIFIED = 3, 3  # largest number of older submaps that a pose is refined in, and of those verified
+_REFINED, _REFINED_RAD = 3.0, 0.15  # half widths of the window around it, cells and radians
+_TOUCHING = 1.5  # cells, within which a column lies on another one
+
+
+@dataclass(frozen=True, slots=True)
+class Outline:
+    """Upright columns (M, 2) of a submap in its level frame; T_anchor_level is that frame in its keyframe's."""
+
+    anchor: int
+    T_anchor_level: Pose
+    columns: Points
+
+
+class OutlineRecognizer:
+    """Proposes where the upright structure of a submap lies on that of older ones, from any direction.
+
+    All poses that the drift allows are searched in the outlines of all older submaps together, as the graph has
+    them; what fits is refined in those single ones that it touches most.
+    """
+
+    def __init__(self, config: Config, dimension: int) -> None:
+        if dimension != 3:
+            raise InputError("loops.recognizer outline is for 3D logs; leave it at auto in a 2D log")
+        self.config = config
+        self.outlines: list[Outline] = []
+
+    def add(self, submap: Submap) -> None:
+        """Keep the outline of a submap."""
+        T_anchor_level = level_frame(submap.anchor, self.config.local_map)
+        points = lie.transform(lie.inverse(T_anchor_level), submap.points())
+        columns = upright_columns(points, self.config.local_map.voxel_size_m * submap.anchor.scale)
+        self.outlines.append(Outline(submap.anchor.index, T_anchor_level, columns))
+
+    def query(self, query: Query) -> list[Candidate]:
+        """The best few of the poses that fit, each with the older submaps that it touches most."""
+        newest, keyframes, limits = self.outlines[-1], query.keyframes, self.config.loops
+        old = [each for each in self.outlines if keyframes[each.anchor].traveled_m <= query.max_traveled_m]
+        if not old or len(newest.columns) < _MIN_COLUMNS:
+            return []
+        T_plane_old, T_expected = _in_plane(old, newest, query)
+        here = query.submap.anchor
+        path_m = here.traveled_m - np.array([keyframes[each.anchor].traveled_m for each in old])
+        reach_m = np.maximum(_REACH * path_m, limits.min_radius_m)
+        near = np.flatnonzero(_away_m(T_plane_old, T_expected) <= reach_m + query.submap.radius_m)
+        if not len(near):
+            return []
+        drawn = np.vstack([lie.transform(T_plane_old[k], old[k].columns) for k in near.tolist()])
+        within_m, fine_m = float(reach_m[near].max()), self.config.local_map.voxel_size_m * here.scale
+        size_m = max(fine_m, 2.0 * within_m / _MAX_CELLS)
+        found = find(
+            evenly(newest.columns, _COLUMNS),
+            SearchGrid.of_points(drawn, size_m),
+            Window(T_expected, within_m, _HEADING_RAD),
+            Wanted(_APART * size_m, _RIVAL, _POSES, _MIN_SHARE),
+        )
+        candidates: list[Candidate] = []
+        for each in found:
+            T_plane = each.T_target_source
+            beside = near[_away_m(T_plane_old[near], T_plane) <= query.submap.radius_m].tolist()
+            T_targets = {k: lie.between(T_plane_old[k], T_plane) for k in beside}
+            touching = {
+                k: _touching(lie.transform(T, newest.columns), old[k], size_m) for k, T in T_targets.items()
+            }
+            others = [other.T_target_source for other in found if other is not each]
+            for k in sorted(beside, key=lambda k: -touching[k])[:_TARGETS]:
+                drift_m = float(np.clip(limits.drift * path_m[k], limits.min_radius_m, limits.max_radius_m))
+                is_near = _away_m(T_plane, T_expected) <= drift_m
+                apart_m = max(_MIN_APART * query.submap.radius_m, drift_m)
+                is_rivaled = not is_near and any(_away_m(other, T_plane) > apart_m for other in others)
+                by = Proposal.POSITION if is_near else Proposal.PLACE
+                for fit in _refined(newest.columns, old[k], T_targets[k], size_m, fine_m):
+                    T_target_source = (
+                        old[k].T_anchor_level @ lie.lift(fit.T_target_source) @ lie.inverse(newest.T_anchor_level)
+                    )
+                    rival = old[k].anchor if is_rivaled else -1
+                    candidates.append(Candidate(old[k].anchor, T_target_source, fit.share, by, rival))
+        return sorted(candidates, key=lambda each: -each.score)[:_VERIFIED]
+
+
+def _in_plane(old: Sequence[Outline], newest: Outline, query: Query) -> tuple[Matrix, Pose]:
+    """Poses (N, 3, 3) of the level frames of older submaps, and the expected one of the newest, from above."""
+    T_world_old = query.T_world[[each.anchor for each in old]] @ np.array([each.T_anchor_level for each in old])
+    up = T_world_old[:, :3, 2].mean(axis=0)
+    T_level_world = lie.inverse(upright_frame(up / np.linalg.norm(up)))
+    T_world_newest = query.T_world_anchor @ newest.T_anchor_level
+    return lie.flatten(T_level_world @ T_world_old), lie.flatten(T_level_world @ T_world_newest)
+
+
+def _touching(columns: Points, outline: Outline, size_m: float) -> float:
+    """Share of columns (N, 2) that lie on those of an outline, in its frame."""
+    if not len(outline.columns):
+        return 0.0
+    away_m = KDTree(outline.columns).query(columns, distance_upper_bound=_TOUCHING * size_m)[0]
+    return float(np.isfinite(away_m).mean())
+
+
+def _refined(columns: Points, outline: Outline, T: Pose, size_m: float, fine_m: float) -> Sequence[Found]:
+    """The pose near by that fits a single outline best, if any does."""
+    grid, around = SearchGrid.of_points(outline.columns, fine_m), Window(T, _REFINED * size_m, _REFINED_RAD)
+    return find(evenly(columns, _COLUMNS), grid, around, Wanted(_APART * fine_m, 1.0, 1))
+
+
+def _away_m(T: Matrix, T_other: Pose) -> NDArray[np.float64]:
+    return np.linalg.norm(T[..., :2, 2] - T_other[:2, 2], axis=-1)
