@@ -76,46 +76,6 @@ def _row_of(point, scale, slots, cells, counts, used):
 
 
 @njit(nogil=True)
-def beams_in_slice(T, points, max_range_m, min_z_m, max_z_m, starts, ends):
-    """Fill ``starts`` and ``ends`` (N, 2) with the part of each beam that lies in a horizontal slice.
-
-    A beam runs straight from the lidar, which is at height 0 of the slice's own scale, to its return at height z.
-    Returns outside the slice or the usable range are left out. Where the slice does not hold the lidar's height,
-    a beam starts where it enters the slice: at the share limit / z of its length.
-
-    T : (d+1, d+1) pose of the lidar; points : (N, d) meters, lidar frame; starts, ends : (N, 2) meters, world.
-    In 2D every return is in the slice. Returns how many beams were kept.
-    """
-    d = points.shape[1]
-    limit = min(max_range_m * max_range_m, _LARGEST)
-    count = 0
-    for i in range(points.shape[0]):
-        px, py = points[i, 0], points[i, 1]
-        pz = points[i, 2] if d == 3 else 0.0
-        if not px * px + py * py + pz * pz <= limit:
-            continue
-        dx = T[0, 0] * px + T[0, 1] * py
-        dy = T[1, 0] * px + T[1, 1] * py
-        share = 0.0
-        if d == 3:
-            dx += T[0, 2] * pz
-            dy += T[1, 2] * pz
-            dz = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz
-            if not min_z_m <= dz <= max_z_m:
-                continue
-            if min_z_m > 0.0:
-                share = min_z_m / dz
-            elif max_z_m < 0.0:
-                share = max_z_m / dz
-        starts[count, 0] = T[0, d] + share * dx
-        starts[count, 1] = T[1, d] + share * dy
-        ends[count, 0] = T[0, d] + dx
-        ends[count, 1] = T[1, d] + dy
-        count += 1
-    return count
-
-
-@njit(nogil=True)
 def draw_beams(starts, ends, offsets, origin, resolution_m, first_scan, hit, miss, low, high, log_odds, drawn):
     """Add the evidence of several scans: the cells that beams cross are free, the cells they end in occupied.
 

@@ -109,11 +109,11 @@ def plan(
         raise InputError(
             f"wheels_slip from {start_s:g} to {end_s:g} s by {size_m:g} m: begin at 0 s or later, end later"
         )
-    if isinstance(scene.route, tuple) and (reverse or start_m):
-        raise InputError(f"{world} is no route round which one could drive; leave reverse and start_m out")
     solids = scene.build(_random(seed, _PLACE))
     rng, driven_s = _random(seed, _DEVIATION, changed), length_s + lidar.period_ns * 1e-9
     if isinstance(scene.route, tuple):
+        if reverse or start_m:
+            raise InputError(f"{world} is no route round which one could drive; leave reverse and start_m out")
         motion = pivots(scene.route, scene.vehicle, solids, duration_s=driven_s, rng=rng)
     else:
         route = begun_at(scene.route[::-1] if reverse else scene.route, start_m)

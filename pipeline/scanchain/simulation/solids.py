@@ -144,10 +144,9 @@ class Scenery:
 
     def __init__(self, ground: NDArray[np.float64] = FLAT) -> None:
         self._ground = ground
-        self._boxes: list[tuple[float, ...]] = []
+        self._boxes: list[tuple[float, ...]] = []  # each behind the number of the object that it is a part of
         self._cylinders: list[tuple[float, ...]] = []
         self._ellipsoids: list[tuple[float, ...]] = []
-        self._owners: tuple[list[int], list[int], list[int]] = ([], [], [])  # of boxes, cylinders, ellipsoids
         self._objects = 0
         self._owner = FIXED
 
@@ -165,30 +164,25 @@ class Scenery:
         """Put down a box: full lengths along its own axes, heights ``z`` above the ground at its center."""
         base = self._base(center)
         half = (0.5 * size[0], 0.5 * size[1])
-        self._owners[0].append(self._owner)
-        self._boxes.append((*center, *half, base + z[0], base + z[1], np.cos(yaw_rad), np.sin(yaw_rad)))
+        turn = np.cos(yaw_rad), np.sin(yaw_rad)
+        self._boxes.append((self._owner, *center, *half, base + z[0], base + z[1], *turn))
 
     def cylinder(self, center: tuple[float, float], radius: float, z: tuple[float, float]) -> None:
         """Put down an upright cylinder, heights ``z`` above the ground at its center."""
         base = self._base(center)
-        self._owners[1].append(self._owner)
-        self._cylinders.append((*center, radius, base + z[0], base + z[1]))
+        self._cylinders.append((self._owner, *center, radius, base + z[0], base + z[1]))
 
     def ellipsoid(self, center: tuple[float, float, float], radii: tuple[float, float, float]) -> None:
         """Put down an ellipsoid; its center's height counts from the ground there."""
         x, y, z = center
-        self._owners[2].append(self._owner)
-        self._ellipsoids.append((x, y, z + self._base((x, y)), *radii))
+        self._ellipsoids.append((self._owner, x, y, z + self._base((x, y)), *radii))
 
     def finish(self) -> Solids:
         """The solids put down so far."""
-        return Solids(
-            boxes=np.array(self._boxes, dtype=np.float64).reshape(-1, 8),
-            cylinders=np.array(self._cylinders, dtype=np.float64).reshape(-1, 5),
-            ellipsoids=np.array(self._ellipsoids, dtype=np.float64).reshape(-1, 6),
-            ground=self._ground,
-            owner=np.array([owner for owners in self._owners for owner in owners], np.int64),
-        )
+        groups = (self._boxes, 8), (self._cylinders, 5), (self._ellipsoids, 6)
+        rows = [np.array(group, dtype=np.float64).reshape(-1, 1 + width) for group, width in groups]
+        owner = np.concatenate([each[:, 0] for each in rows]).astype(np.int64)
+        return Solids(*(each[:, 1:].copy() for each in rows), ground=self._ground, owner=owner)
 
     def _base(self, center: tuple[float, float]) -> float:
         return float(_height(self._ground, np.array(center)))
