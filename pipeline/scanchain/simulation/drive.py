@@ -140,7 +140,6 @@ def _random(seed: int, purpose: int, changed: int | None = None) -> np.random.Ge
 
 
 def _check_range(name: str, value: float, low: float, high: float) -> None:
-    """Refuse a value outside its limits, or one that is not a number."""
     if not low <= value <= high:
         raise InputError(f"{name} {value:g} is out of range; choose one from {low:g} to {high:g}")
 
@@ -256,8 +255,6 @@ def _sweeps(drive: Drive) -> Iterator[Sweep]:
 
 
 class _Wheels:
-    """Writer of the wheel odometry up to the log's present time."""
-
     def __init__(self, log: LogWriter, drive: Drive, last_ns: int) -> None:
         self._log = log
         self._stamps_ns = np.arange(EPOCH_NS, last_ns + 1, _ODOMETRY_PERIOD_NS)

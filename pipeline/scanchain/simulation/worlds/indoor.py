@@ -424,8 +424,11 @@ STAIRCASE_ROUTE = _staircase_route()
 
 def staircase(rng: np.random.Generator) -> Solids:
     """The stairwell: flights along x, landings at either end; doors, radiators and pipes drawn from ``rng``."""
-    scenery = Scenery()
-    _shaft(scenery)
+    scenery, middle, length = Scenery(), 0.5 * _RUN_M, _RUN_M + 2.0 * _LANDING_M
+    scenery.box((middle, 0.0), (length + 1.0, 2.0 * _STAIR_HALF_M + 1.0), (_ROOF_M, _ROOF_M + 0.2))
+    for side in (-1.0, 1.0):
+        scenery.box((middle, side * (_STAIR_HALF_M + 0.1)), (length + 0.4, 0.2), (0.0, _ROOF_M))
+        scenery.box((middle + side * (0.5 * length + 0.1), 0.0), (0.2, 2.0 * _STAIR_HALF_M), (0.0, _ROOF_M))
     for flight in range(_FLIGHTS):
         _flight(scenery, flight)
         _landing(scenery, flight, rng)
@@ -433,15 +436,6 @@ def staircase(rng: np.random.Generator) -> Solids:
     for y in (-_STAIR_HALF_M + 0.1, _STAIR_HALF_M - 0.1):
         scenery.cylinder((-_LANDING_M + 0.1, y), rng.uniform(0.03, 0.08), (0.0, _ROOF_M))
     return scenery.finish()
-
-
-def _shaft(scenery: Scenery) -> None:
-    """Four walls and a roof."""
-    middle, length = 0.5 * _RUN_M, _RUN_M + 2.0 * _LANDING_M
-    scenery.box((middle, 0.0), (length + 1.0, 2.0 * _STAIR_HALF_M + 1.0), (_ROOF_M, _ROOF_M + 0.2))
-    for side in (-1.0, 1.0):
-        scenery.box((middle, side * (_STAIR_HALF_M + 0.1)), (length + 0.4, 0.2), (0.0, _ROOF_M))
-        scenery.box((middle + side * (0.5 * length + 0.1), 0.0), (0.2, 2.0 * _STAIR_HALF_M), (0.0, _ROOF_M))
 
 
 def _flight(scenery: Scenery, flight: int) -> None:
