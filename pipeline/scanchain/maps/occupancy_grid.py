@@ -75,7 +75,7 @@ class OccupancyGrid:
         """
         squares = sum(column * column for column in points.T)
         points = points[squares <= min(self.max_range_m**2, _LARGEST)]
-        moved: Matrix = sum(T[:-1, axis] * points[:, axis, None] for axis in range(points.shape[1]))
+        moved = np.asarray(sum(T[:-1, axis] * points[:, axis, None] for axis in range(points.shape[1])))
         share = 0.0
         if points.shape[1] == 3:
             low_m, high_m = self.config.slice_min_z_m, self.config.slice_max_z_m

@@ -305,7 +305,7 @@ def _rates(step: Pivot, vehicle: Vehicle) -> Matrix:
     """Turning and moving speeds (T, 2) of one step, each followed by a pause."""
     turn = _trapezoid(np.deg2rad(step.turn_deg), TURN_RAD_S, _TURN_RAD_S2)
     ahead = _trapezoid(step.ahead_m, vehicle.speed_m_s, vehicle.acceleration_m_s2)
-    return block_diag(turn[:, np.newaxis], ahead[:, np.newaxis])
+    return np.asarray(block_diag(turn[:, np.newaxis], ahead[:, np.newaxis]))
 
 
 def _trapezoid(distance: float, limit: float, acceleration: float) -> NDArray[np.float64]:
