@@ -8,7 +8,7 @@ import pytest
 
 from scanchain import lie
 from scanchain.baselines import BASELINES
-from scanchain.baselines.baseline import AtStamp, finite
+from scanchain.baselines.wrapped import AtStamp, finite
 from scanchain.data import Trajectory
 from scanchain.errors import MissingExtraError
 from scanchain.evaluation import absolute_error, pair

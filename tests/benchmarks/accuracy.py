@@ -29,7 +29,7 @@ from scanchain.slam import Slam, SlamResult
 from scanchain.trajectory import read_tum
 from tests.benchmarks.harness import DATA, command_line, table
 from tests.support import made
-from tests.support.standing import standing
+from tests.support.moving_worlds import standing
 
 MATCHERS = ("plicp", "svd")
 STANDING = (

@@ -65,9 +65,10 @@ def toml(path, text_):
     return path
 
 
-def classes(path, *names):
-    """Settings that call methods as the classes of bad_odometries, in small letters."""
-    return toml(path, "".join(f'[{name.lower()}]\nmethod = "bad_odometries:{name}"\n' for name in names))
+def bad(path, *natures):
+    """Settings of methods named after the nature of a bad odometry, which may write a file beside them."""
+    of_all = f'method = "bad_odometries:Bad"\nfile = "{path.with_suffix(".said")}"\n'
+    return toml(path, "".join(f'[{nature}]\nnature = "{nature}"\n{of_all}' for nature in natures))
 
 
 def run(office, folder, *methods, progress=None, **changes):
@@ -96,7 +97,8 @@ GOOD = """
     method = "bad_odometries:Shifted"
     step_m = 0.25
     [unsteady]
-    method = "bad_odometries:Unsteady"
+    method = "bad_odometries:Bad"
+    nature = "is-unsteady"
 """
 
 
@@ -121,18 +123,17 @@ def test_one_that_hangs_or_kills_its_process_is_a_row_that_says_how_it_ended_and
     office, tmp_path, monkeypatch
 ):
     """The clock of the time limit stands still until one hangs, so that a slow machine ends no other."""
-    hanging, folder = tmp_path / "hanging", tmp_path / "out"
-    settings = classes(tmp_path / "bad.toml", "Hangs", "Eats", "Dies", "DiesEarly")
-    monkeypatch.setenv("HANGS_FILE", str(hanging))
+    hanging, folder = tmp_path / "bad.said", tmp_path / "out"
+    settings = bad(tmp_path / "bad.toml", "hangs", "eats", "dies", "dies-early")
     monkeypatch.setattr("scanchain.processes.monotonic", lambda: 1000.0 * hanging.exists())
-    words = ["--methods", "hangs,eats,plicp,dies,diesearly", "--time-limit", "20", "--memory-limit", "1"]
+    words = ["--methods", "hangs,eats,plicp,dies,dies-early", "--time-limit", "20", "--memory-limit", "1"]
     code = main(["compare", str(office), "--out", str(folder), "--settings", str(settings), *words])
     table = read_table(folder)
     for name, status, reason in (
         ("hangs", Status.TIMED_OUT, "at scan 10: took longer than --time-limit (20 s)"),
         ("eats", Status.OUT_OF_MEMORY, "at scan 10: took more than --memory-limit (1 GiB)"),
         ("dies", Status.CRASHED, "at scan 10: ended by SIGSEGV"),
-        ("diesearly", Status.CRASHED, "while starting or warming up: ended by SIGSEGV"),
+        ("dies-early", Status.CRASHED, "while starting or warming up: ended by SIGSEGV"),
     ):
         assert (row(table, name).status, row(table, name).reason) == (status, reason)
         assert row(table, name).figures["ate_m"] is None
@@ -148,8 +149,8 @@ def test_one_that_hangs_or_kills_its_process_is_a_row_that_says_how_it_ended_and
 
 @pytest.mark.usefixtures("in_process")
 def test_where_all_fail_the_tables_still_say_how(office, tmp_path):
-    names = ("Raises", "LosesItself", "Spatial")
-    table = run(office, tmp_path, *map(str.lower, names), config_file=classes(tmp_path / "a.toml", *names))
+    natures = ("raises", "is-lost", "is-spatial")
+    table = run(office, tmp_path, *natures, config_file=bad(tmp_path / "a.toml", *natures))
     for each, reason in zip(
         table.rows,
         (
@@ -164,28 +165,26 @@ def test_where_all_fail_the_tables_still_say_how(office, tmp_path):
 
 
 @pytest.mark.usefixtures("own_processes")
-def test_children_of_a_method_end_with_it(office, tmp_path, monkeypatch):
-    monkeypatch.setenv("SPAWNED_FILE", str(tmp_path / "spawned"))
-    names = ("Spawns", "SpawnsAway", "SpawnsAndDies")
-    table = run(office, tmp_path, *map(str.lower, names), config_file=classes(tmp_path / "a.toml", *names))
+def test_children_of_a_method_end_with_it(office, tmp_path):
+    natures = ("spawns", "spawns-away", "spawns-and-dies")
+    table = run(office, tmp_path, *natures, config_file=bad(tmp_path / "a.toml", *natures))
     assert [row.status for row in table.rows] == [Status.OK, Status.OK, Status.CRASHED]
-    pids = [int(line) for line in (tmp_path / "spawned").read_text().splitlines()]
+    pids = [int(line) for line in (tmp_path / "a.said").read_text().splitlines()]
     assert len(pids) == 3
     for spawned in pids:
         wait_until(lambda pid=spawned: not psutil.pid_exists(pid) or psutil.Process(pid).status() == "zombie")
 
 
 @pytest.mark.usefixtures("own_processes")
-def test_a_killed_comparison_leaves_neither_processes_nor_folders(office, tmp_path, monkeypatch):
-    monkeypatch.setenv("HANGS_FILE", str(tmp_path / "hanging"))
+def test_a_killed_comparison_leaves_neither_processes_nor_folders(office, tmp_path):
     command = [sys.executable, "-m", "scanchain", "compare", str(office), "--out", str(tmp_path / "out" / "table")]
     child = subprocess.Popen(
-        [*command, "--methods", "bad_odometries:Hangs"],
+        [*command, "--methods", "hangs", "--config", str(bad(tmp_path / "a.toml", "hangs"))],
         cwd=ROOT,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
-    wait_until((tmp_path / "hanging").exists)
+    wait_until((tmp_path / "a.said").exists)
     assert len(processes_about(tmp_path)) == 2
     child.kill()
     child.wait()
@@ -394,18 +393,18 @@ def test_methods_of_like_names_have_folders_of_their_own(tmp_path):
 def test_errors_are_those_of_evaluate_against_the_log_a_tum_or_a_kitti_file_and_relations(office, tmp_path):
     truth = read_tum(office.with_suffix(".tum"))
     write_kitti(tmp_path / "truth.txt", truth)
-    file, stamps = classes(tmp_path / "a.toml", "Shifted"), [f"{ns / 1e9:.6f}" for ns in truth.stamps_ns.tolist()]
+    stamps = [f"{ns / 1e9:.6f}" for ns in truth.stamps_ns.tolist()]
     one = toml(tmp_path / "a.relations", f"{stamps[0]} {stamps[20]} 0.5 0 0 0 0 0\n")  # the method's own are 2 m
     for reference in (None, office.with_suffix(".tum"), tmp_path / "truth.txt"):
         truths = {"ground_truth": reference, "relations": one}
-        table = run(office, tmp_path, "shifted", config_file=file, force=True, **truths)
-        estimate = read_tum(tmp_path / "out" / "methods" / "shifted" / "trajectory.tum")
+        table = run(office, tmp_path, "bad_odometries:Shifted", force=True, **truths)
+        estimate = read_tum(method_folder(tmp_path / "out", table.rows[0].name) / "trajectory.tum")
         error_m = absolute_error(pair(estimate, truth)).translation_m.rmse
         assert table.rows[0].figures["ate_m"] == pytest.approx(error_m, abs=1e-8)
         assert table.rows[0].figures["paired_share"] == 1.0
         assert table.rows[0].figures["relations_m"] == pytest.approx(1.5, abs=1e-9)
         relations = pq.read_table(tmp_path / "out" / "per_relation.parquet").to_pylist()
-        assert [(each["method"], each["relation"]) for each in relations] == [("shifted", 0)]
+        assert [(each["method"], each["relation"]) for each in relations] == [(table.rows[0].name, 0)]
 
 
 @pytest.mark.usefixtures("in_process")
@@ -441,7 +440,7 @@ def test_a_truth_that_does_not_fit_is_refused_before_anything_runs(office, tmp_p
 
 @pytest.mark.usefixtures("in_process")
 def test_without_truth_there_is_sharpness_and_disagreement_and_it_is_said_that_they_are_none(tmp_path):
-    log, still = shared_data("3d/kitti_0005_first60.mcap"), "bad_odometries:StandsStill"
+    log, still = shared_data("3d/kitti_0005_first60.mcap"), "bad_odometries:Bad"
     table = run(log, tmp_path, "plicp", "svd", still, overrides=(Override("log.end_s", "1.6", ""),))
     assert table.truth == "" and all(each.figures["ate_m"] is None for each in table.rows)
     sharp = [row(table, name).figures for name in ("plicp", still)]

@@ -9,8 +9,8 @@ from scanchain import lie
 from scanchain.odometry import Odometry
 from scanchain.odometry.standstill import Standstill
 from scanchain.odometry.tracked import first_match
+from tests.support.moving_worlds import standing
 from tests.support.scenes import configured
-from tests.support.standing import standing
 
 SIGMA_M = 0.005
 

@@ -1,4 +1,4 @@
-"""Odometries that a comparison must survive: each stands still for ten scans, then shows its nature."""
+"""Odometries that a comparison must survive, and one that is as good as it is told to be."""
 
 import os
 import signal
@@ -8,107 +8,54 @@ from pathlib import Path
 
 import numpy as np
 
-
-class StandsStill:
-    def __init__(self):
-        self.scans = 0
-
-    def track(self, points, times_s, stamp_ns):
-        self.scans += 1
-        if self.scans > 10:
-            self.misbehave()
-        return np.eye(points.shape[1] + 1)
-
-    def misbehave(self):
-        pass
+AT_ONCE = ("dies-early", "is-spatial", "is-unsteady")
 
 
-class Raises(StandsStill):
-    def misbehave(self):
-        raise ValueError("no more <b>patience</b>")
+class Bad:
+    """Stands still for ten scans, then shows its nature, some of it by a file."""
 
-
-class Hangs(StandsStill):
-    """Says that it hangs by a file, so that a test need not wait."""
-
-    def misbehave(self):
-        Path(os.environ["HANGS_FILE"]).touch()
-        time.sleep(600.0)
-
-
-class Eats(StandsStill):
-    def __init__(self):
-        super().__init__()
-        self.hoard = []
-
-    def misbehave(self):
-        while True:
-            self.hoard.append(np.ones(1 << 20))
-            time.sleep(0.005)
-
-
-class Dies(StandsStill):
-    def misbehave(self):
-        os.kill(os.getpid(), signal.SIGSEGV)
-
-
-class Spawns(StandsStill):
-    """Starts a process of its own and forgets it."""
-
-    is_away = False
-
-    def misbehave(self):
-        if self.scans == 11:
-            child = subprocess.Popen(["sleep", "600"], start_new_session=self.is_away)
-            with Path(os.environ["SPAWNED_FILE"]).open("a") as file:
-                print(child.pid, file=file)
-            time.sleep(0.5)
-
-
-class SpawnsAway(Spawns):
-    is_away = True
-
-
-class SpawnsAndDies(Spawns):
-    def misbehave(self):
-        super().misbehave()
-        os.kill(os.getpid(), signal.SIGSEGV)
-
-
-class Spatial(StandsStill):
-    """A 3D pose of a 2D log."""
-
-    def track(self, points, times_s, stamp_ns):
-        return np.eye(4)
-
-
-class LosesItself(StandsStill):
-    def track(self, points, times_s, stamp_ns):
-        pose = super().track(points, times_s, stamp_ns)
-        return np.nan * pose if self.scans > 10 else pose
-
-
-class DiesEarly(Dies):
-    def track(self, points, times_s, stamp_ns):
-        self.misbehave()
-
-
-class Unsteady(StandsStill):
-    """Never twice the same."""
+    def __init__(self, nature="stands", file=""):
+        self.nature, self.file = nature, Path(file)
+        self.scans, self.hoard = 0, []
 
     def track(self, points, times_s, stamp_ns):
         self.scans += 1
         pose = np.eye(points.shape[1] + 1)
-        pose[:-1, -1] = np.random.default_rng().normal(scale=0.1, size=points.shape[1]) + 0.1 * self.scans
-        return pose
+        if self.scans <= 10 and self.nature not in AT_ONCE:
+            return pose
+        match self.nature:
+            case "raises":
+                raise ValueError("no more <b>patience</b>")
+            case "hangs":  # and says so, so that a test need not wait
+                self.file.touch()
+                time.sleep(600.0)
+            case "eats":
+                while True:
+                    self.hoard.append(np.ones(1 << 20))
+                    time.sleep(0.005)
+            case "dies" | "dies-early":
+                os.kill(os.getpid(), signal.SIGSEGV)
+            case "spawns" | "spawns-away" | "spawns-and-dies" if self.scans == 11:
+                self._spawn()
+        if self.nature == "is-unsteady":  # never twice the same
+            pose[:-1, -1] = np.random.default_rng().normal(scale=0.1, size=points.shape[1]) + 0.1 * self.scans
+        return {"is-spatial": np.eye(4), "is-lost": np.nan * pose}.get(self.nature, pose)
+
+    def _spawn(self):
+        """Start a process and forget it."""
+        child = subprocess.Popen(["sleep", "600"], start_new_session=self.nature == "spawns-away")
+        with self.file.open("a") as file:
+            print(child.pid, file=file)
+        time.sleep(0.5)
+        if self.nature == "spawns-and-dies":
+            os.kill(os.getpid(), signal.SIGSEGV)
 
 
-class Shifted(StandsStill):
+class Shifted:
     """Ten centimeters forward a scan, or whatever it is told."""
 
     def __init__(self, step_m=0.1):
-        super().__init__()
-        self.step_m = step_m
+        self.scans, self.step_m = 0, step_m
         self.description = f"moves {step_m} m a scan"
 
     def track(self, points, times_s, stamp_ns):

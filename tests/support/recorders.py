@@ -157,18 +157,10 @@ class Ros(naive_logs.Ros):
 
 def mcap_of(path, ros, told):
     """Messages of ROS in an MCAP that the mcap package writes."""
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(profile=ros.encoding)
-        channels = {}
-        for topic, type_name, time_ns, message in told:
-            if topic not in channels:
-                name = type_name.replace("/msg/", "/") if ros.is_ros1 else type_name
-                schema = writer.register_schema(name, ros.language, ros.definition(type_name))
-                channels[topic] = writer.register_channel(topic, ros.encoding, schema)
-            writer.add_message(channels[topic], time_ns, ros.serialize(message, type_name), time_ns)
-        writer.finish()
-    return path
+    said = [naive_logs.Said(*head, ros.serialize(message, head[1])) for *head, message in told]
+    rename = (lambda kind: kind.replace("/msg/", "/")) if ros.is_ros1 else str
+    encodings = {"encoding": ros.language, "message_encoding": ros.encoding, "rename": rename}
+    return naive_logs.write(path, said, ros=ros, **encodings)
 
 
 def bag1_of(path, told, compression=None, *, chunk_bytes=None):

@@ -61,7 +61,8 @@ def comparison(evil, tmp_path_factory):
     """The directory of a comparison, in this process, of ours, a variant of an evil name, and one that raises."""
     folder = tmp_path_factory.mktemp("compared")
     (folder / "a.toml").write_text(
-        f'["{EVIL}"]\nmethod = "bad_odometries:Shifted"\n[raises]\nmethod = "bad_odometries:Raises"\n'
+        f'["{EVIL}"]\nmethod = "bad_odometries:Shifted"\n'
+        '[raises]\nmethod = "bad_odometries:Bad"\nnature = "raises"\n'
     )
 
     with pytest.MonkeyPatch.context() as patch:

@@ -5,7 +5,7 @@ package, ``scanchain compare --methods my_module:MyClass`` runs a class of yours
 keywords.
 """
 
-from scanchain.baselines.baseline import Baseline as Baseline
-from scanchain.baselines.baseline import InPlane as InPlane
 from scanchain.baselines.wrapped import BASELINES as BASELINES
+from scanchain.baselines.wrapped import Baseline as Baseline
 from scanchain.baselines.wrapped import Entry as Entry
+from scanchain.baselines.wrapped import InPlane as InPlane

@@ -110,7 +110,7 @@ def _evaluated(
     results = Results({}, {})
     if gt is not None:
         truth = read_kitti(gt) if kitti else read_truth(gt).at(trajectory.stamps_ns)
-        results = evaluate(trajectory, truth, source="--rpe", **given)
+        results = evaluate(trajectory, truth, **given)
     if relations is not None:
         results.found["relations"] = relation_error(trajectory, read_relations(relations))
     return results

@@ -139,7 +139,6 @@ def _spelled_out(name: str, dimension: int) -> Sequence[str]:
 
 
 def _their_settings(name: str, base: str, own: Mapping[str, Any], dimension: int, where: str) -> dict[str, Any]:
-    """Settings of a baseline, by key."""
     defaults = BASELINES[base].settings if dimension == 3 else BASELINES[base].planar
     if defaults is None:
         raise InputError(f"{name} is made for 3D clouds, the log is 2D; leave it out of --methods")

@@ -208,7 +208,6 @@ def _run(method: Method, scans: StoredScans, folder: Path, limits: Limits) -> Ou
 
 
 def _where(outcome: Outcome) -> str:
-    """Stage at which it ended."""
     if not (outcome.folder / TRACK_FILE).exists():
         return "while starting or warming up"
     tracked = int(np.isfinite(outcome.seconds).sum())

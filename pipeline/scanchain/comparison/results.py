@@ -249,13 +249,11 @@ def _write_method(own: Path, results: Results, name: str) -> None:
 
 
 def _write_tables(path: Path, tables: Sequence[pa.Table], notes: Mapping[str, str] | None = None) -> None:
-    """Write tables one below the other, where there are any."""
     if tables:
         pq.write_table(pa.concat_tables(tables).replace_schema_metadata(notes), path, compression="zstd")
 
 
 def _relations(assessed: Mapping[str, Assessed]) -> list[pa.Table]:
-    """The errors over relations, method by method."""
     errors = {name: each.relations for name, each in assessed.items() if each.relations is not None}
     return [
         pa.table(

@@ -65,9 +65,10 @@ class Column(Struct, frozen=True):
         """The figures of a table's rows; none is the best where all that are known are equal as text."""
         values = [self.of(row) for row in rows]
         digits = self._digits([abs(value) for value in values if value])
-        badness = [None if value is None else self._badness(round(value, digits)) for value in values]
+        sign = {"low": 1.0, "high": -1.0, "": 0.0}[self.better]
+        badness = [None if value is None else sign * round(value, digits) for value in values]
         known = {each for each in badness if each is not None}
-        is_contest = bool(self.better) and len(known) > 1
+        is_contest = len(known) > 1
         return [
             Shown("–", False) if value is None else Shown(f"{value:.{digits}f}", is_contest and each == min(known))
             for value, each in zip(values, badness, strict=True)
@@ -76,9 +77,6 @@ class Column(Struct, frozen=True):
     def _digits(self, sizes: list[float]) -> int:
         """As many as the smallest needs for three figures."""
         return min(self.digits, max(0, 2 - math.floor(math.log10(min(sizes))))) if sizes else self.digits
-
-    def _badness(self, shown: float) -> float:
-        return {"low": shown, "high": -shown, "": 0.0}[self.better]
 
 
 _DEGREES = 57.29577951308232

@@ -126,7 +126,6 @@ def run(folder: Path) -> None:
 
 
 def _report(scans: StoredScans, method: Method, folder: Path) -> EndReport:
-    """Report of the work, or of the error that ended it."""
     try:
         return work(scans, method, folder)
     except MissingExtraError as error:
@@ -141,7 +140,6 @@ def _report(scans: StoredScans, method: Method, folder: Path) -> EndReport:
 
 
 def _words(error: Exception) -> str:
-    """Message of an error on one line."""
     return f"{type(error).__name__}: {' '.join(str(error).split())[:_MAX_CHARACTERS]}"
 
 

@@ -6,8 +6,6 @@ from scanchain.evaluation.consistency import disagreement as disagreement
 from scanchain.evaluation.consistency import expected_ate as expected_ate
 from scanchain.evaluation.consistency import expected_errors as expected_errors
 from scanchain.evaluation.consistency import motion_nees as motion_nees
-from scanchain.evaluation.errors import KITTI_LENGTHS_M as KITTI_LENGTHS_M
-from scanchain.evaluation.errors import RELATION_LIMIT_S as RELATION_LIMIT_S
 from scanchain.evaluation.errors import SHORT_LENGTHS_M as SHORT_LENGTHS_M
 from scanchain.evaluation.errors import AbsoluteError as AbsoluteError
 from scanchain.evaluation.errors import Alignment as Alignment

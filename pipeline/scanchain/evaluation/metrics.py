@@ -151,7 +151,6 @@ def evaluate(
     rpe: str = "1pose,1s,10m,100m",
     scale: bool = False,
     time_offset: float | Literal["auto"] = 0.0,
-    source: str = "rpe",
 ) -> Results:
     """Every metric that a trajectory and its ground truth allow: ATE, RPE over each interval, KITTI.
 
@@ -159,14 +158,14 @@ def evaluate(
     truth : a trajectory, a TUM file, or a KITTI file with one row a pose of the estimate
     align : "rigid", "first" or "none", for the ATE
     max_gap_s : truth is interpolated over at most this; by default five of its usual intervals, 0.1 to 0.6 s
-    rpe : intervals in poses, seconds or meters; ``source`` names them in errors
+    rpe : intervals in poses, seconds or meters
     scale : whether the estimate is scaled to fit the truth first (Umeyama 1991), for one of unknown scale
     time_offset : seconds to add to the stamps of the estimate, or "auto" for those of the least ATE within ±1 s
     Returns ``ate``, ``rpe`` by interval ("1_s") and ``kitti``; ``missing`` with reasons, ``warnings``.
     Raises InputError where no pose has a true one, or an argument is none of these.
     """
     checks.one_of(align, tuple(each.value for each in Alignment), "align")
-    intervals = _intervals(rpe, source)
+    intervals = _intervals(rpe)
     trajectory = read_tum(Path(estimate)) if isinstance(estimate, str | Path) else estimate
     checks.instance(trajectory, Trajectory, "estimate", "read_tum(path)")
     if isinstance(truth, str | Path):
@@ -187,10 +186,10 @@ def evaluate(
     return Results(found, missing, pairs.description, warnings, factor, offset_s, aligned, pairs.reference)
 
 
-def _intervals(text: str, source: str) -> list[tuple[float, str]]:
+def _intervals(text: str) -> list[tuple[float, str]]:
     """Size and unit of each interval of a list such as ``1pose,0.5s,10m``."""
     found = [(word, _INTERVAL.fullmatch(word.strip())) for word in text.split(",")]
     for word, match in found:
         if match is None or float(match[1]) == 0.0 or (match[2].startswith("pose") and "." in match[1]):
-            raise InputError(f"{source} has {word!r}; take sizes such as 1pose, 0.5s or 10m, with commas")
+            raise InputError(f"--rpe has {word!r}; take sizes such as 1pose, 0.5s or 10m, with commas")
     return [(float(match[1]), match[2].removesuffix("s") or "s") for _, match in found if match]

@@ -13,14 +13,7 @@ _SMALL = 1e-8  # sine of half the angle, below which the series is exact
 @njit()
 def inverse(T):
     """T⁻¹ = [Rᵀ, −Rᵀt; 0, 1] of T (d+1, d+1)."""
-    d = T.shape[0] - 1
-    out = np.zeros((d + 1, d + 1))
-    for i in range(d):
-        for j in range(d):
-            out[i, j] = T[j, i]
-            out[i, d] -= T[j, i] * T[j, d]
-    out[d, d] = 1.0
-    return out
+    return between(T, np.eye(T.shape[0]))
 
 
 @njit()

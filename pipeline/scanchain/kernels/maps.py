@@ -5,114 +5,34 @@ import numpy as np
 from scanchain.kernels.compiling import njit
 from scanchain.kernels.voxels import REACH, find, key_of
 
-_LARGEST = 1e300  # m²; keeps points at infinity out where the range has no limit
-
 
 @njit(nogil=True)
-def add_points(T, points, max_range_m, voxel_m, center, slots, cells, sums, counts, used):
-    """Move points by a pose and add each to the sum of its voxel, until the table is full.
+def add_points(points, sums_of, counts_of, voxel_m, center, slots, cells, sums, counts, used):
+    """Add points, or means of several, to the sums of their voxels, until the table is full.
 
+    points : (N, d) meters, finite; sums_of (N, d) and counts_of (N,) of what each is the mean of
     center : (3,) meters, of the space in which each voxel has a key of its own; it counts as full beyond
-
-    T : (d+1, d+1); points : (N, d) meters. slots : (S,) int64 keys and cells : (S,) int32 the row that each key
-    has; sums : (C, d) meters and counts : (C,) int64, of which the first ``used`` rows are taken.
+    slots : (S,) int64 keys and cells : (S,) int32 the row that each key has; sums : (C, d) meters and counts :
+        (C,) int64, of which the first ``used`` rows are taken
     Returns the rows taken now and the number of points done: fewer than N where rows or keys did not suffice.
     """
-    d = points.shape[1]
-    scale = 1.0 / voxel_m
-    limit = min(max_range_m * max_range_m, _LARGEST)
-    moved = np.zeros(3)
+    d, scale = points.shape[1], 1.0 / voxel_m
     for i in range(points.shape[0]):
-        square = 0.0
-        for axis in range(d):
-            square += points[i, axis] * points[i, axis]
-        if not square <= limit:
-            continue
-        for row in range(d):
-            value = T[row, d]
-            for axis in range(d):
-                value += T[row, axis] * points[i, axis]
-            moved[row] = value
-        row = np.int64(-1)
-        if max(abs(moved[0] - center[0]), abs(moved[1] - center[1]), abs(moved[2] - center[2])) < REACH * voxel_m:
-            used, row = _row_of(moved, scale, slots, cells, counts, used)
-        if row < 0:
+        x, y, z = points[i, 0], points[i, 1], points[i, 2] if d == 3 else 0.0
+        if not max(abs(x - center[0]), abs(y - center[1]), abs(z - center[2])) < REACH * voxel_m:
             return used, i
+        key = key_of(x, y, z, scale)
+        slot = find(slots, key)
+        if slot < 0:
+            if used == counts.size:
+                return used, i
+            slot = ~slot
+            slots[slot], cells[slot] = key, used
+            used += 1
         for axis in range(d):
-            sums[row, axis] += moved[axis]
-        counts[row] += 1
+            sums[cells[slot], axis] += sums_of[i, axis]
+        counts[cells[slot]] += counts_of[i]
     return used, points.shape[0]
-
-
-@njit(nogil=True)
-def merge_voxels(old_sums, old_counts, voxel_m, slots, cells, sums, counts):
-    """Put the voxels (M, d) of one table into another, empty one of the same or larger voxels; the rows taken."""
-    d = old_sums.shape[1]
-    scale = 1.0 / voxel_m
-    mean = np.zeros(3)
-    used = 0
-    for i in range(old_sums.shape[0]):
-        for axis in range(d):
-            mean[axis] = old_sums[i, axis] / old_counts[i]
-        used, row = _row_of(mean, scale, slots, cells, counts, used)
-        for axis in range(d):
-            sums[row, axis] += old_sums[i, axis]
-        counts[row] += old_counts[i]
-    return used
-
-
-@njit(inline="always")
-def _row_of(point, scale, slots, cells, counts, used):
-    """Rows taken, and the row of the point's voxel; −1 where it is new and there is no room."""
-    key = key_of(point[0], point[1], point[2], scale)
-    slot = find(slots, key)
-    if slot >= 0:
-        return used, np.int64(cells[slot])
-    if used == counts.size:
-        return used, np.int64(-1)
-    slots[~slot] = key
-    cells[~slot] = used
-    return used + 1, np.int64(used)
-
-
-@njit(nogil=True)
-def beams_in_slice(T, points, max_range_m, min_z_m, max_z_m, starts, ends):
-    """Fill ``starts`` and ``ends`` (N, 2) with the part of each beam that lies in a horizontal slice.
-
-    A beam runs straight from the lidar, which is at height 0 of the slice's own scale, to its return at height z.
-    Returns outside the slice or the usable range are left out. Where the slice does not hold the lidar's height,
-    a beam starts where it enters the slice: at the share limit / z of its length.
-
-    T : (d+1, d+1) pose of the lidar; points : (N, d) meters, lidar frame; starts, ends : (N, 2) meters, world.
-    In 2D every return is in the slice. Returns how many beams were kept.
-    """
-    d = points.shape[1]
-    limit = min(max_range_m * max_range_m, _LARGEST)
-    count = 0
-    for i in range(points.shape[0]):
-        px, py = points[i, 0], points[i, 1]
-        pz = points[i, 2] if d == 3 else 0.0
-        if not px * px + py * py + pz * pz <= limit:
-            continue
-        dx = T[0, 0] * px + T[0, 1] * py
-        dy = T[1, 0] * px + T[1, 1] * py
-        share = 0.0
-        if d == 3:
-            dx += T[0, 2] * pz
-            dy += T[1, 2] * pz
-            dz = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz
-            if not min_z_m <= dz <= max_z_m:
-                continue
-            if min_z_m > 0.0:
-                share = min_z_m / dz
-            elif max_z_m < 0.0:
-                share = max_z_m / dz
-        starts[count, 0] = T[0, d] + share * dx
-        starts[count, 1] = T[1, d] + share * dy
-        ends[count, 0] = T[0, d] + dx
-        ends[count, 1] = T[1, d] + dy
-        count += 1
-    return count
 
 
 @njit(nogil=True)

@@ -11,10 +11,10 @@ SECTORS = 720  # sectors of azimuth; a ray tests only the solids that overlap it
 
 @njit(nogil=True)
 def cast_rays(
-    origins, rotations, pose_of_ray, directions, boxes, cylinders, ellipsoids, ground, max_range_m,
-    ranges_m, solid_of_ray,
+    origins, rotations, pose_of_ray, directions, boxes, cylinders, ellipsoids, ground, starts, members, nearest_m,
+    max_range_m, ranges_m,
 ):  # fmt: skip
-    """Range to the first hit of every ray and the solid it hit; inf and −1 where nothing is within reach.
+    """Range to the first hit of every ray; inf where nothing is within reach.
 
     Solids are seen from the outside only: a ray that starts inside one passes through it. Each ray tests the
     solids of its azimuth sector from near to far, and stops where the next cannot begin before its best hit.
@@ -26,13 +26,12 @@ def cast_rays(
     cylinders : (C, 5) center x, y, radius, bottom, top
     ellipsoids : (E, 6) center x, y, z, radii x, y, z
     ground : (7 + 4 W,) z = g0 + g1 sin(g2 x + g3) + g4 sin(g5 y + g6) + Σ a sin(b x + c y + d), W rows a, b, c, d
+    starts, members : solids of sector s are ``members[starts[s] : starts[s + 1]]``, near to far, counted through
+        boxes, cylinders, ellipsoids
+    nearest_m : (B + C + E,) horizontal distance within which no ray hits that solid
     max_range_m : reach
     ranges_m : (N,) out
-    solid_of_ray : (N,) int32 out, counted through boxes, cylinders, ellipsoids; the ground comes last
     """
-    ground_solid = len(boxes) + len(cylinders) + len(ellipsoids)
-    extents = _extents(origins, boxes, cylinders, ellipsoids)
-    starts, members = _sectors(extents, max_range_m)
     for n in range(len(directions)):
         p = pose_of_ray[n]
         ox, oy, oz = origins[p, 0], origins[p, 1], origins[p, 2]
@@ -41,124 +40,18 @@ def cast_rays(
         dy = rotations[p, 1, 0] * x + rotations[p, 1, 1] * y + rotations[p, 1, 2] * z
         dz = rotations[p, 2, 0] * x + rotations[p, 2, 1] * y + rotations[p, 2, 2] * z
         steep = dz < -0.1  # hits the ground soon; a shallow ray is mostly stopped by a solid before
-        best, hit = max_range_m, -1
+        best = max_range_m
         if steep:
-            best, hit = _nearer(best, hit, hit_ground(ox, oy, oz, dx, dy, dz, ground, best), ground_solid)
+            best = min(best, hit_ground(ox, oy, oz, dx, dy, dz, ground, best))
         horizontal = math.sqrt(dx * dx + dy * dy)
-        sector = _sector(math.atan2(dy, dx)) % SECTORS
+        sector = math.floor((math.atan2(dy, dx) + math.pi) * (SECTORS / (2.0 * math.pi))) % SECTORS
         for k in range(starts[sector], starts[sector + 1]):
-            solid = members[k]
-            if extents[solid, 2] > best * horizontal:
+            if nearest_m[members[k]] > best * horizontal:
                 break
-            t = hit_solid(ox, oy, oz, dx, dy, dz, solid, boxes, cylinders, ellipsoids)
-            best, hit = _nearer(best, hit, t, solid)
+            best = min(best, hit_solid(ox, oy, oz, dx, dy, dz, members[k], boxes, cylinders, ellipsoids))
         if not steep:
-            best, hit = _nearer(best, hit, hit_ground(ox, oy, oz, dx, dy, dz, ground, best), ground_solid)
-        ranges_m[n] = best if hit >= 0 else np.inf
-        solid_of_ray[n] = hit
-
-
-@njit()
-def _nearer(best, hit, t, solid):
-    return (t, solid) if t < best else (best, hit)
-
-
-@njit()
-def _sector(azimuth_rad):
-    return math.floor((azimuth_rad + math.pi) * (SECTORS / (2.0 * math.pi)))
-
-
-@njit()
-def _sectors(extents, max_range_m):
-    """The solids that overlap each sector, near to far: ``members[starts[s] : starts[s + 1]]``."""
-    order = np.argsort(extents[:, 2], kind="mergesort")
-    starts = np.zeros(SECTORS + 1, dtype=np.int64)
-    for solid in order:
-        first, count = _span(extents[solid], max_range_m)
-        for i in range(count):
-            starts[(first + i) % SECTORS + 1] += 1
-    starts = np.cumsum(starts)
-    filled = starts.copy()
-    members = np.empty(starts[-1], dtype=np.int64)
-    for solid in order:
-        first, count = _span(extents[solid], max_range_m)
-        for i in range(count):
-            sector = (first + i) % SECTORS
-            members[filled[sector]] = solid
-            filled[sector] += 1
-    return starts, members
-
-
-@njit()
-def _span(extent, max_range_m):
-    """First sector and number of sectors that an extent overlaps; none beyond the sensor's reach."""
-    if extent[2] > max_range_m:
-        return 0, 0
-    first = _sector(extent[0] - extent[1] - 1e-9)
-    return first, min(_sector(extent[0] + extent[1] + 1e-9) - first + 1, SECTORS)
-
-
-@njit()
-def _middle(origins):
-    """Middle of the origins in the plane and the largest distance of one from it."""
-    x, y, slack = 0.0, 0.0, 0.0
-    for i in range(len(origins)):
-        x += origins[i, 0] / len(origins)
-        y += origins[i, 1] / len(origins)
-    for i in range(len(origins)):
-        slack = max(slack, math.hypot(origins[i, 0] - x, origins[i, 1] - y))
-    return x, y, slack
-
-
-@njit()
-def _extents(origins, boxes, cylinders, ellipsoids):
-    """(S, 3) extent of each solid in the plane: bearing, half angle, nearest distance.
-
-    A ray from anywhere within ``slack`` of the middle of the origins that hits the solid has an azimuth in that
-    interval, because the parallel ray from the middle hits the footprint grown by ``slack``.
-    """
-    x, y, slack = _middle(origins)
-    result = np.empty((len(boxes) + len(cylinders) + len(ellipsoids), 3))
-    for i in range(len(boxes)):
-        _box_extent(x, y, slack, boxes[i], result[i])
-    for i in range(len(cylinders)):
-        c = cylinders[i]
-        _disc_extent(c[0] - x, c[1] - y, c[2] + slack, result[len(boxes) + i])
-    for i in range(len(ellipsoids)):
-        e, row = ellipsoids[i], len(boxes) + len(cylinders) + i
-        _disc_extent(e[0] - x, e[1] - y, max(e[3], e[4]) + slack, result[row])
-    return result
-
-
-@njit()
-def _disc_extent(dx, dy, radius, out):
-    """Write bearing, half angle and nearest distance of a disc to ``out``."""
-    distance = math.hypot(dx, dy)
-    if distance <= radius:
-        out[0], out[1], out[2] = 0.0, math.pi, 0.0
-    else:
-        out[0], out[1], out[2] = math.atan2(dy, dx), math.asin(radius / distance), distance - radius
-
-
-@njit()
-def _box_extent(x, y, slack, box, out):
-    """Write bearing, half angle and nearest distance of a box to ``out``."""
-    dx, dy, c, s = box[0] - x, box[1] - y, box[6], box[7]
-    outside_x = max(abs(c * dx + s * dy) - box[2], 0.0)
-    outside_y = max(abs(-s * dx + c * dy) - box[3], 0.0)
-    near = math.hypot(outside_x, outside_y) - slack
-    if near <= 0.0:
-        out[0], out[1], out[2] = 0.0, math.pi, 0.0
-        return
-    bearing, half_angle = math.atan2(dy, dx), 0.0
-    for i in range(4):
-        u = box[2] if i % 2 else -box[2]
-        v = box[3] if i // 2 else -box[3]
-        corner_x, corner_y = dx + c * u - s * v, dy + s * u + c * v
-        turn = math.atan2(corner_y, corner_x) - bearing
-        turn = abs(turn - 2.0 * math.pi * round(turn / (2.0 * math.pi)))
-        half_angle = max(half_angle, turn + math.asin(min(slack / math.hypot(corner_x, corner_y), 1.0)))
-    out[0], out[1], out[2] = bearing, half_angle, near
+            best = min(best, hit_ground(ox, oy, oz, dx, dy, dz, ground, best))
+        ranges_m[n] = best if best < max_range_m else np.inf
 
 
 @njit()

@@ -68,7 +68,13 @@ def insert(voxels, points, T, tick: int, alone: float):
                     voxels.history[voxel, SEEN] = tick
                     touched[touches] = voxel
                     touches += 1
-            _accumulate(voxels, voxel, moved[i, 0], moved[i, 1], moved[i, 2])
+            (ix, iy, iz), size = unpack(voxels.keys[voxel]), voxels.size_m
+            x, y, z = (
+                moved[i, 0] - (ix + 0.5) * size,
+                moved[i, 1] - (iy + 0.5) * size,
+                moved[i, 2] - (iz + 0.5) * size,
+            )
+            add_moments(voxels.moments, voxel, x, y, z)
     for k in range(touches):
         voxel = touched[k]
         if voxels.moments[voxel, 0] >= _GROWN * voxels.history[voxel, FITTED]:
@@ -147,12 +153,6 @@ def _voxel_at(voxels, key: int, tick: int) -> int:
     voxels.cells[voxel].fill(0.0)
     voxels.history[voxel, BORN], voxels.history[voxel, SEEN], voxels.history[voxel, FITTED] = tick, -1, 0
     return voxel
-
-
-@njit(inline="always")
-def _accumulate(voxels, voxel: int, x: float, y: float, z: float):
-    (ix, iy, iz), size = unpack(voxels.keys[voxel]), voxels.size_m
-    add_moments(voxels.moments, voxel, x - (ix + 0.5) * size, y - (iy + 0.5) * size, z - (iz + 0.5) * size)
 
 
 @njit(inline="always")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ MAX_CELLS = 64_000_000  # largest number of cells: half a gigabyte
 _HIT, _MISS = 0.85, -0.4  # log-odds of 0.7 and 0.4, clamped to 0.12 and 0.97: Hornung et al. 2013, . 5.1
 _LOW, _HIGH = -2.0, 3.5
 _MARGIN = 2  # cells around everything that is drawn; rounding may put a beam one cell aside
+_LARGEST = 1e300  # m², of squared ranges
 _GROWTH = 0.25  # share of the extent that is added where the grid has to grow
 
 
@@ -51,17 +53,11 @@ class OccupancyGrid:
 
     def insert_batch(self, poses: Matrix, points: NDArray[np.floating], offsets: NDArray[np.int64]) -> None:
         """Draw K scans: poses (K, d+1, d+1), points (N, d) of all of them, scan k from offsets[k] to [k + 1]."""
-        starts, ends = np.empty((2, len(points), 2))
-        kept = np.zeros(len(offsets), np.int64)
-        config = self.config
-        for k, T in enumerate(poses):
-            part = slice(int(kept[k]), int(kept[k]) + int(offsets[k + 1] - offsets[k]))
-            count = kernels.beams_in_slice(
-                T, points[offsets[k] : offsets[k + 1]], self.max_range_m,
-                config.slice_min_z_m, config.slice_max_z_m, starts[part], ends[part],
-            )  # fmt: skip
-            kept[k + 1] = kept[k] + count
-        starts, ends = starts[: kept[-1]], ends[: kept[-1]]
+        beams = [
+            self._beams_in_slice(T, points[slice(*part)]) for T, part in zip(poses, pairwise(offsets), strict=True)
+        ]
+        kept = np.cumsum([0, *(len(ends) for _, ends in beams)])
+        starts, ends = (np.concatenate(each) for each in zip(*beams, strict=True))
         if len(starts):
             corners = [(each.min(axis=0), each.max(axis=0)) for each in (starts, ends)]
             self._cover(np.concatenate([np.min(corners, axis=(0, 1)), np.max(corners, axis=(0, 1))]))
@@ -70,6 +66,23 @@ class OccupancyGrid:
                 np.float32(_MISS), np.float32(_LOW), np.float32(_HIGH), self.log_odds, self.drawn,
             )  # fmt: skip
         self.scans += len(poses)
+
+    def _beams_in_slice(self, T: Pose, points: NDArray[np.floating]) -> tuple[Matrix, Matrix]:
+        """Start and end (M, 2), world, of the part of each beam of a scan that lies in the slice.
+
+        A beam runs straight from the lidar to its return, at a height z above it. Where the slice does not hold
+        the lidar's height, it starts where it enters the slice: at the share limit / z of its length.
+        """
+        squares = sum(column * column for column in points.T)
+        points = points[squares <= min(self.max_range_m**2, _LARGEST)]
+        moved = np.asarray(sum(T[:-1, axis] * points[:, axis, None] for axis in range(points.shape[1])))
+        share = 0.0
+        if points.shape[1] == 3:
+            low_m, high_m = self.config.slice_min_z_m, self.config.slice_max_z_m
+            moved = moved[(low_m <= moved[:, 2]) & (moved[:, 2] <= high_m)]
+            limit_m = low_m if low_m > 0.0 else min(high_m, 0.0)
+            share = limit_m / moved[:, 2:] if limit_m else 0.0
+        return T[:2, -1] + share * moved[:, :2], T[:2, -1] + moved[:, :2]
 
     def probability(self) -> NDArray[np.float32]:
         """(rows, columns) probability that a cell is occupied; ½ where nothing was seen."""

@@ -31,7 +31,6 @@ class PointMap:
         self.dimension = dimension
         self.voxel_size_m = voxel_size_m
         self.max_voxels = max_voxels
-        self.used = 0
         self.center_m = np.zeros(3)
         self._allocate(min(_FIRST_VOXELS, max_voxels))
 
@@ -44,15 +43,21 @@ class PointMap:
             raise InputError("a scan added to the map has a pose that is not finite")
         if not self.used:
             self.center_m[: self.dimension] = T_world_lidar[:-1, -1]
-        done = 0
-        while done < len(points):
-            self.used, count = kernels.add_points(
-                T_world_lidar, points[done:], np.inf, self.voxel_size_m, self.center_m,
-                self.slots, self.cells, self.sums, self.counts, self.used,
-            )  # fmt: skip
-            done += count
-            if done < len(points):
+        R, t = T_world_lidar[:-1, :-1], T_world_lidar[:-1, -1]
+        finite = points[np.isfinite(points).all(axis=1)]
+        moved = sum((R[:, axis] * finite[:, axis, None] for axis in range(self.dimension)), start=t[None])
+        while len(moved):
+            moved = moved[self._add(moved, moved, np.ones(len(moved), np.int64)) :]
+            if len(moved):
                 self._make_room()
+
+    def _add(self, points: Points, sums: Points, counts: NDArray[np.int64]) -> int:
+        """Number of points that were added: fewer than all where there was no room."""
+        self.used, done = kernels.add_points(
+            points, sums, counts, self.voxel_size_m, self.center_m,
+            self.slots, self.cells, self.sums, self.counts, self.used,
+        )  # fmt: skip
+        return done
 
     def points(self) -> Points:
         """(M, d) mean of every voxel, in the order in which they were first seen."""
@@ -66,9 +71,7 @@ class PointMap:
         else:
             self.voxel_size_m *= 2.0
             self._allocate(len(self.counts))
-        self.used = kernels.merge_voxels(
-            sums, counts, self.voxel_size_m, self.slots, self.cells, self.sums, self.counts
-        )
+        self._add(sums / counts[:, None], sums, counts)
 
     def _allocate(self, rows: int) -> None:
         slots = 1 << int(2 * rows - 1).bit_length()
@@ -76,6 +79,7 @@ class PointMap:
         self.cells = np.zeros(slots, np.int32)
         self.sums = np.zeros((rows, self.dimension))
         self.counts = np.zeros(rows, np.int64)
+        self.used = 0
 
 
 def build_point_map(

@@ -109,11 +109,11 @@ def plan(
         raise InputError(
             f"wheels_slip from {start_s:g} to {end_s:g} s by {size_m:g} m: begin at 0 s or later, end later"
         )
-    if isinstance(scene.route, tuple) and (reverse or start_m):
-        raise InputError(f"{world} is no route round which one could drive; leave reverse and start_m out")
     solids = scene.build(_random(seed, _PLACE))
     rng, driven_s = _random(seed, _DEVIATION, changed), length_s + lidar.period_ns * 1e-9
     if isinstance(scene.route, tuple):
+        if reverse or start_m:
+            raise InputError(f"{world} is no route round which one could drive; leave reverse and start_m out")
         motion = pivots(scene.route, scene.vehicle, solids, duration_s=driven_s, rng=rng)
     else:
         route = begun_at(scene.route[::-1] if reverse else scene.route, start_m)
@@ -140,7 +140,6 @@ def _random(seed: int, purpose: int, changed: int | None = None) -> np.random.Ge
 
 
 def _check_range(name: str, value: float, low: float, high: float) -> None:
-    """Refuse a value outside its limits, or one that is not a number."""
     if not low <= value <= high:
         raise InputError(f"{name} {value:g} is out of range; choose one from {low:g} to {high:g}")
 
@@ -256,8 +255,6 @@ def _sweeps(drive: Drive) -> Iterator[Sweep]:
 
 
 class _Wheels:
-    """Writer of the wheel odometry up to the log's present time."""
-
     def __init__(self, log: LogWriter, drive: Drive, last_ns: int) -> None:
         self._log = log
         self._stamps_ns = np.arange(EPOCH_NS, last_ns + 1, _ODOMETRY_PERIOD_NS)

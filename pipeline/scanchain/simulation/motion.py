@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import BSpline, make_interp_spline
+from scipy.linalg import block_diag
 from scipy.ndimage import gaussian_filter1d
 
 from scanchain import lie
@@ -304,10 +305,7 @@ def _rates(step: Pivot, vehicle: Vehicle) -> Matrix:
     """Turning and moving speeds (T, 2) of one step, each followed by a pause."""
     turn = _trapezoid(np.deg2rad(step.turn_deg), TURN_RAD_S, _TURN_RAD_S2)
     ahead = _trapezoid(step.ahead_m, vehicle.speed_m_s, vehicle.acceleration_m_s2)
-    rates = np.zeros((len(turn) + len(ahead), 2))
-    rates[: len(turn), 0] = turn
-    rates[len(turn) :, 1] = ahead
-    return rates
+    return np.asarray(block_diag(turn[:, np.newaxis], ahead[:, np.newaxis]))
 
 
 def _trapezoid(distance: float, limit: float, acceleration: float) -> NDArray[np.float64]:

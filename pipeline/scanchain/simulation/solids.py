@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.data import Matrix
-from scanchain.kernels.raycast import cast_rays
+from scanchain.kernels.raycast import SECTORS, cast_rays
 
 FLAT = np.zeros(7)
 FIXED = -1  # owner of solids that belong to no movable object
@@ -70,23 +70,55 @@ class Solids:
         return np.stack([along_x, along_y], axis=-1)
 
     def cast(
-        self, T_world_sensor: Matrix, pose_of_ray: NDArray[np.int32], directions: Matrix, max_range_m: float,
-        solid_of_ray: NDArray[np.int32] | None = None,
-    ) -> NDArray[np.float64]:  # fmt: skip
-        """Range to the first surface along each ray, inf beyond reach; poses (P, 4, 4), directions (N, 3).
-
-        solid_of_ray : (N,) takes the number of the solid that each ray hits, −1 where none, counted through boxes,
-            cylinders, ellipsoids, the ground last
-        """
+        self, T_world_sensor: Matrix, pose_of_ray: NDArray[np.int32], directions: Matrix, max_range_m: float
+    ) -> NDArray[np.float64]:
+        """Range to the first surface along each ray, inf beyond reach; poses (P, 4, 4), directions (N, 3)."""
         ranges_m = np.empty(len(directions))
-        solid_of_ray = np.empty(len(directions), np.int32) if solid_of_ray is None else solid_of_ray
         origins = np.ascontiguousarray(T_world_sensor[:, :3, 3])
         rotations = np.ascontiguousarray(T_world_sensor[:, :3, :3])
+        sectors = self._sectors(origins[:, :2], max_range_m)
         cast_rays(
-            origins, rotations, pose_of_ray, directions, *self.groups, self.ground, max_range_m, ranges_m,
-            solid_of_ray,
-        )  # fmt: skip
+            origins, rotations, pose_of_ray, directions, *self.groups, self.ground, *sectors, max_range_m, ranges_m
+        )
         return ranges_m
+
+    def _sectors(
+        self, origins: Matrix, reach_m: float
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+        """``starts``, ``members`` and ``nearest_m`` of ``cast_rays`` for rays from origins (P, 2)."""
+        bearing, half, nearest_m = self._extents(origins)
+        first, last = (
+            np.floor((bearing + side * (half + 1e-9) + np.pi) * (SECTORS / (2.0 * np.pi))).astype(np.int64)
+            for side in (-1.0, 1.0)
+        )
+        near = np.argsort(nearest_m)[: np.count_nonzero(nearest_m <= reach_m)]
+        count = np.minimum(last - first + 1, SECTORS)[near]
+        place = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+        sector = (np.repeat(first[near], count) + place) % SECTORS
+        order = np.argsort(sector.astype(np.int16), kind="stable")  # sorted by radix
+        starts = np.searchsorted(sector[order], np.arange(SECTORS + 1))
+        return starts, np.repeat(near, count)[order], nearest_m
+
+    def _extents(self, origins: Matrix) -> NDArray[np.float64]:
+        """Bearing, half angle and nearest distance (3, S) of each solid, seen from the middle of the origins.
+
+        A ray from anywhere within ``slack`` of the middle that hits the solid has an azimuth in that interval,
+        because the parallel ray from the middle hits the footprint, a box, grown by ``slack``. Complex numbers are
+        positions x + iy.
+        """
+        upright = np.tile([1.0, 0.0], (len(self.cylinders) + len(self.ellipsoids), 1))
+        x_y = np.concatenate([rows[:, :2] for rows in self.groups])
+        size = np.concatenate([self.boxes[:, 2:4], self.cylinders[:, [2, 2]], self.ellipsoids[:, 3:5]])
+        turn = np.concatenate([self.boxes[:, 6:8], upright])
+        center, half, ahead = (rows @ [1.0, 1.0j] for rows in (x_y - origins.mean(axis=0), size, turn))
+        slack = np.linalg.norm(origins - origins.mean(axis=0), axis=1).max()
+        beside = center * ahead.conj()
+        outside = np.maximum(np.abs([beside.real, beside.imag]) - size.T, 0.0)
+        nearest_m = np.maximum(np.hypot(*outside) - slack, 0.0)
+        corners = center + ahead * np.array([half, half.conj(), -half, -half.conj()])
+        grown = np.arcsin(np.minimum(slack / np.maximum(np.abs(corners), 1e-9), 1.0))
+        half_angle = (np.abs(np.angle(corners * center.conj())) + grown).max(axis=0)
+        return np.stack([np.angle(center), np.where(nearest_m > 0.0, half_angle, np.pi), nearest_m])
 
     def clearance_m(self, xy: Matrix, below_m: float) -> NDArray[np.float64]:
         """Distance in the plane from (N, 2) positions to the nearest solid that begins below ``below_m``."""
@@ -112,10 +144,9 @@ class Scenery:
 
     def __init__(self, ground: NDArray[np.float64] = FLAT) -> None:
         self._ground = ground
-        self._boxes: list[tuple[float, ...]] = []
+        self._boxes: list[tuple[float, ...]] = []  # each behind the number of the object that it is a part of
         self._cylinders: list[tuple[float, ...]] = []
         self._ellipsoids: list[tuple[float, ...]] = []
-        self._owners: tuple[list[int], list[int], list[int]] = ([], [], [])  # of boxes, cylinders, ellipsoids
         self._objects = 0
         self._owner = FIXED
 
@@ -133,30 +164,25 @@ class Scenery:
         """Put down a box: full lengths along its own axes, heights ``z`` above the ground at its center."""
         base = self._base(center)
         half = (0.5 * size[0], 0.5 * size[1])
-        self._owners[0].append(self._owner)
-        self._boxes.append((*center, *half, base + z[0], base + z[1], np.cos(yaw_rad), np.sin(yaw_rad)))
+        turn = np.cos(yaw_rad), np.sin(yaw_rad)
+        self._boxes.append((self._owner, *center, *half, base + z[0], base + z[1], *turn))
 
     def cylinder(self, center: tuple[float, float], radius: float, z: tuple[float, float]) -> None:
         """Put down an upright cylinder, heights ``z`` above the ground at its center."""
         base = self._base(center)
-        self._owners[1].append(self._owner)
-        self._cylinders.append((*center, radius, base + z[0], base + z[1]))
+        self._cylinders.append((self._owner, *center, radius, base + z[0], base + z[1]))
 
     def ellipsoid(self, center: tuple[float, float, float], radii: tuple[float, float, float]) -> None:
         """Put down an ellipsoid; its center's height counts from the ground there."""
         x, y, z = center
-        self._owners[2].append(self._owner)
-        self._ellipsoids.append((x, y, z + self._base((x, y)), *radii))
+        self._ellipsoids.append((self._owner, x, y, z + self._base((x, y)), *radii))
 
     def finish(self) -> Solids:
         """The solids put down so far."""
-        return Solids(
-            boxes=np.array(self._boxes, dtype=np.float64).reshape(-1, 8),
-            cylinders=np.array(self._cylinders, dtype=np.float64).reshape(-1, 5),
-            ellipsoids=np.array(self._ellipsoids, dtype=np.float64).reshape(-1, 6),
-            ground=self._ground,
-            owner=np.array([owner for owners in self._owners for owner in owners], np.int64),
-        )
+        groups = (self._boxes, 8), (self._cylinders, 5), (self._ellipsoids, 6)
+        rows = [np.array(group, dtype=np.float64).reshape(-1, 1 + width) for group, width in groups]
+        owner = np.concatenate([each[:, 0] for each in rows]).astype(np.int64)
+        return Solids(*(each[:, 1:].copy() for each in rows), ground=self._ground, owner=owner)
 
     def _base(self, center: tuple[float, float]) -> float:
         return float(_height(self._ground, np.array(center)))

@@ -252,7 +252,6 @@ def _evaluate(problem, scale_m: float, iterate):
 
 @njit(nogil=True)
 def _accept(now, trial):
-    """Copy the trial to the present iterate."""
     now.T[:] = trial.T
     now.offset[:] = trial.offset
     now.H[:] = trial.H

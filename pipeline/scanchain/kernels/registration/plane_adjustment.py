@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.matrices import eigenvalues_3d, eigenvector_3d
+from scanchain.kernels.matrices import eigenvalues_3d, eigenvector_3d, factorize
 from scanchain.kernels.voxels import add_moments, covariance_of, find_row, key_of, move
 
 _FEWEST, _FEWEST_SCANS = 8, 3  # least number of points in a cell that counts as a plane, and of scans that see it
@@ -113,8 +113,8 @@ def plane_equations(points, number, plane, beside, residual, normals, poses, sca
         slopes += weight * (1.0 - 3.0 * square) / (1.0 + square)
     _unfold(among, H)
     for p in range(count):
-        _factorize(S[p])
-        _eliminate(S[p], sums[p], H)
+        if factorize(S[p], 0.0, S[p]):
+            _eliminate(S[p], sums[p], H)
     for row in range(size):
         H[row + 1 :, row] = H[row, row + 1 :]
     slopes = max(slopes, _LEAST_SLOPE * total)
@@ -176,16 +176,6 @@ def _jacobian(points, i: int, normals, p: int, poses, k: int, J):
     J[3], J[4], J[5] = y * J[2] - z * J[1], z * J[0] - x * J[2], x * J[1] - y * J[0]
     level = max(math.sqrt(x * x + y * y), 1e-9)
     J[6] = level * J[2] - z / level * (x * J[0] + y * J[1])
-
-
-@njit(inline="always")
-def _factorize(S):
-    """S (3, 3) ← L with S = L Lᵀ, in the lower half."""
-    for m in range(3):
-        for other in range(m + 1):
-            for i in range(other):
-                S[m, other] -= S[m, i] * S[other, i]
-            S[m, other] = S[m, other] / S[other, other] if other < m else math.sqrt(max(S[m, m], 1e-12))
 
 
 @njit(nogil=True)

@@ -258,7 +258,6 @@ def highway(rng: np.random.Generator) -> Solids:
 
 
 def _rail(scenery: Scenery, road: Lap, left_m: float, begin_m: float, end_m: float) -> None:
-    """A guard rail and its posts."""
     for along in np.arange(begin_m, end_m - _PANEL_M, _PANEL_M):
         middle = along + 0.5 * _PANEL_M
         size = (_PANEL_M * (1.0 + abs(left_m) / _BEND_M), 0.08)  # no gaps on the outside of a bend
