@@ -38,14 +38,6 @@ REPORT_S = {
 AGREEMENT = 1e-8
 
 
-def with_suitesparse():
-    try:
-        import sparseqr  # noqa: F401
-    except ImportError:
-        return METHODS
-    return (*METHODS, "spqr", "spqr_colamd")
-
-
 def report(name, results):
     published = dict(zip(OF_THE_REPORT, REPORT_S[name], strict=True))
     print(f"\n{name}")
@@ -69,7 +61,7 @@ def report(name, results):
 def linear(options):
     for name in REPORT_S:
         system = linear_system(read_landmark_data(DATA / "landmarks" / f"{name}.npz"))
-        report(name, compare(lambda solver, it=system: solver.solve(it), with_suitesparse(), options.repeats))
+        report(name, compare(lambda solver, it=system: solver.solve(it), METHODS, options.repeats))
 
 
 # ---------------------------------------------------------------- the log

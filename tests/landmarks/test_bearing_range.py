@@ -94,7 +94,7 @@ def nonlinear():
     ("guess", "method", "optimizer"),
     [
         *(("odometry", method, "levenberg-marquardt") for method in METHODS),
-        *product(("disturbed", "origin"), ("schur",), ("levenberg-marquardt", "gauss-newton", "dogleg")),
+        *product(("disturbed", "origin"), ("schur",), ("levenberg-marquardt", "gauss-newton")),
     ],
 )
 def test_2d_nonlinear_ends_in_the_same_minimum_from_poor_guesses(nonlinear, guess, method, optimizer):
@@ -111,15 +111,14 @@ def test_2d_nonlinear_ends_in_the_same_minimum_from_poor_guesses(nonlinear, gues
     assert np.abs(minimum.state.unknowns - best.state.unknowns).max() < (1e-8 if guess == "odometry" else 1e-5)
 
 
-def test_an_unseen_landmark_is_named_by_gauss_newton_and_dogleg(nonlinear):
+def test_an_unseen_landmark_is_named_by_gauss_newton(nonlinear):
     _, problem, guess, _ = nonlinear
     given = problem.measurements
     blind = BearingRangeProblem(replace(given, **{
         name: getattr(given, name)[given.observed[:, 1] != 4] for name in ("observed", "measured")
     }))  # fmt: skip
-    for optimizer in ("gauss-newton", "dogleg"):
-        with pytest.raises(UndeterminedError, match="leave landmark 4 x, landmark 4 y open"):
-            minimize(blind, guess, create_solver("schur"), optimizer=optimizer)
+    with pytest.raises(UndeterminedError, match="leave landmark 4 x, landmark 4 y open"):
+        minimize(blind, guess, create_solver("schur"), optimizer="gauss-newton")
 
 
 def measurements(seed=0, unit=1.0, outliers=0):

@@ -143,15 +143,3 @@ def test_methods_are_parsed_and_unknown_ones_refused():
     for text, said in (("", "no method"), ("lu, qr,lu", "twice: lu, qr")):
         with pytest.raises(InputError, match=said):
             parse_methods(text)
-
-
-def test_suitesparse_qr_agrees_where_it_is_installed_and_names_its_extra_where_not():
-    A, system = problem(20, 10, 11)
-    try:
-        import sparseqr  # noqa: F401
-    except ImportError:
-        with pytest.raises(InputError, match=r"scanchain\[suitesparse\]"):
-            create_solver("spqr")
-        return
-    for method in ("spqr", "spqr_colamd"):
-        assert np.allclose(create_solver(method).solve(system), np.linalg.lstsq(A, system.b, rcond=None)[0])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from scanchain.data import Matrix
 from scanchain.graph.cholesky import SingularMatrixError
 from scanchain.graph.losses import RobustLoss
-from scanchain.graph.minimizer import LocalModel, descend, step_rule
+from scanchain.graph.minimizer import LocalModel, Optimizer, descend, step_rule
 from scanchain.landmarks.problem import (
     BearingRangeProblem,
     LandmarkData,
@@ -114,9 +113,6 @@ def chain(start: NDArray[np.float64], motion: Matrix) -> Matrix:
     poses[1:, 0] += np.cumsum(c * motion[:, 0] - s * motion[:, 1])
     poses[1:, 1] += np.cumsum(s * motion[:, 0] + c * motion[:, 1])
     return poses
-
-
-Optimizer = Literal["gauss-newton", "levenberg-marquardt", "dogleg", "gradient-descent"]
 
 
 _FREEDOM = 4.0

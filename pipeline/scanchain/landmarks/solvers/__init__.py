@@ -18,7 +18,7 @@ from scanchain.landmarks.solvers.direct import (
     ScipyMethod,
     UndeterminedError,
 )
-from scanchain.landmarks.solvers.qr import QrMethod, SuiteSparseQrMethod
+from scanchain.landmarks.solvers.qr import QrMethod
 
 __all__ = [
     "ESTIMATOR", "METHODS", "Factor", "LinearSolver", "MethodResult", "UndeterminedError", "compare",
@@ -34,11 +34,9 @@ _MAKERS = {
     "qr_colamd": lambda: QrMethod("colamd"),
     "cholesky": CholeskyMethod,
     "schur": SchurMethod,
-    "spqr": lambda: SuiteSparseQrMethod("natural"),
-    "spqr_colamd": lambda: SuiteSparseQrMethod("colamd"),
 }
 PINV_BELOW = 3_000  # largest number of unknowns: their inverse is all but dense, 110 MB, and takes seconds
-METHODS = tuple(name for name in _MAKERS if not name.startswith("spqr"))
+METHODS = tuple(_MAKERS)
 ESTIMATOR = "schur"  # the fastest: it estimates where no other is requested
 
 
@@ -64,7 +62,7 @@ def parse_methods(text: str) -> tuple[str, ...]:
 def methods_for(requested: Sequence[str], unknowns: int) -> tuple[tuple[str, ...], dict[str, str]]:
     """Methods to run on a problem of so many unknowns, and a fact about one that "all" leaves out there.
 
-    "all" is every method of the default installation. Raises InputError where one is named that is too slow.
+    Raises InputError where one is named that is too slow.
     """
     if "pinv" in requested and unknowns >= PINV_BELOW:
         raise InputError(

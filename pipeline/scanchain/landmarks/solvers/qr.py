@@ -1,8 +1,4 @@
-"""Sparse orthogonal factorization A = Q R, R x = Qᵀb, without ever forming AᵀA.
-
-``qr`` and ``qr_colamd`` are the project's own, ``spqr`` and ``spqr_colamd`` SuiteSparseQR (Davis 2011), where the
-package sparseqr is installed.
-"""
+"""Sparse orthogonal factorization A = Q R, R x = Qᵀb, without ever forming AᵀA."""
 
 from __future__ import annotations
 
@@ -11,11 +7,10 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix, csc_matrix, csr_matrix, triu
+from scipy.sparse import csc_matrix, csr_matrix, triu
 from scipy.sparse.linalg import spsolve_triangular
 
-from scanchain.errors import MissingExtraError
-from scanchain.graph.cholesky import BlockPattern, SingularMatrixError, analyze
+from scanchain.graph.cholesky import BlockPattern, analyze
 from scanchain.kernels.graph import symbolic
 from scanchain.kernels.landmarks import sparse_qr
 from scanchain.landmarks.problem import LinearSystem, Pattern
@@ -23,7 +18,6 @@ from scanchain.landmarks.solvers.direct import Factor, Factored, check_pivots
 
 Ordering = Literal["natural", "colamd"]
 _REST = 4  # rows that wait for the dense factorization, over its columns
-_SPQR_ORDERINGS = {"natural": 0, "colamd": 2}  # SPQR_ORDERING_FIXED, SPQR_ORDERING_COLAMD
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,36 +102,3 @@ def _analyze(pattern: Pattern, ordering: Ordering) -> _Analysis:
     places = place[pattern.columns]
     first, last = (ends.reduceat(places, pattern.row_start[rows]) for ends in (np.minimum, np.maximum))
     return _Analysis(order, place, begin, right, parent, dense, rows[np.lexsort((-last, first))])
-
-
-class SuiteSparseQrMethod:
-    """Householder QR with the fronts of SuiteSparse; GPL, so never part of the default installation."""
-
-    def __init__(self, ordering: Ordering) -> None:
-        try:
-            import sparseqr  # pyright: ignore[reportMissingImports]
-        except ImportError as error:
-            raise MissingExtraError("sparseqr", "suitesparse") from error
-        self._rz = sparseqr.rz
-        self._ordering: Ordering = ordering
-
-    def build(self, system: LinearSystem) -> coo_matrix:
-        """A by triplets."""
-        return coo_matrix(system.A)
-
-    def factorize(self, system: LinearSystem, built: coo_matrix) -> Factored:
-        """R of A, and the head of Qᵀb."""
-        n = system.pattern.shape[1]
-        z, R, permutation, rank = self._rz(built, system.b[:, None], ordering=_SPQR_ORDERINGS[self._ordering])
-        if rank < n:
-            raise SingularMatrixError(rank, rank)
-        order = np.asarray(permutation, np.int64) if self._ordering == "colamd" else np.arange(n)
-        R = csc_matrix(R)
-        check_pivots(np.abs(R.diagonal()), _column_lengths(system)[order])
-
-        def solve() -> NDArray[np.float64]:
-            x = np.empty(n)
-            x[order] = spsolve_triangular(R.tocsr(), np.asarray(z).reshape(-1)[:n], lower=False)
-            return x
-
-        return Factored(solve, lambda: Factor("R of A", R, order))
