@@ -17,24 +17,22 @@ from scanchain.landmarks.problem import LinearSystem, Pattern
 from scanchain.landmarks.solvers.direct import Factor, Factored, check_pivots
 
 Ordering = Literal["natural", "colamd"]
-_REST = 4  # rows that wait for the dense factorization, over its columns
 
 
 @dataclass(frozen=True, slots=True)
 class _Analysis:
-    """Order of the columns, position of each; rows of R, their tree, first full column; order of A's rows."""
+    """Order of the columns, position of each; rows of R, their tree; order of A's rows."""
 
     order: NDArray[np.int64]
     place: NDArray[np.int64]
     begin: NDArray[np.int64]
     right: NDArray[np.int64]
     parent: NDArray[np.int64]
-    dense: int
     rows: NDArray[np.int64]
 
 
 class QrMethod:
-    """QR by Givens rotations, full columns by LAPACK; its analysis is reused while the pattern is the same."""
+    """QR by Givens rotations; its analysis is reused while the pattern is the same."""
 
     def __init__(self, ordering: Ordering) -> None:
         self._ordering: Ordering = ordering
@@ -48,36 +46,20 @@ class QrMethod:
 
     def factorize(self, system: LinearSystem, built: _Analysis) -> Factored:
         """R of A, and the head of Qᵀb."""
-        R, z = _rotated(system, built)
-        n = len(z)
+        pattern, n = system.pattern, system.pattern.shape[1]
+        R, z = np.zeros(len(built.right) + n), np.zeros(n)
+        sparse_qr.rotate(
+            built.rows, pattern.row_start, pattern.columns, system.values, system.b,
+            built.place, built.begin, built.right, built.parent, R, z,
+        )  # fmt: skip
         starts = built.begin + np.arange(n + 1)
         matrix = csr_matrix((R, np.insert(built.right, built.begin[:-1], np.arange(n)), starts), shape=(n, n))
-        check_pivots(np.abs(R[starts[:-1]]), _column_lengths(system)[built.order])
+        lengths = np.sqrt(np.bincount(pattern.columns, system.values**2, n))
+        check_pivots(np.abs(R[starts[:-1]]), lengths[built.order])
         return Factored(
             lambda: spsolve_triangular(matrix, z, lower=False)[built.place],
             lambda: Factor("R of A", csc_matrix(matrix), built.order),
         )
-
-
-def _column_lengths(system: LinearSystem) -> NDArray[np.float64]:
-    """Length of each column of A, (n,)."""
-    return np.sqrt(np.bincount(system.pattern.columns, system.values**2, system.pattern.shape[1]))
-
-
-def _rotated(system: LinearSystem, known: _Analysis) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Entries of R, row by row, and the head of Qᵀb."""
-    pattern, n = system.pattern, system.pattern.shape[1]
-    R, z, width = np.zeros(len(known.right) + n), np.zeros(n), n - known.dense
-    rest, tail, at = np.empty((_REST * width, width + 1)), np.zeros((width, width + 1)), 0
-    while at < len(known.rows):
-        at, filled = sparse_qr.rotate(
-            at, known.rows, pattern.row_start, pattern.columns, system.values, system.b,
-            known.place, known.begin, known.right, known.parent, known.dense, R, z, rest,
-        )  # fmt: skip
-        tail = np.asarray(np.linalg.qr(np.concatenate([tail, rest[:filled]]), mode="r"))[:width]
-    R[known.begin[known.dense] + known.dense :] = tail[np.triu_indices(width)]
-    z[known.dense :] = tail[:, width]
-    return R, z
 
 
 def _analyze(pattern: Pattern, ordering: Ordering) -> _Analysis:
@@ -94,11 +76,9 @@ def _analyze(pattern: Pattern, ordering: Ordering) -> _Analysis:
         order = analyze(BlockPattern(np.ones(n, np.int64), pairs)).order
     parent = symbolic.elimination_tree(start, neighbors, order)
     begin, right = symbolic.column_structures(start, neighbors, order, parent)
-    sparse = np.flatnonzero(np.diff(begin) < n - 1 - np.arange(n))
-    dense = int(sparse[-1]) + 1 if len(sparse) else 0
     place = np.empty(n, np.int64)
     place[order] = np.arange(n)
     rows = np.flatnonzero(np.diff(pattern.row_start))
     places = place[pattern.columns]
     first, last = (ends.reduceat(places, pattern.row_start[rows]) for ends in (np.minimum, np.maximum))
-    return _Analysis(order, place, begin, right, parent, dense, rows[np.lexsort((-last, first))])
+    return _Analysis(order, place, begin, right, parent, rows[np.lexsort((-last, first))])
