@@ -94,7 +94,7 @@ def optimize(
       scanchain optimize sphere2500.g2o --out optimized.g2o
       scanchain optimize sphere2500.g2o --png sphere.png --json
       scanchain optimize candidates.g2o --robust truncated --out robust.g2o --marginals all
-      scanchain optimize manhattan.g2o --initialize spanning-tree --optimizer gauss-newton --graph.max_iterations 100
+      scanchain optimize manhattan.g2o --initialize spanning-tree --optimizer gauss-newton
     """
     from scanchain.graph.g2o import GRAPH_SUFFIXES, rejected_path
     from scanchain.graph.optimization import GraphChange

@@ -21,7 +21,8 @@ def rotate(
 ) -> None:  # fmt: skip
     """Rotate rows of A into R.
 
-    rows : of A, in the order that they come in; row_start (m + 1,), columns, values, b (m,) : A and right-hand side
+    rows : of A, in the order that they come in
+    row_start (m + 1,), columns, values, b (m,) : A by rows, and the right-hand side
     place (n,) : of each column; begin (n + 1,), right, parent (n,) : columns to the right of the diagonal in each
         row of R, and its tree
     R : filled row by row, the diagonal before what is right of it; z (n,) filled with the head of Qᵀb
