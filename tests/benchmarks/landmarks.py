@@ -88,13 +88,13 @@ def as_given(log):
         BearingRangeProblem(given), from_odometry(given), create_solver("schur"),
         loss=RobustLoss("huber", HUBER, 1.0), tolerance=1e-6, first_damping=1e-10,
     )  # fmt: skip
-    return time.perf_counter() - begin, found.state
+    return time.perf_counter() - begin, found.estimate.state
 
 
 def ours(log):
     begin = time.perf_counter()
     solution = solve_range_log(log, None)
-    return time.perf_counter() - begin, solution.minimum.state
+    return time.perf_counter() - begin, solution.minimum.estimate.state
 
 
 def with_gtsam(log, optimizer, parameters, *, covariances=False):

@@ -98,8 +98,8 @@ def nonlinear():
 )
 def test_2d_nonlinear_ends_in_the_same_minimum_from_poor_guesses(nonlinear, guess, method, optimizer):
     data, problem, good, best = nonlinear
-    assert best.converged and best.cost == pytest.approx(1555.1896456, abs=1e-5)
-    assert np.abs(best.state.poses - data.true_poses).max() < 0.05
+    assert best.converged and best.estimate.cost == pytest.approx(1555.1896456, abs=1e-5)
+    assert np.abs(best.estimate.state.poses - data.true_poses).max() < 0.05
     start = {
         "odometry": good,
         "disturbed": guesses.disturbed(good, 1.0, 0.5),
@@ -107,7 +107,9 @@ def test_2d_nonlinear_ends_in_the_same_minimum_from_poor_guesses(nonlinear, gues
     }[guess]
     minimum = minimize(problem, start, create_solver(method), optimizer=optimizer)
     assert minimum.converged
-    assert np.abs(minimum.state.unknowns - best.state.unknowns).max() < (1e-8 if guess == "odometry" else 1e-5)
+    assert np.abs(minimum.estimate.state.unknowns - best.estimate.state.unknowns).max() < (
+        1e-8 if guess == "odometry" else 1e-5
+    )
 
 
 def measurements(seed=0, unit=1.0, outliers=0):
@@ -148,15 +150,16 @@ def solve(given, loss):
 def test_meters_or_centimeters_same_weights_and_same_drive(kernel):
     loss = RobustLoss(kernel, 2.0, 1.0)
     in_m, in_cm = (solve(measurements(unit=unit, outliers=8)[2], loss) for unit in (1.0, 0.01))
-    assert np.allclose(in_m.weights, in_cm.weights, atol=1e-5)
-    assert np.allclose(in_m.state.poses[:, :2], 0.01 * in_cm.state.poses[:, :2], atol=1e-5)
+    assert np.allclose(in_m.estimate.weights, in_cm.estimate.weights, atol=1e-5)
+    assert np.allclose(in_m.estimate.state.poses[:, :2], 0.01 * in_cm.estimate.state.poses[:, :2], atol=1e-5)
 
 
 def test_outliers_lose_their_weight_and_the_drive_stays_right():
     poses, _, given = measurements(outliers=8)
     robust, quadratic = solve(given, RobustLoss("cauchy", 2.0, 1.0)), solve(given, QUADRATIC)
-    assert robust.weights[:8].max() < 0.01 < 0.5 < np.median(robust.weights[8:])
-    off = [np.abs(minimum.state.poses[:, :2] - poses[:, :2]).max() for minimum in (robust, quadratic)]
+    weights = robust.estimate.weights
+    assert weights[:8].max() < 0.01 < 0.5 < np.median(weights[8:])
+    off = [np.abs(minimum.estimate.state.poses[:, :2] - poses[:, :2]).max() for minimum in (robust, quadratic)]
     assert off[0] < 0.1 < off[1]
 
 

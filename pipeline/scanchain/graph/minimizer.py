@@ -93,8 +93,8 @@ class Minimizer:
             return self.evaluate(self.problem.moved(start.poses, step), loss)
 
         descent = descend(partial(self._model, loss), moved, now, self._rule, *(limits or self.limits))
-        weights = self.weights(descent.end.chi2, loss)
-        return Minimum(descent.end, weights, descent.iterations, descent.converged, descent.reason)
+        weights = self.weights(descent.estimate.chi2, loss)
+        return Minimum(descent.estimate, weights, descent.iterations, descent.converged, descent.reason)
 
     def _model(self, loss: Loss, now: Evaluation) -> LocalModel:
         """The model with H = Σ w JᵀΩJ."""
@@ -230,7 +230,7 @@ def steepest_descent(model: LocalModel) -> Vector:
 class Descent(Generic[E]):
     """End of a minimization: estimate, number of steps and reason."""
 
-    end: E
+    estimate: E
     iterations: int
     converged: bool
     reason: str

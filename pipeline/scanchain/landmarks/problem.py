@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -228,11 +227,6 @@ class Linearization:
     odometry_rows: Matrix
     observation_rows: Matrix
 
-    @property
-    def observation_chi2(self) -> NDArray[np.float64]:
-        """χ² of every observation, (N,)."""
-        return np.square(self.observations).sum(axis=1)
-
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
@@ -284,7 +278,7 @@ class Measurements:
 
 
 class BearingRangeProblem:
-    """Prior on the first pose, motion from pose to pose, bearings and ranges; its pattern is found once.
+    """Prior on the first pose, motion from pose to pose, bearings and ranges.
 
     ``motion_columns`` (K − 1, 2 p + C) and ``observation_columns`` (N, p + 2) are the unknowns of each of them,
     ``motion_whitening`` (K − 1, p, p) is W with WᵀW = Σ⁻¹.
@@ -295,8 +289,9 @@ class BearingRangeProblem:
         self.measurements = given
         size = given.motion.shape[1]
         layout = Layout(len(given.motion) + 1, size, given.landmarks, given.calibration.names)
-        self._first = whitening(given.first_covariance)
-        self._whiten()
+        self._first, self._observation = whitening(given.first_covariance), whitening(given.measured_covariance)
+        self.motion_whitening = whitening(given.motion_covariance)
+        self._slope = -self.motion_whitening @ given.calibration.slope
         poses = pose_columns(layout, np.arange(layout.poses))
         own = np.arange(layout.split, layout.landmark_start)
         seen_from, seen = given.observed.T
@@ -309,19 +304,6 @@ class BearingRangeProblem:
         damping = np.arange(layout.columns)[:, None]
         self.motion_columns, self.observation_columns = moves, pairs
         self.pattern, self._damped = pattern_of(groups, layout), pattern_of([*groups, damping], layout)
-
-    def of(self, measurements: Measurements) -> BearingRangeProblem:
-        """The same pattern with other numbers."""
-        result = copy(self)
-        result.measurements = measurements
-        result._whiten()
-        return result
-
-    def _whiten(self) -> None:
-        given = self.measurements
-        self.motion_whitening = whitening(given.motion_covariance)
-        self._slope = -self.motion_whitening @ given.calibration.slope
-        self._observation = whitening(given.measured_covariance)
 
     def linearize(self, state: Values) -> Linearization:
         """Residuals and Jacobians at a state."""

@@ -183,11 +183,11 @@ def consistency(
 
     sources : (K − 1, 4, 3, 3) covariance of every motion by sources
     """
-    at, W = minimum.at, problem.motion_whitening
+    at, W = minimum.estimate.at, problem.motion_whitening
     parts = W[:, None] @ sources @ np.swapaxes(W, 1, 2)[:, None]
     leverage = at.odometry_rows @ covariance.of(problem.motion_columns) @ np.swapaxes(at.odometry_rows, 1, 2)
     r = at.odometry
-    rows, weights = at.observation_rows, minimum.weights[:, None]
+    rows, weights = at.observation_rows, minimum.estimate.weights[:, None]
     h = ((rows @ covariance.of(problem.observation_columns)) * rows).sum(axis=-1)
     return Consistency(
         motion=float(np.square(r).sum()),
@@ -286,12 +286,12 @@ def solve_range_log(log: RangeLog, noise: OdometryNoise | None) -> RangeSolution
             growth[:4] = 1.0
         is_last = turn == _TURNS - 1 or bool(np.abs(np.sqrt(growth) - 1.0).max() < _CHANGE)
         variances = np.maximum(variances * growth, _LEAST)
-        residuals = np.sqrt(minimum.weights / loss.share)[:, None] * minimum.at.observations
+        residuals = np.sqrt(minimum.estimate.weights / loss.share)[:, None] * minimum.estimate.at.observations
         loss = StudentLoss(sightings.share(sightings.correlation(residuals)))
-        state = minimum.state
+        state = minimum.estimate.state
         if turn < _RECKONED:
             reckoning = reckon(log, nodes_s, state.calibration)
-        problem = problem.of(measurements(reckoning, variances))
+        problem = BearingRangeProblem(measurements(reckoning, variances))
         tolerance = _FINE if is_last else _ROUGH
         minimum, covariance, found = _settled(problem, state, loss, variances, reckoning, solver, tolerance)
         iterations += minimum.iterations
@@ -316,6 +316,6 @@ def _settled(
     minimum = minimize(
         problem, state, solver, loss=loss, tolerance=tolerance, first_damping=_LITTLE, max_iterations=_MOST
     )
-    covariance = Covariance(problem.system(minimum.at, minimum.weights))
+    covariance = Covariance(problem.system(minimum.estimate.at, minimum.estimate.weights))
     sources = variances[:4, None, None] * reckoning.sources
     return minimum, covariance, consistency(problem, minimum, covariance, sources, loss.share)

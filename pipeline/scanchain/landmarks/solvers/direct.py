@@ -221,18 +221,16 @@ class SchurMethod:
     """
 
     def __init__(self) -> None:
-        self._known: tuple[Pattern, int] | None = None
         self._cholesky = CholeskyMethod()
 
     def build(self, system: LinearSystem) -> tuple[Arrow | csc_matrix, NDArray[np.float64]]:
         """AᵀA, as an arrow where that is faster, and Aᵀb."""
         pattern = system.pattern
         split, rest = pattern.layout.split, pattern.shape[1] - pattern.layout.split
-        if self._known is None or self._known[0] is not pattern:
-            self._known = pattern, arrow.bandwidth(pattern.row_start, pattern.columns, split)
-        if self._known[1] > _WIDEST_BAND or rest > split or rest * split > _LARGEST_BORDER:
+        width = arrow.bandwidth(pattern.row_start, pattern.columns, split)
+        if width > _WIDEST_BAND or rest > split or rest * split > _LARGEST_BORDER:
             return normal_equations(system)
-        return _form(system, self._known[1])
+        return _form(system, width)
 
     def factorize(self, system: LinearSystem, built: tuple[Arrow | csc_matrix, NDArray[np.float64]]) -> Factored:
         """U with AᵀA = UᵀU."""
