@@ -40,13 +40,8 @@ class BlockPattern:
         self.starts = np.cumsum(sizes) - sizes
         self.scalars = int(sizes.sum())
         self.value_count = int((sizes[self.rows] * sizes[self.columns]).sum())
-        self.diagonal = self._diagonal()
-
-    def _diagonal(self) -> NDArray[np.int64]:
-        """Index among the values of every scalar's diagonal entry, (scalars,)."""
-        squares = np.cumsum(self.sizes**2) - self.sizes**2
-        within = np.arange(self.scalars) - np.repeat(self.starts, self.sizes)
-        return np.repeat(squares, self.sizes) + within * (np.repeat(self.sizes, self.sizes) + 1)
+        squares, within = np.cumsum(sizes**2) - sizes**2, np.arange(self.scalars) - np.repeat(self.starts, sizes)
+        self.diagonal = np.repeat(squares, sizes) + within * (np.repeat(sizes, sizes) + 1)  # (scalars,) of values
 
     def multiply(self, values: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
         """The product of the symmetric matrix of these values with a vector (scalars,)."""

@@ -83,21 +83,22 @@ class Explainer:
         best = first = self._solved(explanation, poses, initialize)
         explains = not len(best.problem.sightings)
         for _ in range(_MAX_STEPS):
-            better = next(self._better(best), None) if explains and best.minimum.price else None
-            if better is None:
+            better = self._better(best) if explains and best.minimum.price else best
+            if better is best:
                 break
             best = better
         if best is not first and self._is_large:
             best = self._solved(best.explanation, best.minimum.estimate.poses, "given")
         return best
 
-    def _better(self, best: Explained) -> Iterator[Explained]:
-        """Explanations under which the cost is lower, those that promise most first."""
+    def _better(self, best: Explained) -> Explained:
+        """The same under the most promising explanation that lowers the cost; itself where none does."""
         price, poses = best.minimum.price, best.minimum.estimate.poses
         for explanation in self._candidates(best):
             trial = self._solved(explanation, poses, "given", groups=not self._is_large)
             if self._cost(trial, price) < self._cost(best, price) - _SETTLED * price:
-                yield trial
+                return trial
+        return best
 
     def _candidates(self, best: Explained) -> list[Explanation]:
         """Explanations that may lower the cost, those that promise most first."""

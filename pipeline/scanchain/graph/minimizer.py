@@ -194,11 +194,13 @@ class Damped:
 
 
 class GradientDescent:
-    """Steepest descent in the measure of diag H, to the lowest point of the model, halved until it helps."""
+    """Steepest descent in the measure of D = diag H, to the lowest point of the model, halved until it helps."""
 
     def move(self, now: E, model: LocalModel, moved: Callable[[Vector], E]) -> tuple[Vector, E] | None:
         """Go down the gradient."""
-        step, share = steepest_descent(model), 1.0
+        direction, share = -model.gradient / np.maximum(model.diagonal, 1e-300), 1.0
+        bent = float(direction @ model.bend(direction))
+        step = direction * (-float(direction @ model.gradient) / max(bent, 1e-300))
         while share > _SHORTEST:
             to = moved(share * step)
             if to.cost <= now.cost:
@@ -217,13 +219,6 @@ def step_rule(optimizer: Optimizer, first_damping: float = _FIRST_DAMPING) -> St
     if optimizer == "levenberg-marquardt":
         return Damped(first_damping)
     return GradientDescent()
-
-
-def steepest_descent(model: LocalModel) -> Vector:
-    """The lowest point of the quadratic model along −D⁻¹g, D = diag H."""
-    direction = -model.gradient / np.maximum(model.diagonal, 1e-300)
-    bent = float(direction @ model.bend(direction))
-    return direction * (-float(direction @ model.gradient) / max(bent, 1e-300))
 
 
 @dataclass(frozen=True, slots=True)
