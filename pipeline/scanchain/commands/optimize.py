@@ -235,9 +235,8 @@ class _Report:
     @property
     def warnings(self) -> list[str]:
         """Warnings to read before the rest."""
-        notes = [self.file.note] if self.file.note else []
         after, graph = self.change.after, self.file.graph
-        notes += [f"odometry {line}; so are its edges in --out" for line in graph.corrections(self.file.ids)]
+        notes = [f"odometry {line}; so are its edges in --out" for line in graph.corrections(self.file.ids)]
         ratio = after.chi2 / max(after.degrees_of_freedom, 1)
         if not graph.is_loop.any() and after.degrees_of_freedom and ratio > _POOR_FIT:
             notes.append(
