@@ -140,6 +140,5 @@ def test_methods_are_parsed_and_unknown_ones_refused():
     kept, note = methods_for(("all",), 3000)
     assert kept == others and "pinv" in note["not compared"] and "limit is 3,000" in note["not compared"]
     assert methods_for(parse_methods("pinv, all"), 100) == (("pinv", *others), {})
-    for text, said in (("", "no method"), ("lu, qr,lu", "twice: lu, qr")):
-        with pytest.raises(InputError, match=said):
-            parse_methods(text)
+    with pytest.raises(InputError, match="no method"):
+        parse_methods("")

@@ -140,7 +140,7 @@ class Consistency:
     ----------
     motion, sensor : χ² of the motions; of bearings and of ranges (2,), weighed
     motion_freedom, redundancy : degrees of freedom of those, observations less what the state takes up
-    sightings : effective number of them
+    sensor_freedom : the redundancy, at least a small share of the effective number of observations, (2,)
     sources, sources_freedom : (4,) the parts of ``motion`` and of its freedom that are each source's
     """
 
@@ -150,12 +150,7 @@ class Consistency:
     sources_freedom: NDArray[np.float64]
     sensor: NDArray[np.float64]
     redundancy: NDArray[np.float64]
-    sightings: float
-
-    @property
-    def sensor_freedom(self) -> NDArray[np.float64]:
-        """The redundancy, at least a small share of the sightings, (2,)."""
-        return np.maximum(self.redundancy, _LEAST_REDUNDANCY * self.sightings)
+    sensor_freedom: NDArray[np.float64]
 
     def growth(self, stated: NDArray[np.float64]) -> NDArray[np.float64]:
         """Factors by which the variances, those of odometry first, should grow, (6,); one where they are right.
@@ -189,14 +184,15 @@ def consistency(
     r = at.odometry
     rows, weights = at.observation_rows, minimum.estimate.weights[:, None]
     h = ((rows @ covariance.of(problem.observation_columns)) * rows).sum(axis=-1)
+    redundancy = (share[:, None] - weights * h).sum(axis=0)
     return Consistency(
         motion=float(np.square(r).sum()),
         motion_freedom=float(r.size - np.trace(leverage, axis1=1, axis2=2).sum()),
         sources=((r[:, None, None, :] @ parts)[:, :, 0] * r[:, None]).sum(axis=(0, 2)),
         sources_freedom=(parts * (np.eye(3) - leverage)[:, None]).sum(axis=(0, 2, 3)),
         sensor=(weights * at.observations**2).sum(axis=0),
-        redundancy=(share[:, None] - weights * h).sum(axis=0),
-        sightings=float(share.sum()),
+        redundancy=redundancy,
+        sensor_freedom=np.maximum(redundancy, _LEAST_REDUNDANCY * share.sum()),
     )
 
 

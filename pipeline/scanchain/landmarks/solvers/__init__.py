@@ -54,8 +54,6 @@ def parse_methods(text: str) -> tuple[str, ...]:
             raise InputError(f"there is no method {name!r}; {choice}")
     if not names:
         raise InputError(f"no method is named; {choice}")
-    if len(set(names)) < len(names):
-        raise InputError(f"--methods names one twice: {', '.join(names)}; name each once")
     return tuple(names)
 
 
@@ -115,27 +113,21 @@ def compare(
     solve: Callable[[LinearSolver], NDArray[np.float64]], methods: Sequence[str], repeats: int
 ) -> tuple[MethodResult, ...]:
     """Let ``solve`` find the unknowns (n,) by every method in turn, slow ones once only."""
-    times_s: dict[str, list[NDArray[np.float64]]] = {method: [] for method in methods}
-    last: dict[str, tuple[int, LinearSolver, NDArray[np.float64]]] = {}
+    results = list[MethodResult]()
     for method in methods:
         create_solver(method).solve(_small_system())  # compiles
-    for _ in range(repeats):
-        for method, earlier in times_s.items():
-            if earlier and earlier[0][-1] > _SLOW_S:
-                continue
+        times_s = list[NDArray[np.float64]]()
+        while len(times_s) < repeats and not (times_s and times_s[0][-1] > _SLOW_S):
             solver = create_solver(method)
             x = solve(solver)
             spent_s, iterations = solver.spent_s.copy(), solver.solutions
             solve(solver)
-            earlier.append(np.append(spent_s, (solver.spent_s - spent_s).sum()))
-            last[method] = iterations, solver, x
-    reference = last[methods[0]][2]
-    results = []
-    for method, (iterations, solver, x) in last.items():
-        build_s, factor_s, solve_s, again_s = np.median(times_s[method], axis=0).tolist()
-        difference = float(np.abs(x - reference).max())
+            times_s.append(np.append(spent_s, (solver.spent_s - spent_s).sum()))
+        build_s, factor_s, solve_s, again_s = np.median(times_s, axis=0).tolist()
+        difference = float(np.abs(x - results[0].x).max()) if results else 0.0
+        factor = solver.factor()
         results.append(
-            MethodResult(method, build_s, factor_s, solve_s, again_s, iterations, solver.factor(), x, difference)
+            MethodResult(method, build_s, factor_s, solve_s, again_s, iterations, factor, x, difference)
         )
     return tuple(results)
 
