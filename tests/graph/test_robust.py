@@ -252,9 +252,7 @@ def test_steps_as_short_as_their_noise_are_no_drift_of_the_scale():
     measured = lie.between(true[edges[:, 0]], true[edges[:, 1]]) @ lie.exp(
         sigma * rng.normal(size=(len(edges), 3))
     )
-    measured[-10:] = measured[-10:] @ lie.pose_2d(
-        1.0, -1.0, 0.5
-    )  # wrong loops, so that there is something to explain
+    measured[-10:] = measured[-10:] @ lie.pose_2d(1.0, -1.0, 0.5)  # wrong: something to explain
     is_loop = np.arange(len(edges)) >= len(chain)
     graph = graph_of(true, edges, measured, np.diag(sigma**-2), is_loop)
     assert graph.optimize(GraphConfig(), initialize="given").rejected.sum() >= 10

@@ -95,19 +95,6 @@ def test_a_share_is_one_over_the_sum_of_a_sightings_correlations():
     assert np.allclose(likeness.share(correlation), [1 / 1.75, 1 / 2.0, 1 / 1.75, 1.0, 1.0])
 
 
-def test_correlations_of_residuals_are_found_by_their_lag():
-    rng = np.random.default_rng(0)
-    seen_s = np.arange(4000) * 0.25
-    residuals = np.empty((4000, 2))
-    residuals[0] = rng.normal(size=2)
-    for k in range(1, 4000):
-        residuals[k] = 0.8 * residuals[k - 1] + 0.6 * rng.normal(size=2)
-    found = SightingPairs(seen_s, np.zeros(4000, int)).correlation(residuals)
-    assert found[0] == pytest.approx(0.8, abs=0.05)
-    assert found[1] == pytest.approx(0.5 * (0.8**2 + 0.8**3), abs=0.08)
-    assert np.all(np.diff(found) <= 0.0)
-
-
 def test_slopes_of_the_motion_equal_central_differences():
     log = made_up_log(1, duration_s=60.0)[0]
     nodes_s = np.unique(log.seen_s)

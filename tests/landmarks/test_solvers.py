@@ -137,8 +137,6 @@ def test_covariances_equal_those_of_the_dense_inverse():
 
 def test_methods_are_parsed_and_unknown_ones_refused():
     others = tuple(name for name in METHODS if name != "pinv")
-    kept, note = methods_for(("all",), 3000)
-    assert kept == others and "pinv" in note["not compared"] and "limit is 3,000" in note["not compared"]
     assert methods_for(parse_methods("pinv, all"), 100) == (("pinv", *others), {})
     with pytest.raises(InputError, match="no method"):
         parse_methods("")

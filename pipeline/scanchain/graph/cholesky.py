@@ -102,11 +102,12 @@ class Analysis:
     rows: NDArray[np.int64]
 
 
-def analyze(pattern: BlockPattern) -> Analysis:
-    """Fill-reducing order of the variables, and the fill-in of the factor; the same for blocks of any size."""
+def analyze(pattern: BlockPattern, order: NDArray[np.int64] | None = None) -> Analysis:
+    """Fill-in of the factor, the same for blocks of any size; without an order (n,) in a fill-reducing one."""
     start, neighbors = _adjacency(pattern)
-    order = _fill_reducing_order(start, neighbors)
-    order = order[symbolic.postorder(symbolic.elimination_tree(start, neighbors, order))]
+    if order is None:
+        order = _fill_reducing_order(start, neighbors)
+        order = order[symbolic.postorder(symbolic.elimination_tree(start, neighbors, order))]
     parent = symbolic.elimination_tree(start, neighbors, order)
     return Analysis(order, parent, *symbolic.column_structures(start, neighbors, order, parent))
 

@@ -7,9 +7,10 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
+from scipy.sparse import csr_matrix, triu
 
 from scanchain.data import Matrix
+from scanchain.graph.cholesky import BlockPattern
 from scanchain.kernels.landmarks import factors
 
 Kind = Literal["linear", "bearing-range"]
@@ -131,10 +132,11 @@ class Pattern:
         """Number of rows and columns of A."""
         return len(self.row_start) - 1, self.layout.columns
 
-    def products(self) -> csr_matrix:
-        """Entries of AᵀA that may be nonzero, as ones and more, (n, n)."""
+    def squared(self) -> BlockPattern:
+        """Entries of AᵀA that may be nonzero, each a block of its own."""
         there = csr_matrix((np.ones(len(self.columns)), self.columns, self.row_start), self.shape)
-        return csr_matrix(there.T @ there)
+        pairs = np.stack(triu(there.T @ there, k=1).nonzero(), axis=1).astype(np.int64)
+        return BlockPattern(np.ones(self.layout.columns, np.int64), pairs)
 
 
 @dataclass(frozen=True, slots=True)

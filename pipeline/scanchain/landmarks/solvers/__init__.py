@@ -14,11 +14,11 @@ from scanchain.landmarks.solvers.direct import (
     CholeskyMethod,
     Factor,
     LinearSolver,
+    QrMethod,
     SchurMethod,
     ScipyMethod,
     UndeterminedError,
 )
-from scanchain.landmarks.solvers.qr import QrMethod
 
 __all__ = [
     "ESTIMATOR", "METHODS", "Factor", "LinearSolver", "MethodResult", "UndeterminedError", "compare",

@@ -1,4 +1,4 @@
-"""A linear solver with its times and errors; the methods on AᵀA x = Aᵀb, and marginal covariances."""
+"""A linear solver with its times and errors; its methods, on AᵀA x = Aᵀb or on A itself; marginal covariances."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_matrix, diags_array, identity, triu
-from scipy.sparse.linalg import MatrixRankWarning, SuperLU, inv, splu, spsolve
+from scipy.sparse import csc_matrix, csr_matrix, diags_array, identity
+from scipy.sparse.linalg import MatrixRankWarning, SuperLU, inv, splu, spsolve, spsolve_triangular
 
 from scanchain.clock import working_s
 from scanchain.data import Matrix
 from scanchain.errors import InputError
-from scanchain.graph.cholesky import BlockPattern, SingularMatrixError, SparseCholesky, analyze, upper_factor
-from scanchain.kernels.landmarks import arrow
+from scanchain.graph.cholesky import Analysis, SingularMatrixError, SparseCholesky, analyze, upper_factor
+from scanchain.kernels.landmarks import arrow, sparse_qr
 from scanchain.landmarks.problem import Layout, LinearSystem, Pattern, landmark_columns, pose_columns
 
 LOST_DIGITS = 1e-13  # a pivot below this share of its diagonal entry (of AᵀA) or column (of A) is rounding noise
@@ -199,14 +199,54 @@ class CholeskyMethod:
         """U with AᵀA = UᵀU."""
         H, g = built
         if self._known is None or self._known[0] is not system.pattern:
-            pairs = np.stack(triu(system.pattern.products(), k=1).nonzero(), axis=1).astype(np.int64)
-            pattern = BlockPattern(np.ones(len(g), np.int64), pairs)
+            pattern = system.pattern.squared()
             self._known = system.pattern, SparseCholesky(pattern, analyze(pattern))
         cholesky = self._known[1]
         H.sum_duplicates()  # sorts it, so that entries are found by bisection
         cholesky.factorize(np.asarray(H[cholesky.pattern.rows, cholesky.pattern.columns]).ravel())
         U, order = upper_factor, cholesky.analysis.order
         return Factored(lambda: cholesky.solve(g), lambda: Factor("U of AᵀA", csc_matrix(U(cholesky)), order))
+
+
+class QrMethod:
+    """A = Q R by Givens rotations, without ever forming AᵀA; the analysis of a pattern is reused as well."""
+
+    def __init__(self, ordering: Literal["natural", "colamd"]) -> None:
+        self._ordering = ordering
+        self._known: tuple[Pattern, Analysis] | None = None
+
+    def build(self, system: LinearSystem) -> Analysis:
+        """The order of the columns, of "colamd" by minimum degree in AᵀA, and where R has entries."""
+        pattern = system.pattern
+        if self._known is None or self._known[0] is not pattern:
+            order = np.arange(pattern.shape[1]) if self._ordering == "natural" else None
+            self._known = pattern, analyze(pattern.squared(), order)
+        return self._known[1]
+
+    def factorize(self, system: LinearSystem, built: Analysis) -> Factored:
+        """R of A, and the head of Qᵀb."""
+        pattern, n = system.pattern, system.pattern.shape[1]
+        place, R, z = np.argsort(built.order), np.zeros(len(built.rows) + n), np.zeros(n)
+        sparse_qr.rotate(
+            _order_of_rows(pattern, place), pattern.row_start, pattern.columns, system.values, system.b,
+            place, built.begin, built.rows, built.parent, R, z,
+        )  # fmt: skip
+        starts = built.begin + np.arange(n + 1)
+        matrix = csr_matrix((R, np.insert(built.rows, built.begin[:-1], np.arange(n)), starts), shape=(n, n))
+        lengths = np.sqrt(np.bincount(pattern.columns, system.values**2, n))
+        check_pivots(np.abs(R[starts[:-1]]), lengths[built.order])
+        return Factored(
+            lambda: spsolve_triangular(matrix, z, lower=False)[place],
+            lambda: Factor("R of A", csc_matrix(matrix), built.order),
+        )
+
+
+def _order_of_rows(pattern: Pattern, place: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Rows of A that are not empty, by their first column and then their last, each column in its place (n,)."""
+    rows = np.flatnonzero(np.diff(pattern.row_start))
+    places = place[pattern.columns]
+    first, last = (ends.reduceat(places, pattern.row_start[rows]) for ends in (np.minimum, np.maximum))
+    return rows[np.lexsort((-last, first))]
 
 
 _WIDEST_BAND = 64  # widest band in scalars; beyond it poses are joined by more than odometry
