@@ -214,11 +214,9 @@ StepRule = GaussNewton | Damped | GradientDescent
 
 def step_rule(optimizer: Optimizer, first_damping: float = _FIRST_DAMPING) -> StepRule:
     """The rule by its name."""
-    if optimizer == "gauss-newton":
-        return GaussNewton()
     if optimizer == "levenberg-marquardt":
         return Damped(first_damping)
-    return GradientDescent()
+    return GaussNewton() if optimizer == "gauss-newton" else GradientDescent()
 
 
 @dataclass(frozen=True, slots=True)

@@ -159,17 +159,11 @@ def _spread(P: _Array, F: _Array, noise: int, c: float, s: float, chord: float, 
     for a in range(3):
         for b in range(2):
             P[a, b] += F[b, 2] * P[a, 2]
-    g0, g1, g2 = c, s, 0.0
+    g = c, s, 0.0
     if noise == 1:
-        g0, g1 = -s, c
+        g = -s, c, 0.0
     elif noise >= 2:
-        g0, g1, g2 = -0.5 * chord * s, 0.5 * chord * c, 1.0
-    P[0, 0] += driven * g0 * g0
-    P[0, 1] += driven * g0 * g1
-    P[1, 0] += driven * g0 * g1
-    P[1, 1] += driven * g1 * g1
-    P[0, 2] += driven * g0 * g2
-    P[2, 0] += driven * g0 * g2
-    P[1, 2] += driven * g1 * g2
-    P[2, 1] += driven * g1 * g2
-    P[2, 2] += driven * g2 * g2
+        g = -0.5 * chord * s, 0.5 * chord * c, 1.0
+    for a in range(3):
+        for b in range(3):
+            P[a, b] += driven * g[min(a, b)] * g[max(a, b)]

@@ -115,8 +115,8 @@ def compare(
     """Let ``solve`` find the unknowns (n,) by every method in turn, slow ones once only."""
     results = list[MethodResult]()
     for method in methods:
-        create_solver(method).solve(_small_system())  # compiles
-        times_s = list[NDArray[np.float64]]()
+        solver, iterations, times_s = create_solver(method), 0, list[NDArray[np.float64]]()
+        x = solver.solve(_small_system())  # compiles
         while len(times_s) < repeats and not (times_s and times_s[0][-1] > _SLOW_S):
             solver = create_solver(method)
             x = solve(solver)

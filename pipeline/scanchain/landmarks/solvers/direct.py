@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,24 +51,11 @@ class Factored(NamedTuple):
     factor: Callable[[], Factor]
 
 
-class Method(Protocol):
-    """A way to solve A x = b in the least-squares sense.
-
-    An analysis is kept for as long as the pattern is the same object. Both raise SingularMatrixError or
-    RuntimeError where A has not full column rank.
-    """
-
-    def build(self, system: LinearSystem) -> Any:
-        """The matrices to factorize: AᵀA and Aᵀb, or the rows of A in their order."""
-        ...
-
-    def factorize(self, system: LinearSystem, built: Any) -> Factored:
-        """Order, analyze and factor it."""
-        ...
-
-
 class LinearSolver:
-    """Solves A x = b by one method.
+    """Solves A x = b in the least-squares sense by one method, which keeps its analysis of the last pattern.
+
+    A method builds what it factorizes, AᵀA and Aᵀb or the order of A. It raises SingularMatrixError or RuntimeError
+    where A has not full column rank.
 
     Attributes
     ----------
@@ -88,7 +75,7 @@ class LinearSolver:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("error", MatrixRankWarning)
-                built = self._method.build(system)
+                built: Any = self._method.build(system)
                 laps_s.append(working_s())
                 self._factored = self._method.factorize(system, built)
                 laps_s.append(working_s())
@@ -279,6 +266,9 @@ class SchurMethod:
             return self._cholesky.factorize(system, (U, g))
         _eliminate(U)
         return Factored(lambda: _solved(U, g), lambda: _factor_of_arrow(U))
+
+
+Method = ScipyMethod | CholeskyMethod | QrMethod | SchurMethod
 
 
 @dataclass(frozen=True, slots=True)
