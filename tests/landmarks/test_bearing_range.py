@@ -15,13 +15,20 @@ from tests.support.naive_landmarks import numeric_jacobian
 from tests.support.scenes import shared_data
 
 
+def observed(pose, landmark, bearing, reach):
+    """Residual and Jacobian of one bearing and range."""
+    residuals, jacobians = np.empty((1, 2)), np.empty((1, 2, len(pose) + 2))
+    pair, measured = np.zeros((1, 2), np.int64), np.array([[bearing, reach]])
+    factors.bearing_range(pose[None], landmark[None], pair, measured, np.eye(2), residuals, jacobians)
+    return residuals[0], jacobians[0]
+
+
 @pytest.mark.parametrize("size", [2, 3])
 @pytest.mark.parametrize("bearing", [0.3, np.pi - 1e-9, -np.pi + 1e-9, -3.0])
 def test_bearing_and_range_equal_the_naive_ones_and_finite_differences(size, bearing):
     rng = np.random.default_rng(1)
     pose, landmark = np.array([1.0, -2.0, 2.8])[:size], rng.normal(size=2) * 3.0
-    r, J = np.empty(2), np.empty((2, size + 2))
-    factors.bearing_range_block(pose, landmark, bearing, 2.0, r, J)
+    r, J = observed(pose, landmark, bearing, 2.0)
     assert np.allclose(r, naive_landmarks.bearing_range(pose, landmark, bearing, 2.0), atol=1e-12)
 
     def residual(x):
@@ -31,8 +38,7 @@ def test_bearing_and_range_equal_the_naive_ones_and_finite_differences(size, bea
 
 
 def test_a_landmark_on_top_of_its_pose_is_pulled_by_the_range_alone():
-    r, J = np.empty(2), np.empty((2, 5))
-    factors.bearing_range_block(np.array([1.0, 2.0, 0.5]), np.array([1.0, 2.0]), 0.2, 3.0, r, J)
+    r, J = observed(np.array([1.0, 2.0, 0.5]), np.array([1.0, 2.0]), 0.2, 3.0)
     assert np.array_equal(r, [0.0, -3.0]) and not J[0].any()
     assert np.allclose(J[1], [-np.cos(0.7), -np.sin(0.7), 0.0, np.cos(0.7), np.sin(0.7)])
 
@@ -40,8 +46,9 @@ def test_a_landmark_on_top_of_its_pose_is_pulled_by_the_range_alone():
 @pytest.mark.parametrize("turn", [0.4, 3.1, -3.1])
 def test_odometry_equals_the_naive_one_and_finite_differences(turn):
     first, second, moved = np.array([1.0, 2.0, 3.0]), np.array([2.5, 1.0, 3.0 + turn]), np.array([0.4, 0.1, turn])
-    r, J = np.empty(3), np.empty((3, 6))
-    factors.odometry_block(first, second, moved, r, J)
+    residuals, jacobians = np.empty((1, 3)), np.empty((1, 3, 6))
+    factors.odometry(np.stack([first, second]), moved[None], np.eye(3)[None], residuals, jacobians)
+    r, J = residuals[0], jacobians[0]
     assert np.allclose(r, naive_landmarks.odometry(first, second, moved), atol=1e-12)
     numeric = numeric_jacobian(
         lambda x: naive_landmarks.odometry(x[:3], x[3:], moved), np.concatenate([first, second])

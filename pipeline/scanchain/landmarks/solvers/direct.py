@@ -54,8 +54,8 @@ class Factored(NamedTuple):
 class LinearSolver:
     """Solves A x = b in the least-squares sense by one method, which keeps its analysis of the last pattern.
 
-    A method builds what it factorizes, AᵀA and Aᵀb or the order of A. It raises SingularMatrixError or RuntimeError
-    where A has not full column rank.
+    A method builds what it factorizes, AᵀA and Aᵀb or the order of A. Where A has not full column rank it raises
+    SingularMatrixError or RuntimeError.
 
     Attributes
     ----------
