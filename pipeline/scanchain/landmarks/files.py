@@ -199,7 +199,9 @@ def read_mrclam(folder: Path, robot: int) -> RangeLog:
         raise InputError(f"{folder}: has no {name}; --robot must be one of those logged there: {listed}")
     odometry = _by_time(_numbers(folder / name, 3))
     seen = _by_time(_numbers(folder / f"Robot{robot}_Measurement.dat", 4))
-    subject = _subjects(_numbers(folder / "Barcodes.dat", 2), seen[:, 1])
+    subjects, codes = _numbers(folder / "Barcodes.dat", 2).T.tolist()
+    subject_of = dict(zip(codes, subjects, strict=True))
+    subject = np.array([subject_of.get(code, 0) for code in seen[:, 1].tolist()], np.int64)
     timely = (seen[:, 0] >= odometry[0, 0]) & (seen[:, 0] <= odometry[-1, 0])
     used = (subject > _ROBOTS) & timely
     if not used.any():
@@ -247,11 +249,3 @@ def _numbers(path: Path, columns: int) -> Matrix:
 
 def _by_time(table: Matrix) -> Matrix:
     return table[np.argsort(table[:, 0], kind="stable")]
-
-
-def _subjects(barcodes: Matrix, seen: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Subject of each barcode seen, 0 where no subject has it."""
-    subjects, codes = barcodes.astype(np.int64).T
-    order = np.argsort(codes, kind="stable")
-    at = np.minimum(np.searchsorted(codes[order], seen), len(codes) - 1)
-    return np.where(codes[order][at] == seen, subjects[order][at], 0)

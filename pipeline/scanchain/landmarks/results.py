@@ -49,12 +49,9 @@ def text_of(study: Study) -> str:
     lines.append(f"  {'A':<15}{size_of(study)}")
     rows = table_of(study)
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        cells = (
-            f"{cell:<{width}}" if k == 0 else f"{cell:>{width}}"
-            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
-        )
-        lines.append("  " + "  ".join(cells))
+    for method, *figures in rows:
+        cells = [f"{cell:>{width}}" for cell, width in zip(figures, widths[1:], strict=True)]
+        lines.append("  ".join(["", f"{method:<{widths[0]}}", *cells]))
     return "\n".join(lines)
 
 
