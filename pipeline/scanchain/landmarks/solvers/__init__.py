@@ -62,16 +62,13 @@ def methods_for(requested: Sequence[str], unknowns: int) -> tuple[tuple[str, ...
 
     Raises InputError where one is named that is too slow.
     """
-    if "pinv" in requested and unknowns >= PINV_BELOW:
-        raise InputError(
-            f"pinv: the inverse of AᵀA would be all but dense for {unknowns:,} unknowns, its limit is"
-            f" {PINV_BELOW:,}; name other --methods"
-        )
     chosen = dict.fromkeys(method for name in requested for method in (METHODS if name == "all" else (name,)))
     if "pinv" not in chosen or unknowns < PINV_BELOW:
         return tuple(chosen), {}
-    del chosen["pinv"]
     why = f"pinv, whose inverse is all but dense: {unknowns:,} unknowns, its limit is {PINV_BELOW:,}"
+    if "pinv" in requested:
+        raise InputError(f"{why}; name other --methods")
+    del chosen["pinv"]
     return tuple(chosen), {"not compared": why}
 
 
