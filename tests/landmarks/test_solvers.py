@@ -5,8 +5,14 @@ from hypothesis import strategies as st
 
 from scanchain.errors import InputError
 from scanchain.landmarks.problem import Layout, LinearSystem, Pattern
-from scanchain.landmarks.solvers import METHODS, UndeterminedError, create_solver, methods_for, parse_methods
-from scanchain.landmarks.solvers.direct import Covariance
+from scanchain.landmarks.solvers import (
+    METHODS,
+    Covariance,
+    UndeterminedError,
+    create_solver,
+    methods_for,
+    parse_methods,
+)
 from tests.support import naive_landmarks
 
 OWN = ("qr", "qr_colamd", "cholesky", "schur")

@@ -14,8 +14,7 @@ from scanchain.kernels.landmarks import factors
 from scanchain.landmarks.estimate import Minimum, StudentLoss, from_odometry, growing, minimize
 from scanchain.landmarks.files import RangeLog
 from scanchain.landmarks.problem import BearingRangeProblem, Calibration, Measurements, Values
-from scanchain.landmarks.solvers import ESTIMATOR, LinearSolver, create_solver
-from scanchain.landmarks.solvers.direct import Covariance
+from scanchain.landmarks.solvers import ESTIMATOR, Covariance, LinearSolver, create_solver
 
 _AT_REST = np.square([1e-3, 1e-3, 1e-3])  # m², m², rad² a second, whether or not the robot moves
 _LEAST_VARIANCE = 1e-12  # m², rad²; keeps the covariance of a motion that takes no time invertible

@@ -33,8 +33,7 @@ from scanchain.landmarks.problem import (
     world_referenced,
 )
 from scanchain.landmarks.ranges import OWN, OWN_UNITS, OdometryNoise, RangeSolution, solve_range_log
-from scanchain.landmarks.solvers import LinearSolver, MethodResult, compare, create_solver, methods_for
-from scanchain.landmarks.solvers.direct import Covariance
+from scanchain.landmarks.solvers import Covariance, LinearSolver, MethodResult, compare, create_solver, methods_for
 
 _WIDEST_GAP_S = 0.5  # between motion-capture poses that are interpolated
 
