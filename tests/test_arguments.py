@@ -335,7 +335,6 @@ def test_a_graph_takes_poses_and_edges_or_refuses_them_and_stays_whole(dimension
     tried(lambda: graph.add_point(information, 0))
     tried(lambda: graph.add_edge(0, 1, T_ij, information))
     tried(lambda: graph.add_edges(information, T_ij, index, T))
-    tried(lambda: graph.add_sightings(information, T_ij, index))
     tried(lambda: graph.fix(index))
     assert np.isfinite(graph.poses).all() and np.isfinite(graph.information).all()
     assert len(graph.edges) == len(graph.measurements) == len(graph.information) == len(graph.is_loop)

@@ -250,7 +250,7 @@ class GraphConfig(Section, frozen=True, forbid_unknown_fields=True):
     robust_scale : normalized error from which on the loss gives way, in standard deviations
     """
 
-    optimizer: Literal["levenberg-marquardt", "gauss-newton", "dogleg", "gradient-descent"] = "levenberg-marquardt"
+    optimizer: Literal["levenberg-marquardt", "gauss-newton", "gradient-descent"] = "levenberg-marquardt"
     max_iterations: Count = 50
     tolerance: Positive = 1e-6
     robust: Loss = "truncated"

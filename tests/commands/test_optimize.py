@@ -195,7 +195,7 @@ def test_an_answer_that_did_not_converge_is_written_and_says_so(call, tmp_path, 
 
 
 def test_optimize_takes_an_optimizer_and_a_first_guess(tree, ring):
-    words = ["--optimizer", "dogleg", "--initialize", "spanning-tree", "--graph.max_iterations", "99"]
+    words = ["--optimizer", "gauss-newton", "--initialize", "spanning-tree", "--graph.max_iterations", "99"]
     found = tree(ring, *words)
     assert found["initialization"] == "spanning-tree" and found["converged"]
 

@@ -207,26 +207,6 @@ def test_an_edge_that_cannot_be_bounded_costs_its_chi2_and_no_more():
     assert 0.9 * price < certificate.gap < 0.01 * certificate.chi2
 
 
-def silenced(name, share):
-    """A published graph some of whose loops say nothing about rotations."""
-    source = published(name)
-    chosen = np.random.default_rng(0).random(len(source.edges)) < share
-    chosen &= np.abs(np.diff(source.edges, axis=1)[:, 0]) != 1
-    information, d = source.information.copy(), source.dimension
-    information[chosen, d:] = 0.0
-    information[chosen, :, d:] = 0.0
-    return graph_of(source.poses, source.edges, source.measurements, information, source.is_loop)
-
-
-@pytest.mark.parametrize("name", ["intel", "smallGrid3D", "sphere2500"])
-def test_loops_of_position_alone_are_certified(name):
-    graph = silenced(name, 0.3)
-    answer = graph.optimize(PLAIN)
-    certificate = graph.certify()
-    assert certificate.certified and certificate.relative_gap < 1e-6
-    assert certificate.chi2 == pytest.approx(answer.chi2_after, rel=1e-9)
-
-
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("information", [1e-300, 1e-50, 1e50])
 def test_no_information_that_is_taken_overflows(dimension, information):

@@ -33,7 +33,7 @@ def _graphs(draw):
 
 @settings(max_examples=150, deadline=None)
 @given(_graphs())
-def test_the_sparse_solution_solves_the_dense_system_for_any_pattern_and_block_sizes(graph):
+def test_solutions_and_the_selected_inverse_equal_the_dense_ones_for_any_pattern_and_block_sizes(graph):
     pattern, values, A = _matrix(*graph)
     cholesky = SparseCholesky(pattern, analyze(pattern))
     for scale in (5.0, 1.0):  # of the first factorization nothing is left
@@ -46,14 +46,6 @@ def test_the_sparse_solution_solves_the_dense_system_for_any_pattern_and_block_s
     B = np.where(here[:, None], b, 0.0)
     assert np.allclose(cholesky.covariance_of(b[here], chosen), B.T @ np.linalg.solve(A, B), rtol=1e-9, atol=1e-12)
     assert np.allclose(pattern.multiply(values, b[:, 0]), A @ b[:, 0], rtol=1e-12, atol=1e-9)
-
-
-@settings(max_examples=150, deadline=None)
-@given(_graphs())
-def test_the_selected_inverse_equals_the_dense_one_for_any_pattern_and_block_sizes(graph):
-    pattern, values, A = _matrix(*graph)
-    cholesky = SparseCholesky(pattern, analyze(pattern))
-    cholesky.factorize(values)
     inverse = naive_graph.dense(pattern, cholesky.inverse_blocks())
     there = naive_graph.dense(pattern, np.ones(pattern.value_count)) != 0.0
     assert np.allclose(inverse[there], np.linalg.inv(A)[there], rtol=1e-9, atol=1e-14)

@@ -92,17 +92,6 @@ def test_a_group_on_next_to_no_information_is_named_whole_by_certificate_and_cov
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_whatever_moves_with_a_free_pose_is_named_too(dimension):
-    """The middle of a chain is free along x: whatever follows goes with it."""
-    graph = chain(dimension)
-    information = graph.information.copy()
-    information[2, 0, 0] = 0.0
-    free = graph_of(graph.poses, graph.edges, graph.measurements, information)
-    with pytest.raises(InputError, match=r"leave 3 poses free: 3 to 5;"):
-        free.optimize(GraphConfig(robust="none", optimizer="gauss-newton"))
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_free_is_what_lies_in_the_null_space_of_the_dense_matrix(dimension):
     rng = np.random.default_rng(1)
     k, count, seen = (3, 6)[dimension - 2], 8, set()

@@ -29,8 +29,14 @@ def field(seed=0, noise=0.05, poses=12, points=5):
     T_i = lie.inverse(true[pairs[:, 0]])
     seen = (T_i[:, :2, :2] @ marks[pairs[:, 1] - poses][..., None])[..., 0] + T_i[:, :2, 2]
     seen += noise * rng.normal(size=seen.shape)
-    graph.add_sightings(pairs, seen, np.tile([[2.0, 0.5], [0.5, 1.0]] / np.array(noise**2), (len(pairs), 1, 1)))
+    for pair, position in zip(pairs.tolist(), seen, strict=True):
+        sight(graph, pair, position, [[2.0, 0.5], [0.5, 1.0]] / np.array(noise**2))
     return graph
+
+
+def sight(graph, pair, position, information):
+    """Add a point as seen from a pose."""
+    graph.add_edge(*pair, lie.pose_2d(*position, 0.0), np.pad(information, (0, 1)))
 
 
 def whitened_residuals(values, graph):
@@ -83,8 +89,7 @@ def test_a_ring_with_a_point_is_certified_unless_it_is_wound_up(turns):
     wound = [lie.pose_2d(0.0, 0.0, 2.0 * np.pi * turns * index / 30) for index in range(30)]
     graph = graph_of(wound, edges, [lie.identity(2)] * 30, np.diag([100.0, 100.0, 1e4]))
     mark = graph.add_point(np.array([2.0, 1.0]), 99)
-    graph.add_sightings(
-        np.array([[0, mark], [1, mark]]), np.array([[2.0, 1.1], [2.1, 1.0]]), np.array([np.eye(2)] * 2)
-    )
+    sight(graph, (0, mark), (2.0, 1.1), np.eye(2))
+    sight(graph, (1, mark), (2.1, 1.0), np.eye(2))
     assert graph.optimize(PLAIN, initialize="given").converged
     assert graph.certify().certified == (turns == 0)

@@ -132,24 +132,17 @@ def test_rejected_edges_have_no_weight_and_the_answer_is_the_minimum_without_the
     assert np.abs(step.solve(equations.gradient)).max() < 0.02  # m and rad, left to the tolerance
 
 
-class Welsch:
-    """A loss of the user's."""
-
-    def weight(self, chi2, s, mu):
-        return np.exp(-chi2 / s**2)
-
-    def loss(self, chi2, s, mu):
-        return s**2 * -np.expm1(-chi2 / s**2)
-
-
-class OtherSlope(Welsch):
+class OtherSlope:
     """Weight and loss of two functions."""
 
     def weight(self, chi2, s, mu):
         return s**2 / (s**2 + chi2)
 
+    def loss(self, chi2, s, mu):
+        return s**2 * -np.expm1(-chi2 / s**2)
 
-class Scalar(Welsch):
+
+class Scalar(OtherSlope):
     """A loss that takes one residual at a time."""
 
     def loss(self, chi2, s, mu):
@@ -252,9 +245,7 @@ def test_steps_as_short_as_their_noise_are_no_drift_of_the_scale():
     measured = lie.between(true[edges[:, 0]], true[edges[:, 1]]) @ lie.exp(
         sigma * rng.normal(size=(len(edges), 3))
     )
-    measured[-10:] = measured[-10:] @ lie.pose_2d(
-        1.0, -1.0, 0.5
-    )  # wrong loops, so that there is something to explain
+    measured[-10:] = measured[-10:] @ lie.pose_2d(1.0, -1.0, 0.5)  # wrong: something to explain
     is_loop = np.arange(len(edges)) >= len(chain)
     graph = graph_of(true, edges, measured, np.diag(sigma**-2), is_loop)
     assert graph.optimize(GraphConfig(), initialize="given").rejected.sum() >= 10

@@ -1,4 +1,3 @@
-from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -10,10 +9,18 @@ from scanchain.landmarks import estimate as guesses
 from scanchain.landmarks.estimate import QUADRATIC, minimize
 from scanchain.landmarks.files import read_landmark_data
 from scanchain.landmarks.problem import BearingRangeProblem, Measurements, Values, no_calibration, world_referenced
-from scanchain.landmarks.solvers import METHODS, UndeterminedError, create_solver
+from scanchain.landmarks.solvers import METHODS, create_solver
 from tests.support import naive_landmarks
 from tests.support.naive_landmarks import numeric_jacobian
 from tests.support.scenes import shared_data
+
+
+def observed(pose, landmark, bearing, reach):
+    """Residual and Jacobian of one bearing and range."""
+    residuals, jacobians = np.empty((1, 2)), np.empty((1, 2, len(pose) + 2))
+    pair, measured = np.zeros((1, 2), np.int64), np.array([[bearing, reach]])
+    factors.bearing_range(pose[None], landmark[None], pair, measured, np.eye(2), residuals, jacobians)
+    return residuals[0], jacobians[0]
 
 
 @pytest.mark.parametrize("size", [2, 3])
@@ -21,8 +28,7 @@ from tests.support.scenes import shared_data
 def test_bearing_and_range_equal_the_naive_ones_and_finite_differences(size, bearing):
     rng = np.random.default_rng(1)
     pose, landmark = np.array([1.0, -2.0, 2.8])[:size], rng.normal(size=2) * 3.0
-    r, J = np.empty(2), np.empty((2, size + 2))
-    factors.bearing_range_block(pose, landmark, bearing, 2.0, r, J)
+    r, J = observed(pose, landmark, bearing, 2.0)
     assert np.allclose(r, naive_landmarks.bearing_range(pose, landmark, bearing, 2.0), atol=1e-12)
 
     def residual(x):
@@ -32,8 +38,7 @@ def test_bearing_and_range_equal_the_naive_ones_and_finite_differences(size, bea
 
 
 def test_a_landmark_on_top_of_its_pose_is_pulled_by_the_range_alone():
-    r, J = np.empty(2), np.empty((2, 5))
-    factors.bearing_range_block(np.array([1.0, 2.0, 0.5]), np.array([1.0, 2.0]), 0.2, 3.0, r, J)
+    r, J = observed(np.array([1.0, 2.0, 0.5]), np.array([1.0, 2.0]), 0.2, 3.0)
     assert np.array_equal(r, [0.0, -3.0]) and not J[0].any()
     assert np.allclose(J[1], [-np.cos(0.7), -np.sin(0.7), 0.0, np.cos(0.7), np.sin(0.7)])
 
@@ -41,8 +46,9 @@ def test_a_landmark_on_top_of_its_pose_is_pulled_by_the_range_alone():
 @pytest.mark.parametrize("turn", [0.4, 3.1, -3.1])
 def test_odometry_equals_the_naive_one_and_finite_differences(turn):
     first, second, moved = np.array([1.0, 2.0, 3.0]), np.array([2.5, 1.0, 3.0 + turn]), np.array([0.4, 0.1, turn])
-    r, J = np.empty(3), np.empty((3, 6))
-    factors.odometry_block(first, second, moved, r, J)
+    residuals, jacobians = np.empty((1, 3)), np.empty((1, 3, 6))
+    factors.odometry(np.stack([first, second]), moved[None], np.eye(3)[None], residuals, jacobians)
+    r, J = residuals[0], jacobians[0]
     assert np.allclose(r, naive_landmarks.odometry(first, second, moved), atol=1e-12)
     numeric = numeric_jacobian(
         lambda x: naive_landmarks.odometry(x[:3], x[3:], moved), np.concatenate([first, second])
@@ -94,13 +100,13 @@ def nonlinear():
     ("guess", "method", "optimizer"),
     [
         *(("odometry", method, "levenberg-marquardt") for method in METHODS),
-        *product(("disturbed", "origin"), ("schur",), ("levenberg-marquardt", "gauss-newton", "dogleg")),
+        *product(("disturbed", "origin"), ("schur",), ("levenberg-marquardt", "gauss-newton")),
     ],
 )
 def test_2d_nonlinear_ends_in_the_same_minimum_from_poor_guesses(nonlinear, guess, method, optimizer):
     data, problem, good, best = nonlinear
-    assert best.converged and best.cost == pytest.approx(1555.1896456, abs=1e-5)
-    assert np.abs(best.state.poses - data.true_poses).max() < 0.05
+    assert best.converged and best.estimate.cost == pytest.approx(1555.1896456, abs=1e-5)
+    assert np.abs(best.estimate.state.poses - data.true_poses).max() < 0.05
     start = {
         "odometry": good,
         "disturbed": guesses.disturbed(good, 1.0, 0.5),
@@ -108,18 +114,9 @@ def test_2d_nonlinear_ends_in_the_same_minimum_from_poor_guesses(nonlinear, gues
     }[guess]
     minimum = minimize(problem, start, create_solver(method), optimizer=optimizer)
     assert minimum.converged
-    assert np.abs(minimum.state.unknowns - best.state.unknowns).max() < (1e-8 if guess == "odometry" else 1e-5)
-
-
-def test_an_unseen_landmark_is_named_by_gauss_newton_and_dogleg(nonlinear):
-    _, problem, guess, _ = nonlinear
-    given = problem.measurements
-    blind = BearingRangeProblem(replace(given, **{
-        name: getattr(given, name)[given.observed[:, 1] != 4] for name in ("observed", "measured")
-    }))  # fmt: skip
-    for optimizer in ("gauss-newton", "dogleg"):
-        with pytest.raises(UndeterminedError, match="leave landmark 4 x, landmark 4 y open"):
-            minimize(blind, guess, create_solver("schur"), optimizer=optimizer)
+    assert np.abs(minimum.estimate.state.unknowns - best.estimate.state.unknowns).max() < (
+        1e-8 if guess == "odometry" else 1e-5
+    )
 
 
 def measurements(seed=0, unit=1.0, outliers=0):
@@ -160,15 +157,16 @@ def solve(given, loss):
 def test_meters_or_centimeters_same_weights_and_same_drive(kernel):
     loss = RobustLoss(kernel, 2.0, 1.0)
     in_m, in_cm = (solve(measurements(unit=unit, outliers=8)[2], loss) for unit in (1.0, 0.01))
-    assert np.allclose(in_m.weights, in_cm.weights, atol=1e-5)
-    assert np.allclose(in_m.state.poses[:, :2], 0.01 * in_cm.state.poses[:, :2], atol=1e-5)
+    assert np.allclose(in_m.estimate.weights, in_cm.estimate.weights, atol=1e-5)
+    assert np.allclose(in_m.estimate.state.poses[:, :2], 0.01 * in_cm.estimate.state.poses[:, :2], atol=1e-5)
 
 
 def test_outliers_lose_their_weight_and_the_drive_stays_right():
     poses, _, given = measurements(outliers=8)
     robust, quadratic = solve(given, RobustLoss("cauchy", 2.0, 1.0)), solve(given, QUADRATIC)
-    assert robust.weights[:8].max() < 0.01 < 0.5 < np.median(robust.weights[8:])
-    off = [np.abs(minimum.state.poses[:, :2] - poses[:, :2]).max() for minimum in (robust, quadratic)]
+    weights = robust.estimate.weights
+    assert weights[:8].max() < 0.01 < 0.5 < np.median(weights[8:])
+    off = [np.abs(minimum.estimate.state.poses[:, :2] - poses[:, :2]).max() for minimum in (robust, quadratic)]
     assert off[0] < 0.1 < off[1]
 
 

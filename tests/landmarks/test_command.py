@@ -83,7 +83,7 @@ def test_pinv_is_left_out_of_all_above_its_limit_and_refused_by_name(call, small
 
 
 @pytest.mark.parametrize(
-    ("optimizer", "ended"), [("dogleg", "converged"), ("gradient-descent", "DID NOT CONVERGE")]
+    ("optimizer", "ended"), [("gauss-newton", "converged"), ("gradient-descent", "DID NOT CONVERGE")]
 )
 def test_every_optimizer_tells_how_it_ended(call, tmp_path, optimizer, ended):
     words = ["--out", tmp_path / "out", "--optimizer", optimizer, "--repeat", "1"]

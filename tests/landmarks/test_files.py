@@ -103,8 +103,8 @@ def test_every_damage_of_a_problem_is_one_line(tmp_path, arrays, damage, said):
 
 @pytest.mark.parametrize(
     ("content", "said"),
-    [(b"", "is no npz file"), (b"hello", "is no npz file"), (b"\x93NUMPY", "is no npz file"),
-     (b"PK\x03\x04 broken", "is no npz of plain arrays"), (None, "does not exist")],
+    [(b"", "is no npz of plain arrays"), (b"\x93NUMPY", "is no npz of plain arrays"),
+     (b"PK\x03\x04 broken", "is no npz of plain arrays"), (None, "cannot be read")],
 )  # fmt: skip
 def test_what_is_no_npz_or_cut_off_is_refused(tmp_path, arrays, content, said):
     path = written(tmp_path, arrays)
@@ -152,15 +152,13 @@ def test_an_exact_drive_is_found_and_what_is_not_its_own_is_counted(folder):
 @pytest.mark.parametrize(
     ("file", "text", "said"),
     [
-        ("Robot1_Odometry.dat", "1.0 2.0\n", "has 2 numbers a line; it must have 3"),
+        ("Robot1_Odometry.dat", "1.0 2.0\n", "has no 3 numbers a line"),
         ("Robot1_Odometry.dat", "1.0 2.0 x\n", "is no table of 3 numbers"),
-        ("Robot1_Odometry.dat", "", "is empty"),
         ("Robot1_Odometry.dat", "# time forward turn\n \n", "is empty"),
         ("Robot1_Odometry.dat", None, "one of those logged there: none"),
         ("Barcodes.dat", None, "is no MRCLAM folder"),
         ("Robot1_Measurement.dat", "1.0 63 nan 0.0\n", "row 1 is not finite"),
         ("Robot1_Measurement.dat", "11.0 14 1.0 0.0\n", "robot 1 saw no landmark"),
-        ("Robot1_Measurement.dat", "11.0 63 2.1 74.5\n", r"dat: bearings reach 74.5: degrees\? give radians"),
         ("Robot1_Measurement.dat", "11.0 63 2.06 1.3\n", "too seldom"),
     ],
 )
@@ -181,27 +179,3 @@ def test_utias_6_robot_1_is_as_accurate_as_a_batch_in_gtsam_or_better_and_noise_
     assert study.facts["odometry noise"].endswith("fits") and study.facts["sensor noise"].endswith("fits")
     stated = study_log(folder, replace(ALONE, noise=OdometryNoise(0.003, 0.001, 0.005, 0.01)))
     assert "off by a factor" in stated.facts["odometry noise"]
-
-
-def test_the_estimate_of_the_noise_hardly_depends_on_where_it_begins(monkeypatch):
-    log = read_mrclam(shared_data("landmarks/utias_mrclam6"), 1)
-    first = solve_range_log(log, None)
-    monkeypatch.setattr("scanchain.landmarks.ranges._SENSOR", np.square([0.02, 0.2]))
-    second = solve_range_log(log, None)
-    assert second.sigmas[3:] == pytest.approx(first.sigmas[3:], rel=0.1)
-
-
-def test_bearings_in_degrees_are_refused_with_and_without_the_truth(tmp_path):
-    rng = np.random.default_rng(0)
-    poses, landmarks = rng.uniform(-9.0, 9.0, (20, 2)), rng.uniform(-9.0, 9.0, (6, 2))
-    pairs = np.stack(np.meshgrid(np.arange(20), np.arange(6), indexing="ij"), -1).reshape(-1, 2)
-    x, y = (landmarks[pairs[:, 1]] - poses[pairs[:, 0]]).T
-    given = {"odom": np.diff(poses, axis=0), "sigma_odom": np.eye(2), "sigma_landmark": np.eye(2)}
-    bearings = np.arctan2(y, x)
-    for truth in ({}, {"gt_traj": poses, "gt_landmarks": landmarks}):
-        for name, angles in (("radians", bearings), ("degrees", np.degrees(bearings))):
-            table = np.column_stack([pairs, angles, np.hypot(x, y)])
-            np.savez(tmp_path / name, observations=table, **given, **truth)
-        assert read_landmark_data(tmp_path / "radians.npz").kind == "bearing-range"
-        with pytest.raises(InputError, match=r"bearings of observations reach 1\d\d.*: degrees\? give radians"):
-            read_landmark_data(tmp_path / "degrees.npz")

@@ -57,7 +57,7 @@ def from_first(first, points):
 
 def squared_distances(solution, landmarks, first):
     """Of every landmark from the true one, in units of its covariance, divided by its dimension."""
-    off = solution.minimum.state.landmarks - from_first(
+    off = solution.minimum.estimate.state.landmarks - from_first(
         first, landmarks[solution.problem.measurements.landmarks - 6]
     )
     return np.einsum("li,lij,lj->l", off, np.linalg.inv(solution.covariance.landmarks), off) / 2.0
@@ -69,13 +69,13 @@ def test_the_robots_own_errors_the_noise_and_its_effect_are_found():
         log, poses, landmarks, first = made_up_log(seed)
         solution = solve_range_log(log, None)
         consistency.append(squared_distances(solution, landmarks, first).mean())
-        own.append(solution.minimum.state.calibration)
+        own.append(solution.minimum.estimate.state.calibration)
         assert solution.sigmas[4] == pytest.approx(SIGMAS[0] * 0.85, rel=0.25)  # Student's scale: smaller
         assert solution.sigmas[5] == pytest.approx(SIGMAS[1] * 0.85, rel=0.25)
         noise = solution.consistency
         assert solution.minimum.converged and 0.7 < noise.motion / noise.motion_freedom < 1.3
         found = from_first(first, poses[:, :2])
-        assert np.sqrt(np.mean((solution.minimum.state.poses[:, :2] - found) ** 2)) < 0.15
+        assert np.sqrt(np.mean((solution.minimum.estimate.state.poses[:, :2] - found) ** 2)) < 0.15
     off = np.abs(np.mean(own, axis=0) - OF_ITS_OWN)
     assert np.all(off < [0.05, 0.05, 0.05, 0.02, 0.06]), dict(zip(OWN, off, strict=True))
     assert 0.3 < np.mean(consistency) < 2.0
@@ -93,19 +93,6 @@ def test_a_share_is_one_over_the_sum_of_a_sightings_correlations():
     likeness = SightingPairs(seen_s, landmarks)
     correlation = np.array([0.5, 0.25, 0.0, 0.0, 0.0, 0.0])  # up to 0.5 s, up to 1 s, beyond
     assert np.allclose(likeness.share(correlation), [1 / 1.75, 1 / 2.0, 1 / 1.75, 1.0, 1.0])
-
-
-def test_correlations_of_residuals_are_found_by_their_lag():
-    rng = np.random.default_rng(0)
-    seen_s = np.arange(4000) * 0.25
-    residuals = np.empty((4000, 2))
-    residuals[0] = rng.normal(size=2)
-    for k in range(1, 4000):
-        residuals[k] = 0.8 * residuals[k - 1] + 0.6 * rng.normal(size=2)
-    found = SightingPairs(seen_s, np.zeros(4000, int)).correlation(residuals)
-    assert found[0] == pytest.approx(0.8, abs=0.05)
-    assert found[1] == pytest.approx(0.5 * (0.8**2 + 0.8**3), abs=0.08)
-    assert np.all(np.diff(found) <= 0.0)
 
 
 def test_slopes_of_the_motion_equal_central_differences():

@@ -5,8 +5,14 @@ from hypothesis import strategies as st
 
 from scanchain.errors import InputError
 from scanchain.landmarks.problem import Layout, LinearSystem, Pattern
-from scanchain.landmarks.solvers import METHODS, UndeterminedError, create_solver, methods_for, parse_methods
-from scanchain.landmarks.solvers.direct import Covariance
+from scanchain.landmarks.solvers import (
+    METHODS,
+    Covariance,
+    UndeterminedError,
+    create_solver,
+    methods_for,
+    parse_methods,
+)
 from tests.support import naive_landmarks
 
 OWN = ("qr", "qr_colamd", "cholesky", "schur")
@@ -137,21 +143,6 @@ def test_covariances_equal_those_of_the_dense_inverse():
 
 def test_methods_are_parsed_and_unknown_ones_refused():
     others = tuple(name for name in METHODS if name != "pinv")
-    kept, note = methods_for(("all",), 3000)
-    assert kept == others and "pinv" in note["not compared"] and "limit is 3,000" in note["not compared"]
     assert methods_for(parse_methods("pinv, all"), 100) == (("pinv", *others), {})
-    for text, said in (("", "no method"), ("lu, qr,lu", "twice: lu, qr")):
-        with pytest.raises(InputError, match=said):
-            parse_methods(text)
-
-
-def test_suitesparse_qr_agrees_where_it_is_installed_and_names_its_extra_where_not():
-    A, system = problem(20, 10, 11)
-    try:
-        import sparseqr  # noqa: F401
-    except ImportError:
-        with pytest.raises(InputError, match=r"scanchain\[suitesparse\]"):
-            create_solver("spqr")
-        return
-    for method in ("spqr", "spqr_colamd"):
-        assert np.allclose(create_solver(method).solve(system), np.linalg.lstsq(A, system.b, rcond=None)[0])
+    with pytest.raises(InputError, match="no method"):
+        parse_methods("")

@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 )
 @click.option(
     "--optimizer",
-    type=click.Choice(["levenberg-marquardt", "gauss-newton", "dogleg", "gradient-descent"]),
+    type=click.Choice(["levenberg-marquardt", "gauss-newton", "gradient-descent"]),
     default="levenberg-marquardt",
     show_default=True,
     help="Optimizer for a nonlinear file.",
@@ -78,16 +78,15 @@ def landmarks(
     DATA is an npz file with a linear problem or with bearing and range measurements, or a folder of the UTIAS
     MRCLAM data sets, of which the log of one robot is used. Estimates, pictures and report.html go to DIR.
 
-    Methods: default, pinv (below 3,000 unknowns), lu, lu_colamd, qr, qr_colamd, cholesky, schur, or all of them;
-    with the package sparseqr also spqr and spqr_colamd. The log of a robot is always estimated by schur; the
-    others are compared on its linear system.
+    Methods: default, pinv (below 3,000 unknowns), lu, lu_colamd, qr, qr_colamd, cholesky, schur, or all of them.
+    The log of a robot is always estimated by schur; the others are compared on its linear system.
 
     \b
     Examples:
       scanchain landmarks 2d_linear.npz --out runs/linear
       scanchain landmarks 2d_linear.npz 2d_linear_loop.npz --methods all --out runs/solvers
       scanchain landmarks 2d_nonlinear.npz --guess origin --methods cholesky,schur --out runs/nonlinear
-      scanchain landmarks 2d_nonlinear.npz --optimizer dogleg --out runs/dogleg --recording dogleg.rrd
+      scanchain landmarks 2d_nonlinear.npz --optimizer gauss-newton --out runs/gn --recording gn.rrd
       scanchain landmarks MRCLAM_Dataset6 --robot 1 --out runs/mrclam --json
     """
     from msgspec.structs import replace

@@ -39,7 +39,7 @@ _HALF = 0.5  # robust weight below which an edge is contradicted by the rest, re
     "--optimizer",
     "graph.optimizer",
     metavar="NAME",
-    help="levenberg-marquardt, gauss-newton, dogleg or gradient-descent; short for --graph.optimizer.",
+    help="levenberg-marquardt, gauss-newton or gradient-descent; short for --graph.optimizer.",
 )
 @click.option(
     "--initialize",
@@ -94,7 +94,7 @@ def optimize(
       scanchain optimize sphere2500.g2o --out optimized.g2o
       scanchain optimize sphere2500.g2o --png sphere.png --json
       scanchain optimize candidates.g2o --robust truncated --out robust.g2o --marginals all
-      scanchain optimize manhattan.g2o --initialize spanning-tree --optimizer dogleg --graph.max_iterations 100
+      scanchain optimize manhattan.g2o --initialize spanning-tree --optimizer gauss-newton
     """
     from scanchain.graph.g2o import GRAPH_SUFFIXES, rejected_path
     from scanchain.graph.optimization import GraphChange
@@ -235,9 +235,8 @@ class _Report:
     @property
     def warnings(self) -> list[str]:
         """Warnings to read before the rest."""
-        notes = [self.file.note] if self.file.note else []
         after, graph = self.change.after, self.file.graph
-        notes += [f"odometry {line}; so are its edges in --out" for line in graph.corrections(self.file.ids)]
+        notes = [f"odometry {line}; so are its edges in --out" for line in graph.corrections(self.file.ids)]
         ratio = after.chi2 / max(after.degrees_of_freedom, 1)
         if not graph.is_loop.any() and after.degrees_of_freedom and ratio > _POOR_FIT:
             notes.append(

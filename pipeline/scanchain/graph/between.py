@@ -60,9 +60,6 @@ class Position:
         return jacobian
 
 
-FACTORS = {"between": Between(), "position": Position()}
-
-
 @dataclass(frozen=True, slots=True)
 class NormalEquations:
     """H = Σ w JᵀΩJ as block values of the problem's pattern, and g = Σ w JᵀΩe; the step solves H ξ = −g."""
@@ -109,8 +106,8 @@ class BetweenProblem:
         d = measurements.shape[-1] - 1
         is_seen = self.is_point[edges].any(axis=1) | ~information[:, d:].any(axis=(1, 2))
         self.sightings = np.flatnonzero(is_seen)
-        kinds = {"between": np.flatnonzero(~is_seen), "position": self.sightings}
-        self._factors = [(FACTORS[kind], of) for kind, of in kinds.items() if len(of)]
+        factors = (Between(), np.flatnonzero(~is_seen)), (Position(), self.sightings)
+        self._factors = [(factor, of) for factor, of in factors if len(of)]
         sizes = np.where(self.is_point[self.free], 2, self.freedom)
         self.pattern = BlockPattern(sizes, np.stack(np.divmod(unique, count), axis=1))
         self.packing = Packing(self.pattern, self.freedom, at_end=False)

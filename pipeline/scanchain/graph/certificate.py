@@ -214,7 +214,8 @@ def minorize(problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64
     kappa[~(kappa > 0.0) | (theta >= _FARTHEST)] = np.nan
     seen = problem.sightings  # of points: quadratic in the position of the point, and nothing else
     left[seen], kappa[seen] = np.linalg.eigvalsh(information[seen, :d, :d])[:, 0], 0.0
-    return Minorants(poses[j, :d, d] - poses[i, :d, d], force, _cross_matrix(torque), left, kappa)
+    crossed = lie.hat(torque) if d == 3 else torque[:, :, None] * np.array([[0.0, -1.0], [1.0, 0.0]])
+    return Minorants(poses[j, :d, d] - poses[i, :d, d], force, crossed, left, kappa)
 
 
 def _isotropic(information: Matrix, d: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -227,10 +228,3 @@ def _isotropic(information: Matrix, d: int) -> tuple[NDArray[np.float64], NDArra
     share = np.asarray(np.clip(least, 1e-12, 1.0) * (1.0 - _ROUNDING), np.float64)
     tau, kappa = (np.asarray(np.maximum(each, _TINY), np.float64) for each in (tau, kappa))
     return share * tau, share * kappa
-
-
-def _cross_matrix(torque: Matrix) -> Matrix:
-    """[g]× (E, d, d) of torques (E, 1 or 3)."""
-    if torque.shape[1] == 3:
-        return lie.hat(torque)
-    return torque[:, :, None] * np.array([[0.0, -1.0], [1.0, 0.0]])

@@ -40,13 +40,8 @@ class BlockPattern:
         self.starts = np.cumsum(sizes) - sizes
         self.scalars = int(sizes.sum())
         self.value_count = int((sizes[self.rows] * sizes[self.columns]).sum())
-        self.diagonal = self._diagonal()
-
-    def _diagonal(self) -> NDArray[np.int64]:
-        """Index among the values of every scalar's diagonal entry, (scalars,)."""
-        squares = np.cumsum(self.sizes**2) - self.sizes**2
-        within = np.arange(self.scalars) - np.repeat(self.starts, self.sizes)
-        return np.repeat(squares, self.sizes) + within * (np.repeat(self.sizes, self.sizes) + 1)
+        squares, within = np.cumsum(sizes**2) - sizes**2, np.arange(self.scalars) - np.repeat(self.starts, sizes)
+        self.diagonal = np.repeat(squares, sizes) + within * (np.repeat(sizes, sizes) + 1)  # (scalars,) of values
 
     def multiply(self, values: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
         """The product of the symmetric matrix of these values with a vector (scalars,)."""
@@ -107,11 +102,12 @@ class Analysis:
     rows: NDArray[np.int64]
 
 
-def analyze(pattern: BlockPattern) -> Analysis:
-    """Fill-reducing order of the variables, and the fill-in of the factor; the same for blocks of any size."""
+def analyze(pattern: BlockPattern, order: NDArray[np.int64] | None = None) -> Analysis:
+    """Fill-in of the factor, the same for blocks of any size; without an order (n,) in a fill-reducing one."""
     start, neighbors = _adjacency(pattern)
-    order = _fill_reducing_order(start, neighbors)
-    order = order[symbolic.postorder(symbolic.elimination_tree(start, neighbors, order))]
+    if order is None:
+        order = _fill_reducing_order(start, neighbors)
+        order = order[symbolic.postorder(symbolic.elimination_tree(start, neighbors, order))]
     parent = symbolic.elimination_tree(start, neighbors, order)
     return Analysis(order, parent, *symbolic.column_structures(start, neighbors, order, parent))
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from pathlib import Path
 
 import numpy as np
@@ -106,9 +104,6 @@ def write_covariances(path: Path, ids: NDArray[np.int64], covariances: Matrix) -
     names = _NAMES[covariances.shape[-1]]
     upper = np.triu_indices(len(names))
     header = ["id", *(f"{names[a]}_{names[b]}" for a, b in zip(*upper, strict=True))]
-    file = io.StringIO(newline="")
-    writer = csv.writer(file)
-    writer.writerow(header)
-    for name, row in zip(ids.tolist(), covariances[:, upper[0], upper[1]].tolist(), strict=True):
-        writer.writerow([name, *row])
-    write_whole(path, file.getvalue().encode())
+    rows = zip(ids.tolist(), covariances[:, *upper].tolist(), strict=True)
+    lines = [header, *([str(name), *map(repr, row)] for name, row in rows)]
+    write_whole(path, "".join(f"{','.join(line)}\r\n" for line in lines).encode())

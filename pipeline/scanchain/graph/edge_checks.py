@@ -38,35 +38,20 @@ def free_poses(
 
     ranks (E,) are those of the information matrices. Where edges of full rank, weak along no axis, join every pose
     to a fixed one, nothing is free. Else those that move in the null space of H, without the axes along which an
-    edge says next to nothing.
+    edge says next to nothing: every pivot of H that vanishes gets a prior, and with H' = H + Σ h e eᵀ over these,
+    the null space is spanned by the columns of H'⁻¹ e, each of which moves one of these scalars alone.
     """
-    fixed, kept, shares = problem.variable < 0, weights > 0.0, _shares(problem.information)
+    pattern, kept, shares = problem.pattern, weights > 0.0, _shares(problem.information)
     is_strong = kept & (ranks == problem.freedom) & (shares.min(axis=1) > _WEAK)
-    if is_connected(problem.edges[is_strong], fixed):
+    if is_connected(problem.edges[is_strong], problem.variable < 0):
         return names[:0]
-    apart = loose(problem.edges[kept & (ranks > 0)], fixed)
     measured = np.where(shares > _LOST, np.sqrt(weights * kept)[:, None], 0.0)
-    information = measured[:, :, None] * problem.information * measured[:, None, :]
-    null = _null_space(problem, poses, information, problem.variable[apart])
-    is_free = np.isin(np.arange(len(poses)), apart)
-    is_free[problem.free] |= (np.abs(null) > _MOVES).any(axis=(1, 2))
-    return names[is_free]
-
-
-def _null_space(problem: BetweenProblem, poses: Matrix, information: Matrix, apart: NDArray[np.int64]) -> Matrix:
-    """Own-frame twists (n, k, m), at most 1, of all variables that change no edge; those ``apart`` are fixed.
-
-    Every pivot of H that vanishes gets a prior: with H' = H + Σ h e eᵀ over these, the null space of H is spanned
-    by the columns of H'⁻¹ e, each of which moves one of these scalars alone.
-    """
-    pattern = problem.pattern
-    values = own_equations(problem, poses, information)
+    values = own_equations(problem, poses, measured[:, :, None] * problem.information * measured[:, None, :])
     diagonal = values[pattern.diagonal]
     largest = diagonal.max(initial=0.0)
     diagonal[diagonal <= _NOTHING * largest] = 0.0
     prior = np.where(diagonal > 0.0, diagonal, max(largest, 1.0))
-    held = np.where(np.repeat(np.isin(np.arange(len(problem.free)), apart), pattern.sizes), prior, 0.0)
-    vanished = list[int]()
+    held, vanished = np.zeros(pattern.scalars), list[int]()
     while len(vanished) <= _MOST:
         values[pattern.diagonal] = diagonal + held
         try:
@@ -78,8 +63,8 @@ def _null_space(problem: BetweenProblem, poses: Matrix, information: Matrix, apa
         held[which] = prior[which]
     ends = np.zeros((pattern.scalars, len(vanished)))
     ends[vanished, np.arange(len(vanished))] = 1.0
-    null = problem.packing.spread_rows(problem.cholesky.solve(ends))
-    return null / np.abs(null).max(axis=(0, 1), initial=0.0)
+    null = np.abs(problem.packing.spread_rows(problem.cholesky.solve(ends)))
+    return names[problem.free[(null > _MOVES * null.max(axis=(0, 1), initial=0.0)).any(axis=(1, 2))]]
 
 
 def weakly_joined(edges: NDArray[np.int64], information: Matrix, fixed: NDArray[np.bool_]) -> NDArray[np.int64]:

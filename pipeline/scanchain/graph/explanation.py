@@ -29,7 +29,7 @@ from scanchain.graph.odometry_errors import (
     prior,
     spread,
 )
-from scanchain.graph.optimization import solve
+from scanchain.graph.optimization import Since, solve
 
 _LARGE = 2000  # edges of odometry from which on groups of loop edges are judged once, under the last explanation
 _FEWEST = 2  # least number of loop edges left out, none near another, that are to be explained
@@ -71,26 +71,34 @@ class Explainer:
     config: GraphConfig
     jumps: bool
 
-    def solve(self, explanation: Explanation, poses: Matrix, initialize: Initialization) -> Explained:
-        """The minimum, from these poses and this explanation."""
-        best = first = self._solved(explanation, poses, initialize, groups=True)
+    def solve(
+        self, explanation: Explanation, poses: Matrix, initialize: Initialization, since: Since | None
+    ) -> Explained:
+        """The minimum, from these poses and this explanation.
+
+        since : for an update, which under the truncated loss leaves the explanation as it is; else None
+        """
+        if since is not None and self.config.robust == "truncated":
+            return self._solved(explanation, poses, initialize, since=since)
+        best = first = self._solved(explanation, poses, initialize)
         explains = not len(best.problem.sightings)
         for _ in range(_MAX_STEPS):
-            better = next(self._better(best), None) if explains and best.minimum.price else None
-            if better is None:
+            better = self._better(best) if explains and best.minimum.price else best
+            if better is best:
                 break
             best = better
         if best is not first and self._is_large:
-            best = self._solved(best.explanation, best.minimum.estimate.poses, "given", groups=True)
+            best = self._solved(best.explanation, best.minimum.estimate.poses, "given")
         return best
 
-    def _better(self, best: Explained) -> Iterator[Explained]:
-        """Explanations under which the cost is lower, those that promise most first."""
+    def _better(self, best: Explained) -> Explained:
+        """The same under the most promising explanation that lowers the cost; itself where none does."""
         price, poses = best.minimum.price, best.minimum.estimate.poses
         for explanation in self._candidates(best):
             trial = self._solved(explanation, poses, "given", groups=not self._is_large)
             if self._cost(trial, price) < self._cost(best, price) - _SETTLED * price:
-                yield trial
+                return trial
+        return best
 
     def _candidates(self, best: Explained) -> list[Explanation]:
         """Explanations that may lower the cost, those that promise most first."""
@@ -115,10 +123,16 @@ class Explainer:
         return [explanation for gain, explanation in found if gain > _SETTLED * price]
 
     def _solved(
-        self, explanation: Explanation, poses: Matrix, initialize: Initialization, *, groups: bool
+        self,
+        explanation: Explanation,
+        poses: Matrix,
+        initialize: Initialization,
+        *,
+        since: Since | None = None,
+        groups: bool = True,
     ) -> Explained:
         problem = self.problem_of(explanation)
-        minimum = solve(problem, poses, self.is_loop, self.config, initialize, groups=groups)
+        minimum = solve(problem, poses, self.is_loop, self.config, initialize, since, groups=groups)
         return Explained(problem, minimum, explanation)
 
     def _cost(self, explained: Explained, price: float) -> float:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections import Counter
 from collections.abc import Iterable
@@ -28,8 +27,6 @@ ROTATION_COMMENT: dict[Rotation, str] = {
     "vector": "# information of EDGE_SE3:QUAT is of (translation, rotation vector in radians)",
     "quaternion": "# information of EDGE_SE3:QUAT is of (translation, vector part of unit quaternion), as g2o",
 }
-_LARGEST_ID = 2**63 - 1  # int64
-_WHOLE_TURN = 2.0 * np.pi + 1e-3  # rad, above which an angle is a turn too many, or degrees
 
 
 class Tag(NamedTuple):
@@ -123,13 +120,12 @@ class Lines:
     vertices, edges : their lines; fixed : line and vertex id (n, 2) of every pose that is held
     others : lines of other tags
     rotation : of which the information is, by the comment that ``write_g2o`` writes
-    turns : line and size of angles beyond a turn, which may be degrees
     """
 
     def __init__(self, path: Path) -> None:
         self.path, self.dimension = path, 0
         self.rotation: Rotation = "vector"
-        self.others, self.turns = list[str](), list[tuple[int, float]]()
+        self.others = list[str]()
         comments: dict[str, Rotation] = {comment: name for name, comment in ROTATION_COMMENT.items()}
         fixed, rows = list[tuple[int, int]](), list[tuple[int, Tag, list[int], list[float]]]()
         for number, line in enumerate(self._text().splitlines(), start=1):
@@ -181,17 +177,6 @@ class Lines:
         result[:, :3, :3] = lie.from_quaternion(numbers[:, 3:7])
         return result
 
-    @property
-    def note(self) -> str:
-        """That angles lie beyond a whole turn, by the largest; empty where none does."""
-        if not self.turns:
-            return ""
-        line, largest = max(self.turns, key=lambda turn: turn[1])
-        return (
-            f"{counted(len(self.turns), 'line has', 'lines have')} an angle beyond a whole turn, up to "
-            f"{largest:.6g} in line {line}; degrees? they are taken as radians"
-        )
-
     def _text(self) -> str:
         try:
             return self.path.read_text(encoding="utf-8")
@@ -215,44 +200,30 @@ class Lines:
             numbers = list(map(float, words[1 + tag.ids :]))
         except ValueError as error:
             raise self.error(line, f"{name}: {error}") from error
-        if not all(map(math.isfinite, numbers)):
-            raise self.error(line, f"{name} has a value that is not finite; remove or mend the line")
-        largest = max(numbers, key=abs)
-        if abs(largest) > LARGEST:
-            raise self.error(
-                line,
-                f"{' '.join([name, *map(str, ids)])} has the value {largest:g}, over {LARGEST:g}; "
-                "write meters and radians, and an inverse covariance of these",
-            )
+        if not all(abs(number) <= LARGEST for number in numbers):
+            edge = " ".join(words[: 1 + tag.ids])
+            fault = f"{edge} has a value that is not finite or over {LARGEST:g}"
+            raise self.error(line, f"{fault}; write meters and radians, and an inverse covariance of these")
         return ids, numbers
 
     def _vertex_id(self, line: int, tag: str, word: str) -> int:
         try:
-            value = int(word)
-        except ValueError:
-            text = f"{tag}: vertex id {shown(word)} is not a whole number; write 0, 1, 2, ..."
+            return int(np.int64(word))
+        except (ValueError, OverflowError):
+            text = f"{tag}: vertex id {shown(word)} is no whole number of 64 bits; write 0, 1, 2, ..."
             raise self.error(line, text) from None
-        if abs(value) > _LARGEST_ID:
-            raise self.error(line, f"{tag}: vertex id {shown(word)} is too large; the limit is {_LARGEST_ID}")
-        return value
 
     def _whole(self, rows: list[tuple[int, Tag, list[int], list[float]]], ids: int) -> Rows:
-        """Vertices or edges as whole lines; angles beyond a turn are added to ``turns``."""
+        """Vertices or edges as whole lines."""
         numbers = np.zeros((len(rows), _WIDTHS.get((self.dimension, ids), 0)))
         for tag in {row[1] for row in rows}:
             of_tag = [place for place, row in enumerate(rows) if row[1] is tag]
             numbers[np.ix_(of_tag, tag.columns)] = [rows[place][3] for place in of_tag]
         lines = np.array([line for line, *_ in rows], np.int64)
         is_point = np.array([tag.is_point for _, tag, *_ in rows], np.bool_)
-        if self.dimension == 2:
-            angles, has_angles = numbers[:, 2:3], ~is_point
-        else:
-            angles, has_angles = numbers[:, 3:6], np.array([tag.is_toro for _, tag, *_ in rows], np.bool_)
-        largest = np.abs(angles).max(axis=1, initial=0.0) * has_angles
-        beyond = largest > _WHOLE_TURN
-        self.turns += zip(lines[beyond].tolist(), largest[beyond].tolist(), strict=True)
-        if self.dimension == 3 and has_angles.any():  # Rz(yaw) Ry(pitch) Rx(roll)
-            numbers[has_angles, 3:7] = Turn.from_euler("ZYX", angles[has_angles, ::-1]).as_quat()
+        is_toro = np.array([tag.is_toro for _, tag, *_ in rows], np.bool_)
+        if self.dimension == 3 and is_toro.any():  # Rz(yaw) Ry(pitch) Rx(roll)
+            numbers[is_toro, 3:7] = Turn.from_euler("ZYX", numbers[is_toro, 5:2:-1]).as_quat()
         return Rows(lines, np.array([row[2] for row in rows], np.int64).reshape(-1, ids), numbers, is_point)
 
 
@@ -359,7 +330,6 @@ class G2oFile:
     other_lines : lines about neither poses nor edges, retained to be written again
     has_guess : whether the file holds vertices; else the graph's poses follow its odometry
     projection : of the indefinite information matrices; None without any
-    note : warning that angles may be degrees; empty where they are radians
     """
 
     __repr__ = brief
@@ -368,7 +338,6 @@ class G2oFile:
     other_lines: tuple[str, ...]
     has_guess: bool
     projection: Projection | None
-    note: str = ""
 
     @property
     def other_tags(self) -> tuple[tuple[str, int], ...]:
@@ -424,9 +393,7 @@ def read_g2o(
     graph.add_edges(pairs, measurements, information, is_robust)
     for index in fixed.tolist():
         graph.fix(index)
-    if lines.note:
-        warnings.warn(f"{path}: {lines.note}", stacklevel=2)
-    return G2oFile(graph, ids, tuple(lines.others), has_guess, projection, lines.note)
+    return G2oFile(graph, ids, tuple(lines.others), has_guess, projection)
 
 
 def _project(lines: Lines, information: Matrix, indefinite: Indefinite) -> Projection | None:

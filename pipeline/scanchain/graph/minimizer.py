@@ -1,4 +1,4 @@
-"""Minimizers by name: Levenberg-Marquardt, Gauss-Newton, dogleg, gradient descent."""
+"""Minimizers by name: Levenberg-Marquardt, Gauss-Newton, gradient descent."""
 
 from __future__ import annotations
 
@@ -93,8 +93,8 @@ class Minimizer:
             return self.evaluate(self.problem.moved(start.poses, step), loss)
 
         descent = descend(partial(self._model, loss), moved, now, self._rule, *(limits or self.limits))
-        weights = self.weights(descent.end.chi2, loss)
-        return Minimum(descent.end, weights, descent.iterations, descent.converged, descent.reason)
+        weights = self.weights(descent.estimate.chi2, loss)
+        return Minimum(descent.estimate, weights, descent.iterations, descent.converged, descent.reason)
 
     def _model(self, loss: Loss, now: Evaluation) -> LocalModel:
         """The model with H = Σ w JᵀΩJ."""
@@ -117,14 +117,14 @@ class Minimizer:
         return float(chi2.sum() - loops.sum() + loss.loss(loops).sum())
 
 
-Optimizer = Literal["gauss-newton", "levenberg-marquardt", "dogleg", "gradient-descent"]
+Optimizer = Literal["gauss-newton", "levenberg-marquardt", "gradient-descent"]
 Vector = NDArray[np.float64]
 
 _MOST_DAMPING = 1e12
 _LEAST_DAMPING = 1e-15
 _FIRST_DAMPING = 1e-12  # first damping, all but Gauss-Newton: weak modes of a long chain have 1e-9 of diag H
 _GROWTH = 8.0  # of the damping after a step that fails, four times as fast after each further one
-_SHORTEST = 1e-12  # share of the first trust region, or of the best length, at which no step is worth trying
+_SHORTEST = 1e-12  # share of the best length at which no step is worth trying
 
 
 class Estimate(Protocol):
@@ -193,43 +193,14 @@ class Damped:
         return None
 
 
-class Dogleg:
-    """Along the steepest descent and then toward the Gauss-Newton step, within a trust region (Powell 1970).
-
-    Lengths are measured with diag H, so that meters and radians compare.
-    """
-
-    def __init__(self) -> None:
-        self._radius = 0.0
-
-    def move(self, now: E, model: LocalModel, moved: Callable[[Vector], E]) -> tuple[Vector, E] | None:
-        """Shrink the region until the cost falls; radius by Madsen et al. (2004), algorithm 3.21."""
-        scale = np.sqrt(model.diagonal)
-        newton, cauchy = model.solve(0.0), steepest_descent(model)
-        first = float(np.linalg.norm(scale * newton))
-        self._radius = self._radius or first
-        while self._radius > _SHORTEST * first:
-            step = _within(newton, cauchy, scale, self._radius)
-            to = moved(step)
-            foreseen = float(-(step * (2.0 * model.gradient + model.bend(step))).sum())
-            gain = (now.cost - to.cost) / max(foreseen, 1e-300)
-            length = float(np.linalg.norm(scale * step))
-            if gain > 0.75:
-                self._radius = max(self._radius, 3.0 * length)
-            elif not gain > 0.25:
-                self._radius = 0.5 * min(self._radius, length)
-            if to.cost <= now.cost:
-                return step, to
-        self._radius = 0.0
-        return None
-
-
 class GradientDescent:
-    """Steepest descent in the measure of diag H, to the lowest point of the model, halved until it helps."""
+    """Steepest descent in the measure of D = diag H, to the lowest point of the model, halved until it helps."""
 
     def move(self, now: E, model: LocalModel, moved: Callable[[Vector], E]) -> tuple[Vector, E] | None:
         """Go down the gradient."""
-        step, share = steepest_descent(model), 1.0
+        direction, share = -model.gradient / np.maximum(model.diagonal, 1e-300), 1.0
+        bent = float(direction @ model.bend(direction))
+        step = direction * (-float(direction @ model.gradient) / max(bent, 1e-300))
         while share > _SHORTEST:
             to = moved(share * step)
             if to.cost <= now.cost:
@@ -238,42 +209,21 @@ class GradientDescent:
         return None
 
 
-StepRule = GaussNewton | Damped | Dogleg | GradientDescent
+StepRule = GaussNewton | Damped | GradientDescent
 
 
 def step_rule(optimizer: Optimizer, first_damping: float = _FIRST_DAMPING) -> StepRule:
     """The rule by its name."""
-    if optimizer == "gauss-newton":
-        return GaussNewton()
     if optimizer == "levenberg-marquardt":
         return Damped(first_damping)
-    return Dogleg() if optimizer == "dogleg" else GradientDescent()
-
-
-def steepest_descent(model: LocalModel) -> Vector:
-    """The lowest point of the quadratic model along −D⁻¹g, D = diag H."""
-    direction = -model.gradient / np.maximum(model.diagonal, 1e-300)
-    bent = float(direction @ model.bend(direction))
-    return direction * (-float(direction @ model.gradient) / max(bent, 1e-300))
-
-
-def _within(newton: Vector, cauchy: Vector, scale: Vector, radius: float) -> Vector:
-    """The point of the path 0 → cauchy → newton at which it leaves the region, or its end."""
-    if np.linalg.norm(scale * newton) <= radius:
-        return newton
-    length = float(np.linalg.norm(scale * cauchy))
-    if length >= radius:
-        return cauchy * (radius / length)
-    a, b = scale * cauchy, scale * (newton - cauchy)
-    ab, bb = float(a @ b), float(b @ b)
-    return cauchy + (newton - cauchy) * ((-ab + np.sqrt(ab * ab + bb * (radius**2 - length**2))) / bb)
+    return GaussNewton() if optimizer == "gauss-newton" else GradientDescent()
 
 
 @dataclass(frozen=True, slots=True)
 class Descent(Generic[E]):
     """End of a minimization: estimate, number of steps and reason."""
 
-    end: E
+    estimate: E
     iterations: int
     converged: bool
     reason: str

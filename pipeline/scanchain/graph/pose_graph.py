@@ -29,7 +29,7 @@ from scanchain.graph.explanation import Explainer
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.initialize import Initialization
 from scanchain.graph.odometry_errors import Explanation, Loosened, corrected, odometry_of
-from scanchain.graph.optimization import Optimization, Rejection, Since, solve
+from scanchain.graph.optimization import Optimization, Rejection, Since
 
 
 class PoseGraph:
@@ -58,7 +58,6 @@ class PoseGraph:
         self._explanation = Explanation.none(k)
         self._problem: BetweenProblem | None = None
         self._factor_is_now = False
-        self._is_end = False  # of a longer graph, in whose odometry jumps are looked for, and no drift
 
     def __len__(self) -> int:
         return len(self._poses)
@@ -224,15 +223,6 @@ class PoseGraph:
             column.replace(column.rows[~is_removed])
         self.since = Since(0, 0)
 
-    def add_sightings(self, edges: NDArray[np.int64], positions: NDArray[np.float64], information: Matrix) -> None:
-        """Add points as observed from poses: edges (E, 2) pose and point, positions (E, 2) there, Ω (E, 2, 2)."""
-        edges = checks.indices(edges, "edges")
-        measurements = np.tile(lie.identity(2), (len(edges), 1, 1))
-        measurements[:, :2, 2] = checks.matrices(positions, "positions", (len(edges), 2))
-        padded = np.zeros((len(edges), 3, 3))
-        padded[:, :2, :2] = checks.matrices(information, "information", (len(edges), 2, 2))
-        self.add_edges(edges, measurements, padded, np.zeros(len(edges), np.bool_))
-
     def predicted(self, T_ij: Pose) -> Pose:
         """A motion by odometry, corrected by ``drift``."""
         return corrected(T_ij, self._explanation.drift)
@@ -275,23 +265,20 @@ class PoseGraph:
         begin = working_s()
         problem = self._prepared()
         chi2_before = self._in_force(problem.chi2(problem.errors(self.poses)))
+        arrays = self._measurements.rows, self._information.rows, self.is_loop
+        explainer = Explainer(self._problem_of, *arrays, config, jumps=False)
+        since = self.since if rejection == "update" else None
         try:
-            if rejection == "update" and config.robust == "truncated":
-                minimum = solve(problem, self.poses, self.is_loop, config, initialize, self.since)
-            else:
-                arrays = self._measurements.rows, self._information.rows, self.is_loop
-                explainer = Explainer(self._problem_of, *arrays, config, self._is_end)
-                explained = explainer.solve(self._explanation, self.poses, initialize)
-                problem, minimum = explained.problem, explained.minimum
-                self._problem, self._explanation = problem, explained.explanation
+            explained = explainer.solve(self._explanation, self.poses, initialize, since)
         except SingularMatrixError as error:
-            raise self._singular(error) from error
+            raise self._singular(error, self.fixed) from error
+        self._problem, self._explanation, minimum = explained.problem, explained.explanation, explained.minimum
         self._poses.replace(minimum.estimate.poses)
         self._weight.replace(minimum.weights)
         self._factor_is_now = False
         edges = len(self.edges)
         self.since = Since(self.since.judged if rejection == "update" else edges, edges)
-        self.work = problem.cholesky.work * minimum.iterations
+        self.work = explained.problem.cholesky.work * minimum.iterations
         return Optimization(
             state=self.state(),
             chi2_before=chi2_before,
@@ -310,19 +297,24 @@ class PoseGraph:
         rejection : as in ``optimize``; what is judged is also explained by jumps of odometry there
         """
         chosen = np.flatnonzero((self.edges >= first).any(axis=1))
-        is_loop, before = self.is_loop[chosen], int((~self.is_loop).sum())
+        edges, is_loop, before = self.edges[chosen], self.is_loop[chosen], int((~self.is_loop).sum())
         measured, information = (each[chosen - chosen[0]] for each in self.added_since(int(chosen[0])))
-        end = PoseGraph(self.dimension, self._names)
-        for column in ("_poses", "_stamps_ns", "_is_point"):
-            getattr(end, column).extend(getattr(self, column).rows)
-        end._fixed = set(np.flatnonzero((np.arange(len(self)) < first) | self.fixed).tolist())
-        end._add_edges(self.edges[chosen], measured, information, is_loop)
-        end._is_end = True
-        end.optimize(config, initialize="given", rejection=rejection)
-        self._explanation = self._explanation.with_later(end._explanation, before - int((~is_loop).sum()))
+        fixed = (np.arange(len(self)) < first) | self.fixed
+
+        def problem_of(explanation: Explanation) -> BetweenProblem:
+            applied = explanation.applied(edges, measured, information, is_loop)
+            return BetweenProblem(edges, *applied, fixed, self.is_point)
+
+        explainer = Explainer(problem_of, measured, information, is_loop, config, jumps=True)
+        since = Since(0, 0) if rejection == "update" else None
+        try:
+            end = explainer.solve(Explanation.none(self.freedom), self.poses, "given", since)
+        except SingularMatrixError as error:
+            raise self._singular(error, fixed) from error
+        self._explanation = self._explanation.with_later(end.explanation, before - int((~is_loop).sum()))
         weight = self.weight.copy()
-        weight[chosen] = end.weight
-        self._poses.replace(end.poses)
+        weight[chosen] = end.minimum.weights
+        self._poses.replace(end.minimum.estimate.poses)
         self._weight.replace(weight)
         self._changed()
 
@@ -405,7 +397,7 @@ class PoseGraph:
             information = self._weight_in_force[:, None, None] * self.information
             problem.cholesky.factorize(own_equations(problem, self.poses, information))
         except SingularMatrixError as error:
-            raise self._singular(error) from error
+            raise self._singular(error, self.fixed) from error
         result = np.zeros((len(self), self.freedom, self.freedom))
         result[problem.free] = inverse_blocks(problem)[: len(problem.free)]
         return result
@@ -433,7 +425,7 @@ class PoseGraph:
             try:
                 problem.cholesky.factorize(equations.values)
             except SingularMatrixError as error:
-                raise self._singular(error) from error
+                raise self._singular(error, self.fixed) from error
             self._factor_is_now = True
         return problem
 
@@ -460,9 +452,9 @@ class PoseGraph:
         free = self.free_poses()
         return free_text(free) if len(free) else ""
 
-    def _singular(self, error: SingularMatrixError) -> InputError:
+    def _singular(self, error: SingularMatrixError, fixed: NDArray[np.bool_]) -> InputError:
         """The error for poses that their edges leave free, or as good as free."""
-        variable = self._prepared().free[[error.variable]]
+        variable = np.flatnonzero(~fixed)[[error.variable]]
         return _refused(self._undetermined() or free_text(self.names[variable]))
 
     @property

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from scanchain.data import Matrix
 from scanchain.graph.cholesky import SingularMatrixError
 from scanchain.graph.losses import RobustLoss
-from scanchain.graph.minimizer import LocalModel, descend, step_rule
+from scanchain.graph.minimizer import Descent, LocalModel, Optimizer, descend, step_rule
 from scanchain.landmarks.problem import (
     BearingRangeProblem,
     LandmarkData,
@@ -74,7 +73,7 @@ def growing(measurements: Measurements, solver: LinearSolver) -> Values:
         guess[settled] = landmarks[known[settled]]
         state = minimize(
             BearingRangeProblem(part), Values(poses, guess, own), solver, loss=_CONVEX, max_iterations=_STEPS
-        ).state
+        ).estimate.state
         poses, landmarks[known], own = state.poses, state.landmarks, state.calibration
         if reach == count:
             return Values(poses, landmarks, own)
@@ -116,9 +115,6 @@ def chain(start: NDArray[np.float64], motion: Matrix) -> Matrix:
     return poses
 
 
-Optimizer = Literal["gauss-newton", "levenberg-marquardt", "dogleg", "gradient-descent"]
-
-
 _FREEDOM = 4.0
 _SCALE2 = _FREEDOM + 2.0  # the weight (ν + 2) / (ν + χ²) is, but for a factor that σ takes up, s² / (s² + χ²)
 
@@ -148,24 +144,19 @@ QUADRATIC = RobustLoss("none", 1.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Minimum:
-    """End of a minimization.
+class Evaluation:
+    """A state with residuals and A there, and the robust weights (N,) of the observations.
 
-    Attributes
-    ----------
-    state : the estimate; at : residuals and A there
-    weights : (N,) robust weight of every observation
-    cost : Σ r² of priors and odometry plus Σ ρ(χ²) of the observations
-    iterations : steps; converged, reason : whether and why it stopped
+    ``cost`` is Σ r² of priors and odometry plus Σ ρ(χ²) of the observations.
     """
 
     state: Values
     at: Linearization
     weights: NDArray[np.float64]
     cost: float
-    iterations: int
-    converged: bool
-    reason: str
+
+
+Minimum = Descent[Evaluation]
 
 
 def minimize(
@@ -184,30 +175,24 @@ def minimize(
     It ends as ``descend`` does. The first damping is for a guess that may be poor; near the minimum 1e-10
     serves better, since a long chain's weakest modes have 1e-9 of diag(AᵀA).
     """
-    start = problem.linearize(guess)
-    here = Evaluation(guess, start, _cost(start, loss))
 
-    def moved(now: Evaluation, step: NDArray[np.float64]) -> Evaluation:
-        state = now.state.moved(step)
+    def evaluate(state: Values) -> Evaluation:
         at = problem.linearize(state)
-        return Evaluation(state, at, _cost(at, loss))
+        quadratic = sum(float(np.square(r).sum()) for r in (at.prior, at.calibration, at.odometry))
+        chi2 = np.square(at.observations).sum(axis=1)
+        return Evaluation(state, at, loss.weight(chi2), quadratic + float(loss.loss(chi2).sum()))
 
     def model_at(now: Evaluation) -> LocalModel:
-        return _model(problem, solver, problem.system(now.at, loss.weight(now.at.observation_chi2)))
+        return _model(problem, solver, problem.system(now.at, now.weights))
 
-    descent = descend(model_at, moved, here, step_rule(optimizer, first_damping), max_iterations, tolerance)
-    end = descent.end
-    weights = loss.weight(end.at.observation_chi2)
-    return Minimum(end.state, end.at, weights, end.cost, descent.iterations, descent.converged, descent.reason)
-
-
-@dataclass(frozen=True, slots=True)
-class Evaluation:
-    """A state with its residuals and the cost of them."""
-
-    state: Values
-    at: Linearization
-    cost: float
+    return descend(
+        model_at,
+        lambda now, step: evaluate(now.state.moved(step)),
+        evaluate(guess),
+        step_rule(optimizer, first_damping),
+        max_iterations,
+        tolerance,
+    )
 
 
 def _model(problem: BearingRangeProblem, solver: LinearSolver, system: LinearSystem) -> LocalModel:
@@ -226,8 +211,3 @@ def _model(problem: BearingRangeProblem, solver: LinearSolver, system: LinearSys
             raise SingularMatrixError(column, column) from error
 
     return LocalModel(-(A.T @ system.b), diagonal, solve, lambda step: A.T @ (A @ step))
-
-
-def _cost(at: Linearization, loss: Loss) -> float:
-    quadratic = sum(float(np.square(r).sum()) for r in (at.prior, at.calibration, at.odometry))
-    return quadratic + float(loss.loss(at.observation_chi2).sum())

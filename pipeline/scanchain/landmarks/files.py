@@ -66,16 +66,14 @@ def _read(path: Path) -> dict[str, Matrix]:
     try:
         with path.open("rb") as file:
             if file.read(2) != b"PK":
-                raise InputError(f"{path}: is no npz file; a problem is one with {', '.join(_SHAPES)}")
+                raise ValueError("it is no zip archive")
         with np.load(path, allow_pickle=False) as file:
             missing = [name for name in _SHAPES if name not in file and name not in _TRUTH]
             if missing:
                 raise InputError(f"{path}: has no array {missing[0]}; a problem has {', '.join(_SHAPES)}")
             return {name: _table(path, name, file[name]) for name in _SHAPES if name in file}
-    except FileNotFoundError:
-        raise InputError(f"{path}: does not exist; check the path") from None
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the file") from None
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path") from None
     except (
         ValueError,
         EOFError,
@@ -128,21 +126,14 @@ def _covariance(path: Path, name: str, arrays: dict[str, Matrix]) -> Matrix:
 def _kind(path: Path, poses: Matrix, landmarks: Matrix, observed: NDArray[np.int64], measured: Matrix) -> Kind:
     """Kind of the measurements: least median distance of the measured points from the landmarks.
 
-    A landmark that is not known (NaN) lies at the median of its measured points. Raises InputError where the
-    points fit bearings in degrees best, and where nothing tells.
+    A landmark that is not known (NaN) lies at the median of its measured points. Raises InputError where nothing
+    tells.
     """
     bearing, reach = measured.T
-    polar, by_degrees = (
-        np.stack([reach * np.cos(angle), reach * np.sin(angle)], axis=1)
-        for angle in (bearing, np.radians(bearing))
+    polar = np.stack([reach * np.cos(bearing), reach * np.sin(bearing)], axis=1)
+    as_linear, as_polar = (
+        _spread(poses[observed[:, 0]] + relative, landmarks, observed[:, 1]) for relative in (measured, polar)
     )
-    as_linear, as_polar, as_degrees = (
-        _spread(poses[observed[:, 0]] + relative, landmarks, observed[:, 1])
-        for relative in (measured, polar, by_degrees)
-    )
-    largest = float(np.abs(bearing).max())
-    if largest > 2.0 * np.pi and 2.0 * as_degrees < min(as_linear, as_polar):
-        raise InputError(f"{path}: bearings of observations reach {largest:.6g}: degrees? give radians")
     if not np.isfinite(landmarks).all() and len(np.unique(observed[:, 1])) == len(observed):
         raise InputError(
             f"{path}: no landmark is observed twice and there is no gt_landmarks, so that nothing tells relative "
@@ -207,11 +198,10 @@ def read_mrclam(folder: Path, robot: int) -> RangeLog:
         listed = ", ".join(map(str, there)) or "none"
         raise InputError(f"{folder}: has no {name}; --robot must be one of those logged there: {listed}")
     odometry = _by_time(_numbers(folder / name, 3))
-    measurements = folder / f"Robot{robot}_Measurement.dat"
-    seen = _by_time(_numbers(measurements, 4))
-    if (largest := float(np.abs(seen[:, 3]).max())) > 2.0 * np.pi:
-        raise InputError(f"{measurements}: bearings reach {largest:.6g}: degrees? give radians")
-    subject = _subjects(_numbers(folder / "Barcodes.dat", 2), seen[:, 1])
+    seen = _by_time(_numbers(folder / f"Robot{robot}_Measurement.dat", 4))
+    subjects, codes = _numbers(folder / "Barcodes.dat", 2).T.tolist()
+    subject_of = dict(zip(codes, subjects, strict=True))
+    subject = np.array([subject_of.get(code, 0) for code in seen[:, 1].tolist()], np.int64)
     timely = (seen[:, 0] >= odometry[0, 0]) & (seen[:, 0] <= odometry[-1, 0])
     used = (subject > _ROBOTS) & timely
     if not used.any():
@@ -245,16 +235,12 @@ def _numbers(path: Path, columns: int) -> Matrix:
     try:
         rows = [line for line in path.read_text(encoding="utf-8").splitlines() if line.partition("#")[0].strip()]
         table = np.loadtxt(rows, ndmin=2) if rows else np.empty((0, columns))
-    except FileNotFoundError:
-        raise InputError(f"{path}: does not exist; an MRCLAM folder needs it") from None
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the file") from None
+        raise InputError(f"{path}: cannot be read ({error.strerror}); an MRCLAM folder needs it") from None
     except ValueError as error:
         raise InputError(f"{path}: is no table of {columns} numbers a line ({error}); check the file") from None
-    if not table.size:
-        raise InputError(f"{path}: is empty; it must have {columns} numbers a line")
-    if table.shape[1] != columns:
-        raise InputError(f"{path}: has {counted(table.shape[1], 'number')} a line; it must have {columns}")
+    if not table.size or table.shape[1] != columns:
+        raise InputError(f"{path}: is empty or has no {columns} numbers a line; check the file")
     if not np.isfinite(table).all():
         row = int(np.flatnonzero(~np.isfinite(table).all(axis=1))[0])
         raise InputError(f"{path}: row {row + 1} is not finite; correct or remove it")
@@ -263,11 +249,3 @@ def _numbers(path: Path, columns: int) -> Matrix:
 
 def _by_time(table: Matrix) -> Matrix:
     return table[np.argsort(table[:, 0], kind="stable")]
-
-
-def _subjects(barcodes: Matrix, seen: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Subject of each barcode seen, 0 where no subject has it."""
-    subjects, codes = barcodes.astype(np.int64).T
-    order = np.argsort(codes, kind="stable")
-    at = np.minimum(np.searchsorted(codes[order], seen), len(codes) - 1)
-    return np.where(codes[order][at] == seen, subjects[order][at], 0)

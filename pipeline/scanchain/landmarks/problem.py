@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_matrix
+from scipy.sparse import csr_matrix, triu
 
 from scanchain.data import Matrix
+from scanchain.graph.cholesky import BlockPattern
 from scanchain.kernels.landmarks import factors
 
 Kind = Literal["linear", "bearing-range"]
@@ -132,10 +132,11 @@ class Pattern:
         """Number of rows and columns of A."""
         return len(self.row_start) - 1, self.layout.columns
 
-    def products(self) -> csr_matrix:
-        """Entries of AᵀA that may be nonzero, as ones and more, (n, n)."""
+    def squared(self) -> BlockPattern:
+        """Entries of AᵀA that may be nonzero, each a block of its own."""
         there = csr_matrix((np.ones(len(self.columns)), self.columns, self.row_start), self.shape)
-        return csr_matrix(there.T @ there)
+        pairs = np.stack(triu(there.T @ there, k=1).nonzero(), axis=1).astype(np.int64)
+        return BlockPattern(np.ones(self.layout.columns, np.int64), pairs)
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,11 +229,6 @@ class Linearization:
     odometry_rows: Matrix
     observation_rows: Matrix
 
-    @property
-    def observation_chi2(self) -> NDArray[np.float64]:
-        """χ² of every observation, (N,)."""
-        return np.square(self.observations).sum(axis=1)
-
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
@@ -284,7 +280,7 @@ class Measurements:
 
 
 class BearingRangeProblem:
-    """Prior on the first pose, motion from pose to pose, bearings and ranges; its pattern is found once.
+    """Prior on the first pose, motion from pose to pose, bearings and ranges.
 
     ``motion_columns`` (K − 1, 2 p + C) and ``observation_columns`` (N, p + 2) are the unknowns of each of them,
     ``motion_whitening`` (K − 1, p, p) is W with WᵀW = Σ⁻¹.
@@ -295,8 +291,9 @@ class BearingRangeProblem:
         self.measurements = given
         size = given.motion.shape[1]
         layout = Layout(len(given.motion) + 1, size, given.landmarks, given.calibration.names)
-        self._first = whitening(given.first_covariance)
-        self._whiten()
+        self._first, self._observation = whitening(given.first_covariance), whitening(given.measured_covariance)
+        self.motion_whitening = whitening(given.motion_covariance)
+        self._slope = -self.motion_whitening @ given.calibration.slope
         poses = pose_columns(layout, np.arange(layout.poses))
         own = np.arange(layout.split, layout.landmark_start)
         seen_from, seen = given.observed.T
@@ -309,19 +306,6 @@ class BearingRangeProblem:
         damping = np.arange(layout.columns)[:, None]
         self.motion_columns, self.observation_columns = moves, pairs
         self.pattern, self._damped = pattern_of(groups, layout), pattern_of([*groups, damping], layout)
-
-    def of(self, measurements: Measurements) -> BearingRangeProblem:
-        """The same pattern with other numbers."""
-        result = copy(self)
-        result.measurements = measurements
-        result._whiten()
-        return result
-
-    def _whiten(self) -> None:
-        given = self.measurements
-        self.motion_whitening = whitening(given.motion_covariance)
-        self._slope = -self.motion_whitening @ given.calibration.slope
-        self._observation = whitening(given.measured_covariance)
 
     def linearize(self, state: Values) -> Linearization:
         """Residuals and Jacobians at a state."""

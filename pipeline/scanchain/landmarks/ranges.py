@@ -14,8 +14,7 @@ from scanchain.kernels.landmarks import factors
 from scanchain.landmarks.estimate import Minimum, StudentLoss, from_odometry, growing, minimize
 from scanchain.landmarks.files import RangeLog
 from scanchain.landmarks.problem import BearingRangeProblem, Calibration, Measurements, Values
-from scanchain.landmarks.solvers import ESTIMATOR, LinearSolver, create_solver
-from scanchain.landmarks.solvers.direct import Covariance
+from scanchain.landmarks.solvers import ESTIMATOR, Covariance, LinearSolver, create_solver
 
 _AT_REST = np.square([1e-3, 1e-3, 1e-3])  # m², m², rad² a second, whether or not the robot moves
 _LEAST_VARIANCE = 1e-12  # m², rad²; keeps the covariance of a motion that takes no time invertible
@@ -140,7 +139,7 @@ class Consistency:
     ----------
     motion, sensor : χ² of the motions; of bearings and of ranges (2,), weighed
     motion_freedom, redundancy : degrees of freedom of those, observations less what the state takes up
-    sightings : effective number of them
+    sensor_freedom : the redundancy, at least a small share of the effective number of observations, (2,)
     sources, sources_freedom : (4,) the parts of ``motion`` and of its freedom that are each source's
     """
 
@@ -150,12 +149,7 @@ class Consistency:
     sources_freedom: NDArray[np.float64]
     sensor: NDArray[np.float64]
     redundancy: NDArray[np.float64]
-    sightings: float
-
-    @property
-    def sensor_freedom(self) -> NDArray[np.float64]:
-        """The redundancy, at least a small share of the sightings, (2,)."""
-        return np.maximum(self.redundancy, _LEAST_REDUNDANCY * self.sightings)
+    sensor_freedom: NDArray[np.float64]
 
     def growth(self, stated: NDArray[np.float64]) -> NDArray[np.float64]:
         """Factors by which the variances, those of odometry first, should grow, (6,); one where they are right.
@@ -183,20 +177,21 @@ def consistency(
 
     sources : (K − 1, 4, 3, 3) covariance of every motion by sources
     """
-    at, W = minimum.at, problem.motion_whitening
+    at, W = minimum.estimate.at, problem.motion_whitening
     parts = W[:, None] @ sources @ np.swapaxes(W, 1, 2)[:, None]
     leverage = at.odometry_rows @ covariance.of(problem.motion_columns) @ np.swapaxes(at.odometry_rows, 1, 2)
     r = at.odometry
-    rows, weights = at.observation_rows, minimum.weights[:, None]
+    rows, weights = at.observation_rows, minimum.estimate.weights[:, None]
     h = ((rows @ covariance.of(problem.observation_columns)) * rows).sum(axis=-1)
+    redundancy = (share[:, None] - weights * h).sum(axis=0)
     return Consistency(
         motion=float(np.square(r).sum()),
         motion_freedom=float(r.size - np.trace(leverage, axis1=1, axis2=2).sum()),
         sources=((r[:, None, None, :] @ parts)[:, :, 0] * r[:, None]).sum(axis=(0, 2)),
         sources_freedom=(parts * (np.eye(3) - leverage)[:, None]).sum(axis=(0, 2, 3)),
         sensor=(weights * at.observations**2).sum(axis=0),
-        redundancy=(share[:, None] - weights * h).sum(axis=0),
-        sightings=float(share.sum()),
+        redundancy=redundancy,
+        sensor_freedom=np.maximum(redundancy, _LEAST_REDUNDANCY * share.sum()),
     )
 
 
@@ -286,12 +281,12 @@ def solve_range_log(log: RangeLog, noise: OdometryNoise | None) -> RangeSolution
             growth[:4] = 1.0
         is_last = turn == _TURNS - 1 or bool(np.abs(np.sqrt(growth) - 1.0).max() < _CHANGE)
         variances = np.maximum(variances * growth, _LEAST)
-        residuals = np.sqrt(minimum.weights / loss.share)[:, None] * minimum.at.observations
+        residuals = np.sqrt(minimum.estimate.weights / loss.share)[:, None] * minimum.estimate.at.observations
         loss = StudentLoss(sightings.share(sightings.correlation(residuals)))
-        state = minimum.state
+        state = minimum.estimate.state
         if turn < _RECKONED:
             reckoning = reckon(log, nodes_s, state.calibration)
-        problem = problem.of(measurements(reckoning, variances))
+        problem = BearingRangeProblem(measurements(reckoning, variances))
         tolerance = _FINE if is_last else _ROUGH
         minimum, covariance, found = _settled(problem, state, loss, variances, reckoning, solver, tolerance)
         iterations += minimum.iterations
@@ -316,6 +311,6 @@ def _settled(
     minimum = minimize(
         problem, state, solver, loss=loss, tolerance=tolerance, first_damping=_LITTLE, max_iterations=_MOST
     )
-    covariance = Covariance(problem.system(minimum.at, minimum.weights))
+    covariance = Covariance(problem.system(minimum.estimate.at, minimum.estimate.weights))
     sources = variances[:4, None, None] * reckoning.sources
     return minimum, covariance, consistency(problem, minimum, covariance, sources, loss.share)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 from pathlib import Path
@@ -50,12 +49,9 @@ def text_of(study: Study) -> str:
     lines.append(f"  {'A':<15}{size_of(study)}")
     rows = table_of(study)
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    for row in rows:
-        cells = (
-            f"{cell:<{width}}" if k == 0 else f"{cell:>{width}}"
-            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
-        )
-        lines.append("  " + "  ".join(cells))
+    for method, *figures in rows:
+        cells = [f"{cell:>{width}}" for cell, width in zip(figures, widths[1:], strict=True)]
+        lines.append("  ".join(["", f"{method:<{widths[0]}}", *cells]))
     return "\n".join(lines)
 
 
@@ -102,17 +98,10 @@ def write_estimate(directory: Path, study: Study) -> None:
     """Poses and landmarks with their covariances as CSV, and the poses as TUM where they have stamps."""
     stem, state = file_stem(study.name), study.after.state
     names = ["x_m", "y_m", "heading_rad"][: state.poses.shape[1]]
-    _write_csv(
-        directory / f"{stem}_poses.csv",
-        "pose",
-        np.arange(len(state.poses)),
-        names,
-        state.poses,
-        study.covariance.poses,
-    )
-    numbers = study.system.pattern.layout.landmarks
-    file = directory / f"{stem}_landmarks.csv"
-    _write_csv(file, "landmark", numbers, ["x_m", "y_m"], state.landmarks, study.covariance.landmarks)
+    file, numbers = directory / f"{stem}_poses.csv", np.arange(len(state.poses))
+    _write_csv(file, "pose", numbers, names, state.poses, study.covariance.poses)
+    file, numbers = directory / f"{stem}_landmarks.csv", study.system.pattern.layout.landmarks
+    _write_csv(file, "landmark", numbers, names[:2], state.landmarks, study.covariance.landmarks)
     if study.trajectory is not None:
         write_tum(directory / f"{stem}.tum", study.trajectory, force=True)
 
@@ -123,12 +112,8 @@ def _write_csv(
     """One line each: number, values, upper triangle of the covariance."""
     rows, columns = np.triu_indices(len(names))
     header = [kind, *names, *(f"cov_{names[i]}_{names[j]}" for i, j in zip(rows, columns, strict=True))]
-    table = np.concatenate([values, covariance[:, rows, columns]], axis=1)
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(header)
-        for number, row in zip(numbers.tolist(), table.tolist(), strict=True):
-            writer.writerow([number, *(f"{value:.9g}" for value in row)])
+    table = np.column_stack([numbers, values, covariance[:, rows, columns]])
+    np.savetxt(path, table, ["%d"] + (table.shape[1] - 1) * ["%.9g"], ",", header=",".join(header), comments="")
 
 
 def _accuracy(estimate: Estimate) -> str:

@@ -33,8 +33,7 @@ from scanchain.landmarks.problem import (
     world_referenced,
 )
 from scanchain.landmarks.ranges import OWN, OWN_UNITS, OdometryNoise, RangeSolution, solve_range_log
-from scanchain.landmarks.solvers import LinearSolver, MethodResult, compare, create_solver, methods_for
-from scanchain.landmarks.solvers.direct import Covariance
+from scanchain.landmarks.solvers import Covariance, LinearSolver, MethodResult, compare, create_solver, methods_for
 
 _WIDEST_GAP_S = 0.5  # between motion-capture poses that are interpolated
 
@@ -201,23 +200,23 @@ def _nonlinear(data: LandmarkData, options: Options) -> Study:
     names, left_out = methods_for(options.methods, problem.pattern.shape[1])
     minimum = minimize(problem, guess, create_solver(names[0]), optimizer=options.optimizer)
     begin = working_s()
-    system = problem.system(problem.linearize(minimum.state), minimum.weights)
+    system = problem.system(problem.linearize(minimum.estimate.state), minimum.estimate.weights)
     build_s = working_s() - begin
 
     def solve(solver: LinearSolver) -> NDArray[np.float64]:
         if options.optimizer == "gradient-descent" or not minimum.iterations:  # solves none: take its end
             return solver.solve(system)
-        return minimize(problem, guess, solver, optimizer=options.optimizer).state.unknowns
+        return minimize(problem, guess, solver, optimizer=options.optimizer).estimate.state.unknowns
 
     after = f"after {counted(minimum.iterations, 'step')}: {minimum.reason}"
     facts = {
         "problem": "nonlinear: steps between poses, bearing and range of landmarks; headings known",
         "guess": options.guess,
         "iteration": f"{options.optimizer} {_ended(minimum)} {after}",
-        "χ²": _chi2(minimum.cost, system),
+        "χ²": _chi2(minimum.estimate.cost, system),
         **left_out,
     }
-    before, end = (of_positions(each, data) for each in (guess, minimum.state))
+    before, end = (of_positions(each, data) for each in (guess, minimum.estimate.state))
     return Study(
         data.name, facts, before, end, minimum.converged, Covariance(system), data.true_poses,
         data.true_landmarks, system, build_s, compare(solve, names, options.repeats),
@@ -257,17 +256,17 @@ def study_log(folder: Path, options: Options) -> Study:
     solution = solve_range_log(log, options.noise)
     begin = working_s()
     at = solution.problem.linearize(solution.guess)
-    system = solution.problem.system(at, solution.loss.weight(at.observation_chi2))
+    system = solution.problem.system(at, solution.loss.weight(np.square(at.observations).sum(axis=1)))
     build_s = working_s() - begin
     names, left_out = methods_for(options.methods, system.pattern.shape[1])
     facts = _facts(log, solution, is_stated=options.noise is not None) | left_out
     minimum, nodes_s = solution.minimum, solution.nodes_s
-    states, landmarks = (solution.reckoned, minimum.state), system.pattern.layout.landmarks
+    states, landmarks = (solution.reckoned, minimum.estimate.state), system.pattern.layout.landmarks
     (before, after), true_poses, surveyed = against_truth(states, nodes_s, landmarks, log)
     return Study(
         log.name, facts, before, after, minimum.converged, solution.covariance, true_poses, surveyed, system,
         build_s, compare(lambda solver: solver.solve(system), names, options.repeats),
-        _trajectory(nodes_s, minimum.state.poses),
+        _trajectory(nodes_s, minimum.estimate.state.poses),
     )  # fmt: skip
 
 
@@ -276,17 +275,17 @@ def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> dict[s
     count = len(log.seen_s)
     worth = f"count as {solution.loss.share.sum():.0f}, as errors of a landmark's successive sightings are alike"
     nodes = counted(len(solution.nodes_s), "pose")
-    seen = f"{count:,} of {len(solution.minimum.state.landmarks)} landmarks from {nodes}; they {worth}"
+    seen = f"{count:,} of {len(solution.minimum.estimate.state.landmarks)} landmarks from {nodes}; they {worth}"
     left = f"{log.of_robots} of other robots, {log.unknown} of unknown barcodes, {log.outside} without odometry"
     forward_m, sideways_m, drift_rad, turn_rad, bearing_rad, range_m = solution.sigmas
     wheels = (
         f"{forward_m:.3g} m forward, {sideways_m:.3g} m sideways, {drift_rad:.3g} rad"
         f" after a meter, {turn_rad:.3g} rad after a radian"
     )
-    own = zip(OWN, solution.minimum.state.calibration, OWN_UNITS, strict=True)
+    own = zip(OWN, solution.minimum.estimate.state.calibration, OWN_UNITS, strict=True)
     found = f"bearing {bearing_rad:.4f} rad, range {range_m:.4f} m (Student's t)"
     after = f"{_ended(solution.minimum)} after {counted(solution.iterations, 'step')}: {solution.minimum.reason}"
-    downweighted = int(np.count_nonzero(solution.minimum.weights < _DOWNWEIGHTED * solution.loss.share))
+    downweighted = int(np.count_nonzero(solution.minimum.estimate.weights < _DOWNWEIGHTED * solution.loss.share))
     state, sensor = "stated" if is_stated else "estimated", float(np.mean(noise.sensor / noise.sensor_freedom))
     return {
         "observations": seen,

@@ -78,7 +78,7 @@ def lay_out_fronts(groups: _Index, begin: _Index, rows: _Index, sizes: _Index) -
     has_parent = parent >= 0
     children = np.bincount(parent[has_parent], minlength=len(pivots))
     row_front = np.repeat(np.arange(len(pivots)), heights)
-    is_update = ~_leading(pivots, heights)
+    is_update = ranges(np.zeros_like(heights), heights) >= np.repeat(pivots, heights)
     place = np.full(len(scalar_rows), -1)
     place[is_update] = _index_in_front(
         row_start, scalar_rows, parent[row_front[is_update]], scalar_rows[is_update]
@@ -119,11 +119,6 @@ def _index_in_front(row_start: _Index, rows: _Index, front: _Index, row: _Index)
     size = rows.max(initial=0) + 1
     keys = np.repeat(np.arange(len(row_start) - 1), np.diff(row_start)) * size + rows
     return np.searchsorted(keys, front * size + row) - row_start[front]
-
-
-def _leading(counts: _Index, lengths: _Index) -> NDArray[np.bool_]:
-    """True for the first so many of each of the ranges of these lengths, one after the other."""
-    return ranges(np.zeros_like(lengths), lengths) < np.repeat(counts, lengths)
 
 
 def ranges(starts: _Index, counts: _Index) -> _Index:

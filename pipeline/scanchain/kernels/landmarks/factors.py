@@ -11,10 +11,11 @@ _NOWHERE_M = 1e-9  # distance to the pose below which a landmark has no bearing
 
 
 @njit()
-def bearing_range_block(
-    pose: _Array, landmark: _Array, bearing_rad: float, range_m: float, r: _Array, J: _Array
-) -> None:
-    """Residual (measured from predicted) and Jacobian of a bearing and a range.
+def bearing_range(
+    poses: _Array, landmarks: _Array, observed: _Index, measured: _Array, whitening: _Array, residuals: _Array,
+    jacobians: _Array,
+) -> None:  # fmt: skip
+    """Fill W r and W J of every observation, residual (measured from predicted) and Jacobian, WᵀW = Σ⁻¹.
 
         δ = l − t,  q = ‖δ‖,  r = [wrap(atan2(δ_y, δ_x) − θ − bearing), q − range]
         ∂r/∂t = [δ_y/q², −δ_x/q²; −δ_x/q, −δ_y/q],  ∂r/∂θ = [−1; 0],  ∂r/∂l = −∂r/∂t
@@ -22,87 +23,66 @@ def bearing_range_block(
     On top of the pose a landmark has no bearing; there it is taken to lie in the measured direction, and only the
     range pulls it.
 
-    pose : (2,) x, y, with heading 0, or (3,) x, y, θ; landmark (2,); m, rad
-    r (2,), J (2, pose + 2) : filled, columns pose first
+    poses : (K, 2) x, y, with heading 0, or (K, 3) x, y, θ; landmarks (L, 2); m, rad
+    observed (N, 2) pose and landmark, measured (N, 2) bearing rad, range m, whitening (2, 2) W
+    residuals (N, 2), jacobians (N, 2, pose + 2) : filled, columns pose first
     """
-    p = pose.size
-    heading = pose[2] if p == 3 else 0.0
-    dx, dy = landmark[0] - pose[0], landmark[1] - pose[1]
-    q = np.sqrt(dx * dx + dy * dy)
-    J[:] = 0.0
-    if q > _NOWHERE_M:
-        angle = np.arctan2(dy, dx) - heading - bearing_rad
-        r[0] = angle - 2.0 * np.pi * np.floor((angle + np.pi) / (2.0 * np.pi))
-        J[0, p], J[0, p + 1] = -dy / (q * q), dx / (q * q)
-        J[1, p], J[1, p + 1] = dx / q, dy / q
-    else:
-        r[0] = 0.0
-        J[1, p], J[1, p + 1] = np.cos(heading + bearing_rad), np.sin(heading + bearing_rad)
-    r[1] = q - range_m
-    for a in range(2):
-        J[a, 0], J[a, 1] = -J[a, p], -J[a, p + 1]
-    if p == 3 and q > _NOWHERE_M:
-        J[0, 2] = -1.0
-
-
-@njit()
-def bearing_range(
-    poses: _Array, landmarks: _Array, observed: _Index, measured: _Array, whitening: _Array, residuals: _Array,
-    jacobians: _Array,
-) -> None:  # fmt: skip
-    """Fill W r and W J of every observation, W whitening: WᵀW = Σ⁻¹.
-
-    poses (K, 2 or 3), landmarks (L, 2), observed (N, 2) pose and landmark, measured (N, 2) bearing rad, range m
-    whitening (2, 2); residuals (N, 2), jacobians (N, 2, pose + 2) filled
-    """
-    width = poses.shape[1] + 2
-    r, J = np.empty(2), np.empty((2, width))
+    p = poses.shape[1]
+    J = np.zeros((2, p + 2))
     for k in range(observed.shape[0]):
-        i, j = observed[k]
-        bearing_range_block(poses[i], landmarks[j], measured[k, 0], measured[k, 1], r, J)
+        pose, landmark, bearing_rad = poses[observed[k, 0]], landmarks[observed[k, 1]], measured[k, 0]
+        heading = pose[2] if p == 3 else 0.0
+        dx, dy = landmark[0] - pose[0], landmark[1] - pose[1]
+        q = np.sqrt(dx * dx + dy * dy)
+        if q > _NOWHERE_M:
+            angle = np.arctan2(dy, dx) - heading - bearing_rad
+            off_rad = angle - 2.0 * np.pi * np.floor((angle + np.pi) / (2.0 * np.pi))
+            J[0, p], J[0, p + 1] = -dy / (q * q), dx / (q * q)
+            J[1, p], J[1, p + 1] = dx / q, dy / q
+        else:
+            off_rad = J[0, p] = J[0, p + 1] = 0.0
+            J[1, p], J[1, p + 1] = np.cos(heading + bearing_rad), np.sin(heading + bearing_rad)
+        off_m = q - measured[k, 1]
         for a in range(2):
-            residuals[k, a] = whitening[a, 0] * r[0] + whitening[a, 1] * r[1]
-            for c in range(width):
+            J[a, 0], J[a, 1] = -J[a, p], -J[a, p + 1]
+        if p == 3:
+            J[0, 2] = -1.0 if q > _NOWHERE_M else 0.0
+        for a in range(2):
+            residuals[k, a] = whitening[a, 0] * off_rad + whitening[a, 1] * off_m
+            for c in range(p + 2):
                 jacobians[k, a, c] = whitening[a, 0] * J[0, c] + whitening[a, 1] * J[1, c]
 
 
 @njit()
-def odometry_block(first: _Array, second: _Array, moved: _Array, r: _Array, J: _Array) -> None:
-    """Residual and Jacobian of a motion measured in the frame of its beginning.
+def odometry(poses: _Array, moved: _Array, whitening: _Array, residuals: _Array, jacobians: _Array) -> None:
+    """Fill W r and W J of every motion from a pose to the next, measured in the frame of its beginning.
 
         r = [Rᵀ(θ_i) (t_j − t_i) − t_z, wrap(θ_j − θ_i − θ_z)]
         ∂r/∂(t_i, θ_i) = [−Rᵀ, (∂Rᵀ/∂θ_i)(t_j − t_i); 0, −1],  ∂r/∂(t_j, θ_j) = [Rᵀ, 0; 0, 1]
 
-    first, second, moved : (3,) x, y, heading; m, rad. r (3,), J (3, 6) filled
+    poses (K, 3) and moved (K − 1, 3) x, y, heading; m, rad; whitening (K − 1, 3, 3) W
+    residuals (K − 1, 3), jacobians (K − 1, 3, 6) : filled
     """
-    c, s = np.cos(first[2]), np.sin(first[2])
-    dx, dy = second[0] - first[0], second[1] - first[1]
-    turn = second[2] - first[2] - moved[2]
-    r[0] = c * dx + s * dy - moved[0]
-    r[1] = -s * dx + c * dy - moved[1]
-    r[2] = turn - 2.0 * np.pi * np.floor((turn + np.pi) / (2.0 * np.pi))
-    J[:] = 0.0
-    J[0, 3], J[0, 4], J[1, 3], J[1, 4], J[2, 5] = c, s, -s, c, 1.0
-    J[0, 0], J[0, 1], J[1, 0], J[1, 1], J[2, 2] = -c, -s, s, -c, -1.0
-    J[0, 2], J[1, 2] = -s * dx + c * dy, -c * dx - s * dy
-
-
-@njit()
-def odometry(poses: _Array, moved: _Array, whitening: _Array, residuals: _Array, jacobians: _Array) -> None:
-    """Fill W r and W J of every motion from a pose to the next.
-
-    poses (K, 3), moved (K − 1, 3), whitening (K − 1, 3, 3); residuals (K − 1, 3), jacobians (K − 1, 3, 6) filled
-    """
-    r, J = np.empty(3), np.empty((3, 6))
+    r, J = np.empty(3), np.zeros((3, 6))
+    J[2, 2], J[2, 5] = -1.0, 1.0
     for k in range(moved.shape[0]):
-        odometry_block(poses[k], poses[k + 1], moved[k], r, J)
+        first, second = poses[k], poses[k + 1]
+        c, s = np.cos(first[2]), np.sin(first[2])
+        dx, dy = second[0] - first[0], second[1] - first[1]
+        turn = second[2] - first[2] - moved[k, 2]
+        r[0] = c * dx + s * dy - moved[k, 0]
+        r[1] = -s * dx + c * dy - moved[k, 1]
+        r[2] = turn - 2.0 * np.pi * np.floor((turn + np.pi) / (2.0 * np.pi))
+        J[0, 3], J[0, 4], J[1, 3], J[1, 4] = c, s, -s, c
+        J[0, 0], J[0, 1], J[1, 0], J[1, 1] = -c, -s, s, -c
+        J[0, 2], J[1, 2] = -s * dx + c * dy, -c * dx - s * dy
         residuals[k] = 0.0
         jacobians[k] = 0.0
         for a in range(3):
             for b in range(3):
                 residuals[k, a] += whitening[k, a, b] * r[b]
-                for c in range(6):
-                    jacobians[k, a, c] += whitening[k, a, b] * J[b, c]
+                for d in range(6):
+                    jacobians[k, a, d] += whitening[k, a, b] * J[b, d]
 
 
 @njit()
@@ -159,17 +139,11 @@ def _spread(P: _Array, F: _Array, noise: int, c: float, s: float, chord: float, 
     for a in range(3):
         for b in range(2):
             P[a, b] += F[b, 2] * P[a, 2]
-    g0, g1, g2 = c, s, 0.0
+    g = c, s, 0.0
     if noise == 1:
-        g0, g1 = -s, c
+        g = -s, c, 0.0
     elif noise >= 2:
-        g0, g1, g2 = -0.5 * chord * s, 0.5 * chord * c, 1.0
-    P[0, 0] += driven * g0 * g0
-    P[0, 1] += driven * g0 * g1
-    P[1, 0] += driven * g0 * g1
-    P[1, 1] += driven * g1 * g1
-    P[0, 2] += driven * g0 * g2
-    P[2, 0] += driven * g0 * g2
-    P[1, 2] += driven * g1 * g2
-    P[2, 1] += driven * g1 * g2
-    P[2, 2] += driven * g2 * g2
+        g = -0.5 * chord * s, 0.5 * chord * c, 1.0
+    for a in range(3):
+        for b in range(3):
+            P[a, b] += driven * g[min(a, b)] * g[max(a, b)]

@@ -1,22 +1,22 @@
-"""A linear solver with its times and errors; the methods on AᵀA x = Aᵀb, and marginal covariances."""
+"""Linear solvers of A x = b by name, with their times and errors, and compared; marginal covariances."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_matrix, diags_array, identity, triu
-from scipy.sparse.linalg import MatrixRankWarning, SuperLU, inv, splu, spsolve
+from scipy.sparse import csc_matrix, csr_matrix, diags_array, identity
+from scipy.sparse.linalg import MatrixRankWarning, SuperLU, inv, splu, spsolve, spsolve_triangular
 
 from scanchain.clock import working_s
 from scanchain.data import Matrix
 from scanchain.errors import InputError
-from scanchain.graph.cholesky import BlockPattern, SingularMatrixError, SparseCholesky, analyze, upper_factor
-from scanchain.kernels.landmarks import arrow
+from scanchain.graph.cholesky import Analysis, SingularMatrixError, SparseCholesky, analyze, upper_factor
+from scanchain.kernels.landmarks import arrow, sparse_qr
 from scanchain.landmarks.problem import Layout, LinearSystem, Pattern, landmark_columns, pose_columns
 
 LOST_DIGITS = 1e-13  # a pivot below this share of its diagonal entry (of AᵀA) or column (of A) is rounding noise
@@ -51,24 +51,11 @@ class Factored(NamedTuple):
     factor: Callable[[], Factor]
 
 
-class Method(Protocol):
-    """A way to solve A x = b in the least-squares sense.
-
-    An analysis is kept for as long as the pattern is the same object. Both raise SingularMatrixError or
-    RuntimeError where A has not full column rank.
-    """
-
-    def build(self, system: LinearSystem) -> Any:
-        """The matrices to factorize: AᵀA and Aᵀb, or the rows of A in their order."""
-        ...
-
-    def factorize(self, system: LinearSystem, built: Any) -> Factored:
-        """Order, analyze and factor it."""
-        ...
-
-
 class LinearSolver:
-    """Solves A x = b by one method.
+    """Solves A x = b in the least-squares sense by one method, which keeps its analysis of the last pattern.
+
+    A method builds what it factorizes, AᵀA and Aᵀb or the order of A. Where A has not full column rank it raises
+    SingularMatrixError or RuntimeError.
 
     Attributes
     ----------
@@ -88,7 +75,7 @@ class LinearSolver:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("error", MatrixRankWarning)
-                built = self._method.build(system)
+                built: Any = self._method.build(system)
                 laps_s.append(working_s())
                 self._factored = self._method.factorize(system, built)
                 laps_s.append(working_s())
@@ -199,14 +186,54 @@ class CholeskyMethod:
         """U with AᵀA = UᵀU."""
         H, g = built
         if self._known is None or self._known[0] is not system.pattern:
-            pairs = np.stack(triu(system.pattern.products(), k=1).nonzero(), axis=1).astype(np.int64)
-            pattern = BlockPattern(np.ones(len(g), np.int64), pairs)
+            pattern = system.pattern.squared()
             self._known = system.pattern, SparseCholesky(pattern, analyze(pattern))
         cholesky = self._known[1]
         H.sum_duplicates()  # sorts it, so that entries are found by bisection
         cholesky.factorize(np.asarray(H[cholesky.pattern.rows, cholesky.pattern.columns]).ravel())
         U, order = upper_factor, cholesky.analysis.order
         return Factored(lambda: cholesky.solve(g), lambda: Factor("U of AᵀA", csc_matrix(U(cholesky)), order))
+
+
+class QrMethod:
+    """A = Q R by Givens rotations, without ever forming AᵀA; the analysis of a pattern is reused as well."""
+
+    def __init__(self, ordering: Literal["natural", "colamd"]) -> None:
+        self._ordering = ordering
+        self._known: tuple[Pattern, Analysis] | None = None
+
+    def build(self, system: LinearSystem) -> Analysis:
+        """The order of the columns, of "colamd" by minimum degree in AᵀA, and where R has entries."""
+        pattern = system.pattern
+        if self._known is None or self._known[0] is not pattern:
+            order = np.arange(pattern.shape[1]) if self._ordering == "natural" else None
+            self._known = pattern, analyze(pattern.squared(), order)
+        return self._known[1]
+
+    def factorize(self, system: LinearSystem, built: Analysis) -> Factored:
+        """R of A, and the head of Qᵀb."""
+        pattern, n = system.pattern, system.pattern.shape[1]
+        place, R, z = np.argsort(built.order), np.zeros(len(built.rows) + n), np.zeros(n)
+        sparse_qr.rotate(
+            _order_of_rows(pattern, place), pattern.row_start, pattern.columns, system.values, system.b,
+            place, built.begin, built.rows, built.parent, R, z,
+        )  # fmt: skip
+        starts = built.begin + np.arange(n + 1)
+        matrix = csr_matrix((R, np.insert(built.rows, built.begin[:-1], np.arange(n)), starts), shape=(n, n))
+        lengths = np.sqrt(np.bincount(pattern.columns, system.values**2, n))
+        check_pivots(np.abs(R[starts[:-1]]), lengths[built.order])
+        return Factored(
+            lambda: spsolve_triangular(matrix, z, lower=False)[place],
+            lambda: Factor("R of A", csc_matrix(matrix), built.order),
+        )
+
+
+def _order_of_rows(pattern: Pattern, place: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Rows of A that are not empty, by their first column and then their last, each column in its place (n,)."""
+    rows = np.flatnonzero(np.diff(pattern.row_start))
+    places = place[pattern.columns]
+    first, last = (ends.reduceat(places, pattern.row_start[rows]) for ends in (np.minimum, np.maximum))
+    return rows[np.lexsort((-last, first))]
 
 
 _WIDEST_BAND = 64  # widest band in scalars; beyond it poses are joined by more than odometry
@@ -221,18 +248,16 @@ class SchurMethod:
     """
 
     def __init__(self) -> None:
-        self._known: tuple[Pattern, int] | None = None
         self._cholesky = CholeskyMethod()
 
     def build(self, system: LinearSystem) -> tuple[Arrow | csc_matrix, NDArray[np.float64]]:
         """AᵀA, as an arrow where that is faster, and Aᵀb."""
         pattern = system.pattern
         split, rest = pattern.layout.split, pattern.shape[1] - pattern.layout.split
-        if self._known is None or self._known[0] is not pattern:
-            self._known = pattern, arrow.bandwidth(pattern.row_start, pattern.columns, split)
-        if self._known[1] > _WIDEST_BAND or rest > split or rest * split > _LARGEST_BORDER:
+        width = arrow.bandwidth(pattern.row_start, pattern.columns, split)
+        if width > _WIDEST_BAND or rest > split or rest * split > _LARGEST_BORDER:
             return normal_equations(system)
-        return _form(system, self._known[1])
+        return _form(system, width)
 
     def factorize(self, system: LinearSystem, built: tuple[Arrow | csc_matrix, NDArray[np.float64]]) -> Factored:
         """U with AᵀA = UᵀU."""
@@ -241,6 +266,9 @@ class SchurMethod:
             return self._cholesky.factorize(system, (U, g))
         _eliminate(U)
         return Factored(lambda: _solved(U, g), lambda: _factor_of_arrow(U))
+
+
+Method = ScipyMethod | CholeskyMethod | QrMethod | SchurMethod
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,3 +357,115 @@ def _factor_of_arrow(U: Arrow) -> Factor:
     columns = np.concatenate([right, split + landmark.ravel(), split + lower])
     values = np.concatenate([U.band[below, right], U.border.ravel(), U.corner[upper, lower]])
     return Factor("U of AᵀA", csc_matrix((values, (rows, columns)), shape=(n, n)), np.arange(n))
+
+
+_MAKERS = {
+    "default": lambda: ScipyMethod("default"),
+    "pinv": lambda: ScipyMethod("pinv"),
+    "lu": lambda: ScipyMethod("lu"),
+    "lu_colamd": lambda: ScipyMethod("lu_colamd"),
+    "qr": lambda: QrMethod("natural"),
+    "qr_colamd": lambda: QrMethod("colamd"),
+    "cholesky": CholeskyMethod,
+    "schur": SchurMethod,
+}
+PINV_BELOW = 3_000  # largest number of unknowns: their inverse is all but dense, 110 MB, and takes seconds
+METHODS = tuple(_MAKERS)
+ESTIMATOR = "schur"  # the fastest: it estimates where no other is requested
+
+
+def create_solver(method: str) -> LinearSolver:
+    """A solver by the method of that name."""
+    return LinearSolver(_MAKERS[method]())
+
+
+def parse_methods(text: str) -> tuple[str, ...]:
+    """The names of a list with commas; "all" stands for every method that suits the problem."""
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    choice = f"choose from all, {', '.join(_MAKERS)}"
+    for name in names:
+        if name != "all" and name not in _MAKERS:
+            raise InputError(f"there is no method {name!r}; {choice}")
+    if not names:
+        raise InputError(f"no method is named; {choice}")
+    return tuple(names)
+
+
+def methods_for(requested: Sequence[str], unknowns: int) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Methods to run on a problem of so many unknowns, and a fact about one that "all" leaves out there.
+
+    Raises InputError where one is named that is too slow.
+    """
+    chosen = dict.fromkeys(method for name in requested for method in (METHODS if name == "all" else (name,)))
+    if "pinv" not in chosen or unknowns < PINV_BELOW:
+        return tuple(chosen), {}
+    why = f"pinv, whose inverse is all but dense: {unknowns:,} unknowns, its limit is {PINV_BELOW:,}"
+    if "pinv" in requested:
+        raise InputError(f"{why}; name other --methods")
+    del chosen["pinv"]
+    return tuple(chosen), {"not compared": why}
+
+
+_SLOW_S = 1.0  # seconds of a solution above which it is not repeated
+
+
+@dataclass(frozen=True, slots=True)
+class MethodResult:
+    """One method on one problem.
+
+    Attributes
+    ----------
+    method : its name
+    build_s, factor_s, solve_s : medians over the repetitions, each with a new solver; sums over the iterations
+    again_s : the whole once more with the same solver, which reuses its analysis of the pattern
+    iterations : linear solves
+    factor : of the last one
+    x : (n,) the unknowns
+    difference : largest entry of x minus that of the first method
+    """
+
+    method: str
+    build_s: float
+    factor_s: float
+    solve_s: float
+    again_s: float
+    iterations: int
+    factor: Factor
+    x: NDArray[np.float64]
+    difference: float
+
+    @property
+    def total_s(self) -> float:
+        """Seconds of one solution from scratch."""
+        return self.build_s + self.factor_s + self.solve_s
+
+
+def compare(
+    solve: Callable[[LinearSolver], NDArray[np.float64]], methods: Sequence[str], repeats: int
+) -> tuple[MethodResult, ...]:
+    """Let ``solve`` find the unknowns (n,) by every method in turn, slow ones once only."""
+    results = list[MethodResult]()
+    for method in methods:
+        solver, iterations, times_s = create_solver(method), 0, list[NDArray[np.float64]]()
+        x = solver.solve(_small_system())  # compiles
+        while len(times_s) < repeats and not (times_s and times_s[0][-1] > _SLOW_S):
+            solver = create_solver(method)
+            x = solve(solver)
+            spent_s, iterations = solver.spent_s.copy(), solver.solutions
+            solve(solver)
+            times_s.append(np.append(spent_s, (solver.spent_s - spent_s).sum()))
+        build_s, factor_s, solve_s, again_s = np.median(times_s, axis=0).tolist()
+        difference = float(np.abs(x - results[0].x).max()) if results else 0.0
+        factor = solver.factor()
+        results.append(
+            MethodResult(method, build_s, factor_s, solve_s, again_s, iterations, factor, x, difference)
+        )
+    return tuple(results)
+
+
+def _small_system() -> LinearSystem:
+    """Two poses and a landmark, one step and two observations."""
+    row_start = np.concatenate([[0, 1, 2], 2 + 2 * np.arange(1, 7)])
+    columns = np.array([0, 1, 0, 2, 1, 3, 0, 4, 1, 5, 2, 4, 3, 5])
+    values = np.concatenate([[1.0, 1.0], np.tile([-1.0, 1.0], 6)])
+    return LinearSystem(Pattern(row_start, columns, Layout(2, 2, np.zeros(1, np.int64))), values, np.ones(8))
