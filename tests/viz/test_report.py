@@ -3,7 +3,6 @@
 import html
 import json
 import re
-import shutil
 import subprocess
 import sys
 from base64 import b64decode, b64encode
@@ -21,10 +20,9 @@ from scanchain.comparison.table import COLUMNS, read_table
 from scanchain.logs.writer import ORIGIN, LogWriter, pack_laser_scan, pack_odometry
 from scanchain.maps import read_ply
 from scanchain.runs.metrics import Metrics
-from scanchain.runs.results import OVERLAY_FILE
 from scanchain.verdict import Judged, Kind, Stretch, Verdict
 from scanchain_viz.pictures.figure import Line
-from scanchain_viz.pictures.maps import AFTER, BEFORE, surroundings
+from scanchain_viz.pictures.maps import surroundings
 from scanchain_viz.pictures.trajectories import DrawnTrajectory
 from scanchain_viz.report.page import (
     SCRIPT,
@@ -39,7 +37,7 @@ from scanchain_viz.report.page import (
     interactive_map,
     write_page,
 )  # fmt: skip
-from scanchain_viz.report.run import map_section, trajectory_lines, write_run_report
+from scanchain_viz.report.run import map_section, trajectory_lines
 from scanchain_viz.report.sections import loop_section
 from tests.support import made
 from tests.support.browser import find_browser, look
@@ -198,21 +196,6 @@ def test_the_verdict_stands_at_the_head_in_its_color_with_its_error_and_a_line_a
     assert page.index("<strong>") < page.index("warned") < page.index("<dt>fact")
     assert ("ATE below 1 m" in page) is (verdict is not Verdict.NOT_TRUSTWORTHY)
     assert ("otherwise ATE" in page) is (verdict is Verdict.CHECK)
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_the_worst_place_of_a_run_is_drawn_and_lies_where_its_points_are(one_run, tmp_path, dimension):
-    assert "Worst place" not in (one_run / "report.html").read_text(encoding="utf-8")
-    folder = shutil.copytree(one_run, tmp_path / "run")
-    rng = np.random.default_rng(0)
-    clouds = {name: rng.uniform(20.0, 30.0, (500, dimension)) for name in ("before", "after")}
-    paths = {f"path_{name}": rng.uniform(24.0, 26.0, (5, dimension)) for name in clouds}
-    np.savez(folder / OVERLAY_FILE, text="scans 3 to 9: lost", place=np.full(dimension, 25.0), **clouds, **paths)
-    write_run_report(folder)
-    page = (folder / "report.html").read_text(encoding="utf-8")
-    assert "Worst place" in page and "scans 3 to 9: lost" in page and BEFORE in page and AFTER in page
-    shown = re.findall(r">(\d\d)</text>", page[page.index("Worst place") : page.index("Loop closures")])
-    assert "20" in shown and "30" in shown
 
 
 def test_the_same_directory_gives_the_same_page_without_matplotlib(pages):

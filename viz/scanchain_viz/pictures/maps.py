@@ -21,7 +21,6 @@ from scanchain.evaluation import on_the_estimate
 from scanchain.evaluation.errors import path_length
 from scanchain.maps import SavedMap, open_saved_map, read_map, read_ply
 from scanchain.runs.directory import TRUTH_FILE
-from scanchain.runs.results import Overlay
 from scanchain.trajectory import read_tum
 from scanchain.verdict import Kind, Stretch
 from scanchain_viz.colors import STRETCH_COLORS, TRUTH, color_of, height_shares, palette_of
@@ -33,7 +32,6 @@ GRAY = "#808893"  # of points of a map beneath lines
 _MAX_POINTS = 120_000
 _SAMPLE = 200_000  # points taken of a map's keyframes
 _PIXELS_A_POINT, _WIDTHS = 2.0, (200.0, 700.0)  # of a map's picture: per root of the points; pixels
-_LOWEST = 5.0  # percentile of the heights that is taken for the ground's
 _SHADES, _HEIGHTS = 6, 36  # numbers of opacities and of colors of heights; a PNG has 256 colors
 _VIRIDIS = (
     "440154", "48186a", "472d7b", "424086", "3b528b", "33638d", "2c728e", "26828e", "21918c", "1fa088", "28ae80",
@@ -103,32 +101,6 @@ def path_over_map(
     for line in lines:
         figure.line(line.positions, line.color, line.width, (3.0, 3.0) if line.is_dashed else ())
     return figure.svg()
-
-
-BEFORE, AFTER = "#1aa179", "#a55bd6"  # colors of two passes
-_MARGIN_M = 1.0  # around their points
-_VIEW_M = {2: 12.0, 3: 30.0}  # half width of a picture of two passes
-_GROUND_M = 0.5  # height above the lowest points below which points in space are ground, which hides walls
-
-
-def overlay_picture(overlay: Overlay) -> Markup:
-    """Points and paths of two passes over one place, seen from above; ground is left out."""
-    half_m = _VIEW_M[overlay.before.shape[1]]
-    before, after = _above_ground(overlay.before), _above_ground(overlay.after)
-    drawn = np.concatenate([before, after])[:, :2] if len(before) + len(after) else overlay.place[None, :2]
-    low = np.maximum(overlay.place[:2] - half_m, np.minimum(drawn.min(axis=0), overlay.place[:2]) - _MARGIN_M)
-    high = np.minimum(overlay.place[:2] + half_m, np.maximum(drawn.max(axis=0), overlay.place[:2]) + _MARGIN_M)
-    figure = Plot.of_plan(low, high)
-    for points, path, color in ((before, overlay.path_before, BEFORE), (after, overlay.path_after, AFTER)):
-        draw_points(figure, points, low, high, (color,))
-        figure.line(path, color, 1.4)
-    return figure.svg()
-
-
-def _above_ground(points: Points) -> Points:
-    if points.shape[1] == 2:
-        return np.pad(points, ((0, 0), (0, 1)))
-    return points[points[:, 2] > np.percentile(points[:, 2], _LOWEST) + _GROUND_M]
 
 
 def draw_points(figure: Plot, points: Points, low: Floats, high: Floats, colors: Sequence[str] = (GRAY,)) -> None:

@@ -18,14 +18,13 @@ from scanchain.maps import read_ply
 from scanchain.runs.directory import RUN_FILE, TRUTH_FILE
 from scanchain.runs.metrics import VERDICT, GroundTruth, Metrics
 from scanchain.runs.provenance import Provenance
-from scanchain.runs.results import OVERLAY_FILE, read_overlay
 from scanchain.runs.step_table import STAGES
 from scanchain.settings import read_layer
 from scanchain.trajectory import read_tum
 from scanchain.verdict import VELOCITY_LIMIT, WHEEL_LIMIT, Kind, Stretch
 from scanchain_viz.colors import STRETCH_COLORS, TRUTH, color_of
 from scanchain_viz.pictures.figure import Floats, Line
-from scanchain_viz.pictures.maps import AFTER, BEFORE, map_picture, overlay_picture, path_over_map, surroundings
+from scanchain_viz.pictures.maps import map_picture, path_over_map, surroundings
 from scanchain_viz.pictures.trajectories import frame, trajectories_of_run
 from scanchain_viz.report import page, sections
 
@@ -110,7 +109,7 @@ def _sections(directory: Path, metrics: Metrics) -> Iterator[page.Section]:
     lines = trajectory_lines(optimized.positions, steps, closures, metrics.stretches, true_path)
     low, high = frame([optimized], true_path)
     yield map_section(lines, read_ply(directory / "map.ply"), low, high, float(str(config["maps.voxel_size_m"])))
-    yield verdict_section(metrics, steps, directory / OVERLAY_FILE)
+    yield verdict_section(metrics, steps)
     if config["loops.enabled"]:
         min_travel_m = float(str(config["loops.min_travel_m"]))
         yield from sections.loop_section(optimized, closures, "Loop closures", min_travel_m)
@@ -197,8 +196,8 @@ def _marked_parts(path: Floats, is_marked: NDArray[np.bool_]) -> Floats:
     return positions
 
 
-def verdict_section(metrics: Metrics, steps: pa.Table, overlay_file: Path) -> page.Section:
-    """Innovations along the log, two passes over the worst place if there is one, and every suspicious stretch."""
+def verdict_section(metrics: Metrics, steps: pa.Table) -> page.Section:
+    """Innovations along the log, and every suspicious stretch."""
     curves = [
         (name, steps[column].to_numpy(zero_copy_only=False).astype(np.float64) / limit, color_of(place))
         for place, (column, name, limit) in enumerate(_CURVES)
@@ -207,18 +206,9 @@ def verdict_section(metrics: Metrics, steps: pa.Table, overlay_file: Path) -> pa
     shaded = [(each.first, each.last, _SHADE) for each in metrics.stretches if each.kind is not Kind.LOOPS]
     chips = [page.Chip(name, color) for name, _, color in curves]
     chips += [page.Chip("stretches to check", _SHADE)] if shaded else []
-    is_alone = not overlay_file.exists()
-    drawings = [sections.innovations([curve[1:] for curve in curves], shaded, is_wide=is_alone)]
-    if not is_alone:
-        overlay = read_overlay(overlay_file)
-        chips += [page.Chip("scans before", BEFORE), page.Chip("scans after", AFTER)]
-        caption = (
-            f"{overlay.text}: the scans before it and after it, or of both passes of a loop, where the trajectory "
-            "places them, seen from above. Where it is right, both show the same walls."
-        )
-        drawings.append(page.Drawing("Worst place", caption, overlay_picture(overlay)))
+    drawing = sections.innovations([curve[1:] for curve in curves], shaded)
     grid = _stretches(metrics.stretches) if metrics.stretches else None
-    return page.Section("Checks", "", tuple(chips), tuple(drawings), grid)
+    return page.Section("Checks", "", tuple(chips), (drawing,), grid)
 
 
 def _stretches(stretches: Sequence[Stretch]) -> page.Grid:
