@@ -281,7 +281,7 @@ def test_the_map_in_a_page_stays_small_and_lies_where_the_points_are():
     random = np.random.default_rng(3)
     points = random.normal(0.0, [80.0, 50.0, 4.0], (900_000, 3)).astype(np.float32)
     path = np.linspace([-60.0, 0.0, 0.0], [60.0, 5.0, 1.0], 20_000)
-    low, high = surroundings(path.min(axis=0), path.max(axis=0), [points])
+    low, high = surroundings(path, [points])
     broken = np.where(np.arange(20_000)[:, None] % 7 < 5, path, np.nan)
     lines = [Line("", path, "red", 1.0), Line("", broken[:500], "", 1.0)]
     scene = interactive_map(points, lines, low, high, grain_m=0.3, is_flat=False).svg
@@ -307,7 +307,7 @@ def test_a_map_is_shown_whole_whatever_the_trajectory_but_for_outliers():
     points = random.uniform([-90.0, -20.0, -2.0], [70.0, 20.0, 8.0], (20_000, 3))
     points[:30, 0] = 130.0  # a gable far away
     points[30:40] = [[9000.0, -3000.0, 50.0]] * 10
-    low, high = surroundings(np.array([-1.0, -1.0, 0.0]), np.array([30.0, 1.0, 0.1]), [points])
+    low, high = surroundings(np.array([[-1.0, -1.0, 0.0], [30.0, 1.0, 0.1]]), [points])
     assert (low > [-96.0, -22.0, -3.0]).all() and (low < [-89.9, -19.9, -1.9]).all()
     assert (high > [129.9, 19.9, 7.9]).all() and (high < [136.0, 22.0, 9.0]).all()
 
@@ -325,7 +325,7 @@ def test_stretches_and_closures_by_verdict_are_told_apart_and_a_scan_of_several_
     points = np.random.default_rng(1).uniform(-5.0, 45.0, (300, 3))
     stretch = Stretch(Kind.ACCELERATION, 0, 3, 4, 0.3, 0.4, 0.5)
     lines = trajectory_lines(positions, steps, closures, [stretch], positions + 0.1)
-    section = map_section(lines, points, positions.min(axis=0), positions.max(axis=0), 0.2)
+    section = map_section(lines, points, (positions.min(axis=0), positions.max(axis=0)), 0.2)
     assert [chip.name for chip in section.chips] == [
         "trajectory",
         "closures rejected by verification: 1", "closures rejected by the back end: 1", "closures accepted: 1",

@@ -9,7 +9,6 @@ from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
-from markupsafe import Markup
 
 from scanchain.batch.batch import totals
 from scanchain.batch.task import Row, State, output_file
@@ -126,7 +125,7 @@ def _spread(done: Sequence[Row]) -> Iterator[page.Section]:
         "Memory [MiB]": [row.peak_mib for row, _ in every],
     }
     drawings = [
-        page.Drawing(name.partition(" [")[0], "", _sorted_values(name, sorted(values)))
+        page.Drawing.of(name.partition(" [")[0], "", _sorted_values(name, sorted(values)))
         for name, values in figures.items()
         if len(values) > 1
     ]
@@ -135,7 +134,7 @@ def _spread(done: Sequence[Row]) -> Iterator[page.Section]:
         yield page.Section("Distributions", text, drawings=drawings, is_small=True)
 
 
-def _sorted_values(name: str, values: Sequence[float]) -> Markup:
+def _sorted_values(name: str, values: Sequence[float]) -> Plot:
     figure = Plot(name, "logs below [%]")
     points = np.stack([values, 100.0 * (np.arange(len(values)) + 1) / len(values)], axis=1)
     steps = np.stack([np.repeat(points[:, 0], 2)[1:], np.repeat(points[:, 1], 2)[:-1]], axis=1)
@@ -143,13 +142,13 @@ def _sorted_values(name: str, values: Sequence[float]) -> Markup:
     figure.marks(points, "o", color_of(0), 3.5)
     figure.x.limit(0.0, _BEYOND * max(values) or 1.0)
     figure.y.limit(0.0, 105.0)
-    return figure.svg()
+    return figure
 
 
 def _trajectories(directory: Path, done: Sequence[Row], names: dict[str, str]) -> Iterator[page.Section]:
     """Every trajectory from above, as far as a page can hold them."""
     drawings = [
-        page.Drawing(names[row.log], f"{row.run}", _trajectory(directory / row.run / "trajectory.tum"))
+        page.Drawing.of(names[row.log], row.run, _trajectory(directory / row.run / "trajectory.tum"))
         for row in done[:_MAX_TRAJECTORIES]
     ]
     text = f"The first {_MAX_TRAJECTORIES} of {len(done):,}." if len(done) > _MAX_TRAJECTORIES else ""
@@ -158,7 +157,7 @@ def _trajectories(directory: Path, done: Sequence[Row], names: dict[str, str]) -
         yield page.Section(title, text, drawings=drawings, is_small=True)
 
 
-def _trajectory(trajectory: Path) -> Markup:
+def _trajectory(trajectory: Path) -> Plot:
     positions = read_tum(trajectory).poses[:, :2, -1]
     rows = np.linspace(0, len(positions) - 1, min(len(positions), _MAX_POINTS)).astype(int)
     middle, size = 0.5 * (positions.min(axis=0) + positions.max(axis=0)), np.ptp(positions, axis=0)
@@ -166,4 +165,4 @@ def _trajectory(trajectory: Path) -> Markup:
     figure = Plot.of_plan(middle - half, middle + half, has_grid=True)
     figure.line(positions[rows], color_of(0))
     figure.marks(positions[:1], "o", color_of(0), 5.0)
-    return figure.svg()
+    return figure

@@ -14,7 +14,7 @@ from scanchain.comparison.table import Row as TableRow
 from scanchain.maps import read_ply
 from scanchain.trajectory import read_tum
 from scanchain_viz.pictures.figure import Floats
-from scanchain_viz.pictures.maps import map_picture, surroundings
+from scanchain_viz.pictures.maps import VIRIDIS, over_map, surroundings
 from scanchain_viz.pictures.trajectories import DrawnTrajectory, frame, trajectories_of_comparison
 from scanchain_viz.report import page, sections
 
@@ -78,7 +78,7 @@ def _grid(
     has_verdicts: bool = False,
 ) -> page.Grid:
     """A row a method; the end of a failed one in place of its figures."""
-    chips = {trajectory.name: sections.chip(trajectory) for trajectory in trajectories}
+    chips = {trajectory.name: trajectory for trajectory in trajectories}
     shown = [dict(zip((row.name for row in table.rows), c.cells(table.figures), strict=True)) for c in columns]
     lines = []
     for row in rows:
@@ -143,9 +143,10 @@ def _map_section(
     if not maps:
         return
     whole = {each.name for each in framing}
-    corners = surroundings(*box, [points for each, points in maps if each.name in whole])
+    corners = surroundings(np.stack(box), [points for each, points in maps if each.name in whole])
     drawings = [
-        page.Drawing(each.name, "", map_picture(points, *corners), sections.chip(each)) for each, points in maps
+        page.Drawing.of(each.name, "", over_map([], points, *corners, colors=VIRIDIS), each)
+        for each, points in maps
     ]
     text = "The same points of the same scans, placed by the poses of each method."
     text += " Dark is low, bright is high." if dimension == 3 else ""

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from scanchain.data import Points
 from scanchain.files import write_whole
 from scanchain.verdict import Judged, Verdict
-from scanchain_viz.pictures.figure import Floats, Line
+from scanchain_viz.pictures.figure import Floats, Line, Plot
+from scanchain_viz.pictures.trajectories import DrawnTrajectory
 
 REPORT_FILE = "report.html"
 _TEMPLATES = Path(__file__).parent / "templates"
@@ -39,6 +40,9 @@ class Chip:
     name: str
     color: str
     is_dashed: bool = False
+
+
+Named = Chip | Line | DrawnTrajectory  # what a legend names
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +86,7 @@ class Row:
 
     name: str
     cells: Sequence[Cell | str]
-    chip: Chip | None = None
+    chip: Named | None = None
     link: str = ""
 
 
@@ -115,9 +119,14 @@ class Drawing:
     title: str
     caption: str
     svg: Markup
-    chip: Chip | None = None
+    chip: Named | None = None
     is_wide: bool = False
     is_scripted: bool = False
+
+    @classmethod
+    def of(cls, title: str, caption: str, figure: Plot, chip: Named | None = None) -> Drawing:
+        """The picture of a figure."""
+        return cls(title, caption, figure.svg(), chip, figure.is_wide)
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +135,7 @@ class Section:
 
     title: str
     text: str = ""
-    chips: Sequence[Chip] = ()
+    chips: Sequence[Named] = ()
     drawings: Sequence[Drawing] = ()
     grid: Grid | None = None
     is_small: bool = False

@@ -24,7 +24,7 @@ from scanchain.trajectory import read_tum
 from scanchain.verdict import VELOCITY_LIMIT, WHEEL_LIMIT, Kind, Stretch
 from scanchain_viz.colors import STRETCH_COLORS, TRUTH, color_of
 from scanchain_viz.pictures.figure import Floats, Line
-from scanchain_viz.pictures.maps import map_picture, path_over_map, surroundings
+from scanchain_viz.pictures.maps import VIRIDIS, over_map, surroundings
 from scanchain_viz.pictures.trajectories import frame, trajectories_of_run
 from scanchain_viz.report import page, sections
 
@@ -107,8 +107,8 @@ def _sections(directory: Path, metrics: Metrics) -> Iterator[page.Section]:
     if accuracy is not None:
         yield accuracy_section(accuracy)
     lines = trajectory_lines(optimized.positions, steps, closures, metrics.stretches, true_path)
-    low, high = frame([optimized], true_path)
-    yield map_section(lines, read_ply(directory / "map.ply"), low, high, float(str(config["maps.voxel_size_m"])))
+    box, grain_m = frame([optimized], true_path), float(str(config["maps.voxel_size_m"]))
+    yield map_section(lines, read_ply(directory / "map.ply"), box, grain_m)
     yield verdict_section(metrics, steps)
     if config["loops.enabled"]:
         min_travel_m = float(str(config["loops.min_travel_m"]))
@@ -123,18 +123,19 @@ def _sections(directory: Path, metrics: Metrics) -> Iterator[page.Section]:
     yield from sections.time_section([optimized], _stages(metrics))
 
 
-def map_section(lines: Sequence[Line], points: Points, low: Floats, high: Floats, grain_m: float) -> page.Section:
+def map_section(lines: Sequence[Line], points: Points, box: tuple[Floats, Floats], grain_m: float) -> page.Section:
     """The map (M, 3) of grains so far apart and lines, the trajectory first, which lie within corners."""
     is_flat, path = not len(points) or not np.ptp(points[:, 2]), lines[0].positions
-    low, high = surroundings(low, high, [points])
-    above = "seen from above; dark is low, bright is high."
-    over_map = path_over_map(points, lines, low, high, path)
-    drawings = (
-        page.Drawing("Trajectory over the map", "Seen from above; circle: start, square: end.", over_map),
-        *(() if is_flat else (page.Drawing("Map", f"map.ply, {above}", map_picture(points, low, high)),)),
-        page.interactive_map(points, lines, low, high, grain_m=grain_m, is_flat=is_flat, is_wide=not is_flat),
+    corners = surroundings(np.stack(box), [points])
+    around = "Seen from above; circle: start, square: end."
+    drawings = [page.Drawing.of("Trajectory over the map", around, over_map(lines, points, *corners, path=path))]
+    if not is_flat:
+        text, figure = "dark is low, bright is high.", over_map([], points, *corners, colors=VIRIDIS)
+        drawings.append(page.Drawing.of("Map", f"map.ply, seen from above; {text}", figure))
+    drawings.append(
+        page.interactive_map(points, lines, *corners, grain_m=grain_m, is_flat=is_flat, is_wide=not is_flat)
     )
-    return page.Section("Trajectory and map", chips=tuple(map(sections.chip, lines)), drawings=drawings)
+    return page.Section("Trajectory and map", chips=lines, drawings=drawings)
 
 
 def trajectory_lines(
