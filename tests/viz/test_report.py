@@ -123,7 +123,7 @@ def test_a_comparison_shows_every_figure_and_a_row_for_every_method(comparison, 
         "Disagreement", "Command", "Versions", "Settings",
     ):  # fmt: skip
         assert title in page["text"], title
-    assert len(page["svgs"]) >= 11 and page["tables"] >= 2 and page["bold"] >= 5
+    assert len(page["svgs"]) >= 10 and page["tables"] >= 2 and page["bold"] >= 5
     for row in table.rows:
         assert row.name in page["text"]
     assert "raises crashed: at scan 10: ValueError: no more <b>patience</b>" in page["text"]

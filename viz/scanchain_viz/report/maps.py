@@ -119,7 +119,7 @@ def write_localization_report(folder: Path, localized: LocalizedLog) -> None:
         ("log-odds of the place", f"{m.log_odds:.0f}" if np.isfinite(m.log_odds) else "none"),
         *([] if m.ground_truth is None else [("ATE", f"{m.ground_truth.optimized.ate_rmse_m:.4f} m (rmse)")]),
     )
-    subtitle = f"{localized.path.name.split('.partial')[0]} in the map {localized.prior.name}"
+    subtitle = f"{localized.path.name} in the map {localized.prior.name}"
     sections, judged = list(_localized(localized)), Judged(m.verdict, m.reason)
     page.write_page(folder, page.Page("Localization", subtitle, facts, m.warnings, (), sections, judged=judged))
 
