@@ -35,6 +35,7 @@ from tests.support import naive_maps as naive
 
 RESOLUTION_M = 0.1
 CONFIG = MapsConfig(grid_resolution_m=RESOLUTION_M)
+ENDLESS = MapsConfig(grid_resolution_m=RESOLUTION_M, grid_max_range_m=np.inf)
 
 
 def random_scans(count=12, beams=80, seed=0):
@@ -87,7 +88,7 @@ def test_a_scan_counts_once_in_a_cell_and_its_end_outweighs_crossings():
 
 
 def test_returns_beyond_the_usable_range_do_not_carve():
-    grid = OccupancyGrid(CONFIG, max_range_m=5.0)
+    grid = OccupancyGrid(MapsConfig(grid_resolution_m=RESOLUTION_M, grid_max_range_m=5.0))
     grid.insert(lie.identity(2), np.array([[0.0, 4.0], [9.0, 0.0], [np.nan, 1.0], [np.inf, 1.0]]))
     assert hits(grid) == 1
     assert grid.trimmed().log_odds.shape == (41, 1)
@@ -169,7 +170,7 @@ def test_a_grid_too_large_for_memory_is_refused_and_a_coarser_one_fits():
 @pytest.mark.parametrize("far_m", [1e12, 1e30, 1e140])
 def test_cells_beyond_what_64_bits_count_are_refused_and_not_drawn_elsewhere(far_m):
     for points in ([[1.0, 2.0], [far_m, 0.0]], [[far_m, 0.0], [far_m, 1.0]]):
-        grid = OccupancyGrid(CONFIG, max_range_m=np.inf)
+        grid = OccupancyGrid(ENDLESS)
         with pytest.raises(InputError, match=r"raise maps\.grid_resolution_m"):
             grid.insert(np.eye(3), np.array(points))
 
@@ -218,7 +219,7 @@ def test_points_that_are_not_finite_stay_out_of_the_maps():
     points = np.array([[np.nan, 0.0, 0.0], [np.inf, 0.0, 0.0], [0.0, -np.inf, 0.0], [1.0, 2.0, 0.3]])
     built = build_point_map([(lie.identity(3), points)], dimension=3, voxel_size_m=0.1)
     np.testing.assert_allclose(built.points(), points[3:])
-    assert hits(draw_grid([(lie.identity(3), points)], CONFIG, max_range_m=float("inf"))) == 1
+    assert hits(draw_grid([(lie.identity(3), points)], ENDLESS)) == 1
 
 
 def test_a_ply_file_holds_the_points(tmp_path):

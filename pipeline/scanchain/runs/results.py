@@ -202,8 +202,9 @@ def views_of(keyframes: Sequence[Keyframe], poses: Matrix, config: Config) -> It
 
 def grid_of(keyframes: Sequence[Keyframe], poses: Matrix, config: MapsConfig) -> OccupancyGrid:
     """The grid of keyframes at poses (K, d+1, d+1), coarser than configured where that is too large."""
-    max_range_m = config.grid_max_range_m
-    resolution_m = fitting_resolution(poses, resolution_m=config.grid_resolution_m, max_range_m=max_range_m)
+    resolution_m = fitting_resolution(
+        poses, resolution_m=config.grid_resolution_m, max_range_m=config.grid_max_range_m
+    )
     fitting = msgspec.structs.replace(config, grid_resolution_m=resolution_m)
     scans = ((T, keyframe.points) for T, keyframe in zip(poses, keyframes, strict=True))
-    return draw_grid(scans, fitting, max_range_m=max_range_m)
+    return draw_grid(scans, fitting)
