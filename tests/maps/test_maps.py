@@ -9,6 +9,7 @@ import pytest
 
 from scanchain import lie
 from scanchain.baselines.wrapped import Open3dPairs
+from scanchain.checks import LARGEST
 from scanchain.config import MapsConfig
 from scanchain.errors import InputError
 from scanchain.logs import open_log
@@ -35,7 +36,7 @@ from tests.support import naive_maps as naive
 
 RESOLUTION_M = 0.1
 CONFIG = MapsConfig(grid_resolution_m=RESOLUTION_M)
-ENDLESS = MapsConfig(grid_resolution_m=RESOLUTION_M, grid_max_range_m=np.inf)
+ENDLESS = MapsConfig(grid_resolution_m=RESOLUTION_M, grid_max_range_m=LARGEST)
 
 
 def random_scans(count=12, beams=80, seed=0):
@@ -167,7 +168,7 @@ def test_a_grid_too_large_for_memory_is_refused_and_a_coarser_one_fits():
     assert fitting_resolution(poses[:1], resolution_m=RESOLUTION_M, max_range_m=80.0) == RESOLUTION_M
 
 
-@pytest.mark.parametrize("far_m", [1e12, 1e30, 1e140])
+@pytest.mark.parametrize("far_m", [1e12, 1e30, 1e49])
 def test_cells_beyond_what_64_bits_count_are_refused_and_not_drawn_elsewhere(far_m):
     for points in ([[1.0, 2.0], [far_m, 0.0]], [[far_m, 0.0], [far_m, 1.0]]):
         grid = OccupancyGrid(ENDLESS)
