@@ -325,7 +325,7 @@ def test_stretches_and_closures_by_verdict_are_told_apart_and_a_scan_of_several_
     points = np.random.default_rng(1).uniform(-5.0, 45.0, (300, 3))
     stretch = Stretch(Kind.ACCELERATION, 0, 3, 4, 0.3, 0.4, 0.5)
     lines = trajectory_lines(positions, steps, closures, [stretch], positions + 0.1)
-    section = map_section(lines, points, (positions.min(axis=0), positions.max(axis=0)), 0.2)
+    section = map_section(lines, points, positions, 0.2)
     assert [chip.name for chip in section.chips] == [
         "trajectory",
         "closures rejected by verification: 1", "closures rejected by the back end: 1", "closures accepted: 1",

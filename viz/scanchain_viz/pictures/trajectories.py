@@ -52,20 +52,15 @@ class DrawnTrajectory:
     nees: Floats
     observability: Floats
 
-    @property
-    def dashes(self) -> tuple[float, ...]:
-        """Of its line, in widths."""
-        return (3.0, 1.5) if self.is_dashed else ()
 
-
-def frame(trajectories: Sequence[DrawnTrajectory], truth: Floats | None) -> tuple[Floats, Floats]:
-    """Corners (3,) of the axes: the ground truth if there is one, else the trajectories, with a margin."""
+def frame(trajectories: Sequence[DrawnTrajectory], truth: Floats | None) -> Floats:
+    """Corners (2, 3) of the axes: the ground truth if there is one, else the trajectories, with a margin."""
     paths = [truth] if truth is not None else [trajectory.positions for trajectory in trajectories]
     low = np.min([path.min(axis=0) for path in paths], axis=0)
     high = np.max([path.max(axis=0) for path in paths], axis=0)
     size = high - low
     margin = np.array([max(0.08 * size[:2].max(), 1.0)] * 2 + [max(_MARGIN * size[2], 0.1)])
-    return low - margin, high + margin
+    return np.stack([low - margin, high + margin])
 
 
 def trajectories_of_run(

@@ -58,7 +58,7 @@ def write_batch_report(directory: Path, rows: Sequence[Row], command: Sequence[s
         page.Collapsible("Command", shlex.join(without_keys(command))),
         page.Collapsible("Paths", "\n".join(paths)),
     )
-    sections = (_logs(directory, rows, names), *_spread(done), *_trajectories(directory, done, names))
+    sections = (_logs(directory, rows, names), *_trajectories(directory, done, names))
     title = f"Batch of {counted(len(rows), 'log')}"
     subtitle = "Each was run in its own process."
     page.write_page(directory, page.Page(title, subtitle, totals(rows), warnings, (), sections, folds))
@@ -114,35 +114,6 @@ def _link(directory: Path, row: Row) -> str:
         if path is not None and (directory / path).is_file():
             return quote(path.as_posix())
     return ""
-
-
-def _spread(done: Sequence[Row]) -> Iterator[page.Section]:
-    """Distributions of the figures, if there are several logs."""
-    every = [(row, row.metrics) for row in done if row.metrics is not None]
-    figures = {
-        "ATE [m]": [m.ground_truth.optimized.ate_rmse_m for _, m in every if m.ground_truth is not None],
-        "Speed [× real time]": [m.times_real_time for _, m in every],
-        "Memory [MiB]": [row.peak_mib for row, _ in every],
-    }
-    drawings = [
-        page.Drawing.of(name.partition(" [")[0], "", _sorted_values(name, sorted(values)))
-        for name, values in figures.items()
-        if len(values) > 1
-    ]
-    if drawings:
-        text = "Cumulative distribution over the logs."
-        yield page.Section("Distributions", text, drawings=drawings, is_small=True)
-
-
-def _sorted_values(name: str, values: Sequence[float]) -> Plot:
-    figure = Plot(name, "logs below [%]")
-    points = np.stack([values, 100.0 * (np.arange(len(values)) + 1) / len(values)], axis=1)
-    steps = np.stack([np.repeat(points[:, 0], 2)[1:], np.repeat(points[:, 1], 2)[:-1]], axis=1)
-    figure.line(steps, color_of(0))
-    figure.marks(points, "o", color_of(0), 3.5)
-    figure.x.limit(0.0, _BEYOND * max(values) or 1.0)
-    figure.y.limit(0.0, 105.0)
-    return figure
 
 
 def _trajectories(directory: Path, done: Sequence[Row], names: dict[str, str]) -> Iterator[page.Section]:

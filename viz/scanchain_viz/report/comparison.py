@@ -21,7 +21,6 @@ from scanchain_viz.report import page, sections
 _VERDICT = page.Head(
     "verdict", "", "of other tools by wheels and constant velocity alone, with the error that it vouches for", True
 )
-_WIDEST = 10  # largest number of columns of a table beside the summary
 _NEARLY = 1.25  # thickness of a map over that of the sharpest, up to which it frames the pictures
 
 
@@ -56,17 +55,13 @@ def write_compare_report(directory: Path) -> None:
 
 
 def _figures(table: Table, trajectories: Sequence[DrawnTrajectory]) -> Iterator[page.Section]:
-    """The summary, and all else in one table more, or in two where that would be too wide."""
+    """The summary, and tables of all else."""
     summary = columns_of(table.figures, "summary")
     yield page.Section("Summary", grid=_grid(table, table.rows, trajectories, summary, has_verdicts=True))
     ended = [row for row in table.rows if row.status is Status.OK]
-    accuracy, time = columns_of(table.figures, "accuracy"), columns_of(table.figures, "time")
-    parts = {"More on accuracy": accuracy, "More on time": time}
-    if len(accuracy) + len(time) <= _WIDEST:
-        parts = {"More figures": [*accuracy, *time]}
-    for title, columns in parts.items():
-        if columns:
-            yield page.Section(title, grid=_grid(table, ended, trajectories, columns))
+    for part in ("accuracy", "time"):
+        if columns := columns_of(table.figures, part):
+            yield page.Section(f"More on {part}", grid=_grid(table, ended, trajectories, columns))
 
 
 def _grid(
@@ -134,7 +129,7 @@ def _map_section(
     directory: Path,
     trajectories: Sequence[DrawnTrajectory],
     framing: Sequence[DrawnTrajectory],
-    box: tuple[Floats, Floats],
+    box: Floats,
     dimension: int,
 ) -> Iterator[page.Section]:
     """Maps, all within the same corners; those of ``framing`` must be seen whole."""
@@ -143,7 +138,7 @@ def _map_section(
     if not maps:
         return
     whole = {each.name for each in framing}
-    corners = surroundings(np.stack(box), [points for each, points in maps if each.name in whole])
+    corners = surroundings(box, [points for each, points in maps if each.name in whole])
     drawings = [
         page.Drawing.of(each.name, "", over_map([], points, *corners, colors=VIRIDIS), each)
         for each, points in maps

@@ -34,7 +34,7 @@ _HEADS = (
     page.Head("closures", "", "closures in force between this session and those of other maps"),
 )
 _GONE = page.Head("gone", "points", "points of its keyframes that newer sessions saw through, removed")
-_STATE_COLORS = {
+STATE_COLORS = {
     MapState.SEARCHING: "#8c9096",
     MapState.LOCALIZED: "#3f9b2f",
     MapState.UNMATCHED: "#c77800",
@@ -152,7 +152,7 @@ def _path_section(localized: LocalizedLog) -> page.Section:
     later = found.is_placed & (found.states == MapState.SEARCHING)
     path = np.where(later[:, None], final, np.nan)
     lines = [Line("placed afterwards", path, _PLACED_LATER, 1.2, is_dashed=True)] if later.any() else []
-    for state, color in _STATE_COLORS.items():
+    for state, color in STATE_COLORS.items():
         if (is_in := found.states == state).any():
             lines.append(Line(state, np.where(is_in[:, None], live, np.nan), color))
     figure = maps.over_map(lines, points, low, high, path=ends, is_wide=True)
@@ -169,7 +169,7 @@ def _states_picture(localized: LocalizedLog) -> page.Drawing:
     top = float(np.nanmax(found.sigma_m, initial=0.01)) if np.isfinite(found.sigma_m).any() else 1.0
     for run in np.split(np.arange(len(found.states)), runs):
         first_m, last_m = found.traveled_m[[run[0], min(run[-1] + 1, len(found.states) - 1)]].tolist()
-        figure.span(first_m, last_m, f"{_STATE_COLORS[MapState(str(found.states[run[0]]))]}40")
+        figure.span(first_m, last_m, f"{STATE_COLORS[MapState(str(found.states[run[0]]))]}40")
     figure.line(np.stack([found.traveled_m, found.sigma_m], axis=1), INK, 0.9)
     figure.y.limit(0.0, 1.1 * top)
     count = counted(len(found.closures), "match with the map", "matches with the map")

@@ -27,8 +27,7 @@ SCRIPT = (_TEMPLATES / "map_viewer.js").read_text(encoding="utf-8")
 _MAX_POINTS = 160_000  # 6 bytes each, 8 as text: 1.3 MB of a page
 _MAX_LINE_POINTS = 4_000
 _HIGHEST = 65_535.0
-_BULK = (3.0, 97.0)  # percentiles of the points: what is in view at first, and the ends of the color scale
-_BULK_2D, _MARGIN = (0.5, 99.5), 0.03  # the same of a flat map, and its share that is added on each side
+_BULK, _MARGIN = (0.5, 99.5), 0.03  # percentiles of the points in view at first; the share added on each side
 _WIDEST = 3.0  # greatest width of a flat map's canvas over its height
 _WIDER = 1.8  # lines, on the canvas
 
@@ -195,15 +194,12 @@ def interactive_map(
     """
     inside = points[((points >= low) & (points <= high)).all(axis=1)]
     shown = inside[:: max(1, -(-len(inside) // _MAX_POINTS))]
-    if is_flat:
-        bulk = _flat_view(shown, lines, low, high)
-    else:
-        bulk = np.percentile(shown, _BULK, axis=0) if len(shown) else np.stack([low, high])
-    width, height = (bulk[1] - bulk[0])[:2]
+    view = _first_view(shown, lines, low, high)
+    width, height = (view[1] - view[0])[:2]
     scene = {
         "box": [low.tolist(), high.tolist()],
-        "view": bulk.tolist(),
-        "heights": bulk[:, 2].tolist(),
+        "view": view.tolist(),
+        "heights": view[:, 2].tolist(),
         "grain": grain_m * np.sqrt(max(len(inside), 1) / max(len(shown), 1)),
         "flat": is_flat,
         "points": _packed(shown, low, high),
@@ -220,9 +216,9 @@ def interactive_map(
     return Drawing("Interactive map", text, svg, is_wide=is_wide, is_scripted=True)
 
 
-def _flat_view(points: Points, lines: Sequence[Line], low: Floats, high: Floats) -> Floats:
+def _first_view(points: Points, lines: Sequence[Line], low: Floats, high: Floats) -> Floats:
     """Corners (2, 3) of what is in view at first: all lines and most points, with a margin."""
-    bulk = np.percentile(points, _BULK_2D, axis=0) if len(points) else np.empty((0, 3))
+    bulk = np.percentile(points, _BULK, axis=0) if len(points) else np.empty((0, 3))
     seen = np.vstack([bulk, *(line.positions for line in lines)])
     first, last = np.nanmin(seen, axis=0), np.nanmax(seen, axis=0)
     margin = _MARGIN * (last - first)

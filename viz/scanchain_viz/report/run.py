@@ -123,10 +123,10 @@ def _sections(directory: Path, metrics: Metrics) -> Iterator[page.Section]:
     yield from sections.time_section([optimized], _stages(metrics))
 
 
-def map_section(lines: Sequence[Line], points: Points, box: tuple[Floats, Floats], grain_m: float) -> page.Section:
-    """The map (M, 3) of grains so far apart and lines, the trajectory first, which lie within corners."""
+def map_section(lines: Sequence[Line], points: Points, box: Floats, grain_m: float) -> page.Section:
+    """The map (M, 3) of grains so far apart and lines, the trajectory first, which lie within corners (2, 3)."""
     is_flat, path = not len(points) or not np.ptp(points[:, 2]), lines[0].positions
-    corners = surroundings(np.stack(box), [points])
+    corners = surroundings(box, [points])
     around = "Seen from above; circle: start, square: end."
     drawings = [page.Drawing.of("Trajectory over the map", around, over_map(lines, points, *corners, path=path))]
     if not is_flat:

@@ -39,7 +39,8 @@ def _known(trajectories: Sequence[DrawnTrajectory], key: str) -> list[DrawnTraje
 
 
 def _draw(figure: Plot, trajectory: DrawnTrajectory, x: Floats, y: Floats, width: float = 1.2) -> None:
-    figure.line(np.stack([x, y], axis=1), trajectory.color, width, trajectory.dashes)
+    dashes = DASHED if trajectory.is_dashed else ()
+    figure.line(np.stack([x, y], axis=1), trajectory.color, width, dashes)
 
 
 def trajectories_section(
@@ -56,7 +57,7 @@ def trajectories_section(
     height = Plot("distance traveled [m]", "z [m]")
     for each in reversed(trajectories):  # the first on top
         rows = _some(len(each.positions))
-        plan.line(each.positions[rows], each.color, dashes=each.dashes)
+        plan.line(each.positions[rows], each.color, dashes=DASHED if each.is_dashed else ())
         _draw(height, each, each.distance_m[rows], each.positions[rows, 2])
     chips: Sequence[Named] = _legend(trajectories)
     if truth is not None:
