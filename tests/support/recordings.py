@@ -77,10 +77,10 @@ def graph_of(steps, last_keyframe):
     return GraphState(poses, np.zeros(len(poses), np.int64), edges, is_loop, weight, 1.0, np.zeros(len(edges)))
 
 
-def opened(path, dimension=2, sinks=("save",), config=None, **ports):
+def opened(path, dimension=2, sinks=("save",), config=None):
     """A recording before it begins."""
     config = config or RecordingConfig()
-    return Recording(path, dimension=dimension, name="test", sinks=frozenset(sinks), config=config, **ports)
+    return Recording(path, dimension=dimension, name="test", sinks=frozenset(sinks), config=config)
 
 
 def record(path, steps, dimension, final=None, **options):

@@ -14,7 +14,6 @@ from scanchain.runs.vouching import evidence_of, evidence_of_trajectory
 from scanchain.verdict import (
     Closures,
     Evidence,
-    Judged,
     Kind,
     Stretch,
     Verdict,
@@ -478,12 +477,6 @@ def test_after_a_gap_one_contradicted_scan_is_to_be_checked_unless_wheels_agree_
 def test_a_stretch_shorter_than_a_digit_of_its_times_has_one_time():
     assert Stretch(Kind.LOST, 7, 8, 2, 2262.91, 2262.94).text == "scans 7 to 8 (2262.9 s): lost"
     assert Stretch(Kind.LOST, 7, 9, 3, 2262.9, 2263.1).text == "scans 7 to 9 (2262.9 to 2263.1 s): lost"
-
-
-def test_stretches_that_the_reason_names_are_not_listed_again():
-    stretches = tuple(Stretch(Kind.LOST, 10 * k, 10 * k + 4 + k, 5 + k, float(k), k + 0.5) for k in range(5))
-    judged = Judged(Verdict.CHECK, "; ".join(each.text for each in stretches[2:]) + "; and 2 more", stretches)
-    assert judged.unnamed == stretches[:2]
 
 
 def test_every_kind_of_stretch_has_a_color():

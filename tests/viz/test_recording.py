@@ -167,7 +167,16 @@ def test_a_match_without_any_information_is_drawn_at_the_cap_and_breaks_nothing(
     np.testing.assert_allclose(ellipsoid_of(information)[0], [0.2] * 3, rtol=1e-5)
 
 
+@pytest.fixture
+def ports(monkeypatch):
+    """Free ones, which viewers use in this test."""
+    monkeypatch.setattr(viewer, "PORT", free_port())
+    monkeypatch.setattr(viewer, "WEB_PORT", free_port())
+    return viewer.PORT, viewer.WEB_PORT
+
+
 @pytest.mark.parametrize(("sink", "why"), [("connect", "no viewer at 127.0.0.1"), ("spawn", "no display")])
+@pytest.mark.usefixtures("ports")
 def test_without_a_viewer_or_a_display_the_file_is_whole_at_once_and_one_line_says_so(
     tmp_path, monkeypatch, sink, why
 ):
@@ -175,16 +184,18 @@ def test_without_a_viewer_or_a_display_the_file_is_whole_at_once_and_one_line_sa
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     started = time.perf_counter()
-    recording = record(tmp_path / "a.rrd", STEPS[2], 2, sinks=("save", sink), port=free_port())
+    recording = record(tmp_path / "a.rrd", STEPS[2], 2, sinks=("save", sink))
     assert time.perf_counter() - started < 15.0
     assert len(recording.warnings) == 1 and why in recording.warnings[0] and "\n" not in recording.warnings[0]
     assert rows_of(tmp_path / "a.rrd")[0][entities.INLIERS] == 61
 
 
 @pytest.mark.parametrize("dies", [False, True])
-def test_the_web_viewer_listens_on_this_machine_only_ends_with_the_recording_and_may_die_before(tmp_path, dies):
-    port, web_port, steps = free_port(), free_port(), drive(600, 2)
-    with opened(tmp_path / "a.rrd", sinks=("save", "web"), port=port, web_port=web_port) as recording:
+def test_the_web_viewer_listens_on_this_machine_only_ends_with_the_recording_and_may_die_before(
+    tmp_path, ports, dies
+):
+    web_port, steps = ports[1], drive(600, 2)
+    with opened(tmp_path / "a.rrd", sinks=("save", "web")) as recording:
         assert recording.warnings == []
         assert recording.web_address.startswith(f"http://127.0.0.1:{web_port}/?url=")
         assert viewer.is_listening(web_port)
@@ -202,13 +213,13 @@ def test_the_web_viewer_listens_on_this_machine_only_ends_with_the_recording_and
 
 @posix
 @pytest.mark.slow
+@pytest.mark.usefixtures("ports")
 def test_a_viewer_that_stops_reading_does_not_stop_the_run(tmp_path, monkeypatch):
     monkeypatch.setattr(sinks, "_VIEWER_PATIENCE_S", 1.0)
-    port, steps = free_port(), drive(400, 3, points=8000)
-    server = viewer.start_web(port, free_port())
+    steps, server = drive(400, 3, points=8000), viewer.start_web()
     os.killpg(server.pid, signal.SIGSTOP)
     try:
-        with opened(tmp_path / "a.rrd", 3, sinks=("save", "connect"), port=port) as recording:
+        with opened(tmp_path / "a.rrd", 3, sinks=("save", "connect")) as recording:
             started = time.perf_counter()
             for step in steps:
                 recording.log(step)
@@ -221,8 +232,8 @@ def test_a_viewer_that_stops_reading_does_not_stop_the_run(tmp_path, monkeypatch
 
 @posix
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_view_web_prints_one_address_and_takes_its_server_along(recorded, number):
-    port, web_port = free_port(), free_port()
+def test_view_web_prints_one_address_and_takes_its_server_along(recorded, ports, number):
+    port, web_port = ports
     script = f"""
 import sys
 from scanchain.__main__ import main
@@ -234,7 +245,7 @@ sys.exit(main(["view", "--web", sys.argv[1]]))
         [sys.executable, "-c", script, str(recorded[2])], cwd=ROOT, stdout=subprocess.PIPE,
         stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
-    assert child.stdout.readline() == f"{viewer.web_address(port, web_port)}\n"
+    assert child.stdout.readline() == f"{viewer.web_address()}\n"
     assert viewer.is_listening(port) and viewer.is_listening(web_port)
     servers = psutil.Process(child.pid).children(recursive=True)
     assert servers
@@ -306,9 +317,10 @@ def table_of(steps):
     return table
 
 
+@pytest.mark.usefixtures("ports")
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_recording_goes_on_in_file_and_viewer_from_what_was_secured_of_it(tmp_path, dimension):
-    steps, port = drive(300, dimension), free_port()
+    steps = drive(300, dimension)
     whole, begun, again = (tmp_path / name for name in ("whole.rrd", "begun.rrd", "again.rrd"))
     config = RecordingConfig(local_map_every=2)
     closures = [closure for step in steps for closure in step.closures]
@@ -329,9 +341,9 @@ def test_a_recording_goes_on_in_file_and_viewer_from_what_was_secured_of_it(tmp_
         secured = recording.secure()
         log(recording, rest[:50])  # what a process records that is killed after its checkpoint
     os.truncate(begun, secured)
-    server = viewer.start_web(port, free_port())
+    server = viewer.start_web()
     try:
-        with opened(again, dimension, ("save", "connect"), config, port=port) as recording:
+        with opened(again, dimension, ("save", "connect"), config) as recording:
             known = [closure for step in first for closure in step.closures]
             recording.resume(begun, table_of(first), known, last.graph)
             log(recording, rest)

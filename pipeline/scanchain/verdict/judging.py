@@ -62,11 +62,6 @@ class Judged:
         """Verdict, error and reasons."""
         return f"{self.verdict}{f' ({self.vouched})' if self.vouched else ''}: {self.reason}"
 
-    @property
-    def unnamed(self) -> tuple[Stretch, ...]:
-        """Stretches that the reason does not name."""
-        return tuple(each for each in self.stretches if each.text not in self.reason)
-
 
 def judge(evidence: Evidence) -> Judged:
     """The verdict on a trajectory.

@@ -115,7 +115,6 @@ class Batcher:
         self.graph = KeyframeGraph()
         self.gathered: list[tuple[Step, list[str], tuple[int, int]]] = []  # with the news and counts of closures
         self.bytes = 0
-        self.scans = 0
         self.points = 0
         self.box: Floats | None = None
         self.started_s = perf_counter()
@@ -127,7 +126,7 @@ class Batcher:
         odom, world = steps.columns["T_odom_lidar"], steps.columns["T_world_lidar"]
         positions = drawing.positions(world)
         self.graph.restore(positions[steps.columns["keyframe"] >= 0], closures, graph)
-        self.scans, self.points = len(steps), int(steps.columns["points"].sum())
+        self.points = int(steps.columns["points"].sum())
         self._frame(positions)
         self.last = odom[-1:]
         self.state = steps.last_state
@@ -140,7 +139,6 @@ class Batcher:
         self.gathered.append((step, news, self.graph.counts))
         self.bytes += 12 * len(step.points)
         self.points += len(step.points)
-        self.scans += 1
 
     @property
     def is_due(self) -> bool:

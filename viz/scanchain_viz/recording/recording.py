@@ -65,8 +65,6 @@ class Recording:
         name: str,
         sinks: frozenset[SinkName],
         config: RecordingConfig,
-        port: int = viewer.PORT,
-        web_port: int = viewer.WEB_PORT,
     ) -> None:
         if "save" in sinks and path is None:
             raise InputError("no path for the recording: give --out, or leave save out of --rerun")
@@ -75,8 +73,6 @@ class Recording:
         self.name = name
         self.wanted = sinks
         self.config = config
-        self.port = port
-        self.web_port = web_port
         self.web_address = ""
         self.sinks: list[Sink] = []
         self.file: Sink | None = None
@@ -135,10 +131,7 @@ class Recording:
         if not self.sinks:
             return
         self.last = step.scan.index, step.scan.stamp_ns
-        try:
-            self.batcher.add(step)
-        except Exception as error:
-            self._note(error)
+        self._guard(lambda: self.batcher.add(step))
         has_news = self.batcher.graph.has_grown or self._draws_map_of(step)
         if has_news or self.batcher.is_due:
             self._send(lambda: self._step(step))
@@ -221,7 +214,7 @@ class Recording:
     def close(self) -> None:
         """Write the last batch, frame the view, and close file and viewer; may be called twice."""
         self._send(lambda: [*self.batcher.messages(), *self.batcher.graph.draw(self.now)])
-        layout = blueprint(self.dimension, self.batcher.box, self.batcher.scans)
+        layout = blueprint(self.dimension, self.batcher.box, self.last[0])
         for sink in self.sinks:
             sink.send(layout)
             sink.close()
@@ -243,18 +236,18 @@ class Recording:
         """Address of a viewer; empty, with a warning, if there is none."""
         try:
             if "web" in self.wanted:
-                self.server = viewer.start_web(self.port, self.web_port)
-                self.web_address = viewer.web_address(self.port, self.web_port)
+                self.server = viewer.start_web()
+                self.web_address = viewer.web_address()
             elif "spawn" in self.wanted:
-                viewer.start_window(self.port)
-            elif not viewer.is_listening(self.port):
+                viewer.start_window()
+            elif not viewer.is_listening(viewer.PORT):
                 raise viewer.ViewerError(
-                    f"no viewer at {viewer.HOST}:{self.port}, the run goes on without it; open one with: rerun"
+                    f"no viewer at {viewer.HOST}:{viewer.PORT}, the run goes on without it; open one with: rerun"
                 )
         except (viewer.ViewerError, OSError) as error:
             self.problems.append(str(error))
             return ""
-        return viewer.grpc_address(self.port)
+        return viewer.grpc_address()
 
     @property
     def now(self) -> Times:
@@ -287,16 +280,13 @@ class Recording:
             with catch_and_log_exceptions(strict=True):  # else rerun turns errors into warnings on stderr
                 act()
         except Exception as error:
-            self._note(error)
-
-    def _note(self, error: Exception) -> None:
-        problem = f"the recording lacks something: {type(error).__name__}: {error}"
-        if problem not in self.problems:
-            self.problems.append(problem)
+            problem = f"the recording lacks something: {type(error).__name__}: {error}"
+            if problem not in self.problems:
+                self.problems.append(problem)
 
 
 def _document(judged: Judged) -> str:
-    listed = "".join(f"- {each.text}\n" for each in judged.unnamed[:_LISTED])
-    more = len(judged.unnamed) - _LISTED
+    listed = "".join(f"- {each.text}\n" for each in judged.stretches[:_LISTED])
+    more = len(judged.stretches) - _LISTED
     head = f"## {judged.verdict}\n\n{judged.vouched}\n\n{judged.reason}\n\n"
     return head + listed + (f"- and {more:,} more\n" if more > 0 else "")

@@ -109,11 +109,9 @@ def _sections(
         yield from sections.time_section(trajectories)
         yield from sections.uncertainty_section(trajectories, is_planar=is_planar)
         yield from _map_section(directory, trajectories, framing, frame(framing, truth), table.dimension)
-    settings = {row.name: row.settings for row in table.rows}
     for each in trajectories:
         closures = sections.read_closures(method_folder(directory, each.name) / CLOSURES_FILE)
-        min_travel_m = float(settings[each.name].get("loops", {}).get("min_travel_m", 0.0))
-        yield from sections.loop_section(each, closures, f"Loop closures of {each.name}", min_travel_m)
+        yield from sections.loop_section(each, closures, f"Loop closures of {each.name}")
     if len(table.rows) > 1:
         yield _disagreement(table)
 

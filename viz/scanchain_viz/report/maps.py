@@ -21,7 +21,7 @@ from scanchain.sessions.localize import LocalizedLog
 from scanchain.sessions.localizer import MapState
 from scanchain.sessions.merging import MergeMetrics
 from scanchain.verdict import Judged
-from scanchain_viz.colors import CLOSURES, hex_of
+from scanchain_viz.colors import CLOSURES
 from scanchain_viz.pictures import maps
 from scanchain_viz.pictures.figure import INK, Line, Plot, broken
 from scanchain_viz.report import page
@@ -45,7 +45,7 @@ _PLACED_LATER = "#0f9bb5"
 _ROWS, _CLOSE_UPS = 200, 12
 _AROUND_M = 3.0  # around a cluster in a close-up
 _ORDER = (Label.SAME, Label.UNKNOWN, Label.VANISHED, Label.APPEARED)
-_HEX = {label: hex_of(COLORS[label]) for label in Label}
+_HEX = {label: f"#{bytes(COLORS[label]).hex()}" for label in Label}
 _HOW_TOLD = (
     "A change is named where the scans of the other map looked through the place. Unknown is what the other map "
     "did not see, or what is too small."

@@ -111,8 +111,7 @@ def _sections(directory: Path, metrics: Metrics) -> Iterator[page.Section]:
     yield map_section(lines, read_ply(directory / "map.ply"), box, grain_m)
     yield verdict_section(metrics, steps)
     if config["loops.enabled"]:
-        min_travel_m = float(str(config["loops.min_travel_m"]))
-        yield from sections.loop_section(optimized, closures, "Loop closures", min_travel_m)
+        yield from sections.loop_section(optimized, closures, "Loop closures")
     is_planar, text = metrics.dimension == 2, ""
     if truth is not None:
         text = "Odometry and ground truth are aligned to the optimized trajectory as for the ATE."

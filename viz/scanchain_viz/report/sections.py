@@ -233,18 +233,13 @@ def closure_lines(path: Floats, closures: pa.Table) -> list[Line]:
     return lines
 
 
-def loop_section(
-    trajectory: DrawnTrajectory, closures: pa.Table | None, title: str, min_travel_m: float
-) -> Iterator[Section]:
-    """Every loop closure tried, and the number of each verdict; ``min_travel_m`` is ``loops.min_travel_m``."""
+def loop_section(trajectory: DrawnTrajectory, closures: pa.Table | None, title: str) -> Iterator[Section]:
+    """Every loop closure tried, and the number of each verdict."""
     if closures is None:
         return
     if not closures.num_rows:
-        length_m = float(trajectory.distance_m[-1])
-        reason = f"the trajectory did not return to a place visited more than {min_travel_m:g} m before"
-        if length_m <= min_travel_m:
-            reason = f"the trajectory is {length_m:.1f} m long, and a loop has more than {min_travel_m:g} m"
-        yield Section(title, f"None was tried: {reason} (loops.min_travel_m).")
+        reason = f"after more than loops.min_travel_m in {trajectory.distance_m[-1]:.1f} m"
+        yield Section(title, f"None was tried: the trajectory did not return to a place {reason}.")
         return
     path, lines = trajectory.positions, closure_lines(trajectory.positions, closures)
     figure = over_map(
