@@ -5,8 +5,6 @@ The SVG of a report is written here: matplotlib takes half a second to load, and
 
 from __future__ import annotations
 
-import struct
-import zlib
 from base64 import b64encode
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
+from PIL import Image
 
 from scanchain.files import write_whole
 from scanchain_viz.pictures.axis import FONT, Axis, width_of
@@ -81,8 +80,7 @@ class Plot:
         self.x, self.y = (Axis(is_logarithmic=name == logarithmic) for name in "xy")
         self.x.label, self.y.label = x_label, y_label
         self.has_grid = True
-        self.is_wide, self.proportions = is_wide, (0.0, 0.0)  # of a plan
-        self._lay_out(height_inches, is_wide=is_wide)
+        self.height_inches, self.is_wide, self.proportions = height_inches, is_wide, (0.0, 0.0)  # of a plan
         self._within: list[Callable[[], str]] = []
         self._on_axes: list[Callable[[Axes], object]] = []
 
@@ -93,12 +91,12 @@ class Plot:
         figure.x.limit(low[0], high[0])
         figure.y.limit(low[1], high[1])
         figure.proportions, figure.has_grid = (float(high[0] - low[0]), float(high[1] - low[1])), has_grid
-        figure._lay_out(0.0, is_wide=is_wide)
         return figure
 
-    def _lay_out(self, height_inches: float, *, is_wide: bool) -> None:
+    def _lay_out(self, *, is_wide: bool) -> None:
         """Size of the figure, and corner and extent of its axes; of a plan so that a meter is equal along both."""
         whole, (width, height) = _WHOLE if is_wide else _WIDTH, self.proportions
+        height_inches = self.height_inches
         across = whole - _LEFT - _RIGHT
         if width:
             needed = across * height / width + _BOTTOM + _TOP
@@ -207,13 +205,8 @@ class Plot:
 
     def svg(self) -> Markup:
         """The figure as SVG for a page, a wide one once more for a narrow page; no text of a log is ever drawn."""
-        if not self.is_wide:
-            return Markup(self._drawn())
-        wide, height_inches = self._drawn("wide"), self.size[1] / _INCH
-        self._lay_out(height_inches, is_wide=False)
-        narrow = self._drawn("narrow")
-        self._lay_out(height_inches, is_wide=True)
-        return Markup(wide + narrow)
+        sizes = (("wide", True), ("narrow", False)) if self.is_wide else (("", False),)
+        return Markup("".join(self._drawn(name, is_wide=is_wide) for name, is_wide in sizes))
 
     def draw_on(self, axes: Axes, title: str) -> None:
         """Draw on axes of matplotlib, on white."""
@@ -230,7 +223,8 @@ class Plot:
         for spine in axes.spines.values():
             spine.set_color(_FRAME)
 
-    def _drawn(self, name: str = "") -> str:
+    def _drawn(self, name: str, *, is_wide: bool) -> str:
+        self._lay_out(is_wide=is_wide)
         (left, top), (width, height) = self.corner, self.extent
         across = [(left + place * width, text) for place, text in self.x.ticks(width, is_upright=False)]
         up = [(top + (1.0 - place) * height, text) for place, text in self.y.ticks(height, is_upright=True)]
@@ -306,29 +300,16 @@ def _image(
     rows: NDArray[np.uint8], palette: NDArray[np.uint8], box: tuple[float, float, float, float], rendering: str
 ) -> str:
     """Pixels (H, W), each the number of a color, in a box: left, top, width, height."""
-    data = b64encode(_png(rows, palette)).decode("ascii")
+    image, file = Image.fromarray(rows), BytesIO()
+    image.putpalette(palette[:, :3].tobytes())
+    image.save(file, "PNG", compress_level=_LEVEL, transparency=palette[:, 3].tobytes())
+    data = b64encode(file.getvalue()).decode("ascii")
     where = " ".join(
         f'{name}="{value:.2f}"' for name, value in zip(("x", "y", "width", "height"), box, strict=True)
     )
     return (
         f'<image {where} preserveAspectRatio="none" style="image-rendering: {rendering}" '
         f'href="data:image/png;base64,{data}"/>'
-    )
-
-
-def _png(rows: NDArray[np.uint8], palette: NDArray[np.uint8]) -> bytes:
-    """A PNG file of pixels (H, W), the numbers of the colors of a palette (K, 4) (ISO/IEC 15948)."""
-    height, width = rows.shape
-    chunks = (
-        (b"IHDR", struct.pack(">2I5B", width, height, 8, 3, 0, 0, 0)),
-        (b"PLTE", palette[:, :3].tobytes()),
-        (b"tRNS", palette[:, 3].tobytes()),
-        (b"IDAT", zlib.compress(np.pad(rows, ((0, 0), (1, 0))).tobytes(), _LEVEL)),
-        (b"IEND", b""),
-    )
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-        for kind, data in chunks
     )
 
 
