@@ -355,7 +355,9 @@ def test_logs_with_several_lidars_take_the_flags_of_run_and_one_that_is_not_sure
     assert "2: 1 done, 1 not trustworthy" in output
     assert errors == f"error: 1 of 2 logs are not trustworthy; {out}/summary.txt has the reason\n"
     assert f"{two_lidars[0]} is not trustworthy" in (out / "report.html").read_text()
-    assert room["ate_share_of_path"] is None  # it stood still
+    assert room["ate_share_of_path"] is None  # it stood still, without loops
+    page = (out / room["run"] / "report.html").read_text(encoding="utf-8")
+    assert "Accuracy" in page and "<td>–</td>" in page and "Loop closures" not in page
     for row in (wall, room):
         config = (out / row["run"] / "config.toml").read_text()
         assert row["scans"] == 10

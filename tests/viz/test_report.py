@@ -17,7 +17,6 @@ from rerun.chunk import RrdReader
 
 from scanchain.__main__ import main
 from scanchain.comparison.table import COLUMNS, read_table
-from scanchain.logs.writer import ORIGIN, LogWriter, pack_laser_scan, pack_odometry
 from scanchain.maps import read_ply
 from scanchain.runs.metrics import Metrics
 from scanchain.verdict import Judged, Kind, Stretch, Verdict
@@ -333,23 +332,6 @@ def test_stretches_and_closures_by_verdict_are_told_apart_and_a_scan_of_several_
     assert len(told["lines"]) == len(section.chips) == len({chip.color for chip in section.chips})
     assert [line["color"] for line in told["lines"]] == [chip.color for chip in section.chips]
     assert all(chip.color in section.drawings[0].svg for chip in section.chips)
-
-
-def test_a_lidar_that_stands_still_without_loops_has_a_report_too(tmp_path):
-    angles = np.linspace(-np.pi / 2.0, np.pi / 2.0, 181)  # of a square room: a round one leaves the heading open
-    ranges_m = 3.0 / np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles)))
-    ranges_m += np.random.default_rng(0).normal(0.0, 0.01, 181)
-    with LogWriter(tmp_path / "still.mcap") as log:
-        for k in range(8):
-            stamp_ns = 10**18 + k * 10**8
-            scan = pack_laser_scan(stamp_ns, "lidar", -1.57, 0.01745, ranges_m, range_min_m=0.1, range_max_m=30.0)
-            log.append("/scan", "sensor_msgs/msg/LaserScan", scan, stamp_ns)
-            pose = pack_odometry(stamp_ns, "world", "lidar", ORIGIN)
-            log.append("/ground_truth", "nav_msgs/msg/Odometry", pose, stamp_ns)
-    files = [str(tmp_path / "still.mcap"), "--out", str(tmp_path / "out")]
-    assert main(["run", *files, "--rerun", "off", "--no-loops"]) == 0
-    text = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    assert "Accuracy" in text and "<td>–</td>" in text and "Loop closures" not in text
 
 
 @BOTH
