@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import subprocess
 from collections.abc import Callable, Iterable, Sequence
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from types import TracebackType
 from typing import Concatenate, ParamSpec
@@ -113,10 +113,9 @@ class Recording:
         """
         self.last = int(steps.columns["index"][-1]), int(steps.columns["stamp_ns"][-1])
         self._guard(lambda: self.batcher.restore(steps, closures, graph))
-        if before is not None:
-            for sink in self.sinks:
-                sink.send(before)
         for sink in self.sinks:
+            if before is not None:
+                sink.send(partial(sink.copy, before))
             sink.settle()
 
     def secure(self) -> int:
@@ -216,7 +215,7 @@ class Recording:
         self._send(lambda: [*self.batcher.messages(), *self.batcher.graph.draw(self.now)])
         layout = blueprint(self.dimension, self.batcher.box, self.last[0])
         for sink in self.sinks:
-            sink.send(layout)
+            sink.send(lambda stream: stream.send_blueprint(layout))
             sink.close()
         self.problems, self.sinks = self.warnings, []
         if self.server is not None:
@@ -269,10 +268,15 @@ class Recording:
     def _send(self, say: Callable[[], Iterable[Message]]) -> None:
         """Send the messages that ``say`` returns to every sink."""
         messages: list[Message] = []
+
+        def write(stream: rr.RecordingStream) -> None:
+            for message in messages:
+                message.send(stream)
+
         if self.sinks:
             self._guard(lambda: messages.extend(say()))
         for sink in self.sinks if messages else ():
-            sink.send(messages)
+            sink.send(write)
 
     def _guard(self, act: Callable[[], object]) -> None:
         """Turn an exception into a warning, once per kind: a recording that fails must not fail the run."""
