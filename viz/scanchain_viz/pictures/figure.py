@@ -217,9 +217,6 @@ class Plot:
         axes.set_ylabel(self.y.label, fontsize=_TITLE_FONT - 2.0)
         axes.set_title(title, loc="left", fontsize=_TITLE_FONT)
         axes.tick_params(labelsize=_TITLE_FONT - 2.0, color=_FRAME)
-        for axis, shown in ((axes.xaxis, self.x), (axes.yaxis, self.y)):
-            if shown.only_ticks is not None:
-                axis.set_ticks(shown.only_ticks)
         for spine in axes.spines.values():
             spine.set_color(_FRAME)
 

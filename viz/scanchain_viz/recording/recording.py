@@ -130,10 +130,7 @@ class Recording:
         if not self.sinks:
             return
         self.last = step.scan.index, step.scan.stamp_ns
-        self._guard(lambda: self.batcher.add(step))
-        has_news = self.batcher.graph.has_grown or self._draws_map_of(step)
-        if has_news or self.batcher.is_due:
-            self._send(lambda: self._step(step))
+        self._send(lambda: self._step(step))
 
     @_recorded
     def log_trajectory(
@@ -253,14 +250,11 @@ class Recording:
         """The instant of the last step."""
         return Times.at(*self.last)
 
-    def _draws_map_of(self, step: Step) -> bool:
-        """True for every so many keyframes."""
-        return step.keyframe >= 0 and step.keyframe % self.config.local_map_every == 0 and len(step.local_map) > 0
-
     def _step(self, step: Step) -> list[Message]:
-        """Messages that are due after a step."""
+        """Take in a step; the messages that are due after it."""
+        self.batcher.add(step)
         messages = self.batcher.graph.draw(self.now) if self.batcher.graph.has_grown else []
-        if self._draws_map_of(step):
+        if step.keyframe >= 0 and step.keyframe % self.config.local_map_every == 0 and len(step.local_map):
             points = drawing.at_most(step.local_map, self.config.max_map_points)
             messages.append(Message(entities.LOCAL_MAP, drawing.dots(points), self.now))
         return [*messages, *self.batcher.messages()] if self.batcher.is_due else messages

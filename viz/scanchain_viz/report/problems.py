@@ -53,9 +53,7 @@ def _graph(state: GraphState) -> Plot:
     low, high = center - half, center + half  # a square, since the panels stand side by side
     figure = Plot.of_plan(low, high)
     if not is_flat:
-        figure.x.limit(low[0], high[0], ticks=())
-        figure.y.limit(low[1], high[1], ticks=())
-        figure.x.label, figure.y.label = "seen obliquely from above", ""
+        figure.x.label, figure.y.label = "seen obliquely from above [m]", ""
     skips = np.abs(state.edges[:, 0] - state.edges[:, 1]) != 1
     width = float(np.clip(2000.0 / max(len(state.edges), 1), 0.25, 1.0))
     for chosen, color, thickness, name in (
@@ -113,8 +111,7 @@ def _factor(method: MethodResult) -> Plot:
     shades = np.where(count > 0, 0.30 + 0.70 * np.sqrt(np.minimum(share, 1.0)), 0.0)
     low, high = np.zeros(2), np.full(2, float(size))
     figure = Plot.of_plan(low, high)
-    figure.x.limit(0.0, size, ticks=(0, size))
-    figure.y.limit(size, 0.0, ticks=(0, size))
+    figure.y.limit(size, 0.0)
     figure.x.label, figure.y.label = f"{method.factor.nnz:,} nonzero", ""
     figure.image(np.rint(255.0 * shades).astype(np.uint8), palette_of(_BLUES), low, high, rendering="auto")
     return figure
