@@ -260,7 +260,7 @@ def test_the_map_is_turned_moved_and_zoomed_and_the_page_scrolls_unless_it_was_c
     points = np.random.default_rng(2).uniform([-20.0, -10.0, 0.0], [20.0, 10.0, 6.0], (5000, 3))
     low, high = points.min(axis=0), points.max(axis=0)
     solid, dashed = Line("", np.linspace(low, high, 50), "red"), Line("", np.linspace(high, low, 9), "", 1.0, True)
-    drawing = interactive_map(points, [solid, dashed], low, high, grain_m=0.2, is_flat=False, is_wide=True)
+    drawing = interactive_map(points, [solid, dashed], low, high, grain_m=0.2, is_flat=False)
     write_page(tmp_path, Page("a", "b", sections=[Section("Map", drawings=[drawing])]))
     text = re.sub('<meta http-equiv="Content-Security-Policy"[^>]*>', "", (tmp_path / "report.html").read_text())
     frames = "<script>window.requestAnimationFrame = act => setTimeout(act, 10);</script>"  # none without a window

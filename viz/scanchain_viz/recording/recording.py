@@ -6,11 +6,10 @@ Nothing that goes wrong here after the start ends a run; it is collected in ``Re
 from __future__ import annotations
 
 import subprocess
-from collections.abc import Callable, Iterable, Sequence
-from functools import partial, wraps
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Concatenate, ParamSpec
 from uuid import uuid4
 
 import numpy as np
@@ -33,19 +32,6 @@ from scanchain_viz.recording.sinks import Sink, file_sink, open_stream, viewer_s
 
 _LISTED = 50  # largest number of stretches in the text of a verdict
 _RADIUS = 3.5  # of a stretch, in points of the screen
-Given = ParamSpec("Given")
-
-
-def _recorded(
-    draw: Callable[Concatenate[Recording, Given], Iterable[Message]],
-) -> Callable[Concatenate[Recording, Given], None]:
-    """A method that sends the messages which it makes to every sink."""
-
-    @wraps(draw)
-    def send(recording: Recording, *values: Given.args, **named: Given.kwargs) -> None:
-        recording._send(lambda: draw(recording, *values, **named))
-
-    return send
 
 
 class Recording:
@@ -132,80 +118,41 @@ class Recording:
         self.last = step.scan.index, step.scan.stamp_ns
         self._send(lambda: self._step(step))
 
-    @_recorded
     def log_trajectory(
         self, stamps_ns: NDArray[np.int64], poses_optimized: Matrix, indices: NDArray[np.int64]
-    ) -> Iterable[Message]:
+    ) -> None:
         """Record the optimized trajectory: poses (N, d+1, d+1) of the scans ``indices``."""
-        path = drawing.lines([drawing.positions(poses_optimized)], entities.CYAN, 0.75)
-        yield Message(entities.OPTIMIZED, path)
         times = Times(indices, stamps_ns)
-        yield Message(entities.OPTIMIZED_LIDAR, drawing.transforms(poses_optimized), times)
+        self._send(lambda: [
+            _path(entities.OPTIMIZED, poses_optimized, entities.CYAN),
+            Message(entities.OPTIMIZED_LIDAR, drawing.transforms(poses_optimized), times),
+        ])  # fmt: skip
 
-    @_recorded
-    def log_closures(self, closures: Sequence[Closure], graph: GraphState) -> Iterable[Message]:
+    def log_closures(self, closures: Sequence[Closure], graph: GraphState) -> None:
         """Record the final graph and the final verdict on every closure, at the last scan."""
-        return self.batcher.settled(closures, graph, self.now)
+        self._send(lambda: self.batcher.settled(closures, graph, self.now))
 
-    @_recorded
-    def log_verdict(self, judged: Judged, trajectory: Trajectory) -> Iterable[Message]:
+    def log_verdict(self, judged: Judged, trajectory: Trajectory) -> None:
         """Record the verdict, and its stretches on the optimized trajectory of all scans of the log."""
-        document = rr.TextDocument(_document(judged), media_type=rr.MediaType.MARKDOWN)
-        yield Message(entities.VERDICT, document)
-        if judged.stretches:
-            path = drawing.positions(trajectory.poses)
-            strips = [  # of disagreeing loops the line between their ends
-                path[[each.first, each.last]]
-                if each.kind is Kind.LOOPS
-                else path[max(each.first - 1, 0) : each.last + 1]
-                for each in judged.stretches
-            ]
-            lines = rr.LineStrips3D(
-                strips,
-                colors=[rgb(STRETCH_COLORS[each.kind]) for each in judged.stretches],
-                radii=drawing.pixels(_RADIUS),
-                labels=[str(each.kind) for each in judged.stretches],
-                show_labels=False,
-            )
-            yield Message(entities.STRETCHES, lines)
-            first = np.array([each.first for each in judged.stretches], np.int64)
-            texts = [[(WARNING, f"stretch to check: {each.text}")] for each in judged.stretches]
-            yield from events(texts, Times(first, trajectory.stamps_ns[first]))
+        self._send(lambda: _verdict(judged, trajectory))
 
-    @_recorded
-    def log_ground_truth(self, poses: Matrix) -> Iterable[Message]:
+    def log_ground_truth(self, poses: Matrix) -> None:
         """Record true poses (N, 4, 4), aligned to the optimized trajectory."""
-        line = drawing.lines([drawing.positions(poses)], entities.WHITE, 0.75)
-        yield Message(entities.GROUND_TRUTH, line)
+        self._send(lambda: [_path(entities.GROUND_TRUTH, poses, entities.WHITE)])
 
-    @_recorded
-    def log_map(self, points: NDArray[np.floating]) -> Iterable[Message]:
+    def log_map(self, points: NDArray[np.floating]) -> None:
         """Record the finished map (N, d), downsampled to a third of the points of the scans."""
-        limit = max(self.config.max_map_points, self.batcher.points // 3)
-        drawn = drawing.at_most(points, limit)
-        if len(drawn):
-            color = entities.height_colors(drawn) if self.dimension == 3 else entities.WHITE
-            yield Message(entities.MAP, drawing.dots(drawn, color, 1.0))
+        self._send(lambda: self._map(points))
 
-    @_recorded
     def log_grid(
         self, cells: NDArray[np.int8] | NDArray[np.uint8], *, resolution_m: float, origin_m: tuple[float, float]
-    ) -> Iterable[Message]:
+    ) -> None:
         """Record the finished occupancy grid of a 2D log.
 
         cells : (H, W), as ROS counts: 0 free to 100 occupied, −1 (255) unknown; row 0 at the lowest y
         origin_m : x, y of the outer corner of cells[0, 0]
         """
-        height, width = cells.shape
-        pixels = np.ascontiguousarray(cells[::-1]).view(np.uint8)  # rerun's first row is the top one
-        grid = rr.GridMap(
-            data=pixels.tobytes(),
-            format=rr.components.ImageFormat(width=width, height=height, color_model="L", channel_datatype="U8"),
-            cell_size=resolution_m,
-            translation=[*origin_m, -0.05],
-            colormap=rr.components.Colormap.RvizMap,
-        )
-        yield Message(entities.GRID, grid)
+        self._send(lambda: [Message(entities.GRID, _grid(cells, resolution_m, origin_m))])
 
     def close(self) -> None:
         """Write the last batch, frame the view, and close file and viewer; may be called twice."""
@@ -259,6 +206,14 @@ class Recording:
             messages.append(Message(entities.LOCAL_MAP, drawing.dots(points), self.now))
         return [*messages, *self.batcher.messages()] if self.batcher.is_due else messages
 
+    def _map(self, points: NDArray[np.floating]) -> list[Message]:
+        """The map's points as far as they are drawn."""
+        drawn = drawing.at_most(points, max(self.config.max_map_points, self.batcher.points // 3))
+        if not len(drawn):
+            return []
+        color = entities.height_colors(drawn) if self.dimension == 3 else entities.WHITE
+        return [Message(entities.MAP, drawing.dots(drawn, color, 1.0))]
+
     def _send(self, say: Callable[[], Iterable[Message]]) -> None:
         """Send the messages that ``say`` returns to every sink."""
         messages: list[Message] = []
@@ -283,8 +238,47 @@ class Recording:
                 self.problems.append(problem)
 
 
-def _document(judged: Judged) -> str:
+def _path(entity: str, poses: Matrix, color: drawing.Color) -> Message:
+    """A line through poses (N, d+1, d+1)."""
+    return Message(entity, drawing.lines([drawing.positions(poses)], color, 0.75))
+
+
+def _grid(
+    cells: NDArray[np.int8] | NDArray[np.uint8], resolution_m: float, origin_m: tuple[float, float]
+) -> rr.GridMap:
+    height, width = cells.shape
+    pixels = np.ascontiguousarray(cells[::-1]).view(np.uint8)  # rerun's first row is the top one
+    return rr.GridMap(
+        data=pixels.tobytes(),
+        format=rr.components.ImageFormat(width=width, height=height, color_model="L", channel_datatype="U8"),
+        cell_size=resolution_m,
+        translation=[*origin_m, -0.05],
+        colormap=rr.components.Colormap.RvizMap,
+    )
+
+
+def _verdict(judged: Judged, trajectory: Trajectory) -> Iterator[Message]:
+    """The verdict as text, its stretches as lines and as events."""
     listed = "".join(f"- {each.text}\n" for each in judged.stretches[:_LISTED])
     more = len(judged.stretches) - _LISTED
-    head = f"## {judged.verdict}\n\n{judged.vouched}\n\n{judged.reason}\n\n"
-    return head + listed + (f"- and {more:,} more\n" if more > 0 else "")
+    listed += f"- and {more:,} more\n" if more > 0 else ""
+    text = f"## {judged.verdict}\n\n{judged.vouched}\n\n{judged.reason}\n\n{listed}"
+    yield Message(entities.VERDICT, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+    if not judged.stretches:
+        return
+    path = drawing.positions(trajectory.poses)
+    strips = [  # of disagreeing loops the line between their ends
+        path[[each.first, each.last]] if each.kind is Kind.LOOPS else path[max(each.first - 1, 0) : each.last + 1]
+        for each in judged.stretches
+    ]
+    lines = rr.LineStrips3D(
+        strips,
+        colors=[rgb(STRETCH_COLORS[each.kind]) for each in judged.stretches],
+        radii=drawing.pixels(_RADIUS),
+        labels=[str(each.kind) for each in judged.stretches],
+        show_labels=False,
+    )
+    yield Message(entities.STRETCHES, lines)
+    first = np.array([each.first for each in judged.stretches], np.int64)
+    texts = [[(WARNING, f"stretch to check: {each.text}")] for each in judged.stretches]
+    yield from events(texts, Times(first, trajectory.stamps_ns[first]))

@@ -21,7 +21,6 @@ from scanchain_viz.pictures.figure import Plot
 from scanchain_viz.report import page
 
 _MAX_TRAJECTORIES = 60
-_MAX_POINTS = 1500  # largest number of points of a line
 _BOX = np.array([1.0, 0.84])  # proportions of the plan of a trajectory
 _BEYOND = 1.05  # of the greatest value, so that its mark is whole
 _MANY_DEGENERATE, _MANY_LOST = 0.5, 0.01  # shares of the scans above which a figure is marked
@@ -130,10 +129,9 @@ def _trajectories(directory: Path, done: Sequence[Row], names: dict[str, str]) -
 
 def _trajectory(trajectory: Path) -> Plot:
     positions = read_tum(trajectory).poses[:, :2, -1]
-    rows = np.linspace(0, len(positions) - 1, min(len(positions), _MAX_POINTS)).astype(int)
     middle, size = 0.5 * (positions.min(axis=0) + positions.max(axis=0)), np.ptp(positions, axis=0)
     half = _BEYOND * 0.5 * (max(size / _BOX) or 1.0) * _BOX
     figure = Plot.of_plan(middle - half, middle + half, has_grid=True)
-    figure.line(positions[rows], color_of(0))
+    figure.line(positions, color_of(0))
     figure.marks(positions[:1], "o", color_of(0), 5.0)
     return figure

@@ -185,8 +185,7 @@ def write_page(folder: Path, page: Page) -> None:
 
 
 def interactive_map(
-    points: Points, lines: Sequence[Line], low: Floats, high: Floats, *, grain_m: float, is_flat: bool,
-    is_wide: bool = False,
+    points: Points, lines: Sequence[Line], low: Floats, high: Floats, *, grain_m: float, is_flat: bool
 ) -> Drawing:  # fmt: skip
     """The canvas in which ``SCRIPT`` draws a map (M, 3) and lines; points outside of the corners are left out.
 
@@ -213,7 +212,7 @@ def interactive_map(
     drag = "Drag to move" if is_flat else "Drag to rotate, Shift-drag to move"
     text = f"{drag}, click it and scroll to zoom, double-click to reset; two fingers zoom and move."
     svg = canvas.format(style if is_flat else "", json.dumps(scene, separators=(",", ":")))
-    return Drawing("Interactive map", text, svg, is_wide=is_wide, is_scripted=True)
+    return Drawing("Interactive map", text, svg, is_wide=not is_flat, is_scripted=True)
 
 
 def _first_view(points: Points, lines: Sequence[Line], low: Floats, high: Floats) -> Floats:
@@ -230,6 +229,7 @@ def _line(line: Line, low: Floats, high: Floats) -> dict[str, object]:
     positions, is_known = line.positions, np.isfinite(line.positions[:, 0])
     if is_broken := not is_known.all():
         starts = np.flatnonzero(is_known[:-1] & is_known[1:])
+        starts = starts[:: max(1, -(-len(starts) // _MAX_LINE_POINTS))]
         positions = positions[np.stack([starts, starts + 1], axis=1).ravel()]
     elif len(positions) > _MAX_LINE_POINTS:
         positions = positions[np.linspace(0, len(positions) - 1, _MAX_LINE_POINTS).astype(int)]

@@ -45,7 +45,6 @@ _SHADE = "#d6308f"
 _MAX_ROWS = 100  # largest number of stretches in the table; the longest
 _DISPUTED = "at closures rejected by the back end"
 _OVER_STATES = (Kind.OVERLAP, Kind.WHEELS, Kind.ACCELERATION, Kind.DISCONNECTED, Kind.COPIES)
-_MAX_SEGMENTS = 3000  # largest number of segments of a path; of longer ones the worst state of successive scans
 
 
 def write_run_report(directory: Path) -> None:
@@ -131,9 +130,7 @@ def map_section(lines: Sequence[Line], points: Points, box: Floats, grain_m: flo
     if not is_flat:
         text, figure = "dark is low, bright is high.", over_map([], points, *corners, colors=VIRIDIS)
         drawings.append(page.Drawing.of("Map", f"map.ply, seen from above; {text}", figure))
-    drawings.append(
-        page.interactive_map(points, lines, *corners, grain_m=grain_m, is_flat=is_flat, is_wide=not is_flat)
-    )
+    drawings.append(page.interactive_map(points, lines, *corners, grain_m=grain_m, is_flat=is_flat))
     return page.Section("Trajectory and map", chips=lines, drawings=drawings)
 
 
@@ -187,13 +184,8 @@ def _within(parts: Sequence[slice], count: int) -> NDArray[np.bool_]:
 
 def _marked_parts(path: Floats, is_marked: NDArray[np.bool_]) -> Floats:
     """The segments of the path that lead to a marked scan, NaN elsewhere."""
-    size = max(1, -(-len(path) // _MAX_SEGMENTS))
-    groups = [slice(k, k + size) for k in range(0, len(path), size)]
-    has_marked = np.array([bool(is_marked[group].any()) for group in groups])
-    positions = path[[min(group.stop, len(path)) - 1 for group in groups]].copy()
-    shown = has_marked | np.append(has_marked[1:], False)
-    positions[~shown] = np.nan
-    return positions
+    shown = is_marked | np.append(is_marked[1:], False)
+    return np.where(shown[:, None], path, np.nan)
 
 
 def verdict_section(metrics: Metrics, steps: pa.Table) -> page.Section:
