@@ -362,8 +362,6 @@ def test_logs_with_several_lidars_take_the_flags_of_run_and_one_that_is_not_sure
         config = (out / row["run"] / "config.toml").read_text()
         assert row["scans"] == 10
         assert 'topic = "/rear"' in config and "every = 2" in config and "enabled = false" in config
-    first = made_at(out)
-    assert main(words) == 1 and made_at(out) == first and "2 results from before" in capfd.readouterr()[0]
     assert main([*words, "--gt", "truth.tum"]) == 2
 
 

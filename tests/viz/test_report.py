@@ -164,22 +164,6 @@ def test_a_run_says_its_verdict_and_result_first_and_its_time_last(one_run, page
     assert "Versions" in seen("one_run")["text"] and len(seen("one_run")["svgs"]) >= 8
 
 
-@BOTH
-def test_text_is_as_large_in_figures_over_the_whole_page_as_in_others_and_a_lone_figure_is_one(which, pages):
-    page = pages[which].read_text(encoding="utf-8")
-    wide, others = (
-        {
-            float(width)
-            for width in re.findall(f'<figure{name}>(?:(?!</figure>).)*?viewBox="0 0 ([0-9.]+)', page, re.S)
-        }
-        for name in (' class="whole"', "")
-    )
-    assert len(wide) == len(others) == 1 and wide.pop() / others.pop() == pytest.approx(1090.0 / 523.0, rel=0.02)
-    for drawings in re.findall(r'<div class="drawings">(.*?)\n</div>', page, re.S):
-        if drawings.count("<figure") == 1:
-            assert '<figure class="whole">' in drawings
-
-
 @pytest.mark.parametrize("verdict", list(Verdict))
 def test_the_verdict_stands_at_the_head_in_its_color_with_its_error_and_a_line_a_reason(tmp_path, verdict):
     judged = Judged(verdict, "first <b>; second", error="ATE below 1 m")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from scanchain import lie
@@ -107,15 +108,12 @@ def trajectories_of_comparison(directory: Path) -> list[DrawnTrajectory]:
 
 def _of_method(row: Row, color: str, scans: pa.Table, relations: pa.Table | None) -> DrawnTrajectory:
     """Of several runs the one with most scans, the first of those."""
-
-    def chosen(table: pa.Table, column: str, value: object) -> pa.Table:
-        return table.filter(pa.array(np.array(table[column].to_pylist(), object) == value))
-
-    runs = chosen(scans, "method", row.name)
+    is_of_it = pc.field("method") == row.name
+    runs = scans.filter(is_of_it)
     if len(runs):
-        runs = chosen(runs, "repeat", int(np.argmax(np.bincount(runs["repeat"].to_numpy()))))
+        runs = runs.filter(pc.field("repeat") == int(np.argmax(np.bincount(runs["repeat"].to_numpy()))))
     known = (_column(runs, name) for name in ("seconds", "nees", "observability"))
-    errors_m = np.empty(0) if relations is None else _column(chosen(relations, "method", row.name), "error_m")
+    errors_m = np.empty(0) if relations is None else _column(relations.filter(is_of_it), "error_m")
     positions = np.stack([_column(runs, f"aligned_{axis}") for axis in "xyz"], axis=1)
     distance_m, is_dashed = _column(runs, "distance_m"), "+loops" in row.base
     return DrawnTrajectory(

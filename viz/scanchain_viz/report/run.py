@@ -151,8 +151,10 @@ def trajectory_lines(
         )
     ]  # fmt: skip
     for kind in _OVER_STATES:
-        parts = [slice(each.first, each.last + 1) for each in stretches if each.kind == kind]
-        marks.append((str(kind), _within(parts, len(steps)), kind))
+        is_marked = np.zeros(len(steps), bool)
+        for each in stretches:
+            is_marked[each.first : each.last + 1] |= each.kind is kind
+        marks.append((str(kind), is_marked, kind))
     for name, is_marked, kind in marks:  # the later are drawn on top
         if is_marked.any():
             name = f"{name}: {counted(int(is_marked.sum()), 'scan')}"
@@ -165,21 +167,11 @@ def trajectory_lines(
 def _disputed(steps: pa.Table, closures: pa.Table | None) -> NDArray[np.bool_]:
     """(N,) scans from each keyframe of a closure that the back end rejected to the next keyframe."""
     if closures is None or not len(closures):
-        return _within([], len(steps))
-    keyframes = np.append(np.flatnonzero(steps["keyframe"].to_numpy() >= 0), len(steps))
+        return np.zeros(len(steps), bool)
+    keyframe = np.maximum.accumulate(np.where(steps["keyframe"].to_numpy() >= 0, np.arange(len(steps)), -1))
     is_rejected = np.array(closures["rejected_by"].to_pylist()) == BACK_END
     ends = np.stack([closures[name].to_numpy() for name in ("target_scan", "source_scan")])
-    firsts = np.unique(ends[:, is_rejected])
-    lasts = keyframes[np.searchsorted(keyframes, firsts, side="right")]
-    return _within([slice(*ends) for ends in zip(firsts.tolist(), lasts.tolist(), strict=True)], len(steps))
-
-
-def _within(parts: Sequence[slice], count: int) -> NDArray[np.bool_]:
-    """(N,) which of so many scans are in one of these parts."""
-    is_within = np.zeros(count, bool)
-    for part in parts:
-        is_within[part] = True
-    return is_within
+    return np.isin(keyframe, ends[:, is_rejected])
 
 
 def _marked_parts(path: Floats, is_marked: NDArray[np.bool_]) -> Floats:
