@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -22,8 +21,8 @@ from scanchain.runs.step_table import STAGES
 from scanchain.settings import read_layer
 from scanchain.trajectory import read_tum
 from scanchain.verdict import VELOCITY_LIMIT, WHEEL_LIMIT, Kind, Stretch
-from scanchain_viz.colors import STRETCH_COLORS, TRUTH, color_of
-from scanchain_viz.pictures.figure import Floats, Line
+from scanchain_viz.colors import CLOSURES, STRETCH_COLORS, TRUTH, color_of
+from scanchain_viz.pictures.figure import Floats, Line, broken
 from scanchain_viz.pictures.maps import VIRIDIS, over_map, surroundings
 from scanchain_viz.pictures.trajectories import frame, trajectories_of_run
 from scanchain_viz.report import page, sections
@@ -43,6 +42,7 @@ _ACCURACY = (  # a column's head, the field of ``Accuracy``, the factor to the h
 )
 _SHADE = "#d6308f"
 _MAX_ROWS = 100  # largest number of stretches in the table; the longest
+_MAX_CLOSURES = 1500  # largest number of closures of a verdict that are drawn
 _DISPUTED = "at closures rejected by the back end"
 _OVER_STATES = (Kind.OVERLAP, Kind.WHEELS, Kind.ACCELERATION, Kind.DISCONNECTED, Kind.COPIES)
 
@@ -139,9 +139,8 @@ def trajectory_lines(
 ) -> list[Line]:
     """The trajectory, closures by verdict, what is to check on it, a scan in several of them, and the truth."""
     lines = [Line("trajectory", path, color_of(0), 1.2)]
-    for line in sections.closure_lines(path, closures) if closures is not None and len(closures) else ():
-        if len(line.positions):
-            lines.append(replace(line, name=f"closures {line.name}"))
+    if closures is not None and len(closures):
+        lines += _closure_lines(path, closures)
     states = np.array(steps["state"].to_pylist())
     marks = [(_DISPUTED, _disputed(steps, closures), Kind.LOOPS)]
     marks += [
@@ -162,6 +161,17 @@ def trajectory_lines(
     if truth is not None:
         lines.append(Line("ground truth", truth, TRUTH, 0.9, is_dashed=True))
     return lines
+
+
+def _closure_lines(path: Floats, closures: pa.Table) -> Iterator[Line]:
+    """Closures by verdict with their numbers, as lines over a path (N, 3); of many every n-th is drawn."""
+    ends = np.stack([closures["target_scan"].to_numpy(), closures["source_scan"].to_numpy()], axis=1)
+    rejected_by = np.array(closures["rejected_by"].to_pylist())
+    for by, (name, color) in CLOSURES.items():
+        chosen = ends[rejected_by == by]
+        if len(chosen):
+            drawn = chosen[:: -(-len(chosen) // _MAX_CLOSURES)]
+            yield Line(f"closures {name}: {len(chosen):,}", broken(path[drawn]), color, 0.9)
 
 
 def _disputed(steps: pa.Table, closures: pa.Table | None) -> NDArray[np.bool_]:

@@ -16,14 +16,12 @@ from scipy.special import gammaincinv
 
 from scanchain.runs.provenance import Provenance
 from scanchain_viz.colors import CLOSURES, TRUTH
-from scanchain_viz.pictures.figure import DASHED, DOTS, INK, THIN, Floats, Line, Plot, broken
-from scanchain_viz.pictures.maps import GRAY, over_map
+from scanchain_viz.pictures.figure import DASHED, DOTS, INK, THIN, Floats, Plot
 from scanchain_viz.pictures.trajectories import DrawnTrajectory, frame
 from scanchain_viz.report import page
 from scanchain_viz.report.page import Cell, Chip, Collapsible, Drawing, Grid, Head, Named, Row, Section
 
 _MAX_POINTS = 1500  # largest number of points of a line
-_MAX_CLOSURES = 1500  # largest number of closures of a verdict that are drawn
 _WINDOWS = 250  # number of windows over which a value of each scan is averaged
 _SHOWN_SHARES = (0.5, 99.5)  # per cent of the values of a distribution
 _LOWEST, _HIGHEST = 0.01, 1000.0  # range to which observability is clipped
@@ -222,32 +220,14 @@ def read_closures(file: Path) -> pa.Table | None:
     return pq.ParquetFile(file).read() if file.exists() else None  # read_table imports much more
 
 
-def closure_lines(path: Floats, closures: pa.Table) -> list[Line]:
-    """Closures by verdict with their numbers, as lines over a path (N, 3); of many every n-th is drawn."""
-    ends = np.stack([closures["target_scan"].to_numpy(), closures["source_scan"].to_numpy()], axis=1)
-    rejected_by, lines = np.array(closures["rejected_by"].to_pylist()), []
-    for by, (name, color) in CLOSURES.items():
-        chosen = ends[rejected_by == by]
-        drawn = chosen[:: max(1, -(-len(chosen) // _MAX_CLOSURES))]
-        lines.append(Line(f"{name}: {len(chosen):,}", broken(path[drawn]), color, 0.9))
-    return lines
-
-
 def loop_section(trajectory: DrawnTrajectory, closures: pa.Table | None, title: str) -> Iterator[Section]:
-    """Every loop closure tried, and the number of each verdict."""
-    if closures is None:
-        return
-    if not closures.num_rows:
+    """Number of the loop closures of each verdict and cause."""
+    if closures is not None and len(closures):
+        text = f"{len(closures):,} tried; each is a row of loops.parquet."
+        yield Section(title, text, grid=_verdict_grid(closures))
+    elif closures is not None:
         reason = f"after more than loops.min_travel_m in {trajectory.distance_m[-1]:.1f} m"
         yield Section(title, f"None was tried: the trajectory did not return to a place {reason}.")
-        return
-    path, lines = trajectory.positions, closure_lines(trajectory.positions, closures)
-    figure = over_map(
-        [Line("", path, GRAY, 0.7), *lines], np.empty((0, 3)), *frame([trajectory], None), path=path, is_wide=True
-    )
-    drawing = Drawing.of("On the trajectory", "Seen from above; circle: start, square: end.", figure)
-    text = f"{closures.num_rows:,} tried; each is a row of loops.parquet."
-    yield Section(title, text, lines, (drawing,), _verdict_grid(closures))
 
 
 def _verdict_grid(closures: pa.Table) -> Grid:
