@@ -113,8 +113,6 @@ class Recording:
 
     def log(self, step: Step) -> None:
         """Record one step; most of it is gathered and written in batches."""
-        if not self.sinks:
-            return
         self.last = step.scan.index, step.scan.stamp_ns
         self._send(lambda: self._step(step))
 
