@@ -328,7 +328,7 @@ def test_the_truth_is_drawn_in_recording_and_picture_where_the_trajectory_is(dri
     np.testing.assert_allclose(np.array(line), found, atol=0.1)
     shown = []
     monkeypatch.setattr(
-        "scanchain_viz.pictures.maps.draw_map", lambda path, title, lines, **what: shown.extend(lines)
+        "scanchain_viz.pictures.maps.draw_map", lambda picture, title, lines, **what: shown.extend(lines)
     )
     succeed("view", drive.folder, "--png", tmp_path / "a.png")
     (truth,) = (line for line in shown if line.is_dashed)

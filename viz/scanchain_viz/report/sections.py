@@ -226,8 +226,8 @@ def loop_section(trajectory: DrawnTrajectory, closures: pa.Table | None, title: 
         text = f"{len(closures):,} tried; each is a row of loops.parquet."
         yield Section(title, text, grid=_verdict_grid(closures))
     elif closures is not None:
-        reason = f"after more than loops.min_travel_m in {trajectory.distance_m[-1]:.1f} m"
-        yield Section(title, f"None was tried: the trajectory did not return to a place {reason}.")
+        path = f"the trajectory of {trajectory.distance_m[-1]:.1f} m"
+        yield Section(title, f"None was tried: {path} did not return to a place after loops.min_travel_m.")
 
 
 def _verdict_grid(closures: pa.Table) -> Grid:
