@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from scanchain.data import BACK_END, Points, State
+from scanchain.data import BACK_END, Points
 from scanchain.errors import counted
 from scanchain.maps import read_ply
 from scanchain.runs.directory import RUN_FILE, TRUTH_FILE
@@ -44,6 +44,7 @@ _SHADE = "#d6308f"
 _MAX_ROWS = 100  # largest number of stretches in the table; the longest
 _MAX_CLOSURES = 1500  # largest number of closures of a verdict that are drawn
 _DISPUTED = "at closures rejected by the back end"
+_STATES = (Kind.DEGENERATE, Kind.LOST, Kind.CONTRADICTED)  # named as those of scans
 _OVER_STATES = (Kind.OVERLAP, Kind.WHEELS, Kind.ACCELERATION, Kind.DISCONNECTED, Kind.COPIES)
 
 
@@ -143,12 +144,7 @@ def trajectory_lines(
         lines += _closure_lines(path, closures)
     states = np.array(steps["state"].to_pylist())
     marks = [(_DISPUTED, _disputed(steps, closures), Kind.LOOPS)]
-    marks += [
-        (str(state), states == state, kind)
-        for state, kind in (
-            (State.DEGENERATE, Kind.DEGENERATE), (State.LOST, Kind.LOST), (State.CONTRADICTED, Kind.CONTRADICTED),
-        )
-    ]  # fmt: skip
+    marks += [(str(kind), states == kind, kind) for kind in _STATES]
     for kind in _OVER_STATES:
         is_marked = np.zeros(len(steps), bool)
         for each in stretches:
@@ -157,7 +153,9 @@ def trajectory_lines(
     for name, is_marked, kind in marks:  # the later are drawn on top
         if is_marked.any():
             name = f"{name}: {counted(int(is_marked.sum()), 'scan')}"
-            lines.append(Line(name, _marked_parts(path, is_marked), STRETCH_COLORS[kind], 2.6))
+            leads_there = is_marked | np.append(is_marked[1:], False)
+            part = np.where(leads_there[:, None], path, np.nan)
+            lines.append(Line(name, part, STRETCH_COLORS[kind], 2.6))
     if truth is not None:
         lines.append(Line("ground truth", truth, TRUTH, 0.9, is_dashed=True))
     return lines
@@ -182,12 +180,6 @@ def _disputed(steps: pa.Table, closures: pa.Table | None) -> NDArray[np.bool_]:
     is_rejected = np.array(closures["rejected_by"].to_pylist()) == BACK_END
     ends = np.stack([closures[name].to_numpy() for name in ("target_scan", "source_scan")])
     return np.isin(keyframe, ends[:, is_rejected])
-
-
-def _marked_parts(path: Floats, is_marked: NDArray[np.bool_]) -> Floats:
-    """The segments of the path that lead to a marked scan, NaN elsewhere."""
-    shown = is_marked | np.append(is_marked[1:], False)
-    return np.where(shown[:, None], path, np.nan)
 
 
 def verdict_section(metrics: Metrics, steps: pa.Table) -> page.Section:
