@@ -103,7 +103,6 @@ def test_two_problems_stand_side_by_side_in_a_recording_too_and_the_figures_come
         assert [method["method"] for method in problem["methods"]] == ["qr", "schur"]
         assert problem["after"]["poses_m"] < problem["before"]["poses_m"]
         assert problem["methods"][1]["difference"] < 1e-8
-    assert (tmp_path / "out" / "factors.png").exists()
     entities = {chunk.entity_path.lstrip("/") for chunk in RrdReader(recording).stream()}
     for name in ("truth/trajectory", "truth/landmarks", "trajectory", "landmarks", "ellipses"):
         assert {f"world/a_b_c/{name}", f"world/other/{name}"} <= entities

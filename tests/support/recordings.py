@@ -16,10 +16,10 @@ START_NS = 976_052_857_000_000_000
 EVERY_SCAN = (
     entities.LIDAR, entities.SCAN, entities.COVARIANCE, entities.ODOMETRY, entities.TRAJECTORY,
     entities.TIME, entities.INLIERS, entities.INLIER_SHARE, entities.RESIDUAL, entities.OBSERVABILITY,
-    entities.ITERATIONS, entities.OPTIMIZED_LIDAR,
+    entities.ITERATIONS, entities.OPTIMIZED_LIDAR, entities.ODOM,
 )  # fmt: skip
 NOW_AND_THEN = (
-    entities.ODOM, entities.LOCAL_MAP, entities.KEYFRAMES, entities.ODOMETRY_EDGES, entities.ACCEPTED,
+    entities.LOCAL_MAP, entities.KEYFRAMES, entities.ODOMETRY_EDGES, entities.ACCEPTED,
     entities.REJECTED, entities.STATE, entities.EVENTS,
 )  # fmt: skip
 FOR_EVER = (entities.WORLD, entities.OPTIMIZED, entities.LEGEND)
@@ -77,10 +77,10 @@ def graph_of(steps, last_keyframe):
     return GraphState(poses, np.zeros(len(poses), np.int64), edges, is_loop, weight, 1.0, np.zeros(len(edges)))
 
 
-def opened(path, dimension=2, sinks=("save",), config=None, **ports):
+def opened(path, dimension=2, sinks=("save",), config=None):
     """A recording before it begins."""
     config = config or RecordingConfig()
-    return Recording(path, dimension=dimension, name="test", sinks=frozenset(sinks), config=config, **ports)
+    return Recording(path, dimension=dimension, name="test", sinks=frozenset(sinks), config=config)
 
 
 def record(path, steps, dimension, final=None, **options):

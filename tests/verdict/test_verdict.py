@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -10,24 +9,20 @@ import pytest
 
 from scanchain import lie
 from scanchain.data import Trajectory
-from scanchain.runs.results import read_overlay, write_overlay
 from scanchain.runs.step_table import StepTable
 from scanchain.runs.vouching import evidence_of, evidence_of_trajectory
 from scanchain.verdict import (
     Closures,
     Evidence,
-    Judged,
     Kind,
     Stretch,
     Verdict,
-    WorstPlace,
     apart_m,
     check_overlap,
     check_velocity,
     check_wheels,
     judge,
     wheel_bound_m,
-    worst_place,
 )
 from scanchain_viz.colors import STRETCH_COLORS
 from tests.support.recordings import drive
@@ -461,46 +456,6 @@ def test_a_table_holds_the_figures_of_the_steps(tmp_path):
     assert np.flatnonzero(found.starts_segment).tolist() == [7]
 
 
-def test_the_worst_place_of_a_slip_lies_around_it_of_a_long_stretch_in_it_and_of_loops_in_both_passes():
-    found = slipped_at(500, 530)
-    worst = worst_place(judge(found).stretches, found)
-    assert worst.stretch.kind is Kind.WHEELS and worst.before < 505 and worst.after > 525
-    assert worst_place((), found) is None
-    fit = np.where(marked(300, 700), 0.5, 0.9)
-    fit[444] = 0.1
-    found = evidence(fit=fit)
-    worst = worst_place(judge(found).stretches, found)
-    assert worst.stretch.kind is Kind.CONTRADICTED and (worst.before, worst.after) == (443, 444)
-    loops = Stretch(Kind.LOOPS, 100, 700, 4, 20.0, 140.0, 2.0)
-    slip = Stretch(Kind.WHEELS, 300, 310, 11, 60.0, 62.0, 1.0)
-    assert worst_place((slip, loops), found)[1:] == (100, 700)
-
-
-@pytest.mark.parametrize(("kind", "seen"), [(Kind.WHEELS, "one side"), (Kind.LOOPS, "around")])
-def test_an_overlay_holds_the_points_of_keyframes_near_the_worst_place(tmp_path, kind, seen):
-    numbers = np.arange(0, N, 5)
-    beside = np.array([[0.0, 1.0]])
-    result = SimpleNamespace(
-        trajectory=Trajectory(np.arange(N), POSES),
-        keyframes=[SimpleNamespace(scan_index=int(k), points=beside) for k in numbers],
-        T_world_keyframes=POSES[numbers],
-    )
-    stretch = Stretch(kind, 200, 205, 6, 40.0, 41.0, 1.0)
-    write_overlay(tmp_path / "overlay.npz", WorstPlace(stretch, 199, 605), result)
-    overlay = read_overlay(tmp_path / "overlay.npz")
-    before, after = (
-        numbers[(np.abs(STEP_M * (numbers - scan)) < 6.0) & ((side * (numbers - scan) >= 0) | (seen == "around"))]
-        for scan, side in ((199, -1), (605, 1))
-    )
-    assert overlay.text == stretch.text and np.allclose(overlay.place, POSES[605, :2, 2])
-    assert abs(len(overlay.before) - len(before)) <= 2 and abs(len(overlay.after) - len(after)) <= 2
-    assert np.isclose(overlay.before, lie.transform(POSES[before[3]], beside), atol=1e-4).all(axis=1).any()
-    result.keyframes, result.T_world_keyframes = result.keyframes[:1], POSES[:1]  # none near: the nearest
-    write_overlay(tmp_path / "overlay.npz", WorstPlace(stretch, 199, 605), result)
-    overlay = read_overlay(tmp_path / "overlay.npz")
-    assert len(overlay.before) == len(overlay.after) == 1
-
-
 @pytest.mark.parametrize("count", [0, 1, 3, 4, 10, 11, 12, 60])
 def test_the_usual_overlap_is_the_median_of_up_to_ten_scans_before(count):
     share = np.random.default_rng(count).random(count)
@@ -522,12 +477,6 @@ def test_after_a_gap_one_contradicted_scan_is_to_be_checked_unless_wheels_agree_
 def test_a_stretch_shorter_than_a_digit_of_its_times_has_one_time():
     assert Stretch(Kind.LOST, 7, 8, 2, 2262.91, 2262.94).text == "scans 7 to 8 (2262.9 s): lost"
     assert Stretch(Kind.LOST, 7, 9, 3, 2262.9, 2263.1).text == "scans 7 to 9 (2262.9 to 2263.1 s): lost"
-
-
-def test_stretches_that_the_reason_names_are_not_listed_again():
-    stretches = tuple(Stretch(Kind.LOST, 10 * k, 10 * k + 4 + k, 5 + k, float(k), k + 0.5) for k in range(5))
-    judged = Judged(Verdict.CHECK, "; ".join(each.text for each in stretches[2:]) + "; and 2 more", stretches)
-    assert judged.unnamed == stretches[:2]
 
 
 def test_every_kind_of_stretch_has_a_color():

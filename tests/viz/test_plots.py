@@ -5,22 +5,18 @@ from io import BytesIO
 import numpy as np
 import pytest
 
-from scanchain import lie
-from scanchain.verdict import Kind, Stretch
-from scanchain_viz.colors import palette_of
+from scanchain.verdict import Kind
+from scanchain_viz.colors import STRETCH_COLORS, TRUTH, palette_of
 from scanchain_viz.pictures.axis import Axis, width_of
-from scanchain_viz.pictures.figure import Plot
+from scanchain_viz.pictures.figure import Line, Plot
 from scanchain_viz.pictures.maps import draw_map, draw_points
 
 image = pytest.importorskip("matplotlib.image")
 
 
-def circle(radius_m, dimension=2):
-    twists = np.zeros((100, 3 if dimension == 2 else 6))
-    twists[:, -1] = np.linspace(0.0, 1.9 * np.pi, 100)
-    arm = np.eye(dimension + 1)
-    arm[0, -1] = radius_m
-    return lie.exp(twists) @ arm
+def circle(radius_m):
+    angle = np.linspace(0.0, 1.9 * np.pi, 100)
+    return radius_m * np.stack([np.cos(angle), np.sin(angle), np.zeros(100)], axis=1)
 
 
 BLUE, AMBER, MAGENTA = (0.122, 0.373, 0.816), (0.878, 0.482, 0.0), (0.878, 0.149, 0.62)
@@ -29,10 +25,10 @@ PINK, WHITE = (0.839, 0.188, 0.561), (1.0, 1.0, 1.0)
 
 @pytest.fixture
 def drawn(tmp_path):
-    """Pixels of a map with a circular trajectory and what else is given."""
+    """Pixels of a map with lines and what else is given."""
 
-    def pixels(**what):
-        draw_map(tmp_path / "a.png", **{"title": "t", "optimized": circle(10.0)} | what)
+    def pixels(*lines, **what):
+        draw_map(tmp_path / "a.png", "t", lines, **what)
         return image.imread(tmp_path / "a.png")
 
     return pixels
@@ -43,22 +39,23 @@ def share_of(pixels, color, tolerance=0.06):
     return float(np.mean(np.all(np.abs(pixels[..., :3] - np.array(color)) < tolerance, axis=-1)))
 
 
-def test_trajectories_and_stretches_to_check_are_drawn_in_their_colors_on_white(drawn):
-    stretches = (Stretch(Kind.WHEELS, 10, 30, 21, 1.0, 3.0, 0.7), Stretch(Kind.WHEELS, 60, 60, 1, 6.0, 6.0))
-    pixels = drawn(odometry=circle(12.0), ground_truth=circle(8.0), stretches=stretches)
-    assert all(share_of(pixels, color) > 0.001 for color in (BLUE, AMBER, MAGENTA, PINK))
+def test_lines_are_drawn_in_their_colors_over_a_map_on_white(drawn):
+    colors = {"#1f5fd0": BLUE, "#e07b00": AMBER, TRUTH: MAGENTA, STRETCH_COLORS[Kind.WHEELS]: PINK}
+    lines = [Line("", circle(8.0 + k), color) for k, color in enumerate(colors)]
+    pixels, alone = drawn(*lines, path=lines[0].positions), drawn(lines[0])
+    assert all(share_of(pixels, color) > 0.001 for color in colors.values())
     assert share_of(pixels, WHITE) > 0.8
-    assert [share_of(drawn(), color) for color in (AMBER, MAGENTA, PINK)] == [0.0, 0.0, 0.0]
+    assert [share_of(alone, color) for color in (AMBER, MAGENTA, PINK)] == [0.0, 0.0, 0.0]
     points = np.random.default_rng(3).uniform(-15.0, 15.0, (20_000, 3))
-    assert share_of(drawn(optimized=circle(10.0, dimension=3), points=points), WHITE) < 0.95
-    assert share_of(drawn(optimized=np.empty((0, 3, 3))), WHITE) > 0.9
+    assert share_of(drawn(lines[0], points=points), WHITE) < 0.95
+    assert share_of(drawn(Line("", np.zeros((1, 3)), "#1f5fd0")), WHITE) > 0.9
 
 
 def test_a_grid_lies_where_its_origin_says_with_row_0_at_the_bottom(drawn):
     cells = np.zeros((200, 200), np.int8)
     cells[:60] = 100  # a wall along the lowest y
     cells[:, 100:] = np.where(cells[:, 100:] == 0, -1, cells[:, 100:])
-    pixels = drawn(optimized=circle(9.0), grid=(cells, 0.1, (-10.0, -10.0)))[..., 0]
+    pixels = drawn(Line("", circle(9.0), "#1f5fd0"), grid=(cells, 0.1, (-10.0, -10.0)))[..., 0]
     dark_rows = np.nonzero((np.abs(pixels - 0.15) < 0.03).mean(axis=1) > 0.4)[0]
     assert dark_rows.min() > 0.5 * len(pixels)
     assert (np.abs(pixels - 0.90) < 0.01).mean() > 0.15  # unknown is gray, not white

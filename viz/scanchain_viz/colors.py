@@ -1,6 +1,6 @@
 """Colors as numbers and as text, and what they stand for in pages, pictures and recordings."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,11 +43,6 @@ def rgb(color: str) -> tuple[int, int, int]:
     """Red, green and blue of #rrggbb."""
     red, green, blue = bytes.fromhex(color.removeprefix("#"))
     return red, green, blue
-
-
-def hex_of(color: Iterable[int]) -> str:
-    """#rrggbb of red, green and blue."""
-    return f"#{bytes(color).hex()}"
 
 
 def height_shares(z: NDArray[np.floating]) -> NDArray[np.floating]:

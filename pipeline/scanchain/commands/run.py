@@ -145,7 +145,7 @@ def check(
             click.echo(
                 f"warning: {counted(missing, 'scan')} without a pose in {trajectory} are left out", err=True
             )
-    lines = [judged.sentence, *(f"  {stretch.text}" for stretch in judged.unnamed)]
+    lines = [judged.sentence, *(f"  {stretch.text}" for stretch in judged.stretches)]
     tree = {
         "verdict": judged.verdict,
         "verdict_reason": judged.reason,

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import msgspec
 import numpy as np
 
 from scanchain import lie
+from scanchain.checks import LARGEST
 from scanchain.config import MapsConfig
 from scanchain.data import Closure, Keyframe, Points, Pose, Problem, Proposal
 from scanchain.kernels.search import FREE, NEAR, UNKNOWN
@@ -85,8 +85,8 @@ class PlanarMapSearch:
         self.resolution_m = fitting_resolution(
             T_map_lidar, resolution_m=resolution_m, max_range_m=reach_m, max_cells=_MAX_CELLS
         )
-        config = msgspec.structs.replace(MapsConfig(), grid_resolution_m=self.resolution_m)
-        grid = OccupancyGrid(config, max_range_m=math.inf)
+        config = MapsConfig(grid_resolution_m=self.resolution_m, grid_max_range_m=LARGEST)
+        grid = OccupancyGrid(config)
         grid.insert_batch(T_map_lidar, np.vstack(clouds), np.append(0, np.cumsum([len(each) for each in clouds])))
         grid = grid.trimmed()
         log_odds = np.pad(grid.log_odds, 1)

@@ -28,7 +28,7 @@ class OccupancyGrid:
     """Log-odds of occupancy over the xy plane of the world; grows as scans come in.
 
     2D scans are drawn as they are. Of 3D scans the returns count that lie between ``slice_min_z_m`` and
-    ``slice_max_z_m`` above the lidar, along the world's z. Returns beyond ``max_range_m`` do not count.
+    ``slice_max_z_m`` above the lidar, along the world's z. Returns beyond ``grid_max_range_m`` do not count.
 
     Attributes
     ----------
@@ -38,10 +38,9 @@ class OccupancyGrid:
     drawn : (rows, columns) number of the last scan that was seen in a cell, from 1; 0 for none
     """
 
-    def __init__(self, config: MapsConfig, *, max_range_m: float = 80.0) -> None:
+    def __init__(self, config: MapsConfig) -> None:
         self.config = config
         self.resolution_m = config.grid_resolution_m
-        self.max_range_m = max_range_m
         self.origin_m = np.zeros(2)
         self.log_odds = np.zeros((0, 0), np.float32)
         self.drawn = np.zeros((0, 0), np.int32)
@@ -74,7 +73,7 @@ class OccupancyGrid:
         the lidar's height, it starts where it enters the slice: at the share limit / z of its length.
         """
         squares = sum(column * column for column in points.T)
-        points = points[squares <= min(self.max_range_m**2, _LARGEST)]
+        points = points[squares <= min(self.config.grid_max_range_m**2, _LARGEST)]
         moved = np.asarray(sum(T[:-1, axis] * points[:, axis, None] for axis in range(points.shape[1])))
         share = 0.0
         if points.shape[1] == 3:
@@ -92,7 +91,7 @@ class OccupancyGrid:
         """The same grid without the unseen rows and columns around what was seen."""
         seen = self.drawn > 0
         rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
-        result = OccupancyGrid(self.config, max_range_m=self.max_range_m)
+        result = OccupancyGrid(self.config)
         result.scans = self.scans
         if len(rows):
             box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
@@ -129,11 +128,9 @@ class OccupancyGrid:
         self.log_odds, self.drawn = np.pad(self.log_odds, margins), np.pad(self.drawn, margins)
 
 
-def draw_grid(
-    scans: Iterable[tuple[Pose, NDArray[np.floating]]], config: MapsConfig, *, max_range_m: float = 80.0
-) -> OccupancyGrid:
+def draw_grid(scans: Iterable[tuple[Pose, NDArray[np.floating]]], config: MapsConfig) -> OccupancyGrid:
     """The grid of (T_world_lidar, points) pairs; only one scan is in memory at a time."""
-    grid = OccupancyGrid(config, max_range_m=max_range_m)
+    grid = OccupancyGrid(config)
     for T_world_lidar, points in scans:
         grid.insert(T_world_lidar, points)
     return grid.trimmed()

@@ -17,7 +17,6 @@ from scanchain.config import Config, MapsConfig
 from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import ExpectedErrors, expected_errors
-from scanchain.evaluation.errors import path_length
 from scanchain.graph.g2o import rejected_path, write_g2o
 from scanchain.logs import Log
 from scanchain.loops import level_of, outline_of
@@ -45,12 +44,8 @@ from scanchain.runs.results_mcap import write_results_mcap
 from scanchain.runs.step_table import StepTable
 from scanchain.slam import SlamResult
 from scanchain.trajectory import write_kitti, write_tum, write_wide_tum
-from scanchain.verdict import Kind, WorstPlace
 
 GRAPH_FILE = "graph.g2o"  # the edges in force; rejected ones go to graph_rejected.g2o, if there are any
-OVERLAY_FILE = "overlay.npz"
-_REACH_M = {2: 6.0, 3: 15.0}  # path of a pass by dimension
-_MAX_POINTS = 60_000
 _TILTED_RAD = math.radians(5.0)  # tilt of the lidar's first frame to the ground from which on it is said
 
 
@@ -206,64 +201,9 @@ def views_of(keyframes: Sequence[Keyframe], poses: Matrix, config: Config) -> It
 
 def grid_of(keyframes: Sequence[Keyframe], poses: Matrix, config: MapsConfig) -> OccupancyGrid:
     """The grid of keyframes at poses (K, d+1, d+1), coarser than configured where that is too large."""
-    max_range_m = config.grid_max_range_m
-    resolution_m = fitting_resolution(poses, resolution_m=config.grid_resolution_m, max_range_m=max_range_m)
+    resolution_m = fitting_resolution(
+        poses, resolution_m=config.grid_resolution_m, max_range_m=config.grid_max_range_m
+    )
     fitting = msgspec.structs.replace(config, grid_resolution_m=resolution_m)
     scans = ((T, keyframe.points) for T, keyframe in zip(poses, keyframes, strict=True))
-    return draw_grid(scans, fitting, max_range_m=max_range_m)
-
-
-@dataclass(frozen=True, slots=True)
-class Overlay:
-    """Points (M, d) of two passes and the positions (N, d) of their scans, as the trajectory places them.
-
-    ``text`` : the stretch in words; ``place`` (d,) : position of the second pass
-    """
-
-    text: str
-    before: Points
-    after: Points
-    path_before: Points
-    path_after: Points
-    place: NDArray[np.float64]
-
-
-def write_overlay(path: Path, worst: WorstPlace, result: SlamResult) -> None:
-    """Write the points of the keyframes before and after a contradiction, or of both passes of a loop."""
-    poses = result.trajectory.poses
-    path_m = path_length(poses)
-    reach_m = _REACH_M[result.trajectory.dimension]
-    is_loop = worst.stretch.kind is Kind.LOOPS
-    arrays: dict[str, NDArray[np.floating] | str] = {
-        "text": worst.stretch.text,
-        "place": poses[worst.after, :-1, -1],
-    }
-    for name, scan, low_m, high_m in (
-        ("before", worst.before, -reach_m, reach_m if is_loop else 0.0),
-        ("after", worst.after, -reach_m if is_loop else 0.0, reach_m),
-    ):
-        away_m = path_m - path_m[scan]
-        is_near = (away_m >= low_m) & (away_m <= high_m)
-        if not is_loop:  # where the lidar stands, one place belongs to the scans of both sides
-            numbers = np.arange(len(poses))
-            is_near &= numbers <= scan if name == "before" else numbers >= scan
-        arrays[name] = _points(result, is_near, scan)
-        arrays[f"path_{name}"] = poses[is_near, :-1, -1]
-    np.savez_compressed(path, **arrays)  # pyright: ignore[reportArgumentType]
-
-
-def read_overlay(path: Path) -> Overlay:
-    """Read what ``write_overlay`` wrote."""
-    with np.load(path) as file:
-        clouds = (file[name] for name in ("before", "after", "path_before", "path_after", "place"))
-        return Overlay(str(file["text"]), *clouds)
-
-
-def _points(result: SlamResult, is_near: NDArray[np.bool_], scan: int) -> NDArray[np.float32]:
-    """Points (M, d) of the keyframes among these scans, of the nearest one where there is none."""
-    chosen = [k for k, keyframe in enumerate(result.keyframes) if is_near[keyframe.scan_index]]
-    if not chosen:
-        chosen = [int(np.argmin([abs(keyframe.scan_index - scan) for keyframe in result.keyframes]))]
-    poses = result.T_world_keyframes
-    points = np.concatenate([lie.transform(poses[k], result.keyframes[k].points) for k in chosen])
-    return points[:: max(1, -(-len(points) // _MAX_POINTS))].astype(np.float32)
+    return draw_grid(scans, fitting)

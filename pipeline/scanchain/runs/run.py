@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import AbstractContextManager, closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,7 +44,7 @@ from scanchain.runs.metrics import (
     summary,
 )
 from scanchain.runs.provenance import Hashing, describe_start
-from scanchain.runs.results import OVERLAY_FILE, Results, record_results, results_of, write_overlay, write_results
+from scanchain.runs.results import Results, record_results, results_of, write_results
 from scanchain.runs.resume import Checkpoints, after, find_left, rescued, resume_recording, set_aside
 from scanchain.runs.step_table import StepTable
 from scanchain.runs.vouching import evidence_of_run
@@ -52,7 +52,7 @@ from scanchain.settings import Settings, dump, load_settings, named
 from scanchain.slam import Slam, SlamResult
 from scanchain.threads import threads
 from scanchain.trajectory import write_tum
-from scanchain.verdict import Judged, judge, worst_place
+from scanchain.verdict import Judged, judge
 
 _FEW_SCANS = 2  # scans whose trajectory shows at most one motion
 TruePoses = Callable[[NDArray[np.int64]], Trajectory | None]  # of scans with these stamps; may raise InputError
@@ -164,7 +164,7 @@ class _Run:
         if self.left is not None:
             self.notes.append(resume_recording(self.directory.path, self.left, recording, checkpoints))
         with closing(scans):  # what it left out is counted then, also if the run was stopped
-            tracked = self.progress.track(self._previewed(scans, recording), self.log.scan_count - len(self.steps))
+            tracked = self.progress.track(scans, self.log.scan_count - len(self.steps))
             if slam.dimension == 3 and threads() > 1:
                 tracked = prepare_ahead(tracked, slam.front_end.odometry.resolution)
             for scan in tracked:
@@ -176,13 +176,6 @@ class _Run:
         checkpoints.write(slam, self.steps, recording.secure())  # an interruption from here on loses no scan
         return slam.finish(self.progress.say)
 
-    def _previewed(self, scans: Iterator[Scan], recording: Recorder) -> Iterator[Scan]:
-        """The scans; the first one is shown as measured where its step waits for kernels that are compiled."""
-        for number, scan in enumerate(scans):
-            if not number and self.left is None and compiled_s() > self.compiled_before_s:
-                recording.preview(scan)
-            yield scan
-
     def write(self, result: SlamResult, recording: Recorder) -> tuple[Results, Judged]:
         """Write the results to the directory, and the verdict on them and on the truth to the recording."""
         self.progress.say("building the maps and writing the results")
@@ -190,11 +183,7 @@ class _Run:
             final = final_verdicts(result.closures, result.state)
             results = results_of(self.log, self.config, self.steps, result, final)
             write_results(folder, results)
-            evidence = evidence_of_run(folder, results.expected and results.expected.ate)
-            judged = judge(evidence)
-            worst = worst_place(judged.stretches, evidence)
-            if worst is not None:
-                write_overlay(folder / OVERLAY_FILE, worst, result)
+            judged = judge(evidence_of_run(folder, results.expected and results.expected.ate))
             record_results(recording, results)
             recording.log_verdict(judged, result.trajectory)
             with suppress(InputError):  # which is reported with the accuracy

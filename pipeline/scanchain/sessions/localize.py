@@ -168,7 +168,7 @@ def localize(
                 truth, note = accuracy_of(poses, source, job.max_gap_s, placed, folder)
                 warnings += note
             metrics = measure(found, prior, config, time_s, warnings, truth)
-            localized = LocalizedLog(directory.path, prior, found, metrics, _summary(metrics, prior, log))
+            localized = LocalizedLog(directory.destination, prior, found, metrics, _summary(metrics, prior, log))
             _write(folder, localized)
             draw(folder, localized)
         localizer.slam.points.close()
@@ -177,7 +177,7 @@ def localize(
             provenance.hashed(hashing), complete=True, stopped=stopped, duration_s=working_s() - started
         ).write(directory.path / RUN_FILE)
         directory.complete()
-    return replace(localized, path=directory.path)
+    return localized
 
 
 def _followed(

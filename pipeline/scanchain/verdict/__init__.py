@@ -14,10 +14,10 @@ from scanchain.verdict.checks import (
 )
 from scanchain.verdict.closures import Closures
 from scanchain.verdict.judging import MOST_CONTRADICTED, Judged, Verdict, judge
-from scanchain.verdict.stretches import KNOWN, Evidence, WorstPlace, worst_place
+from scanchain.verdict.stretches import KNOWN, Evidence
 
 __all__ = [
     "KNOWN", "MOST_CONTRADICTED", "VELOCITY_LIMIT", "WHEEL_LIMIT", "Closures", "Evidence", "Judged", "Kind",
-    "Stretch", "Verdict", "WorstPlace", "apart_m", "check_overlap", "check_velocity", "check_wheels", "judge",
-    "smallest_jump_m", "wheel_bound_m", "worst_place",
+    "Stretch", "Verdict", "apart_m", "check_overlap", "check_velocity", "check_wheels", "judge",
+    "smallest_jump_m", "wheel_bound_m",
 ]  # fmt: skip

@@ -62,11 +62,6 @@ class Judged:
         """Verdict, error and reasons."""
         return f"{self.verdict}{f' ({self.vouched})' if self.vouched else ''}: {self.reason}"
 
-    @property
-    def unnamed(self) -> tuple[Stretch, ...]:
-        """Stretches that the reason does not name."""
-        return tuple(each for each in self.stretches if each.text not in self.reason)
-
 
 def judge(evidence: Evidence) -> Judged:
     """The verdict on a trajectory.
@@ -160,8 +155,18 @@ def _doubts(evidence: Evidence, stretches: Sequence[Stretch], rest: _Rest) -> It
     if rest.is_there and not rest.is_shown:
         yield rest.text
     yield from _unlike_wheels(evidence)
-    yield from _degenerate(evidence)
-    yield from _unlike_map(evidence)
+    count = int(evidence.is_degenerate.sum())
+    if count > _MOST_OPEN * len(evidence):
+        source = "the wheels' alone" if evidence.wheels.known_share >= KNOWN else "predicted"
+        yield (
+            f"{count:,} of {len(evidence):,} scans are degenerate: along at least one direction poses are {source}"
+        )
+    tried, accepted = evidence.closures.tried, int(evidence.closures.is_accepted.sum())
+    if tried >= _FEWEST_TRIED and accepted < _LEAST_ACCEPTED * tried:
+        yield (
+            f"of {tried:,} loop closures tried {accepted:,} were accepted: where the trajectory returns, "
+            "the place does not look as mapped"
+        )
     if stretches:
         yield _listed(stretches)
 
@@ -216,27 +221,6 @@ def _unlike_wheels(evidence: Evidence) -> Iterator[str]:
         f"the wheels disagree with the trajectory all along, by {apart_m:.1f} m and {apart_deg:.0f} deg over "
         f"{WINDOW_M:g} m (medians): their scale or the mounting is wrong, or the lidar follows what moves along"
     )
-
-
-def _degenerate(evidence: Evidence) -> Iterator[str]:
-    """Directions in which nothing but wheels or prediction says where the lidar is, in many scans."""
-    count = int(evidence.is_degenerate.sum())
-    if count > _MOST_OPEN * len(evidence):
-        source = "the wheels' alone" if evidence.wheels.known_share >= KNOWN else "predicted"
-        yield (
-            f"{count:,} of {len(evidence):,} scans are degenerate: along at least one direction poses are {source}"
-        )
-
-
-def _unlike_map(evidence: Evidence) -> Iterator[str]:
-    """Revisits where next to nothing looks as it was mapped."""
-    closures = evidence.closures
-    accepted = int(closures.is_accepted.sum())
-    if closures.tried >= _FEWEST_TRIED and accepted < _LEAST_ACCEPTED * closures.tried:
-        yield (
-            f"of {closures.tried:,} loop closures tried {accepted:,} were accepted: where the trajectory returns, "
-            "the place does not look as mapped"
-        )
 
 
 def _listed(stretches: Sequence[Stretch]) -> str:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -33,11 +31,10 @@ class Axis:
         self.label = ""
         self._least, self._greatest = np.inf, -np.inf
         self._limits: tuple[float, float] | None = None
-        self.only_ticks: Sequence[float] | None = None
 
-    def limit(self, low: float, high: float, ticks: Sequence[float] | None = None) -> None:
-        """Set the range, downward or to the left where ``low`` is the greater, and, if given, the only ticks."""
-        self._limits, self.only_ticks = (float(low), float(high)), ticks
+    def limit(self, low: float, high: float) -> None:
+        """Set the range, downward or to the left where ``low`` is the greater."""
+        self._limits = float(low), float(high)
 
     def include(self, values: NDArray[np.float64]) -> None:
         """Widen the range by values, unless it is set; NaN have no place."""
@@ -69,9 +66,9 @@ class Axis:
     def ticks(self, length: float, *, is_upright: bool) -> list[tuple[float, str]]:
         """Fraction and number of each tick on an axis so many points long."""
         low, high = min(self.ends), max(self.ends)
-        values = self._decades(low, high) if self.only_ticks is None else list(self.only_ticks)
+        values = self._decades(low, high)
         texts = [f"{value:g}" for value in values]
-        if self.only_ticks is None and not values:
+        if not values:
             values, texts = _round_steps(low, high, length, is_upright)
         places = self.fractions(np.array(values, np.float64)).tolist()
         return [(place, text.replace("-", "−")) for place, text in zip(places, texts, strict=True)]

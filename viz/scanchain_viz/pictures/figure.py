@@ -5,19 +5,17 @@ The SVG of a report is written here: matplotlib takes half a second to load, and
 
 from __future__ import annotations
 
-import struct
-import zlib
 from base64 import b64encode
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from io import BytesIO
-from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
+from PIL import Image
 
 from scanchain.files import write_whole
 from scanchain_viz.pictures.axis import FONT, Axis, width_of
@@ -28,7 +26,8 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 INK, LINE = "var(--ink)", "var(--line)"  # the page's own colors
-THIN, DOTS = 0.8, (1.0, 1.5)  # width and dashes of a dotted line
+THIN, DOTS = 0.8, (1.0, 1.5)  # width and dashes, in widths, of a dotted line
+DASHED = (3.0, 3.0)
 _INCH = 72.0  # points, the unit of the drawing
 _WIDTH, _WHOLE = 4.6, 9.6  # inches: of a figure beside another, and of one over the whole page, of equal text
 _LEFT, _RIGHT, _BOTTOM, _TOP = 0.8, 0.2, 0.45, 0.12  # inches around the axes: room for numbers and labels
@@ -36,13 +35,12 @@ _LOWEST, _HIGHEST, _HIGHEST_WHOLE = 1.5, 5.2, 6.5  # least and greatest heights 
 _TICK = 3.5  # length of a tick, and its distance to the number
 _ABOVE, _BELOW = 0.76 * FONT, 0.24 * FONT  # of text, over and under its baseline
 _LABEL = 4.0  # distance of a label to the numbers
-_BAR, _BAR_AWAY = 9.0, 6.0  # width of a color bar, and its distance to the axes
 _SAME = 0.1  # points; successive positions of a line that are nearer are one
 _FAR = 1e5  # points beyond which nothing is drawn
 _LEVEL = 3  # of compression: more is as long again and saves a tenth
 _FRAME = "#cccccc"  # of axes on white
 _PANEL_INCHES = (2.0, 12.0)  # least and greatest height of a figure in a PNG
-_TITLE_INCHES = 0.07  # room for its title and labels, times the height of text in points
+_TITLE_INCHES, _TITLE_FONT = 0.77, 11.0  # room for its title and labels, and the height of their text in points
 _STYLE = (
     f"font: {FONT:g}px 'DejaVu Sans', Verdana, Arial, sans-serif; fill: none; stroke-linejoin: round; "
     "stroke-linecap: butt"
@@ -67,7 +65,6 @@ class Plot:
 
     logarithmic : the axis whose decades are equally long, "x" or "y"
     height_inches : of the whole figure
-    spare_inches : left free beside the axes
     is_wide : over the whole width of the page
     """
 
@@ -78,34 +75,29 @@ class Plot:
         *,
         logarithmic: str = "",
         height_inches: float = 2.7,
-        spare_inches: float = 0.0,
         is_wide: bool = False,
     ) -> None:
         self.x, self.y = (Axis(is_logarithmic=name == logarithmic) for name in "xy")
         self.x.label, self.y.label = x_label, y_label
         self.has_grid = True
-        self.is_wide, self.spare, self.proportions = is_wide, spare_inches, (0.0, 0.0)  # of a plan
-        self._lay_out(height_inches, is_wide=is_wide)
+        self.height_inches, self.is_wide, self.proportions = height_inches, is_wide, (0.0, 0.0)  # of a plan
         self._within: list[Callable[[], str]] = []
         self._on_axes: list[Callable[[Axes], object]] = []
-        self._beside: list[Callable[[], str]] = []
 
     @classmethod
-    def of_plan(
-        cls, low: Floats, high: Floats, spare_inches: float = 0.0, *, is_wide: bool = False, has_grid: bool = False
-    ) -> Plot:
+    def of_plan(cls, low: Floats, high: Floats, *, is_wide: bool = False, has_grid: bool = False) -> Plot:
         """A figure in the proportions of the box between two corners."""
-        figure = cls("x [m]", "y [m]", spare_inches=spare_inches, is_wide=is_wide)
+        figure = cls("x [m]", "y [m]", is_wide=is_wide)
         figure.x.limit(low[0], high[0])
         figure.y.limit(low[1], high[1])
         figure.proportions, figure.has_grid = (float(high[0] - low[0]), float(high[1] - low[1])), has_grid
-        figure._lay_out(0.0, is_wide=is_wide)
         return figure
 
-    def _lay_out(self, height_inches: float, *, is_wide: bool) -> None:
+    def _lay_out(self, *, is_wide: bool) -> None:
         """Size of the figure, and corner and extent of its axes; of a plan so that a meter is equal along both."""
         whole, (width, height) = _WHOLE if is_wide else _WIDTH, self.proportions
-        across = whole - _LEFT - _RIGHT - self.spare
+        height_inches = self.height_inches
+        across = whole - _LEFT - _RIGHT
         if width:
             needed = across * height / width + _BOTTOM + _TOP
             height_inches = float(np.clip(needed, _LOWEST, _HIGHEST_WHOLE if is_wide else _HIGHEST))
@@ -211,47 +203,25 @@ class Plot:
 
         self._within.append(drawn)
 
-    def color_bar(self, palette: NDArray[np.uint8], axis: Axis) -> None:
-        """Draw the colors beside the axes, with the values of an axis that they stand for from end to end."""
-
-        def drawn() -> str:
-            left, (top, height) = self.corner[0] + self.extent[0] + _BAR_AWAY, (self.corner[1], self.extent[1])
-            rows = np.arange(len(palette), dtype=np.uint8)[::-1, None]
-            numbers = "".join(
-                _text(left + _BAR + 2.0 * _TICK, top + (1.0 - place) * height + 0.5 * _ABOVE, text, "start")
-                + _rule(left + _BAR, top + (1.0 - place) * height, f"h{_TICK}", 0.8)
-                for place, text in axis.ticks(height, is_upright=True)
-            )
-            return _image(rows, palette, (left, top, _BAR, height), "auto") + numbers
-
-        self._beside.append(drawn)
-
     def svg(self) -> Markup:
         """The figure as SVG for a page, a wide one once more for a narrow page; no text of a log is ever drawn."""
-        if not self.is_wide:
-            return Markup(self._drawn())
-        wide, height_inches = self._drawn("wide"), self.size[1] / _INCH
-        self._lay_out(height_inches, is_wide=False)
-        narrow = self._drawn("narrow")
-        self._lay_out(height_inches, is_wide=True)
-        return Markup(wide + narrow)
+        sizes = (("wide", True), ("narrow", False)) if self.is_wide else (("", False),)
+        return Markup("".join(self._drawn(name, is_wide=is_wide) for name, is_wide in sizes))
 
-    def draw_on(self, axes: Axes, title: str, font: float) -> None:
+    def draw_on(self, axes: Axes, title: str) -> None:
         """Draw on axes of matplotlib, on white."""
         for draw in self._on_axes:
             draw(axes)
         axes.set(xlim=self.x.ends, ylim=self.y.ends, aspect="equal" if self.proportions[0] else "auto")
-        axes.set_xlabel(self.x.label, fontsize=font - 2.0)
-        axes.set_ylabel(self.y.label, fontsize=font - 2.0)
-        axes.set_title(title, loc="left", fontsize=font)
-        axes.tick_params(labelsize=font - 2.0, color=_FRAME)
-        for axis, shown in ((axes.xaxis, self.x), (axes.yaxis, self.y)):
-            if shown.only_ticks is not None:
-                axis.set_ticks(shown.only_ticks)
+        axes.set_xlabel(self.x.label, fontsize=_TITLE_FONT - 2.0)
+        axes.set_ylabel(self.y.label, fontsize=_TITLE_FONT - 2.0)
+        axes.set_title(title, loc="left", fontsize=_TITLE_FONT)
+        axes.tick_params(labelsize=_TITLE_FONT - 2.0, color=_FRAME)
         for spine in axes.spines.values():
             spine.set_color(_FRAME)
 
-    def _drawn(self, name: str = "") -> str:
+    def _drawn(self, name: str, *, is_wide: bool) -> str:
+        self._lay_out(is_wide=is_wide)
         (left, top), (width, height) = self.corner, self.extent
         across = [(left + place * width, text) for place, text in self.x.ticks(width, is_upright=False)]
         up = [(top + (1.0 - place) * height, text) for place, text in self.y.ticks(height, is_upright=True)]
@@ -274,7 +244,6 @@ class Plot:
             parts.append(_text(left + 0.5 * width, below, self.x.label))
         if self.y.label:
             parts.append(_text(beside, top + 0.5 * height, self.y.label, is_upright=True))
-        parts += [drawn() for drawn in self._beside]
         return "".join([*parts, "</svg>"])
 
     def _included(self, positions: NDArray[np.floating]) -> Floats:
@@ -328,29 +297,16 @@ def _image(
     rows: NDArray[np.uint8], palette: NDArray[np.uint8], box: tuple[float, float, float, float], rendering: str
 ) -> str:
     """Pixels (H, W), each the number of a color, in a box: left, top, width, height."""
-    data = b64encode(_png(rows, palette)).decode("ascii")
+    image, file = Image.fromarray(rows), BytesIO()
+    image.putpalette(palette[:, :3].tobytes())
+    image.save(file, "PNG", compress_level=_LEVEL, transparency=palette[:, 3].tobytes())
+    data = b64encode(file.getvalue()).decode("ascii")
     where = " ".join(
         f'{name}="{value:.2f}"' for name, value in zip(("x", "y", "width", "height"), box, strict=True)
     )
     return (
         f'<image {where} preserveAspectRatio="none" style="image-rendering: {rendering}" '
         f'href="data:image/png;base64,{data}"/>'
-    )
-
-
-def _png(rows: NDArray[np.uint8], palette: NDArray[np.uint8]) -> bytes:
-    """A PNG file of pixels (H, W), the numbers of the colors of a palette (K, 4) (ISO/IEC 15948)."""
-    height, width = rows.shape
-    chunks = (
-        (b"IHDR", struct.pack(">2I5B", width, height, 8, 3, 0, 0, 0)),
-        (b"PLTE", palette[:, :3].tobytes()),
-        (b"tRNS", palette[:, 3].tobytes()),
-        (b"IDAT", zlib.compress(np.pad(rows, ((0, 0), (1, 0))).tobytes(), _LEVEL)),
-        (b"IEND", b""),
-    )
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-        for kind, data in chunks
     )
 
 
@@ -368,34 +324,21 @@ def around(points: NDArray[np.floating], share: float, least: float) -> tuple[Fl
     return low - margin, high + margin
 
 
-def write_png(
-    path: Path,
-    panels: Sequence[tuple[str, Plot | None]],
-    *,
-    width_inches: float,
-    columns: int = 1,
-    font: float = 11.0,
-) -> None:
-    """Write figures beside and below each other, each under its title, over one legend; None leaves a place free.
+def write_png(path: Path, panels: Sequence[tuple[str, Plot]], *, width_inches: float) -> None:
+    """Write figures beside each other, each under its title, over one legend; the highest sets the height of all.
 
-    width_inches : of each; the highest sets the height of all
+    width_inches : of each
     Raises OSError.
     """
     from matplotlib.figure import Figure
 
-    shapes = [plot.proportions for _, plot in panels if plot is not None]
+    shapes = [plot.proportions for _, plot in panels]
     height_inches = np.clip(width_inches * max(height / width for width, height in shapes), *_PANEL_INCHES)
-    height_inches += _TITLE_INCHES * font
-    rows = -(-len(panels) // columns)
-    figure = Figure(figsize=(columns * width_inches, rows * float(height_inches)), layout="constrained")
-    named = {}
-    for axes, panel in zip_longest(figure.subplots(rows, columns, squeeze=False).ravel(), panels):
-        title, plot = panel or ("", None)
-        if plot is None:
-            axes.set_axis_off()
-        else:
-            plot.draw_on(axes, title, font)
-            named |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+    size = len(panels) * width_inches, float(height_inches) + _TITLE_INCHES
+    figure, named = Figure(figsize=size, layout="constrained"), {}
+    for axes, (title, plot) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
+        plot.draw_on(axes, title)
+        named |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
     if named:
         figure.legend([*named.values()], [*named], loc="outside lower center", ncols=5, frameon=False, fontsize=9)
     picture = BytesIO()

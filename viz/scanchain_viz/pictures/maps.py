@@ -10,7 +10,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from markupsafe import Markup
 from numpy.typing import NDArray
 
 from scanchain import lie
@@ -21,11 +20,10 @@ from scanchain.evaluation import on_the_estimate
 from scanchain.evaluation.errors import path_length
 from scanchain.maps import SavedMap, open_saved_map, read_map, read_ply
 from scanchain.runs.directory import TRUTH_FILE
-from scanchain.runs.results import Overlay
 from scanchain.trajectory import read_tum
 from scanchain.verdict import Kind, Stretch
 from scanchain_viz.colors import STRETCH_COLORS, TRUTH, color_of, height_shares, palette_of
-from scanchain_viz.pictures.figure import INK, Floats, Line, Plot, around, write_png
+from scanchain_viz.pictures.figure import DASHED, INK, Floats, Line, Plot, around, write_png
 
 Grid = tuple[NDArray[np.int8], float, tuple[float, float]]  # as ``read_map`` returns it
 
@@ -33,9 +31,8 @@ GRAY = "#808893"  # of points of a map beneath lines
 _MAX_POINTS = 120_000
 _SAMPLE = 200_000  # points taken of a map's keyframes
 _PIXELS_A_POINT, _WIDTHS = 2.0, (200.0, 700.0)  # of a map's picture: per root of the points; pixels
-_LOWEST = 5.0  # percentile of the heights that is taken for the ground's
 _SHADES, _HEIGHTS = 6, 36  # numbers of opacities and of colors of heights; a PNG has 256 colors
-_VIRIDIS = (
+VIRIDIS = (
     "440154", "48186a", "472d7b", "424086", "3b528b", "33638d", "2c728e", "26828e", "21918c", "1fa088", "28ae80",
     "3fbc73", "5ec962", "84d44b", "addc30", "d8e219", "fde725",
 )  # fmt: skip
@@ -44,14 +41,16 @@ _BULK, _REACH = (0.5, 99.5), 0.5  # percentiles of a map; its sizes that a point
 _ALL_BUT_FEW, _MARGIN = (0.05, 99.95), 0.02  # percentiles that are shown, and the share of their range around them
 _PNG_INCHES, _PNG_MARGIN = 8.0, (0.04, 1.0)  # width; share of the extent and least meters
 _ODOMETRY, _OPTIMIZED = "#e07b00", "#1f5fd0"
+_NO_POINTS = np.empty((0, 3))
 _INKS = ("#a9b1bd", "#747c88", "#14171b")  # of points in space, by height
 
 
-def surroundings(low: Floats, high: Floats, clouds: Sequence[Points]) -> tuple[Floats, Floats]:
-    """Corners (3,) that hold a trajectory, from ``low`` to ``high``, and the extents of its maps with a margin."""
-    boxes = np.array([(low, high), *(extent(points) for points in clouds if len(points))])
-    boxes[1:] += _MARGIN * np.ptp(boxes[1:], axis=1, keepdims=True) * np.array([[-1.0], [1.0]])
-    return boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+def surroundings(positions: NDArray[np.floating], clouds: Sequence[Points]) -> tuple[Floats, Floats]:
+    """Corners (3,) that hold positions (N, 3) and, but for outliers, the points of maps (M, 3) with a margin."""
+    boxes = np.array([extent(points) for points in clouds if len(points)]).reshape(-1, 2, 3)
+    boxes += _MARGIN * np.ptp(boxes, axis=1, keepdims=True) * np.array([[-1.0], [1.0]])
+    held = np.concatenate([positions, *boxes])
+    return held.min(axis=0), held.max(axis=0)
 
 
 def extent(points: NDArray[np.floating]) -> tuple[Floats, Floats]:
@@ -75,60 +74,32 @@ def map_points(prior: SavedMap) -> Points:
     return np.vstack(clouds)
 
 
-def map_picture(points: Points, low: Floats, high: Floats) -> Markup:
-    """Points (M, 3) seen from above, within corners; the color is the height, where there is any."""
-    figure = Plot.of_plan(low, high)
-    draw_points(figure, points, low, high, _VIRIDIS)
-    return figure.svg()
-
-
-def path_over_map(
-    points: Points,
+def over_map(
     lines: Sequence[Line],
+    points: Points,
     low: Floats,
     high: Floats,
-    path: Floats | None = None,
     *,
+    grid: Grid | None = None,
+    colors: Sequence[str] = (GRAY,),
+    path: Floats | None = None,
     is_wide: bool = False,
-) -> Markup:
-    """Lines over the map (gray), seen from above, within corners.
+) -> Plot:
+    """Lines over a map, seen from above, within corners.
 
+    points : (M, 3) of the map, in one color or, where they have heights, in several from low to high
     path : (N, 3) its begin and end have outlines, circle and square, however short it is: it is drawn over them
     """
     figure = Plot.of_plan(low, high, is_wide=is_wide)
-    draw_points(figure, points, low, high)
-    if path is not None:
-        figure.marks(path[:1], "o", INK, 7.0, line=1.0)
-        figure.marks(path[-1:], "s", INK, 7.0, line=1.0)
+    if grid is not None:
+        _draw_grid(figure, grid, low, high)
+    draw_points(figure, points, low, high, colors)
+    for place, shape, name in ((slice(1), "o", "start"), (slice(-1, None), "s", "end")):
+        if path is not None and len(path):
+            figure.marks(path[place], shape, INK, 7.0, line=1.0, name=name)
     for line in lines:
-        figure.line(line.positions, line.color, line.width, (3.0, 3.0) if line.is_dashed else ())
-    return figure.svg()
-
-
-BEFORE, AFTER = "#1aa179", "#a55bd6"  # colors of two passes
-_MARGIN_M = 1.0  # around their points
-_VIEW_M = {2: 12.0, 3: 30.0}  # half width of a picture of two passes
-_GROUND_M = 0.5  # height above the lowest points below which points in space are ground, which hides walls
-
-
-def overlay_picture(overlay: Overlay) -> Markup:
-    """Points and paths of two passes over one place, seen from above; ground is left out."""
-    half_m = _VIEW_M[overlay.before.shape[1]]
-    before, after = _above_ground(overlay.before), _above_ground(overlay.after)
-    drawn = np.concatenate([before, after])[:, :2] if len(before) + len(after) else overlay.place[None, :2]
-    low = np.maximum(overlay.place[:2] - half_m, np.minimum(drawn.min(axis=0), overlay.place[:2]) - _MARGIN_M)
-    high = np.minimum(overlay.place[:2] + half_m, np.maximum(drawn.max(axis=0), overlay.place[:2]) + _MARGIN_M)
-    figure = Plot.of_plan(low, high)
-    for points, path, color in ((before, overlay.path_before, BEFORE), (after, overlay.path_after, AFTER)):
-        draw_points(figure, points, low, high, (color,))
-        figure.line(path, color, 1.4)
-    return figure.svg()
-
-
-def _above_ground(points: Points) -> Points:
-    if points.shape[1] == 2:
-        return np.pad(points, ((0, 0), (0, 1)))
-    return points[points[:, 2] > np.percentile(points[:, 2], _LOWEST) + _GROUND_M]
+        figure.line(line.positions, line.color, line.width, DASHED if line.is_dashed else (), name=line.name)
+    return figure
 
 
 def draw_points(figure: Plot, points: Points, low: Floats, high: Floats, colors: Sequence[str] = (GRAY,)) -> None:
@@ -189,50 +160,26 @@ def read_merge(directory: Path) -> DrawnMerge:
 
 
 def draw_map(
-    path: Path,
-    *,
+    picture: Path,
     title: str,
-    optimized: Matrix,
-    odometry: Matrix | None = None,
-    ground_truth: Matrix | None = None,
-    sessions: Sequence[tuple[str, Matrix]] = (),
-    stretches: Sequence[Stretch] = (),
-    points: NDArray[np.floating] | None = None,
+    lines: Sequence[Line],
+    *,
+    points: Points = _NO_POINTS,
     grid: Grid | None = None,
+    path: Floats | None = None,
 ) -> None:
-    """Draw trajectories (N, d+1, d+1) over a map, all in the world frame, to a PNG.
+    """Draw lines over a map, all in the world frame, to a PNG; points (M, 3) of the map are shaded by height.
 
-    sessions : names and poses of those of a merged map, instead of one trajectory
-    stretches : to check, of the optimized trajectory
-    points : (M, d) of the map; of a 3D one the height is the shade
-    ground_truth : already aligned to the estimate
+    path : as of ``over_map``. Raises OSError.
     """
-    drawn = (optimized, odometry, ground_truth, *(poses for _, poses in sessions))
-    corners = [path[:, :2, -1] for path in drawn if path is not None and len(path)]
-    seen = np.empty((0, 2)) if points is None else points[:, :2]
+    seen = points[:, :2]
     if grid is not None:
         cells, resolution_m, origin_m = grid
         seen = np.array(origin_m) + resolution_m * np.argwhere(cells > 0)[:, ::-1]
-    corners += [np.array(extent(seen))] if len(seen) else []
-    low, high = around(np.concatenate(corners) if corners else np.zeros((1, 2)), *_PNG_MARGIN)
-    figure = Plot.of_plan(low, high)
-    if grid is not None:
-        _draw_grid(figure, grid, low, high)
-    if points is not None and len(points):
-        draw_points(figure, lie.lift_points(points), low, high, _INKS)
-    _draw_path(figure, odometry, "odometry", _ODOMETRY, 1.0)
-    _draw_path(figure, optimized, "optimized", _OPTIMIZED, 1.8)
-    _draw_path(figure, ground_truth, "ground truth", TRUTH, 1.2, (4.0, 3.0))
-    for number, (name, poses) in enumerate(sessions):
-        _draw_path(figure, poses, name, color_of(number), 1.4)
-    for each in stretches:
-        if each.kind is not Kind.LOOPS:
-            part = optimized[max(each.first - 1, 0) : each.last + 1, :2, -1]
-            figure.line(part, STRETCH_COLORS[each.kind], 3.0, name=str(each.kind))
-    for place, shape, name in ((0, "o", "start"), (-1, "s", "end")):
-        if len(optimized):
-            figure.marks(optimized[place, None, :2, -1], shape, _OPTIMIZED, 7.0, line=1.0, name=name)
-    write_png(path, [(title, figure)], width_inches=_PNG_INCHES)
+    corners = [line.positions[:, :2] for line in lines] + ([np.array(extent(seen))] if len(seen) else [])
+    low, high = around(np.concatenate(corners), *_PNG_MARGIN)
+    figure = over_map(lines, points, low, high, grid=grid, colors=_INKS, path=path)
+    write_png(picture, [(title, figure)], width_inches=_PNG_INCHES)
 
 
 def _draw_grid(figure: Plot, grid: Grid, low: Floats, high: Floats) -> None:
@@ -245,19 +192,10 @@ def _draw_grid(figure: Plot, grid: Grid, low: Floats, high: Floats) -> None:
     figure.image(shades, palette, first, first + resolution_m * np.array(shades.shape[::-1]))
 
 
-def _draw_path(
-    figure: Plot, poses: Matrix | None, name: str, color: str, width: float, dashes: Sequence[float] = ()
-) -> None:
-    """Draw one line, its length in the legend."""
-    if poses is not None and len(poses):
-        figure.line(poses[:, :2, -1], color, width, dashes, name=f"{name} ({path_length(poses)[-1]:.0f} m)")
-
-
 def draw_evaluated(picture: Path, evaluated: Mapping[str, tuple[Matrix, Matrix]]) -> None:
     """Draw estimates (N, 4, 4), aligned, over the true poses (N, 4, 4) beside them, those of the longest one."""
-    paths = [(name, aligned) for name, (aligned, _) in evaluated.items()]
     truth = max((reference for _, reference in evaluated.values()), key=len)
-    draw_map(picture, title="Estimates and ground truth", optimized=truth[:0], sessions=paths, ground_truth=truth)
+    draw_map(picture, "Estimates and ground truth", [*_sessions(evaluated), _line("ground truth", truth, TRUTH)])
 
 
 def draw_run(directory: Path, picture: Path) -> None:
@@ -270,50 +208,56 @@ def draw_run(directory: Path, picture: Path) -> None:
         metrics = json.loads((directory / "metrics.json").read_bytes())
     except (OSError, ValueError):
         metrics = {}
+    path, grid = None, None
     if "stretches" in metrics:
-        drawn = _run(directory, metrics)
+        lines, path = _lines_of_run(directory, metrics)
     elif "placed" in metrics:
-        drawn = _localized(directory, metrics)
+        if not metrics["placed"]:
+            raise InputError(f"{directory}: {metrics['reason']}; there is no trajectory to draw")
+        lines = [_line("optimized", read_tum(directory / "trajectory.tum").poses, _OPTIMIZED, 1.8)]
+        path = lines[0].positions
     elif "sessions" in metrics:
         names = [each["name"] for each in metrics["sessions"]]
-        sessions = [(name, read_tum(directory / f"{name}.tum").poses) for name in names]
-        drawn = {"optimized": np.empty((0, 4, 4)), "sessions": sessions, **_map(directory)}
+        lines = _sessions({name: (read_tum(directory / f"{name}.tum").poses,) for name in names})
     else:
         raise InputError(
             f"{directory}: holds no trajectory to draw; give the directory of a run, of localize or of merge, or "
             "open report.html"
         )
+    if "placed" in metrics:  # over the map that it was sought in
+        points = map_points(open_saved_map(Path(metrics["map"])))
+    else:
+        points = read_ply(directory / "map.ply")
+        if not points[:, 2].any():
+            points, grid = _NO_POINTS, read_map(directory)
     try:
-        draw_map(picture, title=directory.resolve().name, **drawn)
+        draw_map(picture, directory.resolve().name, lines, points=points, grid=grid, path=path)
     except OSError as error:
         raise InputError(f"{picture}: not writable ({error.strerror}); choose another place") from error
 
 
-def _run(directory: Path, metrics: dict[str, Any]) -> dict[str, Any]:
-    """Arguments of ``draw_map`` for a run."""
+def _lines_of_run(directory: Path, metrics: dict[str, Any]) -> tuple[list[Line], Floats]:
+    """Trajectories, truth and stretches to check of a run, and its path (N, 3)."""
     optimized, truth_file = read_tum(directory / "trajectory.tum"), directory / TRUTH_FILE
-    truth = None
+    odometry, path = read_tum(directory / "odometry.tum").poses, optimized.poses[:, :3, 3]
+    lines = [_line("odometry", odometry, _ODOMETRY, 1.0), _line("optimized", optimized.poses, _OPTIMIZED, 1.8)]
     if truth_file.exists():
         accuracy = metrics["ground_truth"] or {}
         truth = on_the_estimate(optimized, read_tum(truth_file), gap_s=accuracy.get("max_gap_s"))
-    return {
-        "optimized": optimized.poses,
-        "odometry": read_tum(directory / "odometry.tum").poses,
-        "ground_truth": None if truth is None else truth.poses,
-        "stretches": msgspec.convert(metrics["stretches"], tuple[Stretch, ...]),
-        **_map(directory),
-    }
+        lines.append(_line("ground truth", truth.poses, TRUTH))
+    for each in msgspec.convert(metrics["stretches"], tuple[Stretch, ...]):
+        if each.kind is not Kind.LOOPS:
+            part = path[max(each.first - 1, 0) : each.last + 1]
+            lines.append(Line(str(each.kind), part, STRETCH_COLORS[each.kind], 3.0))
+    return lines, path
 
 
-def _localized(directory: Path, metrics: dict[str, Any]) -> dict[str, Any]:
-    """Arguments of ``draw_map`` for a localized log, over the map that it was sought in."""
-    if not metrics["placed"]:
-        raise InputError(f"{directory}: {metrics['reason']}; there is no trajectory to draw")
-    prior = open_saved_map(Path(metrics["map"]))
-    points = map_points(prior)[:, : prior.dimension]
-    return {"optimized": read_tum(directory / "trajectory.tum").poses, "points": points}
+def _sessions(poses: Mapping[str, Sequence[Matrix]]) -> list[Line]:
+    """A line through the first poses (N, 4, 4) of each name."""
+    return [_line(name, each[0], color_of(place)) for place, (name, each) in enumerate(poses.items())]
 
 
-def _map(directory: Path) -> dict[str, Any]:
-    points = read_ply(directory / "map.ply")
-    return {"points": points} if points[:, 2].any() else {"grid": read_map(directory)}
+def _line(name: str, poses: Matrix, color: str, width: float = 1.4) -> Line:
+    """The line through poses (N, 4, 4), its length in the legend; that of the truth is dashed."""
+    length_m = path_length(poses)[-1]
+    return Line(f"{name} ({length_m:.0f} m)", poses[:, :3, 3], color, width, is_dashed=color == TRUTH)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from scanchain import lie
@@ -52,20 +53,15 @@ class DrawnTrajectory:
     nees: Floats
     observability: Floats
 
-    @property
-    def dashes(self) -> tuple[float, ...]:
-        """Of its line, in widths."""
-        return (3.0, 1.5) if self.is_dashed else ()
 
-
-def frame(trajectories: Sequence[DrawnTrajectory], truth: Floats | None) -> tuple[Floats, Floats]:
-    """Corners (3,) of the axes: the ground truth if there is one, else the trajectories, with a margin."""
+def frame(trajectories: Sequence[DrawnTrajectory], truth: Floats | None) -> Floats:
+    """Corners (2, 3) of the axes: the ground truth if there is one, else the trajectories, with a margin."""
     paths = [truth] if truth is not None else [trajectory.positions for trajectory in trajectories]
     low = np.min([path.min(axis=0) for path in paths], axis=0)
     high = np.max([path.max(axis=0) for path in paths], axis=0)
     size = high - low
     margin = np.array([max(0.08 * size[:2].max(), 1.0)] * 2 + [max(_MARGIN * size[2], 0.1)])
-    return low - margin, high + margin
+    return np.stack([low - margin, high + margin])
 
 
 def trajectories_of_run(
@@ -112,15 +108,12 @@ def trajectories_of_comparison(directory: Path) -> list[DrawnTrajectory]:
 
 def _of_method(row: Row, color: str, scans: pa.Table, relations: pa.Table | None) -> DrawnTrajectory:
     """Of several runs the one with most scans, the first of those."""
-
-    def chosen(table: pa.Table, column: str, value: object) -> pa.Table:
-        return table.filter(pa.array(np.array(table[column].to_pylist(), object) == value))
-
-    runs = chosen(scans, "method", row.name)
+    is_of_it = pc.field("method") == row.name
+    runs = scans.filter(is_of_it)
     if len(runs):
-        runs = chosen(runs, "repeat", int(np.argmax(np.bincount(runs["repeat"].to_numpy()))))
+        runs = runs.filter(pc.field("repeat") == int(np.argmax(np.bincount(runs["repeat"].to_numpy()))))
     known = (_column(runs, name) for name in ("seconds", "nees", "observability"))
-    errors_m = np.empty(0) if relations is None else _column(chosen(relations, "method", row.name), "error_m")
+    errors_m = np.empty(0) if relations is None else _column(relations.filter(is_of_it), "error_m")
     positions = np.stack([_column(runs, f"aligned_{axis}") for axis in "xyz"], axis=1)
     distance_m, is_dashed = _column(runs, "distance_m"), "+loops" in row.base
     return DrawnTrajectory(

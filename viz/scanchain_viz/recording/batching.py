@@ -113,55 +113,48 @@ class Batcher:
 
     def __init__(self) -> None:
         self.graph = KeyframeGraph()
-        self.steps: list[Step] = []
-        self.news: list[list[str]] = []  # of each step
-        self.counts: list[tuple[int, int]] = []  # of closures after each step
+        self.gathered: list[tuple[Step, list[str], tuple[int, int]]] = []  # with the news and counts of closures
         self.bytes = 0
-        self.scans = 0
         self.points = 0
         self.box: Floats | None = None
         self.started_s = perf_counter()
-        self.last: tuple[Matrix, Matrix] | None = None  # pose (1, d+1, d+1) of the scan before, odometry and world
+        self.last: Matrix | None = None  # (1, d+1, d+1) T_odom_lidar of the scan before
         self.state: State | None = None
-        self.last_counts: tuple[int, int] | None = None
 
     def restore(self, steps: StepTable, closures: Sequence[Closure], graph: GraphState) -> None:
         """Restore the state after these steps from the closures and the graph at that time."""
         odom, world = steps.columns["T_odom_lidar"], steps.columns["T_world_lidar"]
         positions = drawing.positions(world)
         self.graph.restore(positions[steps.columns["keyframe"] >= 0], closures, graph)
-        self.scans, self.points = len(steps), int(steps.columns["points"].sum())
+        self.points = int(steps.columns["points"].sum())
         self._frame(positions)
-        self.last = odom[-1:], world[-1:]
-        self.state, self.last_counts = steps.last_state, self.graph.counts
+        self.last = odom[-1:]
+        self.state = steps.last_state
 
     def add(self, step: Step) -> None:
         """Take in one step, and the verdicts of that moment."""
         news = self.graph.add(step)
-        if not self.steps:
+        if not self.gathered:
             self.started_s = perf_counter()
-        self.steps.append(step)
-        self.news.append(news)
-        self.counts.append(self.graph.counts)
+        self.gathered.append((step, news, self.graph.counts))
         self.bytes += 12 * len(step.points)
         self.points += len(step.points)
-        self.scans += 1
 
     @property
     def is_due(self) -> bool:
         """True if the batch is large or old enough."""
         return (
-            len(self.steps) >= _MAX_SCANS
+            len(self.gathered) >= _MAX_SCANS
             or self.bytes >= _MAX_BYTES
             or perf_counter() - self.started_s >= _MAX_WAIT_S
         )
 
     def messages(self) -> list[Message]:
         """Messages of the gathered steps, scan by scan; the batch is empty afterwards."""
-        steps, self.steps, self.bytes = self.steps, [], 0
-        news, self.news, counts, self.counts = self.news, [], self.counts, []
-        if not steps:
+        if not self.gathered:
             return []
+        steps, news, counts = zip(*self.gathered, strict=True)
+        self.gathered, self.bytes = [], 0
         times = Times(
             np.array([step.scan.index for step in steps], np.int64),
             np.array([step.scan.stamp_ns for step in steps], np.int64),
@@ -177,14 +170,14 @@ class Batcher:
             *self._trails(times, odom, world),
             *_plots(steps, times),
             *self._states(steps, news, times),
-            *self._counts(counts, times),
+            _counts(counts, times),
         ]
 
     def settled(self, closures: Sequence[Closure], graph: GraphState, times: Times) -> list[Message]:
-        """All that is left, and the final verdicts at ``times``, of the last step; their numbers in any case."""
-        messages, news, self.last_counts = self.messages(), self.graph.settle(closures, graph), None
+        """All that is left, and the final verdicts at ``times``, of the last step."""
+        messages, news = self.messages(), self.graph.settle(closures, graph)
         told = events([[(_INFORMATION, text) for text in news]], times)
-        return [*messages, *told, *self._counts([self.graph.counts], times), *self.graph.draw(times)]
+        return [*messages, *told, _counts([self.graph.counts], times), *self.graph.draw(times)]
 
     def _frame(self, positions: Floats) -> None:
         """Widen the box around everything that was passed, (2, 3)."""
@@ -192,29 +185,23 @@ class Batcher:
         self.box = np.stack([known.min(axis=0), known.max(axis=0)])
 
     def _trails(self, times: Times, odom: Matrix, world: Matrix) -> list[Message]:
-        """Each scan's segment of the trajectory, before and after correction, and the correction where it changed.
+        """Each scan's segment of the trajectory, before and after correction, and the correction.
 
         A segment of the corrected trajectory starts where the scan before stands under the same correction, so
         that a closure does not draw a jump.
         """
-        is_first, last = self.last is None, self.last or (odom[:1], world[:1])
-        self.last = odom[-1:], world[-1:]
-        before = np.concatenate([last[0], odom[:-1]])
-        corrections = np.concatenate([last[1], world]) @ lie.inverse(np.concatenate([last[0], odom]))
-        changed = np.abs(np.diff(corrections, axis=0)).max(axis=(1, 2)) > 1e-6
-        changed[0] |= is_first
-        messages = []
+        before = np.concatenate([odom[:1] if self.last is None else self.last, odom[:-1]])
+        self.last, corrections = odom[-1:], world @ lie.inverse(odom)
+        messages = [Message(entities.ODOM, drawing.transforms(corrections), times)]
         for entity, *ends in (
             (entities.ODOMETRY, before, odom),
-            (entities.TRAJECTORY, corrections[1:] @ before, world),
+            (entities.TRAJECTORY, corrections @ before, world),
         ):
             strips = np.stack([drawing.positions(poses) for poses in ends], axis=1)
             messages.append(Message(entity, rr.LineStrips3D.columns(strips=strips), times))
-        if changed.any():
-            messages.append(Message(entities.ODOM, drawing.transforms(corrections[1:][changed]), times[changed]))
         return messages
 
-    def _states(self, steps: list[Step], news: list[list[str]], times: Times) -> list[Message]:
+    def _states(self, steps: Sequence[Step], news: Sequence[list[str]], times: Times) -> list[Message]:
         """The state where it changes, with the reason as an event, and the news of loop closures."""
         before = [self.state, *(step.state for step in steps[:-1])]
         changed = np.array([step.state is not state for step, state in zip(steps, before, strict=True)])
@@ -229,16 +216,6 @@ class Batcher:
             messages.append(Message(entities.STATE, rr.StateChange.columns(state=states), times[changed]))
         return messages
 
-    def _counts(self, counts: list[tuple[int, int]], times: Times) -> list[Message]:
-        """Numbers of accepted and rejected closures, where they change."""
-        before = [self.last_counts, *counts[:-1]]
-        changed = np.array([now != then for now, then in zip(counts, before, strict=True)])
-        self.last_counts = counts[-1]
-        if not changed.any():
-            return []
-        columns = rr.Scalars.columns(scalars=np.array(counts, np.float64)[changed].reshape(-1))
-        return [Message(entities.LOOPS, columns.partition([2] * int(changed.sum())), times[changed])]
-
 
 def events(events: Sequence[Sequence[tuple[str, str]]], times: Times) -> list[Message]:
     """The events of each row of ``times``, level and text."""
@@ -250,7 +227,13 @@ def events(events: Sequence[Sequence[tuple[str, str]]], times: Times) -> list[Me
     return [Message(entities.EVENTS, columns, times[np.array(rows)])]
 
 
-def _plots(steps: list[Step], times: Times) -> list[Message]:
+def _counts(counts: Sequence[tuple[int, int]], times: Times) -> Message:
+    """Numbers of accepted and rejected closures after each scan."""
+    columns = rr.Scalars.columns(scalars=np.array(counts, np.float64).reshape(-1))
+    return Message(entities.LOOPS, columns.partition([2] * len(counts)), times)
+
+
+def _plots(steps: Sequence[Step], times: Times) -> list[Message]:
     """Figures and covariance of the registrations, what is infinite is a gap, and times of the stages."""
     matches = [step.match for step in steps]
     figures = {

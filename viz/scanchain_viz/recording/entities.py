@@ -101,6 +101,8 @@ def height_colors(points: Floats) -> NDArray[np.uint8]:
 def constants(dimension: int) -> list[Message]:
     """Static messages: axes, colors, line widths, names of the series."""
     size_m = 0.5 if dimension == 2 else 2.0
+    stages = rr.SeriesLines(names=[f"{stage} [ms]" for stage in STAGES], colors=[CYAN, GREEN, BLUE, YELLOW, RED])
+    states = rr.StateConfiguration(values=list(State), labels=list(State), colors=[GREEN, VIOLET, ORANGE, RED])
     return [
         UP,
         Message(LIDAR, rr.TransformAxes3D(axis_length=size_m)),
@@ -115,22 +117,9 @@ def constants(dimension: int) -> list[Message]:
         Message(REJECTED, lines(color=RED, radius=0.75)),
         Message(LEGEND, rr.TextDocument(_LEGEND, media_type=rr.MediaType.MARKDOWN)),
         Message(VERDICT, rr.TextDocument("The verdict comes with the end of the run.")),
-        *_series(),
-    ]
-
-
-def _series() -> list[Message]:
-    stages = rr.SeriesLines(names=[f"{stage} [ms]" for stage in STAGES], colors=[CYAN, GREEN, BLUE, YELLOW, RED])
-    states = rr.StateConfiguration(values=list(State), labels=list(State), colors=[GREEN, VIOLET, ORANGE, RED])
-    loops = rr.SeriesLines(
-        names=["accepted", "rejected"],
-        colors=[GREEN, RED],
-        interpolation_mode=rr.components.InterpolationMode.StepAfter,  # each holds until the next
-    )
-    return [
         Message(TIME, stages),
         *(Message(entity, rr.SeriesLines(names=[name], colors=[BLUE])) for entity, name in SERIES.items()),
-        Message(LOOPS, loops),
+        Message(LOOPS, rr.SeriesLines(names=["accepted", "rejected"], colors=[GREEN, RED])),
         Message(STATE, states),
     ]
 

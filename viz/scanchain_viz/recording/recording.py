@@ -6,11 +6,10 @@ Nothing that goes wrong here after the start ends a run; it is collected in ``Re
 from __future__ import annotations
 
 import subprocess
-from collections.abc import Callable, Iterable, Sequence
-from functools import wraps
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Concatenate, ParamSpec
 from uuid import uuid4
 
 import numpy as np
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from rerun.error_utils import catch_and_log_exceptions
 
 from scanchain.config import RecordingConfig
-from scanchain.data import Closure, GraphState, Matrix, Scan, Step, Trajectory
+from scanchain.data import Closure, GraphState, Matrix, Step, Trajectory
 from scanchain.errors import InputError
 from scanchain.runs.job import SinkName
 from scanchain.runs.step_table import StepTable
@@ -33,19 +32,6 @@ from scanchain_viz.recording.sinks import Sink, file_sink, open_stream, viewer_s
 
 _LISTED = 50  # largest number of stretches in the text of a verdict
 _RADIUS = 3.5  # of a stretch, in points of the screen
-Given = ParamSpec("Given")
-
-
-def _recorded(
-    draw: Callable[Concatenate[Recording, Given], Iterable[Message]],
-) -> Callable[Concatenate[Recording, Given], None]:
-    """A method that sends the messages which it makes to every sink."""
-
-    @wraps(draw)
-    def send(recording: Recording, *values: Given.args, **named: Given.kwargs) -> None:
-        recording._send(lambda: draw(recording, *values, **named))
-
-    return send
 
 
 class Recording:
@@ -65,8 +51,6 @@ class Recording:
         name: str,
         sinks: frozenset[SinkName],
         config: RecordingConfig,
-        port: int = viewer.PORT,
-        web_port: int = viewer.WEB_PORT,
     ) -> None:
         if "save" in sinks and path is None:
             raise InputError("no path for the recording: give --out, or leave save out of --rerun")
@@ -75,8 +59,6 @@ class Recording:
         self.name = name
         self.wanted = sinks
         self.config = config
-        self.port = port
-        self.web_port = web_port
         self.web_address = ""
         self.sinks: list[Sink] = []
         self.file: Sink | None = None
@@ -117,10 +99,9 @@ class Recording:
         """
         self.last = int(steps.columns["index"][-1]), int(steps.columns["stamp_ns"][-1])
         self._guard(lambda: self.batcher.restore(steps, closures, graph))
-        if before is not None:
-            for sink in self.sinks:
-                sink.send(before)
         for sink in self.sinks:
+            if before is not None:
+                sink.send(partial(sink.copy, before))
             sink.settle()
 
     def secure(self) -> int:
@@ -130,105 +111,53 @@ class Recording:
             return 0
         return self.path.stat().st_size
 
-    def preview(self, scan: Scan) -> None:
-        """Show a viewer, but no file, every n-th point of the first scan until its step is recorded."""
-        viewers = [sink for sink in self.sinks if sink is not self.file]
-        self._send(lambda: self._cloud(entities.SCAN, scan.points, Times.at(scan.index, scan.stamp_ns)), viewers)
-
     def log(self, step: Step) -> None:
         """Record one step; most of it is gathered and written in batches."""
-        if not self.sinks:
-            return
         self.last = step.scan.index, step.scan.stamp_ns
-        try:
-            self.batcher.add(step)
-        except Exception as error:
-            self._note(error)
-        has_news = self.batcher.graph.has_grown or self._draws_map_of(step)
-        if has_news or self.batcher.is_due:
-            self._send(lambda: self._step(step))
+        self._send(lambda: self._step(step))
 
-    @_recorded
     def log_trajectory(
         self, stamps_ns: NDArray[np.int64], poses_optimized: Matrix, indices: NDArray[np.int64]
-    ) -> Iterable[Message]:
+    ) -> None:
         """Record the optimized trajectory: poses (N, d+1, d+1) of the scans ``indices``."""
-        path = drawing.lines([drawing.positions(poses_optimized)], entities.CYAN, 0.75)
-        yield Message(entities.OPTIMIZED, path)
         times = Times(indices, stamps_ns)
-        yield Message(entities.OPTIMIZED_LIDAR, drawing.transforms(poses_optimized), times)
+        self._send(lambda: [
+            _path(entities.OPTIMIZED, poses_optimized, entities.CYAN),
+            Message(entities.OPTIMIZED_LIDAR, drawing.transforms(poses_optimized), times),
+        ])  # fmt: skip
 
-    @_recorded
-    def log_closures(self, closures: Sequence[Closure], graph: GraphState) -> Iterable[Message]:
+    def log_closures(self, closures: Sequence[Closure], graph: GraphState) -> None:
         """Record the final graph and the final verdict on every closure, at the last scan."""
-        return self.batcher.settled(closures, graph, self.now)
+        self._send(lambda: self.batcher.settled(closures, graph, self.now))
 
-    @_recorded
-    def log_verdict(self, judged: Judged, trajectory: Trajectory) -> Iterable[Message]:
+    def log_verdict(self, judged: Judged, trajectory: Trajectory) -> None:
         """Record the verdict, and its stretches on the optimized trajectory of all scans of the log."""
-        document = rr.TextDocument(_document(judged), media_type=rr.MediaType.MARKDOWN)
-        yield Message(entities.VERDICT, document)
-        if judged.stretches:
-            path = drawing.positions(trajectory.poses)
-            strips = [  # of disagreeing loops the line between their ends
-                path[[each.first, each.last]]
-                if each.kind is Kind.LOOPS
-                else path[max(each.first - 1, 0) : each.last + 1]
-                for each in judged.stretches
-            ]
-            lines = rr.LineStrips3D(
-                strips,
-                colors=[rgb(STRETCH_COLORS[each.kind]) for each in judged.stretches],
-                radii=drawing.pixels(_RADIUS),
-                labels=[str(each.kind) for each in judged.stretches],
-                show_labels=False,
-            )
-            yield Message(entities.STRETCHES, lines)
-            first = np.array([each.first for each in judged.stretches], np.int64)
-            texts = [[(WARNING, f"stretch to check: {each.text}")] for each in judged.stretches]
-            yield from events(texts, Times(first, trajectory.stamps_ns[first]))
+        self._send(lambda: _verdict(judged, trajectory))
 
-    @_recorded
-    def log_ground_truth(self, poses: Matrix) -> Iterable[Message]:
+    def log_ground_truth(self, poses: Matrix) -> None:
         """Record true poses (N, 4, 4), aligned to the optimized trajectory."""
-        line = drawing.lines([drawing.positions(poses)], entities.WHITE, 0.75)
-        yield Message(entities.GROUND_TRUTH, line)
+        self._send(lambda: [_path(entities.GROUND_TRUTH, poses, entities.WHITE)])
 
-    @_recorded
-    def log_map(self, points: NDArray[np.floating]) -> Iterable[Message]:
+    def log_map(self, points: NDArray[np.floating]) -> None:
         """Record the finished map (N, d), downsampled to a third of the points of the scans."""
-        limit = max(self.config.max_map_points, self.batcher.points // 3)
-        drawn = drawing.at_most(points, limit)
-        if len(drawn):
-            color = entities.height_colors(drawn) if self.dimension == 3 else entities.WHITE
-            yield Message(entities.MAP, drawing.dots(drawn, color, 1.0))
+        self._send(lambda: self._map(points))
 
-    @_recorded
     def log_grid(
         self, cells: NDArray[np.int8] | NDArray[np.uint8], *, resolution_m: float, origin_m: tuple[float, float]
-    ) -> Iterable[Message]:
+    ) -> None:
         """Record the finished occupancy grid of a 2D log.
 
         cells : (H, W), as ROS counts: 0 free to 100 occupied, −1 (255) unknown; row 0 at the lowest y
         origin_m : x, y of the outer corner of cells[0, 0]
         """
-        height, width = cells.shape
-        pixels = np.ascontiguousarray(cells[::-1]).view(np.uint8)  # rerun's first row is the top one
-        grid = rr.GridMap(
-            data=pixels.tobytes(),
-            format=rr.components.ImageFormat(width=width, height=height, color_model="L", channel_datatype="U8"),
-            cell_size=resolution_m,
-            translation=[*origin_m, -0.05],
-            colormap=rr.components.Colormap.RvizMap,
-        )
-        yield Message(entities.GRID, grid)
+        self._send(lambda: [Message(entities.GRID, _grid(cells, resolution_m, origin_m))])
 
     def close(self) -> None:
         """Write the last batch, frame the view, and close file and viewer; may be called twice."""
         self._send(lambda: [*self.batcher.messages(), *self.batcher.graph.draw(self.now)])
-        layout = blueprint(self.dimension, self.batcher.box, self.batcher.scans)
+        layout = blueprint(self.dimension, self.batcher.box, self.last[0])
         for sink in self.sinks:
-            sink.send(layout)
+            sink.send(lambda stream: stream.send_blueprint(layout))
             sink.close()
         self.problems, self.sinks = self.warnings, []
         if self.server is not None:
@@ -248,47 +177,53 @@ class Recording:
         """Address of a viewer; empty, with a warning, if there is none."""
         try:
             if "web" in self.wanted:
-                self.server = viewer.start_web(self.port, self.web_port)
-                self.web_address = viewer.web_address(self.port, self.web_port)
+                self.server = viewer.start_web()
+                self.web_address = viewer.web_address()
             elif "spawn" in self.wanted:
-                viewer.start_window(self.port)
-            elif not viewer.is_listening(self.port):
+                viewer.start_window()
+            elif not viewer.is_listening(viewer.PORT):
                 raise viewer.ViewerError(
-                    f"no viewer at {viewer.HOST}:{self.port}, the run goes on without it; open one with: rerun"
+                    f"no viewer at {viewer.HOST}:{viewer.PORT}, the run goes on without it; open one with: rerun"
                 )
         except (viewer.ViewerError, OSError) as error:
             self.problems.append(str(error))
             return ""
-        return viewer.grpc_address(self.port)
+        return viewer.grpc_address()
 
     @property
     def now(self) -> Times:
         """The instant of the last step."""
         return Times.at(*self.last)
 
-    def _draws_map_of(self, step: Step) -> bool:
-        """True for every so many keyframes."""
-        return step.keyframe >= 0 and step.keyframe % self.config.local_map_every == 0 and len(step.local_map) > 0
-
-    def _cloud(self, entity: str, points: NDArray[np.floating], times: Times) -> list[Message]:
-        """Every n-th point, so that a viewer can draw them."""
-        return [Message(entity, drawing.dots(drawing.at_most(points, self.config.max_map_points)), times)]
-
     def _step(self, step: Step) -> list[Message]:
-        """Messages that are due after a step."""
+        """Take in a step; the messages that are due after it."""
+        self.batcher.add(step)
         messages = self.batcher.graph.draw(self.now) if self.batcher.graph.has_grown else []
-        if self._draws_map_of(step):
-            messages += self._cloud(entities.LOCAL_MAP, step.local_map, self.now)
+        if step.keyframe >= 0 and step.keyframe % self.config.local_map_every == 0 and len(step.local_map):
+            points = drawing.at_most(step.local_map, self.config.max_map_points)
+            messages.append(Message(entities.LOCAL_MAP, drawing.dots(points), self.now))
         return [*messages, *self.batcher.messages()] if self.batcher.is_due else messages
 
-    def _send(self, say: Callable[[], Iterable[Message]], sinks: Sequence[Sink] | None = None) -> None:
-        """Send the messages that ``say`` returns to these sinks, or to every one."""
-        sinks = self.sinks if sinks is None else sinks
+    def _map(self, points: NDArray[np.floating]) -> list[Message]:
+        """The map's points as far as they are drawn."""
+        drawn = drawing.at_most(points, max(self.config.max_map_points, self.batcher.points // 3))
+        if not len(drawn):
+            return []
+        color = entities.height_colors(drawn) if self.dimension == 3 else entities.WHITE
+        return [Message(entities.MAP, drawing.dots(drawn, color, 1.0))]
+
+    def _send(self, say: Callable[[], Iterable[Message]]) -> None:
+        """Send the messages that ``say`` returns to every sink."""
         messages: list[Message] = []
-        if sinks:
+
+        def write(stream: rr.RecordingStream) -> None:
+            for message in messages:
+                message.send(stream)
+
+        if self.sinks:
             self._guard(lambda: messages.extend(say()))
-        for sink in sinks if messages else ():
-            sink.send(messages)
+        for sink in self.sinks if messages else ():
+            sink.send(write)
 
     def _guard(self, act: Callable[[], object]) -> None:
         """Turn an exception into a warning, once per kind: a recording that fails must not fail the run."""
@@ -296,16 +231,52 @@ class Recording:
             with catch_and_log_exceptions(strict=True):  # else rerun turns errors into warnings on stderr
                 act()
         except Exception as error:
-            self._note(error)
-
-    def _note(self, error: Exception) -> None:
-        problem = f"the recording lacks something: {type(error).__name__}: {error}"
-        if problem not in self.problems:
-            self.problems.append(problem)
+            problem = f"the recording lacks something: {type(error).__name__}: {error}"
+            if problem not in self.problems:
+                self.problems.append(problem)
 
 
-def _document(judged: Judged) -> str:
-    listed = "".join(f"- {each.text}\n" for each in judged.unnamed[:_LISTED])
-    more = len(judged.unnamed) - _LISTED
-    head = f"## {judged.verdict}\n\n{judged.vouched}\n\n{judged.reason}\n\n"
-    return head + listed + (f"- and {more:,} more\n" if more > 0 else "")
+def _path(entity: str, poses: Matrix, color: drawing.Color) -> Message:
+    """A line through poses (N, d+1, d+1)."""
+    return Message(entity, drawing.lines([drawing.positions(poses)], color, 0.75))
+
+
+def _grid(
+    cells: NDArray[np.int8] | NDArray[np.uint8], resolution_m: float, origin_m: tuple[float, float]
+) -> rr.GridMap:
+    height, width = cells.shape
+    pixels = np.ascontiguousarray(cells[::-1]).view(np.uint8)  # rerun's first row is the top one
+    return rr.GridMap(
+        data=pixels.tobytes(),
+        format=rr.components.ImageFormat(width=width, height=height, color_model="L", channel_datatype="U8"),
+        cell_size=resolution_m,
+        translation=[*origin_m, -0.05],
+        colormap=rr.components.Colormap.RvizMap,
+    )
+
+
+def _verdict(judged: Judged, trajectory: Trajectory) -> Iterator[Message]:
+    """The verdict as text, its stretches as lines and as events."""
+    listed = "".join(f"- {each.text}\n" for each in judged.stretches[:_LISTED])
+    more = len(judged.stretches) - _LISTED
+    listed += f"- and {more:,} more\n" if more > 0 else ""
+    text = f"## {judged.verdict}\n\n{judged.vouched}\n\n{judged.reason}\n\n{listed}"
+    yield Message(entities.VERDICT, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+    if not judged.stretches:
+        return
+    path = drawing.positions(trajectory.poses)
+    strips = [  # of disagreeing loops the line between their ends
+        path[[each.first, each.last]] if each.kind is Kind.LOOPS else path[max(each.first - 1, 0) : each.last + 1]
+        for each in judged.stretches
+    ]
+    lines = rr.LineStrips3D(
+        strips,
+        colors=[rgb(STRETCH_COLORS[each.kind]) for each in judged.stretches],
+        radii=drawing.pixels(_RADIUS),
+        labels=[str(each.kind) for each in judged.stretches],
+        show_labels=False,
+    )
+    yield Message(entities.STRETCHES, lines)
+    first = np.array([each.first for each in judged.stretches], np.int64)
+    texts = [[(WARNING, f"stretch to check: {each.text}")] for each in judged.stretches]
+    yield from events(texts, Times(first, trajectory.stamps_ns[first]))

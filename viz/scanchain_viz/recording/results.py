@@ -26,7 +26,6 @@ from scanchain.runs.directory import RECORDING_FILE
 from scanchain.sessions.change_run import COLORS, SUMMARY_FILE
 from scanchain.sessions.changes import Changes, Label
 from scanchain.sessions.localize import LocalizedLog
-from scanchain.sessions.localizer import MapState
 from scanchain.trajectory import read_tum
 from scanchain_viz.colors import rgb
 from scanchain_viz.pictures.maps import DrawnMerge, map_points, read_merge
@@ -36,24 +35,25 @@ from scanchain_viz.recording.drawing import Message, Times
 from scanchain_viz.recording.entities import scene, up_to_now, whole_log, with_panels
 from scanchain_viz.recording.sinks import write_recording
 from scanchain_viz.report.comparison import write_compare_report
-from scanchain_viz.report.maps import write_changes_report, write_localization_report, write_merge_report
+from scanchain_viz.report.maps import (
+    STATE_COLORS,
+    write_changes_report,
+    write_localization_report,
+    write_merge_report,
+)
 from scanchain_viz.report.problems import ellipses
 
 _MAP_POINTS = 300_000
 _COMPARED_POINTS = 60_000  # of the map of a method
 _HEADROOM = 1.2  # factor over the 99th percentile at which a plot ends
-_PLOTS = {"error": "position error [m]", "time": "time of a scan [ms]"}
+_PLOTS = (  # name, title, field of a trajectory, factor to the unit
+    ("error", "position error [m]", "error_m", 1.0),
+    ("time", "time of a scan [ms]", "seconds", 1e3),
+)
 _BOX_M, _ELLIPSE_M = 0.02, 1e-4  # heights of what is flat
 _RADII = {Label.SAME: 0.75, Label.UNKNOWN: 1.0, Label.APPEARED: 2.0, Label.VANISHED: 2.0}
 _FINAL, _SIGMA = "world/final", "plots/sigma"
 _MATCHED, _UNMATCHED = "world/matches/accepted", "world/matches/rejected"
-_STATE_COLORS = {
-    MapState.SEARCHING: entities.GRAY,
-    MapState.LOCALIZED: entities.GREEN,
-    MapState.UNMATCHED: entities.ORANGE,
-    MapState.OUTSIDE: entities.VIOLET,
-    MapState.LOST: entities.RED,
-}
 _MAX_SCAN_POINTS = 5_000
 
 
@@ -96,23 +96,19 @@ def _of_method(trajectory: DrawnTrajectory, map_file: Path, stamps_ns: NDArray[n
         points = drawing.at_most(read_ply(map_file), _COMPARED_POINTS)
         red, green, blue = ((value + shade) // 2 for value, shade in zip(color, entities.GRAY, strict=True))
         yield Message(f"world/{name}/map", drawing.dots(points, (red, green, blue), 0.5))
-    for plot, values in _series(trajectory).items():
+    for plot, _, field, scale in _PLOTS:
+        values = scale * getattr(trajectory, field)
         if (known := np.isfinite(values)).any():
             series = rr.SeriesLines(colors=[color], names=[trajectory.name], widths=[1.0])
             yield Message(f"plots/{plot}/{name}", series)
             yield Message(f"plots/{plot}/{name}", rr.Scalars.columns(scalars=values[known]), times[known])
 
 
-def _series(trajectory: DrawnTrajectory) -> dict[str, NDArray[np.float64]]:
-    """Scan by scan, by plot."""
-    return {"error": trajectory.error_m, "time": 1e3 * trajectory.seconds}
-
-
 def _plots(trajectories: Sequence[DrawnTrajectory]) -> list[rrb.TimeSeriesView]:
     """Plots of the known values with one legend, scaled so that a single slow scan leaves the rest visible."""
     views = []
-    for plot, name in _PLOTS.items():
-        values = np.concatenate([np.empty(0), *(_series(trajectory)[plot] for trajectory in trajectories)])
+    for plot, name, field, scale in _PLOTS:
+        values = np.concatenate([np.empty(0), *(scale * getattr(each, field) for each in trajectories)])
         if np.isfinite(values).any():
             highest = _HEADROOM * float(np.nanpercentile(values, 99.0))
             legend = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=plot == "time")
@@ -204,7 +200,7 @@ def present_localization(directory: Path, localized: LocalizedLog) -> None:
     )
     views = rrb.Horizontal(scene("map", prior.dimension, points), side, column_shares=[5, 2])
     layout = with_panels(views, scans=len(localized.localization.states))
-    names, colors = list(MapState), list(_STATE_COLORS.values())
+    names, colors = list(STATE_COLORS), [rgb(color) for color in STATE_COLORS.values()]
     messages = [
         Message(entities.MAP, drawing.dots(points, entities.height_colors(points), 1.0)),
         Message(entities.LIDAR, rr.TransformAxes3D(axis_length=0.5 if prior.dimension == 2 else 2.0)),

@@ -61,21 +61,16 @@ class Sink:
         self.dropped = 0
         self.flushes = 0
         self.lock = threading.Lock()
-        self.waiting: queue.Queue[list[Message] | rrb.Blueprint | Path | threading.Event | None] = queue.Queue(
-            _QUEUED_BATCHES
-        )
+        self.waiting: queue.Queue[Callable[[rr.RecordingStream], object] | None] = queue.Queue(_QUEUED_BATCHES)
         self.thread = threading.Thread(target=self._serve, name=f"recording to {name}", daemon=True)
         self.thread.start()
 
-    def send(self, item: list[Message] | rrb.Blueprint | Path) -> None:
-        """Hand over a batch, a blueprint to replace the one before, or a recording whose rows are to be copied.
-
-        What goes wrong ends up in ``warnings``.
-        """
+    def send(self, write: Callable[[rr.RecordingStream], object]) -> None:
+        """Have the thread write to the stream; what goes wrong ends up in ``warnings``."""
         if self.warnings:
             return
         try:
-            self.waiting.put(item, timeout=self.patience_s if self.is_lossless else 0.0)
+            self.waiting.put(write, timeout=self.patience_s if self.is_lossless else 0.0)
         except queue.Full:
             self.dropped += 1
             if self.is_lossless:
@@ -86,7 +81,7 @@ class Sink:
         settled = threading.Event()
         if not self.warnings:
             with contextlib.suppress(queue.Full):
-                self.waiting.put(settled, timeout=self.patience_s)
+                self.waiting.put(lambda stream: settled.set(), timeout=self.patience_s)
             flushes, since_s = self.flushes, perf_counter()
             while not settled.wait(_LOOK_EVERY_S) and not self.warnings:
                 if flushes != self.flushes:
@@ -109,30 +104,20 @@ class Sink:
     def _serve(self) -> None:
         try:
             self.connect()
-            while (item := self.waiting.get()) is not None:
-                match item:
-                    case threading.Event():
-                        item.set()
-                        continue
-                    case Path():
-                        self._copy(item)
-                    case list():
-                        for message in item:
-                            message.send(self.stream)
-                    case _:
-                        self.stream.send_blueprint(item)
+            while (write := self.waiting.get()) is not None:
+                write(self.stream)
                 self._flush()
             self.stream.disconnect()
         except Exception as error:
             self._give_up(str(error))
 
-    def _copy(self, path: Path) -> None:
-        """Pass on a recording except its static messages, which are sent again."""
+    def copy(self, path: Path, stream: rr.RecordingStream) -> None:
+        """Write, in the thread, what a recording holds, except its static messages, which are sent again."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RerunWarning)  # what a killed process wrote lacks rerun's index
             chunks = RrdReader(path).stream().filter(is_static=False)
         for number, chunk in enumerate(chunks, start=1):
-            rr.send_chunks(chunk, recording=self.stream)
+            rr.send_chunks(chunk, recording=stream)
             if number % _COPIED_CHUNKS == 0:
                 self._flush()
 

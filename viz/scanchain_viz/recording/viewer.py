@@ -28,14 +28,14 @@ class ViewerError(ScanchainError):
     """No viewer: what failed and what to do, on one line."""
 
 
-def grpc_address(port: int) -> str:
+def grpc_address() -> str:
     """Address at which a viewer on this machine takes data."""
-    return f"rerun+http://{HOST}:{port}/proxy"
+    return f"rerun+http://{HOST}:{PORT}/proxy"
 
 
-def web_address(port: int, web_port: int) -> str:
-    """The page of the server on ``port``."""
-    return f"http://{HOST}:{web_port}/?url={quote(grpc_address(port), safe='')}"
+def web_address() -> str:
+    """The page of the web viewer."""
+    return f"http://{HOST}:{WEB_PORT}/?url={quote(grpc_address(), safe='')}"
 
 
 def is_listening(port: int) -> bool:
@@ -52,25 +52,23 @@ def has_display() -> bool:
     return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def start_window(port: int) -> None:
+def start_window() -> None:
     """Open the viewer's window; it outlives the run. A viewer that is open already is used as it is."""
-    if is_listening(port):
+    if is_listening(PORT):
         return
     if not has_display():
         raise ViewerError("no viewer spawned: there is no display; use --rerun web, or open the recording later")
-    _launch((port,), "--port", str(port), "--expect-data-soon")
+    _launch((PORT,), "--expect-data-soon")
 
 
-def start_web(port: int, web_port: int, recording: Path | None = None) -> subprocess.Popen[bytes]:
-    """Serve the web viewer on this machine only: of a .rrd file, or of what is sent to ``port``."""
-    for taken in (port, web_port):
+def start_web(*recordings: Path) -> subprocess.Popen[bytes]:
+    """Serve the web viewer on this machine only: of .rrd files, or of what is sent to ``PORT``."""
+    for taken in (PORT, WEB_PORT):
         if is_listening(taken):
             raise ViewerError(
                 f"no web viewer: port {taken} is taken; close the program that uses it (another viewer?)"
             )
-    files = [] if recording is None else [str(recording)]
-    served = "--serve-web", "--port", str(port), "--web-viewer-port", str(web_port)
-    return _launch((port, web_port), *served, *files)
+    return _launch((PORT, WEB_PORT), "--serve-web", "--web-viewer-port", str(WEB_PORT), *map(str, recordings))
 
 
 def stop(process: subprocess.Popen[bytes]) -> None:
@@ -86,7 +84,7 @@ def stop(process: subprocess.Popen[bytes]) -> None:
 def _launch(ports: tuple[int, ...], *arguments: str) -> subprocess.Popen[bytes]:
     """Start rerun bound to this machine alone (its own default is every interface), and wait for these ports."""
     process = subprocess.Popen(
-        [sys.executable, "-P", "-m", "rerun_cli", "--bind", HOST, *arguments],
+        [sys.executable, "-P", "-m", "rerun_cli", "--bind", HOST, "--port", str(PORT), *arguments],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
@@ -133,9 +131,9 @@ def show(path: Path, announce: Callable[[str], None], *, in_browser: bool) -> No
 
 def _serve(path: Path, announce: Callable[[str], None]) -> None:
     """Until KeyboardInterrupt; whatever ends this ends the server."""
-    server = start_web(PORT, WEB_PORT, path)
+    server = start_web(path)
     try:
-        address = web_address(PORT, WEB_PORT)
+        address = web_address()
         announce(address)
         if has_display():
             webbrowser.open(address)

@@ -9,7 +9,6 @@ from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
-from markupsafe import Markup
 
 from scanchain.batch.batch import totals
 from scanchain.batch.task import Row, State, output_file
@@ -22,7 +21,6 @@ from scanchain_viz.pictures.figure import Plot
 from scanchain_viz.report import page
 
 _MAX_TRAJECTORIES = 60
-_MAX_POINTS = 1500  # largest number of points of a line
 _BOX = np.array([1.0, 0.84])  # proportions of the plan of a trajectory
 _BEYOND = 1.05  # of the greatest value, so that its mark is whole
 _MANY_DEGENERATE, _MANY_LOST = 0.5, 0.01  # shares of the scans above which a figure is marked
@@ -59,7 +57,7 @@ def write_batch_report(directory: Path, rows: Sequence[Row], command: Sequence[s
         page.Collapsible("Command", shlex.join(without_keys(command))),
         page.Collapsible("Paths", "\n".join(paths)),
     )
-    sections = (_logs(directory, rows, names), *_spread(done), *_trajectories(directory, done, names))
+    sections = (_logs(directory, rows, names), *_trajectories(directory, done, names))
     title = f"Batch of {counted(len(rows), 'log')}"
     subtitle = "Each was run in its own process."
     page.write_page(directory, page.Page(title, subtitle, totals(rows), warnings, (), sections, folds))
@@ -117,39 +115,10 @@ def _link(directory: Path, row: Row) -> str:
     return ""
 
 
-def _spread(done: Sequence[Row]) -> Iterator[page.Section]:
-    """Distributions of the figures, if there are several logs."""
-    every = [(row, row.metrics) for row in done if row.metrics is not None]
-    figures = {
-        "ATE [m]": [m.ground_truth.optimized.ate_rmse_m for _, m in every if m.ground_truth is not None],
-        "Speed [× real time]": [m.times_real_time for _, m in every],
-        "Memory [MiB]": [row.peak_mib for row, _ in every],
-    }
-    drawings = [
-        page.Drawing(name.partition(" [")[0], "", _sorted_values(name, sorted(values)))
-        for name, values in figures.items()
-        if len(values) > 1
-    ]
-    if drawings:
-        text = "Cumulative distribution over the logs."
-        yield page.Section("Distributions", text, drawings=drawings, is_small=True)
-
-
-def _sorted_values(name: str, values: Sequence[float]) -> Markup:
-    figure = Plot(name, "logs below [%]")
-    points = np.stack([values, 100.0 * (np.arange(len(values)) + 1) / len(values)], axis=1)
-    steps = np.stack([np.repeat(points[:, 0], 2)[1:], np.repeat(points[:, 1], 2)[:-1]], axis=1)
-    figure.line(steps, color_of(0))
-    figure.marks(points, "o", color_of(0), 3.5)
-    figure.x.limit(0.0, _BEYOND * max(values) or 1.0)
-    figure.y.limit(0.0, 105.0)
-    return figure.svg()
-
-
 def _trajectories(directory: Path, done: Sequence[Row], names: dict[str, str]) -> Iterator[page.Section]:
     """Every trajectory from above, as far as a page can hold them."""
     drawings = [
-        page.Drawing(names[row.log], f"{row.run}", _trajectory(directory / row.run / "trajectory.tum"))
+        page.Drawing.of(names[row.log], row.run, _trajectory(directory / row.run / "trajectory.tum"))
         for row in done[:_MAX_TRAJECTORIES]
     ]
     text = f"The first {_MAX_TRAJECTORIES} of {len(done):,}." if len(done) > _MAX_TRAJECTORIES else ""
@@ -158,12 +127,11 @@ def _trajectories(directory: Path, done: Sequence[Row], names: dict[str, str]) -
         yield page.Section(title, text, drawings=drawings, is_small=True)
 
 
-def _trajectory(trajectory: Path) -> Markup:
+def _trajectory(trajectory: Path) -> Plot:
     positions = read_tum(trajectory).poses[:, :2, -1]
-    rows = np.linspace(0, len(positions) - 1, min(len(positions), _MAX_POINTS)).astype(int)
     middle, size = 0.5 * (positions.min(axis=0) + positions.max(axis=0)), np.ptp(positions, axis=0)
     half = _BEYOND * 0.5 * (max(size / _BOX) or 1.0) * _BOX
     figure = Plot.of_plan(middle - half, middle + half, has_grid=True)
-    figure.line(positions[rows], color_of(0))
+    figure.line(positions, color_of(0))
     figure.marks(positions[:1], "o", color_of(0), 5.0)
-    return figure.svg()
+    return figure

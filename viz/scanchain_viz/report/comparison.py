@@ -14,14 +14,13 @@ from scanchain.comparison.table import Row as TableRow
 from scanchain.maps import read_ply
 from scanchain.trajectory import read_tum
 from scanchain_viz.pictures.figure import Floats
-from scanchain_viz.pictures.maps import map_picture, surroundings
+from scanchain_viz.pictures.maps import VIRIDIS, over_map, surroundings
 from scanchain_viz.pictures.trajectories import DrawnTrajectory, frame, trajectories_of_comparison
 from scanchain_viz.report import page, sections
 
 _VERDICT = page.Head(
     "verdict", "", "of other tools by wheels and constant velocity alone, with the error that it vouches for", True
 )
-_WIDEST = 10  # largest number of columns of a table beside the summary
 _NEARLY = 1.25  # thickness of a map over that of the sharpest, up to which it frames the pictures
 
 
@@ -56,17 +55,13 @@ def write_compare_report(directory: Path) -> None:
 
 
 def _figures(table: Table, trajectories: Sequence[DrawnTrajectory]) -> Iterator[page.Section]:
-    """The summary, and all else in one table more, or in two where that would be too wide."""
+    """The summary, and tables of all else."""
     summary = columns_of(table.figures, "summary")
     yield page.Section("Summary", grid=_grid(table, table.rows, trajectories, summary, has_verdicts=True))
     ended = [row for row in table.rows if row.status is Status.OK]
-    accuracy, time = columns_of(table.figures, "accuracy"), columns_of(table.figures, "time")
-    parts = {"More on accuracy": accuracy, "More on time": time}
-    if len(accuracy) + len(time) <= _WIDEST:
-        parts = {"More figures": [*accuracy, *time]}
-    for title, columns in parts.items():
-        if columns:
-            yield page.Section(title, grid=_grid(table, ended, trajectories, columns))
+    for part in ("accuracy", "time"):
+        if columns := columns_of(table.figures, part):
+            yield page.Section(f"More on {part}", grid=_grid(table, ended, trajectories, columns))
 
 
 def _grid(
@@ -78,7 +73,7 @@ def _grid(
     has_verdicts: bool = False,
 ) -> page.Grid:
     """A row a method; the end of a failed one in place of its figures."""
-    chips = {trajectory.name: sections.chip(trajectory) for trajectory in trajectories}
+    chips = {trajectory.name: trajectory for trajectory in trajectories}
     shown = [dict(zip((row.name for row in table.rows), c.cells(table.figures), strict=True)) for c in columns]
     lines = []
     for row in rows:
@@ -114,11 +109,9 @@ def _sections(
         yield from sections.time_section(trajectories)
         yield from sections.uncertainty_section(trajectories, is_planar=is_planar)
         yield from _map_section(directory, trajectories, framing, frame(framing, truth), table.dimension)
-    settings = {row.name: row.settings for row in table.rows}
     for each in trajectories:
         closures = sections.read_closures(method_folder(directory, each.name) / CLOSURES_FILE)
-        min_travel_m = float(settings[each.name].get("loops", {}).get("min_travel_m", 0.0))
-        yield from sections.loop_section(each, closures, f"Loop closures of {each.name}", min_travel_m)
+        yield from sections.loop_section(each, closures, f"Loop closures of {each.name}")
     if len(table.rows) > 1:
         yield _disagreement(table)
 
@@ -134,7 +127,7 @@ def _map_section(
     directory: Path,
     trajectories: Sequence[DrawnTrajectory],
     framing: Sequence[DrawnTrajectory],
-    box: tuple[Floats, Floats],
+    box: Floats,
     dimension: int,
 ) -> Iterator[page.Section]:
     """Maps, all within the same corners; those of ``framing`` must be seen whole."""
@@ -143,9 +136,10 @@ def _map_section(
     if not maps:
         return
     whole = {each.name for each in framing}
-    corners = surroundings(*box, [points for each, points in maps if each.name in whole])
+    corners = surroundings(box, [points for each, points in maps if each.name in whole])
     drawings = [
-        page.Drawing(each.name, "", map_picture(points, *corners), sections.chip(each)) for each, points in maps
+        page.Drawing.of(each.name, "", over_map([], points, *corners, colors=VIRIDIS), each)
+        for each, points in maps
     ]
     text = "The same points of the same scans, placed by the poses of each method."
     text += " Dark is low, bright is high." if dimension == 3 else ""

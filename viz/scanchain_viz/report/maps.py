@@ -8,7 +8,6 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from markupsafe import Markup
 
 from scanchain import lie
 from scanchain.data import Matrix
@@ -22,11 +21,11 @@ from scanchain.sessions.localize import LocalizedLog
 from scanchain.sessions.localizer import MapState
 from scanchain.sessions.merging import MergeMetrics
 from scanchain.verdict import Judged
-from scanchain_viz.colors import CLOSURES, hex_of
+from scanchain_viz.colors import CLOSURES
 from scanchain_viz.pictures import maps
 from scanchain_viz.pictures.figure import INK, Line, Plot, broken
 from scanchain_viz.report import page
-from scanchain_viz.report.sections import chip, configuration, provenance_sections, when
+from scanchain_viz.report.sections import configuration, provenance_sections, when
 
 _HEADS = (
     page.Head("session"),
@@ -35,7 +34,7 @@ _HEADS = (
     page.Head("closures", "", "closures in force between this session and those of other maps"),
 )
 _GONE = page.Head("gone", "points", "points of its keyframes that newer sessions saw through, removed")
-_STATE_COLORS = {
+STATE_COLORS = {
     MapState.SEARCHING: "#8c9096",
     MapState.LOCALIZED: "#3f9b2f",
     MapState.UNMATCHED: "#c77800",
@@ -46,7 +45,7 @@ _PLACED_LATER = "#0f9bb5"
 _ROWS, _CLOSE_UPS = 200, 12
 _AROUND_M = 3.0  # around a cluster in a close-up
 _ORDER = (Label.SAME, Label.UNKNOWN, Label.VANISHED, Label.APPEARED)
-_HEX = {label: hex_of(COLORS[label]) for label in Label}
+_HEX = {label: f"#{bytes(COLORS[label]).hex()}" for label in Label}
 _HOW_TOLD = (
     "A change is named where the scans of the other map looked through the place. Unknown is what the other map "
     "did not see, or what is too small."
@@ -81,18 +80,18 @@ def _merge_facts(m: MergeMetrics) -> Iterator[tuple[str, str]]:
 
 def _merged_map(directory: Path, drawn: maps.DrawnMerge, metrics: MergeMetrics) -> page.Section:
     points = read_ply(directory / "map.ply").astype(float)
-    low, high = maps.surroundings(drawn.positions.min(axis=0), drawn.positions.max(axis=0), [points])
+    low, high = maps.surroundings(drawn.positions, [points])
     closures = Line("", broken(drawn.closures), CLOSURES[""][1], 0.5)
     is_flat = metrics.dimension == 2
     drawings = (
-        page.Drawing(
+        page.Drawing.of(
             "Sessions over the map",
             "Seen from above; thin lines: closures in force between sessions.",
-            maps.path_over_map(points, [closures, *drawn.sessions], low, high),
+            maps.over_map([closures, *drawn.sessions], points, low, high),
         ),
         page.interactive_map(points, drawn.sessions, low, high, grain_m=drawn.grain_m, is_flat=is_flat),
     )
-    return page.Section("Map", chips=list(map(chip, drawn.sessions)), drawings=drawings)
+    return page.Section("Map", chips=drawn.sessions, drawings=drawings)
 
 
 def _sessions(drawn: maps.DrawnMerge, metrics: MergeMetrics) -> page.Section:
@@ -100,7 +99,7 @@ def _sessions(drawn: maps.DrawnMerge, metrics: MergeMetrics) -> page.Section:
     for each, line in zip(metrics.sessions, drawn.sessions, strict=True):
         cells = [page.date(each.first_stamp_ns), f"{each.keyframes:,}", f"{each.closures:,}"]
         cells += [f"{each.removed_points:,}"] if metrics.updated else []
-        rows.append(page.Row(each.name, cells, chip(line)))
+        rows.append(page.Row(each.name, cells, line))
     for group, warning in zip(metrics.apart, metrics.warnings, strict=False):  # of the map come last
         why = page.Cell(warning.partition(": ")[2], "wide bad")
         rows += [page.Row(name, [why]) for name in group]
@@ -120,7 +119,7 @@ def write_localization_report(folder: Path, localized: LocalizedLog) -> None:
         ("log-odds of the place", f"{m.log_odds:.0f}" if np.isfinite(m.log_odds) else "none"),
         *([] if m.ground_truth is None else [("ATE", f"{m.ground_truth.optimized.ate_rmse_m:.4f} m (rmse)")]),
     )
-    subtitle = f"{localized.path.name.split('.partial')[0]} in the map {localized.prior.name}"
+    subtitle = f"{localized.path.name} in the map {localized.prior.name}"
     sections, judged = list(_localized(localized)), Judged(m.verdict, m.reason)
     page.write_page(folder, page.Page("Localization", subtitle, facts, m.warnings, (), sections, judged=judged))
 
@@ -148,21 +147,18 @@ def _localized(localized: LocalizedLog) -> Iterator[page.Section]:
 def _path_section(localized: LocalizedLog) -> page.Section:
     found, points = localized.localization, maps.map_points(localized.prior)
     final, live = (lie.lift_points(poses[:, :-1, -1]) for poses in (found.trajectory.poses, found.live))
-    (low, high), ends = maps.extent(points), None
+    ends = final[found.is_placed]
+    low, high = maps.surroundings(ends, [points])
     later = found.is_placed & (found.states == MapState.SEARCHING)
     path = np.where(later[:, None], final, np.nan)
     lines = [Line("placed afterwards", path, _PLACED_LATER, 1.2, is_dashed=True)] if later.any() else []
-    if found.is_placed.any():
-        ends = final[found.is_placed]
-        low, high = np.minimum(low, ends.min(axis=0)), np.maximum(high, ends.max(axis=0))
-    for state, color in _STATE_COLORS.items():
+    for state, color in STATE_COLORS.items():
         if (is_in := found.states == state).any():
             lines.append(Line(state, np.where(is_in[:, None], live, np.nan), color))
-    margin = 0.02 * (high - low)
-    svg = maps.path_over_map(points, lines, low - margin, high + margin, ends, is_wide=True)
-    drawing = page.Drawing("Path over the map", "Circle: first scan placed; square: last.", svg, is_wide=True)
+    figure = maps.over_map(lines, points, low, high, path=ends, is_wide=True)
+    drawing = page.Drawing.of("Path over the map", "Circle: first scan placed; square: last.", figure)
     text = "As known at the time; the place of a dashed part was found afterwards, by smoothing."
-    return page.Section("Path in the map", text, list(map(chip, lines)), [drawing])
+    return page.Section("Path in the map", text, lines, [drawing])
 
 
 def _states_picture(localized: LocalizedLog) -> page.Drawing:
@@ -173,12 +169,12 @@ def _states_picture(localized: LocalizedLog) -> page.Drawing:
     top = float(np.nanmax(found.sigma_m, initial=0.01)) if np.isfinite(found.sigma_m).any() else 1.0
     for run in np.split(np.arange(len(found.states)), runs):
         first_m, last_m = found.traveled_m[[run[0], min(run[-1] + 1, len(found.states) - 1)]].tolist()
-        figure.span(first_m, last_m, f"{_STATE_COLORS[MapState(str(found.states[run[0]]))]}40")
+        figure.span(first_m, last_m, f"{STATE_COLORS[MapState(str(found.states[run[0]]))]}40")
     figure.line(np.stack([found.traveled_m, found.sigma_m], axis=1), INK, 0.9)
     figure.y.limit(0.0, 1.1 * top)
     count = counted(len(found.closures), "match with the map", "matches with the map")
     text = f"Behind it the state, in the colors above; {count} tried."
-    return page.Drawing("Standard deviation of the position", text, figure.svg(), is_wide=True)
+    return page.Drawing.of("Standard deviation of the position", text, figure)
 
 
 def write_changes_report(directory: Path, changes: Changes) -> None:
@@ -198,23 +194,22 @@ def write_changes_report(directory: Path, changes: Changes) -> None:
 def _changed(changes: Changes) -> Iterator[page.Section]:
     points = lie.lift_points(changes.points)
     chips = [page.Chip(label.name.lower(), _HEX[label]) for label in _ORDER]
-    corners = maps.surroundings(*maps.extent(points), [points])
-    plan = _changes_picture(points, changes, *corners, is_wide=True)
-    drawing = page.Drawing("Plan", "Seen from above; boxes around clusters.", plan, is_wide=True)
+    plan = _changes_picture(points, changes, *maps.surroundings(points[:0], [points]), is_wide=True)
+    drawing = page.Drawing.of("Plan", "Seen from above; boxes around clusters.", plan)
     yield page.Section("Where", _HOW_TOLD, chips, [drawing])
     if changes.clusters:
         yield page.Section("What changed", grid=_cluster_grid(changes))
         drawings = []
         for each in changes.clusters[:_CLOSE_UPS]:
             center, half_m = np.append(each.center[:2], 0.0), 0.5 * float(each.size_m[:2].max()) + _AROUND_M
-            svg = _changes_picture(points, changes, center - half_m, center + half_m)
-            drawings.append(page.Drawing(f"{each.number}: {each.kind}", counted(each.points, "point"), svg))
+            figure = _changes_picture(points, changes, center - half_m, center + half_m)
+            drawings.append(page.Drawing.of(f"{each.number}: {each.kind}", counted(each.points, "point"), figure))
         yield page.Section("The largest changes", drawings=drawings, is_small=True)
 
 
 def _changes_picture(
     points: Matrix, changes: Changes, low: Matrix, high: Matrix, *, is_wide: bool = False
-) -> Markup:
+) -> Plot:
     """Points (M, 3) in the colors of their labels, seen from above, and boxes of clusters."""
     figure = Plot.of_plan(low, high, is_wide=is_wide)
     for label in _ORDER:
@@ -223,7 +218,7 @@ def _changes_picture(
         c, s = np.cos(cluster.yaw_rad), np.sin(cluster.yaw_rad)
         corners = 0.5 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]]) * cluster.size_m[:2]
         figure.line(corners @ np.array([[c, s], [-s, c]]) + cluster.center[:2], INK, 0.8)
-    return figure.svg()
+    return figure
 
 
 def _cluster_grid(changes: Changes) -> page.Grid:

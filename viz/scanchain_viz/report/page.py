@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from scanchain.data import Points
 from scanchain.files import write_whole
 from scanchain.verdict import Judged, Verdict
-from scanchain_viz.pictures.figure import Floats, Line
+from scanchain_viz.pictures.figure import Floats, Line, Plot
+from scanchain_viz.pictures.trajectories import DrawnTrajectory
 
 REPORT_FILE = "report.html"
 _TEMPLATES = Path(__file__).parent / "templates"
@@ -26,8 +27,7 @@ SCRIPT = (_TEMPLATES / "map_viewer.js").read_text(encoding="utf-8")
 _MAX_POINTS = 160_000  # 6 bytes each, 8 as text: 1.3 MB of a page
 _MAX_LINE_POINTS = 4_000
 _HIGHEST = 65_535.0
-_BULK = (3.0, 97.0)  # percentiles of the points: what is in view at first, and the ends of the color scale
-_BULK_2D, _MARGIN = (0.5, 99.5), 0.03  # the same of a flat map, and its share that is added on each side
+_BULK, _MARGIN = (0.5, 99.5), 0.03  # percentiles of the points in view at first; the share added on each side
 _WIDEST = 3.0  # greatest width of a flat map's canvas over its height
 _WIDER = 1.8  # lines, on the canvas
 
@@ -39,6 +39,9 @@ class Chip:
     name: str
     color: str
     is_dashed: bool = False
+
+
+Named = Chip | Line | DrawnTrajectory  # what a legend names
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +85,7 @@ class Row:
 
     name: str
     cells: Sequence[Cell | str]
-    chip: Chip | None = None
+    chip: Named | None = None
     link: str = ""
 
 
@@ -115,9 +118,14 @@ class Drawing:
     title: str
     caption: str
     svg: Markup
-    chip: Chip | None = None
+    chip: Named | None = None
     is_wide: bool = False
     is_scripted: bool = False
+
+    @classmethod
+    def of(cls, title: str, caption: str, figure: Plot, chip: Named | None = None) -> Drawing:
+        """The picture of a figure."""
+        return cls(title, caption, figure.svg(), chip, figure.is_wide)
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +134,7 @@ class Section:
 
     title: str
     text: str = ""
-    chips: Sequence[Chip] = ()
+    chips: Sequence[Named] = ()
     drawings: Sequence[Drawing] = ()
     grid: Grid | None = None
     is_small: bool = False
@@ -177,8 +185,7 @@ def write_page(folder: Path, page: Page) -> None:
 
 
 def interactive_map(
-    points: Points, lines: Sequence[Line], low: Floats, high: Floats, *, grain_m: float, is_flat: bool,
-    is_wide: bool = False,
+    points: Points, lines: Sequence[Line], low: Floats, high: Floats, *, grain_m: float, is_flat: bool
 ) -> Drawing:  # fmt: skip
     """The canvas in which ``SCRIPT`` draws a map (M, 3) and lines; points outside of the corners are left out.
 
@@ -186,15 +193,12 @@ def interactive_map(
     """
     inside = points[((points >= low) & (points <= high)).all(axis=1)]
     shown = inside[:: max(1, -(-len(inside) // _MAX_POINTS))]
-    if is_flat:
-        bulk = _flat_view(shown, lines, low, high)
-    else:
-        bulk = np.percentile(shown, _BULK, axis=0) if len(shown) else np.stack([low, high])
-    width, height = (bulk[1] - bulk[0])[:2]
+    view = _first_view(shown, lines, low, high)
+    width, height = (view[1] - view[0])[:2]
     scene = {
         "box": [low.tolist(), high.tolist()],
-        "view": bulk.tolist(),
-        "heights": bulk[:, 2].tolist(),
+        "view": view.tolist(),
+        "heights": view[:, 2].tolist(),
         "grain": grain_m * np.sqrt(max(len(inside), 1) / max(len(shown), 1)),
         "flat": is_flat,
         "points": _packed(shown, low, high),
@@ -208,12 +212,12 @@ def interactive_map(
     drag = "Drag to move" if is_flat else "Drag to rotate, Shift-drag to move"
     text = f"{drag}, click it and scroll to zoom, double-click to reset; two fingers zoom and move."
     svg = canvas.format(style if is_flat else "", json.dumps(scene, separators=(",", ":")))
-    return Drawing("Interactive map", text, svg, is_wide=is_wide, is_scripted=True)
+    return Drawing("Interactive map", text, svg, is_wide=not is_flat, is_scripted=True)
 
 
-def _flat_view(points: Points, lines: Sequence[Line], low: Floats, high: Floats) -> Floats:
+def _first_view(points: Points, lines: Sequence[Line], low: Floats, high: Floats) -> Floats:
     """Corners (2, 3) of what is in view at first: all lines and most points, with a margin."""
-    bulk = np.percentile(points, _BULK_2D, axis=0) if len(points) else np.empty((0, 3))
+    bulk = np.percentile(points, _BULK, axis=0) if len(points) else np.empty((0, 3))
     seen = np.vstack([bulk, *(line.positions for line in lines)])
     first, last = np.nanmin(seen, axis=0), np.nanmax(seen, axis=0)
     margin = _MARGIN * (last - first)
@@ -225,6 +229,7 @@ def _line(line: Line, low: Floats, high: Floats) -> dict[str, object]:
     positions, is_known = line.positions, np.isfinite(line.positions[:, 0])
     if is_broken := not is_known.all():
         starts = np.flatnonzero(is_known[:-1] & is_known[1:])
+        starts = starts[:: max(1, -(-len(starts) // _MAX_LINE_POINTS))]
         positions = positions[np.stack([starts, starts + 1], axis=1).ravel()]
     elif len(positions) > _MAX_LINE_POINTS:
         positions = positions[np.linspace(0, len(positions) - 1, _MAX_LINE_POINTS).astype(int)]

@@ -22,7 +22,6 @@ _CHAIN, _LOOP, _REJECTED = "#1f5fd0", "#8a8f98", "#d03030"
 _SEEN_FROM = np.array([[0.80, 0.60, 0.0], [-0.30, 0.40, 0.866]])  # rows: right and up of an oblique view, in 3D
 BEFORE, AFTER = "#e07b00", "#1f5fd0"
 _MARGIN = 0.05, 1e-3  # of a view: share of its extent, least
-_ACROSS = 4  # panels of factors in a row
 _PIXELS = 500  # largest width in pixels of a picture of a factor
 _ELLIPSE = 2.4477  # standard deviations that hold 95 % of a Gaussian in the plane
 _ELLIPSE_POINTS = 37
@@ -42,7 +41,7 @@ def draw_graph(change: GraphChange, path: Path) -> None:
     """
     states = (("before", change.before), ("after", change.after))
     panels = [(f"{change.name} {when}\n{fit(state)}", _graph(state)) for when, state in states]
-    write_png(path, panels, width_inches=6.0, columns=2)
+    write_png(path, panels, width_inches=6.0)
 
 
 def _graph(state: GraphState) -> Plot:
@@ -54,9 +53,7 @@ def _graph(state: GraphState) -> Plot:
     low, high = center - half, center + half  # a square, since the panels stand side by side
     figure = Plot.of_plan(low, high)
     if not is_flat:
-        figure.x.limit(low[0], high[0], ticks=())
-        figure.y.limit(low[1], high[1], ticks=())
-        figure.x.label, figure.y.label = "seen obliquely from above", ""
+        figure.x.label, figure.y.label = "seen obliquely from above [m]", ""
     skips = np.abs(state.edges[:, 0] - state.edges[:, 1]) != 1
     width = float(np.clip(2000.0 / max(len(state.edges), 1), 0.25, 1.0))
     for chosen, color, thickness, name in (
@@ -114,34 +111,14 @@ def _factor(method: MethodResult) -> Plot:
     shades = np.where(count > 0, 0.30 + 0.70 * np.sqrt(np.minimum(share, 1.0)), 0.0)
     low, high = np.zeros(2), np.full(2, float(size))
     figure = Plot.of_plan(low, high)
-    figure.x.limit(0.0, size, ticks=(0, size))
-    figure.y.limit(size, 0.0, ticks=(0, size))
+    figure.y.limit(size, 0.0)
     figure.x.label, figure.y.label = f"{method.factor.nnz:,} nonzero", ""
     figure.image(np.rint(255.0 * shades).astype(np.uint8), palette_of(_BLUES), low, high, rendering="auto")
     return figure
 
 
-def _draw_factors(path: Path, studies: Sequence[Study]) -> None:
-    """Draw every method's factor to a PNG; several problems stand side by side. Raises OSError.
-
-    The place of a method that a problem was not solved by stays empty.
-    """
-    solved = [{method.method: method for method in study.methods} for study in studies]
-    panels = []
-    for name in dict.fromkeys(name for methods in solved for name in methods):
-        for study, methods in zip(studies, solved, strict=True):
-            problem, method = f"{study.name}\n" if len(studies) > 1 else "", methods.get(name)
-            title = "" if method is None else f"{problem}{name}: {method.factor.name}"
-            panels.append((title, None if method is None else _factor(method)))
-    columns = len(studies) * max(1, min(_ACROSS, len(panels)) // len(studies))
-    write_png(path, panels, width_inches=2.9, columns=columns, font=9.0)
-
-
 def write_report(directory: Path, studies: Sequence[Study]) -> None:
-    """Write a PNG of every estimate and of the factors, and report.html.
-
-    With several problems their factors stand side by side in one more picture.
-    """
+    """Write a PNG of every estimate, and report.html."""
     sections: list[page.Section] = []
     try:
         for study in studies:
@@ -150,11 +127,8 @@ def write_report(directory: Path, studies: Sequence[Study]) -> None:
                 off_m = estimate.poses_m
                 error = f": poses {off_m:.3g} m off" if np.isfinite(off_m) else ""
                 panels.append((f"{study.name}, {when}{error}", plot))
-            write_png(directory / f"{file_stem(study.name)}.png", panels, width_inches=5.5, columns=2)
-            _draw_factors(directory / f"{file_stem(study.name)}_factors.png", [study])
+            write_png(directory / f"{file_stem(study.name)}.png", panels, width_inches=5.5)
             sections += [_estimate_section(study, *plots), _solver_section(study)]
-        if len(studies) > 1:
-            _draw_factors(directory / "factors.png", studies)
         title = f"Landmark problem{'s' if len(studies) > 1 else ''}"
         names = ", ".join(study.name for study in studies)
         definitions = dict.fromkeys(study.after.definition for study in studies)
@@ -173,16 +147,15 @@ def _estimate_section(study: Study, before: Plot, after: Plot) -> page.Section:
         chips.append(page.Chip("truth", INK, is_dashed=True))
         marks += "; crosses: true ones"
     drawings = (
-        page.Drawing("Before optimization", f"{marks}.", before.svg()),
-        page.Drawing("After optimization", f"{marks}; ellipses: 95 %.", after.svg()),
+        page.Drawing.of("Before optimization", f"{marks}.", before),
+        page.Drawing.of("After optimization", f"{marks}; ellipses: 95 %.", after),
     )
     return page.Section(study.name, facts=facts, chips=chips, drawings=drawings)
 
 
 def _solver_section(study: Study) -> page.Section:
     factors = [
-        page.Drawing(f"{method.method}: {method.factor.name}", "", _factor(method).svg())
-        for method in study.methods
+        page.Drawing.of(f"{method.method}: {method.factor.name}", "", _factor(method)) for method in study.methods
     ]
     text = f"The Jacobian A has {size_of(study)}. Drawn is where the factor of every method is not zero."
     title = f"Linear solvers on {study.name}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -12,20 +11,19 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from scanchain.data import BACK_END, Points, State
+from scanchain.data import BACK_END, Points
 from scanchain.errors import counted
 from scanchain.maps import read_ply
 from scanchain.runs.directory import RUN_FILE, TRUTH_FILE
 from scanchain.runs.metrics import VERDICT, GroundTruth, Metrics
 from scanchain.runs.provenance import Provenance
-from scanchain.runs.results import OVERLAY_FILE, read_overlay
 from scanchain.runs.step_table import STAGES
 from scanchain.settings import read_layer
 from scanchain.trajectory import read_tum
 from scanchain.verdict import VELOCITY_LIMIT, WHEEL_LIMIT, Kind, Stretch
-from scanchain_viz.colors import STRETCH_COLORS, TRUTH, color_of
-from scanchain_viz.pictures.figure import Floats, Line
-from scanchain_viz.pictures.maps import AFTER, BEFORE, map_picture, overlay_picture, path_over_map, surroundings
+from scanchain_viz.colors import CLOSURES, STRETCH_COLORS, TRUTH, color_of
+from scanchain_viz.pictures.figure import Floats, Line, broken
+from scanchain_viz.pictures.maps import VIRIDIS, over_map, surroundings
 from scanchain_viz.pictures.trajectories import frame, trajectories_of_run
 from scanchain_viz.report import page, sections
 
@@ -44,9 +42,10 @@ _ACCURACY = (  # a column's head, the field of ``Accuracy``, the factor to the h
 )
 _SHADE = "#d6308f"
 _MAX_ROWS = 100  # largest number of stretches in the table; the longest
+_MAX_CLOSURES = 1500  # largest number of closures of a verdict that are drawn
 _DISPUTED = "at closures rejected by the back end"
+_STATES = (Kind.DEGENERATE, Kind.LOST, Kind.CONTRADICTED)  # named as those of scans
 _OVER_STATES = (Kind.OVERLAP, Kind.WHEELS, Kind.ACCELERATION, Kind.DISCONNECTED, Kind.COPIES)
-_MAX_SEGMENTS = 3000  # largest number of segments of a path; of longer ones the worst state of successive scans
 
 
 def write_run_report(directory: Path) -> None:
@@ -108,12 +107,11 @@ def _sections(directory: Path, metrics: Metrics) -> Iterator[page.Section]:
     if accuracy is not None:
         yield accuracy_section(accuracy)
     lines = trajectory_lines(optimized.positions, steps, closures, metrics.stretches, true_path)
-    low, high = frame([optimized], true_path)
-    yield map_section(lines, read_ply(directory / "map.ply"), low, high, float(str(config["maps.voxel_size_m"])))
-    yield verdict_section(metrics, steps, directory / OVERLAY_FILE)
+    box, grain_m = frame([optimized], true_path), float(str(config["maps.voxel_size_m"]))
+    yield map_section(lines, read_ply(directory / "map.ply"), box, grain_m)
+    yield verdict_section(metrics, steps)
     if config["loops.enabled"]:
-        min_travel_m = float(str(config["loops.min_travel_m"]))
-        yield from sections.loop_section(optimized, closures, "Loop closures", min_travel_m)
+        yield from sections.loop_section(optimized, closures, "Loop closures")
     is_planar, text = metrics.dimension == 2, ""
     if truth is not None:
         text = "Odometry and ground truth are aligned to the optimized trajectory as for the ATE."
@@ -124,18 +122,17 @@ def _sections(directory: Path, metrics: Metrics) -> Iterator[page.Section]:
     yield from sections.time_section([optimized], _stages(metrics))
 
 
-def map_section(lines: Sequence[Line], points: Points, low: Floats, high: Floats, grain_m: float) -> page.Section:
-    """The map (M, 3) of grains so far apart and lines, the trajectory first, which lie within corners."""
+def map_section(lines: Sequence[Line], points: Points, box: Floats, grain_m: float) -> page.Section:
+    """The map (M, 3) of grains so far apart and lines, the trajectory first, which lie within corners (2, 3)."""
     is_flat, path = not len(points) or not np.ptp(points[:, 2]), lines[0].positions
-    low, high = surroundings(low, high, [points])
-    above = "seen from above; dark is low, bright is high."
-    over_map = path_over_map(points, lines, low, high, path)
-    drawings = (
-        page.Drawing("Trajectory over the map", "Seen from above; circle: start, square: end.", over_map),
-        *(() if is_flat else (page.Drawing("Map", f"map.ply, {above}", map_picture(points, low, high)),)),
-        page.interactive_map(points, lines, low, high, grain_m=grain_m, is_flat=is_flat, is_wide=not is_flat),
-    )
-    return page.Section("Trajectory and map", chips=tuple(map(sections.chip, lines)), drawings=drawings)
+    corners = surroundings(box, [points])
+    around = "Seen from above; circle: start, square: end."
+    drawings = [page.Drawing.of("Trajectory over the map", around, over_map(lines, points, *corners, path=path))]
+    if not is_flat:
+        text, figure = "dark is low, bright is high.", over_map([], points, *corners, colors=VIRIDIS)
+        drawings.append(page.Drawing.of("Map", f"map.ply, seen from above; {text}", figure))
+    drawings.append(page.interactive_map(points, lines, *corners, grain_m=grain_m, is_flat=is_flat))
+    return page.Section("Trajectory and map", chips=lines, drawings=drawings)
 
 
 def trajectory_lines(
@@ -143,62 +140,50 @@ def trajectory_lines(
 ) -> list[Line]:
     """The trajectory, closures by verdict, what is to check on it, a scan in several of them, and the truth."""
     lines = [Line("trajectory", path, color_of(0), 1.2)]
-    for line in sections.closure_lines(path, closures) if closures is not None and len(closures) else ():
-        if len(line.positions):
-            lines.append(replace(line, name=f"closures {line.name}"))
+    if closures is not None and len(closures):
+        lines += _closure_lines(path, closures)
     states = np.array(steps["state"].to_pylist())
     marks = [(_DISPUTED, _disputed(steps, closures), Kind.LOOPS)]
-    marks += [
-        (str(state), states == state, kind)
-        for state, kind in (
-            (State.DEGENERATE, Kind.DEGENERATE), (State.LOST, Kind.LOST), (State.CONTRADICTED, Kind.CONTRADICTED),
-        )
-    ]  # fmt: skip
+    marks += [(str(kind), states == kind, kind) for kind in _STATES]
     for kind in _OVER_STATES:
-        parts = [slice(each.first, each.last + 1) for each in stretches if each.kind == kind]
-        marks.append((str(kind), _within(parts, len(steps)), kind))
+        is_marked = np.zeros(len(steps), bool)
+        for each in stretches:
+            is_marked[each.first : each.last + 1] |= each.kind is kind
+        marks.append((str(kind), is_marked, kind))
     for name, is_marked, kind in marks:  # the later are drawn on top
         if is_marked.any():
             name = f"{name}: {counted(int(is_marked.sum()), 'scan')}"
-            lines.append(Line(name, _marked_parts(path, is_marked), STRETCH_COLORS[kind], 2.6))
+            leads_there = is_marked | np.append(is_marked[1:], False)
+            part = np.where(leads_there[:, None], path, np.nan)
+            lines.append(Line(name, part, STRETCH_COLORS[kind], 2.6))
     if truth is not None:
         lines.append(Line("ground truth", truth, TRUTH, 0.9, is_dashed=True))
     return lines
 
 
+def _closure_lines(path: Floats, closures: pa.Table) -> Iterator[Line]:
+    """Closures by verdict with their numbers, as lines over a path (N, 3); of many every n-th is drawn."""
+    ends = np.stack([closures["target_scan"].to_numpy(), closures["source_scan"].to_numpy()], axis=1)
+    rejected_by = np.array(closures["rejected_by"].to_pylist())
+    for by, (name, color) in CLOSURES.items():
+        chosen = ends[rejected_by == by]
+        if len(chosen):
+            drawn = chosen[:: -(-len(chosen) // _MAX_CLOSURES)]
+            yield Line(f"closures {name}: {len(chosen):,}", broken(path[drawn]), color, 0.9)
+
+
 def _disputed(steps: pa.Table, closures: pa.Table | None) -> NDArray[np.bool_]:
     """(N,) scans from each keyframe of a closure that the back end rejected to the next keyframe."""
     if closures is None or not len(closures):
-        return _within([], len(steps))
-    keyframes = np.append(np.flatnonzero(steps["keyframe"].to_numpy() >= 0), len(steps))
+        return np.zeros(len(steps), bool)
+    keyframe = np.maximum.accumulate(np.where(steps["keyframe"].to_numpy() >= 0, np.arange(len(steps)), -1))
     is_rejected = np.array(closures["rejected_by"].to_pylist()) == BACK_END
     ends = np.stack([closures[name].to_numpy() for name in ("target_scan", "source_scan")])
-    firsts = np.unique(ends[:, is_rejected])
-    lasts = keyframes[np.searchsorted(keyframes, firsts, side="right")]
-    return _within([slice(*ends) for ends in zip(firsts.tolist(), lasts.tolist(), strict=True)], len(steps))
+    return np.isin(keyframe, ends[:, is_rejected])
 
 
-def _within(parts: Sequence[slice], count: int) -> NDArray[np.bool_]:
-    """(N,) which of so many scans are in one of these parts."""
-    is_within = np.zeros(count, bool)
-    for part in parts:
-        is_within[part] = True
-    return is_within
-
-
-def _marked_parts(path: Floats, is_marked: NDArray[np.bool_]) -> Floats:
-    """The segments of the path that lead to a marked scan, NaN elsewhere."""
-    size = max(1, -(-len(path) // _MAX_SEGMENTS))
-    groups = [slice(k, k + size) for k in range(0, len(path), size)]
-    has_marked = np.array([bool(is_marked[group].any()) for group in groups])
-    positions = path[[min(group.stop, len(path)) - 1 for group in groups]].copy()
-    shown = has_marked | np.append(has_marked[1:], False)
-    positions[~shown] = np.nan
-    return positions
-
-
-def verdict_section(metrics: Metrics, steps: pa.Table, overlay_file: Path) -> page.Section:
-    """Innovations along the log, two passes over the worst place if there is one, and every suspicious stretch."""
+def verdict_section(metrics: Metrics, steps: pa.Table) -> page.Section:
+    """Innovations along the log, and every suspicious stretch."""
     curves = [
         (name, steps[column].to_numpy(zero_copy_only=False).astype(np.float64) / limit, color_of(place))
         for place, (column, name, limit) in enumerate(_CURVES)
@@ -207,18 +192,9 @@ def verdict_section(metrics: Metrics, steps: pa.Table, overlay_file: Path) -> pa
     shaded = [(each.first, each.last, _SHADE) for each in metrics.stretches if each.kind is not Kind.LOOPS]
     chips = [page.Chip(name, color) for name, _, color in curves]
     chips += [page.Chip("stretches to check", _SHADE)] if shaded else []
-    is_alone = not overlay_file.exists()
-    drawings = [sections.innovations([curve[1:] for curve in curves], shaded, is_wide=is_alone)]
-    if not is_alone:
-        overlay = read_overlay(overlay_file)
-        chips += [page.Chip("scans before", BEFORE), page.Chip("scans after", AFTER)]
-        caption = (
-            f"{overlay.text}: the scans before it and after it, or of both passes of a loop, where the trajectory "
-            "places them, seen from above. Where it is right, both show the same walls."
-        )
-        drawings.append(page.Drawing("Worst place", caption, overlay_picture(overlay)))
+    drawing = sections.innovations([curve[1:] for curve in curves], shaded)
     grid = _stretches(metrics.stretches) if metrics.stretches else None
-    return page.Section("Checks", "", tuple(chips), tuple(drawings), grid)
+    return page.Section("Checks", "", tuple(chips), (drawing,), grid)
 
 
 def _stretches(stretches: Sequence[Stretch]) -> page.Grid:

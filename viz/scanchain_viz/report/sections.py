@@ -15,33 +15,21 @@ from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
 from scanchain.runs.provenance import Provenance
-from scanchain_viz.colors import CLOSURES, TRUTH, hex_of, palette_of
-from scanchain_viz.pictures.axis import Axis
-from scanchain_viz.pictures.figure import DOTS, INK, THIN, Floats, Line, Plot, broken
-from scanchain_viz.pictures.maps import GRAY, path_over_map
+from scanchain_viz.colors import CLOSURES, TRUTH
+from scanchain_viz.pictures.figure import DASHED, DOTS, INK, THIN, Floats, Plot
 from scanchain_viz.pictures.trajectories import DrawnTrajectory, frame
 from scanchain_viz.report import page
-from scanchain_viz.report.page import Cell, Chip, Collapsible, Drawing, Grid, Head, Row, Section
+from scanchain_viz.report.page import Cell, Chip, Collapsible, Drawing, Grid, Head, Named, Row, Section
 
 _MAX_POINTS = 1500  # largest number of points of a line
-_MAX_CLOSURES = 1500  # largest number of closures of a verdict that are drawn
 _WINDOWS = 250  # number of windows over which a value of each scan is averaged
 _SHOWN_SHARES = (0.5, 99.5)  # per cent of the values of a distribution
 _LOWEST, _HIGHEST = 0.01, 1000.0  # range to which observability is clipped
-_BAR_INCHES = 0.65  # of a color bar and its numbers
-# a decade each, degenerate up to orange
-_WORST_TO_BEST = ("#7a0177", "#dd1c77", "#f2a03d", "#9fb8ad", "#41a6c4", "#1f6fd0")
-_MAX_DOTS = 3000
 
 
-def chip(drawn: DrawnTrajectory | Line) -> Chip:
-    """The line in a legend."""
-    return Chip(drawn.name, drawn.color, drawn.is_dashed)
-
-
-def _legend(trajectories: Sequence[DrawnTrajectory]) -> tuple[Chip, ...]:
+def _legend(trajectories: Sequence[DrawnTrajectory]) -> Sequence[DrawnTrajectory]:
     """Legend of several trajectories; one needs none."""
-    return tuple(map(chip, trajectories)) if len(trajectories) > 1 else ()
+    return trajectories if len(trajectories) > 1 else ()
 
 
 def _known(trajectories: Sequence[DrawnTrajectory], key: str) -> list[DrawnTrajectory]:
@@ -49,7 +37,8 @@ def _known(trajectories: Sequence[DrawnTrajectory], key: str) -> list[DrawnTraje
 
 
 def _draw(figure: Plot, trajectory: DrawnTrajectory, x: Floats, y: Floats, width: float = 1.2) -> None:
-    figure.line(np.stack([x, y], axis=1), trajectory.color, width, trajectory.dashes)
+    dashes = DASHED if trajectory.is_dashed else ()
+    figure.line(np.stack([x, y], axis=1), trajectory.color, width, dashes)
 
 
 def trajectories_section(
@@ -62,25 +51,23 @@ def trajectories_section(
 ) -> Section:
     """Trajectories from above, and their heights; ``framing`` are those that must fit in the axes."""
     low, high = frame(framing, truth)
-    plan, height = (
-        Plot.of_plan(low, high, is_wide=is_planar, has_grid=True),
-        Plot("distance traveled [m]", "z [m]"),
-    )
+    plan = Plot.of_plan(low, high, is_wide=is_planar, has_grid=True)
+    height = Plot("distance traveled [m]", "z [m]")
     for each in reversed(trajectories):  # the first on top
         rows = _some(len(each.positions))
-        plan.line(each.positions[rows], each.color, dashes=each.dashes)
+        plan.line(each.positions[rows], each.color, dashes=DASHED if each.is_dashed else ())
         _draw(height, each, each.distance_m[rows], each.positions[rows, 2])
-    chips = _legend(trajectories)
+    chips: Sequence[Named] = _legend(trajectories)
     if truth is not None:
-        chips = (*map(chip, trajectories), Chip("ground truth", TRUTH, is_dashed=True))
+        chips = (*trajectories, Chip("ground truth", TRUTH, is_dashed=True))
         traveled_m = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(truth, axis=0), axis=1)))
         for figure, path in ((plan, truth), (height, np.stack([traveled_m, truth[:, 2]], axis=1))):
-            figure.line(path[_some(len(truth))], TRUTH, 0.9, (3.0, 3.0))
-    drawings = [Drawing("Plan", "Seen from above.", plan.svg(), is_wide=is_planar)]
+            figure.line(path[_some(len(truth))], TRUTH, 0.9, DASHED)
+    drawings = [Drawing.of("Plan", "Seen from above.", plan)]
     if not is_planar:
         height.y.limit(low[2], high[2])
         height.x.limit(0.0, 1.05 * max(float(np.median([each.distance_m[-1] for each in trajectories])), 1.0))
-        drawings.append(Drawing("Height", "Over the distance traveled.", height.svg()))
+        drawings.append(Drawing.of("Height", "Over the distance traveled.", height))
     return Section("Trajectories", text, chips, tuple(drawings))
 
 
@@ -95,7 +82,7 @@ def error_section(trajectories: Sequence[DrawnTrajectory], truth_name: str) -> I
         x, y = _windowed(each.distance_m[finite]), _windowed(each.error_m[finite], np.median)
         _draw(figure, each, x, np.maximum(y, 1e-4))
     drawings = (
-        Drawing("Over the distance", _of_neighbors("Medians", known, "error_m"), figure.svg()),
+        Drawing.of("Over the distance", _of_neighbors("Medians", known, "error_m"), figure),
         _distribution(known, "error_m", 1.0, "position error [m]", "scans with a smaller error"),
     )
     text = f"Distance of each position from the true one after rigid alignment, against {truth_name}."
@@ -121,7 +108,7 @@ def time_section(trajectories: Sequence[DrawnTrajectory], stages: Grid | None = 
     for each in reversed(known):
         _draw(figure, each, *_over_scans(1e3 * each.seconds, np.median), width=0.9)
     drawings = (
-        Drawing("Along the log", _of_neighbors("Medians", known, "seconds"), figure.svg()),
+        Drawing.of("Along the log", _of_neighbors("Medians", known, "seconds"), figure),
         _distribution(known, "seconds", 1e3, "time of a scan [ms]", "scans that took less"),
     )
     yield Section("Time per scan", "", _legend(known), drawings, stages)
@@ -132,7 +119,7 @@ def uncertainty_section(trajectories: Sequence[DrawnTrajectory], *, is_planar: b
     reported, estimated = _known(trajectories, "observability"), _known(trajectories, "nees")
     if not reported:
         return
-    along = Plot("scan", "observability", logarithmic="y", is_wide=bool(estimated))
+    along = Plot("scan", "observability", logarithmic="y", is_wide=not estimated)
     for each in reversed(reported):
         _draw(along, each, *_over_scans(np.clip(each.observability, _LOWEST, _HIGHEST), np.min))
     along.level(1.0)
@@ -141,19 +128,15 @@ def uncertainty_section(trajectories: Sequence[DrawnTrajectory], *, is_planar: b
         "Information along the least constrained direction over the minimum required; below 1 (dotted) a scan is "
         f"degenerate.{least}"
     )
-    drawings = [Drawing("Observability", text, along.svg(), is_wide=bool(estimated))]
+    drawings = [Drawing.of("Observability", text, along)]
     if estimated:
         drawings.append(_consistency(estimated, 3 if is_planar else 6))
-    whose = f" of {reported[0].name}" if len(trajectories) > 1 else ""
-    drawings.append(_observability_plan(reported[0], f"Observability{whose} on the trajectory"))
     yield Section("Uncertainty", "", _legend(reported), tuple(drawings))
 
 
-def innovations(
-    curves: Sequence[tuple[Floats, str]], stretches: Sequence[tuple[int, int, str]], *, is_wide: bool
-) -> Drawing:
+def innovations(curves: Sequence[tuple[Floats, str]], stretches: Sequence[tuple[int, int, str]]) -> Drawing:
     """Innovations (N,) over their limits scan by scan, in their colors, over stretches in theirs."""
-    figure = Plot("scan", "innovation / limit", is_wide=is_wide)
+    figure = Plot("scan", "innovation / limit", is_wide=True)
     for first, last, color in stretches:
         figure.span(first - 0.5, last + 0.5, f"{color}33")
     for values, color in curves:
@@ -165,7 +148,7 @@ def innovations(
     text = (
         f"Normalized innovations over their limits{largest}; above 1 (dotted) is a finding, or wheels that slip."
     )
-    return Drawing("Innovations", text, figure.svg(), is_wide=is_wide)
+    return Drawing.of("Innovations", text, figure)
 
 
 def _distribution(
@@ -177,7 +160,7 @@ def _distribution(
         ends.append(np.percentile(_cumulative(figure, each, scale * getattr(each, key), 1e-6), _SHOWN_SHARES))
     figure.x.limit(0.9 * np.min(ends), 1.1 * np.max(ends))
     figure.y.limit(0.0, 100.0)
-    return Drawing("Distribution", f"Share of the {those}.", figure.svg(), is_wide=is_wide)
+    return Drawing.of("Distribution", f"Share of the {those}.", figure)
 
 
 def _consistency(estimated: Sequence[DrawnTrajectory], degrees_of_freedom: int) -> Drawing:
@@ -193,24 +176,7 @@ def _consistency(estimated: Sequence[DrawnTrajectory], degrees_of_freedom: int) 
         "Squared error of each motion over its covariance. Dotted: exact covariances; to the left of it they are "
         "too large, to the right too small."
     )
-    return Drawing("Covariance consistency", text, figure.svg())
-
-
-def _observability_plan(trajectory: DrawnTrajectory, title: str) -> Drawing:
-    """Observability on the trajectory from above, the worst scans on top; of many the worst of successive ones."""
-    figure = Plot.of_plan(*frame([trajectory], None), spare_inches=_BAR_INCHES, has_grid=True)
-    values = np.nan_to_num(trajectory.observability, nan=_HIGHEST)
-    groups = np.array_split(np.arange(len(values)), min(len(values), _MAX_DOTS))
-    worst = np.array([group[np.argmin(values[group])] for group in groups])
-    axis, palette = Axis(is_logarithmic=True), palette_of(_WORST_TO_BEST)
-    axis.limit(_LOWEST, _HIGHEST, (_LOWEST, 1.0, _HIGHEST))
-    shades = np.rint(255.0 * axis.fractions(np.clip(values[worst], _LOWEST, _HIGHEST))).astype(int)
-    size = float(np.sqrt(np.clip(3000.0 / len(values), 4.0, 30.0)))
-    for shade in np.unique(shades)[::-1]:
-        positions = trajectory.positions[worst[shades == shade]]
-        figure.marks(positions, "o", hex_of(palette[shade, :3]), size)
-    figure.color_bar(palette, axis)
-    return Drawing(title, "Seen from above, the least observable scans on top.", figure.svg())
+    return Drawing.of("Covariance consistency", text, figure)
 
 
 def _cumulative(figure: Plot, trajectory: DrawnTrajectory, values: Floats, least: float) -> Floats:
@@ -254,37 +220,14 @@ def read_closures(file: Path) -> pa.Table | None:
     return pq.ParquetFile(file).read() if file.exists() else None  # read_table imports much more
 
 
-def closure_lines(path: Floats, closures: pa.Table) -> list[Line]:
-    """Closures by verdict with their numbers, as lines over a path (N, 3); of many every n-th is drawn."""
-    ends = np.stack([closures["target_scan"].to_numpy(), closures["source_scan"].to_numpy()], axis=1)
-    rejected_by, lines = np.array(closures["rejected_by"].to_pylist()), []
-    for by, (name, color) in CLOSURES.items():
-        chosen = ends[rejected_by == by]
-        drawn = chosen[:: max(1, -(-len(chosen) // _MAX_CLOSURES))]
-        lines.append(Line(f"{name}: {len(chosen):,}", broken(path[drawn]), color, 0.9))
-    return lines
-
-
-def loop_section(
-    trajectory: DrawnTrajectory, closures: pa.Table | None, title: str, min_travel_m: float
-) -> Iterator[Section]:
-    """Every loop closure tried, and the number of each verdict; ``min_travel_m`` is ``loops.min_travel_m``."""
-    if closures is None:
-        return
-    if not closures.num_rows:
-        length_m = float(trajectory.distance_m[-1])
-        reason = f"the trajectory did not return to a place visited more than {min_travel_m:g} m before"
-        if length_m <= min_travel_m:
-            reason = f"the trajectory is {length_m:.1f} m long, and a loop has more than {min_travel_m:g} m"
-        yield Section(title, f"None was tried: {reason} (loops.min_travel_m).")
-        return
-    path, lines = trajectory.positions, closure_lines(trajectory.positions, closures)
-    svg = path_over_map(
-        np.empty((0, 3)), [Line("", path, GRAY, 0.7), *lines], *frame([trajectory], None), path, is_wide=True
-    )
-    drawing = Drawing("On the trajectory", "Seen from above; circle: start, square: end.", svg, is_wide=True)
-    text = f"{closures.num_rows:,} tried; each is a row of loops.parquet."
-    yield Section(title, text, tuple(map(chip, lines)), (drawing,), _verdict_grid(closures))
+def loop_section(trajectory: DrawnTrajectory, closures: pa.Table | None, title: str) -> Iterator[Section]:
+    """Number of the loop closures of each verdict and cause."""
+    if closures is not None and len(closures):
+        text = f"{len(closures):,} tried; each is a row of loops.parquet."
+        yield Section(title, text, grid=_verdict_grid(closures))
+    elif closures is not None:
+        path = f"the trajectory of {trajectory.distance_m[-1]:.1f} m"
+        yield Section(title, f"None was tried: {path} did not return to a place after loops.min_travel_m.")
 
 
 def _verdict_grid(closures: pa.Table) -> Grid:
