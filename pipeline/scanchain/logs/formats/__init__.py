@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from scanchain.logs.mcap.records import Block, Channel, Entry, FileIndex
+from scanchain.logs.mcap.records import Block, Channel, FileIndex
 from scanchain.logs.writer import schema_text
 
 
@@ -24,17 +24,11 @@ def add_block(
     index: FileIndex, offset: int, size: int, times_ns: Sequence[int], counts: dict[Channel, int]
 ) -> None:
     """Append a block: ``index.make`` finds it by ``offset``; ``size`` is about its number of bytes."""
-    entries = tuple(Entry(channel.key[1], -1, count) for channel, count in counts.items() if count)
-    index.blocks.append(
-        Block(index.number, offset, size, "", size, 0, min(times_ns), max(times_ns), entries, is_chunk=False)
-    )
-    for entry in entries:
-        index.counts[entry.channel] = index.counts.get(entry.channel, 0) + entry.messages
-
-
-def on_demand_index(path: Path, number: int) -> FileIndex:
-    """An index without channels or blocks; the format sets ``index.make``, which converts a block."""
-    return FileIndex(path, number, b"", is_counted=True)
+    held = {channel.key[1]: count for channel, count in counts.items() if count}
+    span = min(times_ns), max(times_ns)
+    index.blocks.append(Block(index.number, offset, size, "", size, 0, *span, held, is_chunk=False))
+    for channel, count in held.items():
+        index.counts[channel] = index.counts.get(channel, 0) + count
 
 
 def natural_order(path: Path) -> tuple[tuple[int, ...], str]:

@@ -22,7 +22,7 @@ import numpy as np
 
 from scanchain.errors import InputError, counted
 from scanchain.files import Source
-from scanchain.logs.formats import UnknownFormatError, add_block, add_channel, on_demand_index
+from scanchain.logs.formats import UnknownFormatError, add_block, add_channel
 from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
 from scanchain.logs.writer import LATEST_NS, Link, Place, pack_laser_scan, pack_odometry, pack_transforms
 
@@ -51,7 +51,7 @@ def is_carmen(head: bytes) -> bool:
 def index_carmen(path: Path, number: int) -> FileIndex:
     """Index the lines of a log. Raises UnknownFormatError where the file has none of a known kind."""
     text, damage = read_text(path)
-    index = on_demand_index(path, number)
+    index = FileIndex(path, number, is_counted=True)
     index.damage += [damage] if damage else []
     malformed: list[int] = []
     parameters: dict[bytes, float] = {}

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.errors import InputError, counted
-from scanchain.logs.formats import add_block, add_channel, left_out, natural_order, on_demand_index
+from scanchain.logs.formats import add_block, add_channel, left_out, natural_order
 from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
 from scanchain.logs.writer import LATEST_NS, pack_cloud
 
@@ -245,7 +245,7 @@ def index_clouds(folder: Path, number: int, rate_hz: float = 0.0, bin_columns: i
     """
     files = _files(folder)
     stamps_ns = [round(k * _NS / rate_hz) for k in range(len(files))] if rate_hz else _stamps(folder, files)
-    index = on_demand_index(folder, number)
+    index = FileIndex(folder, number, is_counted=True)
     raw = point_of_columns(np.dtype("<f4"), bin_columns)
     if files[0].suffix.lower() == ".bin":
         _check_size(files, bin_columns)

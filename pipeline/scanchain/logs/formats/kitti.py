@@ -16,7 +16,7 @@ from numpy.linalg import LinAlgError
 from scanchain import lie
 from scanchain.data import Matrix, Pose
 from scanchain.errors import InputError, counted
-from scanchain.logs.formats import add_block, add_channel, natural_order, on_demand_index
+from scanchain.logs.formats import add_block, add_channel, natural_order
 from scanchain.logs.formats.clouds import XYZI, contents_of, read_raw
 from scanchain.logs.mcap.records import Block, Contents, FileIndex, Message
 from scanchain.logs.writer import LATEST_NS, pack_odometry, place
@@ -35,14 +35,15 @@ def index_kitti_raw(folder: Path, number: int) -> FileIndex:
     """A drive of the raw recordings (``..._sync``); truth is its GPS/INS, moved to the lidar."""
     files = _sweeps(folder / "velodyne_points" / "data")
     times_ns = read_times(folder / "velodyne_points" / "timestamps.txt")
-    return _index(on_demand_index(folder, number), files, times_ns, lambda index: _raw_truth(index, folder))
+    index = FileIndex(folder, number, is_counted=True)
+    return _index(index, files, times_ns, lambda index: _raw_truth(index, folder))
 
 
 def index_kitti_odometry(folder: Path, number: int) -> FileIndex:
     """A sequence of the odometry benchmark (``sequences/00``); truth lies in ``poses/00.txt`` beside it."""
     files = _sweeps(folder / "velodyne")
     times_ns = read_seconds(folder / "times.txt")
-    index = on_demand_index(folder, number)
+    index = FileIndex(folder, number, is_counted=True)
     return _index(index, files, times_ns, lambda index: _benchmark_truth(index, folder, times_ns))
 
 
@@ -107,7 +108,7 @@ def _index(
         )
 
     def make(block: Block, _: AbstractSet[int] | None) -> Contents:
-        channel = index.channels[block.entries[0].channel]
+        channel = index.channels[next(iter(block.counts))]
         if block.offset == _TRUTH:
             said = [(each, pack_odometry(each, "world", "velodyne", place(T))) for each, T in truth]
             return Contents([Message(channel, each, memoryview(data)) for each, data in said], "")

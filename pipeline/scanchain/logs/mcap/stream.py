@@ -7,15 +7,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from heapq import heappop, heappush
 from itertools import pairwise
 from math import inf
 from typing import NamedTuple, TypeVar
-
-import numpy as np
-from numpy.typing import NDArray
 
 from scanchain.config import LogConfig
 from scanchain.errors import InputError, duration
@@ -44,6 +42,10 @@ class Span(NamedTuple):
     def duration_s(self) -> float:
         """Seconds from one end to the other."""
         return (self.end_ns - self.begin_ns) * 1e-9
+
+    def holds(self, message: Message) -> bool:
+        """True if the message was logged within it."""
+        return self.begin_ns <= message.log_time_ns <= self.end_ns
 
     def meets(self, block: Block) -> bool:
         """True if the block may hold messages of the span."""
@@ -157,13 +159,12 @@ def count_messages(indexes: Sequence[FileIndex], topic: str, span: Span) -> int:
     """Number of messages of a topic in the span."""
     count = 0
     for index in indexes:
-        for number in index.numbers_of(topic):
-            for block in filter(span.meets, index.blocks):
-                if block.entries and span.covers(block):
-                    count += sum(entry.messages for entry in block.entries if entry.channel == number)
-                    continue
-                times_ns = log_times(index, block, number)
-                count += int(np.count_nonzero((times_ns >= span.begin_ns) & (times_ns <= span.end_ns)))
+        wanted = index.numbers_of(topic)
+        for block in filter(span.meets, index.blocks):
+            if block.counts and span.covers(block):
+                count += sum(block.counts.get(number, 0) for number in wanted)
+            elif index.may_hold(block, wanted):
+                count += sum(span.holds(message) for message in messages_of(index, block, wanted))
     return count
 
 
@@ -192,12 +193,10 @@ def complete(index: FileIndex) -> None:
     """Add the channels and counts that a file without a full summary has inside its chunks."""
     counts = index.indexed_counts()
     unknown = {number for number in {*index.counts, *counts} if not index.knows(number)}
-    for block in sorted(
-        index.blocks, key=lambda each: unknown.isdisjoint(entry.channel for entry in each.entries)
-    ):
-        if unknown or not (block.entries or index.is_counted):
+    for block in sorted(index.blocks, key=lambda each: unknown.isdisjoint(each.counts)):
+        if unknown or not (block.counts or index.is_counted):
             messages = messages_of(index, block)
-            counts.update(message.channel.key[1] for message in messages if not block.entries)
+            counts.update(message.channel.key[1] for message in messages if not block.counts)
             unknown = {number for number in unknown if not index.knows(number)}
     index.channels |= {k: channel for k, channel in index.uncertain_channels.items() if k in unknown}
     if not index.is_counted:
@@ -206,42 +205,23 @@ def complete(index: FileIndex) -> None:
 
 
 def times_of(indexes: Sequence[FileIndex], topic: str) -> tuple[int, int, int]:
-    """Number of messages of a topic, and log times of the first and the last of them; 0, 0 where unknown.
-
-    Exact where a file has a message index, else as exact as its chunks.
-    """
-    messages, ends_ns = 0, list[int]()
+    """Number of messages of a topic, and log times of the first and last chunk with one; 0, 0 where unknown."""
+    messages, holding = 0, list[Block]()
     for index in indexes:
         for number in index.numbers_of(topic):
             messages += index.counts.get(number, 0)
-            holding = [block for block in index.blocks if any(entry.channel == number for entry in block.entries)]
-            for block in holding[:1] + holding[1:][-1:]:
-                has_times = any(entry.channel == number and entry.offset >= 0 for entry in block.entries)
-                times_ns = log_times(index, block, number) if has_times else ()
-                found = len(times_ns) > 0
-                ends_ns += [int(min(times_ns)), int(max(times_ns))] if found else [block.start_ns, block.end_ns]
-    return messages, min(ends_ns, default=0), max(ends_ns, default=0)
+            holding += [block for block in index.blocks if number in block.counts]
+    begin_ns = min((block.start_ns for block in holding), default=0)
+    return messages, begin_ns, max((block.end_ns for block in holding), default=0)
 
 
-def messages_of(index: FileIndex, block: Block) -> list[Message]:
-    """The messages of a block, none where it is damaged, which is noted in the index."""
+def messages_of(index: FileIndex, block: Block, wanted: AbstractSet[int] | None = None) -> list[Message]:
+    """The messages of a block, of all channels or of those wanted; none where it is damaged, which is noted."""
     try:
-        return read_block(index, block).messages
+        return read_block(index, block, wanted).messages
     except DamagedBlockError as error:
         index.note_damage(f"{error}; it was left out")
         return []
-
-
-def log_times(index: FileIndex, block: Block, channel: int) -> NDArray[np.uint64]:
-    """Log times of a channel's messages in a block, from the message index where there is one."""
-    for entry in block.entries:
-        if entry.channel == channel and entry.offset >= 0:
-            return np.frombuffer(index.bytes_at(entry.offset, 16 * entry.messages), "<u8")[::2]
-    if block.entries and all(entry.channel != channel for entry in block.entries):
-        return np.empty(0, np.uint64)
-    messages = messages_of(index, block)
-    times = [message.log_time_ns for message in messages if message.channel.key[1] == channel]
-    return np.array(times, np.uint64)
 
 
 Decoders = Mapping[str, Callable[[memoryview], object]]
@@ -268,7 +248,7 @@ def decoded_messages(
 
     At most ``ahead`` blocks wait decoded. What is damaged is left out and named in ``damage``.
     """
-    wanted = [{number for topic in decoders for number in index.numbers_of(topic)} for index in indexes]
+    wanted = [index.numbers_of(*decoders) for index in indexes]
 
     def decode(block: Block) -> tuple[list[Decoded], str]:
         try:
@@ -278,7 +258,7 @@ def decoded_messages(
         decoded = [
             Decoded(message.channel, message.log_time_ns, _decode(decoders[message.channel.topic], message))
             for message in contents.messages
-            if span.begin_ns <= message.log_time_ns <= span.end_ns
+            if span.holds(message)
         ]
         release(indexes[block.file], block)
         return decoded, contents.damage
@@ -345,11 +325,11 @@ def sampled_messages(
 ) -> Iterator[T]:
     """Decoded messages in a topic's first blocks, or in some from all over a span; malformed ones are left out."""
     chosen = EVERYTHING if span is None else span
-    blocks = _blocks_of(indexes, [set(index.numbers_of(topic)) for index in indexes], chosen)
+    blocks = _blocks_of(indexes, [index.numbers_of(topic) for index in indexes], chosen)
     if span is not None and len(blocks) > _SAMPLED_BLOCKS:
         blocks = [blocks[k * (len(blocks) - 1) // (_SAMPLED_BLOCKS - 1)] for k in range(_SAMPLED_BLOCKS)]
     for block in blocks[:_SAMPLED_BLOCKS]:
         for message in messages_of(indexes[block.file], block):
-            if message.channel.topic == topic and chosen.begin_ns <= message.log_time_ns <= chosen.end_ns:
+            if message.channel.topic == topic and chosen.holds(message):
                 with suppress(MalformedMessageError):
                     yield decode(message.data)
