@@ -170,7 +170,7 @@ def test_files_more_than_a_day_apart_are_not_read_as_one_log(tmp_path):
     )
     with pytest.raises(InputError, match=line):
         open_log(tmp_path)
-    assert line[:9] in describe([tmp_path]).problem
+    assert line[:9] in describe([tmp_path], LogConfig())["problem"]
     assert open_log(tmp_path, LogConfig(end_s=3.0)).scan_count < 40
     mounts = transforms_said(STAMP_NS - year_ns, transforms(("base_link", "laser", 0.2, 0.1, 0.3, 0.0)))
     calibration = write(tmp_path / "calibration.mcap", [mounts])  # which holds no scan

@@ -204,15 +204,15 @@ def complete(index: FileIndex) -> None:
         index.is_counted = True
 
 
-def times_of(indexes: Sequence[FileIndex], topic: str) -> tuple[int, int, int]:
-    """Number of messages of a topic, and log times of the first and last chunk with one; 0, 0 where unknown."""
-    messages, holding = 0, list[Block]()
+def ends_of(indexes: Sequence[FileIndex], topic: str) -> Span:
+    """From the first message of a topic to the last, by the chunks they are in; (0, 0) where unknown."""
+    times_ns: list[int] = []
     for index in indexes:
         for number in index.numbers_of(topic):
-            messages += index.counts.get(number, 0)
-            holding += [block for block in index.blocks if number in block.counts]
-    begin_ns = min((block.start_ns for block in holding), default=0)
-    return messages, begin_ns, max((block.end_ns for block in holding), default=0)
+            holding = [block for block in index.blocks if number in block.counts]
+            for block in holding[:1] + holding[1:][-1:]:
+                times_ns += [message.log_time_ns for message in messages_of(index, block, {number})]
+    return Span(min(times_ns, default=0), max(times_ns, default=0))
 
 
 def messages_of(index: FileIndex, block: Block, wanted: AbstractSet[int] | None = None) -> list[Message]:
