@@ -237,7 +237,7 @@ def test_stamps_that_step_back_or_repeat_are_told(tmp_path):
         assert [scan.stamp_ns - STAMP_NS for scan in log.scans()] == stamps
         assert len(log.notes) == 2
         assert any("1 step back in the header stamps of /scan" in note for note in log.notes)
-        assert any("1 scan of /scan with the header stamp of the one before" in note for note in log.notes)
+        assert any("1 of 6 scans of /scan with the header stamp of the one before" in note for note in log.notes)
 
 
 def test_a_chunk_that_says_nothing_of_its_times_loses_no_scan(tmp_path):
@@ -381,9 +381,9 @@ def test_many_copies_of_scans_are_a_warning_and_a_few_are_a_note(tmp_path, copie
     log, scans = read(write(tmp_path / "a.mcap", said))
     assert len(scans) == 20
     if copies > 1:
-        assert "6 of 20 scans of /scan are the one before once more" in log.copies[0]
+        assert "6 of 20 scans of /scan are the one before once more" in log.damage[0]
     else:
-        assert not log.copies and any("1 of 20 scans of /scan logged twice" in note for note in log.notes)
+        assert not log.damage and any("1 of 20 scans of /scan logged twice" in note for note in log.notes)
 
 
 # clouds of planar scanners
@@ -443,33 +443,27 @@ def joined(at, *entries):
     return transforms_said(stamp_ns, transforms(*entries, stamp_ns=stamp_ns), "/tf")
 
 
-def swinging(roll, *, parent="base_link", yaw=lambda at: 0.0, seconds=2.0, extra=()):
-    """Scans at 10 Hz of a lidar whose joint is told at 20 Hz, ``roll`` and ``yaw`` of the seconds."""
-    said = [*extra]
+def swinging(roll, *, yaw=0.0, seconds=2.0):
+    """Scans at 10 Hz of a lidar whose joint is told at 20 Hz, ``roll`` of the seconds."""
+    said = []
     for k in range(round(20 * seconds)):
         at = k / 20
-        said.append(joined(at, (parent, "laser", 0.2, 0.0, yaw(at), roll(at))))
+        said.append(joined(at, ("base_link", "laser", 0.2, 0.0, yaw, roll(at))))
         said += [] if k % 2 else [one_scan(at, at)]
     return said
 
 
-def tilt(at):
-    return 0.7 * np.sin(2.0 * np.pi * at)
-
-
-@pytest.mark.parametrize("parent", ["base_link", "torso"])
-def test_a_lidar_that_moves_on_the_robot_is_told_with_its_frames_and_its_range(tmp_path, parent):
-    path = write(tmp_path / "a.mcap", swinging(lambda at: tilt(max(at - 1.0, 0.0)), parent=parent))
-    assert any(
-        f"({parent} → laser in /tf turns by up to 40 deg): poses are the" in n for n in open_log(path).notes
-    )
+def test_a_lidar_that_moves_on_the_robot_is_told_with_its_frames_and_its_range(tmp_path):
+    path = write(tmp_path / "a.mcap", swinging(lambda at: 0.7 * np.sin(2.0 * np.pi * max(at - 1.0, 0.0))))
+    said = "(base_link → laser in /tf turns by up to 40 deg): poses are the"
+    assert any(said in note for note in open_log(path).notes)
     log, scans = read(path, end_s=0.95)  # while it rests
     assert len(scans) == 10 and log.mounting.motion is None
 
 
 @pytest.mark.parametrize("seconds", [2.0, 40.0])
 def test_a_transform_of_tf_that_repeats_itself_is_a_static_mounting(tmp_path, seconds):
-    path = write(tmp_path / "a.mcap", swinging(lambda at: 0.0, yaw=lambda at: 0.4, seconds=seconds))
+    path = write(tmp_path / "a.mcap", swinging(lambda at: 0.0, yaw=0.4, seconds=seconds))
     log, _ = read(path)
     np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(0.2, 0.0, 0.4), atol=1e-12)
     assert log.mounting.motion is None and log.notes == []
@@ -486,17 +480,6 @@ def test_transforms_of_the_robot_in_the_world_are_no_moving_mount(tmp_path):
         log, scans = read(write(tmp_path / f"{name}.mcap", said))
         assert log.mounting.motion is None and len(scans) == 20 and log.notes == []
         assert log.T_base_lidar[0, 2] == (0.2 if mount else 0.0)
-
-
-@pytest.mark.parametrize("frame", ["t265_odom_frame", "robot_1/odom", "camera_init", "world", "start"])
-def test_a_frame_in_which_the_robot_moves_is_no_mount(tmp_path, frame):
-    said = swinging(tilt, parent=frame)
-    if frame == "start":  # no word for a world: by its travel
-        said = []
-        for k in range(20):
-            said += [joined(k / 10, (frame, "laser", 0.2 * k, 0.0, 0.0, 0.02 * k)), one_scan(k / 10, k / 10)]
-    log, _ = read(write(tmp_path / "a.mcap", said))
-    assert log.mounting.motion is None and log.mounting.base == ""
 
 
 def test_wheels_are_no_prior_for_a_lidar_that_pans_by_tf(tmp_path):

@@ -86,7 +86,6 @@ class Log:
     scans_with_wheels : how many scans had a reading of the wheels near, of those that passed so far
     notes : what was chosen or assumed
     bad_scans : how many scans were left out, once ``scans`` is through or closed
-    copies : a warning where scans that passed so far are copies of those before
     """
 
     def __init__(self, indexes: Sequence[FileIndex], config: LogConfig) -> None:
@@ -132,7 +131,6 @@ class Log:
         }
         self.scans_with_wheels = 0
         self.bad_scans = 0
-        self.copies: list[str] = []
         self._opening_notes = tuple(self.notes)
         self._truth: Trajectory | None = None
 
@@ -209,7 +207,7 @@ class Log:
         finally:  # also where the caller wants no more scans
             is_damaged = bool(self._damage)
             self._damage += [*counts.losses(), *poses.complaints()]
-            self.copies, self.bad_scans = counts.copied(), counts.bad
+            self.bad_scans = counts.bad
             self.notes += [*([] if is_scan(self.lidar) else [times.assumed]), *counts.notes()]
         if not index:
             raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")

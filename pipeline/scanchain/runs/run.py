@@ -225,7 +225,7 @@ class _Run:
         with self.directory.results() as folder:
             source = str(self.job.ground_truth or log.ground_truth_topic)
             truth, note = accuracy_of(self._true_poses, source, self.job.max_gap_s, result, folder)
-            lost = (*log.damage, *log.copies, *self.notes, *result.warnings, *results.warnings, *of_recording)
+            lost = (*log.damage, *self.notes, *result.warnings, *results.warnings, *of_recording)
             metrics = measure(
                 self.steps, results, judged, run_s=run_s, compile_s=compile_s, ground_truth=truth,
                 warnings=(*lost, *_few_scans(len(self.steps)), *note), stopped=stopped,
