@@ -18,7 +18,10 @@ from tests.support.sensor_files import flaser, kitti_odometry, kitti_raw, odom, 
 
 
 def carmen(folder):
-    return save(folder / "a.log", *[line for k in range(600) for line in (odom(k, 1.0), flaser(k))])
+    return save(
+        folder / "a.log",
+        *[line for k in range(600) for line in (odom(k, 1.0), flaser(k, np.linspace(1.0, 2.0 + 0.01 * k, 180)))],
+    )
 
 
 def clouds(folder):
