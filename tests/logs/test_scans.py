@@ -89,7 +89,7 @@ def _named(options):
 def test_every_container_gives_the_same_scans(tmp_path, chunked, options):
     log, scans = read(write(tmp_path / "a.mcap", office(), chunked=chunked, **options))
     assert_office(log, scans)
-    assert log.has_odometry and log.duration_s == pytest.approx(3.9)
+    assert log.odometry_topic and log.duration_s == pytest.approx(3.9)
     np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(0.2, 0.1, 0.3), atol=1e-12)
 
 
@@ -300,7 +300,7 @@ def test_of_several_odometry_topics_none_is_used_until_one_is_chosen(tmp_path):
     said = [*wheels((0.0, 0.0, 4.0)), *wheels((0.0, 0.0, 8.0), topic="/visual"), one_scan(0.01, 0.0)]
     path = write(tmp_path / "a.mcap", said)
     log, (scan,) = read(path)
-    assert scan.T_odom_base is None and not log.has_odometry
+    assert scan.T_odom_base is None and not log.odometry_topic
     assert any("/odom" in note and "/visual" in note for note in log.notes)
     assert prior_x(path, odometry_topic="/visual") == 8.0
 
@@ -488,7 +488,7 @@ def test_wheels_are_no_prior_for_a_lidar_that_pans_by_tf(tmp_path):
     log, scans = read(write(tmp_path / "a.mcap", said))
     assert "base_link → laser in /tf turns by up to 23 deg)" in log.notes[0]
     assert "the wheels (/odom) are no prior for it" in log.notes[0]
-    assert [scan.T_odom_base for scan in scans] == [None, None] and not log.has_odometry
+    assert [scan.T_odom_base for scan in scans] == [None, None] and not log.odometry_topic
     np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(0.2, 0.0, 0.0), atol=1e-12)
 
 
@@ -564,7 +564,7 @@ def test_the_truth_met_on_the_way_is_that_of_a_pass_of_its_own_and_no_prior(tmp_
     path = write(tmp_path / "a.mcap", said)
     alone = open_log([path], LogConfig()).ground_truth()
     log, scans = read(path)
-    assert not log.has_odometry and all(scan.T_odom_base is None for scan in scans)
+    assert not log.odometry_topic and all(scan.T_odom_base is None for scan in scans)
     np.testing.assert_array_equal(log.ground_truth().poses, alone.poses)
     assert alone.poses.shape == (5, 3, 3) and alone.poses[4, 0, 2] == 4.0
     np.testing.assert_array_equal(log.ground_truth().stamps_ns, alone.stamps_ns)
@@ -573,4 +573,4 @@ def test_the_truth_met_on_the_way_is_that_of_a_pass_of_its_own_and_no_prior(tmp_
 def test_the_truth_of_a_log_can_be_left_unused_and_does_not_become_wheels(tmp_path):
     path = write(tmp_path / "a.mcap", [*wheels((0.0, 0.0, 4.0), topic="/ground_truth"), one_scan(0.0, 0.0)])
     log = open_log([path], LogConfig(ground_truth_topic="none"))
-    assert log.ground_truth() is None and not log.ground_truth_topic and not log.has_odometry
+    assert log.ground_truth() is None and not log.ground_truth_topic and not log.odometry_topic

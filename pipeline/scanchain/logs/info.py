@@ -56,8 +56,8 @@ def _pose_topics(indexes: Sequence[FileIndex], config: LogConfig) -> tuple[str, 
     """Topics of wheels and ground truth, whichever lidar is chosen, and notes; empty where the log has none."""
     notes = [line for index in indexes for line in index.notes]
     try:
-        wheels = find_odometry(indexes, config.odometry_topic, config.ground_truth_topic, notes)
-        truth = find_ground_truth(indexes, config.ground_truth_topic, LogConfig().ground_truth_topic)
+        wheels = find_odometry(indexes, config, notes)
+        truth = find_ground_truth(indexes, config.ground_truth_topic)
     except InputError:  # which is the problem of the log as well
         return "", "", notes
     return wheels.topic if wheels else "", truth.topic if truth else "", notes

@@ -49,18 +49,23 @@ class Mounting(NamedTuple):
         """Name of the base in print: its frame where that is another than usual."""
         return "the base" if not self.base or self.base in _BASE_FRAMES else self.base
 
-    @property
-    def out_of_plane(self) -> list[str]:
-        """Notes on a planar lidar whose plane is not that of the base as seen from above."""
+    def notes(self, wheels: str, dimension: int) -> list[str]:
+        """Assumptions about a lidar of this dimension, and of wheels with this topic."""
+        notes = [self.note] if self.note else []
+        if self.motion is not None:
+            prior = f"; the wheels ({wheels}) are no prior for it" if wheels else ""
+            notes.append(
+                f"the lidar moves on the robot ({self.motion}): poses are the lidar's, this motion included{prior}"
+            )
         tilted_rad = np.arccos(np.clip(abs(self.T_base_lidar[2, 2]), 0.0, 1.0))
-        if tilted_rad > _TILTED_RAD:
-            return [
+        if dimension == 2 and tilted_rad > _TILTED_RAD:
+            notes.append(
                 f"the plane of the scans is tilted by {np.degrees(tilted_rad):.0f} deg on {self.base_name} "
                 f"{self.source}: a floor plan takes a level one; correct the transforms, or choose another --topic"
-            ]
-        if is_upside_down(self.T_base_lidar):
-            return [f"the lidar hangs upside down {self.source}: its scans are mirrored"]
-        return []
+            )
+        elif dimension == 2 and is_upside_down(self.T_base_lidar):
+            notes.append(f"the lidar hangs upside down {self.source}: its scans are mirrored")
+        return notes
 
 
 class MovingFrame(NamedTuple):

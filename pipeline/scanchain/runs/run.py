@@ -273,7 +273,7 @@ def opened(job: Job) -> tuple[Log, Settings, TruthFile | None]:
     RunDirectory(job.out, force=job.force)  # refused before the log is read
     log = open_log(job.logs, early.config.log)
     settings = load_settings(log.dimension, file=job.config_file, overrides=job.overrides)
-    if settings.config.odometry.prior == "wheel" and not log.has_odometry:
+    if settings.config.odometry.prior == "wheel" and not log.odometry_topic:
         raise InputError(
             f"{log.name}: odometry.prior is 'wheel', but the log has no wheel odometry that is known; "
             "set log.odometry_topic, or odometry.prior to 'auto'"
@@ -346,7 +346,7 @@ def _idle_sensors(log: Log) -> list[str]:
 
 def _wheels(log: Log, config: Config) -> str:
     """Wheel odometry of a log, with the reason if it was not used."""
-    if not log.has_odometry:
+    if not log.odometry_topic:
         return "no wheel odometry"
     unused = ""
     if config.odometry.prior == "constant-velocity":
