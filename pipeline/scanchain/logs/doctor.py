@@ -141,16 +141,15 @@ class Survey:
         self.stamps_ns.append(scan.stamp_ns)
         if scan.T_odom_base is not None:
             self.wheels.append((scan.stamp_ns, scan.T_odom_base[:-1, -1]))
-        points = scan.points
-        ranges_m = np.sort(np.sqrt(np.sum(np.square(points), axis=1)))
-        turn, start_rad = _turning(points)
+        ranges_m = np.sort(np.linalg.norm(scan.points, axis=1))
+        turn, start_rad = _turning(scan.points)
         self.scans.append(
             Facts(
-                kept=len(points),
+                kept=len(ranges_m),
                 dropped=scan.dropped,
                 farthest_m=round(float(ranges_m[-1]), 4),
                 at_farthest=int(np.count_nonzero(ranges_m > ranges_m[-1] - _SAME_M)),
-                ranges_m=ranges_m[np.linspace(0, len(points) - 1, 101).astype(int)],
+                ranges_m=ranges_m[np.linspace(0, len(ranges_m) - 1, 101).astype(int)],
                 time_span_s=float(np.ptp(scan.times_s)) if len(scan.times_s) else math.nan,
                 turn=turn,
                 start_rad=start_rad,
@@ -207,20 +206,17 @@ def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:
     if not len(gaps):
         return Finding("gaps", Severity.OK, f"none longer than {_GAP_PERIODS:g} periods")
     longest = int(gaps[np.argmax(steps_s[gaps])])
-    at_s = seen.into_log_s(longest)
-    found = (
-        f"{len(gaps):,} longer than {_GAP_PERIODS:g} periods, the longest {steps_s[longest]:.3g} s, "
-        f"{at_s:.1f} s into the log"
+    longest_s, at_s = steps_s[longest], seen.into_log_s(longest)
+    found = f"{len(gaps):,} longer than {_GAP_PERIODS:g} periods, the longest {longest_s:.3g} s, "
+    found += f"{at_s:.1f} s into the log"
+    effect = f"the motion over a gap is predicted {'by the wheels' if is_on_wheels else 'at constant velocity'}"
+    if longest_s < (_LONG_GAP_ON_WHEELS_S if is_on_wheels else _LONG_GAP_S):
+        return Finding("gaps", Severity.NOTE, found, effect)
+    effect += (
+        "; after a long one the match may settle elsewhere: run what comes before it, as below, and the rest, "
+        f"--start {math.floor(10.0 * (at_s + longest_s)) / 10.0:g}, apart"
     )
-    predicted = f"the motion over a gap is predicted {'by the wheels' if is_on_wheels else 'at constant velocity'}"
-    if steps_s[longest] < (_LONG_GAP_ON_WHEELS_S if is_on_wheels else _LONG_GAP_S):
-        return Finding("gaps", Severity.NOTE, found, predicted)
-    until_s, again_s = math.ceil(10.0 * at_s) / 10.0, math.floor(10.0 * (at_s + steps_s[longest])) / 10.0
-    effect = (
-        f"{predicted}; after a long one the match may settle elsewhere: run what comes before it, as below, and "
-        f"the rest, --start {again_s:g}, apart"
-    )
-    return Finding("gaps", Severity.WARNING, found, effect, f"--end {until_s:g}")
+    return Finding("gaps", Severity.WARNING, found, effect, f"--end {math.ceil(10.0 * at_s) / 10.0:g}")
 
 
 def _wheels(seen: Survey) -> Finding:
