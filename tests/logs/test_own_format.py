@@ -112,10 +112,10 @@ def test_a_known_format_can_be_named(tmp_path):
     ("body", "complaint"),
     [
         ("yield 1.0, [[1, 2]]", r"scan 0 of own_\d+:Clouds is a tuple|scan 0 .*wanted a tuple \(stamp_s"),
-        ("yield 1e18, [[1, 2, 3]], None", r"has the stamp 1e\+18; wanted seconds"),
-        ("yield 1.0, [1, 2, 3], None", r"wanted \(N, 2\) or \(N, 3\) numbers in meters"),
+        ("yield 1e18, [[1, 2, 3]], None", r"stamp_s is 1e\+18; wanted seconds"),
+        ("yield 1.0, [1, 2, 3], None", r"scan 0 .*: points has the shape \(3,\)"),
         ("yield 1.0, [[1, 2, 3]], [1, 2]", r"times_s has the shape \(2,\); wanted \(1,\)"),
-        ("yield 1.0, [[1, 2, 3]], None; yield 1.1, [[1, 2]], None", r"scan 1 .* has points \(N, 2\), the scans"),
+        ("yield 1.0, [[1, 2, 3]], None; yield 1.1, [[1, 2]], None", r"scan 1 .* points are no \(N, 3\) as those"),
         (
             "yield 1.0, [[1, 2, 3]], None; 1 / 0",
             r"scan 1 .*ZeroDivisionError: division by zero \(own_\d+\.py, line",
