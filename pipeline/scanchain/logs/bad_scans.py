@@ -14,7 +14,6 @@ from scanchain.kernels.geometry import largest_magnitude
 from scanchain.logs.mcap.stream import Decoded
 from scanchain.logs.messages.returns import Returns
 
-_FARTHEST_M = 1000.0  # range beyond which a typical one is in another unit than meters
 _MOST_REPEATED = 0.5  # share of repeated stamps above which it is a warning
 _SPANS = 100  # number of first scans whose point times are compared with the period
 _SHORTEST_PART, _LONGEST_PART = 0.005, 2.0  # shares of the period outside which point times are of another unit
@@ -66,14 +65,9 @@ def _none_retained(points: RawPoints, config: PreprocessConfig) -> str:
     near_m, far_m = np.sqrt([squares.min(), squares.max()])
     limits = f"preprocess.min_range_m ({low_m:g}) and preprocess.max_range_m ({high_m:g})"
     seen = f"its {counted(len(points), 'point')} lie at {near_m:.3g} to {far_m:.3g} m"
-    in_millimeters = near_m > high_m and are_millimeters(float(np.median(np.sqrt(squares))), config)
+    in_millimeters = low_m <= 1e-3 * near_m <= high_m < near_m
     remedy = "millimeters? convert them to meters" if in_millimeters else "widen these limits"
     return f"no point between {limits} ({seen}: {remedy})"
-
-
-def are_millimeters(range_m: float, config: PreprocessConfig) -> bool:
-    """True if a typical range is one that no lidar has in meters, and within the limits in millimeters."""
-    return range_m > _FARTHEST_M and config.min_range_m <= 1e-3 * range_m <= config.max_range_m
 
 
 class ScanCounts:

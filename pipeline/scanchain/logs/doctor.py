@@ -18,7 +18,7 @@ from scanchain.config import Config, LogConfig, PreprocessConfig
 from scanchain.data import MOST_COPIES, RawPoints, Scan
 from scanchain.errors import counted
 from scanchain.files import Source
-from scanchain.logs.bad_scans import are_millimeters, most_bad_scans
+from scanchain.logs.bad_scans import most_bad_scans
 from scanchain.logs.log import Log, open_log
 from scanchain.logs.mcap.stream import whole_span
 from scanchain.logs.messages.readers import is_scan
@@ -359,7 +359,7 @@ def _ranges(seen: Survey, preprocess: PreprocessConfig) -> Finding:
     if far_m > high_m:
         unused = float(np.mean(ranges_m > high_m))
         effect = f"{100 * unused:.3g} % lie beyond {high_m:g} m and are not used"
-        if are_millimeters(float(np.median(ranges_m)), preprocess):
+        if low_m <= 1e-3 * float(np.median(ranges_m)) <= high_m < near_m:
             return Finding("ranges", Severity.PROBLEM, found, f"{effect}: millimeters? convert them to meters")
         remedy = f"--preprocess.max_range_m {np.ceil(far_m):g}" if unused > _MANY_UNUSED else ""
         return Finding("ranges", Severity.NOTE, found, effect, remedy)

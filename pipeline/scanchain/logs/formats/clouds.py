@@ -10,6 +10,7 @@ import re
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from collections.abc import Set as AbstractSet
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import IO
@@ -260,18 +261,15 @@ def contents_of(
 
 
 def _found(folder: Path, files: Sequence[Path], raw: np.dtype[np.void]) -> list[str]:
-    """Fields of the files, by the first that can be read."""
+    """A note on the fields of the files, by the first that can be read."""
     for file in files[:_FIRST_FILES]:
-        try:
+        with suppress(CloudFileError, OSError):
             points = read_cloud_file(file, raw)
-        except (CloudFileError, OSError):
-            continue
-        kinds = ", ".join(dict.fromkeys(points.dtype[name].name for name in points.dtype.names or ()))
-        names = " ".join(points.dtype.names or ())
-        suffix = file.suffix.lower()
-        guess = " (log.bin_columns)" if suffix == ".bin" else ""
-        held = f"{names}, {kinds}{guess}; {counted(len(points), 'point')} in {file.name}"
-        return [f"{folder}: {counted(len(files), f'{suffix} file')} of {held}"]
+            kinds = ", ".join(dict.fromkeys(points.dtype[name].name for name in points.dtype.names or ()))
+            guess = " (log.bin_columns)" if file.suffix.lower() == ".bin" else ""
+            held = f"{' '.join(points.dtype.names or ())}, {kinds}{guess}; {counted(len(points), 'point')}"
+            kind = f"{file.suffix.lower()} file"
+            return [f"{folder}: {counted(len(files), kind)} of {held} in {file.name}"]
     return []
 
 

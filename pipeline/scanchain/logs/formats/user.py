@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Protocol
 
 import numpy as np
@@ -17,7 +16,7 @@ from scanchain import plugins
 from scanchain.data import Scan
 from scanchain.errors import InputError, counted, one_line, shown
 from scanchain.files import Source
-from scanchain.logs.mcap.index import index_file
+from scanchain.logs.formats import temporary_index
 from scanchain.logs.mcap.records import FileIndex
 from scanchain.logs.writer import LATEST_NS, LogWriter
 
@@ -51,45 +50,38 @@ def index_scans(path: Path, number: int, name: str, source: Source | None = None
     """
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; check the path")
-    with TemporaryDirectory(prefix="scanchain-", ignore_cleanup_errors=True) as folder:
-        copy = Path(folder) / "log.mcap"
-        try:
-            scans = _write(copy, path, name)
-        except OSError as error:
-            raise InputError(f"{copy}: {path} cannot be converted there ({error.strerror}); set TMPDIR") from error
-        index = index_file(copy, number, source or path)  # which maps the file: it may be deleted
+    index = temporary_index(path, number, lambda log: _write(log, path, name), source)
+    scans = sum(index.counts.values())
+    if not scans:
+        raise InputError(f"{path}: {name} yields no scan of it; check the path and the format")
     index.notes.append(f"{source or path}: {counted(scans, 'scan')} read by {name} (log.format)")
     return index
 
 
-def _write(destination: Path, path: Path, name: str) -> int:
-    """Write the scans that the class reads of a path; returns their number."""
+def _write(log: LogWriter, path: Path, name: str) -> None:
+    """Write the scans that the class reads of a path."""
     make = load_format(name)
-    written, dimension, end = 0, 0, object()
-    with LogWriter(destination) as log:
-        with _blaming(f"{path}: {name}"):
-            scans = iter(make(path).scans())
-        for written in count():
-            with _blaming(f"{path}: scan {written} of {name}"):
-                given = next(scans, end)
-                if given is end:
-                    break
-                if not isinstance(given, tuple) or len(given) != 3:
-                    raise InputError(f"is {shown(given)}; wanted a tuple (stamp_s, points, times_s or None)")
-                stamp_s, points, times_s = given
-                scan = Scan.of(points, stamp_s, times_s)
-                if not 0 <= scan.stamp_ns < LATEST_NS:
-                    raise InputError(f"stamp_s is {stamp_s}; wanted 0 to {LATEST_NS * 1e-9:.0f} s")
-                dimension = dimension or scan.points.shape[1]
-                if scan.points.shape[1] != dimension:
-                    raise InputError(f"points are no (N, {dimension}) as those before; yield one kind")
-            rows = np.asarray(points, np.float32)
-            rows = np.pad(rows, ((0, 0), (0, 3 - dimension)))  # in the plane z = 0, by which it is known as 2D
-            seconds = np.asarray(times_s, np.float32) if len(scan.times_s) else None
-            log.point_cloud(_TOPIC, scan.stamp_ns, _FRAME, rows, times_s=seconds, time_field="time")
-    if not written:
-        raise InputError(f"{path}: {name} yields no scan of it; check the path and the format")
-    return written
+    dimension, end = 0, object()
+    with _blaming(f"{path}: {name}"):
+        scans = iter(make(path).scans())
+    for number in count():
+        with _blaming(f"{path}: scan {number} of {name}"):
+            given = next(scans, end)
+            if given is end:
+                break
+            if not isinstance(given, tuple) or len(given) != 3:
+                raise InputError(f"is {shown(given)}; wanted a tuple (stamp_s, points, times_s or None)")
+            stamp_s, points, times_s = given
+            scan = Scan.of(points, stamp_s, times_s)
+            if not 0 <= scan.stamp_ns < LATEST_NS:
+                raise InputError(f"stamp_s is {stamp_s}; wanted 0 to {LATEST_NS * 1e-9:.0f} s")
+            dimension = dimension or scan.points.shape[1]
+            if scan.points.shape[1] != dimension:
+                raise InputError(f"points are no (N, {dimension}) as those before; yield one kind")
+        rows = np.asarray(points, np.float32)
+        rows = np.pad(rows, ((0, 0), (0, 3 - dimension)))  # in the plane z = 0, by which it is known as 2D
+        seconds = np.asarray(times_s, np.float32) if len(scan.times_s) else None
+        log.point_cloud(_TOPIC, scan.stamp_ns, _FRAME, rows, times_s=seconds, time_field="time")
 
 
 @contextmanager

@@ -78,14 +78,6 @@ def chosen_span(whole: Span, config: LogConfig) -> Span:
     return Span(begin_ns, whole.end_ns if end_s == whole.duration_s else whole.begin_ns + round(end_s * 1e9))
 
 
-class Gap(NamedTuple):
-    """A part of a log without any message, and the numbers of the files before and behind it."""
-
-    span: Span
-    before: int
-    behind: int
-
-
 def notes_on(indexes: Sequence[FileIndex], config: LogConfig) -> list[str]:
     """Warnings about the chosen part: an end beyond that of the log, long gaps within it."""
     whole_s = whole_span(indexes).duration_s
@@ -96,13 +88,13 @@ def notes_on(indexes: Sequence[FileIndex], config: LogConfig) -> list[str]:
 
 def gap_notes(indexes: Sequence[FileIndex], config: LogConfig) -> list[str]:
     """Warnings about gaps of more than a minute in the chosen part."""
-    whole, notes = whole_span(indexes), []
-    for gap in _long_gaps(indexes, config):
-        files = [indexes[number].path.name for number in (gap.before, gap.behind)]
-        where = f" between {files[0]} and {files[1]}" if gap.before != gap.behind else ""
+    begin_ns, notes = whole_span(indexes).begin_ns, []
+    for before, behind in _long_gaps(indexes, config):
+        files = [indexes[block.file].path.name for block in (before, behind)]
+        where = f" between {files[0]} and {files[1]}" if before.file != behind.file else ""
         notes.append(
-            f"no message for {duration(gap.span.duration_s)} from "
-            f"{1e-9 * (gap.span.begin_ns - whole.begin_ns):.1f} s on{where}: read as one log all the same; "
+            f"no message for {duration(1e-9 * (behind.start_ns - before.end_ns))} from "
+            f"{1e-9 * (before.end_ns - begin_ns):.1f} s on{where}: read as one log all the same; "
             "--start and --end choose a part"
         )
     return notes
@@ -113,12 +105,12 @@ def check_one_log(indexes: Sequence[FileIndex], scanned: Collection[int], config
 
     scanned : numbers of the files with scans; others, as of a calibration, may be of any time
     """
-    for gap in _long_gaps(indexes, config, scanned):
-        if gap.before != gap.behind and gap.span.end_ns - gap.span.begin_ns > _LONGEST_GAP_NS:
-            before, behind = (indexes[number].path for number in (gap.before, gap.behind))
+    for before, behind in _long_gaps(indexes, config, scanned):
+        gap_ns = behind.start_ns - before.end_ns
+        if before.file != behind.file and gap_ns > _LONGEST_GAP_NS:
             raise InputError(
-                f"{before} ends {duration(gap.span.duration_s)} before {behind} begins: they are not parts of one "
-                "log; run each by itself, or all of them with scanchain batch"
+                f"{indexes[before.file].path} ends {duration(1e-9 * gap_ns)} before {indexes[behind.file].path} "
+                "begins: they are not parts of one log; run each by itself, or all of them with scanchain batch"
             )
 
 
@@ -131,22 +123,21 @@ def are_parts(indexes: Sequence[FileIndex], is_lidar: Callable[[Channel], bool])
             if span.begin_ns < last.get(topic, 0):
                 return False
             last[topic] = span.end_ns
-    return not any(gap.before != gap.behind for gap in _long_gaps(indexes, LogConfig()))
+    return not any(before.file != behind.file for before, behind in _long_gaps(indexes, LogConfig()))
 
 
 def _long_gaps(
     indexes: Sequence[FileIndex], config: LogConfig, files: Collection[int] | None = None
-) -> Iterator[Gap]:
-    """Gaps of more than a minute in the chosen part, or in that of some files."""
+) -> Iterator[tuple[Block, Block]]:
+    """The blocks before and behind gaps of more than a minute in the chosen part, or in that of some files."""
     span = chosen_span(whole_span(indexes), config)
-    end_ns, before = None, 0
-    for block in sorted(_timed(indexes), key=lambda block: block.start_ns):
-        if not span.meets(block) or (files is not None and block.file not in files):
+    last: Block | None = None
+    for block in sorted(filter(span.meets, _timed(indexes)), key=lambda block: block.start_ns):
+        if files is not None and block.file not in files:
             continue
-        if end_ns is not None and block.start_ns - end_ns > _LONG_GAP_NS:
-            yield Gap(Span(end_ns, block.start_ns), before, block.file)
-        if end_ns is None or block.end_ns > end_ns:
-            end_ns, before = block.end_ns, block.file
+        if last is not None and block.start_ns - last.end_ns > _LONG_GAP_NS:
+            yield last, block
+        last = block if last is None or block.end_ns > last.end_ns else last
 
 
 def _timed(indexes: Sequence[FileIndex]) -> list[Block]:
