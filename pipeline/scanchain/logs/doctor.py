@@ -101,28 +101,17 @@ def examine(
 
 
 class Facts(NamedTuple):
-    """Statistics of the returns of one scan.
+    """Statistics of the returns of one scan."""
 
-    Attributes
-    ----------
-    kept, dropped : number of valid returns, and of the others
-    farthest_m, at_farthest : the largest range and the number of returns with just that one
-    ranges_m : (101,) percentiles of the ranges
-    time_span_s : of the per-point times, NaN where there are none
-    turn : 1 if the points, in their order, go around once counter-clockwise, −1 if clockwise, else 0
-    start_rad : azimuth of the first point
-    is_copy : the points are those of the scan before, to the last bit
-    """
-
-    kept: int
-    dropped: int
+    kept: int  # number of valid returns
+    dropped: int  # and of the others
     farthest_m: float
-    at_farthest: int
-    ranges_m: NDArray[np.float32]
-    time_span_s: float
-    turn: int
-    start_rad: float
-    is_copy: bool
+    at_farthest: int  # number of returns with just that range
+    ranges_m: NDArray[np.float32]  # (101,) percentiles
+    time_span_s: float  # of the per-point times, NaN where there are none
+    turn: int  # 1 if the points, in their order, go around once counter-clockwise, −1 if clockwise, else 0
+    start_rad: float  # azimuth of the first point
+    is_copy: bool  # the points are those of the scan before, to the last bit
 
 
 class Survey:
