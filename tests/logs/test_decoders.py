@@ -8,7 +8,6 @@ from scanchain.errors import InputError
 from scanchain.logs import open_log
 from tests.support.naive_logs import (
     ROS,
-    SECOND,
     STAMP_NS,
     Said,
     cloud_said,
@@ -82,19 +81,6 @@ def test_angles_in_degrees_are_refused_and_a_turn_and_a_bit_is_not(tmp_path, ste
 def test_range_limits_of_zero_or_nonsense_are_none(tmp_path, ranges, limits, kept):
     scan = laser(tmp_path, ranges, **limits)
     assert distances(scan) == pytest.approx(kept) and scan.dropped == len(ranges) - len(kept)
-
-
-def test_a_channel_may_change_its_geometry_in_every_scan(tmp_path):
-    said, expected = [], []
-    for k in range(200):
-        ranges = np.full(20 + k % 3, 2.0)
-        first, step = -1.0 + 0.1 * (k % 5), 0.01 * (1 + k % 7)
-        stamp_ns = STAMP_NS + k * SECOND
-        said.append(scan_said(stamp_ns, laser_scan(stamp_ns, ranges, first=first, step=step)))
-        expected.append(laser_points(ranges, first, step))
-    log = open_log([write(tmp_path / "a.mcap", said, chunk_size=300)], LogConfig())
-    for scan, points in zip(log.scans(), expected, strict=True):
-        np.testing.assert_allclose(scan.points, points, atol=2e-6)
 
 
 # PointCloud2

@@ -249,39 +249,33 @@ def test_a_run_of_ranges_in_millimeters_is_refused_with_the_reason(call, tmp_pat
     assert code == 2 and "millimeters? convert them to meters" in errors and "widen" not in errors
 
 
-def test_imu_gnss_and_truth_are_named_with_what_is_made_of_them(tmp_path, capfd):
-    said = [*drive(wheels=True), odometry_said(STAMP_NS, odometry(STAMP_NS, 0.0, 0.0), "/ground_truth")]
+def test_imu_gnss_poses_and_truth_are_named_with_what_is_made_of_them_though_no_lidar_is_chosen(tmp_path, capfd):
+    said = drive(wheels=True)
+    said += [odometry_said(STAMP_NS, odometry(STAMP_NS, 0.0, 0.0), topic) for topic in ("/ground_truth", "/gps")]
     names = {"nav_msgs/msg/Path": "sensor_msgs/msg/Imu", "nav_msgs/msg/MapMetaData": "sensor_msgs/msg/NavSatFix"}
     said += [Said(topic, kind, STAMP_NS, b"0") for topic, kind in zip(("/imu/data", "/fix"), names, strict=True)]
     path = saved(tmp_path, said, rename=lambda kind: names.get(kind, kind))
-    assert main(["info", str(path)]) == 0
+    flags = ["--log.odometry_topic", "/odom"]
+    assert main(["info", str(path), *flags]) == 0
     text = capfd.readouterr().out
-    for line in (
-        "GNSS /fix: not used", "ground truth /ground_truth: evaluates the result, is not used for it",
+    lines = [
+        "GNSS /fix: not used",
+        "poses /gps: not used; --gt /gps takes them as the truth",
+        "ground truth /ground_truth: evaluates the result, is not used for it",
         "IMU /imu/data: not used",
-    ):  # fmt: skip
-        assert f"sensor    {line}\n" in text
+    ]
+    assert all(f"sensor    {line}\n" in text for line in lines)
     assert "wheels    /odom" in text and "/odom:" not in text
-    assert main(["run", str(path), "--out", str(tmp_path / "a"), "--rerun", "off"]) == 0
+    assert main(["run", str(path), "--out", str(tmp_path / "a"), "--rerun", "off", *flags]) == 0
     text = capfd.readouterr().out
     assert "note           IMU /imu/data: not used\n" in text and "note           GNSS /fix: not used\n" in text
     assert "/ground_truth: evaluates" not in text
-    assert main(["info", str(path), "--json"]) == 0
-    assert [each["sensor"] for each in json.loads(capfd.readouterr().out)["sensors"]] == [
-        "GNSS", "ground truth", "IMU",
-    ]  # fmt: skip
-
-
-def test_truth_and_wheels_are_named_though_the_lidar_is_not_chosen(tmp_path, capfd):
-    said = drive(wheels=True)
     other = [Said("/other", each.kind, each.log_ns, each.data) for each in said if each.topic == "/scan"]
-    truth = odometry_said(STAMP_NS, odometry(STAMP_NS, 0.0, 0.0), "/ground_truth")
-    path = saved(tmp_path, [*said, *other, truth, odometry_said(STAMP_NS, odometry(STAMP_NS, 0.0, 0.0), "/gps")])
-    assert main(["info", str(path)]) == 1
-    text = capfd.readouterr().out
-    assert "several lidar topics" in text
-    assert "sensor    poses /gps: not used; --gt /gps takes them as the truth\n" in text
-    assert "sensor    ground truth /ground_truth: evaluates the result, is not used for it\n" in text
+    saved(tmp_path, [*said, *other], rename=lambda kind: names.get(kind, kind))
+    assert main(["info", str(path), "--json"]) == 1
+    told = json.loads(capfd.readouterr().out)
+    assert "several lidar topics" in told["problem"]
+    assert sorted({each["sensor"] for each in told["sensors"]}) == ["GNSS", "IMU", "ground truth", "poses"]
 
 
 # The whole

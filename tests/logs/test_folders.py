@@ -88,24 +88,6 @@ def test_a_kitti_odometry_sequence_begins_at_time_zero_and_knows_its_truth(tmp_p
         np.testing.assert_allclose(truth.poses[k], expected, atol=1e-9)
 
 
-def test_a_part_of_a_kitti_sequence_opens_only_its_own_files(tmp_path, monkeypatch):
-    from scanchain.logs.formats import kitti
-
-    opened = []
-
-    def noted(path, point, whole=kitti.read_raw):
-        opened.append(path.name)
-        return whole(path, point)
-
-    monkeypatch.setattr(kitti, "read_raw", noted)
-    said = recorders.clouds(9)
-    sequence = kitti_odometry(tmp_path, said, poses=False)
-    log, scans = read(sequence, start_s=0.2, end_s=0.5)
-    assert log.scan_count == len(scans) == 3
-    assert_points(scans, said[2:5])
-    assert set(opened) <= {f"{k:06d}.bin" for k in (0, 2, 3, 4)}  # the first tells the lidar's frame
-
-
 def test_a_kitti_folder_whose_parts_do_not_fit_says_so(tmp_path):
     sequence = kitti_odometry(tmp_path, recorders.clouds())
     (sequence / "times.txt").write_text("0.0\n")

@@ -15,7 +15,6 @@ from scanchain.errors import InputError
 from scanchain.logs import open_log
 from scanchain.logs.info import describe
 from scanchain.logs.mcap import stream
-from scanchain.logs.messages.point_cloud import PointCloudDecoder
 from scanchain.logs.opening import index_files
 from tests.support import made
 from tests.support.naive_logs import (
@@ -151,17 +150,6 @@ def test_a_gap_between_two_files_is_a_note_and_one_of_more_than_a_day_refused(tm
     mounts = transforms_said(STAMP_NS - year_ns, transforms(("base_link", "laser", 0.2, 0.1, 0.3, 0.0)))
     calibration = write(tmp_path / "calibration.mcap", [mounts])  # which holds no scan
     assert open_log([calibration, first]).scan_count == 40
-
-
-def test_opening_decodes_no_scan_twice(tmp_path, monkeypatch):
-    rows = np.array([(1, 2, 3), (2, 3, 5)], dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
-    said = [cloud_said(STAMP_NS + k, point_cloud(STAMP_NS + k, rows)) for k in range(5)]
-    path, counted = write(tmp_path / "a.mcap", said), []
-    real = PointCloudDecoder.decode
-    monkeypatch.setattr(PointCloudDecoder, "decode", lambda *args: counted.append(1) or real(*args))
-    log = open_log(path)
-    assert log.assumed_point_times().startswith("no point times")
-    assert len(counted) == 1
 
 
 @pytest.mark.skipif(not Path("/proc/self/smaps").exists(), reason="needs Linux to say what is in memory")
