@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -63,7 +63,7 @@ def _write(log: LogWriter, path: Path, name: str) -> None:
     make = load_format(name)
     dimension, end = 0, object()
     with _blaming(f"{path}: {name}"):
-        scans = iter(make(path).scans())
+        scans: Iterator[Any] = iter(make(path).scans())
     for number in count():
         with _blaming(f"{path}: scan {number} of {name}"):
             given = next(scans, end)
