@@ -149,20 +149,6 @@ def test_an_archive_is_unpacked_and_its_folder_converted_with_its_truth(site, tm
     assert log.scan_count == 3 and truth is not None and len(truth) == 3
 
 
-def test_names_in_an_archive_lead_nowhere_else(site, tmp_path, monkeypatch):
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w") as archive:
-        for name in ("../../outside.txt", "/absolute.txt"):
-            archive.writestr(name, "no")
-    site.files = {"/drive.zip": packed.getvalue()}
-    served(monkeypatch, "kitti", url=f"{site.url}/drive.zip", reference_url="")
-    logs = tmp_path / "a" / "logs"
-    with pytest.raises(InputError):
-        catalog.prepare("kitti", logs)
-    unpacked = sorted(tmp_path.rglob("*.txt"))
-    assert unpacked == sorted(logs / "kitti-unpacked" / name for name in ("absolute.txt", "outside.txt"))
-
-
 def test_an_archive_that_is_none_says_so(site, tmp_path, monkeypatch):
     site.files = {"/drive.zip": b"no zip"}
     served(monkeypatch, "kitti", url=f"{site.url}/drive.zip", reference_url="")

@@ -30,7 +30,7 @@ class Mounting(NamedTuple):
 
     Attributes
     ----------
-    base, lidar : the frames; the base's is empty where the log does not state it
+    base : its frame, empty where the log does not state it
     T_base_lidar : (4, 4), the first one seen where it moves; the identity where the log does not state it
     source : of the pose, as text
     motion : the joint that moves the lidar and how far, as text; None where it stays where it is
@@ -38,7 +38,6 @@ class Mounting(NamedTuple):
     """
 
     base: str
-    lidar: str
     T_base_lidar: Pose
     source: str = "by static transforms"
     motion: str | None = None
@@ -86,26 +85,26 @@ def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel 
     for base in bases:
         T_base_lidar = chain(fixed, base, frame)
         if T_base_lidar is not None:
-            return Mounting(base, frame, T_base_lidar)
+            return Mounting(base, T_base_lidar)
     joints: dict[Edge, list[StampedPose]] = {}
     for each in _transforms(indexes, is_fixed=False, span=span):
-        joints.setdefault(_edge(each), []).append(each)
+        if not _is_world(each.parent):
+            joints.setdefault(_edge(each), []).append(each)
     first = [*fixed, *(poses[0] for poses in joints.values())]
     for base in bases:
         T_base_lidar = chain(first, base, frame)
         if T_base_lidar is not None:
             motion = _motion(joints, first, base, frame)
             source = "by transforms of /tf" + (" that change" if motion else ", which do not change")
-            return Mounting(base, frame, T_base_lidar, source, motion)
-    parents = {child: parent for parent, child in map(_edge, fixed)}
-    root = _root({c: p for c, p in parents.items() if not _WORLD_WORDS & set(re.split(r"[/_]", p.lower()))}, frame)
+            return Mounting(base, T_base_lidar, source, motion)
+    root = _root({child: parent for parent, child in map(_edge, fixed) if not _is_world(parent)}, frame)
     T_root_lidar = chain(fixed, root, frame)
     if root != frame and T_root_lidar is not None:
         note = f"the log has no transform from {bases[0]} to {frame}: {root} is taken as the base"
-        return Mounting(root, frame, T_root_lidar, note=note)
+        return Mounting(root, T_root_lidar, note=note)
     why = f"no static transform from {bases[0]} to {frame or 'the lidar'}"
     note = "" if not fixed and wheels is None else f"{why}: the lidar is taken to sit at the robot's origin"
-    return Mounting("", frame, np.eye(4), note=note)
+    return Mounting("", np.eye(4), note=note)
 
 
 def _motion(
@@ -149,6 +148,10 @@ def _root(parents: dict[str, str], frame: str) -> str:
         seen.add(frame)
         frame = parents[frame]
     return frame
+
+
+def _is_world(frame: str) -> bool:
+    return not _WORLD_WORDS.isdisjoint(re.split(r"[/_]", frame.lower()))
 
 
 def _edge(transform: StampedPose) -> Edge:
