@@ -75,13 +75,15 @@ def _write(log: LogWriter, text: bytes, malformed: list[int], others: Counter[by
     parameters: dict[bytes, float] = {}
     scan_ns, is_mounted = 0, False
     for number, line in enumerate(io.BytesIO(text), start=1):
+        kind = line[:16].split(maxsplit=1)[0] if line[:16].strip() else b"#"
+        if kind not in (*KINDS, b"PARAM"):
+            if not kind.startswith((b"#", b"PARAM")):
+                others[kind] += 1
+            continue
         words = line.split()
-        kind = words[0] if words else b"#"
-        if kind == b"PARAM" and len(words) > 2 and words[1] in _PARAMETERS:
-            with suppress(ValueError):
+        if kind == b"PARAM":
+            with suppress(ValueError, IndexError):
                 parameters[words[1]] = float(words[2])
-        if kind not in KINDS:
-            others.update([] if kind.startswith((b"#", b"PARAM")) else [kind[:16]])
             continue
         try:  # the stamp is the third word from behind, a double like in CARMEN
             stamp_ns = int(float(words[-3]) * 1e9)
