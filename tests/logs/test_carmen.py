@@ -81,7 +81,7 @@ def test_wheels_mounting_and_truth_of_a_log(tmp_path):
     log, (scan,) = read(save(tmp_path / "a.log", *lines))
     np.testing.assert_allclose(scan.T_odom_base, lie.pose_2d(1.0, 2.0, 0.5), atol=1e-12)
     np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(0.35, 0.0, 0.0), atol=1e-12)
-    assert log.indexes[0].counts[log.indexes[0].channels[2].key[1]] == 3
+    assert log.indexes[0].counts[log.indexes[0].numbers_of("/odom").pop()] == 3
     np.testing.assert_allclose(log.ground_truth().poses[:, 0, 2], [0.5, 1.5, 2.5])
 
 

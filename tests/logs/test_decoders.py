@@ -3,14 +3,11 @@
 import numpy as np
 import pytest
 
-from scanchain import lie
 from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.logs import open_log
-from scanchain.simulation import simulate
 from tests.support.naive_logs import (
     ROS,
-    SECOND,
     STAMP_NS,
     Said,
     cloud_said,
@@ -18,7 +15,6 @@ from tests.support.naive_logs import (
     laser_scan,
     odometry,
     odometry_said,
-    office,
     point_cloud,
     scan_said,
     transforms,
@@ -49,10 +45,9 @@ def distances(scan):
 # LaserScan
 
 
-@pytest.mark.parametrize("order", ["<", ">"])
-@pytest.mark.parametrize("frame", ["", "l", "la", "las", "lase"])
-def test_a_laser_scan_is_read_in_either_byte_order_any_alignment_and_any_sense(tmp_path, order, frame):
-    ranges, first, step = np.linspace(1.0, 5.0, 50), *((-1.0, 0.01) if frame else (1.5, -0.05))
+@pytest.mark.parametrize(("order", "frame", "first", "step"), [("<", "las", -1.0, 0.01), (">", "", 1.5, -0.05)])
+def test_a_laser_scan_is_read_in_either_byte_order_and_sense(tmp_path, order, frame, first, step):
+    ranges = np.linspace(1.0, 5.0, 50)
     scan = laser(tmp_path, ranges, order=order, frame=frame, beam_s=1e-4, first=first, step=step)
     np.testing.assert_allclose(scan.points, laser_points(ranges, first, step), atol=2e-6)
     np.testing.assert_allclose(scan.times_s, 1e-4 * np.arange(50), rtol=1e-5)
@@ -86,25 +81,6 @@ def test_angles_in_degrees_are_refused_and_a_turn_and_a_bit_is_not(tmp_path, ste
 def test_range_limits_of_zero_or_nonsense_are_none(tmp_path, ranges, limits, kept):
     scan = laser(tmp_path, ranges, **limits)
     assert distances(scan) == pytest.approx(kept) and scan.dropped == len(ranges) - len(kept)
-
-
-def test_a_channel_may_change_its_geometry_in_every_scan(tmp_path):
-    said, expected = [], []
-    for k in range(200):
-        ranges = np.full(20 + k % 3, 2.0)
-        first, step = -1.0 + 0.1 * (k % 5), 0.01 * (1 + k % 7)
-        stamp_ns = STAMP_NS + k * SECOND
-        said.append(scan_said(stamp_ns, laser_scan(stamp_ns, ranges, first=first, step=step)))
-        expected.append(laser_points(ranges, first, step))
-    log = open_log([write(tmp_path / "a.mcap", said, chunk_size=300)], LogConfig())
-    for scan, points in zip(log.scans(), expected, strict=True):
-        np.testing.assert_allclose(scan.points, points, atol=2e-6)
-
-
-def test_scans_do_not_share_memory_that_someone_could_write_into(tmp_path):
-    log = open_log([write(tmp_path / "a.mcap", office(2))], LogConfig())
-    first, second = log.scans()
-    assert not np.shares_memory(first.points, second.points)
 
 
 # PointCloud2
@@ -147,18 +123,11 @@ SCATTERED = np.dtype({
 @pytest.mark.parametrize(
     ("rows", "options"),
     [
-        *((ROWS, {"height": height, "padding": padding}) for height in (1, 4) for padding in (0, 1, 7, 100)),
-        (
-            ROWS,
-            {
-                "height": 4,
-                "padding": 5,
-                "data": b"\xff\xff\xff\xff\xff".join(r.tobytes() for r in ROWS.reshape(4, 6)),
-            },
-        ),
+        *((ROWS, {"height": height, "padding": padding}) for height in (1, 4) for padding in (0, 7)),
+        (ROWS, {"height": 4, "padding": 5, "data": (5 * b"\xff").join(r.tobytes() for r in ROWS.reshape(4, 6))}),
         (ROWS, {"row_step": 0}),
         (random_rows(SCATTERED), {}),
-        *((random_rows([*XYZ, (name, "u1")]), {"frame": name}) for name in ("i", "in", "int", "inte", "inten")),
+        (random_rows([*XYZ, ("inten", "u1")]), {"frame": "inten"}),
     ],
 )
 def test_rows_may_be_padded_and_fields_lie_anywhere(tmp_path, rows, options):
@@ -259,22 +228,11 @@ def test_the_unit_of_times_can_be_set_or_times_left_alone(tmp_path, unit, per_se
 )
 def test_a_lidar_without_times_can_be_timed_by_its_azimuth(tmp_path, sense, start_rad, expected_s):
     rows = np.array([(2, 0, 0), (0, 2, 1), (0, -2, 0), (-2, 0, 0)], dtype=XYZ)
-    config = {"point_times": sense, "revolution_s": 0.2, "revolution_start_rad": start_rad}
-    np.testing.assert_allclose(cloud(tmp_path, rows, config=config).times_s, expected_s, atol=1e-6)
-
-
-def test_the_azimuth_of_a_spinning_lidar_tells_its_times_and_what_was_assumed_is_told(tmp_path):
-    simulate("town", tmp_path / "town.mcap", duration_s=0.2, sensor="os1-32")
-    times_s = {}
-    for unit, note in (
-        ("auto", "field t (uint32) taken as ns after the stamp"),
-        ("clockwise", "point times by the azimuth: clockwise"),
-        ("none", "no point times"),
-    ):
-        log = open_log(tmp_path / "town.mcap", LogConfig(point_times=unit))
-        times_s[unit] = next(iter(list(log.scans()))).times_s
-        assert any(note in line for line in log.notes)
-    assert np.median(np.abs(times_s["auto"] - times_s["clockwise"])) < 1e-3
+    config = LogConfig(point_times=sense, revolution_s=0.2, revolution_start_rad=start_rad)
+    log = open_log(write(tmp_path / "a.mcap", [cloud_said(STAMP_NS, point_cloud(STAMP_NS, rows))]), config)
+    (scan,) = log.scans()
+    np.testing.assert_allclose(scan.times_s, expected_s, atol=1e-6)
+    assert f"point times by the azimuth: {sense} from {start_rad:.3g} rad" in log.notes[-1]
 
 
 # poses
@@ -298,25 +256,6 @@ def test_stamped_poses_lead_where_they_are_asked_for(tmp_path, kind):
     np.testing.assert_allclose(scan.T_odom_base[:3, 3], [3.0, 4.0, 6.0])
     np.testing.assert_allclose(log.ground_truth().poses[0], scan.T_odom_base)
     assert log.T_base_lidar[0, 3] == 1.0 and log.T_base_lidar[1, 3] == 2.0
-
-
-@pytest.mark.parametrize("order", ["<", ">"])
-def test_poses_are_read_in_either_byte_order(tmp_path, order):
-    rows = random_rows(XYZ)
-    said = [
-        transforms_said(STAMP_NS, transforms(("base_link", "lidar", 1.0, 2.0, 0.3, 0.1), order=order)),
-        odometry_said(
-            STAMP_NS, odometry(STAMP_NS, 3.0, 4.0, 0.5, z=6.0, order=order, frame="o", child="base_link")
-        ),
-        cloud_said(STAMP_NS, point_cloud(STAMP_NS, rows)),
-    ]
-    log = open_log([write(tmp_path / "a.mcap", said)], LogConfig())
-    (scan,) = log.scans()
-    quat_xyzw = np.array([0.0, 0.0, np.sin(0.25), np.cos(0.25)])
-    np.testing.assert_allclose(scan.T_odom_base[:3, :3], lie.from_quaternion(quat_xyzw), atol=1e-12)
-    np.testing.assert_allclose(scan.T_odom_base[:3, 3], [3.0, 4.0, 6.0])
-    np.testing.assert_allclose(log.T_base_lidar[:3, 3], [1.0, 2.0, 0.5])
-    assert lie.rotation_angle(log.T_base_lidar) > 0.3
 
 
 def test_a_quaternion_that_is_not_quite_unit_is_normalized(tmp_path):

@@ -10,7 +10,6 @@ from scanchain.config import Config, LogConfig
 from scanchain.errors import InputError
 from scanchain.logs import open_log
 from scanchain.logs.doctor import examine
-from tests.support import made
 from tests.support.naive_logs import (
     SECOND,
     STAMP_NS,
@@ -78,6 +77,7 @@ def test_scans_without_a_point_in_range_are_left_out(call, tmp_path):
     found = diagnose(path)["damage"]
     assert found.severity == "warning"
     assert "2 scans without a point between preprocess.min_range_m (0.5)" in found.found
+    assert diagnose(path, every=4)["damage"].found.startswith("2 scans without")  # of ten
     flags = ["--preprocess.min_range_m", "0.5", "--rerun", "off"]
     code, output, errors = call("run", path, "--out", tmp_path / "a", *flags)
     assert code == 0 and "scans          38 over" in output
@@ -85,58 +85,39 @@ def test_scans_without_a_point_in_range_are_left_out(call, tmp_path):
     assert "no point between preprocess.min_range_m (0.5) and preprocess.max_range_m" in errors
 
 
-@pytest.mark.parametrize("percent", ["10", "100"])
-def test_a_log_without_a_point_in_range_names_the_settings_and_the_ranges_seen(call, tmp_path, percent):
+def test_a_log_without_a_point_in_range_names_the_settings_and_the_ranges_seen(call, tmp_path):
     path = saved(tmp_path, drive(ranges=covered(*range(40))))
     found = diagnose(path)
     assert (found["damage"].severity, found["damage"].remedy) == ("problem", "")
     assert found["ranges"].remedy == "--preprocess.min_range_m 0.18"
-    flags = ["--preprocess.min_range_m", "0.5", "--log.max_bad_scans_percent", percent]
+    flags = ["--preprocess.min_range_m", "0.5", "--log.max_bad_scans_percent", "100"]
     code, _, errors = call("run", path, "--out", tmp_path / "a", "--rerun", "off", *flags)
     assert code == 2 and errors.count("\n") == 1 and not (tmp_path / "a").exists()
     assert "no point between preprocess.min_range_m (0.5) and preprocess.max_range_m" in errors
     assert "lie at 0.2 to 0.2 m" in errors
 
 
-def test_the_scans_looked_at_are_those_that_a_run_would_take():
-    town = made.log("town", seconds=3, sensor="vlp-16")
-    assert diagnose(town, every=4)["damage"].found.startswith("8 scans")
-
-
 def test_a_gap_is_found_where_it_is(tmp_path):
     def hole(k):
         return 2 * SECOND if k >= 20 else 0
 
-    finding = diagnose(saved(tmp_path, drive(stamp=hole, log=hole)))["gaps"]
-    assert (
-        finding.severity == "warning"
-        and finding.found == "1 longer than 2.5 periods, the longest 2.1 s, 1.9 s into the log"
-    )
-    assert finding.remedy == "--end 1.9" and "at constant velocity" in finding.effect
+    path = saved(tmp_path, drive(stamp=hole, log=hole))
+    finding = diagnose(path)["gaps"]
+    assert (finding.severity, finding.remedy) == ("warning", "--end 1.9")
+    assert finding.found == "1 longer than 2.5 periods, the longest 2.1 s, 1.9 s into the log"
+    assert "at constant velocity" in finding.effect
     assert "run what comes before it, as below, and the rest, --start 4, apart" in finding.effect
-    on_wheels = diagnose(saved(tmp_path, drive(stamp=hole, log=hole, wheels=True)))["gaps"]
+    later = diagnose(path, start_s=1.0)["gaps"]
+    assert (later.found, later.remedy) == (finding.found, finding.remedy)  # the flag counts from the same moment
+    path = saved(tmp_path, drive(stamp=hole, log=hole, wheels=True))
+    on_wheels = diagnose(path)["gaps"]
     assert on_wheels.severity == "note" and "by the wheels" in on_wheels.effect
     unused = configured(2, {"odometry.prior": "constant-velocity"})
-    path = saved(tmp_path, drive(stamp=hole, log=hole, wheels=True))
-    findings = examine([path], lambda _: unused, LogConfig(), lambda *_: None).findings
-    without = next(each for each in findings if each.check == "gaps")
-    assert (without.severity, without.effect) == (finding.severity, finding.effect)
-    later = diagnose(saved(tmp_path, drive(stamp=hole, log=hole)), start_s=1.0)["gaps"]
-    assert (later.found, later.remedy) == (finding.found, finding.remedy)  # the flag counts from the same moment
+    assert finding in examine([path], lambda _: unused, LogConfig(), lambda *_: None).findings
 
 
-def test_a_range_that_stands_for_no_return_is_found_and_mended_by_its_flag(tmp_path):
-    def ranges(k):
-        values = room(k)
-        values[::7] = 29.99
-        return values
-
-    path = saved(tmp_path, drive(ranges=ranges))
-    finding = diagnose(path)["no return"]
-    assert finding.severity == "warning" and "15 % of the beams have exactly 29.99 m" in finding.found
-    flag, value = finding.remedy.split()
-    assert flag == "--log.max_range_m" and 29.98 < float(value) < np.float32(29.99)
-    assert diagnose(path, max_range_m=float(value))["no return"].severity == "ok"
+def stuck(k):
+    return np.where(np.arange(100) % 7, room(k), 29.99)
 
 
 def mostly_lost(k):
@@ -154,8 +135,41 @@ def at_times(k):
     return STAMP_NS + k * STEP_NS
 
 
+ROW = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("time", "<f4"), ("ring", "<u2")])
+
+
+def sweep(k, *, span=0.095, fields=ROW, shift_m=0.0):
+    rng = np.random.default_rng(3)
+    rows = np.zeros(640, fields)
+    for name, reach in zip("xyz", (20.0, 20.0, 2.0), strict=True):
+        rows[name] = rng.uniform(1.0, reach, 640)
+    rows["x"] -= 0.3 * k
+    rows["y"] += shift_m
+    if "time" in fields.names:
+        rows["time"] = np.linspace(0.0, span, 640)
+    return rows
+
+
+def turning(sense, times):
+    """A cloud without times in the order of firing, ``times`` around."""
+    azimuth = sense * np.linspace(0.0, 2.0 * np.pi * times, 640) + 1.0
+    rows = np.zeros(640, ROW.descr[:3])
+    rows["x"], rows["y"] = 10.0 * np.cos(azimuth), 10.0 * np.sin(azimuth)
+    return rows
+
+
+def clouds(rows):
+    return [cloud_said(at_times(k), point_cloud(at_times(k), rows)) for k in range(20)]
+
+
+def sweeps(**options):
+    return [cloud_said(at_times(k), point_cloud(at_times(k), sweep(k, **options))) for k in range(20)]
+
+
+NO_RETURN = "--log.max_range_m 29.989"
 NO_WHEELS = "--odometry.prior constant-velocity"
 IN_MILLIMETERS = [odometry_said(at_times(k), odometry(at_times(k), 100.0 * k, 0.0)) for k in range(40)]
+BY_AZIMUTH = "--log.point_times {} --log.revolution_s 0.1 --log.revolution_start_rad 1"
 
 
 @pytest.mark.parametrize(
@@ -166,24 +180,37 @@ IN_MILLIMETERS = [odometry_said(at_times(k), odometry(at_times(k), 100.0 * k, 0.
         (drive(wheels=True, stamp=lambda k: -37 * SECOND), "wheels", "warning", "40 of 40 scans without", ""),
         (drive(wheels=True, mounted=False), "wheels", "warning", "no static transform from base_link", NO_WHEELS),
         ([*drive(), *IN_MILLIMETERS], "wheels", "problem", "moves at 1e+03 m/s", NO_WHEELS),
-        (
-            drive(ranges=mostly_lost),
-            "returns",
-            "warning",
-            "80 % of the beams without a valid return, 20 valid a",
-            "",
-        ),
+        (drive(ranges=mostly_lost), "returns", "warning", "80 % of the beams without a valid return, 20", ""),
         (drive(ranges=blind_until(25, 40)), "returns", "warning", "3 valid a scan", "--start 2.5"),
         (drive(ranges=blind_until(5, 30)), "returns", "warning", "100 valid a", "--start 0.5 --end 2.901"),
         (drive(ranges=blind_until(0, 40)), "returns", "ok", "0 % of the beams", ""),
+        (drive(ranges=stuck), "no return", "warning", "15 % of the beams have exactly 29.99 m", NO_RETURN),
+        (drive(ranges=lambda k: 1e3 * room(k)), "ranges", "problem", "98 % of the returns lie between", ""),
+        (sweeps(shift_m=150.0), "ranges", "note", "98 % of the returns", "--preprocess.max_range_m 171"),
         (drive(ranges=lambda k: room(k // 2)), "duplicates", "warning", "20 of 40 scans", "--every 2"),
         (drive(ranges=lambda k: room(min(k, 20))), "duplicates", "warning", "20 of them in a row", ""),
+        (sweeps(), "point times", "ok", "field time (float32) taken as s after the stamp", ""),
+        (sweeps(span=9.5), "point times", "warning", "95 of the period", "--log.point_times none"),  # no unit fits
+        (clouds(turning(1.0, 1.0)), "point times", "note", "none", BY_AZIMUTH.format("counterclockwise")),
+        (clouds(turning(-1.0, 1.0)), "point times", "note", "none", BY_AZIMUTH.format("clockwise")),
+        (clouds(turning(1.0, 16.0)), "point times", "note", "none", ""),  # ring by ring
+        (clouds(turning(1.0, 0.3)), "point times", "note", "none", ""),
+        (sweeps(fields=np.dtype(ROW.descr[:3])), "point times", "note", "none", ""),  # in no order
     ],
 )
-def test_a_fault_is_measured_and_graded(tmp_path, said, check, severity, found, remedy):
-    finding = diagnose(saved(tmp_path, said))[check]
+def test_a_fault_is_measured_and_graded_and_mended_by_the_flag_of_a_log(
+    tmp_path, said, check, severity, found, remedy
+):
+    path = saved(tmp_path, said)
+    finding = diagnose(path)[check]
     assert (finding.severity, finding.remedy) == (severity, remedy)
     assert found in finding.found
+    if remedy.startswith("--log."):
+        words = remedy.split()
+        keys = [flag.removeprefix("--log.") for flag in words[::2]]
+        values = [float(value) if value[0].isdigit() else value for value in words[1::2]]
+        mended = diagnose(path, **dict(zip(keys, values, strict=True)))[check]
+        assert (mended.severity, mended.remedy) == ("note" if values[0] == "none" else "ok", "")
 
 
 def test_scans_that_would_stop_a_run_are_a_problem_with_a_flag(tmp_path):
@@ -199,42 +226,8 @@ def test_scans_that_would_stop_a_run_are_a_problem_with_a_flag(tmp_path):
         assert finding.severity == "warning" and "left out" in finding.effect
 
 
-# Clouds
-
-ROW = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("time", "<f4"), ("ring", "<u2")])
-
-
-def sweep(k, *, span=0.095, rings=16, fields=ROW):
-    rng = np.random.default_rng(3)
-    rows = np.zeros(640, fields)
-    for name, reach in zip("xyz", (20.0, 20.0, 2.0), strict=True):
-        rows[name] = rng.uniform(1.0, reach, 640)
-    rows["x"] -= 0.3 * k
-    if "time" in fields.names:
-        rows["time"] = np.linspace(0.0, span, 640)
-    if "ring" in fields.names:
-        rows["ring"] = np.arange(640) % rings
-    return rows
-
-
-def sweeps(count=20, **options):
-    stamps_ns = [STAMP_NS + k * STEP_NS for k in range(count)]
-    return [cloud_said(stamp, point_cloud(stamp, sweep(k, **options))) for k, stamp in enumerate(stamps_ns)]
-
-
-def test_point_times_of_a_healthy_cloud_are_told(tmp_path):
-    found = diagnose(saved(tmp_path, sweeps()))
-    assert sorted(found) == sorted([*CHECKS, "point times"])
-    assert "field time (float32) taken as s" in found["point times"].found
-    assert "lasts 95 ms" in found["point times"].found and found["point times"].severity == "ok"
-
-
 def test_a_wrong_unit_of_point_times_is_found_and_mended_by_its_flag(tmp_path):
-    path = saved(tmp_path, sweeps(span=9.5))  # in hundredths of a second: no unit that is guessed fits
-    finding = diagnose(path)["point times"]
-    assert finding.severity == "warning" and "95 of the period" in finding.found
-    assert finding.remedy == "--log.point_times none"
-    path = saved(tmp_path, sweeps(span=0.095))
+    path = saved(tmp_path, sweeps())
     finding = diagnose(path, point_times="ms")["point times"]
     assert finding.severity == "warning" and finding.remedy == "--log.point_times s"
     assert diagnose(path, point_times="s")["point times"].severity == "ok"
@@ -250,83 +243,39 @@ def test_a_run_warns_of_point_times_that_do_not_fit_the_period(tmp_path, factor,
     assert log.damage == []
 
 
-def test_a_cloud_without_times_is_told_how_its_azimuth_could_stand_in(tmp_path):
-    plain = np.dtype([(name, "<f4") for name in "xyz"])
-
-    def turning(sense, times):
-        """A cloud in the order of firing, ``times`` around."""
-        azimuth = sense * np.linspace(0.0, 2.0 * np.pi * times, 640) + 1.0
-        rows = np.zeros(640, plain)
-        rows["x"], rows["y"] = 10.0 * np.cos(azimuth), 10.0 * np.sin(azimuth)
-        return rows
-
-    def found(rows):
-        stamps_ns = [STAMP_NS + k * STEP_NS for k in range(20)]
-        path = saved(tmp_path, [cloud_said(stamp, point_cloud(stamp, rows)) for stamp in stamps_ns])
-        return path, diagnose(path)["point times"]
-
-    for sense, way in ((1.0, "counterclockwise"), (-1.0, "clockwise")):
-        path, finding = found(turning(sense, 1.0))
-        assert finding.severity == "note"
-        assert finding.remedy == f"--log.point_times {way} --log.revolution_s 0.1 --log.revolution_start_rad 1"
-        assert diagnose(path, point_times=way)["point times"].severity == "ok"
-    ring_by_ring, in_no_order, part = turning(1.0, 16.0), sweep(0, fields=plain), turning(1.0, 0.3)
-    for rows in (ring_by_ring, in_no_order, part):
-        assert found(rows)[1].remedy == ""
-
-
-def test_returns_beyond_what_a_run_uses_are_noted_with_the_flag(tmp_path):
-    def far(k):
-        rows = sweep(k)
-        rows["y"] += 150.0
-        return rows
-
-    said = [cloud_said(STAMP_NS + k * STEP_NS, point_cloud(STAMP_NS + k * STEP_NS, far(k))) for k in range(5)]
-    finding = diagnose(saved(tmp_path, said))["ranges"]
-    assert finding.severity == "note" and finding.remedy.startswith("--preprocess.max_range_m 17")
-
-
-def test_ranges_in_millimeters_are_a_problem_and_not_to_be_widened_to(call, tmp_path):
+def test_a_run_of_ranges_in_millimeters_is_refused_with_the_reason(call, tmp_path):
     path = saved(tmp_path, drive(ranges=lambda k: 1e3 * room(k)))
-    finding = diagnose(path)["ranges"]
-    assert (finding.severity, finding.remedy) == ("problem", "") and "100 % lie beyond" in finding.effect
     code, _, errors = call("run", path, "--out", tmp_path / "a", "--rerun", "off")
     assert code == 2 and "millimeters? convert them to meters" in errors and "widen" not in errors
 
 
-def test_imu_gnss_and_truth_are_named_with_what_is_made_of_them(tmp_path, capfd):
-    said = [*drive(wheels=True), odometry_said(STAMP_NS, odometry(STAMP_NS, 0.0, 0.0), "/ground_truth")]
+def test_imu_gnss_poses_and_truth_are_named_with_what_is_made_of_them_though_no_lidar_is_chosen(tmp_path, capfd):
+    said = drive(wheels=True)
+    said += [odometry_said(STAMP_NS, odometry(STAMP_NS, 0.0, 0.0), topic) for topic in ("/ground_truth", "/gps")]
     names = {"nav_msgs/msg/Path": "sensor_msgs/msg/Imu", "nav_msgs/msg/MapMetaData": "sensor_msgs/msg/NavSatFix"}
     said += [Said(topic, kind, STAMP_NS, b"0") for topic, kind in zip(("/imu/data", "/fix"), names, strict=True)]
     path = saved(tmp_path, said, rename=lambda kind: names.get(kind, kind))
-    assert main(["info", str(path)]) == 0
+    flags = ["--log.odometry_topic", "/odom"]
+    assert main(["info", str(path), *flags]) == 0
     text = capfd.readouterr().out
-    for line in (
-        "GNSS /fix: not used", "ground truth /ground_truth: evaluates the result, is not used for it",
+    lines = [
+        "GNSS /fix: not used",
+        "poses /gps: not used; --gt /gps takes them as the truth",
+        "ground truth /ground_truth: evaluates the result, is not used for it",
         "IMU /imu/data: not used",
-    ):  # fmt: skip
-        assert f"sensor    {line}\n" in text
+    ]
+    assert all(f"sensor    {line}\n" in text for line in lines)
     assert "wheels    /odom" in text and "/odom:" not in text
-    assert main(["run", str(path), "--out", str(tmp_path / "a"), "--rerun", "off"]) == 0
+    assert main(["run", str(path), "--out", str(tmp_path / "a"), "--rerun", "off", *flags]) == 0
     text = capfd.readouterr().out
     assert "note           IMU /imu/data: not used\n" in text and "note           GNSS /fix: not used\n" in text
     assert "/ground_truth: evaluates" not in text
-    assert main(["info", str(path), "--json"]) == 0
-    assert [each["sensor"] for each in json.loads(capfd.readouterr().out)["sensors"]] == [
-        "GNSS", "ground truth", "IMU",
-    ]  # fmt: skip
-
-
-def test_truth_and_wheels_are_named_though_the_lidar_is_not_chosen(tmp_path, capfd):
-    said = drive(wheels=True)
     other = [Said("/other", each.kind, each.log_ns, each.data) for each in said if each.topic == "/scan"]
-    truth = odometry_said(STAMP_NS, odometry(STAMP_NS, 0.0, 0.0), "/ground_truth")
-    path = saved(tmp_path, [*said, *other, truth, odometry_said(STAMP_NS, odometry(STAMP_NS, 0.0, 0.0), "/gps")])
-    assert main(["info", str(path)]) == 1
-    text = capfd.readouterr().out
-    assert "several lidar topics" in text
-    assert "sensor    poses /gps: not used; --gt /gps takes them as the truth\n" in text
-    assert "sensor    ground truth /ground_truth: evaluates the result, is not used for it\n" in text
+    saved(tmp_path, [*said, *other], rename=lambda kind: names.get(kind, kind))
+    assert main(["info", str(path), "--json"]) == 1
+    told = json.loads(capfd.readouterr().out)
+    assert "several lidar topics" in told["problem"]
+    assert sorted({each["sensor"] for each in told["sensors"]}) == ["GNSS", "IMU", "ground truth", "poses"]
 
 
 # The whole

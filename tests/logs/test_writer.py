@@ -5,15 +5,7 @@ import pytest
 
 from scanchain import lie
 from scanchain.errors import InputError
-from scanchain.logs.writer import (
-    Link,
-    LogWriter,
-    pack_laser_scan,
-    pack_odometry,
-    pack_transforms,
-    place,
-    schema_text,
-)
+from scanchain.logs.writer import Link, LogWriter, pack_laser_scan, pack_odometry, pack_transforms, place
 from tests.support.naive_logs import decoded
 
 STAMP_NS = 1_700_000_000_123_456_789
@@ -28,70 +20,45 @@ def nanoseconds(message):
     return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
 
 
-def columns(cloud):
-    codes = {7: "<f4", 6: "<u4", 4: "<u2"}
-    layout = {"names": [], "formats": [], "offsets": [], "itemsize": cloud.point_step}
-    for field in cloud.fields:
-        layout["names"].append(field.name)
-        layout["formats"].append(codes[field.datatype])
-        layout["offsets"].append(field.offset)
-    return np.frombuffer(cloud.data, dtype=np.dtype(layout))
-
-
-@pytest.mark.parametrize("frame", ["", "l", "la", "las", "lase", "laser"])
-def test_a_laser_scan_survives_any_length_of_frame_name(tmp_path, frame):
+def test_a_laser_scan_survives(tmp_path):
     ranges = np.array([1.5, np.inf, 29.75], dtype=np.float32)
     with LogWriter(tmp_path / "a.mcap") as log:
         data = pack_laser_scan(
-            STAMP_NS, frame, -0.5, 0.5, ranges, range_min_m=0.1, range_max_m=30.0, time_increment_s=1e-3,
+            STAMP_NS, "lidar", -0.5, 0.5, ranges, range_min_m=0.1, range_max_m=30.0, time_increment_s=1e-3,
             scan_time_s=0.1,
         )  # fmt: skip
         log.append("/scan", "sensor_msgs/msg/LaserScan", data, STAMP_NS)
     ((schema, channel, message, scan),) = decoded(tmp_path / "a.mcap")
     assert (schema.name, schema.encoding) == ("sensor_msgs/msg/LaserScan", "ros2msg")
+    assert schema.data.decode().count("MSG: std_msgs/Header\n") == 1, "a definition brings the types it uses"
     assert (channel.topic, channel.message_encoding) == ("/scan", "cdr")
-    assert message.log_time == nanoseconds(scan) == STAMP_NS
-    assert scan.header.frame_id == frame
+    assert message.log_time == nanoseconds(scan) == STAMP_NS and scan.header.frame_id == "lidar"
     assert np.array_equal(np.array(scan.ranges, dtype=np.float32), ranges)
-    assert scan.angle_min == -0.5 and scan.angle_max == 0.5 and scan.angle_increment == 0.5
-    assert scan.time_increment == pytest.approx(1e-3) and scan.scan_time == pytest.approx(0.1)
-    assert scan.range_min == pytest.approx(0.1) and scan.range_max == 30.0
+    told = scan.angle_min, scan.angle_max, scan.angle_increment, scan.time_increment, scan.scan_time
+    assert (*told, scan.range_min, scan.range_max) == pytest.approx((-0.5, 0.5, 0.5, 1e-3, 0.1, 0.1, 30.0))
 
 
-@pytest.mark.parametrize("time_field", ["t", "time"])
-def test_a_cloud_survives_with_its_times_and_rings(tmp_path, time_field):
+@pytest.mark.parametrize(("count", "time_field"), [(1000, "t"), (1000, "time"), (0, "time")])
+def test_a_cloud_survives_with_its_times_and_rings(tmp_path, count, time_field):
     rng = np.random.default_rng(3)
-    points = rng.normal(size=(1000, 3)).astype(np.float32)
-    times = np.sort(rng.uniform(0.0, 0.1, 1000)).astype(np.float32)
-    ring = rng.integers(0, 64, 1000)
+    points = rng.normal(size=(count, 3)).astype(np.float32)
+    times = np.sort(rng.uniform(0.0, 0.1, count)).astype(np.float32)
+    ring = rng.integers(0, 64, count)
+    options = {"times_s": times, "time_field": time_field, "ring": ring, "log_time_ns": STAMP_NS + 5}
     with LogWriter(tmp_path / "a.mcap") as log:
-        log.point_cloud(
-            "/points",
-            STAMP_NS,
-            "lidar",
-            points,
-            times_s=times,
-            time_field=time_field,
-            ring=ring,
-            log_time_ns=STAMP_NS + 5,
-        )
+        log.point_cloud("/points", STAMP_NS, "lidar", points, **options)
     ((_, _, message, cloud),) = decoded(tmp_path / "a.mcap")
     assert message.log_time == STAMP_NS + 5 and nanoseconds(cloud) == STAMP_NS
-    assert (cloud.height, cloud.width, cloud.is_bigendian, cloud.is_dense) == (1, 1000, False, True)
-    assert cloud.row_step == cloud.point_step * 1000 == len(cloud.data)
-    rows = columns(cloud)
+    assert (cloud.height, cloud.width, cloud.is_bigendian, cloud.is_dense) == (1, count, False, True)
+    assert cloud.row_step == cloud.point_step * count == len(cloud.data)
+    codes = {7: "<f4", 6: "<u4", 4: "<u2"}
+    names, kinds, offsets = zip(*((f.name, codes[f.datatype], f.offset) for f in cloud.fields), strict=True)
+    point = {"names": names, "formats": kinds, "offsets": offsets, "itemsize": cloud.point_step}
+    rows = np.frombuffer(cloud.data, np.dtype(point))
     assert np.array_equal(np.stack([rows["x"], rows["y"], rows["z"]], axis=1), points)
     assert np.array_equal(rows["ring"], ring)
     seconds = rows["t"] * 1e-9 if time_field == "t" else rows["time"]
-    assert np.abs(seconds - times).max() < 1e-9
-
-
-def test_a_bare_cloud_has_coordinates_only(tmp_path):
-    with LogWriter(tmp_path / "a.mcap") as log:
-        log.point_cloud("/points", STAMP_NS, "lidar", np.zeros((0, 3)))
-    ((_, _, _, cloud),) = decoded(tmp_path / "a.mcap")
-    assert [field.name for field in cloud.fields] == ["x", "y", "z"]
-    assert cloud.width == 0 and len(cloud.data) == 0
+    np.testing.assert_allclose(seconds, times, atol=1e-9)
 
 
 def test_poses_of_either_dimension_survive_as_odometry_and_static_transform(tmp_path):
@@ -118,17 +85,6 @@ def test_poses_of_either_dimension_survive_as_odometry_and_static_transform(tmp_
     assert np.array_equal(odometry.twist.covariance, np.zeros(36))
 
 
-def test_every_definition_brings_the_types_it_uses():
-    text = schema_text("nav_msgs/msg/Odometry").decode()
-    for name in (
-        "std_msgs/Header",
-        "builtin_interfaces/Time",
-        "geometry_msgs/Quaternion",
-        "geometry_msgs/Vector3",
-    ):
-        assert text.count(f"MSG: {name}\n") == 1
-
-
 def test_a_failure_leaves_no_file_that_looks_complete(tmp_path):
     with pytest.raises(ZeroDivisionError), LogWriter(tmp_path / "a.mcap") as log:
         append_mounting(log, np.eye(4))
@@ -147,8 +103,3 @@ def test_an_existing_file_is_replaced_only_on_demand_and_a_directory_never(tmp_p
     with LogWriter(path, force=True) as log:
         append_mounting(log, np.eye(4))
     assert len(list(decoded(path))) == 1
-
-
-def test_a_point_before_the_stamp_does_not_fit_an_unsigned_time(tmp_path):
-    with pytest.raises(InputError, match="time_field='time'"), LogWriter(tmp_path / "a.mcap") as log:
-        log.point_cloud("/points", STAMP_NS, "lidar", np.zeros((2, 3)), times_s=np.array([-0.05, 0.0]))

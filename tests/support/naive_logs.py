@@ -158,7 +158,7 @@ def transforms_said(log_ns, data, topic="/tf_static"):
 
 def write(
     path, messages, *, chunked=True, compression="zstd", summary=True, chunk_size=2000, crcs=True,
-    ros=ROS, encoding="ros2msg", rename=lambda kind: kind, message_encoding="cdr", announced=(), **options,
+    encoding="", rename=str, message_encoding="", announced=(), ros=ROS, **options,
 ):  # fmt: skip
     """Write messages in the given order; ``announced`` are topics registered without any message."""
     if not summary:
@@ -177,8 +177,10 @@ def write(
         channels = {}
         for said in (*announced, *messages):
             if said.topic not in channels:
-                schema = writer.register_schema(rename(said.kind), encoding, ros.definition(said.kind))
-                channels[said.topic] = writer.register_channel(said.topic, message_encoding, schema)
+                language, definition = encoding or ros.language, ros.definition(said.kind)
+                schema = writer.register_schema(rename(said.kind), language, definition)
+                form = message_encoding or ros.encoding
+                channels[said.topic] = writer.register_channel(said.topic, form, schema)
             if said.data:
                 writer.add_message(channels[said.topic], said.log_ns, said.data, said.log_ns)
         writer.finish()

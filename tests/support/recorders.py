@@ -15,7 +15,7 @@ from rosbags.typesys import get_types_from_msg
 from scanchain.config import LogConfig
 from scanchain.logs import open_log
 from tests.support import naive_logs
-from tests.support.naive_logs import ROS1, ROS2, SECOND, STAMP_NS
+from tests.support.naive_logs import ROS1, ROS2, SECOND, STAMP_NS, Said
 
 FIRST_RAD, STEP_RAD = np.float32(-1.0), np.float32(0.03125)  # exact in binary, so that other formats can tell them
 RANGE_MIN_M, RANGE_MAX_M = np.float32(0.25), np.float32(30.0)
@@ -157,10 +157,9 @@ class Ros(naive_logs.Ros):
 
 def mcap_of(path, ros, told):
     """Messages of ROS in an MCAP that the mcap package writes."""
-    said = [naive_logs.Said(*head, ros.serialize(message, head[1])) for *head, message in told]
+    said = [Said(topic, kind, time_ns, ros.serialize(message, kind)) for topic, kind, time_ns, message in told]
     rename = (lambda kind: kind.replace("/msg/", "/")) if ros.is_ros1 else str
-    encodings = {"encoding": ros.language, "message_encoding": ros.encoding, "rename": rename}
-    return naive_logs.write(path, said, ros=ros, **encodings)
+    return naive_logs.write(path, said, ros=ros, rename=rename, chunk_size=1 << 20)
 
 
 def bag1_of(path, told, compression=None, *, chunk_bytes=None):

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 class Site:
     """Files to serve by their path.
 
-    has_ranges : whether it honors Range; etag : what it calls their version; tells_length : of its answers
+    has_ranges : whether it honors Range; etag : what it calls their version
     failures : statuses of the next GET answers, 0 for one that breaks off in the middle
     cuts : numbers of bytes after which the next answers break off
     asked : the ranges asked for, None for the whole; sent : bytes of bodies
@@ -17,7 +17,7 @@ class Site:
 
     def __init__(self, files):
         self.files = files
-        self.has_ranges, self.etag, self.tells_length = True, '"one"', True
+        self.has_ranges, self.etag = True, '"one"'
         self.failures, self.cuts, self.asked = [], [], []
         self.sent = 0
         self.lock = threading.Lock()
@@ -32,8 +32,7 @@ class Site:
             return handler.send_error(failure)
         wanted = re.fullmatch(r"bytes=(\d+)-(\d*)", handler.headers.get("Range") or "")
         begin, end = 0, len(body)
-        is_same = handler.headers.get("If-Range") in (None, self.etag)
-        if wanted and self.has_ranges and is_same:
+        if wanted and self.has_ranges:
             begin, end = int(wanted[1]), min(int(wanted[2] or end) + 1, end)
             if begin >= len(body):
                 return handler.send_error(416)
@@ -41,10 +40,8 @@ class Site:
             handler.send_header("Content-Range", f"bytes {begin}-{end - 1}/{len(body)}")
         else:
             handler.send_response(200)
-        if self.etag:
-            handler.send_header("ETag", self.etag)
-        if self.tells_length:
-            handler.send_header("Content-Length", str(end - begin))
+        handler.send_header("ETag", self.etag)
+        handler.send_header("Content-Length", str(end - begin))
         handler.end_headers()
         if is_head:
             return None

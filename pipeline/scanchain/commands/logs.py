@@ -17,7 +17,6 @@ from scanchain.settings import Override, load_settings
 if TYPE_CHECKING:
     from scanchain.config import Config
     from scanchain.logs.doctor import Diagnosis
-    from scanchain.logs.info import LogInfo
 
 _KEYS = tuple(f"log.{name}" for name in ("format", "rate_hz", "topic", "start_s", "end_s", "every"))  # of convert
 
@@ -42,41 +41,41 @@ def info(logs: tuple[Source, ...], as_json: bool, overrides: tuple[Override, ...
 
     found = describe(logs, load_settings(overrides=overrides).config.log)
     click.echo(options.json_text(found) if as_json else _info_text(found))
-    return int(bool(found.problem))
+    return int(bool(found["problem"]))
 
 
-def _info_text(log: LogInfo) -> str:
-    start = datetime.fromtimestamp(log.start_ns * 1e-9, UTC).isoformat(sep=" ", timespec="milliseconds")
+def _info_text(log: dict[str, Any]) -> str:
+    start = datetime.fromtimestamp(log["start_ns"] * 1e-9, UTC).isoformat(sep=" ", timespec="milliseconds")
     lines = [
-        f"files     {', '.join(log.files)} ({log.size_bytes / 1e6:.1f} MB)",
-        f"time      {log.duration_s:.1f} s from {start}",
+        f"files     {', '.join(log['files'])} ({log['size_bytes'] / 1e6:.1f} MB)",
+        f"time      {log['duration_s']:.1f} s from {start}",
     ]
-    width = max((len(topic.topic) for topic in log.topics), default=0)
-    for topic in log.topics:
-        messages = f"{topic.messages:>8,} {'message ' if topic.messages == 1 else 'messages'}"
-        name = f"{topic.topic:<{width}}  {topic.type_name or 'no schema':<28}"
-        lines.append(f"topic     {name}  {messages}  {topic.rate_hz:7.1f} Hz  {topic.encoding}")
-    if log.lidar:
+    width = max((len(topic["topic"]) for topic in log["topics"]), default=0)
+    for topic in log["topics"]:
+        messages = f"{topic['messages']:>8,} {'message ' if topic['messages'] == 1 else 'messages'}"
+        name = f"{topic['topic']:<{width}}  {topic['type_name'] or 'no schema':<28}"
+        lines.append(f"topic     {name}  {messages}  {topic['rate_hz']:7.1f} Hz  {topic['encoding']}")
+    if log["lidar"]:
         import numpy as np
 
         from scanchain.logs.mounting import turned_by
 
-        T_base_lidar = np.array(log.T_base_lidar)
+        T_base_lidar = np.array(log["T_base_lidar"])
         place = ", ".join(f"{axis} {at_m:.3f} m" for axis, at_m in zip("xyz", T_base_lidar[:-1, -1], strict=False))
         turned = turned_by(T_base_lidar)
         lines += [
-            f"lidar     {log.lidar}: {log.dimension}D, {counted(log.scans, 'scan')}",
-            f"mounting  at {place} on {log.base_frame or 'the base'}{turned and f', turned by {turned}'}"
-            + (f" at first; {log.mount_motion}" if log.mount_motion else ""),
+            f"lidar     {log['lidar']}: {log['dimension']}D, {counted(log['scans'], 'scan')}",
+            f"mounting  at {place} on {log['base_frame'] or 'the base'}{turned and f', turned by {turned}'}"
+            + (f" at first; {log['mount_motion']}" if log["mount_motion"] else ""),
         ]
-    if log.lidar or log.odometry:
-        lines.append(f"wheels    {log.odometry or 'none: the motion is predicted from the scans alone'}")
-    if log.point_times:
-        lines.append(f"times     {log.point_times.removeprefix('point times: ')}")
-    lines += [f"sensor    {each.sensor} {each.topic}: {each.use}" for each in log.sensors]
-    lines += [f"note      {note}" for note in log.notes]
-    lines += [f"damage    {line}" for line in log.damage]
-    return "\n".join([*lines, *([f"problem   {log.problem}"] if log.problem else [])])
+    if log["lidar"] or log["odometry"]:
+        lines.append(f"wheels    {log['odometry'] or 'none: the motion is predicted from the scans alone'}")
+    if log["point_times"]:
+        lines.append(f"times     {log['point_times'].removeprefix('point times: ')}")
+    lines += [f"sensor    {each.sensor} {each.topic}: {each.use}" for each in log["sensors"]]
+    lines += [f"note      {note}" for note in log["notes"]]
+    lines += [f"damage    {line}" for line in log["damage"]]
+    return "\n".join([*lines, *([f"problem   {log['problem']}"] if log["problem"] else [])])
 
 
 @click.command(cls=OverrideCommand)

@@ -14,7 +14,6 @@ from scanchain.kernels.geometry import largest_magnitude
 from scanchain.logs.mcap.stream import Decoded
 from scanchain.logs.messages.returns import Returns
 
-_FARTHEST_M = 1000.0  # range beyond which a typical one is in another unit than meters
 _MOST_REPEATED = 0.5  # share of repeated stamps above which it is a warning
 _SPANS = 100  # number of first scans whose point times are compared with the period
 _SHORTEST_PART, _LONGEST_PART = 0.005, 2.0  # shares of the period outside which point times are of another unit
@@ -66,14 +65,9 @@ def _none_retained(points: RawPoints, config: PreprocessConfig) -> str:
     near_m, far_m = np.sqrt([squares.min(), squares.max()])
     limits = f"preprocess.min_range_m ({low_m:g}) and preprocess.max_range_m ({high_m:g})"
     seen = f"its {counted(len(points), 'point')} lie at {near_m:.3g} to {far_m:.3g} m"
-    in_millimeters = near_m > high_m and are_millimeters(float(np.median(np.sqrt(squares))), config)
+    in_millimeters = low_m <= 1e-3 * near_m <= high_m < near_m
     remedy = "millimeters? convert them to meters" if in_millimeters else "widen these limits"
     return f"no point between {limits} ({seen}: {remedy})"
-
-
-def are_millimeters(range_m: float, config: PreprocessConfig) -> bool:
-    """True if a typical range is one that no lidar has in meters, and within the limits in millimeters."""
-    return range_m > _FARTHEST_M and config.min_range_m <= 1e-3 * range_m <= config.max_range_m
 
 
 class ScanCounts:
@@ -118,21 +112,21 @@ class ScanCounts:
     def _share(self, count: int) -> str:
         return f"{count} of {counted(self.scans, 'scan')} of {self.topic}"
 
-    @property
-    def _has_no_stamps(self) -> bool:
-        return self.repeated > _MOST_REPEATED * self.scans
-
     def losses(self) -> list[str]:
-        """Lines on scans left out, stamps that most scans do not have, and odd point times; none as a rule."""
+        """Warnings of scans left out or copied, stamps that most scans do not have, and odd point times."""
         lines = []
         if self.bad:
             were = "was" if self.bad == 1 else "were"
             lines.append(f"{self._share(self.bad)} {were} left out (the first: {self.first_complaint})")
-        if self._has_no_stamps and self.last_stamp_ns is not None:
+        if self.repeated > _MOST_REPEATED * self.scans:
             lines.append(
-                f"{self._share(self.repeated)} have the header stamp of the one before (the last "
-                f"{1e-9 * self.last_stamp_ns:.3f} s): the times in the results do not tell scans apart; record "
-                "with stamps"
+                f"{self._share(self.repeated)} have the header stamp of the one before: the times in the results "
+                "do not tell scans apart; record with stamps"
+            )
+        if self.copies > max(MOST_COPIES, _COPIES_SHARE * self.scans):
+            lines.append(
+                f"{self._share(self.copies)} are the one before once more, to the last bit: where the driver was "
+                "stuck, the poses stand still though the lidar may have moved (scanchain doctor)"
             )
         span_s = float(np.median(self.spans_s)) if self.spans_s else 0.0
         period_s = 1e-9 * float(np.median(np.diff(self.log_times_ns))) if len(self.log_times_ns) > 1 else 0.0
@@ -144,33 +138,21 @@ class ScanCounts:
             )
         return lines
 
-    def copied(self) -> list[str]:
-        """A line where more than a few scans are copies."""
-        if self.copies <= max(MOST_COPIES, _COPIES_SHARE * self.scans):
-            return []
-        return [
-            f"{self._share(self.copies)} are the one before once more, to the last bit: where the driver was "
-            "stuck, the poses stand still though the lidar may have moved (scanchain doctor)"
-        ]
-
     def notes(self) -> list[str]:
         """Lines on a few copies, stamps out of order and missing wheel odometry."""
         lines = []
-        if self.copies and not self.copied():
+        if 0 < self.copies <= max(MOST_COPIES, _COPIES_SHARE * self.scans):
             lines.append(
-                f"{self._share(self.copies)} logged twice, to the last bit: such a copy has the pose of the "
-                "first, and no other use"
+                f"{self._share(self.copies)} logged twice, to the last bit: a copy has the first one's pose"
             )
         if self.backwards:
             steps = counted(self.backwards, "step")
             lines.append(f"{steps} back in the header stamps of {self.topic}; the log's order is kept")
-        if self.repeated and not self._has_no_stamps:
-            lines.append(
-                f"{counted(self.repeated, 'scan')} of {self.topic} with the header stamp of the one before"
-            )
+        if 0 < self.repeated <= _MOST_REPEATED * self.scans:
+            lines.append(f"{self._share(self.repeated)} with the header stamp of the one before")
         if self.odometry_topic and self.without_wheels:
             lines.append(
-                f"{self.without_wheels} of {counted(self.scans, 'scan')} without a reading of "
-                f"{self.odometry_topic} near the stamp; their motion is predicted from the scans"
+                f"{self._share(self.without_wheels)} without a reading of {self.odometry_topic} near the stamp; "
+                "their motion is predicted from the scans"
             )
         return lines

@@ -59,7 +59,8 @@ def convert(
     indexes = index_files(sources, config)
     is_folder = isinstance(sources[0], Path) and sources[0].is_dir()
     is_part = (config.topic, config.start_s, config.end_s, config.every) != _WHOLE
-    if len(indexes) == 1 and indexes[0].make is None and not is_folder and not is_part and config.format == AUTO:
+    is_mcap = indexes[0].make is None and indexes[0].path.name.endswith(".mcap") and config.format == AUTO
+    if len(indexes) == 1 and is_mcap and not is_folder and not is_part:
         raise InputError(f"{sources[0]}: is MCAP already; --start, --end, --every or --topic cut it")
     total = sum(sum(index.counts.values()) for index in indexes)
     counts = dict.fromkeys(_chosen(indexes, config.topic), 0)

@@ -18,7 +18,7 @@ from scanchain.config import Config, LogConfig, PreprocessConfig
 from scanchain.data import MOST_COPIES, RawPoints, Scan
 from scanchain.errors import counted
 from scanchain.files import Source
-from scanchain.logs.bad_scans import are_millimeters, most_bad_scans
+from scanchain.logs.bad_scans import most_bad_scans
 from scanchain.logs.log import Log, open_log
 from scanchain.logs.mcap.stream import whole_span
 from scanchain.logs.messages.readers import is_scan
@@ -101,28 +101,17 @@ def examine(
 
 
 class Facts(NamedTuple):
-    """Statistics of the returns of one scan.
+    """Statistics of the returns of one scan."""
 
-    Attributes
-    ----------
-    kept, dropped : number of valid returns, and of the others
-    farthest_m, at_farthest : the largest range and the number of returns with just that one
-    ranges_m : (101,) percentiles of the ranges
-    time_span_s : of the per-point times, NaN where there are none
-    turn : 1 if the points, in their order, go around once counter-clockwise, −1 if clockwise, else 0
-    start_rad : azimuth of the first point
-    is_copy : the points are those of the scan before, to the last bit
-    """
-
-    kept: int
-    dropped: int
+    kept: int  # number of valid returns
+    dropped: int  # and of the others
     farthest_m: float
-    at_farthest: int
-    ranges_m: NDArray[np.float32]
-    time_span_s: float
-    turn: int
-    start_rad: float
-    is_copy: bool
+    at_farthest: int  # number of returns with just that range
+    ranges_m: NDArray[np.float32]  # (101,) percentiles
+    time_span_s: float  # of the per-point times, NaN where there are none
+    turn: int  # 1 if the points, in their order, go around once counter-clockwise, −1 if clockwise, else 0
+    start_rad: float  # azimuth of the first point
+    is_copy: bool  # the points are those of the scan before, to the last bit
 
 
 class Survey:
@@ -141,16 +130,15 @@ class Survey:
         self.stamps_ns.append(scan.stamp_ns)
         if scan.T_odom_base is not None:
             self.wheels.append((scan.stamp_ns, scan.T_odom_base[:-1, -1]))
-        points = scan.points
-        ranges_m = np.sort(np.sqrt(np.sum(np.square(points), axis=1)))
-        turn, start_rad = _turning(points)
+        ranges_m = np.sort(np.linalg.norm(scan.points, axis=1))
+        turn, start_rad = _turning(scan.points)
         self.scans.append(
             Facts(
-                kept=len(points),
+                kept=len(ranges_m),
                 dropped=scan.dropped,
                 farthest_m=round(float(ranges_m[-1]), 4),
                 at_farthest=int(np.count_nonzero(ranges_m > ranges_m[-1] - _SAME_M)),
-                ranges_m=ranges_m[np.linspace(0, len(points) - 1, 101).astype(int)],
+                ranges_m=ranges_m[np.linspace(0, len(ranges_m) - 1, 101).astype(int)],
                 time_span_s=float(np.ptp(scan.times_s)) if len(scan.times_s) else math.nan,
                 turn=turn,
                 start_rad=start_rad,
@@ -207,20 +195,17 @@ def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:
     if not len(gaps):
         return Finding("gaps", Severity.OK, f"none longer than {_GAP_PERIODS:g} periods")
     longest = int(gaps[np.argmax(steps_s[gaps])])
-    at_s = seen.into_log_s(longest)
-    found = (
-        f"{len(gaps):,} longer than {_GAP_PERIODS:g} periods, the longest {steps_s[longest]:.3g} s, "
-        f"{at_s:.1f} s into the log"
+    longest_s, at_s = steps_s[longest], seen.into_log_s(longest)
+    found = f"{len(gaps):,} longer than {_GAP_PERIODS:g} periods, the longest {longest_s:.3g} s, "
+    found += f"{at_s:.1f} s into the log"
+    effect = f"the motion over a gap is predicted {'by the wheels' if is_on_wheels else 'at constant velocity'}"
+    if longest_s < (_LONG_GAP_ON_WHEELS_S if is_on_wheels else _LONG_GAP_S):
+        return Finding("gaps", Severity.NOTE, found, effect)
+    effect += (
+        "; after a long one the match may settle elsewhere: run what comes before it, as below, and the rest, "
+        f"--start {math.floor(10.0 * (at_s + longest_s)) / 10.0:g}, apart"
     )
-    predicted = f"the motion over a gap is predicted {'by the wheels' if is_on_wheels else 'at constant velocity'}"
-    if steps_s[longest] < (_LONG_GAP_ON_WHEELS_S if is_on_wheels else _LONG_GAP_S):
-        return Finding("gaps", Severity.NOTE, found, predicted)
-    until_s, again_s = math.ceil(10.0 * at_s) / 10.0, math.floor(10.0 * (at_s + steps_s[longest])) / 10.0
-    effect = (
-        f"{predicted}; after a long one the match may settle elsewhere: run what comes before it, as below, and "
-        f"the rest, --start {again_s:g}, apart"
-    )
-    return Finding("gaps", Severity.WARNING, found, effect, f"--end {until_s:g}")
+    return Finding("gaps", Severity.WARNING, found, effect, f"--end {math.ceil(10.0 * at_s) / 10.0:g}")
 
 
 def _wheels(seen: Survey) -> Finding:
@@ -363,7 +348,7 @@ def _ranges(seen: Survey, preprocess: PreprocessConfig) -> Finding:
     if far_m > high_m:
         unused = float(np.mean(ranges_m > high_m))
         effect = f"{100 * unused:.3g} % lie beyond {high_m:g} m and are not used"
-        if are_millimeters(float(np.median(ranges_m)), preprocess):
+        if low_m <= 1e-3 * float(np.median(ranges_m)) <= high_m < near_m:
             return Finding("ranges", Severity.PROBLEM, found, f"{effect}: millimeters? convert them to meters")
         remedy = f"--preprocess.max_range_m {np.ceil(far_m):g}" if unused > _MANY_UNUSED else ""
         return Finding("ranges", Severity.NOTE, found, effect, remedy)

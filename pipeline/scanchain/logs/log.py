@@ -86,7 +86,6 @@ class Log:
     scans_with_wheels : how many scans had a reading of the wheels near, of those that passed so far
     notes : what was chosen or assumed
     bad_scans : how many scans were left out, once ``scans`` is through or closed
-    copies : a warning where scans that passed so far are copies of those before
     """
 
     def __init__(self, indexes: Sequence[FileIndex], config: LogConfig) -> None:
@@ -97,13 +96,8 @@ class Log:
         self.notes: list[str] = [line for index in indexes for line in index.notes]
         check_one_log(indexes, files_with_scans(indexes), config)
         lidar = find_lidar(indexes, config.topic)
-        wheels = find_odometry(
-            indexes,
-            config.odometry_topic,
-            (config.ground_truth_topic, _DEFAULTS.ground_truth_topic),
-            self.notes,
-        )
-        truth = find_ground_truth(indexes, config.ground_truth_topic, _DEFAULTS.ground_truth_topic)
+        wheels = find_odometry(indexes, config, self.notes)
+        truth = find_ground_truth(indexes, config.ground_truth_topic)
         self.topic = lidar.topic
         self.odometry_topic = "" if wheels is None else wheels.topic
         self.ground_truth_topic = "" if truth is None else truth.topic
@@ -112,13 +106,14 @@ class Log:
         self.plane_height_m: float | None = None
         if not is_scan(lidar):
             self.plane_height_m = self._plane_height_m()
-        self.dimension = 3 if self.plane_height_m is None and not is_scan(lidar) else 2
+        self.dimension = 2 if is_scan(lidar) or self.plane_height_m is not None else 3
         whole = whole_span(indexes)
         self.duration_s = whole.duration_s
         self.span = chosen_span(whole, config)
         self.scan_count = count_scans(indexes, self.topic, whole, config)
         self.mounting = find_mounting(indexes, lidar, wheels, self.span)
-        self.notes += [*notes_on(indexes, config), *self._mounting_notes()]
+        self.gaps = gap_notes(indexes, config)  # those of the notes that are of long gaps
+        self.notes += [*notes_on(indexes, config), *self.mounting.notes(self.odometry_topic, self.dimension)]
         if self.mounting.motion is not None:
             wheels, self.odometry_topic = None, ""
         T_base_lidar = self.mounting.T_base_lidar
@@ -132,7 +127,6 @@ class Log:
         }
         self.scans_with_wheels = 0
         self.bad_scans = 0
-        self.copies: list[str] = []
         self._opening_notes = tuple(self.notes)
         self._truth: Trajectory | None = None
 
@@ -149,16 +143,6 @@ class Log:
     def damage(self) -> list[str]:
         """Damage that was met; complete once ``scans`` is through or closed."""
         return grouped(self._damage)
-
-    @property
-    def gaps(self) -> list[str]:
-        """Those of the notes that are of long gaps."""
-        return gap_notes(self.indexes, self.config)
-
-    @property
-    def has_odometry(self) -> bool:
-        """True if scans carry the wheels' pose."""
-        return self.odometry_topic != ""
 
     def scans(self, preprocess: PreprocessConfig | None = None) -> Generator[Scan, None, None]:
         """Scans in the order of log time, each with the wheels' pose at its stamp.
@@ -209,25 +193,13 @@ class Log:
         finally:  # also where the caller wants no more scans
             is_damaged = bool(self._damage)
             self._damage += [*counts.losses(), *poses.complaints()]
-            self.copies, self.bad_scans = counts.copied(), counts.bad
+            self.bad_scans = counts.bad
             self.notes += [*([] if is_scan(self.lidar) else [times.assumed]), *counts.notes()]
         if not index:
             raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
         if is_damaged:
             scans = counted(count - counts.bad, "scan")
             self._damage.append(f"{scans} of {self.topic} {'was' if scans == '1 scan' else 'were'} recovered")
-
-    def _mounting_notes(self) -> list[str]:
-        """Assumptions about the mounting."""
-        mounting = self.mounting
-        notes = [mounting.note] if mounting.note else []
-        if mounting.motion is not None:
-            wheels = f"; the wheels ({self.odometry_topic}) are no prior for it" if self.has_odometry else ""
-            notes.append(
-                f"the lidar moves on the robot ({mounting.motion}): poses are the lidar's, this motion "
-                f"included{wheels}"
-            )
-        return [*notes, *(mounting.out_of_plane if self.dimension == 2 else [])]
 
     def assumed_point_times(self) -> str:
         """Assumption of a run about per-point times, by the first scan that has returns; empty for laser scans."""

@@ -21,7 +21,6 @@ _WORLD_WORDS = {"map", "odom", "world", "earth", "global", "origin", "init"}  # 
 _TURN_RAD, _SHIFT_M = np.radians(0.2), 0.005  # least turn and shift of a mount that moves
 _TILTED_RAD = np.radians(10.0)  # tilt of a planar lidar's plane from which on it is no floor plan
 _TURNED_DEG = 0.5  # least turn of a lidar on its robot that is worth a word
-_MOUNT_M = 1.0  # largest motion of a sensor on a robot; a frame that moves by more is no part of it
 
 Edge = tuple[str, str]  # parent and child
 
@@ -31,7 +30,7 @@ class Mounting(NamedTuple):
 
     Attributes
     ----------
-    base, lidar : the frames; the base's is empty where the log does not state it
+    base : its frame, empty where the log does not state it
     T_base_lidar : (4, 4), the first one seen where it moves; the identity where the log does not state it
     source : of the pose, as text
     motion : the joint that moves the lidar and how far, as text; None where it stays where it is
@@ -39,7 +38,6 @@ class Mounting(NamedTuple):
     """
 
     base: str
-    lidar: str
     T_base_lidar: Pose
     source: str = "by static transforms"
     motion: str | None = None
@@ -50,18 +48,23 @@ class Mounting(NamedTuple):
         """Name of the base in print: its frame where that is another than usual."""
         return "the base" if not self.base or self.base in _BASE_FRAMES else self.base
 
-    @property
-    def out_of_plane(self) -> list[str]:
-        """Notes on a planar lidar whose plane is not that of the base as seen from above."""
-        tilted_rad = float(np.arccos(np.clip(abs(self.T_base_lidar[2, 2]), 0.0, 1.0)))
-        if tilted_rad > _TILTED_RAD:
-            return [
+    def notes(self, wheels: str, dimension: int) -> list[str]:
+        """Assumptions about a lidar of this dimension, and of wheels with this topic."""
+        notes = [self.note] if self.note else []
+        if self.motion is not None:
+            prior = f"; the wheels ({wheels}) are no prior for it" if wheels else ""
+            notes.append(
+                f"the lidar moves on the robot ({self.motion}): poses are the lidar's, this motion included{prior}"
+            )
+        tilted_rad = np.arccos(np.clip(abs(self.T_base_lidar[2, 2]), 0.0, 1.0))
+        if dimension == 2 and tilted_rad > _TILTED_RAD:
+            notes.append(
                 f"the plane of the scans is tilted by {np.degrees(tilted_rad):.0f} deg on {self.base_name} "
                 f"{self.source}: a floor plan takes a level one; correct the transforms, or choose another --topic"
-            ]
-        if is_upside_down(self.T_base_lidar):
-            return [f"the lidar hangs upside down {self.source}: its scans are mirrored"]
-        return []
+            )
+        elif dimension == 2 and is_upside_down(self.T_base_lidar):
+            notes.append(f"the lidar hangs upside down {self.source}: its scans are mirrored")
+        return notes
 
 
 class MovingFrame(NamedTuple):
@@ -82,46 +85,43 @@ def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel 
     for base in bases:
         T_base_lidar = chain(fixed, base, frame)
         if T_base_lidar is not None:
-            return Mounting(base, frame, T_base_lidar)
-    moving: dict[Edge, list[StampedPose]] = {}
+            return Mounting(base, T_base_lidar)
+    joints: dict[Edge, list[StampedPose]] = {}
     for each in _transforms(indexes, is_fixed=False, span=span):
-        moving.setdefault(_edge(each), []).append(each)
-    worlds = {"" if stated is None else stated.parent.lstrip("/")}
-    frames = {name for edge in (*moving, *map(_edge, fixed)) for name in edge}
-    worlds |= {name for name in frames if _WORLD_WORDS & set(re.split(r"[/_]", name.lower()))}
-    moving = {joint: poses for joint, poses in moving.items() if not worlds & set(joint)}
-    tree = [*fixed, *(poses[0] for poses in moving.values())]
-    base = next((base for base in bases if chain(tree, base, frame) is not None), "")
-    root = base or _top(fixed, moving, frame, worlds)
-    if root == frame:
-        why = f"no static transform from {bases[0]} to {frame or 'the lidar'}"
-        note = "" if not fixed and wheels is None else f"{why}: the lidar is taken to sit at the robot's origin"
-        return Mounting("", frame, np.eye(4), note=note)
-    note = "" if base else f"the log has no transform from {bases[0]} to {frame}: {root} is taken as the base"
-    return _on_joints(Mounting(root, frame, np.eye(4), note=note), fixed, moving)
+        if not _is_world(each.parent):
+            joints.setdefault(_edge(each), []).append(each)
+    first = [*fixed, *(poses[0] for poses in joints.values())]
+    for base in bases:
+        T_base_lidar = chain(first, base, frame)
+        if T_base_lidar is not None:
+            motion = _motion(joints, first, base, frame)
+            source = "by transforms of /tf" + (" that change" if motion else ", which do not change")
+            return Mounting(base, T_base_lidar, source, motion)
+    root = _root({child: parent for parent, child in map(_edge, fixed) if not _is_world(parent)}, frame)
+    T_root_lidar = chain(fixed, root, frame)
+    if root != frame and T_root_lidar is not None:
+        note = f"the log has no transform from {bases[0]} to {frame}: {root} is taken as the base"
+        return Mounting(root, T_root_lidar, note=note)
+    why = f"no static transform from {bases[0]} to {frame or 'the lidar'}"
+    note = "" if not fixed and wheels is None else f"{why}: the lidar is taken to sit at the robot's origin"
+    return Mounting("", np.eye(4), note=note)
 
 
-def _on_joints(
-    mounting: Mounting, fixed: Sequence[StampedPose], moving: dict[Edge, list[StampedPose]]
-) -> Mounting:
-    """A mounting with the first pose that its transforms show, and the largest motion of one of them."""
-    base, frame = mounting.base, mounting.lidar
-    first = {joint: poses[0] for joint, poses in moving.items()}
-    T_first = chain([*fixed, *first.values()], base, frame)
-    assert T_first is not None
-    motion, most_rad, source = None, -1.0, mounting.source
-    for joint, poses in moving.items():
-        others = [*fixed, *(pose for other, pose in first.items() if other != joint)]
-        if chain(others, base, frame) is not None:  # the lidar does not hang on it
-            continue
-        seen = [T for pose in poses if (T := chain([*others, pose], base, frame)) is not None]
-        shift_m, turn_rad = np.max([lie.apart(T_first, T) for T in seen], axis=0)
+def _motion(
+    joints: dict[Edge, list[StampedPose]], first: Sequence[StampedPose], base: str, frame: str
+) -> str | None:
+    """The joint between base and lidar that turns most, and how far, as text; None where none moves."""
+    motion, most_rad = None, -1.0
+    for joint, poses in joints.items():
+        if chain([each for each in first if _edge(each) != joint], base, frame) is not None:
+            continue  # the lidar does not hang on it
+        moved = [lie.apart(poses[0].T_parent_child, pose.T_parent_child) for pose in poses]
+        shift_m, turn_rad = np.max(moved, axis=0)
         if (turn_rad > _TURN_RAD or shift_m > _SHIFT_M) and turn_rad > most_rad:
             most_rad = turn_rad
             shift = f" and shifts by {shift_m:.2f} m" if shift_m > _SHIFT_M else ""
             motion = f"{joint[0]} → {joint[1]} in /tf turns by up to {np.degrees(turn_rad):.0f} deg{shift}"
-        source = "by transforms of /tf" + (" that change" if motion else ", which do not change")
-    return mounting._replace(T_base_lidar=T_first, source=source, motion=motion)
+    return motion
 
 
 def moving_frame(
@@ -141,15 +141,6 @@ def moving_frame(
     return MovingFrame(root, lie.inverse(in_plane(T_root_lidar) if dimension == 2 else T_root_lidar))
 
 
-def _top(fixed: Sequence[StampedPose], moving: dict[Edge, list[StampedPose]], frame: str, worlds: set[str]) -> str:
-    """The topmost frame above the lidar that is a part of the robot."""
-    parents = {child: parent for parent, child in map(_edge, fixed)}
-    for (parent, child), poses in moving.items():
-        if np.ptp([pose.T_parent_child[:3, 3] for pose in poses], axis=0).max() < _MOUNT_M:
-            parents.setdefault(child, parent)
-    return _root({child: parent for child, parent in parents.items() if parent not in worlds}, frame)
-
-
 def _root(parents: dict[str, str], frame: str) -> str:
     """The topmost frame above one, by the parent of each; the frame itself where it has none."""
     seen: set[str] = set()
@@ -157,6 +148,10 @@ def _root(parents: dict[str, str], frame: str) -> str:
         seen.add(frame)
         frame = parents[frame]
     return frame
+
+
+def _is_world(frame: str) -> bool:
+    return not _WORLD_WORDS.isdisjoint(re.split(r"[/_]", frame.lower()))
 
 
 def _edge(transform: StampedPose) -> Edge:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from scanchain.config import NO_TRUTH
+from scanchain.config import NO_TRUTH, LogConfig
 from scanchain.errors import InputError
 from scanchain.logs.mcap.records import Channel, FileIndex, damage_of, name_of
 from scanchain.logs.messages.readers import LIDAR_TYPES, has_poses, is_lidar, is_odometry, kind
 
 _MOST_LISTED = 8
+_USUAL_TRUTH = LogConfig().ground_truth_topic
 _IMU = ("sensor_msgs/Imu",)
 _GNSS = (
     "sensor_msgs/NavSatFix", "gps_common/GPSFix", "gps_msgs/GPSFix", "nmea_msgs/Sentence", "foxglove.LocationFix"
@@ -32,8 +33,9 @@ def find_lidar(indexes: Sequence[FileIndex], wanted: str) -> Channel:
     channels = topics_of(indexes)
     name = name_of(indexes)
     lidars = [channel for channel in channels.values() if is_lidar(channel)]
-    if wanted and wanted in channels and channels[wanted] in lidars:
-        return channels[wanted]
+    found = [channel for channel in lidars if wanted in ("", channel.topic)]
+    if len(found) == 1:
+        return found[0]
     if not lidars:
         absent = f"topic {wanted}, nor any other" if wanted and wanted not in channels else "lidar topic"
         raise InputError(
@@ -41,25 +43,18 @@ def find_lidar(indexes: Sequence[FileIndex], wanted: str) -> Channel:
             f"it holds: {_listed(channels.values())}{damage_of(indexes)}"
         )
     if wanted:
-        why = (
-            f"topic {_listed([channels[wanted]])} is no lidar's"
-            if wanted in channels
-            else f"has no topic {wanted}"
-        )
+        is_other = f"topic {_listed([channels[wanted]])} is no lidar's" if wanted in channels else ""
+        why = is_other or f"has no topic {wanted}"
         raise InputError(f"{name}: {why}; choose --topic from: {_listed(lidars)}")
-    if len(lidars) > 1:
-        raise InputError(f"{name}: has several lidar topics; choose one with --topic: {_listed(lidars, indexes)}")
-    return lidars[0]
+    raise InputError(f"{name}: has several lidar topics; choose one with --topic: {_listed(lidars, indexes)}")
 
 
-def find_odometry(
-    indexes: Sequence[FileIndex], wanted: str, no_wheels: Container[str], notes: list[str]
-) -> Channel | None:
+def find_odometry(indexes: Sequence[FileIndex], config: LogConfig, notes: list[str]) -> Channel | None:
     """The wheel odometry's channel: the configured topic, else the only one apart from those of true poses."""
-    if wanted:
-        return _chosen(indexes, wanted, "log.odometry_topic")
-    channels = topics_of(indexes).values()
-    found = [channel for channel in channels if is_odometry(channel) and channel.topic not in no_wheels]
+    if config.odometry_topic:
+        return _chosen(indexes, config.odometry_topic, "log.odometry_topic")
+    truths = config.ground_truth_topic, _USUAL_TRUTH
+    found = [each for each in topics_of(indexes).values() if is_odometry(each) and each.topic not in truths]
     if len(found) > 1:
         names = ", ".join(channel.topic for channel in found)
         notes.append(f"several odometry topics ({names}), none is used; choose with --log.odometry_topic")
@@ -67,14 +62,11 @@ def find_odometry(
     return found[0] if found else None
 
 
-def find_ground_truth(indexes: Sequence[FileIndex], wanted: str, default: str) -> Channel | None:
-    """The ground truth's channel; only a topic that is not the default one must exist.
-
-    None for ``NO_TRUTH``.
-    """
+def find_ground_truth(indexes: Sequence[FileIndex], wanted: str) -> Channel | None:
+    """The ground truth's channel, None for ``NO_TRUTH``; only a topic that is not the usual one must exist."""
     if wanted == NO_TRUTH:
         return None
-    if wanted == default and not any(channel.topic == wanted for channel in _with_poses(indexes)):
+    if wanted == _USUAL_TRUTH and not any(channel.topic == wanted for channel in _with_poses(indexes)):
         return None
     return _chosen(indexes, wanted, "log.ground_truth_topic")
 

@@ -230,7 +230,8 @@ class LogWriter:
             name: ("<f4", points[:, axis]) for axis, name in enumerate("xyz")
         }
         if times_s is not None:
-            columns[time_field] = ("<f4", times_s) if time_field == "time" else ("<u4", _whole_ns(times_s))
+            whole_ns = np.rint(1e9 * times_s.astype(np.float64)).astype(np.int64)
+            columns[time_field] = ("<f4", times_s) if time_field == "time" else ("<u4", whole_ns)
         if ring is not None:
             columns["ring"] = ("<u2", ring)
         rows = np.empty(len(points), dtype=[(name, code) for name, (code, _) in columns.items()])
@@ -255,9 +256,3 @@ class LogWriter:
             self._numbers[key] = self._writer.register_channel(channel.topic, channel.encoding, number)
         self._writer.add_message(self._numbers[key], log_time_ns, data, log_time_ns, self._sequence)
         self._sequence += 1
-
-
-def _whole_ns(times_s: NDArray[np.floating]) -> NDArray[np.int64]:
-    if len(times_s) and times_s.min() < 0.0:
-        raise InputError(f"point time {times_s.min():.6f} s is before the stamp; use time_field='time'")
-    return np.rint(np.asarray(times_s, dtype=np.float64) * 1e9).astype(np.int64)

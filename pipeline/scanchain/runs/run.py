@@ -213,7 +213,7 @@ class _Run:
         with self.directory.results() as folder:
             source = str(self.job.ground_truth or log.ground_truth_topic)
             truth, note = accuracy_of(self._true_poses, source, self.job.max_gap_s, result, folder)
-            lost = (*log.damage, *log.copies, *self.notes, *result.warnings, *results.warnings, *of_recording)
+            lost = (*log.damage, *self.notes, *result.warnings, *results.warnings, *of_recording)
             metrics = measure(
                 self.steps, results, judged, run_s=run_s, compile_s=compile_s, ground_truth=truth,
                 warnings=(*lost, *_few_scans(len(self.steps)), *note), stopped=stopped,
@@ -261,7 +261,7 @@ def opened(job: Job) -> tuple[Log, Settings, TruthFile | None]:
     RunDirectory(job.out, force=job.force)  # refused before the log is read
     log = open_log(job.logs, early.config.log)
     settings = load_settings(log.dimension, file=job.config_file, overrides=job.overrides)
-    if settings.config.odometry.prior == "wheel" and not log.has_odometry:
+    if settings.config.odometry.prior == "wheel" and not log.odometry_topic:
         raise InputError(
             f"{log.name}: odometry.prior is 'wheel', but the log has no wheel odometry that is known; "
             "set log.odometry_topic, or odometry.prior to 'auto'"
@@ -334,7 +334,7 @@ def _idle_sensors(log: Log) -> list[str]:
 
 def _wheels(log: Log, config: Config) -> str:
     """Wheel odometry of a log, with the reason if it was not used."""
-    if not log.has_odometry:
+    if not log.odometry_topic:
         return "no wheel odometry"
     unused = ""
     if config.odometry.prior == "constant-velocity":

@@ -157,7 +157,7 @@ def localize(
         progress.say("smoothing the path")
         found = localizer.finish()
         stopped = f"stopped by the user after {counted(len(found.states), 'scan')}" if progress.stopped else ""
-        warnings = (*filter(None, [stopped]), *log.damage, *log.copies, *localizer.warnings)
+        warnings = (*filter(None, [stopped]), *log.damage, *localizer.warnings)
         time_s, truth = working_s() - started, None
         progress.say("writing the results")
         with directory.results() as folder:

@@ -1,14 +1,18 @@
-"""Logs that are no MCAP: each file or folder as an index whose messages are made when they are read."""
+"""Logs that are no MCAP: an index whose messages are made when they are read, or of a temporary MCAP file."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
-from scanchain.logs.mcap.records import Block, Channel, Entry, FileIndex
-from scanchain.logs.writer import schema_text
+from scanchain.errors import InputError
+from scanchain.files import Source
+from scanchain.logs.mcap.index import index_file
+from scanchain.logs.mcap.records import Block, Channel, FileIndex
+from scanchain.logs.writer import LogWriter, schema_text
 
 
 def add_channel(index: FileIndex, topic: str, type_name: str) -> Channel:
@@ -24,17 +28,28 @@ def add_block(
     index: FileIndex, offset: int, size: int, times_ns: Sequence[int], counts: dict[Channel, int]
 ) -> None:
     """Append a block: ``index.make`` finds it by ``offset``; ``size`` is about its number of bytes."""
-    entries = tuple(Entry(channel.key[1], -1, count) for channel, count in counts.items() if count)
-    index.blocks.append(
-        Block(index.number, offset, size, "", size, 0, min(times_ns), max(times_ns), entries, is_chunk=False)
-    )
-    for entry in entries:
-        index.counts[entry.channel] = index.counts.get(entry.channel, 0) + entry.messages
+    held = {channel.key[1]: count for channel, count in counts.items() if count}
+    span = min(times_ns), max(times_ns)
+    index.blocks.append(Block(index.number, offset, size, "", size, 0, *span, held, is_chunk=False))
+    for channel, count in held.items():
+        index.counts[channel] = index.counts.get(channel, 0) + count
 
 
-def on_demand_index(path: Path, number: int) -> FileIndex:
-    """An index without channels or blocks; the format sets ``index.make``, which converts a block."""
-    return FileIndex(path, number, b"", is_counted=True)
+def temporary_index(
+    path: Path, number: int, write: Callable[[LogWriter], None], source: Source | None = None
+) -> FileIndex:
+    """Index of the messages of a path that ``write`` converts, as the ``number``-th file of a log.
+
+    source : what ``path`` is a copy of, None for itself
+    """
+    with TemporaryDirectory(prefix="scanchain-", ignore_cleanup_errors=True) as folder:
+        copy = Path(folder) / "log.mcap"
+        try:
+            with LogWriter(copy) as log:
+                write(log)
+        except OSError as error:
+            raise InputError(f"{copy}: {path} cannot be converted there ({error.strerror}); set TMPDIR") from error
+        return index_file(copy, number, source or path)  # which maps the file: it may be deleted
 
 
 def natural_order(path: Path) -> tuple[tuple[int, ...], str]:

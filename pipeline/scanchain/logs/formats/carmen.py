@@ -12,21 +12,24 @@ import io
 import math
 import zlib
 from collections import Counter
-from collections.abc import Iterator
-from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from scanchain.errors import InputError, counted
-from scanchain.files import Source
-from scanchain.logs.formats import UnknownFormatError, add_block, add_channel, on_demand_index
-from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
-from scanchain.logs.writer import LATEST_NS, Link, Place, pack_laser_scan, pack_odometry, pack_transforms
+from scanchain.logs.formats import UnknownFormatError, temporary_index
+from scanchain.logs.mcap.records import FileIndex
+from scanchain.logs.writer import (
+    LATEST_NS,
+    Link,
+    LogWriter,
+    Place,
+    pack_laser_scan,
+    pack_odometry,
+    pack_transforms,
+)
 
-_LINES_A_BLOCK = 512
 _LEAST_STEP_NS = 100_000  # least step between the log times of two scans
 _PARAMETERS = (b"robot_frontlaser_offset", b"robot_front_laser_max")
 
@@ -49,108 +52,60 @@ def is_carmen(head: bytes) -> bool:
 
 
 def index_carmen(path: Path, number: int) -> FileIndex:
-    """Index the lines of a log. Raises UnknownFormatError where the file has none of a known kind."""
+    """The messages of a log's lines. Raises UnknownFormatError where the file has none of a known kind."""
     text, damage = read_text(path)
-    index = on_demand_index(path, number)
-    index.damage += [damage] if damage else []
     malformed: list[int] = []
-    parameters: dict[bytes, float] = {}
     others = Counter[bytes]()
-    lines = list(_lines(text, parameters, malformed, others))
-    if not lines:
+    index = temporary_index(path, number, lambda log: _write(log, text, malformed, others))
+    if not index.counts and not malformed:
         absent = f"text without a line of {b', '.join(KINDS).decode()}"
         raise UnknownFormatError(text, damage.removeprefix(f"{path}: ") or absent)
-    index.damage += [_complaint(path, malformed)] if malformed else []
+    index.damage += [damage] if damage else []
+    if malformed:
+        lines = f"{counted(len(malformed), 'malformed line')} left out (the first: line {malformed[0]})"
+        index.damage.append(f"{path}: {lines}")
     if others:
         listed = ", ".join(f"{count} {kind.decode('ascii', 'replace')}" for kind, count in others.items())
         index.notes.append(f"{path}: lines of kinds that are not read: {listed}")
-    _add_lines(index, lines, parameters)
     return index
 
 
-def _add_lines(index: FileIndex, lines: list[Line], parameters: dict[bytes, float]) -> None:
-    """Add blocks of lines, and how they are made messages."""
-    scan = add_channel(index, "/scan", "sensor_msgs/msg/LaserScan")
-    odometry = add_channel(index, "/odom", "nav_msgs/msg/Odometry")
-    mounting = add_channel(index, "/tf_static", "tf2_msgs/msg/TFMessage")
-    truth = add_channel(index, "/ground_truth", "nav_msgs/msg/Odometry")
-    first_scan = next((line.number for line in lines if line.kind in SCANS), -1)
-    for begin in range(0, len(lines), _LINES_A_BLOCK):
-        block = lines[begin : begin + _LINES_A_BLOCK]
-        kinds = Counter(line.kind for line in block)
-        scans = sum(kinds[kind] for kind in SCANS)
-        counts = {mounting: int(any(line.number == first_scan for line in block))}
-        counts |= {odometry: scans + kinds[b"ODOM"], scan: scans, truth: kinds[b"TRUEPOS"]}
-        size = sum(len(line.text) for line in block)
-        add_block(index, begin, size, [line.log_time_ns for line in block], counts)
-    index.channels = {number: c for number, c in index.channels.items() if index.counts.get(number)}
-
-    def messages(line: Line) -> Iterator[tuple[Channel, bytes]]:
-        words = line.text.split()
-        if line.kind in SCANS:
-            packed, robot, laser = read_scan(words, line.stamp_ns, parameters)
-            if line.number == first_scan:
-                yield mounting, pack_transforms(line.stamp_ns, Link("base_link", "laser", laser))
-            yield odometry, pack_odometry(line.stamp_ns, "odom", "base_link", robot)
-            yield scan, packed
-        else:
-            channel, frame = (odometry, "odom") if line.kind == b"ODOM" else (truth, "world")
-            yield channel, pack_odometry(line.stamp_ns, frame, "base_link", planar(*_numbers(words[1:], 3)))
-
-    def make(block: Block, _: AbstractSet[int] | None) -> Contents:
-        made: list[Message] = []
-        malformed: list[int] = []
-        for line in lines[block.offset : block.offset + _LINES_A_BLOCK]:
-            try:
-                said = list(messages(line))
-                made += [Message(channel, line.log_time_ns, memoryview(data)) for channel, data in said]
-            except (ValueError, IndexError):
-                malformed.append(line.number)
-        return Contents(made, _complaint(index.path, malformed))
-
-    index.make = make
-
-
-class Line(NamedTuple):
-    """A line of a known kind, its number, stamp and log time."""
-
-    kind: bytes
-    text: bytes
-    number: int
-    stamp_ns: int
-    log_time_ns: int
-
-
-def _lines(
-    text: bytes, parameters: dict[bytes, float], malformed: list[int], others: Counter[bytes]
-) -> Iterator[Line]:
-    """Every line of a known kind, in the order of the file; what the others hold is added to the rest."""
-    log_ns = 0
-    for number, raw in enumerate(io.BytesIO(text), start=1):
-        kind = raw[:16].split(maxsplit=1)[0] if raw[:16].strip() else b"#"
-        if kind in KINDS:
-            try:  # the stamp is the third word from behind, a double like in CARMEN
-                stamp_ns = int(float(raw.rsplit(maxsplit=3)[-3]) * 1e9)
-            except (ValueError, IndexError, OverflowError):
-                stamp_ns = -1
-            if not 0 <= stamp_ns < LATEST_NS:
-                malformed.append(number)
-                continue
-            line_ns = max(stamp_ns, log_ns)
-            if kind in SCANS:
-                line_ns = log_ns = max(stamp_ns, log_ns + _LEAST_STEP_NS)
-            yield Line(kind, raw, number, stamp_ns, line_ns)
-        elif kind == b"PARAM" and len(words := raw.split()) > 2 and words[1] in _PARAMETERS:
-            with suppress(ValueError):
+def _write(log: LogWriter, text: bytes, malformed: list[int], others: Counter[bytes]) -> None:
+    """Write the messages of each line of a known kind; numbers and kinds of the others are added to the rest."""
+    parameters: dict[bytes, float] = {}
+    scan_ns, is_mounted = 0, False
+    for number, line in enumerate(io.BytesIO(text), start=1):
+        kind = line[:16].split(maxsplit=1)[0] if line[:16].strip() else b"#"
+        if kind not in (*KINDS, b"PARAM"):
+            if not kind.startswith((b"#", b"PARAM")):
+                others[kind] += 1
+            continue
+        words = line.split()
+        if kind == b"PARAM":
+            with suppress(ValueError, IndexError):
                 parameters[words[1]] = float(words[2])
-        elif not kind.startswith((b"#", b"PARAM")):
-            others[kind] += 1
-
-
-def _complaint(path: Source, malformed: list[int]) -> str:
-    if not malformed:
-        return ""
-    return f"{path}: {counted(len(malformed), 'malformed line')} left out (the first: line {malformed[0]})"
+            continue
+        try:  # the stamp is the third word from behind, a double like in CARMEN
+            stamp_ns = int(float(words[-3]) * 1e9)
+            if not 0 <= stamp_ns < LATEST_NS:
+                raise ValueError
+            if kind not in SCANS:
+                topic, frame = ("/odom", "odom") if kind == b"ODOM" else ("/ground_truth", "world")
+                packed = pack_odometry(stamp_ns, frame, "base_link", planar(*_numbers(words[1:], 3)))
+                log.append(topic, "nav_msgs/msg/Odometry", packed, stamp_ns, max(stamp_ns, scan_ns))
+                continue
+            scan, robot, laser = read_scan(words, stamp_ns, parameters)
+        except (ValueError, IndexError, OverflowError):
+            malformed.append(number)
+            continue
+        scan_ns = max(stamp_ns, scan_ns + _LEAST_STEP_NS)
+        if not is_mounted:
+            mounting = pack_transforms(stamp_ns, Link("base_link", "laser", laser))
+            log.append("/tf_static", "tf2_msgs/msg/TFMessage", mounting, stamp_ns, scan_ns)
+            is_mounted = True
+        packed = pack_odometry(stamp_ns, "odom", "base_link", robot)
+        log.append("/odom", "nav_msgs/msg/Odometry", packed, stamp_ns, scan_ns)
+        log.append("/scan", "sensor_msgs/msg/LaserScan", scan, stamp_ns, scan_ns)
 
 
 def read_scan(words: list[bytes], stamp_ns: int, parameters: dict[bytes, float]) -> tuple[bytes, Place, Place]:

@@ -10,6 +10,7 @@ import re
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from collections.abc import Set as AbstractSet
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import IO
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.errors import InputError, counted
-from scanchain.logs.formats import add_block, add_channel, left_out, natural_order, on_demand_index
+from scanchain.logs.formats import add_block, add_channel, left_out, natural_order
 from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
 from scanchain.logs.writer import LATEST_NS, pack_cloud
 
@@ -34,7 +35,6 @@ XYZI = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
 _PCD_TYPES = {("F", "4"): "<f4", ("F", "8"): "<f8"} | {
     (sign, str(size)): f"<{code}{size}" for sign, code in (("I", "i"), ("U", "u")) for size in (1, 2, 4, 8)
 }
-_MOST_PCD_LINES = 100
 _MOST_LZF_RATIO = 1000  # largest ratio of packing that is accepted; LZF reaches about 130
 
 _PLY_TYPES = {
@@ -43,7 +43,7 @@ _PLY_TYPES = {
     "double": "f8", "float64": "f8",
 }  # fmt: skip
 _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
-_MOST_PLY_LINES = 1000
+_MOST_HEADER_LINES = 1000
 
 
 class CloudFileError(Exception):
@@ -131,30 +131,24 @@ def _ros_type(kind: np.dtype[np.generic]) -> str:
 def read_pcd(path: Path) -> NDArray[np.void]:
     """The points of a file, ascii, binary or binary_compressed, fields as they are."""
     with path.open("rb") as file:
-        header = _pcd_header(file)
+        header = {words[0]: words[1:] for words in _header_lines(file, "DATA") if words}
         try:
             point, count, form = _pcd_point(header), int(header["POINTS"][0]), header["DATA"][0]
             if count < 0:
                 raise ValueError(f"how many points there are, but {count}")
         except (KeyError, IndexError, ValueError) as error:
             raise CloudFileError(f"is no PCD: its header does not state {error}") from error
-        if form == "ascii":
-            return ascii_rows(file, point, count)
-        return (
-            _lzf_unpacked(file, point, count) if form == "binary_compressed" else binary_rows(file, point, count)
-        )
+        read = {"ascii": ascii_rows, "binary_compressed": _lzf_unpacked}.get(form, binary_rows)
+        return read(file, point, count)
 
 
-def _pcd_header(file: IO[bytes]) -> dict[str, list[str]]:
-    """The words of each line, by the first."""
-    header: dict[str, list[str]] = {}
-    for _ in range(_MOST_PCD_LINES):
+def _header_lines(file: IO[bytes], last: str) -> Iterator[list[str]]:
+    """The words of each line up to the one that begins with ``last``, or the first thousand."""
+    for _ in range(_MOST_HEADER_LINES):
         words = file.readline(65536).decode("ascii", "replace").split()
-        if words:
-            header[words[0]] = words[1:]
-        if "DATA" in header:
+        yield words
+        if words[:1] == [last]:
             break
-    return header
 
 
 def _pcd_point(header: dict[str, list[str]]) -> np.dtype[np.void]:
@@ -204,8 +198,8 @@ def read_ply(path: Path) -> NDArray[np.void]:
 def _ply_header(file: IO[bytes]) -> tuple[np.dtype[np.void], int, str]:
     """The layout of a vertex, their number, and the form; vertices must come first, as they do."""
     fields: list[tuple[str, str]] = []
-    form, element, count = "", "", 0
-    for words in _ply_lines(file):
+    form, element, count, words = "", "", 0, list[str]()
+    for words in _header_lines(file, "end_header"):
         match words:
             case ["format", form, *_] if form in _PLY_ORDERS:
                 pass
@@ -218,38 +212,31 @@ def _ply_header(file: IO[bytes]) -> tuple[np.dtype[np.void], int, str]:
                 fields.append((name, _PLY_ORDERS.get(form, "<") + _PLY_TYPES[kind]))
             case ["property", *_] if element == "vertex":
                 raise CloudFileError(f"has the vertex property {' '.join(words[1:])!r}, which is not understood")
-    if not form or not fields:
-        raise CloudFileError("is no PLY with vertices")
+    if not form or not fields or words != ["end_header"]:
+        raise CloudFileError("is no PLY with vertices, or its header does not end")
     if len(dict(fields)) < len(fields):
         raise CloudFileError(f"has a vertex property twice among {' '.join(name for name, _ in fields)}")
     return np.dtype(fields), count, form
 
 
-def _ply_lines(file: IO[bytes]) -> Iterator[list[str]]:
-    if file.readline(8).strip() != b"ply":
-        raise CloudFileError("is no PLY: its first line is another")
-    for _ in range(_MOST_PLY_LINES):
-        words = file.readline(4096).decode("ascii", "replace").split()
-        if words == ["end_header"]:
-            return
-        yield words
-    raise CloudFileError("is no PLY: its header does not end")
-
-
 def index_clouds(folder: Path, number: int, rate_hz: float = 0.0, bin_columns: int = 4) -> FileIndex:
-    """The files of a folder as the scans of /points.
+    """The files of the first kind that a folder has, as the scans of /points.
 
     rate_hz : at which they come, from the epoch on; 0 takes the stamps from the names
     bin_columns : float32 numbers of a point in .bin files
     Raises InputError where names hold no stamps, or files no such points.
     """
-    files = _files(folder)
+    found = sorted((file for file in folder.iterdir() if file.is_file()), key=natural_order)
+    kinds = {suffix: [file for file in found if file.suffix.lower() == suffix] for suffix in SUFFIXES}
+    suffix, files = next(((suffix, files) for suffix, files in kinds.items() if files), ("", []))
+    if not files:
+        raise InputError(f"{folder}: has no {', '.join(SUFFIXES)} file; name the folder that holds them")
     stamps_ns = [round(k * _NS / rate_hz) for k in range(len(files))] if rate_hz else _stamps(folder, files)
-    index = on_demand_index(folder, number)
+    index = FileIndex(folder, number, is_counted=True)
     raw = point_of_columns(np.dtype("<f4"), bin_columns)
-    if files[0].suffix.lower() == ".bin":
+    if suffix == ".bin":
         _check_size(files, bin_columns)
-    index.notes += [*_found(folder, files, raw), *left_out(folder, files[0].suffix.lower(), SUFFIXES)]
+    index.notes += [*_found(folder, files, raw), *left_out(folder, suffix, SUFFIXES)]
     channel = add_channel(index, "/points", "sensor_msgs/msg/PointCloud2")
     for place, (file, stamp_ns) in enumerate(zip(files, stamps_ns, strict=True)):
         add_block(index, place, file.stat().st_size, [stamp_ns], {channel: 1})
@@ -274,18 +261,15 @@ def contents_of(
 
 
 def _found(folder: Path, files: Sequence[Path], raw: np.dtype[np.void]) -> list[str]:
-    """Fields of the files, by the first that can be read."""
+    """A note on the fields of the files, by the first that can be read."""
     for file in files[:_FIRST_FILES]:
-        try:
+        with suppress(CloudFileError, OSError):
             points = read_cloud_file(file, raw)
-        except (CloudFileError, OSError):
-            continue
-        kinds = ", ".join(dict.fromkeys(points.dtype[name].name for name in points.dtype.names or ()))
-        names = " ".join(points.dtype.names or ())
-        suffix = file.suffix.lower()
-        guess = " (log.bin_columns)" if suffix == ".bin" else ""
-        held = f"{names}, {kinds}{guess}; {counted(len(points), 'point')} in {file.name}"
-        return [f"{folder}: {counted(len(files), f'{suffix} file')} of {held}"]
+            kinds = ", ".join(dict.fromkeys(points.dtype[name].name for name in points.dtype.names or ()))
+            guess = " (log.bin_columns)" if file.suffix.lower() == ".bin" else ""
+            held = f"{' '.join(points.dtype.names or ())}, {kinds}{guess}; {counted(len(points), 'point')}"
+            kind = f"{file.suffix.lower()} file"
+            return [f"{folder}: {counted(len(files), kind)} of {held} in {file.name}"]
     return []
 
 
@@ -303,16 +287,6 @@ def stamp_of_name(stem: str) -> int | None:
     elif match := re.search(r"(?<!\d)([1-9]\d*)$", stem):
         stamp_ns = int(match[1]) * _UNITS_NS.get(len(match[1]), LATEST_NS)
     return stamp_ns if stamp_ns < LATEST_NS else None
-
-
-def _files(folder: Path) -> list[Path]:
-    """The files of the first kind that the folder has."""
-    found = [file for file in folder.iterdir() if file.is_file()]
-    for suffix in SUFFIXES:
-        files = sorted((file for file in found if file.suffix.lower() == suffix), key=natural_order)
-        if files:
-            return files
-    raise InputError(f"{folder}: has no {', '.join(SUFFIXES)} file; name the folder that holds them")
 
 
 def _stamps(folder: Path, files: Sequence[Path]) -> list[int]:

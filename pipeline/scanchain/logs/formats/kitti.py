@@ -7,16 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from collections.abc import Set as AbstractSet
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 from numpy.linalg import LinAlgError
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from scanchain import lie
 from scanchain.data import Matrix, Pose
 from scanchain.errors import InputError, counted
-from scanchain.logs.formats import add_block, add_channel, natural_order, on_demand_index
+from scanchain.logs.formats import add_block, add_channel, natural_order
 from scanchain.logs.formats.clouds import XYZI, contents_of, read_raw
 from scanchain.logs.mcap.records import Block, Contents, FileIndex, Message
 from scanchain.logs.writer import LATEST_NS, pack_odometry, place
@@ -33,36 +34,30 @@ _NS = 1_000_000_000
 
 def index_kitti_raw(folder: Path, number: int) -> FileIndex:
     """A drive of the raw recordings (``..._sync``); truth is its GPS/INS, moved to the lidar."""
-    files = _sweeps(folder / "velodyne_points" / "data")
     times_ns = read_times(folder / "velodyne_points" / "timestamps.txt")
-    return _index(on_demand_index(folder, number), files, times_ns, lambda index: _raw_truth(index, folder))
+    index = FileIndex(folder, number, is_counted=True)
+    return _index(index, folder / "velodyne_points" / "data", times_ns, lambda: _raw_truth(index, folder))
 
 
 def index_kitti_odometry(folder: Path, number: int) -> FileIndex:
     """A sequence of the odometry benchmark (``sequences/00``); truth lies in ``poses/00.txt`` beside it."""
-    files = _sweeps(folder / "velodyne")
     times_ns = read_seconds(folder / "times.txt")
-    index = on_demand_index(folder, number)
-    return _index(index, files, times_ns, lambda index: _benchmark_truth(index, folder, times_ns))
+    index = FileIndex(folder, number, is_counted=True)
+    return _index(index, folder / "velodyne", times_ns, lambda: _benchmark_truth(index, folder, times_ns))
 
 
 def _raw_truth(index: FileIndex, folder: Path) -> Truth:
-    calibration = folder.parent / "calib_imu_to_velo.txt"
-    if not (folder / "oxts").is_dir():
-        index.notes.append(f"{folder}: has no oxts folder, so no ground truth")
+    calibration, readings = folder.parent / "calib_imu_to_velo.txt", folder / "oxts"
+    if absent := next((path for path in (readings, calibration) if not path.exists()), None):
+        index.notes.append(f"{absent}: is absent, so there is no ground truth")
         return []
-    if not calibration.is_file():
-        index.notes.append(
-            f"{calibration}: is absent, so the GPS/INS poses cannot be moved to the lidar; no truth"
-        )
-        return []
-    times_ns = read_times(folder / "oxts" / "timestamps.txt")
+    times_ns = read_times(readings / "timestamps.txt")
     T_lidar_imu = np.eye(4)
     T_lidar_imu[:3, :3], T_lidar_imu[:3, 3] = _entry(calibration, "R", (3, 3)), _entry(calibration, "T", (3,))
-    poses = read_oxts(folder / "oxts" / "data", T_lidar_imu)
+    poses = read_oxts(readings / "data", T_lidar_imu)
     if len(poses) != len(times_ns):
         raise InputError(
-            f"{folder / 'oxts'}: has {counted(len(poses), 'reading')} and {counted(len(times_ns), 'time')}; "
+            f"{readings}: has {counted(len(poses), 'reading')} and {counted(len(times_ns), 'time')}; "
             "download it again"
         )
     return list(zip(times_ns, poses, strict=True))
@@ -76,19 +71,13 @@ def _benchmark_truth(index: FileIndex, folder: Path, times_ns: Sequence[int]) ->
     return list(zip(times_ns, read_camera_poses(file, folder / "calib.txt"), strict=False))
 
 
-def _sweeps(folder: Path) -> list[Path]:
+def _index(index: FileIndex, folder: Path, times_ns: Sequence[int], read_truth: Callable[[], Truth]) -> FileIndex:
+    """/velodyne_points from the files, whose names count the times, and /ground_truth where it can be read."""
     files = sorted(folder.glob("*.bin"), key=natural_order)
     if not files:
         raise InputError(f"{folder}: has no .bin file; of the raw recordings take the synced ones (..._sync)")
-    return files
-
-
-def _index(
-    index: FileIndex, files: Sequence[Path], times_ns: Sequence[int], read_truth: Callable[[FileIndex], Truth]
-) -> FileIndex:
-    """/velodyne_points from the files, whose names count the times, and /ground_truth where it can be read."""
     try:
-        truth = read_truth(index)
+        truth = read_truth()
     except (InputError, LinAlgError) as error:
         index.note_damage(f"{error}; until then there is no ground truth")
         truth = []
@@ -107,7 +96,7 @@ def _index(
         )
 
     def make(block: Block, _: AbstractSet[int] | None) -> Contents:
-        channel = index.channels[block.entries[0].channel]
+        channel = index.channels[next(iter(block.counts))]
         if block.offset == _TRUTH:
             said = [(each, pack_odometry(each, "world", "velodyne", place(T))) for each, T in truth]
             return Contents([Message(channel, each, memoryview(data)) for each, data in said], "")
@@ -121,25 +110,22 @@ def _index(
 
 def read_times(file: Path) -> list[int]:
     """Nanoseconds of each line ``2011-09-26 13:02:25.594360375``, which is taken as UTC."""
-    times_ns: list[int] = []
-    for number, line in enumerate(map(str.strip, _lines(file)), start=1):
-        try:
-            whole, _, fraction = line.partition(".")
-            moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
-            times_ns.append(int(moment.timestamp()) * _NS + int(fraction.ljust(9, "0")[:9]))
-            if not 0 <= times_ns[-1] < LATEST_NS:
-                raise ValueError("before 1970 or after 2038")
-        except ValueError as error:
-            raise InputError(f"{file}: line {number} is no time ({line!r}); download it again") from error
-    return times_ns
+    try:
+        times_ns = np.array(_lines(file), "datetime64[ns]").astype(np.int64)
+    except (ValueError, UserWarning) as error:
+        raise InputError(f"{file}: is no list of times ({error}); download it again") from error
+    return _checked(file, times_ns)
 
 
 def read_seconds(file: Path) -> list[int]:
     """Nanoseconds of each line that is a number of seconds."""
-    seconds = _table(file, 1)[:, 0].tolist()
-    if not all(0.0 <= each * _NS < LATEST_NS for each in seconds):
-        raise InputError(f"{file}: has times that are not between 0 and {LATEST_NS / _NS:g} s; download it again")
-    return [round(each * _NS) for each in seconds]
+    return _checked(file, np.rint(_table(file, 1)[:, 0] * _NS))
+
+
+def _checked(file: Path, times_ns: NDArray[np.int64] | Matrix) -> list[int]:
+    if not ((times_ns >= 0) & (times_ns < LATEST_NS)).all():
+        raise InputError(f"{file}: has times before 1970 or after 2038; download it again")
+    return times_ns.astype(np.int64).tolist()
 
 
 def _entry(file: Path, name: str, shape: tuple[int, ...]) -> Matrix:
@@ -172,7 +158,7 @@ def read_oxts(folder: Path, T_lidar_imu: Pose) -> Matrix:
     T_world_imu[:, 0, 3] = scale * _EARTH_M * np.radians(longitude)
     T_world_imu[:, 1, 3] = scale * _EARTH_M * np.log(np.tan(np.radians(90.0 + latitude) / 2.0))
     T_world_imu[:, 2, 3] = up_m
-    T_world_imu[:, :3, :3] = _turn(yaw, 2) @ _turn(pitch, 1) @ _turn(roll, 0)
+    T_world_imu[:, :3, :3] = Rotation.from_euler("ZYX", np.column_stack([yaw, pitch, roll])).as_matrix()
     T_world_lidar = T_world_imu @ lie.inverse(T_lidar_imu)
     return lie.inverse(T_world_lidar[0]) @ T_world_lidar
 
@@ -185,16 +171,6 @@ def read_camera_poses(file: Path, calibration: Path) -> Matrix:
     T_camera_lidar = np.vstack([_entry(calibration, "Tr", (3, 4)), [0.0, 0.0, 0.0, 1.0]])
     T_world_lidar = T_world_camera @ T_camera_lidar
     return np.linalg.inv(T_world_lidar[0]) @ T_world_lidar
-
-
-def _turn(angles_rad: Matrix, axis: int) -> Matrix:
-    """Rotations (N, 3, 3) about one axis."""
-    a, b = [(1, 2), (2, 0), (0, 1)][axis]
-    R = np.tile(np.eye(3), (len(angles_rad), 1, 1))
-    R[:, a, a] = R[:, b, b] = np.cos(angles_rad)
-    R[:, b, a] = np.sin(angles_rad)
-    R[:, a, b] = -R[:, b, a]
-    return R
 
 
 def _table(file: Path, columns: int) -> Matrix:
@@ -213,6 +189,7 @@ def _table(file: Path, columns: int) -> Matrix:
 
 def _lines(file: Path) -> list[str]:
     try:
-        return [line for line in file.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+        lines = file.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError as error:
         raise InputError(f"{file}: cannot be read ({error.strerror}); download it again") from error
+    return [line.strip() for line in lines if line.strip()]

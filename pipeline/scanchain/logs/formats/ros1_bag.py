@@ -21,7 +21,7 @@ import numpy as np
 
 from scanchain.errors import InputError, counted
 from scanchain.logs.mcap.index import is_plausible_size
-from scanchain.logs.mcap.records import Block, Channel, Contents, Entry, FileIndex, Message, unpack
+from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message, unpack
 from scanchain.logs.mcap.stream import messages_of
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -178,7 +178,7 @@ def _stated_chunk(index: FileIndex, info: Record) -> Block:
         _chunk(index, record),
         start_ns=info.time_ns(b"start_time"),
         end_ns=info.time_ns(b"end_time"),
-        entries=tuple(Entry(number, -1, count) for number, count in pairs),
+        counts=dict(pairs),
     )
 
 
@@ -231,8 +231,7 @@ def _counted(index: FileIndex, block: Block) -> Block:
     messages = messages_of(index, block)
     counts = Counter(message.channel.key[1] for message in messages)
     times_ns = [message.log_time_ns for message in messages] or [0]
-    entries = tuple(Entry(number, -1, count) for number, count in counts.items())
-    return replace(block, start_ns=min(times_ns), end_ns=max(times_ns), entries=entries)
+    return replace(block, start_ns=min(times_ns), end_ns=max(times_ns), counts=dict(counts))
 
 
 def _contents(index: FileIndex, block: Block, _: AbstractSet[int] | None) -> Contents:

@@ -9,15 +9,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from scanchain.errors import InputError, counted, one_line
+from scanchain.errors import InputError, one_line
 from scanchain.logs.files import size_of
-from scanchain.logs.formats import on_demand_index
 from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
 from scanchain.logs.writer import schema_text
 
-_BLOCK_BYTES = 8_000_000  # size of a block in bytes of the file, about
-_MOST_BLOCKS = 4096
-_MOST_TRIES = 400  # largest number of tries to read parts of a damaged block
+_BLOCK_BYTES = 4_000_000  # size of a block in bytes of the file, about; damage loses the rest of one
+_MOST_BLOCKS = 8192
 _LATEST_NS = (1 << 63) - 1
 
 
@@ -33,7 +31,7 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
             f"{path}: cannot be read as a ROS bag ({_reason(error)}); "
             "ros2 bag reindex mends the folder of a ROS 2 bag"
         ) from error
-    index = on_demand_index(path, number)
+    index = FileIndex(path, number, is_counted=True)
     connections: dict[int, Any] = {}
     for id_, each in enumerate(reader.connections, start=1):
         encoding = each.ext.serialization_format
@@ -87,36 +85,28 @@ def _contents(
     block: Block,
     wanted: AbstractSet[int] | None,
 ) -> Contents:
-    """The messages of a span of time; one that cannot be read is halved until what is damaged stands alone.
+    """The messages of a span of time, up to the first that cannot be read.
 
     One thread at a time may use the reader of rosbags.
     """
     chosen = [each for number, each in connections.items() if wanted is None or number in wanted]
-    numbers = {id(each): number for number, each in connections.items()}
-    last = len(index.blocks) - 1  # the first and the last reach as far as time, whatever the metadata
-    begin_ns = 0 if block.offset == 0 else block.start_ns
-    spans = [(begin_ns, _LATEST_NS if block.offset == last else block.end_ns + 1)] if chosen else []
+    if not chosen:
+        return Contents([], "")
+    channels = {id(each): index.channels[number] for number, each in connections.items()}
+    is_last = block.offset == len(index.blocks) - 1  # both ends reach as far as time, whatever the metadata
+    begin_ns, end_ns = block.start_ns if block.offset else 0, _LATEST_NS if is_last else block.end_ns + 1
     messages: list[Message] = []
-    lost, first_ns, reason, tries = 0, 0, "", _MOST_TRIES
     with lock:
-        while spans:
-            start_ns, stop_ns = spans.pop()
-            try:
-                found = list(reader.messages(chosen, start_ns, stop_ns))
-            except Exception as error:  # whatever a damaged file makes the libraries below raise
-                middle_ns, tries = (start_ns + stop_ns) // 2, tries - 1
-                if start_ns < middle_ns and tries > 0:
-                    spans += [(middle_ns, stop_ns), (start_ns, middle_ns)]
-                else:
-                    first_ns, reason = first_ns or start_ns, reason or _reason(error)
-                    lost += 1
-                continue
-            messages += [
-                Message(index.channels[numbers[id(each)]], time_ns, memoryview(data))
-                for each, time_ns, data in found
-            ]
-    what = f"at least {counted(lost, 'message')} from {first_ns * 1e-9:.3f} s on cannot be read ({reason})"
-    return Contents(messages, f"{index.path}: {what}" if lost else "")
+        try:
+            for connection, time_ns, data in reader.messages(chosen, begin_ns, end_ns):
+                messages.append(Message(channels[id(connection)], time_ns, memoryview(data)))
+        except Exception as error:  # whatever a damaged file makes the libraries below raise
+            begin_ns = messages[-1].log_time_ns if messages else block.start_ns
+            lost = (
+                f"{begin_ns * 1e-9:.3f} to {block.end_ns * 1e-9:.3f} s cannot be read further ({_reason(error)})"
+            )
+            return Contents(messages, f"{index.path}: what was recorded from {lost}")
+    return Contents(messages, "")
 
 
 def _reason(error: Exception) -> str:

@@ -36,7 +36,6 @@ from scanchain.logs.mcap.records import (
     RECORD,
     SCHEMA,
     Block,
-    Entry,
     FileIndex,
     read_definition,
 )
@@ -133,14 +132,13 @@ def _indexed(chunk: ChunkIndex, file: int) -> Block:
     end = chunk.chunk_start_offset + chunk.chunk_length
     stated = sorted((offset, channel) for channel, offset in chunk.message_index_offsets.items())
     ends = [*(offset for offset, _ in stated[1:]), end + chunk.message_index_length]
-    begins = [offset + RECORD.size + 6 for offset, _ in stated]
-    entries = tuple(
-        Entry(channel, begin, (end - begin) // 16)
-        for (_, channel), begin, end in zip(stated, begins, ends, strict=False)
-        if end - begin >= 16
-    )
+    counts = {
+        channel: (behind - offset - RECORD.size - 6) // 16
+        for (offset, channel), behind in zip(stated, ends, strict=False)
+        if behind - offset > RECORD.size + 6
+    }
     size, times_ns = chunk.compressed_size, (chunk.message_start_time, chunk.message_end_time)
-    return Block(file, end - size, size, chunk.compression, chunk.uncompressed_size, None, *times_ns, entries)
+    return Block(file, end - size, size, chunk.compression, chunk.uncompressed_size, None, *times_ns, counts)
 
 
 class Walk:
@@ -150,7 +148,7 @@ class Walk:
         self.index = index
         self.data = index.data
         self.chunk: Block | None = None
-        self.entries: list[Entry] = []
+        self.counts = Counter[int]()  # of the chunk, by channel
         self.loose: list[tuple[int, int]] = []  # channel and log time of messages outside of chunks
         self.loose_from = 0
         self.loose_sizes: deque[int] = deque(maxlen=8)  # of the records met last
@@ -207,7 +205,7 @@ class Walk:
             index.note_damage(f"{index.path}: the chunk before the message index at byte {offset} is missing")
         elif opcode == MESSAGE_INDEX and end - body > 6:
             (channel,) = struct.unpack_from("<H", self.data, body)
-            self.entries.append(Entry(channel, body + 6, (end - body - 6) // 16))
+            self.counts[channel] += (end - body - 6) // 16
         elif opcode in (SCHEMA, CHANNEL):
             index.define(read_definition(opcode, self.data[body:end]))
         else:
@@ -258,17 +256,16 @@ class Walk:
             self._close(size, complete=False)
 
     def _close(self, offset: int, *, complete: bool) -> None:
-        """End the chunk or the run of loose messages at this byte; incomplete entries are discarded."""
+        """End the chunk or the run of loose messages at this byte; incomplete counts are discarded."""
         if self.chunk is not None:
-            self.index.blocks.append(replace(self.chunk, entries=tuple(self.entries) if complete else ()))
+            self.index.blocks.append(replace(self.chunk, counts=self.counts if complete else {}))
         if self.loose:
             times_ns = [log_time_ns for _, log_time_ns in self.loose]
             counts = Counter(channel for channel, _ in self.loose)
-            entries = tuple(Entry(channel, -1, count) for channel, count in counts.items())
             begin, size, span = self.loose_from, offset - self.loose_from, (min(times_ns), max(times_ns))
-            block = Block(self.index.number, begin, size, "", size, 0, *span, entries, is_chunk=False)
+            block = Block(self.index.number, begin, size, "", size, 0, *span, counts, is_chunk=False)
             self.index.blocks.append(block)
-        self.chunk, self.entries, self.loose = None, [], []
+        self.chunk, self.counts, self.loose = None, Counter(), []
 
 
 def is_plausible_size(size: int, uncompressed: int) -> bool:

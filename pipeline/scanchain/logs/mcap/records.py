@@ -63,14 +63,6 @@ class Contents(NamedTuple):
     damage: str
 
 
-class Entry(NamedTuple):
-    """Number of a channel's messages in a chunk; their (log time, offset) pairs lie at byte ``offset``."""
-
-    channel: int
-    offset: int
-    messages: int
-
-
 @dataclass(frozen=True, slots=True)
 class Block:
     """A run of records: a chunk, or messages outside of any chunk.
@@ -81,7 +73,7 @@ class Block:
     compression, uncompressed_size, crc : as the chunk states; crc 0 means unchecked, None that the chunk's head
         has to be read for it
     start_ns, end_ns : log time of the first and last message
-    entries : the channels in it; empty where the file does not state them
+    counts : messages by channel id; empty where the file does not state them
     """
 
     file: int
@@ -92,7 +84,7 @@ class Block:
     crc: int | None
     start_ns: int
     end_ns: int
-    entries: tuple[Entry, ...] = ()
+    counts: dict[int, int] = field(default_factory=dict)
     is_chunk: bool = True
     is_cut: bool = False
 
@@ -104,7 +96,7 @@ class Block:
     @property
     def may_be_empty(self) -> bool:
         """True if its times are those that writers give a chunk without any message."""
-        return (self.start_ns == self.end_ns == 0 and not self.entries) or self.start_ns > self.end_ns
+        return (self.start_ns == self.end_ns == 0 and not self.counts) or self.start_ns > self.end_ns
 
 
 @dataclass(slots=True)
@@ -123,7 +115,7 @@ class FileIndex:
 
     path: Source
     number: int
-    data: mmap.mmap | bytes
+    data: mmap.mmap | bytes = b""
     fetch: Callable[[int, int], bytes] | None = None
     make: Callable[[Block, AbstractSet[int] | None], Contents] | None = None
     blocks: list[Block] = field(default_factory=list)
@@ -161,22 +153,20 @@ class FileIndex:
                 key, record.topic, record.message_encoding, record.schema_id, *schema
             )
 
-    def numbers_of(self, topic: str) -> list[int]:
-        """Ids of the channels of a topic."""
-        return [number for number, channel in self.channels.items() if channel.topic == topic]
+    def numbers_of(self, *topics: str) -> set[int]:
+        """Ids of the channels of the topics."""
+        return {number for number, channel in self.channels.items() if channel.topic in topics}
 
     def indexed_counts(self) -> Counter[int]:
         """Messages by channel id, as the blocks state them."""
         counts = Counter[int]()
-        for entry in (entry for block in self.blocks for entry in block.entries):
-            counts[entry.channel] += entry.messages
+        for block in self.blocks:
+            counts.update(block.counts)
         return counts
 
     def may_hold(self, block: Block, channels: AbstractSet[int]) -> bool:
         """True if a block can have messages of the channels."""
-        if not self.is_consistent or not block.entries:
-            return True
-        return any(entry.channel in channels for entry in block.entries)
+        return not self.is_consistent or not block.counts or not channels.isdisjoint(block.counts)
 
     def note_damage(self, line: str) -> None:
         """Note a line once, however often the damage is met."""
@@ -240,7 +230,7 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
     except MALFORMED:
         damage = "a record in it is malformed; what follows was left out"
         return Contents(messages, "" if block.is_cut else f"{_name(index, block)}: {damage}")
-    stated = sum(entry.messages for entry in block.entries)
+    stated = sum(block.counts.values())
     damage = f"holds {met} of the {stated} indexed messages" if met < stated else ""
     if undefined:
         damage = f"{counted(undefined, 'message')} of a channel that nothing defines"

@@ -7,15 +7,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from heapq import heappop, heappush
 from itertools import pairwise
 from math import inf
 from typing import NamedTuple, TypeVar
-
-import numpy as np
-from numpy.typing import NDArray
 
 from scanchain.config import LogConfig
 from scanchain.errors import InputError, duration
@@ -44,6 +42,10 @@ class Span(NamedTuple):
     def duration_s(self) -> float:
         """Seconds from one end to the other."""
         return (self.end_ns - self.begin_ns) * 1e-9
+
+    def holds(self, message: Message) -> bool:
+        """True if the message was logged within it."""
+        return self.begin_ns <= message.log_time_ns <= self.end_ns
 
     def meets(self, block: Block) -> bool:
         """True if the block may hold messages of the span."""
@@ -76,14 +78,6 @@ def chosen_span(whole: Span, config: LogConfig) -> Span:
     return Span(begin_ns, whole.end_ns if end_s == whole.duration_s else whole.begin_ns + round(end_s * 1e9))
 
 
-class Gap(NamedTuple):
-    """A part of a log without any message, and the numbers of the files before and behind it."""
-
-    span: Span
-    before: int
-    behind: int
-
-
 def notes_on(indexes: Sequence[FileIndex], config: LogConfig) -> list[str]:
     """Warnings about the chosen part: an end beyond that of the log, long gaps within it."""
     whole_s = whole_span(indexes).duration_s
@@ -94,13 +88,13 @@ def notes_on(indexes: Sequence[FileIndex], config: LogConfig) -> list[str]:
 
 def gap_notes(indexes: Sequence[FileIndex], config: LogConfig) -> list[str]:
     """Warnings about gaps of more than a minute in the chosen part."""
-    whole, notes = whole_span(indexes), []
-    for gap in _long_gaps(indexes, config):
-        files = [indexes[number].path.name for number in (gap.before, gap.behind)]
-        where = f" between {files[0]} and {files[1]}" if gap.before != gap.behind else ""
+    begin_ns, notes = whole_span(indexes).begin_ns, []
+    for before, behind in _long_gaps(indexes, config):
+        files = [indexes[block.file].path.name for block in (before, behind)]
+        where = f" between {files[0]} and {files[1]}" if before.file != behind.file else ""
         notes.append(
-            f"no message for {duration(gap.span.duration_s)} from "
-            f"{1e-9 * (gap.span.begin_ns - whole.begin_ns):.1f} s on{where}: read as one log all the same; "
+            f"no message for {duration(1e-9 * (behind.start_ns - before.end_ns))} from "
+            f"{1e-9 * (before.end_ns - begin_ns):.1f} s on{where}: read as one log all the same; "
             "--start and --end choose a part"
         )
     return notes
@@ -111,12 +105,12 @@ def check_one_log(indexes: Sequence[FileIndex], scanned: Collection[int], config
 
     scanned : numbers of the files with scans; others, as of a calibration, may be of any time
     """
-    for gap in _long_gaps(indexes, config, scanned):
-        if gap.before != gap.behind and gap.span.end_ns - gap.span.begin_ns > _LONGEST_GAP_NS:
-            before, behind = (indexes[number].path for number in (gap.before, gap.behind))
+    for before, behind in _long_gaps(indexes, config, scanned):
+        gap_ns = behind.start_ns - before.end_ns
+        if before.file != behind.file and gap_ns > _LONGEST_GAP_NS:
             raise InputError(
-                f"{before} ends {duration(gap.span.duration_s)} before {behind} begins: they are not parts of one "
-                "log; run each by itself, or all of them with scanchain batch"
+                f"{indexes[before.file].path} ends {duration(1e-9 * gap_ns)} before {indexes[behind.file].path} "
+                "begins: they are not parts of one log; run each by itself, or all of them with scanchain batch"
             )
 
 
@@ -129,22 +123,21 @@ def are_parts(indexes: Sequence[FileIndex], is_lidar: Callable[[Channel], bool])
             if span.begin_ns < last.get(topic, 0):
                 return False
             last[topic] = span.end_ns
-    return not any(gap.before != gap.behind for gap in _long_gaps(indexes, LogConfig()))
+    return not any(before.file != behind.file for before, behind in _long_gaps(indexes, LogConfig()))
 
 
 def _long_gaps(
     indexes: Sequence[FileIndex], config: LogConfig, files: Collection[int] | None = None
-) -> Iterator[Gap]:
-    """Gaps of more than a minute in the chosen part, or in that of some files."""
+) -> Iterator[tuple[Block, Block]]:
+    """The blocks before and behind gaps of more than a minute in the chosen part, or in that of some files."""
     span = chosen_span(whole_span(indexes), config)
-    end_ns, before = None, 0
-    for block in sorted(_timed(indexes), key=lambda block: block.start_ns):
-        if not span.meets(block) or (files is not None and block.file not in files):
+    last: Block | None = None
+    for block in sorted(filter(span.meets, _timed(indexes)), key=lambda block: block.start_ns):
+        if files is not None and block.file not in files:
             continue
-        if end_ns is not None and block.start_ns - end_ns > _LONG_GAP_NS:
-            yield Gap(Span(end_ns, block.start_ns), before, block.file)
-        if end_ns is None or block.end_ns > end_ns:
-            end_ns, before = block.end_ns, block.file
+        if last is not None and block.start_ns - last.end_ns > _LONG_GAP_NS:
+            yield last, block
+        last = block if last is None or block.end_ns > last.end_ns else last
 
 
 def _timed(indexes: Sequence[FileIndex]) -> list[Block]:
@@ -157,13 +150,12 @@ def count_messages(indexes: Sequence[FileIndex], topic: str, span: Span) -> int:
     """Number of messages of a topic in the span."""
     count = 0
     for index in indexes:
-        for number in index.numbers_of(topic):
-            for block in filter(span.meets, index.blocks):
-                if block.entries and span.covers(block):
-                    count += sum(entry.messages for entry in block.entries if entry.channel == number)
-                    continue
-                times_ns = log_times(index, block, number)
-                count += int(np.count_nonzero((times_ns >= span.begin_ns) & (times_ns <= span.end_ns)))
+        wanted = index.numbers_of(topic)
+        for block in filter(span.meets, index.blocks):
+            if block.counts and span.covers(block):
+                count += sum(block.counts.get(number, 0) for number in wanted)
+            elif index.may_hold(block, wanted):
+                count += sum(span.holds(message) for message in messages_of(index, block, wanted))
     return count
 
 
@@ -192,12 +184,10 @@ def complete(index: FileIndex) -> None:
     """Add the channels and counts that a file without a full summary has inside its chunks."""
     counts = index.indexed_counts()
     unknown = {number for number in {*index.counts, *counts} if not index.knows(number)}
-    for block in sorted(
-        index.blocks, key=lambda each: unknown.isdisjoint(entry.channel for entry in each.entries)
-    ):
-        if unknown or not (block.entries or index.is_counted):
+    for block in sorted(index.blocks, key=lambda each: unknown.isdisjoint(each.counts)):
+        if unknown or not (block.counts or index.is_counted):
             messages = messages_of(index, block)
-            counts.update(message.channel.key[1] for message in messages if not block.entries)
+            counts.update(message.channel.key[1] for message in messages if not block.counts)
             unknown = {number for number in unknown if not index.knows(number)}
     index.channels |= {k: channel for k, channel in index.uncertain_channels.items() if k in unknown}
     if not index.is_counted:
@@ -205,43 +195,24 @@ def complete(index: FileIndex) -> None:
         index.is_counted = True
 
 
-def times_of(indexes: Sequence[FileIndex], topic: str) -> tuple[int, int, int]:
-    """Number of messages of a topic, and log times of the first and the last of them; 0, 0 where unknown.
-
-    Exact where a file has a message index, else as exact as its chunks.
-    """
-    messages, ends_ns = 0, list[int]()
+def ends_of(indexes: Sequence[FileIndex], topic: str) -> Span:
+    """From the first message of a topic to the last, by the chunks they are in; (0, 0) where unknown."""
+    times_ns: list[int] = []
     for index in indexes:
         for number in index.numbers_of(topic):
-            messages += index.counts.get(number, 0)
-            holding = [block for block in index.blocks if any(entry.channel == number for entry in block.entries)]
+            holding = [block for block in index.blocks if number in block.counts]
             for block in holding[:1] + holding[1:][-1:]:
-                has_times = any(entry.channel == number and entry.offset >= 0 for entry in block.entries)
-                times_ns = log_times(index, block, number) if has_times else ()
-                found = len(times_ns) > 0
-                ends_ns += [int(min(times_ns)), int(max(times_ns))] if found else [block.start_ns, block.end_ns]
-    return messages, min(ends_ns, default=0), max(ends_ns, default=0)
+                times_ns += [message.log_time_ns for message in messages_of(index, block, {number})]
+    return Span(min(times_ns, default=0), max(times_ns, default=0))
 
 
-def messages_of(index: FileIndex, block: Block) -> list[Message]:
-    """The messages of a block, none where it is damaged, which is noted in the index."""
+def messages_of(index: FileIndex, block: Block, wanted: AbstractSet[int] | None = None) -> list[Message]:
+    """The messages of a block, of all channels or of those wanted; none where it is damaged, which is noted."""
     try:
-        return read_block(index, block).messages
+        return read_block(index, block, wanted).messages
     except DamagedBlockError as error:
         index.note_damage(f"{error}; it was left out")
         return []
-
-
-def log_times(index: FileIndex, block: Block, channel: int) -> NDArray[np.uint64]:
-    """Log times of a channel's messages in a block, from the message index where there is one."""
-    for entry in block.entries:
-        if entry.channel == channel and entry.offset >= 0:
-            return np.frombuffer(index.bytes_at(entry.offset, 16 * entry.messages), "<u8")[::2]
-    if block.entries and all(entry.channel != channel for entry in block.entries):
-        return np.empty(0, np.uint64)
-    messages = messages_of(index, block)
-    times = [message.log_time_ns for message in messages if message.channel.key[1] == channel]
-    return np.array(times, np.uint64)
 
 
 Decoders = Mapping[str, Callable[[memoryview], object]]
@@ -268,7 +239,7 @@ def decoded_messages(
 
     At most ``ahead`` blocks wait decoded. What is damaged is left out and named in ``damage``.
     """
-    wanted = [{number for topic in decoders for number in index.numbers_of(topic)} for index in indexes]
+    wanted = [index.numbers_of(*decoders) for index in indexes]
 
     def decode(block: Block) -> tuple[list[Decoded], str]:
         try:
@@ -278,7 +249,7 @@ def decoded_messages(
         decoded = [
             Decoded(message.channel, message.log_time_ns, _decode(decoders[message.channel.topic], message))
             for message in contents.messages
-            if span.begin_ns <= message.log_time_ns <= span.end_ns
+            if span.holds(message)
         ]
         release(indexes[block.file], block)
         return decoded, contents.damage
@@ -345,11 +316,11 @@ def sampled_messages(
 ) -> Iterator[T]:
     """Decoded messages in a topic's first blocks, or in some from all over a span; malformed ones are left out."""
     chosen = EVERYTHING if span is None else span
-    blocks = _blocks_of(indexes, [set(index.numbers_of(topic)) for index in indexes], chosen)
+    blocks = _blocks_of(indexes, [index.numbers_of(topic) for index in indexes], chosen)
     if span is not None and len(blocks) > _SAMPLED_BLOCKS:
         blocks = [blocks[k * (len(blocks) - 1) // (_SAMPLED_BLOCKS - 1)] for k in range(_SAMPLED_BLOCKS)]
     for block in blocks[:_SAMPLED_BLOCKS]:
         for message in messages_of(indexes[block.file], block):
-            if message.channel.topic == topic and chosen.begin_ns <= message.log_time_ns <= chosen.end_ns:
+            if message.channel.topic == topic and chosen.holds(message):
                 with suppress(MalformedMessageError):
                     yield decode(message.data)

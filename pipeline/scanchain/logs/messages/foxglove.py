@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from typing import Any, TypeVar
+from functools import cache
+from typing import Any, get_type_hints
 
 import msgspec
 import numpy as np
@@ -22,8 +23,6 @@ from scanchain.logs.messages.poses import StampedPose, pose_of
 from scanchain.logs.messages.ros import MalformedMessageError
 
 _POINT_FIELD = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}  # foxglove.NumericType to sensor_msgs/PointField
-
-T = TypeVar("T")
 
 
 class _Stamp(Struct, frozen=True):
@@ -161,25 +160,24 @@ def _pose(position: _Vector, orientation: _Vector, dimension: int) -> Pose:
     return pose_of(position, orientation if is_given else _Vector(w=1.0), dimension)
 
 
-LASER_SCAN = laser_scan, _LaserScan  # readers, and what JSON is parsed to for them
-POINT_CLOUD = point_cloud, _PointCloud
-POSE_IN_FRAME = pose_in_frame, _PoseInFrame
-FRAME_TRANSFORM = frame_transform, _FrameTransform
-FRAME_TRANSFORMS = frame_transforms, _FrameTransforms
-
-
-def parse_json(data: memoryview, kind: type[T]) -> T:
-    """One message. NaN and Infinity, which are no JSON but which Python and others write, are taken."""
+def parse_json(data: memoryview, read: Callable[..., Any]) -> Any:
+    """The record that ``read`` takes. NaN and Infinity, which are no JSON but which Python writes, are taken."""
+    record = _record_of(read)
     try:
-        return msgspec.json.decode(data, type=kind)
+        return msgspec.json.decode(data, type=record)
     except msgspec.ValidationError as error:
         raise MalformedMessageError(f"it does not fit its type: {error}") from error
     except (msgspec.DecodeError, UnicodeDecodeError):
         pass
     try:
-        return msgspec.convert(json.loads(bytes(data)), kind)
+        return msgspec.convert(json.loads(bytes(data)), record)
     except (ValueError, RecursionError) as error:
         raise MalformedMessageError(f"it is no JSON of its type: {error}") from error
+
+
+@cache
+def _record_of(read: Callable[..., Any]) -> Any:
+    return get_type_hints(read)["message"]
 
 
 def protobuf_parser(channel: Channel) -> Callable[[memoryview], Any]:

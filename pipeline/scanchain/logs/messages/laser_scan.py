@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.data import Pose
-from scanchain.logs.messages.returns import NO_TIMES, RangeLimits, Returns, moved
+from scanchain.logs.messages.returns import NEAREST_M, NO_TIMES, RangeLimits, Returns, moved, why_none
 from scanchain.logs.messages.ros import MalformedMessageError, stamp_ns
 
 _MOST_GEOMETRIES = 16
 _MOST_TURNS = 2.0  # largest number of turns that the beams of a scan cover; in degrees they seem to cover more
-_NEAREST_M = float(np.finfo(np.float32).tiny)
 _FARTHEST_M = float(np.finfo(np.float32).max)
 
 
@@ -82,7 +81,7 @@ class LaserScanDecoder:
         """
         message = self.read(data)
         ranges_m = message.ranges_m
-        low_m = max(message.range_min_m if message.range_min_m > 0.0 else 0.0, self.limits.min_m, _NEAREST_M)
+        low_m = max(message.range_min_m if message.range_min_m > 0.0 else 0.0, self.limits.min_m, NEAREST_M)
         high_m = min(
             message.range_max_m if message.range_max_m > 0.0 else _FARTHEST_M, self.limits.max_m, _FARTHEST_M
         )
@@ -95,7 +94,7 @@ class LaserScanDecoder:
             points = geometry.directions[valid] * ranges_m[valid, None]
             times_s = geometry.times_s[valid] if len(geometry.times_s) else NO_TIMES
         points = moved(points, message.T_frame_scan).astype(np.float32, copy=False)
-        why = "" if len(valid) else _why_none(ranges_m, low_m, high_m)
+        why = "" if len(valid) else why_none(ranges_m, low_m, high_m)
         return Returns(message.stamp_ns, points, times_s, len(ranges_m) - len(valid), why)
 
 
@@ -115,13 +114,3 @@ def _geometry(first_rad: float, step_rad: float, beam_s: float, count: int) -> G
     times_s = (beam_s * np.arange(count)).astype(np.float32) if beam_s else NO_TIMES
     times_s.flags.writeable = False
     return Geometry(directions, times_s)
-
-
-def _why_none(ranges_m: NDArray[np.float32], low_m: float, high_m: float) -> str:
-    undefined = int(np.count_nonzero(~np.isfinite(ranges_m)))
-    near = int(np.count_nonzero(ranges_m < low_m)) - int(np.count_nonzero(np.isneginf(ranges_m)))
-    far = len(ranges_m) - undefined - near
-    return (
-        f"of {len(ranges_m)} beams {undefined} are NaN or infinite, {near} are below {low_m:.3g} m, "
-        f"{far} are at {high_m:.3g} m or beyond"
-    )

@@ -12,7 +12,16 @@ from numpy.typing import NDArray
 from scanchain.data import Pose, RawPoints
 from scanchain.errors import one_line
 from scanchain.kernels.scans import keep_valid
-from scanchain.logs.messages.returns import NAMES, NO_TIMES, PointTimes, RangeLimits, Returns, moved
+from scanchain.logs.messages.returns import (
+    NAMES,
+    NEAREST_M,
+    NO_TIMES,
+    PointTimes,
+    RangeLimits,
+    Returns,
+    moved,
+    why_none,
+)
 from scanchain.logs.messages.ros import MalformedMessageError, stamp_ns
 
 _FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
@@ -141,7 +150,10 @@ class PointCloudDecoder:
         points = moved(points[:count], message.T_frame_cloud)
         if self.plane_m is not None:
             points = _in_plane(points, self.plane_m)
-        return Returns(message.stamp_ns, points, times_s, len(cloud) - count, "" if count else _why_none(x, y, z))
+        why = ""
+        if not count:
+            why = why_none(np.hypot(np.hypot(x, y), z), max(self.limits.min_m, NEAREST_M), np.sqrt(high_square))
+        return Returns(message.stamp_ns, points, times_s, len(cloud) - count, why)
 
 
 def _in_plane(points: RawPoints, height_m: float) -> RawPoints:
@@ -227,13 +239,3 @@ def _rows(message: PointCloudMessage, point: np.dtype[np.void]) -> NDArray[np.vo
         return np.frombuffer(body, point, height * width)
     rows = np.ndarray((height, width), point, body, strides=(stride, point.itemsize))
     return rows.reshape(-1)
-
-
-def _why_none(x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32]) -> str:
-    count = len(x)
-    if not count:
-        return "the cloud is empty"
-    undefined = int(np.count_nonzero(~(np.isfinite(x) & np.isfinite(y) & np.isfinite(z))))
-    zero = int(np.count_nonzero((x == 0.0) & (y == 0.0) & (z == 0.0)))
-    outside = count - undefined - zero
-    return f"of {count} points {undefined} are NaN or infinite, {zero} are (0, 0, 0), {outside} are out of range"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from enum import StrEnum
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 from scanchain.logs.mcap.records import Channel
 from scanchain.logs.messages import foxglove
@@ -15,13 +15,7 @@ from scanchain.logs.messages.poses import StampedPose, read_odometry, read_pose,
 from scanchain.logs.messages.ros import unpacked
 
 Read = Callable[..., Any]
-_ROS = ("cdr", "ros1")
-_SCHEMA_LANGUAGES = {
-    "cdr": ("ros2msg", "ros2idl"),
-    "ros1": ("ros1msg",),
-    "json": ("jsonschema", ""),
-    "protobuf": ("protobuf",),
-}
+_ROS, _FOXGLOVE = ("cdr", "ros1"), ("json", "protobuf")  # encodings
 
 
 class Role(StrEnum):
@@ -34,33 +28,25 @@ class Role(StrEnum):
     TRANSFORMS = "transforms"
 
 
-class _Type(NamedTuple):
-    """A message type: its reader takes what the message is parsed to, of Foxglove's types like ``json_type``."""
-
-    role: Role
-    read: Read
-    json_type: type | None = None  # of ROS where None: laid out alike in ROS 1 and 2
-
-
-_TYPES = {
-    "sensor_msgs/LaserScan": _Type(Role.SCAN, read_laser_scan),
-    "sensor_msgs/MultiEchoLaserScan": _Type(Role.SCAN, read_multi_echo_scan),
-    "foxglove.LaserScan": _Type(Role.SCAN, *foxglove.LASER_SCAN),
-    "sensor_msgs/PointCloud2": _Type(Role.CLOUD, read_point_cloud),
-    "livox_ros_driver2/CustomMsg": _Type(Role.CLOUD, read_livox),
-    "livox_ros_driver/CustomMsg": _Type(Role.CLOUD, read_livox),
-    "livox_interfaces/CustomMsg": _Type(Role.CLOUD, read_livox),
-    "foxglove.PointCloud": _Type(Role.CLOUD, *foxglove.POINT_CLOUD),
-    "nav_msgs/Odometry": _Type(Role.ODOMETRY, read_odometry),
-    "geometry_msgs/PoseStamped": _Type(Role.POSE, read_pose),
-    "geometry_msgs/PoseWithCovarianceStamped": _Type(Role.POSE, read_pose),
-    "foxglove.PoseInFrame": _Type(Role.POSE, *foxglove.POSE_IN_FRAME),
-    "tf2_msgs/TFMessage": _Type(Role.TRANSFORMS, read_transforms),
-    "tf/tfMessage": _Type(Role.TRANSFORMS, read_transforms),
-    "foxglove.FrameTransform": _Type(Role.TRANSFORMS, *foxglove.FRAME_TRANSFORM),
-    "foxglove.FrameTransforms": _Type(Role.TRANSFORMS, *foxglove.FRAME_TRANSFORMS),
+_TYPES: dict[str, tuple[Role, Read]] = {  # those of ROS are laid out alike in ROS 1 and 2
+    "sensor_msgs/LaserScan": (Role.SCAN, read_laser_scan),
+    "sensor_msgs/MultiEchoLaserScan": (Role.SCAN, read_multi_echo_scan),
+    "foxglove.LaserScan": (Role.SCAN, foxglove.laser_scan),
+    "sensor_msgs/PointCloud2": (Role.CLOUD, read_point_cloud),
+    "livox_ros_driver2/CustomMsg": (Role.CLOUD, read_livox),
+    "livox_ros_driver/CustomMsg": (Role.CLOUD, read_livox),
+    "livox_interfaces/CustomMsg": (Role.CLOUD, read_livox),
+    "foxglove.PointCloud": (Role.CLOUD, foxglove.point_cloud),
+    "nav_msgs/Odometry": (Role.ODOMETRY, read_odometry),
+    "geometry_msgs/PoseStamped": (Role.POSE, read_pose),
+    "geometry_msgs/PoseWithCovarianceStamped": (Role.POSE, read_pose),
+    "foxglove.PoseInFrame": (Role.POSE, foxglove.pose_in_frame),
+    "tf2_msgs/TFMessage": (Role.TRANSFORMS, read_transforms),
+    "tf/tfMessage": (Role.TRANSFORMS, read_transforms),
+    "foxglove.FrameTransform": (Role.TRANSFORMS, foxglove.frame_transform),
+    "foxglove.FrameTransforms": (Role.TRANSFORMS, foxglove.frame_transforms),
 }
-LIDAR_TYPES = tuple(sorted(name for name, each in _TYPES.items() if each.role in (Role.SCAN, Role.CLOUD)))
+LIDAR_TYPES = tuple(sorted(name for name, (role, _) in _TYPES.items() if role in (Role.SCAN, Role.CLOUD)))
 
 
 def kind(channel: Channel) -> str:
@@ -70,10 +56,9 @@ def kind(channel: Channel) -> str:
 
 def role(channel: Channel) -> Role | None:
     """Use of the channel's messages; None for a type or an encoding that is not supported."""
-    known = _TYPES.get(kind(channel))
-    if known is None or channel.schema_encoding not in _SCHEMA_LANGUAGES.get(channel.encoding, ()):
-        return None
-    return known.role if (channel.encoding in _ROS) == (known.json_type is None) else None
+    name = kind(channel)
+    encodings = _FOXGLOVE if name.startswith("foxglove.") else _ROS
+    return _TYPES[name][0] if name in _TYPES and channel.encoding in encodings else None
 
 
 def is_scan(channel: Channel) -> bool:
@@ -104,15 +89,15 @@ def has_transforms(channel: Channel) -> bool:
 def reader(channel: Channel) -> Read:
     """Reader of the messages of a channel that has a role; that of poses takes their ``dimension``, too."""
     name, encoding = kind(channel), channel.encoding
-    _, read, json_type = _TYPES[name]
+    _, read = _TYPES[name]
     if read is read_livox:
         return partial(read_livox, encoding=encoding)
-    if json_type is None:
+    if encoding in _ROS:
         package, _, type_name = name.partition("/")
         ros_name = "tf2_msgs/msg/TFMessage" if package == "tf" else f"{package}/msg/{type_name}"
         parse = partial(unpacked, type_name=ros_name, encoding=encoding)
     elif encoding == "json":
-        parse = partial(foxglove.parse_json, kind=json_type)
+        parse = partial(foxglove.parse_json, read=read)
     else:
         parse = foxglove.protobuf_parser(channel)
     return lambda data, **options: read(parse(data), **options)

@@ -32,6 +32,7 @@ class Returns(NamedTuple):
     why: str
 
 
+NEAREST_M = float(np.finfo(np.float32).tiny)  # below it a range is zero
 NO_TIMES = np.empty(0, np.float32)
 NO_TIMES.flags.writeable = False
 
@@ -42,6 +43,16 @@ def moved(points: RawPoints, T_frame_cloud: Pose | None) -> RawPoints:
         return points
     d = points.shape[1]
     return (points @ T_frame_cloud[:d, :d].T + T_frame_cloud[:d, 3]).astype(np.float32)
+
+
+def why_none(ranges_m: NDArray[np.float32], low_m: float, high_m: float) -> str:
+    """Reason why none of the ranges (N,) is a return between these limits."""
+    undefined = int(np.count_nonzero(~np.isfinite(ranges_m)))
+    near = int(np.count_nonzero(ranges_m < low_m)) - int(np.count_nonzero(np.isneginf(ranges_m)))
+    return (
+        f"of {len(ranges_m)} ranges {undefined} are NaN or infinite, {near} are below {low_m:.3g} m, "
+        f"{len(ranges_m) - undefined - near} are at {high_m:.3g} m or beyond"
+    )
 
 
 NAMES = ("t", "time", "timestamp", "offset_time", "time_offset", "timeOffset", "time_stamp")
