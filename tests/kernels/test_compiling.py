@@ -6,7 +6,6 @@ import re
 import shutil
 import subprocess
 import sys
-from itertools import count
 from pathlib import Path
 from time import perf_counter
 
@@ -27,7 +26,6 @@ from scanchain.runs.job import Job, Progress
 from scanchain.runs.run import run
 from scanchain.settings import load_settings
 from scanchain.slam import Slam
-from scanchain_viz.recording.recording import Recording
 
 
 def kernel(module="scanchain.kernels.voxels"):
@@ -139,17 +137,6 @@ def test_a_run_tells_compilation_apart_from_work(office, tmp_path, monkeypatch):
     assert metrics["run_s"] + metrics["compile_s"] <= took_s + 0.01
     assert metrics["times_real_time"] == pytest.approx(metrics["log_span_s"] / metrics["run_s"])
     assert max(metrics["p95_ms"].values()) < 300.0
-
-
-@pytest.mark.parametrize("compiles", [True, False])
-def test_the_first_scan_is_shown_ahead_where_kernels_are_compiled(office, tmp_path, monkeypatch, compiles):
-    seconds, shown, steps = count(), [], []
-    monkeypatch.setattr("scanchain.runs.run.compiled_s", lambda: next(seconds) if compiles else 0.0)
-    monkeypatch.setattr(Recording, "preview", lambda self, scan: shown.append(scan))
-    monkeypatch.setattr(Recording, "log", lambda self, step: steps.append(step))
-    run(Job(logs=(office,), out=tmp_path / "run", sinks=frozenset()), open_recorder, Progress())
-    assert [scan.index for scan in shown] == [steps[0].scan.index] * compiles
-    np.testing.assert_array_equal(steps[0].T_world_lidar, np.eye(3))  # as the viewer draws a scan without a pose
 
 
 @pytest.mark.parametrize("d", [2, 3])

@@ -22,11 +22,9 @@ from scanchain.runs.closures import final_verdicts
 from scanchain.runs.step_table import StepTable
 from scanchain.verdict import Judged, Kind, Stretch, Verdict
 from scanchain_viz.recording import drawing, entities, sinks, viewer
-from scanchain_viz.recording import recording as module
 from scanchain_viz.recording.drawing import Message
 from scanchain_viz.recording.entities import blueprint
-from scanchain_viz.recording.recording import Recording
-from scanchain_viz.recording.sinks import file_sink, write_recording
+from scanchain_viz.recording.sinks import write_recording
 from tests.support.killing import same_recording, wait_until
 from tests.support.recordings import (
     EVERY_SCAN,
@@ -88,28 +86,6 @@ def test_states_are_recorded_where_they_change_and_say_why(recorded):
     assert states == [["ok"], ["degenerate"], ["lost"], ["ok"]]
     texts = [row[0] for row in column(recorded[2], entities.EVENTS, "TextLog:text")]
     assert "lost: a reason" in texts and "closure 1 (0 to 4) accepted: looked alike" in texts
-
-
-@pytest.mark.filterwarnings("ignore:RRD file has no footer")  # before the recording is closed
-def test_a_preview_is_shown_by_a_viewer_until_its_step_is_recorded_and_is_in_no_file(tmp_path, monkeypatch):
-    steps, before, after = drive(20, 2), tmp_path / "before.rrd", tmp_path / "after.rrd"
-    monkeypatch.setattr(Recording, "_viewer_address", lambda self: "a viewer")
-    monkeypatch.setattr(module, "viewer_sink", lambda address, stream, layout: file_sink(after, stream, layout))
-    measured = replace(steps[0].scan, points=2.0 * steps[0].scan.points)
-    with opened(tmp_path / "a.rrd", sinks=("save", "connect")) as recording:
-        recording.preview(measured)
-        assert all(sink.settle() for sink in recording.sinks)
-        before.write_bytes(after.read_bytes())
-        for step in steps:
-            recording.log(step)
-    assert recording.warnings == []
-    scan = "Points3D:positions"
-    (previewed,) = column(before, entities.SCAN, scan)
-    np.testing.assert_array_equal(np.array(previewed)[:, :2], measured.points)
-    assert column(after, entities.SCAN, "scan") == [0, *range(20)]
-    assert column(after, entities.SCAN, scan)[1:] == column(tmp_path / "a.rrd", entities.SCAN, scan)
-    assert column(after, entities.SCAN, scan)[0] == previewed
-    assert column(tmp_path / "a.rrd", entities.SCAN, "scan") == list(range(20))
 
 
 def test_what_the_back_end_rejects_and_accepts_again_is_told_when_it_does_so(tmp_path):

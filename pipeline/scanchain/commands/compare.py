@@ -83,12 +83,11 @@ def compare(logs: tuple[Source, ...], methods: str | None, out: Path | None, as_
     from scanchain.comparison.compare import Comparison
     from scanchain.comparison.compare import compare as run_comparison
     from scanchain.comparison.table import TABLE_FILE, text
-    from scanchain.runs.directory import directory_name
     from scanchain_viz.recording.results import present_comparison
 
     comparison = Comparison(
         logs=logs,
-        out=Path("runs") / f"compare-{directory_name(logs[0].stem)}" if out is None else out,
+        out=Path("runs") / f"compare-{logs[0].stem}" if out is None else out,
         methods=tuple(name.strip() for name in methods.split(",") if name.strip()) if methods else (),
         command=tuple(sys.argv),
         **given,

@@ -288,8 +288,8 @@ def _keep(bug: BaseException | None, folder: Path, steps: StepTable, provenance:
         if bug is not None:
             written[2].write_text("".join(traceback.format_exception(bug)), encoding="utf-8")
         if len(steps) and not (folder / "metrics.json").exists():  # else the results are better
-            write_tum(written[0], steps.odometry, force=True)
-            steps.write(written[1], steps.best_known)
+            write_tum(written[0], steps.trajectory("T_odom_lidar"), force=True)
+            steps.write(written[1], steps.trajectory("T_world_lidar"))
     except OSError:
         for path in written:
             path.unlink(missing_ok=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import AbstractContextManager, closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,14 +25,13 @@ from scanchain.logs.topics import other_sensors
 from scanchain.preprocess import prepare_ahead
 from scanchain.runs.closures import final_verdicts
 from scanchain.runs.directory import (
-    CHECKPOINT_FILE,
     POINTS_FILE,
     RECORDING_FILE,
     RUN_FILE,
     TRUTH_FILE,
     RunDirectory,
+    left_behind,
     partial_runs,
-    stopped_run,
 )
 from scanchain.runs.job import Job, OpenRecorder, Progress, Recorder
 from scanchain.runs.metrics import (
@@ -125,9 +124,9 @@ class _Run:
             self.steps = left.steps
             self.began_s -= left.run_s
             progress.announce(f"resuming after {counted(len(self.steps), 'scan')} of {left.folder.name}")
-        elif idle := stopped_run(job.out):
+        elif idle := left_behind(job.out):
             progress.announce(
-                f"{idle.name} is of a run that was stopped; --resume would continue it, this run starts over and "
+                f"{idle.name} is of a run that did not end; --resume would continue it, this run starts over and "
                 "removes it once complete"
             )
         elif job.resume and (begun := partial_runs(job.out)):
@@ -165,7 +164,7 @@ class _Run:
         if self.left is not None:
             self.notes.append(resume_recording(self.directory.path, self.left, recording, checkpoints))
         with closing(scans):  # what it left out is counted then, also if the run was stopped
-            tracked = self.progress.track(self._previewed(scans, recording), self.log.scan_count - len(self.steps))
+            tracked = self.progress.track(scans, self.log.scan_count - len(self.steps))
             if slam.dimension == 3 and threads() > 1:
                 tracked = prepare_ahead(tracked, slam.front_end.odometry.resolution)
             for scan in tracked:
@@ -176,13 +175,6 @@ class _Run:
                     checkpoints.write(slam, self.steps, recording.secure())
         checkpoints.write(slam, self.steps, recording.secure())  # an interruption from here on loses no scan
         return slam.finish(self.progress.say)
-
-    def _previewed(self, scans: Iterator[Scan], recording: Recorder) -> Iterator[Scan]:
-        """The scans; the first one is shown as measured where its step waits for kernels that are compiled."""
-        for number, scan in enumerate(scans):
-            if not number and self.left is None and compiled_s() > self.compiled_before_s:
-                recording.preview(scan)
-            yield scan
 
     def write(self, result: SlamResult, recording: Recorder) -> tuple[Results, Judged]:
         """Write the results to the directory, and the verdict on them and on the truth to the recording."""

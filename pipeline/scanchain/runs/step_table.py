@@ -52,22 +52,9 @@ class StepTable:
         """State of the last step."""
         return State(self.columns.texts[self.columns["state"][-1]])
 
-    def texts(self, name: str) -> pa.DictionaryArray:
-        """Texts (N,) of a column, in the order in which they occur."""
-        import pyarrow as pa
-
-        names = self.columns.texts
-        return pa.array([names[code] for code in self.columns[name].tolist()], pa.string()).dictionary_encode()
-
-    @property
-    def odometry(self) -> Trajectory:
-        """T_odom_lidar of the steps so far."""
-        return self._trajectory("T_odom_lidar")
-
-    @property
-    def best_known(self) -> Trajectory:
-        """T_world_lidar of the steps so far, each as it was known at its time."""
-        return self._trajectory("T_world_lidar")
+    def trajectory(self, name: str) -> Trajectory:
+        """The steps so far by ``T_odom_lidar``, or by ``T_world_lidar``, each as it was known at its time."""
+        return Trajectory(self.columns["stamp_ns"].copy(), self.columns[name].copy())
 
     @property
     def span_s(self) -> float:
@@ -75,10 +62,14 @@ class StepTable:
         times_ns = self.columns["log_time_ns"]
         return int(times_ns[-1] - times_ns[0]) * 1e-9 if len(times_ns) else 0.0
 
-    def covariances(self) -> list[Matrix | None]:
-        """Covariance (k, k) of each match, of a lidar-frame twist; None where a direction is unobservable."""
-        values, is_sound = _covariances(self.columns)
-        return [value if good else None for value, good in zip(values, is_sound.tolist(), strict=True)]
+    def covariances(self) -> Matrix:
+        """(N, k, k) of the matches, of lidar-frame twists; NaN where a direction is unobservable."""
+        informations = self.columns["information"]
+        finite = np.atleast_1d(np.isfinite(informations).all(axis=(1, 2)))
+        values, vectors = np.linalg.eigh(np.where(finite[:, None, None], informations, 0.0))
+        sound = finite & (values[:, 0] > _SINGULAR * values[:, -1]) & (values[:, -1] > 0.0)
+        scaled = vectors / np.sqrt(np.where(sound[:, None], values, np.nan))[:, None, :]
+        return self.columns["variance_factor"][:, None, None] * (scaled @ np.swapaxes(scaled, 1, 2))
 
     def states(self) -> Counter[State]:
         """Number of steps in each state."""
@@ -96,20 +87,20 @@ class StepTable:
         import pyarrow as pa
 
         steps = self.columns
-        covariances, is_sound = _covariances(steps)
+        covariances = self.covariances()
         columns: dict[str, object] = {
             **{name: steps[name] for name in ("index", "stamp_ns", "log_time_ns")},
             **pose_columns(trajectory.poses),
             **{f"odom_{name}": values for name, values in pose_columns(steps["T_odom_lidar"]).items()},
             **self._checks(steps, trajectory, T_base_lidar),
-            "covariance": _lists(covariances, ~is_sound),
+            "covariance": _lists(covariances, np.isnan(covariances[:, 0, 0])),
             **{name: steps[name] for name in ("scan_points", "dropped", *_OF_MATCH[:5], "cost_m2", "converged")},
-            "match_reason": self.texts("match_reason"),
+            "match_reason": self._texts("match_reason"),
             "degeneracy_eigenvalue": steps["degeneracy_eigenvalue"],
             "observability": steps["observability"],
             "degeneracy_direction": _lists(steps["degeneracy_direction"]),
-            "state": self.texts("state"),
-            "reason": self.texts("reason"),
+            "state": self._texts("state"),
+            "reason": self._texts("reason"),
             "starts_segment": steps["starts_segment"],
             "is_copy": steps["is_copy"],
             "keyframe": steps["keyframe"],
@@ -137,9 +128,11 @@ class StepTable:
         innovation = check_wheels(trajectory.poses, wheels).innovation
         return columns | {"wheel_innovation": pa.array(innovation, from_pandas=True)} | _wheel_columns(wheels)
 
-    def _trajectory(self, name: str) -> Trajectory:
-        steps = self.columns
-        return Trajectory(steps["stamp_ns"].copy(), steps[name].copy())
+    def _texts(self, name: str) -> pa.DictionaryArray:
+        import pyarrow as pa
+
+        names = self.columns.texts
+        return pa.array([names[code] for code in self.columns[name].tolist()], pa.string()).dictionary_encode()
 
 
 def inlier_shares(steps: Columns) -> NDArray[np.float64]:
@@ -194,16 +187,6 @@ def _wheel_columns(poses: Matrix) -> dict[str, object]:
     known = np.isfinite(poses[:, 0, 0])
     columns = pose_columns(np.where(known[:, None, None], poses, np.eye(poses.shape[-1])))
     return {f"wheel_{name}": pa.array(values, mask=~known) for name, values in columns.items()}
-
-
-def _covariances(steps: Columns) -> tuple[Matrix, NDArray[np.bool_]]:
-    """Covariances (N, k, k) of the matches of steps in columns, and True where there is one (N,)."""
-    informations = steps["information"]
-    finite = np.atleast_1d(np.isfinite(informations).all(axis=(1, 2)))
-    values, vectors = np.linalg.eigh(np.where(finite[:, None, None], informations, 0.0))
-    sound = finite & (values[:, 0] > _SINGULAR * values[:, -1]) & (values[:, -1] > 0.0)
-    scaled = vectors / np.sqrt(np.where(sound[:, None], values, 1.0))[:, None, :]
-    return steps["variance_factor"][:, None, None] * (scaled @ np.swapaxes(scaled, 1, 2)), sound
 
 
 COLUMNS = ("covariance", "state")

@@ -72,9 +72,7 @@ def evidence_of_run(folder: Path, expected: ExpectedError | None) -> Evidence:
     try:
         steps = pq.ParquetFile(folder / "steps.parquet").read()
     except FileNotFoundError:
-        told = "no run directory, or that of an unfinished run (--resume goes on)"
-        if (folder / "summary.txt").exists():  # of another command
-            told = "only scanchain run writes it; see summary.txt"
+        told = "no directory of scanchain run, or that of an unfinished one (--resume goes on)"
         raise InputError(f"{folder}: has no steps.parquet: {told}") from None
     except (OSError, ValueError) as error:
         raise InputError(f"{folder}: no steps.parquet that can be read ({error}); name a run directory") from None

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rerun.error_utils import catch_and_log_exceptions
 
 from scanchain.config import RecordingConfig
-from scanchain.data import Closure, GraphState, Matrix, Scan, Step, Trajectory
+from scanchain.data import Closure, GraphState, Matrix, Step, Trajectory
 from scanchain.errors import InputError
 from scanchain.runs.job import SinkName
 from scanchain.runs.step_table import StepTable
@@ -129,11 +129,6 @@ class Recording:
         if self.path is None or self.file is None or not self.file.settle():
             return 0
         return self.path.stat().st_size
-
-    def preview(self, scan: Scan) -> None:
-        """Show a viewer, but no file, every n-th point of the first scan until its step is recorded."""
-        viewers = [sink for sink in self.sinks if sink is not self.file]
-        self._send(lambda: self._cloud(entities.SCAN, scan.points, Times.at(scan.index, scan.stamp_ns)), viewers)
 
     def log(self, step: Step) -> None:
         """Record one step; most of it is gathered and written in batches."""
@@ -281,13 +276,12 @@ class Recording:
             messages += self._cloud(entities.LOCAL_MAP, step.local_map, self.now)
         return [*messages, *self.batcher.messages()] if self.batcher.is_due else messages
 
-    def _send(self, say: Callable[[], Iterable[Message]], sinks: Sequence[Sink] | None = None) -> None:
-        """Send the messages that ``say`` returns to these sinks, or to every one."""
-        sinks = self.sinks if sinks is None else sinks
+    def _send(self, say: Callable[[], Iterable[Message]]) -> None:
+        """Send the messages that ``say`` returns to every sink."""
         messages: list[Message] = []
-        if sinks:
+        if self.sinks:
             self._guard(lambda: messages.extend(say()))
-        for sink in sinks if messages else ():
+        for sink in self.sinks if messages else ():
             sink.send(messages)
 
     def _guard(self, act: Callable[[], object]) -> None:
