@@ -33,8 +33,8 @@ def test_a_log_is_opened_with_keys_of_its_section(office):
     assert sc.open_log(office, log.config, log__every=2).scan_count == 5
     for changes, words in (
         ({"topic": "/nowhere"}, "has no topic /nowhere"),
-        ({"topics": "/scan"}, "log.topics is not a configuration key; did you mean topic"),
-        ({"end_s": "soon"}, "log.end_s is 'soon'"),
+        ({"topics": "/scan"}, "log__topics is not a configuration key; did you mean log__topic"),
+        ({"end_s": "soon"}, "log__end_s is 'soon'"),
     ):
         with pytest.raises(InputError, match=words):
             sc.open_log(office, **changes)
@@ -154,7 +154,7 @@ RECORDS = np.zeros(10, [("x", np.float32), ("y", np.float32), ("z", np.float32),
         (lambda: sc.downsample(POINTS + 5.4e6, 0.002), r"points lie up to 5.4e\+06 m from the origin"),
         (lambda: sc.downsample(np.array([[0.0, 0.0], [2.0**21, 0.0]]), 1.0), r"2.1e\+06 m apart"),
         (lambda: sc.run("nowhere.mcap", "out"), "nowhere.mcap"),
-        (lambda: sc.optimize(sc.PoseGraph(2), max_iter=3), r"did you mean max_iterations\?"),
+        (lambda: sc.optimize(sc.PoseGraph(2), max_iter=3), r"did you mean graph__max_iterations\?"),
         (lambda: sc.optimize("graph.g2o"), r"graph is 'graph.g2o'; wanted a PoseGraph: read_g2o\(path\).graph"),
         (lambda: sc.write_g2o("/nope/x.g2o", sc.PoseGraph(2)), "/nope/x.g2o: cannot be written"),
         (lambda: sc.run("nowhere.mcap", 3), "out is 3; wanted a path"),

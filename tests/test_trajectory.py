@@ -78,7 +78,7 @@ def test_comments_and_empty_lines_are_passed_over_and_words_separated(tmp_path, 
         ("1.0 1 2 inf 0 0 0 1", "finite"),
         ("1.0 1 2 3 0 0 0 0", "quaternion"),
         ("1.0 1 2 3 0 0 0 3", "has a quaternion of length 3, not 1"),
-        ("976052905.167 976052911.885 -0.1 -0.1 0 0 0 -1.7", "has two stamps, as a file of relations"),
+        ("976052905.167 976052911.885 -0.1 -0.1 0 0 0 -1.7", "evaluate --relations"),
     ],
 )
 def test_a_bad_tum_line_is_named_with_its_number(tmp_path, line, says):
