@@ -168,35 +168,24 @@ def run_within(
             env=environment,
             start_new_session=True,
         )
-        seen: dict[int, psutil.Process] = {}
+        seen: dict[int, psutil.Process] = {}  # all below it
+        began, peak, reason, stop = monotonic(), 0.0, KilledFor.NOTHING, stop or Event()
         try:
-            return _watch(process, limits, interval_s, stop or Event(), seen)
+            while reason is KilledFor.NOTHING and process.poll() is None:
+                peak = max(peak, resident_mib(process.pid, seen))
+                if peak > limits.memory_mib:
+                    reason = KilledFor.MEMORY
+                elif monotonic() - began > limits.time_s:
+                    reason = KilledFor.TIME
+                elif stop.wait(interval_s):
+                    reason = KilledFor.STOP
+            return Ending(process.returncode or 0, reason, peak, monotonic() - began)
         finally:
             _kill(process.pid, with_group=True)
             for each in seen.values():  # those in groups of their own that lost their parent, too
                 with suppress(psutil.Error):
                     each.kill()
             process.communicate()
-
-
-def _watch(
-    process: subprocess.Popen[bytes],
-    limits: Limits,
-    interval_s: float,
-    stop: Event,
-    seen: dict[int, psutil.Process],
-) -> Ending:
-    """Wait for the end, or for the moment at which there is a reason to kill it; ``seen`` takes all below it."""
-    began, peak, reason = monotonic(), 0.0, KilledFor.NOTHING
-    while reason is KilledFor.NOTHING and process.poll() is None:
-        peak = max(peak, resident_mib(process.pid, seen))
-        if peak > limits.memory_mib:
-            reason = KilledFor.MEMORY
-        elif monotonic() - began > limits.time_s:
-            reason = KilledFor.TIME
-        elif stop.wait(interval_s):
-            reason = KilledFor.STOP
-    return Ending(process.returncode or 0, reason, peak, monotonic() - began)
 
 
 def _kill(pid: int, *, with_group: bool) -> None:

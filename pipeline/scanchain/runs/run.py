@@ -321,11 +321,8 @@ def _heading(log: Log, config: Config, stopped: str) -> str:
         known += ", not used: odometry.prior is constant-velocity"
     elif log.has_odometry and not log.scans_with_wheels:
         known += ", not used: no reading is near the stamp of a scan"
-    place, turned, is_moving = (
-        log.T_base_lidar[:-1, -1],
-        turned_by(log.T_base_lidar),
-        log.mounting.motion is not None,
-    )
+    place, turned = log.T_base_lidar[:-1, -1], turned_by(log.T_base_lidar)
+    is_moving = log.mounting.motion is not None
     if place.any() or turned or is_moving:
         at = ", ".join(f"{axis} {value_m:.2f}" for axis, value_m in zip("xyz", place, strict=False))
         known += f"; lidar at {at} m of {log.mounting.base_name}{turned and f', turned by {turned}'}"

@@ -122,11 +122,14 @@ class StepTable:
             "velocity_innovation": pa.array(velocity, from_pandas=True),
             "overlap_ratio": pa.array(overlap, from_pandas=True),
         }
-        if T_base_lidar is None or not steps["has_wheels"].any():
+        known = steps["has_wheels"]
+        if T_base_lidar is None or not known.any():
             return columns
         wheels = steps["T_odom_base"] @ T_base_lidar
         innovation = check_wheels(trajectory.poses, wheels).innovation
-        return columns | {"wheel_innovation": pa.array(innovation, from_pandas=True)} | _wheel_columns(wheels)
+        columns["wheel_innovation"] = pa.array(innovation, from_pandas=True)
+        places = pose_columns(np.where(known[:, None, None], wheels, lie.identity(trajectory.dimension)))
+        return columns | {f"wheel_{name}": pa.array(values, mask=~known) for name, values in places.items()}
 
     def _texts(self, name: str) -> pa.DictionaryArray:
         import pyarrow as pa
@@ -178,15 +181,6 @@ def pose_columns(poses: Matrix) -> dict[str, NDArray[np.float64]]:
     values = np.hstack([lifted[:, :3, 3], lie.to_quaternion(lifted[:, :3, :3])])
     names = ("x", "y", "z", "qx", "qy", "qz", "qw")
     return {name: column.copy() for name, column in zip(names, values.T, strict=True)}
-
-
-def _wheel_columns(poses: Matrix) -> dict[str, object]:
-    """Pose columns of poses (N, d+1, d+1), null where one is NaN."""
-    import pyarrow as pa
-
-    known = np.isfinite(poses[:, 0, 0])
-    columns = pose_columns(np.where(known[:, None, None], poses, np.eye(poses.shape[-1])))
-    return {f"wheel_{name}": pa.array(values, mask=~known) for name, values in columns.items()}
 
 
 COLUMNS = ("covariance", "state")
