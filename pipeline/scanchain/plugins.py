@@ -41,10 +41,7 @@ def load(name: str, *methods: str) -> type:
         raise InputError(f"{name}: {reason}") from error
     found = getattr(module, class_name, None)
     if not isinstance(found, type):
-        own = [key for key, value in vars(module).items() if getattr(value, "__module__", "") == module.__name__]
-        classes = [key for key in own if isinstance(vars(module)[key], type)]
-        there = f"there are {', '.join(classes)}" if classes else "it defines none"
-        raise InputError(f"{name}: {module.__file__} has no class {class_name}; {there}")
+        raise InputError(f"{name}: {module.__file__} has no class {class_name}; check its name")
     for method in methods:
         if not callable(getattr(found, method, None)):
             needs = f"it needs {' and '.join(methods)} (documentation: Extending)"

@@ -123,8 +123,6 @@ def read_toml(file: Path) -> dict[str, Any]:
     """The tree of a TOML file that a user named."""
     try:
         return tomllib.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{file}: no such file; check --config") from None
     except OSError as error:
         raise InputError(f"{file}: cannot be read ({error.strerror}); --config takes a TOML file") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -144,10 +144,6 @@ def text_lines(path: Path | str) -> Iterator[tuple[str, list[str]]]:
     path = checks.path(path, "path")
     try:
         text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(f"{path} does not exist; check the path") from None
-    except IsADirectoryError:
-        raise InputError(f"{path} is a directory; name a file in it") from None
     except UnicodeDecodeError:
         raise InputError(f"{path} is not text; expected a trajectory with one pose a line") from None
     except OSError as error:

@@ -60,7 +60,7 @@ def test_several_lidars_ask_for_a_choice_by_the_short_option_which_info_and_conv
         (["evaluate", "{long}", "{long}"], TOO_LONG),
         (["simulate", "office", "x.mcap", "--duration", "long"], ["--duration", "simulate --help"]),
         (["sequence", "get", "mulran"], ["mulran.mcap", "ask for a sequence", "scanchain convert"]),
-        (["check", "{tmp}"], ["has no steps.parquet: no directory of scanchain run", "--resume"]),
+        (["check", "{tmp}"], ["has no steps.parquet that can be read", "scanchain run", "--resume"]),
         (["check", "{office}"], ["is not a run directory", "--trajectory"]),
         (["check", "{office}", "{office}"], ["--trajectory"]),
         (["evaluate", "absent.tum"], ["give GT", "--relations"]),
@@ -70,7 +70,7 @@ def test_several_lidars_ask_for_a_choice_by_the_short_option_which_info_and_conv
         (["evaluate", "a", "b", "--png", "{office}"], ["name a file that ends in .png"]),
         (["config", "show", "--loops.enable", "off"], ["--loops.enable", "loops.enabled"]),
         (["config", "dump", "--lidar", "4d"], ["--lidar", "'4d'", "config dump --help"]),
-        (["view", "absent"], ["absent", "no such directory", "scanchain run"]),
+        (["view", "absent"], ["absent: no recording", "scanchain run"]),
     ],
 )
 def test_a_wrong_command_line_is_one_line_with_what_to_do(refused, monkeypatch, tmp_path, office, words, said):

@@ -174,10 +174,6 @@ def view(directory: Path, web: bool, png: Path | None, force: bool) -> None:
     """
     from scanchain.commands.terminal import Terminal
 
-    if not directory.exists():
-        raise InputError(
-            f"{directory}: no such directory or file; check the path (scanchain run makes it by --out)"
-        )
     if png is not None:
         from scanchain_viz.pictures.maps import draw_run
 
@@ -186,12 +182,10 @@ def view(directory: Path, web: bool, png: Path | None, force: bool) -> None:
         click.echo(png)
         return
     path = directory / "recording.rrd" if directory.is_dir() else directory
-    if not path.exists():
+    if not path.exists() or path.suffix != ".rrd":
         raise InputError(
-            f"{directory}: holds no recording.rrd; scanchain run writes it unless --rerun leaves out save"
+            f"{directory}: no recording; give a .rrd file, or a directory of scanchain run with --rerun save"
         )
-    if path.suffix != ".rrd":
-        raise InputError(f"{path}: is no recording (.rrd); give a run directory")
     from scanchain_viz.recording.viewer import show
 
     with Terminal("recordings"):  # SIGTERM ends it like Ctrl-C: the server goes with it

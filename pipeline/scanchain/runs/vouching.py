@@ -70,11 +70,9 @@ def evidence_of_run(folder: Path, expected: ExpectedError | None) -> Evidence:
         raise InputError(f"{folder}: is not a run directory; to check a log, name a --trajectory FILE.tum")
     try:
         steps = pq.ParquetFile(folder / "steps.parquet").read()
-    except FileNotFoundError:
-        told = "no directory of scanchain run, or that of an unfinished one (--resume goes on)"
-        raise InputError(f"{folder}: has no steps.parquet: {told}") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{folder}: no steps.parquet that can be read ({error}); name a run directory") from None
+    except (OSError, ValueError):
+        remedy = "name a directory of scanchain run (--resume ends an unfinished one)"
+        raise InputError(f"{folder}: has no steps.parquet that can be read; {remedy}") from None
     loops_file = folder / "loops.parquet"
     return evidence_of(steps, pq.ParquetFile(loops_file).read() if loops_file.exists() else None, expected)
 
