@@ -110,7 +110,7 @@ class StepTable:
             name: pa.array(np.ascontiguousarray(values)) if isinstance(values, np.ndarray) else values
             for name, values in columns.items()
         }
-        return pa.table(arrays).replace_schema_metadata(_NOTES)
+        return pa.table(arrays)
 
     def _checks(self, steps: Columns, trajectory: Trajectory, T_base_lidar: Pose | None) -> dict[str, object]:
         """Poses by the wheels, and normalized innovations of the independent checks, null where there are none."""
@@ -150,20 +150,6 @@ _OF_MATCH = (
     "degeneracy_direction", "information", "variance_factor",
 )  # fmt: skip
 STAGES = ("read", "preprocess", "match", "map", "loops")
-_NOTES = {
-    "x y z qx qy qz qw": "T_world_lidar after optimization, meters; odom_*: T_odom_lidar before it; "
-    "wheel_*: of the lidar by wheel odometry, null where there is no reading near the stamp",
-    "covariance": "row by row, of a twist xi in the lidar's own frame, T exp(xi), order (translation, rotation), "
-    "SE(2) 3x3, SE(3) 6x6; null where a direction of the match is unobservable",
-    "points, inliers": "of the downsampled scan; scan_points: valid returns, dropped: invalid ones",
-    "wheel_innovation": "difference of the motion around the scan from that by the wheels, standard deviations; "
-    "null where there is nothing to compare",
-    "velocity_innovation": "change of the motion to the scan, standard deviations of what an acceleration can be",
-    "starts_segment": "true if the motion from the scan before is unknown: a new map begins there",
-    "is_copy": "true if the scan is the one before once more, to the last bit",
-    "overlap_ratio": "share of the points with a correspondence over its median in the scans before",
-    "keyframe": "number in the graph, -1 if none was made",
-}
 
 
 def _lists(rows: Matrix, is_null: NDArray[np.bool_] | None = None) -> pa.FixedSizeListArray:
