@@ -150,16 +150,6 @@ def test_a_value_out_of_range_names_key_value_and_range(file, key, text, limit):
     says(complaint(file=path), f"{path}: {key} is {text}; it must be {limit}")
 
 
-def test_limits_the_wrong_way_round_name_both_once_the_preset_is_known():
-    for dimension in (None, 2):
-        text = complaint(dimension=dimension, overrides=[flag("log.start_s", "5"), flag("log.end_s", "3")])
-        says(text, "--log.start_s", "log.start_s is 5; it must be below log.end_s (3)")
-    change = [flag("loops.max_radius_m", "3")]  # 2D: at least 1 m; by default at least 5
-    assert load_settings(overrides=change).config.loops.max_radius_m == 3.0
-    assert load_settings(2, overrides=change).config.loops.max_radius_m == 3.0
-    says(complaint(dimension=3, overrides=change), "loops.min_radius_m is 5; it must be below loops.max_radius_m")
-
-
 def test_a_file_that_is_no_toml_or_not_there_is_named(tmp_path):
     (tmp_path / "mine.toml").write_text("[matching\n")
     (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe")

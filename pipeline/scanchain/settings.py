@@ -20,13 +20,6 @@ from scanchain.errors import InputError, one_line, shown
 
 _ALIKE = 0.75  # least likeness of a misspelt key to the one that is meant
 PRESETS = {2: "lidar2d", 3: "lidar3d"}
-_ORDERED = (
-    ("log.start_s", "log.end_s"),
-    ("log.min_range_m", "log.max_range_m"),
-    ("preprocess.min_range_m", "preprocess.max_range_m"),
-    ("loops.min_radius_m", "loops.max_radius_m"),
-    ("maps.slice_min_z_m", "maps.slice_max_z_m"),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,10 +99,7 @@ def load_settings(
             _check_dimension(values, dimension, str(file), remedy)
     for override in overrides:
         values[override.key] = find_key(override.key, override.flag).parse(override.text, override.flag)
-    flags = {override.key: override.flag for override in overrides}
-    is_final = dimension is not None  # else a preset may still change all but log.*
-    _check_order(values, source, flags, [pair for pair in _ORDERED if is_final or pair[0].startswith("log.")])
-    for key in flags:
+    for key in dict.fromkeys(override.key for override in overrides):
         text = str(values[key])
         source += f", {key} {text.lower() if isinstance(values[key], bool) else text}"
     tree: dict[str, dict[str, Value]] = {field.name: {} for field in fields(Config)}
@@ -159,11 +149,6 @@ def flatten(config: Config) -> dict[str, Value]:
     return {f"{section}.{leaf}": value for section, branch in tree.items() for leaf, value in branch.items()}
 
 
-def check_order(config: Config) -> None:
-    """Refuse a configuration whose lower limits are not below the upper ones."""
-    _check_order(flatten(config), "Config", {}, _ORDERED)
-
-
 def check_dimension(config: Config, dimension: int) -> None:
     """Refuse a configuration made for logs of the other dimension."""
     _check_dimension(flatten(config), dimension, "config", f"start from load_settings({dimension}).config")
@@ -197,13 +182,3 @@ def _leaves(tree: Mapping[str, object]) -> Iterator[tuple[str, object]]:
             yield from ((f"{section}.{leaf}", value) for leaf, value in branch.items())
         else:
             yield section, branch
-
-
-def _check_order(
-    values: Mapping[str, Value], source: str, flags: Mapping[str, str], ordered: Sequence[tuple[str, str]]
-) -> None:
-    for lower, upper in ordered:
-        low, high = values[lower], values[upper]
-        if isinstance(low, float) and isinstance(high, float) and not low < high:
-            where = flags.get(lower) or flags.get(upper) or source
-            raise InputError(f"{where}: {lower} is {low:g}; it must be below {upper} ({high:g})")

@@ -32,7 +32,6 @@ from scanchain.runs.directory import (
     TRUTH_FILE,
     RunDirectory,
     left_behind,
-    partial_runs,
 )
 from scanchain.runs.job import Job, OpenRecorder, Progress, Recorder
 from scanchain.runs.metrics import (
@@ -131,9 +130,8 @@ class _Run:
                 f"{idle.name} is of a run that did not end; --resume would continue it, this run starts over and "
                 "removes it once complete"
             )
-        elif job.resume and (begun := partial_runs(job.out)):
-            names = ", ".join(path.name for path in begun)
-            progress.announce(f"{names}: no checkpoint to resume from, this run starts over")
+        elif job.resume:
+            progress.announce(f"{job.out}: no checkpoint to resume from, this run starts at the first scan")
 
     def begin(self) -> tuple[Slam, Generator[Scan, None, None]]:
         """SLAM, new or as of the checkpoint, and the scans that follow; the directory states what is run in it."""
