@@ -175,10 +175,9 @@ def _preset_values(dimension: int | None) -> Mapping[str, Value]:
 
 
 def _leaves(tree: Mapping[str, object]) -> Iterator[tuple[str, object]]:
-    """Dotted names and values; what is no section, misspelt and empty ones included, comes under its own name."""
-    sections = {key.partition(".")[0] for key in config_keys()}
+    """Dotted names and values; what is no section comes under its own name."""
     for section, branch in tree.items():
-        if isinstance(branch, Mapping) and (branch or section in sections):
+        if isinstance(branch, Mapping):
             yield from ((f"{section}.{leaf}", value) for leaf, value in branch.items())
         else:
             yield section, branch

@@ -131,7 +131,6 @@ def landmarks(
 
 
 def _noise(text: str | None) -> OdometryNoise | None:
-    """Four positive numbers with commas; None is to be estimated."""
     from scanchain.landmarks.ranges import OdometryNoise
 
     if text is None:

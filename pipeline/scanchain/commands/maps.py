@@ -221,7 +221,6 @@ def changes(
 
 
 def _pose(earlier: Path, text: str | None) -> Pose | None:
-    """The transform of a position and a heading."""
     import numpy as np
 
     from scanchain import lie

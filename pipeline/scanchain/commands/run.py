@@ -78,12 +78,10 @@ def run(out: Path, rerun: str, strict: bool, as_json: bool, **given: Any) -> int
         click.echo(f"error: {finished.path}: {finished.metrics.sentence}", err=True)
     for warning in [each for each in finished.warnings if not (is_seen and each in finished.summary)]:
         click.echo(f"warning: {warning}", err=True)
-    click.echo((finished.path / "metrics.json").read_text() if as_json else finished.summary, nl=False)
+    options.print_summary(finished.path if finished.stopped else out, finished.summary, as_json=as_json)
     if finished.stopped:
         again = how_to_resume(job.command)
         raise ScanchainError(f"{finished.stopped}; the results so far are in {finished.path}; {again}")
-    if not as_json:
-        click.echo(f"written        {out}")
     return int(fails)
 
 

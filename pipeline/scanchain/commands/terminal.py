@@ -86,7 +86,6 @@ class Terminal(Progress):
         click.echo(_CLEAR + self.bar, nl=False, err=True)
 
     def _close(self) -> None:
-        """Leave the bar as it is."""
         if self.bar:
             click.echo(err=True)
         self.bar = ""

@@ -144,7 +144,6 @@ def check_outside_runs(destination: Path) -> None:
 
 
 def _check(destination: Path, force: bool) -> None:
-    """Refuse what must not be overwritten."""
     check_outside_runs(destination)
     if not destination.exists():
         return

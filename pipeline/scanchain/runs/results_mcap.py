@@ -87,7 +87,4 @@ def _write_motion(writer: LogWriter, moving: MovingFrame, steps: StepTable, pose
 
 def _rows(points: Points) -> NDArray[np.void]:
     """Points (N, d) as rows of x, y, z, which is 0 in the plane."""
-    rows = np.zeros(len(points), [(name, "<f4") for name in "xyz"])
-    for axis in range(points.shape[1]):
-        rows["xyz"[axis]] = points[:, axis]
-    return rows
+    return lie.lift_points(points).astype("<f4").view([(name, "<f4") for name in "xyz"])[:, 0]

@@ -313,7 +313,6 @@ def accuracy_of(
 
 
 def _heading(log: Log, config: Config, stopped: str) -> str:
-    """Files, topic, wheels and mounting of a log."""
     known = f"wheel odometry {log.odometry_topic}" if log.has_odometry else "no wheel odometry"
     if log.has_odometry and config.odometry.prior == "constant-velocity":
         known += ", not used: odometry.prior is constant-velocity"
