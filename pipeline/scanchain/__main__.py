@@ -10,11 +10,10 @@ from collections.abc import Sequence
 
 import click
 
-from scanchain.commands.batch import batch
-from scanchain.commands.compare import compare
 from scanchain.commands.evaluate import evaluate
 from scanchain.commands.landmarks import landmarks
 from scanchain.commands.logs import convert, doctor, info, simulate
+from scanchain.commands.many import batch, compare
 from scanchain.commands.maps import changes, localize, map_group, merge
 from scanchain.commands.optimize import optimize
 from scanchain.commands.preparing import config, sequence, warm_up

@@ -157,14 +157,12 @@ def text_lines(path: Path | str) -> Iterator[tuple[str, list[str]]]:
 
 def numbers(words: list[str], place: str) -> list[float]:
     """The words as finite numbers; ``place`` is named in the error."""
-    values: list[float] = []
-    for word in words:
-        try:
-            values.append(float(word))
-        except ValueError:
-            raise InputError(f"{place} has {word!r} where a number is expected; separate by spaces") from None
-        if not np.isfinite(values[-1]):
-            raise InputError(f"{place} has {word}; a pose must be finite")
+    try:
+        values = [float(word) for word in words]
+    except ValueError as error:
+        raise InputError(f"{place}: {error}; wanted numbers, separated by spaces") from None
+    if not np.isfinite(values).all():
+        raise InputError(f"{place} has a number that is not finite; a pose must be")
     return values
 
 

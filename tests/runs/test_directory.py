@@ -10,11 +10,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from scanchain.api import open_recorder
-from scanchain.errors import InputError
+from scanchain.errors import InputError, ScanchainError
 from scanchain.runs.directory import RunDirectory
 from scanchain.runs.job import Job, Progress
 from scanchain.runs.metrics import summary
-from scanchain.runs.resume import PartialRunError
 from scanchain.runs.run import run
 from scanchain.settings import Override
 from tests.support.naive_logs import SECOND, STAMP_NS, laser_scan, scan_said, write
@@ -167,7 +166,7 @@ def test_a_run_that_the_user_stops_tells_of_the_scans_that_it_left_out(tmp_path)
 def test_a_crash_leaves_what_there_was_marked_partial_with_its_traceback_and_the_old_run_whole(tmp_path, office):
     old, told = an_old_run(tmp_path / "a"), Watcher(20, RuntimeError("boom"))
     with pytest.raises(
-        PartialRunError, match=r"RuntimeError: boom; traceback.txt and the 20 scans until then are in"
+        ScanchainError, match=r"RuntimeError: boom; traceback.txt and the 20 scans until then are in"
     ) as e:
         run(job(office, old, force=True), open_recorder, told)
     folder = partial_in(tmp_path)
@@ -187,7 +186,7 @@ def test_an_interrupt_a_full_disk_and_bad_input_keep_the_scans_if_any_without_a_
     with pytest.raises(type(error)):
         run(job(office, tmp_path / "a"), open_recorder, Watcher(0, error))
     assert names(tmp_path) == []
-    kind = InputError if isinstance(error, InputError) else PartialRunError
+    kind = InputError if isinstance(error, InputError) else ScanchainError
     with pytest.raises(kind, match="20 scans until then are in"):
         run(job(office, tmp_path / "a"), open_recorder, Watcher(20, error))
     folder = partial_in(tmp_path)
@@ -237,7 +236,7 @@ def test_interrupted_while_it_optimizes_a_run_can_be_resumed(tmp_path, office):
             if line.startswith("optimizing"):
                 raise KeyboardInterrupt
 
-    with pytest.raises(PartialRunError, match=r"interrupted; 60 scans until then are in .*; to resume: "):
+    with pytest.raises(ScanchainError, match=r"interrupted; 60 scans until then are in .*; to resume: "):
         run(job(office, tmp_path / "a"), open_recorder, Interrupted())
     told = Watcher()
     run(job(office, tmp_path / "a", resume=True), open_recorder, told)

@@ -47,10 +47,6 @@ _NEEDED = (RUN_FILE, "config.toml", CHECKPOINT_FILE, POINTS_FILE)
 _CRC_BYTES = 4
 
 
-class PartialRunError(ScanchainError):
-    """A run that failed after some scans; its results so far are in a directory marked partial."""
-
-
 @dataclass(frozen=True, slots=True)
 class Checkpoint:
     """A run after some scans, which took ``run_s`` seconds of work, in the directory that it left.
@@ -270,7 +266,7 @@ def rescued(
     if isinstance(error, InputError):
         return InputError(f"{error.text}; {where}")
     kind = f"{type(error).__name__}: " if is_bug else ""
-    return PartialRunError(f"{kind}{reason}; {where}")
+    return ScanchainError(f"{kind}{reason}; {where}")
 
 
 def _keep(bug: BaseException | None, folder: Path, steps: StepTable) -> None:

@@ -258,7 +258,7 @@ def _matched(scans: Iterable[Scan], trajectory: Trajectory, config: Config) -> t
 
 def _velocities(trajectory: Trajectory) -> NDArray[np.float64]:
     """(N, k) twist per second from each scan to the next, for deskewing; 0 where stamps stand still."""
-    seconds = np.diff(trajectory.stamps_ns) * 1e-9
+    seconds = 1e-9 * np.diff(trajectory.stamps_ns)[:, None]
     twists = lie.log(lie.between(trajectory.poses[:-1], trajectory.poses[1:]))
-    velocities = np.where(seconds[:, None] > 0.0, twists / np.where(seconds > 0.0, seconds, 1.0)[:, None], 0.0)
+    velocities = np.divide(twists, seconds, out=np.zeros_like(twists), where=seconds > 0.0)
     return np.vstack([velocities, velocities[-1:]])
