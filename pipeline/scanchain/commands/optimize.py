@@ -137,26 +137,32 @@ def _write(
     from scanchain.graph.covariance import write_covariances
     from scanchain.graph.g2o import rejected_path, write_g2o
 
-    graph, ids, paths = file.graph, file.ids, [out, png, recording]
+    graph, ids = file.graph, file.ids
+    written: list[Path] = []
     if out is not None:
         write_g2o(out, graph, ids=ids, other_lines=file.other_lines, force=True)
-        rejected, table = rejected_path(out), out.with_suffix(".marginals.csv")
+        written.append(out)
+        rejected = rejected_path(out)
         if graph.is_rejected.any():
             write_g2o(rejected, graph, ids=ids, edges="rejected", force=True)
+            written.append(rejected)
         else:
             rejected.unlink(missing_ok=True)  # of an earlier report, whose place --force gave away
         if len(chosen):
+            table = out.with_suffix(".marginals.csv")
             write_covariances(table, ids[chosen], graph.covariances()[chosen])
-        paths[1:1] = [rejected if graph.is_rejected.any() else None, table if len(chosen) else None]
+            written.append(table)
     if png is not None:
         from scanchain_viz.report.problems import draw_graph
 
         draw_graph(change, png)
+        written.append(png)
     if recording is not None:
         from scanchain_viz.recording.results import record_graph
 
         record_graph(change, recording)
-    return [str(path) for path in paths if path is not None]
+        written.append(recording)
+    return [str(path) for path in written]
 
 
 def _read(source: Path, indefinite: Indefinite, is_robust: bool) -> G2oFile:
