@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -114,7 +113,7 @@ def optimize(
     is_robust = config.robust != "none" and any(override.key == "graph.robust" for override in overrides)
     file = _read(source, cast("Indefinite", indefinite), is_robust)
     graph, ids, before = file.graph, file.ids, file.graph.state()
-    chosen = chosen_poses(marginals, ids) if marginals else []
+    chosen = None if marginals is None else chosen_poses(marginals, ids)
     done = graph.optimize(config, initialize=cast("Initialization", initialize))
     change = GraphChange(source.name, before, done.state)
     report = _Report(file, change, done, graph.free_poses(), graph.weakly_joined(), graph.certify())
@@ -128,12 +127,12 @@ def optimize(
 def _write(
     file: G2oFile,
     change: GraphChange,
-    chosen: Sequence[int],
+    chosen: NDArray[np.int64] | None,
     out: Path | None,
     png: Path | None,
     recording: Path | None,
 ) -> list[str]:
-    """Write the files asked for, with the covariances of the chosen poses; their paths."""
+    """Write the files asked for, with the covariances of the chosen poses (M,); their paths."""
     from scanchain.graph.covariance import write_covariances
     from scanchain.graph.g2o import rejected_path, write_g2o
 
@@ -148,7 +147,7 @@ def _write(
             written.append(rejected)
         else:
             rejected.unlink(missing_ok=True)  # of an earlier report, whose place --force gave away
-        if len(chosen):
+        if chosen is not None:
             table = out.with_suffix(".marginals.csv")
             write_covariances(table, ids[chosen], graph.covariances()[chosen])
             written.append(table)
