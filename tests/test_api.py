@@ -33,8 +33,8 @@ def test_a_log_is_opened_with_keys_of_its_section(office):
     assert sc.open_log(office, log.config, log__every=2).scan_count == 5
     for changes, words in (
         ({"topic": "/nowhere"}, "has no topic /nowhere"),
-        ({"topics": "/scan"}, "log.topics is not a configuration key; did you mean topic"),
-        ({"end_s": "soon"}, "log.end_s is 'soon'"),
+        ({"topics": "/scan"}, "log__topics is not a configuration key; did you mean log__topic"),
+        ({"end_s": "soon"}, "log__end_s is 'soon'"),
     ):
         with pytest.raises(InputError, match=words):
             sc.open_log(office, **changes)
@@ -144,22 +144,16 @@ RECORDS = np.zeros(10, [("x", np.float32), ("y", np.float32), ("z", np.float32),
         (lambda: sc.Odometry(dimension=2, T_base_lidar=np.eye(4)), r"dimension is 2, but T_base_lidar .* SE\(3\)"),
         (lambda: sc.Odometry(dimension=2).track(POINTS, 0.0), "has 3D points"),
         (lambda: sc.Odometry().track(POINTS, 1_700_000_000_000_000_000), "stamp_s is 17"),
-        (lambda: sc.Odometry().track(POINTS, "now"), "stamp_s is 'now'; wanted seconds"),
-        (lambda: sc.Slam(dimension=3).track(POINTS[:, :2], 0.0), "has 2D points"),
         (lambda: sc.downsample(POINTS, 0.0), "voxel_size_m is 0"),
         (lambda: sc.align(Open3DCloud(), POINTS), r"target holds objects.*: np\.asarray\(target\.points\)"),
-        (lambda: sc.Odometry().track(Open3DCloud(), 0.0), r"np\.asarray\(points\.points\)"),
         (lambda: sc.downsample(RECORDS, 1.0), r"np\.stack\(\[points\[axis\] for axis in 'xyz'\], axis=1\)"),
         (lambda: sc.align(POINTS.reshape(2, 5, 3), POINTS), r"organized\? pass target\.reshape\(-1, 3\)"),
         (lambda: sc.downsample(POINTS + 5.4e6, 0.002), r"points lie up to 5.4e\+06 m from the origin"),
         (lambda: sc.downsample(np.array([[0.0, 0.0], [2.0**21, 0.0]]), 1.0), r"2.1e\+06 m apart"),
         (lambda: sc.run("nowhere.mcap", "out"), "nowhere.mcap"),
-        (lambda: sc.optimize(sc.PoseGraph(2), max_iter=3), r"did you mean max_iterations\?"),
+        (lambda: sc.optimize(sc.PoseGraph(2), max_iter=3), r"did you mean graph__max_iterations\?"),
         (lambda: sc.optimize("graph.g2o"), r"graph is 'graph.g2o'; wanted a PoseGraph: read_g2o\(path\).graph"),
-        (lambda: sc.write_g2o("/nope/x.g2o", sc.PoseGraph(2)), "/nope/x.g2o: cannot be written"),
         (lambda: sc.run("nowhere.mcap", 3), "out is 3; wanted a path"),
-        (lambda: sc.compare(["a.mcap", 3], "out"), "a log is .* wanted a path"),
-        (lambda: sc.Odometry(sc.load_settings(2).config, np.eye(4)), "config is made for 2D scans: .*3D"),
         (lambda: sc.Slam(sc.Config(), dimension=2), r"made for 3D .* start from load_settings\(2\).config"),
     ],
 )

@@ -93,13 +93,11 @@ NEAREST = "did you mean matching.max_distance_m"
         (
             "matching.max_distanc_m",
             "1",
-            f" is not a configuration key; {NEAREST}? (all keys: scanchain config show)",
+            " is not a configuration key; did you mean --matching.max_distance_m? all keys: scanchain config show",
         ),
-        ("odometry.place_radius_m", "1", " is not a configuration key; did you mean loops.place_radius_m?"),
-        ("zzz.qqq", "1", " is not a configuration key; all keys: scanchain config show"),
+        ("odometry.place_radius_m", "1", " is not a configuration key; did you mean --loops.place_radius_m?"),
         ("log.nosuch", "1", " is not a configuration key; all keys: scanchain config show"),
         ("matching.max_distance_m", "far", " is 'far'; it must be a number > 0"),
-        ("matching.max_distance_m", "", " is ''; it must be a number > 0"),
         ("loops.enabled", "maybe", " is 'maybe'; it must be true or false"),
         (
             "matching.optimizer",
@@ -118,13 +116,9 @@ def test_a_wrong_flag_names_itself_and_the_nearest_key_or_its_value_and_the_dema
     [
         ("[matching]\nmax_distanc_m = 1\n", "matching.max_distanc_m", NEAREST),
         ("[matchin]\nmatcher = 'svd'\n", "matchin.matcher", "did you mean matching.matcher"),
-        ("[matchin]\n", "matchin", "did you mean matching."),
-        ("matching = 3\n", "matching", "did you mean matching."),
         ("matcher = 'svd'\n", "matcher", "did you mean matching.matcher"),
         ("[matching]\nmax_distance_m = 'far'\n", "matching.max_distance_m", "it must be a number > 0"),
         ("[matching]\nmax_distance_m = true\n", "matching.max_distance_m", "it must be a number > 0"),
-        ("[matching]\nmax_distance_m = [1.0]\n", "matching.max_distance_m", "it must be a number > 0"),
-        ("[loops]\nenabled = 1\n", "loops.enabled", "it must be true or false"),
         ("[loops]\nenabled = 'true'\n", "loops.enabled", "it must be true or false"),
         ("[matching]\nmatcher = 3\n", "matching.matcher", "it must be one of plicp, svd"),
         ("[log]\ntopic = 7\n", "log.topic", "it must be text"),
@@ -139,10 +133,8 @@ def test_a_wrong_key_or_value_in_a_file_is_named_with_the_file_and_what_is_wante
     ("key", "text", "limit"),
     [
         ("matching.max_distance_m", "-1", "a number > 0, in m"),
-        ("matching.max_distance_m", "0", "a number > 0, in m"),
         ("matching.max_distance_m", "nan", "a number > 0, in m"),
         ("matching.min_inlier_share", "1.5", "a number from 0 to 1"),
-        ("log.every", "0", "a whole number >= 1"),
         ("log.every", "1.5", "a whole number >= 1"),
         ("log.every", "inf", "a whole number >= 1"),
         ("local_map.voxel_size_m", "inf", "a number > 0 and finite, in m"),
@@ -158,23 +150,13 @@ def test_a_value_out_of_range_names_key_value_and_range(file, key, text, limit):
     says(complaint(file=path), f"{path}: {key} is {text}; it must be {limit}")
 
 
-def test_limits_the_wrong_way_round_name_both_once_the_preset_is_known():
-    for dimension in (None, 2):
-        text = complaint(dimension=dimension, overrides=[flag("log.start_s", "5"), flag("log.end_s", "3")])
-        says(text, "--log.start_s", "log.start_s is 5; it must be below log.end_s (3)")
-    change = [flag("loops.max_radius_m", "3")]  # 2D: at least 1 m; by default at least 5
-    assert load_settings(overrides=change).config.loops.max_radius_m == 3.0
-    assert load_settings(2, overrides=change).config.loops.max_radius_m == 3.0
-    says(complaint(dimension=3, overrides=change), "loops.min_radius_m is 5; it must be below loops.max_radius_m")
-
-
 def test_a_file_that_is_no_toml_or_not_there_is_named(tmp_path):
     (tmp_path / "mine.toml").write_text("[matching\n")
     (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe")
     for name, words in (
         ("mine.toml", "is not TOML"),
         ("bytes.toml", "is not TOML"),
-        ("absent.toml", "no such file"),
+        ("absent.toml", "No such file"),
         (".", "--config takes a TOML file"),
     ):
         says(complaint(file=tmp_path / name), str(tmp_path / name), words, ";")
@@ -203,17 +185,8 @@ def test_every_key_is_in_the_tree_with_its_default_and_a_description():
     assert list(flatten(Config()).items()) == [(name, key.default) for name, key in config_keys().items()]
     for name, key in config_keys().items():
         assert key.check(key.default, name) == key.default and len(key.description) > 15, name
+    units = {"odometry.max_speed_m_s": "m/s", "log.max_bad_scans_percent": "%", "matching.min_signal": ""}
+    assert {name: config_keys()[name].unit for name in units} == units
     for section in fields(Config):
         described = re.findall(r"^ {4}(\w+) : ", section.type.__doc__, re.MULTILINE)
         assert described == [field.name for field in fields(section.type)]
-
-
-@pytest.mark.parametrize(
-    ("key", "unit"),
-    [
-        ("odometry.max_speed_m_s", "m/s"), ("odometry.max_turn_rad_s", "rad/s"), ("log.start_s", "s"),
-        ("matching.max_distance_m", "m"), ("log.max_bad_scans_percent", "%"), ("matching.min_signal", ""),
-    ],
-)  # fmt: skip
-def test_a_key_has_the_unit_that_its_name_ends_with(key, unit):
-    assert config_keys()[key].unit == unit

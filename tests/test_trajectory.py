@@ -68,17 +68,14 @@ def test_comments_and_empty_lines_are_passed_over_and_words_separated(tmp_path, 
     ("line", "says"),
     [
         ("1.0 1 2 3 0 0 0", "7 fields"),
-        ("1.0,1,2,3,0,0,0", "7 fields"),
         ("timestamp,tx,ty,tz,qx,qy,qz,qw", "begin a line of column names with #"),
         ("1317042145963999987 1 2 3 0 0 0 1", "give it in seconds"),
         ("noon 1 2 3 0 0 0 1", "'noon'"),
         ("nan 1 2 3 0 0 0 1", "nan"),
-        ("1e30 1 2 3 0 0 0 1", "64 bits"),
         ("1.0 1 2 x 0 0 0 1", "'x'"),
         ("1.0 1 2 inf 0 0 0 1", "finite"),
-        ("1.0 1 2 3 0 0 0 0", "quaternion"),
         ("1.0 1 2 3 0 0 0 3", "has a quaternion of length 3, not 1"),
-        ("976052905.167 976052911.885 -0.1 -0.1 0 0 0 -1.7", "has two stamps, as a file of relations"),
+        ("976052905.167 976052911.885 -0.1 -0.1 0 0 0 -1.7", "evaluate --relations"),
     ],
 )
 def test_a_bad_tum_line_is_named_with_its_number(tmp_path, line, says):

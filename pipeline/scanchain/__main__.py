@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import atexit
-import difflib
 import errno
 import os
 import sys
@@ -11,11 +10,10 @@ from collections.abc import Sequence
 
 import click
 
-from scanchain.commands.batch import batch
-from scanchain.commands.compare import compare
 from scanchain.commands.evaluate import evaluate
 from scanchain.commands.landmarks import landmarks
 from scanchain.commands.logs import convert, doctor, info, simulate
+from scanchain.commands.many import batch, compare
 from scanchain.commands.maps import changes, localize, map_group, merge
 from scanchain.commands.optimize import optimize
 from scanchain.commands.preparing import config, sequence, warm_up
@@ -62,7 +60,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(words: list[str]) -> int:
-    """Exit code of a command."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small: threads would wait for each other
     try:
         return scanchain.main(words, prog_name="scanchain", standalone_mode=False) or 0
@@ -70,8 +67,6 @@ def _run(words: list[str]) -> int:
         click.echo(error.format_message())
         return 2
     except click.UsageError as error:
-        if isinstance(error, click.NoSuchOption):
-            error = _with_near_options(error)
         path = error.ctx.command_path if error.ctx else "scanchain"
         return _fail(f"{error.format_message().rstrip('.')}; see {path} --help", 2)
     except click.ClickException as error:
@@ -94,13 +89,6 @@ def _unforeseen(error: Exception) -> int:
     if isinstance(error, OSError) and remedy_of(error):
         return _fail(remedy_of(error), 2 if error.errno == errno.ENAMETOOLONG else 1)
     return _fail(f"{type(error).__name__}: {error}; SCANCHAIN_DEBUG=1 shows the traceback", 1)
-
-
-def _with_near_options(error: click.NoSuchOption) -> click.NoSuchOption:
-    """The error without suggestions that are near only by the hyphens that every option begins with."""
-    bare = {option.lstrip("-"): option for option in error.possibilities or ()}
-    near = [bare[name] for name in difflib.get_close_matches(error.option_name.lstrip("-"), bare)]
-    return click.NoSuchOption(error.option_name, possibilities=near, ctx=error.ctx)
 
 
 def _fail(message: str, code: int) -> int:

@@ -16,20 +16,29 @@ _WARNING = "compiling kernels, once after an installation: the first calls take 
 
 
 class _Compilation(event.Listener):
-    """Time that compiling has taken in this process; kernels that call others compile these within themselves."""
+    """Compilation in this process: the time that it takes, and who is told of each module that it begins with.
+
+    Kernels that call others compile these within themselves.
+    """
 
     def __init__(self) -> None:
         self.depth = 0
         self.began_s = self.ended_s = 0.0
         self.is_silent = True
+        self.told: list[Callable[[str], None]] = []
 
     def on_start(self, event: Any) -> None:
         if not self.depth:
             self.began_s = perf_counter()
         self.depth += 1
-        if not self.is_silent and event.data["dispatcher"].py_func.__module__.startswith("scanchain."):
+        module = event.data["dispatcher"].py_func.__module__
+        if not module.startswith("scanchain."):
+            return
+        if not self.is_silent:
             self.is_silent = True
             logging.getLogger("scanchain").warning(_WARNING)
+        for tell in self.told:
+            tell(module)
 
     def on_end(self, event: Any) -> None:
         self.depth -= 1
@@ -63,34 +72,24 @@ def announcing_compilation(say: Callable[[str], None], beside: Sequence[str] = (
 
     beside : arguments of ``python -m`` of a process that meanwhile compiles what this one will need later
     """
-    announcer = _Announcer(say, beside)
+    modules: set[str] = set()
+    processes: list[subprocess.Popen[bytes]] = []
+
+    def tell(module: str) -> None:
+        if not modules:
+            say("compiling, once after the installation:")
+            if beside:
+                command, nothing = [sys.executable, "-P", "-m", *beside], subprocess.DEVNULL
+                processes.append(subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing))
+        if module not in modules:
+            modules.add(module)
+            say(f"  {module.removeprefix('scanchain.')}")
+
+    _compilation.told.append(tell)
     try:
-        with event.install_listener("numba:compile", announcer):
-            yield
+        yield
     finally:
-        if announcer.process is not None:
-            announcer.process.kill()
-            announcer.process.wait()
-
-
-class _Announcer(event.Listener):
-    def __init__(self, say: Callable[[str], None], beside: Sequence[str]) -> None:
-        self.say, self.beside = say, beside
-        self.modules: set[str] = set()
-        self.process: subprocess.Popen[bytes] | None = None
-
-    def on_start(self, event: Any) -> None:
-        module = event.data["dispatcher"].py_func.__module__
-        if not module.startswith("scanchain.") or module in self.modules:
-            return
-        if not self.modules:
-            self.say("compiling, once after the installation:")
-            if self.beside:
-                command = [sys.executable, "-P", "-m", *self.beside]
-                nothing = subprocess.DEVNULL
-                self.process = subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing)
-        self.modules.add(module)
-        self.say(f"  {module.removeprefix('scanchain.')}")
-
-    def on_end(self, event: Any) -> None:
-        pass
+        _compilation.told.remove(tell)
+        for process in processes:
+            process.kill()
+            process.wait()

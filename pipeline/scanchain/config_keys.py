@@ -99,7 +99,6 @@ def section_keys(section: type) -> tuple[ConfigKey, ...]:
 
 
 def _values(kind: object) -> str:
-    """Values of a type as text."""
     match inspect.type_info(kind):
         case inspect.BoolType():
             return "true | false"

@@ -6,7 +6,6 @@ import importlib
 import re
 import sys
 from pathlib import Path
-from types import ModuleType
 
 from scanchain.errors import InputError, one_line
 
@@ -21,47 +20,30 @@ def is_class_name(text: str) -> bool:
 def load(name: str, *methods: str) -> type:
     """The class that ``module:Class`` names: installed, on PYTHONPATH or else in the working directory.
 
-    The working directory joins the search path only for a module found nowhere else: until then nothing that
-    happens to lie there is imported. Raises InputError where there is no such module or class, or the class lacks
-    one of the methods.
+    The working directory joins the search path only for a module of the user's, as the last: until then nothing
+    that happens to lie there is imported. Raises InputError where there is no such module or class, or the class
+    lacks one of the methods.
     """
     module_name, _, class_name = name.partition(":")
     if not module_name or not class_name:
         raise InputError(f"{name!r} names no class; wanted module:Class, as in my_module:MyClass")
-    module = _imported(module_name, name)
+    here = str(Path.cwd())
+    if not module_name.startswith("scanchain.") and here not in sys.path:
+        sys.path.append(here)
+    importlib.invalidate_caches()
+    try:
+        module = importlib.import_module(module_name)
+    except Exception as error:  # whatever the module does at its top level
+        reason = f"importing {module_name} failed with {type(error).__name__}: {one_line(error)}"
+        if isinstance(error, ModuleNotFoundError) and f"{module_name}.".startswith(f"{error.name}."):
+            remedy = "go to its folder, or set PYTHONPATH to it"
+            reason = f"there is no module {module_name} in {here} or on PYTHONPATH; {remedy}"
+        raise InputError(f"{name}: {reason}") from error
     found = getattr(module, class_name, None)
     if not isinstance(found, type):
-        own = [key for key, value in vars(module).items() if getattr(value, "__module__", "") == module.__name__]
-        classes = [key for key in own if isinstance(vars(module)[key], type)]
-        there = f"there are {', '.join(classes)}" if classes else "it defines none"
-        raise InputError(f"{name}: {module.__file__} has no class {class_name}; {there}")
+        raise InputError(f"{name}: {module.__file__} has no class {class_name}; check its name")
     for method in methods:
         if not callable(getattr(found, method, None)):
             needs = f"it needs {' and '.join(methods)} (documentation: Extending)"
             raise InputError(f"{name}: the class has no method {method}; {needs}")
     return found
-
-
-def _imported(module_name: str, name: str) -> ModuleType:
-    here = str(Path.cwd())
-    importlib.invalidate_caches()
-    try:
-        try:
-            return importlib.import_module(module_name)
-        except ModuleNotFoundError as error:
-            if not _is_missing(module_name, error) or here in sys.path:
-                raise
-        sys.path.append(here)
-        return importlib.import_module(module_name)
-    except Exception as error:  # whatever the module does at its top level
-        if _is_missing(module_name, error):
-            remedy = "go to its folder, or set PYTHONPATH to it"
-            reason = f"there is no module {module_name} in {here} or on PYTHONPATH; {remedy}"
-            raise InputError(f"{name}: {reason}") from None
-        reason = f"importing {module_name} failed with {type(error).__name__}: {one_line(error)}"
-        raise InputError(f"{name}: {reason}") from error
-
-
-def _is_missing(module_name: str, error: Exception) -> bool:
-    """True if the module itself, or a package it lies in, was not found."""
-    return isinstance(error, ModuleNotFoundError) and f"{module_name}.".startswith(f"{error.name}.")

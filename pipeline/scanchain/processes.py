@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import resource
 import runpy
 import shutil
 import signal
@@ -23,8 +24,6 @@ import psutil
 _MIB = 1024.0**2
 _SYSTEM_KILL = -9  # code of a process that the system killed, as it does when memory runs out
 _LAST_CHARACTERS = 300  # of the output of a process that crashed, which are reported
-_HAS_GROUPS = sys.platform != "win32"
-_KILL = signal.SIGKILL if sys.platform != "win32" else signal.SIGTERM
 
 
 def peak_mib() -> float:
@@ -34,10 +33,6 @@ def peak_mib() -> float:
         for line in status.read_text().splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) / 1024.0
-    if sys.platform == "win32":
-        return psutil.Process().memory_info().peak_wset / _MIB
-    import resource
-
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _MIB  # bytes on macOS
 
 
@@ -143,7 +138,7 @@ def die_with_parent(leftover: Path | None = None) -> None:
         os.read(watched, 1)
         if leftover is not None:
             shutil.rmtree(leftover, ignore_errors=True)
-        _kill(os.getpid(), with_group=_HAS_GROUPS and os.getpgrp() == os.getpid())
+        _kill(os.getpid(), with_group=os.getpgrp() == os.getpid())
 
     threading.Thread(target=wait, name="parent", daemon=True).start()
 
@@ -173,44 +168,33 @@ def run_within(
             env=environment,
             start_new_session=True,
         )
-        seen: dict[int, psutil.Process] = {}
+        seen: dict[int, psutil.Process] = {}  # all below it
+        began, peak, reason, stop = monotonic(), 0.0, KilledFor.NOTHING, stop or Event()
         try:
-            return _watch(process, limits, interval_s, stop or Event(), seen)
+            while reason is KilledFor.NOTHING and process.poll() is None:
+                peak = max(peak, resident_mib(process.pid, seen))
+                if peak > limits.memory_mib:
+                    reason = KilledFor.MEMORY
+                elif monotonic() - began > limits.time_s:
+                    reason = KilledFor.TIME
+                elif stop.wait(interval_s):
+                    reason = KilledFor.STOP
+            return Ending(process.returncode or 0, reason, peak, monotonic() - began)
         finally:
-            _kill(process.pid, with_group=_HAS_GROUPS)
+            _kill(process.pid, with_group=True)
             for each in seen.values():  # those in groups of their own that lost their parent, too
                 with suppress(psutil.Error):
                     each.kill()
             process.communicate()
 
 
-def _watch(
-    process: subprocess.Popen[bytes],
-    limits: Limits,
-    interval_s: float,
-    stop: Event,
-    seen: dict[int, psutil.Process],
-) -> Ending:
-    """Wait for the end, or for the moment at which there is a reason to kill it; ``seen`` takes all below it."""
-    began, peak, reason = monotonic(), 0.0, KilledFor.NOTHING
-    while reason is KilledFor.NOTHING and process.poll() is None:
-        peak = max(peak, resident_mib(process.pid, seen))
-        if peak > limits.memory_mib:
-            reason = KilledFor.MEMORY
-        elif monotonic() - began > limits.time_s:
-            reason = KilledFor.TIME
-        elif stop.wait(interval_s):
-            reason = KilledFor.STOP
-    return Ending(process.returncode or 0, reason, peak, monotonic() - began)
-
-
 def _kill(pid: int, *, with_group: bool) -> None:
     """Kill a process, all below it, and the group that it leads, where members may be that lost their parent."""
     for each in reversed(_family(pid)[1:]):
         with suppress(OSError):
-            os.kill(each, _KILL)
+            os.kill(each, signal.SIGKILL)
     with suppress(OSError):
-        (os.killpg if with_group else os.kill)(pid, _KILL)
+        (os.killpg if with_group else os.kill)(pid, signal.SIGKILL)
 
 
 if __name__ == "__main__":

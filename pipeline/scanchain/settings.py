@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import functools
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,14 +18,8 @@ from scanchain.config import Config
 from scanchain.config_keys import ConfigKey, Value, section_keys
 from scanchain.errors import InputError, one_line, shown
 
+_ALIKE = 0.75  # least likeness of a misspelt key to the one that is meant
 PRESETS = {2: "lidar2d", 3: "lidar3d"}
-_ORDERED = (
-    ("log.start_s", "log.end_s"),
-    ("log.min_range_m", "log.max_range_m"),
-    ("preprocess.min_range_m", "preprocess.max_range_m"),
-    ("loops.min_radius_m", "loops.max_radius_m"),
-    ("maps.slice_min_z_m", "maps.slice_max_z_m"),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,13 +36,10 @@ def overrides_of(values: Mapping[str, object], section: str = "") -> tuple[Overr
 
     section : that the keys are of, where the arguments do not name it
     """
+    named = {f"{section}.{name}" if section else name.replace("__", "."): value for name, value in values.items()}
     return tuple(
-        Override(
-            f"{section}.{name}" if section else name.replace("__", "."),
-            str(value).lower() if isinstance(value, bool) else str(value),
-            name,
-        )
-        for name, value in values.items()
+        Override(key, str(value).lower() if isinstance(value, bool) else str(value), f"--{key}")
+        for key, value in named.items()
     )
 
 
@@ -82,14 +73,11 @@ def find_key(name: str, source: str) -> ConfigKey:
     keys = config_keys()
     if name in keys:
         return keys[name]
-    subject = source if name in source else f"{source}: {name}"
-    remedy = _remedy(name, tuple(keys), lambda key: _as_argument(key, source) if source.isidentifier() else key)
-    raise InputError(f"{subject} is not a configuration key; {remedy}")
-
-
-def _as_argument(key: str, source: str) -> str:
-    """A key as a keyword argument, with its section where the one given has it."""
-    return key.replace(".", "__") if "__" in source else key.rpartition(".")[2]
+    same_leaf = [key for key in keys if key.rpartition(".")[2] == name.rpartition(".")[2]]
+    near = difflib.get_close_matches(name, same_leaf or keys, n=1, cutoff=0.0 if same_leaf else _ALIKE)
+    subject, flag = (source, "--") if source == f"--{name}" else (f"{source}: {name}", "")
+    nearest = "".join(f"did you mean {flag}{key}? " for key in near)
+    raise InputError(f"{subject} is not a configuration key; {nearest}all keys: scanchain config show")
 
 
 def load_settings(
@@ -99,10 +87,6 @@ def load_settings(
 
     Raises InputError naming the file or the flag, the key and its limits, or the nearest key there is.
     """
-    if not isinstance(file, str | Path | None):
-        raise InputError(f"file is {shown(file)}; wanted the path of a TOML file")
-    if not (isinstance(overrides, Sequence) and all(isinstance(each, Override) for each in overrides)):
-        raise InputError(f"overrides is {shown(overrides)}; wanted a list of Override(key, text, flag)")
     if dimension is not None and not (isinstance(dimension, int) and dimension in PRESETS):
         raise InputError(f"dimension is {shown(dimension)}; it must be 2 (laser scans) or 3 (clouds)")
     source = "defaults" if dimension is None else f"preset {PRESETS[dimension]} of {dimension}D logs"
@@ -115,10 +99,7 @@ def load_settings(
             _check_dimension(values, dimension, str(file), remedy)
     for override in overrides:
         values[override.key] = find_key(override.key, override.flag).parse(override.text, override.flag)
-    flags = {override.key: override.flag for override in overrides}
-    is_final = dimension is not None  # else a preset may still change all but log.*
-    _check_order(values, source, flags, [pair for pair in _ORDERED if is_final or pair[0].startswith("log.")])
-    for key in flags:
+    for key in dict.fromkeys(override.key for override in overrides):
         text = str(values[key])
         source += f", {key} {text.lower() if isinstance(values[key], bool) else text}"
     tree: dict[str, dict[str, Value]] = {field.name: {} for field in fields(Config)}
@@ -132,8 +113,6 @@ def read_toml(file: Path) -> dict[str, Any]:
     """The tree of a TOML file that a user named."""
     try:
         return tomllib.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"{file}: no such file; check --config") from None
     except OSError as error:
         raise InputError(f"{file}: cannot be read ({error.strerror}); --config takes a TOML file") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -170,11 +149,6 @@ def flatten(config: Config) -> dict[str, Value]:
     return {f"{section}.{leaf}": value for section, branch in tree.items() for leaf, value in branch.items()}
 
 
-def check_order(config: Config) -> None:
-    """Refuse a configuration whose lower limits are not below the upper ones."""
-    _check_order(flatten(config), "Config", {}, _ORDERED)
-
-
 def check_dimension(config: Config, dimension: int) -> None:
     """Refuse a configuration made for logs of the other dimension."""
     _check_dimension(flatten(config), dimension, "config", f"start from load_settings({dimension}).config")
@@ -201,33 +175,9 @@ def _preset_values(dimension: int | None) -> Mapping[str, Value]:
 
 
 def _leaves(tree: Mapping[str, object]) -> Iterator[tuple[str, object]]:
-    """Dotted names and values; what is no section, misspelt and empty ones included, comes under its own name."""
-    sections = {key.partition(".")[0] for key in config_keys()}
+    """Dotted names and values; what is no section comes under its own name."""
     for section, branch in tree.items():
-        if isinstance(branch, Mapping) and (branch or section in sections):
+        if isinstance(branch, Mapping):
             yield from ((f"{section}.{leaf}", value) for leaf, value in branch.items())
         else:
             yield section, branch
-
-
-def _check_order(
-    values: Mapping[str, Value], source: str, flags: Mapping[str, str], ordered: Sequence[tuple[str, str]]
-) -> None:
-    for lower, upper in ordered:
-        low, high = values[lower], values[upper]
-        if isinstance(low, float) and isinstance(high, float) and not low < high:
-            where = flags.get(lower) or flags.get(upper) or source
-            raise InputError(f"{where}: {lower} is {low:g}; it must be below {upper} ({high:g})")
-
-
-def _remedy(name: str, keys: tuple[str, ...], spell: Callable[[str], str]) -> str:
-    section, _, leaf = name.rpartition(".")
-    same_leaf = [key for key in keys if key.rpartition(".")[2] == leaf]
-    inside = {key.rpartition(".")[2]: key for key in keys if key.startswith(f"{section}.")}
-    near = difflib.get_close_matches(name, same_leaf, n=1, cutoff=0.0)
-    near = near or [inside[other] for other in difflib.get_close_matches(leaf, inside, n=1)]
-    if not near and not inside:
-        near = difflib.get_close_matches(name, keys, n=1)
-    listing = "all keys: scanchain config show"
-    spelled = [spell(key) for key in near]
-    return f"did you mean {spelled[0]}? ({listing})" if near else listing

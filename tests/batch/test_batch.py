@@ -23,7 +23,6 @@ from scanchain.errors import InputError
 from scanchain.files import Address
 from scanchain.logs.writer import ORIGIN, LogWriter, pack_laser_scan, pack_odometry
 from scanchain.processes import Ending, KilledFor, resident_mib
-from scanchain.runs.directory import directory_name
 from scanchain_viz.report.batch import names_of
 from tests.support import made
 from tests.support.browser import look
@@ -112,12 +111,6 @@ def test_of_4_logs_two_are_poison_and_2_have_results_and_a_second_call_runs_only
 
     assert main(words) == 1  # only the two are tried again
     assert made_at(out) == first and "2 results from before" in capfd.readouterr()[0]
-
-
-def test_logs_of_the_longest_names_have_directories_of_their_own():
-    assert directory_name("log") == "log"
-    names = [directory_name(f"{'ä' * 121}{k}") for k in range(2)]
-    assert names[0] != names[1] and all(len(os.fsencode(name)) <= 200 for name in names)
 
 
 @pytest.mark.usefixtures("in_this_process")

@@ -358,7 +358,7 @@ def test_a_table_of_settings_sets_a_method_or_makes_a_variant_of_it_and_can_be_g
         (["plicp"], 3, "[plicp.matching]\nmax_distnce_m = 1", r"\[plicp\].*did you mean matching\.max_distance_m"),
         (["svd"], 3, "[plicp.matching]\nmax_iterations = 5", r"\[plicp\] is not among the methods"),
         (["plicp"], 3, "plicp = 1", "is no table"),
-        (["plicp"], 3, None, r"a\.toml: no such file"),
+        (["plicp"], 3, None, r"a\.toml: .*No such file"),
         (["plicp"], 3, '[plicp]\nmethod = ["svd"]', r"no method \"\['svd'\]\""),
         ([".."], 3, '[".."]\nmethod = "svd"', "folder"),
         (["plicp"], 3, '[plicp]\nmatching.matcher = "svd"', r"\[plicp\] matching\.matcher is svd, but plicp has"),

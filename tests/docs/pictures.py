@@ -10,7 +10,6 @@ of the reports of their captions in a browser, viewer.jpg is a view of the rerun
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import tempfile
@@ -23,63 +22,43 @@ from tests.support.scenes import ROOT
 
 FOLDER = ROOT / "docs" / "pictures"
 WIDTH, BESIDE_WIDTH = 1000, 750  # px, of a picture alone and of each of those beside each other
-NEARLY_WHITE = 248
 NARROW = "--preprocess.max_range_m 4"
-PICTURES = {  # for each picture the commands, and the pictures drawn by them that stand beside each other in it
-    "run": (
-        (
-            "simulate office office.mcap --duration 120",
-            "run office.mcap --out office --rerun off",
-            "view office --png office.png",
-        ),
-        ("office.png",),
-    ),
+PICTURES = {  # for each picture the commands; the runs by them stand beside each other in it
+    "run": ("simulate office office.mcap --duration 120", "run office.mcap --out office"),
     "doubled": (
-        (
-            "simulate identical identical.mcap",
-            f"run identical.mcap --out without_wheels {NARROW} --odometry.prior constant-velocity --rerun off",
-            "view without_wheels --png without_wheels.png",
-            f"run identical.mcap --out with_wheels {NARROW} --rerun off",
-            "view with_wheels --png with_wheels.png",
-        ),
-        ("without_wheels.png", "with_wheels.png"),
+        "simulate identical identical.mcap",
+        f"run identical.mcap --out without_wheels {NARROW} --odometry.prior constant-velocity",
+        f"run identical.mcap --out with_wheels {NARROW}",
     ),
-    "intel": ((f"run {DATA}/2d/intel.mcap --out intel --rerun off", "view intel --png intel.png"), ("intel.png",)),
-    "mit_csail": (
-        (f"run {DATA}/2d/mit_csail.mcap --out mit_csail --rerun off", "view mit_csail --png mit_csail.png"),
-        ("mit_csail.png",),
-    ),
+    "intel": (f"run {DATA}/2d/intel.mcap --out intel",),
+    "mit_csail": (f"run {DATA}/2d/mit_csail.mcap --out mit_csail",),
 }
 
 
 def draw(name: str, folder: Path) -> None:
     """Write a picture; a verdict that is none to rely on is what some of them show."""
-    commands, drawn = PICTURES[name]
-    for command in commands:
-        words = [sys.executable, "-m", "scanchain", *command.split()]
-        done = subprocess.run(words, cwd=folder, capture_output=True)
-        if done.returncode and not command.startswith("run "):
-            sys.exit(f"{command}: {done.stderr.decode()}")
-    images = [Image.open(folder / file).convert("RGB") for file in drawn]
+    images = []
+    for command in PICTURES[name]:
+        subprocess.run([sys.executable, "-m", "scanchain", *command.split()], cwd=folder)
+        if command.startswith("run "):
+            run = command.split()[3]
+            view = [sys.executable, "-m", "scanchain", "view", run, "--png", f"{run}.png"]
+            subprocess.run(view, cwd=folder, check=True)
+            images.append(Image.open(folder / f"{run}.png").convert("RGB"))
     width = WIDTH if len(images) == 1 else BESIDE_WIDTH
     for place, image in enumerate(images):
         images[place] = image.resize((width, round(image.height * width / image.width)), Image.Resampling.LANCZOS)
     whole = Image.new("RGB", (width * len(images), max(image.height for image in images)), "white")
     for place, image in enumerate(images):
         whole.paste(image, (place * width, 0))
-    # Colors of thin lines as well, then moved to the frequent ones.
-    palette = whole.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=10)
+    palette = whole.quantize(256, Image.Quantize.MAXCOVERAGE, kmeans=10)  # with the colors of thin lines
     flat = whole.quantize(palette=palette, dither=Image.Dither.NONE)
-    colors = flat.getpalette() or []
-    entries = [colors[at : at + 3] for at in range(0, len(colors), 3)]
-    flat.putpalette([value for each in entries for value in ([255] * 3 if min(each) >= NEARLY_WHITE else each)])
     flat.save(FOLDER / f"{name}.png", optimize=True)
-    print(f"{name}.png, {os.path.getsize(FOLDER / f'{name}.png') // 1024} kB", flush=True)
 
 
 def main() -> None:
     for name in sys.argv[1:] or PICTURES:
-        absent = [word for word in " ".join(PICTURES[name][0]).split() if word.startswith(str(DATA))]
+        absent = [word for word in " ".join(PICTURES[name]).split() if word.startswith(str(DATA))]
         if absent and not Path(absent[0]).exists():
             print(f"{name}.png is left as it is: {absent[0]} is absent")
             continue

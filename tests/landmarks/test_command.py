@@ -113,8 +113,6 @@ def test_two_problems_stand_side_by_side_in_a_recording_too_and_the_figures_come
     [
         (["--method", "chol"], "there is no method 'chol'"),
         (["--odometry-noise", "0.1,0.1,-1,1"], "give four positive numbers"),
-        (["--robot", "3"], "--robot is for MRCLAM folders alone"),
-        (["--guess", "odometry"], "--guess is for nonlinear files alone"),
         (["{small}", "--method", "schur"], "two problems are called a<b>&c"),
         (["--recording", "{small}.rrd"], "exists; choose another name"),
     ],

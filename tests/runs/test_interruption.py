@@ -88,7 +88,7 @@ def test_interrupted_again_and_again_a_run_goes_on_to_the_same_result_and_record
         table = read_checkpoint(partial(out), config_of(partial(out))).steps
         reached.append(len(table))
         assert (partial(out) / RECORDING_FILE).exists()
-        np.testing.assert_array_equal(table.odometry.stamps_ns, stamps_ns[: len(table)])
+        np.testing.assert_array_equal(table.trajectory("T_odom_lidar").stamps_ns, stamps_ns[: len(table)])
     assert 0 < reached[0] <= reached[1] <= reached[2] and reached[0] < len(stamps_ns)
     assert start(log, out, *RECORDED, "--resume").wait() == 0
     assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["run"]

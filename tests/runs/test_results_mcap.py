@@ -119,6 +119,6 @@ def test_maps_are_those_of_the_files(finished):
 def test_a_covariance_turns_with_the_lidar_and_is_zero_where_it_is_unknown():
     told = ros_covariance(np.diag([4.0, 1.0, 0.01]), lie.pose_2d(5.0, 6.0, np.pi / 2))
     np.testing.assert_allclose(np.diag(told), [1.0, 4.0, 0.0, 0.0, 0.0, 0.01], atol=1e-12)
-    assert not ros_covariance(None, np.eye(3)).any()
+    assert not ros_covariance(np.full((3, 3), np.nan), np.eye(3)).any()
     spread = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
     np.testing.assert_allclose(ros_covariance(spread, np.eye(4)), spread)

@@ -190,7 +190,7 @@ def test_a_comparison_names_both_maps_and_is_no_run_to_check_or_draw(tmp_path, c
     logs = json.loads((tmp_path / "ab" / "run.json").read_text())["logs"]
     assert [log["path"] for log in logs] == [str(a / "map"), str(b / "map")]
     assert main(["check", str(tmp_path / "ab")]) == 2
-    assert "see summary.txt" in capsys.readouterr().err
+    assert "name a directory of scanchain run" in capsys.readouterr().err
     assert main(["view", str(tmp_path / "ab"), "--png", str(tmp_path / "ab.png")]) == 2
     assert "open report.html" in capsys.readouterr().err
 

@@ -447,12 +447,13 @@ def test_a_table_holds_the_figures_of_the_steps(tmp_path):
         table.append(step)
     columns = table.columns
     assert len(table) == 20 and columns["has_wheels"].tolist() == [k == 9 for k in range(20)]
-    assert table.texts("reason").to_pylist() == [step.reason for step in steps]
     np.testing.assert_array_equal(columns["T_odom_base"][9], T_odom_base)
     np.testing.assert_array_equal(columns["information"], [step.match.information for step in steps])
     np.testing.assert_array_equal(columns["timing"][:, 2], [step.timing.match_s for step in steps])
-    table.write(tmp_path / "steps.parquet", table.best_known)
-    found = evidence_of(pq.ParquetFile(tmp_path / "steps.parquet").read(), None)
+    table.write(tmp_path / "steps.parquet", table.trajectory("T_world_lidar"))
+    written = pq.ParquetFile(tmp_path / "steps.parquet").read()
+    assert written["reason"].to_pylist() == [step.reason for step in steps]
+    found = evidence_of(written, None)
     assert np.flatnonzero(found.starts_segment).tolist() == [7]
 
 

@@ -15,7 +15,7 @@ from msgspec import Struct
 from scanchain.files import source_of
 from scanchain.logs.files import spelled
 from scanchain.processes import Ending, KilledFor, Limits, run_within
-from scanchain.runs.directory import RUN_FILE, directory_name
+from scanchain.runs.directory import RUN_FILE
 from scanchain.runs.metrics import METRICS_FILE, Metrics
 from scanchain.runs.provenance import Provenance, package_version
 from scanchain.settings import Override, dump, load_settings
@@ -71,7 +71,7 @@ class Task(Struct, frozen=True):
     @property
     def run(self) -> Path:
         """The run directory; its name is that of the log and the key's first letters."""
-        return Path(self.out) / f"{directory_name(source_of(self.log).resolve().stem)}-{self.key[:8]}"
+        return Path(self.out) / f"{source_of(self.log).resolve().stem}-{self.key[:8]}"
 
     @property
     def row_file(self) -> Path:

@@ -117,7 +117,6 @@ def _evaluated(
 
 
 def _text(evaluated: dict[str, Results]) -> str:
-    """All of one estimate, or a table of several."""
     if len(evaluated) > 1:
         return _table(evaluated)
     (results,) = evaluated.values()

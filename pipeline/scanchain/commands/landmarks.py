@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from click.core import ParameterSource
 
 from scanchain.commands import options
 from scanchain.commands.options import PATH
@@ -103,7 +102,6 @@ def landmarks(
 
     chosen = Options(parse_methods(methods), noise=_noise(noise), **more)
     problems = [path if path.is_dir() else read_landmark_data(path) for path in data]
-    _check_options({"log" if isinstance(each, Path) else each.kind for each in problems})
     if recording is not None:
         options.check_output(recording, force=force, endings=(".rrd",))
     with RunDirectory(out, force=force) as directory, Terminal("problems") as terminal:
@@ -131,35 +129,15 @@ def landmarks(
     return int(not all(study.converged for study in studies))
 
 
-_OF_LOGS, _OF_NONLINEAR = ("log", "MRCLAM folders"), ("bearing-range", "nonlinear files")
-_ALONE = {  # options that only some problems take
-    "robot": ("--robot", *_OF_LOGS),
-    "noise": ("--odometry-noise", *_OF_LOGS),
-    "guess": ("--guess", *_OF_NONLINEAR),
-    "optimizer": ("--optimizer", *_OF_NONLINEAR),
-}
-
-
-def _check_options(kinds: Collection[str]) -> None:
-    """Refuse options that none of the problems, of these kinds, takes."""
-    ctx = click.get_current_context()
-    for name, (flag, kind, what) in _ALONE.items():
-        if kind not in kinds and ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE:
-            raise InputError(f"{flag} is for {what} alone, and DATA names none; leave it out")
-
-
 def _noise(text: str | None) -> OdometryNoise | None:
-    """Four positive numbers with commas; None is to be estimated."""
     from scanchain.landmarks.ranges import OdometryNoise
 
     if text is None:
         return None
-    try:
-        values = [float(word) for word in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) != 4 or not all(0.0 < value < 1e3 for value in values):
-        raise InputError(f"--odometry-noise is {text!r}; give four positive numbers, as 0.03,0.01,0.05,0.1")
+    wrong = f"--odometry-noise is {text!r}; give four positive numbers, as 0.03,0.01,0.05,0.1"
+    values = options.numbers(text, (4,), wrong)
+    if not all(0.0 < value < 1e3 for value in values):
+        raise InputError(wrong)
     return OdometryNoise(*values)
 
 

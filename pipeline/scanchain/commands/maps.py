@@ -11,7 +11,7 @@ import click
 
 from scanchain.commands import options
 from scanchain.commands.options import ABOVE_ZERO, PATH, OverrideCommand
-from scanchain.errors import InputError, counted
+from scanchain.errors import counted
 
 if TYPE_CHECKING:
     from scanchain.data import Pose
@@ -116,11 +116,8 @@ def _initial(text: str) -> Callable[[int, SavedMap], Pose]:
 
     if text.endswith(".tum"):
         return pose_in_file(Path(text))
-    try:
-        x_m, y_m, yaw_deg = map(float, text.split(","))
-    except ValueError:
-        raise InputError(f"--initial is {text!r}; give x,y,yaw in meters and degrees, or a file .tum") from None
-    return pose_near(x_m, y_m, yaw_deg)
+    wrong = f"--initial is {text!r}; give x,y,yaw in meters and degrees, or a file .tum"
+    return pose_near(*options.numbers(text, (3,), wrong))
 
 
 @click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
@@ -224,7 +221,6 @@ def changes(
 
 
 def _pose(earlier: Path, text: str | None) -> Pose | None:
-    """The transform of a position and a heading."""
     import numpy as np
 
     from scanchain import lie
@@ -232,14 +228,9 @@ def _pose(earlier: Path, text: str | None) -> Pose | None:
 
     if text is None:
         return None
-    try:
-        numbers = [float(word) for word in text.split(",")]
-        x, y, *z, yaw_deg = numbers
-        pose = lie.pose_2d(x, y, np.radians(yaw_deg))
-        if not np.isfinite(numbers).all() or len(z) > 1:
-            raise ValueError
-    except ValueError:
-        raise InputError(f"--transform is {text!r}; give X,Y,YAW or X,Y,Z,YAW in meters and degrees") from None
+    wrong = f"--transform is {text!r}; give X,Y,YAW or X,Y,Z,YAW in meters and degrees"
+    x, y, *z, yaw_deg = options.numbers(text, (3, 4), wrong)
+    pose = lie.pose_2d(x, y, np.radians(yaw_deg))
     if open_saved_map(earlier).dimension == 2:
         return pose
     pose = lie.lift(pose)

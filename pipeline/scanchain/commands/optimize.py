@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -12,14 +11,13 @@ import click
 
 from scanchain.commands import options
 from scanchain.commands.options import PATH, OverrideCommand
-from scanchain.errors import FREEDOM, InputError, counted, remedy_of
+from scanchain.errors import FREEDOM, InputError, counted
 from scanchain.settings import Override, load_settings
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from scanchain.config import GraphConfig
     from scanchain.graph.certificate import Certificate
     from scanchain.graph.g2o import G2oFile, Indefinite
     from scanchain.graph.initialize import Initialization
@@ -96,6 +94,7 @@ def optimize(
       scanchain optimize candidates.g2o --robust truncated --out robust.g2o --marginals all
       scanchain optimize manhattan.g2o --initialize spanning-tree --optimizer gauss-newton
     """
+    from scanchain.graph.covariance import chosen_poses
     from scanchain.graph.g2o import GRAPH_SUFFIXES, rejected_path
     from scanchain.graph.optimization import GraphChange
 
@@ -107,37 +106,62 @@ def optimize(
     for path, allowed in endings.items():
         if path is not None:
             options.check_output(path, force=force, endings=allowed)
-    config = _config(overrides)
+    for override in overrides:
+        if not override.key.startswith("graph."):
+            raise InputError(f"{override.flag} has no meaning for optimize; its keys begin with --graph.")
+    config = load_settings(overrides=overrides).config.graph
     is_robust = config.robust != "none" and any(override.key == "graph.robust" for override in overrides)
     file = _read(source, cast("Indefinite", indefinite), is_robust)
-    before = file.graph.state()
-    done = file.graph.optimize(config, initialize=cast("Initialization", initialize))
+    graph, ids, before = file.graph, file.ids, file.graph.state()
+    chosen = None if marginals is None else chosen_poses(marginals, ids)
+    done = graph.optimize(config, initialize=cast("Initialization", initialize))
     change = GraphChange(source.name, before, done.state)
-    free, weak = file.graph.free_poses(), file.graph.weakly_joined()
-    report = _Report(file, change, done, free, weak, file.graph.certify())
-    writers = _writers(file, change, out, marginals, png, recording)
-    for path, write in writers.items():
-        try:
-            write()
-        except OSError as error:
-            if remedy_of(error):
-                raise
-            raise InputError(f"{path}: not writable ({error.strerror}); choose another place") from error
-    if rejected is not None and rejected not in writers:
-        rejected.unlink(missing_ok=True)  # of an earlier report, whose place --force gave away
-    written = [str(path) for path in writers]
+    report = _Report(file, change, done, graph.free_poses(), graph.weakly_joined(), graph.certify())
+    written = _write(file, change, chosen, out, png, recording)
     lines = [*report.lines(), *(("written", path) for path in written)]
     text = "\n".join(f"{name:<15}{fact}" for name, fact in lines)
     click.echo(options.json_text(report.tree() | {"written": written}) if as_json else text)
     return int(not done.converged)
 
 
-def _config(overrides: Sequence[Override]) -> GraphConfig:
-    """The graph's branch of the configuration; other keys are refused."""
-    for override in overrides:
-        if not override.key.startswith("graph."):
-            raise InputError(f"{override.flag} has no meaning for optimize; its keys begin with --graph.")
-    return load_settings(overrides=overrides).config.graph
+def _write(
+    file: G2oFile,
+    change: GraphChange,
+    chosen: NDArray[np.int64] | None,
+    out: Path | None,
+    png: Path | None,
+    recording: Path | None,
+) -> list[str]:
+    """Write the files asked for, with the covariances of the chosen poses (M,); their paths."""
+    from scanchain.graph.covariance import write_covariances
+    from scanchain.graph.g2o import rejected_path, write_g2o
+
+    graph, ids = file.graph, file.ids
+    written: list[Path] = []
+    if out is not None:
+        write_g2o(out, graph, ids=ids, other_lines=file.other_lines, force=True)
+        written.append(out)
+        rejected = rejected_path(out)
+        if graph.is_rejected.any():
+            write_g2o(rejected, graph, ids=ids, edges="rejected", force=True)
+            written.append(rejected)
+        else:
+            rejected.unlink(missing_ok=True)  # of an earlier report, whose place --force gave away
+        if chosen is not None:
+            table = out.with_suffix(".marginals.csv")
+            write_covariances(table, ids[chosen], graph.covariances()[chosen])
+            written.append(table)
+    if png is not None:
+        from scanchain_viz.report.problems import draw_graph
+
+        draw_graph(change, png)
+        written.append(png)
+    if recording is not None:
+        from scanchain_viz.recording.results import record_graph
+
+        record_graph(change, recording)
+        written.append(recording)
+    return [str(path) for path in written]
 
 
 def _read(source: Path, indefinite: Indefinite, is_robust: bool) -> G2oFile:
@@ -151,39 +175,6 @@ def _read(source: Path, indefinite: Indefinite, is_robust: bool) -> G2oFile:
         remedy = "fix the program that wrote them, or stop here with --indefinite refuse"
         click.echo(f"warning: {source}: {file.projection.text}; {remedy}", err=True)
     return file
-
-
-def _writers(
-    file: G2oFile,
-    change: GraphChange,
-    out: Path | None,
-    marginals: str | None,
-    png: Path | None,
-    recording: Path | None,
-) -> dict[Path, Callable[[], None]]:
-    """Writer of each requested file."""
-    from scanchain.graph.covariance import chosen_poses, write_covariances
-    from scanchain.graph.g2o import rejected_path, write_g2o
-
-    graph, ids = file.graph, file.ids
-    writers: dict[Path, Callable[[], None]] = {}
-    if out is not None:
-        writers[out] = lambda: write_g2o(out, graph, ids=ids, other_lines=file.other_lines, force=True)
-        rejected = rejected_path(out)
-        if graph.is_rejected.any():
-            writers[rejected] = lambda: write_g2o(rejected, graph, ids=ids, edges="rejected", force=True)
-        if marginals is not None:
-            chosen, table = chosen_poses(marginals, ids), out.with_suffix(".marginals.csv")
-            writers[table] = lambda: write_covariances(table, ids[chosen], graph.covariances()[chosen])
-    if png is not None:
-        from scanchain_viz.report.problems import draw_graph
-
-        writers[png] = lambda: draw_graph(change, png)
-    if recording is not None:
-        from scanchain_viz.recording.results import record_graph
-
-        writers[recording] = lambda: record_graph(change, recording)
-    return writers
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,31 +197,30 @@ class _Report:
         if guess == "given":
             guess = "the file's poses" if file.has_guess else "odometry, as the file has no vertices"
         size = f"{graph.dimension}D, {counted(len(graph), 'pose')}, {counted(len(graph.edges), 'edge')}"
-        loops, certified, robust = int(graph.is_loop.sum()), self.certificate.verdict, []
-        if loops:
-            certified += ", with fixed robust weights"
-            others = f"the other {counted(len(graph.edges) - loops, 'edge')} (odometry, points) in full weight"
-            rest = "; they do not count" if done.rejected.any() else ""
-            robust = [
-                ("robust", f"on {counted(loops, 'loop edge')}; {others}"),
-                ("rejected", f"{done.rejected.sum():,} of {loops:,} loop edges{rest}"),
-            ]
-        projected = file.projection
-        indefinite = projected and f"{projected.edges:,} of {projected.of:,} indefinite information matrices"
+        lines = [("warning", warning) for warning in self.warnings]
+        lines.append(("graph", f"{self.change.name}: {size}"))
+        lines += [("kept as is", f"{counted(count, 'line')} {tag}") for tag, count in file.other_tags]
+        if (projected := file.projection) is not None:
+            of_all = f"{projected.edges:,} of {projected.of:,}"
+            lines.append(("projected", f"{of_all} indefinite information matrices"))
         ending = done.reason if done.converged else f"DID NOT CONVERGE: {done.reason}"
-        return [
-            *(("warning", warning) for warning in self.warnings),
-            ("graph", f"{self.change.name}: {size}"),
-            *(("kept as is", f"{counted(count, 'line')} {tag}") for tag, count in file.other_tags),
-            *([("projected", indefinite)] if indefinite else []),
+        lines += [
             ("initial guess", guess),
             ("chi2", self._chi2),
             ("iterations", f"{done.iterations:,} in {1e3 * done.time_s:.0f} ms; {ending}"),
-            *robust,
-            *([("free", free_text(self.free))] if len(self.free) else []),
-            *([("weakly joined", weak_text(self.weak))] if len(self.weak) else []),
-            ("certificate", f"{certified}; {1e3 * self.certificate.time_s:.0f} ms"),
         ]
+        loops, certified = int(graph.is_loop.sum()), self.certificate.verdict
+        if loops:
+            certified += ", with fixed robust weights"
+            others = f"the other {counted(len(graph.edges) - loops, 'edge')} (odometry, points) in full weight"
+            lines.append(("robust", f"on {counted(loops, 'loop edge')}; {others}"))
+            rest = "; they do not count" if done.rejected.any() else ""
+            lines.append(("rejected", f"{done.rejected.sum():,} of {loops:,} loop edges{rest}"))
+        if len(self.free):
+            lines.append(("free", free_text(self.free)))
+        if len(self.weak):
+            lines.append(("weakly joined", weak_text(self.weak)))
+        return [*lines, ("certificate", f"{certified}; {1e3 * self.certificate.time_s:.0f} ms")]
 
     @property
     def warnings(self) -> list[str]:

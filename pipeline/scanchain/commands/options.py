@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import reduce
-from math import inf, isnan
+from math import inf, isfinite, isnan
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +53,7 @@ class OverrideCommand(click.Command):
         super().__init__(*words, options_metavar=options_metavar, **more)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse the overrides and the ordinary arguments. Raises click.UsageError for a key set by two options."""
+        """Parse the overrides and the ordinary arguments; of a key that is set twice the last counts."""
         rest: list[str] = []
         overrides: list[Override] = []
         words = iter(args)
@@ -70,15 +70,7 @@ class OverrideCommand(click.Command):
                 raise click.UsageError(f"{flag} needs a value, as in {flag} VALUE", ctx)
             overrides.append(Override(flag[2:], text, flag))
         unused = super().parse_args(ctx, rest)
-        chosen: dict[str, Override] = {}
-        for override in (*ctx.meta.get(_ALIASES, ()), *overrides):
-            other = chosen.setdefault(override.key, override)
-            if other is not override:
-                flag, key = override.flag, override.key
-                twice = f"{flag} is given twice ({other.text}, {override.text}); give it once"
-                both = f"{other.flag} and {flag} both set {key}; give one of them"
-                raise click.UsageError(twice if other.flag == flag else both, ctx)
-        ctx.params["overrides"] = tuple(chosen.values())
+        ctx.params["overrides"] = (*ctx.meta.get(_ALIASES, ()), *overrides)
         return unused
 
 
@@ -143,17 +135,10 @@ strict = click.option("--strict", is_flag=True, help="Exit with 1 unless the ver
 as_json = click.option("--json", "as_json", is_flag=True, help="Print as JSON.")
 
 
-def _checked_gap(_: click.Context, __: click.Parameter, value: float | None) -> float | None:
-    if value is not None and not 0.0 <= value < inf:
-        raise InputError(f"--max-gap is {value:g} s; choose a number from 0 up")
-    return value
-
-
 max_gap = click.option(
     "--max-gap",
     "max_gap_s",
-    type=float,
-    callback=_checked_gap,
+    type=NumberRange(0.0, inf, max_open=True),
     metavar="SECONDS",
     help="Longest gap between true poses to interpolate. [default: 5 of their usual intervals, 0.1 to 0.6]",
 )
@@ -229,6 +214,17 @@ def limits(what: str, *, time_default: str, memory_default: str) -> Callable[[An
             help=f"Memory limit of {what}. [default: {memory_default}]",
         ),
     )
+
+
+def numbers(text: str, counts: Collection[int], wrong: str) -> list[float]:
+    """Numbers with commas between them, as many as one of these counts. Raises InputError with this message."""
+    try:
+        values = [float(word) for word in text.split(",")]
+    except ValueError:
+        raise InputError(wrong) from None
+    if len(values) not in counts or not all(map(isfinite, values)):
+        raise InputError(wrong)
+    return values
 
 
 def check_output(path: Path, *, force: bool, endings: Sequence[str] = ()) -> None:

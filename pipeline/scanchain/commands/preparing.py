@@ -59,31 +59,24 @@ def show(settings: Settings, as_json: bool) -> None:
       scanchain config show --lidar 2d --matching.max_distance_m 0.3
       scanchain config show --config mine.toml --json
     """
-    values = flatten(settings.config)
-    rows: list[dict[str, Any]] = [
-        {
-            "key": key.name,
-            "value": values[key.name],
-            "unit": key.unit,
-            "range": key.range,
-            "default": key.default,
-            "description": key.description,
-        }
-        for key in config_keys().values()
-    ]
+    values, keys = flatten(settings.config), config_keys()
     if as_json:
+        names = ("unit", "range", "default", "description")
+        rows = [
+            {"key": name, "value": values[name]} | {each: getattr(key, each) for each in names}
+            for name, key in keys.items()
+        ]
         click.echo(options.json_text(rows))
         return
     click.echo(f"# {settings.source}; * differs from the default")
-    marks = [" " if row["value"] == row["default"] else "*" for row in rows]
     cells = [
-        (f"{mark} {row['key']}", _text(row["value"]), row["unit"], row["range"])
-        for mark, row in zip(marks, rows, strict=True)
+        (f"{' ' if values[name] == key.default else '*'} {name}", _text(values[name]), key.unit, key.range)
+        for name, key in keys.items()
     ]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    for cell, row in zip(cells, rows, strict=True):
+    for cell, key in zip(cells, keys.values(), strict=True):
         click.echo("  ".join(map(str.ljust, cell, widths)).rstrip())
-        description = row["description"].replace("``", "")
+        description = key.description.replace("``", "")
         click.echo(textwrap.fill(description, 100, initial_indent=_INDENT, subsequent_indent=_INDENT))
 
 

@@ -78,12 +78,10 @@ def run(out: Path, rerun: str, strict: bool, as_json: bool, **given: Any) -> int
         click.echo(f"error: {finished.path}: {finished.metrics.sentence}", err=True)
     for warning in [each for each in finished.warnings if not (is_seen and each in finished.summary)]:
         click.echo(f"warning: {warning}", err=True)
-    click.echo((finished.path / "metrics.json").read_text() if as_json else finished.summary, nl=False)
+    options.print_summary(finished.path if finished.stopped else out, finished.summary, as_json=as_json)
     if finished.stopped:
         again = how_to_resume(job.command)
         raise ScanchainError(f"{finished.stopped}; the results so far are in {finished.path}; {again}")
-    if not as_json:
-        click.echo(f"written        {out}")
     return int(fails)
 
 
@@ -174,10 +172,6 @@ def view(directory: Path, web: bool, png: Path | None, force: bool) -> None:
     """
     from scanchain.commands.terminal import Terminal
 
-    if not directory.exists():
-        raise InputError(
-            f"{directory}: no such directory or file; check the path (scanchain run makes it by --out)"
-        )
     if png is not None:
         from scanchain_viz.pictures.maps import draw_run
 
@@ -186,12 +180,10 @@ def view(directory: Path, web: bool, png: Path | None, force: bool) -> None:
         click.echo(png)
         return
     path = directory / "recording.rrd" if directory.is_dir() else directory
-    if not path.exists():
+    if not path.exists() or path.suffix != ".rrd":
         raise InputError(
-            f"{directory}: holds no recording.rrd; scanchain run writes it unless --rerun leaves out save"
+            f"{directory}: no recording; give a .rrd file, or a directory of scanchain run with --rerun save"
         )
-    if path.suffix != ".rrd":
-        raise InputError(f"{path}: is no recording (.rrd); give a run directory")
     from scanchain_viz.recording.viewer import show
 
     with Terminal("recordings"):  # SIGTERM ends it like Ctrl-C: the server goes with it

@@ -1,4 +1,4 @@
-"""A progress bar on a terminal, silence elsewhere, and Ctrl-C that ends a run in good order."""
+"""A line of progress on a terminal, silence elsewhere, and Ctrl-C that ends a run in good order."""
 
 from __future__ import annotations
 
@@ -8,18 +8,19 @@ import threading
 from collections.abc import Iterator
 from time import monotonic
 from types import FrameType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 import click
 
+from scanchain.errors import duration
 from scanchain.runs.job import Progress
 
 if TYPE_CHECKING:
-    from rich.progress import Progress as Bar
-
     from scanchain.data import Scan
 
 _REDRAW_S = 0.2
+_CLEAR = "\r\033[K"  # to the begin of the line, which is emptied
+_WIDTH = 30  # characters of a full bar
 _SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 
@@ -31,10 +32,12 @@ class Terminal(Progress):
     """
 
     def __init__(self, unit: str) -> None:
+        self.unit = unit
         self.stopped = self.is_tracking = False
+        self.is_seen = sys.stderr.isatty()
         self.started_s = self.drawn_s = 0.0
+        self.bar = ""  # as it stands in the last line
         self.handlers = {}
-        self.bar = _bar(unit) if sys.stderr.isatty() else None
 
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():
@@ -49,12 +52,12 @@ class Terminal(Progress):
 
     def say(self, line: str) -> None:
         """Show a line on a terminal only, above the bar."""
-        if self.bar is not None:
-            self.bar.console.print(line, highlight=False, markup=False, soft_wrap=True)
+        if self.is_seen:
+            click.echo(f"{_CLEAR}{line}\n{self.bar}", nl=False, err=True)
 
     def announce(self, line: str) -> None:
         """Show a line on a terminal or in a pipe."""
-        if self.bar is None:
+        if not self.is_seen:
             click.echo(line, err=True)
         self.say(line)
 
@@ -71,44 +74,24 @@ class Terminal(Progress):
 
     def count(self, done: int, total: int) -> None:
         """Draw how many are done, but not more often than an eye can follow."""
-        if self.bar is None:
-            return
         now_s = monotonic()
-        if not self.bar.live.is_started:
-            self.started_s = now_s
-            self.bar.start()
-        if now_s - self.drawn_s < _REDRAW_S and done < total:
+        self.started_s = self.started_s or now_s
+        if not self.is_seen or (now_s - self.drawn_s < _REDRAW_S and done < total):
             return
         self.drawn_s = now_s
         rate = done / max(now_s - self.started_s, 1e-3)
-        self.bar.update(self.bar.task_ids[0], completed=done, total=max(done, total), rate=rate)
-        self.bar.refresh()
+        bar = "━" * round(_WIDTH * min(done / max(total, 1), 1.0))
+        left = duration(max(total - done, 0) / max(rate, 1e-3))
+        self.bar = f"{bar:<{_WIDTH}} {done:,}/{total:,} {self.unit}  {rate:.0f} {self.unit}/s  {left} left"
+        click.echo(_CLEAR + self.bar, nl=False, err=True)
 
     def _close(self) -> None:
-        """Leave the bar as it is."""
-        if self.bar is not None and self.bar.live.is_started:
-            self.bar.refresh()
-            self.bar.stop()
+        if self.bar:
+            click.echo(err=True)
+        self.bar = ""
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
         if not self.is_tracking or self.stopped:
             raise KeyboardInterrupt
         self.stopped = True
         self.say("stopping: finishing with what there is; once more to quit at once")
-
-
-def _bar(unit: str) -> Bar:
-    """Progress bar of rich on stderr, drawn by hand so that no thread takes time from the run."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-    from rich.progress import Progress as Bar
-
-    columns: list[Any] = [
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn(f"{unit}  {{task.fields[rate]:.0f}} {unit}/s"),
-        TimeRemainingColumn(compact=True, elapsed_when_finished=True),
-    ]
-    bar = Bar(*columns, console=Console(stderr=True), auto_refresh=False)
-    bar.add_task("", total=None, rate=0.0)
-    return bar

@@ -82,14 +82,4 @@ def closures_table(closures: Sequence[Closure], keyframes: Sequence[Keyframe], d
         **of(matches, pa.bool_(), "converged"),
         **of(matches, number, "degeneracy_eigenvalue"),
     }
-    notes = {
-        "x y z qx qy qz qw": "pose of keyframe source in the frame of keyframe target",
-        "information": "row by row, of a twist in the source's own frame, order (translation, rotation)",
-        "proposed_by": "position: close by odometry; place: by place recognition, independent of odometry",
-        "rejected_by": "verification: by matching; back end: verified, but it contradicts the rest of the graph; "
-        "empty where it is accepted",
-        "cause": "the reason without its figures, the same for all closures of its kind",
-        "chi2_before chi2_after": "of its edge, when it entered the graph and at the end; null where it never did",
-        "weight": "robust weight after the last optimization, 0 for closures that never entered the graph",
-    }
-    return pa.table(columns).replace_schema_metadata(notes)
+    return pa.table(columns)

@@ -7,7 +7,6 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from glob import escape
-from hashlib import sha256
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -22,16 +21,6 @@ CHECKPOINT_FILE = "state.checkpoint"  # of a run that is not complete
 RECORDING_FILE = "recording.rrd"
 POINTS_FILE = "points.store"  # beside it: what the chain keeps out of memory
 _UNFINISHED = "unfinished"
-_LONGEST_NAME = 200  # bytes; file systems allow 255
-
-
-def directory_name(stem: str) -> str:
-    """Name of a directory for a log, with room for what is put around it; long ones end in a hash of the whole."""
-    name = os.fsencode(stem)
-    if len(name) <= _LONGEST_NAME:
-        return stem
-    digest = sha256(name).hexdigest()[:8]
-    return f"{name[: _LONGEST_NAME - 9].decode('utf-8', 'ignore')}-{digest}"
 
 
 class RunDirectory:
@@ -128,12 +117,6 @@ def left_behind(destination: Path) -> Path | None:
     return max(checkpoints, key=lambda file: file.stat().st_mtime_ns).parent if checkpoints else None
 
 
-def stopped_run(destination: Path) -> Path | None:
-    """The same, None where another process still writes to it."""
-    left = left_behind(destination)
-    return left if left is not None and not writer_of(left) else None
-
-
 def writer_of(partial: Path) -> int:
     """Number of another process that still writes to a directory marked partial, 0 if none does.
 
@@ -161,19 +144,14 @@ def check_outside_runs(destination: Path) -> None:
 
 
 def _check(destination: Path, force: bool) -> None:
-    """Refuse what must not be overwritten."""
     check_outside_runs(destination)
     if not destination.exists():
         return
     if not destination.is_dir():
         raise InputError(f"{destination}: is a file; choose another --out")
     if not force:
-        resume = ""
-        whole, mark, _ = destination.name.rpartition(".partial-")
-        if mark and (destination / CHECKPOINT_FILE).is_file():
-            resume = f"; it is what a stopped run left: --out {destination.with_name(whole)} --resume continues it"
-        elif left := stopped_run(destination):
-            resume = f"; {left.name} is of a run that was stopped: --force --resume continues it"
+        left = left_behind(destination)
+        resume = f"; {left.name} is of a run that did not end: --force --resume continues it" if left else ""
         raise InputError(f"{destination}: exists; choose another --out or pass --force to replace it{resume}")
     if any(destination.iterdir()) and not (destination / RUN_FILE).is_file():
         raise InputError(

@@ -53,18 +53,16 @@ def write_results_mcap(path: Path, log: Log, steps: StepTable, result: SlamResul
         _write_motion(writer, moving, steps, trajectory.poses)
 
 
-def ros_covariance(covariance: Matrix | None, T: Pose) -> NDArray[np.float64]:
+def ros_covariance(covariance: Matrix, T: Pose) -> NDArray[np.float64]:
     """A covariance (6, 6) as in nav_msgs/Odometry: x, y, z, and turns about the fixed axes of its frame.
 
-    covariance : (k, k) of a twist in the moving frame, T exp(ξ), order (translation, rotation); None, where a
+    covariance : (k, k) of a twist in the moving frame, T exp(ξ), order (translation, rotation); NaN, where a
         direction is undetermined, becomes zeros, which stand for unknown
     T : that frame's pose
     """
     spread = np.zeros((6, 6))
-    if covariance is None:
-        return spread
     places = _PLANAR if len(covariance) == 3 else list(range(6))
-    spread[np.ix_(places, places)] = covariance
+    spread[np.ix_(places, places)] = np.nan_to_num(covariance)
     turn = np.kron(np.eye(2), lie.lift(T)[:3, :3])
     return turn @ spread @ turn.T
 
@@ -82,14 +80,11 @@ def _write_motion(writer: LogWriter, moving: MovingFrame, steps: StepTable, pose
         links = Link(_WORLD, _ODOM, place(T_world_odom)), Link(_ODOM, moving.name, here)
         data = pack_transforms(stamp_ns, *links)
         writer.append("/tf", "tf2_msgs/msg/TFMessage", data, stamp_ns, log_time_ns)
-        in_ros = None if covariance is None else adjoint @ covariance @ adjoint.T
-        data = pack_odometry(stamp_ns, _ODOM, moving.name, here, ros_covariance(in_ros, T_odom_frame))
+        in_ros = ros_covariance(adjoint @ covariance @ adjoint.T, T_odom_frame)
+        data = pack_odometry(stamp_ns, _ODOM, moving.name, here, in_ros)
         writer.append("/odometry", "nav_msgs/msg/Odometry", data, stamp_ns, log_time_ns)
 
 
 def _rows(points: Points) -> NDArray[np.void]:
     """Points (N, d) as rows of x, y, z, which is 0 in the plane."""
-    rows = np.zeros(len(points), [(name, "<f4") for name in "xyz"])
-    for axis in range(points.shape[1]):
-        rows["xyz"[axis]] = points[:, axis]
-    return rows
+    return lie.lift_points(points).astype("<f4").view([(name, "<f4") for name in "xyz"])[:, 0]

@@ -24,7 +24,7 @@ from scanchain.data import Scan
 from scanchain.errors import InputError, ScanchainError, counted, remedy_of
 from scanchain.files import without_keys, write_whole
 from scanchain.point_store import PointStore
-from scanchain.registration.matcher import CheckedMatcher, Matcher, create_matcher
+from scanchain.registration.matcher import CheckedMatcher, create_matcher
 from scanchain.runs.directory import (
     CHECKPOINT_FILE,
     POINTS_FILE,
@@ -37,7 +37,7 @@ from scanchain.runs.directory import (
 from scanchain.runs.job import Recorder
 from scanchain.runs.provenance import Provenance, package_version
 from scanchain.runs.step_table import StepTable
-from scanchain.settings import dump, flatten
+from scanchain.settings import flatten
 from scanchain.slam import Slam
 from scanchain.trajectory import write_tum
 
@@ -45,10 +45,6 @@ _LEISURE = 20.0  # least time between two checkpoints over the time that one tak
 _REMEDY = "run without --resume"
 _NEEDED = (RUN_FILE, "config.toml", CHECKPOINT_FILE, POINTS_FILE)
 _CRC_BYTES = 4
-
-
-class PartialRunError(ScanchainError):
-    """A run that failed after some scans; its results so far are in a directory marked partial."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +112,7 @@ def read_checkpoint(folder: Path, config: Config) -> Checkpoint:
         raise InputError(f"{path}: was made by {made}, this is {this}; {_REMEDY}")
     checkpoint = Checkpoint(folder, *_Unpickler(file, config).load())
     if checkpoint.slam.config != config:
-        raise InputError(f"{path}: has another configuration; {_REMEDY}")
+        raise InputError(f"{path}: has another configuration; repeat the flags of the run, or {_REMEDY}")
     return checkpoint
 
 
@@ -164,15 +160,12 @@ class _Unpickler(pickle.Unpickler):
 
     def persistent_load(self, pid: tuple[Any, ...]) -> Any:
         if pid not in self.left_out:
-            self.left_out[pid] = self._made(*pid)
+            what, *size = pid
+            self.left_out[pid] = create_matcher(self.config.matching) if what == "matcher" else None
+            if what == "points":
+                self.left_out[pid] = store = PointStore(size[0])
+                store.rows = size[1]  # of the file that it is to reopen
         return self.left_out[pid]
-
-    def _made(self, what: str, dimension: int = 0, rows: int = 0) -> PointStore | Matcher | None:
-        if what == "points":
-            store = PointStore(dimension)
-            store.rows = rows  # of the file that it is to reopen
-            return store
-        return create_matcher(self.config.matching) if what == "matcher" else None
 
 
 def _is_of_slam(module: str) -> bool:
@@ -189,8 +182,6 @@ def find_left(out: Path, config: Config) -> Checkpoint | None:
         return None
     if writer := writer_of(folder):
         raise InputError(f"{folder}: is being written by process {writer}; wait for its end or stop it")
-    if (folder / "config.toml").read_text(encoding="utf-8") != dump(config):
-        raise InputError(f"{folder}: was run with another configuration; repeat its flags, or {_REMEDY}")
     return read_checkpoint(folder, config)
 
 
@@ -257,18 +248,16 @@ def rescued(
     if not len(steps) and not is_bug:
         return error
     directory.worth_keeping()
-    if isinstance(error, OSError) and error.filename is None:
-        error.filename = str(directory.destination)
-    known = "interrupted" if isinstance(error, KeyboardInterrupt) else ""
-    known = remedy_of(error) if isinstance(error, OSError) else known
-    reason = known or str(error) or type(error).__name__
+    reason = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or type(error).__name__
+    if isinstance(error, OSError):
+        error.filename = error.filename or str(directory.destination)
+        reason = remedy_of(error) or reason
     until = f"{counted(len(steps), 'scan')} until then"
     is_or_are = "is" if len(steps) == 1 and not is_bug else "are"
     where = f"{'traceback.txt and the ' if is_bug else ''}{until} {is_or_are} in {directory.path}"
     try:
-        _keep(
-            error if is_bug else None, directory.path, steps, msgspec.structs.replace(provenance, stopped=reason)
-        )
+        msgspec.structs.replace(provenance, stopped=reason).write(directory.path / RUN_FILE)
+        _keep(error if is_bug else None, directory.path, steps)
     except OSError as failure:
         why = "" if isinstance(error, OSError) else f" ({remedy_of(failure) or failure.strerror})"
         where = f"{until} could not be written to {directory.path}{why}"
@@ -277,20 +266,19 @@ def rescued(
     if isinstance(error, InputError):
         return InputError(f"{error.text}; {where}")
     kind = f"{type(error).__name__}: " if is_bug else ""
-    return PartialRunError(f"{kind}{reason}; {where}")
+    return ScanchainError(f"{kind}{reason}; {where}")
 
 
-def _keep(bug: BaseException | None, folder: Path, steps: StepTable, provenance: Provenance) -> None:
+def _keep(bug: BaseException | None, folder: Path, steps: StepTable) -> None:
     """Write the results so far. Raises OSError on a full disk, after which nothing half-written is left."""
-    written = [folder / name for name in ("odometry.tum", "steps.parquet", "traceback.txt")]
+    odometry, table, trace = (folder / name for name in ("odometry.tum", "steps.parquet", "traceback.txt"))
     try:
-        provenance.write(folder / RUN_FILE)
         if bug is not None:
-            written[2].write_text("".join(traceback.format_exception(bug)), encoding="utf-8")
+            trace.write_text("".join(traceback.format_exception(bug)), encoding="utf-8")
         if len(steps) and not (folder / "metrics.json").exists():  # else the results are better
-            write_tum(written[0], steps.odometry, force=True)
-            steps.write(written[1], steps.best_known)
+            write_tum(odometry, steps.trajectory("T_odom_lidar"), force=True)
+            steps.write(table, steps.trajectory("T_world_lidar"))
     except OSError:
-        for path in written:
+        for path in (odometry, table, trace):
             path.unlink(missing_ok=True)
         raise

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Generator, Sequence
 from contextlib import AbstractContextManager, closing, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 
@@ -30,8 +31,7 @@ from scanchain.runs.directory import (
     RUN_FILE,
     TRUTH_FILE,
     RunDirectory,
-    partial_runs,
-    stopped_run,
+    left_behind,
 )
 from scanchain.runs.job import Job, OpenRecorder, Progress, Recorder
 from scanchain.runs.metrics import (
@@ -109,7 +109,8 @@ class _Run:
         self.began_s, self.compiled_before_s = working_s(), compiled_s()
         self.hashing = Hashing(job.logs)  # from the beginning on: while the log is opened a core is idle
         self.job, self.progress = job, progress
-        self.log, settings, self.truth_file = opened(job)
+        self.log, settings, truth_file = opened(job)
+        self.true_poses = partial(true_poses, self.log, truth_file, progress)
         self.config, self.source = settings.config, settings.source
         self.provenance = describe_start(job.command, job.logs, self.source)
         self.steps, self.notes = StepTable(), list[str]()
@@ -124,14 +125,13 @@ class _Run:
             self.steps = left.steps
             self.began_s -= left.run_s
             progress.announce(f"resuming after {counted(len(self.steps), 'scan')} of {left.folder.name}")
-        elif idle := stopped_run(job.out):
+        elif idle := left_behind(job.out):
             progress.announce(
-                f"{idle.name} is of a run that was stopped; --resume would continue it, this run starts over and "
+                f"{idle.name} is of a run that did not end; --resume would continue it, this run starts over and "
                 "removes it once complete"
             )
-        elif job.resume and (begun := partial_runs(job.out)):
-            names = ", ".join(path.name for path in begun)
-            progress.announce(f"{names}: no checkpoint to resume from, this run starts over")
+        elif job.resume:
+            progress.announce(f"{job.out}: no checkpoint to resume from, this run starts at the first scan")
 
     def begin(self) -> tuple[Slam, Generator[Scan, None, None]]:
         """SLAM, new or as of the checkpoint, and the scans that follow; the directory states what is run in it."""
@@ -187,7 +187,7 @@ class _Run:
             record_results(recording, results)
             recording.log_verdict(judged, result.trajectory)
             with suppress(InputError):  # which is reported with the accuracy
-                reference = self._true_poses(result.trajectory.stamps_ns)
+                reference = self.true_poses(result.trajectory.stamps_ns)
                 if reference is not None:
                     moved = on_the_estimate(result.trajectory, reference, gap_s=self.job.max_gap_s)
                     recording.log_ground_truth(moved.poses)
@@ -210,17 +210,20 @@ class _Run:
         log, result = self.log, results.result
         run_s, compile_s = working_s() - self.began_s - held_s, compiled_s() - self.compiled_before_s
         stopped = f"stopped by the user after {counted(len(self.steps), 'scan')}" if self.progress.stopped else ""
+        lost = [*log.damage, *self.notes, *result.warnings, *results.warnings, *of_recording]
+        if len(self.steps) <= _FEW_SCANS:
+            few = f"a trajectory of {counted(len(self.steps), 'scan')}"
+            lost.append(f"{few} says nothing about the log; check --start, --end, --every")
+        sensors = other_sensors(log.indexes, wheels=log.odometry_topic, truth=log.ground_truth_topic)
+        idle = [f"{each.sensor} {each.topic}: {each.use}" for each in sensors if each.use.startswith("not used")]
         with self.directory.results() as folder:
             source = str(self.job.ground_truth or log.ground_truth_topic)
-            truth, note = accuracy_of(self._true_poses, source, self.job.max_gap_s, result, folder)
-            lost = (*log.damage, *self.notes, *result.warnings, *results.warnings, *of_recording)
+            truth, note = accuracy_of(self.true_poses, source, self.job.max_gap_s, result, folder)
             metrics = measure(
                 self.steps, results, judged, run_s=run_s, compile_s=compile_s, ground_truth=truth,
-                warnings=(*lost, *_few_scans(len(self.steps)), *note), stopped=stopped,
+                warnings=(*lost, *note), stopped=stopped,
             )  # fmt: skip
-            text = summary(
-                metrics, _heading(log, self.config, stopped), self.source, [*log.notes, *_idle_sensors(log)]
-            )
+            text = summary(metrics, _heading(log, self.config, stopped), self.source, [*log.notes, *idle])
             metrics.write(folder / METRICS_FILE)
             (folder / "summary.txt").write_text(text, encoding="utf-8")
         return metrics, text
@@ -243,9 +246,6 @@ class _Run:
         if not stopped:
             directory.complete()
         return Finished(directory.path, metrics, text, warnings, stopped)
-
-    def _true_poses(self, stamps_ns: NDArray[np.int64]) -> Trajectory | None:
-        return true_poses(self.log, self.truth_file, self.progress, stamps_ns)
 
 
 def opened(job: Job) -> tuple[Log, Settings, TruthFile | None]:
@@ -308,37 +308,17 @@ def accuracy_of(
     return truth, tuple(filter(None, (truth.complaint, *misleading)))
 
 
-def _few_scans(count: int) -> tuple[str, ...]:
-    """Warning about a trajectory of one or two scans."""
-    if count > _FEW_SCANS:
-        return ()
-    return (f"a trajectory of {counted(count, 'scan')} says nothing about the log; check --start, --end, --every",)
-
-
 def _heading(log: Log, config: Config, stopped: str) -> str:
-    paths = ", ".join(str(path) for path in log.paths)
+    known = f"wheel odometry {log.odometry_topic}" if log.odometry_topic else "no wheel odometry"
+    if log.odometry_topic and config.odometry.prior == "constant-velocity":
+        known += ", not used: odometry.prior is constant-velocity"
+    elif log.odometry_topic and not log.scans_with_wheels:
+        known += ", not used: no reading is near the stamp of a scan"
     place, turned = log.T_base_lidar[:-1, -1], turned_by(log.T_base_lidar)
-    at = ", ".join(f"{axis} {value_m:.2f}" for axis, value_m in zip("xyz", place, strict=False))
-    mounting = f"lidar at {at} m of {log.mounting.base_name}{turned and f', turned by {turned}'}"
-    moving = " at the first scan, moving on it" if log.mounting.motion is not None else ""
-    is_stated = bool(place.any() or turned or moving)
-    known = "; ".join(part for part in (_wheels(log, config), mounting + moving if is_stated else "") if part)
+    is_moving = log.mounting.motion is not None
+    if place.any() or turned or is_moving:
+        at = ", ".join(f"{axis} {value_m:.2f}" for axis, value_m in zip("xyz", place, strict=False))
+        known += f"; lidar at {at} m of {log.mounting.base_name}{turned and f', turned by {turned}'}"
+        known += " at the first scan, moving on it" if is_moving else ""
+    paths = ", ".join(map(str, log.paths))
     return f"{paths} {log.topic} ({known})" + (f" (PARTIAL: {stopped})" if stopped else "")
-
-
-def _idle_sensors(log: Log) -> list[str]:
-    """A line on each IMU, GNSS or topic of poses that the log has and a run leaves aside."""
-    found = other_sensors(log.indexes, wheels=log.odometry_topic, truth=log.ground_truth_topic)
-    return [f"{each.sensor} {each.topic}: {each.use}" for each in found if each.use.startswith("not used")]
-
-
-def _wheels(log: Log, config: Config) -> str:
-    """Wheel odometry of a log, with the reason if it was not used."""
-    if not log.odometry_topic:
-        return "no wheel odometry"
-    unused = ""
-    if config.odometry.prior == "constant-velocity":
-        unused = ", not used: odometry.prior is constant-velocity"
-    elif not log.scans_with_wheels:
-        unused = ", not used: no reading is near the stamp of a scan"
-    return f"wheel odometry {log.odometry_topic}{unused}"

@@ -52,22 +52,9 @@ class StepTable:
         """State of the last step."""
         return State(self.columns.texts[self.columns["state"][-1]])
 
-    def texts(self, name: str) -> pa.DictionaryArray:
-        """Texts (N,) of a column, in the order in which they occur."""
-        import pyarrow as pa
-
-        names = self.columns.texts
-        return pa.array([names[code] for code in self.columns[name].tolist()], pa.string()).dictionary_encode()
-
-    @property
-    def odometry(self) -> Trajectory:
-        """T_odom_lidar of the steps so far."""
-        return self._trajectory("T_odom_lidar")
-
-    @property
-    def best_known(self) -> Trajectory:
-        """T_world_lidar of the steps so far, each as it was known at its time."""
-        return self._trajectory("T_world_lidar")
+    def trajectory(self, name: str) -> Trajectory:
+        """The steps so far by ``T_odom_lidar``, or by ``T_world_lidar``, each as it was known at its time."""
+        return Trajectory(self.columns["stamp_ns"].copy(), self.columns[name].copy())
 
     @property
     def span_s(self) -> float:
@@ -75,10 +62,14 @@ class StepTable:
         times_ns = self.columns["log_time_ns"]
         return int(times_ns[-1] - times_ns[0]) * 1e-9 if len(times_ns) else 0.0
 
-    def covariances(self) -> list[Matrix | None]:
-        """Covariance (k, k) of each match, of a lidar-frame twist; None where a direction is unobservable."""
-        values, is_sound = _covariances(self.columns)
-        return [value if good else None for value, good in zip(values, is_sound.tolist(), strict=True)]
+    def covariances(self) -> Matrix:
+        """(N, k, k) of the matches, of lidar-frame twists; NaN where a direction is unobservable."""
+        informations = self.columns["information"]
+        finite = np.atleast_1d(np.isfinite(informations).all(axis=(1, 2)))
+        values, vectors = np.linalg.eigh(np.where(finite[:, None, None], informations, 0.0))
+        sound = finite & (values[:, 0] > _SINGULAR * values[:, -1]) & (values[:, -1] > 0.0)
+        scaled = vectors / np.sqrt(np.where(sound[:, None], values, np.nan))[:, None, :]
+        return self.columns["variance_factor"][:, None, None] * (scaled @ np.swapaxes(scaled, 1, 2))
 
     def states(self) -> Counter[State]:
         """Number of steps in each state."""
@@ -96,20 +87,20 @@ class StepTable:
         import pyarrow as pa
 
         steps = self.columns
-        covariances, is_sound = _covariances(steps)
+        covariances = self.covariances()
         columns: dict[str, object] = {
             **{name: steps[name] for name in ("index", "stamp_ns", "log_time_ns")},
             **pose_columns(trajectory.poses),
             **{f"odom_{name}": values for name, values in pose_columns(steps["T_odom_lidar"]).items()},
             **self._checks(steps, trajectory, T_base_lidar),
-            "covariance": _lists(covariances, ~is_sound),
+            "covariance": _lists(covariances, np.isnan(covariances[:, 0, 0])),
             **{name: steps[name] for name in ("scan_points", "dropped", *_OF_MATCH[:5], "cost_m2", "converged")},
-            "match_reason": self.texts("match_reason"),
+            "match_reason": self._texts("match_reason"),
             "degeneracy_eigenvalue": steps["degeneracy_eigenvalue"],
             "observability": steps["observability"],
             "degeneracy_direction": _lists(steps["degeneracy_direction"]),
-            "state": self.texts("state"),
-            "reason": self.texts("reason"),
+            "state": self._texts("state"),
+            "reason": self._texts("reason"),
             "starts_segment": steps["starts_segment"],
             "is_copy": steps["is_copy"],
             "keyframe": steps["keyframe"],
@@ -119,7 +110,7 @@ class StepTable:
             name: pa.array(np.ascontiguousarray(values)) if isinstance(values, np.ndarray) else values
             for name, values in columns.items()
         }
-        return pa.table(arrays).replace_schema_metadata(_NOTES)
+        return pa.table(arrays)
 
     def _checks(self, steps: Columns, trajectory: Trajectory, T_base_lidar: Pose | None) -> dict[str, object]:
         """Poses by the wheels, and normalized innovations of the independent checks, null where there are none."""
@@ -131,15 +122,20 @@ class StepTable:
             "velocity_innovation": pa.array(velocity, from_pandas=True),
             "overlap_ratio": pa.array(overlap, from_pandas=True),
         }
-        if T_base_lidar is None or not steps["has_wheels"].any():
+        known = steps["has_wheels"]
+        if T_base_lidar is None or not known.any():
             return columns
         wheels = steps["T_odom_base"] @ T_base_lidar
         innovation = check_wheels(trajectory.poses, wheels).innovation
-        return columns | {"wheel_innovation": pa.array(innovation, from_pandas=True)} | _wheel_columns(wheels)
+        columns["wheel_innovation"] = pa.array(innovation, from_pandas=True)
+        places = pose_columns(np.where(known[:, None, None], wheels, lie.identity(trajectory.dimension)))
+        return columns | {f"wheel_{name}": pa.array(values, mask=~known) for name, values in places.items()}
 
-    def _trajectory(self, name: str) -> Trajectory:
-        steps = self.columns
-        return Trajectory(steps["stamp_ns"].copy(), steps[name].copy())
+    def _texts(self, name: str) -> pa.DictionaryArray:
+        import pyarrow as pa
+
+        names = self.columns.texts
+        return pa.array([names[code] for code in self.columns[name].tolist()], pa.string()).dictionary_encode()
 
 
 def inlier_shares(steps: Columns) -> NDArray[np.float64]:
@@ -154,20 +150,6 @@ _OF_MATCH = (
     "degeneracy_direction", "information", "variance_factor",
 )  # fmt: skip
 STAGES = ("read", "preprocess", "match", "map", "loops")
-_NOTES = {
-    "x y z qx qy qz qw": "T_world_lidar after optimization, meters; odom_*: T_odom_lidar before it; "
-    "wheel_*: of the lidar by wheel odometry, null where there is no reading near the stamp",
-    "covariance": "row by row, of a twist xi in the lidar's own frame, T exp(xi), order (translation, rotation), "
-    "SE(2) 3x3, SE(3) 6x6; null where a direction of the match is unobservable",
-    "points, inliers": "of the downsampled scan; scan_points: valid returns, dropped: invalid ones",
-    "wheel_innovation": "difference of the motion around the scan from that by the wheels, standard deviations; "
-    "null where there is nothing to compare",
-    "velocity_innovation": "change of the motion to the scan, standard deviations of what an acceleration can be",
-    "starts_segment": "true if the motion from the scan before is unknown: a new map begins there",
-    "is_copy": "true if the scan is the one before once more, to the last bit",
-    "overlap_ratio": "share of the points with a correspondence over its median in the scans before",
-    "keyframe": "number in the graph, -1 if none was made",
-}
 
 
 def _lists(rows: Matrix, is_null: NDArray[np.bool_] | None = None) -> pa.FixedSizeListArray:
@@ -185,25 +167,6 @@ def pose_columns(poses: Matrix) -> dict[str, NDArray[np.float64]]:
     values = np.hstack([lifted[:, :3, 3], lie.to_quaternion(lifted[:, :3, :3])])
     names = ("x", "y", "z", "qx", "qy", "qz", "qw")
     return {name: column.copy() for name, column in zip(names, values.T, strict=True)}
-
-
-def _wheel_columns(poses: Matrix) -> dict[str, object]:
-    """Pose columns of poses (N, d+1, d+1), null where one is NaN."""
-    import pyarrow as pa
-
-    known = np.isfinite(poses[:, 0, 0])
-    columns = pose_columns(np.where(known[:, None, None], poses, np.eye(poses.shape[-1])))
-    return {f"wheel_{name}": pa.array(values, mask=~known) for name, values in columns.items()}
-
-
-def _covariances(steps: Columns) -> tuple[Matrix, NDArray[np.bool_]]:
-    """Covariances (N, k, k) of the matches of steps in columns, and True where there is one (N,)."""
-    informations = steps["information"]
-    finite = np.atleast_1d(np.isfinite(informations).all(axis=(1, 2)))
-    values, vectors = np.linalg.eigh(np.where(finite[:, None, None], informations, 0.0))
-    sound = finite & (values[:, 0] > _SINGULAR * values[:, -1]) & (values[:, -1] > 0.0)
-    scaled = vectors / np.sqrt(np.where(sound[:, None], values, 1.0))[:, None, :]
-    return steps["variance_factor"][:, None, None] * (scaled @ np.swapaxes(scaled, 1, 2)), sound
 
 
 COLUMNS = ("covariance", "state")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import VERIFICATION, Match, Matrix, Pose, Proposal, Scan, State, Trajectory
+from scanchain.data import VERIFICATION, Matrix, Proposal, Scan, State, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import ExpectedError, pair
 from scanchain.files import Source
@@ -57,10 +57,9 @@ def judge_run(folder: Path) -> Judged:
 def expected_of_run(folder: Path) -> ExpectedError | None:
     """The expected ATE in the metrics of a run directory; None where these know none."""
     try:
-        known = msgspec.json.decode((folder / METRICS_FILE).read_bytes(), type=_Known)
+        return msgspec.json.decode((folder / METRICS_FILE).read_bytes(), type=_Known).expected_ate_m
     except (OSError, msgspec.DecodeError):
         return None
-    return known.expected_ate_m
 
 
 def evidence_of_run(folder: Path, expected: ExpectedError | None) -> Evidence:
@@ -71,13 +70,9 @@ def evidence_of_run(folder: Path, expected: ExpectedError | None) -> Evidence:
         raise InputError(f"{folder}: is not a run directory; to check a log, name a --trajectory FILE.tum")
     try:
         steps = pq.ParquetFile(folder / "steps.parquet").read()
-    except FileNotFoundError:
-        told = "no run directory, or that of an unfinished run (--resume goes on)"
-        if (folder / "summary.txt").exists():  # of another command
-            told = "only scanchain run writes it; see summary.txt"
-        raise InputError(f"{folder}: has no steps.parquet: {told}") from None
-    except (OSError, ValueError) as error:
-        raise InputError(f"{folder}: no steps.parquet that can be read ({error}); name a run directory") from None
+    except (OSError, ValueError):
+        remedy = "name a directory of scanchain run (--resume ends an unfinished one)"
+        raise InputError(f"{folder}: has no steps.parquet that can be read; {remedy}") from None
     loops_file = folder / "loops.parquet"
     return evidence_of(steps, pq.ParquetFile(loops_file).read() if loops_file.exists() else None, expected)
 
@@ -199,12 +194,16 @@ def judge_trajectory(file: Path, logs: Sequence[Source], overrides: Sequence[Ove
     is_chosen = np.zeros(len(stamps_ns), np.bool_)
     is_chosen[found] = True
     scans = (scan for scan in log.scans(config.preprocess) if is_chosen[scan.index])
-    matches = _matches(scans, trajectory, config)
-    evidence = evidence_of_trajectory(
-        trajectory, log_times_ns[found], wheels[found], points[found],
-        {"scan matching": _matched_bound_m(trajectory.poses, [T for _, T in matches])},
-    )  # fmt: skip
-    return judge(_with_matches(evidence, matches, config)), len(stamps_ns) - len(pairs)
+    corrections, (inlier_shares, observability, fit) = _matched(scans, trajectory, config)
+    bounds_m = {"scan matching": _matched_bound_m(trajectory.poses, corrections)}
+    evidence = replace(
+        evidence_of_trajectory(trajectory, log_times_ns[found], wheels[found], points[found], bounds_m),
+        is_lost=inlier_shares < config.matching.min_inlier_share,
+        is_degenerate=observability < 1.0,
+        overlap=check_overlap(inlier_shares),
+        fit=fit,
+    )
+    return judge(evidence), len(stamps_ns) - len(pairs)
 
 
 def _table(log: Log, config: Config) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Matrix]:
@@ -218,59 +217,48 @@ def _table(log: Log, config: Config) -> tuple[NDArray[np.int64], NDArray[np.int6
     return stamps_ns, log_times_ns, points, np.array(wheels)
 
 
-def _matched_bound_m(poses: Matrix, corrections: Sequence[Pose]) -> float:
+def _matched_bound_m(poses: Matrix, corrections: Matrix) -> float:
     """Difference of a trajectory from the one that goes on from each pose as the next scan is matched.
 
     A scan is matched to a map at the given poses. An error that grows along the path shows in every correction, so
     that their sum is larger than it.
     """
-    motions = lie.between(poses[:-1], poses[1:]) @ np.array(corrections)[1:]
+    motions = lie.between(poses[:-1], poses[1:]) @ corrections[1:]
     chained = [poses[0]]
     for motion in motions:
         chained.append(chained[-1] @ motion)
     return apart_m(poses[:, :-1, -1], np.array(chained)[:, :-1, -1])
 
 
-def _matches(scans: Iterable[Scan], trajectory: Trajectory, config: Config) -> list[tuple[Match | None, Pose]]:
-    """Each scan aligned from its given pose to a map of those before, and the correction of the pose by it."""
+def _matched(scans: Iterable[Scan], trajectory: Trajectory, config: Config) -> tuple[Matrix, Matrix]:
+    """Each scan aligned from its given pose to a map of those before: the corrections (N, d+1, d+1) by it.
+
+    With them, (3, N), share of inliers, observability and fit, which is 0 where the match ended elsewhere.
+    """
     resolution = Resolution(config.preprocess, config.local_map.voxel_size_m)
     keeper, matcher = MapKeeper(trajectory.dimension, config.local_map), create_matcher(config.matching)
     velocities = _velocities(trajectory)
-    matches: list[tuple[Match | None, Pose]] = []
+    corrections, figures = [], []
     for scan, T_world_lidar, velocity in zip(scans, trajectory.poses, velocities, strict=True):
         sweep, sparse = resolution.downsampled(scan)
         keeper.resize(resolution.scale)
         points = sparse.from_middle(velocity)
         T_world_middle = T_world_lidar @ lie.exp(sweep.middle_s * velocity)
-        match, T_matched = None, T_world_middle
+        correction, figure = lie.identity(trajectory.dimension), (1.0, np.inf, np.nan)
         if len(keeper.surfaces) and len(points):
             match = matcher.align(points, keeper.surfaces, T_world_middle)
-            T_matched = match.T_target_source
-        matches.append((match, lie.between(T_world_middle, T_matched)))
+            correction = lie.between(T_world_middle, match.T_target_source)
+            is_near = np.linalg.norm(correction[:-1, -1]) < config.matching.max_distance_m
+            figure = (match.inlier_share, match.observability, match.fit * is_near)
+        corrections.append(correction)
+        figures.append(figure)
         keeper.extend(sweep.from_middle(velocity), T_world_middle)
-    return matches
+    return np.array(corrections), np.array(figures).T
 
 
 def _velocities(trajectory: Trajectory) -> NDArray[np.float64]:
     """(N, k) twist per second from each scan to the next, for deskewing; 0 where stamps stand still."""
-    seconds = np.diff(trajectory.stamps_ns) * 1e-9
+    seconds = 1e-9 * np.diff(trajectory.stamps_ns)[:, None]
     twists = lie.log(lie.between(trajectory.poses[:-1], trajectory.poses[1:]))
-    velocities = np.where(seconds[:, None] > 0.0, twists / np.where(seconds > 0.0, seconds, 1.0)[:, None], 0.0)
+    velocities = np.divide(twists, seconds, out=np.zeros_like(twists), where=seconds > 0.0)
     return np.vstack([velocities, velocities[-1:]])
-
-
-def _with_matches(evidence: Evidence, matches: Sequence[tuple[Match | None, Pose]], config: Config) -> Evidence:
-    """With states and fit by the matches; one that ends elsewhere contradicts the pose."""
-    least, farthest_m = config.matching.min_inlier_share, config.matching.max_distance_m
-    return replace(
-        evidence,
-        is_lost=np.array([match is not None and match.inlier_share < least for match, _ in matches]),
-        is_degenerate=np.array([match is not None and match.observability < 1.0 for match, _ in matches]),
-        overlap=check_overlap(np.array([1.0 if match is None else match.inlier_share for match, _ in matches])),
-        fit=np.array(
-            [
-                np.nan if match is None else match.fit * (np.linalg.norm(T[:-1, -1]) < farthest_m)
-                for match, T in matches
-            ]
-        ),
-    )

@@ -24,7 +24,6 @@ from scanchain.loops import refined, spread
 from scanchain.maps import SavedMap, write_map, write_ply, write_saved_map
 from scanchain.point_store import PointStore
 from scanchain.runs.closures import final_verdicts, write_closures
-from scanchain.runs.directory import directory_name
 from scanchain.runs.results import GRAPH_FILE, Cloud, grid_of
 from scanchain.sessions.changes import Label, Part, changes_between
 from scanchain.sessions.joining import Joined, graph_of
@@ -62,7 +61,7 @@ def session_names(maps: Sequence[SavedMap], order: Sequence[int]) -> list[list[s
     for number in order:
         saved = maps[number]
         for session in saved.sessions:
-            stem = name = directory_name(saved.name if len(saved.sessions) == 1 else session.name)
+            stem = name = saved.name if len(saved.sessions) == 1 else session.name
             numbers = count(2)
             while name in taken:
                 name = f"{stem}-{next(numbers)}"
