@@ -219,8 +219,8 @@ class LoopsConfig(Section, frozen=True, forbid_unknown_fields=True):
     min_information : information per inlier of the worst direction from which on a closure is accepted
     edge_sigma_m : translational standard deviation added to that of a loop edge
     edge_sigma_rad : rotational standard deviation added to that of a loop edge
-    recognizer : proposes places seen before, however far the map has drifted: "auto" (descriptors of submaps seen
-        from above in 3D, none in the plane), "none", or ``module:Class`` of your own
+    recognizer : proposes places seen before, however far the map has drifted: "auto" ("outline", the
+        upright structure of submaps, in 3D, none in the plane), "none", or ``module:Class`` of your own
     place_radius_m : radius of a submap that is recognized; it shrinks with the voxels
     refine : whether at the end every planar scan is aligned once more, to the map of all keyframes
     """

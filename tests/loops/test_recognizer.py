@@ -124,8 +124,8 @@ def test_a_run_finds_it_in_the_working_directory_also_where_python_does_not_look
         ("my_places:Rangers", ("has no class Rangers",)),
         ("nowhere:Ranges", ("no module nowhere", "PYTHONPATH")),
         ("my_places:", ("wanted module:Class",)),
-        ("ranges", ("one of auto, none, descriptor", "module:Class")),
-        ("descriptor", ("3D logs",)),
+        ("ranges", ("one of auto, none, outline", "module:Class")),
+        ("outline", ("3D logs",)),
     ],
 )
 def test_a_name_that_leads_to_no_recognizer_is_refused_with_what_to_do(folder, name, parts):

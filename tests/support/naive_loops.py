@@ -8,19 +8,6 @@ from scanchain import lie
 from scanchain.kernels.registration.icp import CONVERGED, align, problem_of
 
 
-def heights(points, T, cell_m, size):
-    """Occupied heights above the lowest one, (size, size), row along y."""
-    cubes = np.floor(lie.transform(T, points) / cell_m).astype(int) + np.array([size // 2, size // 2, 32])
-    inside = np.all((cubes >= 0) & (cubes < [size, size, 64]), axis=1)
-    columns = {}
-    for x, y, z in cubes[inside]:
-        columns.setdefault((y, x), set()).add(z)
-    counts = np.zeros((size, size), int)
-    for place, levels in columns.items():
-        counts[place] = len(levels) - 1
-    return counts
-
-
 def bin_of(point, shape):
     range_m = np.linalg.norm(point)
     row = int((np.arcsin(point[2] / range_m) / np.pi + 0.5) * shape[0])

@@ -60,47 +60,47 @@ class OutlineRecognizer:
         self.outlines.append(Outline(submap.anchor.index, T_anchor_level, columns))
 
     def query(self, query: Query) -> list[Candidate]:
-        """The best few of the poses that fit, each with the older submaps that it touches most."""
+        """The best few of the poses that fit, each with the older submaps that it touches most.
+
+        Far from the expected pose one must not have a rival.
+        """
         newest, keyframes, limits = self.outlines[-1], query.keyframes, self.config.loops
+        here, radius_m = query.submap.anchor, query.submap.radius_m
         old = [each for each in self.outlines if keyframes[each.anchor].traveled_m <= query.max_traveled_m]
         if not old or len(newest.columns) < _MIN_COLUMNS:
             return []
-        T_plane_old, T_expected = _in_plane(old, newest, query)
-        here = query.submap.anchor
+        T_old, T_expected = _in_plane(old, newest, query)
         path_m = here.traveled_m - np.array([keyframes[each.anchor].traveled_m for each in old])
         reach_m = np.maximum(_REACH * path_m, limits.min_radius_m)
-        near = np.flatnonzero(_away_m(T_plane_old, T_expected) <= reach_m + query.submap.radius_m)
+        near = np.flatnonzero(_away_m(T_old, T_expected) <= reach_m + radius_m)
         if not len(near):
             return []
-        drawn = np.vstack([lie.transform(T_plane_old[k], old[k].columns) for k in near.tolist()])
         within_m, fine_m = float(reach_m[near].max()), self.config.local_map.voxel_size_m * here.scale
         size_m = max(fine_m, 2.0 * within_m / _MAX_CELLS)
-        found = find(
-            evenly(newest.columns, _COLUMNS),
-            SearchGrid.of_points(drawn, size_m),
+        drawn = np.vstack([lie.transform(T_old[k], old[k].columns) for k in near.tolist()])
+        window, wanted = (
             Window(T_expected, within_m, _HEADING_RAD),
             Wanted(_APART * size_m, _RIVAL, _POSES, _MIN_SHARE),
         )
+        found = find(evenly(newest.columns, _COLUMNS), SearchGrid.of_points(drawn, size_m), window, wanted)
+        poses = np.array([each.T_target_source for each in found]).reshape(-1, 3, 3)
         candidates: list[Candidate] = []
-        for each in found:
-            T_plane = each.T_target_source
-            beside = near[_away_m(T_plane_old[near], T_plane) <= query.submap.radius_m].tolist()
-            T_targets = {k: lie.between(T_plane_old[k], T_plane) for k in beside}
+        for T in poses:
+            beside = near[_away_m(T_old[near], T) <= radius_m]
+            T_targets = {k: lie.between(T_old[k], T) for k in beside.tolist()}
             touching = {
                 k: _touching(lie.transform(T, newest.columns), old[k], size_m) for k, T in T_targets.items()
             }
-            others = [other.T_target_source for other in found if other is not each]
-            for k in sorted(beside, key=lambda k: -touching[k])[:_TARGETS]:
+            for k in sorted(touching, key=lambda k: -touching[k])[:_TARGETS]:
                 drift_m = float(np.clip(limits.drift * path_m[k], limits.min_radius_m, limits.max_radius_m))
-                is_near = _away_m(T_plane, T_expected) <= drift_m
-                apart_m = max(_MIN_APART * query.submap.radius_m, drift_m)
-                is_rivaled = not is_near and any(_away_m(other, T_plane) > apart_m for other in others)
-                by = Proposal.POSITION if is_near else Proposal.PLACE
+                by, rival = Proposal.POSITION, -1
+                if _away_m(T, T_expected) > drift_m:
+                    elsewhere = poses[_away_m(poses, T) > max(_MIN_APART * radius_m, drift_m)]
+                    rivals = [old[int(np.argmin(_away_m(T_old, other)))].anchor for other in elsewhere]
+                    by, rival = Proposal.PLACE, next(iter(rivals), -1)
                 for fit in _refined(newest.columns, old[k], T_targets[k], size_m, fine_m):
-                    T_target_source = (
-                        old[k].T_anchor_level @ lie.lift(fit.T_target_source) @ lie.inverse(newest.T_anchor_level)
-                    )
-                    rival = old[k].anchor if is_rivaled else -1
+                    T_level = old[k].T_anchor_level @ lie.lift(fit.T_target_source)
+                    T_target_source = T_level @ lie.inverse(newest.T_anchor_level)
                     candidates.append(Candidate(old[k].anchor, T_target_source, fit.share, by, rival))
         return sorted(candidates, key=lambda each: -each.score)[:_VERIFIED]
 

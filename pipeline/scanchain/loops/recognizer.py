@@ -18,7 +18,6 @@ from scanchain.loops.submaps import RADII_AHEAD, RADII_BEHIND, Submap, VoxelSubm
 from scanchain.loops.verification import Verification, Verifier
 
 RECOGNIZERS = {
-    "descriptor": "scanchain.loops.descriptor:DescriptorRecognizer",
     "outline": "scanchain.loops.outline:OutlineRecognizer",
 }
 _PLACE_DRIFT = 0.1  # largest distance from the prediction as a share of the path between
@@ -95,7 +94,7 @@ def create_recognizer(config: Config, dimension: int) -> Recognizer | None:
     """
     name = config.loops.recognizer
     if name == "auto":
-        name = "descriptor" if dimension == 3 else "none"
+        name = "outline" if dimension == 3 else "none"
     if name == "none" or not config.loops.enabled:
         return None
     if name not in RECOGNIZERS and ":" not in name:
