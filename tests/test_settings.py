@@ -150,6 +150,11 @@ def test_a_value_out_of_range_names_key_value_and_range(file, key, text, limit):
     says(complaint(file=path), f"{path}: {key} is {text}; it must be {limit}")
 
 
+def test_limits_the_wrong_way_round_are_refused():
+    text = complaint(dimension=3, overrides=[flag("loops.min_radius_m", "60")])
+    says(text, "loops.min_radius_m is 60.0; it must be below loops.max_radius_m (30.0)")
+
+
 def test_a_file_that_is_no_toml_or_not_there_is_named(tmp_path):
     (tmp_path / "mine.toml").write_text("[matching\n")
     (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe")

@@ -19,6 +19,7 @@ from scanchain.config_keys import ConfigKey, Value, section_keys
 from scanchain.errors import InputError, one_line, shown
 
 _ALIKE = 0.75  # least likeness of a misspelt key to the one that is meant
+_ORDERED = (("loops.min_radius_m", "loops.max_radius_m"), ("maps.slice_min_z_m", "maps.slice_max_z_m"))
 PRESETS = {2: "lidar2d", 3: "lidar3d"}
 
 
@@ -102,6 +103,9 @@ def load_settings(
     for key in dict.fromkeys(override.key for override in overrides):
         text = str(values[key])
         source += f", {key} {text.lower() if isinstance(values[key], bool) else text}"
+    for lower, upper in _ORDERED if dimension is not None else ():  # else a preset may still change them
+        if float(values[lower]) >= float(values[upper]):
+            raise InputError(f"{source}: {lower} is {values[lower]}; it must be below {upper} ({values[upper]})")
     tree: dict[str, dict[str, Value]] = {field.name: {} for field in fields(Config)}
     for key, value in values.items():
         section, _, leaf = key.partition(".")

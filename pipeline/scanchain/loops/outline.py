@@ -78,26 +78,22 @@ class OutlineRecognizer:
         within_m, fine_m = float(reach_m[near].max()), self.config.local_map.voxel_size_m * here.scale
         size_m = max(fine_m, 2.0 * within_m / _MAX_CELLS)
         drawn = np.vstack([lie.transform(T_old[k], old[k].columns) for k in near.tolist()])
-        window, wanted = (
-            Window(T_expected, within_m, _HEADING_RAD),
-            Wanted(_APART * size_m, _RIVAL, _POSES, _MIN_SHARE),
-        )
+        window = Window(T_expected, within_m, _HEADING_RAD)
+        wanted = Wanted(_APART * size_m, _RIVAL, _POSES, _MIN_SHARE)
         found = find(evenly(newest.columns, _COLUMNS), SearchGrid.of_points(drawn, size_m), window, wanted)
         poses = np.array([each.T_target_source for each in found]).reshape(-1, 3, 3)
         candidates: list[Candidate] = []
         for T in poses:
-            beside = near[_away_m(T_old[near], T) <= radius_m]
-            T_targets = {k: lie.between(T_old[k], T) for k in beside.tolist()}
-            touching = {
-                k: _touching(lie.transform(T, newest.columns), old[k], size_m) for k, T in T_targets.items()
-            }
-            for k in sorted(touching, key=lambda k: -touching[k])[:_TARGETS]:
+            beside = near[_away_m(T_old[near], T) <= radius_m].tolist()
+            T_targets = {k: lie.between(T_old[k], T) for k in beside}
+            touching = {k: _touching(newest.columns, old[k], T_targets[k], size_m) for k in beside}
+            for k in sorted(beside, key=lambda k: -touching[k])[:_TARGETS]:
                 drift_m = float(np.clip(limits.drift * path_m[k], limits.min_radius_m, limits.max_radius_m))
                 by, rival = Proposal.POSITION, -1
                 if _away_m(T, T_expected) > drift_m:
+                    by = Proposal.PLACE
                     elsewhere = poses[_away_m(poses, T) > max(_MIN_APART * radius_m, drift_m)]
-                    rivals = [old[int(np.argmin(_away_m(T_old, other)))].anchor for other in elsewhere]
-                    by, rival = Proposal.PLACE, next(iter(rivals), -1)
+                    rival = old[int(np.argmin(_away_m(T_old, elsewhere[0])))].anchor if len(elsewhere) else -1
                 for fit in _refined(newest.columns, old[k], T_targets[k], size_m, fine_m):
                     T_level = old[k].T_anchor_level @ lie.lift(fit.T_target_source)
                     T_target_source = T_level @ lie.inverse(newest.T_anchor_level)
@@ -114,11 +110,11 @@ def _in_plane(old: Sequence[Outline], newest: Outline, query: Query) -> tuple[Ma
     return lie.flatten(T_level_world @ T_world_old), lie.flatten(T_level_world @ T_world_newest)
 
 
-def _touching(columns: Points, outline: Outline, size_m: float) -> float:
-    """Share of columns (N, 2) that lie on those of an outline, in its frame."""
+def _touching(columns: Points, outline: Outline, T: Pose, size_m: float) -> float:
+    """Share of columns (N, 2) that lie on those of an outline at this pose in it."""
     if not len(outline.columns):
         return 0.0
-    away_m = KDTree(outline.columns).query(columns, distance_upper_bound=_TOUCHING * size_m)[0]
+    away_m = KDTree(outline.columns).query(lie.transform(T, columns), distance_upper_bound=_TOUCHING * size_m)[0]
     return float(np.isfinite(away_m).mean())
 
 

@@ -145,12 +145,13 @@ def _verified(table: pa.Table, dimension: int) -> Closures:
     """The closures that verification accepted."""
     rejected_by = np.array(table["rejected_by"].to_pylist(), np.str_)
     chosen = rejected_by != VERIFICATION
+    by_position = np.array(table["proposed_by"].to_pylist(), np.str_) == Proposal.POSITION
     return Closures(
         table["target_scan"].to_numpy()[chosen],
         table["source_scan"].to_numpy()[chosen],
         poses_of(table, "", dimension)[chosen],
         rejected_by[chosen] == "",
-        tried=table["proposed_by"].to_pylist().count(Proposal.POSITION),
+        tried=len(np.unique(table["source_scan"].to_numpy()[by_position])),
     )
 
 

@@ -36,7 +36,7 @@ class Closures:
     target, source : (C,) scans
     T_target_source : (C, d+1, d+1) as measured
     is_accepted : (C,) by the back end
-    tried : number of all, accepted or not, that were tried as the trajectory returned to a place
+    tried : number of scans from which any was tried, accepted or not, as the trajectory returned to a place
     """
 
     target: NDArray[np.int64]

@@ -25,7 +25,7 @@ _MOST_OPEN = 0.2  # largest share of degenerate scans of a trajectory that is tr
 _MEDIAN_LIMIT = 2.0  # largest median innovation of the wheels; about 1 where their calibration and σ are right
 _REST_M, _REST_RAD, _REST_M_S = 1.0, 0.5, 0.1  # extent and speed of a trajectory, up to which it is one of rest
 _MOST_OPEN_AT_REST = 0.05  # largest share of scans that leave a direction open, of those that show a rest
-_FEWEST_TRIED, _LEAST_ACCEPTED = 10, 0.2  # loop closures that must be tried, and share of them that must fit
+_FEWEST_TRIED, _LEAST_ACCEPTED = 10, 0.2  # scans that must try loop closures, and least share of closures accepted
 _OPPOSED = -0.5  # turns of the trajectory over those of the wheels, below which one of the two is mirrored
 _SHOWN = 3  # stretches that the sentence lists
 
@@ -164,7 +164,7 @@ def _doubts(evidence: Evidence, stretches: Sequence[Stretch], rest: _Rest) -> It
     tried, accepted = evidence.closures.tried, int(evidence.closures.is_accepted.sum())
     if tried >= _FEWEST_TRIED and accepted < _LEAST_ACCEPTED * tried:
         yield (
-            f"of {tried:,} loop closures tried {accepted:,} were accepted: where the trajectory returns, "
+            f"loop closures were tried from {tried:,} scans, {accepted:,} accepted: where the trajectory returns, "
             "the place does not look as mapped"
         )
     if stretches:
