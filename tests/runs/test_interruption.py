@@ -80,7 +80,7 @@ def test_interrupted_again_and_again_a_run_goes_on_to_the_same_result_and_record
     out, stamps_ns = tmp_path / "run", read_tum(whole / "odometry.tum").stamps_ns
     assert pq.read_table(whole / "loops.parquet").num_rows > 0
     reached = []
-    for interruption, share in ((signal.SIGKILL, 0.2), (signal.SIGINT, 0.4), (signal.SIGKILL, 0.6)):
+    for interruption, share in ((signal.SIGKILL, 0.1), (signal.SIGINT, 0.25), (signal.SIGKILL, 0.4)):
         child = start(log, out, *RECORDED, "--resume")
         wait_for_steps(child, out, share * len(stamps_ns))
         child.send_signal(interruption)
