@@ -8,9 +8,10 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
-from msgspec.structs import force_setattr
+from msgspec.structs import fields, force_setattr
 
 from scanchain.config_keys import LARGEST, section_keys
+from scanchain.errors import InputError, shown
 from scanchain.plugins import CLASS_NAME
 
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
@@ -314,3 +315,13 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True):
     maps: MapsConfig = MapsConfig()
     recording: RecordingConfig = RecordingConfig()
     outputs: OutputsConfig = OutputsConfig()
+
+    def __post_init__(self) -> None:
+        """Raises InputError where a branch is of another kind."""
+        for field in fields(Config):
+            branch = getattr(self, field.name)
+            if not isinstance(branch, field.type):
+                raise InputError(
+                    f"Config: {field.name} is {shown(branch)}; wanted a {field.type.__name__}, as in "
+                    f"Config({field.name}={field.type.__name__}())"
+                )

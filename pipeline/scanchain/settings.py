@@ -19,7 +19,13 @@ from scanchain.config_keys import ConfigKey, Value, section_keys
 from scanchain.errors import InputError, one_line, shown
 
 _ALIKE = 0.75  # least likeness of a misspelt key to the one that is meant
-_ORDERED = (("loops.min_radius_m", "loops.max_radius_m"), ("maps.slice_min_z_m", "maps.slice_max_z_m"))
+_ORDERED = (
+    ("log.start_s", "log.end_s"),
+    ("log.min_range_m", "log.max_range_m"),
+    ("preprocess.min_range_m", "preprocess.max_range_m"),
+    ("loops.min_radius_m", "loops.max_radius_m"),
+    ("maps.slice_min_z_m", "maps.slice_max_z_m"),
+)
 PRESETS = {2: "lidar2d", 3: "lidar3d"}
 
 

@@ -256,3 +256,17 @@ def test_a_matrix_is_sound_that_is_finite_symmetric_and_has_no_negative_eigenval
     matrix = np.eye(3)
     matrix[1:, 1:] = corner
     assert positive_semidefinite(matrix[None]).tolist() == [is_sound]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 180\nEDGE_SE2 0 1 1 0 180 1 0 0 1 0 1\n",
+        "VERTEX3 0 0 0 0 0 0 0\nVERTEX3 1 1 0 0 0 0 90\n"
+        "EDGE3 0 1 1 0 0 0 0 90 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1\n",
+    ],
+)
+def test_angles_that_may_be_degrees_are_told(tmp_path, text):
+    (tmp_path / "x.g2o").write_text(text)
+    with pytest.warns(UserWarning, match=r"x\.g2o:2: an angle of (180|90); degrees\?"):
+        read_g2o(tmp_path / "x.g2o")

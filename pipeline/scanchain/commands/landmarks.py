@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from scanchain.commands import options
 from scanchain.commands.options import PATH
@@ -16,6 +17,15 @@ from scanchain.errors import InputError
 if TYPE_CHECKING:
     from scanchain.landmarks.ranges import OdometryNoise
     from scanchain.landmarks.study import Study
+
+
+_OF_LOGS, _OF_NONLINEAR = ("log", "MRCLAM folders"), ("bearing-range", "nonlinear files")
+_ALONE = {  # options that only some problems take
+    "robot": ("--robot", *_OF_LOGS),
+    "noise": ("--odometry-noise", *_OF_LOGS),
+    "guess": ("--guess", *_OF_NONLINEAR),
+    "optimizer": ("--optimizer", *_OF_NONLINEAR),
+}
 
 
 @click.command()
@@ -102,6 +112,7 @@ def landmarks(
 
     chosen = Options(parse_methods(methods), noise=_noise(noise), **more)
     problems = [path if path.is_dir() else read_landmark_data(path) for path in data]
+    _check_options({"log" if isinstance(each, Path) else each.kind for each in problems})
     if recording is not None:
         options.check_output(recording, force=force, endings=(".rrd",))
     with RunDirectory(out, force=force) as directory, Terminal("problems") as terminal:
@@ -127,6 +138,14 @@ def landmarks(
     if not as_json:
         click.echo("".join(f"\nwritten        {path}" for path in (out, recording) if path is not None))
     return int(not all(study.converged for study in studies))
+
+
+def _check_options(kinds: Collection[str]) -> None:
+    """Refuse options that none of the problems, of these kinds, takes."""
+    ctx = click.get_current_context()
+    for name, (flag, kind, what) in _ALONE.items():
+        if kind not in kinds and ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE:
+            raise InputError(f"{flag} is for {what} alone, and DATA names none; leave it out")
 
 
 def _noise(text: str | None) -> OdometryNoise | None:

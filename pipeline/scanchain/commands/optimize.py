@@ -226,7 +226,8 @@ class _Report:
     def warnings(self) -> list[str]:
         """Warnings to read before the rest."""
         after, graph = self.change.after, self.file.graph
-        notes = [f"odometry {line}; so are its edges in --out" for line in graph.corrections(self.file.ids)]
+        notes = list(filter(None, [self.file.note]))
+        notes += [f"odometry {line}; so are its edges in --out" for line in graph.corrections(self.file.ids)]
         ratio = after.chi2 / max(after.degrees_of_freedom, 1)
         if not graph.is_loop.any() and after.degrees_of_freedom and ratio > _POOR_FIT:
             notes.append(

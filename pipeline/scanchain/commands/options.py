@@ -53,7 +53,10 @@ class OverrideCommand(click.Command):
         super().__init__(*words, options_metavar=options_metavar, **more)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse the overrides and the ordinary arguments; of a key that is set twice the last counts."""
+        """Parse the overrides and the ordinary arguments; of a key that is set twice the last counts.
+
+        Short forms yield to keys that are written out.
+        """
         rest: list[str] = []
         overrides: list[Override] = []
         words = iter(args)

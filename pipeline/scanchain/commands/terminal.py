@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import sys
 import threading
@@ -82,7 +83,8 @@ class Terminal(Progress):
         rate = done / max(now_s - self.started_s, 1e-3)
         bar = "━" * round(_WIDTH * min(done / max(total, 1), 1.0))
         left = duration(max(total - done, 0) / max(rate, 1e-3))
-        self.bar = f"{bar:<{_WIDTH}} {done:,}/{total:,} {self.unit}  {rate:.0f} {self.unit}/s  {left} left"
+        text = f"{bar:<{_WIDTH}} {done:,}/{total:,} {self.unit}  {rate:.0f} {self.unit}/s  {left} left"
+        self.bar = text[: shutil.get_terminal_size().columns - 1]
         click.echo(_CLEAR + self.bar, nl=False, err=True)
 
     def _close(self) -> None:

@@ -22,6 +22,7 @@ from scanchain.graph.edge_checks import nearest_semidefinite, positive_semidefin
 from scanchain.graph.initialize import follow_odometry
 from scanchain.graph.pose_graph import PoseGraph
 
+_WHOLE_TURN = 2.0 * np.pi + 1e-3  # rad, above which an angle is a turn too many, or degrees
 Rotation = Literal["vector", "quaternion"]  # of which Ω is in 3D
 ROTATION_COMMENT: dict[Rotation, str] = {
     "vector": "# information of EDGE_SE3:QUAT is of (translation, rotation vector in radians)",
@@ -119,13 +120,14 @@ class Lines:
     dimension : 2 or 3
     vertices, edges : their lines; fixed : line and vertex id (n, 2) of every pose that is held
     others : lines of other tags
+    note : as of ``G2oFile``
     rotation : of which the information is, by the comment that ``write_g2o`` writes
     """
 
     def __init__(self, path: Path) -> None:
         self.path, self.dimension = path, 0
         self.rotation: Rotation = "vector"
-        self.others = list[str]()
+        self.others, self.note = list[str](), ""
         comments: dict[str, Rotation] = {comment: name for name, comment in ROTATION_COMMENT.items()}
         fixed, rows = list[tuple[int, int]](), list[tuple[int, Tag, list[int], list[float]]]()
         for number, line in enumerate(self._text().splitlines(), start=1):
@@ -222,6 +224,13 @@ class Lines:
         lines = np.array([line for line, *_ in rows], np.int64)
         is_point = np.array([tag.is_point for _, tag, *_ in rows], np.bool_)
         is_toro = np.array([tag.is_toro for _, tag, *_ in rows], np.bool_)
+        angles, has_angles = (numbers[:, 2:3], ~is_point) if self.dimension == 2 else (numbers[:, 3:6], is_toro)
+        largest = np.abs(angles).max(axis=1, initial=0.0) * has_angles
+        if len(rows) and largest.max() > _WHOLE_TURN:
+            line = lines[largest.argmax()]
+            self.note = (
+                f"{self.path}:{line}: an angle of {largest.max():.6g}; degrees? angles are taken as radians"
+            )
         if self.dimension == 3 and is_toro.any():  # Rz(yaw) Ry(pitch) Rx(roll)
             numbers[is_toro, 3:7] = Turn.from_euler("ZYX", numbers[is_toro, 5:2:-1]).as_quat()
         return Rows(lines, np.array([row[2] for row in rows], np.int64).reshape(-1, ids), numbers, is_point)
@@ -330,6 +339,7 @@ class G2oFile:
     other_lines : lines about neither poses nor edges, retained to be written again
     has_guess : whether the file holds vertices; else the graph's poses follow its odometry
     projection : of the indefinite information matrices; None without any
+    note : that angles may be degrees; empty where none lies beyond a turn
     """
 
     __repr__ = brief
@@ -338,6 +348,7 @@ class G2oFile:
     other_lines: tuple[str, ...]
     has_guess: bool
     projection: Projection | None
+    note: str = ""
 
     @property
     def other_tags(self) -> tuple[tuple[str, int], ...]:
@@ -393,7 +404,9 @@ def read_g2o(
     graph.add_edges(pairs, measurements, information, is_robust)
     for index in fixed.tolist():
         graph.fix(index)
-    return G2oFile(graph, ids, tuple(lines.others), has_guess, projection)
+    if lines.note:
+        warnings.warn(lines.note, stacklevel=2)
+    return G2oFile(graph, ids, tuple(lines.others), has_guess, projection, lines.note)
 
 
 def _project(lines: Lines, information: Matrix, indefinite: Indefinite) -> Projection | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import os
 from collections.abc import Callable
@@ -11,11 +12,6 @@ from typing import Any
 import numba
 from numba import config
 from numba.core.caching import FunctionCache
-
-try:
-    import fcntl
-except ImportError:  # Windows: two processes that compile the same kernel for different types can exchange them
-    fcntl = None
 
 
 def _cache_by_source() -> None:
@@ -47,9 +43,6 @@ class _SharedCache(FunctionCache):
     """Saves one at a time: Numba reads an index, adds to it and writes it back."""
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        if fcntl is None:
-            super().save_overload(sig, data)
-            return
         folder = Path(self.cache_path)
         folder.mkdir(parents=True, exist_ok=True)
         with (folder / "lock").open("w") as lock:

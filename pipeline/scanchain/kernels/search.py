@@ -15,7 +15,7 @@ from scanchain.kernels.compiling import njit
 SURFACE, NEAR, UNKNOWN, FREE = 2, 1, 0, -2  # score of a point in a cell
 APART_RAD = 0.1  # least angle between two distinct poses
 _EARLY = 32  # points between two tests whether the rest can still reach the least score
-TURNS = 3  # headings that are scored at once: a cell more on each side is what points move by between two
+TURNS = 3  # headings that are scored at once: a cell more on each side is what one at the median range moves by
 
 
 @njit(nogil=True)

@@ -126,14 +126,21 @@ def _covariance(path: Path, name: str, arrays: dict[str, Matrix]) -> Matrix:
 def _kind(path: Path, poses: Matrix, landmarks: Matrix, observed: NDArray[np.int64], measured: Matrix) -> Kind:
     """Kind of the measurements: least median distance of the measured points from the landmarks.
 
-    A landmark that is not known (NaN) lies at the median of its measured points. Raises InputError where nothing
-    tells.
+    A landmark that is not known (NaN) lies at the median of its measured points. Raises InputError where the
+    points fit bearings in degrees best, and where nothing tells.
     """
     bearing, reach = measured.T
-    polar = np.stack([reach * np.cos(bearing), reach * np.sin(bearing)], axis=1)
-    as_linear, as_polar = (
-        _spread(poses[observed[:, 0]] + relative, landmarks, observed[:, 1]) for relative in (measured, polar)
+    polar, by_degrees = (
+        np.stack([reach * np.cos(angle), reach * np.sin(angle)], axis=1)
+        for angle in (bearing, np.radians(bearing))
     )
+    as_linear, as_polar, as_degrees = (
+        _spread(poses[observed[:, 0]] + relative, landmarks, observed[:, 1])
+        for relative in (measured, polar, by_degrees)
+    )
+    largest = float(np.abs(bearing).max())
+    if largest > 2.0 * np.pi and 2.0 * as_degrees < min(as_linear, as_polar):
+        raise InputError(f"{path}: bearings of observations reach {largest:.6g}: degrees? give radians")
     if not np.isfinite(landmarks).all() and len(np.unique(observed[:, 1])) == len(observed):
         raise InputError(
             f"{path}: no landmark is observed twice and there is no gt_landmarks, so that nothing tells relative "
@@ -198,7 +205,10 @@ def read_mrclam(folder: Path, robot: int) -> RangeLog:
         listed = ", ".join(map(str, there)) or "none"
         raise InputError(f"{folder}: has no {name}; --robot must be one of those logged there: {listed}")
     odometry = _by_time(_numbers(folder / name, 3))
-    seen = _by_time(_numbers(folder / f"Robot{robot}_Measurement.dat", 4))
+    measurements = folder / f"Robot{robot}_Measurement.dat"
+    seen = _by_time(_numbers(measurements, 4))
+    if (largest := float(np.abs(seen[:, 3]).max())) > 2.0 * np.pi:
+        raise InputError(f"{measurements}: bearings reach {largest:.6g}: degrees? give radians")
     subjects, codes = _numbers(folder / "Barcodes.dat", 2).T.tolist()
     subject_of = dict(zip(codes, subjects, strict=True))
     subject = np.array([subject_of.get(code, 0) for code in seen[:, 1].tolist()], np.int64)

@@ -230,7 +230,9 @@ class LogWriter:
             name: ("<f4", points[:, axis]) for axis, name in enumerate("xyz")
         }
         if times_s is not None:
-            whole_ns = np.rint(1e9 * times_s.astype(np.float64)).astype(np.int64)
+            whole_ns = np.rint(1e9 * np.asarray(times_s, np.float64)).astype(np.int64)
+            if time_field == "t" and whole_ns.min(initial=0) < 0:
+                raise InputError(f"{topic}: times_s begin at {whole_ns.min():,} ns; t counts from 0 up, give time")
             columns[time_field] = ("<f4", times_s) if time_field == "time" else ("<u4", whole_ns)
         if ring is not None:
             columns["ring"] = ("<u2", ring)

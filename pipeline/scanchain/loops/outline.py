@@ -20,12 +20,12 @@ from scanchain.registration.search import Found, evenly, upright_columns
 
 _COLUMNS, _MIN_COLUMNS = 150, 30  # number of columns that are scored, evenly spread, and that are too few to see
 _REACH, _HEADING_RAD = 0.1, 0.5  # largest error of odometry: position, as a share of the path between, and heading
-_MAX_CELLS = 800  # along the window; a larger one has coarser cells
+_MAX_REACH_M, _MAX_CELLS = 1000.0, 800  # of the window to either side, and along it, beyond which cells grow
 _MIN_SHARE = 0.4  # least share of the columns that lie on older ones: from the other side half is hidden
 _POSES, _APART = 8, 4.0  # largest number of poses that are compared, and least distance of two, cells
 _RIVAL = 0.9  # share of the best score, from which on a pose elsewhere makes it ambiguous
 _MIN_APART = 0.25  # least distance in radii of a submap between two poses that are not the same
-_TARGETS, _VERIFIED = 3, 3  # largest number of older submaps that a pose is refined in, and of those verified
+_TARGETS, _VERIFIED = 8, 8  # largest number of older submaps that a pose is refined in, and of those verified
 _REFINED, _REFINED_RAD = 3.0, 0.15  # half widths of the window around it, cells and radians
 _TOUCHING = 1.5  # cells, within which a column lies on another one
 
@@ -71,7 +71,7 @@ class OutlineRecognizer:
             return []
         T_old, T_expected = _in_plane(old, newest, query)
         path_m = here.traveled_m - np.array([keyframes[each.anchor].traveled_m for each in old])
-        reach_m = np.maximum(_REACH * path_m, limits.min_radius_m)
+        reach_m = np.clip(_REACH * path_m, limits.min_radius_m, _MAX_REACH_M)
         near = np.flatnonzero(_away_m(T_old, T_expected) <= reach_m + radius_m)
         if not len(near):
             return []

@@ -52,6 +52,8 @@ class OccupancyGrid:
 
     def insert_batch(self, poses: Matrix, points: NDArray[np.floating], offsets: NDArray[np.int64]) -> None:
         """Draw K scans: poses (K, d+1, d+1), points (N, d) of all of them, scan k from offsets[k] to [k + 1]."""
+        if not len(poses):
+            return
         beams = [
             self._beams_in_slice(T, points[slice(*part)]) for T, part in zip(poses, pairwise(offsets), strict=True)
         ]

@@ -150,8 +150,9 @@ def _check(destination: Path, force: bool) -> None:
     if not destination.is_dir():
         raise InputError(f"{destination}: is a file; choose another --out")
     if not force:
-        left = left_behind(destination)
-        resume = f"; {left.name} is of a run that did not end: --force --resume continues it" if left else ""
+        left, resume = left_behind(destination), ""
+        if left is not None and not writer_of(left):
+            resume = f"; {left.name} is of a run that did not end: --force --resume continues it"
         raise InputError(f"{destination}: exists; choose another --out or pass --force to replace it{resume}")
     if any(destination.iterdir()) and not (destination / RUN_FILE).is_file():
         raise InputError(

@@ -307,6 +307,7 @@ def _verdict(
     share = f"{100.0 * matched / max(matched + unmatched, 1):.0f} % of the scans within the map matched"
     away = f", {100.0 * outside / scans:.0f} % outside of it" if outside else ""
     evidence = f"{share}{away}; log-odds {log_odds:.0f}"
+    doubt = doubt or ("" if matched else "no scan matched the map")
     doubtful = sorted((part for part in parts if part.is_doubtful), key=lambda part: -part.length_m)
     if not doubtful and not doubt:
         return Verdict.TRUSTWORTHY, f"{where}, and followed: {tried}; {evidence}"

@@ -1,4 +1,4 @@
-"""report.html of a batch: a row a log, distributions of the figures, small plots of all trajectories."""
+"""report.html of a batch: a row a log, small plots of all trajectories."""
 
 from __future__ import annotations
 

@@ -229,7 +229,6 @@ def _line(line: Line, low: Floats, high: Floats) -> dict[str, object]:
     positions, is_known = line.positions, np.isfinite(line.positions[:, 0])
     if is_broken := not is_known.all():
         starts = np.flatnonzero(is_known[:-1] & is_known[1:])
-        starts = starts[:: max(1, -(-len(starts) // _MAX_LINE_POINTS))]
         positions = positions[np.stack([starts, starts + 1], axis=1).ravel()]
     elif len(positions) > _MAX_LINE_POINTS:
         positions = positions[np.linspace(0, len(positions) - 1, _MAX_LINE_POINTS).astype(int)]

@@ -5,6 +5,7 @@ Geiger, Lenz, Stiller & Urtasun 2013, "Vision meets robotics: the KITTI dataset"
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from collections.abc import Set as AbstractSet
 from pathlib import Path
@@ -16,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from scanchain import lie
 from scanchain.data import Matrix, Pose
-from scanchain.errors import InputError, counted
+from scanchain.errors import InputError, counted, shown
 from scanchain.logs.formats import add_block, add_channel, natural_order
 from scanchain.logs.formats.clouds import XYZI, contents_of, read_raw
 from scanchain.logs.mcap.records import Block, Contents, FileIndex, Message
@@ -24,6 +25,7 @@ from scanchain.logs.writer import LATEST_NS, pack_odometry, place
 
 _TRUTH = -1  # index of the block of the ground truth
 _POSE_BYTES = 720
+_TIME = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d(\.\d+)?$")
 Truth = list[tuple[int, Pose]]  # stamps in nanoseconds, and T_world_lidar
 
 _EARTH_M = 6378137.0
@@ -111,8 +113,10 @@ def _index(index: FileIndex, folder: Path, times_ns: Sequence[int], read_truth: 
 def read_times(file: Path) -> list[int]:
     """Nanoseconds of each line ``2011-09-26 13:02:25.594360375``, which is taken as UTC."""
     try:
+        if odd := next((line for line in _lines(file) if not _TIME.match(line)), ""):
+            raise ValueError(shown(odd))
         times_ns = np.array(_lines(file), "datetime64[ns]").astype(np.int64)
-    except (ValueError, UserWarning) as error:
+    except ValueError as error:
         raise InputError(f"{file}: is no list of times ({error}); download it again") from error
     return _checked(file, times_ns)
 
