@@ -228,9 +228,8 @@ class Lines:
         largest = np.abs(angles).max(axis=1, initial=0.0) * has_angles
         if len(rows) and largest.max() > _WHOLE_TURN:
             line = lines[largest.argmax()]
-            self.note = (
-                f"{self.path}:{line}: an angle of {largest.max():.6g}; degrees? angles are taken as radians"
-            )
+            note = f"{self.path}:{line}: an angle of {largest.max():.6g}; degrees? angles are taken as radians"
+            self.note = self.note or note
         if self.dimension == 3 and is_toro.any():  # Rz(yaw) Ry(pitch) Rx(roll)
             numbers[is_toro, 3:7] = Turn.from_euler("ZYX", numbers[is_toro, 5:2:-1]).as_quat()
         return Rows(lines, np.array([row[2] for row in rows], np.int64).reshape(-1, ids), numbers, is_point)
