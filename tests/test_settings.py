@@ -5,8 +5,9 @@ import re
 import pytest
 from msgspec.structs import fields
 
-from scanchain.config import Config
+from scanchain.config import Config, LoopsConfig
 from scanchain.errors import InputError
+from scanchain.odometry import Odometry
 from scanchain.settings import Override, config_keys, dump, flatten, load_settings, read_layer, shipped
 from tests.support.messages import says
 from tests.support.scenes import ROOT, configured
@@ -153,6 +154,13 @@ def test_a_value_out_of_range_names_key_value_and_range(file, key, text, limit):
 def test_limits_the_wrong_way_round_are_refused():
     text = complaint(dimension=3, overrides=[flag("loops.min_radius_m", "60")])
     says(text, "loops.min_radius_m is 60.0; it must be below loops.max_radius_m (30.0)")
+    says(complaint(overrides=[flag("log.start_s", "9"), flag("log.end_s", "5")]), "log.start_s is 9.0", "(5.0)")
+    with pytest.raises(InputError, match=r"config: loops\.min_radius_m is 60\.0"):
+        Odometry(Config(loops=LoopsConfig(min_radius_m=60.0)), dimension=3)
+
+
+def test_an_empty_section_that_is_misspelt_is_no_key(file):
+    says(complaint(file=file("[lops]\n")), "lops is not a configuration key")
 
 
 def test_a_file_that_is_no_toml_or_not_there_is_named(tmp_path):

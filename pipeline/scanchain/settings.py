@@ -109,9 +109,8 @@ def load_settings(
     for key in dict.fromkeys(override.key for override in overrides):
         text = str(values[key])
         source += f", {key} {text.lower() if isinstance(values[key], bool) else text}"
-    for lower, upper in _ORDERED if dimension is not None else ():  # else a preset may still change them
-        if float(values[lower]) >= float(values[upper]):
-            raise InputError(f"{source}: {lower} is {values[lower]}; it must be below {upper} ({values[upper]})")
+    is_final = dimension is not None  # else a preset may still change all but log.*
+    _check_order(values, source, [pair for pair in _ORDERED if is_final or pair[0].startswith("log.")])
     tree: dict[str, dict[str, Value]] = {field.name: {} for field in fields(Config)}
     for key, value in values.items():
         section, _, leaf = key.partition(".")
@@ -159,6 +158,11 @@ def flatten(config: Config) -> dict[str, Value]:
     return {f"{section}.{leaf}": value for section, branch in tree.items() for leaf, value in branch.items()}
 
 
+def check_order(config: Config) -> None:
+    """Refuse a configuration whose lower limits are not below the upper ones."""
+    _check_order(flatten(config), "config", _ORDERED)
+
+
 def check_dimension(config: Config, dimension: int) -> None:
     """Refuse a configuration made for logs of the other dimension."""
     _check_dimension(flatten(config), dimension, "config", f"start from load_settings({dimension}).config")
@@ -185,9 +189,16 @@ def _preset_values(dimension: int | None) -> Mapping[str, Value]:
 
 
 def _leaves(tree: Mapping[str, object]) -> Iterator[tuple[str, object]]:
-    """Dotted names and values; what is no section comes under its own name."""
+    """Dotted names and values; what is no section, misspelt and empty ones included, comes under its own name."""
+    sections = {key.partition(".")[0] for key in config_keys()}
     for section, branch in tree.items():
-        if isinstance(branch, Mapping):
+        if isinstance(branch, Mapping) and (branch or section in sections):
             yield from ((f"{section}.{leaf}", value) for leaf, value in branch.items())
         else:
             yield section, branch
+
+
+def _check_order(values: Mapping[str, Value], source: str, ordered: Sequence[tuple[str, str]]) -> None:
+    for lower, upper in ordered:
+        if float(values[lower]) >= float(values[upper]):
+            raise InputError(f"{source}: {lower} is {values[lower]}; it must be below {upper} ({values[upper]})")

@@ -37,6 +37,7 @@ class Outline:
     anchor: int
     T_anchor_level: Pose
     columns: Points
+    tree: KDTree
 
 
 class OutlineRecognizer:
@@ -57,7 +58,7 @@ class OutlineRecognizer:
         T_anchor_level = level_frame(submap.anchor, self.config.local_map)
         points = lie.transform(lie.inverse(T_anchor_level), submap.points())
         columns = upright_columns(points, self.config.local_map.voxel_size_m * submap.anchor.scale)
-        self.outlines.append(Outline(submap.anchor.index, T_anchor_level, columns))
+        self.outlines.append(Outline(submap.anchor.index, T_anchor_level, columns, KDTree(columns)))
 
     def query(self, query: Query) -> list[Candidate]:
         """The best few of the poses that fit, each with the older submaps that it touches most.
@@ -112,9 +113,7 @@ def _in_plane(old: Sequence[Outline], newest: Outline, query: Query) -> tuple[Ma
 
 def _touching(columns: Points, outline: Outline, T: Pose, size_m: float) -> float:
     """Share of columns (N, 2) that lie on those of an outline at this pose in it."""
-    if not len(outline.columns):
-        return 0.0
-    away_m = KDTree(outline.columns).query(lie.transform(T, columns), distance_upper_bound=_TOUCHING * size_m)[0]
+    away_m = outline.tree.query(lie.transform(T, columns), distance_upper_bound=_TOUCHING * size_m)[0]
     return float(np.isfinite(away_m).mean())
 
 

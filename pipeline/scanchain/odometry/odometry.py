@@ -33,7 +33,7 @@ from scanchain.odometry.tracked import (
 )
 from scanchain.preprocess import Prepared, Resolution, Sweep, prepare
 from scanchain.registration import MapKeeper, VoxelMap, create_matcher
-from scanchain.settings import check_dimension, load_settings
+from scanchain.settings import check_dimension, check_order, load_settings
 
 _SAMPLE = 1000  # number of points of two scans, evenly spread, which are compared
 _FEWEST_COPIED = 10  # least number of points of a scan that may be a copy
@@ -337,5 +337,6 @@ def checked_start(config: Config | None, T_base_lidar: Pose | None, dimension: i
     if config is None:
         config = load_settings(len(T_base_lidar) - 1).config
     checks.instance(config, Config, "config", "load_settings(dimension).config, or dimension=2 or 3")
+    check_order(config)
     check_dimension(config, len(T_base_lidar) - 1)
     return config, T_base_lidar

@@ -117,6 +117,12 @@ def left_behind(destination: Path) -> Path | None:
     return max(checkpoints, key=lambda file: file.stat().st_mtime_ns).parent if checkpoints else None
 
 
+def stopped_run(destination: Path) -> Path | None:
+    """The same, None where another process still writes to it."""
+    left = left_behind(destination)
+    return left if left is not None and not writer_of(left) else None
+
+
 def writer_of(partial: Path) -> int:
     """Number of another process that still writes to a directory marked partial, 0 if none does.
 
@@ -150,9 +156,8 @@ def _check(destination: Path, force: bool) -> None:
     if not destination.is_dir():
         raise InputError(f"{destination}: is a file; choose another --out")
     if not force:
-        left, resume = left_behind(destination), ""
-        if left is not None and not writer_of(left):
-            resume = f"; {left.name} is of a run that did not end: --force --resume continues it"
+        left = stopped_run(destination)
+        resume = f"; {left.name} is of a run that did not end: --force --resume continues it" if left else ""
         raise InputError(f"{destination}: exists; choose another --out or pass --force to replace it{resume}")
     if any(destination.iterdir()) and not (destination / RUN_FILE).is_file():
         raise InputError(

@@ -31,8 +31,7 @@ from scanchain.runs.directory import (
     RUN_FILE,
     TRUTH_FILE,
     RunDirectory,
-    left_behind,
-    writer_of,
+    stopped_run,
 )
 from scanchain.runs.job import Job, OpenRecorder, Progress, Recorder
 from scanchain.runs.metrics import (
@@ -126,7 +125,7 @@ class _Run:
             self.steps = left.steps
             self.began_s -= left.run_s
             progress.announce(f"resuming after {counted(len(self.steps), 'scan')} of {left.folder.name}")
-        elif (idle := left_behind(job.out)) and not writer_of(idle):
+        elif idle := stopped_run(job.out):
             progress.announce(
                 f"{idle.name} is of a run that did not end; --resume would continue it, this run starts over and "
                 "removes it once complete"
