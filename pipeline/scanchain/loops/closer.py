@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import Config, LoopsConfig
-from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Points, Pose, Proposal
+from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Drift, Segments
 from scanchain.loops.map_search import UprightFinder
 from scanchain.loops.place_search import PlaceSearch
 from scanchain.loops.planar_map_search import PlanarFinder
 from scanchain.loops.recognizer import PlaceCloser
-from scanchain.loops.submaps import VoxelSubmaps
+from scanchain.loops.submaps import VoxelSubmaps, seen_together
 from scanchain.loops.verification import Verifier
+from scanchain.preprocess import downsample
 from scanchain.registration import SearchGrid, Wanted, Window, find, thinned
-from scanchain.registration.search import Found
 
 _KEPT_M = 10.0  # largest distance from the anchor of a map's submap, up to which it is matched on, at full scale
 _LARGE = 2000  # keyframes from which on those of one pass go before the nearest one
@@ -34,11 +34,7 @@ _BASIN_M = 0.5  # largest uncertainty that matching corrects without a search
 _INTERVAL = 0.2  # share of the uncertainty that is traveled between two searches: wide windows cost most
 _RADIANS_A_METER = 0.2  # half width of the window in heading for each meter of uncertainty
 _MIN_RAD = 0.1  # least half width of the window in heading
-_SPACING_M = 4.0  # least distance between the anchors of submaps that are searched
-_MAX_SUBMAPS = 6  # largest number of submaps searched near the expected pose
-_WANTED = Wanted(apart_m=1.0, rival=0.8, answers=2, least=0.55)  # near it, in each submap
-_SAME_POSE_M = 2.0  # distance within which the results of two submaps are the same pose
-_AMBIGUOUS = 0.9  # share of the best score, from which on a result elsewhere makes it ambiguous
+_WANTED = Wanted(apart_m=2.0, rival=0.9, answers=2, least=0.55)  # within the drift: a second pose is as good
 
 
 class LoopCloser:
@@ -56,13 +52,12 @@ class LoopCloser:
         self.segments = Segments()
         submaps = VoxelSubmaps(dimension, _SUBMAP_KEYFRAMES, config.local_map, self.segments)
         verifier = Verifier(config)
-        is_planar = dimension == 2
-        self.near = ProximityCloser(config.loops, submaps, verifier, PlanarSearch(submaps) if is_planar else None)
-        self.search: PlaceSearch[Any] = (
-            PlaceSearch(PlanarFinder(submaps, verifier), config.loops, self.segments)
-            if is_planar
-            else PlaceSearch(UprightFinder(config), config.loops, self.segments)
-        )
+        within_drift, finder = None, UprightFinder(config)
+        if dimension == 2:
+            finder = PlanarFinder(submaps, verifier)
+            within_drift = PlanarSearch(finder)
+        self.near = ProximityCloser(config.loops, submaps, verifier, within_drift)
+        self.search: PlaceSearch[Any] = PlaceSearch(finder, config.loops, self.segments)
         self.places = PlaceCloser(config, dimension, submaps, verifier)
 
     def begin_in(
@@ -172,12 +167,7 @@ class ProximityCloser:
             return (closure,)
         if uncertainty_m is None:
             near, uncertainty_m = self._near(graph, old, connected)
-        found = self.search.find(keyframes, T_world, near, uncertainty_m)
-        if found is None:
-            return (closure,)
-        submap = self.submaps.around(found.anchor, keyframes, old - 1)
-        searched = self.verifier.scan(keyframes[newest], submap, found.T_anchor_source)
-        return closure, searched.closure(found.anchor, newest, Proposal.PLACE)
+        return closure, *self.search.close(keyframes, T_world, near, float(uncertainty_m[near].max()), old)
 
     def _near(
         self, graph: PoseGraph, old: int, connected: NDArray[np.bool_]
@@ -217,68 +207,43 @@ class ProximityCloser:
         return old
 
 
-@dataclass(frozen=True, slots=True)
-class Nearby:
-    """The anchor of the submap that the newest keyframe fits best, and its pose there, to within a voxel."""
-
-    anchor: int
-    T_anchor_source: Pose
-
-
 class PlanarSearch:
-    """Correlative search over all windows that the uncertainty of the graph allows."""
+    """Correlative search over all poses that the uncertainty of the graph allows, in older keyframes together."""
 
-    def __init__(self, submaps: VoxelSubmaps) -> None:
-        self.submaps = submaps
+    def __init__(self, finder: PlanarFinder) -> None:
+        """Finder : which aligns a scan where it was found."""
+        self.finder = finder
         self.next_m = 0.0
 
     def is_due(self, keyframes: Sequence[Keyframe]) -> bool:
         """True if the lidar has traveled far enough since the last search."""
         return keyframes[-1].traveled_m >= self.next_m
 
-    def find(
-        self,
-        keyframes: Sequence[Keyframe],
-        T_world: Matrix,
-        near: NDArray[np.int64],
-        uncertainty_m: NDArray[np.float64],
-    ) -> Nearby | None:
-        """The best fit of the newest keyframe; None where there is none, an ambiguous one, or none is needed.
+    def close(
+        self, keyframes: Sequence[Keyframe], T_world: Matrix, near: NDArray[np.int64], radius_m: float, old: int
+    ) -> tuple[Closure, ...]:
+        """The closure of the newest keyframe where it fits best; none where it fits nowhere, or two places.
 
-        near : older keyframes within reach; uncertainty_m : of the position of each of the older keyframes
+        near : keyframes within reach; radius_m : uncertainty of the position relative to them; old : number of
+            the keyframes that submaps may have
         """
-        source = keyframes[-1]
-        if uncertainty_m[near].max() <= _BASIN_M:
-            return None
-        self.next_m = source.traveled_m + _INTERVAL * float(uncertainty_m[near].max())
-        anchors = self._anchors(near, T_world)
-        points = self._points(keyframes, self.submaps.half_width)
-        T_first = lie.between(T_world[anchors], T_world[-1])
-        found: list[tuple[Found, int]] = []
-        for anchor, T, radius_m in zip(anchors, T_first, uncertainty_m[anchors].tolist(), strict=True):
-            grid = SearchGrid.of_voxels(self.submaps.around(anchor, keyframes, len(uncertainty_m) - 1), T)
-            window = Window(T, radius_m, _MIN_RAD + _RADIANS_A_METER * radius_m)
-            some = find(thinned(points, grid.resolution_m), grid, window, _WANTED)
-            found += [(each, anchor) for each in some]
-        return _best(found, T_world)
-
-    def _anchors(self, near: NDArray[np.int64], T_world: Matrix) -> list[int]:
-        """Anchors among the keyframes within reach, the nearest to the newest first, none close to another."""
-        positions = T_world[:, :2, 2]
-        anchors = np.unique([self.submaps.anchor_of(index) for index in near.tolist()])
-        nearest_first = anchors[np.argsort(np.linalg.norm(positions[anchors] - positions[-1], axis=1))]
-        chosen: list[int] = []
-        for anchor in nearest_first.tolist():
-            away_m = np.linalg.norm(positions[chosen] - positions[anchor], axis=1)
-            if len(chosen) < _MAX_SUBMAPS and (away_m >= _SPACING_M).all():
-                chosen.append(anchor)
-        return chosen
-
-    def _points(self, keyframes: Sequence[Keyframe], count: int) -> Points:
-        """Points of the last keyframes in the newest one's frame: one scan alone may fit at many poses."""
-        T_source_odom = lie.inverse(keyframes[-1].T_odom_lidar)
-        members = keyframes[-count:]
-        return np.vstack([lie.transform(T_source_odom @ member.T_odom_lidar, member.points) for member in members])
+        if radius_m <= _BASIN_M:
+            return ()
+        newest, submaps = keyframes[-1], self.finder.submaps
+        self.next_m = newest.traveled_m + _INTERVAL * radius_m
+        size_m = submaps.config.voxel_size_m * newest.scale
+        placed = {k: replace(keyframes[k], T_odom_lidar=T_world[k]) for k in near.tolist()}
+        surfaces = seen_together(list(placed.values()), lie.identity(2))
+        grid = SearchGrid.of_points(downsample(surfaces, size_m), size_m)
+        points = seen_together(keyframes[-submaps.half_width :], lie.inverse(newest.T_odom_lidar))
+        window = Window(T_world[-1], radius_m, _MIN_RAD + _RADIANS_A_METER * radius_m)
+        found = find(thinned(points, size_m), grid, window, _WANTED)
+        if len(found) != 1:
+            return ()
+        anchors = {submaps.anchor_of(k): None for k in placed}
+        on_map = [replace(keyframes[k], T_odom_lidar=T_world[k]) for k in anchors]
+        closure = self.finder.aligned(newest, found[0].T_target_source, on_map, keyframes[:old])
+        return () if closure is None else (closure,)
 
 
 def on_first_pass(T_world: Matrix, chosen: NDArray[np.bool_], reach_m: float) -> int:
@@ -298,20 +263,3 @@ def on_first_pass(T_world: Matrix, chosen: NDArray[np.bool_], reach_m: float) ->
 def _distances_m(T_world: Matrix, keyframes: NDArray[np.int64] | slice | int) -> NDArray[np.float64]:
     """Distances of some keyframes from the newest."""
     return np.linalg.norm(T_world[keyframes, :-1, -1] - T_world[-1, :-1, -1], axis=-1)
-
-
-def _best(found: Sequence[tuple[Found, int]], T_world: Matrix) -> Nearby | None:
-    """The best of the poses in submaps of anchors; None where there is none, or another one is as good.
-
-    Two of the same submap are distinct.
-    """
-    if not found:
-        return None
-    best, anchor = max(found, key=lambda each: each[0].share)
-    position = (T_world[anchor] @ best.T_target_source)[:2, 2]
-    for each, other in found:
-        away_m = np.linalg.norm((T_world[other] @ each.T_target_source)[:2, 2] - position)
-        is_distinct = each is not best if other == anchor else away_m > _SAME_POSE_M
-        if is_distinct and each.share >= _AMBIGUOUS * best.share:
-            return None
-    return Nearby(anchor, best.T_target_source)

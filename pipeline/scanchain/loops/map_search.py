@@ -18,7 +18,7 @@ from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Points, Po
 from scanchain.errors import InputError
 from scanchain.files import write_whole
 from scanchain.loops.place_search import Underway
-from scanchain.loops.submaps import Submap, level_frame, upright_frame
+from scanchain.loops.submaps import Submap, level_frame, seen_together, upright_frame
 from scanchain.loops.verification import Verifier
 from scanchain.maps.saved_map import read_arrays
 from scanchain.registration import SearchGrid, Wanted, Window, find
@@ -81,7 +81,8 @@ class UprightMap:
         """The closure of the last one of some keyframes with the map's; None where nothing is alike."""
         newest = members[-1]
         T_newest_level = level_frame(newest, self.config.local_map)
-        seeds = yield from self.seeds(_together(members, lie.inverse(T_newest_level)))
+        T_level_odom = lie.inverse(T_newest_level) @ lie.inverse(newest.T_odom_lidar)
+        seeds = yield from self.seeds(seen_together(members, T_level_odom))
         source = Submap(newest, members, self.radius_m)
         tried: list[tuple[Closure, Pose]] = []  # and T_world_newest by it
         for seed in seeds:
@@ -236,17 +237,6 @@ def _columns(keyframes: Sequence[Keyframe], T_level_map: Pose, size_m: float) ->
     seen: list[NDArray[np.float64]] = []
     for first in range(0, len(keyframes), _TOGETHER):
         members = keyframes[first : first + _TOGETHER]
-        seen.append(
-            upright_columns(
-                np.vstack([lie.transform(T_level_map @ each.T_odom_lidar, each.points) for each in members]),
-                size_m,
-            )
-        )
+        seen.append(upright_columns(seen_together(members, T_level_map), size_m))
     columns = np.vstack(seen)
     return columns[np.unique(np.floor(columns / size_m), axis=0, return_index=True)[1]]
-
-
-def _together(members: Sequence[Keyframe], T_level_newest: Pose) -> Points:
-    """(N, 3) points of keyframes in the level frame of the last one."""
-    T_level_odom = T_level_newest @ lie.inverse(members[-1].T_odom_lidar)
-    return np.vstack([lie.transform(T_level_odom @ each.T_odom_lidar, each.points) for each in members])

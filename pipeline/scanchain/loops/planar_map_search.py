@@ -16,7 +16,7 @@ from scanchain.data import Closure, Keyframe, Points, Pose, Problem, Proposal
 from scanchain.kernels.search import FREE, NEAR, UNKNOWN
 from scanchain.loops.evidence import rank_of
 from scanchain.loops.place_search import Underway
-from scanchain.loops.submaps import VoxelSubmaps
+from scanchain.loops.submaps import VoxelSubmaps, seen_together
 from scanchain.loops.verification import Verifier
 from scanchain.maps.occupancy_grid import OccupancyGrid, fitting_resolution
 from scanchain.preprocess import downsample
@@ -34,7 +34,7 @@ _CERTAINLY = 0.06  # share above that, from which on a place is taken for found
 _CLEAR_M = 2.0  # path since a search that fitted several places, from which on a place is taken for found
 _PATH_M = 8.0  # length of the path whose points are searched for: over it odometry drifts less than a cell or two
 _AGREE_M, _AGREE_RAD = 0.5, 0.1  # largest distance of an aligned scan from where its path was found
-_SOURCES, _SUBMAPS = 4, 6  # keyframes of the path that are aligned, and submaps that are tried for each
+_SOURCES, _SUBMAPS = 8, 6  # keyframes of the path that are aligned, about 1 m apart, and submaps tried for each
 _NEAR_M = 8.0  # largest distance of such a submap's anchor
 
 
@@ -105,8 +105,7 @@ class PlanarMapSearch:
     def likely(self, path: Sequence[Keyframe]) -> Hypothesis | None:
         """The pose of the middle keyframe of a path that its points fit best; None where they fit none."""
         T_middle_odom = lie.inverse(path[len(path) // 2].T_odom_lidar)
-        points = np.vstack([lie.transform(T_middle_odom @ each.T_odom_lidar, each.points) for each in path])
-        best = self.best(points, LEAST_SHARE)
+        best = self.best(seen_together(path, T_middle_odom), LEAST_SHARE)
         return best if best is not None and best.is_likely else None
 
 
@@ -164,8 +163,7 @@ class PlanarFinder:
         """Closures of keyframes of the path with older ones; see ``Finder``."""
         path = keyframes[_path_begin(keyframes, start) :]
         T_newest_odom = lie.inverse(path[-1].T_odom_lidar)
-        points = np.vstack([lie.transform(T_newest_odom @ member.T_odom_lidar, member.points) for member in path])
-        search = WholeSearch(target, points, LEAST_SHARE)
+        search = WholeSearch(target, seen_together(path, T_newest_odom), LEAST_SHARE)
         search.advance()
         while not search.is_done:
             yield
@@ -177,15 +175,18 @@ class PlanarFinder:
             return ()
         anchors = [each for each in target.keyframes if each.index % self.submaps.half_width == 0]
         closures = [
-            self._aligned(source, best.T_map_lidar @ T_newest_odom @ source.T_odom_lidar, anchors, keyframes)
+            self.aligned(source, best.T_map_lidar @ T_newest_odom @ source.T_odom_lidar, anchors, keyframes)
             for source in path[:: -max(len(path) // _SOURCES, 1)][:_SOURCES]
         ]
         return sorted((each for each in closures if each is not None), key=rank_of, reverse=True)
 
-    def _aligned(
+    def aligned(
         self, source: Keyframe, T_world_source: Pose, anchors: Sequence[Keyframe], keyframes: Sequence[Keyframe]
     ) -> Closure | None:
-        """The closure of a keyframe to the submap near by that it overlaps most; None where there is none."""
+        """The closure of a keyframe to the submap near by that it overlaps most; None where there is none.
+
+        anchors : of submaps out of ``keyframes``; their ``T_odom_lidar`` is T_world_lidar
+        """
         positions = np.array([each.T_odom_lidar[:2, 2] for each in anchors]).reshape(-1, 2)
         away_m = np.linalg.norm(positions - T_world_source[:2, 2], axis=1)
         best: Closure | None = None

@@ -52,6 +52,11 @@ class Submap:
         return moved[np.einsum("ij,ij->i", moved, moved) < self.radius_m**2]
 
 
+def seen_together(keyframes: Sequence[Keyframe], T_frame_odom: Pose) -> Points:
+    """Points (N, d) of keyframes in a frame that odometry places: one scan alone may fit at many poses."""
+    return np.vstack([lie.transform(T_frame_odom @ each.T_odom_lidar, each.points) for each in keyframes])
+
+
 def submap_around(keyframes: Sequence[Keyframe], anchor: int, radius_m: float, segments: Segments) -> Submap:
     """The submap of a keyframe out of the keyframes of its segment so far."""
     here_m = keyframes[anchor].traveled_m
