@@ -52,7 +52,8 @@ class SlamResult:
     ``map_errors`` are those of the keyframes against the map.
     ``warnings`` has a line on wheels that were left out.
     ``map_log_odds`` are those that the log is where it was placed in a prior map, or, where they do not suffice,
-    might have been; NaN without a map, and where nothing spoke for a place in it.
+    might have been; NaN without a map, and where nothing spoke for a place in it. ``map_alike_share`` is the share
+    of the searches of the map that found several places alike.
     ``components`` (K,) numbers the pieces that the keyframes belong to, which no loop joins; one as a rule.
     """
 
@@ -70,6 +71,7 @@ class SlamResult:
     elevation_sigma_rad: float = math.inf
     calibrated_from: int = 0
     map_log_odds: float = math.nan
+    map_alike_share: float = 0.0
 
     @property
     def keyframe_trajectory(self) -> Trajectory:
@@ -242,6 +244,7 @@ class Slam:
             elevation_sigma_rad=tracking.elevation.sigma_rad,
             calibrated_from=tracking.calibrated_from,
             map_log_odds=self.placement.evidence.best if first else math.nan,
+            map_alike_share=self.closer.alike_share,
         )
 
     def _check_unfinished(self) -> None:

@@ -7,7 +7,7 @@ A map is made of each place by ``run``, and every log of another place is locali
 its last: all ordered pairs. --own localizes a log of the same place instead: another day, another start or
 another part of it. --set changes the configuration of localization (``--set log.every=2 log.wheels=``).
 
-  refused   "not from this place", and none of its scans has ever had a pose in the map
+  refused   not placed, and none of its scans has ever had a pose in the map
   held      refused in the end, but scans had a pose in the map for a while
   followed  placed in the map in the end
   error     anything else that ended it

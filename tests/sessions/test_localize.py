@@ -88,6 +88,15 @@ def test_a_whole_log_of_another_place_is_never_placed_though_it_returns_to_its_s
     assert code == 2 and "there is no trajectory to draw" in error
 
 
+def test_a_log_that_fits_several_places_of_its_map_alike_is_not_said_to_be_of_another_place(tmp_path):
+    prior = made.run("hall", seconds=20.0, sensor="lms-270")
+    log = made.log("hall", seconds=6.0, start_m=20.0, sensor="lms-270")
+    found = localize(log, prior, tmp_path / "loc", recording=False)
+    assert found.metrics.placed == 0
+    assert found.metrics.reason.startswith("not certain: 60 scans over ")
+    assert "fit several places of hall" in found.metrics.reason
+
+
 def test_a_localized_log_names_the_directory_that_it_was_written_to_and_its_map(
     office, tmp_path, monkeypatch, call
 ):

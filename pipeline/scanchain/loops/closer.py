@@ -75,6 +75,12 @@ class LoopCloser:
             self.search.begin_in(keyframes, folder)
         return self.places.begin_in(keyframes, are_added=self.near.search is not None)
 
+    @property
+    def alike_share(self) -> float:
+        """Share of the searches of a map, or of older segments, that found several places alike."""
+        finder = self.search.finder
+        return finder.alike / max(finder.searches, 1)
+
     def start_segment(self, keyframe: int) -> None:
         """Start a new segment at this keyframe: the motion to it from the one before is unknown."""
         self.segments.start(keyframe)

@@ -183,6 +183,7 @@ class UprightFinder:
 
     def __init__(self, config: Config) -> None:
         self.config = config
+        self.searches = self.alike = 0
 
     def draw(self, keyframes: Sequence[Keyframe], folder: Path | None = None) -> UprightMap:
         """The upright structure of keyframes."""
@@ -191,6 +192,8 @@ class UprightFinder:
     def find(self, keyframes: Sequence[Keyframe], start: int, target: UprightMap) -> Underway:
         """The closure of the newest keyframe with the older ones, verified or not; see ``Finder``."""
         closure = yield from target.found(keyframes[max(start, len(keyframes) - MEMBERS) :])
+        self.searches += 1
+        self.alike += closure is not None and closure.cause == _ALIKE.cause
         return () if closure is None else (closure,)
 
 

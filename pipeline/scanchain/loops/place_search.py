@@ -34,12 +34,15 @@ class Finder(Protocol[Map]):
     ----------
     first_m, least_m, most_m : path of a segment before its first search, and least and largest between two
     follows : whether a log that is joined to a map is sought there again after a while without a match
+    searches, alike : number of searches so far, and of those that found several places alike
     """
 
     first_m: float
     least_m: float
     most_m: float
     follows: bool
+    searches: int
+    alike: int
 
     def draw(self, keyframes: Sequence[Keyframe], folder: Path | None = None) -> Map:
         """Draw older keyframes, whose ``T_odom_lidar`` is T_world_lidar; the folder of a map may keep a part."""

@@ -40,6 +40,7 @@ _WITHOUT_MAP_M = {2: 2.0, 3: 10.0}  # shortest path without the map that is told
 _MOVED_M, _MOVED_SIGMAS = 0.3, 5.0  # between a pose as known at its time and in the end, that is told
 _PATHS = 12  # largest number of paths that are compared with the map in the end
 _APART_S = 1.0  # largest difference between the first scan and the nearest pose of a file
+_ALIKE_SHARE = 0.5  # of the searches, from which on a log that is not found shows what is in several places
 _SHOWN = 3  # stretches that the verdict lists
 
 
@@ -296,6 +297,8 @@ def _verdict(
             reason = (
                 f"not certain: {tried} may be in {prior.name}, with log-odds of {log_odds:.1f}, which are too low"
             )
+        elif found.result.map_alike_share >= _ALIKE_SHARE:
+            reason = f"not certain: {tried} fit several places of {prior.name} alike"
         else:
             reason = f"not from this place: nothing in {tried} is in {prior.name}"
         return Verdict.NOT_TRUSTWORTHY, reason
