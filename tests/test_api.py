@@ -11,6 +11,7 @@ import pytest
 
 import scanchain as sc
 from scanchain.errors import InputError
+from tests.support.in_process import here
 from tests.support.scenes import ROOT, configured, kitti_scans, shared_data
 
 
@@ -215,7 +216,8 @@ def test_a_scan_that_was_refused_is_forgotten():
     assert odometry.track(ROOM, 0.2).scan.index == 2
 
 
-def test_a_comparison_from_python_has_a_row_a_method(office, tmp_path):
+def test_a_comparison_from_python_has_a_row_a_method(office, tmp_path, monkeypatch):
+    here(monkeypatch)
     compared = sc.compare(office, tmp_path / "compared", ["svd"])
     assert [row.name for row in compared.table.rows] == ["svd"]
     assert (compared.path / "report.html").exists()

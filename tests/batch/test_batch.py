@@ -85,6 +85,7 @@ def made_at(folder):
     return {path.parent: path.stat().st_mtime_ns for path in folder.glob("*/run.json")}
 
 
+@pytest.mark.slow
 def test_of_4_logs_two_are_poison_and_2_have_results_and_a_second_call_runs_only_the_rest(
     drawers, poisoned, tmp_path, capfd
 ):

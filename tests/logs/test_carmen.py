@@ -28,6 +28,7 @@ def assert_same(ours, theirs):
     assert ours.T_odom_base.tobytes() == theirs.T_odom_base.tobytes()
 
 
+@pytest.mark.slow
 def test_the_published_intel_log_is_the_same_as_its_mcap_to_the_last_bit():
     text = open_log(shared_data("2d/intel.clf.bz2"))
     mcap = open_log(shared_data("2d/intel.mcap"))

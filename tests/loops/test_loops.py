@@ -84,7 +84,9 @@ def undrifted():
     return run(0.0, 0.0)
 
 
-@pytest.mark.parametrize(("longer", "turn_rad_m"), [(0.01, 0.002), (0.01, -0.005)])
+@pytest.mark.parametrize(
+    ("longer", "turn_rad_m"), [(0.01, 0.002), pytest.param(0.01, -0.005, marks=pytest.mark.slow)]
+)
 def test_drift_is_closed_to_a_fifth_and_no_loop_is_wrong(undrifted, longer, turn_rad_m):
     truth = undrifted.trajectory
     drifted = run(longer, turn_rad_m)

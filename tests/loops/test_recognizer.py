@@ -108,6 +108,7 @@ def test_a_recognizer_of_ones_own_closes_loops_and_survives_checkpoints_bit_by_b
     assert a.trajectory.poses.tobytes() == b.trajectory.poses.tobytes()
 
 
+@pytest.mark.slow
 def test_a_run_finds_it_in_the_working_directory_also_where_python_does_not_look_there(folder):
     command = [sys.executable, "-P", "-m", "scanchain", "run", shared_data(CSAIL), "--out", "run", "--end", "150"]
     command += [word for key, value in SMALL.items() for word in (f"--{key}", str(value))]

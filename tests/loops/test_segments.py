@@ -232,6 +232,7 @@ def carried(slam, scans, first, last):
     return slam.finish(), starts
 
 
+@pytest.mark.slow
 def test_a_robot_that_was_carried_elsewhere_is_found_again():
     log = open_log(shared_data("2d/intel.mcap"))
     scans = list(islice(log.scans(), 8000))
@@ -254,6 +255,7 @@ def test_a_robot_that_was_carried_elsewhere_is_found_again():
     assert len(across) > 10
 
 
+@pytest.mark.slow
 def test_a_robot_that_was_carried_to_another_corridor_like_one_before_stays_apart():
     log = open_log(shared_data("2d/intel.mcap"))
     scans = list(islice(log.scans(), 3485, 10087))

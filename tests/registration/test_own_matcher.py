@@ -63,6 +63,7 @@ def test_it_runs_is_stopped_and_goes_on_to_the_same_result(office, folder):
     assert "resumed after" in (folder / "run" / "summary.txt").read_text()
 
 
+@pytest.mark.slow
 def test_it_is_a_row_of_a_comparison_and_its_settings_can_be_given_back(office, folder):
     names, short = ("svd", "PointToPoint"), ("--log.end_s", "3")
     words = ("compare", office, *short, "--methods", ",".join(names), "--matcher", NAME, "--out", "a")

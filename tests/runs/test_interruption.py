@@ -75,6 +75,7 @@ def left_after(steps, log, out, *words):
     child.wait()
 
 
+@pytest.mark.slow
 def test_interrupted_again_and_again_a_run_goes_on_to_the_same_result_and_recording(undisturbed, tmp_path):
     log, whole = undisturbed
     out, stamps_ns = tmp_path / "run", read_tum(whole / "odometry.tum").stamps_ns
@@ -105,6 +106,7 @@ def test_killed_at_any_moment_a_run_leaves_files_that_open_and_goes_on_to_the_sa
     assert len(killed) == 3
 
 
+@pytest.mark.slow
 def test_killed_while_it_takes_up_the_recording_a_run_goes_on_to_the_same_one(office, whole, tmp_path):
     out = tmp_path / "run"
     left_after(100, office, out, *RECORDED)
@@ -227,6 +229,7 @@ def test_ctrl_c_ends_a_run_in_good_order_with_exit_code_1(office, tmp_path):
     assert 30 <= assert_readable(partial(out)) < 300
 
 
+@pytest.mark.slow
 def test_ctrl_c_twice_ends_a_run_at_once_and_it_can_go_on(office, whole, tmp_path):
     out = tmp_path / "run"
     words = ["run", str(office), "--out", str(out), *LOOPING, "--checkpoint", "0", "--rerun", "off"]
