@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import logging
-import subprocess
-import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from time import perf_counter
 from typing import Any
@@ -18,18 +17,21 @@ _WARNING = "compiling kernels, once after an installation: the first calls take 
 class _Compilation(event.Listener):
     """Compilation in this process: the time that it takes, and who is told of each module that it begins with.
 
-    Kernels that call others compile these within themselves.
+    Kernels that call others compile these within themselves. No garbage is collected meanwhile: a compiler makes
+    much that lasts.
     """
 
     def __init__(self) -> None:
         self.depth = 0
         self.began_s = self.ended_s = 0.0
         self.is_silent = True
+        self.is_collecting = False
         self.told: list[Callable[[str], None]] = []
 
     def on_start(self, event: Any) -> None:
         if not self.depth:
-            self.began_s = perf_counter()
+            self.began_s, self.is_collecting = perf_counter(), gc.isenabled()
+            gc.disable()
         self.depth += 1
         module = event.data["dispatcher"].py_func.__module__
         if not module.startswith("scanchain."):
@@ -44,6 +46,8 @@ class _Compilation(event.Listener):
         self.depth -= 1
         if not self.depth:
             self.ended_s += perf_counter() - self.began_s
+            if self.is_collecting:
+                gc.enable()
 
 
 _compilation = _Compilation()
@@ -67,20 +71,13 @@ def working_s() -> float:
 
 
 @contextmanager
-def announcing_compilation(say: Callable[[str], None], beside: Sequence[str] = ()) -> Iterator[None]:
-    """Name each module of kernels when its compilation begins; kernels from the cache on disk are not named.
-
-    beside : arguments of ``python -m`` of a process that meanwhile compiles what this one will need later
-    """
+def announcing_compilation(say: Callable[[str], None]) -> Iterator[None]:
+    """Name each module of kernels when its compilation begins; kernels from the cache on disk are not named."""
     modules: set[str] = set()
-    processes: list[subprocess.Popen[bytes]] = []
 
     def tell(module: str) -> None:
         if not modules:
             say("compiling, once after the installation:")
-            if beside:
-                command, nothing = [sys.executable, "-P", "-m", *beside], subprocess.DEVNULL
-                processes.append(subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing))
         if module not in modules:
             modules.add(module)
             say(f"  {module.removeprefix('scanchain.')}")
@@ -90,6 +87,3 @@ def announcing_compilation(say: Callable[[str], None], beside: Sequence[str] = (
         yield
     finally:
         _compilation.told.remove(tell)
-        for process in processes:
-            process.kill()
-            process.wait()

@@ -21,11 +21,9 @@ from scanchain.kernels import compiling
 from scanchain.kernels.registration import icp, residuals
 from scanchain.registration import VoxelMap
 from scanchain.registration.plicp import settings_of
-from scanchain.runs import results, warm_up
 from scanchain.runs.job import Job, Progress
 from scanchain.runs.run import run
 from scanchain.settings import load_settings
-from scanchain.slam import Slam
 
 
 def kernel(module="scanchain.kernels.voxels"):
@@ -45,43 +43,6 @@ def test_each_module_of_kernels_is_named_once_and_others_and_what_is_compiled_al
             assert kernel(module)(2) == 4
     kernel("scanchain.kernels.matrices")(2)
     assert told == ["compiling, once after the installation:", "  kernels.voxels"]
-
-
-def test_beside_what_is_compiled_one_process_begins_and_is_over_in_the_end(monkeypatch):
-    begun, start = [], subprocess.Popen
-
-    def remembered(*words, **options):
-        begun.append(start(*words, **options))
-        return begun[-1]
-
-    monkeypatch.setattr(subprocess, "Popen", remembered)
-    with announcing_compilation(lambda line: None, ("http.server", "0")):
-        kernel("numba.np.arrayobj")(2)
-        assert not begun
-        kernel()(2)
-        kernel("scanchain.kernels.matrices")(2)
-        assert [each.poll() for each in begun] == [None]
-    assert None not in [each.poll() for each in begun]
-
-
-def _remembering(made, module, name):
-    function = getattr(module, name)
-
-    def remembered(*given):
-        made[name] = function(*given)
-        return made[name]
-
-    return remembered
-
-
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_a_warm_up_optimizes_a_graph_of_all_its_scans_and_draws_both_maps(monkeypatch, dimension):
-    made = {}
-    for module, name in ((results, "cloud_of"), (results, "grid_of"), (Slam, "finish")):
-        monkeypatch.setattr(module, name, _remembering(made, module, name))
-    warm_up.compile_the_rest(dimension)
-    assert len(made["cloud_of"].points) > 0 and made["grid_of"].log_odds.max() > 0.0
-    assert len(made["finish"].trajectory) == 3 and len(made["finish"].state.edges) >= 2
 
 
 def test_the_command_goes_through_what_needs_kernels_and_names_what_failed(monkeypatch, capsys):

@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+from scipy.sparse.csgraph import csgraph_from_dense, dijkstra
 
 from scanchain import lie
 from scanchain.data import ClosureVerdict
 from scanchain.evaluation import absolute_error, pair
 from scanchain.graph.pose_graph import PoseGraph
+from scanchain.kernels.graph.paths import path_lengths
 from scanchain.logs import open_log
 from scanchain.loops import LoopCloser, closer
 from scanchain.loops.connectivity import Drift
@@ -51,6 +53,20 @@ def test_of_edges_between_the_same_two_the_shortest_counts_once():
     for meters in (3.0, 0.5):
         graph.add_edge(1, 3, lie.pose_2d(meters, 0.0, 0.0), 1e6 * np.eye(3))
     assert Drift(0.1).between(graph, 0, 5.0) == pytest.approx([0.0, 0.1, 0.2, 0.15])
+
+
+def test_paths_through_a_chain_with_loops_are_the_shortest():
+    rng, count = np.random.default_rng(0), 400
+    edges = np.vstack(
+        [np.column_stack([np.arange(count - 1), np.arange(1, count)]), rng.integers(0, count, (60, 2))]
+    )
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    lengths = np.where(rng.random(len(edges)) < 0.05, np.inf, rng.uniform(0.1, 2.0, len(edges)))
+    matrix = np.full((count, count), np.inf)
+    np.minimum.at(matrix, tuple(np.vstack([edges, edges[:, ::-1]]).T), np.tile(lengths, 2))
+    for limit in (5.0, 1e9):
+        wanted = dijkstra(csgraph_from_dense(matrix, null_value=np.inf), indices=count - 1, limit=limit)
+        np.testing.assert_array_equal(path_lengths(edges, lengths, count, count - 1, limit), wanted)
 
 
 @pytest.mark.parametrize(

@@ -57,11 +57,11 @@ def defect(message: Decoded, preprocess: PreprocessConfig | None) -> str:
 def _none_retained(points: RawPoints, config: PreprocessConfig) -> str:
     """Reason for which preprocessing retains none of the points (N, d); empty where it retains one."""
     low_m, high_m = config.min_range_m, config.max_range_m
-    squares = np.empty(0)
-    for part in (points[::_SAMPLE], points):
-        squares = np.einsum("ij,ij->i", part, part, dtype=np.float64)
-        if ((low_m * low_m <= squares) & (squares <= high_m * high_m)).any():
-            return ""
+    if any(low_m <= math.hypot(*point) <= high_m for point in points[::_SAMPLE].tolist()):
+        return ""
+    squares = np.einsum("ij,ij->i", points, points, dtype=np.float64)
+    if ((low_m * low_m <= squares) & (squares <= high_m * high_m)).any():
+        return ""
     near_m, far_m = np.sqrt([squares.min(), squares.max()])
     limits = f"preprocess.min_range_m ({low_m:g}) and preprocess.max_range_m ({high_m:g})"
     seen = f"its {counted(len(points), 'point')} lie at {near_m:.3g} to {far_m:.3g} m"

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import dijkstra
 
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.pose_graph import PoseGraph
+from scanchain.kernels.graph.paths import path_lengths
 
 _MIN_WEIGHT = 0.5  # robust weight of a loop edge, from which on it connects its keyframes
 _LOOP_LENGTH_M = 1e-3  # length of a loop edge in the shortest path: it adds next to no drift
@@ -91,8 +90,7 @@ class Drift:
         """Uncertainty (K,) of each keyframe of the graph relative to one of them, meters, at most the limit."""
         self.measure(graph)
         is_open = ~graph.is_loop | (graph.weight > _MIN_WEIGHT)
-        paths = coo_array((self.lengths.rows[is_open], tuple(graph.edges[is_open].T)), shape=(len(graph),) * 2)
-        paths.has_canonical_format = True  # so that the lengths of edges between the same two are not added up
-        meters = dijkstra(paths.tocsr(), directed=False, indices=keyframe, limit=limit_m / self.drift)
+        lengths = np.where(is_open, self.lengths.rows, np.inf)
+        meters = path_lengths(graph.edges, lengths, len(graph), keyframe, limit_m / self.drift)
         meters[graph.held] = meters[graph.held].min(initial=np.inf)  # they do not drift against each other
         return np.minimum(self.drift * meters, limit_m)

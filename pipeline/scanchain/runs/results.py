@@ -96,9 +96,8 @@ def _write_saved_map(path: Path, results: Results) -> None:
     """The map of the largest piece of the log."""
     result, graph = results.result, results.result.graph
     chosen = np.flatnonzero(result.components == np.bincount(result.components).argmax())
-    keyframes = tuple(
-        replace(result.keyframes[k], T_odom_lidar=result.T_world_keyframes[k]) for k in chosen.tolist()
-    )
+    poses = result.T_world_keyframes
+    keyframes = tuple(replace(result.keyframes[k], T_odom_lidar=poses[k]) for k in chosen.tolist())
     edges = Edges(graph.edges, graph.measurements, graph.information, graph.is_loop, graph.weight)
     in_force = edges.where(~graph.is_rejected).among(chosen)
     stamps_ns = result.trajectory.stamps_ns

@@ -86,8 +86,7 @@ def run(
     Raises InputError for bad input, which leaves nothing behind unless scans were processed before it was met.
     """
     this = _Run(job, progress)
-    compiling = announcing_compilation(progress.say, ("scanchain.runs.warm_up", str(this.log.dimension)))
-    with this.directory, compiling:
+    with this.directory, announcing_compilation(progress.say):
         try:
             slam, scans = this.begin()
             with this.recording(record) as recording:
