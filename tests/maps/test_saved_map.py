@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import scanchain
 from scanchain.data import Keyframe
 from scanchain.errors import InputError
 from scanchain.maps import Edges, SavedMap, SavedPoints, Session, open_saved_map, write_saved_map
+from scanchain.slam import SlamResult
 
 
 @pytest.fixture
@@ -70,3 +72,11 @@ def test_an_index_of_another_version_or_without_sense_is_refused(written, before
 def test_a_folder_without_a_map_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"holds no map \(map/map.json\); give the directory of a finished run"):
         open_saved_map(tmp_path)
+
+
+def test_the_poses_of_all_keyframes_are_computed_a_few_times_not_once_for_each(office, tmp_path, monkeypatch):
+    """Each time takes memory for all of them, which views of one pose would keep."""
+    poses, asked = SlamResult.T_world_keyframes.fget, []
+    monkeypatch.setattr(SlamResult, "T_world_keyframes", property(lambda result: asked.append(0) or poses(result)))
+    scanchain.run(office, tmp_path / "run", recording=False)
+    assert 0 < len(asked) < len(open_saved_map(tmp_path / "run").keyframes)
