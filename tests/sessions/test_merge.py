@@ -172,7 +172,7 @@ def test_maps_that_cannot_be_merged_are_refused_before_the_search(runs, merged, 
     ):
         with pytest.raises(InputError, match=message):
             quietly(*runs_, out=out, **options)
-    with pytest.raises(InputError, match="is one of the runs"):
+    with pytest.raises(InputError, match="is one of the maps"):
         sc.merge((noon, folder / "morning"), noon, force=True)
     assert not out.exists()
 
