@@ -36,12 +36,6 @@ _INDEPENDENT_M = {2: 1.0, 3: 3.0}  # path from which on two keyframes are indepe
 _AGREE_M, _AGREE_RAD = 1.0, 0.1  # largest difference between the poses that two closures imply
 
 
-def contradiction(some: Sequence[Keyframe], others: Sequence[Keyframe]) -> float:
-    """Share, of the points of keyframes in view of the nearest one of the others, that lie in its free space."""
-    agreeing, contradicting = compared(some, others) + compared(others, some)
-    return float(contradicting / max(agreeing + contradicting, 1))
-
-
 def compared(
     viewers: Sequence[Keyframe], viewed: Sequence[Keyframe], min_path_m: float = 0.0
 ) -> NDArray[np.int64]:
