@@ -24,7 +24,8 @@ from scipy.optimize import minimize
 from scanchain import lie
 from scanchain.data import Keyframe, Matrix, Pose
 from scanchain.loops import LoopCloser, evidence
-from scanchain.loops.planar_map_search import PlanarMapSearch, WholeSearch
+from scanchain.loops.place_search import completed
+from scanchain.loops.planar_map_search import PlanarMapSearch
 from scanchain.maps import SavedMap, open_saved_map
 from scanchain.settings import load_settings
 from tests.benchmarks.harness import command_line, poses_at, table, true_in_map
@@ -89,10 +90,7 @@ def wrong(guest: SavedMap, host: SavedMap, found: list[bool]) -> Iterator[tuple[
         members, middle = guest.keyframes[first:end], guest.keyframes[(first + end) // 2]
         T_middle_odom = lie.inverse(middle.T_odom_lidar)
         points = np.vstack([lie.transform(T_middle_odom @ each.T_odom_lidar, each.points) for each in members])
-        sought = WholeSearch(search, points, LEAST)
-        while not sought.is_done:
-            sought.advance()
-        best = sought.best()
+        best = completed(search.sought(points, LEAST))
         found.append(best is not None and best.is_certain and not best.is_ambiguous)
         if best is None:
             continue

@@ -148,8 +148,8 @@ def test_the_verdict_names_what_speaks_for_the_place(office, monkeypatch):
             "--initial is '1,2'; give x,y,yaw in meters and degrees, or a file .tum",
         ),
         (["--out", "OUT", "--loops.enabled=false"], "a place in a map is found by loop closures; leave it true"),
-        (["--out", "MAP", "--force"], "is the map; choose another --out"),
-        (["--out", "MAP/map", "--force"], "is the map; choose another --out"),
+        (["--out", "MAP", "--force"], "is one of the maps; choose another --out"),
+        (["--out", "MAP/map", "--force"], "is one of the maps; choose another --out"),
     ],
 )
 def test_what_cannot_be_localized_is_refused_and_leaves_the_map_as_it_was(office, tmp_path, call, words, message):

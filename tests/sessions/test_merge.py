@@ -14,7 +14,7 @@ from scanchain.data import Closure, ClosureVerdict, Keyframe, Trajectory
 from scanchain.errors import InputError, ScanchainError
 from scanchain.evaluation import absolute_error, pair
 from scanchain.graph.pose_graph import PoseGraph
-from scanchain.loops.planar_map_search import WholeSearch
+from scanchain.loops.planar_map_search import PlanarMapSearch
 from scanchain.loops.verification import Verifier
 from scanchain.maps import Edges, SavedPoints, open_saved_map, read_ply
 from scanchain.odometry.tracked import first_match
@@ -172,7 +172,7 @@ def test_maps_that_cannot_be_merged_are_refused_before_the_search(runs, merged, 
     ):
         with pytest.raises(InputError, match=message):
             quietly(*runs_, out=out, **options)
-    with pytest.raises(InputError, match="is one of the runs"):
+    with pytest.raises(InputError, match="is one of the maps"):
         sc.merge((noon, folder / "morning"), noon, force=True)
     assert not out.exists()
 
@@ -326,11 +326,11 @@ def test_merging_searches_and_aligns_no_more_than_runs_do(runs, tmp_path, monkey
         span = {"log__start_s": k * quarter_s, "log__end_s": (k + 1) * quarter_s}
         made.run("office", tmp_path, seed=2, **span).rename(part)
     work: Counter[str] = Counter()
-    for owner, name in ((WholeSearch, "__init__"), (Verifier, "scan"), (PoseGraph, "optimize")):
+    for owner, name in ((PlanarMapSearch, "sought"), (Verifier, "scan"), (PoseGraph, "optimize")):
         monkeypatch.setattr(owner, name, _counted(getattr(owner, name), owner.__name__, work))
     merged = quietly(*parts, folder / "stranger", out=tmp_path / "out")
     assert merged.metrics.apart == (("stranger",),)
-    assert work["WholeSearch"] < merged.metrics.keyframes / 4
+    assert work["PlanarMapSearch"] < merged.metrics.keyframes / 4
     assert work["Verifier"] < merged.metrics.keyframes
     assert work["PoseGraph"] < merged.metrics.keyframes / 5
 

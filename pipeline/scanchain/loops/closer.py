@@ -52,11 +52,9 @@ class LoopCloser:
         self.segments = Segments()
         submaps = VoxelSubmaps(dimension, _SUBMAP_KEYFRAMES, config.local_map, self.segments)
         verifier = Verifier(config)
-        within_drift, finder = None, UprightFinder(config)
-        if dimension == 2:
-            finder = PlanarFinder(submaps, verifier)
-            within_drift = PlanarSearch(finder)
-        self.near = ProximityCloser(config.loops, submaps, verifier, within_drift)
+        planar = PlanarFinder(submaps, verifier) if dimension == 2 else None
+        finder = planar or UprightFinder(config)
+        self.near = ProximityCloser(config.loops, submaps, verifier, planar)
         self.search: PlaceSearch[Any] = PlaceSearch(finder, config.loops, self.segments)
         self.places = PlaceCloser(config, dimension, submaps, verifier)
 
@@ -73,7 +71,7 @@ class LoopCloser:
             self.near.submaps.begin_in(keyframes)
         if self.config.loops.enabled:
             self.search.begin_in(keyframes, folder)
-        return self.places.begin_in(keyframes, are_added=self.near.search is not None)
+        return self.places.begin_in(keyframes, are_added=self.near.finder is not None)
 
     @property
     def alike_share(self) -> float:
@@ -127,12 +125,14 @@ class ProximityCloser:
     """Aligns each new keyframe to the nearest older one; in the plane, searches within the drift if that fails."""
 
     def __init__(
-        self, config: LoopsConfig, submaps: VoxelSubmaps, verifier: Verifier, search: PlanarSearch | None
+        self, config: LoopsConfig, submaps: VoxelSubmaps, verifier: Verifier, finder: PlanarFinder | None
     ) -> None:
+        """Begin without keyframes; ``finder`` aligns what is found within the drift, None in space."""
         self.config = config
         self.submaps = submaps
         self.verifier = verifier
-        self.search = search
+        self.finder = finder
+        self.next_m = 0.0  # path up to which there is no other search within the drift
         self.drift = Drift(config.drift)
         self.of_map = 0  # number of the first keyframes that belong to a map
         self.target = -1  # anchor of the last submap that was matched, -1 where that failed
@@ -157,7 +157,7 @@ class ProximityCloser:
             if not len(near):
                 return ()
         target = self.submaps.anchor_of(int(near[np.argmin(_distances_m(T_world, near))]))
-        if self.search is None and target < self.of_map:
+        if self.finder is None and target < self.of_map:
             kept = self.target_in_map
             if kept in near and _distances_m(T_world, kept) <= _KEPT_M * keyframes[kept].scale:
                 target = kept
@@ -167,13 +167,47 @@ class ProximityCloser:
         verified = self.verifier.scan(keyframes[newest], submap, T_first, in_map=target < self.of_map)
         closure = verified.closure(target, newest)
         self.target = target if closure.verdict is ClosureVerdict.ACCEPTED else -1
-        if closure.verdict is ClosureVerdict.ACCEPTED or self.search is None:
+        if closure.verdict is ClosureVerdict.ACCEPTED or self.finder is None:
             return (closure,)
-        if self.submaps.segments.is_assumed or not self.search.is_due(keyframes):
+        if self.submaps.segments.is_assumed or keyframes[newest].traveled_m < self.next_m:
             return (closure,)
         if uncertainty_m is None:
             near, uncertainty_m = self._near(graph, old, connected)
-        return closure, *self.search.close(keyframes, T_world, near, float(uncertainty_m[near].max()), old)
+        radius_m = float(uncertainty_m[near].max())
+        found = self._within_drift(self.finder, keyframes, T_world, near, radius_m, old)
+        return (closure,) if found is None else (closure, found)
+
+    def _within_drift(
+        self,
+        finder: PlanarFinder,
+        keyframes: Sequence[Keyframe],
+        T_world: Matrix,
+        near: NDArray[np.int64],
+        radius_m: float,
+        old: int,
+    ) -> Closure | None:
+        """The closure of the newest keyframe by a correlative search over all poses that the drift allows.
+
+        None where it fits nowhere in older keyframes together, or in two places.
+        near : keyframes within reach; radius_m : uncertainty of the position relative to them; old : number of
+            the keyframes that submaps may have
+        """
+        if radius_m <= _BASIN_M:
+            return None
+        newest, submaps = keyframes[-1], self.submaps
+        self.next_m = newest.traveled_m + _INTERVAL * radius_m
+        size_m = submaps.config.voxel_size_m * newest.scale
+        placed = {k: replace(keyframes[k], T_odom_lidar=T_world[k]) for k in near.tolist()}
+        surfaces = seen_together(list(placed.values()), lie.identity(2))
+        grid = SearchGrid.of_points(downsample(surfaces, size_m), size_m)
+        points = seen_together(keyframes[-submaps.half_width :], lie.inverse(newest.T_odom_lidar))
+        window = Window(T_world[-1], radius_m, _MIN_RAD + _RADIANS_A_METER * radius_m)
+        found = find(thinned(points, size_m), grid, window, _WANTED)
+        if len(found) != 1:
+            return None
+        anchors = {submaps.anchor_of(k): None for k in placed}
+        on_map = [replace(keyframes[k], T_odom_lidar=T_world[k]) for k in anchors]
+        return finder.aligned(newest, found[0].T_target_source, on_map, keyframes[:old])
 
     def _near(
         self, graph: PoseGraph, old: int, connected: NDArray[np.bool_]
@@ -211,45 +245,6 @@ class ProximityCloser:
         while old > 0 and keyframes[old - 1].traveled_m > limit_m:
             old -= 1
         return old
-
-
-class PlanarSearch:
-    """Correlative search over all poses that the uncertainty of the graph allows, in older keyframes together."""
-
-    def __init__(self, finder: PlanarFinder) -> None:
-        """Finder : which aligns a scan where it was found."""
-        self.finder = finder
-        self.next_m = 0.0
-
-    def is_due(self, keyframes: Sequence[Keyframe]) -> bool:
-        """True if the lidar has traveled far enough since the last search."""
-        return keyframes[-1].traveled_m >= self.next_m
-
-    def close(
-        self, keyframes: Sequence[Keyframe], T_world: Matrix, near: NDArray[np.int64], radius_m: float, old: int
-    ) -> tuple[Closure, ...]:
-        """The closure of the newest keyframe where it fits best; none where it fits nowhere, or two places.
-
-        near : keyframes within reach; radius_m : uncertainty of the position relative to them; old : number of
-            the keyframes that submaps may have
-        """
-        if radius_m <= _BASIN_M:
-            return ()
-        newest, submaps = keyframes[-1], self.finder.submaps
-        self.next_m = newest.traveled_m + _INTERVAL * radius_m
-        size_m = submaps.config.voxel_size_m * newest.scale
-        placed = {k: replace(keyframes[k], T_odom_lidar=T_world[k]) for k in near.tolist()}
-        surfaces = seen_together(list(placed.values()), lie.identity(2))
-        grid = SearchGrid.of_points(downsample(surfaces, size_m), size_m)
-        points = seen_together(keyframes[-submaps.half_width :], lie.inverse(newest.T_odom_lidar))
-        window = Window(T_world[-1], radius_m, _MIN_RAD + _RADIANS_A_METER * radius_m)
-        found = find(thinned(points, size_m), grid, window, _WANTED)
-        if len(found) != 1:
-            return ()
-        anchors = {submaps.anchor_of(k): None for k in placed}
-        on_map = [replace(keyframes[k], T_odom_lidar=T_world[k]) for k in anchors]
-        closure = self.finder.aligned(newest, found[0].T_target_source, on_map, keyframes[:old])
-        return () if closure is None else (closure,)
 
 
 def on_first_pass(T_world: Matrix, chosen: NDArray[np.bool_], reach_m: float) -> int:

@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from scanchain import lie
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Pose, Proposal
@@ -35,12 +34,6 @@ _IN_SIGHT_OF_BOTH = 0.2  # share of the points in view of the other side, from w
 _LATEST = 10  # number of the last keyframes that counted, from which the next one may not be independent
 _INDEPENDENT_M = {2: 1.0, 3: 3.0}  # path from which on two keyframes are independent, at full scale
 _AGREE_M, _AGREE_RAD = 1.0, 0.1  # largest difference between the poses that two closures imply
-
-
-def contradiction(some: Sequence[Keyframe], others: Sequence[Keyframe]) -> float:
-    """Share, of the points of keyframes in view of the nearest one of the others, that lie in its free space."""
-    agreeing, contradicting = compared(some, others) + compared(others, some)
-    return float(contradicting / max(agreeing + contradicting, 1))
 
 
 def compared(
@@ -70,16 +63,12 @@ def compared(
     return counts
 
 
-def are_in_sight(keyframes: Sequence[Keyframe], others: Sequence[Keyframe]) -> NDArray[np.bool_]:
-    """True for keyframes (N,) that show what the nearest one of the others shows, or what it sees through."""
-    pairs = zip(nearest(keyframes, others), keyframes, strict=True)
-    return np.array([compared([a], [b]).sum() >= _IN_SIGHT * max(len(b.points), 1) for a, b in pairs], np.bool_)
-
-
-def nearest(keyframes: Sequence[Keyframe], others: Sequence[Keyframe]) -> list[Keyframe]:
-    """Of each of some keyframes, the nearest one of the others."""
-    positions, targets = (np.array([each.T_odom_lidar[:-1, -1] for each in part]) for part in (others, keyframes))
-    return [others[index] for index in np.atleast_1d(KDTree(positions).query(targets)[1]).tolist()]
+def is_in_sight(keyframe: Keyframe, others: Sequence[Keyframe]) -> bool:
+    """True if a keyframe shows what the nearest one of the others shows, or what it sees through."""
+    positions = np.array([each.T_odom_lidar[:-1, -1] for each in others])
+    away_m = np.linalg.norm(positions - keyframe.T_odom_lidar[:-1, -1], axis=1)
+    seen = compared([others[int(away_m.argmin())]], [keyframe]).sum()
+    return bool(seen >= _IN_SIGHT * max(len(keyframe.points), 1))
 
 
 class PlaceTest:

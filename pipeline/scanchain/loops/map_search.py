@@ -17,7 +17,7 @@ from scanchain.config import Config, LocalMapConfig
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Points, Pose, Problem, Proposal
 from scanchain.errors import InputError
 from scanchain.files import write_whole
-from scanchain.loops.place_search import Underway
+from scanchain.loops.place_search import Underway, completed, searched
 from scanchain.loops.submaps import Submap, level_frame, seen_together, upright_frame
 from scanchain.loops.verification import Verifier
 from scanchain.maps.saved_map import read_arrays
@@ -102,12 +102,8 @@ class UprightMap:
 
     def is_repeated(self, members: Sequence[Keyframe]) -> bool:
         """True if what some keyframes show is in several places of the map."""
-        search = self.found(members)
-        while True:
-            try:
-                next(search)
-            except StopIteration as over:
-                return over.value is not None and over.value.cause == _ALIKE.cause
+        closure = completed(self.found(members))
+        return closure is not None and closure.cause == _ALIKE.cause
 
     def seeds(self, points: Points) -> Generator[None, None, Sequence[Found]]:
         """The best poses (3, 3) of points in the level frame of the map, sought coarsely, then refined."""
@@ -119,14 +115,10 @@ class UprightMap:
             self.grid = self._drawn()
         coarse_m = self.grid.resolution_m
         wanted = Wanted(_APART * coarse_m, _RIVAL, _COARSE_SEEDS, _MIN_SHARE)
-        search = Search(evenly(columns, _COARSE_COLUMNS), self.grid, None, wanted)
-        search.advance()
-        while not search.is_done:
-            yield
-            search.advance()
+        poses = yield from searched(Search(evenly(columns, _COARSE_COLUMNS), self.grid, None, wanted))
         reach_m = 2.0 * _RADIUS * self.radius_m + coarse_m
         seeds: list[Found] = []
-        for coarse in search.poses():
+        for coarse in poses:
             surfaces = self.columns[np.abs(self.columns - coarse.T_target_source[:2, 2]).max(axis=1) < reach_m]
             around = Window(coarse.T_target_source, coarse_m, _REFINED_RAD)
             seeds += find(columns, SearchGrid.of_points(surfaces, self.size_m), around, wanted._replace(answers=1))

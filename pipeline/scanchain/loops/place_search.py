@@ -17,6 +17,7 @@ from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Problem
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
 from scanchain.loops.evidence import pose_by
+from scanchain.registration.search import Found, Search
 
 _BACKOFF = 0.2  # path between two searches, as a share of what was searched in vain
 _MATCH_M = 3.5  # path between two matches with a map that a log is followed in, at full scale
@@ -24,6 +25,7 @@ _TRACKED_M = 20.0  # path since the last match with the map, up to which it is n
 _DRIFT = 0.1  # largest distance from the prediction, as a share of the path since the last match
 
 Map = TypeVar("Map")  # older keyframes as a search needs them
+Result = TypeVar("Result")
 Underway = Generator[None, None, Sequence[Closure]]
 
 
@@ -173,3 +175,21 @@ class PlaceSearch(Generic[Map]):
             return closure
         limit = f"from the prediction, more than {100.0 * _DRIFT:g} % of the path between"
         return closure.rejected(Problem(f"far {limit}", f"{moved_m:.1f} m {limit}"))
+
+
+def searched(search: Search) -> Generator[None, None, Sequence[Found]]:
+    """The poses that a search finds, in slices of equal work, one a scan."""
+    search.advance()
+    while not search.is_done:
+        yield
+        search.advance()
+    return search.poses()
+
+
+def completed(underway: Generator[None, None, Result]) -> Result:
+    """The result of a search that no scan waits for."""
+    while True:
+        try:
+            next(underway)
+        except StopIteration as over:
+            return over.value

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,12 +15,13 @@ from scanchain.config import MapsConfig
 from scanchain.data import Closure, Keyframe, Points, Pose, Problem, Proposal
 from scanchain.kernels.search import FREE, NEAR, UNKNOWN
 from scanchain.loops.evidence import rank_of
-from scanchain.loops.place_search import Underway
+from scanchain.loops.place_search import Underway, completed, searched
 from scanchain.loops.submaps import VoxelSubmaps, seen_together
 from scanchain.loops.verification import Verifier
 from scanchain.maps.occupancy_grid import OccupancyGrid, fitting_resolution
 from scanchain.preprocess import downsample
-from scanchain.registration import SearchGrid, Wanted, search
+from scanchain.registration import SearchGrid, Wanted
+from scanchain.registration.search import Search, draw_surfaces
 
 _MAX_CELLS = 16_000_000  # of the grid: a hundred megabytes with its pyramid; larger maps get larger cells
 _CERTAIN = 0.6  # log-odds of occupancy, from which on a cell is a surface, and below minus which it is free
@@ -91,54 +92,31 @@ class PlanarMapSearch:
         grid = grid.trimmed()
         log_odds = np.pad(grid.log_odds, 1)
         cells = np.where(log_odds < -_CERTAIN, FREE, UNKNOWN).astype(np.int8)
-        search.draw_surfaces(cells, *np.nonzero(log_odds > _CERTAIN))
+        draw_surfaces(cells, *np.nonzero(log_odds > _CERTAIN))
         room = (cells == FREE) | (cells == NEAR)
         self.grid = SearchGrid(cells, grid.origin_m - self.resolution_m, self.resolution_m, room)
 
-    def best(self, points: Points, least: float) -> Hypothesis | None:
-        """The pose that the points (N, 2), lidar frame, fit best; None where none has the least share."""
-        search = WholeSearch(self, points, least)
-        while not search.is_done:
-            search.advance()
-        return search.best()
+    def sought(self, points: Points, least: float = LEAST_SHARE) -> Generator[None, None, Hypothesis | None]:
+        """The pose that the points (N, 2), lidar frame, fit best; None where none has the least share.
 
-    def likely(self, path: Sequence[Keyframe]) -> Hypothesis | None:
-        """The pose of the middle keyframe of a path that its points fit best; None where they fit none."""
-        T_middle_odom = lie.inverse(path[len(path) // 2].T_odom_lidar)
-        best = self.best(seen_together(path, T_middle_odom), LEAST_SHARE)
-        return best if best is not None and best.is_likely else None
-
-
-class WholeSearch:
-    """Search of a whole map for points, in slices of equal work; what it finds is compared with more points."""
-
-    def __init__(self, target: PlanarMapSearch, points: Points, least: float) -> None:
-        """Begin to search for points (N, 2), lidar frame; least : share of the highest score that counts."""
-        points = np.random.default_rng(0).permutation(downsample(points, target.resolution_m))
-        self.count = len(points)
-        self.points = points[:_MORE_POINTS].copy()
-        self.search = search.Search(points[:_POINTS], target.grid, None, Wanted(_APART_M, _RIVAL, _ANSWERS, least))
-
-    @property
-    def is_done(self) -> bool:
-        """True once all poses were searched."""
-        return self.search.is_done
-
-    def advance(self) -> None:
-        """Search on."""
-        self.search.advance()
-
-    def best(self) -> Hypothesis | None:
-        """The pose that the points fit best; None where none has the least share."""
-        step_rad = 0.5 * self.search.turn_rad
-        found = [
-            self.search.grid.climbed(self.points, each.T_target_source, step_rad) for each in self.search.poses()
-        ]
+        Poses are searched with some of the points, in slices of equal work; those found are compared with more.
+        """
+        points = np.random.default_rng(0).permutation(downsample(points, self.resolution_m))
+        search = Search(points[:_POINTS], self.grid, None, Wanted(_APART_M, _RIVAL, _ANSWERS, least))
+        more, step_rad = points[:_MORE_POINTS].copy(), 0.5 * search.turn_rad
+        poses = yield from searched(search)
+        found = [self.grid.climbed(more, each.T_target_source, step_rad) for each in poses]
         if not found:
             return None
         best = max(found, key=lambda each: each.share)
         apart = (each.share for each in found if _are_apart(each.T_target_source, best.T_target_source))
-        return Hypothesis(best.T_target_source, best.share, max(apart, default=0.0), self.count)
+        return Hypothesis(best.T_target_source, best.share, max(apart, default=0.0), len(points))
+
+    def likely(self, path: Sequence[Keyframe]) -> Hypothesis | None:
+        """The pose of the middle keyframe of a path that its points fit best; None where they fit none."""
+        T_middle_odom = lie.inverse(path[len(path) // 2].T_odom_lidar)
+        best = completed(self.sought(seen_together(path, T_middle_odom)))
+        return best if best is not None and best.is_likely else None
 
 
 class PlanarFinder:
@@ -164,12 +142,8 @@ class PlanarFinder:
         """Closures of keyframes of the path with older ones; see ``Finder``."""
         path = keyframes[_path_begin(keyframes, start) :]
         T_newest_odom = lie.inverse(path[-1].T_odom_lidar)
-        search = WholeSearch(target, seen_together(path, T_newest_odom), LEAST_SHARE)
-        search.advance()
-        while not search.is_done:
-            yield
-            search.advance()
-        best, newest_m = search.best(), path[-1].traveled_m
+        best = yield from target.sought(seen_together(path, T_newest_odom))
+        newest_m = path[-1].traveled_m
         self.searches += 1
         if best is not None and best.is_likely and best.is_ambiguous:
             self.ambiguous_m = newest_m

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -26,7 +27,7 @@ from scanchain.data import (
     State,
 )
 from scanchain.errors import InputError, counted
-from scanchain.maps import Edges, SavedMap
+from scanchain.maps import Edges, SavedMap, open_saved_map
 from scanchain.odometry.front_end import Located
 from scanchain.odometry.tracked import Tracked, first_match
 from scanchain.slam import Slam
@@ -56,6 +57,25 @@ class Alignment:
     def accepted(self) -> tuple[Closure, ...]:
         """The closures that were accepted."""
         return tuple(each for each in self.closures if each.verdict is ClosureVerdict.ACCEPTED)
+
+
+def opened_maps(runs: Sequence[Path], out: Path) -> list[SavedMap]:
+    """The maps of run directories, or in folders, of one kind; none of them is the directory to be written.
+
+    Raises InputError for a map that cannot be read, or has no keyframe.
+    """
+    maps = [open_saved_map(run) for run in runs]
+    for run, saved in zip(runs, maps, strict=True):
+        if saved.dimension != maps[0].dimension:
+            raise InputError(
+                f"{run}: is a {saved.dimension}D map, {runs[0]} a {maps[0].dimension}D one; give maps of the same "
+                "kind"
+            )
+        if not saved.keyframes:
+            raise InputError(f"{run}: its map has no keyframe; give another one")
+        if out.resolve() in (run.resolve(), saved.folder.resolve()):
+            raise InputError(f"{out}: is one of the maps; choose another --out")
+    return maps
 
 
 def align_maps(target: SavedMap, source: SavedMap, config: Config) -> Alignment:

@@ -16,10 +16,10 @@ from scanchain import checks, lie
 from scanchain.config import Config
 from scanchain.data import Pose
 from scanchain.errors import InputError, counted
-from scanchain.maps import SavedMap, open_saved_map, write_ply
+from scanchain.maps import SavedMap, write_ply
 from scanchain.runs.directory import RUN_FILE, RunDirectory
 from scanchain.runs.provenance import describe_start
-from scanchain.sessions.alignment import align_maps
+from scanchain.sessions.alignment import align_maps, opened_maps
 from scanchain.sessions.changes import Changes, Cluster, Label, Part, changes_between
 from scanchain.settings import load_settings
 
@@ -54,12 +54,7 @@ def compare_maps(
     voxel_size_m, min_size_m : as in ``changes_between``
     Raises InputError for bad input, and where the maps are not of one place.
     """
-    maps = [open_saved_map(run) for run in runs]
-    for run, saved in zip(runs, maps, strict=True):
-        if not saved.keyframes:
-            raise InputError(f"{run}: its map has no keyframe; give another one")
-        if out.resolve() in (run.resolve(), saved.folder.resolve()):
-            raise InputError(f"{out}: is one of the maps; choose another --out")
+    maps = opened_maps(runs, out)
     config = load_settings(maps[0].dimension).config
     with RunDirectory(out, force=force) as directory:
         if len(maps) == 1:
@@ -95,11 +90,6 @@ def _in_one_frame(
 ) -> tuple[Part, Part, str]:
     """Both maps in the frame of the first, and how the second came into it, in words."""
     first, second = maps
-    if second.dimension != first.dimension:
-        raise InputError(
-            f"{runs[1]}: is a {second.dimension}D map, {runs[0]} a {first.dimension}D one; "
-            "give maps of the same kind"
-        )
     names = (first.name, second.name) if first.name != second.name else (str(runs[0]), str(runs[1]))
     if T is None:
         say(f"placing {names[1]} in {names[0]}")

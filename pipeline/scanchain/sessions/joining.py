@@ -18,7 +18,7 @@ from scanchain.data import Closure, Keyframe, Matrix, Pose
 from scanchain.errors import counted
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
-from scanchain.loops.evidence import PlaceTest, compared, contradiction
+from scanchain.loops.evidence import PlaceTest, compared
 from scanchain.loops.map_search import MEMBERS, UprightMap
 from scanchain.loops.planar_map_search import PlanarMapSearch
 from scanchain.maps import Edges, SavedMap
@@ -257,7 +257,8 @@ def changed(joined: Joined) -> dict[int, float]:
     found: dict[int, float] = {}
     for number in joined.maps[1:]:
         others = [k for other, part in parts.items() if other != number for k in part]
-        share = contradiction(others, parts[number])
+        agreeing, contradicting = compared(others, parts[number]) + compared(parts[number], others)
+        share = float(contradicting / max(agreeing + contradicting, 1))
         if share > least:
             found[number] = share
     return found

@@ -21,13 +21,14 @@ from scanchain.data import ClosureVerdict, Pose, brief
 from scanchain.errors import InputError, counted
 from scanchain.files import write_whole
 from scanchain.logs import Log
-from scanchain.maps import SavedMap, open_saved_map
+from scanchain.maps import SavedMap
 from scanchain.runs.directory import POINTS_FILE, RUN_FILE, RunDirectory
 from scanchain.runs.job import Job, Progress
 from scanchain.runs.metrics import GroundTruth, accuracy_lines
 from scanchain.runs.provenance import Hashing, describe_start
 from scanchain.runs.run import accuracy_of, opened, true_poses
 from scanchain.runs.step_table import pose_columns
+from scanchain.sessions.alignment import opened_maps
 from scanchain.sessions.joining import MAX_REPEATED, repeated_paths
 from scanchain.sessions.localizer import Localization, Localizer, MapState
 from scanchain.settings import dump
@@ -137,9 +138,7 @@ def localize(
     Raises InputError for a log or a map that cannot be read.
     """
     started = working_s()
-    prior = open_saved_map(map_path)
-    if job.out.resolve() in (map_path.resolve(), prior.folder.resolve()):
-        raise InputError(f"{job.out}: is the map; choose another --out")
+    (prior,) = opened_maps([map_path], job.out)
     log, settings, truth_file = opened(job)
     config = settings.config
     if not config.loops.enabled:

@@ -14,7 +14,7 @@ from scanchain import checks, lie
 from scanchain.config import Config
 from scanchain.data import AnyPoints, Closure, Keyframe, Matrix, Pose, Scan, State, Step, Trajectory, brief
 from scanchain.evaluation.consistency import edge_errors, with_map_errors
-from scanchain.loops.evidence import are_in_sight
+from scanchain.loops.evidence import is_in_sight
 from scanchain.maps import SavedMap, open_saved_map
 from scanchain.placement import loop_information
 from scanchain.preprocess import Prepared
@@ -220,7 +220,7 @@ class Localizer:
             self.state = MapState.LOCALIZED
         else:
             placed = replace(newest, T_odom_lidar=slam.graph.poses[-1])
-            is_known = are_in_sight([placed], slam.keyframes[: slam.trail.first])[0]
+            is_known = is_in_sight(placed, slam.keyframes[: slam.trail.first])
             self.state = MapState.UNMATCHED if is_known else MapState.OUTSIDE
 
     def _errors(self, information: Matrix, keyframe: int, *, is_loop: bool) -> tuple[Matrix, Matrix]:

@@ -16,11 +16,12 @@ from scanchain.data import REJECTED_WEIGHT, Closure, ClosureVerdict, brief
 from scanchain.errors import InputError, ScanchainError, counted
 from scanchain.files import write_whole
 from scanchain.graph.optimization import fit
-from scanchain.maps import MAP_FOLDER, SavedMap, Session, open_saved_map
+from scanchain.maps import MAP_FOLDER, SavedMap, Session
 from scanchain.runs.directory import RUN_FILE, RunDirectory
 from scanchain.runs.job import Job, Progress
 from scanchain.runs.provenance import Hashing, describe_start
 from scanchain.runs.results import Cloud, cloud_of
+from scanchain.sessions.alignment import opened_maps
 from scanchain.sessions.joining import Doubt, Joined, changed, graph_of, join_all
 from scanchain.sessions.merged_map import MergedMap, final_closures, merged_map, session_names, write_merged
 from scanchain.settings import dump, load_settings
@@ -138,17 +139,9 @@ def _opened(runs: Sequence[Path], out: Path) -> list[SavedMap]:
     """The maps of runs. Raises InputError where they cannot be merged."""
     if len(runs) < 2:
         raise InputError("merge takes two run directories or more; name another one")
-    maps = [open_saved_map(run) for run in runs]
+    maps = opened_maps(runs, out)
     holders: dict[tuple[int, int, int], Path] = {}
     for run, saved in zip(runs, maps, strict=True):
-        if saved.dimension != maps[0].dimension:
-            raise InputError(
-                f"{run}: is a {saved.dimension}D map, {runs[0]} a {maps[0].dimension}D one; merge maps of one kind"
-            )
-        if not saved.keyframes:
-            raise InputError(f"{run}: its map has no keyframe; leave it out")
-        if out.resolve() in (run.resolve(), saved.folder.resolve()):
-            raise InputError(f"{out}: is one of the runs; choose another --out")
         for session in saved.sessions:
             key = (session.first_stamp_ns, session.last_stamp_ns, session.keyframes)
             if key in holders:
