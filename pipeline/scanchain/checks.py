@@ -48,7 +48,9 @@ def dimension_of(value: object, name: str) -> int:
 
 def points(value: object, name: str, d: int, *, dtype: DTypeLike = np.float64) -> NDArray[Any]:
     """Points (N, d), finite; N may be 0."""
-    array = _numbers(value, name, f"an (N, {d}) array of meters{_where(value, name)}", dtype)
+    array: Any = value
+    if not _is_ready(value, dtype):
+        array = _numbers(value, name, f"an (N, {d}) array of meters{_where(value, name)}", dtype)
     if array.ndim != 2 or array.shape[1] != d:
         raise InputError(
             f"{name} has the shape {array.shape}; wanted (N, {d}), one row a point{_remedy(array, name, d)}"
@@ -263,7 +265,9 @@ def writing(path: Path, *, force: bool = True) -> Generator[None]:
 
 def _shaped(array: NDArray[Any], name: str, shape: tuple[int | None, ...], wanted: str) -> NDArray[Any]:
     """The array, which must have this shape; None stands for any size."""
-    if array.ndim == len(shape) and all(size in (n, None) for n, size in zip(array.shape, shape, strict=True)):
+    if array.shape == shape or (
+        array.ndim == len(shape) and all(size in (n, None) for n, size in zip(array.shape, shape, strict=True))
+    ):
         return array
     raise InputError(f"{name} has the shape {array.shape}; wanted {wanted}")
 
