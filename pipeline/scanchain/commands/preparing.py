@@ -168,8 +168,8 @@ _EXPECTED = (0, 1)  # 1: logs this short are not all judged trustworthy
 def warm_up(which: str) -> None:
     """Compile what run, localize, merge and simulate need into the cache, instead of in the first of them.
 
-    For container images and CI: a minute and a half on two cores, seconds where all is compiled. The cache is of this
-    machine's kind of processor; it lies in the folder NUMBA_CACHE_DIR, by default in ~/.cache/scanchain.
+    For container images and CI: a minute and a half on two cores, seconds where all is compiled. The cache is of
+    this machine's kind of processor; it lies in the folder NUMBA_CACHE_DIR, by default in ~/.cache/scanchain.
 
     \b
     Examples:
