@@ -82,6 +82,7 @@ def against_truth(
     truth, estimates = _trajectory(log.true_s, log.true_poses), list[Estimate]()
     try:
         pairs = [pair(_trajectory(nodes_s, each.poses), truth, gap_s=_WIDEST_GAP_S) for each in states]
+        errors = [absolute_error(each, Alignment.RIGID) for each in pairs]
     except InputError:
         why = "no motion capture at these times"
         return (
@@ -89,8 +90,7 @@ def against_truth(
             np.empty((0, 2)),
             surveyed,
         )
-    for state, paired in zip(states, pairs, strict=True):
-        error = absolute_error(paired, Alignment.RIGID)
+    for state, error in zip(states, errors, strict=True):
         T_truth_estimate = lie.flatten(error.T_reference_estimate)
         landmarks_m = _rms(lie.transform(T_truth_estimate, state.landmarks) - surveyed)
         definition = f"{error.definition}, over {error.pairing}"
