@@ -236,14 +236,11 @@ def _order_of_rows(pattern: Pattern, place: NDArray[np.int64]) -> NDArray[np.int
     return rows[np.lexsort((-last, first))]
 
 
-_LARGEST_BORDER = 25_000_000  # largest number of entries of the dense border: 200 MB
-
-
 class SchurMethod:
     """Two stages: S = C − B P⁻¹ Bᵀ of AᵀA = [P, Bᵀ; B, C], dense as it joins every two landmarks, then the rest.
 
-    Poses joined by odometry alone make P banded. Where they are fewer than the landmarks, or B too large to be
-    kept dense, sparse Cholesky of the whole is faster and takes its place.
+    Poses joined by odometry alone make P banded. Where they are fewer than the landmarks, sparse Cholesky of the
+    whole is faster and takes its place.
     """
 
     def __init__(self) -> None:
@@ -252,8 +249,7 @@ class SchurMethod:
     def build(self, system: LinearSystem) -> tuple[Arrow | csc_matrix, NDArray[np.float64]]:
         """AᵀA, as an arrow where that is faster, and Aᵀb."""
         split = system.pattern.layout.split
-        rest = system.pattern.shape[1] - split
-        return normal_equations(system) if rest > split or rest * split > _LARGEST_BORDER else _form(system)
+        return normal_equations(system) if system.pattern.shape[1] > 2 * split else _form(system)
 
     def factorize(self, system: LinearSystem, built: tuple[Arrow | csc_matrix, NDArray[np.float64]]) -> Factored:
         """U with AᵀA = UᵀU."""

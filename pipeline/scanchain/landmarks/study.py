@@ -202,11 +202,10 @@ def _nonlinear(data: LandmarkData, options: Options) -> Study:
             return solver.solve(system)
         return minimize(problem, guess, solver, optimizer=options.optimizer).estimate.state.unknowns
 
-    after = f"after {counted(minimum.iterations, 'step')}: {minimum.reason}"
     facts = {
         "problem": "nonlinear: steps between poses, bearing and range of landmarks; headings known",
         "guess": options.guess,
-        "iteration": f"{options.optimizer} {_ended(minimum)} {after}",
+        "iteration": f"{options.optimizer} {_ended(minimum, minimum.iterations)}",
         "χ²": _chi2(minimum.estimate.cost, system),
         **left_out,
     }
@@ -236,8 +235,9 @@ def _chi2(chi2: float, system: LinearSystem) -> str:
     return f"{chi2:.4f} over {counted(freedom, *FREEDOM)}: {chi2 / freedom:.3f}; {verdict}"
 
 
-def _ended(minimum: Minimum) -> str:
-    return "converged" if minimum.converged else "DID NOT CONVERGE"
+def _ended(minimum: Minimum, iterations: int) -> str:
+    how = "converged" if minimum.converged else "DID NOT CONVERGE"
+    return f"{how} after {counted(iterations, 'step')}: {minimum.reason}"
 
 
 def study_log(folder: Path, options: Options) -> Study:
@@ -278,13 +278,12 @@ def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> dict[s
     )
     own = zip(OWN, solution.minimum.estimate.state.calibration, OWN_UNITS, strict=True)
     found = f"bearing {bearing_rad:.4f} rad, range {range_m:.4f} m (Student's t)"
-    after = f"{_ended(solution.minimum)} after {counted(solution.iterations, 'step')}: {solution.minimum.reason}"
     downweighted = int(np.count_nonzero(solution.minimum.estimate.weights < _DOWNWEIGHTED * solution.loss.share))
     state, sensor = "stated" if is_stated else "estimated", float(np.mean(noise.sensor / noise.sensor_freedom))
     return {
         "observations": seen,
         "left out": left,
-        "estimate": f"{1e3 * solution.time_s:.0f} ms, {after}",
+        "estimate": f"{1e3 * solution.time_s:.0f} ms, {_ended(solution.minimum, solution.iterations)}",
         "robot": "estimated: " + ", ".join(f"{name} {value:+.3f}{unit}" for name, value, unit in own),
         "odometry noise": f"{state}: {wheels}; {_verdict(noise.motion / noise.motion_freedom)}",
         "sensor noise": f"estimated: {found}; {_verdict(sensor)}",
