@@ -20,6 +20,7 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.data import Matrix
+from scanchain.kernels.raycast import BOX, ELLIPSOID
 from scanchain.maps import SavedMap, open_saved_map
 from scanchain.sessions.alignment import align_maps
 from scanchain.sessions.changes import Changes, Part, changes_between
@@ -128,33 +129,25 @@ def _in_world(points: Matrix, drive: Drive, saved: SavedMap) -> Matrix:
 def _on(points: Matrix, solids: Solids, owner: int, margin_m: float) -> np.ndarray:
     """True for points within a margin of the solids of one object."""
     on = np.zeros(len(points), bool)
-    parts = np.split(solids.owner == owner, np.cumsum([len(solids.boxes), len(solids.cylinders)]))
-    for x, y, half_x, half_y, low, high, c, s in solids.boxes[parts[0]]:
+    for kind, x, y, half_x, half_y, c, s, low, high in solids.rows[solids.owner == owner]:
         dx, dy = points[:, 0] - x, points[:, 1] - y
-        inside = (np.abs(c * dx + s * dy) < half_x + margin_m) & (np.abs(-s * dx + c * dy) < half_y + margin_m)
+        if kind == ELLIPSOID:
+            radii = np.array([half_x, half_y, high]) + margin_m
+            on |= ((np.column_stack([dx, dy, points[:, 2] - low]) / radii) ** 2).sum(axis=1) < 1.0
+            continue
+        inside = np.hypot(dx, dy) < half_x + margin_m
+        if kind == BOX:
+            inside = np.abs(c * dx + s * dy) < half_x + margin_m
+            inside &= np.abs(-s * dx + c * dy) < half_y + margin_m
         on |= inside & (points[:, 2] > low - margin_m) & (points[:, 2] < high + margin_m)
-    for x, y, radius, low, high in solids.cylinders[parts[1]]:
-        inside = np.hypot(points[:, 0] - x, points[:, 1] - y) < radius + margin_m
-        on |= inside & (points[:, 2] > low - margin_m) & (points[:, 2] < high + margin_m)
-    for row in solids.ellipsoids[parts[2]]:
-        on |= (((points - row[:3]) / (row[3:] + margin_m)) ** 2).sum(axis=1) < 1.0
     return on
 
 
 def _with_objects(solids: Solids, others: Solids, owners: list[int]) -> Solids:
     """The solids, which no longer count as these objects, and the objects as they stand on another day."""
-    rows, owner = [], []
-    for k, name in enumerate(("boxes", "cylinders", "ellipsoids")):
-        kept = ~np.isin(own := _owner(solids, k), owners)
-        added = np.isin(of_others := _owner(others, k), owners)
-        rows.append(np.vstack([getattr(solids, name), getattr(others, name)[added]]))
-        owner.append(np.concatenate([np.where(kept, own, FIXED), of_others[added]]))
-    return Solids(*rows, ground=solids.ground, owner=np.concatenate(owner))
-
-
-def _owner(solids: Solids, kind: int) -> np.ndarray:
-    ends = np.cumsum([0, len(solids.boxes), len(solids.cylinders), len(solids.ellipsoids)])
-    return solids.owner[ends[kind] : ends[kind + 1]]
+    added, kept = np.isin(others.owner, owners), ~np.isin(solids.owner, owners)
+    owner = np.append(np.where(kept, solids.owner, FIXED), others.owner[added])
+    return Solids(np.vstack([solids.rows, others.rows[added]]), owner, solids.ground)
 
 
 def _rays_by_owner(drive: Drive, saved: SavedMap, solids: Solids) -> np.ndarray:

@@ -60,7 +60,7 @@ def report(name, results):
 
 def linear(options):
     for name in REPORT_S:
-        system = linear_system(read_landmark_data(DATA / "landmarks" / f"{name}.npz"))
+        system = linear_system(read_landmark_data(DATA / "landmarks" / f"{name}.npz").measurements)
         report(name, compare(lambda solver, it=system: solver.solve(it), METHODS, options.repeats))
 
 

@@ -16,10 +16,11 @@ from scipy.spatial.transform import Rotation
 
 from scanchain import lie
 from scanchain.data import Matrix
+from scanchain.kernels.raycast import BOX, CYLINDER
 from scanchain.simulation import SENSORS, Drive, plan, record
 from scanchain.simulation.motion import Motion
 from scanchain.simulation.sensors import Rays, Sensor
-from scanchain.simulation.solids import Solids
+from scanchain.simulation.solids import FIXED, Solids
 from tests.benchmarks.harness import DATA
 from tests.support.scan_information import information, spectrum
 
@@ -198,8 +199,8 @@ def _people(drive: Drive, rng: np.random.Generator) -> Callable[[float], Solids]
         offset = (place + _AROUND_M) % (2.0 * _AROUND_M) - _AROUND_M
         distance_m = np.maximum(np.linalg.norm(offset, axis=1, keepdims=True), 1e-6)
         place = lidar[:2, 3] + offset * np.maximum(1.0, _NEAREST_M / distance_m)
-        heights = np.tile([0.25, base[2, 3] - 0.5, base[2, 3] + 1.75], (_PEOPLE, 1))
-        return replace(drive.solids, cylinders=np.vstack([drive.solids.cylinders, np.hstack([place, heights])]))
+        size = np.tile([0.25, 0.25, 1.0, 0.0, base[2, 3] - 0.5, base[2, 3] + 1.75], (_PEOPLE, 1))
+        return drive.solids.with_object(np.column_stack([np.full(_PEOPLE, CYLINDER), place, size]), FIXED)
 
     return solids
 
@@ -215,8 +216,8 @@ def _traffic(drive: Drive, rng: np.random.Generator) -> Callable[[float], Solids
         ahead = base[:2, 0] / np.linalg.norm(base[:2, 0])
         u = np.where(relative_m_s == 0.0, along, (along + relative_m_s * time_s + 40.0) % 80.0 - 40.0)
         place = base[:2, 3] + u[:, None] * ahead + across[:, None] * np.array([-ahead[1], ahead[0]])
-        size = np.tile([4.0, 1.2, base[2, 3] + 0.3, base[2, 3] + 3.2, *ahead], (len(place), 1))
-        return replace(drive.solids, boxes=np.vstack([drive.solids.boxes, np.hstack([place, size])]))
+        size = np.tile([4.0, 1.2, *ahead, base[2, 3] + 0.3, base[2, 3] + 3.2], (len(place), 1))
+        return drive.solids.with_object(np.column_stack([np.full(len(place), BOX), place, size]), FIXED)
 
     return solids
 

@@ -8,7 +8,7 @@ from scanchain.kernels.landmarks import factors
 from scanchain.landmarks import estimate as guesses
 from scanchain.landmarks.estimate import QUADRATIC, minimize
 from scanchain.landmarks.files import read_landmark_data
-from scanchain.landmarks.problem import BearingRangeProblem, Measurements, Values, no_calibration, world_referenced
+from scanchain.landmarks.problem import BearingRangeProblem, Measurements, Values, no_calibration
 from scanchain.landmarks.solvers import METHODS, create_solver
 from tests.support import naive_landmarks
 from tests.support.naive_landmarks import numeric_jacobian
@@ -91,7 +91,7 @@ def test_the_spread_of_dead_reckoning_is_what_noisy_velocities_do():
 @pytest.fixture(scope="module")
 def nonlinear():
     data = read_landmark_data(shared_data("landmarks/2d_nonlinear.npz"))
-    problem = BearingRangeProblem(world_referenced(data))
+    problem = BearingRangeProblem(data.measurements)
     guess = guesses.from_odometry(problem.measurements)
     return data, problem, guess, minimize(problem, guess, create_solver("cholesky"))
 

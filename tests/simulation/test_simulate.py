@@ -15,11 +15,12 @@ import scanchain
 from scanchain import catalog, lie
 from scanchain.__main__ import main
 from scanchain.errors import InputError
+from scanchain.kernels.raycast import BOX, CYLINDER, ELLIPSOID
 from scanchain.settings import shipped
 from scanchain.simulation import NO_SLIP, SENSORS, WORLDS, Slip, plan, record, simulate
 from scanchain.simulation.motion import wheel_odometry
 from scanchain.simulation.sensors import take_sweep
-from scanchain.simulation.solids import Solids
+from scanchain.simulation.solids import FIXED, Solids
 from scanchain.simulation.worlds.indoor import CORRIDOR_M, CORRIDOR_SIGHT_M, CORRIDOR_STRUCTURE_M
 from scanchain.trajectory import read_tum
 from tests.support import naive_raycast
@@ -59,12 +60,13 @@ def random_solids(rng, ground=SMOOTH):
     bottom = rng.uniform(-3.0, 3.0, 30)
     height = rng.uniform(0.5, 6.0, 30)
     size = rng.uniform(0.1, 6.0, (30, 3))
-    return Solids(
-        boxes=np.column_stack([places, size[:, :2], bottom, bottom + height, np.cos(yaw), np.sin(yaw)]),
-        cylinders=np.column_stack([places[::-1] + 3.0, size[:, 0], bottom, bottom + height]),
-        ellipsoids=np.column_stack([places[:, ::-1], bottom, size]),
-        ground=ground,
+    kind, upright = np.ones((30, 1)), np.tile([1.0, 0.0], (30, 1))
+    groups = (
+        (BOX * kind, places, size[:, :2], np.cos(yaw), np.sin(yaw), bottom, bottom + height),
+        (CYLINDER * kind, places[::-1] + 3.0, size[:, [0, 0]], upright, bottom, bottom + height),
+        (ELLIPSOID * kind, places[:, ::-1], size[:, :2], upright, bottom, size[:, 2]),
     )
+    return Solids(np.vstack([np.column_stack(each) for each in groups]), np.full(90, FIXED), ground)
 
 
 @pytest.mark.parametrize(("seed", "ground"), [(0, SMOOTH), (1, SMOOTH), (4, ROUGH), (5, ROUGH)])
@@ -227,7 +229,7 @@ def test_motion_along_the_middle_of_the_corridor_changes_no_range(sensor):
 @pytest.mark.parametrize("sensor", LIDARS)
 def test_place_and_heading_change_no_range_in_the_field_where_no_pole_is_in_sight(sensor):
     drive, seen = planned("field", sensor), set()
-    poles, sight_m = drive.solids.cylinders[:, :2], WORLDS["field"].sight_m
+    poles, sight_m = drive.solids.rows[:, 1:3], WORLDS["field"].sight_m  # there is nothing else
     for scan in range(0, 400, 20):
         T, (here, *moved) = seen_from(drive, scan, np.eye(6)[[0, 0, 1, 5]] * [[0.0], [0.5], [0.5], [0.1]])
         offsets = (poles - T[:2, 3]) @ T[:2, :2]  # ahead, to the left
@@ -452,9 +454,9 @@ def test_a_simulated_sequence_is_made_once(tmp_path, monkeypatch):
 def test_another_day_changes_movable_objects_alone_keeps_the_path_free_and_is_listed_beside_the_log(tmp_path):
     first, later = (plan("office", seed=3, duration_s=20.0, changed=changed) for changed in (None, 1))
     assert {change.kind for change in later.changes} == {"removed", "moved", "added"}
-    for kept, of_later in zip(first.solids.groups, later.solids.groups, strict=True):
-        assert set(map(tuple, kept)) & set(map(tuple, of_later))
-    fixed = [drive.solids.part(drive.solids.owner < 0).boxes for drive in (first, later)]
+    kept = set(map(tuple, first.solids.rows)) & set(map(tuple, later.solids.rows))
+    assert {row[0] for row in kept} == {BOX, CYLINDER, ELLIPSOID}
+    fixed = [drive.solids.part(drive.solids.owner == FIXED).rows for drive in (first, later)]
     assert np.array_equal(*fixed)
     path = later.motion.base(np.arange(0.0, 20.0, 0.1))[:, :2, 3]
     assert later.solids.clearance_m(path, 2.0).min() > 0.1

@@ -6,8 +6,10 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.data import Matrix, Points, Pose, Scan
+from scanchain.kernels.raycast import BOX, CYLINDER
 from scanchain.preprocess import first_per_voxel
 from scanchain.simulation.drive import plan
+from scanchain.simulation.solids import FIXED
 from scanchain.simulation.worlds.outdoor import town
 
 PLACE_SEED = 3
@@ -109,11 +111,9 @@ def _thinned(T, points: Matrix, moves, voxel_m, dimension):
 
 def _among(solids, boxes, cylinders):
     """Solids and others that move."""
-    return replace(
-        solids,
-        boxes=np.vstack([solids.boxes, np.reshape(boxes, (-1, 8))]),
-        cylinders=np.vstack([solids.cylinders, np.reshape(cylinders, (-1, 5))]),
-    )
+    rows = [(BOX, x, y, half_x, half_y, c, s, low, high) for x, y, half_x, half_y, low, high, c, s in boxes]
+    rows += [(CYLINDER, x, y, radius, radius, 1.0, 0.0, low, high) for x, y, radius, low, high in cylinders]
+    return solids.with_object(np.reshape(rows, (-1, 9)), FIXED)
 
 
 def standing(sensor, count, world="town", seed=2, noise_m=None, people=0, cars=0):

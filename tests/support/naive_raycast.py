@@ -3,30 +3,40 @@
 import numpy as np
 from scipy.optimize import brentq
 
+from scanchain.kernels.raycast import BOX, CYLINDER, ELLIPSOID
+
+
+def _groups(solids):
+    """Boxes, cylinders and ellipsoids: place, size, then heights and turn; of ellipsoids center and radii."""
+    columns = {BOX: [1, 2, 3, 4, 7, 8, 5, 6], CYLINDER: [1, 2, 3, 7, 8], ELLIPSOID: [1, 2, 7, 3, 4, 8]}
+    return [solids.rows[solids.rows[:, 0] == kind][:, chosen] for kind, chosen in columns.items()]
+
 
 def cast(origin, direction, solids, max_range):
     """Range to the first surface of one ray in the world frame, inf beyond reach."""
+    boxes, cylinders, ellipsoids = _groups(solids)
     hits = [np.inf]
-    hits += [_box(origin, direction, box) for box in solids.boxes]
-    hits += [_cylinder(origin, direction, cylinder) for cylinder in solids.cylinders]
-    hits += [_ellipsoid(origin, direction, ellipsoid) for ellipsoid in solids.ellipsoids]
+    hits += [_box(origin, direction, box) for box in boxes]
+    hits += [_cylinder(origin, direction, cylinder) for cylinder in cylinders]
+    hits += [_ellipsoid(origin, direction, ellipsoid) for ellipsoid in ellipsoids]
     hits += [_ground(origin, direction, solids, max_range)]
     return min(hits) if min(hits) < max_range else np.inf
 
 
 def distance_to_surface(points, solids):
     """(N,) distance of each point to the nearest surface; of an ellipsoid and of the ground to first order."""
+    boxes, cylinders, ellipsoids = _groups(solids)
     gradient = solids.ground_slope(points[:, :2])
     gap = np.abs(points[:, 2] - solids.ground_height(points[:, :2]))
     nearest = gap / np.sqrt(1.0 + np.sum(gradient**2, axis=1))
-    for cx, cy, half_x, half_y, bottom, top, c, s in solids.boxes:
+    for cx, cy, half_x, half_y, bottom, top, c, s in boxes:
         x, y = points[:, 0] - cx, points[:, 1] - cy
         q = np.stack([abs(c * x + s * y) - half_x, abs(-s * x + c * y) - half_y, _outside(points, bottom, top)])
         nearest = np.minimum(nearest, _to_surface(q))
-    for cx, cy, radius, bottom, top in solids.cylinders:
+    for cx, cy, radius, bottom, top in cylinders:
         q = np.stack([np.hypot(points[:, 0] - cx, points[:, 1] - cy) - radius, _outside(points, bottom, top)])
         nearest = np.minimum(nearest, _to_surface(q))
-    for ellipsoid in solids.ellipsoids:
+    for ellipsoid in ellipsoids:
         scaled = (points - ellipsoid[:3]) / ellipsoid[3:]
         value = np.sum(scaled**2, axis=1) - 1.0
         slope = np.linalg.norm(2.0 * scaled / ellipsoid[3:], axis=1)

@@ -6,14 +6,14 @@ import numpy as np
 
 from scanchain.kernels.compiling import njit
 
+BOX, CYLINDER, ELLIPSOID = 0.0, 1.0, 2.0
 SECTORS = 720  # sectors of azimuth; a ray tests only the solids that overlap its own
 
 
 @njit(nogil=True)
 def cast_rays(
-    origins, rotations, pose_of_ray, directions, boxes, cylinders, ellipsoids, ground, starts, members, nearest_m,
-    max_range_m, ranges_m,
-):  # fmt: skip
+    origins, rotations, pose_of_ray, directions, solids, ground, starts, members, nearest_m, max_range_m, ranges_m
+):
     """Range to the first hit of every ray; inf where nothing is within reach.
 
     Solids are seen from the outside only: a ray that starts inside one passes through it. Each ray tests the
@@ -22,13 +22,11 @@ def cast_rays(
     origins, rotations : (P, 3) meters and (P, 3, 3), sensor poses in the world, near to each other
     pose_of_ray : (N,) int32, the pose that ray n is fired from
     directions : (N, 3) unit, sensor frame
-    boxes : (B, 8) center x, y, half lengths x, y, bottom, top, cos and sin of the yaw
-    cylinders : (C, 5) center x, y, radius, bottom, top
-    ellipsoids : (E, 6) center x, y, z, radii x, y, z
+    solids : (S, 9) kind; center x, y; half lengths, or radii, x, y; cos and sin of the yaw; bottom and top, or of
+        ellipsoids center z and radius z
     ground : (7 + 4 W,) z = g0 + g1 sin(g2 x + g3) + g4 sin(g5 y + g6) + Σ a sin(b x + c y + d), W rows a, b, c, d
-    starts, members : solids of sector s are ``members[starts[s] : starts[s + 1]]``, near to far, counted through
-        boxes, cylinders, ellipsoids
-    nearest_m : (B + C + E,) horizontal distance within which no ray hits that solid
+    starts, members : solids of sector s are ``members[starts[s] : starts[s + 1]]``, near to far
+    nearest_m : (S,) horizontal distance within which no ray hits that solid
     max_range_m : reach
     ranges_m : (N,) out
     """
@@ -48,21 +46,20 @@ def cast_rays(
         for k in range(starts[sector], starts[sector + 1]):
             if nearest_m[members[k]] > best * horizontal:
                 break
-            best = min(best, hit_solid(ox, oy, oz, dx, dy, dz, members[k], boxes, cylinders, ellipsoids))
+            best = min(best, hit_solid(ox, oy, oz, dx, dy, dz, solids[members[k]]))
         if not steep:
             best = min(best, hit_ground(ox, oy, oz, dx, dy, dz, ground, best))
         ranges_m[n] = best if best < max_range_m else np.inf
 
 
 @njit()
-def hit_solid(ox, oy, oz, dx, dy, dz, solid, boxes, cylinders, ellipsoids):
-    """Distance at which a ray enters the solid of that number, inf if it does not."""
-    if solid < len(boxes):
-        return _hit_box(ox, oy, oz, dx, dy, dz, boxes[solid])
-    solid -= len(boxes)
-    if solid < len(cylinders):
-        return _hit_cylinder(ox, oy, oz, dx, dy, dz, cylinders[solid])
-    return _hit_ellipsoid(ox, oy, oz, dx, dy, dz, ellipsoids[solid - len(cylinders)])
+def hit_solid(ox, oy, oz, dx, dy, dz, solid):
+    """Distance at which a ray enters a solid (9,), inf if it does not."""
+    if solid[0] == BOX:
+        return _hit_box(ox, oy, oz, dx, dy, dz, solid)
+    if solid[0] == CYLINDER:
+        return _hit_cylinder(ox, oy, oz, dx, dy, dz, solid)
+    return _hit_ellipsoid(ox, oy, oz, dx, dy, dz, solid)
 
 
 @njit()
@@ -76,20 +73,20 @@ def _slab(o, d, low, high):
 
 @njit()
 def _hit_box(ox, oy, oz, dx, dy, dz, box):
-    x, y, c, s = ox - box[0], oy - box[1], box[6], box[7]
-    enter_x, leave_x = _slab(c * x + s * y, c * dx + s * dy, -box[2], box[2])
-    enter_y, leave_y = _slab(-s * x + c * y, -s * dx + c * dy, -box[3], box[3])
-    enter_z, leave_z = _slab(oz, dz, box[4], box[5])
+    x, y, c, s = ox - box[1], oy - box[2], box[5], box[6]
+    enter_x, leave_x = _slab(c * x + s * y, c * dx + s * dy, -box[3], box[3])
+    enter_y, leave_y = _slab(-s * x + c * y, -s * dx + c * dy, -box[4], box[4])
+    enter_z, leave_z = _slab(oz, dz, box[7], box[8])
     enter, leave = max(enter_x, enter_y, enter_z), min(leave_x, leave_y, leave_z)
     return enter if 0.0 < enter <= leave else np.inf
 
 
 @njit()
 def _hit_cylinder(ox, oy, oz, dx, dy, dz, cylinder):
-    x, y = ox - cylinder[0], oy - cylinder[1]
+    x, y = ox - cylinder[1], oy - cylinder[2]
     a, b = dx * dx + dy * dy, x * dx + y * dy
-    c = x * x + y * y - cylinder[2] * cylinder[2]
-    enter, leave = _slab(oz, dz, cylinder[3], cylinder[4])
+    c = x * x + y * y - cylinder[3] * cylinder[3]
+    enter, leave = _slab(oz, dz, cylinder[7], cylinder[8])
     if a > 1e-24:
         discriminant = b * b - a * c
         if discriminant < 0.0:
@@ -103,8 +100,8 @@ def _hit_cylinder(ox, oy, oz, dx, dy, dz, cylinder):
 
 @njit()
 def _hit_ellipsoid(ox, oy, oz, dx, dy, dz, e):
-    x, y, z = (ox - e[0]) / e[3], (oy - e[1]) / e[4], (oz - e[2]) / e[5]
-    u, v, w = dx / e[3], dy / e[4], dz / e[5]
+    x, y, z = (ox - e[1]) / e[3], (oy - e[2]) / e[4], (oz - e[7]) / e[8]
+    u, v, w = dx / e[3], dy / e[4], dz / e[8]
     a, b, c = u * u + v * v + w * w, x * u + y * v + z * w, x * x + y * y + z * z - 1.0
     discriminant = b * b - a * c
     if discriminant < 0.0:

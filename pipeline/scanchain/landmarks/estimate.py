@@ -13,7 +13,6 @@ from scanchain.graph.losses import RobustLoss
 from scanchain.graph.minimizer import Descent, LocalModel, Optimizer, descend, step_rule
 from scanchain.landmarks.problem import (
     BearingRangeProblem,
-    LandmarkData,
     Linearization,
     LinearSystem,
     Measurements,
@@ -32,16 +31,15 @@ def from_odometry(measurements: Measurements) -> Values:
         poses = chain(measurements.first_pose, measurements.motion)
     else:
         poses = measurements.first_pose + np.cumsum(np.vstack([np.zeros(2), measurements.motion]), axis=0)
-    return Values(poses, _first_seen(measurements, poses), measurements.calibration.value)
+    return Values(
+        poses, _first_seen(measurements, poses, _relative(measurements, poses)), measurements.calibration.value
+    )
 
 
-def of_relative_positions(data: LandmarkData) -> Values:
+def of_relative_positions(measurements: Measurements) -> Values:
     """The same for a linear problem."""
-    poses = np.cumsum(np.vstack([np.zeros(2), data.odometry]), axis=0)
-    _, first = np.unique(data.observed[:, 1], return_index=True)
-    landmarks = np.full(data.true_landmarks.shape, np.nan)
-    landmarks[data.observed[first, 1]] = poses[data.observed[first, 0]] + data.measured[first]
-    return Values(poses, landmarks)
+    poses = np.cumsum(np.vstack([np.zeros(2), measurements.motion]), axis=0)
+    return Values(poses, _first_seen(measurements, poses, measurements.measured))
 
 
 def disturbed(state: Values, shift_m: float, turn_rad: float) -> Values:
@@ -62,13 +60,13 @@ def growing(measurements: Measurements, solver: LinearSolver) -> Values:
     count = len(measurements.motion) + 1
     poses, landmarks = measurements.first_pose[None], np.full((len(measurements.landmarks), 2), np.nan)
     calibration, reach = measurements.calibration, _FIRST
-    own = calibration.mean
+    own = np.zeros_like(calibration.sigma)
     while True:
         reach = min(reach, count)
         motion = measurements.motion + calibration.slope @ (own - calibration.value)  # to first order
         poses = np.vstack([poses, chain(poses[-1], motion[len(poses) - 1 : reach - 1])[1:]])
         part, known = _beginning(measurements, reach)
-        guess = _first_seen(part, poses)
+        guess = _first_seen(part, poses, _relative(part, poses))
         settled = np.isfinite(landmarks[known, 0])
         guess[settled] = landmarks[known[settled]]
         state = minimize(
@@ -96,13 +94,17 @@ def _beginning(measurements: Measurements, poses: int) -> tuple[Measurements, ND
     return part, known
 
 
-def _first_seen(measurements: Measurements, poses: Matrix) -> Matrix:
-    """Position (L, 2) of every landmark by its first observation."""
+def _first_seen(measurements: Measurements, poses: Matrix, relative: Matrix) -> Matrix:
+    """Position (L, 2) of every landmark by the first of its observations, positions (N, 2) from their poses."""
     _, first = np.unique(measurements.observed[:, 1], return_index=True)
-    pose = poses[measurements.observed[first, 0]]
-    bearing, reach = measurements.measured[first].T
-    direction = bearing + (pose[:, 2] if poses.shape[1] == 3 else 0.0)
-    return pose[:, :2] + reach[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
+    return poses[measurements.observed[first, 0], :2] + relative[first]
+
+
+def _relative(measurements: Measurements, poses: Matrix) -> Matrix:
+    """Positions (N, 2) of the landmarks, from the poses that saw them and in the world's axes."""
+    bearing, reach = measurements.measured.T
+    direction = bearing + (poses[measurements.observed[:, 0], 2] if poses.shape[1] == 3 else 0.0)
+    return reach[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
 
 
 def chain(start: NDArray[np.float64], motion: Matrix) -> Matrix:

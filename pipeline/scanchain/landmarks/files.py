@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from scanchain.data import Matrix
 from scanchain.errors import InputError, counted
-from scanchain.landmarks.problem import Kind, LandmarkData
+from scanchain.landmarks.problem import FIRST_SHARE, Kind, LandmarkData, Measurements, no_calibration
 
 _SHAPES = {
     "gt_traj": "(poses, 2)",
@@ -48,17 +48,20 @@ def read_landmark_data(path: Path) -> LandmarkData:
             f"{unseen[0]}; add observations of them, or leave them out and number the others on"
         )
     reckoned = np.cumsum(np.vstack([np.zeros(2), odometry]), axis=0)
-    return LandmarkData(
-        name=path.stem,
-        kind=_kind(path, poses if len(poses) else reckoned, landmarks, observed, table[:, 2:]),
-        odometry=odometry,
+    kind = _kind(path, poses if len(poses) else reckoned, landmarks, observed, table[:, 2:])
+    covariance = _covariance(path, "sigma_odom", arrays)
+    measurements = Measurements(
+        first_pose=np.zeros(2),
+        first_covariance=FIRST_SHARE**2 * covariance,
+        motion=odometry,
+        motion_covariance=np.broadcast_to(covariance, (len(odometry), 2, 2)),
+        calibration=no_calibration(odometry),
         observed=observed,
         measured=np.ascontiguousarray(table[:, 2:]),
-        odometry_covariance=_covariance(path, "sigma_odom", arrays),
-        observation_covariance=_covariance(path, "sigma_landmark", arrays),
-        true_poses=poses,
-        true_landmarks=landmarks,
+        measured_covariance=_covariance(path, "sigma_landmark", arrays),
+        landmarks=np.arange(len(landmarks)),
     )
+    return LandmarkData(path.stem, kind, measurements, poses, landmarks)
 
 
 def _read(path: Path) -> dict[str, Matrix]:

@@ -24,21 +24,13 @@ class LandmarkData:
     ----------
     name : of the file
     kind : whether an observation is the landmark's position relative to the pose, or its bearing and range
-    odometry : (K − 1, 2) step from each pose to the next, m
-    observed : (N, 2) pose, landmark
-    measured : (N, 2) relative x, y in m; or bearing in rad, range in m
-    odometry_covariance : (2, 2) m²
-    observation_covariance : (2, 2) of ``measured``
+    measurements : of poses without headings; ``measured`` is relative x, y in m in a linear problem
     true_poses, true_landmarks : (K, 2), (L, 2) m; (0, 2) and NaN where unknown
     """
 
     name: str
     kind: Kind
-    odometry: Matrix
-    observed: NDArray[np.int64]
-    measured: Matrix
-    odometry_covariance: Matrix
-    observation_covariance: Matrix
+    measurements: Measurements
     true_poses: Matrix
     true_landmarks: Matrix
 
@@ -69,7 +61,7 @@ class Values:
         )
 
 
-_FIRST_POSE = 100.0  # weight of the first pose over that of a step in a linear problem
+FIRST_SHARE = 0.01  # noise of the first pose as a share of a step's
 _COMPONENTS = ("x", "y", "heading")
 
 
@@ -94,6 +86,11 @@ class Layout:
     def split(self) -> int:
         """Columns of the poses; all others come after."""
         return self.poses * self.pose_size
+
+    @property
+    def bandwidth(self) -> int:
+        """Largest distance of two columns of poses in one row: odometry joins each to the next, nothing else."""
+        return 2 * self.pose_size - 1
 
     @property
     def landmark_start(self) -> int:
@@ -191,25 +188,22 @@ def _differences(
     return columns.reshape(-1, columns.shape[-1]), np.broadcast_to(values, columns.shape)
 
 
-def linear_system(data: LandmarkData) -> LinearSystem:
+def linear_system(given: Measurements) -> LinearSystem:
     """A x = b with A = Σ^(−1/2) H, b = Σ^(−1/2) z: a prior on the first pose, odometry, observations.
 
     The prior puts the first pose at the origin. It can be met exactly, so that its weight, a hundredth of a step's
     noise, matters to the covariance alone.
     """
-    layout = Layout(len(data.odometry) + 1, 2, np.arange(len(data.true_landmarks)))
-    W_odometry, W_observation = whitening(data.odometry_covariance), whitening(data.observation_covariance)
+    layout = Layout(len(given.motion) + 1, 2, given.landmarks)
+    W_odometry, W_observation = whitening(given.motion_covariance[0]), whitening(given.measured_covariance)
     poses = pose_columns(layout, np.arange(layout.poses))
-    seen_from, seen = data.observed.T
+    seen_from, seen = given.observed.T
     steps, stepped = _differences(W_odometry, poses[:-1], poses[1:])
     pairs, weighed = _differences(W_observation, poses[seen_from], landmark_columns(layout, seen))
-    values = [_FIRST_POSE * W_odometry.diagonal(), stepped.ravel(), weighed.ravel()]
-    b = [np.zeros(2), (data.odometry @ W_odometry.T).ravel(), (data.measured @ W_observation.T).ravel()]
+    values = [1.0 / FIRST_SHARE * W_odometry.diagonal(), stepped.ravel(), weighed.ravel()]
+    b = [np.zeros(2), (given.motion @ W_odometry.T).ravel(), (given.measured @ W_observation.T).ravel()]
     pattern = pattern_of([poses[0][:, None], steps, pairs], layout)
     return LinearSystem(pattern, np.concatenate(values), np.concatenate(b))
-
-
-_ANCHOR = 0.01  # noise of the first pose as a share of a step's
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,19 +232,18 @@ class Calibration:
     ----------
     names : (C,) what they are called
     value : (C,) at which the motions were worked out; slope (K − 1, p, C) by how much they change with them
-    mean, sigma : (C,) prior
+    sigma : (C,) prior about zero
     """
 
     names: tuple[str, ...]
     value: NDArray[np.float64]
     slope: Matrix
-    mean: NDArray[np.float64]
     sigma: NDArray[np.float64]
 
 
 def no_calibration(motion: Matrix) -> Calibration:
     """Calibration without parameters, of motions (K − 1, p)."""
-    return Calibration((), np.zeros(0), np.zeros((*motion.shape, 0)), np.zeros(0), np.zeros(0))
+    return Calibration((), np.zeros(0), np.zeros((*motion.shape, 0)), np.zeros(0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -327,7 +320,7 @@ class BearingRangeProblem:
         )
         off = state.poses[0] - given.first_pose
         off[2:] = (off[2:] + np.pi) % (2.0 * np.pi) - np.pi
-        own = (state.calibration - calibration.mean) / calibration.sigma
+        own = state.calibration / calibration.sigma
         return Linearization(self._first @ off, own, motion, seen, J_motion, J_seen)
 
     def system(self, at: Linearization, weights: NDArray[np.float64]) -> LinearSystem:
@@ -343,18 +336,3 @@ class BearingRangeProblem:
         """The system with a row √d of its own for every unknown, so that AᵀA grows by diag(d); d (n,)."""
         values, b = np.concatenate([system.values, np.sqrt(damping)]), np.append(system.b, np.zeros(len(damping)))
         return LinearSystem(self._damped, values, b)
-
-
-def world_referenced(data: LandmarkData) -> Measurements:
-    """The problem of an npz file: headings are known, so that bearings are those of the world's axes."""
-    return Measurements(
-        first_pose=np.zeros(2),
-        first_covariance=_ANCHOR**2 * data.odometry_covariance,
-        motion=data.odometry,
-        motion_covariance=np.broadcast_to(data.odometry_covariance, (len(data.odometry), 2, 2)),
-        calibration=no_calibration(data.odometry),
-        observed=data.observed,
-        measured=data.measured,
-        measured_covariance=data.observation_covariance,
-        landmarks=np.arange(len(data.true_landmarks)),
-    )

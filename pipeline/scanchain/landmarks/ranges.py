@@ -21,7 +21,6 @@ _LEAST_VARIANCE = 1e-12  # m², rad²; keeps the covariance of a motion that tak
 
 OWN = ("forward scale", "forward lost in turning", "turn scale", "drift", "delay")
 OWN_UNITS = ("", " m/rad", "", " rad/m", " s")
-_MEAN = np.zeros(5)
 _SIGMA = np.array([0.1, 0.1, 0.1, 0.1, 0.3])  # typical of differential drives; the units as above
 _STEP = np.array([1e-3, 1e-3, 1e-3, 1e-3, 0.05])  # over which the slopes are taken
 
@@ -77,7 +76,7 @@ def reckon(log: RangeLog, nodes_s: NDArray[np.float64], own: NDArray[np.float64]
         ahead, _ = _integrated(log, nodes_s, own + step, sources=0)
         slope[..., column] = (ahead - motion) / _STEP[column]
     rest = np.diff(nodes_s)[:, None, None] * np.diag(_AT_REST) + _LEAST_VARIANCE * np.eye(3)
-    return Reckoning(motion, sources, rest, Calibration(OWN, own, slope, _MEAN, _SIGMA))
+    return Reckoning(motion, sources, rest, Calibration(OWN, own, slope, _SIGMA))
 
 
 def _integrated(

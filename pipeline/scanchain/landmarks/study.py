@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.clock import working_s
 from scanchain.data import Matrix, Pose, Trajectory
-from scanchain.errors import FREEDOM, counted
+from scanchain.errors import FREEDOM, InputError, counted
 from scanchain.evaluation import Alignment, absolute_error, pair
 from scanchain.landmarks.estimate import (
     Minimum,
@@ -30,7 +30,6 @@ from scanchain.landmarks.problem import (
     LinearSystem,
     Values,
     linear_system,
-    world_referenced,
 )
 from scanchain.landmarks.ranges import OWN, OWN_UNITS, OdometryNoise, RangeSolution, solve_range_log
 from scanchain.landmarks.solvers import Covariance, LinearSolver, MethodResult, compare, create_solver, methods_for
@@ -80,36 +79,29 @@ def against_truth(
     """
     place, unknown = dict(zip(log.true_subjects.tolist(), log.true_landmarks, strict=True)), np.full(2, np.nan)
     surveyed = np.array([place.get(subject, unknown) for subject in landmarks.tolist()])
-    known, true_poses = _truth_at(log, nodes_s)
-    positions = true_poses[:, :2]
-    if np.count_nonzero(known) < 2:
+    truth, estimates = _trajectory(log.true_s, log.true_poses), list[Estimate]()
+    try:
+        pairs = [pair(_trajectory(nodes_s, each.poses), truth, gap_s=_WIDEST_GAP_S) for each in states]
+        errors = [absolute_error(each, Alignment.RIGID) for each in pairs]
+    except InputError:
         why = "no motion capture at these times"
-        return [Estimate(each, lie.identity(2), np.nan, np.nan, why) for each in states], positions, surveyed
-    estimates, truth = [], _trajectory(nodes_s[known], true_poses)
-    for state in states:
-        error = absolute_error(pair(_trajectory(nodes_s[known], state.poses[known]), truth), Alignment.RIGID)
+        return (
+            [Estimate(each, lie.identity(2), np.nan, np.nan, why) for each in states],
+            np.empty((0, 2)),
+            surveyed,
+        )
+    for state, error in zip(states, errors, strict=True):
         T_truth_estimate = lie.flatten(error.T_reference_estimate)
         landmarks_m = _rms(lie.transform(T_truth_estimate, state.landmarks) - surveyed)
         definition = f"{error.definition}, over {error.pairing}"
         estimates.append(Estimate(state, T_truth_estimate, error.translation_m.rmse, landmarks_m, definition))
-    return estimates, positions, surveyed
-
-
-def _truth_at(log: RangeLog, nodes_s: NDArray[np.float64]) -> tuple[NDArray[np.bool_], Matrix]:
-    """Times (K,) at which there is motion capture, and the poses (k, 3) there, interpolated."""
-    if len(log.true_s) < 2:
-        return np.zeros(len(nodes_s), np.bool_), np.empty((0, 3))
-    after = np.clip(np.searchsorted(log.true_s, nodes_s), 1, len(log.true_s) - 1)
-    inside = (nodes_s >= log.true_s[0]) & (nodes_s <= log.true_s[-1])
-    known = inside & (log.true_s[after] - log.true_s[after - 1] <= _WIDEST_GAP_S)
-    columns = (*log.true_poses[:, :2].T, np.unwrap(log.true_poses[:, 2]))
-    return known, np.stack([np.interp(nodes_s[known], log.true_s, column) for column in columns], axis=-1)
+    return estimates, pairs[0].reference[:, :2, 3], surveyed
 
 
 def _trajectory(nodes_s: NDArray[np.float64], poses: Matrix) -> Trajectory:
     """Poses x, y, heading (K, 3) at times that were written with milliseconds."""
     stamps_ns = np.round(nodes_s * 1e3).astype(np.int64) * 1_000_000
-    return Trajectory(stamps_ns, np.array([lie.pose_2d(*pose) for pose in poses]))
+    return Trajectory(stamps_ns, np.array([lie.pose_2d(*pose) for pose in poses]).reshape(-1, 3, 3))
 
 
 def _rms(differences: Matrix) -> float:
@@ -179,7 +171,7 @@ def study_file(data: LandmarkData, options: Options) -> Study:
 
 def _linear(data: LandmarkData, options: Options) -> Study:
     begin = working_s()
-    system = linear_system(data)
+    system = linear_system(data.measurements)
     build_s = working_s() - begin
     names, left_out = methods_for(options.methods, system.pattern.shape[1])
     methods = compare(lambda solver: solver.solve(system), names, options.repeats)
@@ -187,7 +179,9 @@ def _linear(data: LandmarkData, options: Options) -> Study:
     problem = "linear: steps between poses, landmarks' positions relative to them"
     facts = {"problem": problem, "χ²": _chi2(chi2, system), **left_out}
     poses, landmarks = (part.reshape(-1, 2) for part in np.split(methods[0].x, [system.pattern.layout.split]))
-    before, after = (of_positions(each, data) for each in (of_relative_positions(data), Values(poses, landmarks)))
+    before, after = (
+        of_positions(each, data) for each in (of_relative_positions(data.measurements), Values(poses, landmarks))
+    )
     return Study(
         data.name, facts, before, after, True, Covariance(system), data.true_poses, data.true_landmarks, system,
         build_s, methods,
@@ -195,7 +189,7 @@ def _linear(data: LandmarkData, options: Options) -> Study:
 
 
 def _nonlinear(data: LandmarkData, options: Options) -> Study:
-    problem = BearingRangeProblem(world_referenced(data))
+    problem = BearingRangeProblem(data.measurements)
     guess = _guess(problem, options.guess)
     names, left_out = methods_for(options.methods, problem.pattern.shape[1])
     minimum = minimize(problem, guess, create_solver(names[0]), optimizer=options.optimizer)
@@ -208,11 +202,10 @@ def _nonlinear(data: LandmarkData, options: Options) -> Study:
             return solver.solve(system)
         return minimize(problem, guess, solver, optimizer=options.optimizer).estimate.state.unknowns
 
-    after = f"after {counted(minimum.iterations, 'step')}: {minimum.reason}"
     facts = {
         "problem": "nonlinear: steps between poses, bearing and range of landmarks; headings known",
         "guess": options.guess,
-        "iteration": f"{options.optimizer} {_ended(minimum)} {after}",
+        "iteration": f"{options.optimizer} {_ended(minimum, minimum.iterations)}",
         "χ²": _chi2(minimum.estimate.cost, system),
         **left_out,
     }
@@ -242,8 +235,9 @@ def _chi2(chi2: float, system: LinearSystem) -> str:
     return f"{chi2:.4f} over {counted(freedom, *FREEDOM)}: {chi2 / freedom:.3f}; {verdict}"
 
 
-def _ended(minimum: Minimum) -> str:
-    return "converged" if minimum.converged else "DID NOT CONVERGE"
+def _ended(minimum: Minimum, iterations: int) -> str:
+    how = "converged" if minimum.converged else "DID NOT CONVERGE"
+    return f"{how} after {counted(iterations, 'step')}: {minimum.reason}"
 
 
 def study_log(folder: Path, options: Options) -> Study:
@@ -284,13 +278,12 @@ def _facts(log: RangeLog, solution: RangeSolution, *, is_stated: bool) -> dict[s
     )
     own = zip(OWN, solution.minimum.estimate.state.calibration, OWN_UNITS, strict=True)
     found = f"bearing {bearing_rad:.4f} rad, range {range_m:.4f} m (Student's t)"
-    after = f"{_ended(solution.minimum)} after {counted(solution.iterations, 'step')}: {solution.minimum.reason}"
     downweighted = int(np.count_nonzero(solution.minimum.estimate.weights < _DOWNWEIGHTED * solution.loss.share))
     state, sensor = "stated" if is_stated else "estimated", float(np.mean(noise.sensor / noise.sensor_freedom))
     return {
         "observations": seen,
         "left out": left,
-        "estimate": f"{1e3 * solution.time_s:.0f} ms, {after}",
+        "estimate": f"{1e3 * solution.time_s:.0f} ms, {_ended(solution.minimum, solution.iterations)}",
         "robot": "estimated: " + ", ".join(f"{name} {value:+.3f}{unit}" for name, value, unit in own),
         "odometry noise": f"{state}: {wheels}; {_verdict(noise.motion / noise.motion_freedom)}",
         "sensor noise": f"estimated: {found}; {_verdict(sensor)}",

@@ -101,7 +101,6 @@ class SvdMatcher:
         squares = np.einsum("ij,ij->i", errors, errors)
         fit = Fit(
             H=_information(source - T[:-1, -1], weight),
-            unweighted=np.empty((0, 0)),
             cost=0.5 * float((s2 * squares / (s2 + squares)).sum()) + 0.5 * s2 * (len(points) - pairs),
             total_weight=float(weight.sum()),
             squares=float(weight @ squares),

@@ -27,6 +27,7 @@ _PLACE, _DEVIATION, _WHEELS, _RANGES = range(4)  # every purpose draws its own r
 _ODOMETRY_PERIOD_NS = 20_000_000
 _DROPOUT_S = 1.0
 _PATH_STEP_S = 0.1  # between the positions of a drive that objects must not be moved to
+_SPARE_M = 0.25  # distance that they keep from it, besides half the vehicle's width
 _LONGEST_S = 36_000.0
 _FARTHEST_M = 1e5
 
@@ -121,7 +122,7 @@ def plan(
     changes: tuple[Change, ...] = ()
     if changed is not None:
         path = motion.base(np.arange(0.0, length_s, _PATH_STEP_S))[:, :2, 3]
-        free_m = scene.vehicle.radius_m + scene.vehicle.deviation_m
+        free_m = scene.vehicle.radius_m + scene.vehicle.deviation_m + _SPARE_M
         solids, changes = another_day(solids, path, free_m, _random(seed, _PLACE, changed))
     scans = _recorded(scene, motion, lidar, count)
     return Drive(

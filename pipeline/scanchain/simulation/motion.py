@@ -17,7 +17,7 @@ from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.simulation.solids import Solids
 
-_HERTZ = {2: 1.3, 3: 0.9, 4: 1.1, 1: 0.8, 5: 0.6}  # of the sway, by twist axis
+_SWAY_HERTZ = np.array([1.3, 0.9, 1.1, 0.8, 0.6])  # heave, roll, pitch, sideways, heading
 
 _SCALE_SHARE = 0.01  # error of the distance as a share: wheels are not as large as assumed
 _TURN_SHARE = 0.02  # error of the angle as a share: nor as far apart
@@ -112,13 +112,12 @@ def _sway(
 ) -> Matrix:
     """Twists (N, 6) of a body on its springs or legs, as large as the ``share`` (N,) of the full speed.
 
-    Heave at 1.3 Hz, roll at 0.9 Hz, pitch at 1.1 Hz, sideways at 0.8 Hz, heading at 0.6 Hz; ``phases`` (5,).
+    phases : (5,) of heave, roll, pitch, sideways and heading
     """
-    sizes = (vehicle.heave_m, vehicle.sway_rad, vehicle.sway_rad, vehicle.swing_m, vehicle.swing_rad)
+    sizes = np.array([vehicle.heave_m, vehicle.sway_rad, vehicle.sway_rad, vehicle.swing_m, vehicle.swing_rad])
     twist = np.zeros((len(times_s), 6))
-    for (column, hertz), size, phase in zip(_HERTZ.items(), sizes, phases, strict=True):
-        if size > 0.0:
-            twist[:, column] = share * size * np.sin(2.0 * np.pi * hertz * times_s + phase)
+    waves = np.sin(2.0 * np.pi * _SWAY_HERTZ * times_s[:, None] + phases)
+    twist[:, [2, 3, 4, 1, 5]] = share[:, None] * sizes * waves
     return twist
 
 

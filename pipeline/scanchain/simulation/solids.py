@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.data import Matrix
-from scanchain.kernels.raycast import SECTORS, cast_rays
+from scanchain.kernels.raycast import BOX, CYLINDER, ELLIPSOID, SECTORS, cast_rays
 
+Pair = tuple[float, float]
 FLAT = np.zeros(7)
 FIXED = -1  # owner of solids that belong to no movable object
 
@@ -22,38 +23,30 @@ class Solids:
 
     Attributes
     ----------
-    boxes : (B, 8) center x, y, half lengths x, y, bottom, top, cos and sin of the yaw
-    cylinders : (C, 5) upright: center x, y, radius, bottom, top
-    ellipsoids : (E, 6) center x, y, z, radii x, y, z
+    rows : (S, 9) kind; center x, y; half lengths, or radii, x, y; cos and sin of the yaw; bottom and top, or of
+        ellipsoids center z and radius z
+    owner : (S,) number of the movable object that each solid is a part of, FIXED for none
     ground : (7 + 4 W,) z = g0 + g1 sin(g2 x + g3) + g4 sin(g5 y + g6) + Σ a sin(b x + c y + d), W rows a, b, c, d
-    owner : (B + C + E,) number of the movable object that each solid is a part of, FIXED for none; (0,) where
-        nothing is movable
     """
 
-    boxes: Matrix
-    cylinders: Matrix
-    ellipsoids: Matrix
+    rows: Matrix
+    owner: NDArray[np.int64]
     ground: NDArray[np.float64]
-    owner: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
 
     @property
-    def groups(self) -> tuple[Matrix, Matrix, Matrix]:
-        """Boxes, cylinders, ellipsoids."""
-        return self.boxes, self.cylinders, self.ellipsoids
+    def heights(self) -> Matrix:
+        """Bottom and top of each, (S, 2)."""
+        middle, radius = self.rows[:, 7:8], self.rows[:, 8:]
+        return np.where(self.rows[:, :1] == ELLIPSOID, middle + radius * [-1.0, 1.0], self.rows[:, 7:])
 
     def part(self, chosen: NDArray[np.bool_]) -> Solids:
-        """Some of the solids, chosen by (B + C + E,)."""
-        of_group = np.split(chosen, np.cumsum([len(rows) for rows in self.groups[:2]]))
-        groups = (rows[each] for rows, each in zip(self.groups, of_group, strict=True))
-        return Solids(*groups, ground=self.ground, owner=self.owner[chosen])
+        """Some of the solids, chosen by (S,)."""
+        return replace(self, rows=self.rows[chosen], owner=self.owner[chosen])
 
-    def with_object(self, thing: Solids, owner: int) -> Solids:
-        """These and those of one object, of that number."""
-        groups = [np.vstack(both) for both in zip(self.groups, thing.groups, strict=True)]
-        owners = np.split(self.owner, np.cumsum([len(rows) for rows in self.groups[:2]]))
-        numbers = (np.full(len(rows), owner) for rows in thing.groups)
-        of_both = [each for both in zip(owners, numbers, strict=True) for each in both]
-        return Solids(*groups, ground=self.ground, owner=np.concatenate(of_both))
+    def with_object(self, rows: Matrix, owner: int) -> Solids:
+        """These and those (N, 9) of one object, of that number."""
+        owners = np.append(self.owner, np.full(len(rows), owner))
+        return replace(self, rows=np.vstack([self.rows, rows]), owner=owners)
 
     def ground_height(self, xy: Matrix) -> NDArray[np.float64]:
         """Height of the ground at (..., 2) positions."""
@@ -78,7 +71,7 @@ class Solids:
         rotations = np.ascontiguousarray(T_world_sensor[:, :3, :3])
         sectors = self._sectors(origins[:, :2], max_range_m)
         cast_rays(
-            origins, rotations, pose_of_ray, directions, *self.groups, self.ground, *sectors, max_range_m, ranges_m
+            origins, rotations, pose_of_ray, directions, self.rows, self.ground, *sectors, max_range_m, ranges_m
         )
         return ranges_m
 
@@ -106,10 +99,7 @@ class Solids:
         because the parallel ray from the middle hits the footprint, a box, grown by ``slack``. Complex numbers are
         positions x + iy.
         """
-        upright = np.tile([1.0, 0.0], (len(self.cylinders) + len(self.ellipsoids), 1))
-        x_y = np.concatenate([rows[:, :2] for rows in self.groups])
-        size = np.concatenate([self.boxes[:, 2:4], self.cylinders[:, [2, 2]], self.ellipsoids[:, 3:5]])
-        turn = np.concatenate([self.boxes[:, 6:8], upright])
+        x_y, size, turn = self.rows[:, 1:3], self.rows[:, 3:5], self.rows[:, 5:7]
         center, half, ahead = (rows @ [1.0, 1.0j] for rows in (x_y - origins.mean(axis=0), size, turn))
         slack = np.linalg.norm(origins - origins.mean(axis=0), axis=1).max()
         beside = center * ahead.conj()
@@ -123,20 +113,15 @@ class Solids:
     def clearance_m(self, xy: Matrix, below_m: float) -> NDArray[np.float64]:
         """Distance in the plane from (N, 2) positions to the nearest solid that begins below ``below_m``."""
         nearest = np.full(len(xy), np.inf)
-        for cx, cy, half_x, half_y, _, _, c, s in self._low(self.boxes, 4, below_m):
+        low = self.heights[:, 0] - self.ground_height(self.rows[:, 1:3]) < below_m
+        for kind, cx, cy, half_x, half_y, c, s, _, _ in self.rows[low]:
             dx, dy = xy[:, 0] - cx, xy[:, 1] - cy
-            outside_x = np.maximum(np.abs(c * dx + s * dy) - half_x, 0.0)
-            outside_y = np.maximum(np.abs(-s * dx + c * dy) - half_y, 0.0)
-            nearest = np.minimum(nearest, np.hypot(outside_x, outside_y))
-        for cx, cy, radius, _, _ in self._low(self.cylinders, 3, below_m):
-            nearest = np.minimum(nearest, np.hypot(xy[:, 0] - cx, xy[:, 1] - cy) - radius)
-        low = self.ellipsoids[:, 2] - self.ellipsoids[:, 5] - self.ground_height(self.ellipsoids[:, :2]) < below_m
-        for cx, cy, _, radius_x, radius_y, _ in self.ellipsoids[low]:
-            nearest = np.minimum(nearest, np.hypot(xy[:, 0] - cx, xy[:, 1] - cy) - max(radius_x, radius_y))
+            off_m = np.hypot(dx, dy) - max(half_x, half_y)
+            if kind == BOX:
+                beside = np.abs([c * dx + s * dy, -s * dx + c * dy]) - [[half_x], [half_y]]
+                off_m = np.hypot(*np.maximum(beside, 0.0))
+            nearest = np.minimum(nearest, off_m)
         return nearest
-
-    def _low(self, solids: Matrix, bottom_column: int, below_m: float) -> Matrix:
-        return solids[solids[:, bottom_column] - self.ground_height(solids[:, :2]) < below_m]
 
 
 class Scenery:
@@ -144,9 +129,8 @@ class Scenery:
 
     def __init__(self, ground: NDArray[np.float64] = FLAT) -> None:
         self._ground = ground
-        self._boxes: list[tuple[float, ...]] = []  # each behind the number of the object that it is a part of
-        self._cylinders: list[tuple[float, ...]] = []
-        self._ellipsoids: list[tuple[float, ...]] = []
+        self._rows: list[tuple[float, ...]] = []
+        self._owners: list[int] = []
         self._objects = 0
         self._owner = FIXED
 
@@ -158,33 +142,31 @@ class Scenery:
         self._objects += 1
         self._owner = FIXED
 
-    def box(
-        self, center: tuple[float, float], size: tuple[float, float], z: tuple[float, float], yaw_rad: float = 0.0
-    ) -> None:
+    def box(self, center: Pair, size: Pair, z: Pair, yaw_rad: float = 0.0) -> None:
         """Put down a box: full lengths along its own axes, heights ``z`` above the ground at its center."""
-        base = self._base(center)
         half = (0.5 * size[0], 0.5 * size[1])
-        turn = np.cos(yaw_rad), np.sin(yaw_rad)
-        self._boxes.append((self._owner, *center, *half, base + z[0], base + z[1], *turn))
+        base = self._base(center)
+        self._put(BOX, center, half, (base + z[0], base + z[1]), (np.cos(yaw_rad), np.sin(yaw_rad)))
 
-    def cylinder(self, center: tuple[float, float], radius: float, z: tuple[float, float]) -> None:
+    def cylinder(self, center: Pair, radius: float, z: Pair) -> None:
         """Put down an upright cylinder, heights ``z`` above the ground at its center."""
         base = self._base(center)
-        self._cylinders.append((self._owner, *center, radius, base + z[0], base + z[1]))
+        self._put(CYLINDER, center, (radius, radius), (base + z[0], base + z[1]))
 
     def ellipsoid(self, center: tuple[float, float, float], radii: tuple[float, float, float]) -> None:
         """Put down an ellipsoid; its center's height counts from the ground there."""
         x, y, z = center
-        self._ellipsoids.append((self._owner, x, y, z + self._base((x, y)), *radii))
+        self._put(ELLIPSOID, (x, y), radii[:2], (z + self._base((x, y)), radii[2]))
 
     def finish(self) -> Solids:
         """The solids put down so far."""
-        groups = (self._boxes, 8), (self._cylinders, 5), (self._ellipsoids, 6)
-        rows = [np.array(group, dtype=np.float64).reshape(-1, 1 + width) for group, width in groups]
-        owner = np.concatenate([each[:, 0] for each in rows]).astype(np.int64)
-        return Solids(*(each[:, 1:].copy() for each in rows), ground=self._ground, owner=owner)
+        return Solids(np.array(self._rows), np.array(self._owners), self._ground)
 
-    def _base(self, center: tuple[float, float]) -> float:
+    def _put(self, kind: float, place: Pair, half: Pair, heights: Pair, turn: Pair = (1.0, 0.0)) -> None:
+        self._rows.append((kind, *place, *half, *turn, *heights))
+        self._owners.append(self._owner)
+
+    def _base(self, center: Pair) -> float:
         return float(_height(self._ground, np.array(center)))
 
 

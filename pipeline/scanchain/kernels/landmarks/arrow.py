@@ -11,19 +11,6 @@ _PANEL = 16  # rows of the border that are subtracted from the corner together
 
 
 @njit()
-def bandwidth(row_start: _Index, columns: _Index, split: int) -> int:
-    """Largest distance of two columns before ``split`` in one row."""
-    widest = 0
-    for r in range(row_start.size - 1):
-        low, high = split, -1
-        for q in range(row_start[r], row_start[r + 1]):
-            if columns[q] < split:
-                low, high = min(low, columns[q]), max(high, columns[q])
-        widest = max(widest, high - low)
-    return widest
-
-
-@njit()
 def products(
     row_start: _Index, columns: _Index, values: _Array, b: _Array, split: int, band: _Array, border: _Array,
     corner: _Array, g: _Array,

@@ -10,7 +10,6 @@ from scanchain.kernels.geometry import orthonormalize, perturb
 from scanchain.kernels.matrices import solve
 from scanchain.kernels.registration.association import associate, weigh
 from scanchain.kernels.registration.residuals import (
-    WITHOUT_KERNEL_M,
     Problem,
     gradients_by_group,
     normal_equations,
@@ -24,7 +23,7 @@ SHRINK = 0.6  # ratio of the kernel's scale from one iteration to the next
 SLACK = 0.02  # voxels that points may move before they are associated again
 PATIENCE = 20  # steps at the last scale, after which correspondences are fixed
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e8
-_SECTORS = 8  # of a scan, in ``shape_information``
+_SECTORS = 8  # of a scan
 _COST, _WEIGHT, _SQUARES, _DAMPING = 0, 1, 2, 3  # entries of ``Iterate.sums``
 
 
@@ -46,14 +45,12 @@ class Fit(NamedTuple):
 
     H (k, k) : Σ w JᵀJ over planes and lines, twists about the problem's origin, map axes; the mean of a voxel
         without a shape constrains a pose in every direction, whether the surface there does or not
-    unweighted (k, k) : the same without robust weights; zeros until it is ``judged``
     cost : robust cost in m², every point without a correspondence at its limit ½s²
     total_weight, squares : Σ w and Σ w r² (m²)
     pairs, iterations, ending : correspondences, linearizations, one of the codes above
     """
 
     H: NDArray[np.float64]
-    unweighted: NDArray[np.float64]
     cost: float
     total_weight: float
     squares: float
@@ -71,8 +68,8 @@ def problem_of(voxels, points, T_first, prior, settings):
     for i in range(N):
         for axis in range(d):
             squares += points[i, axis] * points[i, axis]
-    gradients, range_m = np.zeros((_SECTORS, prior.shape[0])), np.sqrt(squares / max(N, 1))
-    return Problem(voxels, points, origin, prior, np.empty(N, np.int32), np.empty(N), gradients, range_m, settings)
+    range_m = np.sqrt(squares / max(N, 1))
+    return Problem(voxels, points, origin, prior, np.empty(N, np.int32), np.empty(N), range_m, settings)
 
 
 @njit(nogil=True)
@@ -119,7 +116,7 @@ def align(problem, T, offset, first_scale_m: float):
     cost = now.sums[_COST] - _prior_cost(problem.prior, now.offset)
     cost += 0.5 * settings.scale_m**2 * (problem.points.shape[0] - pairs)
     H = shape_information(problem, T)
-    return Fit(H, np.zeros((k, k)), cost, now.sums[_WEIGHT], now.sums[_SQUARES], pairs, iterations, ending)
+    return Fit(H, cost, now.sums[_WEIGHT], now.sums[_SQUARES], pairs, iterations, ending)
 
 
 @njit(nogil=True)
@@ -129,12 +126,12 @@ def fit_at(problem, T, fit):
     pairs = correspond(problem, T, settings.last_reach, settings.last_distance_m)
     _, total_weight, squares = robust_sums(problem, T, settings.scale_m)
     H = shape_information(problem, T)
-    return judged(problem, T, Fit(H, H, fit.cost, total_weight, squares, pairs, fit.iterations, fit.ending))
+    return Fit(H, fit.cost, total_weight, squares, pairs, fit.iterations, fit.ending)
 
 
 @njit(nogil=True)
-def judged(problem, T, fit):
-    """``fit`` with the information without robust weights; the gradients of sectors are filled as well.
+def gradients_of_sectors(problem, T):
+    """Gradients (8, k) of the points of each sector at the pose T.
 
     Sectors lie ahead or behind, left or right, nearer or farther than the problem's range: calibration, motion
     within the scan and surfaces that repeat shift the points of one together.
@@ -145,11 +142,9 @@ def judged(problem, T, fit):
         for axis in range(points.shape[1]):
             squared += points[i, axis] * points[i, axis]
         sector[i] = (points[i, 0] > 0.0) + 2 * (points[i, 1] > 0.0) + 4 * (squared > problem.range_m**2)
-    problem.gradients.fill(0.0)
-    gradients_by_group(problem, T, problem.settings.scale_m, sector, problem.gradients)
-    unweighted, b = np.empty_like(fit.H), np.empty(fit.H.shape[0])
-    normal_equations(problem, T, WITHOUT_KERNEL_M, 0.0, unweighted, b)
-    return Fit(fit.H, unweighted, fit.cost, fit.total_weight, fit.squares, fit.pairs, fit.iterations, fit.ending)
+    gradients = np.zeros((_SECTORS, problem.prior.shape[0]))
+    gradients_by_group(problem, T, problem.settings.scale_m, sector, gradients)
+    return gradients
 
 
 @njit(nogil=True)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scanchain.kernels.compiling import njit
 from scanchain.kernels.geometry import adjoint, between, centered, inverse, twist_2d, twist_3d
 from scanchain.kernels.matrices import congruent, definite_inverse, factorize, substitute
-from scanchain.kernels.registration.icp import NO_CORRESPONDENCES, align, fit_at, judged, problem_of
+from scanchain.kernels.registration.icp import NO_CORRESPONDENCES, align, fit_at, gradients_of_sectors, problem_of
 from scanchain.kernels.registration.observability import (
     WEAK,
     add_signals,
@@ -20,7 +20,7 @@ from scanchain.kernels.registration.observability import (
     spectrum_of,
     weak_prior,
 )
-from scanchain.kernels.registration.residuals import gradient_spread
+from scanchain.kernels.registration.residuals import WITHOUT_KERNEL_M, gradient_spread, normal_equations
 
 _TURN_INFORMATION = 25.0  # rad⁻² of a turn that nothing determines
 _POOLED_RESIDUALS = 10.0  # number of residuals that the sensor's variance counts for
@@ -91,10 +91,9 @@ def match(voxels, points, T_first, expected, settings):
                 prior[i, j] += remapped[i, j]
         T = T_first.copy()
     spread = _spread(problem, T, fit)
+    last = fit
     if settings.reach != settings.last_reach or settings.max_distance_m != settings.last_distance_m:
         last = fit_at(problem, T, fit)
-    else:
-        last = judged(problem, T, fit)
     if points.shape[1] == 2 and not is_fused:
         add_signals(problem, T, spectrum)
     if is_fused:
@@ -123,6 +122,8 @@ def _result(problem, T, T_first, fit, last, spectrum, spread):
 
     spread : (k, k) covariance of the gradient, empty to have one variance for all residuals
     """
+    unweighted, b = np.empty_like(last.H), np.empty(last.H.shape[0])
+    normal_equations(problem, T, WITHOUT_KERNEL_M, 0.0, unweighted, b)
     m = np.argmin(spectrum.signals)
     H, variance = fit.H, _variance(problem, fit)
     if len(spread):
@@ -137,7 +138,7 @@ def _result(problem, T, T_first, fit, last, spectrum, spread):
         direction,
         max(spectrum.values[0], 0.0),
         spectrum.signals[m],
-        agreement(last.H, last.unweighted, problem.range_m),
+        agreement(last.H, unweighted, problem.range_m),
         problem.range_m,
         _residual_of(last),
         fit.cost,
@@ -146,7 +147,7 @@ def _result(problem, T, T_first, fit, last, spectrum, spread):
         fit.iterations,
         fit.ending if last.pairs else NO_CORRESPONDENCES,
         1.0 if len(spread) else _variance_factor(problem, fit),
-        _systematic(problem, T, T_first, fit),
+        _systematic(problem, T, T_first, fit, gradients_of_sectors(problem, T)),
     )
 
 
@@ -178,8 +179,8 @@ def _variance_factor(problem, fit) -> float:
 
 
 @njit(nogil=True)
-def _systematic(problem, T, T_first, fit):
-    """Covariance (k, k) in the source's own frame by how the gradients b_s of sectors differ.
+def _systematic(problem, T, T_first, fit, gradients):
+    """Covariance (k, k) in the source's own frame by how the gradients b_s (8, k) of sectors differ.
 
     H⁻¹ (Σ b_s b_sᵀ) H⁻¹ G / (G − 1) of G sectors with correspondences, H with the prior (cluster-robust
     covariance, as ``gradient_spread``). Directions that neither determines are known to a meter and 0.2 rad.
@@ -191,8 +192,8 @@ def _systematic(problem, T, T_first, fit):
     spread, factor, shift = np.zeros((k, k)), np.empty((k, k)), np.empty(k)
     if not factorize(H, 0.0, factor):
         return spread
-    for sector in range(problem.gradients.shape[0]):
-        b = problem.gradients[sector]
+    for sector in range(gradients.shape[0]):
+        b = gradients[sector]
         groups += b[0] != 0.0 or b[1] != 0.0
         substitute(factor, b, shift)
         for m in range(k):

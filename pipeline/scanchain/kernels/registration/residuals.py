@@ -48,7 +48,7 @@ class Problem(NamedTuple):
 
     origin : (3,), map frame, that twists rotate about
     prior : (k, k) information of the predicted pose times the variance of a residual, along the map's axes
-    correspondence, weight : (N,) of the last association; gradients (8, k) of sectors of the points at a ``Fit``
+    correspondence, weight : (N,) of the last association
     range_m : root mean square of the points' ranges
     """
 
@@ -58,7 +58,6 @@ class Problem(NamedTuple):
     prior: NDArray[np.float64]
     correspondence: NDArray[np.int32]
     weight: NDArray[np.float64]
-    gradients: NDArray[np.float64]
     range_m: float
     settings: Settings
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.data import Matrix
+from scanchain.kernels.raycast import BOX
 from scanchain.simulation.motion import Lap, Pivot, Vehicle, mount, sampled
 from scanchain.simulation.solids import Scenery, Solids
 
@@ -67,17 +68,16 @@ TOWN_ROUTE = np.array([
 ])  # fmt: skip
 
 ROUNDS_CAR = replace(TOWN_CAR, corner_m=4.0)  # tighter bends, so that it keeps its lane
-_LANE_M = 2.0  # from the middle of the street, to the right
 _LANE_FREE_M = 1.8  # on either side of the middle of a lane
 
-# Crossings in the order they are passed, and the lane taken from there: 1 is the right one, −1 the left one.
-_LEGS = (
-    ((0, 0), 1), ((100, 0), 1), ((100, 40), 1), ((0, 40), 1),  # new
-    ((0, 0), 1), ((0, -40), 1), ((-50, -40), 1), ((-50, 40), 1),  # new
-    ((0, 40), 1), ((100, 40), 1), ((100, 0), 1),  # the first block again, in the other direction
-    ((0, 0), 1), ((0, 40), 1), ((0, 80), 1), ((50, 80), 1), ((50, 40), 1),  # partly new
-    ((50, 0), 1), ((100, 0), 1), ((100, 40), -1), ((0, 40), -1),  # as the first time, at last in the other lane
-)  # fmt: skip
+# In the right lane, 2 m from the middle of the street, but at last in the left one.
+ROUNDS_ROUTE = np.array([
+    [2.0, -2.0], [102.0, -2.0], [102.0, 42.0], [-2.0, 42.0],  # new
+    [-2.0, 0.0], [-2.0, -38.0], [-48.0, -38.0], [-48.0, 38.0],  # new
+    [0.0, 38.0], [98.0, 38.0], [98.0, 2.0],  # the first block again, in the other direction
+    [2.0, 2.0], [2.0, 40.0], [2.0, 78.0], [48.0, 78.0], [48.0, 40.0],  # partly new
+    [48.0, -2.0], [102.0, -2.0], [102.0, 38.0], [2.0, 38.0],  # as the first time, at last in the other lane
+])  # fmt: skip
 
 
 def town(
@@ -189,33 +189,12 @@ def rounds(rng: np.random.Generator) -> Solids:
     """The town, its kerbs empty and its hedges cut where they reach into the lanes."""
     solids = town(rng, parked=0.0)
     lanes = np.vstack([np.linspace(a, b, 100) for a, b in pairwise([*ROUNDS_ROUTE, ROUNDS_ROUTE[0]])])
-    gap = np.abs(lanes[:, None] - solids.boxes[:, :2]) - solids.boxes[:, 2:4]
-    distance_m = np.linalg.norm(np.maximum(gap, 0.0), axis=2).min(axis=0)
-    is_kept = np.ones(len(solids.owner), bool)
-    is_kept[: len(distance_m)] = distance_m > _LANE_FREE_M
+    is_kept = solids.rows[:, 0] != BOX
+    boxes = solids.rows[~is_kept]
+    gap = np.abs(lanes[:, None] - boxes[:, 1:3]) - boxes[:, 3:5]
+    is_kept[~is_kept] = np.linalg.norm(np.maximum(gap, 0.0), axis=2).min(axis=0) > _LANE_FREE_M
     return solids.part(is_kept)
 
-
-def _lanes() -> Matrix:
-    """The route (W, 2): the lane of each street, and its intersection with that of the next one."""
-    legs = [*_LEGS, _LEGS[0]]
-    lines = []
-    for (start, lane), (end, _) in pairwise(legs):
-        along = np.subtract(end, start) / np.linalg.norm(np.subtract(end, start))
-        lines.append((np.array(start) + lane * _LANE_M * np.array([along[1], -along[0]]), along))
-    return np.array([_meeting(*lines[k - 1], *lines[k]) for k in range(len(lines))])
-
-
-def _meeting(p: Matrix, u: Matrix, q: Matrix, v: Matrix) -> Matrix:
-    """Intersection of the lines p + s u and q + t v, or q where they are parallel."""
-    cross = u[0] * v[1] - u[1] * v[0]
-    if abs(cross) < 1e-9:
-        return q
-    d = q - p
-    return p + (d[0] * v[1] - d[1] * v[0]) / cross * u
-
-
-ROUNDS_ROUTE = _lanes()
 
 # the highway
 
