@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -180,35 +181,35 @@ class CholeskyMethod:
     build = staticmethod(normal_equations)
 
     def __init__(self) -> None:
-        self._known: tuple[Pattern, SparseCholesky] | None = None
+        self._analyzed = lru_cache(maxsize=1)(_cholesky_of)
 
     def factorize(self, system: LinearSystem, built: tuple[csc_matrix, NDArray[np.float64]]) -> Factored:
         """U with AᵀA = UᵀU."""
         H, g = built
-        if self._known is None or self._known[0] is not system.pattern:
-            pattern = system.pattern.squared()
-            self._known = system.pattern, SparseCholesky(pattern, analyze(pattern))
-        cholesky = self._known[1]
+        cholesky = self._analyzed(system.pattern)
         H.sum_duplicates()  # sorts it, so that entries are found by bisection
         cholesky.factorize(np.asarray(H[cholesky.pattern.rows, cholesky.pattern.columns]).ravel())
         U, order = upper_factor, cholesky.analysis.order
         return Factored(lambda: cholesky.solve(g), lambda: Factor("U of AᵀA", csc_matrix(U(cholesky)), order))
 
 
+def _cholesky_of(pattern: Pattern) -> SparseCholesky:
+    squared = pattern.squared()
+    return SparseCholesky(squared, analyze(squared))
+
+
 class QrMethod:
     """A = Q R by Givens rotations, without ever forming AᵀA; the analysis of a pattern is reused as well."""
 
-    def __init__(self, ordering: Literal["natural", "colamd"]) -> None:
-        self._ordering = ordering
-        self._known: tuple[Pattern, Analysis] | None = None
+    def __init__(self, *, is_natural: bool) -> None:
+        def analyzed(pattern: Pattern) -> Analysis:
+            return analyze(pattern.squared(), np.arange(pattern.shape[1]) if is_natural else None)
+
+        self._analyzed = lru_cache(maxsize=1)(analyzed)
 
     def build(self, system: LinearSystem) -> Analysis:
-        """The order of the columns, of "colamd" by minimum degree in AᵀA, and where R has entries."""
-        pattern = system.pattern
-        if self._known is None or self._known[0] is not pattern:
-            order = np.arange(pattern.shape[1]) if self._ordering == "natural" else None
-            self._known = pattern, analyze(pattern.squared(), order)
-        return self._known[1]
+        """The order of the columns, by minimum degree in AᵀA where it is not natural, and where R has entries."""
+        return self._analyzed(system.pattern)
 
     def factorize(self, system: LinearSystem, built: Analysis) -> Factored:
         """R of A, and the head of Qᵀb."""
@@ -358,8 +359,8 @@ _MAKERS = {
     "pinv": lambda: ScipyMethod("pinv"),
     "lu": lambda: ScipyMethod("lu"),
     "lu_colamd": lambda: ScipyMethod("lu_colamd"),
-    "qr": lambda: QrMethod("natural"),
-    "qr_colamd": lambda: QrMethod("colamd"),
+    "qr": lambda: QrMethod(is_natural=True),
+    "qr_colamd": lambda: QrMethod(is_natural=False),
     "cholesky": CholeskyMethod,
     "schur": SchurMethod,
 }
