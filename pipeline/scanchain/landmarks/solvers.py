@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_matrix, csr_matrix, diags_array, identity
+from scipy.sparse import block_array, csc_matrix, csr_matrix, dia_array, diags_array, identity
 from scipy.sparse.linalg import MatrixRankWarning, SuperLU, inv, splu, spsolve, spsolve_triangular
 
 from scanchain.clock import working_s
@@ -341,17 +341,11 @@ def _eliminate(H: Arrow) -> None:
 
 
 def _factor_of_arrow(U: Arrow) -> Factor:
-    """The three parts put together, with every entry that may fill in."""
-    width, split = U.band.shape[0] - 1, U.band.shape[1]
-    n, rest = split + len(U.corner), len(U.corner)
-    places = np.indices(U.band.shape).reshape(2, -1)
-    below, right = places[:, places.sum(axis=0) >= width]  # the corner of a band's storage is not part of it
-    pose, landmark = np.indices(U.border.shape)
-    upper, lower = np.triu_indices(rest)
-    rows = np.concatenate([below + right - width, pose.ravel(), split + upper])
-    columns = np.concatenate([right, split + landmark.ravel(), split + lower])
-    values = np.concatenate([U.band[below, right], U.border.ravel(), U.corner[upper, lower]])
-    return Factor("U of AᵀA", csc_matrix((values, (rows, columns)), shape=(n, n)), np.arange(n))
+    """The three parts put together."""
+    split = U.band.shape[1]
+    poses = dia_array((U.band[::-1], np.arange(len(U.band))), shape=(split, split))
+    matrix = block_array([[poses, csc_matrix(U.border)], [None, csc_matrix(np.triu(U.corner))]])
+    return Factor("U of AᵀA", csc_matrix(matrix), np.arange(split + len(U.corner)))
 
 
 _MAKERS = {
