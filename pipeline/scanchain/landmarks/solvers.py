@@ -17,7 +17,7 @@ from scanchain.clock import working_s
 from scanchain.data import Matrix
 from scanchain.errors import InputError
 from scanchain.graph.cholesky import Analysis, SingularMatrixError, SparseCholesky, analyze, upper_factor
-from scanchain.kernels.landmarks import arrow, sparse_qr
+from scanchain.kernels.landmarks import algebra
 from scanchain.landmarks.problem import Layout, LinearSystem, Pattern, landmark_columns, pose_columns
 
 LOST_DIGITS = 1e-13  # a pivot below this share of its diagonal entry (of AᵀA) or column (of A) is rounding noise
@@ -215,7 +215,7 @@ class QrMethod:
         """R of A, and the head of Qᵀb."""
         pattern, n = system.pattern, system.pattern.shape[1]
         place, R, z = np.argsort(built.order), np.zeros(len(built.rows) + n), np.zeros(n)
-        sparse_qr.rotate(
+        algebra.rotate(
             _order_of_rows(pattern, place), pattern.row_start, pattern.columns, system.values, system.b,
             place, built.begin, built.rows, built.parent, R, z,
         )  # fmt: skip
@@ -285,7 +285,7 @@ class Covariance:
         except SingularMatrixError as error:
             raise undetermined(system) from error
         self._band, self._border, self._corner = (np.empty_like(part) for part in (U.band, U.border, U.corner))
-        arrow.invert(U.band, U.border, U.corner, self._band, self._border, self._corner)
+        algebra.invert(U.band, U.border, U.corner, self._band, self._border, self._corner)
 
     @property
     def poses(self) -> Matrix:
@@ -300,18 +300,18 @@ class Covariance:
     def of(self, columns: NDArray[np.int64]) -> Matrix:
         """Covariances of groups of unknowns, (N, c) columns of A to (N, c, c); NaN for poses far apart."""
         result = np.empty((*columns.shape, columns.shape[1]))
-        arrow.blocks(self._band, self._border, self._corner, columns, result)
+        algebra.blocks(self._band, self._border, self._corner, columns, result)
         return result
 
 
 def _solved(U: Arrow, g: NDArray[np.float64]) -> NDArray[np.float64]:
     """Solve UᵀU x = g, in place of g."""
     poses, landmarks = np.split(g, [U.band.shape[1]])
-    arrow.solve_forward(U.band, poses)
+    algebra.solve_forward(U.band, poses)
     landmarks -= poses @ U.border
-    arrow.solve_corner(U.corner, landmarks)
+    algebra.solve_corner(U.corner, landmarks)
     poses -= U.border @ landmarks
-    arrow.solve_backward(U.band, poses)
+    algebra.solve_backward(U.band, poses)
     return g
 
 
@@ -323,7 +323,7 @@ def _form(system: LinearSystem) -> tuple[Arrow, NDArray[np.float64]]:
         np.zeros((layout.bandwidth + 1, split)), np.zeros((split, n - split)), np.zeros((n - split, n - split))
     )
     g = np.zeros(n)
-    arrow.products(
+    algebra.products(
         pattern.row_start, pattern.columns, system.values, system.b, split, H.band, H.border, H.corner, g
     )
     return H, g
@@ -332,10 +332,10 @@ def _form(system: LinearSystem) -> tuple[Arrow, NDArray[np.float64]]:
 def _eliminate(H: Arrow) -> None:
     """Turn AᵀA into its factor, in place: P = UᵀU banded, Y = U⁻ᵀ Bᵀ, S = C − YᵀY = UᵀU dense."""
     floor = LOST_DIGITS * H.corner.diagonal()
-    failed = arrow.eliminate(H.band, H.border, LOST_DIGITS)
+    failed = algebra.eliminate(H.band, H.border, LOST_DIGITS)
     if failed < 0:
-        arrow.complement(H.corner, H.border)
-        failed = arrow.eliminate_corner(H.corner, floor)
+        algebra.complement(H.corner, H.border)
+        failed = algebra.eliminate_corner(H.corner, floor)
     if failed >= 0:
         raise SingularMatrixError(failed, failed)
 
