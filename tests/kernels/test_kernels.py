@@ -253,9 +253,10 @@ def test_damped_solve_equals_numpy_and_says_so_where_the_system_is_singular(damp
     rng = np.random.default_rng(5)
     B, b = rng.normal(size=(8, 6)), rng.normal(size=6)
     H, x = B.T @ B, np.empty(6)
-    assert matrices.solve(H, b, damping, np.empty((6, 6)), x)
+    assert icp.step(icp.LEVENBERG_MARQUARDT, H, b, damping, np.empty((6, 6)), x)
     np.testing.assert_allclose(x, -np.linalg.solve(H + damping * np.diag(np.diag(H)), b), rtol=1e-9)
-    assert not matrices.solve(np.diag([1.0, 0.0, 1.0]), np.ones(3), 0.5, np.empty((3, 3)), np.empty(3))
+    singular, room, x = np.diag([1.0, 0.0, 1.0]), np.empty((3, 3)), np.empty(3)
+    assert not icp.step(icp.LEVENBERG_MARQUARDT, singular, np.ones(3), 0.5, room, x)
 
 
 @pytest.mark.parametrize("optimizer", [icp.NEWTON, icp.GAUSS_NEWTON, icp.GRADIENT_DESCENT])

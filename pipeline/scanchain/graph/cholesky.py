@@ -10,7 +10,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.linalg import spilu
 
 from scanchain.data import Matrix
-from scanchain.kernels.graph import cholesky, fronts, symbolic
+from scanchain.kernels.graph import cholesky, symbolic
 
 _LOST_DIGITS = 1e-13  # a pivot below this share of its diagonal entry is rounding noise
 
@@ -46,7 +46,7 @@ class BlockPattern:
     def multiply(self, values: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
         """The product of the symmetric matrix of these values with a vector (scalars,)."""
         counts = self.sizes[self.rows] * self.sizes[self.columns]
-        block, within = np.repeat(np.arange(len(counts)), counts), fronts.ranges(np.zeros_like(counts), counts)
+        block, within = np.repeat(np.arange(len(counts)), counts), symbolic.ranges(np.zeros_like(counts), counts)
         row, column = (starts[block] for starts in (self.starts[self.rows], self.starts[self.columns]))
         below, beside = np.divmod(within, self.sizes[self.columns][block])
         row, column, is_pair = row + below, column + beside, row != column
@@ -125,10 +125,10 @@ class SparseCholesky:
         order, parent, begin, rows = analysis.order, analysis.parent, analysis.begin, analysis.rows
         sizes = pattern.sizes[order]
         groups = symbolic.group_columns(parent, begin, rows, sizes)
-        self._fronts = fronts.lay_out_fronts(groups, begin, rows, sizes)
+        self._fronts = symbolic.lay_out_fronts(groups, begin, rows, sizes)
         places = np.empty(len(order), np.int64)
         places[order] = np.cumsum(sizes) - sizes
-        self._blocks = fronts.lay_out_blocks(self._fronts, places, pattern.sizes, pattern.rows, pattern.columns)
+        self._blocks = symbolic.lay_out_blocks(self._fronts, places, pattern.sizes, pattern.rows, pattern.columns)
         self._places = np.repeat(places - pattern.starts, pattern.sizes) + np.arange(pattern.scalars)
         self._factor: NDArray[np.float64] | None = None
         self._floor = np.empty(pattern.scalars)
@@ -187,9 +187,9 @@ class SparseCholesky:
         With A = Uᵀ U it is CᵀC, Uᵀ C = B: half of a solve, by the fronts between these variables and the roots of
         the elimination tree alone.
         """
-        places = self._places[fronts.ranges(self.pattern.starts[variables], self.pattern.sizes[variables])]
+        places = self._places[symbolic.ranges(self.pattern.starts[variables], self.pattern.sizes[variables])]
         path, local = self._path(places), np.empty(self._fronts.widest)
-        reached = fronts.ranges(self._first_pivot[path], self._fronts.pivots[path])
+        reached = symbolic.ranges(self._first_pivot[path], self._fronts.pivots[path])
         x, C = np.zeros(self.pattern.scalars), np.empty((B.shape[1], len(reached)))
         for row, column in zip(C, B.T, strict=True):
             x[places] = column
@@ -251,8 +251,8 @@ def upper_factor(cholesky: SparseCholesky) -> csr_matrix:
     layout, size = cholesky._fronts, cholesky.pattern.scalars
     widths = np.diff(layout.row_start)
     front = np.repeat(np.arange(len(widths)), layout.pivots)
-    within = fronts.ranges(np.zeros_like(layout.pivots), layout.pivots)
+    within = symbolic.ranges(np.zeros_like(layout.pivots), layout.pivots)
     lengths = widths[front] - within
     row_start = np.concatenate([[0], np.cumsum(lengths)])
-    columns = layout.rows[fronts.ranges(layout.row_start[front] + within, lengths)]
+    columns = layout.rows[symbolic.ranges(layout.row_start[front] + within, lengths)]
     return csr_matrix((cholesky.factor.copy(), columns, row_start), shape=(size, size))

@@ -113,15 +113,6 @@ def _sort_columns(values, vectors):
 
 
 @njit(nogil=True)
-def solve(H, b, damping: float, factor, x) -> bool:
-    """Write −(H + damping · diag(H))⁻¹ b to ``x`` by Cholesky; False where that is not positive definite."""
-    if not factorize(H, damping, factor):
-        return False
-    substitute(factor, b, x)
-    return True
-
-
-@njit(nogil=True)
 def factorize(H, damping: float, factor) -> bool:
     """Write L with L Lᵀ = H + damping · diag(H) to the lower half of ``factor``; False where there is none."""
     k = H.shape[0]

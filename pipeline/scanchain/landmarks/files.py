@@ -77,14 +77,7 @@ def _read(path: Path) -> dict[str, Matrix]:
             return {name: _table(path, name, file[name]) for name in _SHAPES if name in file}
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path") from None
-    except (
-        ValueError,
-        EOFError,
-        KeyError,
-        zipfile.BadZipFile,
-        zipfile.LargeZipFile,
-        NotImplementedError,
-    ) as error:
+    except (ValueError, EOFError, KeyError, zipfile.BadZipFile, NotImplementedError) as error:
         reason = "it holds pickled objects" if "pickle" in str(error) else str(error)
         raise InputError(f"{path}: is no npz of plain arrays ({reason}); write it with numpy.savez") from None
 

@@ -14,7 +14,7 @@ from scanchain.kernels.landmarks import factors
 from scanchain.landmarks.estimate import Minimum, StudentLoss, from_odometry, growing, minimize
 from scanchain.landmarks.files import RangeLog
 from scanchain.landmarks.problem import BearingRangeProblem, Calibration, Measurements, Values
-from scanchain.landmarks.solvers import ESTIMATOR, Covariance, LinearSolver, create_solver
+from scanchain.landmarks.solvers import ESTIMATOR, Covariance, create_solver
 
 _AT_REST = np.square([1e-3, 1e-3, 1e-3])  # m², m², rad² a second, whether or not the robot moves
 _LEAST_VARIANCE = 1e-12  # m², rad²; keeps the covariance of a motion that takes no time invertible
@@ -266,50 +266,42 @@ def solve_range_log(log: RangeLog, noise: OdometryNoise | None) -> RangeSolution
         )
 
     stated = np.concatenate([(noise or OdometryNoise()).densities, _SENSOR])
-    reckoning = reckon(log, nodes_s, np.zeros(len(OWN)))
+    reckoning, variances, loss = (
+        reckon(log, nodes_s, np.zeros(len(OWN))),
+        stated,
+        StudentLoss(np.ones(len(observed))),
+    )
     problem = BearingRangeProblem(measurements(reckoning, stated))
     reckoned, guess = from_odometry(problem.measurements), growing(problem.measurements, solver)
-    variances, loss = stated, StudentLoss(np.ones(len(observed)))
-    minimum, covariance, found = _settled(problem, guess, loss, variances, reckoning, solver, _ROUGH)
-    if not np.all(found.redundancy > _LEAST_FREEDOM):
-        raise InputError("the landmarks were seen too seldom to estimate the sensor's noise; give a longer log")
-    iterations = minimum.iterations
-    for turn in range(_TURNS):
+    state, iterations, turn, is_last = guess, 0, 0, False
+    while True:
+        minimum = minimize(
+            problem, state, solver, loss=loss, tolerance=_FINE if is_last else _ROUGH, first_damping=_LITTLE,
+            max_iterations=_MOST,
+        )  # fmt: skip
+        iterations += minimum.iterations
+        covariance = Covariance(problem.system(minimum.estimate.at, minimum.estimate.weights))
+        sources = variances[:4, None, None] * reckoning.sources
+        found = consistency(problem, minimum, covariance, sources, loss.share)
+        if turn == 0 and not np.all(found.redundancy > _LEAST_FREEDOM):
+            raise InputError(
+                "the landmarks were seen too seldom to estimate the sensor's noise; give a longer log"
+            )
+        if is_last:
+            break
         growth = found.growth(stated / variances)
         if noise is not None:
             growth[:4] = 1.0
-        is_last = turn == _TURNS - 1 or bool(np.abs(np.sqrt(growth) - 1.0).max() < _CHANGE)
+        turn += 1
+        is_last = turn == _TURNS or bool(np.abs(np.sqrt(growth) - 1.0).max() < _CHANGE)
         variances = np.maximum(variances * growth, _LEAST)
         residuals = np.sqrt(minimum.estimate.weights / loss.share)[:, None] * minimum.estimate.at.observations
         loss = StudentLoss(sightings.share(sightings.correlation(residuals)))
         state = minimum.estimate.state
-        if turn < _RECKONED:
+        if turn <= _RECKONED:
             reckoning = reckon(log, nodes_s, state.calibration)
         problem = BearingRangeProblem(measurements(reckoning, variances))
-        tolerance = _FINE if is_last else _ROUGH
-        minimum, covariance, found = _settled(problem, state, loss, variances, reckoning, solver, tolerance)
-        iterations += minimum.iterations
-        if is_last:
-            break
     return RangeSolution(
         nodes_s, reckoned, problem, guess, minimum, variances, loss, covariance, found, iterations,
         working_s() - begin,
     )  # fmt: skip
-
-
-def _settled(
-    problem: BearingRangeProblem,
-    state: Values,
-    loss: StudentLoss,
-    variances: NDArray[np.float64],
-    reckoning: Reckoning,
-    solver: LinearSolver,
-    tolerance: float,
-) -> tuple[Minimum, Covariance, Consistency]:
-    """The minimum for a given noise, the covariance there, and the consistency of its residuals."""
-    minimum = minimize(
-        problem, state, solver, loss=loss, tolerance=tolerance, first_damping=_LITTLE, max_iterations=_MOST
-    )
-    covariance = Covariance(problem.system(minimum.estimate.at, minimum.estimate.weights))
-    sources = variances[:4, None, None] * reckoning.sources
-    return minimum, covariance, consistency(problem, minimum, covariance, sources, loss.share)

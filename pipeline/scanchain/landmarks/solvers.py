@@ -5,18 +5,19 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_matrix, csr_matrix, diags_array, identity
+from scipy.sparse import block_array, csc_matrix, csr_matrix, dia_array, diags_array, identity
 from scipy.sparse.linalg import MatrixRankWarning, SuperLU, inv, splu, spsolve, spsolve_triangular
 
 from scanchain.clock import working_s
 from scanchain.data import Matrix
 from scanchain.errors import InputError
 from scanchain.graph.cholesky import Analysis, SingularMatrixError, SparseCholesky, analyze, upper_factor
-from scanchain.kernels.landmarks import arrow, sparse_qr
+from scanchain.kernels.landmarks import algebra
 from scanchain.landmarks.problem import Layout, LinearSystem, Pattern, landmark_columns, pose_columns
 
 LOST_DIGITS = 1e-13  # a pivot below this share of its diagonal entry (of AᵀA) or column (of A) is rounding noise
@@ -180,41 +181,41 @@ class CholeskyMethod:
     build = staticmethod(normal_equations)
 
     def __init__(self) -> None:
-        self._known: tuple[Pattern, SparseCholesky] | None = None
+        self._analyzed = lru_cache(maxsize=1)(_cholesky_of)
 
     def factorize(self, system: LinearSystem, built: tuple[csc_matrix, NDArray[np.float64]]) -> Factored:
         """U with AᵀA = UᵀU."""
         H, g = built
-        if self._known is None or self._known[0] is not system.pattern:
-            pattern = system.pattern.squared()
-            self._known = system.pattern, SparseCholesky(pattern, analyze(pattern))
-        cholesky = self._known[1]
+        cholesky = self._analyzed(system.pattern)
         H.sum_duplicates()  # sorts it, so that entries are found by bisection
         cholesky.factorize(np.asarray(H[cholesky.pattern.rows, cholesky.pattern.columns]).ravel())
         U, order = upper_factor, cholesky.analysis.order
         return Factored(lambda: cholesky.solve(g), lambda: Factor("U of AᵀA", csc_matrix(U(cholesky)), order))
 
 
+def _cholesky_of(pattern: Pattern) -> SparseCholesky:
+    squared = pattern.squared()
+    return SparseCholesky(squared, analyze(squared))
+
+
 class QrMethod:
     """A = Q R by Givens rotations, without ever forming AᵀA; the analysis of a pattern is reused as well."""
 
-    def __init__(self, ordering: Literal["natural", "colamd"]) -> None:
-        self._ordering = ordering
-        self._known: tuple[Pattern, Analysis] | None = None
+    def __init__(self, *, is_natural: bool) -> None:
+        def analyzed(pattern: Pattern) -> Analysis:
+            return analyze(pattern.squared(), np.arange(pattern.shape[1]) if is_natural else None)
+
+        self._analyzed = lru_cache(maxsize=1)(analyzed)
 
     def build(self, system: LinearSystem) -> Analysis:
-        """The order of the columns, of "colamd" by minimum degree in AᵀA, and where R has entries."""
-        pattern = system.pattern
-        if self._known is None or self._known[0] is not pattern:
-            order = np.arange(pattern.shape[1]) if self._ordering == "natural" else None
-            self._known = pattern, analyze(pattern.squared(), order)
-        return self._known[1]
+        """The order of the columns, by minimum degree in AᵀA where it is not natural, and where R has entries."""
+        return self._analyzed(system.pattern)
 
     def factorize(self, system: LinearSystem, built: Analysis) -> Factored:
         """R of A, and the head of Qᵀb."""
         pattern, n = system.pattern, system.pattern.shape[1]
         place, R, z = np.argsort(built.order), np.zeros(len(built.rows) + n), np.zeros(n)
-        sparse_qr.rotate(
+        algebra.rotate(
             _order_of_rows(pattern, place), pattern.row_start, pattern.columns, system.values, system.b,
             place, built.begin, built.rows, built.parent, R, z,
         )  # fmt: skip
@@ -284,7 +285,7 @@ class Covariance:
         except SingularMatrixError as error:
             raise undetermined(system) from error
         self._band, self._border, self._corner = (np.empty_like(part) for part in (U.band, U.border, U.corner))
-        arrow.invert(U.band, U.border, U.corner, self._band, self._border, self._corner)
+        algebra.invert(U.band, U.border, U.corner, self._band, self._border, self._corner)
 
     @property
     def poses(self) -> Matrix:
@@ -299,18 +300,18 @@ class Covariance:
     def of(self, columns: NDArray[np.int64]) -> Matrix:
         """Covariances of groups of unknowns, (N, c) columns of A to (N, c, c); NaN for poses far apart."""
         result = np.empty((*columns.shape, columns.shape[1]))
-        arrow.blocks(self._band, self._border, self._corner, columns, result)
+        algebra.blocks(self._band, self._border, self._corner, columns, result)
         return result
 
 
 def _solved(U: Arrow, g: NDArray[np.float64]) -> NDArray[np.float64]:
     """Solve UᵀU x = g, in place of g."""
     poses, landmarks = np.split(g, [U.band.shape[1]])
-    arrow.solve_forward(U.band, poses)
+    algebra.solve_forward(U.band, poses)
     landmarks -= poses @ U.border
-    arrow.solve_corner(U.corner, landmarks)
+    algebra.solve_corner(U.corner, landmarks)
     poses -= U.border @ landmarks
-    arrow.solve_backward(U.band, poses)
+    algebra.solve_backward(U.band, poses)
     return g
 
 
@@ -322,7 +323,7 @@ def _form(system: LinearSystem) -> tuple[Arrow, NDArray[np.float64]]:
         np.zeros((layout.bandwidth + 1, split)), np.zeros((split, n - split)), np.zeros((n - split, n - split))
     )
     g = np.zeros(n)
-    arrow.products(
+    algebra.products(
         pattern.row_start, pattern.columns, system.values, system.b, split, H.band, H.border, H.corner, g
     )
     return H, g
@@ -331,26 +332,20 @@ def _form(system: LinearSystem) -> tuple[Arrow, NDArray[np.float64]]:
 def _eliminate(H: Arrow) -> None:
     """Turn AᵀA into its factor, in place: P = UᵀU banded, Y = U⁻ᵀ Bᵀ, S = C − YᵀY = UᵀU dense."""
     floor = LOST_DIGITS * H.corner.diagonal()
-    failed = arrow.eliminate(H.band, H.border, LOST_DIGITS)
+    failed = algebra.eliminate(H.band, H.border, LOST_DIGITS)
     if failed < 0:
-        arrow.complement(H.corner, H.border)
-        failed = arrow.eliminate_corner(H.corner, floor)
+        algebra.complement(H.corner, H.border)
+        failed = algebra.eliminate_corner(H.corner, floor)
     if failed >= 0:
         raise SingularMatrixError(failed, failed)
 
 
 def _factor_of_arrow(U: Arrow) -> Factor:
-    """The three parts put together, with every entry that may fill in."""
-    width, split = U.band.shape[0] - 1, U.band.shape[1]
-    n, rest = split + len(U.corner), len(U.corner)
-    places = np.indices(U.band.shape).reshape(2, -1)
-    below, right = places[:, places.sum(axis=0) >= width]  # the corner of a band's storage is not part of it
-    pose, landmark = np.indices(U.border.shape)
-    upper, lower = np.triu_indices(rest)
-    rows = np.concatenate([below + right - width, pose.ravel(), split + upper])
-    columns = np.concatenate([right, split + landmark.ravel(), split + lower])
-    values = np.concatenate([U.band[below, right], U.border.ravel(), U.corner[upper, lower]])
-    return Factor("U of AᵀA", csc_matrix((values, (rows, columns)), shape=(n, n)), np.arange(n))
+    """The three parts put together."""
+    split = U.band.shape[1]
+    poses = dia_array((U.band[::-1], np.arange(len(U.band))), shape=(split, split))
+    matrix = block_array([[poses, csc_matrix(U.border)], [None, csc_matrix(np.triu(U.corner))]])
+    return Factor("U of AᵀA", csc_matrix(matrix), np.arange(split + len(U.corner)))
 
 
 _MAKERS = {
@@ -358,8 +353,8 @@ _MAKERS = {
     "pinv": lambda: ScipyMethod("pinv"),
     "lu": lambda: ScipyMethod("lu"),
     "lu_colamd": lambda: ScipyMethod("lu_colamd"),
-    "qr": lambda: QrMethod("natural"),
-    "qr_colamd": lambda: QrMethod("colamd"),
+    "qr": lambda: QrMethod(is_natural=True),
+    "qr_colamd": lambda: QrMethod(is_natural=False),
     "cholesky": CholeskyMethod,
     "schur": SchurMethod,
 }

@@ -85,11 +85,8 @@ def against_truth(
         errors = [absolute_error(each, Alignment.RIGID) for each in pairs]
     except InputError:
         why = "no motion capture at these times"
-        return (
-            [Estimate(each, lie.identity(2), np.nan, np.nan, why) for each in states],
-            np.empty((0, 2)),
-            surveyed,
-        )
+        estimates += [Estimate(each, lie.identity(2), np.nan, np.nan, why) for each in states]
+        return estimates, np.empty((0, 2)), surveyed
     for state, error in zip(states, errors, strict=True):
         T_truth_estimate = lie.flatten(error.T_reference_estimate)
         landmarks_m = _rms(lie.transform(T_truth_estimate, state.landmarks) - surveyed)

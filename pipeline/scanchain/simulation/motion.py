@@ -71,40 +71,34 @@ class Course(NamedTuple):
     speed_m_s: NDArray[np.float64]
 
 
+@dataclass(frozen=True, slots=True)
 class Motion:
     """A vehicle's motion along a course, whose pose is known at any instant.
 
     ``course`` at (N,) instants; ``phases`` (5,) of the body's sway.
     """
 
-    def __init__(
-        self,
-        course: Callable[[NDArray[np.floating]], Course],
-        vehicle: Vehicle,
-        solids: Solids,
-        phases: NDArray[np.float64],
-    ) -> None:
-        self._course = course
-        self._vehicle = vehicle
-        self._solids = solids
-        self._phases = phases
+    course: Callable[[NDArray[np.floating]], Course]
+    vehicle: Vehicle
+    solids: Solids
+    phases: NDArray[np.float64]
 
     def base(self, times_s: NDArray[np.floating]) -> Matrix:
         """T_world_base at (N,) instants, (N, 4, 4): x along the path, z normal to the ground."""
-        place, forward, speed_m_s = self._course(times_s)
+        place, forward, speed_m_s = self.course(times_s)
         if place.shape[1] == 2:
-            height_m, slope = self._solids.ground_height(place), self._solids.ground_slope(place)
+            height_m, slope = self.solids.ground_height(place), self.solids.ground_slope(place)
         else:
             height_m, slope = place[:, 2], np.zeros_like(forward)
         poses = _stand(place[:, :2], height_m, slope, forward)
-        if self._vehicle.sway_rad > 0.0 or self._vehicle.heave_m > 0.0:
-            share = speed_m_s / self._vehicle.speed_m_s
-            poses = poses @ lie.exp(_sway(self._vehicle, self._phases, times_s, share))
+        if self.vehicle.sway_rad > 0.0 or self.vehicle.heave_m > 0.0:
+            share = speed_m_s / self.vehicle.speed_m_s
+            poses = poses @ lie.exp(_sway(self.vehicle, self.phases, times_s, share))
         return poses
 
     def lidar(self, times_s: NDArray[np.floating]) -> Matrix:
         """T_world_lidar at (N,) instants, (N, 4, 4)."""
-        return self.base(times_s) @ self._vehicle.T_base_lidar
+        return self.base(times_s) @ self.vehicle.T_base_lidar
 
 
 def _sway(

@@ -23,8 +23,7 @@ class Solids:
 
     Attributes
     ----------
-    rows : (S, 9) kind; center x, y; half lengths, or radii, x, y; cos and sin of the yaw; bottom and top, or of
-        ellipsoids center z and radius z
+    rows : (S, 9) as ``cast_rays`` takes them
     owner : (S,) number of the movable object that each solid is a part of, FIXED for none
     ground : (7 + 4 W,) z = g0 + g1 sin(g2 x + g3) + g4 sin(g5 y + g6) + Σ a sin(b x + c y + d), W rows a, b, c, d
     """

@@ -238,29 +238,13 @@ def scatter_between(
     for f in range(errors.shape[0]):
         _weigh(jacobian[f], errors[f], information[f], weights[f], whitened, M, g)
         i, j, pair = slots[f, 0], slots[f, 1], slots[f, 2]
-        if i >= 0:
-            _add(blocks[i], M, 1.0)
-            _add_row(gradient[i], g, -1.0)
-        if j >= 0:
-            _add(blocks[j], M, 1.0)
-            _add_row(gradient[j], g, 1.0)
-        if pair >= 0:
-            _add(blocks[pair], M, -1.0)
-
-
-@njit(nogil=True)
-def _add(block: _Array, M: _Array, sign: float) -> None:
-    """Add ±M to a block."""
-    for a in range(M.shape[0]):
-        for b in range(M.shape[1]):
-            block[a, b] += sign * M[a, b]
-
-
-@njit(nogil=True)
-def _add_row(row: _Array, g: _Array, sign: float) -> None:
-    """Add ±g to a row of the gradient."""
-    for a in range(g.size):
-        row[a] += sign * g[a]
+        for slot, sign in ((i, 1.0), (j, 1.0), (pair, -1.0)):
+            for a in range(k if slot >= 0 else 0):
+                for b in range(k):
+                    blocks[slot, a, b] += sign * M[a, b]
+        for slot, sign in ((i, -1.0), (j, 1.0)):
+            for a in range(k if slot >= 0 else 0):
+                gradient[slot, a] += sign * g[a]
 
 
 @njit(nogil=True)

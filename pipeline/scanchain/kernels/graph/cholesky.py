@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.graph.fronts import Blocks, Fronts, triangle
-from scanchain.kernels.graph.symbolic import families
+from scanchain.kernels.graph.symbolic import Blocks, Fronts, families, triangle
 
 _Array = NDArray[np.float64]
 _PANEL = 32  # pivots eliminated before the rest of the front is touched

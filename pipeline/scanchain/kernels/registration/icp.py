@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from scanchain.kernels.compiling import njit
 from scanchain.kernels.geometry import orthonormalize, perturb
-from scanchain.kernels.matrices import solve
+from scanchain.kernels.matrices import factorize, substitute
 from scanchain.kernels.registration.association import associate, weigh
 from scanchain.kernels.registration.residuals import (
     Problem,
@@ -195,8 +195,9 @@ def _descend(problem, scale_m: float, slack_m: float, now, trial, x, factor) -> 
     """True if one step x (k,) was taken with the present correspondences; False where H is singular.
 
     Levenberg–Marquardt takes back a step that raises the cost and damps harder (Marquardt 1963), by a factor
-    that doubles each time (Nielsen 1999); x is zero where no step lowers the cost any more. After a step by which
-    a point moves further than slack_m, the normal equations are left as they are: the caller associates again.
+    that doubles each time; after one of gain ratio ρ it damps by λ · max(⅓, 1 − (2ρ − 1)³) (Nielsen 1999). x is
+    zero where no step lowers the cost any more. After a step by which a point moves further than slack_m, the
+    normal equations are left as they are: the caller associates again.
     """
     settings = problem.settings
     growth = 2.0
@@ -210,8 +211,9 @@ def _descend(problem, scale_m: float, slack_m: float, now, trial, x, factor) -> 
             _linearize(problem, scale_m, trial)
         lowered = now.sums[_COST] - trial.sums[_COST]
         if settings.optimizer != LEVENBERG_MARQUARDT or lowered >= 0.0:
-            gain = lowered / max(predicted_decrease(now.H, now.b, x), 1e-300)
-            trial.sums[_DAMPING] = max(relax(now.sums[_DAMPING], min(gain, 1.0)), _LEAST_DAMPING)
+            gain = min(lowered / max(predicted_decrease(now.H, now.b, x), 1e-300), 1.0)
+            relaxed = now.sums[_DAMPING] * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
+            trial.sums[_DAMPING] = max(relaxed, _LEAST_DAMPING)
             _accept(now, trial)
             return True
         if _is_small(x, settings) or now.sums[_DAMPING] > _MOST_DAMPING:
@@ -315,11 +317,12 @@ def step(optimizer: int, H, b, damping: float, factor, x) -> bool:
         return along > 0.0
     if optimizer != LEVENBERG_MARQUARDT:
         damping = 0.0
-    solved = solve(H, b, damping, factor, x)
-    while not solved and optimizer == NEWTON and damping < 1e6:
+    while not factorize(H, damping, factor):
+        if optimizer != NEWTON or damping >= 1e6:
+            return False
         damping = max(4.0 * damping, 1e-3)
-        solved = solve(H, b, damping, factor, x)
-    return solved
+    substitute(factor, b, x)
+    return True
 
 
 @njit(nogil=True)
@@ -332,9 +335,3 @@ def predicted_decrease(H, b, x) -> float:
             row += 0.5 * H[i, j] * x[j]
         total -= x[i] * row
     return total
-
-
-@njit(nogil=True)
-def relax(damping: float, gain: float) -> float:
-    """The damping after an accepted step of gain ratio ρ: λ · max(⅓, 1 − (2ρ − 1)³) (Nielsen 1999)."""
-    return damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)

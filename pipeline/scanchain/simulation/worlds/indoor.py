@@ -75,17 +75,11 @@ def build_wall(scenery: Scenery, wall: Wall, rng: np.random.Generator) -> None:
             scenery.box(middle, (2.0 * half, 0.04), (0.01, 2.1), wall.yaw_rad - wall.leaves * turn_rad)
 
 
-class Room(NamedTuple):
-    """A rectangle between the middles of its walls, meters."""
-
-    x0: float
-    y0: float
-    x1: float
-    y1: float
-
-
 class Furnisher:
-    """Fills rooms at random; furniture that finds no room after a few tries is left out."""
+    """Fills rooms at random; furniture that finds no room after a few tries is left out.
+
+    Rooms are rectangles between the middles of their walls: low x, low y, high x, high y.
+    """
 
     def __init__(self, scenery: Scenery, route: Matrix, doors: Matrix, rng: np.random.Generator) -> None:
         self._scenery = scenery
@@ -94,20 +88,19 @@ class Furnisher:
         self._rng = rng
         self._taken: list[tuple[Matrix, Matrix]] = []  # center and half size
 
-    def furnish(self, room: Room) -> None:
+    def furnish(self, room: Matrix) -> None:
         """Shelves along the walls, a desk for every 5 m², bins and a plant."""
-        desks = int((room.x1 - room.x0) * (room.y1 - room.y0) / 5.0)
+        desks = int(np.prod(room[2:] - room[:2]) / 5.0)
         wishes: tuple[tuple[Kind, int], ...] = (("shelf", 3), ("desk", desks), ("bin", 2), ("plant", 1))
         for kind, count in wishes:
             for _ in range(count):
                 any(self._try(kind, room) for _ in range(_TRIES))
 
-    def _try(self, kind: Kind, room: Room) -> bool:
+    def _try(self, kind: Kind, room: Matrix) -> bool:
         """Put one piece of furniture at a random position in the room, unless something overlaps it."""
         upright = int(self._rng.integers(2))
         half = 0.5 * np.array(_SIZES_M[kind])[[upright, 1 - upright]]
-        low = np.array([room.x0, room.y0]) + 0.1 + half
-        high = np.array([room.x1, room.y1]) - 0.1 - half
+        low, high = room[:2] + 0.1 + half, room[2:] - 0.1 - half
         center = self._rng.uniform(low, high)
         if kind == "shelf":  # its back to a wall
             axis = 1 - upright
@@ -186,12 +179,11 @@ _WALLS = (
     Wall(6, 6, 6, 12), Wall(20, 6, 20, 12, (1.6,)), Wall(10.5, 6, 10.5, 12), Wall(15.2, 6, 15.2, 12),
 )  # fmt: skip
 
-_ROOMS = (
-    Room(0, 0, 5.6, 4), Room(5.6, 0, 10.3, 4), Room(10.3, 0, 15.9, 4), Room(15.9, 0, 20.4, 4),
-    Room(20.4, 0, 26, 4), Room(0, 14, 5.2, 18), Room(5.2, 14, 12.6, 18), Room(12.6, 14, 20.2, 18),
-    Room(20.2, 14, 26, 18), Room(0, 4, 4, 8.7), Room(0, 8.7, 4, 14), Room(22, 4, 26, 9.4), Room(22, 9.4, 26, 14),
-    Room(10.5, 6, 15.2, 12), Room(15.2, 6, 20, 12),
-)  # fmt: skip
+_ROOMS = np.array([
+    [0, 0, 5.6, 4], [5.6, 0, 10.3, 4], [10.3, 0, 15.9, 4], [15.9, 0, 20.4, 4], [20.4, 0, 26, 4], [0, 14, 5.2, 18],
+    [5.2, 14, 12.6, 18], [12.6, 14, 20.2, 18], [20.2, 14, 26, 18], [0, 4, 4, 8.7], [0, 8.7, 4, 14],
+    [22, 4, 26, 9.4], [22, 9.4, 26, 14], [10.5, 6, 15.2, 12], [15.2, 6, 20, 12],
+])  # fmt: skip
 
 
 def office(rng: np.random.Generator) -> Solids:
