@@ -128,8 +128,6 @@ def _problems(
     result: Result, points: int, target: VoxelMap, observability: float, config: MatchingConfig
 ) -> Iterator[Problem]:
     """Why a result did not converge, the worst first; none if it did."""
-    freedom, voxel_m = len(result.information), target.voxels.size_m
-    paired = f"{result.pairs} of {points} points have a correspondence"
     if not math.isfinite(largest_magnitude(result.T)):
         yield Problem.plain("the pose is not finite")
     if result.ending == icp.NO_CORRESPONDENCES:
@@ -137,7 +135,8 @@ def _problems(
     if result.pairs < config.min_inlier_share * points:
         yield Problem(
             "few points have a correspondence (matching.min_inlier_share)",
-            f"{paired}, below the share matching.min_inlier_share ({config.min_inlier_share:g})",
+            f"{result.pairs} of {points} points have a correspondence, below the share "
+            f"matching.min_inlier_share ({config.min_inlier_share:g})",
         )
     if observability < 1.0:
         direction = " ".join(f"{value:.2f}" for value in result.direction)
@@ -160,10 +159,18 @@ def _problems(
             "residual > matching.kernel_scale_m",
             f"residual {result.residual_m:.2g} m > matching.kernel_scale_m ({config.kernel_scale_m:g})",
         )
-    # a fit may be due to chance where it is not redundant enough
+    yield from _chances(result, points, target)
+
+
+def _chances(result: Result, points: int, target: VoxelMap) -> Iterator[Problem]:
+    """Why the fit may be due to chance; none if it is redundant enough."""
+    freedom, voxel_m = len(result.information), target.voxels.size_m
     if result.pairs < _LEAST_OVERLAP * points:
         few = f"fewer than {100 * _LEAST_OVERLAP:.0f} %"
-        yield Problem(f"{few} of the points have a correspondence", f"{paired}, {few}")
+        yield Problem(
+            f"{few} of the points have a correspondence",
+            f"{result.pairs} of {points} points have a correspondence, {few}",
+        )
     if result.on_surfaces < _REDUNDANCY * freedom:
         yield Problem(
             "few correspondences with a surface",
