@@ -227,7 +227,7 @@ def _fill_reducing_order(links: csr_matrix) -> NDArray[np.int64]:
 
     An incomplete factorization that drops every entry hands the ordering out without the work of a full one.
     """
-    n = links.shape[0]
+    n = len(links.indptr) - 1
     if n < 2:
         return np.arange(n)
     dominant = diags(np.diff(links.indptr) + 1.0) - links
