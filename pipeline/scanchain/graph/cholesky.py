@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse import csr_matrix, diags
 from scipy.sparse.linalg import spilu
 
 from scanchain.data import Matrix
@@ -104,9 +104,11 @@ class Analysis:
 
 def analyze(pattern: BlockPattern, order: NDArray[np.int64] | None = None) -> Analysis:
     """Fill-in of the factor, the same for blocks of any size; without an order (n,) in a fill-reducing one."""
-    start, neighbors = _adjacency(pattern)
+    ends, n = np.concatenate([pattern.pairs, pattern.pairs[:, ::-1]]).T, len(pattern.sizes)
+    links = csr_matrix((np.ones(ends.shape[1]), ends), shape=(n, n))
+    start, neighbors = links.indptr.astype(np.int64), links.indices.astype(np.int64)
     if order is None:
-        order = _fill_reducing_order(start, neighbors)
+        order = _fill_reducing_order(links)
         order = order[symbolic.postorder(symbolic.elimination_tree(start, neighbors, order))]
     parent = symbolic.elimination_tree(start, neighbors, order)
     return Analysis(order, parent, *symbolic.column_structures(start, neighbors, order, parent))
@@ -220,28 +222,21 @@ class SparseCholesky:
         return result
 
 
-def _adjacency(pattern: BlockPattern) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Neighbor lists of the variables, without themselves: (start (n + 1,), neighbors)."""
-    both = np.concatenate([pattern.pairs, pattern.pairs[:, ::-1]])
-    both = both[np.lexsort((both[:, 1], both[:, 0]))]
-    start = np.searchsorted(both[:, 0], np.arange(len(pattern.sizes) + 1))
-    return start.astype(np.int64), np.ascontiguousarray(both[:, 1])
-
-
-def _fill_reducing_order(start: NDArray[np.int64], neighbors: NDArray[np.int64]) -> NDArray[np.int64]:
+def _fill_reducing_order(links: csr_matrix) -> NDArray[np.int64]:
     """Variable to eliminate at each position, by multiple minimum degree (Liu 1985) as SuperLU has it.
 
     An incomplete factorization that drops every entry hands the ordering out without the work of a full one.
     """
-    n = len(start) - 1
+    n = len(links.indptr) - 1
     if n < 2:
         return np.arange(n)
-    rows = np.concatenate([np.repeat(np.arange(n), np.diff(start)), np.arange(n)])
-    columns = np.concatenate([neighbors, np.arange(n)])
-    weights = np.concatenate([np.full(len(neighbors), -1.0), np.diff(start) + 1.0])
-    matrix = coo_matrix((weights, (rows, columns)), shape=(n, n)).tocsc()
+    dominant = diags(np.diff(links.indptr) + 1.0) - links
     factor = spilu(
-        matrix, drop_tol=1.0, fill_factor=1.0, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}
+        dominant.tocsc(),
+        drop_tol=1.0,
+        fill_factor=1.0,
+        permc_spec="MMD_AT_PLUS_A",
+        options={"SymmetricMode": True},
     )
     return np.argsort(factor.perm_c).astype(np.int64)
 

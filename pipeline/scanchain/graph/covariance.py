@@ -7,19 +7,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.errors import InputError
 from scanchain.files import write_whole
 from scanchain.graph.between import BetweenProblem, turns
 
 _NAMES = {3: ("x", "y", "yaw"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
-
-
-def relative_covariance(problem: BetweenProblem, poses: Matrix, i: int, j: int) -> Matrix:
-    """Covariance (k, k) of a right twist on T_i⁻¹ T_j, Ad(T_j⁻¹) Cov(ξ_j − ξ_i) Ad(T_j⁻¹)ᵀ."""
-    adjoint = lie.adjoint(lie.inverse(poses[j]))
-    return adjoint @ difference_covariances(problem, np.array([[i, j]]))[0, 0] @ adjoint.T
 
 
 def responses(problem: BetweenProblem, i: int, j: int) -> Matrix:
@@ -89,10 +82,9 @@ def chosen_poses(text: str, ids: NDArray[np.int64]) -> NDArray[np.int64]:
         wanted = [int(word) for word in text.split(",")]
     except ValueError:
         raise InputError(f"--marginals is {text!r}; take all, or vertex ids with commas between them") from None
-    unknown = sorted(set(wanted) - set(ids.tolist()))
-    if unknown:
-        raise InputError(f"--marginals {unknown[0]}: no such vertex; the ids go from {ids.min()} to {ids.max()}")
     place = {name: index for index, name in enumerate(ids.tolist())}
+    for unknown in sorted(set(wanted) - set(place))[:1]:
+        raise InputError(f"--marginals {unknown}: no such vertex; the ids go from {ids.min()} to {ids.max()}")
     return np.array([place[name] for name in wanted])
 
 

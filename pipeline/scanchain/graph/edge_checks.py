@@ -116,7 +116,7 @@ def check_edges(edges: NDArray[np.int64], measurements: Matrix, information: Mat
     ]
     limit = f"over {LARGEST:g}; give meters and radians, and an inverse covariance of these"
     for what, matrices in (("measurement", measurements), ("information", information)):
-        size = np.nan_to_num(np.abs(matrices).max(axis=(1, 2), initial=0.0), posinf=0.0)
+        size = np.abs(matrices).max(axis=(1, 2), initial=0.0)
         largest = size.max(initial=LARGEST)
         faults.append(((size > LARGEST) & (size == largest), f": {what} of {largest:g}, {limit}"))
     text = ": information matrix is not symmetric positive semidefinite; give an inverse covariance"
@@ -126,13 +126,10 @@ def check_edges(edges: NDArray[np.int64], measurements: Matrix, information: Mat
 
 
 def positive_semidefinite(information: Matrix) -> NDArray[np.bool_]:
-    """True for each of the matrices (E, k, k) that is finite, symmetric and positive semidefinite, (E,)."""
-    largest = np.abs(information).max(axis=(1, 2), initial=0.0)
-    is_finite = np.isfinite(largest)
-    known = np.where(is_finite[:, None, None], information, 0.0)
-    margin = np.where(is_finite, _ROUNDING * largest, 0.0)
-    asymmetry = np.abs(known - np.swapaxes(known, 1, 2)).max(axis=(1, 2), initial=0.0)
-    return is_finite & (asymmetry <= margin) & (np.linalg.eigvalsh(known)[:, 0] >= -margin)
+    """True for each of the finite matrices (E, k, k) that is symmetric and positive semidefinite, (E,)."""
+    margin = _ROUNDING * np.abs(information).max(axis=(1, 2), initial=0.0)
+    asymmetry = np.abs(information - np.swapaxes(information, 1, 2)).max(axis=(1, 2), initial=0.0)
+    return (asymmetry <= margin) & (np.linalg.eigvalsh(information)[:, 0] >= -margin)
 
 
 def nearest_semidefinite(information: Matrix) -> Matrix:

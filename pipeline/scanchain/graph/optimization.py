@@ -16,7 +16,7 @@ from scanchain.graph.consistency import Consistency, agreeing_groups
 from scanchain.graph.edge_checks import has_loop, is_connected
 from scanchain.graph.initialize import Initialization, first_guess
 from scanchain.graph.losses import InlierSet, RobustLoss, fair_price, rejection_limit, robust_loss
-from scanchain.graph.minimizer import Evaluation, Limits, Minimizer, Minimum
+from scanchain.graph.minimizer import Evaluation, Limits, Loss, Minimizer, Minimum
 
 Rejection = Literal["update", "judge"]
 
@@ -148,16 +148,6 @@ def minimize(minimizer: Minimizer, poses: Matrix, loss: RobustLoss, *, groups: b
     return replace(minimum, iterations=used + minimum.iterations)
 
 
-def settle(minimizer: Minimizer, start: Evaluation, inliers: InlierSet) -> Minimum:
-    """The minimum with these inliers."""
-    weights = minimizer.weights(start.chi2, inliers)
-    chosen = Focus(minimizer).on(weights)
-    kept = inliers.kept
-    inner = InlierSet(kept if chosen is minimizer else kept[kept], inliers.price)
-    minimum = chosen.descend(chosen.evaluate(start.poses, inner), inner)
-    return replace(minimum, estimate=minimizer.evaluate(minimum.estimate.poses, inliers), weights=weights)
-
-
 def _graduate(minimizer: Minimizer, now: Evaluation, loss: RobustLoss) -> tuple[Evaluation, RobustLoss, int]:
     """Follow the minimum from the convex loss to the loss itself, one step for each between.
 
@@ -169,9 +159,8 @@ def _graduate(minimizer: Minimizer, now: Evaluation, loss: RobustLoss) -> tuple[
         is_crisp = np.isinf(final.control) and np.all((weights < _CRISP) | (weights > 1.0 - _CRISP))
         if loss == final or is_crisp:
             break
-        chosen = focus.on(weights)
-        minimum = chosen.descend(chosen.evaluate(now.poses, loss), loss, Limits(1, 0.0))
-        now, used = minimizer.evaluate(minimum.estimate.poses, loss), used + minimum.iterations
+        minimum = focus.descend(now, loss, Limits(1, 0.0))
+        now, used = minimum.estimate, used + minimum.iterations
     return minimizer.reweighed(now, loss), loss, used
 
 
@@ -205,19 +194,25 @@ class Focus:
         problem = minimizer.problem
         self._is_free = is_connected(problem.edges[~minimizer.is_loop], problem.variable < 0)
 
-    def on(self, weights: NDArray[np.float64]) -> Minimizer:
-        """A minimizer of the edges with weight, (E,), and of hardly any other."""
-        wanted = weights > 0.0
+    def descend(self, start: Evaluation, loss: Loss, limits: Limits | None = None) -> Minimum:
+        """The minimum near these poses, by the edges that have weight there and hardly any other."""
+        whole = self._whole
+        wanted = whole.weights(start.chi2, loss) > 0.0
         wasted = 1.0 - wanted.sum() / self._kept.sum()
         if self._is_free and ((wanted & ~self._kept).any() or wasted > _WASTE):
-            self._kept, self._chosen = wanted, self._whole.restricted(wanted)
-        return self._chosen
+            self._kept, self._chosen = wanted, whole.restricted(wanted)
+        inner = loss
+        if isinstance(loss, InlierSet):
+            inner = InlierSet(loss.kept[self._kept[whole.loops]], loss.price)
+        minimum = self._chosen.descend(self._chosen.evaluate(start.poses, inner), inner, limits)
+        estimate = whole.evaluate(minimum.estimate.poses, loss)
+        return replace(minimum, estimate=estimate, weights=whole.weights(estimate.chi2, loss))
 
 
 def _refine(minimizer: Minimizer, now: Evaluation, loss: RobustLoss, *, groups: bool) -> Minimum:
     """The minimum with the present inliers, and then with those that the other edges do not contradict."""
     kept, nominal = loss.weight(now.chi2[minimizer.loops]) > 0.5, loss.scale**2
-    minimum = settle(minimizer, now, InlierSet(kept, nominal))
+    minimum = Focus(minimizer).descend(now, InlierSet(kept, nominal))
     problem = minimizer.problem
     if not is_connected(problem.edges[minimum.weights > 0.5], problem.variable < 0):
         return minimum
@@ -238,7 +233,7 @@ def _refine_edges(minimizer: Minimizer, minimum: Minimum, against: NDArray[np.fl
         if share < _FEWEST or not (gain > 0.0).any():
             break
         inliers = InlierSet(kept ^ (gain > (1.0 - share) * gain.max()), price)
-        trial = settle(minimizer, minimum.estimate, inliers)
+        trial = Focus(minimizer).descend(minimum.estimate, inliers)
         used = minimum.iterations + trial.iterations
         if not trial.estimate.cost < minimum.estimate.cost:
             minimum, share = replace(minimum, iterations=used), _FEWER * share
@@ -264,7 +259,7 @@ def _refine_groups(minimizer: Minimizer, minimum: Minimum, price: float, limit: 
         kept = minimum.weights > 0.5
         kept[group] ^= True
         inliers = InlierSet(kept[minimizer.loops], price)
-        trial = settle(minimizer, minimum.estimate, inliers)
+        trial = Focus(minimizer).descend(minimum.estimate, inliers)
         against = _against(minimizer, trial, price)
         trial = _refine_edges(minimizer, trial, against, price)
         used = minimum.iterations + trial.iterations
@@ -312,7 +307,7 @@ def update(minimizer: Minimizer, poses: Matrix, loss: RobustLoss, since: Since) 
     The graph predicts a revisit the less surely, the longer the path since the last: an edge with a large residual
     may agree with it all the same. New ones and groups of them that do are taken in where the cost falls.
     """
-    minimum = _descend(minimizer, minimizer.evaluate(poses, loss), loss)
+    minimum = Focus(minimizer).descend(minimizer.evaluate(poses, loss), loss)
     left_out = minimizer.is_loop & (minimum.weights < 0.5)
     problem = minimizer.problem
     if not left_out[since.updated :].any() or not is_connected(problem.edges[~left_out], problem.variable < 0):
@@ -323,19 +318,11 @@ def update(minimizer: Minimizer, poses: Matrix, loss: RobustLoss, since: Since) 
     kept = ~left_out
     kept[np.concatenate(promising)] = True
     inliers = InlierSet(kept[minimizer.loops], loss.scale**2)
-    trial = settle(minimizer, minimum.estimate, inliers)
+    trial = Focus(minimizer).descend(minimum.estimate, inliers)
     used = minimum.iterations + trial.iterations
-    trial = _descend(minimizer, minimizer.reweighed(trial.estimate, loss), loss)
+    trial = Focus(minimizer).descend(trial.estimate, loss)
     best = trial if trial.estimate.cost < minimum.estimate.cost else minimum
     return replace(best, iterations=used + trial.iterations)
-
-
-def _descend(minimizer: Minimizer, now: Evaluation, loss: RobustLoss) -> Minimum:
-    """The minimum near these poses."""
-    chosen = Focus(minimizer).on(minimizer.weights(now.chi2, loss))
-    minimum = chosen.descend(chosen.evaluate(now.poses, loss), loss)
-    estimate = minimizer.evaluate(minimum.estimate.poses, loss)
-    return replace(minimum, estimate=estimate, weights=minimizer.weights(estimate.chi2, loss))
 
 
 def _promising(minimizer: Minimizer, minimum: Minimum, limit: float, since: Since) -> list[NDArray[np.int64]]:

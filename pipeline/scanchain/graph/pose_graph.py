@@ -15,7 +15,7 @@ from scanchain.errors import InputError, counted
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.certificate import Certificate, certify
 from scanchain.graph.cholesky import SingularMatrixError
-from scanchain.graph.covariance import inverse_blocks, pose_errors, relative_covariance
+from scanchain.graph.covariance import difference_covariances, inverse_blocks, pose_errors
 from scanchain.graph.edge_checks import (
     check_connected,
     check_edges,
@@ -379,9 +379,11 @@ class PoseGraph:
     def relative_covariance(self, i: int, j: int) -> Matrix:
         """Covariance (k, k) of T_ij = T_i⁻¹ T_j, a right twist on it as in ``add_edge``, at the poses of now.
 
-        The factor of H is kept until the graph changes, so that each further pair costs k solves.
+        Of left twists it is Ad(T_j⁻¹) Cov(ξ_j − ξ_i) Ad(T_j⁻¹)ᵀ. The factor of H is kept until the graph changes,
+        so that each further pair costs k solves.
         """
-        return relative_covariance(self._factored(), self.poses, i, j)
+        adjoint = lie.adjoint(lie.inverse(self.poses[j]))
+        return adjoint @ difference_covariances(self._factored(), np.array([[i, j]]))[0, 0] @ adjoint.T
 
     def covariances(self) -> Matrix:
         """Covariance (K, k, k) of every pose's right twist, T exp(ξ), by the edges in force, at the poses of now.

@@ -48,29 +48,28 @@ class BackgroundOptimization:
         self.due, self.config, self.plan = due, config, plan
         self.before = graph.copy()
         self._thread: Thread | None = Thread(target=self._optimize, daemon=True)
-        self._optimized: PoseGraph | None = None
-        self._error: BaseException | None = None
+        self._outcome: PoseGraph | Exception | None = None
         self._thread.start()
 
     def result(self) -> PoseGraph:
         """The optimized graph, once it is done. Raises what ``PoseGraph.optimize`` does."""
         if self._thread is not None:
             self._thread.join()
-        elif self._optimized is None:  # from a checkpoint, which does not hold the thread
+        elif self._outcome is None:  # from a checkpoint, which does not hold the thread
             self._optimize()
-        if self._error is not None:
-            raise self._error
-        assert self._optimized is not None
-        return self._optimized
+        if isinstance(self._outcome, Exception):
+            raise self._outcome
+        assert self._outcome is not None
+        return self._outcome
 
     def _optimize(self) -> None:
         try:
             graph = self.before.copy()
             return_freed_memory()
             self.plan.carry_out(graph, self.config)
-            self._optimized = graph
+            self._outcome = graph
         except Exception as error:  # raised where the result is asked for
-            self._error = error
+            self._outcome = error
 
 
 class Schedule:

@@ -58,7 +58,10 @@ class FrontEnd:
     def locate(self, scan: Scan | Prepared) -> Located:
         """Place one scan by odometry; it becomes a keyframe where it moved far enough from the last one."""
         tracked = self.odometry.place(scan)
-        is_keyframe = not self.scans or tracked.elsewhere_m > 0.0 or self._moved_enough(tracked)
+        distance_m, angle_rad = lie.apart(self.T_odom_keyframe, tracked.T_odom_lidar)
+        is_far = distance_m > self.config.keyframe_distance_m or angle_rad > self.config.keyframe_angle_rad
+        has_moved = is_far and tracked.state is not State.LOST
+        is_keyframe = not self.scans or tracked.elsewhere_m > 0.0 or has_moved
         self.scans += 1
         if not tracked.is_repeated:
             self.information = self._since(tracked)
@@ -112,11 +115,6 @@ class FrontEnd:
             return information
         scale = np.eye(len(information)) + information @ self.doubt
         return np.asarray(np.linalg.solve(scale, information), np.float64)
-
-    def _moved_enough(self, tracked: Tracked) -> bool:
-        distance_m, angle_rad = lie.apart(self.T_odom_keyframe, tracked.T_odom_lidar)
-        is_far = distance_m > self.config.keyframe_distance_m or angle_rad > self.config.keyframe_angle_rad
-        return is_far and tracked.state is not State.LOST
 
 
 def _doubt_of(tracked: Tracked) -> Matrix:

@@ -254,11 +254,11 @@ class Odometry:
 
     def _extend(self, points: Points, registered: _Registered) -> None:
         """Insert the scan where its pose is known, or after so many lost scans that the map must be extended."""
-        self.recovery.take(registered.state)
+        if self.recovery.gives_up(registered.state):
+            self.map.insert(points, self.predictor.T_odom_lidar)
         if registered.state is State.LOST:
-            if self.recovery.has_given_up:
-                self.map.insert(points, self.predictor.T_odom_lidar)
-        elif registered.is_standing or not self.standstill.is_standing:  # else drawn aside by what moves past
+            return
+        if registered.is_standing or not self.standstill.is_standing:  # else drawn aside by what moves past
             self.map.extend(points, self.predictor.T_odom_lidar, is_standing=registered.is_standing)
 
     def _calibrate(self, scan: Scan, points: Points, state: State) -> None:

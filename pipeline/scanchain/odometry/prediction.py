@@ -105,7 +105,6 @@ class Prediction(msgspec.Struct, frozen=True):
     Attributes
     ----------
     prior : predicted pose and its covariance
-    statistics : those of the errors of predictions by the same means
     is_guess : whether scans are missing before this one, so that the pose may be far off
     velocity : (k,) twist per second at the last scan, lidar frame
     T_odom_last, T_previous_current : pose of the last scan, (d+1, d+1), and its motion since the one before
@@ -117,7 +116,6 @@ class Prediction(msgspec.Struct, frozen=True):
     """
 
     prior: Prior
-    statistics: ErrorStatistics
     is_guess: bool
     velocity: NDArray[np.float64]
     T_odom_last: Pose
@@ -249,18 +247,16 @@ class Predictor:
         wheel, is_guess, jump_m = self._wheel_motion(scan) if by_wheels else None, False, 0.0
         self.is_contradicted = False
         if wheel is not None:
-            motion, statistics, jump_m = wheel, self.by_wheels, self._jump_m(wheel, interval_s)
-            covariance = statistics.covariance
+            motion, covariance, jump_m = wheel, self.by_wheels.covariance, self._jump_m(wheel, interval_s)
         elif times.is_gap(interval_s):
             motion = _stretched(self.T_previous_current, interval_s, times.last_s, times.usual_s)
-            covariance, statistics, is_guess = self.filter.any_motion, self.by_velocity, True
+            covariance, is_guess = self.filter.any_motion, True
         else:
-            covariance = self.filter.predicted(self.by_velocity.covariance)[0]
-            motion, statistics = self.filter.motion, self.by_velocity
+            motion, covariance = self.filter.motion, self.filter.predicted(self.by_velocity.covariance)[0]
+        widest = (self.by_velocity if wheel is None else self.by_wheels).first_sigma
         T_predicted = lie.normalize(self.T_odom_lidar.dot(motion))  # here and below: half the time of @
         return Prediction(
-            prior=Prior(T_predicted, covariance, statistics.first_sigma, statistics is self.by_wheels),
-            statistics=statistics,
+            prior=Prior(T_predicted, covariance, widest, is_measured=wheel is not None),
             is_guess=is_guess,
             velocity=self.velocity,
             T_odom_last=self.T_odom_lidar,
@@ -317,13 +313,15 @@ class Predictor:
             self.filter.begin(lie.exp(share * lie.log(self.T_previous_current)))
         else:
             innovation = lie.log(lie.between(prediction.T_odom_lidar, match.T_target_source))
-            if prediction.statistics is self.by_velocity:
-                self.filter.correct(innovation, match.information, self.by_velocity.covariance)
-            else:
+            is_measured, statistics = prediction.prior.is_measured, self.by_velocity
+            if is_measured:
+                statistics = self.by_wheels
                 self.filter.begin(self.T_previous_current)
-            is_independent = not prediction.prior.is_measured or match.observability >= WEAK
+            else:
+                self.filter.correct(innovation, match.information, statistics.covariance)
+            is_independent = not is_measured or match.observability >= WEAK
             if state is State.OK and is_independent and not prediction.is_second:
-                prediction.statistics.update(innovation, definite_inverse(match.information).diagonal())
+                statistics.update(innovation, definite_inverse(match.information).diagonal())
 
     def _wheel_motion(self, scan: Scan) -> Pose | None:
         """Motion of the lidar since the last scan by the wheels; None without a reading at both ends."""

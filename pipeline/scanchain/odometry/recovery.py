@@ -77,20 +77,16 @@ class Recovery:
         """
         return state is State.LOST or match.cost / match.points > max(_ELSEWHERE * usual_cost, self.rough_cost)
 
-    def take(self, state: State) -> None:
-        """Count lost scans and those to search wide."""
+    def gives_up(self, state: State) -> bool:
+        """Count a scan; true if so many were lost in a row that the map has to be extended at the prediction."""
         is_lost = state is State.LOST
         self.lost_scans = self.lost_scans + 1 if is_lost else 0
         self.wide_scans = _WIDE_SCANS if is_lost else max(self.wide_scans - 1, 0)
+        return self.lost_scans >= _PATIENCE
 
     def forget(self) -> None:
         """Start with another map, in which the usual cost is unknown."""
         self.usual_cost = 0.0
-
-    @property
-    def has_given_up(self) -> bool:
-        """True if so many scans were lost that the map has to be extended at the prediction."""
-        return self.lost_scans >= _PATIENCE
 
     def _is_contradicted(self, match: Match) -> bool:
         """True if correspondences contradict the pose, and the cost per point is not as usual either."""

@@ -63,7 +63,8 @@ def align(
     if not range_m > 0.0:
         raise InputError(f"target: its {len(target):,} points lie on one point; wanted a cloud with an extent")
     if voxel_size_m is None:
-        voxel_size_m = range_m / _range_voxels(len(target), d)
+        around = 2.0 * (d - 1) * math.pi  # of a circle or a sphere of radius 1: few points span few voxels
+        voxel_size_m = range_m / min((len(target) / around) ** (1.0 / (d - 1)), _RANGE_VOXELS[d])
     unit_m = checks.positive(voxel_size_m, "voxel_size_m") / config.local_map.voxel_size_m
     source = lie.transform(lie.inverse(at_source), source)
     T_first = lie.inverse(at_target) @ T_guess @ at_source
@@ -122,12 +123,6 @@ def as_ambiguous(match: Match, apart_m: float, apart_rad: float) -> Match:
     """The same match, not converged because a pose so far away fits nearly as well."""
     reason = f"ambiguous: a pose {apart_m:.2g} m away, turned by {apart_rad:.2f} rad, fits nearly as well"
     return replace(match, converged=False, reason=reason, cause="ambiguous: another pose fits nearly as well")
-
-
-def _range_voxels(points: int, d: int) -> float:
-    """Voxels from the centroid to the median point: fewer where the points are few."""
-    circumference = 2.0 * math.pi if d == 2 else 4.0 * math.pi
-    return min((points / circumference) ** (1.0 / (d - 1)), _RANGE_VOXELS[d])
 
 
 def _downsampled(points: Points, config: PreprocessConfig) -> Points:

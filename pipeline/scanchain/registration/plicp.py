@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -27,7 +28,6 @@ _REACH, _LARGEST_REACH = 0.4, 8  # share of the largest distance that is searche
 _LEAST_OVERLAP = 0.75  # share of the points with a correspondence: made-up places have more at right poses
 _REDUNDANCY = 10  # correspondences on surfaces for each degree of freedom, below which wrong poses fit by chance
 _SPAN_VOXELS = 4.0  # root mean square range of the points, below which voxels do not resolve their shape
-_NO_PROBLEM = Problem("", "")
 _ENDINGS = {
     icp.OUT_OF_ITERATIONS: "out of iterations (matching.max_iterations)",
     icp.NO_CORRESPONDENCES: "no point has a correspondence in the map",
@@ -102,7 +102,7 @@ def match_of(result: Result, points: int, target: VoxelMap, config: MatchingConf
     observability = min(
         _ratio(result.eigenvalue, config.min_information), _ratio(result.signal, config.min_signal)
     )
-    problem = _problem(result, points, target, observability, config) or _NO_PROBLEM
+    problem = next(_problems(result, points, target, observability, config), Problem("", ""))
     return Match(
         T_target_source=result.T,
         information=result.information,
@@ -124,76 +124,71 @@ def match_of(result: Result, points: int, target: VoxelMap, config: MatchingConf
     )
 
 
-def _problem(
+def _problems(
     result: Result, points: int, target: VoxelMap, observability: float, config: MatchingConfig
-) -> Problem | None:
-    """Why a result did not converge, None if it did."""
+) -> Iterator[Problem]:
+    """Why a result did not converge, the worst first; none if it did."""
     if not math.isfinite(largest_magnitude(result.T)):
-        return Problem.plain("the pose is not finite")
+        yield Problem.plain("the pose is not finite")
     if result.ending == icp.NO_CORRESPONDENCES:
-        return Problem.plain(_ENDINGS[result.ending])
+        yield Problem.plain(_ENDINGS[result.ending])
     if result.pairs < config.min_inlier_share * points:
-        return Problem(
+        yield Problem(
             "few points have a correspondence (matching.min_inlier_share)",
             f"{result.pairs} of {points} points have a correspondence, below the share "
             f"matching.min_inlier_share ({config.min_inlier_share:g})",
         )
     if observability < 1.0:
         direction = " ".join(f"{value:.2f}" for value in result.direction)
-        return Problem(
+        yield Problem(
             "motion is undetermined (matching.min_signal or matching.min_information)",
             f"motion along [{direction}] is undetermined: observability {observability:.1e} < 1, by "
             f"matching.min_signal ({config.min_signal:g}) or matching.min_information "
             f"({config.min_information:g})",
         )
     if result.ending != icp.CONVERGED:
-        return Problem.plain(_ENDINGS[result.ending])
-    return _contradiction(result, config) or _chance(result, points, target)
-
-
-def _contradiction(result: Result, config: MatchingConfig) -> Problem | None:
-    """Why the correspondences contradict the pose, None if they agree with it."""
+        yield Problem.plain(_ENDINGS[result.ending])
     if result.fit < LEAST_FIT:
-        return Problem(
+        yield Problem(
             f"the correspondences contradict the pose (fit < {LEAST_FIT:g})",
             f"the correspondences contradict the pose: fit {below(result.fit)} < {LEAST_FIT:g}, residuals along "
             f"one direction are far above matching.kernel_scale_m ({config.kernel_scale_m:g})",
         )
     if result.residual_m > config.kernel_scale_m:
-        return Problem(
+        yield Problem(
             "residual > matching.kernel_scale_m",
             f"residual {result.residual_m:.2g} m > matching.kernel_scale_m ({config.kernel_scale_m:g})",
         )
-    return None
+    yield from _chances(result, points, target)
 
 
-def _chance(result: Result, points: int, target: VoxelMap) -> Problem | None:
-    """Why the fit may be due to chance, None if it is redundant enough."""
+def _chances(result: Result, points: int, target: VoxelMap) -> Iterator[Problem]:
+    """Why the fit may be due to chance; none if it is redundant enough."""
     freedom, voxel_m = len(result.information), target.voxels.size_m
     if result.pairs < _LEAST_OVERLAP * points:
-        return Problem(
-            f"fewer than {100 * _LEAST_OVERLAP:.0f} % of the points have a correspondence",
-            f"{result.pairs} of {points} points have a correspondence, fewer than {100 * _LEAST_OVERLAP:.0f} %",
+        few = f"fewer than {100 * _LEAST_OVERLAP:.0f} %"
+        yield Problem(
+            f"{few} of the points have a correspondence",
+            f"{result.pairs} of {points} points have a correspondence, {few}",
         )
     if result.on_surfaces < _REDUNDANCY * freedom:
-        return Problem(
+        yield Problem(
             "few correspondences with a surface",
             f"{result.on_surfaces} correspondences with a surface, fewer than {_REDUNDANCY} for each of {freedom} "
             "degrees of freedom",
         )
     if len(target) < 2 * _REDUNDANCY * freedom:
-        return Problem(
+        yield Problem(
             "the map has few voxels (local_map.voxel_size_m)",
             f"the map has {counted(len(target), 'voxel')}, fewer than {2 * _REDUNDANCY} for each degree of "
             f"freedom: lower local_map.voxel_size_m ({voxel_m:g})",
         )
     if result.range_m < _SPAN_VOXELS * voxel_m:
-        return Problem(
+        yield Problem(
             "the points spread over few voxels (local_map.voxel_size_m)",
             f"the points spread over {result.range_m:.2g} m, less than {_SPAN_VOXELS:g} voxels: lower "
             f"local_map.voxel_size_m ({voxel_m:g})",
         )
-    return None
 
 
 def _ratio(known: float, least: float) -> float:
