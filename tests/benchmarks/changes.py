@@ -34,6 +34,7 @@ LEAST_M = 0.3  # size of the objects that count
 LEAST_RAYS = {2: 10, 3: 40}  # of the keyframes' scans, for an object to be in sight
 REACH_M = {2: 8.6, 3: 34.0}  # farthest that scans are compared at: docs/maps.md
 MARGIN_M = {2: 0.1, 3: 0.3}  # around an object, within which points belong to it
+SURFACE_M = 1e-3  # as near as a ray ends to the solid that it hits
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,12 +158,13 @@ def _rays_by_owner(drive: Drive, saved: SavedMap, solids: Solids) -> np.ndarray:
         start_s = (keyframe.stamp_ns - EPOCH_NS) * 1e-9
         rays = drive.sensor.rays(round(start_s / (drive.sensor.period_ns * 1e-9)))
         poses = drive.motion.lidar(start_s + rays.instants_ns * 1e-9)
-        solid, reach_m = np.empty(len(rays.directions), np.int32), REACH_M[saved.dimension]
-        solids.cast(
-            poses, rays.instant_of_ray, rays.directions, min(drive.sensor.max_range_m, reach_m), solid
-        )  # fmt: skip
-        owner = solids.owner[solid[(solid >= 0) & (solid < len(solids.owner))]]
-        counts += np.bincount(owner[owner != FIXED], minlength=len(counts))
+        reach_m = min(drive.sensor.max_range_m, REACH_M[saved.dimension])
+        ranges_m = solids.cast(poses, rays.instant_of_ray, rays.directions, reach_m)
+        hits = np.isfinite(ranges_m)
+        T = poses[rays.instant_of_ray[hits]]
+        ends = T[:, :3, 3] + ranges_m[hits, None] * (T[:, :3, :3] @ rays.directions[hits, :, None])[..., 0]
+        for owner in np.unique(solids.owner[solids.owner != FIXED]).tolist():
+            counts[owner] += _on(ends, solids, owner, SURFACE_M).sum()
     return counts
 
 
