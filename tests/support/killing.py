@@ -199,6 +199,13 @@ def _read_text(path):
     assert path.read_text(encoding="utf-8").endswith("\n")
 
 
+def _read_as_viewer(path):
+    """As rerun's viewer does, without a last message that was not finished, where rerun's API refuses the file."""
+    command = [sys.executable, "-m", "rerun_cli", "rrd", "print", str(path)]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "ERROR" not in printed.stderr and "StoreInfo" in printed.stdout, printed.stderr
+
+
 _READ = {
     CHECKPOINT_FILE: _read_checkpoint,
     MAP_FOLDER: open_saved_map,
@@ -214,7 +221,7 @@ _READ = {
     ".yaml": lambda path: read_map(path.parent),
     ".json": lambda path: json.loads(path.read_text(encoding="utf-8")),
     ".toml": lambda path: tomllib.loads(path.read_text(encoding="utf-8")),
-    ".rrd": lambda path: list(RrdReader(path).stream()),
+    ".rrd": _read_as_viewer,
     ".html": _read_html,
 }
 _REACHED = {
