@@ -98,7 +98,7 @@ def perturb(twist, T, origin, out):
         out[axis, d] += origin[axis]
 
 
-@njit()
+@njit(inline="always")
 def _perturb_2d(twist, T, out):
     theta = twist[2]
     c, s = math.cos(theta), math.sin(theta)
@@ -115,7 +115,7 @@ def _perturb_2d(twist, T, out):
     out[1, 2] += b * twist[0] + a * twist[1]
 
 
-@njit()
+@njit(inline="always")
 def _perturb_3d(twist, T, out):
     x, y, z = twist[3], twist[4], twist[5]
     theta2 = x * x + y * y + z * z

@@ -10,7 +10,7 @@ _SWEEPS = 30  # largest number of sweeps of rotations; a handful does
 _BESIDE = 1e-16  # largest off-diagonal entry as a share of the diagonal
 
 
-@njit()
+@njit(inline="always")
 def normal_2d(cxx: float, cxy: float, cyy: float):
     """Eigenvalues (small, large) of [[cxx, cxy], [cxy, cyy]] and the unit eigenvector of the small one."""
     half_trace = 0.5 * (cxx + cyy)
@@ -86,7 +86,7 @@ def eigensystem(A, values, vectors):
     _sort_columns(values, vectors)
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _rotate_pair(A, V, p: int, q: int):
     """Turn axes p and q so that A[p, q] becomes zero: t = tan of the angle, the smaller root of t² + 2τt = 1."""
     tau = 0.5 * (A[q, q] - A[p, p]) / A[p, q]
@@ -100,7 +100,7 @@ def _rotate_pair(A, V, p: int, q: int):
         A[p, i], A[q, i] = c * A[p, i] - s * A[q, i], s * A[p, i] + c * A[q, i]
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _sort_columns(values, vectors):
     """Bring eigenvalues into ascending order, their vectors along."""
     for i in range(1, values.shape[0]):

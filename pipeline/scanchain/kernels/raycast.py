@@ -52,7 +52,7 @@ def cast_rays(
         ranges_m[n] = best if best < max_range_m else np.inf
 
 
-@njit()
+@njit(inline="always")
 def hit_solid(ox, oy, oz, dx, dy, dz, solid):
     """Distance at which a ray enters a solid (9,), inf if it does not."""
     if solid[0] == BOX:
@@ -71,7 +71,7 @@ def _slab(o, d, low, high):
     return min(a, b), max(a, b)
 
 
-@njit()
+@njit(inline="always")
 def _hit_box(ox, oy, oz, dx, dy, dz, box):
     x, y, c, s = ox - box[1], oy - box[2], box[5], box[6]
     enter_x, leave_x = _slab(c * x + s * y, c * dx + s * dy, -box[3], box[3])
@@ -81,7 +81,7 @@ def _hit_box(ox, oy, oz, dx, dy, dz, box):
     return enter if 0.0 < enter <= leave else np.inf
 
 
-@njit()
+@njit(inline="always")
 def _hit_cylinder(ox, oy, oz, dx, dy, dz, cylinder):
     x, y = ox - cylinder[1], oy - cylinder[2]
     a, b = dx * dx + dy * dy, x * dx + y * dy
@@ -98,7 +98,7 @@ def _hit_cylinder(ox, oy, oz, dx, dy, dz, cylinder):
     return enter if 0.0 < enter <= leave else np.inf
 
 
-@njit()
+@njit(inline="always")
 def _hit_ellipsoid(ox, oy, oz, dx, dy, dz, e):
     x, y, z = (ox - e[1]) / e[3], (oy - e[2]) / e[4], (oz - e[7]) / e[8]
     u, v, w = dx / e[3], dy / e[4], dz / e[8]
@@ -156,7 +156,7 @@ def _descend(ox, oy, oz, dx, dy, dz, ground, start_m, max_range_m):
     return np.inf
 
 
-@njit()
+@njit(inline="always")
 def _steepest(dx, dy, dz, ground):
     """Bounds of the speed at which a ray and the ground approach each other, and of its derivative."""
     slope_x, slope_y = ground[1] * ground[2], ground[4] * ground[5]

@@ -52,7 +52,7 @@ def first_per_voxel(points, voxel_m: float, min_range_m: float, max_range_m: flo
     return count
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _keys(points, scale: float, low: float, high: float, keys):
     """Write the key of each point's voxel, EMPTY for squared ranges below low or above high.
 

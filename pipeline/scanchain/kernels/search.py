@@ -56,7 +56,7 @@ def score_windows(blocks, pyramid, room, has_room, spans, cells, first: int, lea
     return _array_of(windows)
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _score_heading(blocks, level: int, has_room, spans, cells, scores):
     """Score of the points in every window, under one heading: cells (N, 2). The innermost loop is vectorized."""
     size, rows, columns = 1 << level, blocks.shape[2], blocks.shape[3]
@@ -76,7 +76,7 @@ def _score_heading(blocks, level: int, has_room, spans, cells, scores):
                 scores[row, column] = -1
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _best_of_window(layer, room, cells, first_row: int, first_column: int, size: int) -> int:
     """Best score of the shifts of a window, 0 where there is none."""
     best = 0
@@ -135,7 +135,7 @@ def split_best(
     return _array_of(heap)
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _split(heap, pyramid, room, cells, level: int, turn: int, x: int, y: int, least: float):
     """Push those of the four windows of the next level that make up one which reach the least score."""
     half = 1 << level

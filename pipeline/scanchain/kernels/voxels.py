@@ -203,7 +203,7 @@ def _fit_shape(m, dimension: int, cell) -> float:
     return _fit_2d(m, cell) if dimension == 2 else _fit_3d(m, cell)
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _sum_neighborhood(voxels, ix: int, iy: int, iz: int, height: int, sums):
     """Moments of the 3ᵈ voxels around one, relative to its center, written to ``sums`` (10,)."""
     sums.fill(0.0)
@@ -228,7 +228,7 @@ def _sum_neighborhood(voxels, ix: int, iy: int, iz: int, height: int, sums):
                 sums[9] += m[9] + 2.0 * z * m[3] + n * z * z
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _fit_2d(m, cell):
     """Normal of the points where they lie along a line, by the eigenvalues of their covariance."""
     cell[SHAPE] = POINT
@@ -245,7 +245,7 @@ def _fit_2d(m, cell):
     return large
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _fit_3d(m, cell):
     """Plane, line or point by the eigenvalues λ₁ ≤ λ₂ ≤ λ₃ of the covariance.
 

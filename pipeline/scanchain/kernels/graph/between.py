@@ -69,7 +69,7 @@ def _half_cotangent(theta_rad: float) -> float:
     return half * np.cos(half) / np.sin(half)
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _half_cotangent_slope(theta_rad: float) -> float:
     """Derivative of (θ/2) / tan(θ/2): (sin θ − θ) / (4 sin²(θ/2))."""
     if abs(theta_rad) < 1e-2:
@@ -134,7 +134,7 @@ def _relative(T_i: _Array, T_j: _Array, Z: _Array, E: _Array) -> None:
         E[a, 3] = t - Z[0, a] * Z[0, 3] - Z[1, a] * Z[1, 3] - Z[2, a] * Z[2, 3]
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _inverse_left_jacobian(p: float, q: float, r: float, C: _Array) -> None:
     """Fill C = J_l(φ)⁻¹ = I − ½ [φ]× + k [φ]×² of SO(3)."""
     theta2 = p * p + q * q + r * r
@@ -146,7 +146,7 @@ def _inverse_left_jacobian(p: float, q: float, r: float, C: _Array) -> None:
     C[1, 2], C[2, 1] = k * q * r + 0.5 * p, k * q * r - 0.5 * p
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _coupling(error: _Array, Q: _Array) -> None:
     """Fill Q(−ρ, −φ) (Barfoot 2017, eq. 7.86b).
 
@@ -175,7 +175,7 @@ def _coupling(error: _Array, Q: _Array) -> None:
     Q[1, 2], Q[2, 1] = yz - u, yz + u
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _coupling_coefficients(theta2: float) -> tuple[float, float, float]:
     """(θ − sin θ)/θ³, (θ² + 2 cos θ − 2)/(2θ⁴), (2θ − 3 sin θ + θ cos θ)/(2θ⁵), by series below 0.1 rad."""
     if theta2 < 1e-2:
@@ -247,7 +247,7 @@ def scatter_between(
                 gradient[slot, a] += sign * g[a]
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _weigh(J: _Array, e: _Array, omega: _Array, weight: float, whitened: _Array, M: _Array, g: _Array) -> None:
     """Fill whitened = w Ω J, M = Jᵀ w Ω J and g = (w Ω J)ᵀ e of one factor."""
     k = e.size

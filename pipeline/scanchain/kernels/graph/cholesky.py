@@ -103,7 +103,7 @@ def solve_upper(fronts: Fronts, factor: _Array, x: _Array, local: _Array) -> Non
             x[rows[a]] = below[0]
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _place_block(front: _Array, blocks: Blocks, b: int, values: _Array) -> None:
     """Add one block of A to the upper triangle of its front."""
     top, left, height, width = blocks.top[b], blocks.left[b], blocks.height[b], blocks.width[b]
@@ -117,7 +117,7 @@ def _place_block(front: _Array, blocks: Blocks, b: int, values: _Array) -> None:
             at += 1
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _extend_add(front: _Array, place: NDArray[np.int64], update: _Array, runs: NDArray[np.int64]) -> None:
     """Add a child's update matrix, its upper triangle, in runs of columns that are neighbors in the front too."""
     size, count, start = place.size, 0, 0
@@ -162,7 +162,7 @@ def _eliminate(front: _Array, pivots: int, floor: _Array) -> int:
     return -1
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _update_rest(front: _Array, k0: int, k1: int, c0: int, c1: int) -> None:
     """Subtract Uᵀ U of rows k0 to k1 from columns c0 to c1 of the rows below: two rows, four pivots a time."""
     i = k1
@@ -240,7 +240,7 @@ def selected_inverse(
             child = sibling[child]
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _fill_row(Z: _Array, a: int, upper: _Array) -> None:
     """Fill row and column a of Z from those beyond it; upper is row a of U from the diagonal on."""
     height = a + upper.size
@@ -257,7 +257,7 @@ def _fill_row(Z: _Array, a: int, upper: _Array) -> None:
     row[a] = total / upper[0]
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _take_block(Z: _Array, blocks: Blocks, b: int, inverse: _Array) -> None:
     """Copy one block out of its front."""
     top, left, at = blocks.top[b], blocks.left[b], blocks.offset[b]

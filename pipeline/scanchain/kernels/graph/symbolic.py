@@ -163,7 +163,7 @@ def group_columns(parent: _Index, begin: _Index, rows: _Index, sizes: _Index) ->
     return fronts[: kept + 1]
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _most_zeros(columns: int) -> float:
     """Share of explicit zeros that a front of so many scalar columns may hold."""
     if columns <= 4:

@@ -68,7 +68,7 @@ def associate(voxels, points, T, reach: int, max_distance_m: float, corresponden
     return found
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def weigh(voxels, points, T, correspondence, variance: float, weight):
     """Weights (N,) of all correspondences at the pose T: σ²/(variance of the residual) ≤ 1, 0 without one.
 

@@ -129,7 +129,7 @@ def fit_at(problem, T, fit):
     return Fit(H, fit.cost, total_weight, squares, pairs, fit.iterations, fit.ending)
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def gradients_of_sectors(problem, T):
     """Gradients (8, k) of the points of each sector at the pose T.
 
@@ -239,7 +239,7 @@ def _linearize(problem, scale_m: float, iterate):
     iterate.sums[_COST], iterate.sums[_WEIGHT], iterate.sums[_SQUARES] = cost, total_weight, squares
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _evaluate(problem, scale_m: float, iterate):
     """Fill the iterate's sums at its pose, and leave its normal equations as they are."""
     cost, total_weight, squares = robust_sums(problem, iterate.T, scale_m)
@@ -247,7 +247,7 @@ def _evaluate(problem, scale_m: float, iterate):
     iterate.sums[_COST], iterate.sums[_WEIGHT], iterate.sums[_SQUARES] = cost, total_weight, squares
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _accept(now, trial):
     now.T[:] = trial.T
     now.offset[:] = trial.offset
@@ -325,7 +325,7 @@ def step(optimizer: int, H, b, damping: float, factor, x) -> bool:
     return True
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def predicted_decrease(H, b, x) -> float:
     """Decrease of the quadratic model along the step, −bᵀx − ½ xᵀHx."""
     total = 0.0

@@ -167,7 +167,7 @@ def _spread(problem, T, fit):
     return spread
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _variance_factor(problem, fit) -> float:
     """Variance that residuals do not share with the next scan's, over that which the information counts.
 
@@ -178,7 +178,7 @@ def _variance_factor(problem, fit) -> float:
     return min(variance / _variance(problem, fit), 1.0)
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _systematic(problem, T, T_first, fit, gradients):
     """Covariance (k, k) in the source's own frame by how the gradients b_s (8, k) of sectors differ.
 
@@ -225,7 +225,7 @@ def _about_target(information, T, variance: float):
     return out
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _twist_between(T_from, T_to):
     """Twist (k,) from one pose to another near it, about the latter's position and along the target's axes."""
     motion = between(inverse(centered(T_to, T_to)), inverse(centered(T_from, T_to)))
@@ -236,7 +236,7 @@ def _twist_between(T_from, T_to):
     return out
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _uncertainty_of(covariance, range_m: float) -> float:
     """Standard deviation of a point at that range, by the covariance (k, k) of its pose; meters."""
     k = covariance.shape[0]

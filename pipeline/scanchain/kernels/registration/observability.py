@@ -102,7 +102,7 @@ def is_below(spectrum, m: int, times: float, settings) -> bool:
     return is_blind or spectrum.signals[m] < times * settings.min_signal
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def weak_prior(spectrum, total_weight: float, believed, is_fused: bool, settings):
     """Information (k, k), times the variance of a residual, of the prior along the weak directions alone.
 
@@ -133,7 +133,7 @@ def weak_prior(spectrum, total_weight: float, believed, is_fused: bool, settings
     return prior
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def remove_noise(spectrum, H, total_weight: float, settings):
     """Take the noise-induced part along weak directions from the information H (k, k) of residuals.
 
@@ -166,7 +166,7 @@ def add_signals(problem, T, spectrum):
             break
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def signal_along(problem, T, twist) -> float:
     """Signal-to-noise ratio of the information along a twist (k,) (after Hatleskog & Alexis 2024).
 
@@ -227,7 +227,7 @@ def _normal_variance(cells, voxel: int, dx, dy, dz, beside: float, parameters: f
     return variance * (slope_across * across * across + slope_along * (beside - across * across))
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _sum_around(voxels, voxel: int, correspondence, informative) -> float:
     """Sum of the information (N,) of correspondences with a voxel or its neighbors."""
     ix, iy, iz = unpack(voxels.keys[voxel])
@@ -240,7 +240,7 @@ def _sum_around(voxels, voxel: int, correspondence, informative) -> float:
     return total
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def seen_from_source(T, T_first, H, direction, variance: float):
     """Information (k, k) and a direction (k,) of twists, in the source's own frame.
 

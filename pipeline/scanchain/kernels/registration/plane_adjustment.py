@@ -70,7 +70,7 @@ def _from_mean(sums, cell: int, normals, p: int, beside, i: int) -> float:
     return residual
 
 
-@njit()
+@njit(inline="always")
 def _is_plane(sums, cell_m: float, normal) -> bool:
     """True if points of these sums lie in a plane, whose normal (3,) is written."""
     xx, xy, xz, yy, yz, zz = covariance_of(sums)

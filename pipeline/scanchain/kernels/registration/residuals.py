@@ -105,7 +105,7 @@ def gradients_by_group(problem, T, scale_m: float, group, gradients):
         _sum_by_group(*_arrays(problem, T), scale_m, (0.0,) * 6, (0.0,) * 3, group, gradients)
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def gradient_spread(problem, T, scale_m: float):
     """Covariance (6, 6) of b in ``normal_equations``, by how b differs from voxel to voxel: Σ b_v b_vᵀ.
 
