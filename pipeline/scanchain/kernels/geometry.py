@@ -196,7 +196,7 @@ def twist_3d(T, out):
     out[3], out[4], out[5] = x, y, z
 
 
-@njit()
+@njit(inline="always")
 def second_coefficient(theta2):
     """(1 − θ/2 cot θ/2) / θ² of the squared angle, the factor of the squared hat in V(φ)⁻¹."""
     if theta2 < 1e-6:

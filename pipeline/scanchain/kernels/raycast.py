@@ -62,7 +62,7 @@ def hit_solid(ox, oy, oz, dx, dy, dz, solid):
     return _hit_ellipsoid(ox, oy, oz, dx, dy, dz, solid)
 
 
-@njit()
+@njit(inline="always")
 def _slab(o, d, low, high):
     """Interval of t in which o + t d lies between two planes (Kay & Kajiya 1986)."""
     if abs(d) < 1e-12:

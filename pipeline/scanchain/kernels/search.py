@@ -148,7 +148,7 @@ def _split(heap, pyramid, room, cells, level: int, turn: int, x: int, y: int, le
                 heapq.heappush(heap, (-bound, level, turn, far_x, far_y))
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _array_of(windows):
     result = np.empty((len(windows), 5), np.int64)
     for k, window in enumerate(windows):
@@ -207,7 +207,7 @@ def climb(cells, points, origin, resolution_m: float, pose, step_rad: float):
     return best
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _mean_score(cells, points, origin, resolution_m: float, x: float, y: float, yaw: float) -> float:
     c, s = math.cos(yaw) / resolution_m, math.sin(yaw) / resolution_m
     left, low = (x - origin[0]) / resolution_m, (y - origin[1]) / resolution_m

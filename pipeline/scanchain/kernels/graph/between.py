@@ -46,7 +46,7 @@ def jacobians_2d(poses: _Array, edges: NDArray[np.int64], measurements: _Array, 
         J[2, 0], J[2, 1], J[2, 2] = 0.0, 0.0, 1.0
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _mismatch_2d(T_i: _Array, T_j: _Array, Z: _Array) -> tuple[float, float, float, float, float]:
     """Translation and angle in (−π, π] of Z⁻¹ T_i⁻¹ T_j, and cosine and sine of R_i R_z.
 
@@ -60,7 +60,7 @@ def _mismatch_2d(T_i: _Array, T_j: _Array, Z: _Array) -> tuple[float, float, flo
     return x, y, np.arctan2(c * T_j[1, 0] - s * T_j[0, 0], c * T_j[0, 0] + s * T_j[1, 0]), c, s
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _half_cotangent(theta_rad: float) -> float:
     """(θ/2) / tan(θ/2), the diagonal of V(θ)⁻¹."""
     if abs(theta_rad) < _SMALL:
@@ -191,7 +191,7 @@ def _coupling_coefficients(theta2: float) -> tuple[float, float, float]:
     return a, b, c
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _multiply(A: _Array, B: _Array, out: _Array) -> None:
     """Fill out = A B, 3 × 3."""
     for a in range(3):

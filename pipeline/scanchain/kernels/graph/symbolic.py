@@ -108,7 +108,7 @@ def _structures(start: _Index, neighbors: _Index, order: _Index, parent: _Index)
     return begin, rows[: begin[n]]
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _join(members: _Index, j: int, mark: _Index, rows: _Index, end: int) -> int:
     """Append the members beyond j that are not in column j yet; return the column's new end."""
     for i in members:

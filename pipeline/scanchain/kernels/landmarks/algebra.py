@@ -231,13 +231,13 @@ def rotate(
             k = parent[k]
 
 
-@njit()
+@njit(inline="always")
 def _subtract(row: _Array, factor: float, other: _Array) -> None:
     for c in range(row.size):
         row[c] -= factor * other[c]
 
 
-@njit()
+@njit(inline="always")
 def _divide(row: _Array, number: float) -> None:
     for c in range(row.size):
         row[c] /= number

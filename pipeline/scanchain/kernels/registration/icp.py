@@ -256,7 +256,7 @@ def _accept(now, trial):
     now.sums[:] = trial.sums
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _prior_cost(prior, offset) -> float:
     """½ ξᵀ prior ξ."""
     total = 0.0

@@ -203,19 +203,19 @@ def _systematic(problem, T, T_first, fit, gradients):
     return congruent(to_source, spread) * (groups / max(groups - 1.0, 1.0))
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _variance(problem, fit) -> float:
     """Variance of a residual, by the fit, or the sensor's where the fit is closer than that; m²."""
     return max(problem.settings.variance, _residual_of(fit) ** 2)
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _residual_of(fit) -> float:
     """Root of the weighted mean squared residual, meters; infinite without correspondences."""
     return math.sqrt(fit.squares / fit.total_weight) if fit.total_weight > 0.0 else math.inf
 
 
-@njit(nogil=True)
+@njit(inline="always")
 def _about_target(information, T, variance: float):
     """Information (k, k) about twists in the source's frame, times a variance, as that along the target's axes."""
     out = congruent(adjoint(inverse(centered(T, T))), information)
