@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import subprocess
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from uuid import uuid4
 
 import numpy as np
@@ -34,6 +34,7 @@ _LISTED = 50  # largest number of stretches in the text of a verdict
 _RADIUS = 3.5  # of a stretch, in points of the screen
 
 
+@dataclass(eq=False)
 class Recording:
     """Takes in steps and results; a context that is entered before the first and left after the last.
 
@@ -43,24 +44,18 @@ class Recording:
         none at all is a recording that goes nowhere
     """
 
-    def __init__(
-        self,
-        path: Path | None,
-        *,
-        dimension: int,
-        name: str,
-        sinks: frozenset[SinkName],
-        config: RecordingConfig,
-    ) -> None:
-        if "save" in sinks and path is None:
+    path: Path | None
+    _: KW_ONLY
+    dimension: int
+    name: str
+    sinks: frozenset[SinkName]
+    config: RecordingConfig
+
+    def __post_init__(self) -> None:
+        if "save" in self.sinks and self.path is None:
             raise InputError("no path for the recording: give --out, or leave save out of --rerun")
-        self.path = path
-        self.dimension = dimension
-        self.name = name
-        self.wanted = sinks
-        self.config = config
         self.web_address = ""
-        self.sinks: list[Sink] = []
+        self.opened: list[Sink] = []
         self.file: Sink | None = None
         self.server: subprocess.Popen[bytes] | None = None
         self.batcher = Batcher()
@@ -69,26 +64,31 @@ class Recording:
 
     def __enter__(self) -> Recording:
         recording_id = uuid4()
-        if "save" in self.wanted and self.path is not None:
+        if "save" in self.sinks and self.path is not None:
             stream = open_stream(self.name, self.dimension, recording_id)
             self.file = file_sink(self.path, stream, blueprint(self.dimension))
-            self.sinks.append(self.file)
-        address = self._viewer_address() if self.wanted & {"spawn", "connect", "web"} else ""
+            self.opened.append(self.file)
+        address = self._viewer_address() if self.sinks & {"spawn", "connect", "web"} else ""
         if address:
             stream = open_stream(self.name, self.dimension, recording_id)
-            self.sinks.append(viewer_sink(address, stream, blueprint(self.dimension)))
+            self.opened.append(viewer_sink(address, stream, blueprint(self.dimension)))
         self._send(lambda: entities.constants(self.dimension))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+    def __exit__(self, *error: object) -> None:
+        """Write the last batch, frame the view, and close file and viewer."""
+        self._send(lambda: [*self.batcher.messages(), *self.batcher.graph.draw(self.now)])
+        layout = blueprint(self.dimension, self.batcher.box, self.last[0])
+        for sink in self.opened:
+            sink.send(lambda stream: stream.send_blueprint(layout))
+            sink.close()
+        if self.server is not None:
+            viewer.stop(self.server)
 
     @property
     def warnings(self) -> list[str]:
         """Problems so far, a line each."""
-        return [*self.problems, *(warning for sink in self.sinks for warning in sink.warnings)]
+        return [*self.problems, *(warning for sink in self.opened for warning in sink.warnings)]
 
     def resume(
         self, before: Path | None, steps: StepTable, closures: Sequence[Closure], graph: GraphState
@@ -99,7 +99,7 @@ class Recording:
         """
         self.last = int(steps.columns["index"][-1]), int(steps.columns["stamp_ns"][-1])
         self._guard(lambda: self.batcher.restore(steps, closures, graph))
-        for sink in self.sinks:
+        for sink in self.opened:
             if before is not None:
                 sink.send(partial(sink.copy, before))
             sink.settle()
@@ -152,18 +152,6 @@ class Recording:
         """
         self._send(lambda: [Message(entities.GRID, _grid(cells, resolution_m, origin_m))])
 
-    def close(self) -> None:
-        """Write the last batch, frame the view, and close file and viewer; may be called twice."""
-        self._send(lambda: [*self.batcher.messages(), *self.batcher.graph.draw(self.now)])
-        layout = blueprint(self.dimension, self.batcher.box, self.last[0])
-        for sink in self.sinks:
-            sink.send(lambda stream: stream.send_blueprint(layout))
-            sink.close()
-        self.problems, self.sinks = self.warnings, []
-        if self.server is not None:
-            viewer.stop(self.server)
-            self.server = None
-
     def hold(self) -> None:
         """Keep the web viewer served until it ends or the user interrupts."""
         self._send(self.batcher.messages)
@@ -176,10 +164,10 @@ class Recording:
     def _viewer_address(self) -> str:
         """Address of a viewer; empty, with a warning, if there is none."""
         try:
-            if "web" in self.wanted:
+            if "web" in self.sinks:
                 self.server = viewer.start_web()
                 self.web_address = viewer.web_address()
-            elif "spawn" in self.wanted:
+            elif "spawn" in self.sinks:
                 viewer.start_window()
             elif not viewer.is_listening(viewer.PORT):
                 raise viewer.ViewerError(
@@ -220,9 +208,9 @@ class Recording:
             for message in messages:
                 message.send(stream)
 
-        if self.sinks:
+        if self.opened:
             self._guard(lambda: messages.extend(say()))
-        for sink in self.sinks if messages else ():
+        for sink in self.opened if messages else ():
             sink.send(write)
 
     def _guard(self, act: Callable[[], object]) -> None:
