@@ -171,9 +171,15 @@ class Plot:
 
         def drawn() -> str:
             (left, right), (bottom, top) = self._at(np.array([low[0], high[0]]), np.array([low[1], high[1]])).T
-            rows = pixels[::-1] if top < bottom else pixels
-            box = (left, min(bottom, top), right - left, abs(top - bottom))
-            return _image(rows, palette, box, rendering)
+            picture, file = Image.fromarray(pixels[::-1] if top < bottom else pixels), BytesIO()
+            picture.putpalette(palette[:, :3].tobytes())
+            picture.save(file, "PNG", compress_level=_LEVEL, transparency=palette[:, 3].tobytes())
+            data = b64encode(file.getvalue()).decode("ascii")
+            return (
+                f'<image x="{left:.2f}" y="{min(bottom, top):.2f}" width="{right - left:.2f}" '
+                f'height="{abs(top - bottom):.2f}" preserveAspectRatio="none" '
+                f'style="image-rendering: {rendering}" href="data:image/png;base64,{data}"/>'
+            )
 
         self._within.append(drawn)
         extent = (low[0], high[0], low[1], high[1])
@@ -291,23 +297,6 @@ def _marks(points: Floats, shape: str, half: float, style: str) -> str:
     }[shape]
     known = points[np.isfinite(points[:, 0] + points[:, 1])]
     return f'<path d="{"".join(f"M{x:.2f} {y:.2f}{outline}" for x, y in known.tolist())}" style="{style}"/>'
-
-
-def _image(
-    rows: NDArray[np.uint8], palette: NDArray[np.uint8], box: tuple[float, float, float, float], rendering: str
-) -> str:
-    """Pixels (H, W), each the number of a color, in a box: left, top, width, height."""
-    image, file = Image.fromarray(rows), BytesIO()
-    image.putpalette(palette[:, :3].tobytes())
-    image.save(file, "PNG", compress_level=_LEVEL, transparency=palette[:, 3].tobytes())
-    data = b64encode(file.getvalue()).decode("ascii")
-    where = " ".join(
-        f'{name}="{value:.2f}"' for name, value in zip(("x", "y", "width", "height"), box, strict=True)
-    )
-    return (
-        f'<image {where} preserveAspectRatio="none" style="image-rendering: {rendering}" '
-        f'href="data:image/png;base64,{data}"/>'
-    )
 
 
 def broken(segments: NDArray[np.floating]) -> Floats:

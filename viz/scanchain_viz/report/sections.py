@@ -36,9 +36,8 @@ def _known(trajectories: Sequence[DrawnTrajectory], key: str) -> list[DrawnTraje
     return [trajectory for trajectory in trajectories if np.isfinite(getattr(trajectory, key)).any()]
 
 
-def _draw(figure: Plot, trajectory: DrawnTrajectory, x: Floats, y: Floats, width: float = 1.2) -> None:
-    dashes = DASHED if trajectory.is_dashed else ()
-    figure.line(np.stack([x, y], axis=1), trajectory.color, width, dashes)
+def _draw(figure: Plot, trajectory: DrawnTrajectory, points: Floats, width: float = 1.2) -> None:
+    figure.line(points, trajectory.color, width, DASHED if trajectory.is_dashed else ())
 
 
 def trajectories_section(
@@ -55,8 +54,8 @@ def trajectories_section(
     height = Plot("distance traveled [m]", "z [m]")
     for each in reversed(trajectories):  # the first on top
         rows = _some(len(each.positions))
-        plan.line(each.positions[rows], each.color, dashes=DASHED if each.is_dashed else ())
-        _draw(height, each, each.distance_m[rows], each.positions[rows, 2])
+        _draw(plan, each, each.positions[rows])
+        _draw(height, each, np.stack([each.distance_m[rows], each.positions[rows, 2]], axis=1))
     chips: Sequence[Named] = _legend(trajectories)
     if truth is not None:
         chips = (*trajectories, Chip("ground truth", TRUTH, is_dashed=True))
@@ -79,8 +78,8 @@ def error_section(trajectories: Sequence[DrawnTrajectory], truth_name: str) -> I
     figure = Plot("distance traveled [m]", "position error [m]", logarithmic="y")
     for each in reversed(known):
         finite = np.isfinite(each.error_m)
-        x, y = _windowed(each.distance_m[finite]), _windowed(each.error_m[finite], np.median)
-        _draw(figure, each, x, np.maximum(y, 1e-4))
+        points = _windowed(each.error_m[finite], np.median, each.distance_m[finite])
+        _draw(figure, each, np.maximum(points, [0.0, 1e-4]))
     drawings = (
         Drawing.of("Over the distance", _of_neighbors("Medians", known, "error_m"), figure),
         _distribution(known, "error_m", 1.0, "position error [m]", "scans with a smaller error"),
@@ -106,7 +105,7 @@ def time_section(trajectories: Sequence[DrawnTrajectory], stages: Grid | None = 
         return
     figure = Plot("scan", "time of a scan [ms]", logarithmic="y")
     for each in reversed(known):
-        _draw(figure, each, *_over_scans(1e3 * each.seconds, np.median), width=0.9)
+        _draw(figure, each, _windowed(1e3 * each.seconds, np.median), 0.9)
     drawings = (
         Drawing.of("Along the log", _of_neighbors("Medians", known, "seconds"), figure),
         _distribution(known, "seconds", 1e3, "time of a scan [ms]", "scans that took less"),
@@ -121,7 +120,7 @@ def uncertainty_section(trajectories: Sequence[DrawnTrajectory], *, is_planar: b
         return
     along = Plot("scan", "observability", logarithmic="y", is_wide=not estimated)
     for each in reversed(reported):
-        _draw(along, each, *_over_scans(np.clip(each.observability, _LOWEST, _HIGHEST), np.min))
+        _draw(along, each, _windowed(np.clip(each.observability, _LOWEST, _HIGHEST), np.min))
     along.level(1.0)
     least = _of_neighbors(" Least values", reported, "observability")
     text = (
@@ -140,8 +139,7 @@ def innovations(curves: Sequence[tuple[Floats, str]], stretches: Sequence[tuple[
     for first, last, color in stretches:
         figure.span(first - 0.5, last + 0.5, f"{color}33")
     for values, color in curves:
-        x, y = _over_scans(np.clip(np.nan_to_num(values), _LOWEST, _HIGHEST), np.max)
-        figure.line(np.stack([x, y], axis=1), color, 0.9)
+        figure.line(_windowed(np.clip(np.nan_to_num(values), _LOWEST, _HIGHEST), np.max), color, 0.9)
     figure.level(1.0)
     size = max((_window(len(values)) for values, _ in curves), default=1)
     largest = f", largest of {size} neighboring scans" if size > 1 else ""
@@ -183,7 +181,7 @@ def _cumulative(figure: Plot, trajectory: DrawnTrajectory, values: Floats, least
     """Draw per cent of the known values below each; returns these in order, none below the least."""
     ordered = np.maximum(np.sort(values[np.isfinite(values)]), least)
     rows = np.unique(_some(len(ordered)))
-    _draw(figure, trajectory, ordered[rows], np.linspace(0.0, 100.0, len(ordered))[rows])
+    _draw(figure, trajectory, np.stack([ordered, np.linspace(0.0, 100.0, len(ordered))], axis=1)[rows])
     return ordered
 
 
@@ -197,16 +195,14 @@ def _window(count: int) -> int:
     return max(1, -(-count // _WINDOWS))
 
 
-def _windowed(values: Floats, combine: Callable[..., Floats] = np.mean) -> Floats:
-    """Neighboring values put together so that a line of them can be read."""
+def _windowed(values: Floats, combine: Callable[..., Floats], x: Floats | None = None) -> Floats:
+    """Points (K, 2) of a line that can be read: neighboring values put together, over the means of x or scans."""
     size = _window(len(values))
     count = len(values) // size * size
-    return combine(values[:count].reshape(-1, size), axis=1) if count else values
-
-
-def _over_scans(values: Floats, combine: Callable[..., Floats]) -> tuple[Floats, Floats]:
-    """Numbers of scans and their values, neighboring ones put together."""
-    return _windowed(np.arange(len(values), dtype=np.float64)), _windowed(values, combine)
+    over = np.arange(len(values), dtype=np.float64) if x is None else x
+    return np.stack(
+        [over[:count].reshape(-1, size).mean(axis=1), combine(values[:count].reshape(-1, size), axis=1)]
+    ).T
 
 
 def _of_neighbors(what: str, trajectories: Sequence[DrawnTrajectory], key: str) -> str:
