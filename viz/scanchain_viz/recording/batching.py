@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from time import perf_counter
 
@@ -184,7 +184,7 @@ class Batcher:
         known = positions if self.box is None else np.concatenate([self.box, positions])
         self.box = np.stack([known.min(axis=0), known.max(axis=0)])
 
-    def _trails(self, times: Times, odom: Matrix, world: Matrix) -> list[Message]:
+    def _trails(self, times: Times, odom: Matrix, world: Matrix) -> Iterator[Message]:
         """Each scan's segment of the trajectory, before and after correction, and the correction.
 
         A segment of the corrected trajectory starts where the scan before stands under the same correction, so
@@ -192,16 +192,15 @@ class Batcher:
         """
         before = np.concatenate([odom[:1] if self.last is None else self.last, odom[:-1]])
         self.last, corrections = odom[-1:], world @ lie.inverse(odom)
-        messages = [Message(entities.ODOM, drawing.transforms(corrections), times)]
+        yield Message(entities.ODOM, drawing.transforms(corrections), times)
         for entity, *ends in (
             (entities.ODOMETRY, before, odom),
             (entities.TRAJECTORY, corrections @ before, world),
         ):
             strips = np.stack([drawing.positions(poses) for poses in ends], axis=1)
-            messages.append(Message(entity, rr.LineStrips3D.columns(strips=strips), times))
-        return messages
+            yield Message(entity, rr.LineStrips3D.columns(strips=strips), times)
 
-    def _states(self, steps: Sequence[Step], news: Sequence[list[str]], times: Times) -> list[Message]:
+    def _states(self, steps: Sequence[Step], news: Sequence[list[str]], times: Times) -> Iterator[Message]:
         """The state where it changes, with the reason as an event, and the news of loop closures."""
         before = [self.state, *(step.state for step in steps[:-1])]
         changed = np.array([step.state is not state for step, state in zip(steps, before, strict=True)])
@@ -210,21 +209,18 @@ class Batcher:
         for step, is_new, texts in zip(steps, changed, news, strict=True):
             why = [(WARNING, f"{step.state}: {step.reason}")] if is_new and step.state is not State.OK else []
             told.append([*why, *((_INFORMATION, text) for text in texts)])
-        messages = events(told, times)
+        yield from events(told, times)
         if changed.any():
             states = [str(step.state) for step, new in zip(steps, changed, strict=True) if new]
-            messages.append(Message(entities.STATE, rr.StateChange.columns(state=states), times[changed]))
-        return messages
+            yield Message(entities.STATE, rr.StateChange.columns(state=states), times[changed])
 
 
-def events(events: Sequence[Sequence[tuple[str, str]]], times: Times) -> list[Message]:
+def events(events: Sequence[Sequence[tuple[str, str]]], times: Times) -> Iterator[Message]:
     """The events of each row of ``times``, level and text."""
-    rows = [row for row, of_row in enumerate(events) for _ in of_row]
-    if not rows:
-        return []
-    levels, texts = zip(*(event for of_row in events for event in of_row), strict=True)
-    columns = rr.TextLog.columns(text=list(texts), level=list(levels))
-    return [Message(entities.EVENTS, columns, times[np.array(rows)])]
+    flat = [(row, *event) for row, of_row in enumerate(events) for event in of_row]
+    if flat:
+        rows, levels, texts = map(list, zip(*flat, strict=True))
+        yield Message(entities.EVENTS, rr.TextLog.columns(text=texts, level=levels), times[np.array(rows)])
 
 
 def _counts(counts: Sequence[tuple[int, int]], times: Times) -> Message:
@@ -233,7 +229,7 @@ def _counts(counts: Sequence[tuple[int, int]], times: Times) -> Message:
     return Message(entities.LOOPS, columns.partition([2] * len(counts)), times)
 
 
-def _plots(steps: Sequence[Step], times: Times) -> list[Message]:
+def _plots(steps: Sequence[Step], times: Times) -> Iterator[Message]:
     """Figures and covariance of the registrations, what is infinite is a gap, and times of the stages."""
     matches = [step.match for step in steps]
     figures = {
@@ -243,16 +239,11 @@ def _plots(steps: Sequence[Step], times: Times) -> list[Message]:
         entities.OBSERVABILITY: [math.log10(max(match.observability, _LEAST_DRAWN)) for match in matches],
         entities.ITERATIONS: [match.iterations for match in matches],
     }
-    messages = []
     for entity, values in figures.items():
         known = np.where(np.isfinite(values), values, np.nan)
-        messages.append(Message(entity, rr.Scalars.columns(scalars=known), times))
+        yield Message(entity, rr.Scalars.columns(scalars=known), times)
     informations = np.array([match.information for match in matches])
-    covariances = drawing.ellipsoids(informations, entities.COVARIANCE_SCALE)
+    yield Message(entities.COVARIANCE, drawing.ellipsoids(informations, entities.COVARIANCE_SCALE), times)
     timings = [[getattr(step.timing, f"{stage}_s") for stage in STAGES] for step in steps]
     stages = rr.Scalars.columns(scalars=1e3 * np.array(timings).reshape(-1))
-    return [
-        *messages,
-        Message(entities.COVARIANCE, covariances, times),
-        Message(entities.TIME, stages.partition([len(STAGES)] * len(steps)), times),
-    ]
+    yield Message(entities.TIME, stages.partition([len(STAGES)] * len(steps)), times)

@@ -73,7 +73,9 @@ def present_comparison(directory: Path) -> None:
 
 
 def _compared(directory: Path, trajectories: Sequence[DrawnTrajectory]) -> Iterator[Message]:
-    truth_file, stamps_ns = directory / TRUTH_FILE, _stamps(directory)
+    scans, truth_file = pq.read_table(directory / SCANS_FILE), directory / TRUTH_FILE
+    _, first = np.unique(scans["index"].to_numpy(), return_index=True)  # of the method with the most scans
+    stamps_ns = scans["stamp_ns"].to_numpy()[first]
     if truth_file.exists():
         path = drawing.positions(read_tum(truth_file).poses)
         yield Message(entities.GROUND_TRUTH, drawing.lines([path], entities.WHITE, 0.75))
@@ -115,13 +117,6 @@ def _plots(trajectories: Sequence[DrawnTrajectory]) -> list[rrb.TimeSeriesView]:
             axes = {"axis_x": whole_log(), "axis_y": rrb.ScalarAxis(range=(0.0, highest))}
             views.append(rrb.TimeSeriesView(origin=f"plots/{plot}", name=name, plot_legend=legend, **axes))
     return views
-
-
-def _stamps(directory: Path) -> NDArray[np.int64]:
-    """(N,) of all scans, from the method with the most."""
-    table = pq.read_table(directory / SCANS_FILE, columns=["index", "stamp_ns"])
-    indices, first = np.unique(table["index"].to_numpy(), return_index=True)
-    return table["stamp_ns"].to_numpy()[first] if len(indices) else np.empty(0, np.int64)
 
 
 def present_merge(directory: Path) -> None:

@@ -95,13 +95,9 @@ def _accuracy(m: Metrics) -> str:
 def _sections(directory: Path, metrics: Metrics) -> Iterator[page.Section]:
     """Accuracy, trajectory and map, closures, errors, uncertainty; time last."""
     steps = pq.ParquetFile(directory / "steps.parquet").read()  # read_table imports much more
-    config, accuracy, truth_file = (
-        read_layer(directory / "config.toml"),
-        metrics.ground_truth,
-        directory / TRUTH_FILE,
-    )
+    config, accuracy = read_layer(directory / "config.toml"), metrics.ground_truth
+    truth_file, gap_s = directory / TRUTH_FILE, None if accuracy is None else accuracy.max_gap_s
     truth = read_tum(truth_file) if truth_file.exists() and accuracy is not None else None
-    gap_s = None if accuracy is None else accuracy.max_gap_s
     trajectories, true_path = trajectories_of_run(steps, truth, gap_s)
     optimized, closures = trajectories[0], sections.read_closures(directory / "loops.parquet")
     if accuracy is not None:

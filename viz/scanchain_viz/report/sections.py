@@ -229,9 +229,8 @@ def loop_section(trajectory: DrawnTrajectory, closures: pa.Table | None, title: 
 def _verdict_grid(closures: pa.Table) -> Grid:
     """Closures by verdict and cause, most frequent first."""
     groups: defaultdict[tuple[str, str], list[int]] = defaultdict(list)
-    for place, (by, cause) in enumerate(
-        zip(*(closures[name].to_pylist() for name in ("rejected_by", "cause")), strict=True)
-    ):
+    verdicts = zip(closures["rejected_by"].to_pylist(), closures["cause"].to_pylist(), strict=True)
+    for place, (by, cause) in enumerate(verdicts):
         groups[CLOSURES[by][0], cause].append(place)
     overlap, residual_m = closures["overlap"].to_numpy(), closures["residual_m"].to_numpy()
     rows = []
