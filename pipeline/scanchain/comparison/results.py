@@ -254,18 +254,12 @@ def _write_tables(path: Path, tables: Sequence[pa.Table], notes: Mapping[str, st
 
 
 def _relations(assessed: Mapping[str, Assessed]) -> list[pa.Table]:
-    errors = {name: each.relations for name, each in assessed.items() if each.relations is not None}
-    return [
-        pa.table(
-            {
-                "method": pa.array([name] * len(error.used), pa.string()),
-                "relation": error.used,
-                "error_m": error.errors_m,
-                "error_rad": error.errors_rad,
-            }
-        )
-        for name, error in errors.items()
-    ]
+    tables = []
+    for name, each in assessed.items():
+        if (error := each.relations) is not None:
+            columns = {"relation": error.used, "error_m": error.errors_m, "error_rad": error.errors_rad}
+            tables.append(pa.table({"method": pa.array([name] * len(error.used), pa.string())} | columns))
+    return tables
 
 
 def _scans(results: Results) -> list[pa.Table]:
