@@ -306,7 +306,7 @@ def broken(segments: NDArray[np.floating]) -> Floats:
 
 
 def around(points: NDArray[np.floating], share: float, least: float) -> tuple[Floats, Floats]:
-    """Corners (2,) of a view of the known of points (N, 2): a margin of a share of their extent, or the least."""
+    """Corners (d,) of a view of the known of points (N, d): a margin of a share of their extent, or the least."""
     known = points[np.isfinite(points).all(axis=1)]
     low, high = known.min(axis=0), known.max(axis=0)
     margin = max(share * float((high - low).max()), least)

@@ -13,11 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.config import Config
 from scanchain.data import Matrix, Points
 from scanchain.errors import InputError
-from scanchain.evaluation import on_the_estimate
-from scanchain.evaluation.errors import path_length
+from scanchain.evaluation import on_the_estimate, path_length
 from scanchain.maps import SavedMap, open_saved_map, read_map, read_ply
 from scanchain.runs.directory import TRUTH_FILE
 from scanchain.trajectory import read_tum
@@ -133,17 +131,12 @@ def _image(
 
 @dataclass(frozen=True, slots=True)
 class DrawnMerge:
-    """Sessions of a merged map, ends (E, 2, 3) of the closures between them, and the spacing of its points."""
+    """Positions (K, 3) of a merged map's keyframes, its sessions, and ends (E, 2, 3) of closures between them."""
 
+    positions: Floats
     sessions: tuple[Line, ...]
     closures: Floats
     dimension: int
-    grain_m: float
-
-    @property
-    def positions(self) -> Floats:
-        """(K, 3) of all keyframes."""
-        return np.concatenate([session.positions for session in self.sessions])
 
 
 def read_merge(directory: Path) -> DrawnMerge:
@@ -156,7 +149,7 @@ def read_merge(directory: Path) -> DrawnMerge:
     )
     ends: NDArray[np.int64] = saved.session[saved.edges.pairs]
     between = saved.edges.pairs[ends[:, 0] != ends[:, 1]]
-    return DrawnMerge(sessions, positions[between], saved.dimension, Config().maps.voxel_size_m)
+    return DrawnMerge(positions, sessions, positions[between], saved.dimension)
 
 
 def draw_map(

@@ -15,14 +15,13 @@ from scanchain import lie
 from scanchain.comparison.results import RELATIONS_FILE, SCANS_FILE
 from scanchain.comparison.table import Row, read_table
 from scanchain.data import Matrix, Trajectory
-from scanchain.evaluation import absolute_error_of_any_path, pair
-from scanchain.evaluation.errors import path_length
+from scanchain.evaluation import absolute_error_of_any_path, pair, path_length
 from scanchain.runs.step_table import STAGES, nees_of_steps
 from scanchain.runs.vouching import poses_of
 from scanchain_viz.colors import color_of
-from scanchain_viz.pictures.figure import Floats
+from scanchain_viz.pictures.figure import Floats, around
 
-_MARGIN = 0.25
+_MARGIN, _MARGIN_Z = (0.08, 1.0), (0.25, 0.1)  # shares of the extent and least meters
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,12 +55,8 @@ class DrawnTrajectory:
 
 def frame(trajectories: Sequence[DrawnTrajectory], truth: Floats | None) -> Floats:
     """Corners (2, 3) of the axes: the ground truth if there is one, else the trajectories, with a margin."""
-    paths = [truth] if truth is not None else [trajectory.positions for trajectory in trajectories]
-    low = np.min([path.min(axis=0) for path in paths], axis=0)
-    high = np.max([path.max(axis=0) for path in paths], axis=0)
-    size = high - low
-    margin = np.array([max(0.08 * size[:2].max(), 1.0)] * 2 + [max(_MARGIN * size[2], 0.1)])
-    return np.stack([low - margin, high + margin])
+    held = np.concatenate([each.positions for each in trajectories]) if truth is None else truth
+    return np.hstack([around(held[:, :2], *_MARGIN), around(held[:, 2:], *_MARGIN_Z)])
 
 
 def trajectories_of_run(

@@ -35,14 +35,12 @@ class KeyframeGraph:
         self.closures: list[Closure] = []
         self.graph: GraphState | None = None
         self.counts = (0, 0)  # of closures accepted and rejected
-        self.drawn = 0
-        self.is_current = True
+        self.drawn = 0  # number of keyframes that it had when it was drawn
 
     def add(self, step: Step) -> list[str]:
         """Take in a step; the verdicts on its closures are those of the matcher, then of the back end for all."""
         if step.keyframe >= 0:
             self.positions.append(drawing.positions(step.T_world_lidar[None])[0])
-            self.is_current = False
         news: list[str] = []
         if step.closures:
             self.tried += step.closures
@@ -54,7 +52,7 @@ class KeyframeGraph:
 
     def settle(self, closures: Sequence[Closure], graph: GraphState) -> list[str]:
         """Take in the final graph with every closure tried."""
-        self.graph, self.is_current = graph, False
+        self.graph, self.drawn = graph, 0
         return self._update(closures)
 
     def restore(self, positions: Floats, closures: Sequence[Closure], graph: GraphState) -> None:
@@ -64,7 +62,6 @@ class KeyframeGraph:
         for position in positions:
             self.positions.append(position)
             self.drawn = len(self.positions) if self.has_grown else self.drawn
-        self.is_current = self.drawn == len(self.positions)
 
     @property
     def has_grown(self) -> bool:
@@ -73,9 +70,9 @@ class KeyframeGraph:
 
     def draw(self, times: Times) -> list[Message]:
         """Messages of the present graph, unless it is drawn already."""
-        if self.is_current or not self.positions:
+        if self.drawn == len(self.positions):
             return []
-        self.drawn, self.is_current = len(self.positions), True
+        self.drawn = len(self.positions)
         nodes = np.array(self.positions)
         if self.graph is not None:
             nodes[: len(self.graph.poses)] = drawing.positions(self.graph.poses)

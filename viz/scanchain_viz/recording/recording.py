@@ -27,7 +27,6 @@ from scanchain_viz.colors import STRETCH_COLORS, rgb
 from scanchain_viz.recording import drawing, entities, viewer
 from scanchain_viz.recording.batching import WARNING, Batcher, events
 from scanchain_viz.recording.drawing import Message, Times
-from scanchain_viz.recording.entities import blueprint
 from scanchain_viz.recording.sinks import Sink, file_sink, open_stream, viewer_sink
 
 _LISTED = 50  # largest number of stretches in the text of a verdict
@@ -66,19 +65,19 @@ class Recording:
         recording_id = uuid4()
         if "save" in self.sinks and self.path is not None:
             stream = open_stream(self.name, self.dimension, recording_id)
-            self.file = file_sink(self.path, stream, blueprint(self.dimension))
+            self.file = file_sink(self.path, stream, entities.blueprint(self.dimension))
             self.opened.append(self.file)
         address = self._viewer_address() if self.sinks & {"spawn", "connect", "web"} else ""
         if address:
             stream = open_stream(self.name, self.dimension, recording_id)
-            self.opened.append(viewer_sink(address, stream, blueprint(self.dimension)))
+            self.opened.append(viewer_sink(address, stream, entities.blueprint(self.dimension)))
         self._send(lambda: entities.constants(self.dimension))
         return self
 
     def __exit__(self, *error: object) -> None:
         """Write the last batch, frame the view, and close file and viewer."""
         self._send(lambda: [*self.batcher.messages(), *self.batcher.graph.draw(self.now)])
-        layout = blueprint(self.dimension, self.batcher.box, self.last[0])
+        layout = entities.blueprint(self.dimension, self.batcher.box, self.last[0])
         for sink in self.opened:
             sink.send(lambda stream: stream.send_blueprint(layout))
             sink.close()
