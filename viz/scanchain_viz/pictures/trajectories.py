@@ -79,8 +79,8 @@ def trajectories_of_run(
         T_world_truth = lie.inverse(ate.T_reference_estimate)
         T_world_estimate = T_world_truth @ ate_before.T_reference_estimate
         true_path = lie.transform(T_world_truth, after.reference[:, :3, 3])
-    seconds = np.sum([_column(steps, f"{stage}_s") for stage in STAGES[1:]], axis=0)  # without reading
-    observability = _column(steps, "observability")
+    seconds = np.sum([column_of(steps, f"{stage}_s") for stage in STAGES[1:]], axis=0)  # without reading
+    observability = column_of(steps, "observability")
 
     def drawn(name: str, color: str, poses: Matrix, errors_m: Floats, *figures: Floats) -> DrawnTrajectory:
         length_m, none = path_length(poses), np.empty(0)
@@ -107,15 +107,15 @@ def _of_method(row: Row, color: str, scans: pa.Table, relations: pa.Table | None
     runs = scans.filter(is_of_it)
     if len(runs):
         runs = runs.filter(pc.field("repeat") == int(np.argmax(np.bincount(runs["repeat"].to_numpy()))))
-    known = (_column(runs, name) for name in ("seconds", "nees", "observability"))
-    errors_m = np.empty(0) if relations is None else _column(relations.filter(is_of_it), "error_m")
-    positions = np.stack([_column(runs, f"aligned_{axis}") for axis in "xyz"], axis=1)
-    distance_m, is_dashed = _column(runs, "distance_m"), "+loops" in row.base
+    known = (column_of(runs, name) for name in ("seconds", "nees", "observability"))
+    errors_m = np.empty(0) if relations is None else column_of(relations.filter(is_of_it), "error_m")
+    positions = np.stack([column_of(runs, f"aligned_{axis}") for axis in "xyz"], axis=1)
+    distance_m, is_dashed = column_of(runs, "distance_m"), "+loops" in row.base
     return DrawnTrajectory(
-        row.name, color, is_dashed, positions, distance_m, _column(runs, "error_m"), errors_m, *known
+        row.name, color, is_dashed, positions, distance_m, column_of(runs, "error_m"), errors_m, *known
     )
 
 
-def _column(table: pa.Table, name: str) -> Floats:
+def column_of(table: pa.Table, name: str) -> Floats:
     """A column as floats, NaN for null."""
     return table[name].to_numpy(zero_copy_only=False).astype(np.float64)

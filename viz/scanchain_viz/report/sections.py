@@ -24,7 +24,7 @@ from scanchain_viz.report.page import Cell, Chip, Collapsible, Drawing, Grid, He
 _MAX_POINTS = 1500  # largest number of points of a line
 _WINDOWS = 250  # number of windows over which a value of each scan is averaged
 _SHOWN_SHARES = (0.5, 99.5)  # per cent of the values of a distribution
-_LOWEST, _HIGHEST = 0.01, 1000.0  # range to which observability is clipped
+CLIPPED = (0.01, 1000.0)  # range of observability and innovations that is drawn
 
 
 def _legend(trajectories: Sequence[DrawnTrajectory]) -> Sequence[DrawnTrajectory]:
@@ -78,7 +78,7 @@ def error_section(trajectories: Sequence[DrawnTrajectory], truth_name: str) -> I
     figure = Plot("distance traveled [m]", "position error [m]", logarithmic="y")
     for each in reversed(known):
         finite = np.isfinite(each.error_m)
-        points = _windowed(each.error_m[finite], np.median, each.distance_m[finite])
+        points = windowed(each.error_m[finite], np.median, each.distance_m[finite])
         _draw(figure, each, np.maximum(points, [0.0, 1e-4]))
     drawings = (
         Drawing.of("Over the distance", _of_neighbors("Medians", known, "error_m"), figure),
@@ -105,7 +105,7 @@ def time_section(trajectories: Sequence[DrawnTrajectory], stages: Grid | None = 
         return
     figure = Plot("scan", "time of a scan [ms]", logarithmic="y")
     for each in reversed(known):
-        _draw(figure, each, _windowed(1e3 * each.seconds, np.median), 0.9)
+        _draw(figure, each, windowed(1e3 * each.seconds, np.median), 0.9)
     drawings = (
         Drawing.of("Along the log", _of_neighbors("Medians", known, "seconds"), figure),
         _distribution(known, "seconds", 1e3, "time of a scan [ms]", "scans that took less"),
@@ -120,7 +120,7 @@ def uncertainty_section(trajectories: Sequence[DrawnTrajectory], *, is_planar: b
         return
     along = Plot("scan", "observability", logarithmic="y", is_wide=not estimated)
     for each in reversed(reported):
-        _draw(along, each, _windowed(np.clip(each.observability, _LOWEST, _HIGHEST), np.min))
+        _draw(along, each, windowed(np.clip(each.observability, *CLIPPED), np.min))
     along.level(1.0)
     least = _of_neighbors(" Least values", reported, "observability")
     text = (
@@ -131,22 +131,6 @@ def uncertainty_section(trajectories: Sequence[DrawnTrajectory], *, is_planar: b
     if estimated:
         drawings.append(_consistency(estimated, 3 if is_planar else 6))
     yield Section("Uncertainty", "", _legend(reported), tuple(drawings))
-
-
-def innovations(curves: Sequence[tuple[Floats, str]], stretches: Sequence[tuple[int, int, str]]) -> Drawing:
-    """Innovations (N,) over their limits scan by scan, in their colors, over stretches in theirs."""
-    figure = Plot("scan", "innovation / limit", is_wide=True)
-    for first, last, color in stretches:
-        figure.span(first - 0.5, last + 0.5, f"{color}33")
-    for values, color in curves:
-        figure.line(_windowed(np.clip(np.nan_to_num(values), _LOWEST, _HIGHEST), np.max), color, 0.9)
-    figure.level(1.0)
-    size = max((_window(len(values)) for values, _ in curves), default=1)
-    largest = f", largest of {size} neighboring scans" if size > 1 else ""
-    text = (
-        f"Normalized innovations over their limits{largest}; above 1 (dotted) is a finding, or wheels that slip."
-    )
-    return Drawing.of("Innovations", text, figure)
 
 
 def _distribution(
@@ -190,14 +174,14 @@ def _some(count: int) -> NDArray[np.int64]:
     return np.linspace(0, count - 1, min(count, _MAX_POINTS)).astype(np.int64)
 
 
-def _window(count: int) -> int:
+def window(count: int) -> int:
     """Number of neighboring values, of so many, that make a point of a line."""
     return max(1, -(-count // _WINDOWS))
 
 
-def _windowed(values: Floats, combine: Callable[..., Floats], x: Floats | None = None) -> Floats:
+def windowed(values: Floats, combine: Callable[..., Floats], x: Floats | None = None) -> Floats:
     """Points (K, 2) of a line that can be read: neighboring values put together, over the means of x or scans."""
-    size = _window(len(values))
+    size = window(len(values))
     count = len(values) // size * size
     over = np.arange(len(values), dtype=np.float64) if x is None else x
     return np.stack(
@@ -207,7 +191,7 @@ def _windowed(values: Floats, combine: Callable[..., Floats], x: Floats | None =
 
 def _of_neighbors(what: str, trajectories: Sequence[DrawnTrajectory], key: str) -> str:
     """The caption of lines whose points stand for several scans each; none where each is a scan."""
-    size = _window(max(int(np.isfinite(getattr(each, key)).sum()) for each in trajectories))
+    size = window(max(int(np.isfinite(getattr(each, key)).sum()) for each in trajectories))
     return f"{what} of {size} neighboring scans." if size > 1 else ""
 
 
