@@ -82,7 +82,9 @@ def assess(outcomes: Sequence[Outcome], stamps_ns: NDArray[np.int64], reference:
     by_scan = {name: np.full(len(stamps_ns), np.nan) for name in ("error_m", "error_rad", "nees")}
     if not outcome.is_whole:
         return Assessed(_speed(outcomes), _start(stamps_ns, truth), by_scan, None, [])
-    figures: dict[str, float | None] = _speed(outcomes) | {"repeats_apart_m": _apart_m(outcomes)}
+    first, *others = (each.trajectory.poses[:, :-1, -1] for each in outcomes if each.is_whole)
+    apart_m = max((float(np.linalg.norm(each - first, axis=1).max()) for each in others), default=None)
+    figures: dict[str, float | None] = _speed(outcomes) | {"repeats_apart_m": apart_m}
     error, definitions = None, []
     if reference.relations is not None:
         error = evaluation.relation_error(outcome.trajectory, reference.relations)
@@ -167,12 +169,6 @@ def _stages(outcome: Outcome) -> dict[str, float]:
     loops = seconds.pop("loops_s")
     medians = {name: float(np.median(each)) for name, each in seconds.items()}
     return medians | ({"loops_s": float(loops.mean())} if loops.any() else {})
-
-
-def _apart_m(outcomes: Sequence[Outcome]) -> float | None:
-    """Largest distance between the positions of a scan in two runs."""
-    first, *others = (outcome.trajectory.poses[:, :-1, -1] for outcome in outcomes if outcome.is_whole)
-    return max((float(np.linalg.norm(each - first, axis=1).max()) for each in others), default=None)
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import subprocess
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from pathlib import Path
@@ -155,10 +156,8 @@ class Recording:
         """Keep the web viewer served until it ends or the user interrupts."""
         self._send(self.batcher.messages)
         if self.server is not None:
-            try:
+            with suppress(KeyboardInterrupt):
                 self.server.wait()
-            except KeyboardInterrupt:
-                return
 
     def _viewer_address(self) -> str:
         """Address of a viewer; empty, with a warning, if there is none."""

@@ -184,9 +184,8 @@ def windowed(values: Floats, combine: Callable[..., Floats], x: Floats | None = 
     size = window(len(values))
     count = len(values) // size * size
     over = np.arange(len(values), dtype=np.float64) if x is None else x
-    return np.stack(
-        [over[:count].reshape(-1, size).mean(axis=1), combine(values[:count].reshape(-1, size), axis=1)]
-    ).T
+    x, y = (each[:count].reshape(-1, size) for each in (over, values))
+    return np.stack([x.mean(axis=1), combine(y, axis=1)], axis=1)
 
 
 def _of_neighbors(what: str, trajectories: Sequence[DrawnTrajectory], key: str) -> str:
