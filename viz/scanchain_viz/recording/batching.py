@@ -115,6 +115,7 @@ class Batcher:
         self.points = 0
         self.box: Floats | None = None
         self.started_s = perf_counter()
+        self.now = Times.at(0, 0)  # of the last step
         self.last: Matrix | None = None  # (1, d+1, d+1) T_odom_lidar of the scan before
         self.state: State | None = None
 
@@ -125,11 +126,13 @@ class Batcher:
         self.graph.restore(positions[steps.columns["keyframe"] >= 0], closures, graph)
         self.points = int(steps.columns["points"].sum())
         self._frame(positions)
+        self.now = Times(steps.columns["index"][-1:], steps.columns["stamp_ns"][-1:])
         self.last = odom[-1:]
         self.state = steps.last_state
 
     def add(self, step: Step) -> None:
         """Take in one step, and the verdicts of that moment."""
+        self.now = Times.at(step.scan.index, step.scan.stamp_ns)
         news = self.graph.add(step)
         if not self.gathered:
             self.started_s = perf_counter()
@@ -170,11 +173,11 @@ class Batcher:
             _counts(counts, times),
         ]
 
-    def settled(self, closures: Sequence[Closure], graph: GraphState, times: Times) -> list[Message]:
-        """All that is left, and the final verdicts at ``times``, of the last step."""
+    def settled(self, closures: Sequence[Closure], graph: GraphState) -> list[Message]:
+        """All that is left, and the final verdicts, at the last step."""
         messages, news = self.messages(), self.graph.settle(closures, graph)
-        told = events([[(_INFORMATION, text) for text in news]], times)
-        return [*messages, *told, _counts([self.graph.counts], times), *self.graph.draw(times)]
+        told = events([[(_INFORMATION, text) for text in news]], self.now)
+        return [*messages, *told, _counts([self.graph.counts], self.now), *self.graph.draw(self.now)]
 
     def _frame(self, positions: Floats) -> None:
         """Widen the box around everything that was passed, (2, 3)."""

@@ -59,7 +59,6 @@ class Recording:
         self.file: Sink | None = None
         self.server: subprocess.Popen[bytes] | None = None
         self.batcher = Batcher()
-        self.last = (0, 0)  # scan and stamp of the last step
         self.problems: list[str] = []
 
     def __enter__(self) -> Recording:
@@ -77,8 +76,8 @@ class Recording:
 
     def __exit__(self, *error: object) -> None:
         """Write the last batch, frame the view, and close file and viewer."""
-        self._send(lambda: [*self.batcher.messages(), *self.batcher.graph.draw(self.now)])
-        layout = entities.blueprint(self.dimension, self.batcher.box, self.last[0])
+        self._send(lambda: [*self.batcher.messages(), *self.batcher.graph.draw(self.batcher.now)])
+        layout = entities.blueprint(self.dimension, self.batcher.box, int(self.batcher.now.scans[0]))
         for sink in self.opened:
             sink.send(lambda stream: stream.send_blueprint(layout))
             sink.close()
@@ -97,7 +96,6 @@ class Recording:
 
         before : the recording up to there, which is copied; without one, the recording begins here
         """
-        self.last = int(steps.columns["index"][-1]), int(steps.columns["stamp_ns"][-1])
         self._guard(lambda: self.batcher.restore(steps, closures, graph))
         for sink in self.opened:
             if before is not None:
@@ -113,7 +111,6 @@ class Recording:
 
     def log(self, step: Step) -> None:
         """Record one step; most of it is gathered and written in batches."""
-        self.last = step.scan.index, step.scan.stamp_ns
         self._send(lambda: self._step(step))
 
     def log_trajectory(
@@ -128,7 +125,7 @@ class Recording:
 
     def log_closures(self, closures: Sequence[Closure], graph: GraphState) -> None:
         """Record the final graph and the final verdict on every closure, at the last scan."""
-        self._send(lambda: self.batcher.settled(closures, graph, self.now))
+        self._send(lambda: self.batcher.settled(closures, graph))
 
     def log_verdict(self, judged: Judged, trajectory: Trajectory) -> None:
         """Record the verdict, and its stretches on the optimized trajectory of all scans of the log."""
@@ -176,18 +173,13 @@ class Recording:
             return ""
         return viewer.grpc_address()
 
-    @property
-    def now(self) -> Times:
-        """The instant of the last step."""
-        return Times.at(*self.last)
-
     def _step(self, step: Step) -> list[Message]:
         """Take in a step; the messages that are due after it."""
         self.batcher.add(step)
-        messages = self.batcher.graph.draw(self.now) if self.batcher.graph.has_grown else []
+        messages = self.batcher.graph.draw(self.batcher.now) if self.batcher.graph.has_grown else []
         if step.keyframe >= 0 and step.keyframe % self.config.local_map_every == 0 and len(step.local_map):
             points = drawing.at_most(step.local_map, self.config.max_map_points)
-            messages.append(Message(entities.LOCAL_MAP, drawing.dots(points), self.now))
+            messages.append(Message(entities.LOCAL_MAP, drawing.dots(points), self.batcher.now))
         return [*messages, *self.batcher.messages()] if self.batcher.is_due else messages
 
     def _map(self, points: NDArray[np.floating]) -> list[Message]:
