@@ -11,6 +11,7 @@ import numpy as np
 import rerun as rr
 
 from scanchain import lie
+from scanchain.config import RecordingConfig
 from scanchain.data import Closure, ClosureVerdict, GraphState, Matrix, State, Step
 from scanchain.runs.closures import final_verdicts
 from scanchain.runs.step_table import STAGES, StepTable
@@ -108,7 +109,8 @@ class KeyframeGraph:
 class Batcher:
     """Holds the steps since the last batch; every batch turns them into messages."""
 
-    def __init__(self) -> None:
+    def __init__(self, config: RecordingConfig) -> None:
+        self.config = config
         self.graph = KeyframeGraph()
         self.gathered: list[tuple[Step, list[str], tuple[int, int]]] = []  # with the news and counts of closures
         self.bytes = 0
@@ -130,8 +132,8 @@ class Batcher:
         self.last = odom[-1:]
         self.state = steps.last_state
 
-    def add(self, step: Step) -> None:
-        """Take in one step, and the verdicts of that moment."""
+    def add(self, step: Step) -> list[Message]:
+        """Take in one step, and the verdicts of that moment; the messages that are due after it."""
         self.now = Times.at(step.scan.index, step.scan.stamp_ns)
         news = self.graph.add(step)
         if not self.gathered:
@@ -139,15 +141,13 @@ class Batcher:
         self.gathered.append((step, news, self.graph.counts))
         self.bytes += 12 * len(step.points)
         self.points += len(step.points)
-
-    @property
-    def is_due(self) -> bool:
-        """True if the batch is large or old enough."""
-        return (
-            len(self.gathered) >= _MAX_SCANS
-            or self.bytes >= _MAX_BYTES
-            or perf_counter() - self.started_s >= _MAX_WAIT_S
-        )
+        messages = self.graph.draw(self.now) if self.graph.has_grown else []
+        if step.keyframe >= 0 and step.keyframe % self.config.local_map_every == 0 and len(step.local_map):
+            points = drawing.at_most(step.local_map, self.config.max_map_points)
+            messages.append(Message(entities.LOCAL_MAP, drawing.dots(points), self.now))
+        is_large = len(self.gathered) >= _MAX_SCANS or self.bytes >= _MAX_BYTES
+        is_due = is_large or perf_counter() - self.started_s >= _MAX_WAIT_S
+        return [*messages, *self.messages()] if is_due else messages
 
     def messages(self) -> list[Message]:
         """Messages of the gathered steps, scan by scan; the batch is empty afterwards."""

@@ -58,7 +58,7 @@ class Recording:
         self.opened: list[Sink] = []
         self.file: Sink | None = None
         self.server: subprocess.Popen[bytes] | None = None
-        self.batcher = Batcher()
+        self.batcher = Batcher(self.config)
         self.problems: list[str] = []
 
     def __enter__(self) -> Recording:
@@ -111,7 +111,7 @@ class Recording:
 
     def log(self, step: Step) -> None:
         """Record one step; most of it is gathered and written in batches."""
-        self._send(lambda: self._step(step))
+        self._send(lambda: self.batcher.add(step))
 
     def log_trajectory(
         self, stamps_ns: NDArray[np.int64], poses_optimized: Matrix, indices: NDArray[np.int64]
@@ -172,15 +172,6 @@ class Recording:
             self.problems.append(str(error))
             return ""
         return viewer.grpc_address()
-
-    def _step(self, step: Step) -> list[Message]:
-        """Take in a step; the messages that are due after it."""
-        self.batcher.add(step)
-        messages = self.batcher.graph.draw(self.batcher.now) if self.batcher.graph.has_grown else []
-        if step.keyframe >= 0 and step.keyframe % self.config.local_map_every == 0 and len(step.local_map):
-            points = drawing.at_most(step.local_map, self.config.max_map_points)
-            messages.append(Message(entities.LOCAL_MAP, drawing.dots(points), self.batcher.now))
-        return [*messages, *self.batcher.messages()] if self.batcher.is_due else messages
 
     def _map(self, points: NDArray[np.floating]) -> list[Message]:
         """The map's points as far as they are drawn."""
