@@ -27,7 +27,7 @@ from scanchain.comparison import processes
 from scanchain.comparison.methods import Method
 from scanchain.comparison.processes import EndReport, Status, StoredScans
 from scanchain.data import Pose, Scan, Trajectory
-from scanchain.errors import MissingExtraError, ScanchainError, shown
+from scanchain.errors import MissingExtraError, ScanchainError, one_line, shown
 from scanchain.processes import die_first, die_with_parent, peak_mib
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ def _report(scans: StoredScans, method: Method, folder: Path) -> EndReport:
 
 
 def _words(error: Exception) -> str:
-    return f"{type(error).__name__}: {' '.join(str(error).split())[:_MAX_CHARACTERS]}"
+    return f"{type(error).__name__}: {one_line(error)[:_MAX_CHARACTERS]}"
 
 
 if __name__ == "__main__":

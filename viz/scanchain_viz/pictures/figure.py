@@ -148,8 +148,19 @@ class Plot:
         name : as of a line
         """
         x, y = self._included(positions)
-        style = f"fill: {color}" if not line else f"stroke: {color}; stroke-width: {line:g}"
-        self._within.append(lambda: _marks(self._at(x, y), shape, 0.5 * size, style))
+        half, style = 0.5 * size, f"stroke: {color}; stroke-width: {line:g}" if line else f"fill: {color}"
+        outline = {
+            "o": f"m{-half:g} 0a{half:g} {half:g} 0 1 0 {size:g} 0a{half:g} {half:g} 0 1 0 {-size:g} 0z",
+            "s": f"m{-half:g} {-half:g}h{size:g}v{size:g}h{-size:g}z",
+            "+": f"m{-half:g} 0h{size:g}m{-half:g} {-half:g}v{size:g}",
+        }[shape]
+
+        def path() -> str:
+            points = self._at(x, y)
+            known = points[np.isfinite(points).all(axis=1)].tolist()
+            return f'<path d="{"".join(f"M{x:.2f} {y:.2f}{outline}" for x, y in known)}" style="{style}"/>'
+
+        self._within.append(path)
         drawn = {"markersize": size, "color": _on_white(color), "label": name or None}
         drawn |= {"markerfacecolor": "none", "markeredgewidth": line} if line else {}
         self._on_axes.append(lambda axes: axes.plot(x, y, linestyle="none", marker=shape, **drawn))
@@ -286,17 +297,6 @@ def _path(points: Floats) -> str:
         f"{'M' if is_first else 'L'}{x:.2f} {y:.2f}"
         for is_first, (x, y) in zip(begins[kept].tolist(), points[kept].tolist(), strict=True)
     )
-
-
-def _marks(points: Floats, shape: str, half: float, style: str) -> str:
-    """One path of marks at points (N, 2) that are known."""
-    outline = {
-        "o": f"m{-half:g} 0a{half:g} {half:g} 0 1 0 {2 * half:g} 0a{half:g} {half:g} 0 1 0 {-2 * half:g} 0z",
-        "s": f"m{-half:g} {-half:g}h{2 * half:g}v{2 * half:g}h{-2 * half:g}z",
-        "+": f"m{-half:g} 0h{2 * half:g}m{-half:g} {-half:g}v{2 * half:g}",
-    }[shape]
-    known = points[np.isfinite(points[:, 0] + points[:, 1])]
-    return f'<path d="{"".join(f"M{x:.2f} {y:.2f}{outline}" for x, y in known.tolist())}" style="{style}"/>'
 
 
 def broken(segments: NDArray[np.floating]) -> Floats:

@@ -54,16 +54,6 @@ def write_compare_report(directory: Path) -> None:
     page.write_page(directory, whole)
 
 
-def _figures(table: Table, trajectories: Sequence[DrawnTrajectory]) -> Iterator[page.Section]:
-    """The summary, and tables of all else."""
-    summary = columns_of(table.figures, "summary")
-    yield page.Section("Summary", grid=_grid(table, table.rows, trajectories, summary, has_verdicts=True))
-    ended = [row for row in table.rows if row.status is Status.OK]
-    for part in ("accuracy", "time"):
-        if columns := columns_of(table.figures, part):
-            yield page.Section(f"More on {part}", grid=_grid(table, ended, trajectories, columns))
-
-
 def _grid(
     table: Table,
     rows: Sequence[TableRow],
@@ -91,17 +81,25 @@ def _grid(
 def _sections(
     directory: Path, table: Table, trajectories: Sequence[DrawnTrajectory], truth: Floats | None
 ) -> Iterator[page.Section]:
-    yield from _figures(table, trajectories)
+    summary = columns_of(table.figures, "summary")
+    yield page.Section("Summary", grid=_grid(table, table.rows, trajectories, summary, has_verdicts=True))
+    ended = [row for row in table.rows if row.status is Status.OK]
+    for part in ("accuracy", "time"):
+        if columns := columns_of(table.figures, part):
+            yield page.Section(f"More on {part}", grid=_grid(table, ended, trajectories, columns))
     is_planar = table.dimension == 2
     if trajectories:
-        framing, text = _sharpest(table, trajectories), "All start at the same pose."
+        # those with maps nearly as sharp as the best frame the pictures; all without maps
+        thickness_m = {row.name: row.figures["thickness_m"] or np.inf for row in table.rows}
+        limit_m = _NEARLY * min(thickness_m[each.name] for each in trajectories)
+        framing = [each for each in trajectories if thickness_m[each.name] <= limit_m]
+        text = "All start at the same pose."
         if truth is not None:
             text = (
                 "Each is aligned to the ground truth as for the ATE; one that did not finish, by its first pose."
             )
         elif len(framing) < len(trajectories):
-            framed = {each.name for each in framing}
-            astray = ", ".join(each.name for each in trajectories if each.name not in framed)
+            astray = ", ".join(each.name for each in trajectories if thickness_m[each.name] > limit_m)
             text += f" The axes frame the sharper maps; {astray} may leave them."
         yield sections.trajectories_section(trajectories, framing, truth, is_planar=is_planar, text=text)
         yield from sections.error_section(trajectories, table.truth)
@@ -114,13 +112,6 @@ def _sections(
         yield from sections.loop_section(each, closures, f"Loop closures of {each.name}")
     if len(table.rows) > 1:
         yield _disagreement(table)
-
-
-def _sharpest(table: Table, trajectories: Sequence[DrawnTrajectory]) -> list[DrawnTrajectory]:
-    """Trajectories whose maps are nearly as sharp as the best, which frame the pictures; all without maps."""
-    thickness_m = {row.name: row.figures["thickness_m"] or np.inf for row in table.rows}
-    limit_m = _NEARLY * min(thickness_m[trajectory.name] for trajectory in trajectories)
-    return [trajectory for trajectory in trajectories if thickness_m[trajectory.name] <= limit_m]
 
 
 def _map_section(
