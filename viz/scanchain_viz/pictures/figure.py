@@ -95,20 +95,16 @@ class Plot:
 
     def _lay_out(self, *, is_wide: bool) -> None:
         """Size of the figure, and corner and extent of its axes; of a plan so that a meter is equal along both."""
-        whole, (width, height) = _WHOLE if is_wide else _WIDTH, self.proportions
-        height_inches = self.height_inches
-        across = whole - _LEFT - _RIGHT
+        size, (width, height) = np.array([_WHOLE if is_wide else _WIDTH, self.height_inches]), self.proportions
         if width:
-            needed = across * height / width + _BOTTOM + _TOP
-            height_inches = float(np.clip(needed, _LOWEST, _HIGHEST_WHOLE if is_wide else _HIGHEST))
-        down = height_inches - _TOP - _BOTTOM
-        self.size, fitting = (whole * _INCH, height_inches * _INCH), (across, down)
+            needed = (size[0] - _LEFT - _RIGHT) * height / width + _BOTTOM + _TOP
+            size[1] = np.clip(needed, _LOWEST, _HIGHEST_WHOLE if is_wide else _HIGHEST)
+        first, last = np.array([[_LEFT, _TOP], [_RIGHT, _BOTTOM]])
+        room = extent = size - first - last
         if width:
-            scale = min(across / width, down / height)
-            fitting = (scale * width, scale * height)
-        self.extent = (fitting[0] * _INCH, fitting[1] * _INCH)
-        left, top = _LEFT + 0.5 * (across - fitting[0]), _TOP + 0.5 * (down - fitting[1])
-        self.corner = (left * _INCH, top * _INCH)  # of the axes, on the left and above
+            extent = np.min(room / self.proportions) * np.array(self.proportions)
+        self.size, self.extent = _INCH * size, _INCH * extent
+        self.corner = _INCH * (first + 0.5 * (room - extent))  # of the axes, on the left and above
 
     def line(
         self,

@@ -28,8 +28,6 @@ _MARGIN, _MARGIN_Z = (0.08, 1.0), (0.25, 0.1)  # shares of the extent and least 
 class DrawnTrajectory:
     """A trajectory to draw, with figures of its N scans; unknown ones are NaN.
 
-    Attributes
-    ----------
     name : for legends outside the drawings
     color, is_dashed : how its line is drawn
     positions : (N, 3) meters, in one frame with the other trajectories
