@@ -105,13 +105,11 @@ def _of_method(row: Row, color: str, scans: pa.Table, relations: pa.Table | None
     runs = scans.filter(is_of_it)
     if len(runs):
         runs = runs.filter(pc.field("repeat") == int(np.argmax(np.bincount(runs["repeat"].to_numpy()))))
-    known = (column_of(runs, name) for name in ("seconds", "nees", "observability"))
+    names = ("distance_m", "error_m", "seconds", "nees", "observability")
+    figures = {name: column_of(runs, name) for name in names}
     errors_m = np.empty(0) if relations is None else column_of(relations.filter(is_of_it), "error_m")
     positions = np.stack([column_of(runs, f"aligned_{axis}") for axis in "xyz"], axis=1)
-    distance_m, is_dashed = column_of(runs, "distance_m"), "+loops" in row.base
-    return DrawnTrajectory(
-        row.name, color, is_dashed, positions, distance_m, column_of(runs, "error_m"), errors_m, *known
-    )
+    return DrawnTrajectory(row.name, color, "+loops" in row.base, positions, relation_error_m=errors_m, **figures)
 
 
 def column_of(table: pa.Table, name: str) -> Floats:
