@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
+from functools import partial
 from glob import glob
 from pathlib import Path
 from threading import Event
@@ -112,7 +113,7 @@ def run_batch(batch: Batch, progress: Progress, work: Work | None = None) -> Bat
     if kept:
         progress.say(f"{kept:,} of {len(tasks):,} logs are done already")
     try:
-        for done, row in enumerate((work or _local(batch.workers))(readable), start=1):
+        for done, row in enumerate((work or partial(_local, batch.workers))(readable), start=1):
             write_whole(missing[row.key].row_file, msgspec.json.encode(row))
             rows[row.key] = row
             warnings = f", {counted(row.warnings, 'warning')}" if row.warnings else ""
@@ -158,20 +159,16 @@ def _not_run(task: Task) -> Row:
     return Row(task.name, "", task.key, "", state, reason, 0, 0.0, 0.0, None)
 
 
-def _local(workers: int) -> Work:
-    """Processes on this machine, so many at a time."""
-
-    def work(tasks: Sequence[Task]) -> Iterator[Row]:
-        stop = Event()
-        with ThreadPoolExecutor(workers, "batch") as pool:
-            futures = [pool.submit(attempt, task, stop) for task in tasks]
-            try:
-                yield from (future.result() for future in as_completed(futures))
-            finally:
-                stop.set()
-                pool.shutdown(wait=True, cancel_futures=True)
-
-    return work
+def _local(workers: int, tasks: Sequence[Task]) -> Iterator[Row]:
+    """Run tasks by processes on this machine, so many at a time."""
+    stop = Event()
+    with ThreadPoolExecutor(workers, "batch") as pool:
+        futures = [pool.submit(attempt, task, stop) for task in tasks]
+        try:
+            yield from (future.result() for future in as_completed(futures))
+        finally:
+            stop.set()
+            pool.shutdown(wait=True, cancel_futures=True)
 
 
 def on_cluster(address: str) -> Work:
