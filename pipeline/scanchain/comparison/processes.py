@@ -21,14 +21,12 @@ from numpy.typing import NDArray
 from scanchain.comparison.methods import Method
 from scanchain.data import Matrix, Pose, Scan, Trajectory
 from scanchain.errors import counted
-from scanchain.processes import KilledFor, Limits, available_mib, run_within
+from scanchain.processes import KilledFor, Limits, run_within
 from scanchain.runs.job import Progress
 
 TASK_FILE, TRACK_FILE, TRAJECTORY_FILE, REPORT_FILE = "task.pickle", "track.npy", "trajectory.npy", "end.json"
 STEPS_FILE, CLOSURES_FILE = "steps.parquet", "loops.parquet"
 
-_LEAST_S, _SCAN_S = 300.0, 1.0  # default time limit, seconds: at least, and for each scan
-_SHARE = 0.75  # share of the free memory that is the default limit
 _INTERVAL_S = 0.02  # between two readings of a process's memory
 
 
@@ -147,14 +145,6 @@ class Outcome:
     def is_whole(self) -> bool:
         """True if every scan has a pose."""
         return self.report.status is Status.OK
-
-
-def limits_for(scans: int, time_s: float | None, memory_mib: float | None) -> Limits:
-    """The requested limits, else 300 s and one more a scan, and three quarters of the memory that is free."""
-    return Limits(
-        _LEAST_S + _SCAN_S * scans if time_s is None else time_s,
-        _SHARE * available_mib() if memory_mib is None else memory_mib,
-    )
 
 
 def run_all(

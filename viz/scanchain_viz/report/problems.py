@@ -124,8 +124,7 @@ def write_report(directory: Path, studies: Sequence[Study]) -> None:
         for study in studies:
             plots, panels = _estimates(study), []
             for plot, when, estimate in zip(plots, ("before", "after"), (study.before, study.after), strict=True):
-                off_m = estimate.poses_m
-                error = f": poses {off_m:.3g} m off" if np.isfinite(off_m) else ""
+                error = f": poses {estimate.poses_m:.3g} m off" if np.isfinite(estimate.poses_m) else ""
                 panels.append((f"{study.name}, {when}{error}", plot))
             write_png(directory / f"{file_stem(study.name)}.png", panels, width_inches=5.5)
             sections += [_estimate_section(study, *plots), _solver_section(study)]
