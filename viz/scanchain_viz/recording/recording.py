@@ -113,14 +113,12 @@ class Recording:
         """Record one step; most of it is gathered and written in batches."""
         self._send(lambda: self.batcher.add(step))
 
-    def log_trajectory(
-        self, stamps_ns: NDArray[np.int64], poses_optimized: Matrix, indices: NDArray[np.int64]
-    ) -> None:
-        """Record the optimized trajectory: poses (N, d+1, d+1) of the scans ``indices``."""
-        times = Times(indices, stamps_ns)
+    def log_trajectory(self, optimized: Trajectory) -> None:
+        """Record the optimized trajectory of all scans."""
+        times = Times(np.arange(len(optimized), dtype=np.int64), optimized.stamps_ns)
         self._send(lambda: [
-            _path(entities.OPTIMIZED, poses_optimized, entities.CYAN),
-            Message(entities.OPTIMIZED_LIDAR, drawing.transforms(poses_optimized), times),
+            _path(entities.OPTIMIZED, optimized.poses, entities.CYAN),
+            Message(entities.OPTIMIZED_LIDAR, drawing.transforms(optimized.poses), times),
         ])  # fmt: skip
 
     def log_closures(self, closures: Sequence[Closure], graph: GraphState) -> None:
@@ -139,12 +137,10 @@ class Recording:
         """Record the finished map (N, d), downsampled to a third of the points of the scans."""
         self._send(lambda: self._map(points))
 
-    def log_grid(
-        self, cells: NDArray[np.int8] | NDArray[np.uint8], *, resolution_m: float, origin_m: tuple[float, float]
-    ) -> None:
+    def log_grid(self, cells: NDArray[np.int8], *, resolution_m: float, origin_m: tuple[float, float]) -> None:
         """Record the finished occupancy grid of a 2D log.
 
-        cells : (H, W), as ROS counts: 0 free to 100 occupied, −1 (255) unknown; row 0 at the lowest y
+        cells : (H, W), as ROS counts: 0 free to 100 occupied, −1 unknown; row 0 at the lowest y
         origin_m : x, y of the outer corner of cells[0, 0]
         """
         self._send(lambda: [Message(entities.GRID, _grid(cells, resolution_m, origin_m))])
@@ -210,9 +206,7 @@ def _path(entity: str, poses: Matrix, color: drawing.Color) -> Message:
     return Message(entity, drawing.lines([drawing.positions(poses)], color, 0.75))
 
 
-def _grid(
-    cells: NDArray[np.int8] | NDArray[np.uint8], resolution_m: float, origin_m: tuple[float, float]
-) -> rr.GridMap:
+def _grid(cells: NDArray[np.int8], resolution_m: float, origin_m: tuple[float, float]) -> rr.GridMap:
     height, width = cells.shape
     pixels = np.ascontiguousarray(cells[::-1]).view(np.uint8)  # rerun's first row is the top one
     return rr.GridMap(
