@@ -132,7 +132,7 @@ def read_toml(file: Path) -> dict[str, Any]:
 def read_layer(file: Path) -> dict[str, Value]:
     """The keys that a TOML file sets, checked one by one."""
     layer: dict[str, Value] = {}
-    for name, value in _leaves(read_toml(file)):
+    for name, value in leaves(read_toml(file)):
         key = find_key(name, str(file))
         layer[key.name] = key.check(value, str(file))
     return layer
@@ -188,7 +188,7 @@ def _preset_values(dimension: int | None) -> Mapping[str, Value]:
     return {key: spec.default for key, spec in config_keys().items()} | layer
 
 
-def _leaves(tree: Mapping[str, object]) -> Iterator[tuple[str, object]]:
+def leaves(tree: Mapping[str, object]) -> Iterator[tuple[str, object]]:
     """Dotted names and values; what is no section, misspelt and empty ones included, comes under its own name."""
     sections = {key.partition(".")[0] for key in config_keys()}
     for section, branch in tree.items():

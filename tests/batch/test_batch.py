@@ -73,7 +73,7 @@ def in_this_process(monkeypatch):
         return Ending(code, KilledFor.NOTHING, 100.0, 1.0)
 
     monkeypatch.setattr(task, "run_within", run_within)
-    monkeypatch.setattr(batch, "_local", lambda workers: lambda tasks: map(task.attempt, tasks))
+    monkeypatch.setattr(batch, "_local", lambda workers, tasks: map(task.attempt, tasks))
 
 
 def table(folder):

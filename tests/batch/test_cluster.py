@@ -5,7 +5,7 @@ import os
 import pyarrow.parquet as pq
 import pytest
 
-from scanchain.batch.batch import Batch, run_batch
+from scanchain.batch.batch import Batch, on_cluster, run_batch
 from tests.support import made
 from tests.support.scenes import ROOT
 
@@ -30,8 +30,6 @@ class Watching:
 @pytest.mark.skipif(os.name != "posix", reason="needs a local cluster")
 def test_of_two_nodes_one_dies_and_nothing_is_lost(tmp_path, monkeypatch):
     from ray.cluster_utils import Cluster
-
-    from scanchain.batch.cluster import on_cluster
 
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")

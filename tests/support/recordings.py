@@ -7,7 +7,7 @@ from rerun.chunk import RrdReader
 
 from scanchain import lie
 from scanchain.config import RecordingConfig
-from scanchain.data import Closure, ClosureVerdict, GraphState, Match, Scan, State, Step, Timing
+from scanchain.data import Closure, ClosureVerdict, GraphState, Match, Scan, State, Step, Timing, Trajectory
 from scanchain.runs.closures import final_verdicts
 from scanchain_viz.recording import entities
 from scanchain_viz.recording.recording import Recording
@@ -91,7 +91,7 @@ def record(path, steps, dimension, final=None, **options):
             recording.log(step)
         poses = np.array([step.T_world_lidar for step in steps])
         stamps_ns = np.array([step.scan.stamp_ns for step in steps])
-        recording.log_trajectory(stamps_ns, poses, np.arange(len(steps)))
+        recording.log_trajectory(Trajectory(stamps_ns, poses))
         graphs = [*(step.graph for step in steps if step.graph is not None), *([final] if final else [])]
         closures = [closure for step in steps for closure in step.closures]
         recording.log_closures(final_verdicts(closures, graphs[-1]), graphs[-1])

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import io
+import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
+from functools import partial
 from glob import glob
 from pathlib import Path
 from threading import Event
@@ -15,7 +17,7 @@ import msgspec
 import numpy as np
 
 from scanchain.batch.task import ROWS_FOLDER, Row, State, Task, attempt, finished_row, key_of
-from scanchain.errors import InputError, counted, duration
+from scanchain.errors import InputError, MissingExtraError, counted, duration
 from scanchain.files import Source, source_of, write_whole
 from scanchain.logs.files import matching, misspelled, spelled
 from scanchain.logs.opening import AUTO, logs_in
@@ -27,6 +29,7 @@ from scanchain.runs.provenance import identity_of
 from scanchain.settings import Override
 from scanchain.verdict import Verdict
 
+_NODE_LOSSES = 10  # of a task, before it counts as lost
 _SHARE = 0.75  # of the memory that is free, for all workers together
 TABLE_FILE, SUMMARY_FILE = "batch.parquet", "summary.txt"
 _NUMBERS = (
@@ -110,7 +113,7 @@ def run_batch(batch: Batch, progress: Progress, work: Work | None = None) -> Bat
     if kept:
         progress.say(f"{kept:,} of {len(tasks):,} logs are done already")
     try:
-        for done, row in enumerate((work or _local(batch.workers))(readable), start=1):
+        for done, row in enumerate((work or partial(_local, batch.workers))(readable), start=1):
             write_whole(missing[row.key].row_file, msgspec.json.encode(row))
             rows[row.key] = row
             warnings = f", {counted(row.warnings, 'warning')}" if row.warnings else ""
@@ -136,10 +139,8 @@ def _check_out(batch: Batch) -> None:
 
 
 def _tasks(batch: Batch) -> list[Task]:
-    memory_mib = batch.memory_mib
-    if memory_mib is None:
-        memory_mib = _SHARE * available_mib() / batch.workers
-    limits, tasks = Limits(batch.time_s, memory_mib), []
+    share_mib = _SHARE * available_mib() / batch.workers
+    limits, tasks = Limits(batch.time_s, share_mib if batch.memory_mib is None else batch.memory_mib), []
     for log in batch.logs:
         path = str(log.absolute()) if isinstance(log, Path) else log.url
         identity = "" if misspelled(log) else identity_of(log)
@@ -158,18 +159,45 @@ def _not_run(task: Task) -> Row:
     return Row(task.name, "", task.key, "", state, reason, 0, 0.0, 0.0, None)
 
 
-def _local(workers: int) -> Work:
-    """Processes on this machine, so many at a time."""
+def _local(workers: int, tasks: Sequence[Task]) -> Iterator[Row]:
+    """Run tasks by processes on this machine, so many at a time."""
+    stop = Event()
+    with ThreadPoolExecutor(workers, "batch") as pool:
+        futures = [pool.submit(attempt, task, stop) for task in tasks]
+        try:
+            yield from (future.result() for future in as_completed(futures))
+        finally:
+            stop.set()
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+def on_cluster(address: str) -> Work:
+    """Cores of a Ray cluster that sees the same files, a log each; those of a machine that dies move to another.
+
+    address : of the cluster's head, or "auto" for the one that this machine belongs to
+    Raises MissingExtraError without Ray, InputError where no cluster responds.
+    """
+    try:
+        import ray
+    except ImportError:
+        raise MissingExtraError("ray", "cluster") from None
+    try:
+        ray.init(address, ignore_reinit_error=True, log_to_driver=False, logging_level=logging.ERROR)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"--ray is {address!r}: {reason}; start a cluster with ray start --head") from None
+    remote = ray.remote(num_cpus=1, max_retries=_NODE_LOSSES)(attempt)
 
     def work(tasks: Sequence[Task]) -> Iterator[Row]:
-        stop = Event()
-        with ThreadPoolExecutor(workers, "batch") as pool:
-            futures = [pool.submit(attempt, task, stop) for task in tasks]
-            try:
-                yield from (future.result() for future in as_completed(futures))
-            finally:
-                stop.set()
-                pool.shutdown(wait=True, cancel_futures=True)
+        waiting = [remote.remote(task) for task in tasks]
+        try:
+            while waiting:
+                done, waiting = ray.wait(waiting)
+                yield from ray.get(done)
+        finally:
+            for each in waiting:
+                ray.cancel(each, force=True)
+            ray.shutdown()
 
     return work
 
@@ -258,9 +286,6 @@ def _cells(row: Row) -> dict[str, object]:
     return figures | cells | {"warnings": row.warnings}
 
 
-_WILD = frozenset("*?[")
-
-
 def collect(named: Sequence[Source], manifests: Sequence[Path], log_format: str = AUTO) -> tuple[Source, ...]:
     """Every log once, in the order named; patterns and folders are replaced by the logs in them, by name.
 
@@ -297,7 +322,7 @@ def _matched(named: Iterable[Source], where: str) -> Iterator[Source]:
     """Sources with patterns replaced; a path that exists is taken as it is, whatever its letters."""
     for source in named:
         if isinstance(source, Path):
-            is_pattern = bool(_WILD & set(str(source))) and not source.exists()
+            is_pattern = bool(set("*?[") & set(str(source))) and not source.exists()
             found = list(map(Path, sorted(glob(str(source), recursive=True)))) if is_pattern else [source]
         else:
             found = matching(source) if "*" in source.url else [source]  # ? and [ belong to addresses

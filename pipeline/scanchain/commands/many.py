@@ -84,8 +84,7 @@ def batch(
       scanchain batch --manifest logs.txt --out /shared/all --ray auto
       scanchain batch 's3://bucket/drives/*.mcap' --out runs/drives
     """
-    from scanchain.batch.batch import Batch, collect, run_batch
-    from scanchain.batch.cluster import on_cluster
+    from scanchain.batch.batch import Batch, collect, on_cluster, run_batch
     from scanchain.commands.terminal import Terminal
 
     if ray is not None and workers is not None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.comparison.methods import default_names, resolve, shared_settings
-from scanchain.comparison.processes import StoredScans, limits_for, run_all, store
+from scanchain.comparison.processes import StoredScans, run_all, store
 from scanchain.comparison.results import Reference, results_of, summarize, write_results
 from scanchain.comparison.table import Table, write_table
 from scanchain.config import NO_TRUTH
@@ -22,11 +22,14 @@ from scanchain.errors import InputError, counted
 from scanchain.evaluation import absolute_error_of_any_path, pair, read_relations, read_truth, relation_error
 from scanchain.files import Source
 from scanchain.logs import Log, open_log
+from scanchain.processes import Limits, available_mib
 from scanchain.runs.directory import RUN_FILE, RunDirectory
 from scanchain.runs.job import Progress
 from scanchain.runs.provenance import Hashing, describe_start
 from scanchain.settings import Override, load_settings, named
 
+_LEAST_S, _SCAN_S = 300.0, 1.0  # default time limit, seconds: at least, and for each scan
+_SHARE = 0.75  # share of the free memory that is the default limit
 _SHARED = "scans"  # in the directory until it is complete: what all methods read, and where each writes
 
 
@@ -106,7 +109,9 @@ def compare(comparison: Comparison, present: Callable[[Path], None], progress: P
             f"the user stopped the reading: {counted(len(scans), 'scan')} compared" if progress.stopped else ""
         )
         reference = _reference(replace(comparison, overrides=overrides), log, scans)
-        limits = limits_for(len(scans), comparison.time_s, comparison.memory_mib)
+        time_s = _LEAST_S + _SCAN_S * len(scans) if comparison.time_s is None else comparison.time_s
+        memory_mib = _SHARE * available_mib() if comparison.memory_mib is None else comparison.memory_mib
+        limits = Limits(time_s, memory_mib)
         outcomes = run_all(methods, scans, shared, repeat=comparison.repeat, limits=limits, progress=progress)
         progress.announce("evaluating and drawing")
         results = results_of(methods, scans, outcomes, reference)

@@ -15,7 +15,7 @@ from scanchain.config import MATCHERS, Config
 from scanchain.errors import InputError
 from scanchain.plugins import is_class_name
 from scanchain.registration import create_matcher
-from scanchain.settings import Override, load_settings, read_toml
+from scanchain.settings import Override, leaves, load_settings, read_toml
 
 _ANY = "matcher"  # ours with the matcher that the settings name
 OURS = (*MATCHERS, *(f"{name}+loops" for name in MATCHERS), _ANY, f"{_ANY}+loops")
@@ -174,11 +174,7 @@ def _our_settings(
 
 def _overrides(sections: Mapping[str, Any], where: str) -> list[Override]:
     """The keys of sections, or of what should have been some, as if set on the command line."""
-    found: dict[str, Any] = {}
-    for section, table in sections.items():
-        is_table = isinstance(table, dict)
-        found |= {f"{section}.{key}": value for key, value in table.items()} if is_table else {section: table}
-    return [Override(key, str(value), f"{where} {key}") for key, value in found.items()]
+    return [Override(key, str(value), f"{where} {key}") for key, value in leaves(sections)]
 
 
 def _tables(file: Path | None) -> dict[str, dict[str, Any]]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import pickle
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
@@ -21,14 +21,12 @@ from numpy.typing import NDArray
 from scanchain.comparison.methods import Method
 from scanchain.data import Matrix, Pose, Scan, Trajectory
 from scanchain.errors import counted
-from scanchain.processes import KilledFor, Limits, available_mib, run_within
+from scanchain.processes import KilledFor, Limits, run_within
 from scanchain.runs.job import Progress
 
 TASK_FILE, TRACK_FILE, TRAJECTORY_FILE, REPORT_FILE = "task.pickle", "track.npy", "trajectory.npy", "end.json"
 STEPS_FILE, CLOSURES_FILE = "steps.parquet", "loops.parquet"
 
-_LEAST_S, _SCAN_S = 300.0, 1.0  # default time limit, seconds: at least, and for each scan
-_SHARE = 0.75  # share of the free memory that is the default limit
 _INTERVAL_S = 0.02  # between two readings of a process's memory
 
 
@@ -149,24 +147,6 @@ class Outcome:
         return self.report.status is Status.OK
 
 
-def read_outcome(folder: Path, report: EndReport, scans: StoredScans) -> Outcome:
-    """Outcome of a run from its folder, complete or not."""
-    is_written = (folder / TRACK_FILE).exists()
-    track = np.load(folder / TRACK_FILE) if is_written else np.full(len(scans), np.nan, scans.track_type)
-    odometry, seconds, cpu_seconds = (np.ascontiguousarray(track[name]) for name in scans.track_type.names or ())
-    poses = np.load(folder / TRAJECTORY_FILE) if report.status is Status.OK else odometry[:0]
-    trajectory = Trajectory(scans.stamps_ns[: len(poses)], poses)
-    return Outcome(report, odometry, trajectory, seconds, cpu_seconds, folder)
-
-
-def limits_for(scans: int, time_s: float | None, memory_mib: float | None) -> Limits:
-    """The requested limits, else 300 s and one more a scan, and three quarters of the memory that is free."""
-    return Limits(
-        _LEAST_S + _SCAN_S * scans if time_s is None else time_s,
-        _SHARE * available_mib() if memory_mib is None else memory_mib,
-    )
-
-
 def run_all(
     methods: Sequence[Method], scans: StoredScans, folder: Path, *, repeat: int, limits: Limits, progress: Progress
 ) -> dict[str, list[Outcome]]:
@@ -182,7 +162,11 @@ def run_all(
                 progress.announce(f"{method.name}: compiled its kernels, once after the installation; run again")
                 outcome = _run(method, scans, folder / f"run_{turn}_{place}_compiled", limits)
             outcomes[method.name].append(outcome)
-            progress.announce(_progress_line(method.name, turn, repeat, outcome))
+            which = f" {turn + 1}/{repeat}" if repeat > 1 else ""
+            end = f"{outcome.report.status}: {outcome.report.reason}"
+            if outcome.is_whole:
+                end = f"{counted(len(outcome.seconds), 'scan')} in {outcome.seconds.sum():.1f} s"
+            progress.announce(f"{method.name}{which}: {end}")
     return outcomes
 
 
@@ -201,21 +185,19 @@ def _run(method: Method, scans: StoredScans, folder: Path, limits: Limits) -> Ou
     else:
         reason = ending.reason(limits, output.read_text(errors="replace"))
         report = EndReport(Status(ending.how), reason, peak_mib=ending.peak_mib)
-    outcome = read_outcome(folder, report, scans)
-    if not report.status.is_failure:
-        return outcome
-    return replace(outcome, report=msgspec.structs.replace(report, reason=f"{_where(outcome)}: {report.reason}"))
+    return _outcome(folder, report, scans)
 
 
-def _where(outcome: Outcome) -> str:
-    if not (outcome.folder / TRACK_FILE).exists():
-        return "while starting or warming up"
-    tracked = int(np.isfinite(outcome.seconds).sum())
-    return f"at scan {tracked}" if tracked < len(outcome.seconds) else "after the last scan"
-
-
-def _progress_line(name: str, turn: int, repeat: int, outcome: Outcome) -> str:
-    which = f" {turn + 1}/{repeat}" if repeat > 1 else ""
-    if outcome.is_whole:
-        return f"{name}{which}: {counted(len(outcome.seconds), 'scan')} in {outcome.seconds.sum():.1f} s"
-    return f"{name}{which}: {outcome.report.status}: {outcome.report.reason}"
+def _outcome(folder: Path, report: EndReport, scans: StoredScans) -> Outcome:
+    """Outcome of a run from its folder, complete or not; a failure's reason begins with the scan that it met."""
+    track, where = np.full(len(scans), np.nan, scans.track_type), "while starting or warming up"
+    if (folder / TRACK_FILE).exists():
+        track = np.load(folder / TRACK_FILE)
+        tracked = int(np.isfinite(track["seconds"]).sum())
+        where = f"at scan {tracked}" if tracked < len(scans) else "after the last scan"
+    if report.status.is_failure:
+        report = msgspec.structs.replace(report, reason=f"{where}: {report.reason}")
+    odometry, seconds, cpu_seconds = (np.ascontiguousarray(track[name]) for name in scans.track_type.names or ())
+    poses = np.load(folder / TRAJECTORY_FILE) if report.status is Status.OK else odometry[:0]
+    trajectory = Trajectory(scans.stamps_ns[: len(poses)], poses)
+    return Outcome(report, odometry, trajectory, seconds, cpu_seconds, folder)

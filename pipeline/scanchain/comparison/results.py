@@ -14,28 +14,13 @@ import pyarrow.parquet as pq
 import tomli_w
 from numpy.typing import NDArray
 
-from scanchain import lie
+from scanchain import evaluation, lie
 from scanchain.baselines import BASELINES
 from scanchain.comparison.methods import Method
 from scanchain.comparison.processes import CLOSURES_FILE, STEPS_FILE, Outcome, Status, StoredScans
 from scanchain.comparison.table import COLUMNS, Row, Table
 from scanchain.data import Points, Pose, Trajectory
 from scanchain.errors import InputError
-from scanchain.evaluation import (
-    KittiError,
-    RelationError,
-    Relations,
-    absolute_error_of_any_path,
-    disagreement,
-    during,
-    pair,
-    relation_error,
-    relative_errors,
-    sampled_map,
-    sampling_step,
-    sharpness,
-)
-from scanchain.evaluation.errors import path_length
 from scanchain.logs import Log
 from scanchain.maps import write_ply
 from scanchain.processes import Limits
@@ -66,7 +51,7 @@ class Reference:
     """Reference of the errors: poses, relations, both or none; ``note`` names what is missing."""
 
     truth: Trajectory | None
-    relations: Relations | None
+    relations: evaluation.Relations | None
     source: str
     note: str
 
@@ -87,7 +72,7 @@ class Assessed:
     figures: dict[str, float | None]
     T_reference_estimate: Pose
     by_scan: dict[str, NDArray[np.float64]]
-    relations: RelationError | None
+    relations: evaluation.RelationError | None
     definitions: list[str]
 
 
@@ -97,16 +82,18 @@ def assess(outcomes: Sequence[Outcome], stamps_ns: NDArray[np.int64], reference:
     by_scan = {name: np.full(len(stamps_ns), np.nan) for name in ("error_m", "error_rad", "nees")}
     if not outcome.is_whole:
         return Assessed(_speed(outcomes), _start(stamps_ns, truth), by_scan, None, [])
-    figures: dict[str, float | None] = _speed(outcomes) | {"repeats_apart_m": _apart_m(outcomes)}
+    first, *others = (each.trajectory.poses[:, :-1, -1] for each in outcomes if each.is_whole)
+    apart_m = max((float(np.linalg.norm(each - first, axis=1).max()) for each in others), default=None)
+    figures: dict[str, float | None] = _speed(outcomes) | {"repeats_apart_m": apart_m}
     error, definitions = None, []
     if reference.relations is not None:
-        error = relation_error(outcome.trajectory, reference.relations)
+        error = evaluation.relation_error(outcome.trajectory, reference.relations)
         figures |= {"relations_m": error.translation_m.mean, "relations_rad": error.rotation_rad.mean}
         definitions.append(error.definition)
-    pairs = None if truth is None else pair(outcome.trajectory, truth)
+    pairs = None if truth is None else evaluation.pair(outcome.trajectory, truth)
     if truth is None or pairs is None or len(pairs) < 2:  # one pose has no error after alignment
         return Assessed(figures, np.eye(4), by_scan, error, definitions)
-    ate = absolute_error_of_any_path(pairs)
+    ate = evaluation.absolute_error_of_any_path(pairs)
     by_scan["error_m"][pairs.places], by_scan["error_rad"][pairs.places] = ate.errors_m, ate.errors_rad
     if (steps := _steps(outcome, *NEES_COLUMNS)) is not None:
         by_scan["nees"] = nees_of_steps(steps, Trajectory(stamps_ns, outcome.odometry), truth)
@@ -118,9 +105,9 @@ def assess(outcomes: Sequence[Outcome], stamps_ns: NDArray[np.int64], reference:
         "paired_share": pairs.share,
         "nees": float(np.nanmean(nees)) if np.isfinite(nees).any() else None,
     }
-    relative, _ = relative_errors(pairs, _INTERVALS)
+    relative, _ = evaluation.relative_errors(pairs, _INTERVALS)
     for name, each in relative.items():
-        if isinstance(each, KittiError):
+        if isinstance(each, evaluation.KittiError):
             figures |= {"kitti_share": each.translation_share, "kitti_rad_per_m": each.rotation_rad_per_m}
         else:
             figures[f"{name}_m"] = each.translation_m.rmse
@@ -146,7 +133,7 @@ def _start(stamps_ns: NDArray[np.int64], truth: Trajectory | None) -> Pose:
     if truth is None:
         return np.eye(4)
     try:
-        return pair(Trajectory(stamps_ns[:1], np.eye(4)[None]), truth).reference[0]
+        return evaluation.pair(Trajectory(stamps_ns[:1], np.eye(4)[None]), truth).reference[0]
     except InputError:  # the truth begins later
         return np.eye(4)
 
@@ -184,12 +171,6 @@ def _stages(outcome: Outcome) -> dict[str, float]:
     return medians | ({"loops_s": float(loops.mean())} if loops.any() else {})
 
 
-def _apart_m(outcomes: Sequence[Outcome]) -> float | None:
-    """Largest distance between the positions of a scan in two runs."""
-    first, *others = (outcome.trajectory.poses[:, :-1, -1] for outcome in outcomes if outcome.is_whole)
-    return max((float(np.linalg.norm(each - first, axis=1).max()) for each in others), default=None)
-
-
 @dataclass(frozen=True, slots=True)
 class Results:
     """All runs of all methods by name, the figures of each, and the map (M, d) of each finished one."""
@@ -207,9 +188,9 @@ def results_of(
 ) -> Results:
     """Figures and maps of all methods."""
     assessed = {name: assess(runs, scans.stamps_ns, reference) for name, runs in outcomes.items()}
-    step, chosen = sampling_step(int(scans.points.sum())), map(representative, outcomes.values())
+    step, chosen = evaluation.sampling_step(int(scans.points.sum())), map(representative, outcomes.values())
     maps = {
-        name: sampled_map(scans.scans(), outcome.trajectory, step)
+        name: evaluation.sampled_map(scans.scans(), outcome.trajectory, step)
         for name, outcome in zip(outcomes, chosen, strict=True)
         if outcome.is_whole
     }
@@ -221,7 +202,7 @@ def write_results(folder: Path, results: Results) -> None:
     _write_tables(folder / SCANS_FILE, _scans(results), _NOTES)
     _write_tables(folder / RELATIONS_FILE, _relations(results.assessed))
     if results.reference.truth is not None:
-        write_tum(folder / TRUTH_FILE, during(results.reference.truth, results.scans.stamps_ns))
+        write_tum(folder / TRUTH_FILE, evaluation.during(results.reference.truth, results.scans.stamps_ns))
     settings = {method.name: {"method": method.base} | method.settings for method in results.methods}
     (folder / SETTINGS_FILE).write_text(tomli_w.dumps(settings), encoding="utf-8")
     for method in results.methods:
@@ -254,18 +235,12 @@ def _write_tables(path: Path, tables: Sequence[pa.Table], notes: Mapping[str, st
 
 
 def _relations(assessed: Mapping[str, Assessed]) -> list[pa.Table]:
-    errors = {name: each.relations for name, each in assessed.items() if each.relations is not None}
-    return [
-        pa.table(
-            {
-                "method": pa.array([name] * len(error.used), pa.string()),
-                "relation": error.used,
-                "error_m": error.errors_m,
-                "error_rad": error.errors_rad,
-            }
-        )
-        for name, error in errors.items()
-    ]
+    tables = []
+    for name, each in assessed.items():
+        if (error := each.relations) is not None:
+            columns = {"relation": error.used, "error_m": error.errors_m, "error_rad": error.errors_rad}
+            tables.append(pa.table({"method": pa.array([name] * len(error.used), pa.string())} | columns))
+    return tables
 
 
 def _scans(results: Results) -> list[pa.Table]:
@@ -294,7 +269,7 @@ def _table(name: str, repeat: int, outcome: Outcome, assessed: Assessed, stamps_
         "cpu_seconds": outcome.cpu_seconds,
         **pose_columns(poses),
         **{f"aligned_{axis}": aligned[:, place] for place, axis in enumerate("xyz")},
-        "distance_m": path_length(poses) if count else np.empty(0),
+        "distance_m": evaluation.path_length(poses) if count else np.empty(0),
         **assessed.by_scan,
         "observability": observability,
     }
@@ -333,9 +308,9 @@ def summarize(results: Results, log: Log, limits: Limits, provenance: Provenance
     """Every method's row, with figures that depend on all of them: sharpness and disagreement."""
     scans, maps = results.scans, results.maps
     chosen = {method.name: representative(results.outcomes[method.name]) for method in results.methods}
-    apart_m = disagreement([each.trajectory.poses for each in chosen.values()])
+    apart_m = evaluation.disagreement([each.trajectory.poses for each in chosen.values()])
     more: dict[str, dict[str, float | None]] = {name: {} for name in chosen}
-    for name, sharp in zip(maps, sharpness(list(maps.values())) if maps else (), strict=True):
+    for name, sharp in zip(maps, evaluation.sharpness(list(maps.values())) if maps else (), strict=True):
         if sharp is not None:
             more[name] |= {"thickness_m": sharp.thickness_m, "entropy": sharp.mean_map_entropy}
     for place, name in enumerate(chosen):

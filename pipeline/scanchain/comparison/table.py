@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import csv
-import io
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -64,7 +63,9 @@ class Column(Struct, frozen=True):
     def cells(self, rows: Sequence[Figures]) -> list[Shown]:
         """The figures of a table's rows; none is the best where all that are known are equal as text."""
         values = [self.of(row) for row in rows]
-        digits = self._digits([abs(value) for value in values if value])
+        sizes, digits = [abs(value) for value in values if value], self.digits
+        if sizes:  # as many as the smallest needs for three figures
+            digits = min(digits, max(0, 2 - math.floor(math.log10(min(sizes)))))
         sign = {"low": 1.0, "high": -1.0, "": 0.0}[self.better]
         badness = [None if value is None else sign * round(value, digits) for value in values]
         known = {each for each in badness if each is not None}
@@ -73,10 +74,6 @@ class Column(Struct, frozen=True):
             Shown("–", False) if value is None else Shown(f"{value:.{digits}f}", is_contest and each == min(known))
             for value, each in zip(values, badness, strict=True)
         ]
-
-    def _digits(self, sizes: list[float]) -> int:
-        """As many as the smallest needs for three figures."""
-        return min(self.digits, max(0, 2 - math.floor(math.log10(min(sizes))))) if sizes else self.digits
 
 
 _DEGREES = 57.29577951308232
@@ -223,7 +220,13 @@ def write_table(folder: Path, table: Table) -> None:
     """table.json, table.csv and table.md."""
     tree = msgspec.to_builtins(table) | {"columns": msgspec.to_builtins(COLUMNS)}
     (folder / TABLE_FILE).write_bytes(msgspec.json.format(msgspec.json.encode(tree), indent=2) + b"\n")
-    (folder / "table.csv").write_text(_csv(table), encoding="utf-8")
+    keys = [column.key for column in COLUMNS]
+    with (folder / "table.csv").open("w", encoding="utf-8") as file:  # every figure in its own unit
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["method", "status", "verdict", "verdict_error", *keys])
+        for row in table.rows:
+            figures = [row.figures.get(key) for key in keys]
+            writer.writerow([row.name, row.status, row.verdict, row.verdict_error, *figures])
     (folder / "table.md").write_text(markdown(table), encoding="utf-8")
 
 
@@ -263,29 +266,10 @@ def text(table: Table) -> str:
     verdicts = ["verdict", "", *(row.vouched for row in rows)]
     lines = [f"{line}  {verdict}" for line, verdict in zip(lines, verdicts, strict=True)]
     endings = [f"{row.name}: {row.status}: {row.reason}" for row in rows if row.status is not Status.OK]
-    endings += _not_installed(table)
+    if missing := [row for row in table.rows if row.status is Status.MISSING]:
+        commands = dict.fromkeys(row.reason.rpartition(": ")[2] for row in missing)  # that install them
+        endings += [f"not installed: {', '.join(row.name for row in missing)}; {' and '.join(commands)}"]
     endings += [f"{row.name}: {row.sentence}" for row in table.rows if row.is_doubted]
     endings += [table.provenance.stopped] if table.provenance.stopped else []
     known = [line.rstrip() for line in lines]
     return "\n".join([*known, f"* best of its column. {table.against}", *endings]) + "\n"
-
-
-def _not_installed(table: Table) -> Iterator[str]:
-    """A line for all methods that are not installed, with the command that installs each."""
-    missing = [row for row in table.rows if row.status is Status.MISSING]
-    commands = dict.fromkeys(row.reason.rpartition(": ")[2] for row in missing)
-    if missing:
-        yield f"not installed: {', '.join(row.name for row in missing)}; {' and '.join(commands)}"
-
-
-def _csv(table: Table) -> str:
-    """Every figure in its own unit, plus name, status and verdict."""
-    keys = [column.key for column in COLUMNS]
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(["method", "status", "verdict", "verdict_error", *keys])
-    for row in table.rows:
-        writer.writerow(
-            [row.name, row.status, row.verdict, row.verdict_error, *(row.figures.get(key) for key in keys)]
-        )
-    return buffer.getvalue()

@@ -23,18 +23,11 @@ from numpy.lib.format import open_memmap
 from scanchain import plugins
 from scanchain.baselines import BASELINES, InPlane
 from scanchain.clock import announcing_compilation
+from scanchain.comparison import processes
 from scanchain.comparison.methods import Method
-from scanchain.comparison.processes import (
-    REPORT_FILE,
-    TASK_FILE,
-    TRACK_FILE,
-    TRAJECTORY_FILE,
-    EndReport,
-    Status,
-    StoredScans,
-)
+from scanchain.comparison.processes import EndReport, Status, StoredScans
 from scanchain.data import Pose, Scan, Trajectory
-from scanchain.errors import MissingExtraError, ScanchainError, shown
+from scanchain.errors import MissingExtraError, ScanchainError, one_line, shown
 from scanchain.processes import die_first, die_with_parent, peak_mib
 
 if TYPE_CHECKING:
@@ -79,7 +72,7 @@ def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
     warm_up(scans.scans(), method, scans.T_base_lidar)
     runner = start(method, scans.T_base_lidar)
     start_s = perf_counter() - began
-    track = open_memmap(folder / TRACK_FILE, "w+", scans.track_type, (len(scans),))
+    track = open_memmap(folder / processes.TRACK_FILE, "w+", scans.track_type, (len(scans),))
     track[:] = np.nan
     wanted = scans.T_base_lidar.shape
     for scan in scans.scans():
@@ -93,7 +86,7 @@ def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
         track[scan.index] = pose, took_s, cpu_took_s
     ended = perf_counter()
     trajectory = runner.finish(Trajectory(scans.stamps_ns, np.array(track["pose"])), folder)
-    np.save(folder / TRAJECTORY_FILE, trajectory.poses)
+    np.save(folder / processes.TRAJECTORY_FILE, trajectory.poses)
     return EndReport(Status.OK, "", runner.description, start_s, perf_counter() - ended)
 
 
@@ -117,12 +110,12 @@ def main() -> None:
 
 def run(folder: Path) -> None:
     """Run the task of a folder and write the report."""
-    method, scans = pickle.loads((folder / TASK_FILE).read_bytes())
+    method, scans = pickle.loads((folder / processes.TASK_FILE).read_bytes())
     compiled: list[str] = []
     with announcing_compilation(compiled.append) if method.is_ours else nullcontext():
         report = _report(scans, method, folder)
     report = msgspec.structs.replace(report, peak_mib=peak_mib(), has_compiled=bool(compiled))
-    (folder / REPORT_FILE).write_bytes(msgspec.json.encode(report))
+    (folder / processes.REPORT_FILE).write_bytes(msgspec.json.encode(report))
 
 
 def _report(scans: StoredScans, method: Method, folder: Path) -> EndReport:
@@ -140,7 +133,7 @@ def _report(scans: StoredScans, method: Method, folder: Path) -> EndReport:
 
 
 def _words(error: Exception) -> str:
-    return f"{type(error).__name__}: {' '.join(str(error).split())[:_MAX_CHARACTERS]}"
+    return f"{type(error).__name__}: {one_line(error)[:_MAX_CHARACTERS]}"
 
 
 if __name__ == "__main__":

@@ -167,8 +167,7 @@ def write_results(folder: Path, results: Results) -> None:
 def record_results(recording: Recorder, results: Results) -> None:
     """Send optimized trajectory, final verdicts, cloud and, in 2D, the occupancy grid to the recording."""
     trajectory, grid = results.result.trajectory, results.grid
-    indices = np.arange(len(trajectory), dtype=np.int64)
-    recording.log_trajectory(trajectory.stamps_ns, trajectory.poses, indices)
+    recording.log_trajectory(trajectory)
     recording.log_closures(results.final, results.result.state)
     recording.log_map(results.cloud.points)
     if trajectory.dimension == 2:

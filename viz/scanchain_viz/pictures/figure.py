@@ -95,20 +95,16 @@ class Plot:
 
     def _lay_out(self, *, is_wide: bool) -> None:
         """Size of the figure, and corner and extent of its axes; of a plan so that a meter is equal along both."""
-        whole, (width, height) = _WHOLE if is_wide else _WIDTH, self.proportions
-        height_inches = self.height_inches
-        across = whole - _LEFT - _RIGHT
+        size, (width, height) = np.array([_WHOLE if is_wide else _WIDTH, self.height_inches]), self.proportions
         if width:
-            needed = across * height / width + _BOTTOM + _TOP
-            height_inches = float(np.clip(needed, _LOWEST, _HIGHEST_WHOLE if is_wide else _HIGHEST))
-        down = height_inches - _TOP - _BOTTOM
-        self.size, fitting = (whole * _INCH, height_inches * _INCH), (across, down)
+            needed = (size[0] - _LEFT - _RIGHT) * height / width + _BOTTOM + _TOP
+            size[1] = np.clip(needed, _LOWEST, _HIGHEST_WHOLE if is_wide else _HIGHEST)
+        first, last = np.array([[_LEFT, _TOP], [_RIGHT, _BOTTOM]])
+        room = extent = size - first - last
         if width:
-            scale = min(across / width, down / height)
-            fitting = (scale * width, scale * height)
-        self.extent = (fitting[0] * _INCH, fitting[1] * _INCH)
-        left, top = _LEFT + 0.5 * (across - fitting[0]), _TOP + 0.5 * (down - fitting[1])
-        self.corner = (left * _INCH, top * _INCH)  # of the axes, on the left and above
+            extent = np.min(room / self.proportions) * np.array(self.proportions)
+        self.size, self.extent = _INCH * size, _INCH * extent
+        self.corner = _INCH * (first + 0.5 * (room - extent))  # of the axes, on the left and above
 
     def line(
         self,
@@ -148,8 +144,19 @@ class Plot:
         name : as of a line
         """
         x, y = self._included(positions)
-        style = f"fill: {color}" if not line else f"stroke: {color}; stroke-width: {line:g}"
-        self._within.append(lambda: _marks(self._at(x, y), shape, 0.5 * size, style))
+        half, style = 0.5 * size, f"stroke: {color}; stroke-width: {line:g}" if line else f"fill: {color}"
+        outline = {
+            "o": f"m{-half:g} 0a{half:g} {half:g} 0 1 0 {size:g} 0a{half:g} {half:g} 0 1 0 {-size:g} 0z",
+            "s": f"m{-half:g} {-half:g}h{size:g}v{size:g}h{-size:g}z",
+            "+": f"m{-half:g} 0h{size:g}m{-half:g} {-half:g}v{size:g}",
+        }[shape]
+
+        def path() -> str:
+            points = self._at(x, y)
+            known = points[np.isfinite(points).all(axis=1)].tolist()
+            return f'<path d="{"".join(f"M{x:.2f} {y:.2f}{outline}" for x, y in known)}" style="{style}"/>'
+
+        self._within.append(path)
         drawn = {"markersize": size, "color": _on_white(color), "label": name or None}
         drawn |= {"markerfacecolor": "none", "markeredgewidth": line} if line else {}
         self._on_axes.append(lambda axes: axes.plot(x, y, linestyle="none", marker=shape, **drawn))
@@ -171,9 +178,15 @@ class Plot:
 
         def drawn() -> str:
             (left, right), (bottom, top) = self._at(np.array([low[0], high[0]]), np.array([low[1], high[1]])).T
-            rows = pixels[::-1] if top < bottom else pixels
-            box = (left, min(bottom, top), right - left, abs(top - bottom))
-            return _image(rows, palette, box, rendering)
+            picture, file = Image.fromarray(pixels[::-1] if top < bottom else pixels), BytesIO()
+            picture.putpalette(palette[:, :3].tobytes())
+            picture.save(file, "PNG", compress_level=_LEVEL, transparency=palette[:, 3].tobytes())
+            data = b64encode(file.getvalue()).decode("ascii")
+            return (
+                f'<image x="{left:.2f}" y="{min(bottom, top):.2f}" width="{right - left:.2f}" '
+                f'height="{abs(top - bottom):.2f}" preserveAspectRatio="none" '
+                f'style="image-rendering: {rendering}" href="data:image/png;base64,{data}"/>'
+            )
 
         self._within.append(drawn)
         extent = (low[0], high[0], low[1], high[1])
@@ -282,34 +295,6 @@ def _path(points: Floats) -> str:
     )
 
 
-def _marks(points: Floats, shape: str, half: float, style: str) -> str:
-    """One path of marks at points (N, 2) that are known."""
-    outline = {
-        "o": f"m{-half:g} 0a{half:g} {half:g} 0 1 0 {2 * half:g} 0a{half:g} {half:g} 0 1 0 {-2 * half:g} 0z",
-        "s": f"m{-half:g} {-half:g}h{2 * half:g}v{2 * half:g}h{-2 * half:g}z",
-        "+": f"m{-half:g} 0h{2 * half:g}m{-half:g} {-half:g}v{2 * half:g}",
-    }[shape]
-    known = points[np.isfinite(points[:, 0] + points[:, 1])]
-    return f'<path d="{"".join(f"M{x:.2f} {y:.2f}{outline}" for x, y in known.tolist())}" style="{style}"/>'
-
-
-def _image(
-    rows: NDArray[np.uint8], palette: NDArray[np.uint8], box: tuple[float, float, float, float], rendering: str
-) -> str:
-    """Pixels (H, W), each the number of a color, in a box: left, top, width, height."""
-    image, file = Image.fromarray(rows), BytesIO()
-    image.putpalette(palette[:, :3].tobytes())
-    image.save(file, "PNG", compress_level=_LEVEL, transparency=palette[:, 3].tobytes())
-    data = b64encode(file.getvalue()).decode("ascii")
-    where = " ".join(
-        f'{name}="{value:.2f}"' for name, value in zip(("x", "y", "width", "height"), box, strict=True)
-    )
-    return (
-        f'<image {where} preserveAspectRatio="none" style="image-rendering: {rendering}" '
-        f'href="data:image/png;base64,{data}"/>'
-    )
-
-
 def broken(segments: NDArray[np.floating]) -> Floats:
     """Segments (E, 2, d) as one line (3 E, d) that is broken between them."""
     gaps = np.full((len(segments), 1, segments.shape[-1]), np.nan)
@@ -317,7 +302,7 @@ def broken(segments: NDArray[np.floating]) -> Floats:
 
 
 def around(points: NDArray[np.floating], share: float, least: float) -> tuple[Floats, Floats]:
-    """Corners (2,) of a view of the known of points (N, 2): a margin of a share of their extent, or the least."""
+    """Corners (d,) of a view of the known of points (N, d): a margin of a share of their extent, or the least."""
     known = points[np.isfinite(points).all(axis=1)]
     low, high = known.min(axis=0), known.max(axis=0)
     margin = max(share * float((high - low).max()), least)

@@ -13,11 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.config import Config
 from scanchain.data import Matrix, Points
 from scanchain.errors import InputError
-from scanchain.evaluation import on_the_estimate
-from scanchain.evaluation.errors import path_length
+from scanchain.evaluation import on_the_estimate, path_length
 from scanchain.maps import SavedMap, open_saved_map, read_map, read_ply
 from scanchain.runs.directory import TRUTH_FILE
 from scanchain.trajectory import read_tum
@@ -103,19 +101,15 @@ def over_map(
 
 
 def draw_points(figure: Plot, points: Points, low: Floats, high: Floats, colors: Sequence[str] = (GRAY,)) -> None:
-    """Draw points (M, 3) as seen from above, within corners, in one color, or in several by height, if any."""
-    shown = points[:: max(1, -(-len(points) // _MAX_POINTS))]
-    inside = ((shown[:, :2] > low[:2]) & (shown[:, :2] < high[:2])).all(axis=1)
-    if inside.any():
-        colors = colors if len(colors) == 1 or np.ptp(shown[inside, 2]) else (GRAY,)
-        pixels, palette, edge_m = _image(shown[inside], low, high, colors)
-        figure.image(pixels, palette, low, low[:2] + edge_m * np.array(pixels.shape[::-1]))
+    """Draw points (M, 3) as seen from above, within corners, in one color, or in several by height, if any.
 
-
-def _image(
-    points: Floats, low: Floats, high: Floats, colors: Sequence[str]
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8], float]:
-    """Pixels (H, W), palette (K, 4), edge of a pixel: the color of the highest point, opacity by their number."""
+    A pixel has the color of its highest point and an opacity by their number.
+    """
+    points = points[:: max(1, -(-len(points) // _MAX_POINTS))]
+    points = points[((points[:, :2] > low[:2]) & (points[:, :2] < high[:2])).all(axis=1)]
+    if not len(points):
+        return
+    colors = colors if len(colors) == 1 or np.ptp(points[:, 2]) else (GRAY,)
     width = float(np.clip(_PIXELS_A_POINT * np.sqrt(len(points)), *_WIDTHS))
     edge_m = float(high[0] - low[0]) / width
     columns, rows = np.ceil((high[:2] - low[:2]) / edge_m).astype(int)
@@ -128,22 +122,18 @@ def _image(
         np.maximum.at(highest, pixel, np.rint((len(shades) - 1) * height_shares(points[:, 2])).astype(int))
     palette = np.repeat(shades, _SHADES + 1, axis=0)
     palette[:, 3] = np.tile(np.rint(255.0 * (1.0 - (1.0 - opacity) ** np.arange(_SHADES + 1))), len(shades))
-    return (highest * (_SHADES + 1) + counts).reshape(rows, columns).astype(np.uint8), palette, edge_m
+    pixels = (highest * (_SHADES + 1) + counts).reshape(rows, columns).astype(np.uint8)
+    figure.image(pixels, palette, low, low[:2] + edge_m * np.array(pixels.shape[::-1]))
 
 
 @dataclass(frozen=True, slots=True)
 class DrawnMerge:
-    """Sessions of a merged map, ends (E, 2, 3) of the closures between them, and the spacing of its points."""
+    """Positions (K, 3) of a merged map's keyframes, its sessions, and ends (E, 2, 3) of closures between them."""
 
+    positions: Floats
     sessions: tuple[Line, ...]
     closures: Floats
     dimension: int
-    grain_m: float
-
-    @property
-    def positions(self) -> Floats:
-        """(K, 3) of all keyframes."""
-        return np.concatenate([session.positions for session in self.sessions])
 
 
 def read_merge(directory: Path) -> DrawnMerge:
@@ -156,7 +146,7 @@ def read_merge(directory: Path) -> DrawnMerge:
     )
     ends: NDArray[np.int64] = saved.session[saved.edges.pairs]
     between = saved.edges.pairs[ends[:, 0] != ends[:, 1]]
-    return DrawnMerge(sessions, positions[between], saved.dimension, Config().maps.voxel_size_m)
+    return DrawnMerge(positions, sessions, positions[between], saved.dimension)
 
 
 def draw_map(

@@ -15,22 +15,19 @@ from scanchain import lie
 from scanchain.comparison.results import RELATIONS_FILE, SCANS_FILE
 from scanchain.comparison.table import Row, read_table
 from scanchain.data import Matrix, Trajectory
-from scanchain.evaluation import absolute_error_of_any_path, pair
-from scanchain.evaluation.errors import path_length
+from scanchain.evaluation import absolute_error_of_any_path, pair, path_length
 from scanchain.runs.step_table import STAGES, nees_of_steps
 from scanchain.runs.vouching import poses_of
 from scanchain_viz.colors import color_of
-from scanchain_viz.pictures.figure import Floats
+from scanchain_viz.pictures.figure import Floats, around
 
-_MARGIN = 0.25
+_MARGIN, _MARGIN_Z = (0.08, 1.0), (0.25, 0.1)  # shares of the extent and least meters
 
 
 @dataclass(frozen=True, slots=True)
 class DrawnTrajectory:
     """A trajectory to draw, with figures of its N scans; unknown ones are NaN.
 
-    Attributes
-    ----------
     name : for legends outside the drawings
     color, is_dashed : how its line is drawn
     positions : (N, 3) meters, in one frame with the other trajectories
@@ -56,12 +53,8 @@ class DrawnTrajectory:
 
 def frame(trajectories: Sequence[DrawnTrajectory], truth: Floats | None) -> Floats:
     """Corners (2, 3) of the axes: the ground truth if there is one, else the trajectories, with a margin."""
-    paths = [truth] if truth is not None else [trajectory.positions for trajectory in trajectories]
-    low = np.min([path.min(axis=0) for path in paths], axis=0)
-    high = np.max([path.max(axis=0) for path in paths], axis=0)
-    size = high - low
-    margin = np.array([max(0.08 * size[:2].max(), 1.0)] * 2 + [max(_MARGIN * size[2], 0.1)])
-    return np.stack([low - margin, high + margin])
+    held = np.concatenate([each.positions for each in trajectories]) if truth is None else truth
+    return np.hstack([around(held[:, :2], *_MARGIN), around(held[:, 2:], *_MARGIN_Z)])
 
 
 def trajectories_of_run(
@@ -84,8 +77,8 @@ def trajectories_of_run(
         T_world_truth = lie.inverse(ate.T_reference_estimate)
         T_world_estimate = T_world_truth @ ate_before.T_reference_estimate
         true_path = lie.transform(T_world_truth, after.reference[:, :3, 3])
-    seconds = np.sum([_column(steps, f"{stage}_s") for stage in STAGES[1:]], axis=0)  # without reading
-    observability = _column(steps, "observability")
+    seconds = np.sum([column_of(steps, f"{stage}_s") for stage in STAGES[1:]], axis=0)  # without reading
+    observability = column_of(steps, "observability")
 
     def drawn(name: str, color: str, poses: Matrix, errors_m: Floats, *figures: Floats) -> DrawnTrajectory:
         length_m, none = path_length(poses), np.empty(0)
@@ -112,15 +105,13 @@ def _of_method(row: Row, color: str, scans: pa.Table, relations: pa.Table | None
     runs = scans.filter(is_of_it)
     if len(runs):
         runs = runs.filter(pc.field("repeat") == int(np.argmax(np.bincount(runs["repeat"].to_numpy()))))
-    known = (_column(runs, name) for name in ("seconds", "nees", "observability"))
-    errors_m = np.empty(0) if relations is None else _column(relations.filter(is_of_it), "error_m")
-    positions = np.stack([_column(runs, f"aligned_{axis}") for axis in "xyz"], axis=1)
-    distance_m, is_dashed = _column(runs, "distance_m"), "+loops" in row.base
-    return DrawnTrajectory(
-        row.name, color, is_dashed, positions, distance_m, _column(runs, "error_m"), errors_m, *known
-    )
+    names = ("distance_m", "error_m", "seconds", "nees", "observability")
+    figures = {name: column_of(runs, name) for name in names}
+    errors_m = np.empty(0) if relations is None else column_of(relations.filter(is_of_it), "error_m")
+    positions = np.stack([column_of(runs, f"aligned_{axis}") for axis in "xyz"], axis=1)
+    return DrawnTrajectory(row.name, color, "+loops" in row.base, positions, relation_error_m=errors_m, **figures)
 
 
-def _column(table: pa.Table, name: str) -> Floats:
+def column_of(table: pa.Table, name: str) -> Floats:
     """A column as floats, NaN for null."""
     return table[name].to_numpy(zero_copy_only=False).astype(np.float64)

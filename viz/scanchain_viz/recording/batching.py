@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from time import perf_counter
 
@@ -11,6 +11,7 @@ import numpy as np
 import rerun as rr
 
 from scanchain import lie
+from scanchain.config import RecordingConfig
 from scanchain.data import Closure, ClosureVerdict, GraphState, Matrix, State, Step
 from scanchain.runs.closures import final_verdicts
 from scanchain.runs.step_table import STAGES, StepTable
@@ -35,14 +36,12 @@ class KeyframeGraph:
         self.closures: list[Closure] = []
         self.graph: GraphState | None = None
         self.counts = (0, 0)  # of closures accepted and rejected
-        self.drawn = 0
-        self.is_current = True
+        self.drawn = 0  # number of keyframes that it had when it was drawn
 
     def add(self, step: Step) -> list[str]:
         """Take in a step; the verdicts on its closures are those of the matcher, then of the back end for all."""
         if step.keyframe >= 0:
             self.positions.append(drawing.positions(step.T_world_lidar[None])[0])
-            self.is_current = False
         news: list[str] = []
         if step.closures:
             self.tried += step.closures
@@ -54,7 +53,7 @@ class KeyframeGraph:
 
     def settle(self, closures: Sequence[Closure], graph: GraphState) -> list[str]:
         """Take in the final graph with every closure tried."""
-        self.graph, self.is_current = graph, False
+        self.graph, self.drawn = graph, 0
         return self._update(closures)
 
     def restore(self, positions: Floats, closures: Sequence[Closure], graph: GraphState) -> None:
@@ -64,7 +63,6 @@ class KeyframeGraph:
         for position in positions:
             self.positions.append(position)
             self.drawn = len(self.positions) if self.has_grown else self.drawn
-        self.is_current = self.drawn == len(self.positions)
 
     @property
     def has_grown(self) -> bool:
@@ -73,9 +71,9 @@ class KeyframeGraph:
 
     def draw(self, times: Times) -> list[Message]:
         """Messages of the present graph, unless it is drawn already."""
-        if self.is_current or not self.positions:
+        if self.drawn == len(self.positions):
             return []
-        self.drawn, self.is_current = len(self.positions), True
+        self.drawn = len(self.positions)
         nodes = np.array(self.positions)
         if self.graph is not None:
             nodes[: len(self.graph.poses)] = drawing.positions(self.graph.poses)
@@ -111,13 +109,15 @@ class KeyframeGraph:
 class Batcher:
     """Holds the steps since the last batch; every batch turns them into messages."""
 
-    def __init__(self) -> None:
+    def __init__(self, config: RecordingConfig) -> None:
+        self.config = config
         self.graph = KeyframeGraph()
         self.gathered: list[tuple[Step, list[str], tuple[int, int]]] = []  # with the news and counts of closures
         self.bytes = 0
         self.points = 0
         self.box: Floats | None = None
         self.started_s = perf_counter()
+        self.now = Times.at(0, 0)  # of the last step
         self.last: Matrix | None = None  # (1, d+1, d+1) T_odom_lidar of the scan before
         self.state: State | None = None
 
@@ -128,26 +128,26 @@ class Batcher:
         self.graph.restore(positions[steps.columns["keyframe"] >= 0], closures, graph)
         self.points = int(steps.columns["points"].sum())
         self._frame(positions)
+        self.now = Times(steps.columns["index"][-1:], steps.columns["stamp_ns"][-1:])
         self.last = odom[-1:]
         self.state = steps.last_state
 
-    def add(self, step: Step) -> None:
-        """Take in one step, and the verdicts of that moment."""
+    def add(self, step: Step) -> list[Message]:
+        """Take in one step, and the verdicts of that moment; the messages that are due after it."""
+        self.now = Times.at(step.scan.index, step.scan.stamp_ns)
         news = self.graph.add(step)
         if not self.gathered:
             self.started_s = perf_counter()
         self.gathered.append((step, news, self.graph.counts))
         self.bytes += 12 * len(step.points)
         self.points += len(step.points)
-
-    @property
-    def is_due(self) -> bool:
-        """True if the batch is large or old enough."""
-        return (
-            len(self.gathered) >= _MAX_SCANS
-            or self.bytes >= _MAX_BYTES
-            or perf_counter() - self.started_s >= _MAX_WAIT_S
-        )
+        messages = self.graph.draw(self.now) if self.graph.has_grown else []
+        if step.keyframe >= 0 and step.keyframe % self.config.local_map_every == 0 and len(step.local_map):
+            points = drawing.at_most(step.local_map, self.config.max_map_points)
+            messages.append(Message(entities.LOCAL_MAP, drawing.dots(points), self.now))
+        is_large = len(self.gathered) >= _MAX_SCANS or self.bytes >= _MAX_BYTES
+        is_due = is_large or perf_counter() - self.started_s >= _MAX_WAIT_S
+        return [*messages, *self.messages()] if is_due else messages
 
     def messages(self) -> list[Message]:
         """Messages of the gathered steps, scan by scan; the batch is empty afterwards."""
@@ -173,18 +173,18 @@ class Batcher:
             _counts(counts, times),
         ]
 
-    def settled(self, closures: Sequence[Closure], graph: GraphState, times: Times) -> list[Message]:
-        """All that is left, and the final verdicts at ``times``, of the last step."""
+    def settled(self, closures: Sequence[Closure], graph: GraphState) -> list[Message]:
+        """All that is left, and the final verdicts, at the last step."""
         messages, news = self.messages(), self.graph.settle(closures, graph)
-        told = events([[(_INFORMATION, text) for text in news]], times)
-        return [*messages, *told, _counts([self.graph.counts], times), *self.graph.draw(times)]
+        told = events([[(_INFORMATION, text) for text in news]], self.now)
+        return [*messages, *told, _counts([self.graph.counts], self.now), *self.graph.draw(self.now)]
 
     def _frame(self, positions: Floats) -> None:
         """Widen the box around everything that was passed, (2, 3)."""
         known = positions if self.box is None else np.concatenate([self.box, positions])
         self.box = np.stack([known.min(axis=0), known.max(axis=0)])
 
-    def _trails(self, times: Times, odom: Matrix, world: Matrix) -> list[Message]:
+    def _trails(self, times: Times, odom: Matrix, world: Matrix) -> Iterator[Message]:
         """Each scan's segment of the trajectory, before and after correction, and the correction.
 
         A segment of the corrected trajectory starts where the scan before stands under the same correction, so
@@ -192,16 +192,15 @@ class Batcher:
         """
         before = np.concatenate([odom[:1] if self.last is None else self.last, odom[:-1]])
         self.last, corrections = odom[-1:], world @ lie.inverse(odom)
-        messages = [Message(entities.ODOM, drawing.transforms(corrections), times)]
+        yield Message(entities.ODOM, drawing.transforms(corrections), times)
         for entity, *ends in (
             (entities.ODOMETRY, before, odom),
             (entities.TRAJECTORY, corrections @ before, world),
         ):
             strips = np.stack([drawing.positions(poses) for poses in ends], axis=1)
-            messages.append(Message(entity, rr.LineStrips3D.columns(strips=strips), times))
-        return messages
+            yield Message(entity, rr.LineStrips3D.columns(strips=strips), times)
 
-    def _states(self, steps: Sequence[Step], news: Sequence[list[str]], times: Times) -> list[Message]:
+    def _states(self, steps: Sequence[Step], news: Sequence[list[str]], times: Times) -> Iterator[Message]:
         """The state where it changes, with the reason as an event, and the news of loop closures."""
         before = [self.state, *(step.state for step in steps[:-1])]
         changed = np.array([step.state is not state for step, state in zip(steps, before, strict=True)])
@@ -210,21 +209,18 @@ class Batcher:
         for step, is_new, texts in zip(steps, changed, news, strict=True):
             why = [(WARNING, f"{step.state}: {step.reason}")] if is_new and step.state is not State.OK else []
             told.append([*why, *((_INFORMATION, text) for text in texts)])
-        messages = events(told, times)
+        yield from events(told, times)
         if changed.any():
             states = [str(step.state) for step, new in zip(steps, changed, strict=True) if new]
-            messages.append(Message(entities.STATE, rr.StateChange.columns(state=states), times[changed]))
-        return messages
+            yield Message(entities.STATE, rr.StateChange.columns(state=states), times[changed])
 
 
-def events(events: Sequence[Sequence[tuple[str, str]]], times: Times) -> list[Message]:
+def events(events: Sequence[Sequence[tuple[str, str]]], times: Times) -> Iterator[Message]:
     """The events of each row of ``times``, level and text."""
-    rows = [row for row, of_row in enumerate(events) for _ in of_row]
-    if not rows:
-        return []
-    levels, texts = zip(*(event for of_row in events for event in of_row), strict=True)
-    columns = rr.TextLog.columns(text=list(texts), level=list(levels))
-    return [Message(entities.EVENTS, columns, times[np.array(rows)])]
+    flat = [(row, *event) for row, of_row in enumerate(events) for event in of_row]
+    if flat:
+        rows, levels, texts = map(list, zip(*flat, strict=True))
+        yield Message(entities.EVENTS, rr.TextLog.columns(text=texts, level=levels), times[np.array(rows)])
 
 
 def _counts(counts: Sequence[tuple[int, int]], times: Times) -> Message:
@@ -233,7 +229,7 @@ def _counts(counts: Sequence[tuple[int, int]], times: Times) -> Message:
     return Message(entities.LOOPS, columns.partition([2] * len(counts)), times)
 
 
-def _plots(steps: Sequence[Step], times: Times) -> list[Message]:
+def _plots(steps: Sequence[Step], times: Times) -> Iterator[Message]:
     """Figures and covariance of the registrations, what is infinite is a gap, and times of the stages."""
     matches = [step.match for step in steps]
     figures = {
@@ -243,16 +239,11 @@ def _plots(steps: Sequence[Step], times: Times) -> list[Message]:
         entities.OBSERVABILITY: [math.log10(max(match.observability, _LEAST_DRAWN)) for match in matches],
         entities.ITERATIONS: [match.iterations for match in matches],
     }
-    messages = []
     for entity, values in figures.items():
         known = np.where(np.isfinite(values), values, np.nan)
-        messages.append(Message(entity, rr.Scalars.columns(scalars=known), times))
+        yield Message(entity, rr.Scalars.columns(scalars=known), times)
     informations = np.array([match.information for match in matches])
-    covariances = drawing.ellipsoids(informations, entities.COVARIANCE_SCALE)
+    yield Message(entities.COVARIANCE, drawing.ellipsoids(informations, entities.COVARIANCE_SCALE), times)
     timings = [[getattr(step.timing, f"{stage}_s") for stage in STAGES] for step in steps]
     stages = rr.Scalars.columns(scalars=1e3 * np.array(timings).reshape(-1))
-    return [
-        *messages,
-        Message(entities.COVARIANCE, covariances, times),
-        Message(entities.TIME, stages.partition([len(STAGES)] * len(steps)), times),
-    ]
+    yield Message(entities.TIME, stages.partition([len(STAGES)] * len(steps)), times)

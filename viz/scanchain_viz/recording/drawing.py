@@ -88,9 +88,7 @@ def lines(
 
 def in_space(points: NDArray[np.floating]) -> Floats:
     """Points (N, 2 or 3) as (N, 3); a point in the plane lies at z = 0."""
-    result = np.zeros((len(points), 3), np.float32)
-    result[:, : points.shape[1]] = points
-    return result
+    return lie.lift_points(points).astype(np.float32)
 
 
 def positions(poses: Matrix) -> Floats:

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import subprocess
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from pathlib import Path
-from types import TracebackType
 from uuid import uuid4
 
 import numpy as np
@@ -27,13 +28,13 @@ from scanchain_viz.colors import STRETCH_COLORS, rgb
 from scanchain_viz.recording import drawing, entities, viewer
 from scanchain_viz.recording.batching import WARNING, Batcher, events
 from scanchain_viz.recording.drawing import Message, Times
-from scanchain_viz.recording.entities import blueprint
 from scanchain_viz.recording.sinks import Sink, file_sink, open_stream, viewer_sink
 
 _LISTED = 50  # largest number of stretches in the text of a verdict
 _RADIUS = 3.5  # of a stretch, in points of the screen
 
 
+@dataclass(eq=False)
 class Recording:
     """Takes in steps and results; a context that is entered before the first and left after the last.
 
@@ -43,52 +44,50 @@ class Recording:
         none at all is a recording that goes nowhere
     """
 
-    def __init__(
-        self,
-        path: Path | None,
-        *,
-        dimension: int,
-        name: str,
-        sinks: frozenset[SinkName],
-        config: RecordingConfig,
-    ) -> None:
-        if "save" in sinks and path is None:
+    path: Path | None
+    _: KW_ONLY
+    dimension: int
+    name: str
+    sinks: frozenset[SinkName]
+    config: RecordingConfig
+
+    def __post_init__(self) -> None:
+        if "save" in self.sinks and self.path is None:
             raise InputError("no path for the recording: give --out, or leave save out of --rerun")
-        self.path = path
-        self.dimension = dimension
-        self.name = name
-        self.wanted = sinks
-        self.config = config
         self.web_address = ""
-        self.sinks: list[Sink] = []
+        self.opened: list[Sink] = []
         self.file: Sink | None = None
         self.server: subprocess.Popen[bytes] | None = None
-        self.batcher = Batcher()
-        self.last = (0, 0)  # scan and stamp of the last step
+        self.batcher = Batcher(self.config)
         self.problems: list[str] = []
 
     def __enter__(self) -> Recording:
         recording_id = uuid4()
-        if "save" in self.wanted and self.path is not None:
+        if "save" in self.sinks and self.path is not None:
             stream = open_stream(self.name, self.dimension, recording_id)
-            self.file = file_sink(self.path, stream, blueprint(self.dimension))
-            self.sinks.append(self.file)
-        address = self._viewer_address() if self.wanted & {"spawn", "connect", "web"} else ""
+            self.file = file_sink(self.path, stream, entities.blueprint(self.dimension))
+            self.opened.append(self.file)
+        address = self._viewer_address() if self.sinks & {"spawn", "connect", "web"} else ""
         if address:
             stream = open_stream(self.name, self.dimension, recording_id)
-            self.sinks.append(viewer_sink(address, stream, blueprint(self.dimension)))
+            self.opened.append(viewer_sink(address, stream, entities.blueprint(self.dimension)))
         self._send(lambda: entities.constants(self.dimension))
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+    def __exit__(self, *error: object) -> None:
+        """Write the last batch, frame the view, and close file and viewer."""
+        self._send(lambda: [*self.batcher.messages(), *self.batcher.graph.draw(self.batcher.now)])
+        layout = entities.blueprint(self.dimension, self.batcher.box, int(self.batcher.now.scans[0]))
+        for sink in self.opened:
+            sink.send(lambda stream: stream.send_blueprint(layout))
+            sink.close()
+        if self.server is not None:
+            viewer.stop(self.server)
 
     @property
     def warnings(self) -> list[str]:
         """Problems so far, a line each."""
-        return [*self.problems, *(warning for sink in self.sinks for warning in sink.warnings)]
+        return [*self.problems, *(warning for sink in self.opened for warning in sink.warnings)]
 
     def resume(
         self, before: Path | None, steps: StepTable, closures: Sequence[Closure], graph: GraphState
@@ -97,9 +96,8 @@ class Recording:
 
         before : the recording up to there, which is copied; without one, the recording begins here
         """
-        self.last = int(steps.columns["index"][-1]), int(steps.columns["stamp_ns"][-1])
         self._guard(lambda: self.batcher.restore(steps, closures, graph))
-        for sink in self.sinks:
+        for sink in self.opened:
             if before is not None:
                 sink.send(partial(sink.copy, before))
             sink.settle()
@@ -113,22 +111,19 @@ class Recording:
 
     def log(self, step: Step) -> None:
         """Record one step; most of it is gathered and written in batches."""
-        self.last = step.scan.index, step.scan.stamp_ns
-        self._send(lambda: self._step(step))
+        self._send(lambda: self.batcher.add(step))
 
-    def log_trajectory(
-        self, stamps_ns: NDArray[np.int64], poses_optimized: Matrix, indices: NDArray[np.int64]
-    ) -> None:
-        """Record the optimized trajectory: poses (N, d+1, d+1) of the scans ``indices``."""
-        times = Times(indices, stamps_ns)
+    def log_trajectory(self, optimized: Trajectory) -> None:
+        """Record the optimized trajectory of all scans."""
+        times = Times(np.arange(len(optimized), dtype=np.int64), optimized.stamps_ns)
         self._send(lambda: [
-            _path(entities.OPTIMIZED, poses_optimized, entities.CYAN),
-            Message(entities.OPTIMIZED_LIDAR, drawing.transforms(poses_optimized), times),
+            _path(entities.OPTIMIZED, optimized.poses, entities.CYAN),
+            Message(entities.OPTIMIZED_LIDAR, drawing.transforms(optimized.poses), times),
         ])  # fmt: skip
 
     def log_closures(self, closures: Sequence[Closure], graph: GraphState) -> None:
         """Record the final graph and the final verdict on every closure, at the last scan."""
-        self._send(lambda: self.batcher.settled(closures, graph, self.now))
+        self._send(lambda: self.batcher.settled(closures, graph))
 
     def log_verdict(self, judged: Judged, trajectory: Trajectory) -> None:
         """Record the verdict, and its stretches on the optimized trajectory of all scans of the log."""
@@ -142,44 +137,28 @@ class Recording:
         """Record the finished map (N, d), downsampled to a third of the points of the scans."""
         self._send(lambda: self._map(points))
 
-    def log_grid(
-        self, cells: NDArray[np.int8] | NDArray[np.uint8], *, resolution_m: float, origin_m: tuple[float, float]
-    ) -> None:
+    def log_grid(self, cells: NDArray[np.int8], *, resolution_m: float, origin_m: tuple[float, float]) -> None:
         """Record the finished occupancy grid of a 2D log.
 
-        cells : (H, W), as ROS counts: 0 free to 100 occupied, −1 (255) unknown; row 0 at the lowest y
+        cells : (H, W), as ROS counts: 0 free to 100 occupied, −1 unknown; row 0 at the lowest y
         origin_m : x, y of the outer corner of cells[0, 0]
         """
         self._send(lambda: [Message(entities.GRID, _grid(cells, resolution_m, origin_m))])
-
-    def close(self) -> None:
-        """Write the last batch, frame the view, and close file and viewer; may be called twice."""
-        self._send(lambda: [*self.batcher.messages(), *self.batcher.graph.draw(self.now)])
-        layout = blueprint(self.dimension, self.batcher.box, self.last[0])
-        for sink in self.sinks:
-            sink.send(lambda stream: stream.send_blueprint(layout))
-            sink.close()
-        self.problems, self.sinks = self.warnings, []
-        if self.server is not None:
-            viewer.stop(self.server)
-            self.server = None
 
     def hold(self) -> None:
         """Keep the web viewer served until it ends or the user interrupts."""
         self._send(self.batcher.messages)
         if self.server is not None:
-            try:
+            with suppress(KeyboardInterrupt):
                 self.server.wait()
-            except KeyboardInterrupt:
-                return
 
     def _viewer_address(self) -> str:
         """Address of a viewer; empty, with a warning, if there is none."""
         try:
-            if "web" in self.wanted:
+            if "web" in self.sinks:
                 self.server = viewer.start_web()
                 self.web_address = viewer.web_address()
-            elif "spawn" in self.wanted:
+            elif "spawn" in self.sinks:
                 viewer.start_window()
             elif not viewer.is_listening(viewer.PORT):
                 raise viewer.ViewerError(
@@ -189,20 +168,6 @@ class Recording:
             self.problems.append(str(error))
             return ""
         return viewer.grpc_address()
-
-    @property
-    def now(self) -> Times:
-        """The instant of the last step."""
-        return Times.at(*self.last)
-
-    def _step(self, step: Step) -> list[Message]:
-        """Take in a step; the messages that are due after it."""
-        self.batcher.add(step)
-        messages = self.batcher.graph.draw(self.now) if self.batcher.graph.has_grown else []
-        if step.keyframe >= 0 and step.keyframe % self.config.local_map_every == 0 and len(step.local_map):
-            points = drawing.at_most(step.local_map, self.config.max_map_points)
-            messages.append(Message(entities.LOCAL_MAP, drawing.dots(points), self.now))
-        return [*messages, *self.batcher.messages()] if self.batcher.is_due else messages
 
     def _map(self, points: NDArray[np.floating]) -> list[Message]:
         """The map's points as far as they are drawn."""
@@ -220,9 +185,9 @@ class Recording:
             for message in messages:
                 message.send(stream)
 
-        if self.sinks:
+        if self.opened:
             self._guard(lambda: messages.extend(say()))
-        for sink in self.sinks if messages else ():
+        for sink in self.opened if messages else ():
             sink.send(write)
 
     def _guard(self, act: Callable[[], object]) -> None:
@@ -241,9 +206,7 @@ def _path(entity: str, poses: Matrix, color: drawing.Color) -> Message:
     return Message(entity, drawing.lines([drawing.positions(poses)], color, 0.75))
 
 
-def _grid(
-    cells: NDArray[np.int8] | NDArray[np.uint8], resolution_m: float, origin_m: tuple[float, float]
-) -> rr.GridMap:
+def _grid(cells: NDArray[np.int8], resolution_m: float, origin_m: tuple[float, float]) -> rr.GridMap:
     height, width = cells.shape
     pixels = np.ascontiguousarray(cells[::-1]).view(np.uint8)  # rerun's first row is the top one
     return rr.GridMap(

@@ -34,14 +34,7 @@ from scanchain_viz.recording import drawing, entities
 from scanchain_viz.recording.drawing import Message, Times
 from scanchain_viz.recording.entities import scene, up_to_now, whole_log, with_panels
 from scanchain_viz.recording.sinks import write_recording
-from scanchain_viz.report.comparison import write_compare_report
-from scanchain_viz.report.maps import (
-    STATE_COLORS,
-    write_changes_report,
-    write_localization_report,
-    write_merge_report,
-)
-from scanchain_viz.report.problems import ellipses
+from scanchain_viz.report import comparison, maps, problems
 
 _MAP_POINTS = 300_000
 _COMPARED_POINTS = 60_000  # of the map of a method
@@ -59,7 +52,7 @@ _MAX_SCAN_POINTS = 5_000
 
 def present_comparison(directory: Path) -> None:
     """Write report.html and compare.rrd: trajectories and maps of all methods, to toggle one by one."""
-    write_compare_report(directory)
+    comparison.write_compare_report(directory)
     table, trajectories = read_table(directory), trajectories_of_comparison(directory)
     names = [rr.escape_entity_path_part(each.name) for each in trajectories]
     overrides: dict[Any, Any] = {f"world/{name}/trajectory": [up_to_now()] for name in names}
@@ -73,7 +66,9 @@ def present_comparison(directory: Path) -> None:
 
 
 def _compared(directory: Path, trajectories: Sequence[DrawnTrajectory]) -> Iterator[Message]:
-    truth_file, stamps_ns = directory / TRUTH_FILE, _stamps(directory)
+    scans, truth_file = pq.read_table(directory / SCANS_FILE), directory / TRUTH_FILE
+    _, first = np.unique(scans["index"].to_numpy(), return_index=True)  # of the method with the most scans
+    stamps_ns = scans["stamp_ns"].to_numpy()[first]
     if truth_file.exists():
         path = drawing.positions(read_tum(truth_file).poses)
         yield Message(entities.GROUND_TRUTH, drawing.lines([path], entities.WHITE, 0.75))
@@ -117,16 +112,9 @@ def _plots(trajectories: Sequence[DrawnTrajectory]) -> list[rrb.TimeSeriesView]:
     return views
 
 
-def _stamps(directory: Path) -> NDArray[np.int64]:
-    """(N,) of all scans, from the method with the most."""
-    table = pq.read_table(directory / SCANS_FILE, columns=["index", "stamp_ns"])
-    indices, first = np.unique(table["index"].to_numpy(), return_index=True)
-    return table["stamp_ns"].to_numpy()[first] if len(indices) else np.empty(0, np.int64)
-
-
 def present_merge(directory: Path) -> None:
     """Write report.html and recording.rrd: map, every session to toggle, the closures between them."""
-    write_merge_report(directory)
+    maps.write_merge_report(directory)
     drawn = read_merge(directory)
     layout = with_panels(scene("sessions over the map", drawn.dimension, drawn.positions), has_toggles=True)
     path, messages = directory / RECORDING_FILE, _merge(directory, drawn)
@@ -146,7 +134,7 @@ def _merge(directory: Path, drawn: DrawnMerge) -> Iterator[Message]:
 
 def present_changes(directory: Path, changes: Changes) -> None:
     """Write report.html and recording.rrd beside summary.txt: points by label, boxes around clusters, arrows."""
-    write_changes_report(directory, changes)
+    maps.write_changes_report(directory, changes)
     world = scene("changes", changes.dimension, drawing.in_space(changes.points))
     text = rrb.TextDocumentView(origin="summary", name="summary")
     layout = with_panels(rrb.Horizontal(world, text, column_shares=[3, 1]))
@@ -191,7 +179,7 @@ def _upright(angles_rad: Sequence[float] | NDArray[np.float64]) -> NDArray[np.fl
 
 def present_localization(directory: Path, localized: LocalizedLog) -> None:
     """Write report.html and recording.rrd: map, live pose, hypotheses while searching, state and final path."""
-    write_localization_report(directory, localized)
+    maps.write_localization_report(directory, localized)
     prior, points = localized.prior, drawing.in_space(map_points(localized.prior))
     side = rrb.Vertical(
         rrb.TextDocumentView(origin=entities.VERDICT, name="verdict"),
@@ -200,7 +188,7 @@ def present_localization(directory: Path, localized: LocalizedLog) -> None:
     )
     views = rrb.Horizontal(scene("map", prior.dimension, points), side, column_shares=[5, 2])
     layout = with_panels(views, scans=len(localized.localization.states))
-    names, colors = list(STATE_COLORS), [rgb(color) for color in STATE_COLORS.values()]
+    names, colors = list(maps.STATE_COLORS), [rgb(color) for color in maps.STATE_COLORS.values()]
     messages = [
         Message(entities.MAP, drawing.dots(points, entities.height_colors(points), 1.0)),
         Message(entities.LIDAR, rr.TransformAxes3D(axis_length=0.5 if prior.dimension == 2 else 2.0)),
@@ -284,7 +272,7 @@ def _study(root: str, study: Study) -> Iterator[Message]:
     yield Message(f"{root}/truth/landmarks", drawing.dots(drawing.in_space(known), entities.GRAY, 4.0))
     yield from _estimate(root, study.before, Times.at(0, 0), entities.ORANGE)
     yield from _estimate(root, study.after, Times.at(1, 1), entities.BLUE)
-    axes_m, angles_rad = ellipses(study)
+    axes_m, angles_rad = problems.ellipses(study)
     drawn = rr.Ellipsoids3D.from_fields(
         centers=drawing.in_space(study.after.in_truth()[1]),
         half_sizes=np.pad(axes_m, ((0, 0), (0, 1)), constant_values=_ELLIPSE_M),

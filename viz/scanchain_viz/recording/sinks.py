@@ -13,6 +13,8 @@ import queue
 import threading
 import warnings
 from collections.abc import Callable, Iterable
+from dataclasses import KW_ONLY, dataclass
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from uuid import UUID, uuid4
@@ -34,6 +36,7 @@ _FILE_PATIENCE_S = 10.0
 _VIEWER_PATIENCE_S = 5.0
 
 
+@dataclass(eq=False)
 class Sink:
     """Passes batches on to one stream.
 
@@ -43,26 +46,20 @@ class Sink:
     is_lossless : whether the run waits for it when it falls behind; else what it is too slow for is dropped
     """
 
-    def __init__(
-        self,
-        name: str,
-        stream: rr.RecordingStream,
-        connect: Callable[[], None],
-        *,
-        patience_s: float,
-        is_lossless: bool,
-    ) -> None:
-        self.name = name
-        self.stream = stream
-        self.connect = connect
-        self.patience_s = patience_s
-        self.is_lossless = is_lossless
+    name: str
+    stream: rr.RecordingStream
+    connect: Callable[[], None]
+    _: KW_ONLY
+    patience_s: float
+    is_lossless: bool
+
+    def __post_init__(self) -> None:
         self.warnings: list[str] = []
         self.dropped = 0
         self.flushes = 0
         self.lock = threading.Lock()
         self.waiting: queue.Queue[Callable[[rr.RecordingStream], object] | None] = queue.Queue(_QUEUED_BATCHES)
-        self.thread = threading.Thread(target=self._serve, name=f"recording to {name}", daemon=True)
+        self.thread = threading.Thread(target=self._serve, name=f"recording to {self.name}", daemon=True)
         self.thread.start()
 
     def send(self, write: Callable[[rr.RecordingStream], object]) -> None:
@@ -178,8 +175,5 @@ def write_recording(
 
 def viewer_sink(address: str, stream: rr.RecordingStream, blueprint: rrb.Blueprint) -> Sink:
     """A viewer at ``address``."""
-
-    def connect() -> None:
-        stream.set_sinks(rr.GrpcSink(address), default_blueprint=blueprint)
-
+    connect = partial(stream.set_sinks, rr.GrpcSink(address), default_blueprint=blueprint)
     return Sink(f"the viewer at {address}", stream, connect, patience_s=_VIEWER_PATIENCE_S, is_lossless=False)

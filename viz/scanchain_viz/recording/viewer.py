@@ -73,11 +73,8 @@ def start_web(*recordings: Path) -> subprocess.Popen[bytes]:
 
 def stop(process: subprocess.Popen[bytes]) -> None:
     """End a viewer that was started here, with the process that its launcher started; it has nothing to save."""
-    if os.name == "posix":
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-    else:
-        process.kill()
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
     process.wait(timeout=5.0)
 
 
@@ -120,17 +117,12 @@ def show(path: Path, announce: Callable[[str], None], *, in_browser: bool) -> No
 
     announce : called with the page's address
     """
-    if in_browser:
-        _serve(path, announce)
+    if not in_browser:
+        if not has_display():
+            raise InputError(f"{path}: there is no display; use scanchain view --web, or open the file elsewhere")
+        command = [sys.executable, "-P", "-m", "rerun_cli", "--bind", HOST, str(path), "--new"]
+        subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL)
         return
-    if not has_display():
-        raise InputError(f"{path}: there is no display; use scanchain view --web, or open the file elsewhere")
-    command = [sys.executable, "-P", "-m", "rerun_cli", "--bind", HOST, str(path), "--new"]
-    subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL)
-
-
-def _serve(path: Path, announce: Callable[[str], None]) -> None:
-    """Until KeyboardInterrupt; whatever ends this ends the server."""
     server = start_web(path)
     try:
         address = web_address()
@@ -141,5 +133,5 @@ def _serve(path: Path, announce: Callable[[str], None]) -> None:
         raise ViewerError(f"the web viewer of {path} ended with code {code}; try `rerun {path}` on its own")
     except KeyboardInterrupt:
         return
-    finally:
+    finally:  # whatever ends this ends the server
         stop(server)

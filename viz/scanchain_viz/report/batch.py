@@ -57,7 +57,11 @@ def write_batch_report(directory: Path, rows: Sequence[Row], command: Sequence[s
         page.Collapsible("Command", shlex.join(without_keys(command))),
         page.Collapsible("Paths", "\n".join(paths)),
     )
-    sections = (_logs(directory, rows, names), *_trajectories(directory, done, names))
+    text = "A name links to the report of its run, or to its output if there is none."
+    lines = [page.Row(names[row.log], _cells(row), link=_link(directory, row)) for row in rows]
+    legend = [f"{head.text}: {head.hint}" for head in _HEADS if head.hint]
+    logs = page.Section("Logs", text, grid=page.Grid(_HEADS, lines, legend))
+    sections = (logs, *_trajectories(directory, done, names))
     title = f"Batch of {counted(len(rows), 'log')}"
     subtitle = "Each was run in its own process."
     page.write_page(directory, page.Page(title, subtitle, totals(rows), warnings, (), sections, folds))
@@ -72,13 +76,6 @@ def names_of(logs: Sequence[str]) -> dict[str, str]:
             log: name if counts[name] == 1 else "/".join(Path(log).parts[-depth:]) for log, name in names.items()
         }
     return names
-
-
-def _logs(directory: Path, rows: Sequence[Row], names: dict[str, str]) -> page.Section:
-    legend = [f"{head.text}: {head.hint}" for head in _HEADS if head.hint]
-    text = "A name links to the report of its run, or to its output if there is none."
-    lines = [page.Row(names[row.log], _cells(row), link=_link(directory, row)) for row in rows]
-    return page.Section("Logs", text, grid=page.Grid(_HEADS, lines, legend))
 
 
 def _cells(row: Row) -> Sequence[page.Cell | str]:

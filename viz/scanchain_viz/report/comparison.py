@@ -9,8 +9,7 @@ import numpy as np
 
 from scanchain.comparison.processes import CLOSURES_FILE, Status
 from scanchain.comparison.results import MAP_FILE, SETTINGS_FILE, TRUTH_FILE, method_folder
-from scanchain.comparison.table import Column, Table, columns_of, read_table
-from scanchain.comparison.table import Row as TableRow
+from scanchain.comparison.table import Table, columns_of, read_table
 from scanchain.maps import read_ply
 from scanchain.trajectory import read_tum
 from scanchain_viz.pictures.figure import Floats
@@ -54,54 +53,44 @@ def write_compare_report(directory: Path) -> None:
     page.write_page(directory, whole)
 
 
-def _figures(table: Table, trajectories: Sequence[DrawnTrajectory]) -> Iterator[page.Section]:
-    """The summary, and tables of all else."""
-    summary = columns_of(table.figures, "summary")
-    yield page.Section("Summary", grid=_grid(table, table.rows, trajectories, summary, has_verdicts=True))
-    ended = [row for row in table.rows if row.status is Status.OK]
-    for part in ("accuracy", "time"):
-        if columns := columns_of(table.figures, part):
-            yield page.Section(f"More on {part}", grid=_grid(table, ended, trajectories, columns))
-
-
-def _grid(
-    table: Table,
-    rows: Sequence[TableRow],
-    trajectories: Sequence[DrawnTrajectory],
-    columns: Sequence[Column],
-    *,
-    has_verdicts: bool = False,
-) -> page.Grid:
-    """A row a method; the end of a failed one in place of its figures."""
+def _grid(table: Table, part: str, trajectories: Sequence[DrawnTrajectory]) -> page.Grid:
+    """A row a method; in the summary with its verdict, and the end of a failed one in place of its figures."""
+    columns, is_summary = columns_of(table.figures, part), part == "summary"
     chips = {trajectory.name: trajectory for trajectory in trajectories}
-    shown = [dict(zip((row.name for row in table.rows), c.cells(table.figures), strict=True)) for c in columns]
-    lines = []
-    for row in rows:
-        cells = [page.Cell(each[row.name].text, "best" if each[row.name].is_best else "") for each in shown]
-        if has_verdicts:
+    shown, lines = [column.cells(table.figures) for column in columns], []
+    for place, row in enumerate(table.rows):
+        cells = [page.Cell(each[place].text, "best" if each[place].is_best else "") for each in shown]
+        if is_summary:
             cells.append(page.verdict_cell(row.verdict, row.vouched))
         if row.status is not Status.OK:
             cells = [page.Cell(f"{row.status}: {row.reason}", "wide")]
-        lines.append(page.Row(row.name, cells, chips.get(row.name)))
+        if is_summary or row.status is Status.OK:
+            lines.append(page.Row(row.name, cells, chips.get(row.name)))
     heads = [page.Head("method"), *(page.Head(column.head, column.unit, column.definition) for column in columns)]
-    heads += [_VERDICT] if has_verdicts else []
+    heads += [_VERDICT] if is_summary else []
     return page.Grid(heads, lines, [f"{column.heading}: {column.definition}" for column in columns])
 
 
 def _sections(
     directory: Path, table: Table, trajectories: Sequence[DrawnTrajectory], truth: Floats | None
 ) -> Iterator[page.Section]:
-    yield from _figures(table, trajectories)
+    yield page.Section("Summary", grid=_grid(table, "summary", trajectories))
+    for part in ("accuracy", "time"):
+        if columns_of(table.figures, part):
+            yield page.Section(f"More on {part}", grid=_grid(table, part, trajectories))
     is_planar = table.dimension == 2
     if trajectories:
-        framing, text = _sharpest(table, trajectories), "All start at the same pose."
+        # those with maps nearly as sharp as the best frame the pictures; all without maps
+        thickness_m = {row.name: row.figures["thickness_m"] or np.inf for row in table.rows}
+        limit_m = _NEARLY * min(thickness_m[each.name] for each in trajectories)
+        framing = [each for each in trajectories if thickness_m[each.name] <= limit_m]
+        text = "All start at the same pose."
         if truth is not None:
             text = (
                 "Each is aligned to the ground truth as for the ATE; one that did not finish, by its first pose."
             )
         elif len(framing) < len(trajectories):
-            framed = {each.name for each in framing}
-            astray = ", ".join(each.name for each in trajectories if each.name not in framed)
+            astray = ", ".join(each.name for each in trajectories if thickness_m[each.name] > limit_m)
             text += f" The axes frame the sharper maps; {astray} may leave them."
         yield sections.trajectories_section(trajectories, framing, truth, is_planar=is_planar, text=text)
         yield from sections.error_section(trajectories, table.truth)
@@ -114,13 +103,6 @@ def _sections(
         yield from sections.loop_section(each, closures, f"Loop closures of {each.name}")
     if len(table.rows) > 1:
         yield _disagreement(table)
-
-
-def _sharpest(table: Table, trajectories: Sequence[DrawnTrajectory]) -> list[DrawnTrajectory]:
-    """Trajectories whose maps are nearly as sharp as the best, which frame the pictures; all without maps."""
-    thickness_m = {row.name: row.figures["thickness_m"] or np.inf for row in table.rows}
-    limit_m = _NEARLY * min(thickness_m[trajectory.name] for trajectory in trajectories)
-    return [trajectory for trajectory in trajectories if thickness_m[trajectory.name] <= limit_m]
 
 
 def _map_section(

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from scanchain import lie
+from scanchain.config import Config
 from scanchain.data import Matrix
 from scanchain.errors import counted
 from scanchain.maps import read_ply
@@ -62,7 +63,7 @@ def write_merge_report(directory: Path) -> None:
         subtitle=summary.partition("\n")[0].removeprefix("merged").strip(),
         facts=[*_merge_facts(metrics), ("made", when(made))],
         warnings=metrics.warnings,
-        sections=(_merged_map(directory, drawn, metrics), _sessions(drawn, metrics)),
+        sections=(_merged_map(directory, drawn), _sessions(drawn, metrics)),
         collapsibles=(*provenance_sections(made, {}), configuration(directory)),
     )
     page.write_page(directory, whole)
@@ -78,18 +79,18 @@ def _merge_facts(m: MergeMetrics) -> Iterator[tuple[str, str]]:
     yield "time", f"{m.run_s:.1f} s"
 
 
-def _merged_map(directory: Path, drawn: maps.DrawnMerge, metrics: MergeMetrics) -> page.Section:
+def _merged_map(directory: Path, drawn: maps.DrawnMerge) -> page.Section:
     points = read_ply(directory / "map.ply").astype(float)
     low, high = maps.surroundings(drawn.positions, [points])
     closures = Line("", broken(drawn.closures), CLOSURES[""][1], 0.5)
-    is_flat = metrics.dimension == 2
+    grain_m, is_flat = Config().maps.voxel_size_m, drawn.dimension == 2
     drawings = (
         page.Drawing.of(
             "Sessions over the map",
             "Seen from above; thin lines: closures in force between sessions.",
             maps.over_map([closures, *drawn.sessions], points, low, high),
         ),
-        page.interactive_map(points, drawn.sessions, low, high, grain_m=drawn.grain_m, is_flat=is_flat),
+        page.interactive_map(points, drawn.sessions, low, high, grain_m=grain_m, is_flat=is_flat),
     )
     return page.Section("Map", chips=drawn.sessions, drawings=drawings)
 

@@ -124,8 +124,7 @@ def write_report(directory: Path, studies: Sequence[Study]) -> None:
         for study in studies:
             plots, panels = _estimates(study), []
             for plot, when, estimate in zip(plots, ("before", "after"), (study.before, study.after), strict=True):
-                off_m = estimate.poses_m
-                error = f": poses {off_m:.3g} m off" if np.isfinite(off_m) else ""
+                error = f": poses {estimate.poses_m:.3g} m off" if np.isfinite(estimate.poses_m) else ""
                 panels.append((f"{study.name}, {when}{error}", plot))
             write_png(directory / f"{file_stem(study.name)}.png", panels, width_inches=5.5)
             sections += [_estimate_section(study, *plots), _solver_section(study)]
@@ -158,14 +157,10 @@ def _solver_section(study: Study) -> page.Section:
         page.Drawing.of(f"{method.method}: {method.factor.name}", "", _factor(method)) for method in study.methods
     ]
     text = f"The Jacobian A has {size_of(study)}. Drawn is where the factor of every method is not zero."
-    title = f"Linear solvers on {study.name}"
-    return page.Section(title, text, grid=_grid(study), drawings=factors, is_small=True)
-
-
-def _grid(study: Study) -> page.Grid:
     headings, *rows = table_of(study)
     split = [heading.partition(" ms") for heading in headings]
     heads = [page.Head(name, unit.strip()) for name, unit, _ in split]
     notes = [_TIMES, _DIFFERS if len(rows) > 1 else "--methods all compares the linear solvers."]
     notes += [_PINV] if any(method.method == "pinv" for method in study.methods) else []
-    return page.Grid(heads, [page.Row(name, cells) for name, *cells in rows], notes)
+    grid = page.Grid(heads, [page.Row(name, cells) for name, *cells in rows], notes)
+    return page.Section(f"Linear solvers on {study.name}", text, grid=grid, drawings=factors, is_small=True)

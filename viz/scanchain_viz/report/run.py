@@ -22,9 +22,9 @@ from scanchain.settings import read_layer
 from scanchain.trajectory import read_tum
 from scanchain.verdict import VELOCITY_LIMIT, WHEEL_LIMIT, Kind, Stretch
 from scanchain_viz.colors import CLOSURES, STRETCH_COLORS, TRUTH, color_of
-from scanchain_viz.pictures.figure import Floats, Line, broken
+from scanchain_viz.pictures.figure import Floats, Line, Plot, broken
 from scanchain_viz.pictures.maps import VIRIDIS, over_map, surroundings
-from scanchain_viz.pictures.trajectories import frame, trajectories_of_run
+from scanchain_viz.pictures.trajectories import column_of, frame, trajectories_of_run
 from scanchain_viz.report import page, sections
 
 _CURVES = (  # a column of steps.parquet, its name, its limit
@@ -95,13 +95,9 @@ def _accuracy(m: Metrics) -> str:
 def _sections(directory: Path, metrics: Metrics) -> Iterator[page.Section]:
     """Accuracy, trajectory and map, closures, errors, uncertainty; time last."""
     steps = pq.ParquetFile(directory / "steps.parquet").read()  # read_table imports much more
-    config, accuracy, truth_file = (
-        read_layer(directory / "config.toml"),
-        metrics.ground_truth,
-        directory / TRUTH_FILE,
-    )
+    config, accuracy = read_layer(directory / "config.toml"), metrics.ground_truth
+    truth_file, gap_s = directory / TRUTH_FILE, None if accuracy is None else accuracy.max_gap_s
     truth = read_tum(truth_file) if truth_file.exists() and accuracy is not None else None
-    gap_s = None if accuracy is None else accuracy.max_gap_s
     trajectories, true_path = trajectories_of_run(steps, truth, gap_s)
     optimized, closures = trajectories[0], sections.read_closures(directory / "loops.parquet")
     if accuracy is not None:
@@ -183,18 +179,25 @@ def _disputed(steps: pa.Table, closures: pa.Table | None) -> NDArray[np.bool_]:
 
 
 def verdict_section(metrics: Metrics, steps: pa.Table) -> page.Section:
-    """Innovations along the log, and every suspicious stretch."""
-    curves = [
-        (name, steps[column].to_numpy(zero_copy_only=False).astype(np.float64) / limit, color_of(place))
-        for place, (column, name, limit) in enumerate(_CURVES)
-        if column in steps.column_names
-    ]
-    shaded = [(each.first, each.last, _SHADE) for each in metrics.stretches if each.kind is not Kind.LOOPS]
-    chips = [page.Chip(name, color) for name, _, color in curves]
+    """Innovations along the log over their limits, and every suspicious stretch."""
+    figure, chips = Plot("scan", "innovation / limit", is_wide=True), []
+    shaded = [each for each in metrics.stretches if each.kind is not Kind.LOOPS]
+    for each in shaded:
+        figure.span(each.first - 0.5, each.last + 0.5, f"{_SHADE}33")
+    for place, (column, name, limit) in enumerate(_CURVES):
+        if column in steps.column_names:
+            values = np.nan_to_num(column_of(steps, column) / limit)
+            figure.line(sections.windowed(np.clip(values, *sections.CLIPPED), np.max), color_of(place), 0.9)
+            chips.append(page.Chip(name, color_of(place)))
+    figure.level(1.0)
     chips += [page.Chip("stretches to check", _SHADE)] if shaded else []
-    drawing = sections.innovations([curve[1:] for curve in curves], shaded)
+    size = sections.window(len(steps))
+    largest = f", largest of {size} neighboring scans" if size > 1 else ""
+    text = (
+        f"Normalized innovations over their limits{largest}; above 1 (dotted) is a finding, or wheels that slip."
+    )
     grid = _stretches(metrics.stretches) if metrics.stretches else None
-    return page.Section("Checks", "", tuple(chips), (drawing,), grid)
+    return page.Section("Checks", "", chips, [page.Drawing.of("Innovations", text, figure)], grid)
 
 
 def _stretches(stretches: Sequence[Stretch]) -> page.Grid:

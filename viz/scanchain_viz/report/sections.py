@@ -24,7 +24,7 @@ from scanchain_viz.report.page import Cell, Chip, Collapsible, Drawing, Grid, He
 _MAX_POINTS = 1500  # largest number of points of a line
 _WINDOWS = 250  # number of windows over which a value of each scan is averaged
 _SHOWN_SHARES = (0.5, 99.5)  # per cent of the values of a distribution
-_LOWEST, _HIGHEST = 0.01, 1000.0  # range to which observability is clipped
+CLIPPED = (0.01, 1000.0)  # range of observability and innovations that is drawn
 
 
 def _legend(trajectories: Sequence[DrawnTrajectory]) -> Sequence[DrawnTrajectory]:
@@ -36,9 +36,8 @@ def _known(trajectories: Sequence[DrawnTrajectory], key: str) -> list[DrawnTraje
     return [trajectory for trajectory in trajectories if np.isfinite(getattr(trajectory, key)).any()]
 
 
-def _draw(figure: Plot, trajectory: DrawnTrajectory, x: Floats, y: Floats, width: float = 1.2) -> None:
-    dashes = DASHED if trajectory.is_dashed else ()
-    figure.line(np.stack([x, y], axis=1), trajectory.color, width, dashes)
+def _draw(figure: Plot, trajectory: DrawnTrajectory, points: Floats, width: float = 1.2) -> None:
+    figure.line(points, trajectory.color, width, DASHED if trajectory.is_dashed else ())
 
 
 def trajectories_section(
@@ -55,8 +54,8 @@ def trajectories_section(
     height = Plot("distance traveled [m]", "z [m]")
     for each in reversed(trajectories):  # the first on top
         rows = _some(len(each.positions))
-        plan.line(each.positions[rows], each.color, dashes=DASHED if each.is_dashed else ())
-        _draw(height, each, each.distance_m[rows], each.positions[rows, 2])
+        _draw(plan, each, each.positions[rows])
+        _draw(height, each, np.stack([each.distance_m[rows], each.positions[rows, 2]], axis=1))
     chips: Sequence[Named] = _legend(trajectories)
     if truth is not None:
         chips = (*trajectories, Chip("ground truth", TRUTH, is_dashed=True))
@@ -79,8 +78,8 @@ def error_section(trajectories: Sequence[DrawnTrajectory], truth_name: str) -> I
     figure = Plot("distance traveled [m]", "position error [m]", logarithmic="y")
     for each in reversed(known):
         finite = np.isfinite(each.error_m)
-        x, y = _windowed(each.distance_m[finite]), _windowed(each.error_m[finite], np.median)
-        _draw(figure, each, x, np.maximum(y, 1e-4))
+        points = windowed(each.error_m[finite], np.median, each.distance_m[finite])
+        _draw(figure, each, np.maximum(points, [0.0, 1e-4]))
     drawings = (
         Drawing.of("Over the distance", _of_neighbors("Medians", known, "error_m"), figure),
         _distribution(known, "error_m", 1.0, "position error [m]", "scans with a smaller error"),
@@ -106,7 +105,7 @@ def time_section(trajectories: Sequence[DrawnTrajectory], stages: Grid | None = 
         return
     figure = Plot("scan", "time of a scan [ms]", logarithmic="y")
     for each in reversed(known):
-        _draw(figure, each, *_over_scans(1e3 * each.seconds, np.median), width=0.9)
+        _draw(figure, each, windowed(1e3 * each.seconds, np.median), 0.9)
     drawings = (
         Drawing.of("Along the log", _of_neighbors("Medians", known, "seconds"), figure),
         _distribution(known, "seconds", 1e3, "time of a scan [ms]", "scans that took less"),
@@ -121,7 +120,7 @@ def uncertainty_section(trajectories: Sequence[DrawnTrajectory], *, is_planar: b
         return
     along = Plot("scan", "observability", logarithmic="y", is_wide=not estimated)
     for each in reversed(reported):
-        _draw(along, each, *_over_scans(np.clip(each.observability, _LOWEST, _HIGHEST), np.min))
+        _draw(along, each, windowed(np.clip(each.observability, *CLIPPED), np.min))
     along.level(1.0)
     least = _of_neighbors(" Least values", reported, "observability")
     text = (
@@ -132,23 +131,6 @@ def uncertainty_section(trajectories: Sequence[DrawnTrajectory], *, is_planar: b
     if estimated:
         drawings.append(_consistency(estimated, 3 if is_planar else 6))
     yield Section("Uncertainty", "", _legend(reported), tuple(drawings))
-
-
-def innovations(curves: Sequence[tuple[Floats, str]], stretches: Sequence[tuple[int, int, str]]) -> Drawing:
-    """Innovations (N,) over their limits scan by scan, in their colors, over stretches in theirs."""
-    figure = Plot("scan", "innovation / limit", is_wide=True)
-    for first, last, color in stretches:
-        figure.span(first - 0.5, last + 0.5, f"{color}33")
-    for values, color in curves:
-        x, y = _over_scans(np.clip(np.nan_to_num(values), _LOWEST, _HIGHEST), np.max)
-        figure.line(np.stack([x, y], axis=1), color, 0.9)
-    figure.level(1.0)
-    size = max((_window(len(values)) for values, _ in curves), default=1)
-    largest = f", largest of {size} neighboring scans" if size > 1 else ""
-    text = (
-        f"Normalized innovations over their limits{largest}; above 1 (dotted) is a finding, or wheels that slip."
-    )
-    return Drawing.of("Innovations", text, figure)
 
 
 def _distribution(
@@ -183,7 +165,7 @@ def _cumulative(figure: Plot, trajectory: DrawnTrajectory, values: Floats, least
     """Draw per cent of the known values below each; returns these in order, none below the least."""
     ordered = np.maximum(np.sort(values[np.isfinite(values)]), least)
     rows = np.unique(_some(len(ordered)))
-    _draw(figure, trajectory, ordered[rows], np.linspace(0.0, 100.0, len(ordered))[rows])
+    _draw(figure, trajectory, np.stack([ordered, np.linspace(0.0, 100.0, len(ordered))], axis=1)[rows])
     return ordered
 
 
@@ -192,26 +174,23 @@ def _some(count: int) -> NDArray[np.int64]:
     return np.linspace(0, count - 1, min(count, _MAX_POINTS)).astype(np.int64)
 
 
-def _window(count: int) -> int:
+def window(count: int) -> int:
     """Number of neighboring values, of so many, that make a point of a line."""
     return max(1, -(-count // _WINDOWS))
 
 
-def _windowed(values: Floats, combine: Callable[..., Floats] = np.mean) -> Floats:
-    """Neighboring values put together so that a line of them can be read."""
-    size = _window(len(values))
+def windowed(values: Floats, combine: Callable[..., Floats], x: Floats | None = None) -> Floats:
+    """Points (K, 2) of a line that can be read: neighboring values put together, over the means of x or scans."""
+    size = window(len(values))
     count = len(values) // size * size
-    return combine(values[:count].reshape(-1, size), axis=1) if count else values
-
-
-def _over_scans(values: Floats, combine: Callable[..., Floats]) -> tuple[Floats, Floats]:
-    """Numbers of scans and their values, neighboring ones put together."""
-    return _windowed(np.arange(len(values), dtype=np.float64)), _windowed(values, combine)
+    over = np.arange(len(values), dtype=np.float64) if x is None else x
+    x, y = (each[:count].reshape(-1, size) for each in (over, values))
+    return np.stack([x.mean(axis=1), combine(y, axis=1)], axis=1)
 
 
 def _of_neighbors(what: str, trajectories: Sequence[DrawnTrajectory], key: str) -> str:
     """The caption of lines whose points stand for several scans each; none where each is a scan."""
-    size = _window(max(int(np.isfinite(getattr(each, key)).sum()) for each in trajectories))
+    size = window(max(int(np.isfinite(getattr(each, key)).sum()) for each in trajectories))
     return f"{what} of {size} neighboring scans." if size > 1 else ""
 
 
@@ -233,9 +212,8 @@ def loop_section(trajectory: DrawnTrajectory, closures: pa.Table | None, title: 
 def _verdict_grid(closures: pa.Table) -> Grid:
     """Closures by verdict and cause, most frequent first."""
     groups: defaultdict[tuple[str, str], list[int]] = defaultdict(list)
-    for place, (by, cause) in enumerate(
-        zip(*(closures[name].to_pylist() for name in ("rejected_by", "cause")), strict=True)
-    ):
+    verdicts = zip(closures["rejected_by"].to_pylist(), closures["cause"].to_pylist(), strict=True)
+    for place, (by, cause) in enumerate(verdicts):
         groups[CLOSURES[by][0], cause].append(place)
     overlap, residual_m = closures["overlap"].to_numpy(), closures["residual_m"].to_numpy()
     rows = []
