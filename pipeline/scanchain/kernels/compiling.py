@@ -54,7 +54,8 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """``numba.njit`` of a kernel, whose machine code is kept for later processes; it divides as NumPy does."""
 
     def compiled(function: Callable[..., Any]) -> Any:
-        kernel: Any = numba.njit(error_model="numpy", no_cfunc_wrapper=True, **options)(function)
+        chosen: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True} | options
+        kernel: Any = numba.njit(**chosen)(function)
         if not config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
             kernel._cache = _SharedCache(function)
         return kernel
