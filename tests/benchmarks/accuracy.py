@@ -27,9 +27,10 @@ from scanchain.odometry import Odometry
 from scanchain.settings import load_settings, overrides_of
 from scanchain.slam import Slam, SlamResult
 from scanchain.trajectory import read_tum
-from tests.benchmarks.harness import DATA, command_line, table
+from tests.benchmarks.harness import command_line, table
 from tests.support import made
 from tests.support.moving_worlds import standing
+from tests.support.scenes import DATA
 
 MATCHERS = ("plicp", "svd")
 STANDING = (

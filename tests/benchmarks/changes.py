@@ -28,7 +28,8 @@ from scanchain.settings import load_settings
 from scanchain.simulation import Drive, plan
 from scanchain.simulation.drive import EPOCH_NS
 from scanchain.simulation.solids import FIXED, Solids
-from tests.benchmarks.harness import command_line, recorded, run_of
+from tests.benchmarks.harness import command_line, recorded
+from tests.support import made
 
 LEAST_M = 0.3  # size of the objects that count
 LEAST_RAYS = {2: 10, 3: 40}  # of the keyframes' scans, for an object to be in sight
@@ -86,7 +87,7 @@ def score_of(options: argparse.Namespace, seed: int) -> Score:
 
 
 def _mapped(drive: Drive, name: str, cache: Path) -> SavedMap:
-    return open_saved_map(run_of(recorded(name, drive, cache), cache, name))
+    return open_saved_map(made.run_of(recorded(name, drive, cache), cache, name))
 
 
 def _score(found: Changes, first: Drive, second: Drive, a: SavedMap, b: SavedMap) -> Score:

@@ -27,7 +27,8 @@ from scanchain.data import Matrix, Scan
 from scanchain.logs import Log, open_log
 from scanchain.settings import load_settings
 from scanchain.slam import Slam
-from tests.benchmarks.harness import DATA, command_line, poses_at, table, traveled_m
+from tests.benchmarks.harness import command_line, poses_at, table, traveled_m
+from tests.support.scenes import DATA
 
 RIGHT_M, IN_SIGHT_M, STEP = 1.5, 3.0, 20
 LOGS = tuple(DATA / name for name in ("2d/intel.mcap", "2d/aces.mcap", "2d/mit_csail.mcap"))

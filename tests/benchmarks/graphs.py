@@ -18,7 +18,8 @@ from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.g2o import read_g2o, write_g2o
-from tests.benchmarks.harness import DATA, command_line, table
+from tests.benchmarks.harness import command_line, table
+from tests.support.scenes import DATA
 
 SHORT = (("LM", "levenberg-marquardt"), ("GN", "gauss-newton"))
 GRAPHS = ("manhattan", "intel", "MIT", "smallGrid3D", "sphere2500", "torus3D")

@@ -15,16 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-import scanchain
 from scanchain import lie
 from scanchain.data import Matrix, Trajectory
 from scanchain.evaluation import absolute_error, pair
 from scanchain.maps import SavedMap
 from scanchain.simulation import SENSORS, WORLDS, Drive, record
 from tests.support import made
-from tests.support.scenes import ROOT
 
-DATA = Path(os.environ.get("SCANCHAIN_DATA", ROOT.parent / "shared" / "data"))
 CACHE = Path(tempfile.gettempdir()) / "scanchain_benchmarks"
 LIDARS = [name for name, sensor in SENSORS.items() if sensor.dimension == 3]
 PLACES = [name for name, world in WORLDS.items() if world.sensor in LIDARS]
@@ -68,15 +65,6 @@ def drive_of(world: str, sensor: str, scans: int, cache: Path, seed: int = 1) ->
 def recorded(name: str, drive: Drive, cache: Path) -> Path:
     """The log of a drive, made once."""
     return made.recorded(name, lambda draft: record(drive, draft, force=True), cache)
-
-
-def run_of(log: Path, cache: Path, name: str, **options: object) -> Path:
-    """The run of a log without a recording, made once for each version of the code."""
-    out = cache / f"runs_{made.version()}" / name
-    if not out.exists():
-        out.parent.mkdir(parents=True, exist_ok=True)
-        scanchain.run(log, out, recording=False, **options)
-    return out
 
 
 def in_fresh_process(function: Callable[..., Answer], *arguments: object) -> Answer:

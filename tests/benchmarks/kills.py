@@ -8,8 +8,9 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from tests.benchmarks.harness import DATA, command_line
+from tests.benchmarks.harness import command_line
 from tests.support.killing import kill_at_random, start
+from tests.support.scenes import DATA
 
 LOGS = ("2d/intel.mcap", "300"), ("3d/kitti_0005_first60.mcap", "3")
 LIVELY = ("--checkpoint", "0.2")

@@ -28,7 +28,8 @@ from scanchain.landmarks.problem import BearingRangeProblem, Values, linear_syst
 from scanchain.landmarks.ranges import OWN, OdometryNoise, reckon, solve_range_log
 from scanchain.landmarks.solvers import METHODS, compare, create_solver
 from scanchain.landmarks.study import against_truth
-from tests.benchmarks.harness import DATA, command_line, table
+from tests.benchmarks.harness import command_line, table
+from tests.support.scenes import DATA
 
 OF_THE_REPORT = ("default", "pinv", "lu", "lu_colamd", "qr", "qr_colamd")
 REPORT_S = {

@@ -51,16 +51,15 @@ from scanchain.simulation.drive import plan
 from scanchain.simulation.worlds import WORLDS, outdoor
 from scanchain.trajectory import read_tum
 from tests.benchmarks.harness import (
-    DATA,
     command_line,
     in_fresh_process,
     recorded,
-    run_of,
     table,
     traveled_m,
     true_in_map,
 )
 from tests.support import made
+from tests.support.scenes import DATA
 
 SEEN_M, SEEN_SHARE, ON_MAP_M = 5.0, 0.6, 0.2
 GIVE_UP_M, AFTER_M, WARM_UP = {2: 15.0, 3: 40.0}, 3.0, 3
@@ -110,8 +109,8 @@ def _truth(log: Path) -> Trajectory:
 def later_part(name: str, end_s: float, options: argparse.Namespace) -> Case:
     """A log, in the map of its first seconds."""
     log = DATA / "2d" / f"{name}.mcap"
-    prior = open_saved_map(run_of(log, options.cache, f"{name}_{end_s:g}", log__end_s=end_s))
-    whole = read_tum(run_of(log, options.cache, name) / "trajectory.tum")
+    prior = open_saved_map(made.run_of(log, options.cache, f"{name}_{end_s:g}", log__end_s=end_s))
+    whole = read_tum(made.run_of(log, options.cache, name) / "trajectory.tum")
     first = max(keyframe.scan_index for keyframe in prior.keyframes) + 1
     return Case(prior, log, true_in_map(prior, whole, whole.poses)[0], first)
 
@@ -157,7 +156,7 @@ def city(options: argparse.Namespace) -> Case:
 
 
 def _mapped(options: argparse.Namespace, mapped: Path, log: Path) -> Case:
-    prior = open_saved_map(run_of(mapped, options.cache, mapped.stem))
+    prior = open_saved_map(made.run_of(mapped, options.cache, mapped.stem))
     return Case(prior, log, true_in_map(prior, _truth(mapped), _truth(log).poses)[0])
 
 

@@ -33,7 +33,6 @@ from scanchain.logs import open_log
 from scanchain.runs.closures import final_verdicts
 from scanchain.settings import load_settings
 from tests.benchmarks.harness import (
-    DATA,
     ate_m,
     choose_sequences,
     command_line,
@@ -43,8 +42,8 @@ from tests.benchmarks.harness import (
     traveled_m,
 )
 from tests.support import made
-from tests.support.drifting import drifting_slam, off_by, stretched
-from tests.support.false_loops import MADE_UP, false_closures
+from tests.support.drifting import MADE_UP, drifting_slam, false_closures, off_by, stretched
+from tests.support.scenes import DATA
 
 NEAR_M, BACK_M, OPPOSITE_RAD, ALONG_M = 5.0, 100.0, np.radians(135.0), 10.0
 TRUE = {2: (0.5, np.inf), 3: (2.0, np.radians(3.0))}

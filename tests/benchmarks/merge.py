@@ -26,8 +26,9 @@ from scanchain.evaluation import read_relations, relation_error
 from scanchain.runs.metrics import Metrics
 from scanchain.sessions.merging import Merged
 from scanchain.trajectory import read_tum
-from tests.benchmarks.harness import DATA, ate_m, command_line, run_of, table
+from tests.benchmarks.harness import ate_m, command_line, table
 from tests.support import made
+from tests.support.scenes import DATA
 
 INTEL, ACES, CSAIL = (DATA / f"2d/{name}.mcap" for name in ("intel", "aces", "mit_csail"))
 LENGTH_S, SCANS = 2691.3, 2000
@@ -35,7 +36,7 @@ LENGTH_S, SCANS = 2691.3, 2000
 
 def run(cache: Path, name: str, log: Path, start_s: float = 0.0, end_s: float = np.inf) -> Path:
     """The run of a part of a log."""
-    return run_of(log, cache, name, log__start_s=start_s, log__end_s=end_s)
+    return made.run_of(log, cache, name, log__start_s=start_s, log__end_s=end_s)
 
 
 def run_s(runs: Sequence[Path]) -> float:

@@ -41,8 +41,9 @@ from scanchain.errors import ScanchainError
 from scanchain.maps import open_saved_map
 from scanchain.sessions.localizer import MapState
 from scanchain.trajectory import read_tum
-from tests.benchmarks.harness import DATA, command_line, poses_at, run_of, settings_of, table, true_in_map
+from tests.benchmarks.harness import command_line, poses_at, settings_of, table, true_in_map
 from tests.support import made
+from tests.support.scenes import DATA
 
 Options = dict[str, object]
 
@@ -118,7 +119,7 @@ def outcome(guest: str, host: str, options: argparse.Namespace) -> tuple[str, st
     mapped = log_of(host, options.seed, options.cache, again=False)
     part = home.mapped if again else {}
     name = f"{host}_{options.seed}{'_part' if part else ''}"
-    prior = run_of(mapped, options.cache, name, **(home.options | part if home.log else {}))
+    prior = made.run_of(mapped, options.cache, name, **(home.options | part if home.log else {}))
     log = log_of(guest, options.seed, options.cache, again=again)
     chosen = (place.options | (place.again if again else {}) if place.log else {}) | settings_of(options.set)
     with tempfile.TemporaryDirectory() as folder:
@@ -188,7 +189,7 @@ REAL = ("csail", "aces", "intel")
 
 def whole_of(name: str, cache: Path) -> Path:
     """The run of a whole real log, whose poses are the truth of its parts."""
-    return run_of(DATA / PLACES[name].log, cache, f"{name}_whole")
+    return made.run_of(DATA / PLACES[name].log, cache, f"{name}_whole")
 
 
 def prepared(name: str, seed: int, cache: Path) -> tuple[Path, Path, Options, Trajectory, Trajectory]:
@@ -199,13 +200,14 @@ def prepared(name: str, seed: int, cache: Path) -> tuple[Path, Path, Options, Tr
     if entry.log in REAL:
         log = DATA / PLACES[entry.log].log
         truth = read_tum(whole_of(entry.log, cache) / "trajectory.tum")
-        prior = run_of(log, cache, out, log__start_s=map_begin, log__end_s=map_end)
+        prior = made.run_of(log, cache, out, log__start_s=map_begin, log__end_s=map_end)
         return prior, log, {"log__start_s": begin, "log__end_s": end}, truth, truth
     drive = {"folder": cache, "seed": seed, **entry.options}
     mapped = made.log(entry.log, start_m=map_begin, seconds=map_end, **drive)
     day = {} if entry.changed is None else {"changed": entry.changed}
     log = made.log(entry.log, start_m=begin, seconds=end, **day, **drive)
-    return run_of(mapped, cache, out), log, {}, *(read_tum(each.with_suffix(".tum")) for each in (mapped, log))
+    truths = (read_tum(each.with_suffix(".tum")) for each in (mapped, log))
+    return made.run_of(mapped, cache, out), log, {}, *truths
 
 
 def entering(name: str, options: argparse.Namespace) -> tuple[str, ...]:

@@ -36,7 +36,8 @@ from scanchain.simulation import record
 from scanchain.simulation.drive import plan
 from scanchain.simulation.sensors import SENSORS, spinning
 from scanchain.threads import threads, use_threads
-from tests.benchmarks.harness import DATA, command_line, in_fresh_process
+from tests.benchmarks.harness import command_line, in_fresh_process
+from tests.support.scenes import DATA
 
 OURS = "plicp"
 METHODS = (OURS, "kiss-icp", "small-vgicp", "genz-icp")

@@ -49,7 +49,8 @@ from scanchain.settings import Override, load_settings
 from scanchain.simulation import SENSORS, WORLDS
 from scanchain.slam import Slam, SlamResult
 from scanchain.trajectory import write_tum, write_wide_tum
-from tests.benchmarks.harness import DATA, PLACES, choose_sequences, command_line, drive_of, table
+from tests.benchmarks.harness import PLACES, choose_sequences, command_line, drive_of, table
+from tests.support.scenes import DATA
 
 WARM_UP_SCANS = 3
 NO_WHEELS = (Override("odometry.prior", "constant-velocity", "this benchmark"),)
@@ -111,10 +112,16 @@ def line(name: str, path: Path, overrides: tuple[Override, ...] = NO_WHEELS, **o
     """A log with a truth of its own."""
     result, steps, _, expected, truth = placed(path, overrides, **of_log)
     assert truth is not None
-    pairs = pair(result.trajectory, truth)
-    ate = expected.ate
-    figures = ate.mean, ate.low, ate.high, _nees(result, steps, truth), _gap(result, expected, truth)
-    return Line(name, absolute_error_of_any_path(pairs).translation_m.rmse, *figures)
+    return judged(name, result, steps, expected, truth)
+
+
+def judged(
+    name: str, result: SlamResult, steps: Sequence[Step], expected: ExpectedErrors, truth: Trajectory
+) -> Line:
+    """A result against the truth."""
+    true_m, ate = absolute_error_of_any_path(pair(result.trajectory, truth)).translation_m.rmse, expected.ate
+    nees, gap = _nees(result, steps, truth), _gap(result, expected, truth)
+    return Line(name, true_m, ate.mean, ate.low, ate.high, nees, gap)
 
 
 def _nees(result: SlamResult, steps: Sequence[Step], truth: Trajectory) -> float:

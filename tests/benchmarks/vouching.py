@@ -46,6 +46,7 @@ from scanchain.trajectory import read_tum
 from scanchain.verdict import judge
 from tests.benchmarks import harness
 from tests.benchmarks.vouching_logs import WHEELS, Case, LogSpec, cases
+from tests.support import made
 
 Row = dict[str, Any]
 
@@ -88,14 +89,13 @@ def measured(log_cases: Sequence[Case], cache: Path) -> list[Row]:
 
 
 def _run(case: Case, cache: Path) -> Path:
-    case.log.make(cache)
-    file, reference = case.log.paths(cache)
+    file, reference = case.log.files(cache)
     options: dict[str, object] = {"log__every": case.every, **case.log.overrides}
     if case.wheels != "wheels":
         options["odometry__prior"] = "constant-velocity"
     is_tum = reference is not None and reference.suffix == ".tum"
     name = case.name.replace(" ", "_").replace("/", "-").replace(",", "")
-    return harness.run_of(file, cache, name, ground_truth=reference if is_tum else None, **options)
+    return made.run_of(file, cache, name, ground_truth=reference if is_tum else None, **options)
 
 
 def judged(case: Case, cache: Path, out: Path) -> Row:
@@ -109,7 +109,7 @@ def judged(case: Case, cache: Path, out: Path) -> Row:
     evidence = evidence_of(steps, pq.read_table(loops_file) if loops_file.exists() else None)
     verdict = judge(evidence)
     trajectory = Trajectory(steps["stamp_ns"].to_numpy(), evidence.poses)
-    reference = case.log.paths(cache)[1] or out / "ground_truth.tum"
+    reference = case.log.files(cache)[1] or out / "ground_truth.tum"
     motions, quality = _compared(trajectory, reference, case.log.dimension)
     if np.isinf(case.log.reference_m):  # good enough for the run as a whole alone
         motions = Motions(*(part[:0] for part in motions))

@@ -23,8 +23,8 @@ from time import perf_counter
 from scanchain.logs import open_log
 from scanchain.odometry import Odometry
 from scanchain.settings import load_settings
-from tests.benchmarks.harness import DATA, KITTI, command_line
-from tests.support.scenes import ROOT
+from tests.benchmarks.harness import KITTI, command_line
+from tests.support.scenes import DATA, ROOT
 
 
 def main() -> None:

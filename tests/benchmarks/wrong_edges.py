@@ -16,7 +16,8 @@ from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.data import Trajectory
 from scanchain.graph.g2o import read_g2o
-from tests.benchmarks.harness import DATA, ate_m, command_line, table
+from tests.benchmarks.harness import ate_m, command_line, table
+from tests.support.scenes import DATA
 
 KINDS = {"anywhere": 1, "nearby": 1, "groups": 5, "groups of 10": 10}  # how many agree with each other
 

@@ -33,7 +33,6 @@ def everywhere(problem, T_i, T_j):
     return of_all.chi2(of_all.errors(np.concatenate([T_i, T_j])))
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("is_of_position", [False, True])
 def test_the_bound_of_an_edge_touches_its_chi2_and_is_nowhere_above_it(dimension, is_of_position):
     rng = np.random.default_rng(1)
@@ -63,7 +62,6 @@ def test_the_bound_of_an_edge_touches_its_chi2_and_is_nowhere_above_it(dimension
     assert bounded >= 20
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_the_dual_matrix_is_the_sum_of_the_bounds_of_the_edges(dimension):
     """For any rotations and positions: S with the multipliers taken off differs from the bounds by a constant."""
     rng = np.random.default_rng(5)
@@ -129,7 +127,6 @@ def closed_ring(dimension, count, turns, noise=0.0):
     return graph_of(lie.exp(twists), edges, measured, np.diag([100.0] * dimension + [1e4] * (k - dimension)))
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_a_ring_wound_up_once_is_a_minimum_but_not_certified(dimension, noise):
     """Turning by 2π/40 at every step no step is far from its measurement, and yet all are wrong."""
@@ -151,7 +148,6 @@ def test_a_graph_without_contradictions_is_optimal_whatever_the_rounding():
     assert certificate.verdict == "globally optimal: χ² is zero"
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_the_minimum_and_its_certificate_do_not_depend_on_the_unit_of_the_information(dimension):
     of_all, poses = [], []
     for unit in (1.0, 1e-6, 1e-12):
@@ -207,7 +203,6 @@ def test_an_edge_that_cannot_be_bounded_costs_its_chi2_and_no_more():
     assert 0.9 * price < certificate.gap < 0.01 * certificate.chi2
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("information", [1e-300, 1e-50, 1e50])
 def test_no_information_that_is_taken_overflows(dimension, information):
     k = (3, 6)[dimension - 2]

@@ -36,7 +36,6 @@ def test_the_published_graphs_reach_the_best_known_chi2_from_their_files_and_are
     assert certificate.relative_gap < 1e-6
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_every_optimizer_ends_in_the_same_minimum_of_a_ring(dimension):
     """Gradient descent too, only that it takes its time."""
     chi2 = {}
@@ -61,7 +60,6 @@ def test_every_way_to_start_ends_in_the_same_minimum(initialize):
     assert 0.5 * answer.chi2_after == pytest.approx(BEST_HALF_CHI2["intel"], rel=2e-5)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_a_hand_made_triangle_shows_that_T_ij_maps_frame_j_into_frame_i(dimension):
     """Pose 1 lies 1 m ahead of pose 0 and looks left; pose 2 lies 1 m ahead of pose 1: at (1, 1), looking left."""
     quarter = lie.exp(np.array([0.0, 0.0, np.pi / 2]))
@@ -78,7 +76,6 @@ def test_a_hand_made_triangle_shows_that_T_ij_maps_frame_j_into_frame_i(dimensio
     assert np.allclose(lie.yaw(graph.poses[2]), np.pi / 2, atol=1e-6)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_the_answer_moves_with_the_world_frame(dimension):
     """Far from the origin as near it: the same graph, its first pose elsewhere, ends in the same shape."""
     near, _ = ring(dimension, noise=0.02)
@@ -128,7 +125,6 @@ def test_every_reason_to_stop_is_reported():
     assert graph.optimize(PLAIN).reason.split()[0] in {"gradient", "step", "χ²"}
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_covariances_equal_the_dense_inverse(dimension):
     graph, _ = ring(dimension, count=9, noise=0.02)
     graph.optimize(PLAIN)
@@ -148,7 +144,6 @@ def test_covariances_equal_the_dense_inverse(dimension):
         assert i or np.allclose(found[j], expected, rtol=1e-5, atol=1e-9)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_errors_drawn_of_positions_have_the_covariances_of_the_poses(dimension):
     graph, _ = ring(dimension, count=9, noise=0.02)
     graph.optimize(PLAIN)
@@ -164,7 +159,6 @@ def test_errors_drawn_of_positions_have_the_covariances_of_the_poses(dimension):
     assert np.array_equal(errors[:5], graph.pose_errors(5))
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_of_results_of_redrawn_measurements_95_of_100_lie_within_the_bounds_of_the_expected_ate(dimension):
     rng = np.random.default_rng(0)
     _, true = ring(dimension, count=24)
@@ -227,7 +221,6 @@ def test_a_graph_without_poses_or_with_one_that_nothing_joins_is_refused():
         graph.optimize(PLAIN)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_poses_without_edges_but_the_first_are_already_optimal(dimension):
     graph = PoseGraph(dimension)
     graph.add_pose(lie.identity(dimension), 5)

@@ -21,7 +21,7 @@ from scanchain.loops.verification import Verifier, free_space_agreement
 from scanchain.registration import VoxelMap
 from scanchain.simulation import plan
 from scanchain.simulation.sensors import take_sweep
-from tests.support import naive_loops
+from tests.support import naive
 from tests.support.scenes import configured, stored
 
 RADIUS_M = 32.0
@@ -91,7 +91,7 @@ def test_ranges_compare_as_the_naive_ones(seed):
     ranges_m = np.empty((20, 40))
     nearest_ranges(seen, ranges_m)
     found = compare_ranges(points, T, ranges_m, 0.5, 0.05)
-    assert found == naive_loops.agreement(seen, points, T, ranges_m.shape, 0.5, 0.05)
+    assert found == naive.agreement(seen, points, T, ranges_m.shape, 0.5, 0.05)
     assert min(found) > 20
 
 

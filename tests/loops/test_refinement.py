@@ -10,7 +10,7 @@ from scanchain.loops import refined
 from scanchain.point_store import PointStore
 from scanchain.registration import VoxelMap
 from scanchain.registration.plicp import settings_of
-from tests.support import naive_loops
+from tests.support import naive
 from tests.support.scenes import configured
 
 ANGLES = np.linspace(-3.0, 3.0, 240)
@@ -90,7 +90,7 @@ def test_the_kernel_is_one_alignment_after_the_other(least_share):
     fast = shaken(truth, 0.05, 0.02)
     slow = fast.copy()
     refine(surfaces.voxels, points, starts, fast, prior, least_share, terms)
-    naive_loops.refine(surfaces.voxels, points, starts, slow, prior, least_share, terms)
+    naive.refine(surfaces.voxels, points, starts, slow, prior, least_share, terms)
     np.testing.assert_allclose(fast, slow, atol=1e-9)
     assert (fast != shaken(truth, 0.05, 0.02)).any()
 

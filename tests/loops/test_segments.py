@@ -8,7 +8,6 @@ import pytest
 
 from scanchain import lie
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Proposal
-from scanchain.evaluation import absolute_error, pair
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.logs import open_log
 from scanchain.loops.connectivity import Segments
@@ -20,6 +19,7 @@ from scanchain.odometry.tracked import first_match
 from scanchain.placement import edge_information
 from scanchain.runs.closures import final_verdicts
 from scanchain.slam import Slam
+from tests.benchmarks.harness import ate_m
 from tests.support.scenes import configured, shared_data, stored
 
 
@@ -38,24 +38,15 @@ def connected(segments, graph):
     return components == components[-1]
 
 
-def test_without_a_gap_everything_is_one_segment():
-    assert connected(Segments(), graph_of(5)).all()
-
-
 def test_a_new_segment_is_connected_to_nothing_until_a_loop_does_it():
     segments = Segments()
+    assert connected(segments, graph_of(5)).all()
     segments.start(3)
     segments.start(6)
     assert connected(segments, graph_of(9)).tolist() == [False] * 6 + [True] * 3
     assert connected(segments, graph_of(9, [(1, 4)])).tolist() == [False] * 6 + [True] * 3
     assert connected(segments, graph_of(9, [(1, 7)])).tolist() == [True] * 3 + [False] * 3 + [True] * 3
     assert connected(segments, graph_of(9, [(4, 7), (1, 4)])).all()
-
-
-def test_a_span_ends_where_the_next_segment_starts():
-    segments = Segments()
-    segments.start(3)
-    assert [segments.span(k, 8) for k in (0, 2, 3, 7)] == [(0, 3), (0, 3), (3, 8), (3, 8)]
 
 
 def test_a_submap_holds_keyframes_of_its_own_segment_alone():
@@ -69,9 +60,10 @@ def test_a_submap_holds_keyframes_of_its_own_segment_alone():
     assert np.ptp(part.points()[:, 0]) == pytest.approx(30.0)
 
 
-def test_a_submap_is_anchored_in_the_segment_of_its_keyframe():
+def test_a_span_ends_where_the_next_segment_starts_in_which_a_submap_is_anchored():
     segments = Segments()
     segments.start(7)
+    assert [segments.span(k, 12) for k in (0, 6, 7, 11)] == [(0, 7), (0, 7), (7, 12), (7, 12)]
     submaps = VoxelSubmaps(2, 5, configured(2).local_map, segments)
     assert [submaps.anchor_of(k) for k in (0, 4, 6, 7, 9, 10, 14)] == [0, 0, 5, 7, 7, 10, 10]
 
@@ -239,10 +231,7 @@ def test_a_robot_that_was_carried_elsewhere_is_found_again():
     whole, none = carried(Slam(configured(2), log.T_base_lidar), scans, 0, 0)
     slam = Slam(configured(2), log.T_base_lidar)
     holed, starts = carried(slam, scans, 4000, 4600)
-    before, after = (
-        absolute_error(pair(trajectory, whole.trajectory)).translation_m.rmse
-        for trajectory in (holed.odometry, holed.trajectory)
-    )
+    before, after = (ate_m(trajectory, whole.trajectory) for trajectory in (holed.odometry, holed.trajectory))
     assert len(slam.closer.segments.starts) == 2
     assert none == [] and starts == [4600]
     assert before > 5.0

@@ -184,7 +184,6 @@ def test_a_pose_that_is_not_finite_is_refused():
         PointMap(2, 0.1).insert(np.full((3, 3), np.nan), np.array([[1.0, 0.0]]))
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_a_point_map_equals_naive(dimension):
     random = np.random.default_rng(4)
     poses = [lie.exp(random.normal(size=3 if dimension == 2 else 6)) for _ in range(4)]

@@ -38,7 +38,6 @@ def held(found, positions_m, **noise):
     return np.array(x), np.array(stands)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_a_log_begins_at_a_standstill_that_averages_the_matches(dimension):
     x, stands = held(Standstill(dimension), np.zeros(300), dimension=dimension)
     assert stands.all()

@@ -24,7 +24,6 @@ def some_scan(dimension=3, n=2000, with_times=True):
     return scan_of(rng.uniform(-60.0, 60.0, (n, dimension)), rng.uniform(0.02, 0.12, n) if with_times else ())
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_a_sweep_is_the_first_point_of_every_voxel_in_range_and_seen_from_its_middle(dimension):
     scan = some_scan(dimension)
     sweep = sweep_of(scan, CONFIG)

@@ -215,7 +215,6 @@ def test_an_updated_map_is_localized_in_and_merged_further(runs, updates, tmp_pa
     assert [len(k.points) for k in np.array(after.keyframes)[kept]] == [len(k.points) for k in before.keyframes]
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_keyframes_held_as_one_pose_leave_the_cost_as_it_is(dimension):
     rng = np.random.default_rng(3)
     k = 3 if dimension == 2 else 6
@@ -244,7 +243,6 @@ def _room(dimension, half_m):
     return Keyframe(0, 0, 0, SavedPoints(points, 1.0), lie.identity(dimension), 0.0)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_a_map_that_differs_from_those_it_joined_by_more_than_they_do_in_themselves_is_told(dimension):
     def joined_with(half_m):
         rooms = [_room(dimension, wide_m) for wide_m in (4.0, 4.0, half_m, half_m)]

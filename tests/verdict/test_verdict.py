@@ -91,7 +91,6 @@ def marked(first, last):
     return (np.arange(N) >= first) & (np.arange(N) <= last)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize(
     "errors", [{}, {"scale": 0.9}, {"scale": 1.05}, {"drift_rad_m": 0.02}, {"share": 0.1}], ids=str
 )
@@ -265,7 +264,6 @@ def test_a_wrong_or_doubtful_trajectory_is_judged_by_its_stretches_with_a_reason
     assert words in judged.reason
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_a_slip_along_a_corridor_is_named_though_every_scan_is_ok(dimension):
     truth, slipped = course(dimension, slip=(500, 530))
     judged = judge(evidence(slipped, wheels=wheels_of(truth)))
@@ -329,7 +327,6 @@ def test_a_verdict_names_the_error_that_it_vouches_for_where_it_vouches():
 
 
 @pytest.mark.parametrize("error_m", [0.05, 0.5])
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_the_error_of_another_tool_is_below_its_distance_to_an_independent_estimate(dimension, error_m):
     truth, _ = course(dimension)
     rng = np.random.default_rng(4)
@@ -396,7 +393,6 @@ def test_a_short_interval_after_a_gap_accelerates_nothing():
     assert np.nanmax(check_velocity(stamps_ns, stamps_ns, poses)) < 1.0
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_wheels_that_turn_the_other_way_or_disagree_all_along_are_named(dimension):
     poses, _ = course(dimension)
     motions = lie.log(lie.between(poses[:-1], poses[1:]))
