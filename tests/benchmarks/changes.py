@@ -101,7 +101,12 @@ def _score(found: Changes, first: Drive, second: Drive, a: SavedMap, b: SavedMap
         changed = [
             each for each in second.changes if np.isfinite(each.before if here[0] is first else each.after).all()
         ]
-        both = _with_objects(there[0].solids, solids, [change.owner for change in changed])
+        owners, others = [change.owner for change in changed], there[0].solids
+        added, kept = np.isin(solids.owner, owners), ~np.isin(others.owner, owners)
+        both = np.append(
+            np.where(kept, others.owner, FIXED), solids.owner[added]
+        )  # as they stand on the other day
+        both = Solids(np.vstack([others.rows, solids.rows[added]]), both, others.ground)
         rays = np.minimum(_rays_by_owner(*here, solids), _rays_by_owner(*there, both))
         for change in changed:
             on = _on(points, solids, change.owner, MARGIN_M[d])
@@ -143,13 +148,6 @@ def _on(points: Matrix, solids: Solids, owner: int, margin_m: float) -> np.ndarr
             inside &= np.abs(-s * dx + c * dy) < half_y + margin_m
         on |= inside & (points[:, 2] > low - margin_m) & (points[:, 2] < high + margin_m)
     return on
-
-
-def _with_objects(solids: Solids, others: Solids, owners: list[int]) -> Solids:
-    """The solids, which no longer count as these objects, and the objects as they stand on another day."""
-    added, kept = np.isin(others.owner, owners), ~np.isin(solids.owner, owners)
-    owner = np.append(np.where(kept, solids.owner, FIXED), others.owner[added])
-    return Solids(np.vstack([solids.rows, others.rows[added]]), owner, solids.ground)
 
 
 def _rays_by_owner(drive: Drive, saved: SavedMap, solids: Solids) -> np.ndarray:

@@ -142,11 +142,6 @@ def _share(chosen) -> str:
     return f"{100.0 * np.mean(chosen):.1f} % of {len(chosen)}" if len(chosen) else "–"
 
 
-def planar_log(name: str, cache: Path) -> Path:
-    real = DATA / "2d" / f"{name}.mcap"
-    return real if real.exists() else made.log(name, folder=cache)
-
-
 def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("kind", choices=("2d", "3d"))
@@ -165,7 +160,8 @@ def main() -> None:
 
 def paths(options: argparse.Namespace) -> list[Path]:
     if options.kind == "2d":
-        return [planar_log(name, options.cache) for name in options.logs]
+        real = {name: DATA / "2d" / f"{name}.mcap" for name in options.logs}
+        return [path if path.exists() else made.log(name, folder=options.cache) for name, path in real.items()]
     pairs = [(world, sensor) for world in options.worlds.split(",") for sensor in options.sensors.split(",")]
     return [drive_of(*pair, options.scans, options.cache) for pair in pairs]
 

@@ -1,16 +1,16 @@
 """3D odometry, ours against others, on the same decoded scans, scan by scan in turn.
 
-    python -m tests.benchmarks.odometry3d [LOG ...] [--methods plicp,...] [--scans 300] [--indoor]
+    python -m tests.benchmarks.odometry3d [LOG ...] [--methods plicp,...] [--scans 300]
     python -m tests.benchmarks.odometry3d --set [--worlds town,...] [--sensors vlp-16,...] [--scans 300]
 
 Methods, settings and warm-up are those of ``scanchain compare``, where each has a process of its own. LOG is any
 MCAP with a 3D lidar. Its scans are decoded once into memory, then every one goes through all methods in turn,
 starting with another one each time, so that whatever else the machine does meets all of them alike. The time is
 that of ``track`` alone, the first scan left out. Poses hold at the scan's stamp; where a method's own hold
-elsewhere in the sweep, its wrapper moves them. Every log has a process of its own. --indoor takes the settings
-that others recommend for indoors where they have some. Memory and sharpness of maps are figures of ``scanchain
-compare``. In the table x is over the same of the first row of ours; CPU time is the median of all threads
-together, ATE the rmse after rigid alignment, KITTI the mean over all stretches of 10, 20 and 40 m.
+elsewhere in the sweep, its wrapper moves them. Every log has a process of its own. Memory and sharpness of maps
+are figures of ``scanchain compare``. In the table x is over the same of the first row of ours; CPU time is the
+median of all threads together, ATE the rmse after rigid alignment, KITTI the mean over all stretches of 10, 20 and
+40 m.
 
 --set: every world of scanchain.simulation that is driven with a 3D lidar, with every 3D sensor. A cell is the
 KITTI translation error in % over stretches of 10, 20 and 40 m, and the ATE in meters. Where the path is shorter
@@ -69,9 +69,9 @@ def method_of(name: str) -> Method:
     return resolve((name,), 3, file=None)[0]
 
 
-def default_methods(path: Path, *, indoor: bool) -> tuple[str, ...]:
+def default_methods(path: Path) -> tuple[str, ...]:
     """Ours and all others that are worth a row; GenZ-ICP as its authors tuned it for such a log."""
-    genz = "genz-icp-indoor" if indoor else "genz-icp-kitti" if "kitti" in path.name else "genz-icp"
+    genz = "genz-icp-kitti" if "kitti" in path.name else "genz-icp"
     return (*OURS, "kiss-icp", "small-vgicp", "small-gicp", genz, "open3d-p2l")
 
 
@@ -245,16 +245,15 @@ def main() -> None:
     parser.add_argument("logs", nargs="*", type=Path, default=[DATA / "3d" / name for name in KITTI])
     parser.add_argument("--methods", help="one that is unknown is answered with all others; --set: genz-icp "
                         "stands for its settings for the place")  # fmt: skip
-    parser.add_argument("--indoor", action="store_true")
     parser.add_argument("--set", action="store_true", help="simulated worlds instead of logs")
     choose_sequences(parser)
     arguments = parser.parse_args()
     named = tuple(arguments.methods.split(",")) if arguments.methods else ()
     if arguments.set:
-        run_set(arguments, named or default_methods(Path("log"), indoor=False))
+        run_set(arguments, named or default_methods(Path("log")))
         return
     for path in arguments.logs:
-        methods = named or default_methods(path, indoor=arguments.indoor)
+        methods = named or default_methods(path)
         in_fresh_process(run_log, path, methods, arguments.scans)
 
 

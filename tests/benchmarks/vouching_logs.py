@@ -243,19 +243,14 @@ def play_backward(log: Path, reference: Path, out: Path) -> None:
                 data = data[:4] + _STAMP.pack(*divmod(stamp_ns, 10**9)) + data[12:]
             writer.add_message(channels[channel.id], time_ns, data, time_ns)
         writer.finish()
-    mirrored = _mirrored_relations if reference.suffix == ".relations" else _mirrored_poses
-    np.savetxt(out.with_suffix(reference.suffix), mirrored(np.loadtxt(reference), 1e-9 * both_ns), "%.9f")
-
-
-def _mirrored_poses(rows: np.ndarray, both_s: float) -> np.ndarray:
-    rows[:, 0] = both_s - rows[:, 0]
-    return rows[::-1]
-
-
-def _mirrored_relations(rows: np.ndarray, both_s: float) -> np.ndarray:
-    """From the pose that is the earlier one now: the motion is the inverse."""
-    turned = Rotation.from_euler("xyz", rows[:, 5:]).inv()
-    return np.hstack([both_s - rows[:, [1, 0]], -turned.apply(rows[:, 2:5]), turned.as_euler("xyz")])
+    rows, both_s = np.loadtxt(reference), 1e-9 * both_ns
+    if reference.suffix == ".relations":  # from the pose that is the earlier one now: the motion is the inverse
+        turned = Rotation.from_euler("xyz", rows[:, 5:]).inv()
+        rows = np.hstack([both_s - rows[:, [1, 0]], -turned.apply(rows[:, 2:5]), turned.as_euler("xyz")])
+    else:
+        rows[:, 0] = both_s - rows[:, 0]
+        rows = rows[::-1]
+    np.savetxt(out.with_suffix(reference.suffix), rows, "%.9f")
 
 
 def _open_shares(drive: Drive) -> Matrix:
