@@ -223,20 +223,6 @@ def test_a_comparison_from_python_has_a_row_a_method(office, tmp_path, monkeypat
     assert (compared.path / "report.html").exists()
 
 
-def test_a_graph_is_optimized_and_written_and_read(tmp_path):
-    graph = sc.PoseGraph(2)
-    for k in range(4):
-        graph.add_pose(np.array([[1.0, 0.0, 1.1 * k], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), k)
-    step = np.array([[1.0, 0.0, 1.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    for k in range(3):
-        graph.add_edge(k, k + 1, step, np.eye(3))
-    done = sc.optimize(graph)
-    assert done.converged
-    assert graph.poses[3][0, 2] == pytest.approx(3.0)
-    sc.write_g2o(tmp_path / "graph.g2o", graph)
-    assert np.allclose(sc.read_g2o(tmp_path / "graph.g2o").graph.poses, graph.poses)
-
-
 @pytest.mark.parametrize("folder", ["pipeline", "viz"])
 def test_no_module_gives_a_second_value_to_a_name_of_its_own(folder):
     """Files that are joined may each have a constant of one name; the later value would hold for both."""

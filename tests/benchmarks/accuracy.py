@@ -27,7 +27,7 @@ from scanchain.odometry import Odometry
 from scanchain.settings import load_settings, overrides_of
 from scanchain.slam import Slam, SlamResult
 from scanchain.trajectory import read_tum
-from tests.benchmarks.harness import command_line, table
+from tests.benchmarks.harness import options_of, table
 from tests.support import made
 from tests.support.moving_worlds import standing
 from tests.support.scenes import DATA
@@ -112,12 +112,7 @@ def standing_still(options: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    parser = command_line(__doc__)
-    parser.add_argument("--only", default="", help="cases whose names hold this")
-    parser.add_argument("--standing", action="store_true")
-    parser.add_argument("--scans", type=int, default=150)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 5])
-    options = parser.parse_args()
+    options = options_of(__doc__, only="", standing=False, scans=150, seeds=[0, 5])
     (standing_still if options.standing else moving)(options)
 
 

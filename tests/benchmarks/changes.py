@@ -28,7 +28,7 @@ from scanchain.settings import load_settings
 from scanchain.simulation import Drive, plan
 from scanchain.simulation.drive import EPOCH_NS
 from scanchain.simulation.solids import FIXED, Solids
-from tests.benchmarks.harness import command_line, recorded
+from tests.benchmarks.harness import options_of, recorded
 from tests.support import made
 
 LEAST_M = 0.3  # size of the objects that count
@@ -51,14 +51,9 @@ class Score:
 
 
 def main() -> None:
-    parser = command_line(__doc__)
-    parser.add_argument("--world", default="office")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
-    parser.add_argument("--sensor")
-    parser.add_argument("--seconds", type=float)
-    parser.add_argument("--later-seconds", type=float)
-    parser.add_argument("--unchanged", action="store_true")
-    options = parser.parse_args()
+    options = options_of(
+        __doc__, world="office", seeds=[1, 2, 3], sensor=str, seconds=float, later_seconds=float, unchanged=False
+    )
     scores = [score_of(options, seed) for seed in options.seeds]
     total = Score(*(sum(getattr(score, name) for score in scores) for name in Score.__slots__))
     for name, score in (*zip(map(str, options.seeds), scores, strict=True), ("all", total)):

@@ -18,11 +18,11 @@ from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.g2o import read_g2o, write_g2o
-from tests.benchmarks.harness import command_line, table
+from tests.benchmarks.harness import options_of, table
 from tests.support.scenes import DATA
 
 SHORT = (("LM", "levenberg-marquardt"), ("GN", "gauss-newton"))
-GRAPHS = ("manhattan", "intel", "MIT", "smallGrid3D", "sphere2500", "torus3D")
+GRAPHS = ["manhattan", "intel", "MIT", "smallGrid3D", "sphere2500", "torus3D"]
 BEST = {"manhattan": 1774.5205, "intel": 22.5021, "MIT": 20.6035, "sphere2500": 675.701, "torus3D": 12117.6}
 SLOW_S = 2.0  # of a method that is run once only
 
@@ -155,10 +155,7 @@ def certify(path):
 
 
 def main():
-    parser = command_line(__doc__)
-    parser.add_argument("graphs", nargs="*", default=GRAPHS)
-    parser.add_argument("--repeats", type=int, default=5)
-    options = parser.parse_args()
+    options = options_of(__doc__, "graphs", graphs=GRAPHS, repeats=5)
     options.cache.mkdir(parents=True, exist_ok=True)
     for path in (DATA / "graphs" / f"{name}.g2o" for name in options.graphs):
         for _, warm in SHORT:

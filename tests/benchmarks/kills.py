@@ -8,7 +8,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from tests.benchmarks.harness import command_line
+from tests.benchmarks.harness import options_of
 from tests.support.killing import kill_at_random, start
 from tests.support.scenes import DATA
 
@@ -17,11 +17,7 @@ LIVELY = ("--checkpoint", "0.2")
 
 
 def main():
-    parser = command_line(__doc__, cache=False)
-    parser.add_argument("--kills", type=int, default=50, help="of each log")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("logs", nargs="*", help="a file, the second at which it is cut, the next file ...")
-    options = parser.parse_args()
+    options = options_of(__doc__, "logs", cache=False, kills=50, seed=1, logs=[])
     named = list(zip(options.logs[::2], options.logs[1::2], strict=True))
     for log, end_s in named or [(DATA / name, end_s) for name, end_s in LOGS]:
         torture(Path(log), (*LIVELY, "--end", end_s), options)

@@ -28,7 +28,7 @@ from scanchain.landmarks.problem import BearingRangeProblem, Values, linear_syst
 from scanchain.landmarks.ranges import OWN, OdometryNoise, reckon, solve_range_log
 from scanchain.landmarks.solvers import METHODS, compare, create_solver
 from scanchain.landmarks.study import against_truth
-from tests.benchmarks.harness import command_line, table
+from tests.benchmarks.harness import options_of, table
 from tests.support.scenes import DATA
 
 OF_THE_REPORT = ("default", "pinv", "lu", "lu_colamd", "qr", "qr_colamd")
@@ -159,11 +159,7 @@ def real_log(options):
 
 
 def main():
-    parser = command_line(__doc__, cache=False)
-    parser.add_argument("which", choices=("linear", "log"))
-    parser.add_argument("--robot", type=int, default=1)
-    parser.add_argument("--repeats", type=int, default=9)
-    options = parser.parse_args()
+    options = options_of(__doc__, "which", cache=False, which=("linear", "log"), robot=1, repeats=9)
     {"linear": linear, "log": real_log}[options.which](options)
 
 

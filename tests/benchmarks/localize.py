@@ -42,6 +42,7 @@ from scipy.spatial import KDTree
 
 from scanchain import lie
 from scanchain.data import Matrix, Scan, Trajectory
+from scanchain.evaluation import path_length
 from scanchain.logs import open_log
 from scanchain.maps import SavedMap, open_saved_map
 from scanchain.odometry import Odometry
@@ -51,11 +52,10 @@ from scanchain.simulation.drive import plan
 from scanchain.simulation.worlds import WORLDS, outdoor
 from scanchain.trajectory import read_tum
 from tests.benchmarks.harness import (
-    command_line,
     in_fresh_process,
+    options_of,
     recorded,
     table,
-    traveled_m,
     true_in_map,
 )
 from tests.support import made
@@ -209,7 +209,7 @@ def starts_of(case: Case, log_scans: list[Scan], count: int) -> list[int]:
         np.mean(surfaces.query(lie.transform(poses[i], log_scans[i].points[::3].astype(float)))[0] < ON_MAP_M)
         for i in some.tolist()
     ])  # fmt: skip
-    path_m = traveled_m(poses[some])
+    path_m = path_length(poses[some])
     ends = np.searchsorted(path_m, path_m + SEEN_M).tolist()
     is_seen = [
         share[k] > SEEN_SHARE and share[k : end + 1].mean() > SEEN_SHARE and path_m[-1] > path_m[k] + GIVE_UP_M[2]
@@ -296,18 +296,10 @@ def row(name: str, options: argparse.Namespace) -> tuple[object, ...]:
 
 
 def main() -> None:
-    parser = command_line(__doc__)
-    parser.add_argument(
-        "--cases", default="intel,aces,identical,vlp-16,os1-32,changed", help="default: %(default)s"
-    )
-    parser.add_argument("--starts", type=int, default=200)
-    parser.add_argument("--whole", action="store_true")
-    parser.add_argument("--live", action="store_true")
-    parser.add_argument("--km", type=float, default=10.0, help="of streets, default: %(default)s")
-    parser.add_argument("--sensor", default="vlp-16", help="of the city, default: %(default)s")
-    parser.add_argument("--every", type=int, default=2, help="sweeps a scan, default: %(default)s")
-    parser.add_argument("--memory", action="store_true")
-    options = parser.parse_args()
+    options = options_of(
+        __doc__, cases="intel,aces,identical,vlp-16,os1-32,changed", starts=200, whole=False, live=False, km=10.0,
+        sensor="vlp-16", every=2, memory=False,
+    )  # fmt: skip
     line = table(*HEAD, *(WHOLE if options.whole else ()))
     for name in options.cases.split(","):
         line(*in_fresh_process(row, name, options))

@@ -24,7 +24,7 @@ from scanchain.logs import Log, open_log
 from scanchain.point_store import PointStore
 from scanchain.processes import peak_mib, resident_mib
 from scanchain.settings import load_settings
-from tests.benchmarks.harness import command_line
+from tests.benchmarks.harness import options_of
 
 _LIVE_S = 0.025  # period of a fast laser scanner
 _PAUSE_NS = 50_000_000  # between two passes, in which nothing moves
@@ -59,12 +59,7 @@ class BackAndForth:
 
 
 def main() -> None:
-    parser = command_line(__doc__, cache=False)
-    parser.add_argument("--scans", type=int, default=20_000)
-    parser.add_argument("--log", type=Path, required=True)
-    parser.add_argument("--live", type=int, default=0)
-    parser.add_argument("--finish", action="store_true")
-    arguments = parser.parse_args()
+    arguments = options_of(__doc__, cache=False, log=Path, scans=20_000, live=0, finish=False)
     log = open_log(arguments.log)
     scans = BackAndForth(log).scans(arguments.scans + arguments.live)
     slam = Slam(load_settings(log.dimension).config, log.T_base_lidar)

@@ -29,17 +29,17 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.data import BACK_END, Closure, ClosureVerdict, Matrix, Pose, Proposal, Trajectory
+from scanchain.evaluation import path_length
 from scanchain.logs import open_log
 from scanchain.runs.closures import final_verdicts
 from scanchain.settings import load_settings
 from tests.benchmarks.harness import (
+    SEQUENCES,
     ate_m,
-    choose_sequences,
-    command_line,
     drive_of,
     in_fresh_process,
+    options_of,
     table,
-    traveled_m,
 )
 from tests.support import made
 from tests.support.drifting import MADE_UP, drifting_slam, false_closures, off_by, stretched
@@ -102,7 +102,7 @@ def row(path: Path, drift: Drift, truth: Trajectory, false_share: float) -> tupl
     overruled = sum(each.rejected_by == BACK_END for each in judged)
     poses = true_poses(log.dimension, truth, result.keyframes)
     false = sum(not is_true(each, poses) for each in accepted)
-    path_m = traveled_m(poses)
+    path_m = path_length(poses)
     sources_m = path_m[[each.source for each in accepted]]
     found = np.any(np.abs(path_m[:, None] - sources_m) <= ALONG_M, axis=1)
     shares = [_share(found[which]) for which in revisits(poses, path_m)]
@@ -143,13 +143,10 @@ def _share(chosen) -> str:
 
 
 def main() -> None:
-    parser = command_line(__doc__)
-    parser.add_argument("kind", choices=("2d", "3d"))
-    parser.add_argument("--logs", nargs="+", default=("intel", "mit_csail", "identical"), help="real or simulated")
-    choose_sequences(parser, worlds=("rounds",), scans=1600)
-    parser.add_argument("--drifts", nargs="+", help="share of the way, radians a meter")
-    parser.add_argument("--false", type=float, default=0.0, help="share of wrong closures, default: %(default)s")
-    options = parser.parse_args()
+    options = options_of(
+        __doc__, "kind", kind=("2d", "3d"), logs=["intel", "mit_csail", "identical"], drifts=[], false=0.0,
+        **SEQUENCES | {"worlds": "rounds", "scans": 1600},
+    )  # fmt: skip
     drifts = [Drift(*map(float, each.split(","))) for each in options.drifts or DRIFTS[int(options.kind[0])]]
     line = table(*HEAD.split(","))
     for path in paths(options):

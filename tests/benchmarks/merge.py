@@ -26,7 +26,7 @@ from scanchain.evaluation import read_relations, relation_error
 from scanchain.runs.metrics import Metrics
 from scanchain.sessions.merging import Merged
 from scanchain.trajectory import read_tum
-from tests.benchmarks.harness import ate_m, command_line, table
+from tests.benchmarks.harness import ate_m, options_of, table
 from tests.support import made
 from tests.support.scenes import DATA
 
@@ -130,9 +130,7 @@ PARTS = {"intel": intel, "eight": eight, "cut": cut, "town": town, "look-alikes"
 
 
 def main() -> None:
-    parser = command_line(__doc__)
-    parser.add_argument("--only", nargs="+", choices=list(PARTS), default=list(PARTS))
-    options = parser.parse_args()
+    options = options_of(__doc__, only=PARTS)
     row = table("sessions", "in the map", "apart", "closures in force", "certified", "error", "runs", "merge")
     with tempfile.TemporaryDirectory() as folder:
         for name in options.only:

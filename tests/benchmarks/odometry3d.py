@@ -40,7 +40,7 @@ from scanchain.data import Scan, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import SHORT_LENGTHS_M, absolute_error, kitti_error, pair
 from scanchain.logs import Log, open_log
-from tests.benchmarks.harness import KITTI, choose_sequences, command_line, drive_of, in_fresh_process, table
+from tests.benchmarks.harness import KITTI, SEQUENCES, drive_of, in_fresh_process, options_of, table
 from tests.support.scenes import DATA
 
 OURS = ("plicp", "svd")
@@ -241,13 +241,8 @@ def summary(
 
 
 def main() -> None:
-    parser = command_line(__doc__)
-    parser.add_argument("logs", nargs="*", type=Path, default=[DATA / "3d" / name for name in KITTI])
-    parser.add_argument("--methods", help="one that is unknown is answered with all others; --set: genz-icp "
-                        "stands for its settings for the place")  # fmt: skip
-    parser.add_argument("--set", action="store_true", help="simulated worlds instead of logs")
-    choose_sequences(parser)
-    arguments = parser.parse_args()
+    logs = [DATA / "3d" / name for name in KITTI]
+    arguments = options_of(__doc__, "logs", logs=logs, methods="", set=False, **SEQUENCES)
     named = tuple(arguments.methods.split(",")) if arguments.methods else ()
     if arguments.set:
         run_set(arguments, named or default_methods(Path("log")))

@@ -28,7 +28,7 @@ from scanchain.loops.place_search import completed
 from scanchain.loops.planar_map_search import PlanarMapSearch
 from scanchain.maps import SavedMap, open_saved_map
 from scanchain.settings import load_settings
-from tests.benchmarks.harness import command_line, poses_at, table, true_in_map
+from tests.benchmarks.harness import options_of, poses_at, table, true_in_map
 from tests.benchmarks.places import ENTRIES, REAL, prepared, whole_of
 
 NEAR_M, AROUND = 5.0, 12
@@ -108,7 +108,7 @@ def told(weights: NDArray[np.float64], ours: Matrix, others: Matrix) -> tuple[st
 
 
 def main() -> None:
-    cache = command_line(__doc__).parse_args().cache
+    cache = options_of(__doc__).cache
     runs = {log: whole_of(log, cache) for log in REAL}
     maps = {log: open_saved_map(run) for log, run in runs.items()}
     ours = np.array([each for name, entry in ENTRIES.items() if entry.log in REAL for each in right(name, cache)])

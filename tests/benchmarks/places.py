@@ -40,7 +40,7 @@ from scanchain.errors import ScanchainError
 from scanchain.maps import open_saved_map
 from scanchain.sessions.localizer import MapState
 from scanchain.trajectory import read_tum
-from tests.benchmarks.harness import command_line, poses_at, settings_of, table, true_in_map
+from tests.benchmarks.harness import options_of, poses_at, settings_of, table, true_in_map
 from tests.support import made
 from tests.support.scenes import DATA
 
@@ -221,15 +221,7 @@ def entering(name: str, options: argparse.Namespace) -> tuple[str, ...]:
 
 
 def main() -> None:
-    parser = command_line(__doc__)
-    parser.add_argument("--kind", nargs="+", choices=("2d", "3d"), default=["2d", "3d"])
-    parser.add_argument(
-        "--places", nargs="+", help="of the logs, maps are those of all; --late: names of its cases"
-    )
-    parser.add_argument("--late", action="store_true")
-    parser.add_argument("--seed", type=int, default=0, help="of the worlds")
-    parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE")
-    options = parser.parse_args()
+    options = options_of(__doc__, kind=["2d", "3d"], places=[], late=False, seed=0, set=[])
     if not options.late:
         all_pairs(options)
         return

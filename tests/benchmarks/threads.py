@@ -36,11 +36,11 @@ from scanchain.simulation import record
 from scanchain.simulation.drive import plan
 from scanchain.simulation.sensors import SENSORS, spinning
 from scanchain.threads import threads, use_threads
-from tests.benchmarks.harness import command_line, in_fresh_process
+from tests.benchmarks.harness import in_fresh_process, options_of
 from tests.support.scenes import DATA
 
 OURS = "plicp"
-METHODS = (OURS, "kiss-icp", "small-vgicp", "genz-icp")
+METHODS = [OURS, "kiss-icp", "small-vgicp", "genz-icp"]
 WITH_THREADS = ("kiss-icp", "small-vgicp", "small-gicp")  # that have a setting of that name; others use all cores
 REPEATS, WARM_UP = 3, 3
 STYLES = ("-", "--", "-.", ":")
@@ -123,14 +123,10 @@ def draw(path: Path, rows: list[tuple[str, int, int, float]]) -> None:
 
 
 def main() -> None:
-    parser = command_line(__doc__, cache=False)
-    parser.add_argument("--points", type=int, nargs="*", default=[10_000, 30_000, 100_000, 300_000, 1_000_000])
-    parser.add_argument("--log", nargs="*", default=[], help="a path, or a name in the folder of real 3D logs")
-    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2, 4, 8])
-    parser.add_argument("--methods", nargs="+", default=METHODS)
-    parser.add_argument("--scans", type=int, default=40)
-    parser.add_argument("--png", type=Path)
-    arguments = parser.parse_args()
+    arguments = options_of(
+        __doc__, cache=False, points=[10_000, 30_000, 100_000, 300_000, 1_000_000], log=[], threads=[1, 2, 4, 8],
+        methods=METHODS, scans=40, png=Path,
+    )  # fmt: skip
     print(f"{os.cpu_count()} cores, load average of the last minute {os.getloadavg()[0]:.1f}; quiet is below 2")
     print(
         f"{'log':24}{'points':>9}{'threads':>9}" + "".join(f"{f'{method} ms':>20}" for method in arguments.methods)

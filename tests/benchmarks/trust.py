@@ -39,17 +39,17 @@ from scanchain.evaluation import (
     expected_errors,
     motion_nees,
     pair,
+    path_length,
     read_relations,
 )
 from scanchain.evaluation.consistency import with_map_errors
-from scanchain.evaluation.errors import path_length
 from scanchain.evaluation.pairing import nearest
 from scanchain.logs import open_log
 from scanchain.settings import Override, load_settings
 from scanchain.simulation import SENSORS, WORLDS
 from scanchain.slam import Slam, SlamResult
 from scanchain.trajectory import write_tum, write_wide_tum
-from tests.benchmarks.harness import PLACES, choose_sequences, command_line, drive_of, table
+from tests.benchmarks.harness import PLACES, SEQUENCES, drive_of, options_of, table
 from tests.support.scenes import DATA
 
 WARM_UP_SCANS = 3
@@ -213,11 +213,9 @@ def summary(kind: str, lines: Sequence[Line]) -> None:
 
 
 def main() -> None:
-    parser = command_line(__doc__)
-    choose_sequences(parser, worlds=(*PLACES, *PLANAR), scans=150)
-    parser.add_argument("--seeds", default="1,2,3")
-    parser.add_argument("--real", action="store_true", help="the real logs alone")
-    arguments = parser.parse_args()
+    arguments = options_of(
+        __doc__, seeds="1,2,3", real=False, **SEQUENCES | {"worlds": ",".join((*PLACES, *PLANAR)), "scans": 150}
+    )
     row = table("sequence", "ATE m", "expected", "over", "NEES/k", "k")
     lines = []
     for world in [] if arguments.real else arguments.worlds.split(","):

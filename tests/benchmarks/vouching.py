@@ -310,12 +310,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
 
 
 def main() -> None:
-    parser = harness.command_line(__doc__)
-    parser.add_argument("--quick", action="store_true", help=f"every {QUICK}th case")
-    parser.add_argument("--only", default="", help="cases whose names hold all of these words")
-    parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--png", type=Path, help="ROC curves of the checks")
-    options = parser.parse_args()
+    options = harness.options_of(__doc__, quick=False, only="", jobs=1, png=Path)
     chosen = [case for case in cases() if all(word in case.name for word in options.only.split())]
     rows = _run_all(chosen[:: QUICK if options.quick else 1], options)
     table(rows)

@@ -12,7 +12,6 @@ compiles all kernels.
 
 from __future__ import annotations
 
-import argparse
 import os
 import subprocess
 import sys
@@ -23,17 +22,13 @@ from time import perf_counter
 from scanchain.logs import open_log
 from scanchain.odometry import Odometry
 from scanchain.settings import load_settings
-from tests.benchmarks.harness import KITTI, command_line
+from tests.benchmarks.harness import KITTI, options_of
 from tests.support.scenes import DATA, ROOT
 
 
 def main() -> None:
-    parser = command_line(__doc__, cache=False)
-    parser.add_argument("logs", nargs="*", type=Path, default=[DATA / "3d" / name for name in KITTI])
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--cold", action="store_true", help="time a first run too, which compiles")
-    parser.add_argument("--track", action="store_true", help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
+    logs = [DATA / "3d" / name for name in KITTI]
+    arguments = options_of(__doc__, "logs", cache=False, logs=logs, repeats=5, cold=False, track=False)
     if arguments.track:
         print(track(arguments.logs[0]))
     else:

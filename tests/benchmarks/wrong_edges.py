@@ -16,7 +16,7 @@ from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.data import Trajectory
 from scanchain.graph.g2o import read_g2o
-from tests.benchmarks.harness import ate_m, command_line, table
+from tests.benchmarks.harness import ate_m, options_of, table
 from tests.support.scenes import DATA
 
 KINDS = {"anywhere": 1, "nearby": 1, "groups": 5, "groups of 10": 10}  # how many agree with each other
@@ -92,13 +92,9 @@ def try_wrong_loops(path, share, kind, seed, robust="truncated"):
 
 
 def main():
-    parser = command_line(__doc__, cache=False)
-    parser.add_argument("graphs", nargs="*", default=("manhattan", "intel"))
-    parser.add_argument("--shares", type=float, nargs="+", default=(0.1, 0.3, 0.5))
-    parser.add_argument("--kinds", nargs="+", default=KINDS)
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--robust", default="truncated")
-    options = parser.parse_args()
+    graphs, shares = ["manhattan", "intel"], [0.1, 0.3, 0.5]
+    more = {"kinds": KINDS, "seeds": 3, "robust": "truncated"}
+    options = options_of(__doc__, "graphs", cache=False, graphs=graphs, shares=shares, **more)
     row = table("graph", "kind", "added", "seed", "wrong rejected", "true rejected", "ATE m", "without", "time s")
     for name, kind, share, seed in product(options.graphs, options.kinds, options.shares, range(options.seeds)):
         found = try_wrong_loops(DATA / "graphs" / f"{name}.g2o", share, kind, seed, options.robust)

@@ -9,9 +9,7 @@ from scanchain.graph.between import BetweenProblem
 from scanchain.graph.certificate import Minorants, dual_matrix, minorize
 from scanchain.graph.cholesky import BlockPattern
 from tests.support import naive_graph
-from tests.support.graphs import graph_of, published
-
-PLAIN = GraphConfig(robust="none")
+from tests.support.graphs import PLAIN, graph_of, published
 
 
 def minorant_values(bound, chi2, G_i, G_j, leap):
@@ -164,7 +162,7 @@ def test_the_minimum_and_its_certificate_do_not_depend_on_the_unit_of_the_inform
 
 def test_an_unfinished_answer_has_a_wider_gap():
     graph = published("sphere2500")
-    best = graph.optimize(GraphConfig(robust="none")).chi2_after
+    best = graph.optimize(PLAIN).chi2_after
     graph = published("sphere2500")
     early = graph.optimize(GraphConfig(robust="none", max_iterations=2))
     certificate = graph.certify()
@@ -196,7 +194,7 @@ def test_an_edge_that_cannot_be_bounded_costs_its_chi2_and_no_more():
             graph.add_edge(i, i + reach, lie.inverse(truth[i]) @ truth[i + reach] @ off, 400.0 * np.eye(3))
     contrary = lie.inverse(truth[3]) @ truth[30] @ lie.pose_2d(0.0, 0.0, 2.0)
     graph.add_edge(3, 30, contrary, 0.1 * np.eye(3))
-    graph.optimize(GraphConfig(robust="none"))
+    graph.optimize(PLAIN)
     certificate = graph.certify()
     price = graph.state().edge_chi2[-1]
     assert certificate.certified

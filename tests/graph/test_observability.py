@@ -10,9 +10,7 @@ from scanchain.graph.between import BetweenProblem
 from scanchain.graph.edge_checks import free_poses, ranks
 from scanchain.graph.pose_graph import PoseGraph
 from tests.support import naive_graph
-from tests.support.graphs import graph_of
-
-PLAIN = GraphConfig(robust="none")
+from tests.support.graphs import PLAIN, graph_of
 
 
 def chain(dimension, silent=None, loops=(), count=6):

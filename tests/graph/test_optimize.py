@@ -11,10 +11,9 @@ from scanchain.evaluation import absolute_error, expected_ate, pair
 from scanchain.graph.minimizer import Optimizer
 from scanchain.graph.odometry_errors import Explanation, Loosened
 from scanchain.graph.pose_graph import PoseGraph
-from tests.support.graphs import graph_of, published, ring
+from tests.support.graphs import PLAIN, graph_of, published, ring
 from tests.support.naive_graph import normal_equations
 
-PLAIN = GraphConfig(robust="none")
 BEST_HALF_CHI2 = {
     "manhattan": 1774.5205,
     "intel": 22.5021,

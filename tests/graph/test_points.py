@@ -7,10 +7,8 @@ from scipy.optimize import least_squares
 from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.graph.between import BetweenProblem
-from tests.support.graphs import graph_of
+from tests.support.graphs import PLAIN, graph_of
 from tests.support.naive_graph import dense
-
-PLAIN = GraphConfig(robust="none")
 
 
 def field(seed=0, noise=0.05, poses=12, points=5):

@@ -14,9 +14,8 @@ from scanchain.errors import InputError
 from scanchain.logs import open_log
 from scanchain.loops import LoopCloser
 from scanchain.runs.directory import POINTS_FILE
-from scanchain.runs.resume import Checkpoints, read_checkpoint
-from scanchain.runs.step_table import StepTable
 from scanchain.slam import Slam
+from tests.support.killing import taken_up
 from tests.support.scenes import configured, shared_data
 
 RECOGNIZER = '''
@@ -96,9 +95,7 @@ def test_a_recognizer_of_ones_own_closes_loops_and_survives_checkpoints_bit_by_b
         a, b = straight.process(scan), broken.process(scan)
         assert a.T_world_lidar.tobytes() == b.T_world_lidar.tobytes()
         if scan.index in breaks:
-            Checkpoints(folder, 10.0).write(broken, StepTable())
-            broken = read_checkpoint(folder, config).slam
-            broken.points.reopen(folder / POINTS_FILE)
+            broken = taken_up(broken, folder)
     a, b = straight.finish(), broken.finish()
     assert len(by_place(a.closures)) > 3
     assert [(c.target, c.source, c.verdict) for c in a.closures] == [

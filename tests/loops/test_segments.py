@@ -84,10 +84,6 @@ def test_a_long_log_that_hangs_on_a_map_by_next_to_no_information_is_optimized()
     assert np.allclose(graph.poses[1:3, :2, 2], graph.poses[399:401, :2, 2], atol=1e-6)
 
 
-def match_of(T):
-    return replace(first_match(T, np.empty((0, 2)), configured(2).matching), T_target_source=T)
-
-
 def square(half_m):
     """A room around the lidar."""
     along = np.linspace(-half_m, half_m, 200)
@@ -118,7 +114,7 @@ def up_to(index, keyframes):
 
 
 def tried(*sources, y_m=0.0, overlap=0.95, verdict=ClosureVerdict.ACCEPTED):
-    match = match_of(lie.pose_2d(0.0, y_m, 0.0))
+    match = first_match(lie.pose_2d(0.0, y_m, 0.0), np.empty((0, 2)), configured(2).matching)
     return [Closure(0, source, match, overlap, verdict, "") for source in sources]
 
 

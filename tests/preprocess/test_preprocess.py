@@ -16,7 +16,7 @@ CONFIG = PreprocessConfig(min_range_m=1.0, max_range_m=50.0, map_voxel_m=0.5)
 
 
 def scan_of(points, times_s=()):
-    return Scan(0, 0, 0, points.astype(np.float32), np.array(times_s, np.float32), 0, None)
+    return Scan.of(points.astype(np.float32), 0.0, np.array(times_s, np.float32))
 
 
 def some_scan(dimension=3, n=2000, with_times=True):

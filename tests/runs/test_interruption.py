@@ -32,6 +32,7 @@ from tests.support.killing import (
     partial,
     same_result,
     start,
+    taken_up,
     wait_for_steps,
 )
 from tests.support.recordings import column
@@ -155,19 +156,15 @@ def test_a_chain_that_is_put_down_and_taken_up_places_every_scan_to_the_same_bit
     office, tmp_path, name, count, changes
 ):
     log = open_log(office if name == "office" else shared_data(name))
-    scans = list(islice(log.scans(), count))
     config = configured(log.dimension, changes)
-    points_file = tmp_path / POINTS_FILE
-    straight, broken = Slam(config, log.T_base_lidar), Slam(config, log.T_base_lidar, points_file)
+    straight, broken = Slam(config, log.T_base_lidar), Slam(config, log.T_base_lidar, tmp_path / POINTS_FILE)
     breaks = set(random.Random(2).sample(range(count), 8)) | {0}
-    for scan in scans:
+    for scan in islice(log.scans(), count):
         a, b = straight.process(scan), broken.process(scan)
         assert a.T_world_lidar.tobytes() == b.T_world_lidar.tobytes()
         assert a.match.information.tobytes() == b.match.information.tobytes()
         if scan.index in breaks:
-            Checkpoints(tmp_path, 10.0).write(broken, StepTable())
-            broken = read_checkpoint(tmp_path, config).slam
-            broken.points.reopen(points_file)
+            broken = taken_up(broken, tmp_path)
     a, b = straight.finish(), broken.finish()
     assert len(a.closures) == len(b.closures)
     assert len(a.closures) > 0 or not config.loops.enabled
@@ -191,9 +188,7 @@ def test_an_optimization_beside_ends_alike_after_a_break(office, tmp_path, monke
         assert (a.graph is None) == (b.graph is None)
         if broken.placement.schedule.beside is not None and not is_beside:
             breaks += 1
-            Checkpoints(tmp_path, 10.0).write(broken, StepTable())
-            broken = read_checkpoint(tmp_path, config).slam
-            broken.points.reopen(tmp_path / POINTS_FILE)
+            broken = taken_up(broken, tmp_path)
     assert breaks > 0
     assert straight.finish().trajectory.poses.tobytes() == broken.finish().trajectory.poses.tobytes()
 

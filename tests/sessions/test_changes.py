@@ -197,32 +197,20 @@ def test_a_comparison_names_both_maps_and_is_no_run_to_check_or_draw(tmp_path, c
 
 def updated_rooms(*parts: Part):
     """Sessions of 8 keyframes each, brought up to date."""
-    keyframes = [
-        replace(keyframe, stamp_ns=start + k)
-        for start, each in zip((0, 100, 200), parts, strict=False)
-        for k, keyframe in enumerate(each.keyframes)
-    ]
+    keyframes = [replace(k, stamp_ns=100 * n + k.stamp_ns) for n, each in enumerate(parts) for k in each.keyframes]
     numbers = np.repeat(np.arange(len(parts)), [len(each.keyframes) for each in parts])
-    starts = zip((0, 100, 200), parts, strict=False)
-    sessions = tuple(Session(each.name, start, start + 9, 8) for start, each in starts)
+    sessions = tuple(Session(each.name, 100 * n, 100 * n + 9, 8) for n, each in enumerate(parts))
     none = np.zeros(len(keyframes), np.int64)
     merged = SavedMap(Path("map"), 2, tuple(keyframes), numbers, sessions, NO_EDGES)
     joined = Joined((0,), tuple(keyframes), none, NO_EDGES)
     return keyframes, updated(MergedMap(joined, merged, (), none), load_settings(2).config)
 
 
-def in_world(keyframe: Keyframe) -> np.ndarray:
-    return lie.transform(keyframe.T_odom_lidar, keyframe.points)
-
-
-def on_box(points: np.ndarray) -> np.ndarray:
-    return (np.abs(points - BOX) < 0.32).all(axis=1)
-
-
 def test_what_newer_sessions_saw_through_is_removed_from_older_ones_and_nothing_else():
     before, after = updated_rooms(part("monday", room(BOX)), part("tuesday", room(BOX)), part("friday", room()))
     for k, (old, new) in enumerate(zip(before, after.saved.keyframes, strict=True)):
-        is_box = on_box(in_world(old)) & (k < 16)
+        away = np.abs(lie.transform(old.T_odom_lidar, old.points) - BOX)
+        is_box = (away < 0.32).all(axis=1) & (k < 16)
         assert np.array_equal(new.points, old.points[~is_box])
         assert after.removed[k] == is_box.sum()
     assert after.removed[:8].sum() > 100

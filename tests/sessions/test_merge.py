@@ -12,7 +12,6 @@ import scanchain as sc
 from scanchain import lie
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Trajectory
 from scanchain.errors import InputError, ScanchainError
-from scanchain.evaluation import absolute_error, pair
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.planar_map_search import PlanarMapSearch
 from scanchain.loops.verification import Verifier
@@ -24,6 +23,7 @@ from scanchain.sessions.merged_map import session_names
 from scanchain.sessions.merging import merge
 from scanchain.trajectory import read_tum
 from scanchain_viz.pictures.maps import draw_run
+from tests.benchmarks import harness
 from tests.support import made
 
 PARTS = {"morning": (0.0, 18.0), "noon": (6.0, 24.0), "evening": (14.0, 34.0)}
@@ -58,8 +58,7 @@ def ate_m(out, truth, names):
     """ATE over the scans of all sessions, rigidly aligned as one."""
     parts = [read_tum(out / f"{name}.tum") for name in names]
     stamps_ns, poses = np.concatenate([part.stamps_ns for part in parts]), np.concatenate([p.poses for p in parts])
-    true = Trajectory(truth.stamps_ns, lie.lift(truth.poses))
-    return absolute_error(pair(Trajectory(stamps_ns, poses), true)).translation_m.rmse
+    return harness.ate_m(Trajectory(stamps_ns, poses), Trajectory(truth.stamps_ns, lie.lift(truth.poses)))
 
 
 def test_sessions_with_unknown_starts_become_one_certified_map(runs, merged):
@@ -224,16 +223,12 @@ def test_keyframes_held_as_one_pose_leave_the_cost_as_it_is(dimension):
     roots = rng.normal(0.0, 1.0, (9, k, k))
     information = roots @ np.swapaxes(roots, 1, 2) + np.eye(k)
     edges = Edges(pairs, measured, information, np.zeros(9, np.bool_), np.ones(9))
-    joined = _joined(poses, edges)
+    keyframes = tuple(Keyframe(i, i, i, None, pose, float(i)) for i, pose in enumerate(poses))
+    joined = Joined((0, 1), keyframes, np.array([0, 0, 0, 1, 1, 1, 1]), edges)
     held, whole = graph_of(joined, held=0), graph_of(joined)
     assert len(held) == 5
     inside = (pairs < 3).all(axis=1)
     assert np.allclose(held.state().edge_chi2, whole.state().edge_chi2[~inside], rtol=1e-9)
-
-
-def _joined(poses, edges):
-    keyframes = tuple(Keyframe(i, i, i, None, pose, float(i)) for i, pose in enumerate(poses))
-    return Joined((0, 1), keyframes, np.array([0, 0, 0, 1, 1, 1, 1]), edges)
 
 
 def _room(dimension, half_m):

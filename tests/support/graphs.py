@@ -3,9 +3,12 @@
 import numpy as np
 
 from scanchain import lie
+from scanchain.config import GraphConfig
 from scanchain.graph.g2o import read_g2o
 from scanchain.graph.pose_graph import PoseGraph
 from tests.support.scenes import shared_data
+
+PLAIN = GraphConfig(robust="none")
 
 
 def published(name, **options):

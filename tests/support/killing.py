@@ -20,7 +20,8 @@ from scanchain.errors import InputError
 from scanchain.graph.g2o import read_g2o
 from scanchain.maps import MAP_FOLDER, open_saved_map, read_map, read_ply
 from scanchain.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RECORDING_FILE
-from scanchain.runs.resume import read_checkpoint
+from scanchain.runs.resume import Checkpoints, read_checkpoint
+from scanchain.runs.step_table import StepTable
 from scanchain.settings import load_settings
 from scanchain.trajectory import read_kitti, read_tum
 from scanchain_viz.recording import entities
@@ -176,6 +177,14 @@ def _left(out, after_s):
     names = {path.name for folder in folders for path in folder.iterdir()}
     where = next((what for name, what in _REACHED.items() if name in names), "before its directory was there")
     return Killed(after_s, where, steps)
+
+
+def taken_up(slam, folder):
+    """A chain, its points in a folder, that was put down there and is taken up again."""
+    Checkpoints(folder, 10.0).write(slam, StepTable())
+    again = read_checkpoint(folder, slam.config).slam
+    again.points.reopen(folder / POINTS_FILE)
+    return again
 
 
 def config_of(folder):
