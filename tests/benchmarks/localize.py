@@ -26,8 +26,8 @@ own.
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
+import os
+import tempfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -46,6 +46,7 @@ from scanchain.evaluation import path_length
 from scanchain.logs import open_log
 from scanchain.maps import SavedMap, open_saved_map
 from scanchain.odometry import Odometry
+from scanchain.processes import Limits, run_within
 from scanchain.sessions.localizer import Localizer
 from scanchain.settings import load_settings
 from scanchain.simulation.drive import plan
@@ -160,20 +161,13 @@ def _mapped(options: argparse.Namespace, mapped: Path, log: Path) -> Case:
     return Case(prior, log, true_in_map(prior, _truth(mapped), _truth(log).poses)[0])
 
 
-def _print_peak(*arguments: str) -> None:
-    """Run a command of scanchain; the peak of its resident memory, its exit code 1 being a verdict.
-
-    A small process starts it, for a child begins with the peak of its parent.
-    """
-    start = (
-        "import resource, subprocess, sys\n"
-        "code = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL).returncode\n"
-        "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)\n"
-        "sys.exit(code > 1)"
-    )
-    command = [sys.executable, "-c", start, sys.executable, "-m", "scanchain", *arguments]
-    kibibytes = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
-    print(f"{arguments[0]}: {int(kibibytes) / 1024.0:.0f} MiB at most", flush=True)
+def _print_peak(*words: str) -> None:
+    """Run a command of scanchain; the peak of its resident memory, its exit code 1 being a verdict."""
+    with tempfile.TemporaryDirectory() as folder:
+        unlimited, said = Limits(np.inf, np.inf), Path(folder) / "said"
+        ended = run_within(unlimited, "scanchain", words, os.environ, output=said, interval_s=0.05)
+    assert ended.code in (0, 1), ended
+    print(f"{words[0]}: {ended.peak_mib:.0f} MiB at most", flush=True)
 
 
 CASES: dict[str, Callable[[argparse.Namespace], Case]] = {

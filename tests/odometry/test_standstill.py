@@ -45,11 +45,6 @@ def test_a_log_begins_at_a_standstill_that_averages_the_matches(dimension):
     assert np.abs(x).max() < 0.001
 
 
-def test_a_first_motion_of_meters_is_no_standstill():
-    _, stands = held(Standstill(3), np.arange(1.0, 30.0))
-    assert not stands.any()
-
-
 def test_a_standstill_after_a_motion_is_found_within_a_second():
     x = np.append(np.arange(1.0, 20.0), np.full(30, 20.0))
     _, stands = held(Standstill(3), x)

@@ -68,6 +68,13 @@ def undisturbed(request, office, whole, tmp_path_factory):
     return log, out
 
 
+def after(code, *words, **options):
+    """A command whose process runs some code first."""
+    before = "import os, signal, sys, time\nfrom scanchain.__main__ import main\n"
+    whole = f"{before}{code}\nsys.exit(main(sys.argv[1:]))"
+    return subprocess.Popen([sys.executable, "-c", whole, *words], cwd=ROOT, **options)
+
+
 def left_after(steps, log, out, *words):
     """Kill a run of a log once it has so many steps in its checkpoint."""
     child = start(log, out, *words)
@@ -117,17 +124,14 @@ def test_killed_while_it_takes_up_the_recording_a_run_goes_on_to_the_same_one(of
         ("scanchain.runs.resume", "Checkpoints", "write"),
     ):
         dying = f"""
-import os, signal, sys
-from scanchain.__main__ import main
 from {module} import {kind}
 act = {kind}.{method}
 def dying(self, *values):
     act(self, *values)
     os.kill(os.getpid(), signal.SIGKILL)
 {kind}.{method} = dying
-sys.exit(main(sys.argv[1:]))
 """
-        assert subprocess.run([sys.executable, "-c", dying, *words], cwd=ROOT).returncode == -signal.SIGKILL
+        assert after(dying, *words).wait() == -signal.SIGKILL
         assert list(partial(out).glob("recording.part_*.rrd"))
     assert start(office, out, *RECORDED, "--resume").wait() == 0
     same_result(out, whole)
@@ -193,22 +197,18 @@ def test_an_optimization_beside_ends_alike_after_a_break(office, tmp_path, monke
     assert straight.finish().trajectory.poses.tobytes() == broken.finish().trajectory.poses.tobytes()
 
 
-def waiting_at(scan):
-    """The command line as a script that dawdles before that scan, then says "there" and waits."""
-    return f"""
-import sys, time
-from scanchain.__main__ import main
+# dawdles before scan 100, then says "there" and waits
+WAITING = """
 from scanchain.slam import Slam
 place = Slam.place
 def waiting(self, located):
-    if located.tracked.scan.index == {scan} - 1:
+    if located.tracked.scan.index == 99:
         time.sleep(0.2)
-    if located.tracked.scan.index == {scan}:
+    if located.tracked.scan.index == 100:
         print("there", flush=True)
         time.sleep(60)
     return place(self, located)
 Slam.place = waiting
-sys.exit(main(sys.argv[1:]))
 """
 
 
@@ -228,13 +228,7 @@ def test_ctrl_c_ends_a_run_in_good_order_with_exit_code_1(office, tmp_path):
 def test_ctrl_c_twice_ends_a_run_at_once_and_it_can_go_on(office, whole, tmp_path):
     out = tmp_path / "run"
     words = ["run", str(office), "--out", str(out), *LOOPING, "--checkpoint", "0", "--rerun", "off"]
-    child = subprocess.Popen(
-        [sys.executable, "-c", waiting_at(100), *words],
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    child = after(WAITING, *words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert child.stdout.readline() == "there\n"
     child.send_signal(signal.SIGINT)
     time.sleep(0.5)
@@ -278,18 +272,14 @@ def test_resuming_is_refused_where_something_else_was_run(office, call, tmp_path
 
 @pytest.mark.parametrize(("limit_kib", "words"), [(64, LIVELY), (400, RECORDED)])
 def test_a_full_disk_is_an_error_and_what_is_on_it_is_whole(office, tmp_path, limit_kib, words):
-    full = f"""
-import resource, signal, sys
-from scanchain.__main__ import main
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, ({limit_kib} << 10, {limit_kib} << 10))
-sys.exit(main(sys.argv[1:]))
-"""
+    full = f"signal.signal(signal.SIGXFSZ, signal.SIG_IGN); limit = {limit_kib} << 10\n"
+    full += "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))\n"
     out = tmp_path / "run"
     words = ["run", str(office), "--out", str(out), *words]
-    child = subprocess.run([sys.executable, "-c", full, *words], cwd=ROOT, capture_output=True, text=True)
-    assert child.returncode == 1 and child.stderr.startswith("error: ") and child.stderr.count("\n") == 1
-    assert "File too large" in child.stderr and not out.exists()
+    child = after(full, *words, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    errors = child.communicate()[1]
+    assert child.returncode == 1 and errors.startswith("error: ") and errors.count("\n") == 1
+    assert "File too large" in errors and not out.exists()
     folder = partial(out)
     assert b'"complete": false' in (folder / "run.json").read_bytes()
     for table in folder.glob("*.parquet"):

@@ -25,6 +25,8 @@ from scanchain.verdict import (
     wheel_bound_m,
 )
 from scanchain_viz.colors import STRETCH_COLORS
+from tests.benchmarks import vouching
+from tests.benchmarks.vouching_logs import Case, LogSpec
 from tests.support.recordings import drive
 
 N, STEP_M, INTERVAL_S = 1200, 0.1, 0.2
@@ -478,3 +480,16 @@ def test_a_stretch_shorter_than_a_digit_of_its_times_has_one_time():
 
 def test_every_kind_of_stretch_has_a_color():
     assert set(STRETCH_COLORS) == set(Kind) and len(set(STRETCH_COLORS.values())) == len(Kind)
+
+
+def test_a_kidnapping_is_wrong_and_flagged_and_the_rest_right(tmp_path, capsys):
+    log = LogSpec("office", "lms-270", "kidnapped", duration_s=8.0, dimension=2)
+    case = Case(log, "no wheels")
+    (row,) = vouching.measured([case], tmp_path)
+    counts = row["counts"]
+    assert (counts["wrong flagged"] >= 5, counts["wrong silent"]) == (True, 0)
+    assert counts["right ok"] >= 40 and row["verdict"] != "trustworthy"
+    (again,) = vouching.measured([case], tmp_path)
+    assert again == row
+    vouching.table([row])
+    assert f"| 2D kidnapped | 1 | {counts['wrong flagged']} of" in capsys.readouterr().out
