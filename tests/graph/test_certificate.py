@@ -9,7 +9,7 @@ from scanchain.graph.between import BetweenProblem
 from scanchain.graph.certificate import Minorants, dual_matrix, minorize
 from scanchain.graph.cholesky import BlockPattern
 from tests.support import naive_graph
-from tests.support.graphs import PLAIN, graph_of, published
+from tests.support.graphs import PLAIN, closed_ring, graph_of, published
 
 
 def minorant_values(bound, chi2, G_i, G_j, leap):
@@ -112,17 +112,6 @@ def test_the_two_numbers_that_the_bound_rests_on():
 def _inverse_v(phi):
     columns = [lie.exp(np.array([*axis, *phi]))[:3, 3] for axis in np.eye(3)]
     return np.linalg.inv(np.array(columns).T)
-
-
-def closed_ring(dimension, count, turns, noise=0.0):
-    """Poses that each measure the next one where they are, the last the first; they start wound up some turns."""
-    k = 3 if dimension == 2 else 6
-    rng = np.random.default_rng(0)
-    twists = np.zeros((count, k))
-    twists[:, -1] = 2.0 * np.pi * turns * np.arange(count) / count
-    edges = np.stack([np.arange(count), (np.arange(count) + 1) % count], axis=1)
-    measured = lie.exp(noise * rng.normal(size=(count, k)))
-    return graph_of(lie.exp(twists), edges, measured, np.diag([100.0] * dimension + [1e4] * (k - dimension)))
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])

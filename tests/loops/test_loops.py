@@ -6,7 +6,6 @@ from scipy.sparse.csgraph import csgraph_from_dense, dijkstra
 
 from scanchain import lie
 from scanchain.data import ClosureVerdict
-from scanchain.graph.pose_graph import PoseGraph
 from scanchain.kernels.graph.paths import path_lengths
 from scanchain.logs import open_log
 from scanchain.loops import LoopCloser, closer
@@ -15,18 +14,15 @@ from scanchain.runs.closures import final_verdicts
 from tests.benchmarks.harness import ate_m
 from tests.benchmarks.loops import is_true, true_poses
 from tests.support.drifting import drifting_slam, stretched
+from tests.support.graphs import graph_of
 from tests.support.scenes import configured, shared_data
 
 
 def chain(count, sigma_m=0.01):
     """Keyframes a meter apart on a straight line."""
-    graph = PoseGraph(2)
+    poses, edges = [lie.pose_2d(float(k), 0.0, 0.0) for k in range(count)], [(k, k + 1) for k in range(count - 1)]
     information = np.diag([sigma_m**-2.0, sigma_m**-2.0, 1e6])
-    for index in range(count):
-        graph.add_pose(lie.pose_2d(float(index), 0.0, 0.0), index)
-        if index:
-            graph.add_edge(index - 1, index, lie.pose_2d(1.0, 0.0, 0.0), information)
-    return graph
+    return graph_of(poses, edges, [lie.pose_2d(1.0, 0.0, 0.0)] * len(edges), information)
 
 
 @pytest.mark.parametrize(

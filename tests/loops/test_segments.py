@@ -20,16 +20,14 @@ from scanchain.placement import edge_information
 from scanchain.runs.closures import final_verdicts
 from scanchain.slam import Slam
 from tests.benchmarks.harness import ate_m
+from tests.support.graphs import graph_of
 from tests.support.scenes import configured, shared_data, stored
 
 
-def graph_of(count, loops=()):
-    graph = PoseGraph(2)
-    for index in range(count):
-        graph.add_pose(lie.identity(2), index)
-    for i, j in loops:
-        graph.add_edge(i, j, lie.identity(2), np.eye(3), is_loop=True)
-    return graph
+def joined(count, loops=()):
+    """So many keyframes, and loops between some of them."""
+    one = [lie.identity(2)]
+    return graph_of(one * count, loops, one * len(loops), np.eye(3), [True] * len(loops))
 
 
 def connected(segments, graph):
@@ -40,13 +38,13 @@ def connected(segments, graph):
 
 def test_a_new_segment_is_connected_to_nothing_until_a_loop_does_it():
     segments = Segments()
-    assert connected(segments, graph_of(5)).all()
+    assert connected(segments, joined(5)).all()
     segments.start(3)
     segments.start(6)
-    assert connected(segments, graph_of(9)).tolist() == [False] * 6 + [True] * 3
-    assert connected(segments, graph_of(9, [(1, 4)])).tolist() == [False] * 6 + [True] * 3
-    assert connected(segments, graph_of(9, [(1, 7)])).tolist() == [True] * 3 + [False] * 3 + [True] * 3
-    assert connected(segments, graph_of(9, [(4, 7), (1, 4)])).all()
+    assert connected(segments, joined(9)).tolist() == [False] * 6 + [True] * 3
+    assert connected(segments, joined(9, [(1, 4)])).tolist() == [False] * 6 + [True] * 3
+    assert connected(segments, joined(9, [(1, 7)])).tolist() == [True] * 3 + [False] * 3 + [True] * 3
+    assert connected(segments, joined(9, [(4, 7), (1, 4)])).all()
 
 
 def test_a_submap_holds_keyframes_of_its_own_segment_alone():
@@ -121,7 +119,7 @@ def tried(*sources, y_m=0.0, overlap=0.95, verdict=ClosureVerdict.ACCEPTED):
 def test_keyframes_that_fit_one_place_join_a_log_to_a_map_once_they_are_enough():
     keyframes = keyframes_in([4.0] * 8)
     evidence, segments = begun()
-    graph = graph_of(11)
+    graph = joined(11)
     assert not evidence.collect(tried(3, overlap=0.61), *up_to(3, keyframes)) and connected(segments, graph).all()
     assert not evidence.collect(tried(4, overlap=0.61), *up_to(4, keyframes))
     assert not evidence.collect(tried(5, y_m=3.0), *up_to(5, keyframes)), "it is at another pose"
@@ -250,14 +248,10 @@ def test_a_robot_that_was_carried_to_another_corridor_like_one_before_stays_apar
 
 
 def test_poses_beyond_a_motion_that_nothing_measured_are_still_optimized():
-    graph, step = PoseGraph(2), lie.pose_2d(1.0, 0.0, 0.0)
-    nothing = np.zeros((3, 3))
-    for index in range(200):
-        graph.add_pose(lie.pose_2d(float(index), 0.0, 0.0), index)
-    for index in range(199):
-        lost = 19 if index in (0, 120) else 0
-        information = edge_information(nothing, 1.0 * lost, 0.2 * lost) if lost else 1e5 * np.eye(3)
-        graph.add_edge(index, index + 1, step, information)
+    information = np.tile(1e5 * np.eye(3), (199, 1, 1))
+    information[[0, 120]] = edge_information(np.zeros((3, 3)), 19.0, 3.8)
+    chain, poses = [(k, k + 1) for k in range(199)], [lie.pose_2d(float(k), 0.0, 0.0) for k in range(200)]
+    graph = graph_of(poses, chain, [lie.pose_2d(1.0, 0.0, 0.0)] * 199, information)
     for index in range(150, 160):
         graph.add_edge(index, index + 30, lie.pose_2d(30.0, 0.0, 0.0), 1e5 * np.eye(3), is_loop=True)
     assert graph.optimize(configured(2).graph, initialize="given").converged

@@ -44,3 +44,14 @@ def ring(dimension, count=12, *, noise=0.0, seed=0):
     is_loop = np.arange(count) == count - 1
     graph = graph_of(poses, edges, [*measured, lie.inverse(true[-1])], 100.0 * np.eye(k), is_loop)
     return graph, np.array(true)
+
+
+def closed_ring(dimension, count, turns, noise=0.0):
+    """Poses that each measure the next one where they are, the last the first; they start wound up some turns."""
+    k = 3 if dimension == 2 else 6
+    rng = np.random.default_rng(0)
+    twists = np.zeros((count, k))
+    twists[:, -1] = 2.0 * np.pi * turns * np.arange(count) / count
+    edges = np.stack([np.arange(count), (np.arange(count) + 1) % count], axis=1)
+    measured = lie.exp(noise * rng.normal(size=(count, k)))
+    return graph_of(lie.exp(twists), edges, measured, np.diag([100.0] * dimension + [1e4] * (k - dimension)))
