@@ -19,11 +19,11 @@ from scanchain.config import GraphConfig
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.g2o import read_g2o, write_g2o
 from tests.benchmarks.harness import options_of, table
+from tests.support.graphs import BEST
 from tests.support.scenes import DATA
 
 SHORT = (("LM", "levenberg-marquardt"), ("GN", "gauss-newton"))
 GRAPHS = ["manhattan", "intel", "MIT", "smallGrid3D", "sphere2500", "torus3D"]
-BEST = {"manhattan": 1774.5205, "intel": 22.5021, "MIT": 20.6035, "sphere2500": 675.701, "torus3D": 12117.6}
 SLOW_S = 2.0  # of a method that is run once only
 
 

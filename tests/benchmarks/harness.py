@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +27,6 @@ LIDARS = [name for name, sensor in SENSORS.items() if sensor.dimension == 3]
 PLACES = [name for name, world in WORLDS.items() if world.sensor in LIDARS]
 SEQUENCES = {"worlds": ",".join(PLACES), "sensors": ",".join(LIDARS), "scans": 300}  # simulated: options
 KITTI = ("kitti_0005_first60.mcap", "kitti_0001_first54.mcap")
-
-Answer = TypeVar("Answer")
 
 
 def options_of(text: str | None, argument: str = "", *, cache: bool = True, **defaults: object) -> Namespace:
@@ -77,7 +74,7 @@ def recorded(name: str, drive: Drive, cache: Path) -> Path:
     return made.recorded(name, lambda draft: record(drive, draft, force=True), cache)
 
 
-def in_fresh_process(function: Callable[..., Answer], *arguments: object) -> Answer:
+def in_fresh_process(function: Callable, *arguments: object) -> object:
     """The function's answer from a process of its own: GenZ-ICP remembers its last log, others may crash.
 
     Threads wait asleep there: small_gicp's spin by default, and where somebody else has one of two cores they

@@ -41,7 +41,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from scanchain import lie
-from scanchain.data import Matrix, Scan, Trajectory
+from scanchain.data import Matrix, Scan
 from scanchain.evaluation import path_length
 from scanchain.logs import open_log
 from scanchain.maps import SavedMap, open_saved_map
@@ -101,12 +101,6 @@ class Outcome:
 # ---------------------------------------------------------------- cases
 
 
-def _truth(log: Path) -> Trajectory:
-    truth = open_log(log).ground_truth()
-    assert truth is not None
-    return truth
-
-
 def later_part(name: str, end_s: float, options: argparse.Namespace) -> Case:
     """A log, in the map of its first seconds."""
     log = DATA / "2d" / f"{name}.mcap"
@@ -158,7 +152,8 @@ def city(options: argparse.Namespace) -> Case:
 
 def _mapped(options: argparse.Namespace, mapped: Path, log: Path) -> Case:
     prior = open_saved_map(made.run_of(mapped, options.cache, mapped.stem))
-    return Case(prior, log, true_in_map(prior, _truth(mapped), _truth(log).poses)[0])
+    truths = open_log(mapped).ground_truth(), open_log(log).ground_truth().poses
+    return Case(prior, log, true_in_map(prior, *truths)[0])
 
 
 def _print_peak(*words: str) -> None:
@@ -193,10 +188,9 @@ CASES: dict[str, Callable[[argparse.Namespace], Case]] = {
 def starts_of(case: Case, log_scans: list[Scan], count: int) -> list[int]:
     """Scans from which the log begins."""
     if case.prior.dimension == 3:
-        length = len(_truth(case.log))
+        length = len(open_log(case.log).ground_truth())
         return np.linspace(0, int(length * 0.9), count).astype(int).tolist()  # so that there is path left
     surfaces = KDTree(np.vstack([lie.transform(k.T_odom_lidar, k.points[::2]) for k in case.prior.keyframes]))
-    assert case.T_map_lidar is not None
     poses = lie.flatten(case.T_map_lidar)
     some = np.arange(case.first, len(log_scans), 5)
     share = np.array([

@@ -74,9 +74,7 @@ def undrifted(path: Path) -> Trajectory:
     """The reference of a log: the truth in space, the log as it is in the plane."""
     log = open_log(path)
     if log.dimension == 3:
-        truth = log.ground_truth()
-        assert truth is not None
-        return truth
+        return log.ground_truth()
     slam = drifting_slam(load_settings(2).config, log.T_base_lidar, stretched(0.0, 0.0))
     for scan in log.scans():
         slam.process(scan)

@@ -73,9 +73,7 @@ def right(name: str, cache: Path) -> Iterator[tuple[float, float, float]]:
     for keyframe in whole.keyframes[::2]:
         expected, away_m = true_in_map(saved, map_truth, poses_at(truth, np.array([keyframe.stamp_ns])))
         after_s = (keyframe.stamp_ns - begin_ns) * 1e-9
-        if away_m[0] < NEAR_M and float(str(options["log__start_s"])) <= after_s <= float(
-            str(options["log__end_s"])
-        ):
+        if away_m[0] < NEAR_M and options["log__start_s"] <= after_s <= options["log__end_s"]:
             off = lie.pose_2d(*random.normal(0.0, (0.3, 0.3, 0.03)).tolist())
             found = shown.of(keyframe, lie.flatten(expected[0]) @ off)
             yield from [] if found is None else [found]

@@ -111,7 +111,6 @@ def placed(
 def line(name: str, path: Path, overrides: tuple[Override, ...] = NO_WHEELS, **of_log: object) -> Line:
     """A log with a truth of its own."""
     result, steps, _, expected, truth = placed(path, overrides, **of_log)
-    assert truth is not None
     return judged(name, result, steps, expected, truth)
 
 

@@ -11,25 +11,17 @@ from scanchain.evaluation import absolute_error, expected_ate, pair
 from scanchain.graph.minimizer import Optimizer
 from scanchain.graph.odometry_errors import Explanation, Loosened
 from scanchain.graph.pose_graph import PoseGraph
-from tests.support.graphs import PLAIN, graph_of, published, ring
+from tests.support.graphs import BEST, PLAIN, graph_of, published, ring
 from tests.support.naive_graph import normal_equations
-
-BEST_HALF_CHI2 = {
-    "manhattan": 1774.5205,
-    "intel": 22.5021,
-    "MIT": 20.6035,
-    "sphere2500": 675.701,
-    "torus3D": 12117.6,
-}
 
 
 @pytest.mark.parametrize("optimizer", ["levenberg-marquardt", "gauss-newton"])
-@pytest.mark.parametrize("name", list(BEST_HALF_CHI2))
+@pytest.mark.parametrize("name", list(BEST))
 def test_the_published_graphs_reach_the_best_known_chi2_from_their_files_and_are_certified(name, optimizer):
     graph = published(name)
     answer = graph.optimize(GraphConfig(optimizer=optimizer))
     assert answer.converged, answer.reason
-    assert 0.5 * answer.chi2_after == pytest.approx(BEST_HALF_CHI2[name], rel=2e-5)
+    assert 0.5 * answer.chi2_after == pytest.approx(BEST[name], rel=2e-5)
     certificate = graph.certify()
     assert certificate.certified and certificate.chi2 == pytest.approx(answer.chi2_after, rel=1e-9)
     assert certificate.relative_gap < 1e-6
@@ -56,7 +48,7 @@ def test_a_poor_guess_is_replaced_by_the_chordal_one_and_a_good_one_kept():
 def test_every_way_to_start_ends_in_the_same_minimum(initialize):
     answer = published("intel").optimize(PLAIN, initialize=initialize)
     assert answer.initialization == initialize
-    assert 0.5 * answer.chi2_after == pytest.approx(BEST_HALF_CHI2["intel"], rel=2e-5)
+    assert 0.5 * answer.chi2_after == pytest.approx(BEST["intel"], rel=2e-5)
 
 
 def test_a_hand_made_triangle_shows_that_T_ij_maps_frame_j_into_frame_i(dimension):

@@ -9,6 +9,7 @@ from scanchain.graph.pose_graph import PoseGraph
 from tests.support.scenes import shared_data
 
 PLAIN = GraphConfig(robust="none")
+BEST = {"manhattan": 1774.5205, "intel": 22.5021, "MIT": 20.6035, "sphere2500": 675.701, "torus3D": 12117.6}  # ½χ²
 
 
 def published(name, **options):
