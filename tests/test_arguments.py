@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import scanchain as sc
 from scanchain import (
     Config,
     InputError,
@@ -26,8 +27,9 @@ from scanchain import (
     rigid_transform,
     write_tum,
 )
-from scanchain.config import GraphConfig, LocalMapConfig, MatchingConfig
+from scanchain.config import GraphConfig, LocalMapConfig, MapsConfig, MatchingConfig
 from scanchain.evaluation import absolute_error, pair
+from scanchain.maps import OccupancyGrid, PointMap
 
 CALLS = 200
 
@@ -75,6 +77,13 @@ def finished():
 ROOM = place(3, 4000, np.random.default_rng(0))
 FLAT = place(2, 2000, np.random.default_rng(0))
 I3, I4 = np.eye(3), np.eye(4)
+RECORDS = np.zeros(10, [("x", np.float32), ("y", np.float32), ("z", np.float32), ("intensity", np.float32)])
+
+
+class Open3DCloud:
+    """A cloud as Open3D has it."""
+
+    points = np.ones((10, 3))
 
 
 @pytest.mark.parametrize(
@@ -111,6 +120,34 @@ I3, I4 = np.eye(3), np.eye(4)
         (lambda: write_tum("/nope/x", Trajectory([0], I4[None])), "/nope/x: cannot be written .*folder"),
         (lambda: write_tum("a.tum", "abc"), "trajectory is 'abc'; wanted a Trajectory"),
         (lambda: Trajectory(np.arange(3), np.zeros((2, 4, 4))), r"poses has the shape \(2, 4, 4\)"),
+        (lambda: Odometry(dimension=2, T_base_lidar=I4), r"dimension is 2, but T_base_lidar .* SE\(3\)"),
+        (lambda: Odometry(dimension=2).track(ROOM, 0.0), "has 3D points"),
+        (lambda: Odometry().track(ROOM, 1_700_000_000_000_000_000), "stamp_s is 17"),
+        (lambda: Slam(Config(), dimension=2), r"made for 3D .* start from load_settings\(2\).config"),
+        (lambda: sc.downsample(ROOM, 0.0), "voxel_size_m is 0"),
+        (lambda: sc.downsample(RECORDS, 1.0), r"np\.stack\(\[points\[axis\] for axis in 'xyz'\], axis=1\)"),
+        (lambda: sc.downsample(ROOM + 5.4e6, 0.002), r"points lie up to 5.4e\+06 m from the origin"),
+        (lambda: sc.downsample(np.array([[0.0, 0.0], [2.0**21, 0.0]]), 1.0), r"2.1e\+06 m apart"),
+        (lambda: sc.run("nowhere.mcap", "out"), "nowhere.mcap"),
+        (lambda: sc.run("nowhere.mcap", 3), "out is 3; wanted a path"),
+        (lambda: sc.optimize(PoseGraph(2), max_iter=3), r"did you mean graph__max_iterations\?"),
+        (lambda: sc.optimize("graph.g2o"), r"graph is 'graph.g2o'; wanted a PoseGraph: read_g2o\(path\).graph"),
+        (lambda: sc.align(Open3DCloud(), ROOM), r"target holds objects.*: np\.asarray\(target\.points\)"),
+        (lambda: sc.align(ROOM.reshape(2, -1, 3), ROOM), r"organized\? pass target\.reshape\(-1, 3\)"),
+        (lambda: sc.align(ROOM, FLAT), "source has the shape"),
+        (lambda: sc.align(ROOM.T, ROOM), "target has the shape"),
+        (lambda: sc.align(np.hstack([ROOM, ROOM]), ROOM), "target has the shape"),
+        (lambda: sc.align(ROOM, ROOM[:0]), "source has no points"),
+        (lambda: sc.align(np.zeros((50, 3)), ROOM), "target: its 50 points lie on one point"),
+        (lambda: sc.align(ROOM, np.full((5, 3), np.nan)), "source has no points that are finite"),
+        (lambda: sc.align(ROOM, ROOM, 2.0 * I4), "T_guess is no rigid"),
+        (lambda: sc.align(ROOM, ROOM, I3), "T_guess has the shape"),
+        (lambda: sc.align(ROOM, ROOM + 1e6), r"T_guess puts the centroid of the source 1.73e\+06 m"),
+        (lambda: sc.align(ROOM, ROOM, voxel_size_m=-1.0), "voxel_size_m is -1"),
+        (lambda: sc.align(ROOM, ROOM, matcher="gicp"), "matcher"),
+        (lambda: sc.align("clouds", ROOM), "target"),
+        (lambda: OccupancyGrid(MapsConfig()).insert(np.nan * I3, np.ones((1, 2))), "not finite"),
+        (lambda: PointMap(2, 0.1).insert(np.nan * I3, np.ones((1, 2))), "not finite"),
     ],
 )  # fmt: skip
 def test_a_wrong_argument_is_named_with_what_came_and_what_is_wanted(call, words):

@@ -177,13 +177,6 @@ def test_voxels_whose_keys_would_repeat_are_doubled_and_a_map_far_from_the_origi
     assert utm.voxel_size_m == 0.05 and len(utm) > 990
 
 
-def test_a_pose_that_is_not_finite_is_refused():
-    with pytest.raises(InputError, match="not finite"):
-        OccupancyGrid(CONFIG).insert(np.full((3, 3), np.nan), np.array([[1.0, 0.0]]))
-    with pytest.raises(InputError, match="not finite"):
-        PointMap(2, 0.1).insert(np.full((3, 3), np.nan), np.array([[1.0, 0.0]]))
-
-
 def test_a_point_map_equals_naive(dimension):
     random = np.random.default_rng(4)
     poses = [lie.exp(random.normal(size=3 if dimension == 2 else 6)) for _ in range(4)]
