@@ -52,13 +52,7 @@ from scanchain.settings import load_settings
 from scanchain.simulation.drive import plan
 from scanchain.simulation.worlds import WORLDS, outdoor
 from scanchain.trajectory import read_tum
-from tests.benchmarks.harness import (
-    in_fresh_process,
-    options_of,
-    recorded,
-    table,
-    true_in_map,
-)
+from tests.benchmarks.harness import in_fresh_process, options_of, recorded, table, true_in_map
 from tests.support import made
 from tests.support.scenes import DATA
 

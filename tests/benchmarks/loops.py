@@ -33,14 +33,7 @@ from scanchain.evaluation import path_length
 from scanchain.logs import open_log
 from scanchain.runs.closures import final_verdicts
 from scanchain.settings import load_settings
-from tests.benchmarks.harness import (
-    SEQUENCES,
-    ate_m,
-    drive_of,
-    in_fresh_process,
-    options_of,
-    table,
-)
+from tests.benchmarks.harness import SEQUENCES, ate_m, drive_of, in_fresh_process, options_of, table
 from tests.support import made
 from tests.support.drifting import MADE_UP, drifting_slam, false_closures, off_by, stretched
 from tests.support.scenes import DATA

@@ -31,17 +31,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain import lie
+from scanchain import evaluation, lie
 from scanchain.data import Matrix, State, Step, Trajectory
-from scanchain.evaluation import (
-    ExpectedErrors,
-    absolute_error_of_any_path,
-    expected_errors,
-    motion_nees,
-    pair,
-    path_length,
-    read_relations,
-)
 from scanchain.evaluation.consistency import with_map_errors
 from scanchain.evaluation.pairing import nearest
 from scanchain.logs import open_log
@@ -95,7 +86,7 @@ class Line:
 
 def placed(
     path: Path, overrides: tuple[Override, ...] = NO_WHEELS, **of_log: object
-) -> tuple[SlamResult, list[Step], Matrix, ExpectedErrors, Trajectory | None]:
+) -> tuple[SlamResult, list[Step], Matrix, evaluation.ExpectedErrors, Trajectory | None]:
     """The result of a log, its steps, T_base_lidar, what is expected of it, and the truth."""
     log = open_log([path], **of_log)
     config = load_settings(log.dimension, overrides=overrides).config
@@ -104,7 +95,7 @@ def placed(
     result = slam.finish()
     starts = [keyframe.scan_index for keyframe in result.keyframes]
     scans = np.diff([*starts, len(steps)])
-    expected = expected_errors(result.graph, result.map_errors, config, scans)
+    expected = evaluation.expected_errors(result.graph, result.map_errors, config, scans)
     return result, steps, log.T_base_lidar, expected, log.ground_truth()
 
 
@@ -115,27 +106,28 @@ def line(name: str, path: Path, overrides: tuple[Override, ...] = NO_WHEELS, **o
 
 
 def judged(
-    name: str, result: SlamResult, steps: Sequence[Step], expected: ExpectedErrors, truth: Trajectory
+    name: str, result: SlamResult, steps: Sequence[Step], expected: evaluation.ExpectedErrors, truth: Trajectory
 ) -> Line:
     """A result against the truth."""
-    true_m, ate = absolute_error_of_any_path(pair(result.trajectory, truth)).translation_m.rmse, expected.ate
+    error = evaluation.absolute_error_of_any_path(evaluation.pair(result.trajectory, truth))
+    true_m, ate = error.translation_m.rmse, expected.ate
     nees, gap = _nees(result, steps, truth), _gap(result, expected, truth)
     return Line(name, true_m, ate.mean, ate.low, ate.high, nees, gap)
 
 
 def _nees(result: SlamResult, steps: Sequence[Step], truth: Trajectory) -> float:
     """Mean NEES of the motions between scans; NaN where not every scan has a true pose."""
-    pairs = pair(result.odometry, truth)
+    pairs = evaluation.pair(result.odometry, truth)
     estimate, reference = pairs.estimate, pairs.reference
     if result.odometry.dimension == 2:
         estimate, reference = lie.flatten(lie.lift(estimate)), lie.flatten(lie.lift(reference))
     covariances = np.array([step.match.covariance for step in steps])[pairs.places]
     is_sure = np.array([step.state in (State.OK, State.CONTRADICTED) for step in steps])[pairs.places]
     covariances[~is_sure | (pairs.places < WARM_UP_SCANS)] = np.nan
-    return float(np.nanmean(motion_nees(estimate, covariances, reference)))
+    return float(np.nanmean(evaluation.motion_nees(estimate, covariances, reference)))
 
 
-def _gap(result: SlamResult, expected: ExpectedErrors, truth: Trajectory) -> float:
+def _gap(result: SlamResult, expected: evaluation.ExpectedErrors, truth: Trajectory) -> float:
     """The scale gap k of smfeval; NaN where it is not installed."""
     try:
         from smfeval.cli.main import main
@@ -157,14 +149,14 @@ def _gap(result: SlamResult, expected: ExpectedErrors, truth: Trajectory) -> flo
 def relations_line(name: str) -> Line:
     """A log whose truth are relations."""
     log = DATA / f"2d/{name}.mcap"
-    relations = read_relations(log.with_suffix(".relations"))
+    relations = evaluation.read_relations(log.with_suffix(".relations"))
     unaided, steps, T_base_lidar, _, _ = placed(log)
     result, _, _, expected, _ = placed(log, ())
     places, off_ns = nearest(relations.stamps_ns.ravel(), result.trajectory.stamps_ns)
     known = (off_ns.reshape(-1, 2) < 1_000_000).all(axis=1)
     a, b = places.reshape(-1, 2)[known].T
     true = lie.flatten(relations.T_first_second[known])
-    path_m = path_length(result.odometry.poses)
+    path_m = evaluation.path_length(result.odometry.poses)
     length_m = np.abs(path_m[b] - path_m[a])
     noise = _own_noise(true, a, b, length_m < SHORT_M, unaided, steps, T_base_lidar)
     keyframes = np.array([keyframe.scan_index for keyframe in result.keyframes])
