@@ -9,16 +9,8 @@ from scanchain.logs import open_log
 from scanchain.maps import read_map, read_ply
 from scanchain.runs.results_mcap import ros_covariance
 from scanchain.trajectory import read_tum
-from tests.support.naive_logs import (
-    SECOND,
-    STAMP_NS,
-    decoded,
-    laser_scan,
-    scan_said,
-    transforms,
-    transforms_said,
-    write,
-)
+from tests.support import naive_logs
+from tests.support.naive_logs import SECOND, STAMP_NS, decoded
 
 
 def matrix(p, q):
@@ -35,8 +27,8 @@ def matrix_of(transform):
 
 def room(folder):
     """A lidar, mounted off the base, that drives through a square room."""
-    mounting = transforms(("base_link", "laser", 0.2, 0.1, 0.3, 0.0))
-    said = [transforms_said(STAMP_NS, mounting)]
+    mounting = naive_logs.transforms(("base_link", "laser", 0.2, 0.1, 0.3, 0.0))
+    said = [naive_logs.transforms_said(STAMP_NS, mounting)]
     angles = -3.0 + 0.0125 * np.arange(480)
     for k in range(8):
         stamp_ns = STAMP_NS + k * SECOND // 10
@@ -44,9 +36,9 @@ def room(folder):
         with np.errstate(divide="ignore"):
             along = np.where(np.cos(angles) > 0, (4.0 - x) / np.cos(angles), (-5.0 - x) / np.cos(angles))
             across = np.where(np.sin(angles) > 0, 3.0 / np.sin(angles), -2.0 / np.sin(angles))
-        scan = laser_scan(stamp_ns, np.minimum(along, across), first=-3.0, step=0.0125)
-        said.append(scan_said(stamp_ns + 5_000_000, scan))
-    return write(folder / "room.mcap", said)
+        scan = naive_logs.laser_scan(stamp_ns, np.minimum(along, across), first=-3.0, step=0.0125)
+        said.append(naive_logs.scan_said(stamp_ns + 5_000_000, scan))
+    return naive_logs.write(folder / "room.mcap", said)
 
 
 @pytest.fixture(scope="module")
