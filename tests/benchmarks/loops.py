@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
 from time import perf_counter
@@ -43,24 +42,12 @@ TRUE = {2: (0.5, np.inf), 3: (2.0, np.radians(3.0))}
 DRIFTS = {2: ("0.01,0.002", "0.01,-0.005", "-0.03,0.01"), 3: ("0.01,0.0002",)}
 HEAD = "log,drift,ATE,accepted,by place,false,overruled,revisits,opposite,named,s,loops"
 
-Drifted = Callable[[Pose], Pose]
 
-
-@dataclass(frozen=True, slots=True)
-class Drift:
-    """Share of the way by which motions are longer, and radians a meter by which they turn."""
-
-    longer: float
-    turn_rad_m: float
-
-    def of(self, dimension: int) -> Drifted:
-        """What becomes of a motion."""
-        if dimension == 2:
-            return stretched(self.longer, self.turn_rad_m)
-        return off_by(np.array([self.longer, 0.0, 0.0, 0.0, -0.25 * self.turn_rad_m, self.turn_rad_m]))
-
-    def __str__(self) -> str:
-        return f"{100.0 * self.longer:g} %, {1e3 * self.turn_rad_m:g} mrad/m"
+def drifted(longer: float, turn_rad_m: float, dimension: int) -> Callable[[Pose], Pose]:
+    """What becomes of a motion: longer by a share of the way, turned by so many radians a meter."""
+    if dimension == 2:
+        return stretched(longer, turn_rad_m)
+    return off_by(np.array([longer, 0.0, 0.0, 0.0, -0.25 * turn_rad_m, turn_rad_m]))
 
 
 def undrifted(path: Path) -> Trajectory:
@@ -74,10 +61,10 @@ def undrifted(path: Path) -> Trajectory:
     return slam.finish().trajectory
 
 
-def row(path: Path, drift: Drift, truth: Trajectory, false_share: float) -> tuple[object, ...]:
+def row(path: Path, drift: tuple[float, float], truth: Trajectory, false_share: float) -> tuple[object, ...]:
     """The cells of a log."""
     log = open_log(path)
-    slam = drifting_slam(load_settings(log.dimension).config, log.T_base_lidar, drift.of(log.dimension))
+    slam = drifting_slam(load_settings(log.dimension).config, log.T_base_lidar, drifted(*drift, log.dimension))
     started = perf_counter()
     loops_s = sum(step.timing.loops_s for step in map(slam.process, log.scans()))
     spent_s = perf_counter() - started
@@ -99,7 +86,8 @@ def row(path: Path, drift: Drift, truth: Trajectory, false_share: float) -> tupl
     shares = [_share(found[which]) for which in revisits(poses, path_m)]
     ate = f"{ate_m(result.odometry, truth):.2f} to {ate_m(result.trajectory, truth):.2f} m"
     counts = len(accepted), by_place, false, overruled
-    return path.stem, drift, ate, *counts, *shares, _share(made_up), f"{spent_s:.1f}", f"{loops_s:.1f}"
+    drift_text = f"{100.0 * drift[0]:g} %, {1e3 * drift[1]:g} mrad/m"
+    return path.stem, drift_text, ate, *counts, *shares, _share(made_up), f"{spent_s:.1f}", f"{loops_s:.1f}"
 
 
 def true_poses(dimension: int, truth: Trajectory, keyframes) -> Matrix:
@@ -138,7 +126,7 @@ def main() -> None:
         __doc__, "kind", kind=("2d", "3d"), logs=["intel", "mit_csail", "identical"], drifts=[], false=0.0,
         **SEQUENCES | {"worlds": "rounds", "scans": 1600},
     )  # fmt: skip
-    drifts = [Drift(*map(float, each.split(","))) for each in options.drifts or DRIFTS[int(options.kind[0])]]
+    drifts = [tuple(map(float, each.split(","))) for each in options.drifts or DRIFTS[int(options.kind[0])]]
     line = table(*HEAD.split(","))
     for path in paths(options):
         truth = undrifted(path)

@@ -47,13 +47,6 @@ STYLES = ("-", "--", "-.", ":")
 RINGS, PERIOD_NS = 64, 100_000_000
 
 
-def scans_of(path: Path, points: int, count: int) -> None:
-    """Simulate a drive with so many rays a sweep."""
-    drive = plan("town", sensor="hdl-64", duration_s=count * PERIOD_NS * 1e-9)
-    rays = spinning(np.linspace(-24.0, 4.0, RINGS), round(points / RINGS), PERIOD_NS)
-    record(replace(drive, sensor=replace(SENSORS["hdl-64"], rays=rays)), path)
-
-
 def tracked(path: Path, method: str, count: int, most: int) -> tuple[float, int, bytes]:
     """Seconds a scan, points a scan, and the last pose: at most so many scans, so many threads in this process."""
     use_threads(count)
@@ -135,7 +128,9 @@ def main() -> None:
     with TemporaryDirectory() as folder:
         for points in arguments.points:
             path = Path(folder) / f"town_{points}.mcap"
-            scans_of(path, points, arguments.scans)
+            drive = plan("town", sensor="hdl-64", duration_s=arguments.scans * PERIOD_NS * 1e-9)
+            rays = spinning(np.linspace(-24.0, 4.0, RINGS), round(points / RINGS), PERIOD_NS)  # so many a sweep
+            record(replace(drive, sensor=replace(SENSORS["hdl-64"], rays=rays)), path)
             rows += measured(path, arguments.methods, arguments.threads, arguments.scans)
         for name in arguments.log:  # not in the picture, which is of one place
             path = Path(name) if Path(name).exists() else DATA / "3d" / name

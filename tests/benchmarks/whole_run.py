@@ -33,32 +33,27 @@ def main() -> None:
         print(track(arguments.logs[0]))
     else:
         for path in arguments.logs:
-            show(path.resolve(), arguments.repeats)
-            if arguments.cold:
-                show_cold(path.resolve())
+            show(path.resolve(), arguments.repeats, cold=arguments.cold)
 
 
-def show(path: Path, repeats: int) -> None:
-    """Measure one log and print what it took."""
+def show(path: Path, repeats: int, *, cold: bool) -> None:
+    """Measure one log and print what it took; cold: also a run without compiled kernels, and the one after it."""
     runs, alone, tracking = [], [], []
     with tempfile.TemporaryDirectory() as folder:
+        words = ("scanchain", "run", str(path), "--out", f"{folder}/run", "--force")
         for _ in range(repeats + 1):
-            runs.append(timed("scanchain", "run", str(path), "--out", f"{folder}/run", "--force")[0])
+            runs.append(timed(*words)[0])
             seconds, answer = timed("tests.benchmarks.whole_run", str(path), "--track")
             alone.append(seconds)
             tracking.append(float(answer))
+        spent_s = [timed(*words, NUMBA_CACHE_DIR=f"{folder}/kernels")[0] for _ in range(2 if cold else 0)]
     run_s, alone_s, tracking_s = (min(each[1:]) for each in (runs, alone, tracking))  # the first may compile
     print(f"\n{path.name}, least of {repeats}")
     print(f"  run {run_s:.2f} s, odometry {alone_s:.2f} s, tracking {tracking_s:.2f} s")
-    print(f"  run / odometry {run_s / alone_s:.2f}, run / tracking {run_s / tracking_s:.2f}")
-
-
-def show_cold(path: Path) -> None:
-    """A run without compiled kernels, and the one after it."""
-    with tempfile.TemporaryDirectory() as folder:
-        words = ("scanchain", "run", str(path), "--out", f"{folder}/run", "--force")
-        cold_s, warm_s = (timed(*words, NUMBA_CACHE_DIR=f"{folder}/kernels")[0] for _ in range(2))
-    print(f"  first run {cold_s:.1f} s, second {warm_s:.1f} s: {cold_s - warm_s:.1f} s to compile", flush=True)
+    print(f"  run / odometry {run_s / alone_s:.2f}, run / tracking {run_s / tracking_s:.2f}", flush=True)
+    if cold:
+        cold_s, warm_s = spent_s
+        print(f"  first run {cold_s:.1f} s, second {warm_s:.1f} s: {cold_s - warm_s:.1f} s to compile", flush=True)
 
 
 def timed(*module_and_words: str, **environment: str) -> tuple[float, str]:
