@@ -1,8 +1,5 @@
 """How far off each matcher is, before and after loop closing; how far the pose of a lidar that stands walks.
 
-    python -m tests.benchmarks.accuracy [--only WORDS]
-    python -m tests.benchmarks.accuracy --standing [--scans 150] [--seeds 0 5]
-
 Real logs that are absent are named; the simulated ones are made in the cache. Prints a Markdown table.
 
 --standing: twelve people walk around the lidar and four cars drive by; ranges err by 2.5 cm. A row has the

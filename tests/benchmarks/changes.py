@@ -1,8 +1,5 @@
 """Changes named between two maps of simulated places against what changed in truth.
 
-    python -m tests.benchmarks.changes [--world office] [--seeds 1 2 3] [--sensor NAME] [--seconds S]
-        [--later-seconds S] [--unchanged]
-
 For each seed the place is driven twice, the second time on another day (``simulate --changed``); logs and runs
 stay in the cache. An object counts where it is larger than 0.3 m and both drives had it, or its place, in sight:
 so many rays of their keyframes' scans end on it, or would, within the reach of the comparison. A cluster is

@@ -1,7 +1,4 @@
-"""Reads damaged logs and messages, as many as wanted, and prints what is read badly.
-
-python -m tests.benchmarks.fuzz --cases 50000 --seed 1 [--only formats] [--keep DIR]
-"""
+"""Reads damaged logs and messages, as many as wanted of each kind, and prints and keeps what is read badly."""
 
 import tempfile
 import time

@@ -1,8 +1,6 @@
-"""A lidar carried elsewhere while nothing is recorded: ``python -m tests.benchmarks.gaps [LOG ...]``.
+"""A lidar carried elsewhere while nothing is recorded.
 
-    [--cases N] [--seed N] [--paths BEFORE GAP AFTER]
-
-Of a log two stretches of the path are taken, these numbers of meters long, with a gap between them, at random
+Of a log two stretches of the path are taken, with a gap between them (``--paths``, meters of all three), at random
 places; wheels are left out. The reference is the run of the whole log, or the truth of a simulated one.
 
   right     the second stretch is joined to the first, within 1.5 m (median over pairs of poses) of the reference

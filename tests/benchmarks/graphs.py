@@ -1,7 +1,5 @@
 """Pose-graph optimization against GTSAM on the published graphs, interleaved.
 
-    python -m tests.benchmarks.graphs [GRAPH ...] [--repeats 5]
-
 Each method optimizes what it has read; reading is not timed, building the problem and the first guess are. GTSAM
 runs from the file's guess and from its own (chordal in 3D; LAGO in 2D, which takes diagonal information only and
 gets the diagonal), with Gauss-Newton and with Levenberg-Marquardt. All ½χ² are evaluated by the same code:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import tempfile
 from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
 from collections.abc import Callable, Iterable
@@ -35,7 +36,8 @@ def options_of(text: str | None, argument: str = "", *, cache: bool = True, **de
     A default tells the type of its option. Of a list or the keys of a dict there may be several; a tuple has the
     choices, a type stands for no default. ``argument`` is the one without dashes.
     """
-    parser = ArgumentParser(description=text, formatter_class=RawDescriptionHelpFormatter)
+    command = f"python -m tests.benchmarks.{Path(sys.argv[0]).stem}"
+    parser = ArgumentParser(command, description=text, formatter_class=RawDescriptionHelpFormatter)
     for name, default in (defaults | ({"cache": CACHE} if cache else {})).items():
         how: dict[str, object] = {"type": type(default), "default": default, "help": "default: %(default)s"}
         if default is False:

@@ -1,6 +1,6 @@
 """Kills runs at random moments and checks that what is left opens and that they go on to the same result.
 
-python -m tests.benchmarks.kills --kills 50 --seed 1 [LOG END_S ...]
+Logs are LOG END_S ..., each with the second at which it is cut.
 """
 
 import tempfile

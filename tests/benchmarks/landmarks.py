@@ -1,8 +1,5 @@
 """The landmark problems of the course report by every linear solver, and an MRCLAM log against GTSAM.
 
-    python -m tests.benchmarks.landmarks linear [--repeats 9]
-    python -m tests.benchmarks.landmarks log [--robot 1] [--repeats 9]
-
 linear: each round solves every problem by every method in turn; times are medians of whole solutions of A x = b,
 a new solver each time; "again" is with the same solver once more, which keeps what it found out about the
 pattern. The report's seconds are of another machine (and its QR is SuiteSparseQR): ratios within a column

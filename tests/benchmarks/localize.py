@@ -1,8 +1,5 @@
 """Localization in a map from nowhere: how soon, how surely, how accurately, and what it costs.
 
-    python -m tests.benchmarks.localize [--cases intel,vlp-16,...] [--starts 200] [--whole]
-    python -m tests.benchmarks.localize --cases city [--km 10] [--sensor vlp-16] [--every 2] [--live] [--memory]
-
 From each start a log begins anew, in the map of another drive or of an earlier part of its own, and is processed
 until it is found and 3 m farther, or until it has traveled 15 m (in space 40 m, in the city 60 m). Logs of other
 places are run whole by ``tests.benchmarks.places``. Starts are evenly spread; those of planar logs over places

@@ -1,7 +1,5 @@
 """Time and memory of SLAM along a long log.
 
-    python -m tests.benchmarks.long_run --log LOG [--scans N] [--live N] [--finish]
-
 The log is played forward and backward in turn. Every tenth of the way: the mean CPU time of ``Slam.process`` a
 scan, loops and optimizations included, of this thread and of all, the memory of this process and its peak, and
 what it keeps in a file instead. With ``--live``, so many scans more come in real time, forty a second: the longest

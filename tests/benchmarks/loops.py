@@ -1,11 +1,8 @@
 """Loop closure with drift turned up: revisits that are found, closures that are false, what the trajectory gains.
 
-    python -m tests.benchmarks.loops 2d [--logs intel mit_csail ...] [--drifts 0.01,0.002 ...] [--false 0.3]
-    python -m tests.benchmarks.loops 3d [--worlds rounds] [--sensors vlp-16,...] [--drifts ...] [--false 0.3]
-
-Every motion of the odometry is made longer by a share of itself and turned left by so much a meter (in space up,
-too, by a quarter of that) before the rest of the chain sees it. The reference is the truth of a simulated log in
-space; of a planar one it is the log as it is, without added drift.
+Every motion of the odometry is made longer by a share of itself and turned left by so much a meter (``--drifts
+0.01,0.002 ...``; in space up, too, by a quarter of that) before the rest of the chain sees it. The reference is
+the truth of a simulated log in space; of a planar one it is the log as it is, without added drift.
 
 A closure is false where its relative pose is more than 0.5 m, in space 2 m or 3°, from the reference (drift
 bends the local maps, too). A keyframe is a revisit where the reference has it within 5 m of an older one that

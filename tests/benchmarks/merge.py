@@ -1,4 +1,4 @@
-"""Sessions cut from logs and merged, their starts unknown: ``python -m tests.benchmarks.merge [--only PART ...]``.
+"""Sessions cut from logs and merged, their starts unknown.
 
 Intel is run whole, and in four parts of a quarter of its time, which are merged; the error over the relations of
 Kümmerle et al. (2009) is that of all scans of both. A simulated town (64 rings) is cut in two, which share 4 s,

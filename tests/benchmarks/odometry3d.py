@@ -1,8 +1,5 @@
 """3D odometry, ours against others, on the same decoded scans, scan by scan in turn.
 
-    python -m tests.benchmarks.odometry3d [LOG ...] [--methods plicp,...] [--scans 300]
-    python -m tests.benchmarks.odometry3d --set [--worlds town,...] [--sensors vlp-16,...] [--scans 300]
-
 Methods, settings and warm-up are those of ``scanchain compare``, where each has a process of its own. LOG is any
 MCAP with a 3D lidar. Its scans are decoded once into memory, then every one goes through all methods in turn,
 starting with another one each time, so that whatever else the machine does meets all of them alike. The time is

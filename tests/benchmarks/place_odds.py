@@ -1,4 +1,4 @@
-"""What keyframes show at right and wrong poses in a map: ``python -m tests.benchmarks.place_odds [--cache DIR]``.
+"""What keyframes show at right and wrong poses in a map.
 
 Right poses are those of logs that enter a map (the real ones of ``places --late``), up to 5 m from its keyframes
 and disturbed by 0.3 m and 0.03 rad. Wrong ones are the best that a search finds for paths of real logs in the

@@ -1,8 +1,5 @@
 """Whole logs in maps of other places, or in maps that they enter later: the states of all scans and the verdict.
 
-    python -m tests.benchmarks.places [--kind 2d 3d] [--places NAME ...] [--seed N] [--set KEY=VALUE ...]
-    python -m tests.benchmarks.places --late [--kind 2d 3d] [--places NAME ...] [--seed N] [--set KEY=VALUE ...]
-
 A map is made of each place by ``run``, and every log of another place is localized in it, from its first scan to
 its last: all ordered pairs. --set changes the configuration of localization (``--set log.every=2``).
 

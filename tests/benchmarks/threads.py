@@ -1,8 +1,5 @@
 """Time of a 3D scan against the number of threads and of points, for ours and others, as a table and a picture.
 
-    python -m tests.benchmarks.threads [--points 10000 ...] [--log LOG ...] [--threads 1 2 4 8] [--scans 40]
-        [--methods plicp kiss-icp small-vgicp genz-icp] [--png FILE]
-
 A lidar of so many points a sweep drives through the simulated town; ranges come with 2 cm of noise. After it
 come the first scans of logs. All are in memory. Each method and number of threads has a process of its own,
 with as many cores as threads, and tracks the scans three times from the beginning, of which the fastest counts.

@@ -1,7 +1,5 @@
 """Expected ATE and covariances against the truth.
 
-    python -m tests.benchmarks.trust [--worlds town,...] [--sensors vlp-16,...] [--seeds 1,2,3] [--scans N]
-
 Worlds of 3D lidars, sensors and cache are those of ``odometry3d --set``; planar worlds are driven with
 LMS-270 and UTM-30, all without wheels. A line says
 

@@ -1,6 +1,4 @@
-"""Wrong and right motions of runs, flagged or not, and their verdicts: ``python -m tests.benchmarks.vouching``.
-
-    [--quick] [--only WORDS] [--jobs N] [--cache DIR] [--png FILE]
+"""Wrong and right motions of runs, flagged or not, and their verdicts.
 
 Simulated worlds and real logs (tests.benchmarks.vouching_logs), with and without wheels, at 10, 5 and 2 Hz, with
 dropped scans, a kidnapping, crowds and traffic, a wrong mounting. Logs and run directories stay in the cache:

@@ -1,7 +1,5 @@
 """How much longer a whole run takes than its odometry alone, and where its time goes.
 
-    python -m tests.benchmarks.whole_run [LOG ...] [--repeats 5] [--cold]
-
 *run* is ``scanchain run LOG --out DIR``: loops on, recording, map and report written. *odometry* is a process
 that reads the same log and tracks its scans with the same configuration, and nothing else. Both are taken by the
 clock, from the start of the interpreter to its end, with compiled kernels. *tracking* is the sum over the scans

@@ -1,4 +1,4 @@
-"""Wrong loop edges added to published graphs, and what becomes of them: python -m tests.benchmarks.wrong_edges.
+"""Wrong loop edges added to published graphs, and what becomes of them.
 
 To the loops of a graph are added, in proportion to their number, edges between random poses that never saw each
 other: "anywhere", their relative pose drawn from the extent of the map; "nearby", within 2 m and any angle, as a
