@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.comparison.methods import Method, resolve
+from scanchain.comparison.methods import resolve
 from scanchain.comparison.worker import start, warm_up
 from scanchain.data import Scan, Trajectory
 from scanchain.errors import InputError
@@ -61,11 +61,6 @@ class Run:
     failure: str
 
 
-def method_of(name: str) -> Method:
-    """One of ours or of the baselines."""
-    return resolve((name,), 3, file=None)[0]
-
-
 def default_methods(path: Path) -> tuple[str, ...]:
     """Ours and all others that are worth a row; GenZ-ICP as its authors tuned it for such a log."""
     genz = "genz-icp-kitti" if "kitti" in path.name else "genz-icp"
@@ -82,9 +77,10 @@ def read(path: Path, count: int | None = None) -> tuple[Log, list[Scan]]:
 
 def run_all(log: Log, scans: list[Scan], methods: Sequence[str]) -> list[Run]:
     """All methods over all scans, in turn, each scan starting with another one."""
-    for name in methods:
-        warm_up(scans, method_of(name), log.T_base_lidar)
-    racers = [start(method_of(name), log.T_base_lidar) for name in methods]
+    chosen = resolve(tuple(methods), 3, file=None)
+    for method in chosen:
+        warm_up(scans, method, log.T_base_lidar)
+    racers = [start(method, log.T_base_lidar) for method in chosen]
     poses = np.full((len(methods), len(scans), 4, 4), np.nan)
     seconds, cpu_seconds = np.zeros((2, len(methods), len(scans)))
     failures = [""] * len(methods)

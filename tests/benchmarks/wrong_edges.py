@@ -45,9 +45,10 @@ def add_wrong_loops(graph, share, kind, rng):
         if abs(i - j) <= 10:
             continue
         T = random_pose(graph, kind, rng)
-        for step in range(agreeing):
-            pairs.append((i + step, j + step))
-            poses.append(moved_along(graph, i, j, step, T))
+        for k in range(agreeing):  # the same mistake a few poses later: T carried along the poses of both ends
+            pairs.append((i + k, j + k))
+            back, ahead = (lie.between(graph.poses[end], graph.poses[end + k]) for end in (i, j))
+            poses.append(lie.inverse(back) @ T @ ahead)
     graph.add_edges(
         np.array(pairs), np.array(poses), np.tile(omega, (len(pairs), 1, 1)), np.ones(len(pairs), bool)
     )
@@ -63,12 +64,6 @@ def random_pose(graph, kind, rng):
     T = lie.exp(twist)
     T[:d, d] = rng.uniform(-reach, reach)
     return T
-
-
-def moved_along(graph, i, j, step, T_ij):
-    """The same mistake a few poses later: T_ij carried along the poses of both ends."""
-    poses = graph.poses
-    return lie.inverse(lie.inverse(poses[i]) @ poses[i + step]) @ T_ij @ lie.inverse(poses[j]) @ poses[j + step]
 
 
 def try_wrong_loops(path, share, kind, seed, robust="truncated"):

@@ -78,14 +78,6 @@ def folder(tmp_path, monkeypatch):
     sys.modules.pop("my_places", None)
 
 
-def by_place(closures):
-    return [
-        closure
-        for closure in closures
-        if closure.verdict is ClosureVerdict.ACCEPTED and closure.proposed_by is Proposal.PLACE
-    ]
-
-
 def test_a_recognizer_of_ones_own_closes_loops_and_survives_checkpoints_bit_by_bit(folder):
     log = open_log(shared_data(CSAIL))
     config = configured(2, SMALL | {"loops.recognizer": "my_places:Ranges"})
@@ -97,7 +89,8 @@ def test_a_recognizer_of_ones_own_closes_loops_and_survives_checkpoints_bit_by_b
         if scan.index in breaks:
             broken = taken_up(broken, folder)
     a, b = straight.finish(), broken.finish()
-    assert len(by_place(a.closures)) > 3
+    accepted = [each for each in a.closures if each.verdict is ClosureVerdict.ACCEPTED]
+    assert sum(each.proposed_by is Proposal.PLACE for each in accepted) > 3
     assert [(c.target, c.source, c.verdict) for c in a.closures] == [
         (c.target, c.source, c.verdict) for c in b.closures
     ]
