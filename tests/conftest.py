@@ -19,6 +19,12 @@ def office():
     return made.log("office", seconds=6)
 
 
+@pytest.fixture(params=[2, 3])
+def dimension(request):
+    """A test that takes it runs in the plane and in space."""
+    return request.param
+
+
 @pytest.fixture
 def call(capfd):
     """Run a command; its exit code, its output, and what it said on stderr, libraries included."""

@@ -129,40 +129,6 @@ def test_invalid_returns_of_an_organized_cloud_are_dropped_with_their_times_and_
     assert np.array_equal(match.T_target_source, wanted.T_target_source)
 
 
-class Open3DCloud:
-    """A cloud as Open3D has it."""
-
-    points = np.ones((10, 3))
-
-
-POINTS = np.ones((10, 3), np.float32)
-RECORDS = np.zeros(10, [("x", np.float32), ("y", np.float32), ("z", np.float32), ("intensity", np.float32)])
-
-
-@pytest.mark.parametrize(
-    ("call", "words"),
-    [
-        (lambda: sc.Odometry(dimension=2, T_base_lidar=np.eye(4)), r"dimension is 2, but T_base_lidar .* SE\(3\)"),
-        (lambda: sc.Odometry(dimension=2).track(POINTS, 0.0), "has 3D points"),
-        (lambda: sc.Odometry().track(POINTS, 1_700_000_000_000_000_000), "stamp_s is 17"),
-        (lambda: sc.downsample(POINTS, 0.0), "voxel_size_m is 0"),
-        (lambda: sc.align(Open3DCloud(), POINTS), r"target holds objects.*: np\.asarray\(target\.points\)"),
-        (lambda: sc.downsample(RECORDS, 1.0), r"np\.stack\(\[points\[axis\] for axis in 'xyz'\], axis=1\)"),
-        (lambda: sc.align(POINTS.reshape(2, 5, 3), POINTS), r"organized\? pass target\.reshape\(-1, 3\)"),
-        (lambda: sc.downsample(POINTS + 5.4e6, 0.002), r"points lie up to 5.4e\+06 m from the origin"),
-        (lambda: sc.downsample(np.array([[0.0, 0.0], [2.0**21, 0.0]]), 1.0), r"2.1e\+06 m apart"),
-        (lambda: sc.run("nowhere.mcap", "out"), "nowhere.mcap"),
-        (lambda: sc.optimize(sc.PoseGraph(2), max_iter=3), r"did you mean graph__max_iterations\?"),
-        (lambda: sc.optimize("graph.g2o"), r"graph is 'graph.g2o'; wanted a PoseGraph: read_g2o\(path\).graph"),
-        (lambda: sc.run("nowhere.mcap", 3), "out is 3; wanted a path"),
-        (lambda: sc.Slam(sc.Config(), dimension=2), r"made for 3D .* start from load_settings\(2\).config"),
-    ],
-)
-def test_what_is_no_argument_is_named(call, words):
-    with pytest.raises(InputError, match=words):
-        call()
-
-
 ROOM = np.random.default_rng(1).uniform(-8.0, 8.0, (400, 3)).round()  # points on planes
 
 
@@ -221,20 +187,6 @@ def test_a_comparison_from_python_has_a_row_a_method(office, tmp_path, monkeypat
     compared = sc.compare(office, tmp_path / "compared", ["svd"])
     assert [row.name for row in compared.table.rows] == ["svd"]
     assert (compared.path / "report.html").exists()
-
-
-def test_a_graph_is_optimized_and_written_and_read(tmp_path):
-    graph = sc.PoseGraph(2)
-    for k in range(4):
-        graph.add_pose(np.array([[1.0, 0.0, 1.1 * k], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]), k)
-    step = np.array([[1.0, 0.0, 1.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    for k in range(3):
-        graph.add_edge(k, k + 1, step, np.eye(3))
-    done = sc.optimize(graph)
-    assert done.converged
-    assert graph.poses[3][0, 2] == pytest.approx(3.0)
-    sc.write_g2o(tmp_path / "graph.g2o", graph)
-    assert np.allclose(sc.read_g2o(tmp_path / "graph.g2o").graph.poses, graph.poses)
 
 
 @pytest.mark.parametrize("folder", ["pipeline", "viz"])

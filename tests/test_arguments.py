@@ -8,26 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from scanchain import (
-    Config,
-    InputError,
-    Odometry,
-    PoseGraph,
-    Scan,
-    ScanchainError,
-    Slam,
-    Trajectory,
-    VoxelMap,
-    create_matcher,
-    lie,
-    load_settings,
-    open_log,
-    read_tum,
-    rigid_transform,
-    write_tum,
-)
-from scanchain.config import GraphConfig, LocalMapConfig, MatchingConfig
+import scanchain as sc
+from scanchain import Config, InputError, Odometry, PoseGraph, Slam, Trajectory, VoxelMap, lie, load_settings
+from scanchain.config import GraphConfig, LocalMapConfig, MapsConfig, MatchingConfig
 from scanchain.evaluation import absolute_error, pair
+from scanchain.maps import OccupancyGrid, PointMap
 
 CALLS = 200
 
@@ -56,12 +41,12 @@ def mapped(points, matcher="plicp"):
     config = load_settings(dimension).config
     target = VoxelMap(dimension, config.local_map)
     target.insert(points, lie.identity(dimension))
-    return create_matcher(msgspec.structs.replace(config.matching, matcher=matcher)), target
+    return sc.create_matcher(msgspec.structs.replace(config.matching, matcher=matcher)), target
 
 
 def scan(points, **changes):
     given = {"times_s": np.empty(0, np.float32), "T_odom_base": None, **changes}
-    return Scan(index=0, stamp_ns=0, log_time_ns=0, dropped=0, points=points, **given)
+    return sc.Scan(index=0, stamp_ns=0, log_time_ns=0, dropped=0, points=points, **given)
 
 
 def finished():
@@ -75,6 +60,13 @@ def finished():
 ROOM = place(3, 4000, np.random.default_rng(0))
 FLAT = place(2, 2000, np.random.default_rng(0))
 I3, I4 = np.eye(3), np.eye(4)
+RECORDS = np.zeros(10, [("x", np.float32), ("y", np.float32), ("z", np.float32), ("intensity", np.float32)])
+
+
+class Open3DCloud:
+    """A cloud as Open3D has it."""
+
+    points = np.ones((10, 3))
 
 
 @pytest.mark.parametrize(
@@ -87,14 +79,14 @@ I3, I4 = np.eye(3), np.eye(4)
         (lambda: MatchingConfig(max_iterations=2.5), "matching.max_iterations is 2.5; it must be a whole number"),
         (lambda: Odometry(MatchingConfig(), I4), "config is .*; wanted a Config"),
         (lambda: Odometry(Config(), 2.0 * I4), r"T_base_lidar is no rigid transformation \(off by 3\)"),
-        (lambda: create_matcher(Config()), "config is .*; wanted a MatchingConfig"),
+        (lambda: sc.create_matcher(Config()), "config is .*; wanted a MatchingConfig"),
         (lambda: scan(np.zeros((9, 4))), r"points has the shape \(9, 4\); wanted \(N, 3\).*points\[:, :3\]"),
         (lambda: scan(np.zeros((9, 3)), times_s=np.arange(8.0)), r"times_s has the shape \(8,\); wanted \(9,\)"),
         (lambda: scan(np.zeros((2, 3)), times_s=[0, 10**8]), "times_s: a point lies 1e.08 s from the stamp"),
         (lambda: Slam(Config(), I4).finish(), "no scan was processed"),
         (lambda: finished().finish(), "Slam.finish was called: .*; begin another Slam"),
-        (lambda: open_log(3), "a log is 3; wanted a path"),
-        (lambda: open_log([]), "no log was given; wanted a path"),
+        (lambda: sc.open_log(3), "a log is 3; wanted a path"),
+        (lambda: sc.open_log([]), "no log was given; wanted a path"),
         (lambda: replace(scan(I3), stamp_ns=1.7e9), "stamp_ns is 1700000000.0; wanted nanoseconds as int"),
         (lambda: Odometry(Config(), I4).process(I3), "scan is an array of the shape .*; wanted a Scan"),
         (lambda: Odometry(Config(), I4).process(scan(FLAT)), "scan 0 has 2D points; wanted"),
@@ -104,13 +96,41 @@ I3, I4 = np.eye(3), np.eye(4)
         (lambda: PoseGraph(2).add_edge(0, 1, I3, I3, is_loop="no"), "is_loop is 'no'; wanted True or False"),
         (lambda: PoseGraph(2).optimize(Config()), "config is .*; wanted a GraphConfig"),
         (lambda: PoseGraph(2).optimize(GraphConfig(), initialize="best"), "initialize is 'best'; it must be"),
-        (lambda: open_log("a.mcap", Config()), "config is .*; wanted a LogConfig"),
-        (lambda: rigid_transform(ROOM, ROOM[:-1], np.ones(len(ROOM))), "wanted pairs"),
-        (lambda: rigid_transform(ROOM, ROOM, -np.ones(len(ROOM))), "weight holds negative"),
-        (lambda: rigid_transform(1e200 * ROOM, ROOM), r"source holds .*e\+20\d, over 1e\+50; give meters"),
-        (lambda: write_tum("/nope/x", Trajectory([0], I4[None])), "/nope/x: cannot be written .*folder"),
-        (lambda: write_tum("a.tum", "abc"), "trajectory is 'abc'; wanted a Trajectory"),
+        (lambda: sc.open_log("a.mcap", Config()), "config is .*; wanted a LogConfig"),
+        (lambda: sc.rigid_transform(ROOM, ROOM[:-1], np.ones(len(ROOM))), "wanted pairs"),
+        (lambda: sc.rigid_transform(ROOM, ROOM, -np.ones(len(ROOM))), "weight holds negative"),
+        (lambda: sc.rigid_transform(1e200 * ROOM, ROOM), r"source holds .*e\+20\d, over 1e\+50; give meters"),
+        (lambda: sc.write_tum("/nope/x", Trajectory([0], I4[None])), "/nope/x: cannot be written .*folder"),
+        (lambda: sc.write_tum("a.tum", "abc"), "trajectory is 'abc'; wanted a Trajectory"),
         (lambda: Trajectory(np.arange(3), np.zeros((2, 4, 4))), r"poses has the shape \(2, 4, 4\)"),
+        (lambda: Odometry(dimension=2, T_base_lidar=I4), r"dimension is 2, but T_base_lidar .* SE\(3\)"),
+        (lambda: Odometry(dimension=2).track(ROOM, 0.0), "has 3D points"),
+        (lambda: Odometry().track(ROOM, 1_700_000_000_000_000_000), "stamp_s is 17"),
+        (lambda: Slam(Config(), dimension=2), r"made for 3D .* start from load_settings\(2\).config"),
+        (lambda: sc.downsample(ROOM, 0.0), "voxel_size_m is 0"),
+        (lambda: sc.downsample(RECORDS, 1.0), r"np\.stack\(\[points\[axis\] for axis in 'xyz'\], axis=1\)"),
+        (lambda: sc.downsample(ROOM + 5.4e6, 0.002), r"points lie up to 5.4e\+06 m from the origin"),
+        (lambda: sc.downsample(np.array([[0.0, 0.0], [2.0**21, 0.0]]), 1.0), r"2.1e\+06 m apart"),
+        (lambda: sc.run("nowhere.mcap", "out"), "nowhere.mcap"),
+        (lambda: sc.run("nowhere.mcap", 3), "out is 3; wanted a path"),
+        (lambda: sc.optimize(PoseGraph(2), max_iter=3), r"did you mean graph__max_iterations\?"),
+        (lambda: sc.optimize("graph.g2o"), r"graph is 'graph.g2o'; wanted a PoseGraph: read_g2o\(path\).graph"),
+        (lambda: sc.align(Open3DCloud(), ROOM), r"target holds objects.*: np\.asarray\(target\.points\)"),
+        (lambda: sc.align(ROOM.reshape(2, -1, 3), ROOM), r"organized\? pass target\.reshape\(-1, 3\)"),
+        (lambda: sc.align(ROOM, FLAT), "source has the shape"),
+        (lambda: sc.align(ROOM.T, ROOM), "target has the shape"),
+        (lambda: sc.align(np.hstack([ROOM, ROOM]), ROOM), "target has the shape"),
+        (lambda: sc.align(ROOM, ROOM[:0]), "source has no points"),
+        (lambda: sc.align(np.zeros((50, 3)), ROOM), "target: its 50 points lie on one point"),
+        (lambda: sc.align(ROOM, np.full((5, 3), np.nan)), "source has no points that are finite"),
+        (lambda: sc.align(ROOM, ROOM, 2.0 * I4), "T_guess is no rigid"),
+        (lambda: sc.align(ROOM, ROOM, I3), "T_guess has the shape"),
+        (lambda: sc.align(ROOM, ROOM + 1e6), r"T_guess puts the centroid of the source 1.73e\+06 m"),
+        (lambda: sc.align(ROOM, ROOM, voxel_size_m=-1.0), "voxel_size_m is -1"),
+        (lambda: sc.align(ROOM, ROOM, matcher="gicp"), "matcher"),
+        (lambda: sc.align("clouds", ROOM), "target"),
+        (lambda: OccupancyGrid(MapsConfig()).insert(np.nan * I3, np.ones((1, 2))), "not finite"),
+        (lambda: PointMap(2, 0.1).insert(np.nan * I3, np.ones((1, 2))), "not finite"),
     ],
 )  # fmt: skip
 def test_a_wrong_argument_is_named_with_what_came_and_what_is_wanted(call, words):
@@ -254,7 +274,7 @@ def tried(call):
     """The answer, or None where it was refused with one line that names something."""
     try:
         return call()
-    except ScanchainError as error:
+    except sc.ScanchainError as error:
         assert isinstance(error, InputError) or "pairs" in str(error)
         assert "\n" not in str(error) and len(str(error)) > 20
         return None
@@ -302,7 +322,7 @@ def test_a_pose_called_converged_is_right_whatever_the_scale_density_and_motion(
 
 @fuzzed(arrays(), arrays(), arrays())
 def test_the_closed_form_takes_pairs_or_refuses_them(source, target, weight):
-    T = tried(lambda: rigid_transform(source, target, weight))
+    T = tried(lambda: sc.rigid_transform(source, target, weight))
     assert T is None or np.isfinite(T).all()
 
 
@@ -338,8 +358,8 @@ def test_a_trajectory_of_anything_is_written_and_read_and_judged_or_refused(fold
     for stamps in (stamps_ns, whole, np.arange(len(poses) if isinstance(poses, list) else 4)):
         made = tried(lambda: Trajectory(stamps, poses))  # noqa: B023
         if made is not None and len(made):
-            write_tum(folder / "a.tum", made, force=True)
-            again = read_tum(folder / "a.tum")
+            sc.write_tum(folder / "a.tum", made, force=True)
+            again = sc.read_tum(folder / "a.tum")
             assert np.abs(again.poses - lie.lift(made.poses)).max() <= 1e-3 * max(1.0, np.abs(made.poses).max())
             error = tried(lambda: absolute_error(pair(made, made)))  # noqa: B023
             is_one_to_one = len(set(made.stamps_ns.tolist())) == len(made)

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from rerun.chunk import RrdReader
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -288,7 +287,7 @@ def test_the_run_file_says_what_was_read_and_the_configuration_is_the_preset_wit
 
 def test_the_recorded_poses_are_those_of_the_trajectories_at_every_scan(drive):
     path = drive.folder / "recording.rrd"
-    (strip,) = optimized_strips(path)
+    ((strip,),) = column(path, entities.OPTIMIZED, "LineStrips3D:strips", is_static=True)
     np.testing.assert_allclose(strip, drive.tum()[:, 1:4], atol=1e-4)
     rows, constant = rows_of(path)[0], static_entities(path)
     for entity in EVERY_SCAN:
@@ -313,18 +312,10 @@ def test_events_edges_counts_and_the_table_agree_on_the_verdict_of_every_closure
     assert drive.metrics["closures_accepted"] == accepted
 
 
-def optimized_strips(path):
-    for chunk in RrdReader(str(path)).stream():
-        batch = chunk.to_record_batch()
-        if chunk.entity_path.lstrip("/") == entities.OPTIMIZED and "LineStrips3D:strips" in batch.schema.names:
-            yield np.array(batch.column("LineStrips3D:strips").to_pylist()[0][0])
-
-
 def test_the_truth_is_drawn_in_recording_and_picture_where_the_trajectory_is(drive, tmp_path, monkeypatch):
     found = drive.tum()[:, 1:4]
-    chunks = RrdReader(str(drive.folder / "recording.rrd")).stream()
-    (drawn,) = (chunk for chunk in chunks if str(chunk.entity_path) == "/world/ground_truth")
-    (line,) = drawn.to_record_batch().column("LineStrips3D:strips").to_pylist()[0]
+    recorded = column(drive.folder / "recording.rrd", "world/ground_truth", "LineStrips3D:strips", is_static=True)
+    ((line,),) = recorded
     np.testing.assert_allclose(np.array(line), found, atol=0.1)
     shown = []
     monkeypatch.setattr(

@@ -1,8 +1,5 @@
 """How far off each matcher is, before and after loop closing; how far the pose of a lidar that stands walks.
 
-    python -m tests.benchmarks.accuracy [--only WORDS]
-    python -m tests.benchmarks.accuracy --standing [--scans 150] [--seeds 0 5]
-
 Real logs that are absent are named; the simulated ones are made in the cache. Prints a Markdown table.
 
 --standing: twelve people walk around the lidar and four cars drive by; ranges err by 2.5 cm. A row has the
@@ -27,9 +24,10 @@ from scanchain.odometry import Odometry
 from scanchain.settings import load_settings, overrides_of
 from scanchain.slam import Slam, SlamResult
 from scanchain.trajectory import read_tum
-from tests.benchmarks.harness import DATA, command_line, table
+from tests.benchmarks.harness import options_of, table
 from tests.support import made
 from tests.support.moving_worlds import standing
+from tests.support.scenes import DATA
 
 MATCHERS = ("plicp", "svd")
 STANDING = (
@@ -111,12 +109,7 @@ def standing_still(options: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    parser = command_line(__doc__)
-    parser.add_argument("--only", default="", help="cases whose names hold this")
-    parser.add_argument("--standing", action="store_true")
-    parser.add_argument("--scans", type=int, default=150)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 5])
-    options = parser.parse_args()
+    options = options_of(__doc__, only="", standing=False, scans=150, seeds=[0, 5])
     (standing_still if options.standing else moving)(options)
 
 

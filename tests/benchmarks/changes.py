@@ -1,8 +1,5 @@
 """Changes named between two maps of simulated places against what changed in truth.
 
-    python -m tests.benchmarks.changes [--world office] [--seeds 1 2 3] [--sensor NAME] [--seconds S]
-        [--later-seconds S] [--unchanged]
-
 For each seed the place is driven twice, the second time on another day (``simulate --changed``); logs and runs
 stay in the cache. An object counts where it is larger than 0.3 m and both drives had it, or its place, in sight:
 so many rays of their keyframes' scans end on it, or would, within the reach of the comparison. A cluster is
@@ -28,7 +25,8 @@ from scanchain.settings import load_settings
 from scanchain.simulation import Drive, plan
 from scanchain.simulation.drive import EPOCH_NS
 from scanchain.simulation.solids import FIXED, Solids
-from tests.benchmarks.harness import command_line, recorded, run_of
+from tests.benchmarks.harness import options_of, recorded
+from tests.support import made
 
 LEAST_M = 0.3  # size of the objects that count
 LEAST_RAYS = {2: 10, 3: 40}  # of the keyframes' scans, for an object to be in sight
@@ -50,14 +48,9 @@ class Score:
 
 
 def main() -> None:
-    parser = command_line(__doc__)
-    parser.add_argument("--world", default="office")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
-    parser.add_argument("--sensor")
-    parser.add_argument("--seconds", type=float)
-    parser.add_argument("--later-seconds", type=float)
-    parser.add_argument("--unchanged", action="store_true")
-    options = parser.parse_args()
+    options = options_of(
+        __doc__, world="office", seeds=[1, 2, 3], sensor=str, seconds=float, later_seconds=float, unchanged=False
+    )
     scores = [score_of(options, seed) for seed in options.seeds]
     total = Score(*(sum(getattr(score, name) for score in scores) for name in Score.__slots__))
     for name, score in (*zip(map(str, options.seeds), scores, strict=True), ("all", total)):
@@ -86,7 +79,7 @@ def score_of(options: argparse.Namespace, seed: int) -> Score:
 
 
 def _mapped(drive: Drive, name: str, cache: Path) -> SavedMap:
-    return open_saved_map(run_of(recorded(name, drive, cache), cache, name))
+    return open_saved_map(made.run_of(recorded(name, drive, cache), cache, name))
 
 
 def _score(found: Changes, first: Drive, second: Drive, a: SavedMap, b: SavedMap) -> Score:
@@ -100,7 +93,12 @@ def _score(found: Changes, first: Drive, second: Drive, a: SavedMap, b: SavedMap
         changed = [
             each for each in second.changes if np.isfinite(each.before if here[0] is first else each.after).all()
         ]
-        both = _with_objects(there[0].solids, solids, [change.owner for change in changed])
+        owners, others = [change.owner for change in changed], there[0].solids
+        added, kept = np.isin(solids.owner, owners), ~np.isin(others.owner, owners)
+        both = np.append(
+            np.where(kept, others.owner, FIXED), solids.owner[added]
+        )  # as they stand on the other day
+        both = Solids(np.vstack([others.rows, solids.rows[added]]), both, others.ground)
         rays = np.minimum(_rays_by_owner(*here, solids), _rays_by_owner(*there, both))
         for change in changed:
             on = _on(points, solids, change.owner, MARGIN_M[d])
@@ -142,13 +140,6 @@ def _on(points: Matrix, solids: Solids, owner: int, margin_m: float) -> np.ndarr
             inside &= np.abs(-s * dx + c * dy) < half_y + margin_m
         on |= inside & (points[:, 2] > low - margin_m) & (points[:, 2] < high + margin_m)
     return on
-
-
-def _with_objects(solids: Solids, others: Solids, owners: list[int]) -> Solids:
-    """The solids, which no longer count as these objects, and the objects as they stand on another day."""
-    added, kept = np.isin(others.owner, owners), ~np.isin(solids.owner, owners)
-    owner = np.append(np.where(kept, solids.owner, FIXED), others.owner[added])
-    return Solids(np.vstack([solids.rows, others.rows[added]]), owner, solids.ground)
 
 
 def _rays_by_owner(drive: Drive, saved: SavedMap, solids: Solids) -> np.ndarray:

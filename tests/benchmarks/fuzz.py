@@ -1,7 +1,4 @@
-"""Reads damaged logs and messages, as many as wanted, and prints what is read badly.
-
-python -m tests.benchmarks.fuzz --cases 50000 --seed 1 [--only formats] [--keep DIR]
-"""
+"""Reads damaged logs and messages, as many as wanted of each kind, and prints and keeps what is read badly."""
 
 import tempfile
 import time
@@ -9,19 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from tests.benchmarks.harness import command_line
+from tests.benchmarks.harness import options_of
 from tests.support import fuzzing, fuzzing_formats
 
 
 def main():
-    parser = command_line(__doc__, cache=False)
-    parser.add_argument("--cases", type=int, default=20_000, help="of each kind")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", choices=KINDS, help="one kind of case; else all")
-    parser.add_argument("--keep", type=Path, help="folder for the files that are read badly")
-    options = parser.parse_args()
+    options = options_of(__doc__, cache=False, cases=20_000, seed=0, only=KINDS, keep=Path)
     bad = 0
-    for name in [options.only] if options.only else KINDS:
+    for name in options.only:
         began, found = time.process_time(), 0
         with tempfile.TemporaryDirectory() as folder:
             for wrong, data in KINDS[name](Path(folder), np.random.default_rng(options.seed), options.cases):

@@ -1,8 +1,6 @@
-"""A lidar carried elsewhere while nothing is recorded: ``python -m tests.benchmarks.gaps [LOG ...]``.
+"""A lidar carried elsewhere while nothing is recorded.
 
-    [--cases N] [--seed N] [--paths BEFORE GAP AFTER]
-
-Of a log two stretches of the path are taken, these numbers of meters long, with a gap between them, at random
+Of a log two stretches of the path are taken, with a gap between them (``--paths``, meters of all three), at random
 places; wheels are left out. The reference is the run of the whole log, or the truth of a simulated one.
 
   right     the second stretch is joined to the first, within 1.5 m (median over pairs of poses) of the reference
@@ -17,20 +15,21 @@ from __future__ import annotations
 import random
 from collections import Counter
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial import KDTree
 
 from scanchain import lie
 from scanchain.data import Matrix, Scan
+from scanchain.evaluation import path_length
 from scanchain.logs import Log, open_log
 from scanchain.settings import load_settings
 from scanchain.slam import Slam
-from tests.benchmarks.harness import DATA, command_line, poses_at, table, traveled_m
+from tests.benchmarks.harness import options_of, poses_at, table
+from tests.support.scenes import DATA
 
 RIGHT_M, IN_SIGHT_M, STEP = 1.5, 3.0, 20
-LOGS = tuple(DATA / name for name in ("2d/intel.mcap", "2d/aces.mcap", "2d/mit_csail.mcap"))
+LOGS = [DATA / name for name in ("2d/intel.mcap", "2d/aces.mcap", "2d/mit_csail.mcap")]
 
 
 def reference_of(log: Log, scans: list[Scan]) -> Matrix:
@@ -72,18 +71,13 @@ def outcome(log: Log, scans: list[Scan], T: Matrix, first: range, second: range)
 
 def main() -> None:
     """Print a line a case, and how many ended how."""
-    parser = command_line(__doc__, cache=False)
-    parser.add_argument("logs", nargs="*", type=Path, default=LOGS)
-    parser.add_argument("--cases", type=int, default=16)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--paths", nargs=3, type=float, default=(120.0, 40.0, 60.0))
-    options = parser.parse_args()
+    options = options_of(__doc__, "logs", cache=False, logs=LOGS, cases=16, seed=1, paths=[120.0, 40.0, 60.0])
     row = table("log", "case", "second stretch", "in sight", "after")
     for path in options.logs:
         log = open_log([path])
         scans = list(log.scans(load_settings(log.dimension).config.preprocess))
         T = reference_of(log, scans)
-        path_m, chosen, ends = traveled_m(T), random.Random(options.seed), Counter[str]()
+        path_m, chosen, ends = path_length(T), random.Random(options.seed), Counter[str]()
         spans_m = np.append(0.0, np.cumsum(options.paths))
         for case in range(options.cases):
             begin_m = chosen.uniform(0.0, max(path_m[-1] - spans_m[-1], 0.0))

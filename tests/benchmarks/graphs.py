@@ -1,7 +1,5 @@
 """Pose-graph optimization against GTSAM on the published graphs, interleaved.
 
-    python -m tests.benchmarks.graphs [GRAPH ...] [--repeats 5]
-
 Each method optimizes what it has read; reading is not timed, building the problem and the first guess are. GTSAM
 runs from the file's guess and from its own (chordal in 3D; LAGO in 2D, which takes diagonal information only and
 gets the diagonal), with Gauss-Newton and with Levenberg-Marquardt. All ½χ² are evaluated by the same code:
@@ -18,11 +16,12 @@ from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.g2o import read_g2o, write_g2o
-from tests.benchmarks.harness import DATA, command_line, table
+from tests.benchmarks.harness import options_of, table
+from tests.support.graphs import BEST
+from tests.support.scenes import DATA
 
 SHORT = (("LM", "levenberg-marquardt"), ("GN", "gauss-newton"))
-GRAPHS = ("manhattan", "intel", "MIT", "smallGrid3D", "sphere2500", "torus3D")
-BEST = {"manhattan": 1774.5205, "intel": 22.5021, "MIT": 20.6035, "sphere2500": 675.701, "torus3D": 12117.6}
+GRAPHS = ["manhattan", "intel", "MIT", "smallGrid3D", "sphere2500", "torus3D"]
 SLOW_S = 2.0  # of a method that is run once only
 
 
@@ -154,10 +153,7 @@ def certify(path):
 
 
 def main():
-    parser = command_line(__doc__)
-    parser.add_argument("graphs", nargs="*", default=GRAPHS)
-    parser.add_argument("--repeats", type=int, default=5)
-    options = parser.parse_args()
+    options = options_of(__doc__, "graphs", graphs=GRAPHS, repeats=5)
     options.cache.mkdir(parents=True, exist_ok=True)
     for path in (DATA / "graphs" / f"{name}.g2o" for name in options.graphs):
         for _, warm in SHORT:

@@ -2,50 +2,56 @@
 
 from __future__ import annotations
 
-import argparse
 import os
+import sys
 import tempfile
+from argparse import ArgumentParser, Namespace, RawDescriptionHelpFormatter
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-import scanchain
 from scanchain import lie
 from scanchain.data import Matrix, Trajectory
 from scanchain.evaluation import absolute_error, pair
+from scanchain.evaluation.pairing import nearest
 from scanchain.maps import SavedMap
 from scanchain.simulation import SENSORS, WORLDS, Drive, record
 from tests.support import made
-from tests.support.scenes import ROOT
 
-DATA = Path(os.environ.get("SCANCHAIN_DATA", ROOT.parent / "shared" / "data"))
 CACHE = Path(tempfile.gettempdir()) / "scanchain_benchmarks"
 LIDARS = [name for name, sensor in SENSORS.items() if sensor.dimension == 3]
 PLACES = [name for name, world in WORLDS.items() if world.sensor in LIDARS]
+SEQUENCES = {"worlds": ",".join(PLACES), "sensors": ",".join(LIDARS), "scans": 300}  # simulated: options
 KITTI = ("kitti_0005_first60.mcap", "kitti_0001_first54.mcap")
 
-Answer = TypeVar("Answer")
 
+def options_of(text: str | None, argument: str = "", *, cache: bool = True, **defaults: object) -> Namespace:
+    """What the command line says, whose help is the text of the benchmark.
 
-def command_line(description: str | None, *, cache: bool = True) -> argparse.ArgumentParser:
-    """A parser whose help is the text of the benchmark; with the folder of what is made once."""
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    if cache:
-        parser.add_argument("--cache", type=Path, default=CACHE, help="default: %(default)s")
-    return parser
-
-
-def choose_sequences(parser: argparse.ArgumentParser, *, worlds: Iterable[str] = PLACES, scans: int = 300) -> None:
-    """Options that choose among the simulated sequences."""
-    parser.add_argument("--worlds", default=",".join(worlds), help="default: %(default)s")
-    parser.add_argument("--sensors", default=",".join(LIDARS), help="default: %(default)s")
-    parser.add_argument("--scans", type=int, default=scans, help="at most, default: %(default)s")
+    A default tells the type of its option. Of a list or the keys of a dict there may be several; a tuple has the
+    choices, a type stands for no default. ``argument`` is the one without dashes.
+    """
+    command = f"python -m tests.benchmarks.{Path(sys.argv[0]).stem}"
+    parser = ArgumentParser(command, description=text, formatter_class=RawDescriptionHelpFormatter)
+    for name, default in (defaults | ({"cache": CACHE} if cache else {})).items():
+        how: dict[str, object] = {"type": type(default), "default": default, "help": "default: %(default)s"}
+        if default is False:
+            how = {"action": "store_true"}
+        elif isinstance(default, tuple):
+            how = {"choices": default}
+        elif isinstance(default, type):
+            how = {"type": default}
+        elif isinstance(default, list | dict):
+            values = list(default)
+            how |= {"default": values, "nargs": "*", "type": type(values[0]) if values else str}
+            how |= {"choices": values} if isinstance(default, dict) else {}
+        parser.add_argument(name if name == argument else f"--{name.replace('_', '-')}", **how)
+    return parser.parse_args()
 
 
 def table(*heads: str) -> Callable[..., None]:
@@ -70,16 +76,7 @@ def recorded(name: str, drive: Drive, cache: Path) -> Path:
     return made.recorded(name, lambda draft: record(drive, draft, force=True), cache)
 
 
-def run_of(log: Path, cache: Path, name: str, **options: object) -> Path:
-    """The run of a log without a recording, made once for each version of the code."""
-    out = cache / f"runs_{made.version()}" / name
-    if not out.exists():
-        out.parent.mkdir(parents=True, exist_ok=True)
-        scanchain.run(log, out, recording=False, **options)
-    return out
-
-
-def in_fresh_process(function: Callable[..., Answer], *arguments: object) -> Answer:
+def in_fresh_process(function: Callable, *arguments: object) -> object:
     """The function's answer from a process of its own: GenZ-ICP remembers its last log, others may crash.
 
     Threads wait asleep there: small_gicp's spin by default, and where somebody else has one of two cores they
@@ -90,18 +87,9 @@ def in_fresh_process(function: Callable[..., Answer], *arguments: object) -> Ans
         return executor.submit(function, *arguments).result()
 
 
-def traveled_m(poses: Matrix) -> NDArray[np.float64]:
-    """(N,) path up to each pose."""
-    return np.append(0.0, np.cumsum(np.linalg.norm(np.diff(poses[:, :-1, -1], axis=0), axis=1)))
-
-
 def poses_at(trajectory: Trajectory, stamps_ns: NDArray[np.int64]) -> Matrix:
     """Poses nearest in time."""
-    order = np.argsort(trajectory.stamps_ns, kind="stable")
-    stamps = trajectory.stamps_ns[order]
-    after = np.clip(np.searchsorted(stamps, stamps_ns), 1, len(stamps) - 1)
-    nearer = after - (stamps_ns - stamps[after - 1] < stamps[after] - stamps_ns)
-    return trajectory.poses[order[nearer]]
+    return trajectory.poses[nearest(stamps_ns, trajectory.stamps_ns)[0]]
 
 
 def true_in_map(prior: SavedMap, map_truth: Trajectory, poses: Matrix) -> tuple[Matrix, NDArray[np.float64]]:

@@ -1,8 +1,5 @@
 """The landmark problems of the course report by every linear solver, and an MRCLAM log against GTSAM.
 
-    python -m tests.benchmarks.landmarks linear [--repeats 9]
-    python -m tests.benchmarks.landmarks log [--robot 1] [--repeats 9]
-
 linear: each round solves every problem by every method in turn; times are medians of whole solutions of A x = b,
 a new solver each time; "again" is with the same solver once more, which keeps what it found out about the
 pattern. The report's seconds are of another machine (and its QR is SuiteSparseQR): ratios within a column
@@ -28,7 +25,8 @@ from scanchain.landmarks.problem import BearingRangeProblem, Values, linear_syst
 from scanchain.landmarks.ranges import OWN, OdometryNoise, reckon, solve_range_log
 from scanchain.landmarks.solvers import METHODS, compare, create_solver
 from scanchain.landmarks.study import against_truth
-from tests.benchmarks.harness import DATA, command_line, table
+from tests.benchmarks.harness import options_of, table
+from tests.support.scenes import DATA
 
 OF_THE_REPORT = ("default", "pinv", "lu", "lu_colamd", "qr", "qr_colamd")
 REPORT_S = {
@@ -158,11 +156,7 @@ def real_log(options):
 
 
 def main():
-    parser = command_line(__doc__, cache=False)
-    parser.add_argument("which", choices=("linear", "log"))
-    parser.add_argument("--robot", type=int, default=1)
-    parser.add_argument("--repeats", type=int, default=9)
-    options = parser.parse_args()
+    options = options_of(__doc__, "which", cache=False, which=("linear", "log"), robot=1, repeats=9)
     {"linear": linear, "log": real_log}[options.which](options)
 
 

@@ -1,8 +1,5 @@
 """Localization in a map from nowhere: how soon, how surely, how accurately, and what it costs.
 
-    python -m tests.benchmarks.localize [--cases intel,vlp-16,...] [--starts 200] [--whole]
-    python -m tests.benchmarks.localize --cases city [--km 10] [--sensor vlp-16] [--every 2] [--live] [--memory]
-
 From each start a log begins anew, in the map of another drive or of an earlier part of its own, and is processed
 until it is found and 3 m farther, or until it has traveled 15 m (in space 40 m, in the city 60 m). Logs of other
 places are run whole by ``tests.benchmarks.places``. Starts are evenly spread; those of planar logs over places
@@ -26,8 +23,8 @@ own.
 from __future__ import annotations
 
 import argparse
-import subprocess
-import sys
+import os
+import tempfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -41,26 +38,20 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from scanchain import lie
-from scanchain.data import Matrix, Scan, Trajectory
+from scanchain.data import Matrix, Scan
+from scanchain.evaluation import path_length
 from scanchain.logs import open_log
 from scanchain.maps import SavedMap, open_saved_map
 from scanchain.odometry import Odometry
+from scanchain.processes import Limits, run_within
 from scanchain.sessions.localizer import Localizer
 from scanchain.settings import load_settings
 from scanchain.simulation.drive import plan
 from scanchain.simulation.worlds import WORLDS, outdoor
 from scanchain.trajectory import read_tum
-from tests.benchmarks.harness import (
-    DATA,
-    command_line,
-    in_fresh_process,
-    recorded,
-    run_of,
-    table,
-    traveled_m,
-    true_in_map,
-)
+from tests.benchmarks.harness import in_fresh_process, options_of, recorded, table, true_in_map
 from tests.support import made
+from tests.support.scenes import DATA
 
 SEEN_M, SEEN_SHARE, ON_MAP_M = 5.0, 0.6, 0.2
 GIVE_UP_M, AFTER_M, WARM_UP = {2: 15.0, 3: 40.0}, 3.0, 3
@@ -101,17 +92,11 @@ class Outcome:
 # ---------------------------------------------------------------- cases
 
 
-def _truth(log: Path) -> Trajectory:
-    truth = open_log(log).ground_truth()
-    assert truth is not None
-    return truth
-
-
 def later_part(name: str, end_s: float, options: argparse.Namespace) -> Case:
     """A log, in the map of its first seconds."""
     log = DATA / "2d" / f"{name}.mcap"
-    prior = open_saved_map(run_of(log, options.cache, f"{name}_{end_s:g}", log__end_s=end_s))
-    whole = read_tum(run_of(log, options.cache, name) / "trajectory.tum")
+    prior = open_saved_map(made.run_of(log, options.cache, f"{name}_{end_s:g}", log__end_s=end_s))
+    whole = read_tum(made.run_of(log, options.cache, name) / "trajectory.tum")
     first = max(keyframe.scan_index for keyframe in prior.keyframes) + 1
     return Case(prior, log, true_in_map(prior, whole, whole.poses)[0], first)
 
@@ -157,24 +142,18 @@ def city(options: argparse.Namespace) -> Case:
 
 
 def _mapped(options: argparse.Namespace, mapped: Path, log: Path) -> Case:
-    prior = open_saved_map(run_of(mapped, options.cache, mapped.stem))
-    return Case(prior, log, true_in_map(prior, _truth(mapped), _truth(log).poses)[0])
+    prior = open_saved_map(made.run_of(mapped, options.cache, mapped.stem))
+    truths = open_log(mapped).ground_truth(), open_log(log).ground_truth().poses
+    return Case(prior, log, true_in_map(prior, *truths)[0])
 
 
-def _print_peak(*arguments: str) -> None:
-    """Run a command of scanchain; the peak of its resident memory, its exit code 1 being a verdict.
-
-    A small process starts it, for a child begins with the peak of its parent.
-    """
-    start = (
-        "import resource, subprocess, sys\n"
-        "code = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL).returncode\n"
-        "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)\n"
-        "sys.exit(code > 1)"
-    )
-    command = [sys.executable, "-c", start, sys.executable, "-m", "scanchain", *arguments]
-    kibibytes = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
-    print(f"{arguments[0]}: {int(kibibytes) / 1024.0:.0f} MiB at most", flush=True)
+def _print_peak(*words: str) -> None:
+    """Run a command of scanchain; the peak of its resident memory, its exit code 1 being a verdict."""
+    with tempfile.TemporaryDirectory() as folder:
+        unlimited, said = Limits(np.inf, np.inf), Path(folder) / "said"
+        ended = run_within(unlimited, "scanchain", words, os.environ, output=said, interval_s=0.05)
+    assert ended.code in (0, 1), ended
+    print(f"{words[0]}: {ended.peak_mib:.0f} MiB at most", flush=True)
 
 
 CASES: dict[str, Callable[[argparse.Namespace], Case]] = {
@@ -200,17 +179,16 @@ CASES: dict[str, Callable[[argparse.Namespace], Case]] = {
 def starts_of(case: Case, log_scans: list[Scan], count: int) -> list[int]:
     """Scans from which the log begins."""
     if case.prior.dimension == 3:
-        length = len(_truth(case.log))
+        length = len(open_log(case.log).ground_truth())
         return np.linspace(0, int(length * 0.9), count).astype(int).tolist()  # so that there is path left
     surfaces = KDTree(np.vstack([lie.transform(k.T_odom_lidar, k.points[::2]) for k in case.prior.keyframes]))
-    assert case.T_map_lidar is not None
     poses = lie.flatten(case.T_map_lidar)
     some = np.arange(case.first, len(log_scans), 5)
     share = np.array([
         np.mean(surfaces.query(lie.transform(poses[i], log_scans[i].points[::3].astype(float)))[0] < ON_MAP_M)
         for i in some.tolist()
     ])  # fmt: skip
-    path_m = traveled_m(poses[some])
+    path_m = path_length(poses[some])
     ends = np.searchsorted(path_m, path_m + SEEN_M).tolist()
     is_seen = [
         share[k] > SEEN_SHARE and share[k : end + 1].mean() > SEEN_SHARE and path_m[-1] > path_m[k] + GIVE_UP_M[2]
@@ -297,18 +275,10 @@ def row(name: str, options: argparse.Namespace) -> tuple[object, ...]:
 
 
 def main() -> None:
-    parser = command_line(__doc__)
-    parser.add_argument(
-        "--cases", default="intel,aces,identical,vlp-16,os1-32,changed", help="default: %(default)s"
-    )
-    parser.add_argument("--starts", type=int, default=200)
-    parser.add_argument("--whole", action="store_true")
-    parser.add_argument("--live", action="store_true")
-    parser.add_argument("--km", type=float, default=10.0, help="of streets, default: %(default)s")
-    parser.add_argument("--sensor", default="vlp-16", help="of the city, default: %(default)s")
-    parser.add_argument("--every", type=int, default=2, help="sweeps a scan, default: %(default)s")
-    parser.add_argument("--memory", action="store_true")
-    options = parser.parse_args()
+    options = options_of(
+        __doc__, cases="intel,aces,identical,vlp-16,os1-32,changed", starts=200, whole=False, live=False, km=10.0,
+        sensor="vlp-16", every=2, memory=False,
+    )  # fmt: skip
     line = table(*HEAD, *(WHOLE if options.whole else ()))
     for name in options.cases.split(","):
         line(*in_fresh_process(row, name, options))

@@ -1,19 +1,14 @@
 """Time and memory of SLAM along a long log.
 
-    python -m tests.benchmarks.long_run [--log LOG] [--scans N] [--pass N] [--live N] [--finish] [--odometry]
-
-A laser scanner goes round the simulated office for hours; or a log given is played forward and backward in turn.
-Every tenth of the way: the mean CPU time of ``Slam.process`` a scan, loops and optimizations included, of this
-thread and of all, the memory of this process and its peak, and what it keeps in a file instead. With ``--live``,
-so many scans more come in real time, forty a second: the longest that ``Slam.track`` took of one, by the clock.
-With ``--finish`` the last optimization follows, of everything. ``--odometry`` tracks the scans and does nothing
-else: its memory stays as it is.
+The log is played forward and backward in turn. Every tenth of the way: the mean CPU time of ``Slam.process`` a
+scan, loops and optimizations included, of this thread and of all, the memory of this process and its peak, and
+what it keeps in a file instead. With ``--live``, so many scans more come in real time, forty a second: the longest
+that ``Slam.track`` took of one, by the clock. With ``--finish`` the last optimization follows, of everything.
 """
 
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Iterator
 from itertools import cycle, islice
 from pathlib import Path
@@ -21,14 +16,13 @@ from time import perf_counter, process_time, sleep, thread_time
 
 import numpy as np
 
-from scanchain import Odometry, Slam
+from scanchain import Slam
 from scanchain.data import Pose, Scan
 from scanchain.logs import Log, open_log
 from scanchain.point_store import PointStore
 from scanchain.processes import peak_mib, resident_mib
 from scanchain.settings import load_settings
-from scanchain.simulation import SENSORS, simulate
-from tests.benchmarks.harness import command_line
+from tests.benchmarks.harness import options_of
 
 _LIVE_S = 0.025  # period of a fast laser scanner
 _PAUSE_NS = 50_000_000  # between two passes, in which nothing moves
@@ -37,11 +31,10 @@ _PAUSE_NS = 50_000_000  # between two passes, in which nothing moves
 class BackAndForth:
     """Scans of a log, kept in files; time runs backward on every other pass, also within a sweep."""
 
-    def __init__(self, log: Log, count: int | None = None) -> None:
-        """Count : of the scans of a pass, from the first on."""
+    def __init__(self, log: Log) -> None:
         self._points, self._times = PointStore(log.dimension), PointStore(1)
         self._kept: list[tuple[int, int, int, int, Pose | None]] = []
-        for scan in islice(log.scans(), count):
+        for scan in log.scans():
             points = self._points.add(scan.points)
             times = self._times.add(scan.times_s[:, None])
             self._kept.append((scan.stamp_ns, points.first, points.count, times.count, scan.T_odom_base))
@@ -64,50 +57,35 @@ class BackAndForth:
 
 
 def main() -> None:
-    parser = command_line(__doc__, cache=False)
-    parser.add_argument("--scans", type=int, default=20_000)
-    parser.add_argument("--log", type=Path, help="take the scans of this log instead of simulating one")
-    parser.add_argument("--pass", type=int, dest="length", help="scans of the log that are played")
-    parser.add_argument("--live", type=int, default=0)
-    parser.add_argument("--finish", action="store_true")
-    parser.add_argument("--odometry", action="store_true")
-    arguments = parser.parse_args()
-    count = arguments.scans + arguments.live
-    with tempfile.TemporaryDirectory() as folder:
-        path = arguments.log or Path(folder) / "office.mcap"
-        if arguments.log is None:
-            simulate("office", path, duration_s=count * SENSORS["lms-270"].period_ns * 1e-9)
-        log = open_log(path)
-        config = load_settings(log.dimension).config
-        scans = BackAndForth(log, arguments.length).scans(count) if arguments.log else log.scans()
-        chain = (Odometry if arguments.odometry else Slam)(config, log.T_base_lidar)
-        _follow(chain, islice(scans, arguments.scans), arguments.scans)
-        if isinstance(chain, Slam):
-            _follow_live(chain, scans)
-            if arguments.finish:
-                started = process_time()
-                chain.finish()
-                print(f"last optimization: {process_time() - started:.1f} s, peak {peak_mib():.1f} MiB")
+    arguments = options_of(__doc__, cache=False, log=Path, scans=20_000, live=0, finish=False)
+    log = open_log(arguments.log)
+    scans = BackAndForth(log).scans(arguments.scans + arguments.live)
+    slam = Slam(load_settings(log.dimension).config, log.T_base_lidar)
+    _follow(slam, islice(scans, arguments.scans), arguments.scans)
+    _follow_live(slam, scans)
+    if arguments.finish:
+        started = process_time()
+        slam.finish()
+        print(f"last optimization: {process_time() - started:.1f} s, peak {peak_mib():.1f} MiB")
 
 
-def _follow(chain: Slam | Odometry, scans: Iterator[Scan], count: int) -> None:
+def _follow(slam: Slam, scans: Iterator[Scan], count: int) -> None:
     tenth, spent_s, held_mib, taken_s, all_s = max(count // 10, 1), [], [], 0.0, 0.0
     for number, scan in enumerate(scans, 1):
         started, all_started = thread_time(), process_time()
-        chain.process(scan)
+        slam.process(scan)
         taken_s, all_s = taken_s + thread_time() - started, all_s + process_time() - all_started
         if number % tenth == 0:
             spent_s.append(taken_s)
             held_mib.append(resident_mib(os.getpid()))
-            line = (
+            stored_mib = 4 * slam.dimension * slam.points.rows / 2**20
+            print(
                 f"{number:6} scans {1e3 * taken_s / tenth:6.2f} ms a scan "
-                f"({1e3 * all_s / tenth:.2f} with threads), {held_mib[-1]:6.1f} MiB (peak {peak_mib():.1f})"
+                f"({1e3 * all_s / tenth:.2f} with threads), {held_mib[-1]:6.1f} MiB (peak {peak_mib():.1f}), "
+                f"{stored_mib:5.1f} in a file; {len(slam.keyframes)} keyframes, "
+                f"{len(slam.closures)} closures tried",
+                flush=True,
             )
-            if isinstance(chain, Slam):
-                stored_mib = 4 * chain.dimension * chain.points.rows / 2**20
-                kept = f"{len(chain.keyframes)} keyframes, {len(chain.closures)} closures tried"
-                line += f", {stored_mib:5.1f} in a file; {kept}"
-            print(line, flush=True)
             taken_s, all_s = 0.0, 0.0
     if len(spent_s) >= 10:
         varies = 100.0 * np.ptp(held_mib) / held_mib[0]

@@ -1,11 +1,8 @@
 """Loop closure with drift turned up: revisits that are found, closures that are false, what the trajectory gains.
 
-    python -m tests.benchmarks.loops 2d [--logs intel mit_csail ...] [--drifts 0.01,0.002 ...] [--false 0.3]
-    python -m tests.benchmarks.loops 3d [--worlds rounds] [--sensors vlp-16,...] [--drifts ...] [--false 0.3]
-
-Every motion of the odometry is made longer by a share of itself and turned left by so much a meter (in space up,
-too, by a quarter of that) before the rest of the chain sees it. The reference is the truth of a simulated log in
-space; of a planar one it is the log as it is, without added drift.
+Every motion of the odometry is made longer by a share of itself and turned left by so much a meter (``--drifts
+0.01,0.002 ...``; in space up, too, by a quarter of that) before the rest of the chain sees it. The reference is
+the truth of a simulated log in space; of a planar one it is the log as it is, without added drift.
 
 A closure is false where its relative pose is more than 0.5 m, in space 2 m or 3°, from the reference (drift
 bends the local maps, too). A keyframe is a revisit where the reference has it within 5 m of an older one that
@@ -19,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
 from time import perf_counter
@@ -29,65 +25,43 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.data import BACK_END, Closure, ClosureVerdict, Matrix, Pose, Proposal, Trajectory
+from scanchain.evaluation import path_length
 from scanchain.logs import open_log
 from scanchain.runs.closures import final_verdicts
 from scanchain.settings import load_settings
-from tests.benchmarks.harness import (
-    DATA,
-    ate_m,
-    choose_sequences,
-    command_line,
-    drive_of,
-    in_fresh_process,
-    table,
-    traveled_m,
-)
+from tests.benchmarks.harness import SEQUENCES, ate_m, drive_of, in_fresh_process, options_of, table
 from tests.support import made
-from tests.support.drifting import drifting_slam, off_by, stretched
-from tests.support.false_loops import MADE_UP, false_closures
+from tests.support.drifting import MADE_UP, drifting_slam, false_closures, off_by, stretched
+from tests.support.scenes import DATA
 
 NEAR_M, BACK_M, OPPOSITE_RAD, ALONG_M = 5.0, 100.0, np.radians(135.0), 10.0
 TRUE = {2: (0.5, np.inf), 3: (2.0, np.radians(3.0))}
 DRIFTS = {2: ("0.01,0.002", "0.01,-0.005", "-0.03,0.01"), 3: ("0.01,0.0002",)}
 HEAD = "log,drift,ATE,accepted,by place,false,overruled,revisits,opposite,named,s,loops"
 
-Drifted = Callable[[Pose], Pose]
 
-
-@dataclass(frozen=True, slots=True)
-class Drift:
-    """Share of the way by which motions are longer, and radians a meter by which they turn."""
-
-    longer: float
-    turn_rad_m: float
-
-    def of(self, dimension: int) -> Drifted:
-        """What becomes of a motion."""
-        if dimension == 2:
-            return stretched(self.longer, self.turn_rad_m)
-        return off_by(np.array([self.longer, 0.0, 0.0, 0.0, -0.25 * self.turn_rad_m, self.turn_rad_m]))
-
-    def __str__(self) -> str:
-        return f"{100.0 * self.longer:g} %, {1e3 * self.turn_rad_m:g} mrad/m"
+def drifted(longer: float, turn_rad_m: float, dimension: int) -> Callable[[Pose], Pose]:
+    """What becomes of a motion: longer by a share of the way, turned by so many radians a meter."""
+    if dimension == 2:
+        return stretched(longer, turn_rad_m)
+    return off_by(np.array([longer, 0.0, 0.0, 0.0, -0.25 * turn_rad_m, turn_rad_m]))
 
 
 def undrifted(path: Path) -> Trajectory:
     """The reference of a log: the truth in space, the log as it is in the plane."""
     log = open_log(path)
     if log.dimension == 3:
-        truth = log.ground_truth()
-        assert truth is not None
-        return truth
+        return log.ground_truth()
     slam = drifting_slam(load_settings(2).config, log.T_base_lidar, stretched(0.0, 0.0))
     for scan in log.scans():
         slam.process(scan)
     return slam.finish().trajectory
 
 
-def row(path: Path, drift: Drift, truth: Trajectory, false_share: float) -> tuple[object, ...]:
+def row(path: Path, drift: tuple[float, float], truth: Trajectory, false_share: float) -> tuple[object, ...]:
     """The cells of a log."""
     log = open_log(path)
-    slam = drifting_slam(load_settings(log.dimension).config, log.T_base_lidar, drift.of(log.dimension))
+    slam = drifting_slam(load_settings(log.dimension).config, log.T_base_lidar, drifted(*drift, log.dimension))
     started = perf_counter()
     loops_s = sum(step.timing.loops_s for step in map(slam.process, log.scans()))
     spent_s = perf_counter() - started
@@ -103,13 +77,14 @@ def row(path: Path, drift: Drift, truth: Trajectory, false_share: float) -> tupl
     overruled = sum(each.rejected_by == BACK_END for each in judged)
     poses = true_poses(log.dimension, truth, result.keyframes)
     false = sum(not is_true(each, poses) for each in accepted)
-    path_m = traveled_m(poses)
+    path_m = path_length(poses)
     sources_m = path_m[[each.source for each in accepted]]
     found = np.any(np.abs(path_m[:, None] - sources_m) <= ALONG_M, axis=1)
     shares = [_share(found[which]) for which in revisits(poses, path_m)]
     ate = f"{ate_m(result.odometry, truth):.2f} to {ate_m(result.trajectory, truth):.2f} m"
     counts = len(accepted), by_place, false, overruled
-    return path.stem, drift, ate, *counts, *shares, _share(made_up), f"{spent_s:.1f}", f"{loops_s:.1f}"
+    drift_text = f"{100.0 * drift[0]:g} %, {1e3 * drift[1]:g} mrad/m"
+    return path.stem, drift_text, ate, *counts, *shares, _share(made_up), f"{spent_s:.1f}", f"{loops_s:.1f}"
 
 
 def true_poses(dimension: int, truth: Trajectory, keyframes) -> Matrix:
@@ -143,20 +118,12 @@ def _share(chosen) -> str:
     return f"{100.0 * np.mean(chosen):.1f} % of {len(chosen)}" if len(chosen) else "–"
 
 
-def planar_log(name: str, cache: Path) -> Path:
-    real = DATA / "2d" / f"{name}.mcap"
-    return real if real.exists() else made.log(name, folder=cache)
-
-
 def main() -> None:
-    parser = command_line(__doc__)
-    parser.add_argument("kind", choices=("2d", "3d"))
-    parser.add_argument("--logs", nargs="+", default=("intel", "mit_csail", "identical"), help="real or simulated")
-    choose_sequences(parser, worlds=("rounds",), scans=1600)
-    parser.add_argument("--drifts", nargs="+", help="share of the way, radians a meter")
-    parser.add_argument("--false", type=float, default=0.0, help="share of wrong closures, default: %(default)s")
-    options = parser.parse_args()
-    drifts = [Drift(*map(float, each.split(","))) for each in options.drifts or DRIFTS[int(options.kind[0])]]
+    options = options_of(
+        __doc__, "kind", kind=("2d", "3d"), logs=["intel", "mit_csail", "identical"], drifts=[], false=0.0,
+        **SEQUENCES | {"worlds": "rounds", "scans": 1600},
+    )  # fmt: skip
+    drifts = [tuple(map(float, each.split(","))) for each in options.drifts or DRIFTS[int(options.kind[0])]]
     line = table(*HEAD.split(","))
     for path in paths(options):
         truth = undrifted(path)
@@ -166,7 +133,8 @@ def main() -> None:
 
 def paths(options: argparse.Namespace) -> list[Path]:
     if options.kind == "2d":
-        return [planar_log(name, options.cache) for name in options.logs]
+        real = {name: DATA / "2d" / f"{name}.mcap" for name in options.logs}
+        return [path if path.exists() else made.log(name, folder=options.cache) for name, path in real.items()]
     pairs = [(world, sensor) for world in options.worlds.split(",") for sensor in options.sensors.split(",")]
     return [drive_of(*pair, options.scans, options.cache) for pair in pairs]
 

@@ -1,4 +1,4 @@
-"""Sessions cut from logs and merged, their starts unknown: ``python -m tests.benchmarks.merge [--only PART ...]``.
+"""Sessions cut from logs and merged, their starts unknown.
 
 Intel is run whole, and in four parts of a quarter of its time, which are merged; the error over the relations of
 Kümmerle et al. (2009) is that of all scans of both. A simulated town (64 rings) is cut in two, which share 4 s,
@@ -26,8 +26,9 @@ from scanchain.evaluation import read_relations, relation_error
 from scanchain.runs.metrics import Metrics
 from scanchain.sessions.merging import Merged
 from scanchain.trajectory import read_tum
-from tests.benchmarks.harness import DATA, ate_m, command_line, run_of, table
+from tests.benchmarks.harness import ate_m, options_of, table
 from tests.support import made
+from tests.support.scenes import DATA
 
 INTEL, ACES, CSAIL = (DATA / f"2d/{name}.mcap" for name in ("intel", "aces", "mit_csail"))
 LENGTH_S, SCANS = 2691.3, 2000
@@ -35,7 +36,7 @@ LENGTH_S, SCANS = 2691.3, 2000
 
 def run(cache: Path, name: str, log: Path, start_s: float = 0.0, end_s: float = np.inf) -> Path:
     """The run of a part of a log."""
-    return run_of(log, cache, name, log__start_s=start_s, log__end_s=end_s)
+    return made.run_of(log, cache, name, log__start_s=start_s, log__end_s=end_s)
 
 
 def run_s(runs: Sequence[Path]) -> float:
@@ -129,9 +130,7 @@ PARTS = {"intel": intel, "eight": eight, "cut": cut, "town": town, "look-alikes"
 
 
 def main() -> None:
-    parser = command_line(__doc__)
-    parser.add_argument("--only", nargs="+", choices=list(PARTS), default=list(PARTS))
-    options = parser.parse_args()
+    options = options_of(__doc__, only=PARTS)
     row = table("sessions", "in the map", "apart", "closures in force", "certified", "error", "runs", "merge")
     with tempfile.TemporaryDirectory() as folder:
         for name in options.only:

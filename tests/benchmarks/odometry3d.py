@@ -1,16 +1,13 @@
 """3D odometry, ours against others, on the same decoded scans, scan by scan in turn.
 
-    python -m tests.benchmarks.odometry3d [LOG ...] [--methods plicp,...] [--scans 300] [--indoor]
-    python -m tests.benchmarks.odometry3d --set [--worlds town,...] [--sensors vlp-16,...] [--scans 300]
-
 Methods, settings and warm-up are those of ``scanchain compare``, where each has a process of its own. LOG is any
 MCAP with a 3D lidar. Its scans are decoded once into memory, then every one goes through all methods in turn,
 starting with another one each time, so that whatever else the machine does meets all of them alike. The time is
 that of ``track`` alone, the first scan left out. Poses hold at the scan's stamp; where a method's own hold
-elsewhere in the sweep, its wrapper moves them. Every log has a process of its own. --indoor takes the settings
-that others recommend for indoors where they have some. Memory and sharpness of maps are figures of ``scanchain
-compare``. In the table x is over the same of the first row of ours; CPU time is the median of all threads
-together, ATE the rmse after rigid alignment, KITTI the mean over all stretches of 10, 20 and 40 m.
+elsewhere in the sweep, its wrapper moves them. Every log has a process of its own. Memory and sharpness of maps
+are figures of ``scanchain compare``. In the table x is over the same of the first row of ours; CPU time is the
+median of all threads together, ATE the rmse after rigid alignment, KITTI the mean over all stretches of 10, 20 and
+40 m.
 
 --set: every world of scanchain.simulation that is driven with a 3D lidar, with every 3D sensor. A cell is the
 KITTI translation error in % over stretches of 10, 20 and 40 m, and the ATE in meters. Where the path is shorter
@@ -24,6 +21,7 @@ import argparse
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -33,18 +31,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
-from scanchain.comparison.methods import Method, resolve
+from scanchain.comparison.methods import resolve
 from scanchain.comparison.worker import start, warm_up
-from scanchain.data import Pose, Scan, Trajectory
+from scanchain.data import Scan, Trajectory
 from scanchain.errors import InputError
-from scanchain.evaluation import (
-    SHORT_LENGTHS_M,
-    absolute_error,
-    kitti_error,
-    pair,
-)
-from scanchain.logs import open_log
-from tests.benchmarks.harness import DATA, KITTI, choose_sequences, command_line, drive_of, in_fresh_process, table
+from scanchain.evaluation import SHORT_LENGTHS_M, absolute_error, kitti_error, pair
+from scanchain.logs import Log, open_log
+from tests.benchmarks.harness import KITTI, SEQUENCES, drive_of, in_fresh_process, options_of, table
+from tests.support.scenes import DATA
 
 OURS = ("plicp", "svd")
 INDOORS = frozenset({"corridor", "staircase", "hall"})  # where others' settings for indoors are taken
@@ -53,17 +47,8 @@ COLUMNS = {"median ms": 2, "CPU ms": 2, "ATE m": 4, "KITTI %": 3, "KITTI deg/m":
 
 
 @dataclass(frozen=True, slots=True)
-class Recording:
-    """A log in memory: scans, where the lidar sits and, where the log has it, the ground truth."""
-
-    scans: list[Scan]
-    T_base_lidar: Pose
-    ground_truth: Trajectory | None
-
-
-@dataclass(frozen=True, slots=True)
 class Run:
-    """What a method made of a recording; the poses after a ``failure`` (empty if there was none) are NaN.
+    """What a method made of a log; the poses after a ``failure`` (empty if there was none) are NaN.
 
     ``seconds`` (N,) passed on the clock while a scan was tracked, ``cpu_seconds`` were spent by all threads.
     """
@@ -75,39 +60,31 @@ class Run:
     cpu_seconds: NDArray[np.float64]
     failure: str
 
-    @property
-    def is_whole(self) -> bool:
-        return bool(np.isfinite(self.trajectory.poses).all())
 
-
-def method_of(name: str) -> Method:
-    """One of ours or of the baselines."""
-    return resolve((name,), 3, file=None)[0]
-
-
-def default_methods(path: Path, *, indoor: bool) -> tuple[str, ...]:
+def default_methods(path: Path) -> tuple[str, ...]:
     """Ours and all others that are worth a row; GenZ-ICP as its authors tuned it for such a log."""
-    genz = "genz-icp-indoor" if indoor else "genz-icp-kitti" if "kitti" in path.name else "genz-icp"
+    genz = "genz-icp-kitti" if "kitti" in path.name else "genz-icp"
     return (*OURS, "kiss-icp", "small-vgicp", "small-gicp", genz, "open3d-p2l")
 
 
-def read(path: Path, count: int | None = None) -> Recording:
-    """The first scans of a log, and its ground truth."""
+def read(path: Path, count: int | None = None) -> tuple[Log, list[Scan]]:
+    """A log, and its first scans."""
     log = open_log(path)
     if log.dimension != 3:
         raise InputError(f"{path}: {log.topic} is 2D; this benchmark is for 3D lidars")
-    return Recording(list(islice(log.scans(), count)), log.T_base_lidar, log.ground_truth())
+    return log, list(islice(log.scans(), count))
 
 
-def run_all(recording: Recording, methods: Sequence[str]) -> list[Run]:
+def run_all(log: Log, scans: list[Scan], methods: Sequence[str]) -> list[Run]:
     """All methods over all scans, in turn, each scan starting with another one."""
-    for name in methods:
-        warm_up(recording.scans, method_of(name), recording.T_base_lidar)
-    racers = [start(method_of(name), recording.T_base_lidar) for name in methods]
-    poses = np.full((len(methods), len(recording.scans), 4, 4), np.nan)
-    seconds, cpu_seconds = np.zeros((2, len(methods), len(recording.scans)))
+    chosen = resolve(tuple(methods), 3, file=None)
+    for method in chosen:
+        warm_up(scans, method, log.T_base_lidar)
+    racers = [start(method, log.T_base_lidar) for method in chosen]
+    poses = np.full((len(methods), len(scans), 4, 4), np.nan)
+    seconds, cpu_seconds = np.zeros((2, len(methods), len(scans)))
     failures = [""] * len(methods)
-    for k, scan in enumerate(recording.scans):
+    for k, scan in enumerate(scans):
         for place in range(len(methods)):
             m = (place + k) % len(methods)
             if failures[m]:
@@ -118,7 +95,7 @@ def run_all(recording: Recording, methods: Sequence[str]) -> list[Run]:
             except Exception as error:  # others' code may raise anything; the race goes on
                 failures[m] = f"scan {k}: {type(error).__name__}: {error}"
             seconds[m, k], cpu_seconds[m, k] = perf_counter() - started, process_time() - cpu_started
-    stamps_ns = np.array([scan.stamp_ns for scan in recording.scans])
+    stamps_ns = np.array([scan.stamp_ns for scan in scans])
     trajectories = [Trajectory(stamps_ns, each) for each in poses]
     descriptions = [racer.description for racer in racers]
     return list(map(Run, methods, descriptions, trajectories, seconds, cpu_seconds, failures))
@@ -127,21 +104,19 @@ def run_all(recording: Recording, methods: Sequence[str]) -> list[Run]:
 # ---------------------------------------------------------------- one log in detail
 
 
-def run_log(path: Path, methods: Sequence[str], scans: int) -> None:
+def run_log(path: Path, methods: Sequence[str], count: int) -> None:
     """One line a method, then what each one did."""
-    recording = read(path, scans)
-    runs = run_all(recording, methods)
-    points = np.mean([len(scan.points) for scan in recording.scans])
-    timed = "with" if len(recording.scans[0].times_s) else "without"
-    print(f"\n{path.name}: {len(recording.scans)} scans of {points:.0f} points, {timed} times")
+    log, scans = read(path, count)
+    runs, truth = run_all(log, scans, methods), log.ground_truth()
+    points = np.mean([len(scan.points) for scan in scans])
+    timed = "with" if len(scans[0].times_s) else "without"
+    print(f"\n{path.name}: {len(scans)} scans of {points:.0f} points, {timed} times")
     print(f"{os.cpu_count()} cores, load average of the last minute {os.getloadavg()[0]:.1f}; quiet is below 2")
-    rows = {
-        run.name: (
-            *(1e3 * np.median(each[1:]) for each in (run.seconds, run.cpu_seconds)),
-            *accuracy(run, recording.ground_truth),
-        )
-        for run in runs
-    }
+    rows = {}
+    for run in runs:
+        spent_ms = (1e3 * np.median(each[1:]) for each in (run.seconds, run.cpu_seconds))
+        found = score(run, truth)
+        rows[run.name] = *spent_ms, found.ate_m, found.kitti_percent, found.kitti_deg_m
     base = rows[next((run.name for run in runs if run.name in OURS), runs[0].name)]
     line = table("method", *COLUMNS)
     for name, row in rows.items():
@@ -156,31 +131,27 @@ def _cell(digits: int, value: float, base: float) -> str:
     return f"{value:.{digits}f}" + (f" x{value / base:.2f}" if base > 0.0 else "")
 
 
-def accuracy(run: Run, ground_truth: Trajectory | None) -> tuple[float, float, float]:
-    """ATE in meters, KITTI in % and deg/m; NaN where there is no ground truth or too short a path."""
-    if ground_truth is None or not run.is_whole:
-        return np.nan, np.nan, np.nan
-    pairs = pair(run.trajectory, ground_truth)
-    ate_m = absolute_error(pairs).translation_m.rmse
-    try:
-        drift = kitti_error(pairs, SHORT_LENGTHS_M, every=1)
-    except InputError:
-        return ate_m, np.nan, np.nan
-    return ate_m, 100.0 * drift.translation_share, float(np.degrees(drift.rotation_rad_per_m))
-
-
 # ---------------------------------------------------------------- all worlds
 
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """How good a method was on a sequence; infinite where it was lost for want of a pose."""
+    """Errors of a method; infinite where there is no truth or not every pose, NaN where the path is too short."""
 
-    translation_percent: float
-    is_of_path: bool
-    ate_m: float
-    is_lost: bool
     median_s: float
+    ate_m: float = np.inf
+    kitti_percent: float = np.inf
+    kitti_deg_m: float = np.inf
+    path_length_m: float = np.inf
+    is_lost: bool = True
+
+    @property
+    def is_of_path(self) -> bool:
+        return self.path_length_m < SHORT_PATH_M
+
+    @property
+    def translation_percent(self) -> float:
+        return 100.0 * self.ate_m / self.path_length_m if self.is_of_path else self.kitti_percent
 
     def __str__(self) -> str:
         star = "*" if self.is_of_path else ""
@@ -189,23 +160,24 @@ class Score:
 
 def scores(path: Path, methods: Sequence[str]) -> list[Score]:
     """One score a method."""
-    recording = read(path)
-    assert recording.ground_truth is not None
-    return [score(run, recording.ground_truth) for run in run_all(recording, methods)]
+    log, scans = read(path)
+    return [score(run, log.ground_truth()) for run in run_all(log, scans, methods)]
 
 
-def score(run: Run, ground_truth: Trajectory) -> Score:
+def score(run: Run, truth: Trajectory | None) -> Score:
     """Errors of a run against the truth."""
     median_s = float(np.median(run.seconds[1:]))
-    if not run.is_whole:
-        return Score(np.inf, False, np.inf, True, median_s)
-    pairs = pair(run.trajectory, ground_truth)
+    if truth is None or not np.isfinite(run.trajectory.poses).all():
+        return Score(median_s)
+    pairs = pair(run.trajectory, truth)
     absolute = absolute_error(pairs)
     ends = (lie.between(poses[0], poses[-1])[:3, 3] for poses in (pairs.estimate, pairs.reference))
     is_lost = float(np.linalg.norm(next(ends) - next(ends))) > max(LOST_SHARE * absolute.path_length_m, LOST_M)
-    is_short = absolute.path_length_m < SHORT_PATH_M
-    share = absolute.share_of_path if is_short else kitti_error(pairs, SHORT_LENGTHS_M, every=1).translation_share
-    return Score(100.0 * share, is_short, absolute.translation_m.rmse, is_lost, median_s)
+    kitti = np.nan, np.nan
+    with suppress(InputError):  # no stretch fits into the path
+        drift = kitti_error(pairs, SHORT_LENGTHS_M, every=1)
+        kitti = 100.0 * drift.translation_share, float(np.degrees(drift.rotation_rad_per_m))
+    return Score(median_s, absolute.translation_m.rmse, *kitti, absolute.path_length_m, is_lost)
 
 
 def rank(row: Sequence[Score], first_rival: int, place: int) -> int:
@@ -262,20 +234,14 @@ def summary(
 
 
 def main() -> None:
-    parser = command_line(__doc__)
-    parser.add_argument("logs", nargs="*", type=Path, default=[DATA / "3d" / name for name in KITTI])
-    parser.add_argument("--methods", help="one that is unknown is answered with all others; --set: genz-icp "
-                        "stands for its settings for the place")  # fmt: skip
-    parser.add_argument("--indoor", action="store_true")
-    parser.add_argument("--set", action="store_true", help="simulated worlds instead of logs")
-    choose_sequences(parser)
-    arguments = parser.parse_args()
+    logs = [DATA / "3d" / name for name in KITTI]
+    arguments = options_of(__doc__, "logs", logs=logs, methods="", set=False, **SEQUENCES)
     named = tuple(arguments.methods.split(",")) if arguments.methods else ()
     if arguments.set:
-        run_set(arguments, named or default_methods(Path("log"), indoor=False))
+        run_set(arguments, named or default_methods(Path("log")))
         return
     for path in arguments.logs:
-        methods = named or default_methods(path, indoor=arguments.indoor)
+        methods = named or default_methods(path)
         in_fresh_process(run_log, path, methods, arguments.scans)
 
 

@@ -1,4 +1,4 @@
-"""What keyframes show at right and wrong poses in a map: ``python -m tests.benchmarks.place_odds [--cache DIR]``.
+"""What keyframes show at right and wrong poses in a map.
 
 Right poses are those of logs that enter a map (the real ones of ``places --late``), up to 5 m from its keyframes
 and disturbed by 0.3 m and 0.03 rad. Wrong ones are the best that a search finds for paths of real logs in the
@@ -28,7 +28,7 @@ from scanchain.loops.place_search import completed
 from scanchain.loops.planar_map_search import PlanarMapSearch
 from scanchain.maps import SavedMap, open_saved_map
 from scanchain.settings import load_settings
-from tests.benchmarks.harness import command_line, poses_at, table, true_in_map
+from tests.benchmarks.harness import options_of, poses_at, table, true_in_map
 from tests.benchmarks.places import ENTRIES, REAL, prepared, whole_of
 
 NEAR_M, AROUND = 5.0, 12
@@ -73,9 +73,7 @@ def right(name: str, cache: Path) -> Iterator[tuple[float, float, float]]:
     for keyframe in whole.keyframes[::2]:
         expected, away_m = true_in_map(saved, map_truth, poses_at(truth, np.array([keyframe.stamp_ns])))
         after_s = (keyframe.stamp_ns - begin_ns) * 1e-9
-        if away_m[0] < NEAR_M and float(str(options["log__start_s"])) <= after_s <= float(
-            str(options["log__end_s"])
-        ):
+        if away_m[0] < NEAR_M and options["log__start_s"] <= after_s <= options["log__end_s"]:
             off = lie.pose_2d(*random.normal(0.0, (0.3, 0.3, 0.03)).tolist())
             found = shown.of(keyframe, lie.flatten(expected[0]) @ off)
             yield from [] if found is None else [found]
@@ -108,7 +106,7 @@ def told(weights: NDArray[np.float64], ours: Matrix, others: Matrix) -> tuple[st
 
 
 def main() -> None:
-    cache = command_line(__doc__).parse_args().cache
+    cache = options_of(__doc__).cache
     runs = {log: whole_of(log, cache) for log in REAL}
     maps = {log: open_saved_map(run) for log, run in runs.items()}
     ours = np.array([each for name, entry in ENTRIES.items() if entry.log in REAL for each in right(name, cache)])

@@ -1,11 +1,7 @@
 """Whole logs in maps of other places, or in maps that they enter later: the states of all scans and the verdict.
 
-    python -m tests.benchmarks.places [--kind 2d 3d] [--places NAME ...] [--own] [--seed N] [--set KEY=VALUE ...]
-    python -m tests.benchmarks.places --late [--kind 2d 3d] [--places NAME ...] [--seed N] [--set KEY=VALUE ...]
-
 A map is made of each place by ``run``, and every log of another place is localized in it, from its first scan to
-its last: all ordered pairs. --own localizes a log of the same place instead: another day, another start or
-another part of it. --set changes the configuration of localization (``--set log.every=2 log.wheels=``).
+its last: all ordered pairs. --set changes the configuration of localization (``--set log.every=2``).
 
   refused   not placed, and none of its scans has ever had a pose in the map
   held      refused in the end, but scans had a pose in the map for a while
@@ -41,8 +37,9 @@ from scanchain.errors import ScanchainError
 from scanchain.maps import open_saved_map
 from scanchain.sessions.localizer import MapState
 from scanchain.trajectory import read_tum
-from tests.benchmarks.harness import DATA, command_line, poses_at, run_of, settings_of, table, true_in_map
+from tests.benchmarks.harness import options_of, poses_at, settings_of, table, true_in_map
 from tests.support import made
+from tests.support.scenes import DATA
 
 Options = dict[str, object]
 
@@ -56,71 +53,50 @@ HEAD = "log|outside|inside|found after|wrong poses|error|σ then, final|NEES|CPU
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """A real log, or a simulated world, and what its map and its log are made of.
-
-    ``mapped`` and ``again`` are options of ``run`` and ``localize``, or of ``simulate``, for the map and for the
-    log that is localized in its own place; ``options`` are those of both. Those of one ``site`` are one place.
-    """
+    """A real log with options of ``run``, or a world with those of ``simulate``; those of a ``site`` are one."""
 
     kind: str
     log: str = ""
     world: str = ""
-    other: str = ""
     options: Options = field(default_factory=dict)
-    again: Options = field(default_factory=dict)
-    mapped: Options = field(default_factory=dict)
     site: str = ""
 
-
-def _real(log: str, end_s: float, **options: object) -> Place:
-    """A log whose first seconds are the map of its own place, and the rest is localized in it."""
-    return Place(log[:2], log, options=options, again={"log__start_s": end_s}, mapped={"log__end_s": end_s})
+    def of(self, seed: int, cache: Path) -> tuple[Path, Options]:
+        """Its log, and the options of ``run`` and ``localize``."""
+        if self.log:
+            return DATA / self.log, self.options
+        return made.log(self.world, folder=cache, seed=seed, **self.options), {}
 
 
 PLACES = {
-    "intel": _real("2d/intel.mcap", 1400.0),
-    "aces": _real("2d/aces.mcap", 700.0),
-    "csail": _real("2d/mit_csail.mcap", 212.0),
-    "mocap": Place("2d", "2d/mocap_room_1.bag", other="2d/mocap_room_2.bag", site="mocap"),
-    "mocap-2": Place("2d", "2d/mocap_room_2.bag", other="2d/mocap_room_1.bag", site="mocap"),
-    "office": Place("2d", world="office", again={"changed": 1, "start_m": 20.0}),
-    "identical": Place("2d", world="identical", again={"reverse": True, "start_m": 15.0}),
-    "streets": Place("2d", world="town", options=PLANAR, again={"changed": 1, "start_m": 100.0}),
-    "passage": Place("2d", world="corridor", options=PLANAR, again={"start_m": 30.0}),
-    "pillars": Place("2d", world="hall", options=PLANAR, again={"start_m": 20.0}),
-    "trunks": Place("2d", world="forest", options=PLANAR, again={"reverse": True}),
+    "intel": Place("2d", "2d/intel.mcap"),
+    "aces": Place("2d", "2d/aces.mcap"),
+    "csail": Place("2d", "2d/mit_csail.mcap"),
+    "mocap": Place("2d", "2d/mocap_room_1.bag", site="mocap"),
+    "mocap-2": Place("2d", "2d/mocap_room_2.bag", site="mocap"),
+    "office": Place("2d", world="office"),
+    "identical": Place("2d", world="identical"),
+    "streets": Place("2d", world="town", options=PLANAR),
+    "passage": Place("2d", world="corridor", options=PLANAR),
+    "pillars": Place("2d", world="hall", options=PLANAR),
+    "trunks": Place("2d", world="forest", options=PLANAR),
     "yard": Place("2d", world="turns", options=PLANAR),
-    "town": Place("3d", world="town", options=LONG, again={"changed": 1, "start_m": 60.0}),
-    "highway": Place("3d", world="highway", options=LONG),
-    "corridor": Place("3d", world="corridor", options=LONG, again={"start_m": 10.0}),
-    "field": Place("3d", world="field", options=LONG, again={"start_m": 30.0}),
-    "forest": Place("3d", world="forest", options=LONG, again={"reverse": True}),
-    "staircase": Place("3d", world="staircase", options=LONG, again={"reverse": True}),
-    "hall": Place("3d", world="hall", options=LONG, again={"start_m": 20.0}),
-    "turns": Place("3d", world="turns", options=LONG),
-    "kitti-1": _real("3d/kitti_0001_first54.mcap", 3.0),
-    "kitti-5": _real("3d/kitti_0005_first60.mcap", 3.0),
-    "pandaset": _real("3d/pandaset_002_sweeps30to55.mcap", 1.5, log__topic="/pandar64/points"),
+    **{
+        world: Place("3d", world=world, options=LONG)
+        for world in ("town", "highway", "corridor", "field", "forest", "staircase", "hall", "turns")
+    },
+    "kitti-1": Place("3d", "3d/kitti_0001_first54.mcap"),
+    "kitti-5": Place("3d", "3d/kitti_0005_first60.mcap"),
+    "pandaset": Place("3d", "3d/pandaset_002_sweeps30to55.mcap", options={"log__topic": "/pandar64/points"}),
 }
-
-
-def log_of(name: str, seed: int, cache: Path, *, again: bool) -> Path:
-    """The log of a place; again: of another drive there."""
-    place = PLACES[name]
-    if not place.world:
-        return DATA / (place.other if again and place.other else place.log)
-    return made.log(place.world, folder=cache, seed=seed, **place.options, **(place.again if again else {}))
 
 
 def outcome(guest: str, host: str, options: argparse.Namespace) -> tuple[str, str]:
     """What becomes of a log in a map: a word and a line."""
-    place, home, again = PLACES[guest], PLACES[host], guest == host
-    mapped = log_of(host, options.seed, options.cache, again=False)
-    part = home.mapped if again else {}
-    name = f"{host}_{options.seed}{'_part' if part else ''}"
-    prior = run_of(mapped, options.cache, name, **(home.options | part if home.log else {}))
-    log = log_of(guest, options.seed, options.cache, again=again)
-    chosen = (place.options | (place.again if again else {}) if place.log else {}) | settings_of(options.set)
+    mapped, of_run = PLACES[host].of(options.seed, options.cache)
+    prior = made.run_of(mapped, options.cache, f"{host}_{options.seed}", **of_run)
+    log, chosen = PLACES[guest].of(options.seed, options.cache)
+    chosen = chosen | settings_of(options.set)
     with tempfile.TemporaryDirectory() as folder:
         try:
             metrics = sc.localize(log, prior, Path(folder) / "out", recording=False, **chosen).metrics
@@ -140,7 +116,7 @@ def all_pairs(options: argparse.Namespace) -> None:
         for guest in options.places or sites:
             if guest not in sites:
                 continue
-            for host in [guest] if options.own else [name for name in sites if sites[name] != sites[guest]]:
+            for host in (name for name in sites if sites[name] != sites[guest]):
                 began_s = process_time()
                 word, line = outcome(guest, host, options)
                 counts[word] += 1
@@ -188,7 +164,7 @@ REAL = ("csail", "aces", "intel")
 
 def whole_of(name: str, cache: Path) -> Path:
     """The run of a whole real log, whose poses are the truth of its parts."""
-    return run_of(DATA / PLACES[name].log, cache, f"{name}_whole")
+    return made.run_of(DATA / PLACES[name].log, cache, f"{name}_whole")
 
 
 def prepared(name: str, seed: int, cache: Path) -> tuple[Path, Path, Options, Trajectory, Trajectory]:
@@ -199,13 +175,14 @@ def prepared(name: str, seed: int, cache: Path) -> tuple[Path, Path, Options, Tr
     if entry.log in REAL:
         log = DATA / PLACES[entry.log].log
         truth = read_tum(whole_of(entry.log, cache) / "trajectory.tum")
-        prior = run_of(log, cache, out, log__start_s=map_begin, log__end_s=map_end)
+        prior = made.run_of(log, cache, out, log__start_s=map_begin, log__end_s=map_end)
         return prior, log, {"log__start_s": begin, "log__end_s": end}, truth, truth
     drive = {"folder": cache, "seed": seed, **entry.options}
     mapped = made.log(entry.log, start_m=map_begin, seconds=map_end, **drive)
     day = {} if entry.changed is None else {"changed": entry.changed}
     log = made.log(entry.log, start_m=begin, seconds=end, **day, **drive)
-    return run_of(mapped, cache, out), log, {}, *(read_tum(each.with_suffix(".tum")) for each in (mapped, log))
+    truths = (read_tum(each.with_suffix(".tum")) for each in (mapped, log))
+    return made.run_of(mapped, cache, out), log, {}, *truths
 
 
 def entering(name: str, options: argparse.Namespace) -> tuple[str, ...]:
@@ -241,16 +218,7 @@ def entering(name: str, options: argparse.Namespace) -> tuple[str, ...]:
 
 
 def main() -> None:
-    parser = command_line(__doc__)
-    parser.add_argument("--kind", nargs="+", choices=("2d", "3d"), default=["2d", "3d"])
-    parser.add_argument(
-        "--places", nargs="+", help="of the logs, maps are those of all; --late: names of its cases"
-    )
-    parser.add_argument("--own", action="store_true")
-    parser.add_argument("--late", action="store_true")
-    parser.add_argument("--seed", type=int, default=0, help="of the worlds")
-    parser.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE")
-    options = parser.parse_args()
+    options = options_of(__doc__, kind=["2d", "3d"], places=[], late=False, seed=0, set=[])
     if not options.late:
         all_pairs(options)
         return

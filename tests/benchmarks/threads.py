@@ -1,8 +1,5 @@
 """Time of a 3D scan against the number of threads and of points, for ours and others, as a table and a picture.
 
-    python -m tests.benchmarks.threads [--points 10000 ...] [--log LOG ...] [--threads 1 2 4 8] [--scans 40]
-        [--methods plicp kiss-icp small-vgicp genz-icp] [--png FILE]
-
 A lidar of so many points a sweep drives through the simulated town; ranges come with 2 cm of noise. After it
 come the first scans of logs. All are in memory. Each method and number of threads has a process of its own,
 with as many cores as threads, and tracks the scans three times from the beginning, of which the fastest counts.
@@ -36,21 +33,15 @@ from scanchain.simulation import record
 from scanchain.simulation.drive import plan
 from scanchain.simulation.sensors import SENSORS, spinning
 from scanchain.threads import threads, use_threads
-from tests.benchmarks.harness import DATA, command_line, in_fresh_process
+from tests.benchmarks.harness import in_fresh_process, options_of
+from tests.support.scenes import DATA
 
 OURS = "plicp"
-METHODS = (OURS, "kiss-icp", "small-vgicp", "genz-icp")
+METHODS = [OURS, "kiss-icp", "small-vgicp", "genz-icp"]
 WITH_THREADS = ("kiss-icp", "small-vgicp", "small-gicp")  # that have a setting of that name; others use all cores
 REPEATS, WARM_UP = 3, 3
 STYLES = ("-", "--", "-.", ":")
 RINGS, PERIOD_NS = 64, 100_000_000
-
-
-def scans_of(path: Path, points: int, count: int) -> None:
-    """Simulate a drive with so many rays a sweep."""
-    drive = plan("town", sensor="hdl-64", duration_s=count * PERIOD_NS * 1e-9)
-    rays = spinning(np.linspace(-24.0, 4.0, RINGS), round(points / RINGS), PERIOD_NS)
-    record(replace(drive, sensor=replace(SENSORS["hdl-64"], rays=rays)), path)
 
 
 def tracked(path: Path, method: str, count: int, most: int) -> tuple[float, int, bytes]:
@@ -122,14 +113,10 @@ def draw(path: Path, rows: list[tuple[str, int, int, float]]) -> None:
 
 
 def main() -> None:
-    parser = command_line(__doc__, cache=False)
-    parser.add_argument("--points", type=int, nargs="*", default=[10_000, 30_000, 100_000, 300_000, 1_000_000])
-    parser.add_argument("--log", nargs="*", default=[], help="a path, or a name in the folder of real 3D logs")
-    parser.add_argument("--threads", type=int, nargs="+", default=[1, 2, 4, 8])
-    parser.add_argument("--methods", nargs="+", default=METHODS)
-    parser.add_argument("--scans", type=int, default=40)
-    parser.add_argument("--png", type=Path)
-    arguments = parser.parse_args()
+    arguments = options_of(
+        __doc__, cache=False, points=[10_000, 30_000, 100_000, 300_000, 1_000_000], log=[], threads=[1, 2, 4, 8],
+        methods=METHODS, scans=40, png=Path,
+    )  # fmt: skip
     print(f"{os.cpu_count()} cores, load average of the last minute {os.getloadavg()[0]:.1f}; quiet is below 2")
     print(
         f"{'log':24}{'points':>9}{'threads':>9}" + "".join(f"{f'{method} ms':>20}" for method in arguments.methods)
@@ -138,7 +125,9 @@ def main() -> None:
     with TemporaryDirectory() as folder:
         for points in arguments.points:
             path = Path(folder) / f"town_{points}.mcap"
-            scans_of(path, points, arguments.scans)
+            drive = plan("town", sensor="hdl-64", duration_s=arguments.scans * PERIOD_NS * 1e-9)
+            rays = spinning(np.linspace(-24.0, 4.0, RINGS), round(points / RINGS), PERIOD_NS)  # so many a sweep
+            record(replace(drive, sensor=replace(SENSORS["hdl-64"], rays=rays)), path)
             rows += measured(path, arguments.methods, arguments.threads, arguments.scans)
         for name in arguments.log:  # not in the picture, which is of one place
             path = Path(name) if Path(name).exists() else DATA / "3d" / name

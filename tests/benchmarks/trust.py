@@ -1,7 +1,5 @@
 """Expected ATE and covariances against the truth.
 
-    python -m tests.benchmarks.trust [--worlds town,...] [--sensors vlp-16,...] [--seeds 1,2,3] [--scans N]
-
 Worlds of 3D lidars, sensors and cache are those of ``odometry3d --set``; planar worlds are driven with
 LMS-270 and UTM-30, all without wheels. A line says
 
@@ -31,25 +29,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain import lie
+from scanchain import evaluation, lie
 from scanchain.data import Matrix, State, Step, Trajectory
-from scanchain.evaluation import (
-    ExpectedErrors,
-    absolute_error_of_any_path,
-    expected_errors,
-    motion_nees,
-    pair,
-    read_relations,
-)
 from scanchain.evaluation.consistency import with_map_errors
-from scanchain.evaluation.errors import path_length
 from scanchain.evaluation.pairing import nearest
 from scanchain.logs import open_log
 from scanchain.settings import Override, load_settings
 from scanchain.simulation import SENSORS, WORLDS
 from scanchain.slam import Slam, SlamResult
 from scanchain.trajectory import write_tum, write_wide_tum
-from tests.benchmarks.harness import DATA, PLACES, choose_sequences, command_line, drive_of, table
+from tests.benchmarks.harness import PLACES, SEQUENCES, drive_of, options_of, table
+from tests.support.scenes import DATA
 
 WARM_UP_SCANS = 3
 NO_WHEELS = (Override("odometry.prior", "constant-velocity", "this benchmark"),)
@@ -94,7 +84,7 @@ class Line:
 
 def placed(
     path: Path, overrides: tuple[Override, ...] = NO_WHEELS, **of_log: object
-) -> tuple[SlamResult, list[Step], Matrix, ExpectedErrors, Trajectory | None]:
+) -> tuple[SlamResult, list[Step], Matrix, evaluation.ExpectedErrors, Trajectory | None]:
     """The result of a log, its steps, T_base_lidar, what is expected of it, and the truth."""
     log = open_log([path], **of_log)
     config = load_settings(log.dimension, overrides=overrides).config
@@ -103,33 +93,39 @@ def placed(
     result = slam.finish()
     starts = [keyframe.scan_index for keyframe in result.keyframes]
     scans = np.diff([*starts, len(steps)])
-    expected = expected_errors(result.graph, result.map_errors, config, scans)
+    expected = evaluation.expected_errors(result.graph, result.map_errors, config, scans)
     return result, steps, log.T_base_lidar, expected, log.ground_truth()
 
 
 def line(name: str, path: Path, overrides: tuple[Override, ...] = NO_WHEELS, **of_log: object) -> Line:
     """A log with a truth of its own."""
     result, steps, _, expected, truth = placed(path, overrides, **of_log)
-    assert truth is not None
-    pairs = pair(result.trajectory, truth)
-    ate = expected.ate
-    figures = ate.mean, ate.low, ate.high, _nees(result, steps, truth), _gap(result, expected, truth)
-    return Line(name, absolute_error_of_any_path(pairs).translation_m.rmse, *figures)
+    return judged(name, result, steps, expected, truth)
+
+
+def judged(
+    name: str, result: SlamResult, steps: Sequence[Step], expected: evaluation.ExpectedErrors, truth: Trajectory
+) -> Line:
+    """A result against the truth."""
+    error = evaluation.absolute_error_of_any_path(evaluation.pair(result.trajectory, truth))
+    true_m, ate = error.translation_m.rmse, expected.ate
+    nees, gap = _nees(result, steps, truth), _gap(result, expected, truth)
+    return Line(name, true_m, ate.mean, ate.low, ate.high, nees, gap)
 
 
 def _nees(result: SlamResult, steps: Sequence[Step], truth: Trajectory) -> float:
     """Mean NEES of the motions between scans; NaN where not every scan has a true pose."""
-    pairs = pair(result.odometry, truth)
+    pairs = evaluation.pair(result.odometry, truth)
     estimate, reference = pairs.estimate, pairs.reference
     if result.odometry.dimension == 2:
         estimate, reference = lie.flatten(lie.lift(estimate)), lie.flatten(lie.lift(reference))
     covariances = np.array([step.match.covariance for step in steps])[pairs.places]
     is_sure = np.array([step.state in (State.OK, State.CONTRADICTED) for step in steps])[pairs.places]
     covariances[~is_sure | (pairs.places < WARM_UP_SCANS)] = np.nan
-    return float(np.nanmean(motion_nees(estimate, covariances, reference)))
+    return float(np.nanmean(evaluation.motion_nees(estimate, covariances, reference)))
 
 
-def _gap(result: SlamResult, expected: ExpectedErrors, truth: Trajectory) -> float:
+def _gap(result: SlamResult, expected: evaluation.ExpectedErrors, truth: Trajectory) -> float:
     """The scale gap k of smfeval; NaN where it is not installed."""
     try:
         from smfeval.cli.main import main
@@ -151,14 +147,14 @@ def _gap(result: SlamResult, expected: ExpectedErrors, truth: Trajectory) -> flo
 def relations_line(name: str) -> Line:
     """A log whose truth are relations."""
     log = DATA / f"2d/{name}.mcap"
-    relations = read_relations(log.with_suffix(".relations"))
+    relations = evaluation.read_relations(log.with_suffix(".relations"))
     unaided, steps, T_base_lidar, _, _ = placed(log)
     result, _, _, expected, _ = placed(log, ())
     places, off_ns = nearest(relations.stamps_ns.ravel(), result.trajectory.stamps_ns)
     known = (off_ns.reshape(-1, 2) < 1_000_000).all(axis=1)
     a, b = places.reshape(-1, 2)[known].T
     true = lie.flatten(relations.T_first_second[known])
-    path_m = path_length(result.odometry.poses)
+    path_m = evaluation.path_length(result.odometry.poses)
     length_m = np.abs(path_m[b] - path_m[a])
     noise = _own_noise(true, a, b, length_m < SHORT_M, unaided, steps, T_base_lidar)
     keyframes = np.array([keyframe.scan_index for keyframe in result.keyframes])
@@ -206,11 +202,9 @@ def summary(kind: str, lines: Sequence[Line]) -> None:
 
 
 def main() -> None:
-    parser = command_line(__doc__)
-    choose_sequences(parser, worlds=(*PLACES, *PLANAR), scans=150)
-    parser.add_argument("--seeds", default="1,2,3")
-    parser.add_argument("--real", action="store_true", help="the real logs alone")
-    arguments = parser.parse_args()
+    arguments = options_of(
+        __doc__, seeds="1,2,3", real=False, **SEQUENCES | {"worlds": ",".join((*PLACES, *PLANAR)), "scans": 150}
+    )
     row = table("sequence", "ATE m", "expected", "over", "NEES/k", "k")
     lines = []
     for world in [] if arguments.real else arguments.worlds.split(","):

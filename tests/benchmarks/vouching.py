@@ -1,6 +1,4 @@
-"""Wrong and right motions of runs, flagged or not, and their verdicts: ``python -m tests.benchmarks.vouching``.
-
-    [--quick] [--only WORDS] [--jobs N] [--cache DIR] [--png FILE]
+"""Wrong and right motions of runs, flagged or not, and their verdicts.
 
 Simulated worlds and real logs (tests.benchmarks.vouching_logs), with and without wheels, at 10, 5 and 2 Hz, with
 dropped scans, a kidnapping, crowds and traffic, a wrong mounting. Logs and run directories stay in the cache:
@@ -46,6 +44,7 @@ from scanchain.trajectory import read_tum
 from scanchain.verdict import judge
 from tests.benchmarks import harness
 from tests.benchmarks.vouching_logs import WHEELS, Case, LogSpec, cases
+from tests.support import made
 
 Row = dict[str, Any]
 
@@ -88,14 +87,13 @@ def measured(log_cases: Sequence[Case], cache: Path) -> list[Row]:
 
 
 def _run(case: Case, cache: Path) -> Path:
-    case.log.make(cache)
-    file, reference = case.log.paths(cache)
+    file, reference = case.log.files(cache)
     options: dict[str, object] = {"log__every": case.every, **case.log.overrides}
     if case.wheels != "wheels":
         options["odometry__prior"] = "constant-velocity"
     is_tum = reference is not None and reference.suffix == ".tum"
     name = case.name.replace(" ", "_").replace("/", "-").replace(",", "")
-    return harness.run_of(file, cache, name, ground_truth=reference if is_tum else None, **options)
+    return made.run_of(file, cache, name, ground_truth=reference if is_tum else None, **options)
 
 
 def judged(case: Case, cache: Path, out: Path) -> Row:
@@ -109,7 +107,7 @@ def judged(case: Case, cache: Path, out: Path) -> Row:
     evidence = evidence_of(steps, pq.read_table(loops_file) if loops_file.exists() else None)
     verdict = judge(evidence)
     trajectory = Trajectory(steps["stamp_ns"].to_numpy(), evidence.poses)
-    reference = case.log.paths(cache)[1] or out / "ground_truth.tum"
+    reference = case.log.files(cache)[1] or out / "ground_truth.tum"
     motions, quality = _compared(trajectory, reference, case.log.dimension)
     if np.isinf(case.log.reference_m):  # good enough for the run as a whole alone
         motions = Motions(*(part[:0] for part in motions))
@@ -310,12 +308,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
 
 
 def main() -> None:
-    parser = harness.command_line(__doc__)
-    parser.add_argument("--quick", action="store_true", help=f"every {QUICK}th case")
-    parser.add_argument("--only", default="", help="cases whose names hold all of these words")
-    parser.add_argument("--jobs", type=int, default=1)
-    parser.add_argument("--png", type=Path, help="ROC curves of the checks")
-    options = parser.parse_args()
+    options = harness.options_of(__doc__, quick=False, only="", jobs=1, png=Path)
     chosen = [case for case in cases() if all(word in case.name for word in options.only.split())]
     rows = _run_all(chosen[:: QUICK if options.quick else 1], options)
     table(rows)

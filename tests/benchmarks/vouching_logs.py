@@ -15,14 +15,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from scanchain import lie
-from scanchain.data import Matrix
+from scanchain.data import Matrix, Pose
 from scanchain.kernels.raycast import BOX, CYLINDER
 from scanchain.simulation import SENSORS, Drive, plan, record
 from scanchain.simulation.motion import Motion
-from scanchain.simulation.sensors import Rays, Sensor
 from scanchain.simulation.solids import FIXED, Solids
-from tests.benchmarks.harness import DATA
-from tests.support.scan_information import information, spectrum
+from tests.support.scenes import DATA
 
 WHEELS = ("wheels", "checked", "no wheels")  # prior and check; check alone; none in the log
 
@@ -33,6 +31,7 @@ _WITHIN_M, _WITHIN_S = 30.0, 10.0  # begin along the corridor and duration of a 
 _MOUNTING = lie.exp(np.array([0.3, 0.0, 0.0, 0.0, 0.0, np.radians(6.0)]))  # error of the transform in the log
 _SHARE_EVERY_S = 0.5  # between two looks at the true geometry
 _SHARE_RAYS = 4000  # of a scan that such a look takes
+_STEP_M = 1e-4  # of the differences of ranges; rays that leave a surface within it count for another
 _PEOPLE, _AROUND_M, _NEAREST_M = 30, 8.0, 0.9
 _WALK_M_S = 1.4
 _ON_ROADS = ("town", "rounds", "highway", "gap")
@@ -74,31 +73,28 @@ class LogSpec:
         """Of the drive, by the name."""
         return zlib.crc32(self.name.encode()) % 1000
 
-    def paths(self, cache: Path) -> tuple[Path, Path | None]:
-        """Log and reference; None where the log holds it."""
+    def files(self, cache: Path) -> tuple[Path, Path | None]:
+        """The log, made unless it is there, and its reference; None where the log holds it."""
         if self.file is not None and self.incident == "plain":
             return self.file, self.reference
         path = cache / "logs" / f"{self.name.replace(' ', '_')}_{self.duration_s:g}s.mcap"
-        return path, path.with_suffix(self.reference.suffix if self.reference else ".tum")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if self.file is None or self.reference is None:
+            if not path.exists():
+                record(self.drive(), path)
+            return path, path.with_suffix(".tum")
+        if not path.exists():
+            play_backward(self.file, self.reference, path)
+        return path, path.with_suffix(self.reference.suffix)
 
     def open_shares(self, cache: Path) -> Matrix | None:
         """(K, 2) stamps in ns and the share of the returns that speak about the worst direction there."""
         if self.file is not None:
             return None
-        return np.load(self.paths(cache)[0].with_suffix(".npy"))
-
-    def make(self, cache: Path) -> None:
-        """Simulate the log, or play it backward, unless it is there."""
-        path = self.paths(cache)[0]
-        if path.exists() and (self.file is not None or path.with_suffix(".npy").exists()):
-            return
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if self.file is not None and self.reference is not None:
-            play_backward(self.file, self.reference, path)
-            return
-        drive = self.drive()
-        record(drive, path, force=True)
-        np.save(path.with_suffix(".npy"), _open_shares(drive))
+        path = self.files(cache)[0].with_suffix(".npy")
+        if not path.exists():
+            np.save(path, _open_shares(self.drive()))
+        return np.load(path)
 
     def drive(self) -> Drive:
         """The drive with its incident."""
@@ -247,50 +243,57 @@ def play_backward(log: Path, reference: Path, out: Path) -> None:
                 data = data[:4] + _STAMP.pack(*divmod(stamp_ns, 10**9)) + data[12:]
             writer.add_message(channels[channel.id], time_ns, data, time_ns)
         writer.finish()
-    mirrored = _mirrored_relations if reference.suffix == ".relations" else _mirrored_poses
-    np.savetxt(out.with_suffix(reference.suffix), mirrored(np.loadtxt(reference), 1e-9 * both_ns), "%.9f")
-
-
-def _mirrored_poses(rows: np.ndarray, both_s: float) -> np.ndarray:
-    rows[:, 0] = both_s - rows[:, 0]
-    return rows[::-1]
-
-
-def _mirrored_relations(rows: np.ndarray, both_s: float) -> np.ndarray:
-    """From the pose that is the earlier one now: the motion is the inverse."""
-    turned = Rotation.from_euler("xyz", rows[:, 5:]).inv()
-    return np.hstack([both_s - rows[:, [1, 0]], -turned.apply(rows[:, 2:5]), turned.as_euler("xyz")])
+    rows, both_s = np.loadtxt(reference), 1e-9 * both_ns
+    if reference.suffix == ".relations":  # from the pose that is the earlier one now: the motion is the inverse
+        turned = Rotation.from_euler("xyz", rows[:, 5:]).inv()
+        rows = np.hstack([both_s - rows[:, [1, 0]], -turned.apply(rows[:, 2:5]), turned.as_euler("xyz")])
+    else:
+        rows[:, 0] = both_s - rows[:, 0]
+        rows = rows[::-1]
+    np.savetxt(out.with_suffix(reference.suffix), rows, "%.9f")
 
 
 def _open_shares(drive: Drive) -> Matrix:
     """As ``LogSpec.open_shares``, from the true geometry without what moves."""
     truth = drive.truth()
     stride = max(1, round(_SHARE_EVERY_S * 1e9 / drive.sensor.period_ns))
-    starts_s = drive.scans[::stride] * (drive.sensor.period_ns * 1e-9)
-    sensor = replace(drive.sensor, rays=_fewer(drive.sensor))
-    axes = [0, 1, 5] if sensor.dimension == 2 else range(6)
-    chosen = np.ix_(axes, axes)  # in the plane x, y and yaw
-    shares = [
-        spectrum(information(drive.solids, T, sensor, index=int(index))[chosen])[0][0]
-        for T, index in zip(drive.motion.lidar(starts_s), drive.scans[::stride], strict=True)
-    ]
+    scans = drive.scans[::stride]
+    poses = drive.motion.lidar(scans * (drive.sensor.period_ns * 1e-9))
+    shares = [_least_share(drive, T, int(index)) for T, index in zip(poses, scans, strict=True)]
     return np.stack([truth.stamps_ns[::stride].astype(np.float64), shares], axis=1)
 
 
-def _fewer(sensor: Sensor) -> Callable[[int], Rays]:
-    """Some of the sensor's rays; a prime stride mixes the rings."""
+def _least_share(drive: Drive, T_world_lidar: Pose, index: int) -> float:
+    """Share of the returns of an ideal scan, taken standing, that constrain the motion in its worst direction.
 
-    def rays(index: int) -> Rays:
-        whole = sensor.rays(index)
-        stride = max(1, len(whole.directions) // _SHARE_RAYS)
-        return replace(
-            whole,
-            directions=whole.directions[:: stride | 1],
-            instant_of_ray=whole.instant_of_ray[:: stride | 1],
-            ring=whole.ring[:: stride | 1],
-        )
+    A right twist ξ = (ρ, φ), T ← T exp(ξ), moves a return p with true normal n, both in the lidar's frame, by
+        r = nᵀ(ρ + φ × p)        J = ∂r/∂ξ = [nᵀ, (p × n)ᵀ]        H = Σ JᵀJ
+    There is neither noise nor loss; normals are parallel to the gradients of the ranges by the lidar's position.
+    Rotations are measured by what they do to the returns: H is scaled by L = √(Σ|p × n|² / N), N = Σ|n|². Shares
+    do not depend on the number of returns nor on units; 1e-4 means that H constrains the direction as well as if
+    one return in ten thousand faced it squarely.
+    """
+    sensor = drive.sensor
+    directions = sensor.rays(index).directions
+    directions = directions[:: max(1, len(directions) // _SHARE_RAYS) | 1]  # some; an odd stride mixes the rings
 
-    return rays
+    def ranges_m(shift_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        T = T_world_lidar.copy()
+        T[:3, 3] += T[:3, :3] @ shift_m
+        return drive.solids.cast(T[None], np.zeros(len(directions), np.int32), directions, sensor.max_range_m)
+
+    reached_m = ranges_m(np.zeros(3))
+    with np.errstate(invalid="ignore"):  # out of reach
+        gradient = np.stack([ranges_m(step) - ranges_m(-step) for step in _STEP_M * np.eye(3)], axis=1)
+    hit = np.isfinite(gradient).all(axis=1) & np.isfinite(reached_m) & (reached_m >= sensor.min_range_m)
+    normals = gradient[hit] / np.linalg.norm(gradient[hit], axis=1, keepdims=True)
+    J = np.hstack([normals, np.cross(directions[hit] * reached_m[hit, None], normals)])
+    J = J[:, [0, 1, 5]] if sensor.dimension == 2 else J  # in the plane x, y and yaw
+    count, levers = (float((part**2).sum()) for part in np.split(J, [sensor.dimension], axis=1))
+    if count == 0.0:
+        return 0.0
+    J = J / lie.by_component(J.shape[1], 1.0, np.sqrt(max(levers, 1e-12 * count) / count))
+    return max(float(np.linalg.eigvalsh(J.T @ J / count)[0]), 0.0)
 
 
 _PLAIN_2D = (

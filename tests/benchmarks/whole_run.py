@@ -1,7 +1,5 @@
 """How much longer a whole run takes than its odometry alone, and where its time goes.
 
-    python -m tests.benchmarks.whole_run [LOG ...] [--repeats 5] [--cold]
-
 *run* is ``scanchain run LOG --out DIR``: loops on, recording, map and report written. *odometry* is a process
 that reads the same log and tracks its scans with the same configuration, and nothing else. Both are taken by the
 clock, from the start of the interpreter to its end, with compiled kernels. *tracking* is the sum over the scans
@@ -12,7 +10,6 @@ compiles all kernels.
 
 from __future__ import annotations
 
-import argparse
 import os
 import subprocess
 import sys
@@ -23,47 +20,38 @@ from time import perf_counter
 from scanchain.logs import open_log
 from scanchain.odometry import Odometry
 from scanchain.settings import load_settings
-from tests.benchmarks.harness import DATA, KITTI, command_line
-from tests.support.scenes import ROOT
+from tests.benchmarks.harness import KITTI, options_of
+from tests.support.scenes import DATA, ROOT
 
 
 def main() -> None:
-    parser = command_line(__doc__, cache=False)
-    parser.add_argument("logs", nargs="*", type=Path, default=[DATA / "3d" / name for name in KITTI])
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--cold", action="store_true", help="time a first run too, which compiles")
-    parser.add_argument("--track", action="store_true", help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
+    logs = [DATA / "3d" / name for name in KITTI]
+    arguments = options_of(__doc__, "logs", cache=False, logs=logs, repeats=5, cold=False, track=False)
     if arguments.track:
         print(track(arguments.logs[0]))
     else:
         for path in arguments.logs:
-            show(path.resolve(), arguments.repeats)
-            if arguments.cold:
-                show_cold(path.resolve())
+            show(path.resolve(), arguments.repeats, cold=arguments.cold)
 
 
-def show(path: Path, repeats: int) -> None:
-    """Measure one log and print what it took."""
+def show(path: Path, repeats: int, *, cold: bool) -> None:
+    """Measure one log and print what it took; cold: also a run without compiled kernels, and the one after it."""
     runs, alone, tracking = [], [], []
     with tempfile.TemporaryDirectory() as folder:
+        words = ("scanchain", "run", str(path), "--out", f"{folder}/run", "--force")
         for _ in range(repeats + 1):
-            runs.append(timed("scanchain", "run", str(path), "--out", f"{folder}/run", "--force")[0])
+            runs.append(timed(*words)[0])
             seconds, answer = timed("tests.benchmarks.whole_run", str(path), "--track")
             alone.append(seconds)
             tracking.append(float(answer))
+        spent_s = [timed(*words, NUMBA_CACHE_DIR=f"{folder}/kernels")[0] for _ in range(2 if cold else 0)]
     run_s, alone_s, tracking_s = (min(each[1:]) for each in (runs, alone, tracking))  # the first may compile
     print(f"\n{path.name}, least of {repeats}")
     print(f"  run {run_s:.2f} s, odometry {alone_s:.2f} s, tracking {tracking_s:.2f} s")
-    print(f"  run / odometry {run_s / alone_s:.2f}, run / tracking {run_s / tracking_s:.2f}")
-
-
-def show_cold(path: Path) -> None:
-    """A run without compiled kernels, and the one after it."""
-    with tempfile.TemporaryDirectory() as folder:
-        words = ("scanchain", "run", str(path), "--out", f"{folder}/run", "--force")
-        cold_s, warm_s = (timed(*words, NUMBA_CACHE_DIR=f"{folder}/kernels")[0] for _ in range(2))
-    print(f"  first run {cold_s:.1f} s, second {warm_s:.1f} s: {cold_s - warm_s:.1f} s to compile", flush=True)
+    print(f"  run / odometry {run_s / alone_s:.2f}, run / tracking {run_s / tracking_s:.2f}", flush=True)
+    if cold:
+        cold_s, warm_s = spent_s
+        print(f"  first run {cold_s:.1f} s, second {warm_s:.1f} s: {cold_s - warm_s:.1f} s to compile", flush=True)
 
 
 def timed(*module_and_words: str, **environment: str) -> tuple[float, str]:

@@ -1,4 +1,4 @@
-"""Wrong loop edges added to published graphs, and what becomes of them: python -m tests.benchmarks.wrong_edges.
+"""Wrong loop edges added to published graphs, and what becomes of them.
 
 To the loops of a graph are added, in proportion to their number, edges between random poses that never saw each
 other: "anywhere", their relative pose drawn from the extent of the map; "nearby", within 2 m and any angle, as a
@@ -16,7 +16,8 @@ from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.data import Trajectory
 from scanchain.graph.g2o import read_g2o
-from tests.benchmarks.harness import DATA, ate_m, command_line, table
+from tests.benchmarks.harness import ate_m, options_of, table
+from tests.support.scenes import DATA
 
 KINDS = {"anywhere": 1, "nearby": 1, "groups": 5, "groups of 10": 10}  # how many agree with each other
 
@@ -44,9 +45,10 @@ def add_wrong_loops(graph, share, kind, rng):
         if abs(i - j) <= 10:
             continue
         T = random_pose(graph, kind, rng)
-        for step in range(agreeing):
-            pairs.append((i + step, j + step))
-            poses.append(moved_along(graph, i, j, step, T))
+        for k in range(agreeing):  # the same mistake a few poses later: T carried along the poses of both ends
+            pairs.append((i + k, j + k))
+            back, ahead = (lie.between(graph.poses[end], graph.poses[end + k]) for end in (i, j))
+            poses.append(lie.inverse(back) @ T @ ahead)
     graph.add_edges(
         np.array(pairs), np.array(poses), np.tile(omega, (len(pairs), 1, 1)), np.ones(len(pairs), bool)
     )
@@ -62,12 +64,6 @@ def random_pose(graph, kind, rng):
     T = lie.exp(twist)
     T[:d, d] = rng.uniform(-reach, reach)
     return T
-
-
-def moved_along(graph, i, j, step, T_ij):
-    """The same mistake a few poses later: T_ij carried along the poses of both ends."""
-    poses = graph.poses
-    return lie.inverse(lie.inverse(poses[i]) @ poses[i + step]) @ T_ij @ lie.inverse(poses[j]) @ poses[j + step]
 
 
 def try_wrong_loops(path, share, kind, seed, robust="truncated"):
@@ -91,13 +87,9 @@ def try_wrong_loops(path, share, kind, seed, robust="truncated"):
 
 
 def main():
-    parser = command_line(__doc__, cache=False)
-    parser.add_argument("graphs", nargs="*", default=("manhattan", "intel"))
-    parser.add_argument("--shares", type=float, nargs="+", default=(0.1, 0.3, 0.5))
-    parser.add_argument("--kinds", nargs="+", default=KINDS)
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--robust", default="truncated")
-    options = parser.parse_args()
+    graphs, shares = ["manhattan", "intel"], [0.1, 0.3, 0.5]
+    more = {"kinds": KINDS, "seeds": 3, "robust": "truncated"}
+    options = options_of(__doc__, "graphs", cache=False, graphs=graphs, shares=shares, **more)
     row = table("graph", "kind", "added", "seed", "wrong rejected", "true rejected", "ATE m", "without", "time s")
     for name, kind, share, seed in product(options.graphs, options.kinds, options.shares, range(options.seeds)):
         found = try_wrong_loops(DATA / "graphs" / f"{name}.g2o", share, kind, seed, options.robust)

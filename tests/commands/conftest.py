@@ -1,6 +1,7 @@
 """Commands: successful ones with their directory, refused ones with their line."""
 
 import json
+import math
 import re
 import tomllib
 from dataclasses import dataclass
@@ -25,6 +26,15 @@ def refused(call, tmp_path):
         return errors
 
     return run
+
+
+@pytest.fixture
+def ring(tmp_path):
+    """A square of four poses and one false edge across it, as g2o."""
+    path = tmp_path / "ring.g2o"
+    lines = [f"EDGE_SE2 {i} {(i + 1) % 4} 1 0 {math.pi / 2} 100 0 0 100 0 1000" for i in range(4)]
+    path.write_text("\n".join([*lines, "EDGE_SE2 0 2 1 1.01 3.14 100 0 0 100 0 1000", "PARAMS 7"]) + "\n")
+    return path
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 import errno
 import json
-import math
 import re
 from pathlib import Path
 
@@ -14,15 +13,6 @@ from tests.commands.conftest import FULL
 from tests.support.messages import says
 
 FALSE_LOOP = "EDGE_SE2 1 3 9 9 1 100 0 0 100 0 1000\n"
-
-
-@pytest.fixture
-def ring(tmp_path):
-    """A square of four poses and one false edge across it, as g2o."""
-    path = tmp_path / "ring.g2o"
-    lines = [f"EDGE_SE2 {i} {(i + 1) % 4} 1 0 {math.pi / 2} 100 0 0 100 0 1000" for i in range(4)]
-    path.write_text("\n".join([*lines, "EDGE_SE2 0 2 1 1.01 3.14 100 0 0 100 0 1000", "PARAMS 7"]) + "\n")
-    return path
 
 
 @pytest.fixture
@@ -198,23 +188,3 @@ def test_optimize_takes_an_optimizer_and_a_first_guess(tree, ring):
     words = ["--optimizer", "gauss-newton", "--initialize", "spanning-tree", "--graph.max_iterations", "99"]
     found = tree(ring, *words)
     assert found["initialization"] == "spanning-tree" and found["converged"]
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["--marginals", "all"], "give --out FILE"),
-        (["--marginals", "9", "--out", "{}/a.g2o"], "--marginals 9: no such vertex; the ids go from 0 to 3"),
-        (["--marginals", "one", "--out", "{}/a.g2o"], "take all, or vertex ids"),
-        (["--png", "{}/a.jpg"], "name a file that ends in .png"),
-        (["--recording", "{}/a.png"], "name a file that ends in .rrd"),
-        (["--out", "{}/zz.txt"], "zz.txt: name a file that ends in .g2o or .graph or .toro"),
-        (["--out", "{}/none/a.g2o"], "there is no folder"),
-        (["--out", "{}/ring.g2o"], "exists; choose another name, or --force"),
-        (["--out", "{}"], "is a folder"),
-        (["--optimizer", "magic"], "graph.optimizer is 'magic'; it must be one of"),
-        (["--loops.drift", "1"], "--loops.drift has no meaning for optimize"),
-    ],
-)
-def test_optimize_refuses_what_it_cannot_do_before_it_begins(refused, tmp_path, ring, words, said):
-    says(refused("optimize", ring, *(word.format(tmp_path) for word in words)), said)

@@ -9,6 +9,7 @@ from tests.support.messages import says
 from tests.support.naive_logs import STAMP_NS, laser_scan, scan_said, write
 
 RUN = ["run", "{office}", "--out", "{tmp}/a"]
+RING = ["optimize", "{ring}"]
 TOO_LONG = ["longer than the file system takes (255 bytes a part); shorten it"]
 
 
@@ -67,10 +68,26 @@ def test_several_lidars_ask_for_a_choice_by_the_short_option_which_info_and_conv
         (["config", "show", "--loops.enable", "off"], ["--loops.enable", "loops.enabled"]),
         (["config", "dump", "--lidar", "4d"], ["--lidar", "'4d'", "config dump --help"]),
         (["view", "absent"], ["absent: no recording", "scanchain run"]),
+        ([*RING, "--marginals", "all"], ["give --out FILE"]),
+        (
+            [*RING, "--marginals", "9", "--out", "a.g2o"],
+            ["--marginals 9: no such vertex; the ids go from 0 to 3"],
+        ),
+        ([*RING, "--marginals", "one", "--out", "a.g2o"], ["take all, or vertex ids"]),
+        ([*RING, "--png", "a.jpg"], ["name a file that ends in .png"]),
+        ([*RING, "--recording", "a.png"], ["name a file that ends in .rrd"]),
+        ([*RING, "--out", "zz.txt"], ["zz.txt: name a file that ends in .g2o or .graph or .toro"]),
+        ([*RING, "--out", "none/a.g2o"], ["there is no folder"]),
+        ([*RING, "--out", "{ring}"], ["exists; choose another name, or --force"]),
+        ([*RING, "--out", "{tmp}"], ["is a folder"]),
+        ([*RING, "--optimizer", "magic"], ["graph.optimizer is 'magic'; it must be one of"]),
+        ([*RING, "--loops.drift", "1"], ["--loops.drift has no meaning for optimize"]),
     ],
 )
-def test_a_wrong_command_line_is_one_line_with_what_to_do(refused, monkeypatch, tmp_path, office, words, said):
+def test_a_wrong_command_line_is_one_line_with_what_to_do(
+    refused, monkeypatch, tmp_path, office, ring, words, said
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty.mcap").touch()
-    names = {"office": office, "tmp": tmp_path, "long": "x" * 260}
+    names = {"office": office, "ring": ring, "tmp": tmp_path, "long": "x" * 260}
     says(refused(*(word.format(**names) for word in words)), *(part.format(**names) for part in said))

@@ -17,8 +17,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from tests.benchmarks.harness import DATA
-from tests.support.scenes import ROOT
+from tests.support.scenes import DATA, ROOT
 
 FOLDER = ROOT / "docs" / "pictures"
 WIDTH, BESIDE_WIDTH = 1000, 750  # px, of a picture alone and of each of those beside each other

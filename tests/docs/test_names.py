@@ -7,10 +7,9 @@ import pytest
 
 import scanchain
 from scanchain.settings import config_keys
-from tests.docs.test_examples import FENCE
+from tests.docs.test_examples import FENCE, PAGES
 from tests.support.scenes import ROOT
 
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 KEYS = set(config_keys())
 SECTIONS = "|".join(sorted({key.partition(".")[0] for key in KEYS}))
 

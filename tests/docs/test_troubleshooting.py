@@ -69,7 +69,6 @@ def test_turns_outside_of_the_window_are_contradicted_and_not_lost(row, override
     assert are_near(ate_m, errors_m(metrics)[1])
 
 
-@pytest.mark.slow
 def test_wheels_hold_the_poses_along_corridors_that_a_short_range_leaves_degenerate(tmp_path):
     log = made.log("identical", seconds=120)  # of the 300 s of the page
     without, with_wheels = (

@@ -6,24 +6,10 @@ import re
 import numpy as np
 import pytest
 
+from scanchain import evaluation as ev
 from scanchain import lie
 from scanchain.data import Trajectory
 from scanchain.errors import InputError
-from scanchain.evaluation import (
-    Alignment,
-    absolute_error,
-    kitti_error,
-    kitti_error_of_any_path,
-    on_the_estimate,
-    pair,
-    path_length,
-    read_relations,
-    read_truth,
-    relation_error,
-    relative_error_over_distance,
-    relative_error_over_frames,
-    relative_error_over_time,
-)
 from scanchain.evaluation.pairing import nearest
 from scanchain.logs import open_log
 from scanchain.odometry import Odometry
@@ -54,7 +40,7 @@ def disturbed(trajectory, seed=2, sigma_m=0.1):
 
 @pytest.fixture(scope="module")
 def pairs():
-    return pair(disturbed(drive()), drive())
+    return ev.pair(disturbed(drive()), drive())
 
 
 def evo_trajectories(pairs):
@@ -73,7 +59,7 @@ def published():
     scans = kitti_scans(30)
     poses = np.array([odometry.process(scan).T_odom_lidar for scan in scans])
     estimate = Trajectory(np.array([scan.stamp_ns for scan in scans]), poses)
-    return pair(estimate, read_tum(shared_data("3d/kitti_0001_first54.tum")))
+    return ev.pair(estimate, read_tum(shared_data("3d/kitti_0001_first54.tum")))
 
 
 @pytest.fixture(params=["pairs", "published"])
@@ -82,17 +68,17 @@ def each(request):
     return request.getfixturevalue(request.param)
 
 
-@pytest.mark.parametrize("alignment", list(Alignment))
+@pytest.mark.parametrize("alignment", list(ev.Alignment))
 def test_ate_equals_evo(each, alignment):
     metrics = pytest.importorskip("evo.core.metrics")
     reference, estimate = evo_trajectories(each)
-    if alignment is Alignment.RIGID:
+    if alignment is ev.Alignment.RIGID:
         estimate.align(reference)
-    if alignment is Alignment.FIRST:
+    if alignment is ev.Alignment.FIRST:
         estimate.align_origin(reference)
-    ours = absolute_error(each, alignment)
+    ours = ev.absolute_error(each, alignment)
     compared = [(metrics.PoseRelation.translation_part, ours.errors_m, ours.translation_m)]
-    if alignment is not Alignment.RIGID:  # evo lets the positions turn the rotations as well
+    if alignment is not ev.Alignment.RIGID:  # evo lets the positions turn the rotations as well
         compared.append((metrics.PoseRelation.rotation_angle_rad, ours.errors_rad, ours.rotation_rad))
     for relation, errors, statistics in compared:
         theirs = metrics.APE(relation)
@@ -107,7 +93,7 @@ def test_ate_equals_evo(each, alignment):
 @pytest.mark.parametrize("frames", [1, 7])
 def test_rpe_over_frames_equals_evo(each, frames):
     metrics = pytest.importorskip("evo.core.metrics")
-    ours = relative_error_over_frames(each, frames)
+    ours = ev.relative_error_over_frames(each, frames)
     for relation, errors in (
         (metrics.PoseRelation.translation_part, ours.errors_m),
         (metrics.PoseRelation.rotation_angle_rad, ours.errors_rad),
@@ -117,7 +103,7 @@ def test_rpe_over_frames_equals_evo(each, frames):
         np.testing.assert_allclose(errors, theirs.error, atol=1e-9)
 
 
-@pytest.mark.parametrize("measure", [(relative_error_over_distance, 10.0), (relative_error_over_time, 1.0)])
+@pytest.mark.parametrize("measure", [(ev.relative_error_over_distance, 10.0), (ev.relative_error_over_time, 1.0)])
 def test_rpe_over_distance_and_time_equals_evo_on_the_same_stretches(each, measure):
     metrics, lie_algebra = (pytest.importorskip(f"evo.core.{name}") for name in ("metrics", "lie_algebra"))
     ours = measure[0](each, measure[1])
@@ -133,11 +119,11 @@ def test_rpe_over_distance_and_time_equals_evo_on_the_same_stretches(each, measu
 
 def test_stretches_end_at_the_first_pose_far_or_late_enough(pairs):
     path = naive.traveled(pairs.reference)
-    stretches = relative_error_over_distance(pairs, 20.0).stretches
+    stretches = ev.relative_error_over_distance(pairs, 20.0).stretches
     assert len(stretches) > 10
     for i, j in stretches:
         assert path[j] - path[i] >= 20.0 - 1e-9 > path[j - 1] - path[i] - 2e-9
-    stretches = relative_error_over_time(pairs, 0.95).stretches
+    stretches = ev.relative_error_over_time(pairs, 0.95).stretches
     np.testing.assert_array_equal(stretches[:, 1] - stretches[:, 0], 10)
     assert len(stretches) == len(pairs) - 10
 
@@ -145,7 +131,7 @@ def test_stretches_end_at_the_first_pose_far_or_late_enough(pairs):
 @pytest.mark.parametrize("every", [1, 10])
 def test_kitti_metric_equals_naive(each, every):
     lengths_m = (10.0, 20.0, 100.0)
-    ours = kitti_error(each, lengths_m, every=every)
+    ours = ev.kitti_error(each, lengths_m, every=every)
     shares, turns = naive.kitti(each.reference, each.estimate, lengths_m, every)
     assert ours.stretches == len(shares) == sum(part.stretches for part in ours.by_length)
     assert ours.translation_share == pytest.approx(np.mean(shares), abs=1e-12)
@@ -159,16 +145,16 @@ def test_the_rotation_error_of_a_straight_course_does_not_depend_on_its_roll():
     estimate = lie.exp(np.array([0.3, -0.2, 0.1, 0.4, 0.2, -0.1])) @ reference
     estimate[:, :3, 3] += np.random.default_rng(0).normal(scale=0.02, size=(50, 3))
     stamps_ns = np.arange(50, dtype=np.int64) * 10**8
-    error = absolute_error(pair(Trajectory(stamps_ns, estimate), Trajectory(stamps_ns, reference)))
+    error = ev.absolute_error(ev.pair(Trajectory(stamps_ns, estimate), Trajectory(stamps_ns, reference)))
     assert error.rotation_rad.maximum < 1e-7
     assert 0.01 < error.translation_m.rmse < 0.04
 
 
 def test_short_paths_are_judged_over_short_lengths(pairs):
-    short = pair(disturbed(drive(65)), drive(65))
-    assert kitti_error_of_any_path(short) == kitti_error(short, (10.0, 20.0, 40.0), every=1)
-    error = kitti_error_of_any_path(pairs)
-    assert error == kitti_error(pairs)
+    short = ev.pair(disturbed(drive(65)), drive(65))
+    assert ev.kitti_error_of_any_path(short) == ev.kitti_error(short, (10.0, 20.0, 40.0), every=1)
+    error = ev.kitti_error_of_any_path(pairs)
+    assert error == ev.kitti_error(pairs)
     assert [part.length_m for part in error.by_length] == [100.0 * k for k in range(1, 9)]
     assert [part.stretches > 0 for part in error.by_length] == [True, True] + [False] * 6
     assert [part.translation_share is not None for part in error.by_length] == [True, True] + [False] * 6
@@ -181,8 +167,8 @@ def scaled(trajectory, factor):
 
 
 def test_meters_or_centimeters_same_judgment(pairs):
-    meters = absolute_error(pairs)
-    centimeters = absolute_error(pair(scaled(disturbed(drive()), 100.0), scaled(drive(), 100.0)))
+    meters = ev.absolute_error(pairs)
+    centimeters = ev.absolute_error(ev.pair(scaled(disturbed(drive()), 100.0), scaled(drive(), 100.0)))
     assert centimeters.translation_m.rmse == pytest.approx(100.0 * meters.translation_m.rmse)
     assert centimeters.rotation_rad.rmse == pytest.approx(meters.rotation_rad.rmse)
     assert centimeters.share_of_path == pytest.approx(meters.share_of_path)
@@ -196,18 +182,18 @@ def planar(xy, yaw=None):
 
 def test_a_mirrored_planar_course_is_not_met_by_turning_the_plane_over():
     xy = np.array([[0.0, 0], [1, 0.2], [2, 0], [3, -0.5], [4, 0.1]])
-    error = absolute_error(pair(planar(xy * [1, -1]), planar(xy)))
+    error = ev.absolute_error(ev.pair(planar(xy * [1, -1]), planar(xy)))
     assert error.translation_m.rmse > 0.1
     assert error.T_reference_estimate[2, 2] == 1.0
 
 
 def test_a_straight_course_aligns_in_the_plane_and_is_refused_in_space():
     xy = np.linspace([0.0, 0.0], [10.0, 5.0], 20)
-    assert absolute_error(pair(planar(xy + np.array([1.0, 2.0])), planar(xy))).translation_m.rmse < 1e-12
+    assert ev.absolute_error(ev.pair(planar(xy + np.array([1.0, 2.0])), planar(xy))).translation_m.rmse < 1e-12
     rolled = planar(xy)
     rolled = Trajectory(rolled.stamps_ns, lie.lift(rolled.poses) @ lie.exp(np.array([0, 0, 0, 0.1, 0, 0])))
     with pytest.raises(InputError, match="align by the first pose"):
-        absolute_error(pair(rolled, rolled))
+        ev.absolute_error(ev.pair(rolled, rolled))
 
 
 def test_nearest_equals_naive_with_repeated_and_unsorted_stamps():
@@ -233,7 +219,7 @@ def test_truth_at_another_rate_is_interpolated_as_naive_does(is_planar):
     sparse = Trajectory(truth.stamps_ns[keep], truth.poses[keep])
     stamps_ns = random.integers(truth.stamps_ns[0] - 10**9, truth.stamps_ns[-1] + 10**9, 100)
     stamps_ns[::7] = sparse.stamps_ns[random.integers(0, 140, len(stamps_ns[::7]))]
-    pairs = pair(Trajectory(stamps_ns, truth.poses[:100]), sparse, gap_s=0.25)
+    pairs = ev.pair(Trajectory(stamps_ns, truth.poses[:100]), sparse, gap_s=0.25)
     known_poses = lie.lift(sparse.poses)
     expected = [naive.interpolated(t, sparse.stamps_ns, known_poses, 0.25e9) for t in stamps_ns.tolist()]
     assert pairs.places.tolist() == [k for k, pose in enumerate(expected) if pose is not None]
@@ -248,29 +234,29 @@ def test_a_true_pose_of_the_same_stamp_is_taken_to_the_last_bit_in_any_order():
     order = np.random.default_rng(0).permutation(50)
     some = order[:20]
     shuffled = Trajectory(truth.stamps_ns[order], truth.poses[order])
-    pairs = pair(Trajectory(truth.stamps_ns[some], truth.poses[some]), shuffled)
+    pairs = ev.pair(Trajectory(truth.stamps_ns[some], truth.poses[some]), shuffled)
     np.testing.assert_array_equal(pairs.estimate, pairs.reference)
     assert pairs.places.tolist() == list(range(20)) and pairs.interpolated == 0
     doubled = Trajectory(np.repeat(truth.stamps_ns[:5], 2), np.repeat(truth.poses[:5], 2, axis=0))
-    np.testing.assert_array_equal(pair(doubled, truth).reference, doubled.poses)
+    np.testing.assert_array_equal(ev.pair(doubled, truth).reference, doubled.poses)
 
 
 def test_scans_without_truth_are_counted_with_the_reason():
     truth = drive(100)
     holed = Trajectory(np.delete(truth.stamps_ns, range(40, 48)), np.delete(truth.poses, range(40, 48), axis=0))
     longer = Trajectory(truth.stamps_ns + 3_000_000 - 500_000_000, truth.poses)
-    pairs = pair(longer, holed)
+    pairs = ev.pair(longer, holed)
     assert (pairs.early, pairs.late, pairs.in_gap) == (5, 0, 9)
     assert pairs.missing == ("14 without a true pose: 5 before the truth begins, 9 in gaps of it wider than 0.5 s")
     assert pairs.share == pytest.approx(0.86)
-    assert pairs.missing in absolute_error(pairs).pairing and "86.0 %" in absolute_error(pairs).pairing
-    assert len(pair(longer, holed, gap_s=1.0)) == 95
+    assert pairs.missing in ev.absolute_error(pairs).pairing and "86.0 %" in ev.absolute_error(pairs).pairing
+    assert len(ev.pair(longer, holed, gap_s=1.0)) == 95
 
 
 def test_a_stamp_rounded_to_milliseconds_is_that_of_the_truth_at_its_ends_too():
     truth = drive(30)
     rounded = Trajectory(truth.stamps_ns + np.where(np.arange(30) < 15, 400_000, -400_000), truth.poses)
-    assert len(pair(rounded, truth)) == len(pair(truth, rounded)) == 30
+    assert len(ev.pair(rounded, truth)) == len(ev.pair(truth, rounded)) == 30
 
 
 def test_truth_without_a_pose_beside_the_estimate_is_refused_with_the_reason():
@@ -282,18 +268,18 @@ def test_truth_without_a_pose_beside_the_estimate_is_refused_with_the_reason():
         (at_rate(truth, 1, late_ns=10_000_000), one, "poses at one instant alone"),
     ):
         with pytest.raises(InputError, match=words):
-            pair(estimate, reference)
-    assert len(pair(late, sparse, gap_s=2.0)) == 80 and len(pair(truth, one)) == 1
+            ev.pair(estimate, reference)
+    assert len(ev.pair(late, sparse, gap_s=2.0)) == 80 and len(ev.pair(truth, one)) == 1
 
 
 def test_truth_that_may_mislead_is_warned_of():
     every = at_rate(drive(100), 1, late_ns=50_000_000)
-    (sparse,) = pair(every, at_rate(drive(100), 20), gap_s=2.0).warnings
+    (sparse,) = ev.pair(every, at_rate(drive(100), 20), gap_s=2.0).warnings
     assert sparse == "true poses are up to 2 s apart, and the path between them is taken as straight"
-    (few,) = pair(drive(100), Trajectory(drive(100).stamps_ns[:30], drive(100).poses[:30])).warnings
+    (few,) = ev.pair(drive(100), Trajectory(drive(100).stamps_ns[:30], drive(100).poses[:30])).warnings
     assert few == "accuracy is that of 30 of 100 scans alone: 70 without a true pose: 70 after it ends"
-    assert pair(drive(5), drive(5)).warnings == ["accuracy is that of 5 poses alone"]
-    assert pair(every, drive(100)).warnings == []
+    assert ev.pair(drive(5), drive(5)).warnings == ["accuracy is that of 5 poses alone"]
+    assert ev.pair(every, drive(100)).warnings == []
 
 
 def test_noise_of_a_fast_truth_does_not_lengthen_the_path_that_is_shown():
@@ -301,35 +287,35 @@ def test_noise_of_a_fast_truth_does_not_lengthen_the_path_that_is_shown():
     poses = drive(200).poses.copy()
     poses[:, :3, 3] += np.random.default_rng(0).normal(0.0, 0.5, (200, 3))
     noisy = Trajectory(drive(200).stamps_ns, poses)
-    pairs = pair(estimate, noisy)
-    shown = on_the_estimate(estimate, noisy)
+    pairs = ev.pair(estimate, noisy)
+    shown = ev.on_the_estimate(estimate, noisy)
     assert shown.stamps_ns.tolist() == estimate.stamps_ns.tolist()
-    assert path_length(shown.poses)[-1] == pytest.approx(absolute_error(pairs).path_length_m)
-    assert path_length(shown.poses)[-1] < 0.9 * path_length(noisy.poses)[-1]
+    assert ev.path_length(shown.poses)[-1] == pytest.approx(ev.absolute_error(pairs).path_length_m)
+    assert ev.path_length(shown.poses)[-1] < 0.9 * ev.path_length(noisy.poses)[-1]
 
 
 def test_stretches_that_do_not_fit_or_cross_a_gap_are_none_of_the_size_asked_for(pairs):
-    coarse = pair(at_rate(drive(100), 50), at_rate(drive(100), 50))  # a pose every 5 s
+    coarse = ev.pair(at_rate(drive(100), 50), at_rate(drive(100), 50))  # a pose every 5 s
     for measure in (
-        lambda: relative_error_over_frames(pairs, 300),
-        lambda: relative_error_over_distance(pairs, 1e4),
-        lambda: relative_error_over_time(pairs, 1e4),
-        lambda: kitti_error(pairs, (1e4,)),
-        lambda: relative_error_over_time(coarse, 1.0),
-        lambda: relative_error_over_distance(coarse, 0.5),
+        lambda: ev.relative_error_over_frames(pairs, 300),
+        lambda: ev.relative_error_over_distance(pairs, 1e4),
+        lambda: ev.relative_error_over_time(pairs, 1e4),
+        lambda: ev.kitti_error(pairs, (1e4,)),
+        lambda: ev.relative_error_over_time(coarse, 1.0),
+        lambda: ev.relative_error_over_distance(coarse, 0.5),
     ):
         with pytest.raises(InputError, match=r"no stretch of .* fits into"):
             measure()
     holed = np.delete(np.arange(100), range(40, 80))
-    pairs = pair(Trajectory(drive(100).stamps_ns[holed], drive(100).poses[holed]), drive(100))
-    found = relative_error_over_time(pairs, 1.0)
+    pairs = ev.pair(Trajectory(drive(100).stamps_ns[holed], drive(100).poses[holed]), drive(100))
+    found = ev.relative_error_over_time(pairs, 1.0)
     assert np.diff(pairs.stamps_ns[found.stretches], axis=1).max() == 10**9
 
 
 def test_a_kitti_file_gives_the_k_th_scan_its_k_th_row_and_must_have_as_many(tmp_path):
     truth = drive(30)
     write_kitti(tmp_path / "poses.txt", truth)
-    file = read_truth(tmp_path / "poses.txt")
+    file = ev.read_truth(tmp_path / "poses.txt")
     file.check(truth.stamps_ns, 30)
     np.testing.assert_allclose(file.at(truth.stamps_ns).poses, truth.poses, atol=1e-7)
     stopped = file.first(12).at(truth.stamps_ns[:12])
@@ -341,7 +327,7 @@ def test_a_kitti_file_gives_the_k_th_scan_its_k_th_row_and_must_have_as_many(tmp
 
 def test_poses_without_time_pair_line_by_line():
     lines = Trajectory(np.arange(120, dtype=np.int64), drive(120).poses)
-    pairs = pair(lines, Trajectory(lines.stamps_ns[:100], lines.poses[:100]))
+    pairs = ev.pair(lines, Trajectory(lines.stamps_ns[:100], lines.poses[:100]))
     assert (len(pairs), pairs.late, pairs.interpolated) == (100, 20, 0)
 
 
@@ -354,9 +340,9 @@ def wheel_odometry():
 
 def test_relations_over_raw_wheel_odometry_equal_naive_and_are_big():
     stamps_ns, poses = wheel_odometry()
-    relations = read_relations(shared_data("2d/intel.relations"))
+    relations = ev.read_relations(shared_data("2d/intel.relations"))
     trajectory = Trajectory(np.array(stamps_ns), np.array([lie.pose_2d(*pose) for pose in poses]))
-    error = relation_error(trajectory, relations)
+    error = ev.relation_error(trajectory, relations)
     assert error.missing == 0
     assert len(error.errors_m) == 2984
     index = {stamp: k for k, stamp in reversed(list(enumerate(stamps_ns)))}
@@ -379,15 +365,15 @@ def test_relations_made_of_a_trajectory_find_no_error_in_it(tmp_path):
         lines.append(f"{i / 10:.6f} {j / 10:.6f} {T[0, 2]:.17g} {T[1, 2]:.17g} 0 0 0 {float(lie.yaw(T)):.17g}")
     lines.append("0.100000 55.000000 0 0 0 0 0 0")
     (tmp_path / "a.relations").write_text("\n".join(lines))
-    relations = read_relations(tmp_path / "a.relations")
-    error = relation_error(trajectory, relations)
+    relations = ev.read_relations(tmp_path / "a.relations")
+    error = ev.relation_error(trajectory, relations)
     assert error.used.tolist() == [0, 1, 2] and error.missing == 1
     assert error.translation_m.maximum < 1e-12 and error.rotation_rad.maximum < 1e-7
     with pytest.raises(InputError, match="belong to this log"):
-        relation_error(Trajectory(trajectory.stamps_ns + 10**15, trajectory.poses), relations)
+        ev.relation_error(Trajectory(trajectory.stamps_ns + 10**15, trajectory.poses), relations)
     (tmp_path / "a.relations").write_text("1.0 2.0 0 0 0 0 0 0\n1.0 2.0 0 0 0 0 0\n")
     with pytest.raises(InputError, match=r"a\.relations:2 has 7 fields"):
-        read_relations(tmp_path / "a.relations")
+        ev.read_relations(tmp_path / "a.relations")
 
 
 def test_scans_in_the_dropouts_of_a_real_motion_capture_are_named():
@@ -395,7 +381,7 @@ def test_scans_in_the_dropouts_of_a_real_motion_capture_are_named():
     config = load_settings(overrides=[Override("log.ground_truth_topic", "/vrpn_client_node/jackal/pose", "--gt")])
     log = open_log(shared_data("2d/mocap_room_1.bag"), config.config.log)
     stamps_ns = np.array([scan.stamp_ns for scan in log.scans()])
-    pairs = pair(Trajectory(stamps_ns, np.tile(np.eye(3), (len(stamps_ns), 1, 1))), log.ground_truth())
+    pairs = ev.pair(Trajectory(stamps_ns, np.tile(np.eye(3), (len(stamps_ns), 1, 1))), log.ground_truth())
     assert (len(pairs), pairs.interpolated) == (383, 383)
     assert pairs.missing == "31 without a true pose: 31 in gaps of it wider than 0.1 s"
 
@@ -406,14 +392,14 @@ def test_stamps_in_bursts_have_the_interval_between_the_bursts():
     bursts_ns = np.arange(100) // 5 * 50_000_000 + np.arange(100) % 5 * 10_000
     wanted_ns = np.arange(1, 19) * 50_000_000 + 25_000_000
     estimate = Trajectory(wanted_ns, truth.poses[: len(wanted_ns)])
-    pairs = pair(estimate, Trajectory(bursts_ns, truth.poses))
+    pairs = ev.pair(estimate, Trajectory(bursts_ns, truth.poses))
     assert len(pairs) == 18 and pairs.gap_s == pytest.approx(0.25, rel=0.01)
 
 
 def test_an_error_is_no_share_of_a_path_that_is_too_short():
     standing = drive(step_m=0.001, count=3)
-    error = absolute_error(pair(disturbed(standing), standing), Alignment.FIRST)
+    error = ev.absolute_error(ev.pair(disturbed(standing), standing), ev.Alignment.FIRST)
     assert error.path_length_m < 1.0
     assert error.share_of_path is None and "%" not in error.summary and "max" in error.summary
-    driven = absolute_error(pair(disturbed(drive()), drive()))
+    driven = ev.absolute_error(ev.pair(disturbed(drive()), drive()))
     assert f"{100.0 * driven.share_of_path:.3f} % of {driven.path_length_m:.1f} m" in driven.summary

@@ -24,7 +24,6 @@ def _problem_with_error(dimension, angle, seed=0):
     return problem, poses, error
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("angle", ANGLES)
 def test_the_error_is_the_logarithm_of_the_mismatch(dimension, angle):
     problem, poses, error = _problem_with_error(dimension, angle)
@@ -33,7 +32,6 @@ def test_the_error_is_the_logarithm_of_the_mismatch(dimension, angle):
     assert np.allclose(found, naive_graph.error(*poses, problem.measurements[0]), atol=1e-6)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("angle", ANGLES)
 def test_jacobians_equal_finite_differences_from_zero_to_nearly_pi(dimension, angle):
     problem, poses, _ = _problem_with_error(dimension, angle)
@@ -46,7 +44,6 @@ def test_jacobians_equal_finite_differences_from_zero_to_nearly_pi(dimension, an
             assert np.allclose(sign * J[:, a], (ahead - back) / (2.0 * step), rtol=2e-6, atol=2e-6)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_normal_equations_equal_dense_finite_differences(dimension):
     rng = np.random.default_rng(4)
     k, count = (3, 6)[dimension - 2], 5
@@ -92,7 +89,6 @@ def test_a_weight_is_the_slope_of_its_loss_and_one_at_zero(loss):
     assert loss.loss(np.array([1e-9]))[0] == pytest.approx(1e-9, rel=1e-6)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("angle", [0.0, 0.1, 3.0])
 def test_an_edge_of_position_alone_measures_the_position_whatever_the_rotation(dimension, angle):
     full, poses, _ = _problem_with_error(dimension, angle)

@@ -6,7 +6,6 @@ from scanchain import lie
 from scanchain.errors import InputError
 from scanchain.graph.edge_checks import nearest_semidefinite, positive_semidefinite, ranks
 from scanchain.graph.g2o import read_g2o, write_g2o
-from scanchain.graph.pose_graph import PoseGraph
 from tests.support.graphs import graph_of
 from tests.support.scenes import shared_data
 
@@ -94,13 +93,9 @@ def test_toro_orders_the_information_of_the_plane_in_its_own_way(read):
 
 @pytest.mark.parametrize("pitch", [0.0, 1.0, np.pi / 2, -np.pi / 2, np.pi / 2 - 1e-7])
 def test_toro_angles_are_roll_pitch_and_yaw_also_looking_straight_up(pitch, tmp_path):
-    graph = PoseGraph(3)
-    angles = [(0.3, pitch, -2.0), (-3.0, pitch, 0.5)]
-    for index, (roll, nod, yaw) in enumerate(angles):
-        T = lie.identity(3)
-        T[:3, :3] = Rotation.from_euler("ZYX", [yaw, nod, roll]).as_matrix()
-        graph.add_pose(T, index)
-    graph.add_edge(0, 1, graph.poses[1], np.eye(6))
+    angles, poses = [(0.3, pitch, -2.0), (-3.0, pitch, 0.5)], np.tile(lie.identity(3), (2, 1, 1))
+    poses[:, :3, :3] = Rotation.from_euler("ZYX", np.array(angles)[:, ::-1]).as_matrix()
+    graph = graph_of(poses, [(0, 1)], poses[1:], np.eye(6))
     path = tmp_path / "up.graph"
     write_g2o(path, graph)
     assert np.allclose(read_g2o(path).graph.poses, graph.poses, rtol=0, atol=1e-12)

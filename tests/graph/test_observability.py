@@ -10,9 +10,7 @@ from scanchain.graph.between import BetweenProblem
 from scanchain.graph.edge_checks import free_poses, ranks
 from scanchain.graph.pose_graph import PoseGraph
 from tests.support import naive_graph
-from tests.support.graphs import graph_of
-
-PLAIN = GraphConfig(robust="none")
+from tests.support.graphs import PLAIN, graph_of
 
 
 def chain(dimension, silent=None, loops=(), count=6):
@@ -39,7 +37,6 @@ def chain(dimension, silent=None, loops=(), count=6):
     return graph
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("silent", ["x", "y", "yaw", "positions", "rotations"])
 def test_a_pose_free_along_some_axis_is_named_and_nothing_certified_unless_a_loop_holds_it(dimension, silent):
     rotations = slice(dimension, None)
@@ -52,20 +49,17 @@ def test_a_pose_free_along_some_axis_is_named_and_nothing_certified_unless_a_loo
     assert not len(chain(dimension, axes.get(silent, rotations), [(0, 5)]).free_poses())
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_all_zero_information_is_refused_with_the_names_of_the_poses(dimension):
     with pytest.raises(InputError, match=r"1 of 6 poses are not joined to a fixed one: 50; .* is not zero"):
         chain(dimension, 0.0).optimize(PLAIN)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_poses_that_hang_on_next_to_no_information_are_named(dimension):
     assert chain(dimension, 1e-9).weakly_joined().tolist() == [50]
     assert chain(dimension, 1e-9, [(0, 5)]).weakly_joined().tolist() == []
     assert chain(dimension, 1e-3).weakly_joined().tolist() == []
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("share", [1e-30, 1e-12, 1e-9])
 @pytest.mark.parametrize("axes", [slice(None), slice(0, 1), slice(-1, None)])
 @pytest.mark.parametrize("far_m", [0.0, 5e6])
@@ -91,7 +85,6 @@ def test_a_group_on_next_to_no_information_is_named_whole_by_certificate_and_cov
     assert certificate.reason in refusal and ("5 to 9;" in refusal) == (share < 1e-10) != certificate.certified
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_free_is_what_lies_in_the_null_space_of_the_dense_matrix(dimension):
     rng = np.random.default_rng(1)
     k, count, seen = (3, 6)[dimension - 2], 8, set()

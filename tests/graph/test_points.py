@@ -7,10 +7,8 @@ from scipy.optimize import least_squares
 from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.graph.between import BetweenProblem
-from tests.support.graphs import graph_of
+from tests.support.graphs import PLAIN, closed_ring, graph_of
 from tests.support.naive_graph import dense
-
-PLAIN = GraphConfig(robust="none")
 
 
 def field(seed=0, noise=0.05, poses=12, points=5):
@@ -85,9 +83,7 @@ def test_covariances_of_points_equal_the_dense_inverse():
 
 @pytest.mark.parametrize("turns", [0, 1])
 def test_a_ring_with_a_point_is_certified_unless_it_is_wound_up(turns):
-    edges = [(index, (index + 1) % 30) for index in range(30)]
-    wound = [lie.pose_2d(0.0, 0.0, 2.0 * np.pi * turns * index / 30) for index in range(30)]
-    graph = graph_of(wound, edges, [lie.identity(2)] * 30, np.diag([100.0, 100.0, 1e4]))
+    graph = closed_ring(2, 30, turns)
     mark = graph.add_point(np.array([2.0, 1.0]), 99)
     sight(graph, (0, mark), (2.0, 1.1), np.eye(2))
     sight(graph, (1, mark), (2.1, 1.0), np.eye(2))

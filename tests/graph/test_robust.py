@@ -51,7 +51,6 @@ def test_a_tenth_to_a_half_of_wrong_loops_leave_the_trajectory_as_it_is_without_
     assert outcome.certified
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_a_contradiction_is_what_chi2_falls_by_without_the_edge_and_rises_by_with_it(dimension):
     rng = np.random.default_rng(3)
     k, count = (3, 6)[dimension - 2], 10

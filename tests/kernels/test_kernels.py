@@ -81,7 +81,6 @@ def test_closed_form_eigenvectors_equal_lapack(spread):
         assert abs(v @ vectors[:, 0]) > 1.0 - 1e-6 / gap**2
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("alone", [1, 8, 10**6])
 def test_voxels_keep_the_mean_and_shape_of_their_points(dimension, alone):
     points = some_points(dimension)
@@ -109,7 +108,6 @@ def test_a_voxel_map_far_from_its_origin_loses_no_precision():
     np.testing.assert_allclose(there.points()[order] - offset, here.points(), atol=1e-9)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("reach", [1, 2])
 def test_association_finds_the_nearest_mean(dimension, reach):
     points = some_points(dimension)
@@ -124,7 +122,6 @@ def test_association_finds_the_nearest_mean(dimension, reach):
     assert found == sum(key is not None for key in expected)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("alone", [8, 10**6])
 def test_the_weight_is_the_sensors_variance_over_the_residuals(dimension, alone):
     points = some_points(dimension)
@@ -186,7 +183,6 @@ def associated(voxel_map, points, T):
     return problem._replace(origin=np.zeros(3))
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_normal_equations_are_the_gradient_and_hessian_of_the_cost(dimension):
     points = some_points(dimension)
     voxel_map = map_of(points)
@@ -212,7 +208,6 @@ def test_normal_equations_are_the_gradient_and_hessian_of_the_cost(dimension):
         assert b[axis] == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-5, abs=1e-6)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_second_order_hessian_is_the_curvature_of_the_squared_residuals(dimension):
     points = some_points(dimension)
     voxel_map = map_of(points)
@@ -271,7 +266,6 @@ def test_a_step_decreases_a_quadratic_as_much_as_predicted(optimizer):
     assert b @ x < 0.0
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_downsampling_keeps_the_first_point_of_each_voxel_in_range(dimension, dtype):
     points = some_points(dimension).astype(dtype)

@@ -4,15 +4,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from scanchain.errors import InputError
+from scanchain.landmarks import solvers
 from scanchain.landmarks.problem import Layout, LinearSystem, Pattern
-from scanchain.landmarks.solvers import (
-    METHODS,
-    Covariance,
-    UndeterminedError,
-    create_solver,
-    methods_for,
-    parse_methods,
-)
+from scanchain.landmarks.solvers import METHODS, UndeterminedError, create_solver
 from tests.support import naive_landmarks
 
 OWN = ("qr", "qr_colamd", "cholesky", "schur")
@@ -135,7 +129,7 @@ def test_covariances_equal_those_of_the_dense_inverse():
     A, system = problem(12, 5, 9, size=3)
     dense = np.linalg.inv(A.T @ A)
     split = system.pattern.layout.split
-    covariance = Covariance(system)
+    covariance = solvers.Covariance(system)
     for wanted in ([3, 4, 5, 6, 7, 8], [0, 1, 2, split, split + 1], [split, split + 1, split + 8, split + 9]):
         assert np.allclose(covariance.of(np.array([wanted]))[0], dense[np.ix_(wanted, wanted)], rtol=1e-9)
     assert np.isnan(covariance.of(np.array([[0, 30]]))[0, 0, 1])
@@ -143,6 +137,6 @@ def test_covariances_equal_those_of_the_dense_inverse():
 
 def test_methods_are_parsed_and_unknown_ones_refused():
     others = tuple(name for name in METHODS if name != "pinv")
-    assert methods_for(parse_methods("pinv, all"), 100) == (("pinv", *others), {})
+    assert solvers.methods_for(solvers.parse_methods("pinv, all"), 100) == (("pinv", *others), {})
     with pytest.raises(InputError, match="no method"):
-        parse_methods("")
+        solvers.parse_methods("")

@@ -6,39 +6,39 @@ from scipy.sparse.csgraph import csgraph_from_dense, dijkstra
 
 from scanchain import lie
 from scanchain.data import ClosureVerdict
-from scanchain.evaluation import absolute_error, pair
-from scanchain.graph.pose_graph import PoseGraph
 from scanchain.kernels.graph.paths import path_lengths
 from scanchain.logs import open_log
 from scanchain.loops import LoopCloser, closer
 from scanchain.loops.connectivity import Drift
 from scanchain.runs.closures import final_verdicts
+from tests.benchmarks.harness import ate_m
+from tests.benchmarks.loops import is_true, true_poses
 from tests.support.drifting import drifting_slam, stretched
+from tests.support.graphs import graph_of
 from tests.support.scenes import configured, shared_data
 
 
 def chain(count, sigma_m=0.01):
     """Keyframes a meter apart on a straight line."""
-    graph = PoseGraph(2)
+    poses, edges = [lie.pose_2d(float(k), 0.0, 0.0) for k in range(count)], [(k, k + 1) for k in range(count - 1)]
     information = np.diag([sigma_m**-2.0, sigma_m**-2.0, 1e6])
-    for index in range(count):
-        graph.add_pose(lie.pose_2d(float(index), 0.0, 0.0), index)
-        if index:
-            graph.add_edge(index - 1, index, lie.pose_2d(1.0, 0.0, 0.0), information)
-    return graph
+    return graph_of(poses, edges, [lie.pose_2d(1.0, 0.0, 0.0)] * len(edges), information)
 
 
-def test_uncertainty_grows_along_the_path_up_to_its_limit():
-    uncertainty_m = Drift(0.1).between(chain(30), 29, 2.0)
-    assert np.allclose(uncertainty_m, np.minimum(0.1 * (29 - np.arange(30)), 2.0))
-
-
-def test_a_loop_shortens_the_path_for_all_that_it_connects():
-    graph = chain(30)
-    graph.add_edge(5, 25, lie.pose_2d(20.0, 0.0, 0.0), 1e6 * np.eye(3), is_loop=True)
-    uncertainty_m = Drift(0.1).between(graph, 29, 5.0)
-    assert uncertainty_m[5] == pytest.approx(0.4, abs=1e-3)
-    assert uncertainty_m[8] == pytest.approx(0.7, abs=1e-3)
+@pytest.mark.parametrize(
+    ("count", "more", "is_loop", "newest", "limit_m", "expected"),
+    [
+        (30, [], False, 29, 2.0, {k: min(0.1 * (29 - k), 2.0) for k in range(30)}),  # up to its limit
+        (30, [(5, 25, 20.0)], True, 29, 5.0, {5: 0.4, 8: 0.7}),  # a loop shortens it for all that it connects
+        (4, [(1, 3, 3.0), (1, 3, 0.5)], False, 0, 5.0, {0: 0.0, 1: 0.1, 2: 0.2, 3: 0.15}),  # the shorter counts
+    ],
+)
+def test_uncertainty_grows_along_the_shortest_path(count, more, is_loop, newest, limit_m, expected):
+    graph = chain(count)
+    for i, j, meters in more:
+        graph.add_edge(i, j, lie.pose_2d(meters, 0.0, 0.0), 1e6 * np.eye(3), is_loop=is_loop)
+    uncertainty_m = Drift(0.1).between(graph, newest, limit_m)
+    assert uncertainty_m[list(expected)] == pytest.approx(list(expected.values()), abs=1e-3)
 
 
 def test_an_edge_counts_by_its_own_uncertainty_where_odometry_was_lost():
@@ -46,13 +46,6 @@ def test_an_edge_counts_by_its_own_uncertainty_where_odometry_was_lost():
     graph.add_pose(lie.pose_2d(3.0, 0.0, 0.0), 3)
     graph.add_edge(2, 3, lie.pose_2d(1.0, 0.0, 0.0), np.diag([2.0, 2.0, 25.0]))
     assert Drift(0.1).between(graph, 3, 5.0) == pytest.approx([1.2, 1.1, 1.0, 0.0])
-
-
-def test_of_edges_between_the_same_two_the_shortest_counts_once():
-    graph = chain(4)
-    for meters in (3.0, 0.5):
-        graph.add_edge(1, 3, lie.pose_2d(meters, 0.0, 0.0), 1e6 * np.eye(3))
-    assert Drift(0.1).between(graph, 0, 5.0) == pytest.approx([0.0, 0.1, 0.2, 0.15])
 
 
 def test_paths_through_a_chain_with_loops_are_the_shortest():
@@ -106,20 +99,14 @@ def undrifted():
 def test_drift_is_closed_to_a_fifth_and_no_loop_is_wrong(undrifted, longer, turn_rad_m):
     truth = undrifted.trajectory
     drifted = run(longer, turn_rad_m)
-    before, after = (
-        absolute_error(pair(trajectory, truth)).translation_m.rmse
-        for trajectory in (drifted.odometry, drifted.trajectory)
-    )
+    before, after = (ate_m(trajectory, truth) for trajectory in (drifted.odometry, drifted.trajectory))
     assert before > 2.0
     assert after < before / 5.0
     judged = final_verdicts(drifted.closures, drifted.state)
     accepted = [item for item in judged if item.verdict is ClosureVerdict.ACCEPTED]
     assert len(accepted) > 50
-    true = truth.poses[[keyframe.scan_index for keyframe in drifted.keyframes]]
-    for closure in accepted:
-        T_true = lie.inverse(true[closure.target]) @ true[closure.source]
-        off = lie.inverse(T_true) @ closure.match.T_target_source
-        assert np.linalg.norm(off[:2, 2]) < 0.5
+    true = true_poses(2, truth, drifted.keyframes)
+    assert all(is_true(closure, true) for closure in accepted)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ import pytest
 
 from scanchain import lie
 from scanchain.data import ClosureVerdict, Keyframe, Proposal
-from scanchain.graph.pose_graph import PoseGraph
 from scanchain.kernels.free_space import FAR, compare_ranges, nearest_ranges
 from scanchain.loops import LoopCloser, outline_of
 from scanchain.loops.connectivity import Segments
@@ -21,7 +20,7 @@ from scanchain.loops.verification import Verifier, free_space_agreement
 from scanchain.registration import VoxelMap
 from scanchain.simulation import plan
 from scanchain.simulation.sensors import take_sweep
-from tests.support import naive_loops
+from tests.support import graphs, naive
 from tests.support.scenes import configured, stored
 
 RADIUS_M = 32.0
@@ -91,7 +90,7 @@ def test_ranges_compare_as_the_naive_ones(seed):
     ranges_m = np.empty((20, 40))
     nearest_ranges(seen, ranges_m)
     found = compare_ranges(points, T, ranges_m, 0.5, 0.05)
-    assert found == naive_loops.agreement(seen, points, T, ranges_m.shape, 0.5, 0.05)
+    assert found == naive.agreement(seen, points, T, ranges_m.shape, 0.5, 0.05)
     assert min(found) > 20
 
 
@@ -201,13 +200,10 @@ def there_and_back(lost_m=0.0):
 
 def graph_of(keyframes, sigma_rad=0.002):
     """The graph of odometry alone, a keyframe's heading known from the one before with so much."""
-    graph = PoseGraph(3)
-    for keyframe in keyframes:
-        graph.add_pose(keyframe.T_odom_lidar, keyframe.stamp_ns)
+    poses = np.array([keyframe.T_odom_lidar for keyframe in keyframes])
     information = np.diag(np.array([0.02, 0.02, 0.02, 0.002, 0.002, sigma_rad]) ** -2.0)
-    for a, b in pairwise(keyframes):
-        graph.add_edge(a.index, b.index, lie.between(a.T_odom_lidar, b.T_odom_lidar), information)
-    return graph
+    edges = [*pairwise(range(len(keyframes)))]
+    return graphs.graph_of(poses, edges, lie.between(poses[:-1], poses[1:]), information)
 
 
 @pytest.mark.parametrize("lost_m", [0.0, 8.0])

@@ -8,7 +8,6 @@ import pytest
 
 from scanchain import lie
 from scanchain.data import Closure, ClosureVerdict, Keyframe, Proposal
-from scanchain.evaluation import absolute_error, pair
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.logs import open_log
 from scanchain.loops.connectivity import Segments
@@ -20,16 +19,15 @@ from scanchain.odometry.tracked import first_match
 from scanchain.placement import edge_information
 from scanchain.runs.closures import final_verdicts
 from scanchain.slam import Slam
+from tests.benchmarks.harness import ate_m
+from tests.support.graphs import graph_of
 from tests.support.scenes import configured, shared_data, stored
 
 
-def graph_of(count, loops=()):
-    graph = PoseGraph(2)
-    for index in range(count):
-        graph.add_pose(lie.identity(2), index)
-    for i, j in loops:
-        graph.add_edge(i, j, lie.identity(2), np.eye(3), is_loop=True)
-    return graph
+def joined(count, loops=()):
+    """So many keyframes, and loops between some of them."""
+    one = [lie.identity(2)]
+    return graph_of(one * count, loops, one * len(loops), np.eye(3), [True] * len(loops))
 
 
 def connected(segments, graph):
@@ -38,24 +36,15 @@ def connected(segments, graph):
     return components == components[-1]
 
 
-def test_without_a_gap_everything_is_one_segment():
-    assert connected(Segments(), graph_of(5)).all()
-
-
 def test_a_new_segment_is_connected_to_nothing_until_a_loop_does_it():
     segments = Segments()
+    assert connected(segments, joined(5)).all()
     segments.start(3)
     segments.start(6)
-    assert connected(segments, graph_of(9)).tolist() == [False] * 6 + [True] * 3
-    assert connected(segments, graph_of(9, [(1, 4)])).tolist() == [False] * 6 + [True] * 3
-    assert connected(segments, graph_of(9, [(1, 7)])).tolist() == [True] * 3 + [False] * 3 + [True] * 3
-    assert connected(segments, graph_of(9, [(4, 7), (1, 4)])).all()
-
-
-def test_a_span_ends_where_the_next_segment_starts():
-    segments = Segments()
-    segments.start(3)
-    assert [segments.span(k, 8) for k in (0, 2, 3, 7)] == [(0, 3), (0, 3), (3, 8), (3, 8)]
+    assert connected(segments, joined(9)).tolist() == [False] * 6 + [True] * 3
+    assert connected(segments, joined(9, [(1, 4)])).tolist() == [False] * 6 + [True] * 3
+    assert connected(segments, joined(9, [(1, 7)])).tolist() == [True] * 3 + [False] * 3 + [True] * 3
+    assert connected(segments, joined(9, [(4, 7), (1, 4)])).all()
 
 
 def test_a_submap_holds_keyframes_of_its_own_segment_alone():
@@ -69,9 +58,10 @@ def test_a_submap_holds_keyframes_of_its_own_segment_alone():
     assert np.ptp(part.points()[:, 0]) == pytest.approx(30.0)
 
 
-def test_a_submap_is_anchored_in_the_segment_of_its_keyframe():
+def test_a_span_ends_where_the_next_segment_starts_in_which_a_submap_is_anchored():
     segments = Segments()
     segments.start(7)
+    assert [segments.span(k, 12) for k in (0, 6, 7, 11)] == [(0, 7), (0, 7), (7, 12), (7, 12)]
     submaps = VoxelSubmaps(2, 5, configured(2).local_map, segments)
     assert [submaps.anchor_of(k) for k in (0, 4, 6, 7, 9, 10, 14)] == [0, 0, 5, 7, 7, 10, 10]
 
@@ -90,10 +80,6 @@ def test_a_long_log_that_hangs_on_a_map_by_next_to_no_information_is_optimized()
             graph.add_edge(1 + before % 2, index, lie.identity(2), close, is_loop=True)
     graph.optimize(configured(2).graph, initialize="given")
     assert np.allclose(graph.poses[1:3, :2, 2], graph.poses[399:401, :2, 2], atol=1e-6)
-
-
-def match_of(T):
-    return replace(first_match(T, np.empty((0, 2)), configured(2).matching), T_target_source=T)
 
 
 def square(half_m):
@@ -126,14 +112,14 @@ def up_to(index, keyframes):
 
 
 def tried(*sources, y_m=0.0, overlap=0.95, verdict=ClosureVerdict.ACCEPTED):
-    match = match_of(lie.pose_2d(0.0, y_m, 0.0))
+    match = first_match(lie.pose_2d(0.0, y_m, 0.0), np.empty((0, 2)), configured(2).matching)
     return [Closure(0, source, match, overlap, verdict, "") for source in sources]
 
 
 def test_keyframes_that_fit_one_place_join_a_log_to_a_map_once_they_are_enough():
     keyframes = keyframes_in([4.0] * 8)
     evidence, segments = begun()
-    graph = graph_of(11)
+    graph = joined(11)
     assert not evidence.collect(tried(3, overlap=0.61), *up_to(3, keyframes)) and connected(segments, graph).all()
     assert not evidence.collect(tried(4, overlap=0.61), *up_to(4, keyframes))
     assert not evidence.collect(tried(5, y_m=3.0), *up_to(5, keyframes)), "it is at another pose"
@@ -239,10 +225,7 @@ def test_a_robot_that_was_carried_elsewhere_is_found_again():
     whole, none = carried(Slam(configured(2), log.T_base_lidar), scans, 0, 0)
     slam = Slam(configured(2), log.T_base_lidar)
     holed, starts = carried(slam, scans, 4000, 4600)
-    before, after = (
-        absolute_error(pair(trajectory, whole.trajectory)).translation_m.rmse
-        for trajectory in (holed.odometry, holed.trajectory)
-    )
+    before, after = (ate_m(trajectory, whole.trajectory) for trajectory in (holed.odometry, holed.trajectory))
     assert len(slam.closer.segments.starts) == 2
     assert none == [] and starts == [4600]
     assert before > 5.0
@@ -265,14 +248,10 @@ def test_a_robot_that_was_carried_to_another_corridor_like_one_before_stays_apar
 
 
 def test_poses_beyond_a_motion_that_nothing_measured_are_still_optimized():
-    graph, step = PoseGraph(2), lie.pose_2d(1.0, 0.0, 0.0)
-    nothing = np.zeros((3, 3))
-    for index in range(200):
-        graph.add_pose(lie.pose_2d(float(index), 0.0, 0.0), index)
-    for index in range(199):
-        lost = 19 if index in (0, 120) else 0
-        information = edge_information(nothing, 1.0 * lost, 0.2 * lost) if lost else 1e5 * np.eye(3)
-        graph.add_edge(index, index + 1, step, information)
+    information = np.tile(1e5 * np.eye(3), (199, 1, 1))
+    information[[0, 120]] = edge_information(np.zeros((3, 3)), 19.0, 3.8)
+    chain, poses = [(k, k + 1) for k in range(199)], [lie.pose_2d(float(k), 0.0, 0.0) for k in range(200)]
+    graph = graph_of(poses, chain, [lie.pose_2d(1.0, 0.0, 0.0)] * 199, information)
     for index in range(150, 160):
         graph.add_edge(index, index + 30, lie.pose_2d(30.0, 0.0, 0.0), 1e5 * np.eye(3), is_loop=True)
     assert graph.optimize(configured(2).graph, initialize="given").converged

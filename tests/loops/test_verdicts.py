@@ -1,8 +1,9 @@
-"""The last word on loop closures: wrong ones are found out, and the table says what became of each."""
+"""Loop closures: kept in columns, wrong ones found out in the end; the table says what became of each."""
 
 import json
 import re
 from collections import Counter, defaultdict
+from dataclasses import fields, replace
 
 import msgspec
 import numpy as np
@@ -10,26 +11,24 @@ import pyarrow.parquet as pq
 import pytest
 
 from scanchain.__main__ import main
-from scanchain.config import GraphConfig, LogConfig
-from scanchain.data import VERIFICATION, ClosureVerdict, Proposal
-from scanchain.evaluation import absolute_error, pair
+from scanchain.config import GraphConfig
+from scanchain.data import VERIFICATION, Closure, ClosureVerdict, Match, Proposal
 from scanchain.graph.g2o import read_g2o
 from scanchain.logs import open_log
+from scanchain.loops import ClosureTable
 from scanchain.runs.closures import final_verdicts, write_closures
 from scanchain.runs.metrics import Metrics
-from scanchain.simulation import simulate
 from scanchain.slam import Slam
-from tests.support.false_loops import MADE_UP, false_closures
+from tests.benchmarks.harness import ate_m
+from tests.support import made
+from tests.support.drifting import MADE_UP, false_closures
 from tests.support.scenes import configured
-
-DURATION_S = 110.0  # round the office's ring once and on for a while
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory):
-    path = tmp_path_factory.mktemp("office") / "office.mcap"
-    simulate("office", path, duration_s=DURATION_S)
-    return open_log([path], LogConfig())
+def log():
+    """Round the office's ring once and on for a while."""
+    return open_log(made.log("office", seconds=110))
 
 
 def driven(log):
@@ -52,10 +51,6 @@ def disturbed(log):
     return slam.finish()
 
 
-def ate_m(result, log):
-    return absolute_error(pair(result.trajectory, log.ground_truth())).translation_m.rmse
-
-
 def made_up(result, judged):
     return [item for item, tried in zip(judged, result.closures, strict=True) if tried.reason == MADE_UP]
 
@@ -66,7 +61,8 @@ def test_with_thirty_percent_wrong_loops_the_map_is_as_good_and_all_of_them_are_
     accepted = [item for item in judged if item.verdict is ClosureVerdict.ACCEPTED]
     assert len(wrong) >= 0.3 * (len(wrong) + len(accepted)) and len(wrong) >= 5
     assert all(item.verdict is ClosureVerdict.REJECTED and "contradicts" in item.reason for item in wrong)
-    assert ate_m(disturbed, log) == pytest.approx(ate_m(undisturbed, log), rel=0.2)
+    errors_m = [ate_m(result.trajectory, log.ground_truth()) for result in (disturbed, undisturbed)]
+    assert errors_m[0] == pytest.approx(errors_m[1], rel=0.2)
 
 
 def test_a_wrong_closure_keeps_a_large_chi2_and_a_true_one_ends_with_a_small_one(disturbed):
@@ -123,6 +119,11 @@ def forced(log, tmp_path_factory):
     return out
 
 
+@pytest.fixture
+def metrics(forced):
+    return json.loads((forced / "metrics.json").read_bytes())
+
+
 def moved_m(poses, others):
     return np.linalg.norm((poses - others)[:, :-1, -1], axis=1).max()
 
@@ -136,8 +137,7 @@ def by_gtsam(path):
     return np.array([found.atPose2(index).matrix() for index in range(found.size())])
 
 
-def test_optimizing_the_graph_of_a_run_with_false_loops_does_not_move_its_poses(forced):
-    metrics = json.loads((forced / "metrics.json").read_bytes())
+def test_optimizing_the_graph_of_a_run_with_false_loops_does_not_move_its_poses(forced, metrics):
     assert metrics["closures_rejected_by_back_end"] >= 5
     graph = read_g2o(forced / "graph.g2o").graph
     before = graph.poses
@@ -150,8 +150,7 @@ def test_optimizing_the_graph_of_a_run_with_false_loops_does_not_move_its_poses(
     assert moved_m(by_gtsam(forced / "graph.g2o"), before) < 1e-3
 
 
-def test_rejected_loops_stand_in_a_file_of_their_own(forced):
-    metrics = json.loads((forced / "metrics.json").read_bytes())
+def test_rejected_loops_stand_in_a_file_of_their_own(forced, metrics):
     rejected = read_g2o(forced / "graph_rejected.g2o").graph
     table = pq.read_table(forced / "loops.parquet").to_pylist()
     named = [[row["target"], row["source"]] for row in table if "contradicts" in row["reason"]]
@@ -164,8 +163,7 @@ def test_rejected_loops_stand_in_a_file_of_their_own(forced):
     assert moved_m(kept.poses, before) > 0.5  # what a graph with all of them would do
 
 
-def test_chi2_counts_what_is_in_force_with_its_degrees_of_freedom(forced):
-    metrics = json.loads((forced / "metrics.json").read_bytes())
+def test_chi2_counts_what_is_in_force_with_its_degrees_of_freedom(forced, metrics):
     assert metrics["chi2"] < 5.0 * metrics["degrees_of_freedom"]
     said = re.search(
         r"χ² ([0-9.,]+) over ([0-9,]+) degrees of freedom, ([0-9]+) closures rejected by the back end",
@@ -177,8 +175,7 @@ def test_chi2_counts_what_is_in_force_with_its_degrees_of_freedom(forced):
     assert said[0] in (forced / "report.html").read_text(encoding="utf-8")
 
 
-def test_closures_tried_are_those_rejected_by_verification_or_by_the_back_end_and_those_accepted(forced):
-    metrics = json.loads((forced / "metrics.json").read_bytes())
+def test_closures_tried_are_those_rejected_by_verification_or_by_the_back_end_and_those_accepted(forced, metrics):
     tried, by_verification, verified, by_back_end, accepted = (
         metrics[f"closures_{name}"]
         for name in ("tried", "rejected_by_verification", "verified", "rejected_by_back_end", "accepted")
@@ -216,3 +213,56 @@ def test_a_run_without_loops_has_none_to_check(tmp_path, log):
     said = (tmp_path / "run" / "summary.txt").read_text(encoding="utf-8")
     assert "no loops to check" in said and "χ²" not in said
     assert not (tmp_path / "run" / "graph_rejected.g2o").exists()
+
+
+# closures in columns come back as they were
+
+
+def closures(k):
+    rng = np.random.default_rng(k)
+    size = 3 if k == 3 else 4
+    for source in range(40):
+        match = Match(
+            T_target_source=rng.normal(size=(size, size)),
+            information=rng.normal(size=(k, k)),
+            cost=rng.normal(),
+            inliers=source,
+            points=2 * source,
+            iterations=source % 7,
+            residual_m=rng.normal(),
+            fit=rng.normal(),
+            at_minimum=source % 2 == 0,
+            converged=source % 3 == 0,
+            reason=f"reason {source % 5}",
+            degeneracy_eigenvalue=rng.normal(),
+            observability=np.inf,
+            degeneracy_direction=rng.normal(size=k),
+            cause=f"cause {source % 3}",
+        )
+        verdict = ClosureVerdict.REJECTED if source % 4 else ClosureVerdict.ACCEPTED
+        cause, reason = f"overlap {source % 2}", f"overlap {source % 6}"
+        yield Closure(source // 2, source, match, rng.random(), verdict, reason, Proposal.PLACE, cause=cause)
+
+
+def same(a, b):
+    return type(a) is type(b) and all(
+        same(x, y) if isinstance(x, Match) else type(x) is type(y) and np.array_equal(x, y)
+        for x, y in ((getattr(a, field.name), getattr(b, field.name)) for field in fields(a))
+    )
+
+
+@pytest.mark.parametrize("k", [3, 6])
+def test_closures_come_back_bit_by_bit_and_in_their_types(k):
+    given = [replace(each, chi2_before=float(each.source), chi2_after=1.0) for each in closures(k)]
+    table = ClosureTable()
+    table.extend(given[:17])
+    table.extend(given[17:])
+    assert len(table) == len(given)
+    assert all(same(a, b) for a, b in zip(given, table, strict=True))
+    assert same(table[-1], given[-1]) and [each.source for each in table[3:9:2]] == [3, 5, 7]
+
+
+def test_an_empty_table_holds_nothing():
+    assert not ClosureTable() and list(ClosureTable()) == []
+    with pytest.raises(IndexError, match="closure 0 of 0"):
+        ClosureTable()[0]

@@ -9,13 +9,14 @@ import pytest
 from scanchain import lie
 from scanchain.data import Pose, Prior, Scan, State, Trajectory
 from scanchain.errors import InputError
-from scanchain.evaluation import absolute_error, pair, read_relations, relation_error
+from scanchain.evaluation import read_relations, relation_error
 from scanchain.logs import open_log
 from scanchain.odometry import FrontEnd, Odometry
 from scanchain.odometry.tracked import Tracked, first_match
 from scanchain.preprocess import sweep_of
-from scanchain.simulation import simulate
 from scanchain.slam import Slam
+from tests.benchmarks.harness import ate_m
+from tests.support import made
 from tests.support.scenes import configured, shared_data
 
 
@@ -45,26 +46,19 @@ class Drive:
     def error_m(self, steps):
         """Absolute trajectory error."""
         stamps_ns = np.array([step.scan.stamp_ns for step in steps])
-        estimate = Trajectory(stamps_ns, np.array([step.T_odom_lidar for step in steps]))
-        return absolute_error(pair(estimate, self.truth)).translation_m.rmse
-
-
-def simulated(tmp_path_factory, world, **options):
-    path = tmp_path_factory.mktemp(world) / f"{world}.mcap"
-    truth = simulate(world, path, **options)
-    return replace(Drive.of(path), truth=truth)
+        return ate_m(Trajectory(stamps_ns, np.array([step.T_odom_lidar for step in steps])), self.truth)
 
 
 @pytest.fixture(scope="module")
-def office(tmp_path_factory):
+def office():
     """A minute in the simulated office."""
-    return simulated(tmp_path_factory, "office", duration_s=60.0, seed=7)
+    return Drive.of(made.log("office", seconds=60, seed=7))
 
 
 @pytest.fixture(scope="module")
-def town(tmp_path_factory):
+def town():
     """Six seconds in the simulated town, with 32 rings."""
-    return simulated(tmp_path_factory, "town", duration_s=6.0, seed=7, sensor="os1-32")
+    return Drive.of(made.log("town", seconds=6, seed=7, sensor="os1-32"))
 
 
 @pytest.fixture
@@ -76,8 +70,8 @@ def drive(request, office, town):
 in_both = pytest.mark.parametrize("drive", [2, 3], indirect=True)
 
 
-def test_heading_at_the_stamp_follows_the_acceleration_of_a_turn(tmp_path_factory):
-    turns = simulated(tmp_path_factory, "turns", duration_s=6.0, sensor="vlp-16")  # at 120 deg/s
+def test_heading_at_the_stamp_follows_the_acceleration_of_a_turn():
+    turns = Drive.of(made.log("turns", seconds=6, sensor="vlp-16"))  # at 120 deg/s
     poses = np.array([step.T_odom_lidar for step in turns.tracked()])
     motions = (lie.between(each[:-10], each[10:]) for each in (turns.truth.poses, poses))
     error = lie.log(lie.between(*motions))
@@ -175,7 +169,7 @@ def scan_of_room(T_room_lidar, niche_m, index, stamp_ns):
     points = np.concatenate([a + along * (b - a) for a, b in pairwise(wall)])
     points += 0.005 * np.random.default_rng(index).normal(size=points.shape)
     seen = lie.transform(lie.inverse(T_room_lidar), points).astype(np.float32)
-    return Scan(index, stamp_ns, stamp_ns, seen, np.empty(0, np.float32), 0, None)
+    return Scan.of(seen, 1e-9 * stamp_ns, index=index)
 
 
 @pytest.mark.parametrize("odd_ns", [1_000, -3_600_000_000_000])
@@ -196,7 +190,7 @@ def test_a_covered_lidar_is_lost_and_found_again_and_closures_can_bend_the_edge_
     assert [step.state for step in steps[29:34]] == [State.OK, *[State.LOST] * 3, State.OK]
     assert "preprocess.min_range_m (0.5)" in steps[31].reason
     result = slam.finish()
-    assert absolute_error(pair(result.odometry, town.truth)).translation_m.rmse < 0.05
+    assert ate_m(result.odometry, town.truth) < 0.05
     after = next(keyframe.index for keyframe in result.keyframes if keyframe.scan_index >= 33)
     sigma_m = [np.sqrt(np.linalg.inv(information)[0, 0]) for information in result.graph.information]
     assert sigma_m[after - 1] > 0.5 and max(sigma_m[: after - 1] + sigma_m[after:]) < 0.1
@@ -209,10 +203,7 @@ def test_a_corridor_without_ends_is_reported_as_degenerate_along_it():
     for index in range(30):
         x = rng.uniform(-8.0, 8.0, 600)
         walls = np.column_stack([x, np.where(rng.random(600) < 0.5, 1.0, -1.0) + 0.005 * rng.normal(size=600)])
-        scan = Scan(
-            index, index * 10**8, index * 10**8, walls.astype(np.float32), np.empty(0, np.float32), 0, None
-        )
-        step = odometry.process(scan)
+        step = odometry.process(Scan.of(walls.astype(np.float32), 0.1 * index, index=index))
     assert step.state is State.DEGENERATE
     assert abs(step.match.degeneracy_direction[0]) > np.cos(np.radians(5.0))
     assert "is undetermined" in step.reason
@@ -257,9 +248,9 @@ def test_a_motion_over_a_scan_that_correspondences_contradict_is_known_as_predic
     assert np.allclose(sigmas[2:], np.hypot(np.abs(off), 0.01), atol=0.02) and sigmas[3, 0] > 0.009
 
 
-def test_in_a_blank_corridor_the_wheels_lead_along_it_and_the_scans_across(tmp_path_factory):
+def test_in_a_blank_corridor_the_wheels_lead_along_it_and_the_scans_across():
     """From the ninth second on its ends are out of sight."""
-    corridor = simulated(tmp_path_factory, "corridor", duration_s=18.0, seed=3, sensor="vlp-16")
+    corridor = Drive.of(made.log("corridor", seconds=18, seed=3, sensor="vlp-16"))
     steps = corridor.tracked()
     blind = [step for step in steps[90:] if step.state is State.DEGENERATE]
     along = [abs(step.match.degeneracy_direction[0]) > np.cos(np.radians(5.0)) for step in blind]

@@ -16,7 +16,7 @@ CONFIG = PreprocessConfig(min_range_m=1.0, max_range_m=50.0, map_voxel_m=0.5)
 
 
 def scan_of(points, times_s=()):
-    return Scan(0, 0, 0, points.astype(np.float32), np.array(times_s, np.float32), 0, None)
+    return Scan.of(points.astype(np.float32), 0.0, np.array(times_s, np.float32))
 
 
 def some_scan(dimension=3, n=2000, with_times=True):
@@ -24,7 +24,6 @@ def some_scan(dimension=3, n=2000, with_times=True):
     return scan_of(rng.uniform(-60.0, 60.0, (n, dimension)), rng.uniform(0.02, 0.12, n) if with_times else ())
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_a_sweep_is_the_first_point_of_every_voxel_in_range_and_seen_from_its_middle(dimension):
     scan = some_scan(dimension)
     sweep = sweep_of(scan, CONFIG)

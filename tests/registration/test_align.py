@@ -133,28 +133,6 @@ def test_a_reason_is_in_the_unit_of_the_clouds_and_never_reads_like_its_limit():
 CLOUD = np.random.default_rng(0).normal(size=(500, 3))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "options", "words"),
-    [
-        ((CLOUD, CLOUD[:, :2]), {}, "source has the shape"),
-        ((CLOUD.T, CLOUD), {}, "target has the shape"),
-        ((np.hstack([CLOUD, CLOUD]), CLOUD), {}, "target has the shape"),
-        ((CLOUD, CLOUD[:0]), {}, "source has no points"),
-        ((np.zeros((50, 3)), CLOUD), {}, "target: its 50 points lie on one point"),
-        ((CLOUD, np.full((5, 3), np.nan)), {}, "source has no points that are finite"),
-        ((CLOUD, CLOUD, 2.0 * np.eye(4)), {}, "T_guess is no rigid"),
-        ((CLOUD, CLOUD, np.eye(3)), {}, "T_guess has the shape"),
-        ((CLOUD, CLOUD + 1e6), {}, "T_guess puts the centroid of the source 1.73e+06 m"),
-        ((CLOUD, CLOUD), {"voxel_size_m": -1.0}, "voxel_size_m is -1"),
-        ((CLOUD, CLOUD), {"matcher": "gicp"}, "matcher"),
-        (("clouds", CLOUD), {}, "target"),
-    ],
-)
-def test_what_cannot_be_aligned_is_named(arguments, options, words):
-    with pytest.raises(InputError, match=words.replace("+", r"\+")):
-        scanchain.align(*arguments, **options)
-
-
 def test_a_few_points_without_a_shape_are_no_match():
     for points in (CLOUD[:1], CLOUD[:3], CLOUD[:20], CLOUD[:, :2][:10]):
         try:

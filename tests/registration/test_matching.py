@@ -56,7 +56,6 @@ def off(T_a, T_b):
     return np.abs(lie.log(lie.inverse(T_a) @ T_b)).max()
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_all_four_optimizers_reach_one_minimum_near_the_truth_by_second_order_in_half_the_steps(dimension):
     T, found = truth(dimension), {}
     for optimizer in OPTIMIZERS:
@@ -71,7 +70,6 @@ def test_all_four_optimizers_reach_one_minimum_near_the_truth_by_second_order_in
     assert slow.iterations >= 2 * expected.iterations
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("matcher_name", ["plicp", "svd"])
 def test_meters_or_centimeters_same_motion(dimension, matcher_name):
     answers = []
@@ -86,7 +84,6 @@ def test_meters_or_centimeters_same_motion(dimension, matcher_name):
     assert answers[0][3] == pytest.approx(answers[1][3], rel=1e-6)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("matcher_name", ["plicp", "svd"])
 def test_both_matchers_find_the_motion_from_a_guess_half_a_meter_off(dimension, matcher_name):
     T = truth(dimension)
@@ -97,7 +94,6 @@ def test_both_matchers_find_the_motion_from_a_guess_half_a_meter_off(dimension, 
     assert off(match.T_target_source, T) < (3e-3 if matcher_name == "plicp" else 0.05)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_the_information_predicts_the_spread_of_repeated_matches(dimension):
     """Independent noise on the scan only: the mean squared Mahalanobis distance is about k, in space below it.
 
@@ -170,7 +166,6 @@ def test_a_scan_far_from_the_map_says_that_nothing_matched(matcher_name):
     assert match.reason == "no point has a correspondence in the map"
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_the_closed_form_equals_scipys(dimension):
     rng = np.random.default_rng(4)
     x = rng.normal(size=(40, 3)) * ([1, 1, 0] if dimension == 2 else 1)
@@ -184,7 +179,6 @@ def test_the_closed_form_equals_scipys(dimension):
     np.testing.assert_allclose(answer[:-1, -1], (center[1] - R @ center[0])[:dimension], atol=1e-9)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_noisy_points_never_come_out_as_a_reflection(dimension):
     rng = np.random.default_rng(5)
     for _ in range(200):

@@ -91,11 +91,11 @@ def test_one_added_to_the_methods_needs_no_name_of_its_own_there(folder):
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("my_match:PointToPoint", "there is no module my_match in"),
+        ("my_match:PointToPoint", "on PYTHONPATH; go to its folder, or set PYTHONPATH to it"),
         ("my_matcher:PointToPlane", "has no class PointToPlane"),
         ("my_matcher:KDTree", "has no method align"),
         ("broken:Matcher", "importing broken failed with SyntaxError"),
-        ("needy:Matcher", "No module named 'not_there'"),
+        ("needy:Matcher", "importing needy failed with ModuleNotFoundError: No module named 'not_there'"),
         ("my_matcher.PointToPoint", "one of plicp, svd or a class of yours, MODULE:CLASS"),
     ],
 )

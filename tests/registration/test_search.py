@@ -39,11 +39,6 @@ def every(grid, points, turn_rad, T, shifts, turns):
     return naive.scores(grid.pyramid[0], grid.origin_m, CELL_M, points, T, shifts, turns, turn_rad)
 
 
-def steps_of(found, T, turn_rad):
-    x, y = np.round((found.T_target_source - T)[:2, 2] / CELL_M).astype(int).tolist()
-    return round(float(lie.yaw(lie.between(T, found.T_target_source))) / turn_rad), x, y
-
-
 def test_every_level_holds_the_best_of_its_windows():
     means = walls(np.random.default_rng(0), 6, 5.0)
     grid = SearchGrid.of_points(means, CELL_M)
@@ -65,7 +60,8 @@ def test_every_answer_is_the_best_pose_of_the_window_that_lies_apart_from_those_
     assert len(answers) > 1 or seed
     for found in answers:
         assert found.share == pytest.approx(max(left.values()))
-        turn, x, y = steps_of(found, T, turn_rad)
+        turn = round(float(lie.yaw(lie.between(T, found.T_target_source))) / turn_rad)
+        x, y = np.round((found.T_target_source - T)[:2, 2] / CELL_M).astype(int).tolist()
         assert left[turn, x, y] == pytest.approx(found.share)
         left = {
             pose: share

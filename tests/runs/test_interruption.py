@@ -24,16 +24,7 @@ from scanchain.runs.step_table import StepTable
 from scanchain.slam import Slam
 from scanchain.trajectory import read_tum
 from scanchain_viz.recording import entities
-from tests.support import made
-from tests.support.killing import (
-    assert_readable,
-    config_of,
-    kill_at_random,
-    partial,
-    same_result,
-    start,
-    wait_for_steps,
-)
+from tests.support import killing, made
 from tests.support.recordings import column
 from tests.support.scenes import ROOT, configured, shared_data
 
@@ -53,7 +44,7 @@ def office(tmp_path_factory):
 def whole(office, tmp_path_factory):
     """A run of it that nobody disturbed."""
     out = tmp_path_factory.mktemp("whole") / "run"
-    assert start(office, out, *RECORDED).wait() == 0
+    assert killing.start(office, out, *RECORDED).wait() == 0
     return out
 
 
@@ -63,14 +54,21 @@ def undisturbed(request, office, whole, tmp_path_factory):
     if request.param == "2D":
         return office, whole
     log, out = made.log("town", seconds=18, sensor="vlp-16"), tmp_path_factory.mktemp("town") / "run"
-    assert start(log, out, *RECORDED).wait() == 0
+    assert killing.start(log, out, *RECORDED).wait() == 0
     return log, out
+
+
+def after(code, *words, **options):
+    """A command whose process runs some code first."""
+    before = "import os, signal, sys, time\nfrom scanchain.__main__ import main\n"
+    whole = f"{before}{code}\nsys.exit(main(sys.argv[1:]))"
+    return subprocess.Popen([sys.executable, "-c", whole, *words], cwd=ROOT, **options)
 
 
 def left_after(steps, log, out, *words):
     """Kill a run of a log once it has so many steps in its checkpoint."""
-    child = start(log, out, *words)
-    wait_for_steps(child, out, steps)
+    child = killing.start(log, out, *words)
+    killing.wait_for_steps(child, out, steps)
     child.kill()
     child.wait()
 
@@ -82,18 +80,18 @@ def test_interrupted_again_and_again_a_run_goes_on_to_the_same_result_and_record
     assert pq.read_table(whole / "loops.parquet").num_rows > 0
     reached = []
     for interruption, share in ((signal.SIGKILL, 0.1), (signal.SIGINT, 0.25), (signal.SIGKILL, 0.4)):
-        child = start(log, out, *RECORDED, "--resume")
-        wait_for_steps(child, out, share * len(stamps_ns))
+        child = killing.start(log, out, *RECORDED, "--resume")
+        killing.wait_for_steps(child, out, share * len(stamps_ns))
         child.send_signal(interruption)
         child.wait()
-        table = read_checkpoint(partial(out), config_of(partial(out))).steps
+        table = read_checkpoint(killing.partial(out), killing.config_of(killing.partial(out))).steps
         reached.append(len(table))
-        assert (partial(out) / RECORDING_FILE).exists()
+        assert (killing.partial(out) / RECORDING_FILE).exists()
         np.testing.assert_array_equal(table.trajectory("T_odom_lidar").stamps_ns, stamps_ns[: len(table)])
     assert 0 < reached[0] <= reached[1] <= reached[2] and reached[0] < len(stamps_ns)
-    assert start(log, out, *RECORDED, "--resume").wait() == 0
+    assert killing.start(log, out, *RECORDED, "--resume").wait() == 0
     assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["run"]
-    same_result(out, whole)
+    killing.same_result(out, whole)
     assert "resumed after" in (out / "summary.txt").read_text()
     assert not list(out.glob("*.checkpoint"))
 
@@ -102,7 +100,7 @@ def test_killed_at_any_moment_a_run_leaves_files_that_open_and_goes_on_to_the_sa
     log, whole = undisturbed
     seed, longest_s = random.randrange(1000), json.loads((whole / "run.json").read_text())["duration_s"] + 1.0
     print(f"seed {seed}; python -m tests.benchmarks.kills kills as often as wanted")
-    killed = list(kill_at_random(log, RECORDED, tmp_path, whole, kills=3, seed=seed, longest_s=longest_s))
+    killed = list(killing.kill_at_random(log, RECORDED, tmp_path, whole, kills=3, seed=seed, longest_s=longest_s))
     assert len(killed) == 3
 
 
@@ -116,27 +114,24 @@ def test_killed_while_it_takes_up_the_recording_a_run_goes_on_to_the_same_one(of
         ("scanchain.runs.resume", "Checkpoints", "write"),
     ):
         dying = f"""
-import os, signal, sys
-from scanchain.__main__ import main
 from {module} import {kind}
 act = {kind}.{method}
 def dying(self, *values):
     act(self, *values)
     os.kill(os.getpid(), signal.SIGKILL)
 {kind}.{method} = dying
-sys.exit(main(sys.argv[1:]))
 """
-        assert subprocess.run([sys.executable, "-c", dying, *words], cwd=ROOT).returncode == -signal.SIGKILL
-        assert list(partial(out).glob("recording.part_*.rrd"))
-    assert start(office, out, *RECORDED, "--resume").wait() == 0
-    same_result(out, whole)
+        assert after(dying, *words).wait() == -signal.SIGKILL
+        assert list(killing.partial(out).glob("recording.part_*.rrd"))
+    assert killing.start(office, out, *RECORDED, "--resume").wait() == 0
+    killing.same_result(out, whole)
 
 
 @pytest.mark.slow
 def test_a_run_recorded_from_the_middle_on_says_so_and_draws_the_whole_graph(office, whole, tmp_path):
     out = tmp_path / "run"
     left_after(150, office, out, *LIVELY)
-    assert start(office, out, *RECORDED, "--resume").wait() == 0
+    assert killing.start(office, out, *RECORDED, "--resume").wait() == 0
     assert "the recording begins there" in (out / "summary.txt").read_text()
     assert "the recording lacks something" not in (out / "summary.txt").read_text()
     for entity, name in ((entities.KEYFRAMES, "Points3D:positions"), (entities.REJECTED, "LineStrips3D:strips")):
@@ -155,19 +150,15 @@ def test_a_chain_that_is_put_down_and_taken_up_places_every_scan_to_the_same_bit
     office, tmp_path, name, count, changes
 ):
     log = open_log(office if name == "office" else shared_data(name))
-    scans = list(islice(log.scans(), count))
     config = configured(log.dimension, changes)
-    points_file = tmp_path / POINTS_FILE
-    straight, broken = Slam(config, log.T_base_lidar), Slam(config, log.T_base_lidar, points_file)
+    straight, broken = Slam(config, log.T_base_lidar), Slam(config, log.T_base_lidar, tmp_path / POINTS_FILE)
     breaks = set(random.Random(2).sample(range(count), 8)) | {0}
-    for scan in scans:
+    for scan in islice(log.scans(), count):
         a, b = straight.process(scan), broken.process(scan)
         assert a.T_world_lidar.tobytes() == b.T_world_lidar.tobytes()
         assert a.match.information.tobytes() == b.match.information.tobytes()
         if scan.index in breaks:
-            Checkpoints(tmp_path, 10.0).write(broken, StepTable())
-            broken = read_checkpoint(tmp_path, config).slam
-            broken.points.reopen(points_file)
+            broken = killing.taken_up(broken, tmp_path)
     a, b = straight.finish(), broken.finish()
     assert len(a.closures) == len(b.closures)
     assert len(a.closures) > 0 or not config.loops.enabled
@@ -191,55 +182,43 @@ def test_an_optimization_beside_ends_alike_after_a_break(office, tmp_path, monke
         assert (a.graph is None) == (b.graph is None)
         if broken.placement.schedule.beside is not None and not is_beside:
             breaks += 1
-            Checkpoints(tmp_path, 10.0).write(broken, StepTable())
-            broken = read_checkpoint(tmp_path, config).slam
-            broken.points.reopen(tmp_path / POINTS_FILE)
+            broken = killing.taken_up(broken, tmp_path)
     assert breaks > 0
     assert straight.finish().trajectory.poses.tobytes() == broken.finish().trajectory.poses.tobytes()
 
 
-def waiting_at(scan):
-    """The command line as a script that dawdles before that scan, then says "there" and waits."""
-    return f"""
-import sys, time
-from scanchain.__main__ import main
+# dawdles before scan 100, then says "there" and waits
+WAITING = """
 from scanchain.slam import Slam
 place = Slam.place
 def waiting(self, located):
-    if located.tracked.scan.index == {scan} - 1:
+    if located.tracked.scan.index == 99:
         time.sleep(0.2)
-    if located.tracked.scan.index == {scan}:
+    if located.tracked.scan.index == 100:
         print("there", flush=True)
         time.sleep(60)
     return place(self, located)
 Slam.place = waiting
-sys.exit(main(sys.argv[1:]))
 """
 
 
 def test_ctrl_c_ends_a_run_in_good_order_with_exit_code_1(office, tmp_path):
     out = tmp_path / "run"
-    child = start(office, out, *RECORDED, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    wait_for_steps(child, out, 30)
+    child = killing.start(office, out, *RECORDED, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    killing.wait_for_steps(child, out, 30)
     child.send_signal(signal.SIGINT)
     output, errors = (text.decode() for text in child.communicate(timeout=60))
     assert child.returncode == 1 and errors.count("\n") == 1 and "PARTIAL" in output
-    assert errors.startswith("error: stopped by the user after ") and str(partial(out)) in errors
+    assert errors.startswith("error: stopped by the user after ") and str(killing.partial(out)) in errors
     assert errors.endswith(f"to resume: scanchain run {office} --out {out} {' '.join(RECORDED)} --resume\n")
-    assert 30 <= assert_readable(partial(out)) < 300
+    assert 30 <= killing.assert_readable(killing.partial(out)) < 300
 
 
 @pytest.mark.slow
 def test_ctrl_c_twice_ends_a_run_at_once_and_it_can_go_on(office, whole, tmp_path):
     out = tmp_path / "run"
     words = ["run", str(office), "--out", str(out), *LOOPING, "--checkpoint", "0", "--rerun", "off"]
-    child = subprocess.Popen(
-        [sys.executable, "-c", waiting_at(100), *words],
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    child = after(WAITING, *words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert child.stdout.readline() == "there\n"
     child.send_signal(signal.SIGINT)
     time.sleep(0.5)
@@ -249,15 +228,15 @@ def test_ctrl_c_twice_ends_a_run_at_once_and_it_can_go_on(office, whole, tmp_pat
     assert child.returncode == 1 and errors.count("\n") == 1
     assert "interrupted; 100 scans until then are in" in errors
     assert f"to resume: scanchain {' '.join(words)} --resume\n" in errors
-    assert assert_readable(partial(out)) == 100
-    assert start(office, out, *LIVELY, "--resume").wait() == 0
-    same_result(out, whole)
+    assert killing.assert_readable(killing.partial(out)) == 100
+    assert killing.start(office, out, *LIVELY, "--resume").wait() == 0
+    killing.same_result(out, whole)
 
 
 def test_resuming_is_refused_where_something_else_was_run(office, call, tmp_path):
     out, other = tmp_path / "run", made.log("office", seconds=3, seed=5)
-    child = start(office, out, *LIVELY)
-    wait_for_steps(child, out, 1)
+    child = killing.start(office, out, *LIVELY)
+    killing.wait_for_steps(child, out, 1)
 
     def refusal(log, *words):
         code, _, errors = call("run", log, "--out", out, *LIVELY, "--resume", *words)
@@ -270,7 +249,7 @@ def test_resuming_is_refused_where_something_else_was_run(office, call, tmp_path
     child.wait()
     assert "another configuration" in refusal(office, "--matching.matcher", "svd")
     assert "scan 0 of the log is not the one that was run" in refusal(other)
-    checkpoint = partial(out) / "state.checkpoint"
+    checkpoint = killing.partial(out) / "state.checkpoint"
     data = checkpoint.read_bytes()
     older = data[:-4].replace(b"(code ", b"(c0de ", 1)
     checkpoint.write_bytes(older + zlib.crc32(older).to_bytes(4, "little"))
@@ -283,19 +262,15 @@ def test_resuming_is_refused_where_something_else_was_run(office, call, tmp_path
 
 @pytest.mark.parametrize(("limit_kib", "words"), [(64, LIVELY), (400, RECORDED)])
 def test_a_full_disk_is_an_error_and_what_is_on_it_is_whole(office, tmp_path, limit_kib, words):
-    full = f"""
-import resource, signal, sys
-from scanchain.__main__ import main
-signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-resource.setrlimit(resource.RLIMIT_FSIZE, ({limit_kib} << 10, {limit_kib} << 10))
-sys.exit(main(sys.argv[1:]))
-"""
+    full = f"signal.signal(signal.SIGXFSZ, signal.SIG_IGN); limit = {limit_kib} << 10\n"
+    full += "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))\n"
     out = tmp_path / "run"
     words = ["run", str(office), "--out", str(out), *words]
-    child = subprocess.run([sys.executable, "-c", full, *words], cwd=ROOT, capture_output=True, text=True)
-    assert child.returncode == 1 and child.stderr.startswith("error: ") and child.stderr.count("\n") == 1
-    assert "File too large" in child.stderr and not out.exists()
-    folder = partial(out)
+    child = after(full, *words, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    errors = child.communicate()[1]
+    assert child.returncode == 1 and errors.startswith("error: ") and errors.count("\n") == 1
+    assert "File too large" in errors and not out.exists()
+    folder = killing.partial(out)
     assert b'"complete": false' in (folder / "run.json").read_bytes()
     for table in folder.glob("*.parquet"):
         pq.read_table(table)

@@ -9,37 +9,26 @@ from scanchain.logs import open_log
 from scanchain.maps import read_map, read_ply
 from scanchain.runs.results_mcap import ros_covariance
 from scanchain.trajectory import read_tum
-from tests.support.naive_logs import (
-    SECOND,
-    STAMP_NS,
-    decoded,
-    laser_scan,
-    scan_said,
-    transforms,
-    transforms_said,
-    write,
-)
+from tests.support import naive_logs
+from tests.support.naive_logs import SECOND, STAMP_NS, decoded
 
 
-def pose_of(pose):
-    p, q = pose.position, pose.orientation
+def matrix(p, q):
+    """Of a position and an orientation."""
     T = np.eye(4)
     T[:3, :3] = lie.from_quaternion(np.array([q.x, q.y, q.z, q.w]))
     T[:3, 3] = p.x, p.y, p.z
     return T
 
 
-def transform_of(transform):
-    class Pose:
-        position, orientation = transform.translation, transform.rotation
-
-    return pose_of(Pose)
+def matrix_of(transform):
+    return matrix(transform.translation, transform.rotation)
 
 
 def room(folder):
     """A lidar, mounted off the base, that drives through a square room."""
-    mounting = transforms(("base_link", "laser", 0.2, 0.1, 0.3, 0.0))
-    said = [transforms_said(STAMP_NS, mounting)]
+    mounting = naive_logs.transforms(("base_link", "laser", 0.2, 0.1, 0.3, 0.0))
+    said = [naive_logs.transforms_said(STAMP_NS, mounting)]
     angles = -3.0 + 0.0125 * np.arange(480)
     for k in range(8):
         stamp_ns = STAMP_NS + k * SECOND // 10
@@ -47,9 +36,9 @@ def room(folder):
         with np.errstate(divide="ignore"):
             along = np.where(np.cos(angles) > 0, (4.0 - x) / np.cos(angles), (-5.0 - x) / np.cos(angles))
             across = np.where(np.sin(angles) > 0, 3.0 / np.sin(angles), -2.0 / np.sin(angles))
-        scan = laser_scan(stamp_ns, np.minimum(along, across), first=-3.0, step=0.0125)
-        said.append(scan_said(stamp_ns + 5_000_000, scan))
-    return write(folder / "room.mcap", said)
+        scan = naive_logs.laser_scan(stamp_ns, np.minimum(along, across), first=-3.0, step=0.0125)
+        said.append(naive_logs.scan_said(stamp_ns + 5_000_000, scan))
+    return naive_logs.write(folder / "room.mcap", said)
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +67,7 @@ def test_transforms_lead_from_the_world_to_the_scans_of_the_log(finished):
         world, odom = message.transforms
         names = [world.header.frame_id, world.child_frame_id, odom.header.frame_id, odom.child_frame_id]
         assert names == ["world", "odom", "odom", "base_link"]
-        T_world_base = transform_of(world.transform) @ transform_of(odom.transform)
+        T_world_base = matrix_of(world.transform) @ matrix_of(odom.transform)
         T_world_found = T_world_base @ lie.lift(opened.T_base_lidar)
         np.testing.assert_allclose(T_world_found, lie.lift(T_world_lidar), atol=1e-6)
 
@@ -87,7 +76,8 @@ def test_odometry_is_that_of_the_transforms_and_has_a_covariance(finished):
     _, _, told = finished
     for (_, odometry), (_, tf) in zip(told["/odometry"], told["/tf"], strict=True):
         assert (odometry.header.frame_id, odometry.child_frame_id) == ("odom", "base_link")
-        np.testing.assert_allclose(pose_of(odometry.pose.pose), transform_of(tf.transforms[1].transform))
+        pose = odometry.pose.pose
+        np.testing.assert_allclose(matrix(pose.position, pose.orientation), matrix_of(tf.transforms[1].transform))
     covariance = np.array(told["/odometry"][-1][1].pose.covariance).reshape(6, 6)
     planar = covariance[np.ix_([0, 1, 5], [0, 1, 5])]
     np.testing.assert_allclose(planar, planar.T)
@@ -100,7 +90,7 @@ def test_the_path_is_the_optimized_one_of_the_robot(finished):
     (log_ns, path), trajectory = told["/path"][0], read_tum(run / "trajectory.tum")
     T_lidar_base = lie.inverse(open_log(log).T_base_lidar)
     assert path.header.frame_id == "world" and log_ns == STAMP_NS + 5_000_000
-    found = [pose_of(pose.pose) for pose in path.poses]
+    found = [matrix(each.pose.position, each.pose.orientation) for each in path.poses]
     np.testing.assert_allclose(found, lie.lift(trajectory.poses) @ lie.lift(T_lidar_base), atol=1e-6)
 
 

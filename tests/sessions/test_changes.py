@@ -21,10 +21,7 @@ from scanchain.simulation.solids import Scenery, Solids
 
 NO_EDGES = Edges(np.empty((0, 2), int), *np.empty((2, 0, 3, 3)), np.empty(0, bool), np.empty(0))
 BOX, HIDDEN = (5.0, 3.0), (8.0, 6.5)  # the first stands free, the second behind a wall
-
-
-def held(points: np.ndarray) -> SavedPoints:
-    return SavedPoints(points, 1.0)
+CORNER = SavedPoints(np.random.default_rng(0).uniform(-0.3, 0.3, (200, 2)), 1.0)  # of what stands there
 
 
 def room(*boxes: tuple[float, float], edge_m: float = 0.6) -> Solids:
@@ -60,7 +57,7 @@ def part(name: str, solids: Solids, T_map_room=None, count: int = 8) -> Part:
         lidar[:3, 3] = x, 1.5, 0.3
         ranges_m = solids.cast(lidar[None], np.zeros(720, np.int32), directions, 30.0)
         pose = T_map_room @ lie.pose_2d(float(x), 1.5, 0.0)
-        keyframes.append(Keyframe(k, k, k, held(directions[:, :2] * ranges_m[:, None]), pose, 1.2 * k))
+        keyframes.append(Keyframe(k, k, k, SavedPoints(directions[:, :2] * ranges_m[:, None], 1.0), pose, 1.2 * k))
         poses.append(pose)
     return Part(name, keyframes, np.array(poses))
 
@@ -98,7 +95,7 @@ def test_nothing_is_named_where_nothing_changed():
 
 def test_what_the_other_map_did_not_see_is_unknown():
     before, after = part("a", room(BOX)), part("b", room(), count=3)
-    hidden = Keyframe(8, 8, 8, held(np.random.default_rng(0).uniform(-0.3, 0.3, (200, 2))), before.poses[0], 20.0)
+    hidden = Keyframe(8, 8, 8, CORNER, before.poses[0], 20.0)
     there = lie.pose_2d(*HIDDEN, 0.0)
     seen_once = Part("a", [*before.keyframes, hidden], np.concatenate([before.poses, there[None]]))
     found = changes_between(seen_once, after, load_settings(2).config)
@@ -197,32 +194,20 @@ def test_a_comparison_names_both_maps_and_is_no_run_to_check_or_draw(tmp_path, c
 
 def updated_rooms(*parts: Part):
     """Sessions of 8 keyframes each, brought up to date."""
-    keyframes = [
-        replace(keyframe, stamp_ns=start + k)
-        for start, each in zip((0, 100, 200), parts, strict=False)
-        for k, keyframe in enumerate(each.keyframes)
-    ]
+    keyframes = [replace(k, stamp_ns=100 * n + k.stamp_ns) for n, each in enumerate(parts) for k in each.keyframes]
     numbers = np.repeat(np.arange(len(parts)), [len(each.keyframes) for each in parts])
-    starts = zip((0, 100, 200), parts, strict=False)
-    sessions = tuple(Session(each.name, start, start + 9, 8) for start, each in starts)
+    sessions = tuple(Session(each.name, 100 * n, 100 * n + 9, 8) for n, each in enumerate(parts))
     none = np.zeros(len(keyframes), np.int64)
     merged = SavedMap(Path("map"), 2, tuple(keyframes), numbers, sessions, NO_EDGES)
     joined = Joined((0,), tuple(keyframes), none, NO_EDGES)
     return keyframes, updated(MergedMap(joined, merged, (), none), load_settings(2).config)
 
 
-def in_world(keyframe: Keyframe) -> np.ndarray:
-    return lie.transform(keyframe.T_odom_lidar, keyframe.points)
-
-
-def on_box(points: np.ndarray) -> np.ndarray:
-    return (np.abs(points - BOX) < 0.32).all(axis=1)
-
-
 def test_what_newer_sessions_saw_through_is_removed_from_older_ones_and_nothing_else():
     before, after = updated_rooms(part("monday", room(BOX)), part("tuesday", room(BOX)), part("friday", room()))
     for k, (old, new) in enumerate(zip(before, after.saved.keyframes, strict=True)):
-        is_box = on_box(in_world(old)) & (k < 16)
+        away = np.abs(lie.transform(old.T_odom_lidar, old.points) - BOX)
+        is_box = (away < 0.32).all(axis=1) & (k < 16)
         assert np.array_equal(new.points, old.points[~is_box])
         assert after.removed[k] == is_box.sum()
     assert after.removed[:8].sum() > 100
@@ -232,7 +217,7 @@ def test_what_newer_sessions_saw_through_is_removed_from_older_ones_and_nothing_
 def test_what_came_stays_and_what_no_newer_session_saw_stays():
     _, after = updated_rooms(part("monday", room((8.0, 3.0))), part("friday", room(BOX, (8.0, 3.0))))
     assert after.removed.sum() == 0
-    corner = Keyframe(0, 0, 5, held(np.random.default_rng(0).uniform(-0.3, 0.3, (200, 2))), lie.identity(2), 0.0)
+    corner = Keyframe(0, 0, 5, CORNER, lie.identity(2), 0.0)
     hidden = part("monday", room(BOX))
     there = Part("monday", [*hidden.keyframes, replace(corner, T_odom_lidar=lie.pose_2d(*HIDDEN, 0.0))],
                  np.concatenate([hidden.poses, lie.pose_2d(*HIDDEN, 0.0)[None]]))  # fmt: skip

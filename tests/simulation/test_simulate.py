@@ -9,12 +9,12 @@ import msgspec
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
 
 import scanchain
 from scanchain import catalog, lie
 from scanchain.__main__ import main
 from scanchain.errors import InputError
+from scanchain.evaluation import path_length
 from scanchain.kernels.raycast import BOX, CYLINDER, ELLIPSOID
 from scanchain.settings import shipped
 from scanchain.simulation import NO_SLIP, SENSORS, WORLDS, Slip, plan, record, simulate
@@ -24,6 +24,7 @@ from scanchain.simulation.solids import FIXED, Solids
 from scanchain.simulation.worlds.indoor import CORRIDOR_M, CORRIDOR_SIGHT_M, CORRIDOR_STRUCTURE_M
 from scanchain.trajectory import read_tum
 from tests.support import naive_raycast
+from tests.support.naive_logs import decoded
 
 LIDARS = [name for name, sensor in SENSORS.items() if sensor.dimension == 3]
 
@@ -41,9 +42,7 @@ def swept(drive, index):
 
 
 def messages(path, topic):
-    with path.open("rb") as stream:
-        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        return [(item.message, item.decoded_message) for item in reader.iter_decoded_messages(topics=[topic])]
+    return [(message, contents) for _, _, message, contents in decoded(path, [topic])]
 
 
 def nanoseconds(message):
@@ -122,7 +121,7 @@ def test_the_motion_is_smooth(name):
 
 def test_the_rounds_pass_streets_again_in_both_directions_and_in_the_other_lane():
     poses = planned("rounds", "vlp-16").truth().poses[::5]
-    traveled_m = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)))
+    traveled_m = path_length(poses)
     same = opposite = aside = 0
     for k, T in enumerate(poses):
         old = poses[traveled_m < traveled_m[k] - 100.0]

@@ -1,10 +1,16 @@
-"""Odometry with its drift turned up, so that loop closure has something to do on logs that are tracked well."""
+"""Odometry with its drift turned up, so that loop closure has something to do on logs that are tracked well, and
+closures that are wrong, to be found out by the back end."""
+
+from dataclasses import replace
 
 import msgspec
 import numpy as np
 
 from scanchain import lie
+from scanchain.data import ClosureVerdict
 from scanchain.slam import Slam
+
+MADE_UP = "made up"  # the reason that is given for wrong closures
 
 
 class DriftingOdometry:
@@ -50,3 +56,20 @@ def stretched(longer, turn_rad_m):
 def off_by(error_per_m):
     """Motions followed by a twist (k,) a meter."""
     return lambda motion: motion @ lie.exp(float(np.linalg.norm(motion[:-1, -1])) * error_per_m)
+
+
+def false_closures(slam, share, seed=0):
+    """So many that they are this share of all: two keyframes at random, the relative pose of another closure.
+
+    Real ones that happen to be nearly right (within 1 m of what the graph says) are drawn again.
+    """
+    rng = np.random.default_rng(seed)
+    true = [closure for closure in slam.closures if closure.verdict is ClosureVerdict.ACCEPTED]
+    wrong = []
+    while len(wrong) < share / (1.0 - share) * len(true):
+        target, source = np.sort(rng.choice(len(slam.keyframes), 2, replace=False))
+        model = true[rng.integers(len(true))]
+        here = slam.graph.poses[target] @ model.match.T_target_source
+        if np.linalg.norm((here - slam.graph.poses[source])[:-1, -1]) > 1.0:
+            wrong.append(replace(model, target=int(target), source=int(source), reason=MADE_UP))
+    return tuple(wrong)

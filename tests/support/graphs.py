@@ -3,9 +3,13 @@
 import numpy as np
 
 from scanchain import lie
+from scanchain.config import GraphConfig
 from scanchain.graph.g2o import read_g2o
 from scanchain.graph.pose_graph import PoseGraph
 from tests.support.scenes import shared_data
+
+PLAIN = GraphConfig(robust="none")
+BEST = {"manhattan": 1774.5205, "intel": 22.5021, "MIT": 20.6035, "sphere2500": 675.701, "torus3D": 12117.6}  # ½χ²
 
 
 def published(name, **options):
@@ -41,3 +45,14 @@ def ring(dimension, count=12, *, noise=0.0, seed=0):
     is_loop = np.arange(count) == count - 1
     graph = graph_of(poses, edges, [*measured, lie.inverse(true[-1])], 100.0 * np.eye(k), is_loop)
     return graph, np.array(true)
+
+
+def closed_ring(dimension, count, turns, noise=0.0):
+    """Poses that each measure the next one where they are, the last the first; they start wound up some turns."""
+    k = 3 if dimension == 2 else 6
+    rng = np.random.default_rng(0)
+    twists = np.zeros((count, k))
+    twists[:, -1] = 2.0 * np.pi * turns * np.arange(count) / count
+    edges = np.stack([np.arange(count), (np.arange(count) + 1) % count], axis=1)
+    measured = lie.exp(noise * rng.normal(size=(count, k)))
+    return graph_of(lie.exp(twists), edges, measured, np.diag([100.0] * dimension + [1e4] * (k - dimension)))

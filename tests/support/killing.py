@@ -20,7 +20,8 @@ from scanchain.errors import InputError
 from scanchain.graph.g2o import read_g2o
 from scanchain.maps import MAP_FOLDER, open_saved_map, read_map, read_ply
 from scanchain.runs.directory import CHECKPOINT_FILE, POINTS_FILE, RECORDING_FILE
-from scanchain.runs.resume import read_checkpoint
+from scanchain.runs.resume import Checkpoints, read_checkpoint
+from scanchain.runs.step_table import StepTable
 from scanchain.settings import load_settings
 from scanchain.trajectory import read_kitti, read_tum
 from scanchain_viz.recording import entities
@@ -145,7 +146,12 @@ def kill_at_random(log, words, folder, whole, *, kills, seed, longest_s):
         out = folder / f"run_{number}"
         for _ in range(min(_KILLS_A_RUN, kills - killed)):
             after_s = rng.uniform(0.0, longest_s)
-            if _is_killed(start(log, out, *words, "--resume"), after_s):
+            child = start(log, out, *words, "--resume")
+            try:
+                assert child.wait(after_s) == 0
+            except subprocess.TimeoutExpired:
+                child.kill()
+                child.wait()
                 killed += 1
                 yield _left(out, after_s)
             if out.exists():
@@ -154,17 +160,6 @@ def kill_at_random(log, words, folder, whole, *, kills, seed, longest_s):
             assert start(log, out, *words, "--resume").wait() == 0
         same_result(out, whole)
         number += 1
-
-
-def _is_killed(child, after_s):
-    """Whether the process was killed after that time, not done before."""
-    try:
-        assert child.wait(after_s) == 0
-        return False
-    except subprocess.TimeoutExpired:
-        child.kill()
-        child.wait()
-        return True
 
 
 def _left(out, after_s):
@@ -178,25 +173,21 @@ def _left(out, after_s):
     return Killed(after_s, where, steps)
 
 
+def taken_up(slam, folder):
+    """A chain, its points in a folder, that was put down there and is taken up again."""
+    Checkpoints(folder, 10.0).write(slam, StepTable())
+    again = read_checkpoint(folder, slam.config).slam
+    again.points.reopen(folder / POINTS_FILE)
+    return again
+
+
 def config_of(folder):
     """The configuration of a run that was left."""
     return load_settings(file=folder / "config.toml").config
 
 
-def _read_checkpoint(path):
-    return len(read_checkpoint(path.parent, config_of(path.parent)).steps)
-
-
-def _read_html(path):
-    assert path.read_text(encoding="utf-8").rstrip().endswith("</html>")
-
-
-def _read_wide_tum(path):
-    assert np.loadtxt(path, ndmin=2).shape[1] == 8 + 21  # a pose, and its covariance's upper triangle
-
-
-def _read_text(path):
-    assert path.read_text(encoding="utf-8").endswith("\n")
+def _check(is_whole):
+    assert is_whole
 
 
 def _read_as_viewer(path):
@@ -207,13 +198,13 @@ def _read_as_viewer(path):
 
 
 _READ = {
-    CHECKPOINT_FILE: _read_checkpoint,
+    CHECKPOINT_FILE: lambda path: len(read_checkpoint(path.parent, config_of(path.parent)).steps),
     MAP_FOLDER: open_saved_map,
     POINTS_FILE: lambda path: np.fromfile(path, np.float32),
-    "keyframes.tum": _read_wide_tum,
+    "keyframes.tum": lambda path: _check(np.loadtxt(path, ndmin=2).shape[1] == 8 + 21),  # covariance's triangle
     ".tum": lambda path: len(read_tum(path)),
     "trajectory.kitti.txt": lambda path: len(read_kitti(path)),
-    "summary.txt": _read_text,
+    "summary.txt": lambda path: _check(path.read_text(encoding="utf-8").endswith("\n")),
     ".g2o": read_g2o,
     ".parquet": pq.read_table,
     ".ply": read_ply,
@@ -222,7 +213,7 @@ _READ = {
     ".json": lambda path: json.loads(path.read_text(encoding="utf-8")),
     ".toml": lambda path: tomllib.loads(path.read_text(encoding="utf-8")),
     ".rrd": _read_as_viewer,
-    ".html": _read_html,
+    ".html": lambda path: _check(path.read_text(encoding="utf-8").rstrip().endswith("</html>")),
 }
 _REACHED = {
     "report.html": "completing", "metrics.json": "writing its report", "trajectory.tum": "writing results",

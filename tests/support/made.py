@@ -49,15 +49,21 @@ def run(world: str, into: Path | None = None, *, folder: Path = _FOLDER, **optio
     """The run directory of a simulated log, without a recording; options of ``log`` and of ``scanchain.run``."""
     source = log(world, folder=folder, **{key: options.pop(key) for key in _OF_SIMULATE if key in options})
     name = "_".join([source.stem, *(f"{key}-{value}" for key, value in sorted(options.items()))])
+    path = run_of(source, folder, name, **options)
+    return path if into is None else _copied(path, into / world)
+
+
+def run_of(log: Path, folder: Path, name: str, **options: object) -> Path:
+    """The run of any log, without a recording."""
     path = _current(folder) / name
     if not path.exists():
         draft = path.with_name(f"{os.getpid()}_{name}")
-        scanchain.run(source, draft, recording=False, **options)
+        scanchain.run(log, draft, recording=False, **options)
         try:
             draft.rename(path)
         except OSError:  # another process was faster
             shutil.rmtree(draft)
-    return path if into is None else _copied(path, into / world)
+    return path
 
 
 def _copied(source: Path, target: Path) -> Path:

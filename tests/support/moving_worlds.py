@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from scanchain import lie
-from scanchain.data import Matrix, Points, Pose, Scan
+from scanchain.data import Points, Pose, Scan
+from scanchain.evaluation import path_length
 from scanchain.kernels.raycast import BOX, CYLINDER
 from scanchain.preprocess import first_per_voxel
 from scanchain.simulation.drive import plan
@@ -87,8 +88,7 @@ def _scans(drive, every_m, voxel_m, cylinders_at, boxes_at):
     sensor = drive.sensor
     times_s = drive.scans * sensor.period_ns * 1e-9
     poses = drive.motion.lidar(times_s)
-    way_m = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)))
-    picked = np.flatnonzero(np.diff(np.floor(way_m / every_m), prepend=-1.0))
+    picked = np.flatnonzero(np.diff(np.floor(path_length(poses) / every_m), prepend=-1.0))
     for number in picked:
         rays = sensor.rays(number)
         time_s, T = times_s[number], poses[number]
@@ -99,14 +99,9 @@ def _scans(drive, every_m, voxel_m, cylinders_at, boxes_at):
         moves = ranges_m < still_m
         noisy_m = ranges_m + sensor.noise_m * random.standard_normal(len(ranges_m))
         kept = np.isfinite(ranges_m) & (noisy_m > sensor.min_range_m)
-        points, moves = rays.directions[kept] * noisy_m[kept, None], moves[kept]
-        yield _thinned(T, points, moves, voxel_m, sensor.dimension)
-
-
-def _thinned(T, points: Matrix, moves, voxel_m, dimension):
-    points = np.ascontiguousarray(points[:, :dimension])
-    chosen = first_per_voxel(points, voxel_m, 0.0, 1e9)
-    return LabeledScan(T if dimension == 3 else lie.flatten(T), points[chosen], moves[chosen])
+        points = np.ascontiguousarray((rays.directions[kept] * noisy_m[kept, None])[:, : sensor.dimension])
+        chosen = first_per_voxel(points, voxel_m, 0.0, 1e9)
+        yield LabeledScan(T if sensor.dimension == 3 else lie.flatten(T), points[chosen], moves[kept][chosen])
 
 
 def _among(solids, boxes, cylinders):

@@ -7,7 +7,7 @@ import numpy as np
 from PIL import Image
 from ruamel.yaml import YAML
 
-from tests.support.naive_loops import bin_of
+from tests.support.naive import bin_of
 
 
 def crossed_cells(start, end, resolution):

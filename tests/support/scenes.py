@@ -13,12 +13,12 @@ from scanchain.logs import open_log
 from scanchain.point_store import PointStore, StoredPoints
 
 ROOT = Path(__file__).resolve().parents[2]
+DATA = Path(os.environ.get("SCANCHAIN_DATA", ROOT.parent / "shared" / "data"))
 
 
 def shared_data(name: str) -> Path:
     """Path of a real recording, or a skip that says what is missing."""
-    folder = Path(os.environ.get("SCANCHAIN_DATA", ROOT.parent / "shared" / "data"))
-    path = folder / name
+    path = DATA / name
     if not path.exists():
         pytest.skip(f"{path} is absent: real recordings are not part of the project (set SCANCHAIN_DATA)")
     return path

@@ -7,24 +7,14 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from scanchain import lie
+from scanchain import lie, verdict
 from scanchain.data import Trajectory
 from scanchain.runs.step_table import StepTable
 from scanchain.runs.vouching import evidence_of, evidence_of_trajectory
-from scanchain.verdict import (
-    Closures,
-    Evidence,
-    Kind,
-    Stretch,
-    Verdict,
-    apart_m,
-    check_overlap,
-    check_velocity,
-    check_wheels,
-    judge,
-    wheel_bound_m,
-)
+from scanchain.verdict import Closures, Evidence, Kind, Stretch, Verdict, judge
 from scanchain_viz.colors import STRETCH_COLORS
+from tests.benchmarks import vouching
+from tests.benchmarks.vouching_logs import Case, LogSpec
 from tests.support.recordings import drive
 
 N, STEP_M, INTERVAL_S = 1200, 0.1, 0.2
@@ -80,8 +70,8 @@ def evidence(poses=POSES, *, wheels=None, closures=(), **changes):
     return Evidence(
         seconds=seconds,
         poses=poses,
-        wheels=check_wheels(poses, unknown if wheels is None else wheels),
-        velocity=check_velocity(stamps_ns, stamps_ns, poses),
+        wheels=verdict.check_wheels(poses, unknown if wheels is None else wheels),
+        velocity=verdict.check_velocity(stamps_ns, stamps_ns, poses),
         closures=Closures(ends[:, 0], ends[:, 1], T, np.zeros(len(ends), bool)),
         **known | changes,
     )
@@ -91,7 +81,6 @@ def marked(first, last):
     return (np.arange(N) >= first) & (np.arange(N) <= last)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize(
     "errors", [{}, {"scale": 0.9}, {"scale": 1.05}, {"drift_rad_m": 0.02}, {"share": 0.1}], ids=str
 )
@@ -144,7 +133,7 @@ def closed(poses, *, by_m=0.01):
 def shares(value, at):
     share = np.full(N, 0.98)
     share[at] = value
-    return check_overlap(share)
+    return verdict.check_overlap(share)
 
 
 CALM = {
@@ -163,7 +152,7 @@ CALM = {
     "degenerate for 0.4 m": lambda: evidence(is_degenerate=marked(300, 303)),
     "lost for 0.4 m": lambda: evidence(is_lost=marked(300, 303)),
     "contradicted for 0.4 m": lambda: evidence(fit=np.where(marked(300, 303), 0.4, 0.9)),
-    "an overlap that shrinks slowly": lambda: evidence(overlap=check_overlap(np.linspace(1.0, 0.3, N))),
+    "an overlap that shrinks slowly": lambda: evidence(overlap=verdict.check_overlap(np.linspace(1.0, 0.3, N))),
     "copies at rest": lambda: evidence(
         np.concatenate([POSES[:500], np.repeat(POSES[500:501], 21, axis=0), POSES[501:]])[:N],
         is_copy=marked(501, 519),
@@ -265,7 +254,6 @@ def test_a_wrong_or_doubtful_trajectory_is_judged_by_its_stretches_with_a_reason
     assert words in judged.reason
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_a_slip_along_a_corridor_is_named_though_every_scan_is_ok(dimension):
     truth, slipped = course(dimension, slip=(500, 530))
     judged = judge(evidence(slipped, wheels=wheels_of(truth)))
@@ -329,7 +317,6 @@ def test_a_verdict_names_the_error_that_it_vouches_for_where_it_vouches():
 
 
 @pytest.mark.parametrize("error_m", [0.05, 0.5])
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_the_error_of_another_tool_is_below_its_distance_to_an_independent_estimate(dimension, error_m):
     truth, _ = course(dimension)
     rng = np.random.default_rng(4)
@@ -337,15 +324,15 @@ def test_the_error_of_another_tool_is_below_its_distance_to_an_independent_estim
     errors = (rng.normal(0.0, error_m / 20.0, (N, len(level))) * level for _ in range(2))
     estimate, other = (truth @ lie.exp(np.cumsum(error, axis=0)) for error in errors)
     positions = [poses[:, :-1, -1] for poses in (estimate, other, truth)]
-    bound_m, true_m = apart_m(positions[0], positions[1]), apart_m(positions[0], positions[2])
+    bound_m, true_m = verdict.apart_m(positions[0], positions[1]), verdict.apart_m(positions[0], positions[2])
     assert 0.5 * true_m < bound_m < 4.0 * true_m
-    assert wheel_bound_m(estimate, other) == pytest.approx(bound_m, rel=0.2)
+    assert verdict.wheel_bound_m(estimate, other) == pytest.approx(bound_m, rel=0.2)
     unknown = np.full_like(truth, np.nan)
     times_ns = (1e9 * INTERVAL_S * np.arange(N)).astype(np.int64)
     trajectory = Trajectory(times_ns, estimate)
     for wheels, bounds, error in (
         (unknown, {}, "no jump above 0.67 m, drift unchecked"),
-        (other, {}, f"ATE below {wheel_bound_m(estimate, other):.2g} m by wheels"),
+        (other, {}, f"ATE below {verdict.wheel_bound_m(estimate, other):.2g} m by wheels"),
         (other, {"ours": 0.001}, "ATE below 0.001 m by ours"),
     ):
         found = evidence_of_trajectory(trajectory, times_ns, wheels, np.full(N, 500), bounds)
@@ -382,8 +369,8 @@ def test_clocks_that_jitter_stand_still_or_leave_scans_out_accelerate_nothing(
 ):
     poses = chained(np.tile([2.0, 0.0, 0.0], (300, 1)), np.random.default_rng(0))  # 10 m/s
     with np.errstate(all="raise"):
-        assert np.nanmax(check_velocity(stamps_ns[there], log_times_ns[there], poses[there])) < largest
-        assert np.isnan(check_velocity(np.zeros_like(TIMES_NS), np.zeros_like(TIMES_NS), poses)).all()
+        assert np.nanmax(verdict.check_velocity(stamps_ns[there], log_times_ns[there], poses[there])) < largest
+        assert np.isnan(verdict.check_velocity(np.zeros_like(TIMES_NS), np.zeros_like(TIMES_NS), poses)).all()
 
 
 def test_a_short_interval_after_a_gap_accelerates_nothing():
@@ -393,10 +380,9 @@ def test_a_short_interval_after_a_gap_accelerates_nothing():
     intervals_s[30:32] = 16.0, 0.08
     stamps_ns = (1e9 * np.concatenate([[0.0], np.cumsum(intervals_s)])).astype(np.int64)
     poses = chained(motions, np.random.default_rng(0))
-    assert np.nanmax(check_velocity(stamps_ns, stamps_ns, poses)) < 1.0
+    assert np.nanmax(verdict.check_velocity(stamps_ns, stamps_ns, poses)) < 1.0
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
 def test_wheels_that_turn_the_other_way_or_disagree_all_along_are_named(dimension):
     poses, _ = course(dimension)
     motions = lie.log(lie.between(poses[:-1], poses[1:]))
@@ -461,7 +447,7 @@ def test_a_table_holds_the_figures_of_the_steps(tmp_path):
 def test_the_usual_overlap_is_the_median_of_up_to_ten_scans_before(count):
     share = np.random.default_rng(count).random(count)
     naive = [np.nan if k < 3 else share[k] / np.median(share[max(k - 10, 0) : k]) for k in range(count)]
-    assert np.array_equal(check_overlap(share), naive, equal_nan=True)
+    assert np.array_equal(verdict.check_overlap(share), naive, equal_nan=True)
 
 
 def test_after_a_gap_one_contradicted_scan_is_to_be_checked_unless_wheels_agree_even_if_the_lidar_seems_to_stand():
@@ -482,3 +468,16 @@ def test_a_stretch_shorter_than_a_digit_of_its_times_has_one_time():
 
 def test_every_kind_of_stretch_has_a_color():
     assert set(STRETCH_COLORS) == set(Kind) and len(set(STRETCH_COLORS.values())) == len(Kind)
+
+
+def test_a_kidnapping_is_wrong_and_flagged_and_the_rest_right(tmp_path, capsys):
+    log = LogSpec("office", "lms-270", "kidnapped", duration_s=8.0, dimension=2)
+    case = Case(log, "no wheels")
+    (row,) = vouching.measured([case], tmp_path)
+    counts = row["counts"]
+    assert (counts["wrong flagged"] >= 5, counts["wrong silent"]) == (True, 0)
+    assert counts["right ok"] >= 40 and row["verdict"] != "trustworthy"
+    (again,) = vouching.measured([case], tmp_path)
+    assert again == row
+    vouching.table([row])
+    assert f"| 2D kidnapped | 1 | {counts['wrong flagged']} of" in capsys.readouterr().out
