@@ -260,7 +260,10 @@ def pivots(
 ) -> Motion:
     """Turns and short moves from the origin, heading along x: ``steps`` that end as they began, repeated."""
     phases = rng.uniform(0.0, 2.0 * np.pi, 5)
-    lap = np.vstack([_rates(step, vehicle) for step in steps])
+    turns = [_trapezoid(np.deg2rad(step.turn_deg), TURN_RAD_S, _TURN_RAD_S2) for step in steps]
+    moves = [_trapezoid(step.ahead_m, vehicle.speed_m_s, vehicle.acceleration_m_s2) for step in steps]
+    pairs = zip(turns, moves, strict=True)  # one after the other
+    lap = np.vstack([np.asarray(block_diag(turn[:, None], move[:, None])) for turn, move in pairs])
     rounds = int((duration_s + 2.0) / (len(lap) * _PIVOT_STEP_S)) + 1
     rates = np.vstack([np.zeros((round(_FIRST_PAUSE_S / _PIVOT_STEP_S), 2)), *[lap] * rounds])
     eased = np.asarray(gaussian_filter1d(rates, _PIVOT_EASE_S / _PIVOT_STEP_S, axis=0))
@@ -277,13 +280,6 @@ def pivots(
         return Course(place(times_s), forward, np.linalg.norm(place(times_s, 1), axis=1))
 
     return Motion(course, vehicle, solids, phases)
-
-
-def _rates(step: Pivot, vehicle: Vehicle) -> Matrix:
-    """Turning and moving speeds (T, 2) of one step, each followed by a pause."""
-    turn = _trapezoid(np.deg2rad(step.turn_deg), TURN_RAD_S, _TURN_RAD_S2)
-    ahead = _trapezoid(step.ahead_m, vehicle.speed_m_s, vehicle.acceleration_m_s2)
-    return np.asarray(block_diag(turn[:, np.newaxis], ahead[:, np.newaxis]))
 
 
 def _trapezoid(distance: float, limit: float, acceleration: float) -> NDArray[np.float64]:

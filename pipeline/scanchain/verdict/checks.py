@@ -154,7 +154,9 @@ def check_wheels(poses: Matrix, wheel_poses: Matrix) -> WheelCheck:
         (slice(d, None), check.apart_rad, _LEAST_RAD),
     ):
         calibration = _calibration(_over(inputs, first, last), _over(outputs[:, part], first, last), length_m)
-        difference = outputs[:, part] - _limited(inputs @ calibration, single_m)
+        correction = inputs @ calibration
+        largest = _LARGEST_CORRECTION * single_m / np.maximum(_lengths(correction), 1e-12)
+        difference = outputs[:, part] - correction * np.minimum(1.0, largest)[:, None]
         drift = _smoothed(np.cumsum(difference, axis=0), path_m)
         apart[checked] = _lengths(drift[last] - drift[first])
         share = np.percentile(apart[checked] / length_m, _TAIL) / _TAIL_SIGMAS
@@ -271,12 +273,6 @@ def _calibration(inputs: Matrix, outputs: Matrix, length_m: Floats) -> Matrix:
         error = _lengths(B - A @ correction)
         weight = 1.0 / (1.0 + (error / max(1.5 * float(np.median(error)), 1e-3)) ** 2) * (weight > 0.0)
     return correction
-
-
-def _limited(corrections: Matrix, length_m: Floats) -> Matrix:
-    """Corrections (N, b) of at most a share of the path."""
-    size = np.maximum(_lengths(corrections), 1e-12)
-    return corrections * np.minimum(1.0, _LARGEST_CORRECTION * length_m / size)[:, None]
 
 
 def _lengths(vectors: Matrix) -> Floats:
