@@ -73,10 +73,9 @@ def align(estimate: Matrix, reference: Matrix, alignment: Alignment) -> Pose:
         raise InputError(
             f"rigid alignment is undetermined: {error}; align by the first pose or not at all"
         ) from None
-    if d == 3:
-        return T
-    T = lie.lift(T)
-    T[2, 3] = reference[0, 2, 3] - estimate[0, 2, 3]
+    if d == 2:
+        T = lie.lift(T)
+        T[2, 3] = reference[0, 2, 3] - estimate[0, 2, 3]
     return T
 
 

@@ -281,8 +281,7 @@ def corridor(rng: np.random.Generator) -> Solids:
         y = side * (_CORRIDOR_HALF_M + 0.5 * _CORRIDOR_WALL_M)
         scenery.box((middle, y), (CORRIDOR_M, _CORRIDOR_WALL_M), (0.0, _CORRIDOR_HEIGHT_M))
     for end, outwards in ((0.0, -1.0), (CORRIDOR_M, 1.0)):
-        _lobby(scenery, end, outwards)
-        _furnish_lobby(scenery, end, outwards, rng)
+        _lobby(scenery, end, outwards, rng)
         for place in rng.uniform([0.5, 2.0, 3.5], [1.5, 3.0, CORRIDOR_STRUCTURE_M - 0.2]):
             size = (rng.uniform(0.1, 0.3), rng.uniform(0.05, 0.2))
             for side in (-1.0, 1.0):
@@ -291,8 +290,11 @@ def corridor(rng: np.random.Generator) -> Solids:
     return scenery.finish()
 
 
-def _lobby(scenery: Scenery, end: float, outwards: float) -> None:
-    """The walls of a lobby; the corridor opens in the middle of the one at x = ``end``."""
+def _lobby(scenery: Scenery, end: float, outwards: float, rng: np.random.Generator) -> None:
+    """A lobby: walls, cupboards and benches along them, a plant in two corners.
+
+    The corridor opens in the middle of the wall at x = ``end``.
+    """
     far = end + outwards * (_LOBBY_M + 0.5 * _CORRIDOR_WALL_M)
     scenery.box(
         (far, 0.0), (_CORRIDOR_WALL_M, 2.0 * _LOBBY_HALF_M + 2.0 * _CORRIDOR_WALL_M), (0.0, _CORRIDOR_HEIGHT_M)
@@ -303,10 +305,6 @@ def _lobby(scenery: Scenery, end: float, outwards: float) -> None:
         width = _LOBBY_HALF_M - _CORRIDOR_HALF_M
         center = (end - outwards * 0.5 * _CORRIDOR_WALL_M, side * (_CORRIDOR_HALF_M + 0.5 * width))
         scenery.box(center, (_CORRIDOR_WALL_M, width), (0.0, _CORRIDOR_HEIGHT_M))
-
-
-def _furnish_lobby(scenery: Scenery, end: float, outwards: float, rng: np.random.Generator) -> None:
-    """Cupboards and benches along the lobby's walls, a plant in two corners."""
     for depth in (1.2, 3.5, 5.8):
         for side in (-1.0, 1.0):
             size = (rng.uniform(0.6, 1.8), rng.uniform(0.3, 0.7))
