@@ -2,15 +2,7 @@
 
 from scanchain.maps.files import read_map, read_ply, write_laz, write_map, write_pcd, write_ply
 from scanchain.maps.occupancy_grid import OccupancyGrid, draw_grid, fitting_resolution
-from scanchain.maps.point_map import (
-    PointMap,
-    View,
-    build_point_map,
-    clearly_through,
-    moved,
-    reach_of,
-    sightings,
-)
+from scanchain.maps.point_map import PointMap, View, build_point_map, clearly_through, moved, reach_of, sightings
 from scanchain.maps.saved_map import (
     MAP_FOLDER,
     Edges,

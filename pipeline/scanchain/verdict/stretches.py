@@ -237,10 +237,8 @@ def _of_segments(evidence: Evidence) -> Iterator[Stretch]:
 def merged(is_marked: NDArray[np.bool_], gap: int = _GAP_SCANS) -> list[slice]:
     """Runs of marked scans, joined over gaps of a few scans."""
     places = np.flatnonzero(is_marked)
-    if not len(places):
-        return []
     parts = np.split(places, np.flatnonzero(np.diff(places) > gap + 1) + 1)
-    return [slice(int(part[0]), int(part[-1]) + 1) for part in parts]
+    return [slice(int(part[0]), int(part[-1]) + 1) for part in parts if len(part)]
 
 
 def _stretch(
@@ -259,8 +257,6 @@ def contradicting_groups(closures: Closures, poses: Matrix, seconds: Floats) -> 
     The motion from the first scan to the last is wrong by about as much, or the two places are alike.
     seconds : (N,) of the scans
     """
-    if not len(closures.target):
-        return []
     expected = lie.between(poses[closures.target], poses[closures.source])
     off = lie.between(expected, closures.T_target_source)[:, :-1, -1]
     size_m = np.linalg.norm(off, axis=1)
