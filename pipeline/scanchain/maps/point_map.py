@@ -36,8 +36,6 @@ _EVERY = np.iinfo(np.int32).max  # a limit that no number of scans reaches
 class PointMap:
     """Scans added up in the world frame; each voxel keeps the mean of its points.
 
-    Attributes
-    ----------
     voxel_size_m : edge of a voxel; doubled each time that ``max_voxels`` of them do not suffice, or that a point
         lies a million of them from the first scan
     dimension : 2 or 3, of the points
@@ -112,8 +110,6 @@ def build_point_map(
 class View:
     """A scan with the ranges of its free space.
 
-    Attributes
-    ----------
     T_world_lidar : (d+1, d+1)
     points : (M, d) meters, lidar frame
     spacing_m : edge of the voxels that the scan was downsampled with; a surface has a point in each

@@ -63,8 +63,6 @@ class _Index(msgspec.Struct, frozen=True):
 class Edges:
     """Edges of a pose graph.
 
-    Attributes
-    ----------
     pairs : (E, 2) int64 keyframes (i, j)
     measurements : (E, d+1, d+1) T_ij; information : (E, k, k) of a right twist on it
     is_loop : (E,) bool; weight : (E,) robust weight
@@ -112,8 +110,6 @@ class SavedPoints:
 class SavedMap:
     """A map, as it is written to disk and opened from there.
 
-    Attributes
-    ----------
     folder : where it lies
     dimension : 2 or 3
     keyframes : their ``T_odom_lidar`` is the final pose, T_map_lidar

@@ -44,8 +44,6 @@ class ElevationCalibration:
     Ground seen from afar lies too high or too low by the offset times the distance, and a map of such points
     pitches every scan that is aligned to it: an offset of 0.2°, as in KITTI, by 0.01° per meter.
 
-    Attributes
-    ----------
     offset_rad : what points are corrected by: the mean of the windows where it is significant, else 0
     sigma_rad : standard deviation of that mean, by the scatter of the windows; infinite before the first one
     """

@@ -61,8 +61,6 @@ class MotionFilter:
     A match measures the pose. One that is a little off moves the pose, and the motion by as much as their errors
     are known to go together: the next match, which is right again, does not reverse the motion.
 
-    Attributes
-    ----------
     motion : T_previous_current, (d+1, d+1), over one scan
     pose_covariance, motion_covariance : (k, k) of twists in the lidar's own frame
     covariance : (k, k) of both, pose by motion
@@ -102,8 +100,6 @@ class MotionFilter:
 class Prediction(msgspec.Struct, frozen=True):
     """The predicted pose of a scan, and the motion before it, for other initial poses and for deskewing.
 
-    Attributes
-    ----------
     prior : predicted pose and its covariance
     is_guess : whether scans are missing before this one, so that the pose may be far off
     velocity : (k,) twist per second at the last scan, lidar frame

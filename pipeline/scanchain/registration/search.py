@@ -38,8 +38,6 @@ class Window:
 class Wanted(NamedTuple):
     """Poses that a search is to find.
 
-    Attributes
-    ----------
     apart_m : least distance of two distinct poses, or 0.1 rad
     rival : share of the best score, from which on further ones are found
     answers : largest number of poses

@@ -33,8 +33,6 @@ _COLUMNS = (
 class Change:
     """A movable object that is not where it was on the first day.
 
-    Attributes
-    ----------
     before, after : (3,) middle of its bounding box, meters; NaN where it was or is not there
     size_m : (3,) length, width and height of its upright bounding box when it was at yaw 0
     owner : number of the object among the solids of both days

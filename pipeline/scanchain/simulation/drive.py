@@ -47,8 +47,6 @@ NO_SLIP = Slip(0.0, 1.0, 0.0)
 class Drive:
     """A drive to record.
 
-    Attributes
-    ----------
     sensor : its reach is what the world lets it see
     T_base_lidar : (4, 4)
     scans : (K,) int64, which scans are recorded, counted from the first instant; the others fall into dropouts

@@ -30,8 +30,6 @@ _NOISE_RAD = 0.004  # slip in heading, per √m
 class Vehicle:
     """Kinematics of a robot, a car or a walking person, and the mounting of the lidar.
 
-    Attributes
-    ----------
     speed_m_s, acceleration_m_s2, lateral_acceleration_m_s2 : limits along the path and in bends
     radius_m : half its width
     T_base_lidar : (4, 4)

@@ -17,8 +17,6 @@ from scanchain.simulation.solids import Solids
 class Rays:
     """The rays of one scan, in the order they are fired.
 
-    Attributes
-    ----------
     directions : (N, 3) unit vectors, sensor frame
     instants_ns : (P,) int64, the firing instants after the scan's stamp, from 0 up
     instant_of_ray : (N,) int32

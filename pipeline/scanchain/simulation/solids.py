@@ -21,8 +21,6 @@ FIXED = -1  # owner of solids that belong to no movable object
 class Solids:
     """Closed solids above a rolling ground, meters, world frame.
 
-    Attributes
-    ----------
     rows : (S, 9) as ``cast_rays`` takes them
     owner : (S,) number of the movable object that each solid is a part of, FIXED for none
     ground : (7 + 4 W,) z = g0 + g1 sin(g2 x + g3) + g4 sin(g5 y + g6) + Σ a sin(b x + c y + d), W rows a, b, c, d

@@ -65,8 +65,6 @@ class Kind(StrEnum):
 class Stretch(Struct, frozen=True):
     """Consecutive suspicious scans.
 
-    Attributes
-    ----------
     first, last : scans, from 0; start_s, end_s : since the first scan of the run
     scans : of this kind among them
     size_m, size_rad : the contradiction; null where it is not measured
@@ -101,8 +99,6 @@ class Stretch(Struct, frozen=True):
 class WheelCheck(NamedTuple):
     """Trajectory against wheels around each scan, NaN where there is nothing to compare.
 
-    Attributes
-    ----------
     innovation : (N,) standard deviations
     apart_m, apart_rad : (N,) difference of the motions over ``WINDOW_M`` after calibration
     poses : (N, d+1, d+1) of the lidar by the wheels, NaN where unknown

@@ -41,8 +41,6 @@ _IMPOSSIBLE_M = 1.0  # smallest change of the wheels' motion from scan to scan t
 class Closures:
     """Closures that verification accepted.
 
-    Attributes
-    ----------
     target, source : (C,) scans
     T_target_source : (C, d+1, d+1) as measured
     is_accepted : (C,) by the back end
@@ -60,8 +58,6 @@ class Closures:
 class Evidence:
     """Evidence of every scan of a trajectory, (N,) each.
 
-    Attributes
-    ----------
     seconds : since the first scan, by the log
     poses : (N, d+1, d+1) final
     is_lost, is_degenerate : states; False where unknown
