@@ -206,12 +206,9 @@ def check_overlap(inlier_share: Floats) -> Floats:
     What the lidar saw before it sees again, from nearby: where much of it is gone at once, the lidar is elsewhere
     than the map says, or something stands close before it.
     """
-    n = len(inlier_share)
-    usual = np.full(n, np.nan)
-    for scan in range(_FEWEST, min(_BEFORE, n)):
-        usual[scan] = np.median(inlier_share[:scan])
-    if n > _BEFORE:
-        usual[_BEFORE:] = np.median(sliding_window_view(inlier_share[:-1], _BEFORE), axis=1)
+    usual = np.full(len(inlier_share), np.nan)
+    padded = np.append(np.full(_BEFORE, np.nan), inlier_share)  # the first scans have fewer before them
+    usual[_FEWEST:] = np.nanmedian(sliding_window_view(padded, _BEFORE)[_FEWEST:-1], axis=1)
     return inlier_share / np.maximum(usual, _LEAST_USUAL)
 
 
