@@ -60,14 +60,20 @@ def sampled_map(scans: Iterable[Scan], trajectory: Trajectory, step: int) -> Poi
 
     scans : one a pose of the trajectory
     """
-    seconds = np.diff(trajectory.stamps_ns)[:, None] * 1e-9
-    motions = lie.log(lie.between(trajectory.poses[:-1], trajectory.poses[1:]))
-    velocities = np.divide(motions, seconds, out=np.zeros_like(motions), where=seconds > 0.0)
-    rest = np.zeros((1, lie.twist_size(trajectory.poses[0])))
-    before = np.vstack([velocities[:1] if len(velocities) else rest, velocities])
-    after = np.vstack([velocities, velocities[-1:] if len(velocities) else rest])
+    after = velocities(trajectory)
+    before = np.vstack([after[:1], after[:-1]])
     rows = zip(scans, trajectory.poses, before, after, strict=True)
     return np.concatenate([lie.transform(pose, _deskewed(scan, step, v, w)) for scan, pose, v, w in rows])
+
+
+def velocities(trajectory: Trajectory) -> NDArray[np.float64]:
+    """(N, k) twist per second from each pose to the next, of the last one as before; 0 where stamps stand."""
+    seconds = 1e-9 * np.diff(trajectory.stamps_ns)[:, None]
+    twists = lie.log(lie.between(trajectory.poses[:-1], trajectory.poses[1:]))
+    result = np.zeros((len(trajectory), twists.shape[1]))
+    np.divide(twists, seconds, out=result[:-1], where=seconds > 0.0)
+    result[-1] = result[max(len(result) - 2, 0)]
+    return result
 
 
 def sampling_step(points: int) -> int:
