@@ -82,7 +82,7 @@ def furnish(scenery: Scenery, rooms: Matrix, route: Matrix, doors: Matrix, rng: 
     rooms : (R, 4) rectangles between the middles of their walls: low x, low y, high x, high y
     route, doors : (N, 2) positions that are kept free
     """
-    taken: list[tuple[Matrix, Matrix]] = []  # center and half size
+    taken: list[Matrix] = []  # center and half size, (2, 2)
     for room in rooms:
         desks = int(np.prod(room[2:] - room[:2]) / 5.0)
         kinds = [*["shelf"] * 3, *["desk"] * desks, *["bin"] * 2, "plant"]
@@ -95,20 +95,19 @@ def furnish(scenery: Scenery, rooms: Matrix, route: Matrix, doors: Matrix, rng: 
                 if kind == "shelf":  # its back to a wall
                     axis = 1 - upright
                     center[axis] = (low, high)[int(rng.integers(2))][axis]
-                if _is_free(center, half, taken, ((route, _ROUTE_M), (doors, _DOORWAY_M))):
-                    taken.append((center, half))
+                if _is_free(center, half, taken, route, doors):
+                    taken.append(np.array([center, half]))
                     x, y = center.tolist()
                     with scenery.movable():
                         _put(scenery, kind, x, y, 0.5 * np.pi * upright, rng)
                     break
 
 
-def _is_free(
-    center: Matrix, half: Matrix, taken: list[tuple[Matrix, Matrix]], kept_free: tuple[tuple[Matrix, float], ...]
-) -> bool:
-    """True if an upright rectangle overlaps no other and is so far from all of some positions (N, 2)."""
+def _is_free(center: Matrix, half: Matrix, taken: list[Matrix], route: Matrix, doors: Matrix) -> bool:
+    """True if an upright rectangle overlaps no other one and leaves the route and the doorways free."""
     if any(np.all(np.abs(center - other) < half + other_half + 0.05) for other, other_half in taken):
         return False
+    kept_free = ((route, _ROUTE_M), (doors, _DOORWAY_M))
     outside = ((np.maximum(np.abs(places - center) - half, 0.0), limit_m) for places, limit_m in kept_free)
     return all(np.linalg.norm(each, axis=1).min() >= limit_m for each, limit_m in outside)
 
