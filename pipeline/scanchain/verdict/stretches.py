@@ -119,10 +119,12 @@ class Evidence:
 def find_stretches(evidence: Evidence) -> list[Stretch]:
     """Every stretch, by time, and those where the wheels slipped, which are none of the trajectory."""
     has_left = (evidence.overlap < _LEAST_OVERLAP) & ~evidence.starts_segment
+    median = median_filter(np.nan_to_num(evidence.fit, nan=1.0), _MEDIAN_SCANS, mode="nearest")
+    fits_badly = (evidence.is_after_gap & ~evidence.is_held_by_wheels) | (median < LEAST_FIT)
     measured = [
         *_of_states(evidence, Kind.LOST, evidence.is_lost),
         *_of_states(evidence, Kind.DEGENERATE, evidence.is_degenerate),
-        *_of_states(evidence, Kind.CONTRADICTED, evidence.is_contradicted & _fits_badly(evidence)),
+        *_of_states(evidence, Kind.CONTRADICTED, evidence.is_contradicted & fits_badly),
         *(_stretch(evidence, Kind.OVERLAP, part, has_left) for part in merged(has_left)),
         *_of_acceleration(evidence),
     ]
@@ -165,12 +167,6 @@ def _passed_m(evidence: Evidence, part: slice) -> float:
     innovation = evidence.wheels.innovation[part]
     is_held = np.isfinite(innovation).mean() >= KNOWN and not (innovation > WHEEL_LIMIT).any()
     return _PASSED_BY_WHEELS_M if is_held else _PASSED_M
-
-
-def _fits_badly(evidence: Evidence) -> NDArray[np.bool_]:
-    """(N,) scans around which most contradict their pose, and those after a gap over which no wheels agree."""
-    median = median_filter(np.nan_to_num(evidence.fit, nan=1.0), _MEDIAN_SCANS, mode="nearest")
-    return (evidence.is_after_gap & ~evidence.is_held_by_wheels) | (median < LEAST_FIT)
 
 
 def _of_wheels(evidence: Evidence, measured: Sequence[Stretch]) -> Iterator[Stretch]:
@@ -307,8 +303,9 @@ def which_slipped(
     found = []
     for place, (first, last) in enumerate(ends.tolist()):
         size_m = float(np.linalg.norm(apart[place]))
-        jumps_m = [_largest_jump_m(poses[first : last + 1]) for poses in (wheels, odometry)]
-        if jumps_m[0] > max(_IMPOSSIBLE_M + 2.0 * jumps_m[1], _EXPLAINED * size_m):
+        changes = (np.diff(poses[first : last + 1, :-1, -1], n=2, axis=0) for poses in (wheels, odometry))
+        jump_m, usual_m = (np.nan_to_num(np.linalg.norm(each, axis=1)).max(initial=0.0) for each in changes)
+        if jump_m > max(_IMPOSSIBLE_M + 2.0 * usual_m, _EXPLAINED * size_m):
             found.append((Kind.WHEELS_SLIP, size_m))
             continue
         around = np.flatnonzero(closures.is_accepted & (low <= first) & (high >= last))
@@ -343,9 +340,3 @@ def _decided(left_m: Floats, size_m: float) -> Kind:
         if (right <= _RATIO * wrong).all() and (wrong >= _EXPLAINED * size_m).all():
             return slipped
     return Kind.WHEELS
-
-
-def _largest_jump_m(poses: Matrix) -> float:
-    """Largest change of the motion from scan to scan; 0 where it is unknown."""
-    changes_m = np.linalg.norm(np.diff(poses[:, :-1, -1], n=2, axis=0), axis=1)
-    return float(np.nan_to_num(changes_m).max(initial=0.0))
