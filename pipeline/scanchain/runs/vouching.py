@@ -16,7 +16,7 @@ from scanchain.config import Config
 from scanchain.data import VERIFICATION, Matrix, Proposal, Scan, State, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import ExpectedError, pair
-from scanchain.evaluation.map_sharpness import velocities
+from scanchain.evaluation.consistency import velocities
 from scanchain.files import Source
 from scanchain.logs import Log, open_log
 from scanchain.preprocess import Resolution
