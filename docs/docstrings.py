@@ -16,20 +16,22 @@ _CODE = re.compile(r"(``.+?``)")
 
 
 def fields_of(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
-    """Rewrite the lines of one docstring in place; Sphinx calls this for each."""
-    lines[:] = list(_rewritten(lines))
+    """Rewrite the lines of one docstring in place; Sphinx calls this for each, that of ``__init__`` apart."""
+    is_of_class = what == "class" and lines[:1] == (obj.__doc__ or "").splitlines()[:1]
+    lines[:] = list(_rewritten(lines, is_of_class))
 
 
-def _rewritten(lines: list[str]) -> Iterator[str]:
-    """Each block, which begins at a blank line or a field, after a blank line of its own."""
-    is_attributes = False
+def _rewritten(lines: list[str], is_of_class: bool) -> Iterator[str]:
+    """Each block, which begins at a blank line or a field, after a blank line of its own.
+
+    The fields of a class are its attributes, those of a function its arguments.
+    """
     is_field = False
     for line in lines:
         text = line.strip()
         if text in ("Attributes", "Parameters") or (text and set(text) == {"-"}):
-            is_attributes |= text == "Attributes"
             continue
-        head = _head(line, is_attributes)
+        head = _head(line, is_of_class)
         if head:
             yield from ("", *head)
             is_field = True

@@ -34,8 +34,6 @@ _ENOUGH = 0.9  # share of the old size above which a new one is not adopted: the
 class Sweep:
     """Points of a scan, one a voxel, with their times.
 
-    Attributes
-    ----------
     points : (M, d) float64 meters, each in the lidar frame of its own instant
     times_s : (M,) seconds after the middle of the scan; (0,) where all count as measured at once
     middle_s : seconds from the scan's stamp to its middle
@@ -116,8 +114,6 @@ def first_per_voxel(
 class Resolution:
     """Voxel sizes chosen scan by scan.
 
-    Attributes
-    ----------
     scale : 1, ½, ¼ …, factor on all voxel sizes of the configuration: small in narrow places, so
         that the median range spans about _RANGE_VOXELS voxels of the local map, or more; times √½ for dense scans
     match_voxel_m : voxels of the points to match, so that about ``preprocess.match_points`` remain

@@ -46,7 +46,7 @@ def office():
 def few_queries():
     """Sharpness at fewer points than is fair, since every comparison measures it."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("scanchain.evaluation.map_sharpness.MAX_QUERIES", 500)
+        patch.setattr("scanchain.evaluation.consistency.MAX_QUERIES", 500)
         yield
 
 

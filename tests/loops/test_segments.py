@@ -15,7 +15,7 @@ from scanchain.loops.evidence import _OF_FIND as FOUND
 from scanchain.loops.evidence import PlaceTest
 from scanchain.loops.submaps import VoxelSubmaps
 from scanchain.odometry import Odometry
-from scanchain.odometry.tracked import first_match
+from scanchain.odometry.odometry import first_match
 from scanchain.placement import edge_information
 from scanchain.runs.closures import final_verdicts
 from scanchain.slam import Slam

@@ -12,7 +12,7 @@ from scanchain.errors import InputError
 from scanchain.evaluation import read_relations, relation_error
 from scanchain.logs import open_log
 from scanchain.odometry import FrontEnd, Odometry
-from scanchain.odometry.tracked import Tracked, first_match
+from scanchain.odometry.odometry import Tracked, first_match
 from scanchain.preprocess import sweep_of
 from scanchain.slam import Slam
 from tests.benchmarks.harness import ate_m

@@ -7,8 +7,8 @@ import pytest
 
 from scanchain import lie
 from scanchain.odometry import Odometry
+from scanchain.odometry.odometry import first_match
 from scanchain.odometry.standstill import Standstill
-from scanchain.odometry.tracked import first_match
 from tests.support.moving_worlds import standing
 from tests.support.scenes import configured
 

@@ -16,7 +16,7 @@ from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.planar_map_search import PlanarMapSearch
 from scanchain.loops.verification import Verifier
 from scanchain.maps import Edges, SavedPoints, open_saved_map, read_ply
-from scanchain.odometry.tracked import first_match
+from scanchain.odometry.odometry import first_match
 from scanchain.runs.job import Job, Progress
 from scanchain.sessions.joining import Joined, changed, doubt_about, graph_of
 from scanchain.sessions.merged_map import session_names

@@ -2,10 +2,14 @@
 
 from scanchain.evaluation.consistency import ExpectedError as ExpectedError
 from scanchain.evaluation.consistency import ExpectedErrors as ExpectedErrors
+from scanchain.evaluation.consistency import Sharpness as Sharpness
 from scanchain.evaluation.consistency import disagreement as disagreement
 from scanchain.evaluation.consistency import expected_ate as expected_ate
 from scanchain.evaluation.consistency import expected_errors as expected_errors
 from scanchain.evaluation.consistency import motion_nees as motion_nees
+from scanchain.evaluation.consistency import sampled_map as sampled_map
+from scanchain.evaluation.consistency import sampling_step as sampling_step
+from scanchain.evaluation.consistency import sharpness as sharpness
 from scanchain.evaluation.errors import SHORT_LENGTHS_M as SHORT_LENGTHS_M
 from scanchain.evaluation.errors import AbsoluteError as AbsoluteError
 from scanchain.evaluation.errors import Alignment as Alignment
@@ -30,10 +34,6 @@ from scanchain.evaluation.errors import relative_error_over_distance as relative
 from scanchain.evaluation.errors import relative_error_over_frames as relative_error_over_frames
 from scanchain.evaluation.errors import relative_error_over_time as relative_error_over_time
 from scanchain.evaluation.errors import relative_errors as relative_errors
-from scanchain.evaluation.map_sharpness import Sharpness as Sharpness
-from scanchain.evaluation.map_sharpness import sampled_map as sampled_map
-from scanchain.evaluation.map_sharpness import sampling_step as sampling_step
-from scanchain.evaluation.map_sharpness import sharpness as sharpness
 from scanchain.evaluation.pairing import Pairs as Pairs
 from scanchain.evaluation.pairing import TruthFile as TruthFile
 from scanchain.evaluation.pairing import check_overlap as check_overlap

@@ -73,10 +73,9 @@ def align(estimate: Matrix, reference: Matrix, alignment: Alignment) -> Pose:
         raise InputError(
             f"rigid alignment is undetermined: {error}; align by the first pose or not at all"
         ) from None
-    if d == 3:
-        return T
-    T = lie.lift(T)
-    T[2, 3] = reference[0, 2, 3] - estimate[0, 2, 3]
+    if d == 2:
+        T = lie.lift(T)
+        T[2, 3] = reference[0, 2, 3] - estimate[0, 2, 3]
     return T
 
 
@@ -154,8 +153,6 @@ class Metric:
 class AbsoluteError(Metric):
     """ATE over paired poses (Sturm et al. 2012, eq. 3; Zhang & Scaramuzza 2018).
 
-    Attributes
-    ----------
     alignment : how the frames were brought together
     translation_m : of ‖t_ref − t_est‖
     rotation_rad : of the angle of R_refᵀ R_est; after a rigid alignment turned by the best common rotation
@@ -251,8 +248,6 @@ def _turned(estimate: Matrix, reference: Matrix) -> Matrix:
 class RelativeError(Metric):
     """RPE over stretches of one size (Sturm et al. 2012, eq. 1; Kümmerle et al. 2009).
 
-    Attributes
-    ----------
     size : of the stretches, in words
     translation_m, rotation_rad : of E = (R_i⁻¹ R_j)⁻¹ (P_i⁻¹ P_j), R the reference and P the estimate
     stretches : (M, 2) int64 places i, j among the pairs
@@ -346,8 +341,6 @@ class LengthError:
 class KittiError:
     """Drift, averaged over all stretches of all lengths (Geiger et al. 2012).
 
-    Attributes
-    ----------
     definition : of the figures, as text; pairing : over which poses
     translation_share : ‖t‖ / length; times 100 it is the published per cent
     rotation_rad_per_m : angle / length
@@ -458,8 +451,6 @@ class Relations:
 class RelationError(Metric):
     """Error over relations (Kümmerle et al. 2009, eq. 4, its translational and rotational parts apart).
 
-    Attributes
-    ----------
     translation_m, translation_squared_m2 : of ‖trans(δ*⁻¹ δ)‖ and of its square
     rotation_rad, rotation_squared_rad2 : of |rot(δ*⁻¹ δ)| and of its square
     missing : relations left out because the trajectory has no pose at one of their stamps

@@ -28,8 +28,6 @@ _SLACK_NS = 1_000_000_000  # largest error of the expected stamps of a log's sca
 class Pairs:
     """Estimate and reference, pose by pose, in the order and at the stamps of the estimate.
 
-    Attributes
-    ----------
     stamps_ns : (N,) int64, the estimate's
     estimate, reference : (N, 4, 4) poses; SE(2) lifted into the plane z = 0
     places : (N,) int64, of the poses among those of the estimate

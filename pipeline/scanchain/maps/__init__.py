@@ -1,9 +1,8 @@
 """Maps of the world: a point cloud and an occupancy grid, written in formats others read."""
 
 from scanchain.maps.files import read_map, read_ply, write_laz, write_map, write_pcd, write_ply
-from scanchain.maps.moving import View, clearly_through, moved, reach_of, sightings
 from scanchain.maps.occupancy_grid import OccupancyGrid, draw_grid, fitting_resolution
-from scanchain.maps.point_map import PointMap, build_point_map
+from scanchain.maps.point_map import PointMap, View, build_point_map, clearly_through, moved, reach_of, sightings
 from scanchain.maps.saved_map import (
     MAP_FOLDER,
     Edges,

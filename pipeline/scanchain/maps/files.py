@@ -50,10 +50,7 @@ _YAML_NUMBERS = re.compile(r"resolution: (\S+)\norigin: \[(\S+), (\S+), 0\]")
 
 
 def write_ply(
-    path: Path | str,
-    points: Points,
-    columns: Mapping[str, NDArray] | None = None,
-    comment: str = _PLY_COMMENT,
+    path: Path | str, points: Points, columns: Mapping[str, NDArray] | None = None, comment: str = _PLY_COMMENT
 ) -> None:
     """Write points (N, d) as binary little-endian PLY of float32, with further columns (N,) of u1 or i4."""
     named = dict(zip("xyz", _in_space(points).T, strict=True)) | dict(columns or {})

@@ -30,8 +30,6 @@ class OccupancyGrid:
     2D scans are drawn as they are. Of 3D scans the returns count that lie between ``slice_min_z_m`` and
     ``slice_max_z_m`` above the lidar, along the world's z. Returns beyond ``grid_max_range_m`` do not count.
 
-    Attributes
-    ----------
     resolution_m : edge of a cell
     origin_m : (2,) outer corner of cell (0, 0), the one of least x and y
     log_odds : (rows, columns) float32, row along y; 0 where nothing was seen

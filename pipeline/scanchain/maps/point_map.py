@@ -1,27 +1,41 @@
-"""A point cloud of the world with one point a voxel."""
+"""A point cloud of the world with one point a voxel, and what moved in it: points that other scans saw through."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scanchain import lie
 from scanchain.checks import LARGEST
 from scanchain.data import Points, Pose
 from scanchain.errors import InputError
 from scanchain.kernels import maps as kernels
+from scanchain.kernels.free_space import nearest_ranges, weigh_points
 from scanchain.kernels.voxels import EMPTY
+from scanchain.threads import threads
 
 MAX_VOXELS = 16_000_000  # largest number of voxels: a gigabyte
 _FIRST_VOXELS = 1 << 14
+
+_COLUMNS = 720  # bins of azimuth, 0.5°; as fine in elevation
+_REACH_BINS = 1.5  # width of a bin in voxels at the farthest range that a scan is used to
+_CUBES_TO_REACH = 8.0  # cubes that points are sorted by, along the reach
+_WINDOW = 0.6  # share of a scan's spacing, within which a surface has a point
+_RANGE_MARGIN_SHARE = 0.03  # share of a range by which two may differ, beside one voxel
+_LEVEL_VOXELS, _LEVEL_SHARE = 0.5, 0.005  # flatness assumed of the ground in voxels, error of an elevation
+_LEAST_THROUGH = 2  # least number of scans that saw through what moved
+_MAJORITY = 1.5  # least ratio of scans that saw through to scans that saw a surface there
+_ENOUGH = 12  # number of scans that saw a surface, for which it stays
+_EVERY = np.iinfo(np.int32).max  # a limit that no number of scans reaches
 
 
 class PointMap:
     """Scans added up in the world frame; each voxel keeps the mean of its points.
 
-    Attributes
-    ----------
     voxel_size_m : edge of a voxel; doubled each time that ``max_voxels`` of them do not suffice, or that a point
         lies a million of them from the first scan
     dimension : 2 or 3, of the points
@@ -90,3 +104,89 @@ def build_point_map(
     for T_world_lidar, points in scans:
         result.insert(T_world_lidar, points)
     return result
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A scan with the ranges of its free space.
+
+    T_world_lidar : (d+1, d+1)
+    points : (M, d) meters, lidar frame
+    spacing_m : edge of the voxels that the scan was downsampled with; a surface has a point in each
+    """
+
+    T_world_lidar: Pose
+    points: Points
+    spacing_m: float
+
+
+def moved(voxels: Points, voxel_size_m: float, views: Iterable[View]) -> NDArray[np.bool_]:
+    """True for points (N, d) of a map, one a voxel, that clearly more scans saw through than saw a surface there.
+
+    A surface that many scans saw stays, whatever others did: what stood there for long is part of the place.
+    """
+    seen, seen_through = sightings(voxels, voxel_size_m, views, enough=_ENOUGH)
+    return clearly_through(seen, seen_through) & (seen < _ENOUGH)
+
+
+def clearly_through(seen: NDArray[np.int32], seen_through: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """True for points that clearly more scans saw through than saw a surface there."""
+    return (seen_through >= _LEAST_THROUGH) & (seen_through > _MAJORITY * seen)
+
+
+def reach_of(voxel_size_m: float) -> float:
+    """Range up to which scans are compared with the points of a map of such voxels, meters."""
+    return _REACH_BINS * voxel_size_m * _COLUMNS / (2.0 * np.pi)
+
+
+def sightings(
+    voxels: Points, voxel_size_m: float, views: Iterable[View], *, enough: int = _EVERY
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Numbers of scans that saw a surface at each point (N, d) of a map, one a voxel, and that saw through it.
+
+    enough : a point that so many scans saw is not tested again
+    """
+    index = _Cells(lie.lift_points(voxels), reach_of(voxel_size_m))
+    seen, seen_through = np.zeros((2, len(voxels)), np.int32)
+    ranges_m = np.empty((1 if voxels.shape[1] == 2 else _COLUMNS // 2, _COLUMNS))
+    count = threads()
+    with ThreadPoolExecutor(count) as pool:  # no point depends on another, and kernels let others run
+        for view in views:
+            nearest_ranges(lie.lift_points(view.points), ranges_m)
+            T_world_lidar = lie.lift(view.T_world_lidar)
+            T_lidar_world, spans = lie.inverse(T_world_lidar), index.within_reach(T_world_lidar[:3, 3])
+            limits = np.array([
+                index.reach_m, max(_WINDOW * view.spacing_m, voxel_size_m), voxel_size_m, _RANGE_MARGIN_SHARE,
+                _LEVEL_VOXELS * voxel_size_m, _LEVEL_SHARE,
+            ])  # fmt: skip
+            parts = [
+                pool.submit(
+                    weigh_points, index.points, np.ascontiguousarray(spans[k::count]), T_lidar_world, ranges_m,
+                    limits, enough, seen, seen_through,
+                )
+                for k in range(count)
+            ]  # fmt: skip
+            for part in parts:
+                part.result()
+    order = np.argsort(index.order)
+    return seen[order], seen_through[order]
+
+
+class _Cells:
+    """Points sorted by cubes, so that a scan tests those within reach alone, and neighbors in turn."""
+
+    def __init__(self, points: Points, reach_m: float) -> None:
+        self.reach_m = reach_m
+        self.edge_m = reach_m / _CUBES_TO_REACH
+        cubes = np.floor(points / self.edge_m)
+        self.order = np.lexsort(cubes.T)
+        self.points, cubes = points[self.order], cubes[self.order]
+        is_first = np.append(True, (cubes[1:] != cubes[:-1]).any(axis=1))[: len(points)]
+        first = np.flatnonzero(is_first)
+        self.middles_m = (cubes[first] + 0.5) * self.edge_m
+        self.spans = np.column_stack([first, np.append(first, len(points))[1:]])
+
+    def within_reach(self, place_m: NDArray[np.float64]) -> NDArray[np.int64]:
+        """(S, 2) spans of the points in cubes that are, in part, within reach of a position."""
+        outside_m = np.maximum(np.abs(self.middles_m - place_m) - 0.5 * self.edge_m, 0.0)
+        return self.spans[np.einsum("ij,ij->i", outside_m, outside_m) <= self.reach_m**2]

@@ -30,6 +30,10 @@ MAP_FOLDER = "map"
 VERSION = 2
 _INDEX, _KEYFRAMES, _EDGES, _POINTS = "map.json", "keyframes.npz", "edges.npz", "points.i16"
 _NUMBER, _WIDE = np.dtype("<i2"), np.dtype("<i4")
+_ROW = np.dtype([
+    ("count", np.int64), ("step_m", np.float64), ("is_wide", np.bool_), ("stamps_ns", np.int64),
+    ("scan_index", np.int64), ("traveled_m", np.float64), ("scale", np.float64),
+])  # fmt: skip
 _STEP_M = 0.001  # of coordinates on disk, more where the keyframe reaches farther than 33 m
 _WIDE_FROM_M = 0.01  # step from which on they take 32 bits: one far return must not make all points coarse
 _BLOCK = 1 << 20
@@ -59,8 +63,6 @@ class _Index(msgspec.Struct, frozen=True):
 class Edges:
     """Edges of a pose graph.
 
-    Attributes
-    ----------
     pairs : (E, 2) int64 keyframes (i, j)
     measurements : (E, d+1, d+1) T_ij; information : (E, k, k) of a right twist on it
     is_loop : (E,) bool; weight : (E,) robust weight
@@ -108,8 +110,6 @@ class SavedPoints:
 class SavedMap:
     """A map, as it is written to disk and opened from there.
 
-    Attributes
-    ----------
     folder : where it lies
     dimension : 2 or 3
     keyframes : their ``T_odom_lidar`` is the final pose, T_map_lidar
@@ -141,29 +141,19 @@ def write_saved_map(saved: SavedMap) -> None:
     """Write a map into its folder, which is new; map.json comes last."""
     folder, keyframes = saved.folder, saved.keyframes
     folder.mkdir(parents=True)
-    stored: list[tuple[int, float, bool]] = []
+    rows = np.empty(len(keyframes), _ROW)
     with (folder / _POINTS).open("wb") as file:
-        for keyframe in keyframes:
-            points = keyframe.points
+        for place, each in enumerate(keyframes):
+            points = each.points
             reach_m = float(np.abs(points).max(initial=0.0))
             is_wide = reach_m > _WIDE_FROM_M * np.iinfo(_NUMBER).max
             number = _WIDE if is_wide else _NUMBER
             step_m = max(reach_m / np.iinfo(number).max, _STEP_M)
             file.write(np.rint(points / step_m).astype(number).tobytes())
-            stored.append((len(points), step_m, is_wide))
-    rows = np.array(stored, [("count", np.int64), ("step_m", np.float64), ("is_wide", np.bool_)])
-    np.savez(
-        folder / _KEYFRAMES,
-        poses=saved.poses,
-        session=saved.session,
-        count=rows["count"],
-        step_m=rows["step_m"],
-        is_wide=rows["is_wide"],
-        stamps_ns=np.array([keyframe.stamp_ns for keyframe in keyframes], np.int64),
-        scan_index=np.array([keyframe.scan_index for keyframe in keyframes], np.int64),
-        traveled_m=np.array([keyframe.traveled_m for keyframe in keyframes]),
-        scale=np.array([keyframe.scale for keyframe in keyframes]),
-    )
+            stored = len(points), step_m, is_wide
+            rows[place] = *stored, each.stamp_ns, each.scan_index, each.traveled_m, each.scale
+    columns: dict[str, Any] = {name: rows[name] for name in _ROW.names or ()}
+    np.savez(folder / _KEYFRAMES, poses=saved.poses, session=saved.session, **columns)
     np.savez(folder / _EDGES, **{name: getattr(saved.edges, name) for name in _EDGE_ARRAYS})
     crc32 = {name: _crc32(folder / name) for name in (_KEYFRAMES, _EDGES, _POINTS)}
     points = int(rows["count"].sum())
@@ -209,21 +199,13 @@ def _keyframes(rows: dict[str, Any], path: Path, d: int) -> tuple[Keyframe, ...]
     sizes = rows["count"] * d * np.where(rows["is_wide"], 2, 1)
     ends = np.cumsum(sizes)
     points = np.memmap(path, _NUMBER, "r") if sizes.any() else np.empty(0, _NUMBER)
-    return tuple(
-        Keyframe(
-            index=k,
-            scan_index=int(rows["scan_index"][k]),
-            stamp_ns=int(rows["stamps_ns"][k]),
-            stored=SavedPoints(
-                points[end - size : end].view(_WIDE if rows["is_wide"][k] else _NUMBER).reshape(-1, d),
-                float(rows["step_m"][k]),
-            ),
-            T_odom_lidar=rows["poses"][k],
-            traveled_m=float(rows["traveled_m"][k]),
-            scale=float(rows["scale"][k]),
-        )
-        for k, (end, size) in enumerate(zip(ends.tolist(), sizes.tolist(), strict=True))
-    )
+    keyframes = []
+    columns = zip(*(rows[name].tolist() for name in _ROW.names or ()), strict=True)
+    for k, (_, step_m, is_wide, stamp_ns, scan_index, traveled_m, scale) in enumerate(columns):
+        numbers = points[ends[k] - sizes[k] : ends[k]].view(_WIDE if is_wide else _NUMBER).reshape(-1, d)
+        stored = SavedPoints(numbers, step_m)
+        keyframes.append(Keyframe(k, scan_index, stamp_ns, stored, rows["poses"][k], traveled_m, scale))
+    return tuple(keyframes)
 
 
 def _index(path: Path) -> _Index:

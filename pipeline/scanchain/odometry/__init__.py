@@ -2,7 +2,6 @@
 
 from scanchain.odometry.front_end import FrontEnd, Located
 from scanchain.odometry.intervals import LiveStamps
-from scanchain.odometry.odometry import Odometry, Tracked, checked_start
-from scanchain.odometry.tracked import owned
+from scanchain.odometry.odometry import Odometry, Tracked, checked_start, owned
 
 __all__ = ["FrontEnd", "LiveStamps", "Located", "Odometry", "Tracked", "checked_start", "owned"]

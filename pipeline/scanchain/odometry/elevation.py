@@ -44,8 +44,6 @@ class ElevationCalibration:
     Ground seen from afar lies too high or too low by the offset times the distance, and a map of such points
     pitches every scan that is aligned to it: an offset of 0.2°, as in KITTI, by 0.01° per meter.
 
-    Attributes
-    ----------
     offset_rad : what points are corrected by: the mean of the windows where it is significant, else 0
     sigma_rad : standard deviation of that mean, by the scatter of the windows; infinite before the first one
     """
@@ -88,7 +86,7 @@ class ElevationCalibration:
             self.left_out += 1
             return []
         own = sweep_of(scan, self.config, self.scale).from_middle(velocity)
-        if not self.collected and len(own):
+        if not self.collected:
             octaves = round(math.log2(float(np.median(np.linalg.norm(own, axis=1))) / (_RANGE_CELLS * _CELL_M)))
             self.scale = min(max(2.0**octaves, _SMALLEST), 1.0)
         self.collected.append((evenly(own, _POINTS), points, T_odom_lidar))
@@ -142,8 +140,6 @@ def adjusted(scans: list[Points], poses: Matrix, cell_m: float, offset_rad: floa
     three scans, are flat (plane adjustment; Liu and Zhang 2021). The ground may have any shape.
     """
     points, number = np.concatenate(scans), np.repeat(np.arange(len(scans)), [len(scan) for scan in scans])
-    if not len(points):
-        return Adjustment(poses, 0.0, math.inf)
     sigma_rad, last, n, size = math.inf, poses[-1], len(points), 6 * len(poses) + 1
     beside, normals, residual, plane = np.empty((n, 3)), np.empty((n, 3)), np.empty(n), np.empty(n, np.int32)
     for _ in range(_ROUNDS):

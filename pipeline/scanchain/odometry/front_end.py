@@ -9,8 +9,7 @@ from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import LEAST_FIT, KeyframeErrors, Matrix, Points, Pose, Scan, State
 from scanchain.kernels.matrices import definite_inverse
-from scanchain.odometry.odometry import Odometry
-from scanchain.odometry.tracked import Tracked
+from scanchain.odometry.odometry import Odometry, Tracked
 from scanchain.preprocess import Prepared
 
 _LATEST = 0.1  # weight of the last scan in the mean of the systematic errors

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -95,28 +96,25 @@ class LiveStamps:
     """Remembers the last stamps, and refuses those that are certainly wrong."""
 
     def __init__(self) -> None:
-        self.last_ns: int | None = None
-        self.intervals_s: list[float] = []
+        self.stamps_ns: list[int] = []
 
     def passed(self, scan: Scan, process: Callable[[Scan], Result]) -> Result:
         """The result of a scan, which is remembered after it.
 
         Raises InputError, and nothing changes, where its stamp or point times contradict those before.
         """
-        recent_s: list[float] = []
-        if self.last_ns is not None:
-            recent_s = [*self.intervals_s, 1e-9 * (scan.stamp_ns - self.last_ns)][-_REMEMBERED:]
-            self._check(scan, self.last_ns, recent_s)
+        stamps_ns = [*self.stamps_ns, scan.stamp_ns][-_REMEMBERED - 1 :]
+        self._check(scan, stamps_ns)
         result = process(scan)
-        self.last_ns, self.intervals_s = scan.stamp_ns, recent_s
+        self.stamps_ns = stamps_ns
         return result
 
-    def _check(self, scan: Scan, last_ns: int, recent_s: list[float]) -> None:
-        if scan.stamp_ns <= last_ns:
-            raise InputError(
-                f"stamp_s is {format_stamp(scan.stamp_ns)}, that of the scan before {format_stamp(last_ns)}; "
-                "wanted seconds that increase from scan to scan"
-            )
+    def _check(self, scan: Scan, stamps_ns: list[int]) -> None:
+        recent_s = [1e-9 * (after - before) for before, after in pairwise(stamps_ns)]
+        if recent_s and recent_s[-1] <= 0.0:
+            before, now = map(format_stamp, stamps_ns[-2:])
+            wanted = "wanted seconds that increase from scan to scan"
+            raise InputError(f"stamp_s is {now}, that of the scan before {before}; {wanted}")
         if len(recent_s) < _LOOKED_AT:
             return
         shortest_s, longest_s = min(recent_s[-_LOOKED_AT:]), max(recent_s[-_LOOKED_AT:])

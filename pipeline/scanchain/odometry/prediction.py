@@ -61,8 +61,6 @@ class MotionFilter:
     A match measures the pose. One that is a little off moves the pose, and the motion by as much as their errors
     are known to go together: the next match, which is right again, does not reverse the motion.
 
-    Attributes
-    ----------
     motion : T_previous_current, (d+1, d+1), over one scan
     pose_covariance, motion_covariance : (k, k) of twists in the lidar's own frame
     covariance : (k, k) of both, pose by motion
@@ -102,8 +100,6 @@ class MotionFilter:
 class Prediction(msgspec.Struct, frozen=True):
     """The predicted pose of a scan, and the motion before it, for other initial poses and for deskewing.
 
-    Attributes
-    ----------
     prior : predicted pose and its covariance
     is_guess : whether scans are missing before this one, so that the pose may be far off
     velocity : (k,) twist per second at the last scan, lidar frame
@@ -247,7 +243,10 @@ class Predictor:
         wheel, is_guess, jump_m = self._wheel_motion(scan) if by_wheels else None, False, 0.0
         self.is_contradicted = False
         if wheel is not None:
-            motion, covariance, jump_m = wheel, self.by_wheels.covariance, self._jump_m(wheel, interval_s)
+            motion, covariance = wheel, self.by_wheels.covariance
+            scans = max(interval_s / times.usual_s, 1.0) if times.usual_s else 1.0
+            if largest_magnitude(wheel - self.filter.motion) > _JUMP * scans:
+                jump_m = float(np.linalg.norm(wheel[:-1, -1] - scans * self.filter.motion[:-1, -1]))
         elif times.is_gap(interval_s):
             motion = _stretched(self.T_previous_current, interval_s, times.last_s, times.usual_s)
             covariance, is_guess = self.filter.any_motion, True
@@ -269,12 +268,6 @@ class Predictor:
             jump_m=jump_m,
             config=self.config,
         )
-
-    def _jump_m(self, wheel: Pose, interval_s: float) -> float:
-        scans = max(interval_s / self.intervals.usual_s, 1.0) if self.intervals.usual_s else 1.0
-        if largest_magnitude(wheel - self.filter.motion) <= _JUMP * scans:
-            return 0.0
-        return float(np.linalg.norm(wheel[:-1, -1] - scans * self.filter.motion[:-1, -1]))
 
     def drop_wheels(self, scan: Scan, jump_m: float) -> None:
         """Leave out the reading at this scan, which is off by so much, here and for the motion to the next."""

@@ -55,7 +55,8 @@ class Recovery:
         wide = self.wide_scans > 0 or prediction.is_guess
         best = self.matcher.align(points, surfaces, prediction.T_odom_lidar, prediction.prior, wide=wide)
         tried = [best]
-        is_contradicted = surfaces.dimension == 3 and self._is_contradicted(best)
+        unusual_cost = max(_UNUSUAL * self.usual_cost, self.rough_cost) * best.points
+        is_contradicted = surfaces.dimension == 3 and best.fit < LEAST_FIT and best.cost > unusual_cost
         if is_contradicted:
             best = self._searched(tried, points, sweep, surfaces, prediction)
         if not (is_contradicted and is_sound(best)) and self._is_uncertain(best.cost / len(points), prediction):
@@ -87,12 +88,6 @@ class Recovery:
     def forget(self) -> None:
         """Start with another map, in which the usual cost is unknown."""
         self.usual_cost = 0.0
-
-    def _is_contradicted(self, match: Match) -> bool:
-        """True if correspondences contradict the pose, and the cost per point is not as usual either."""
-        return (
-            match.fit < LEAST_FIT and match.cost > max(_UNUSUAL * self.usual_cost, self.rough_cost) * match.points
-        )
 
     def _is_uncertain(self, cost: float, prediction: Prediction) -> bool:
         """True if the cost per point is far above the usual one, and above a share of the greatest possible."""

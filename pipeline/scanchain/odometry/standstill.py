@@ -36,8 +36,6 @@ class Standstill:
     that move past draw matches aside for a while: the lidar stands where it stood unless it sets off, or ten scans
     in a row agree with another pose.
 
-    Attributes
-    ----------
     T_odom_lidar : the pose that is held
     bias : (k,) from it to the mean of the matches
     """

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from scanchain import checks, lie
-from scanchain.config import Config, PreprocessConfig
+from scanchain.config import Config
 from scanchain.data import AnyPoints, Match, Points, Pose
 from scanchain.errors import InputError
 from scanchain.preprocess import downsample
@@ -93,9 +93,12 @@ def _matched(
     target: Points, source: Points, T_first: Pose, T_pivot_source: Pose, range_m: float, config: Config
 ) -> Match:
     """The match of two clouds that fit the configuration; in the plane the best of several about a pivot."""
-    local_map = VoxelMap(target.shape[1], config.local_map)
-    local_map.insert(downsample(target, config.preprocess.map_voxel_m), lie.identity(target.shape[1]))
-    sparse = _downsampled(source, config.preprocess)
+    local_map, sizes = VoxelMap(target.shape[1], config.local_map), config.preprocess
+    local_map.insert(downsample(target, sizes.map_voxel_m), lie.identity(target.shape[1]))
+    sparse = downsample(source, sizes.match_voxel_m)
+    finer = math.sqrt(len(sparse) / sizes.match_points)
+    if finer < 1.0:  # voxels by so much, so that about as many points as wanted remain
+        sparse = downsample(source, max(finer * sizes.match_voxel_m, sizes.map_voxel_m))
     matcher = create_matcher(config.matching)
     match = matcher.align(sparse, local_map, T_first, wide=True)
     if local_map.dimension == 3:
@@ -123,15 +126,6 @@ def as_ambiguous(match: Match, apart_m: float, apart_rad: float) -> Match:
     """The same match, not converged because a pose so far away fits nearly as well."""
     reason = f"ambiguous: a pose {apart_m:.2g} m away, turned by {apart_rad:.2f} rad, fits nearly as well"
     return replace(match, converged=False, reason=reason, cause="ambiguous: another pose fits nearly as well")
-
-
-def _downsampled(points: Points, config: PreprocessConfig) -> Points:
-    """One point a voxel, of voxels so much finer than the coarsest that about ``match_points`` remain."""
-    coarse = downsample(points, config.match_voxel_m)
-    finer = math.sqrt(len(coarse) / config.match_points)
-    if finer >= 1.0:
-        return coarse
-    return downsample(points, max(finer * config.match_voxel_m, config.map_voxel_m))
 
 
 def _restored(match: Match, at_target: Pose, at_source: Pose, unit_m: float) -> Match:

@@ -46,9 +46,8 @@ class CheckedMatcher:
         try:
             self.own = kind(config)
         except Exception as error:  # of the user's own code
-            reason = one_line(error)
             raise InputError(
-                f"{name}: cannot be made with a MatchingConfig ({type(error).__name__}: {reason}); "
+                f"{name}: cannot be made with a MatchingConfig ({type(error).__name__}: {one_line(error)}); "
                 "wanted __init__(self, config)"
             ) from error
 
@@ -59,8 +58,9 @@ class CheckedMatcher:
         try:
             match = self.own.align(points, target, T_first, prior, wide=wide)
         except Exception as error:  # of the user's own code
-            reason = one_line(error)
-            raise InputError(f"{self.name}: align failed with {type(error).__name__}: {reason}") from error
+            raise InputError(
+                f"{self.name}: align failed with {type(error).__name__}: {one_line(error)}"
+            ) from error
         if not isinstance(match, Match):
             raise InputError(f"{self.name}: align returned {shown(match)}; wanted a scanchain.Match")
         d, of = len(T_first) - 1, f"{self.name}: of the Match that align returned,"

@@ -48,11 +48,9 @@ class PointToShapeMatcher:
     def align(
         self, points: AnyPoints, target: VoxelMap, T_first: Pose, prior: Prior | None = None, *, wide: bool = False
     ) -> Match:
-        """Pose of the scan in the map's frame, near the first one.
+        """Pose of the scan in the map's frame, near the first one; arguments as ``Matcher.align``.
 
-        points : (N, d) meters, lidar frame
-        prior : predicted pose and its covariance, which sets the first scale of the kernel
-        wide : search far, for a first pose that is little more than a guess
+        The covariance of the prior sets the first scale of the kernel.
         Raises InputError where points or first pose do not fit the map.
         """
         points, T_first = checked(points, target, T_first)

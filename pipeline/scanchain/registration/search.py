@@ -38,8 +38,6 @@ class Window:
 class Wanted(NamedTuple):
     """Poses that a search is to find.
 
-    Attributes
-    ----------
     apart_m : least distance of two distinct poses, or 0.1 rad
     rival : share of the best score, from which on further ones are found
     answers : largest number of poses
@@ -144,10 +142,11 @@ class Search:
         self.cells = self._turned(mixed, turns)
         blocks = _in_blocks(self.room)
         self.has_room = np.asarray(blocks.any(axis=(1, 3)))
-        self.spans = _spans(self.has_room)
+        past_last = self.has_room.shape[1] - self.has_room[:, ::-1].argmax(axis=1)  # in each row, if any has room
+        self.spans = np.column_stack([self.has_room.argmax(axis=1), past_last * self.has_room.any(axis=1)])
         self.full = SURFACE * len(points)
         self.least = max(wanted.least * self.full, 1.0)
-        additions = int(np.maximum(np.diff(self.spans), 0).sum()) * len(points)
+        additions = int(np.diff(self.spans).sum()) * len(points)
         self.headings = TURNS * max(_ADDITIONS // max(additions, 1), 1)
         self.turn = 0 if len(points) else turns
         self.reached = np.zeros(1)
@@ -262,11 +261,3 @@ def _in_blocks(cells: NDArray[Any]) -> NDArray[Any]:
     padded = np.zeros((rows * _SIZE, columns * _SIZE), cells.dtype)
     padded[: cells.shape[0], : cells.shape[1]] = cells
     return padded.reshape(rows, _SIZE, columns, _SIZE)
-
-
-def _spans(has_room: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """First window with room of each row, and past the last: (rows, 2)."""
-    columns = has_room.shape[1]
-    first = np.where(has_room.any(axis=1), has_room.argmax(axis=1), columns)
-    last = np.where(has_room.any(axis=1), columns - has_room[:, ::-1].argmax(axis=1), 0)
-    return np.column_stack([first, last])

@@ -71,7 +71,7 @@ class SvdMatcher:
     def align(
         self, points: AnyPoints, target: VoxelMap, T_first: Pose, prior: Prior | None = None, *, wide: bool = False
     ) -> Match:
-        """Pose of the scan in the map's frame, near the first one; arguments as ``PointToShapeMatcher.align``.
+        """Pose of the scan in the map's frame, near the first one; arguments as ``Matcher.align``.
 
         The closed form has no place for the prediction's information; ``prior`` is not used.
         """

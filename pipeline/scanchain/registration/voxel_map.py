@@ -62,8 +62,8 @@ class VoxelMap:
 
     def compact(self) -> None:
         """Free the memory that is there for further points."""
-        if _capacity(len(self), _LEAST_COMPACT) < len(self.voxels.cells):
-            kept = _empty(len(self), self.voxels.size_m, _LEAST_COMPACT)
+        kept = _empty(len(self), self.voxels.size_m, _LEAST_COMPACT)
+        if len(kept.cells) < len(self.voxels.cells):
             keep(self.voxels, kept, 0.0, 0.0, 0.0, np.inf, 0)
             self.voxels = kept
 
@@ -121,7 +121,7 @@ class MapKeeper:
 
 
 def _empty(room: int, voxel_size_m: float, least: int = _LEAST) -> Voxels:
-    capacity = _capacity(room, least)
+    capacity = 1 << int(np.ceil(np.log2(max(room, least))))
     return Voxels(
         rows=np.full(_SLOTS_PER_VOXEL * capacity, -1, np.int32),
         keys=np.empty(capacity, np.int64),
@@ -131,7 +131,3 @@ def _empty(room: int, voxel_size_m: float, least: int = _LEAST) -> Voxels:
         used=np.zeros(1, np.int64),
         size_m=voxel_size_m,
     )
-
-
-def _capacity(room: int, least: int) -> int:
-    return 1 << int(np.ceil(np.log2(max(room, least))))

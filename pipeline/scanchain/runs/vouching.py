@@ -16,6 +16,7 @@ from scanchain.config import Config
 from scanchain.data import VERIFICATION, Matrix, Proposal, Scan, State, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import ExpectedError, pair
+from scanchain.evaluation.consistency import velocities
 from scanchain.files import Source
 from scanchain.logs import Log, open_log
 from scanchain.preprocess import Resolution
@@ -238,9 +239,8 @@ def _matched(scans: Iterable[Scan], trajectory: Trajectory, config: Config) -> t
     """
     resolution = Resolution(config.preprocess, config.local_map.voxel_size_m)
     keeper, matcher = MapKeeper(trajectory.dimension, config.local_map), create_matcher(config.matching)
-    velocities = _velocities(trajectory)
     corrections, figures = [], []
-    for scan, T_world_lidar, velocity in zip(scans, trajectory.poses, velocities, strict=True):
+    for scan, T_world_lidar, velocity in zip(scans, trajectory.poses, velocities(trajectory), strict=True):
         sweep, sparse = resolution.downsampled(scan)
         keeper.resize(resolution.scale)
         points = sparse.from_middle(velocity)
@@ -255,11 +255,3 @@ def _matched(scans: Iterable[Scan], trajectory: Trajectory, config: Config) -> t
         figures.append(figure)
         keeper.extend(sweep.from_middle(velocity), T_world_middle)
     return np.array(corrections), np.array(figures).T
-
-
-def _velocities(trajectory: Trajectory) -> NDArray[np.float64]:
-    """(N, k) twist per second from each scan to the next, for deskewing; 0 where stamps stand still."""
-    seconds = 1e-9 * np.diff(trajectory.stamps_ns)[:, None]
-    twists = lie.log(lie.between(trajectory.poses[:-1], trajectory.poses[1:]))
-    velocities = np.divide(twists, seconds, out=np.zeros_like(twists), where=seconds > 0.0)
-    return np.vstack([velocities, velocities[-1:]])

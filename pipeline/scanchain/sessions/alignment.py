@@ -29,7 +29,7 @@ from scanchain.data import (
 from scanchain.errors import InputError, counted
 from scanchain.maps import Edges, SavedMap, open_saved_map
 from scanchain.odometry.front_end import Located
-from scanchain.odometry.tracked import Tracked, first_match
+from scanchain.odometry.odometry import Tracked, first_match
 from scanchain.slam import Slam
 
 _LATE = 10  # number of keyframes before the first one that was matched, from which on these are matched, too

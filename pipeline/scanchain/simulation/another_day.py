@@ -33,8 +33,6 @@ _COLUMNS = (
 class Change:
     """A movable object that is not where it was on the first day.
 
-    Attributes
-    ----------
     before, after : (3,) middle of its bounding box, meters; NaN where it was or is not there
     size_m : (3,) length, width and height of its upright bounding box when it was at yaw 0
     owner : number of the object among the solids of both days
@@ -135,8 +133,18 @@ def _middle(thing: Solids) -> NDArray[np.float64]:
 
 
 def _footprint(thing: Solids) -> Matrix:
-    """Points (N, 2) all over what it covers of the ground."""
-    return np.vstack([_rectangle(row) if row[0] == BOX else _disk(row[1:3], row[3:5]) for row in thing.rows])
+    """Points (N, 2) all over what it covers of the ground: on boxes, on rims of ellipses and in their centers."""
+    parts = []
+    for kind, x, y, half_x, half_y, c, s, _, _ in thing.rows:
+        if kind == BOX:
+            u, v = (np.linspace(-half, half, int(2.0 * half / _SAMPLE_M) + 2) for half in (half_x, half_y))
+            grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+            parts.append(grid @ np.array([[c, s], [-s, c]]) + [x, y])
+        else:
+            angle = np.linspace(0.0, 2.0 * np.pi, int(2.0 * np.pi * max(half_x, half_y) / _SAMPLE_M) + 6)
+            rim = np.column_stack([x + half_x * np.cos(angle), y + half_y * np.sin(angle)])
+            parts += [[[x, y]], rim]
+    return np.vstack(parts)
 
 
 def _moved(thing: Solids, shift: NDArray[np.float64], turn_rad: float) -> Solids:
@@ -151,17 +159,3 @@ def _moved(thing: Solids, shift: NDArray[np.float64], turn_rad: float) -> Solids
     rows[:, 7] += shift[2]
     rows[has_top, 8] += shift[2]
     return replace(thing, rows=rows)
-
-
-def _rectangle(box: NDArray[np.float64]) -> Matrix:
-    """Points (N, 2) on a box seen from above."""
-    u, v = (np.linspace(-half, half, int(2.0 * half / _SAMPLE_M) + 2) for half in box[3:5])
-    grid = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-    c, s = box[5:7]
-    return grid @ np.array([[c, s], [-s, c]]) + box[1:3]
-
-
-def _disk(center: NDArray[np.float64], radii: NDArray[np.float64]) -> Matrix:
-    """Points (N, 2) on the rim of an ellipse and its center."""
-    angle = np.linspace(0.0, 2.0 * np.pi, int(2.0 * np.pi * radii.max() / _SAMPLE_M) + 6)
-    return np.vstack([center, center + radii * np.column_stack([np.cos(angle), np.sin(angle)])])

@@ -47,8 +47,6 @@ NO_SLIP = Slip(0.0, 1.0, 0.0)
 class Drive:
     """A drive to record.
 
-    Attributes
-    ----------
     sensor : its reach is what the world lets it see
     T_base_lidar : (4, 4)
     scans : (K,) int64, which scans are recorded, counted from the first instant; the others fall into dropouts
@@ -75,10 +73,6 @@ class Drive:
         starts_ns = self.scans * self.sensor.period_ns
         poses = self.motion.lidar(starts_ns * 1e-9)
         return Trajectory(EPOCH_NS + starts_ns, lie.flatten(poses) if self.sensor.dimension == 2 else poses)
-
-    def random(self, purpose: int) -> np.random.Generator:
-        """Random numbers for one purpose."""
-        return _random(self.seed, purpose, self.changed)
 
 
 def plan(
@@ -239,7 +233,7 @@ def record(
 
 def _sweeps(drive: Drive) -> Iterator[Sweep]:
     """All recorded scans in order; the next is cast in a thread while the last is written."""
-    rng = drive.random(_RANGES)
+    rng = _random(drive.seed, _RANGES, drive.changed)
 
     def take(index: int) -> Sweep:
         start_s = index * drive.sensor.period_ns * 1e-9
@@ -262,7 +256,7 @@ class _Wheels:
         times_s = (self._stamps_ns - EPOCH_NS) * 1e-9
         begin_s, end_s, size_m = drive.wheels_slip
         slips_m = np.diff(size_m * np.clip((times_s - begin_s) / (end_s - begin_s), 0.0, 1.0))
-        poses, rng = drive.motion.base(times_s), drive.random(_WHEELS)
+        poses, rng = drive.motion.base(times_s), _random(drive.seed, _WHEELS, drive.changed)
         self._poses = wheel_odometry(poses, drift=drive.drift, rng=rng, slips_m=slips_m)
         self._covariance = np.diag([1e-4, 1e-4, 1e-6, 1e-6, 1e-6, 1e-4]) * max(drive.drift, 1e-3) ** 2
         self._next = 0

@@ -30,8 +30,6 @@ _NOISE_RAD = 0.004  # slip in heading, per √m
 class Vehicle:
     """Kinematics of a robot, a car or a walking person, and the mounting of the lidar.
 
-    Attributes
-    ----------
     speed_m_s, acceleration_m_s2, lateral_acceleration_m_s2 : limits along the path and in bends
     radius_m : half its width
     T_base_lidar : (4, 4)
@@ -91,28 +89,18 @@ class Motion:
         else:
             height_m, slope = place[:, 2], np.zeros_like(forward)
         poses = _stand(place[:, :2], height_m, slope, forward)
-        if self.vehicle.sway_rad > 0.0 or self.vehicle.heave_m > 0.0:
-            share = speed_m_s / self.vehicle.speed_m_s
-            poses = poses @ lie.exp(_sway(self.vehicle, self.phases, times_s, share))
+        v = self.vehicle
+        if v.sway_rad > 0.0 or v.heave_m > 0.0:  # a body on its springs or legs, the more the faster it goes
+            sizes = np.array([v.heave_m, v.sway_rad, v.sway_rad, v.swing_m, v.swing_rad])
+            waves = np.sin(2.0 * np.pi * _SWAY_HERTZ * times_s[:, None] + self.phases)
+            twists = np.zeros((len(times_s), 6))
+            twists[:, [2, 3, 4, 1, 5]] = (speed_m_s / v.speed_m_s)[:, None] * sizes * waves
+            poses = poses @ lie.exp(twists)
         return poses
 
     def lidar(self, times_s: NDArray[np.floating]) -> Matrix:
         """T_world_lidar at (N,) instants, (N, 4, 4)."""
         return self.base(times_s) @ self.vehicle.T_base_lidar
-
-
-def _sway(
-    vehicle: Vehicle, phases: NDArray[np.float64], times_s: NDArray[np.floating], share: NDArray[np.float64]
-) -> Matrix:
-    """Twists (N, 6) of a body on its springs or legs, as large as the ``share`` (N,) of the full speed.
-
-    phases : (5,) of heave, roll, pitch, sideways and heading
-    """
-    sizes = np.array([vehicle.heave_m, vehicle.sway_rad, vehicle.sway_rad, vehicle.swing_m, vehicle.swing_rad])
-    twist = np.zeros((len(times_s), 6))
-    waves = np.sin(2.0 * np.pi * _SWAY_HERTZ * times_s[:, None] + phases)
-    twist[:, [2, 3, 4, 1, 5]] = share[:, None] * sizes * waves
-    return twist
 
 
 def _stand(xy: Matrix, height_m: NDArray[np.float64], slope: Matrix, forward: Matrix) -> Matrix:
@@ -148,15 +136,10 @@ def wheel_odometry(
     turned = (
         lie.yaw(steps) * (1.0 + turn * _TURN_SHARE) + bias * _BIAS_RAD_PER_M * traveled + _NOISE_RAD * noise[:, 1]
     )
-    heading = np.concatenate([[0.0], np.cumsum(turned)])
-    c, s = np.cos(heading[:-1]), np.sin(heading[:-1])
+    poses = lie.exp(np.outer(np.concatenate([[0.0], np.cumsum(turned)]), [0.0, 0.0, 1.0]))  # at the origin
+    c, s = poses[:-1, 0, 0], poses[:-1, 1, 0]
     ahead = np.stack([c * moved[:, 0] - s * moved[:, 1], s * moved[:, 0] + c * moved[:, 1]], axis=1)
-    poses = np.zeros_like(planar)
-    poses[:, 0, 0] = poses[:, 1, 1] = np.cos(heading)
-    poses[:, 1, 0] = np.sin(heading)
-    poses[:, 0, 1] = -poses[:, 1, 0]
     poses[1:, :2, 2] = np.cumsum(ahead, axis=0)
-    poses[:, 2, 2] = 1.0
     return poses
 
 
@@ -275,7 +258,10 @@ def pivots(
 ) -> Motion:
     """Turns and short moves from the origin, heading along x: ``steps`` that end as they began, repeated."""
     phases = rng.uniform(0.0, 2.0 * np.pi, 5)
-    lap = np.vstack([_rates(step, vehicle) for step in steps])
+    turns = [_trapezoid(np.deg2rad(step.turn_deg), TURN_RAD_S, _TURN_RAD_S2) for step in steps]
+    moves = [_trapezoid(step.ahead_m, vehicle.speed_m_s, vehicle.acceleration_m_s2) for step in steps]
+    pairs = zip(turns, moves, strict=True)  # one after the other
+    lap = np.vstack([np.asarray(block_diag(turn[:, None], move[:, None])) for turn, move in pairs])
     rounds = int((duration_s + 2.0) / (len(lap) * _PIVOT_STEP_S)) + 1
     rates = np.vstack([np.zeros((round(_FIRST_PAUSE_S / _PIVOT_STEP_S), 2)), *[lap] * rounds])
     eased = np.asarray(gaussian_filter1d(rates, _PIVOT_EASE_S / _PIVOT_STEP_S, axis=0))
@@ -292,13 +278,6 @@ def pivots(
         return Course(place(times_s), forward, np.linalg.norm(place(times_s, 1), axis=1))
 
     return Motion(course, vehicle, solids, phases)
-
-
-def _rates(step: Pivot, vehicle: Vehicle) -> Matrix:
-    """Turning and moving speeds (T, 2) of one step, each followed by a pause."""
-    turn = _trapezoid(np.deg2rad(step.turn_deg), TURN_RAD_S, _TURN_RAD_S2)
-    ahead = _trapezoid(step.ahead_m, vehicle.speed_m_s, vehicle.acceleration_m_s2)
-    return np.asarray(block_diag(turn[:, np.newaxis], ahead[:, np.newaxis]))
 
 
 def _trapezoid(distance: float, limit: float, acceleration: float) -> NDArray[np.float64]:

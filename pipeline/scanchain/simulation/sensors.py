@@ -17,8 +17,6 @@ from scanchain.simulation.solids import Solids
 class Rays:
     """The rays of one scan, in the order they are fired.
 
-    Attributes
-    ----------
     directions : (N, 3) unit vectors, sensor frame
     instants_ns : (P,) int64, the firing instants after the scan's stamp, from 0 up
     instant_of_ray : (N,) int32
@@ -47,30 +45,28 @@ class Sensor:
     rays: Callable[[int], Rays]
 
 
+def _fired(azimuth: NDArray[np.float64], elevation: NDArray[np.float64], spacing_ns: float, columns: int) -> Rays:
+    """Rays (N,) of columns that are fired one after the other, those of a column together, the lowest first."""
+    level, rings = np.cos(elevation), len(azimuth) // columns
+    return Rays(
+        directions=np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=1),
+        instants_ns=np.rint(np.arange(columns) * spacing_ns).astype(np.int64),
+        instant_of_ray=np.repeat(np.arange(columns, dtype=np.int32), rings),
+        ring=np.tile(np.arange(rings, dtype=np.uint16), columns),
+    )
+
+
 def _planar(beams: int, step_deg: float, period_ns: int) -> Callable[[int], Rays]:
     """One ring that turns counter-clockwise and looks ahead; its blind angle is behind."""
     azimuth = np.deg2rad(step_deg) * (np.arange(beams) - 0.5 * (beams - 1))
-    rays = Rays(
-        directions=np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(beams)], axis=1),
-        instants_ns=np.rint(np.arange(beams) * (period_ns * step_deg / 360.0)).astype(np.int64),
-        instant_of_ray=np.arange(beams, dtype=np.int32),
-        ring=np.zeros(beams, dtype=np.uint16),
-    )
+    rays = _fired(azimuth, np.zeros(beams), period_ns * step_deg / 360.0, beams)
     return lambda index: rays
 
 
 def spinning(elevations_deg: NDArray[np.float64], columns: int, period_ns: int) -> Callable[[int], Rays]:
     """Rings that turn clockwise from straight behind; the rays of a column are fired together."""
-    rings = len(elevations_deg)
-    azimuth = np.repeat(np.pi - 2.0 * np.pi * np.arange(columns) / columns, rings)
-    elevation = np.tile(np.deg2rad(elevations_deg), columns)
-    level = np.cos(elevation)
-    rays = Rays(
-        directions=np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=1),
-        instants_ns=np.rint(np.arange(columns) * (period_ns / columns)).astype(np.int64),
-        instant_of_ray=np.repeat(np.arange(columns, dtype=np.int32), rings),
-        ring=np.tile(np.arange(rings, dtype=np.uint16), columns),
-    )
+    azimuth = np.repeat(np.pi - 2.0 * np.pi * np.arange(columns) / columns, len(elevations_deg))
+    rays = _fired(azimuth, np.tile(np.deg2rad(elevations_deg), columns), period_ns / columns, columns)
     return lambda index: rays
 
 
@@ -79,29 +75,19 @@ def _rosette(count: int, period_ns: int) -> Callable[[int], Rays]:
 
     Half the field of view is 19.2°; the wedges turn at 7294 and −4664 rpm (Livox Mid-40: Brazeal et al. 2021).
     """
-    instants_ns = np.rint(np.arange(count) * (period_ns / count)).astype(np.int64)
 
     def rays(index: int) -> Rays:
-        times_s = (index * period_ns + instants_ns) * 1e-9
+        times_s = (index * period_ns + np.rint(np.arange(count) * (period_ns / count))) * 1e-9
         first, second = (2.0 * np.pi * rpm / 60.0 * times_s for rpm in (7294.0, -4664.0))
         sideways = 0.5 * np.deg2rad(19.2) * (np.cos(first) + np.cos(second))
         upwards = 0.5 * np.deg2rad(19.2) * (np.sin(first) + np.sin(second))
-        level = np.cos(upwards)
-        return Rays(
-            np.stack([level * np.cos(sideways), level * np.sin(sideways), np.sin(upwards)], axis=1),
-            instants_ns,
-            np.arange(count, dtype=np.int32),
-            np.zeros(count, dtype=np.uint16),
-        )
+        return _fired(sideways, upwards, period_ns / count, count)
 
     return rays
 
 
 _TENTH_S = 100_000_000  # ns
-
-
 _HDL64_DEG = np.concatenate([np.linspace(-24.33, -8.83, 32), np.linspace(-8.33, 2.0, 32)])
-
 
 SENSORS: dict[str, Sensor] = {
     "lms-270": Sensor(2, _TENTH_S, 0.1, 30.0, 0.01, 0.01, _planar(541, 0.5, _TENTH_S)),

@@ -21,8 +21,6 @@ FIXED = -1  # owner of solids that belong to no movable object
 class Solids:
     """Closed solids above a rolling ground, meters, world frame.
 
-    Attributes
-    ----------
     rows : (S, 9) as ``cast_rays`` takes them
     owner : (S,) number of the movable object that each solid is a part of, FIXED for none
     ground : (7 + 4 W,) z = g0 + g1 sin(g2 x + g3) + g4 sin(g5 y + g6) + Σ a sin(b x + c y + d), W rows a, b, c, d
@@ -143,30 +141,26 @@ class Scenery:
 
     def box(self, center: Pair, size: Pair, z: Pair, yaw_rad: float = 0.0) -> None:
         """Put down a box: full lengths along its own axes, heights ``z`` above the ground at its center."""
-        half = (0.5 * size[0], 0.5 * size[1])
-        base = self._base(center)
-        self._put(BOX, center, half, (base + z[0], base + z[1]), (np.cos(yaw_rad), np.sin(yaw_rad)))
+        half, turn = (0.5 * size[0], 0.5 * size[1]), (np.cos(yaw_rad), np.sin(yaw_rad))
+        self._put(BOX, center, half, turn, z)
 
     def cylinder(self, center: Pair, radius: float, z: Pair) -> None:
         """Put down an upright cylinder, heights ``z`` above the ground at its center."""
-        base = self._base(center)
-        self._put(CYLINDER, center, (radius, radius), (base + z[0], base + z[1]))
+        self._put(CYLINDER, center, (radius, radius), (1.0, 0.0), z)
 
     def ellipsoid(self, center: tuple[float, float, float], radii: tuple[float, float, float]) -> None:
         """Put down an ellipsoid; its center's height counts from the ground there."""
-        x, y, z = center
-        self._put(ELLIPSOID, (x, y), radii[:2], (z + self._base((x, y)), radii[2]))
+        self._put(ELLIPSOID, center[:2], radii[:2], (1.0, 0.0), (center[2], radii[2]))
 
     def finish(self) -> Solids:
         """The solids put down so far."""
         return Solids(np.array(self._rows), np.array(self._owners), self._ground)
 
-    def _put(self, kind: float, place: Pair, half: Pair, heights: Pair, turn: Pair = (1.0, 0.0)) -> None:
-        self._rows.append((kind, *place, *half, *turn, *heights))
+    def _put(self, kind: float, place: Pair, half: Pair, turn: Pair, z: Pair) -> None:
+        base = float(_height(self._ground, np.array(place)))
+        second = z[1] if kind == ELLIPSOID else base + z[1]  # its radius, else the top
+        self._rows.append((kind, *place, *half, *turn, base + z[0], second))
         self._owners.append(self._owner)
-
-    def _base(self, center: Pair) -> float:
-        return float(_height(self._ground, np.array(center)))
 
 
 def _height(ground: NDArray[np.float64], xy: Matrix) -> NDArray[np.float64]:

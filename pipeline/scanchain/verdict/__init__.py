@@ -12,9 +12,8 @@ from scanchain.verdict.checks import (
     smallest_jump_m,
     wheel_bound_m,
 )
-from scanchain.verdict.closures import Closures
 from scanchain.verdict.judging import MOST_CONTRADICTED, Judged, Verdict, judge
-from scanchain.verdict.stretches import KNOWN, Evidence
+from scanchain.verdict.stretches import KNOWN, Closures, Evidence
 
 __all__ = [
     "KNOWN", "MOST_CONTRADICTED", "VELOCITY_LIMIT", "WHEEL_LIMIT", "Closures", "Evidence", "Judged", "Kind",

@@ -65,8 +65,6 @@ class Kind(StrEnum):
 class Stretch(Struct, frozen=True):
     """Consecutive suspicious scans.
 
-    Attributes
-    ----------
     first, last : scans, from 0; start_s, end_s : since the first scan of the run
     scans : of this kind among them
     size_m, size_rad : the contradiction; null where it is not measured
@@ -101,8 +99,6 @@ class Stretch(Struct, frozen=True):
 class WheelCheck(NamedTuple):
     """Trajectory against wheels around each scan, NaN where there is nothing to compare.
 
-    Attributes
-    ----------
     innovation : (N,) standard deviations
     apart_m, apart_rad : (N,) difference of the motions over ``WINDOW_M`` after calibration
     poses : (N, d+1, d+1) of the lidar by the wheels, NaN where unknown
@@ -154,7 +150,9 @@ def check_wheels(poses: Matrix, wheel_poses: Matrix) -> WheelCheck:
         (slice(d, None), check.apart_rad, _LEAST_RAD),
     ):
         calibration = _calibration(_over(inputs, first, last), _over(outputs[:, part], first, last), length_m)
-        difference = outputs[:, part] - _limited(inputs @ calibration, single_m)
+        correction = inputs @ calibration
+        largest = _LARGEST_CORRECTION * single_m / np.maximum(_lengths(correction), 1e-12)
+        difference = outputs[:, part] - correction * np.minimum(1.0, largest)[:, None]
         drift = _smoothed(np.cumsum(difference, axis=0), path_m)
         apart[checked] = _lengths(drift[last] - drift[first])
         share = np.percentile(apart[checked] / length_m, _TAIL) / _TAIL_SIGMAS
@@ -208,12 +206,9 @@ def check_overlap(inlier_share: Floats) -> Floats:
     What the lidar saw before it sees again, from nearby: where much of it is gone at once, the lidar is elsewhere
     than the map says, or something stands close before it.
     """
-    n = len(inlier_share)
-    usual = np.full(n, np.nan)
-    for scan in range(_FEWEST, min(_BEFORE, n)):
-        usual[scan] = np.median(inlier_share[:scan])
-    if n > _BEFORE:
-        usual[_BEFORE:] = np.median(sliding_window_view(inlier_share[:-1], _BEFORE), axis=1)
+    usual = np.full(len(inlier_share), np.nan)
+    padded = np.append(np.full(_BEFORE, np.nan), inlier_share)  # the first scans have fewer before them
+    usual[_FEWEST:] = np.nanmedian(sliding_window_view(padded, _BEFORE)[_FEWEST:-1], axis=1)
     return inlier_share / np.maximum(usual, _LEAST_USUAL)
 
 
@@ -271,12 +266,6 @@ def _calibration(inputs: Matrix, outputs: Matrix, length_m: Floats) -> Matrix:
         error = _lengths(B - A @ correction)
         weight = 1.0 / (1.0 + (error / max(1.5 * float(np.median(error)), 1e-3)) ** 2) * (weight > 0.0)
     return correction
-
-
-def _limited(corrections: Matrix, length_m: Floats) -> Matrix:
-    """Corrections (N, b) of at most a share of the path."""
-    size = np.maximum(_lengths(corrections), 1e-12)
-    return corrections * np.minimum(1.0, _LARGEST_CORRECTION * length_m / size)[:, None]
 
 
 def _lengths(vectors: Matrix) -> Floats:

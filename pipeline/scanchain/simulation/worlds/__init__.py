@@ -17,8 +17,6 @@ from scanchain.simulation.worlds import indoor, outdoor
 class World:
     """A world, the route through it, the vehicle, and the default lidar and duration.
 
-    Attributes
-    ----------
     build : draws the place
     route : the closed route driven, (W, 2) along the ground or (W, 3) at heights of its own, or turns and moves
     sight_m : how far any lidar sees there

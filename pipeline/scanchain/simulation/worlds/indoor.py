@@ -8,7 +8,8 @@ and is walked up and down with the lidar in the hand.
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,8 +24,7 @@ _WALL_M, _DOOR_M = 0.12, 1.0
 _ROUTE_M = 0.5  # distance from the robot's route that is kept free
 _DOORWAY_M = 1.0  # distance from a doorway that is kept free
 _TRIES = 12
-Kind = Literal["shelf", "desk", "bin", "plant"]
-_SIZES_M: dict[Kind, tuple[float, float]] = {
+_SIZES_M = {
     "shelf": (1.2, 0.35),
     "desk": (1.6, 1.5),  # with its chair
     "bin": (0.3, 0.3),
@@ -75,86 +75,74 @@ def build_wall(scenery: Scenery, wall: Wall, rng: np.random.Generator) -> None:
             scenery.box(middle, (2.0 * half, 0.04), (0.01, 2.1), wall.yaw_rad - wall.leaves * turn_rad)
 
 
-class Furnisher:
-    """Fills rooms at random; furniture that finds no room after a few tries is left out.
+def furnish(scenery: Scenery, rooms: Matrix, route: Matrix, doors: Matrix, rng: np.random.Generator) -> None:
+    """Fill rooms at random: shelves along the walls, a desk for every 5 m², bins and a plant.
 
-    Rooms are rectangles between the middles of their walls: low x, low y, high x, high y.
+    What finds no room after a few tries is left out.
+    rooms : (R, 4) rectangles between the middles of their walls: low x, low y, high x, high y
+    route, doors : (N, 2) positions that are kept free
     """
-
-    def __init__(self, scenery: Scenery, route: Matrix, doors: Matrix, rng: np.random.Generator) -> None:
-        self._scenery = scenery
-        self._route = route
-        self._doors = doors
-        self._rng = rng
-        self._taken: list[tuple[Matrix, Matrix]] = []  # center and half size
-
-    def furnish(self, room: Matrix) -> None:
-        """Shelves along the walls, a desk for every 5 m², bins and a plant."""
+    taken: list[Matrix] = []  # center and half size, (2, 2)
+    for room in rooms:
         desks = int(np.prod(room[2:] - room[:2]) / 5.0)
-        wishes: tuple[tuple[Kind, int], ...] = (("shelf", 3), ("desk", desks), ("bin", 2), ("plant", 1))
-        for kind, count in wishes:
-            for _ in range(count):
-                any(self._try(kind, room) for _ in range(_TRIES))
-
-    def _try(self, kind: Kind, room: Matrix) -> bool:
-        """Put one piece of furniture at a random position in the room, unless something overlaps it."""
-        upright = int(self._rng.integers(2))
-        half = 0.5 * np.array(_SIZES_M[kind])[[upright, 1 - upright]]
-        low, high = room[:2] + 0.1 + half, room[2:] - 0.1 - half
-        center = self._rng.uniform(low, high)
-        if kind == "shelf":  # its back to a wall
-            axis = 1 - upright
-            center[axis] = (low, high)[int(self._rng.integers(2))][axis]
-        if not self._is_free(center, half):
-            return False
-        self._taken.append((center, half))
-        with self._scenery.movable():
-            self._put(kind, float(center[0]), float(center[1]), 0.5 * np.pi * upright)
-        return True
-
-    def _is_free(self, center: Matrix, half: Matrix) -> bool:
-        if any(np.all(np.abs(center - other) < half + other_half + 0.05) for other, other_half in self._taken):
-            return False
-        free = ((self._route, _ROUTE_M), (self._doors, _DOORWAY_M))
-        return all(_distance_m(places, center, half) >= limit for places, limit in free)
-
-    def _put(self, kind: Kind, x: float, y: float, yaw_rad: float) -> None:
-        match kind:
-            case "shelf":
-                self._scenery.box((x, y), _SIZES_M["shelf"], (0.0, self._rng.uniform(0.8, 2.0)), yaw_rad)
-            case "desk":
-                self._put_desk(x, y, yaw_rad + np.pi * int(self._rng.integers(2)))
-            case "bin":
-                self._scenery.cylinder((x, y), 0.14, (0.0, 0.35))
-            case "plant":
-                self._scenery.cylinder((x, y), 0.18, (0.0, 0.4))
-                self._scenery.ellipsoid((x, y, 0.9), (0.35, 0.35, 0.5))
-
-    def _put_desk(self, x: float, y: float, yaw_rad: float) -> None:
-        """A table on four legs, drawers beneath it, a chair on its foot in front."""
-        c, s = np.cos(yaw_rad), np.sin(yaw_rad)
-
-        def at(u: float, v: float) -> tuple[float, float]:
-            return float(x + c * u - s * v), float(y + s * u + c * v)
-
-        self._scenery.box(at(0.0, 0.35), (1.6, 0.8), (0.71, 0.74), yaw_rad)
-        for u, v in ((-0.76, 0.0), (0.76, 0.0), (-0.76, 0.7), (0.76, 0.7)):
-            self._scenery.box(at(u, v), (0.06, 0.06), (0.0, 0.71), yaw_rad)
-        self._scenery.box(at(0.5, 0.4), (0.42, 0.58), (0.05, 0.65), yaw_rad)
-        chair = at(self._rng.uniform(-0.35, 0.2), self._rng.uniform(-0.4, -0.1))
-        self._scenery.cylinder(chair, 0.05, (0.0, 0.45))
-        self._scenery.cylinder(chair, 0.24, (0.45, 0.52))
+        kinds = [*["shelf"] * 3, *["desk"] * desks, *["bin"] * 2, "plant"]
+        for kind in kinds:
+            for _ in range(_TRIES):
+                upright = int(rng.integers(2))
+                half = 0.5 * np.array(_SIZES_M[kind])[[upright, 1 - upright]]
+                low, high = room[:2] + 0.1 + half, room[2:] - 0.1 - half
+                center = rng.uniform(low, high)
+                if kind == "shelf":  # its back to a wall
+                    axis = 1 - upright
+                    center[axis] = (low, high)[int(rng.integers(2))][axis]
+                if _is_free(center, half, taken, route, doors):
+                    taken.append(np.array([center, half]))
+                    x, y = center.tolist()
+                    with scenery.movable():
+                        _put(scenery, kind, x, y, 0.5 * np.pi * upright, rng)
+                    break
 
 
-def _distance_m(places: Matrix, center: Matrix, half: Matrix) -> float:
-    """Distance from the nearest of (N, 2) positions to an upright rectangle."""
-    outside = np.maximum(np.abs(places - center) - half, 0.0)
-    return float(np.linalg.norm(outside, axis=1).min())
+def _is_free(center: Matrix, half: Matrix, taken: list[Matrix], route: Matrix, doors: Matrix) -> bool:
+    """True if an upright rectangle overlaps no other one and leaves the route and the doorways free."""
+    if any(np.all(np.abs(center - other) < half + other_half + 0.05) for other, other_half in taken):
+        return False
+    kept_free = ((route, _ROUTE_M), (doors, _DOORWAY_M))
+    outside = ((np.maximum(np.abs(places - center) - half, 0.0), limit_m) for places, limit_m in kept_free)
+    return all(np.linalg.norm(each, axis=1).min() >= limit_m for each, limit_m in outside)
+
+
+def _put(scenery: Scenery, kind: str, x: float, y: float, yaw_rad: float, rng: np.random.Generator) -> None:
+    match kind:
+        case "shelf":
+            scenery.box((x, y), _SIZES_M["shelf"], (0.0, rng.uniform(0.8, 2.0)), yaw_rad)
+        case "desk":
+            _put_desk(scenery, x, y, yaw_rad + np.pi * int(rng.integers(2)), rng)
+        case "bin":
+            scenery.cylinder((x, y), 0.14, (0.0, 0.35))
+        case "plant":
+            scenery.cylinder((x, y), 0.18, (0.0, 0.4))
+            scenery.ellipsoid((x, y, 0.9), (0.35, 0.35, 0.5))
+
+
+def _put_desk(scenery: Scenery, x: float, y: float, yaw_rad: float, rng: np.random.Generator) -> None:
+    """A table on four legs, drawers beneath it, a chair on its foot in front."""
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+
+    def at(u: float, v: float) -> tuple[float, float]:
+        return float(x + c * u - s * v), float(y + s * u + c * v)
+
+    scenery.box(at(0.0, 0.35), (1.6, 0.8), (0.71, 0.74), yaw_rad)
+    for u, v in ((-0.76, 0.0), (0.76, 0.0), (-0.76, 0.7), (0.76, 0.7)):
+        scenery.box(at(u, v), (0.06, 0.06), (0.0, 0.71), yaw_rad)
+    scenery.box(at(0.5, 0.4), (0.42, 0.58), (0.05, 0.65), yaw_rad)
+    chair = at(rng.uniform(-0.35, 0.2), rng.uniform(-0.4, -0.1))
+    scenery.cylinder(chair, 0.05, (0.0, 0.45))
+    scenery.cylinder(chair, 0.24, (0.45, 0.52))
 
 
 # the office
 
-_OFFICE_WIDTH_M, _OFFICE_DEPTH_M = 26.0, 18.0
 OFFICE_ROBOT = Vehicle(
     speed_m_s=1.0, acceleration_m_s2=0.5, lateral_acceleration_m_s2=0.5, corner_m=0.6, deviation_m=0.05,
     radius_m=0.25, T_base_lidar=mount(0.15, 0.25),
@@ -189,16 +177,13 @@ _ROOMS = np.array([
 def office(rng: np.random.Generator) -> Solids:
     """The floor; walls and doorways stand where they stand, furniture and door leaves are drawn from ``rng``."""
     scenery = Scenery()
-    middle, size = (0.5 * _OFFICE_WIDTH_M, 0.5 * _OFFICE_DEPTH_M), (_OFFICE_WIDTH_M + 1.0, _OFFICE_DEPTH_M + 1.0)
-    scenery.box(middle, size, (_CEILING_M, _CEILING_M + 0.2))
+    scenery.box((13.0, 9.0), (27.0, 19.0), (_CEILING_M, _CEILING_M + 0.2))
     for wall in _WALLS:
         build_wall(scenery, wall, rng)
     scenery.box((8.25, 9.0), (2.4, 5.88), (0.0, _CEILING_M))  # lift shaft in the closed part of the core
     _line_corridor(scenery, rng)
     doors = np.array([wall.at(place) for wall in _WALLS for place in wall.doors])
-    furnisher = Furnisher(scenery, sampled(OFFICE_ROUTE, 0.05), doors, rng)
-    for room in _ROOMS:
-        furnisher.furnish(room)
+    furnish(scenery, _ROOMS, sampled(OFFICE_ROUTE, 0.05), doors, rng)
     return scenery.finish()
 
 
@@ -244,41 +229,26 @@ def identical(rng: np.random.Generator) -> Solids:
     scenery = Scenery()
     middle = (0.5 * _FLOOR_M, _CORRIDORS_Y_M[1])
     scenery.box(middle, (_FLOOR_M + 6.0, 46.0), (_CEILING_M, _CEILING_M + 0.2))
-    for wall in _identical_walls():
-        build_wall(scenery, wall, rng)
-    for y in _CORRIDORS_Y_M:
-        for side in (-1.0, 1.0):
-            for room in range(_ROOMS_A_SIDE):
-                middle = (room + 0.5) * _ROOM_M, y + side * (_AISLE_HALF_M + 0.5 * _ROOM_DEPTH_M)
-                _furnish_alike(scenery, *middle, side, furniture)
-    return scenery.finish()
-
-
-def _identical_walls() -> list[Wall]:
-    """Every corridor's two sides, the walls between its rooms and behind them, and the two ends of the floor."""
     doors = tuple((room + 0.5) * _ROOM_M for room in range(_ROOMS_A_SIDE))
-    walls: list[Wall] = []
-    for y in _CORRIDORS_Y_M:
-        for side in (-1.0, 1.0):
-            near, far = y + side * _AISLE_HALF_M, y + side * (_AISLE_HALF_M + _ROOM_DEPTH_M)
-            walls.append(Wall(0.0, near, _FLOOR_M, near, doors))
-            walls.append(Wall(0.0, far, _FLOOR_M, far))
-            for room in range(_ROOMS_A_SIDE + 1):
-                x = room * _ROOM_M
-                walls.append(Wall(x, near, x, far, (0.5 * _ROOM_DEPTH_M,) if 0 < room < _ROOMS_A_SIDE else ()))
+    for y, side in product(_CORRIDORS_Y_M, (-1.0, 1.0)):
+        near, far = y + side * _AISLE_HALF_M, y + side * (_AISLE_HALF_M + _ROOM_DEPTH_M)
+        walls = [Wall(0.0, near, _FLOOR_M, near, doors), Wall(0.0, far, _FLOOR_M, far)]
+        for room in range(_ROOMS_A_SIDE + 1):
+            x, is_between = room * _ROOM_M, 0 < room < _ROOMS_A_SIDE
+            walls.append(Wall(x, near, x, far, (0.5 * _ROOM_DEPTH_M,) if is_between else ()))
+        for wall in walls:
+            build_wall(scenery, wall, rng)
+        for door in doors:  # rooms on the two sides of a corridor are turned by 180°
+            for u, v, length, width, height in furniture:
+                with scenery.movable():
+                    center = (door + side * u, y + side * (_AISLE_HALF_M + 0.5 * _ROOM_DEPTH_M) + side * v)
+                    scenery.box(center, (length, width), (0.0, height), 0.0 if side > 0.0 else np.pi)
     south, north = _CORRIDORS_Y_M[0] - _AISLE_HALF_M, _CORRIDORS_Y_M[-1] + _AISLE_HALF_M
     for inner, outer in ((0.0, 2.0 * _WEST_M), (_FLOOR_M, _FLOOR_M + 2.0 * _AISLE_HALF_M)):
-        walls.append(Wall(outer, south, outer, north))
-        walls += [Wall(min(inner, outer), y, max(inner, outer), y) for y in (south, north)]
-    return walls
-
-
-def _furnish_alike(scenery: Scenery, x: float, y: float, side: float, furniture: Matrix) -> None:
-    """The same furniture in the room around (x, y); rooms on the two sides of a corridor are turned by 180°."""
-    yaw_rad = 0.0 if side > 0.0 else np.pi
-    for u, v, length, width, height in furniture:
-        with scenery.movable():
-            scenery.box((x + side * u, y + side * v), (length, width), (0.0, height), yaw_rad)
+        ends = [Wall(min(inner, outer), y, max(inner, outer), y) for y in (south, north)]
+        for wall in (Wall(outer, south, outer, north), *ends):
+            build_wall(scenery, wall, rng)
+    return scenery.finish()
 
 
 # the corridor
@@ -310,8 +280,7 @@ def corridor(rng: np.random.Generator) -> Solids:
         y = side * (_CORRIDOR_HALF_M + 0.5 * _CORRIDOR_WALL_M)
         scenery.box((middle, y), (CORRIDOR_M, _CORRIDOR_WALL_M), (0.0, _CORRIDOR_HEIGHT_M))
     for end, outwards in ((0.0, -1.0), (CORRIDOR_M, 1.0)):
-        _lobby(scenery, end, outwards)
-        _furnish_lobby(scenery, end, outwards, rng)
+        _lobby(scenery, end, outwards, rng)
         for place in rng.uniform([0.5, 2.0, 3.5], [1.5, 3.0, CORRIDOR_STRUCTURE_M - 0.2]):
             size = (rng.uniform(0.1, 0.3), rng.uniform(0.05, 0.2))
             for side in (-1.0, 1.0):
@@ -320,8 +289,11 @@ def corridor(rng: np.random.Generator) -> Solids:
     return scenery.finish()
 
 
-def _lobby(scenery: Scenery, end: float, outwards: float) -> None:
-    """The walls of a lobby; the corridor opens in the middle of the one at x = ``end``."""
+def _lobby(scenery: Scenery, end: float, outwards: float, rng: np.random.Generator) -> None:
+    """A lobby: walls, cupboards and benches along them, a plant in two corners.
+
+    The corridor opens in the middle of the wall at x = ``end``.
+    """
     far = end + outwards * (_LOBBY_M + 0.5 * _CORRIDOR_WALL_M)
     scenery.box(
         (far, 0.0), (_CORRIDOR_WALL_M, 2.0 * _LOBBY_HALF_M + 2.0 * _CORRIDOR_WALL_M), (0.0, _CORRIDOR_HEIGHT_M)
@@ -332,10 +304,6 @@ def _lobby(scenery: Scenery, end: float, outwards: float) -> None:
         width = _LOBBY_HALF_M - _CORRIDOR_HALF_M
         center = (end - outwards * 0.5 * _CORRIDOR_WALL_M, side * (_CORRIDOR_HALF_M + 0.5 * width))
         scenery.box(center, (_CORRIDOR_WALL_M, width), (0.0, _CORRIDOR_HEIGHT_M))
-
-
-def _furnish_lobby(scenery: Scenery, end: float, outwards: float, rng: np.random.Generator) -> None:
-    """Cupboards and benches along the lobby's walls, a plant in two corners."""
     for depth in (1.2, 3.5, 5.8):
         for side in (-1.0, 1.0):
             size = (rng.uniform(0.6, 1.8), rng.uniform(0.3, 0.7))
@@ -423,7 +391,10 @@ def staircase(rng: np.random.Generator) -> Solids:
         scenery.box((middle + side * (0.5 * length + 0.1), 0.0), (0.2, 2.0 * _STAIR_HALF_M), (0.0, _ROOF_M))
     for flight in range(_FLIGHTS):
         _flight(scenery, flight)
-        _landing(scenery, flight, rng)
+        far, outwards = (_RUN_M, 1.0) if flight % 2 == 0 else (0.0, -1.0)
+        level, center = (flight + 1) * _FLIGHT_M, (far + outwards * 0.5 * _LANDING_M, 0.0)
+        scenery.box(center, (_LANDING_M, 2.0 * _STAIR_HALF_M), (level - 0.2, level))
+        _furnish_landing(scenery, level, far + outwards * _LANDING_M, outwards, rng)
     _furnish_landing(scenery, 0.0, -_LANDING_M, -1.0, rng)
     for y in (-_STAIR_HALF_M + 0.1, _STAIR_HALF_M - 0.1):
         scenery.cylinder((-_LANDING_M + 0.1, y), rng.uniform(0.03, 0.08), (0.0, _ROOF_M))
@@ -440,14 +411,6 @@ def _flight(scenery: Scenery, flight: int) -> None:
         scenery.box((x, side * (0.1 + 0.5 * width)), (_TREAD_M, width), (top - _RISE_M - 0.12, top))
         scenery.cylinder((x, side * 0.13), 0.015, (top, top + 0.85))
         scenery.box((x, side * 0.13), (_TREAD_M, 0.05), (top + 0.85, top + 0.9))
-
-
-def _landing(scenery: Scenery, flight: int, rng: np.random.Generator) -> None:
-    """The slab at the upper end of a flight and what stands at its wall."""
-    far, outwards = (_RUN_M, 1.0) if flight % 2 == 0 else (0.0, -1.0)
-    level = (flight + 1) * _FLIGHT_M
-    scenery.box((far + outwards * 0.5 * _LANDING_M, 0.0), (_LANDING_M, 2.0 * _STAIR_HALF_M), (level - 0.2, level))
-    _furnish_landing(scenery, level, far + outwards * _LANDING_M, outwards, rng)
 
 
 def _furnish_landing(

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain.data import Matrix
 from scanchain.kernels.raycast import BOX
 from scanchain.simulation.motion import Lap, Pivot, Vehicle, mount, sampled
 from scanchain.simulation.solids import Scenery, Solids
@@ -94,15 +93,12 @@ def town(
     """
     phase_x, phase_y = rng.uniform(0.0, 2.0 * np.pi, 2)  # of waves of 0.5 m: slopes of 3 % at most
     scenery = Scenery(np.array([0.0, 0.5, 2.0 * np.pi / 140.0, phase_x, 0.5, 2.0 * np.pi / 110.0, phase_y]))
-    for west, east in pairwise(streets_x_m):
-        for south, north in pairwise(streets_y_m):
-            _block(scenery, west, east, south, north, rng)
-    for y in streets_y_m:
-        for west, east in pairwise(streets_x_m):
-            _street(scenery, np.array([west, y]), np.array([east, y]), parked, rng)
-    for x in streets_x_m:
-        for south, north in pairwise(streets_y_m):
-            _street(scenery, np.array([x, south]), np.array([x, north]), parked, rng)
+    for (west, east), (south, north) in product(pairwise(streets_x_m), pairwise(streets_y_m)):
+        _block(scenery, west, east, south, north, rng)
+    for y, (west, east) in product(streets_y_m, pairwise(streets_x_m)):
+        _street(scenery, np.array([west, y]), np.array([east, y]), parked, rng)
+    for x, (south, north) in product(streets_x_m, pairwise(streets_y_m)):
+        _street(scenery, np.array([x, south]), np.array([x, north]), parked, rng)
     return scenery.finish()
 
 
@@ -208,15 +204,11 @@ HIGHWAY_CAR = Vehicle(
 )  # fmt: skip
 
 
-def _stadium() -> Matrix:
-    """Two straights and two half circles, a point every 2° of a bend; the first bend begins after 350 m."""
-    turn = np.deg2rad(np.arange(-90.0, 91.0, 2.0))
-    arc = _BEND_M * np.column_stack([np.cos(turn), 1.0 + np.sin(turn)])
-    begin, end = np.array([350.0, 0.0]), np.array([350.0 - _STRAIGHT_M, 2.0 * _BEND_M])
-    return np.vstack([np.zeros((1, 2)), begin + arc, end - arc])
-
-
-HIGHWAY_ROUTE = _stadium()
+# Two straights and two half circles, a point every 2° of a bend; the first bend begins after 350 m.
+_TURN = np.deg2rad(np.arange(-90.0, 91.0, 2.0))
+_ARC = _BEND_M * np.column_stack([np.cos(_TURN), 1.0 + np.sin(_TURN)])
+_BEGIN, _END = np.array([350.0, 0.0]), np.array([350.0 - _STRAIGHT_M, 2.0 * _BEND_M])
+HIGHWAY_ROUTE = np.vstack([np.zeros((1, 2)), _BEGIN + _ARC, _END - _ARC])
 
 
 def highway(rng: np.random.Generator) -> Solids:
@@ -405,10 +397,8 @@ def yard(rng: np.random.Generator) -> Solids:
             parked_car(scenery, side * (_YARD_X_M - 3.0), y + rng.uniform(-1.5, 1.5), rng.normal(0.0, 0.1), rng)
         tree(scenery, side * rng.uniform(10.5, 12.0), rng.uniform(-6.0, 6.0), rng)
     for bearing in np.deg2rad(np.arange(0.0, 360.0, 60.0)) + rng.uniform(-0.4, 0.4, 6):
-        post = rng.uniform(7.0, 9.5) * np.array([np.cos(bearing), np.sin(bearing)])
-        scenery.cylinder(
-            (float(post[0]), float(post[1])), rng.uniform(0.05, 0.2), (BELOW_M, rng.uniform(0.8, 3.5))
-        )
+        x, y = rng.uniform(7.0, 9.5) * np.array([np.cos(bearing), np.sin(bearing)])
+        scenery.cylinder((x, y), rng.uniform(0.05, 0.2), (BELOW_M, rng.uniform(0.8, 3.5)))
     return scenery.finish()
 
 
