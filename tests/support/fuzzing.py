@@ -17,8 +17,8 @@ from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.logs import open_log
 from scanchain.logs.mcap.records import Channel
-from scanchain.logs.messages.laser_scan import LaserScanDecoder
-from scanchain.logs.messages.point_cloud import PointCloudDecoder
+from scanchain.logs.messages.laser_scan import decode_laser_scan
+from scanchain.logs.messages.point_cloud import decode_cloud
 from scanchain.logs.messages.readers import (
     has_poses,
     has_transforms,
@@ -27,7 +27,7 @@ from scanchain.logs.messages.readers import (
     pose_reader,
     reader,
 )
-from scanchain.logs.messages.returns import PointTimes, RangeLimits
+from scanchain.logs.messages.returns import PointTimes
 from scanchain.logs.messages.ros import MalformedMessageError
 from tests.support import recorders
 from tests.support.mutations import (
@@ -281,11 +281,10 @@ def _messages(folder):
 
 
 def decoder_of(channel):
-    limits = RangeLimits(0.0, float("inf"))
     if is_scan(channel):
-        return LaserScanDecoder(limits, reader(channel)).decode
+        return partial(decode_laser_scan, read=reader(channel), config=LogConfig())
     if is_lidar(channel):
-        return PointCloudDecoder(limits, PointTimes(LogConfig()), reader(channel)).decode
+        return partial(decode_cloud, read=reader(channel), times=PointTimes(LogConfig()))
     if has_transforms(channel):
         return reader(channel)
     assert has_poses(channel), channel

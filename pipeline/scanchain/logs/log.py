@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
+from functools import partial
 
 import numpy as np
 from msgspec.structs import replace
@@ -29,11 +30,11 @@ from scanchain.logs.mcap.stream import (
     sampled_messages,
     whole_span,
 )
-from scanchain.logs.messages.laser_scan import LaserScanDecoder
-from scanchain.logs.messages.point_cloud import PointCloudDecoder, plane_height_m
+from scanchain.logs.messages.laser_scan import decode_laser_scan
+from scanchain.logs.messages.point_cloud import decode_cloud, plane_height_m
 from scanchain.logs.messages.poses import RecordedPoses, StampedPose
 from scanchain.logs.messages.readers import is_scan, pose_reader, reader
-from scanchain.logs.messages.returns import PointTimes, RangeLimits, Returns
+from scanchain.logs.messages.returns import PointTimes, Returns
 from scanchain.logs.mounting import find_mounting, in_plane, is_upside_down
 from scanchain.logs.opening import index_files
 from scanchain.logs.topics import files_with_scans, find_ground_truth, find_lidar, find_odometry
@@ -210,7 +211,7 @@ class Log:
 
         ``topic`` : the lidar's or the ground truth's. Raises InputError where it has no message there.
         """
-        decode = self.pose_decoders.get(topic) or self.decoder(PointTimes(self.config)).decode
+        decode = self.pose_decoders.get(topic) or self.decoder(PointTimes(self.config))
         why = ""
         for message in decoded_messages(self.indexes, {topic: decode}, self.span, ahead=1, damage=[]):
             if isinstance(message.value, Returns | StampedPose):
@@ -234,7 +235,7 @@ class Log:
 
     def _with_poses(self, poses: RecordedPoses, times: PointTimes) -> Iterator[tuple[Decoded, Pose | None]]:
         """Lidar messages with the wheels' pose at their stamp; they wait a little for the readings behind them."""
-        decoders = {self.topic: self.decoder(times).decode, **self.pose_decoders}
+        decoders = {self.topic: self.decoder(times), **self.pose_decoders}
         waiting: deque[Decoded] = deque()
 
         def next_scan() -> tuple[Decoded, Pose | None]:
@@ -256,16 +257,15 @@ class Log:
         while waiting:
             yield next_scan()
 
-    def decoder(self, times: PointTimes) -> LaserScanDecoder | PointCloudDecoder:
+    def decoder(self, times: PointTimes) -> Callable[[memoryview], Returns]:
         """Decoder of the lidar's messages to points; ``times`` collects its assumptions about theirs."""
-        limits = RangeLimits(self.config.min_range_m, self.config.max_range_m)
         if is_scan(self.lidar):
-            return LaserScanDecoder(limits, reader(self.lidar))
-        return PointCloudDecoder(limits, times, reader(self.lidar), self.plane_height_m)
+            return partial(decode_laser_scan, read=reader(self.lidar), config=self.config)
+        return partial(decode_cloud, read=reader(self.lidar), times=times, plane_m=self.plane_height_m)
 
     def _plane_height_m(self) -> float | None:
         """Height of all points of the first clouds, None where they differ; samples their point times, too."""
-        decode = self.decoder(self._sampled_times).decode
+        decode = self.decoder(self._sampled_times)
         height_m = plane_height_m(sampled_messages(self.indexes, self.topic, decode))
         if height_m is not None:
             self.notes.append(

@@ -195,5 +195,5 @@ def _transforms(indexes: Sequence[FileIndex], *, is_fixed: bool, span: Span | No
 
 def _frame_of(indexes: Sequence[FileIndex], lidar: Channel) -> str:
     """The frame of a lidar's first messages, empty where they name none."""
-    read = reader(lidar)
-    return next(sampled_messages(indexes, lidar.topic, lambda data: read(data).frame), "").lstrip("/")
+    first = next(sampled_messages(indexes, lidar.topic, reader(lidar)), None)
+    return "" if first is None else first.message.header.frame_id.lstrip("/")

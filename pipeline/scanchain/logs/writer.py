@@ -17,10 +17,10 @@ from scanchain import lie
 from scanchain.data import Matrix, Pose
 from scanchain.errors import InputError
 from scanchain.logs.mcap.records import Channel
-from scanchain.logs.messages.ros import new, packed, typestore
+from scanchain.logs.messages.ros import NUMBERS, header, new, packed, point_fields, typestore
 
 LATEST_NS = (1 << 31) * 1_000_000_000  # largest stamp of ROS
-_FIELD_TYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}  # sensor_msgs/PointField
+_NUMBER_TYPES = {code: number for number, code in NUMBERS.items()}
 
 
 class Place(NamedTuple):
@@ -63,20 +63,18 @@ def pack_laser_scan(
     ranges = np.ascontiguousarray(ranges_m, np.float32)
     return packed(
         "sensor_msgs/msg/LaserScan",
-        _header(stamp_ns, frame), *angles_rad, time_increment_s, scan_time_s, *limits_m, ranges, ranges[:0],
+        header(stamp_ns, frame), *angles_rad, time_increment_s, scan_time_s, *limits_m, ranges, ranges[:0],
     )  # fmt: skip
 
 
 def pack_cloud(stamp_ns: int, frame: str, rows: NDArray[np.void]) -> bytes:
     """A sensor_msgs/PointCloud2 of one row: the fields of a structured array (N,), little endian."""
-    fields = [
-        new("sensor_msgs/msg/PointField", name, offset, _FIELD_TYPES[number.str[1:]], 1)
-        for name, (number, offset, *_) in (rows.dtype.fields or {}).items()
-    ]
+    layout = (rows.dtype.fields or {}).items()
+    fields = point_fields(*((name, offset, _NUMBER_TYPES[kind.str[1:]]) for name, (kind, offset, *_) in layout))
     data = np.frombuffer(rows.tobytes(), np.uint8)
     return packed(
         "sensor_msgs/msg/PointCloud2",
-        _header(stamp_ns, frame), 1, len(rows), fields, False, rows.itemsize, rows.nbytes, data, True,
+        header(stamp_ns, frame), 1, len(rows), fields, False, rows.itemsize, rows.nbytes, data, True,
     )  # fmt: skip
 
 
@@ -88,7 +86,7 @@ def pack_odometry(
     still = new("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
     return packed(
         "nav_msgs/msg/Odometry",
-        _header(stamp_ns, frame),
+        header(stamp_ns, frame),
         child_frame,
         new("geometry_msgs/msg/PoseWithCovariance", _pose(pose), covariances[0]),
         new("geometry_msgs/msg/TwistWithCovariance", new("geometry_msgs/msg/Twist", still, still), covariances[1]),
@@ -108,7 +106,7 @@ def pack_transforms(stamp_ns: int, *links: Link) -> bytes:
     transforms = [
         new(
             "geometry_msgs/msg/TransformStamped",
-            _header(stamp_ns, link.parent),
+            header(stamp_ns, link.parent),
             link.child,
             new("geometry_msgs/msg/Transform", *_parts(link.pose, "Vector3")),
         )
@@ -120,22 +118,18 @@ def pack_transforms(stamp_ns: int, *links: Link) -> bytes:
 def pack_path(stamp_ns: int, frame: str, stamps_ns: Sequence[int], poses: Sequence[Place]) -> bytes:
     """A nav_msgs/Path: poses in ``frame``, each with its own stamp."""
     stamped = [
-        new("geometry_msgs/msg/PoseStamped", _header(each_ns, frame), _pose(pose))
+        new("geometry_msgs/msg/PoseStamped", header(each_ns, frame), _pose(pose))
         for each_ns, pose in zip(stamps_ns, poses, strict=True)
     ]
-    return packed("nav_msgs/msg/Path", _header(stamp_ns, frame), stamped)
+    return packed("nav_msgs/msg/Path", header(stamp_ns, frame), stamped)
 
 
 def pack_grid(stamp_ns: int, frame: str, cells: NDArray[np.int8], resolution_m: float, origin: Place) -> bytes:
     """A nav_msgs/OccupancyGrid: (rows, columns) cells 0 free to 100 occupied, −1 unknown, row 0 at the origin."""
     rows, columns = cells.shape
-    header = _header(stamp_ns, frame)
-    about = new("nav_msgs/msg/MapMetaData", header.stamp, resolution_m, columns, rows, _pose(origin))
-    return packed("nav_msgs/msg/OccupancyGrid", header, about, np.ascontiguousarray(cells, np.int8).ravel())
-
-
-def _header(stamp_ns: int, frame: str) -> Any:
-    return new("std_msgs/msg/Header", new("builtin_interfaces/msg/Time", *divmod(stamp_ns, 1_000_000_000)), frame)
+    head = header(stamp_ns, frame)
+    about = new("nav_msgs/msg/MapMetaData", head.stamp, resolution_m, columns, rows, _pose(origin))
+    return packed("nav_msgs/msg/OccupancyGrid", head, about, np.ascontiguousarray(cells, np.int8).ravel())
 
 
 def _pose(pose: Place) -> Any:

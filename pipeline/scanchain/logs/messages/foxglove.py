@@ -17,12 +17,11 @@ from msgspec import Struct, field
 
 from scanchain.data import Pose
 from scanchain.logs.mcap.records import Channel
-from scanchain.logs.messages.laser_scan import LaserScanMessage
-from scanchain.logs.messages.point_cloud import PointCloudMessage, PointField
 from scanchain.logs.messages.poses import StampedPose, pose_of
-from scanchain.logs.messages.ros import MalformedMessageError
+from scanchain.logs.messages.returns import Sensed
+from scanchain.logs.messages.ros import MalformedMessageError, header, new, point_fields
 
-_POINT_FIELD = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}  # foxglove.NumericType to sensor_msgs/PointField
+_NUMBERS = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}  # foxglove.NumericType to sensor_msgs/PointField
 
 
 class _Stamp(Struct, frozen=True):
@@ -90,42 +89,32 @@ class _FrameTransforms(Struct, frozen=True):
     transforms: list[_FrameTransform]
 
 
-def laser_scan(message: _LaserScan) -> LaserScanMessage:
+def laser_scan(message: _LaserScan) -> Sensed:
     """The scan, without range limits and times, which Foxglove lacks."""
     with np.errstate(over="ignore"):
         ranges_m = np.array(message.ranges, np.float64).astype(np.float32)
     step_rad = (message.end_angle - message.start_angle) / max(len(ranges_m) - 1, 1)
-    return LaserScanMessage(
-        stamp_ns=_stamp_ns(message.timestamp),
-        frame=message.frame_id,
-        first_rad=message.start_angle,
-        step_rad=step_rad,
-        beam_s=0.0,
-        range_min_m=0.0,
-        range_max_m=0.0,
-        ranges_m=ranges_m,
-        T_frame_scan=_unless_identity(message.pose),
-    )
+    angles_rad = message.start_angle, message.end_angle, step_rad
+    unknown = (0.0,) * 4
+    return _sensed(message, "sensor_msgs/msg/LaserScan", *angles_rad, *unknown, ranges_m, ranges_m[:0])
 
 
-def point_cloud(message: _PointCloud) -> PointCloudMessage:
+def point_cloud(message: _PointCloud) -> Sensed:
     """The cloud, its number types in the codes of sensor_msgs/PointField; little endian."""
-    if not message.point_stride:
+    stride = message.point_stride
+    if not stride:
         raise MalformedMessageError("point_stride is zero")
-    count = len(message.data) // message.point_stride
-    fields = tuple(PointField(each.name, each.offset, _POINT_FIELD.get(each.type, 0)) for each in message.fields)
-    return PointCloudMessage(
-        stamp_ns=_stamp_ns(message.timestamp),
-        frame=message.frame_id,
-        height=1,
-        width=count,
-        fields=fields,
-        is_bigendian=False,
-        point_step=message.point_stride,
-        row_step=count * message.point_stride,
-        data=memoryview(message.data),
-        T_frame_cloud=_unless_identity(message.pose),
-    )
+    count = len(message.data) // stride
+    fields = point_fields(*((each.name, each.offset, _NUMBERS.get(each.type, 0)) for each in message.fields))
+    rows = 1, count, fields, False, stride, count * stride, message.data, True
+    return _sensed(message, "sensor_msgs/msg/PointCloud2", *rows)
+
+
+def _sensed(message: _LaserScan | _PointCloud, type_name: str, *parts: Any) -> Sensed:
+    """A message of sensor_msgs with these parts behind its header."""
+    T = _pose(message.pose.position, message.pose.orientation, 3)
+    head = header(_stamp_ns(message.timestamp), message.frame_id)
+    return Sensed(new(type_name, head, *parts), None if np.array_equal(T, np.eye(4)) else T)
 
 
 def pose_in_frame(message: _PoseInFrame, dimension: int) -> StampedPose:
@@ -147,11 +136,6 @@ def frame_transforms(message: _FrameTransforms) -> list[StampedPose]:
 
 def _stamp_ns(stamp: _Stamp) -> int:
     return stamp.seconds * 1_000_000_000 + stamp.nanos
-
-
-def _unless_identity(pose: _Pose) -> Pose | None:
-    T = _pose(pose.position, pose.orientation, 3)
-    return None if np.array_equal(T, np.eye(4)) else T
 
 
 def _pose(position: _Vector, orientation: _Vector, dimension: int) -> Pose:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain.data import Pose, RawPoints
+from scanchain.data import RawPoints
 from scanchain.errors import one_line
 from scanchain.kernels.scans import keep_valid
 from scanchain.logs.messages.returns import (
@@ -17,75 +17,23 @@ from scanchain.logs.messages.returns import (
     NEAREST_M,
     NO_TIMES,
     PointTimes,
-    RangeLimits,
     Returns,
+    Sensed,
     moved,
     why_none,
 )
-from scanchain.logs.messages.ros import MalformedMessageError, stamp_ns
+from scanchain.logs.messages.ros import NUMBERS, MalformedMessageError, header, new, point_fields, stamp_ns
 
-_FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # sensor_msgs/PointField
-_MOST_FIELDS, _MOST_STEP = 1024, (1 << 31) - 1
+_MOST_STEP = (1 << 31) - 1
 PLANAR_M = 5e-4  # largest distance from the plane of a point of a planar cloud: rounding of float32
 _FEWEST_POINTS, _ENOUGH_POINTS = 3, 1000  # least number of points of a cloud, and in all, that show a plane
 _SQUARE_OF_FARTHEST = float(np.finfo(np.float32).max)
 
 _LIVOX_POINT_BYTES = 19  # offset_time, x, y, z, reflectivity, tag, line
+_LIVOX_FIELDS = (("offset_time", 0, 6), ("x", 4, 7), ("y", 8, 7), ("z", 12, 7))
 
 
-class PointField(NamedTuple):
-    """A sensor_msgs/PointField: offset of a number in a point, and its type."""
-
-    name: str
-    offset: int
-    datatype: int
-
-
-_LIVOX_FIELDS = (
-    PointField("offset_time", 0, 6),
-    PointField("x", 4, 7),
-    PointField("y", 8, 7),
-    PointField("z", 12, 7),
-)
-
-
-class PointCloudMessage(NamedTuple):
-    """A sensor_msgs/PointCloud2 as it is.
-
-    ``T_frame_cloud`` (4, 4) is where the cloud lies in its frame, None where that is its origin.
-    """
-
-    stamp_ns: int
-    frame: str
-    height: int
-    width: int
-    fields: tuple[PointField, ...]
-    is_bigendian: bool
-    point_step: int
-    row_step: int
-    data: memoryview
-    T_frame_cloud: Pose | None = None
-
-
-def read_point_cloud(message: Any) -> PointCloudMessage:
-    """A sensor_msgs/PointCloud2."""
-    if len(message.fields) > _MOST_FIELDS:
-        raise MalformedMessageError(f"it has {len(message.fields)} fields; at most {_MOST_FIELDS} are accepted")
-    fields = tuple(PointField(each.name, each.offset, each.datatype) for each in message.fields)
-    return PointCloudMessage(
-        stamp_ns=stamp_ns(message),
-        frame=message.header.frame_id,
-        height=message.height,
-        width=message.width,
-        fields=fields,
-        is_bigendian=message.is_bigendian,
-        point_step=message.point_step,
-        row_step=message.row_step,
-        data=memoryview(message.data),
-    )
-
-
-def read_livox(data: memoryview, encoding: str) -> PointCloudMessage:
+def read_livox(data: memoryview, encoding: str) -> Sensed:
     """A Livox driver's CustomMsg, the points a view of it, each a row of its own as CDR aligns them."""
     is_ros1 = encoding == "ros1"
     order = "<" if is_ros1 or data[1:2] == b"\1" else ">"
@@ -100,60 +48,43 @@ def read_livox(data: memoryview, encoding: str) -> PointCloudMessage:
     stride = _LIVOX_POINT_BYTES if is_ros1 else _LIVOX_POINT_BYTES + 1
     if (count - 1) * stride + _LIVOX_POINT_BYTES > len(data) - begin - 20:
         raise MalformedMessageError(f"it has {len(data)} bytes, too few for {count} points of {stride} bytes")
-    return PointCloudMessage(
-        stamp_ns=seconds * 1_000_000_000 + nanoseconds,
-        frame=frame,
-        height=count,
-        width=1,
-        fields=_LIVOX_FIELDS,
-        is_bigendian=order == ">",
-        point_step=_LIVOX_POINT_BYTES,
-        row_step=stride,
-        data=data[begin + 20 :],
-    )
+    rows = count, 1, point_fields(*_LIVOX_FIELDS), order == ">", _LIVOX_POINT_BYTES, stride
+    head = header(seconds * 1_000_000_000 + nanoseconds, frame)
+    return Sensed(new("sensor_msgs/msg/PointCloud2", head, *rows, data[begin + 20 :], True))
 
 
-ReadPointCloud = Callable[[memoryview], PointCloudMessage]
+def decode_cloud(
+    data: memoryview, read: Callable[[memoryview], Sensed], times: PointTimes, plane_m: float | None = None
+) -> Returns:
+    """Points that came back: finite, not the origin, within the limits; their times with them.
 
+    Rows may be padded, bytes in either order, x y z of any number type; other fields are passed over.
 
-class PointCloudDecoder:
-    """Decodes clouds; those of a planar scanner, all points of which lie at one height, to points in the plane."""
-
-    def __init__(
-        self, limits: RangeLimits, times: PointTimes, read: ReadPointCloud, plane_m: float | None = None
-    ) -> None:
-        self.limits = limits
-        self.times = times
-        self.read = read
-        self.plane_m = plane_m
-
-    def decode(self, data: memoryview) -> Returns:
-        """Points that came back: finite, not the origin, within the limits; their times with them.
-
-        Rows may be padded, bytes in either order, x y z of any number type; other fields are passed over. Raises
-        MalformedMessageError, also where a point is not in the plane of the others.
-        """
-        message = self.read(data)
-        point = _layout(message, self.times)
-        cloud = _rows(message, point)
-        points = np.empty((len(cloud), 3), np.float32)
-        kept = np.empty(len(cloud), np.int32)
-        x, y, z = (_as_float32(cloud[name]) for name in "xyz")
-        high_square = min(self.limits.max_m * self.limits.max_m, _SQUARE_OF_FARTHEST)
-        count = keep_valid(x, y, z, self.limits.min_m**2, high_square, points, kept)
-        times_s = NO_TIMES
-        for name in (point.names or ())[3:]:
-            times = cloud[name] if count == len(cloud) else cloud[name][kept[:count]]
-            times_s = self.times.from_field(name, message.stamp_ns, times)
-        if self.times.by_azimuth:
-            times_s = self.times.from_azimuth(points[:count])
-        points = moved(points[:count], message.T_frame_cloud)
-        if self.plane_m is not None:
-            points = _in_plane(points, self.plane_m)
-        why = ""
-        if not count:
-            why = why_none(np.hypot(np.hypot(x, y), z), max(self.limits.min_m, NEAREST_M), np.sqrt(high_square))
-        return Returns(message.stamp_ns, points, times_s, len(cloud) - count, why)
+    plane_m : height of the plane of a planar scanner, whose points (N, 2) are those in the plane
+    Raises MalformedMessageError, also where a point is not in the plane of the others.
+    """
+    message, T_frame_points = read(data)
+    point = _layout(message, times)
+    cloud = _rows(message, point)
+    points = np.empty((len(cloud), 3), np.float32)
+    kept = np.empty(len(cloud), np.int32)
+    x, y, z = (_as_float32(cloud[name]) for name in "xyz")
+    low_m, high_m = times.config.min_range_m, times.config.max_range_m
+    high_square = min(high_m * high_m, _SQUARE_OF_FARTHEST)
+    count = keep_valid(x, y, z, low_m**2, high_square, points, kept)
+    times_s = NO_TIMES
+    for name in (point.names or ())[3:]:
+        values = cloud[name] if count == len(cloud) else cloud[name][kept[:count]]
+        times_s = times.from_field(name, stamp_ns(message), values)
+    if times.by_azimuth:
+        times_s = times.from_azimuth(points[:count])
+    points = moved(points[:count], T_frame_points)
+    if plane_m is not None:
+        points = _in_plane(points, plane_m)
+    why = ""
+    if not count:
+        why = why_none(np.hypot(np.hypot(x, y), z), max(low_m, NEAREST_M), np.sqrt(high_square))
+    return Returns(stamp_ns(message), points, times_s, len(cloud) - count, why)
 
 
 def _in_plane(points: RawPoints, height_m: float) -> RawPoints:
@@ -189,7 +120,7 @@ def _as_float32(values: NDArray[np.generic]) -> NDArray[np.float32]:
         return values.astype(np.float32)
 
 
-def _layout(message: PointCloudMessage, times: PointTimes) -> np.dtype[np.void]:
+def _layout(message: Any, times: PointTimes) -> np.dtype[np.void]:
     """A point as a structured type: x, y, z and the time field, if any."""
     if message.point_step > _MOST_STEP:
         raise MalformedMessageError(f"point_step {message.point_step} is more than a point can have")
@@ -197,11 +128,11 @@ def _layout(message: PointCloudMessage, times: PointTimes) -> np.dtype[np.void]:
     for field in message.fields:
         if field.name not in ("x", "y", "z") and not times.wants(field.name):
             continue
-        if field.datatype not in _FORMATS:
+        if field.datatype not in NUMBERS:
             raise MalformedMessageError(
                 f"field {field.name} has data type {field.datatype}; PointField has 1 to 8"
             )
-        number = np.dtype((">" if message.is_bigendian else "<") + _FORMATS[field.datatype])
+        number = np.dtype((">" if message.is_bigendian else "<") + NUMBERS[field.datatype])
         if field.offset + number.itemsize > message.point_step:
             raise MalformedMessageError(
                 f"field {field.name} reaches to byte {field.offset + number.itemsize} of a point, "
@@ -222,7 +153,7 @@ def _layout(message: PointCloudMessage, times: PointTimes) -> np.dtype[np.void]:
     })  # fmt: skip
 
 
-def _rows(message: PointCloudMessage, point: np.dtype[np.void]) -> NDArray[np.void]:
+def _rows(message: Any, point: np.dtype[np.void]) -> NDArray[np.void]:
     """All points of all rows, the padding behind each row left out."""
     height, width, body = message.height, message.width, message.data
     row = width * point.itemsize

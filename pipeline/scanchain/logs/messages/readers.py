@@ -9,9 +9,10 @@ from typing import Any
 
 from scanchain.logs.mcap.records import Channel
 from scanchain.logs.messages import foxglove
-from scanchain.logs.messages.laser_scan import read_laser_scan, read_multi_echo_scan
-from scanchain.logs.messages.point_cloud import read_livox, read_point_cloud
+from scanchain.logs.messages.laser_scan import read_multi_echo_scan
+from scanchain.logs.messages.point_cloud import read_livox
 from scanchain.logs.messages.poses import StampedPose, read_odometry, read_pose, read_transforms
+from scanchain.logs.messages.returns import Sensed
 from scanchain.logs.messages.ros import unpacked
 
 Read = Callable[..., Any]
@@ -29,10 +30,10 @@ class Role(StrEnum):
 
 
 _TYPES: dict[str, tuple[Role, Read]] = {  # those of ROS are laid out alike in ROS 1 and 2
-    "sensor_msgs/LaserScan": (Role.SCAN, read_laser_scan),
+    "sensor_msgs/LaserScan": (Role.SCAN, Sensed),
     "sensor_msgs/MultiEchoLaserScan": (Role.SCAN, read_multi_echo_scan),
     "foxglove.LaserScan": (Role.SCAN, foxglove.laser_scan),
-    "sensor_msgs/PointCloud2": (Role.CLOUD, read_point_cloud),
+    "sensor_msgs/PointCloud2": (Role.CLOUD, Sensed),
     "livox_ros_driver2/CustomMsg": (Role.CLOUD, read_livox),
     "livox_ros_driver/CustomMsg": (Role.CLOUD, read_livox),
     "livox_interfaces/CustomMsg": (Role.CLOUD, read_livox),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +11,11 @@ from scanchain.config import LogConfig
 from scanchain.data import Pose, RawPoints
 
 
-class RangeLimits(NamedTuple):
-    """Meters; what lies outside is dropped at the reader and counted."""
+class Sensed(NamedTuple):
+    """A LaserScan or PointCloud2 of sensor_msgs; pose (4, 4) of its points in its frame, None for its origin."""
 
-    min_m: float
-    max_m: float
+    message: Any
+    T_frame_points: Pose | None = None
 
 
 class Returns(NamedTuple):
@@ -37,12 +37,10 @@ NO_TIMES = np.empty(0, np.float32)
 NO_TIMES.flags.writeable = False
 
 
-def moved(points: RawPoints, T_frame_cloud: Pose | None) -> RawPoints:
-    """Points (N, d) moved by the pose of their frame; None stands for its origin."""
-    if T_frame_cloud is None:
-        return points
+def moved(points: RawPoints, T: Pose | None) -> RawPoints:
+    """Points (N, d) moved by a pose (4, 4); None moves nothing."""
     d = points.shape[1]
-    return (points @ T_frame_cloud[:d, :d].T + T_frame_cloud[:d, 3]).astype(np.float32)
+    return points if T is None else (points @ T[:d, :d].T + T[:d, 3]).astype(np.float32)
 
 
 def why_none(ranges_m: NDArray[np.float32], low_m: float, high_m: float) -> str:
