@@ -23,25 +23,16 @@ LATEST_NS = (1 << 31) * 1_000_000_000  # largest stamp of ROS
 _NUMBER_TYPES = {code: number for number, code in NUMBERS.items()}
 
 
-class Place(NamedTuple):
-    """A pose in messages: meters and a unit quaternion."""
-
-    x: float
-    y: float
-    z: float
-    qx: float
-    qy: float
-    qz: float
-    qw: float
-
-
-ORIGIN = Place(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-
-
-def place(T: Pose) -> Place:
-    """An SE(2) or SE(3) pose, (3, 3) or (4, 4)."""
+def place(T: Pose) -> Any:
+    """A geometry_msgs/Pose of an SE(2) or SE(3) pose, (3, 3) or (4, 4)."""
     lifted = lie.lift(np.asarray(T, dtype=np.float64))
-    return Place(*lifted[:3, 3].tolist(), *lie.to_quaternion(lifted[:3, :3]).tolist())
+    return place_of(lifted[:3, 3].tolist(), lie.to_quaternion(lifted[:3, :3]).tolist())
+
+
+def place_of(position_m: Sequence[float], quat_xyzw: Sequence[float]) -> Any:
+    """A geometry_msgs/Pose."""
+    position = new("geometry_msgs/msg/Point", *position_m)
+    return new("geometry_msgs/msg/Pose", position, new("geometry_msgs/msg/Quaternion", *quat_xyzw))
 
 
 def pack_laser_scan(
@@ -79,26 +70,26 @@ def pack_cloud(stamp_ns: int, frame: str, rows: NDArray[np.void]) -> bytes:
 
 
 def pack_odometry(
-    stamp_ns: int, frame: str, child_frame: str, pose: Place, covariance: Matrix | None = None
+    stamp_ns: int, frame: str, child_frame: str, pose: Any, covariance: Matrix | None = None
 ) -> bytes:
-    """A nav_msgs/Odometry: pose of ``child_frame`` in ``frame``, (6, 6) covariance; no twist."""
+    """A nav_msgs/Odometry: place of ``child_frame`` in ``frame``, (6, 6) covariance; no twist."""
     covariances = np.zeros(36) if covariance is None else covariance.astype(np.float64).ravel(), np.zeros(36)
     still = new("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
     return packed(
         "nav_msgs/msg/Odometry",
         header(stamp_ns, frame),
         child_frame,
-        new("geometry_msgs/msg/PoseWithCovariance", _pose(pose), covariances[0]),
+        new("geometry_msgs/msg/PoseWithCovariance", pose, covariances[0]),
         new("geometry_msgs/msg/TwistWithCovariance", new("geometry_msgs/msg/Twist", still, still), covariances[1]),
     )
 
 
 class Link(NamedTuple):
-    """The pose of the frame ``child`` in ``parent``."""
+    """The place of the frame ``child`` in ``parent``."""
 
     parent: str
     child: str
-    pose: Place
+    pose: Any
 
 
 def pack_transforms(stamp_ns: int, *links: Link) -> bytes:
@@ -108,37 +99,28 @@ def pack_transforms(stamp_ns: int, *links: Link) -> bytes:
             "geometry_msgs/msg/TransformStamped",
             header(stamp_ns, link.parent),
             link.child,
-            new("geometry_msgs/msg/Transform", *_parts(link.pose, "Vector3")),
+            new("geometry_msgs/msg/Transform", link.pose.position, link.pose.orientation),
         )
         for link in links
     ]
     return packed("tf2_msgs/msg/TFMessage", transforms)
 
 
-def pack_path(stamp_ns: int, frame: str, stamps_ns: Sequence[int], poses: Sequence[Place]) -> bytes:
-    """A nav_msgs/Path: poses in ``frame``, each with its own stamp."""
+def pack_path(stamp_ns: int, frame: str, stamps_ns: Sequence[int], poses: Sequence[Any]) -> bytes:
+    """A nav_msgs/Path: places in ``frame``, each with its own stamp."""
     stamped = [
-        new("geometry_msgs/msg/PoseStamped", header(each_ns, frame), _pose(pose))
+        new("geometry_msgs/msg/PoseStamped", header(each_ns, frame), pose)
         for each_ns, pose in zip(stamps_ns, poses, strict=True)
     ]
     return packed("nav_msgs/msg/Path", header(stamp_ns, frame), stamped)
 
 
-def pack_grid(stamp_ns: int, frame: str, cells: NDArray[np.int8], resolution_m: float, origin: Place) -> bytes:
+def pack_grid(stamp_ns: int, frame: str, cells: NDArray[np.int8], resolution_m: float, origin: Any) -> bytes:
     """A nav_msgs/OccupancyGrid: (rows, columns) cells 0 free to 100 occupied, −1 unknown, row 0 at the origin."""
     rows, columns = cells.shape
     head = header(stamp_ns, frame)
-    about = new("nav_msgs/msg/MapMetaData", head.stamp, resolution_m, columns, rows, _pose(origin))
+    about = new("nav_msgs/msg/MapMetaData", head.stamp, resolution_m, columns, rows, origin)
     return packed("nav_msgs/msg/OccupancyGrid", head, about, np.ascontiguousarray(cells, np.int8).ravel())
-
-
-def _pose(pose: Place) -> Any:
-    return new("geometry_msgs/msg/Pose", *_parts(pose, "Point"))
-
-
-def _parts(pose: Place, kind: str) -> tuple[Any, Any]:
-    """Position, of a type of geometry_msgs, and orientation."""
-    return new(f"geometry_msgs/msg/{kind}", *pose[:3]), new("geometry_msgs/msg/Quaternion", *pose[3:])
 
 
 @cache
@@ -230,9 +212,8 @@ class LogWriter:
             columns[time_field] = ("<f4", times_s) if time_field == "time" else ("<u4", whole_ns)
         if ring is not None:
             columns["ring"] = ("<u2", ring)
-        rows = np.empty(len(points), dtype=[(name, code) for name, (code, _) in columns.items()])
-        for name, (_, values) in columns.items():
-            rows[name] = values
+        codes, values = zip(*columns.values(), strict=True)
+        rows = np.rec.fromarrays(values, dtype=list(zip(columns, codes, strict=True)))
         self.append(topic, "sensor_msgs/msg/PointCloud2", pack_cloud(stamp_ns, frame, rows), stamp_ns, log_time_ns)
 
     def append(self, topic: str, schema: str, data: bytes, stamp_ns: int, log_time_ns: int | None = None) -> None:

@@ -232,7 +232,7 @@ def index_clouds(folder: Path, number: int, rate_hz: float = 0.0, bin_columns: i
     if not files:
         raise InputError(f"{folder}: has no {', '.join(SUFFIXES)} file; name the folder that holds them")
     stamps_ns = [round(k * _NS / rate_hz) for k in range(len(files))] if rate_hz else _stamps(folder, files)
-    index = FileIndex(folder, number, is_counted=True)
+    index = FileIndex(folder, number)
     raw = point_of_columns(np.dtype("<f4"), bin_columns)
     if suffix == ".bin":
         _check_size(files, bin_columns)

@@ -37,14 +37,14 @@ _NS = 1_000_000_000
 def index_kitti_raw(folder: Path, number: int) -> FileIndex:
     """A drive of the raw recordings (``..._sync``); truth is its GPS/INS, moved to the lidar."""
     times_ns = read_times(folder / "velodyne_points" / "timestamps.txt")
-    index = FileIndex(folder, number, is_counted=True)
+    index = FileIndex(folder, number)
     return _index(index, folder / "velodyne_points" / "data", times_ns, lambda: _raw_truth(index, folder))
 
 
 def index_kitti_odometry(folder: Path, number: int) -> FileIndex:
     """A sequence of the odometry benchmark (``sequences/00``); truth lies in ``poses/00.txt`` beside it."""
     times_ns = read_seconds(folder / "times.txt")
-    index = FileIndex(folder, number, is_counted=True)
+    index = FileIndex(folder, number)
     return _index(index, folder / "velodyne", times_ns, lambda: _benchmark_truth(index, folder, times_ns))
 
 

@@ -141,7 +141,7 @@ def index_ros1_bag(path: Path, number: int) -> FileIndex:
 
 
 def _new_index(path: Path, number: int, data: mmap.mmap) -> FileIndex:
-    index = FileIndex(path, number, data, is_counted=True)
+    index = FileIndex(path, number, data)
     index.make = partial(_contents, index)
     return index
 

@@ -31,7 +31,7 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
             f"{path}: cannot be read as a ROS bag ({_reason(error)}); "
             "ros2 bag reindex mends the folder of a ROS 2 bag"
         ) from error
-    index = FileIndex(path, number, is_counted=True)
+    index = FileIndex(path, number)
     connections: dict[int, Any] = {}
     for id_, each in enumerate(reader.connections, start=1):
         encoding = each.ext.serialization_format

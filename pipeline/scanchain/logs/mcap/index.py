@@ -104,7 +104,7 @@ def _take_summary(index: FileIndex, size: int, *, needs_crc: bool) -> bool:
     if statistics is None or statistics.chunk_count != len(index.blocks):
         return False
     index.blocks.sort(key=lambda block: block.offset)
-    index.counts, index.is_counted = dict(statistics.channel_message_counts), True
+    index.counts = dict(statistics.channel_message_counts)
     is_complete = +Counter(index.counts) == index.indexed_counts()
     return is_complete and all(
         block.chunk_offset >= 0

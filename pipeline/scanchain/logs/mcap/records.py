@@ -108,7 +108,7 @@ class FileIndex:
     number : its place among the files of the log
     data : the bytes of an MCAP file; ``fetch`` reads those of a remote one, by offset and size; of another
         format ``make`` makes the contents of a block, at least of the channels that are wanted, None for all
-    counts : messages by channel id; ``is_counted`` once they are complete
+    counts : messages by channel id, empty until they are known
     uncertain_channels : those of a summary that was not accepted, for channels defined nowhere else
     is_consistent : whether the channels that blocks state were checked
     """
@@ -122,7 +122,6 @@ class FileIndex:
     schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     counts: dict[int, int] = field(default_factory=dict)
-    is_counted: bool = False
     is_consistent: bool = True
     uncertain_channels: dict[int, Channel] = field(default_factory=dict)
     damage: list[str] = field(default_factory=list)

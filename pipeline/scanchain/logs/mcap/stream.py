@@ -185,14 +185,12 @@ def complete(index: FileIndex) -> None:
     counts = index.indexed_counts()
     unknown = {number for number in {*index.counts, *counts} if not index.knows(number)}
     for block in sorted(index.blocks, key=lambda each: unknown.isdisjoint(each.counts)):
-        if unknown or not (block.counts or index.is_counted):
+        if unknown or not (block.counts or index.counts):
             messages = messages_of(index, block)
             counts.update(message.channel.key[1] for message in messages if not block.counts)
             unknown = {number for number in unknown if not index.knows(number)}
     index.channels |= {k: channel for k, channel in index.uncertain_channels.items() if k in unknown}
-    if not index.is_counted:
-        index.counts = dict(counts)
-        index.is_counted = True
+    index.counts = index.counts or dict(counts)
 
 
 def ends_of(indexes: Sequence[FileIndex], topic: str) -> Span:
