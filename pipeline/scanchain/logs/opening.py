@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+from scanchain import plugins
 from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.files import Source
@@ -18,7 +18,7 @@ from scanchain.logs.formats.clouds import SUFFIXES, index_clouds
 from scanchain.logs.formats.kitti import index_kitti_odometry, index_kitti_raw
 from scanchain.logs.formats.ros1_bag import index_ros1_bag
 from scanchain.logs.formats.ros2_bag import index_ros2_bag, parts_of_bag
-from scanchain.logs.formats.user import index_scans, load_format
+from scanchain.logs.formats.user import index_scans
 from scanchain.logs.mcap.index import index_by_summary, index_file
 from scanchain.logs.mcap.records import MAGIC, FileIndex
 from scanchain.logs.mcap.stream import are_parts, complete
@@ -58,6 +58,8 @@ FORMATS: dict[str, LogFormat] = {  # the first that claims a path reads it; an e
         index_clouds,
     ),
 }
+_KNOWN = ", ".join(form.description for form in FORMATS.values())
+_KNOWN += ", or name a class of your own that reads it, --log.format module:Class"
 AUTO = "auto"  # value of log.format: the format that claims the path
 
 _RUN_FILE, _BAG_FILE = "run.json", "metadata.yaml"
@@ -73,15 +75,13 @@ def index_files(sources: Sequence[Source], config: LogConfig = _DEFAULTS) -> lis
 
     Raises InputError for what is no log, or cannot be read.
     """
-    if not sources:
-        raise InputError("no log was named; give at least one file or folder")
     name = config.format
     if name != AUTO and name not in FORMATS:
         if ":" not in name:
             raise InputError(
                 f"log.format {name!r} is unknown; wanted {AUTO}, {', '.join(FORMATS)} or module:Class"
             )
-        load_format(name)
+        plugins.load(name, "scans")  # before anything is downloaded
         files = list(sources)
     else:
         files = [part for source in sources for part in _parts(source)]
@@ -147,52 +147,39 @@ def _index_path(path: Path, number: int, config: LogConfig, address: Source | No
                 head = file.read(_HEAD_BYTES)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
-    index = (_claiming(path, head) if config.format == AUTO else FORMATS[config.format]).index_of
-    if index is index_clouds:
-        index = partial(index, rate_hz=config.rate_hz, bin_columns=config.bin_columns)
-    elif index is index_file:
-        index = partial(index, source=address)
     try:
-        return index(path, number)
+        index_of = (_claiming(path, head) if config.format == AUTO else FORMATS[config.format]).index_of
+        if index_of is index_file:
+            return index_file(path, number, address)
+        if index_of is index_clouds:
+            return index_clouds(path, number, config.rate_hz, config.bin_columns)
+        return index_of(path, number)
     except UnknownFormatError as error:
-        raise _unknown(path, error.text, error.lack) from None
+        if _POSE_GRAPH.search(error.text):
+            raise InputError(f"{path}: is a pose graph, no log; give it to scanchain optimize") from None
+        raise InputError(f"{path}: is not a recognized log ({error.lack}); give {_KNOWN}") from None
 
 
 def _claiming(path: Path, head: bytes) -> LogFormat:
-    """The format that claims a path. Raises InputError where none does, and for a run directory."""
+    """The format that claims a path. Raises UnknownFormatError, or InputError for a folder that is none."""
     if (path / _RUN_FILE).is_file():
         raise InputError(f"{path}: is a run directory, no log; give the log that its {_RUN_FILE} names")
     for form in FORMATS.values():
         if form.claims(path, head):
             return form
     if path.is_dir():
-        raise InputError(f"{path}: is a folder without a recognized log; give {_known()}")
-    raise _unknown(path, head, f"starts with {head[:8]!r}")
-
-
-def _unknown(path: Path, text: bytes, lack: str) -> InputError:
-    if _POSE_GRAPH.search(text):
-        return InputError(f"{path}: is a pose graph, no log; give it to scanchain optimize")
-    return InputError(f"{path}: is not a recognized log ({lack}); give {_known()}")
-
-
-def _known() -> str:
-    listed = ", ".join(form.description for form in FORMATS.values())
-    return f"{listed}, or name a class of your own that reads it, --log.format module:Class"
+        raise InputError(f"{path}: is a folder without a recognized log; give {_KNOWN}")
+    raise UnknownFormatError(head, f"starts with {head[:8]!r}")
 
 
 def _parts(source: Source) -> Sequence[Source]:
     """The files of a folder that holds the parts of a log, in the order of their names; else the source itself."""
     if not isinstance(source, Path) or not source.is_dir():
         return [source]
-    path = source
-    if (path / _BAG_FILE).is_file():
-        return parts_of_bag(path)
-    for suffix in _PART_SUFFIXES:
-        parts = sorted(path.glob(f"*{suffix}"), key=natural_order)
-        if parts:
-            return parts
-    return [path]
+    if (source / _BAG_FILE).is_file():
+        return parts_of_bag(source)
+    parts = (sorted(source.glob(f"*{suffix}"), key=natural_order) for suffix in _PART_SUFFIXES)
+    return next(filter(None, parts), [source])
 
 
 def _other_parts(source: Source) -> list[str]:

@@ -30,7 +30,7 @@ def add_block(
     """Append a block: ``index.make`` finds it by ``offset``; ``size`` is about its number of bytes."""
     held = {channel.key[1]: count for channel, count in counts.items() if count}
     span = min(times_ns), max(times_ns)
-    index.blocks.append(Block(index.number, offset, size, "", size, 0, *span, held, is_chunk=False))
+    index.blocks.append(Block(index.number, offset, size, "", size, *span, held))
     for channel, count in held.items():
         index.counts[channel] = index.counts.get(channel, 0) + count
 

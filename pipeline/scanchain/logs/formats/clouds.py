@@ -50,23 +50,17 @@ class CloudFileError(Exception):
     """A file that contradicts its header; the message says where."""
 
 
-def ascii_rows(file: IO[bytes], point: np.dtype[np.void], count: int) -> NDArray[np.void]:
-    """``count`` lines of numbers."""
-    lines = list(islice((line for line in file if line.strip()), count))
-    try:
-        rows = np.loadtxt(lines, point, comments=None, ndmin=1) if lines else np.empty(0, point)
-    except ValueError as error:
-        raise CloudFileError(f"is no list of {count} points ({error})") from error
-    return _all_of(rows, count)
-
-
-def binary_rows(file: IO[bytes], point: np.dtype[np.void], count: int) -> NDArray[np.void]:
-    """``count`` points, one after the other."""
-    data = file.read(min(count * point.itemsize, os.fstat(file.fileno()).st_size))  # whatever a header claims
-    return _all_of(np.frombuffer(data, point, len(data) // max(point.itemsize, 1)), count)
-
-
-def _all_of(rows: NDArray[np.void], count: int) -> NDArray[np.void]:
+def _rows(file: IO[bytes], point: np.dtype[np.void], count: int, *, is_text: bool) -> NDArray[np.void]:
+    """``count`` points, one after the other, or as many lines of numbers."""
+    if is_text:
+        lines = list(islice((line for line in file if line.strip()), count))
+        try:
+            rows = np.loadtxt(lines, point, comments=None, ndmin=1) if lines else np.empty(0, point)
+        except ValueError as error:
+            raise CloudFileError(f"is no list of {count} points ({error})") from error
+    else:
+        data = file.read(min(count * point.itemsize, os.fstat(file.fileno()).st_size))  # whatever a header claims
+        rows = np.frombuffer(data, point, len(data) // max(point.itemsize, 1))
     if len(rows) < count:
         raise CloudFileError(f"ends after {len(rows)} of its {count} points")
     return rows
@@ -138,8 +132,9 @@ def read_pcd(path: Path) -> NDArray[np.void]:
                 raise ValueError(f"how many points there are, but {count}")
         except (KeyError, IndexError, ValueError) as error:
             raise CloudFileError(f"is no PCD: its header does not state {error}") from error
-        read = {"ascii": ascii_rows, "binary_compressed": _lzf_unpacked}.get(form, binary_rows)
-        return read(file, point, count)
+        if form == "binary_compressed":
+            return _lzf_unpacked(file, point, count)
+        return _rows(file, point, count, is_text=form == "ascii")
 
 
 def _header_lines(file: IO[bytes], last: str) -> Iterator[list[str]]:
@@ -164,19 +159,15 @@ def _pcd_point(header: dict[str, list[str]]) -> np.dtype[np.void]:
 
 def _lzf_unpacked(file: IO[bytes], point: np.dtype[np.void], count: int) -> NDArray[np.void]:
     """Points that are packed by LZF, field by field."""
-    sizes = file.read(8)
-    if len(sizes) < 8:
-        raise CloudFileError("ends within its header")
-    packed_size, size = struct.unpack("<II", sizes)
+    packed_size, size = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
     packed = file.read(packed_size)
     if size < count * point.itemsize or size > _MOST_LZF_RATIO * len(packed):
         raise CloudFileError(
             f"does not unpack: {size} bytes are stated for {count} points, {len(packed)} are there"
         )
-    try:
+    data = b""
+    with suppress(ValueError):
         data = lzf.decompress(packed, size)
-    except ValueError:
-        data = None
     if data is None or len(data) != size:
         raise CloudFileError("does not unpack: its bytes are damaged")
     rows = np.empty(count, point)
@@ -192,7 +183,7 @@ def read_ply(path: Path) -> NDArray[np.void]:
     """The vertices of a file, ascii or binary in either byte order, fields as they are."""
     with path.open("rb") as file:
         point, count, form = _ply_header(file)
-        return ascii_rows(file, point, count) if form == "ascii" else binary_rows(file, point, count)
+        return _rows(file, point, count, is_text=form == "ascii")
 
 
 def _ply_header(file: IO[bytes]) -> tuple[np.dtype[np.void], int, str]:

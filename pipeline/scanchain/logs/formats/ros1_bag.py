@@ -222,8 +222,8 @@ def _chunk(index: FileIndex, record: Record) -> Block:
     if not is_plausible_size(size, claimed):
         raise ValueError(f"claims to unpack from {size} to {claimed} bytes, more than is accepted,")
     name = record.text(b"compression")
-    is_cut = record.end > end
-    return Block(index.number, record.begin, size, "" if name == "none" else name, claimed, 0, 0, 0, is_cut=is_cut)
+    where = {"head": record.begin - record.offset, "is_cut": record.end > end}
+    return Block(index.number, record.begin, size, "" if name == "none" else name, claimed, 0, 0, **where)
 
 
 def _counted(index: FileIndex, block: Block) -> Block:

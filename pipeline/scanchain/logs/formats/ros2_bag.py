@@ -74,7 +74,7 @@ def _cut(index: FileIndex, begin_ns: int, end_ns: int) -> None:
     edges_ns = [begin_ns + (end_ns - begin_ns) * place // count for place in range(count + 1)]
     for place, (start_ns, stop_ns) in enumerate(pairwise(edges_ns)):
         share = size // count
-        index.blocks.append(Block(index.number, place, share, "", share, 0, start_ns, stop_ns - 1, is_chunk=False))
+        index.blocks.append(Block(index.number, place, share, "", share, start_ns, stop_ns - 1))
 
 
 def _contents(

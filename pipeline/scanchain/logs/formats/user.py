@@ -37,11 +37,6 @@ class ScanFormat(Protocol):
         ...
 
 
-def load_format(name: str) -> type[ScanFormat]:
-    """The class that ``module:Class`` names. Raises InputError where there is none, or it is no log format."""
-    return plugins.load(name, "scans")
-
-
 def index_scans(path: Path, number: int, name: str, source: Source | None = None) -> FileIndex:
     """The scans of a path as the class ``name`` reads them, as the ``number``-th file of a log.
 
@@ -60,7 +55,7 @@ def index_scans(path: Path, number: int, name: str, source: Source | None = None
 
 def _write(log: LogWriter, path: Path, name: str) -> None:
     """Write the scans that the class reads of a path."""
-    make = load_format(name)
+    make: type[ScanFormat] = plugins.load(name, "scans")
     dimension, end = 0, object()
     with _blaming(f"{path}: {name}"):
         scans: Iterator[Any] = iter(make(path).scans())

@@ -107,7 +107,7 @@ def _take_summary(index: FileIndex, size: int, *, needs_crc: bool) -> bool:
     index.counts = dict(statistics.channel_message_counts)
     is_complete = +Counter(index.counts) == index.indexed_counts()
     return is_complete and all(
-        block.chunk_offset >= 0
+        block.offset >= block.head
         and block.offset + block.size <= size
         and is_plausible_size(block.size, block.uncompressed_size)
         for block in index.blocks
@@ -138,7 +138,8 @@ def _indexed(chunk: ChunkIndex, file: int) -> Block:
         if behind - offset > RECORD.size + 6
     }
     size, times_ns = chunk.compressed_size, (chunk.message_start_time, chunk.message_end_time)
-    return Block(file, end - size, size, chunk.compression, chunk.uncompressed_size, None, *times_ns, counts)
+    head = CHUNK_HEAD.size + len(chunk.compression.encode()) + 8
+    return Block(file, end - size, size, chunk.compression, chunk.uncompressed_size, *times_ns, counts, head)
 
 
 class Walk:
@@ -148,7 +149,6 @@ class Walk:
         self.index = index
         self.data = index.data
         self.chunk: Block | None = None
-        self.counts = Counter[int]()  # of the chunk, by channel
         self.loose: list[tuple[int, int]] = []  # channel and log time of messages outside of chunks
         self.loose_from = 0
         self.loose_sizes: deque[int] = deque(maxlen=8)  # of the records met last
@@ -203,9 +203,10 @@ class Walk:
             self._take_message(offset, end)
         elif opcode == MESSAGE_INDEX and self.chunk is None:
             index.note_damage(f"{index.path}: the chunk before the message index at byte {offset} is missing")
-        elif opcode == MESSAGE_INDEX and end - body > 6:
+        elif opcode == MESSAGE_INDEX and self.chunk is not None:
             (channel,) = struct.unpack_from("<H", self.data, body)
-            self.counts[channel] += (end - body - 6) // 16
+            if count := (end - body - 6) // 16:
+                self.chunk.counts[channel] = self.chunk.counts.get(channel, 0) + count
         elif opcode in (SCHEMA, CHANNEL):
             index.define(read_definition(opcode, self.data[body:end]))
         else:
@@ -258,14 +259,14 @@ class Walk:
     def _close(self, offset: int, *, complete: bool) -> None:
         """End the chunk or the run of loose messages at this byte; incomplete counts are discarded."""
         if self.chunk is not None:
-            self.index.blocks.append(replace(self.chunk, counts=self.counts if complete else {}))
+            self.index.blocks.append(self.chunk if complete else replace(self.chunk, counts={}))
         if self.loose:
             times_ns = [log_time_ns for _, log_time_ns in self.loose]
             counts = Counter(channel for channel, _ in self.loose)
             begin, size, span = self.loose_from, offset - self.loose_from, (min(times_ns), max(times_ns))
-            block = Block(self.index.number, begin, size, "", size, 0, *span, counts, is_chunk=False)
+            block = Block(self.index.number, begin, size, "", size, *span, counts)
             self.index.blocks.append(block)
-        self.chunk, self.counts, self.loose = None, Counter(), []
+        self.chunk, self.loose = None, []
 
 
 def is_plausible_size(size: int, uncompressed: int) -> bool:
@@ -305,7 +306,7 @@ def _chunk_at(index: FileIndex, offset: int) -> Block | None:
     head = index.data[offset : offset + CHUNK_HEAD.size + _LONGEST_NAME + 8]
     if len(head) < CHUNK_HEAD.size + 8:
         return None
-    _, length, *times_ns, uncompressed, crc, name = CHUNK_HEAD.unpack_from(head)
+    _, length, *times_ns, uncompressed, _, name = CHUNK_HEAD.unpack_from(head)
     begin = CHUNK_HEAD.size + name + 8
     if begin > len(head):
         return None
@@ -315,7 +316,7 @@ def _chunk_at(index: FileIndex, offset: int) -> Block | None:
     compression = head[CHUNK_HEAD.size : begin - 8].decode("utf-8", "replace")
     there = len(index.data) - offset - begin
     where = index.number, offset + begin, min(size, there)
-    return Block(*where, compression, uncompressed, crc, *times_ns, is_cut=size > there)
+    return Block(*where, compression, uncompressed, *times_ns, head=begin, is_cut=size > there)
 
 
 def _sought(index: FileIndex) -> tuple[int, ...]:

@@ -70,10 +70,10 @@ class Block:
     Attributes
     ----------
     file, offset, size : where its bytes lie; ``is_cut`` where the file ends inside them
-    compression, uncompressed_size, crc : as the chunk states; crc 0 means unchecked, None that the chunk's head
-        has to be read for it
+    compression, uncompressed_size : as the chunk states
     start_ns, end_ns : log time of the first and last message
     counts : messages by channel id; empty where the file does not state them
+    head : number of bytes of the chunk's record before them; 0 for messages outside of any chunk
     """
 
     file: int
@@ -81,17 +81,11 @@ class Block:
     size: int
     compression: str
     uncompressed_size: int
-    crc: int | None
     start_ns: int
     end_ns: int
     counts: dict[int, int] = field(default_factory=dict)
-    is_chunk: bool = True
+    head: int = 0
     is_cut: bool = False
-
-    @property
-    def chunk_offset(self) -> int:
-        """Offset of a chunk's record, its head included."""
-        return self.offset - (CHUNK_HEAD.size + len(self.compression) + 8 if self.is_chunk else 0)
 
     @property
     def may_be_empty(self) -> bool:
@@ -126,14 +120,6 @@ class FileIndex:
     uncertain_channels: dict[int, Channel] = field(default_factory=dict)
     damage: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-
-    def stored(self, block: Block) -> tuple[memoryview, int]:
-        """A block's bytes as the file holds them, and the CRC-32 of the unpacked bytes, 0 for unchecked."""
-        if block.crc is not None:
-            return self.bytes_at(block.offset, block.size), block.crc
-        head = block.offset - block.chunk_offset
-        record = self.bytes_at(block.chunk_offset, head + block.size)
-        return record[head:], CHUNK_HEAD.unpack_from(record)[5]
 
     def bytes_at(self, offset: int, size: int) -> memoryview:
         """A part of an MCAP file, wherever it lies."""
@@ -238,10 +224,11 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
 
 def unpack(index: FileIndex, block: Block) -> memoryview:
     """The records of a block; of one that is cut off those that are there, unchecked. Raises DamagedBlockError."""
-    stored, crc = index.stored(block)
-    size = block.uncompressed_size
+    record = index.bytes_at(block.offset - block.head, block.head + block.size)
+    size, has_crc = block.uncompressed_size, block.head > 0 and index.make is None  # which bags of ROS 1 have not
+    crc = CHUNK_HEAD.unpack_from(record)[5] if has_crc else 0
     try:
-        payload = _decompressed(stored, block.compression, size, is_cut=block.is_cut)
+        payload = _decompressed(record[block.head :], block.compression, size, is_cut=block.is_cut)
     except (zstandard.ZstdError, RuntimeError, MemoryError, EOFError, OSError, ValueError) as error:
         if block.is_cut:
             return memoryview(b"")
@@ -281,7 +268,7 @@ def _decompressed(stored: memoryview, compression: str, size: int, *, is_cut: bo
 
 
 def _name(index: FileIndex, block: Block) -> str:
-    return f"{index.path}: the {'chunk' if block.is_chunk else 'run of messages'} at byte {block.offset}"
+    return f"{index.path}: the {'chunk' if block.head else 'run of messages'} at byte {block.offset}"
 
 
 def name_of(indexes: Sequence[FileIndex]) -> str:
