@@ -17,8 +17,8 @@ from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.logs import open_log
 from scanchain.logs.mcap.records import Channel
-from scanchain.logs.messages.laser_scan import decode_laser_scan
-from scanchain.logs.messages.point_cloud import decode_cloud
+from scanchain.logs.messages.lidar import decode_cloud, decode_laser_scan
+from scanchain.logs.messages.point_times import PointTimes
 from scanchain.logs.messages.readers import (
     has_poses,
     has_transforms,
@@ -27,7 +27,6 @@ from scanchain.logs.messages.readers import (
     pose_reader,
     reader,
 )
-from scanchain.logs.messages.returns import PointTimes
 from scanchain.logs.messages.ros import MalformedMessageError
 from tests.support import recorders
 from tests.support.mutations import (

@@ -10,10 +10,9 @@ from pathlib import Path
 from scanchain.config import LogConfig
 from scanchain.errors import InputError, grouped
 from scanchain.files import Source
-from scanchain.logs.mcap.records import FileIndex, name_of
+from scanchain.logs.mcap.records import Decoded, FileIndex, name_of
 from scanchain.logs.mcap.stream import (
     EVERYTHING,
-    Decoded,
     chosen_span,
     count_messages,
     decoded_messages,

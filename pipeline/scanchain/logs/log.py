@@ -16,10 +16,9 @@ from scanchain.config import LogConfig, PreprocessConfig
 from scanchain.data import Pose, Scan, Trajectory
 from scanchain.errors import InputError, counted, grouped, shown
 from scanchain.files import Source, source_of
-from scanchain.logs.bad_scans import ScanCounts, check_count, defect
-from scanchain.logs.mcap.records import FileIndex, name_of
+from scanchain.logs.bad_scans import ScanCounts, defect
+from scanchain.logs.mcap.records import Decoded, FileIndex, name_of
 from scanchain.logs.mcap.stream import (
-    Decoded,
     Decoders,
     check_one_log,
     chosen_span,
@@ -30,14 +29,13 @@ from scanchain.logs.mcap.stream import (
     sampled_messages,
     whole_span,
 )
-from scanchain.logs.messages.laser_scan import decode_laser_scan
-from scanchain.logs.messages.point_cloud import decode_cloud, plane_height_m
+from scanchain.logs.messages.lidar import Returns, decode_cloud, decode_laser_scan, plane_height_m
+from scanchain.logs.messages.point_times import PointTimes
 from scanchain.logs.messages.poses import RecordedPoses, StampedPose
 from scanchain.logs.messages.readers import is_scan, pose_reader, reader
-from scanchain.logs.messages.returns import PointTimes, Returns
 from scanchain.logs.mounting import find_mounting, in_plane, is_upside_down
 from scanchain.logs.opening import index_files
-from scanchain.logs.topics import files_with_scans, find_ground_truth, find_lidar, find_odometry
+from scanchain.logs.topics import find_ground_truth, find_lidar, find_odometry
 from scanchain.settings import load_settings, overrides_of
 
 _DEFAULTS = LogConfig()
@@ -95,7 +93,7 @@ class Log:
         self.paths = tuple(index.path for index in indexes)
         self.name = name_of(indexes)
         self.notes: list[str] = [line for index in indexes for line in index.notes]
-        check_one_log(indexes, files_with_scans(indexes), config)
+        check_one_log(indexes, config)
         lidar = find_lidar(indexes, config.topic)
         wheels = find_odometry(indexes, config, self.notes)
         truth = find_ground_truth(indexes, config.ground_truth_topic)
@@ -164,21 +162,19 @@ class Log:
                 count += 1
                 if (count - 1) % self.config.every:
                     continue
-                unusable = defect(message, preprocess)
-                if unusable:
+                returns = message.value
+                if unusable := defect(message, preprocess):
                     path = self.indexes[message.channel.key[0]].path
                     complaint = f"{path}: scan {count - 1} of {self.topic} {unusable}"
-                    counts.skip(complaint)
-                    check_count(counts.bad, self.scan_count, self.config, complaint)
+                    counts.skip(complaint, self.scan_count, self.config)
                     continue
-                returns = message.value
                 assert isinstance(returns, Returns)
-                points = returns.points
+                points = returns.points * np.array([1.0, -1.0], np.float32) if self.is_mirrored else returns.points
                 scan = Scan(
                     index=index,
                     stamp_ns=returns.stamp_ns,
                     log_time_ns=message.log_time_ns,
-                    points=points * np.array([1.0, -1.0], np.float32) if self.is_mirrored else points,
+                    points=points,
                     times_s=returns.times_s,
                     dropped=returns.dropped,
                     T_odom_base=T_odom_base,

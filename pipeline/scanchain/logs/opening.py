@@ -22,7 +22,6 @@ from scanchain.logs.formats.user import index_scans
 from scanchain.logs.mcap.index import index_by_summary, index_file
 from scanchain.logs.mcap.records import MAGIC, FileIndex
 from scanchain.logs.mcap.stream import are_parts, complete
-from scanchain.logs.messages.readers import is_lidar
 
 
 class LogFormat(NamedTuple):
@@ -104,7 +103,7 @@ def logs_in(folder: Path) -> list[Path]:
     if len(found) < 2:
         return [folder]
     try:  # in time they follow one another, or have no topic of a lidar in common
-        is_one = found == _parts(folder) and are_parts(index_files(found), is_lidar)
+        is_one = found == _parts(folder) and are_parts(index_files(found))
     except InputError:
         is_one = False
     return [folder] if is_one else found

@@ -66,7 +66,8 @@ def find_ground_truth(indexes: Sequence[FileIndex], wanted: str) -> Channel | No
     """The ground truth's channel, None for ``NO_TRUTH``; only a topic that is not the usual one must exist."""
     if wanted == NO_TRUTH:
         return None
-    if wanted == _USUAL_TRUTH and not any(channel.topic == wanted for channel in _with_poses(indexes)):
+    usual = topics_of(indexes).get(_USUAL_TRUTH)
+    if wanted == _USUAL_TRUTH and not (usual and has_poses(usual)):
         return None
     return _chosen(indexes, wanted, "log.ground_truth_topic")
 
@@ -94,36 +95,22 @@ def other_sensors(indexes: Sequence[FileIndex], *, wheels: str, truth: str) -> l
 
 
 def _chosen(indexes: Sequence[FileIndex], wanted: str, key: str) -> Channel:
-    channels = _with_poses(indexes)
-    for channel in channels:
-        if channel.topic == wanted:
-            return channel
+    channels = {topic: channel for topic, channel in topics_of(indexes).items() if has_poses(channel)}
+    if wanted in channels:
+        return channels[wanted]
     raise InputError(
         f"{name_of(indexes)}: {key} {wanted} is no nav_msgs/Odometry topic of the log, nor one of stamped poses; "
-        f"these are: {_listed(channels)}"
+        f"these are: {_listed(channels.values())}"
     )
-
-
-def _with_poses(indexes: Sequence[FileIndex]) -> list[Channel]:
-    return [channel for channel in topics_of(indexes).values() if has_poses(channel)]
-
-
-def files_with_scans(indexes: Sequence[FileIndex]) -> set[int]:
-    """Numbers of the files that hold messages of a lidar."""
-    return {
-        place
-        for place, index in enumerate(indexes)
-        if any(is_lidar(channel) and index.counts.get(number) for number, channel in index.channels.items())
-    }
 
 
 def _listed(channels: Iterable[Channel], indexes: Sequence[FileIndex] = ()) -> str:
     """Channels with their types and, of several files, the first that each is in."""
     names = []
-    channels = list(channels)
-    for channel in channels[:_MOST_LISTED]:
+    for channel in channels:
         unusual = "" if channel.encoding == "cdr" else f" in {channel.encoding or 'an unnamed encoding'}"
         file = f" in {indexes[channel.key[0]].path.name}" if len(indexes) > 1 else ""
         names.append(f"{channel.topic} ({kind(channel) or 'no schema'}{unusual}){file}")
-    names += [f"{len(channels) - _MOST_LISTED} more, see scanchain info"] if len(channels) > _MOST_LISTED else []
+    if len(names) > _MOST_LISTED:
+        names[_MOST_LISTED:] = [f"{len(names) - _MOST_LISTED} more, see scanchain info"]
     return ", ".join(names) or "none"

@@ -56,6 +56,14 @@ class Message(NamedTuple):
     defect: str = ""
 
 
+class Decoded(NamedTuple):
+    """A decoded message, or the decoder's error, a MalformedMessageError."""
+
+    channel: Channel
+    log_time_ns: int
+    value: object
+
+
 class Contents(NamedTuple):
     """The messages of a block in the order of the file; ``damage`` describes what is missing behind them."""
 

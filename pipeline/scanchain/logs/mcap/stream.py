@@ -19,8 +19,8 @@ from scanchain.config import LogConfig
 from scanchain.errors import InputError, duration
 from scanchain.logs.mcap.records import (
     Block,
-    Channel,
     DamagedBlockError,
+    Decoded,
     FileIndex,
     Message,
     damage_of,
@@ -28,6 +28,7 @@ from scanchain.logs.mcap.records import (
     read_block,
     release,
 )
+from scanchain.logs.messages.readers import is_lidar
 from scanchain.logs.messages.ros import MalformedMessageError
 from scanchain.threads import threads
 
@@ -100,11 +101,16 @@ def gap_notes(indexes: Sequence[FileIndex], config: LogConfig) -> list[str]:
     return notes
 
 
-def check_one_log(indexes: Sequence[FileIndex], scanned: Collection[int], config: LogConfig) -> None:
+def check_one_log(indexes: Sequence[FileIndex], config: LogConfig) -> None:
     """Refuse files with scans that lie too far apart in time to be parts of one log. Raises InputError.
 
-    scanned : numbers of the files with scans; others, as of a calibration, may be of any time
+    Files without scans, as of a calibration, may be of any time.
     """
+    scanned = {
+        index.number
+        for index in indexes
+        if any(is_lidar(channel) and index.counts.get(number) for number, channel in index.channels.items())
+    }
     for before, behind in _long_gaps(indexes, config, scanned):
         gap_ns = behind.start_ns - before.end_ns
         if before.file != behind.file and gap_ns > _LONGEST_GAP_NS:
@@ -114,7 +120,7 @@ def check_one_log(indexes: Sequence[FileIndex], scanned: Collection[int], config
             )
 
 
-def are_parts(indexes: Sequence[FileIndex], is_lidar: Callable[[Channel], bool]) -> bool:
+def are_parts(indexes: Sequence[FileIndex]) -> bool:
     """True if no two files hold the same lidar's scans of one time, and none begins a minute after the others."""
     last: dict[str, int] = {}
     for index in sorted(indexes, key=lambda index: whole_span([index])):
@@ -220,14 +226,6 @@ _MOST_BYTES_AHEAD = 256_000_000
 
 T = TypeVar("T")
 _SAMPLED_BLOCKS = 8  # number of first blocks of a topic that are searched
-
-
-class Decoded(NamedTuple):
-    """A decoded message, or the decoder's error, a MalformedMessageError."""
-
-    channel: Channel
-    log_time_ns: int
-    value: object
 
 
 def decoded_messages(

@@ -17,8 +17,8 @@ from msgspec import Struct, field
 
 from scanchain.data import Pose
 from scanchain.logs.mcap.records import Channel
+from scanchain.logs.messages.lidar import Sensed
 from scanchain.logs.messages.poses import StampedPose, pose_of
-from scanchain.logs.messages.returns import Sensed
 from scanchain.logs.messages.ros import MalformedMessageError, header, new, point_fields
 
 _NUMBERS = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}  # foxglove.NumericType to sensor_msgs/PointField

@@ -13,7 +13,7 @@ import numpy as np
 from scanchain import lie
 from scanchain.data import Pose, Trajectory
 from scanchain.errors import counted
-from scanchain.logs.mcap.stream import Decoded
+from scanchain.logs.mcap.records import Decoded
 from scanchain.logs.messages.ros import MalformedMessageError, stamp_ns
 
 

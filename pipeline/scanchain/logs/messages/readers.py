@@ -9,10 +9,8 @@ from typing import Any
 
 from scanchain.logs.mcap.records import Channel
 from scanchain.logs.messages import foxglove
-from scanchain.logs.messages.laser_scan import read_multi_echo_scan
-from scanchain.logs.messages.point_cloud import read_livox
+from scanchain.logs.messages.lidar import Sensed, read_livox, read_multi_echo_scan
 from scanchain.logs.messages.poses import StampedPose, read_odometry, read_pose, read_transforms
-from scanchain.logs.messages.returns import Sensed
 from scanchain.logs.messages.ros import unpacked
 
 Read = Callable[..., Any]

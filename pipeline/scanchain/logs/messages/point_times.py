@@ -1,58 +1,15 @@
-"""Valid returns of a scan message and their times, whatever a driver's name and unit for these."""
+"""Times of the points of a scan, whatever a driver's name and unit for them."""
 
 from __future__ import annotations
-
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.config import LogConfig
-from scanchain.data import Pose, RawPoints
+from scanchain.data import RawPoints
 
-
-class Sensed(NamedTuple):
-    """A LaserScan or PointCloud2 of sensor_msgs; pose (4, 4) of its points in its frame, None for its origin."""
-
-    message: Any
-    T_frame_points: Pose | None = None
-
-
-class Returns(NamedTuple):
-    """The valid returns of one scan message.
-
-    ``points`` (N, d) float32 meters, ``times_s`` (N,) float32 seconds after ``stamp_ns`` or (0,); ``dropped``
-    counts what was left out, ``why`` is the reason where nothing is left.
-    """
-
-    stamp_ns: int
-    points: RawPoints
-    times_s: NDArray[np.float32]
-    dropped: int
-    why: str
-
-
-NEAREST_M = float(np.finfo(np.float32).tiny)  # below it a range is zero
 NO_TIMES = np.empty(0, np.float32)
 NO_TIMES.flags.writeable = False
-
-
-def moved(points: RawPoints, T: Pose | None) -> RawPoints:
-    """Points (N, d) moved by a pose (4, 4); None moves nothing."""
-    d = points.shape[1]
-    return points if T is None else (points @ T[:d, :d].T + T[:d, 3]).astype(np.float32)
-
-
-def why_none(ranges_m: NDArray[np.float32], low_m: float, high_m: float) -> str:
-    """Reason why none of the ranges (N,) is a return between these limits."""
-    undefined = int(np.count_nonzero(~np.isfinite(ranges_m)))
-    near = int(np.count_nonzero(ranges_m < low_m)) - int(np.count_nonzero(np.isneginf(ranges_m)))
-    return (
-        f"of {len(ranges_m)} ranges {undefined} are NaN or infinite, {near} are below {low_m:.3g} m, "
-        f"{len(ranges_m) - undefined - near} are at {high_m:.3g} m or beyond"
-    )
-
-
 NAMES = ("t", "time", "timestamp", "offset_time", "time_offset", "timeOffset", "time_stamp")
 
 UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}

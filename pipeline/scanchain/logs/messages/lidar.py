@@ -1,36 +1,105 @@
-"""sensor_msgs/PointCloud2 and a Livox driver's CustomMsg to points in space."""
+"""Messages of lidars to the points that came back: laser scans in the plane, clouds in space."""
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterable
-from typing import Any
+from functools import lru_cache
+from math import isfinite
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain.data import RawPoints
+from scanchain.config import LogConfig
+from scanchain.data import Pose, RawPoints
 from scanchain.errors import one_line
 from scanchain.kernels.scans import keep_valid
-from scanchain.logs.messages.returns import (
-    NAMES,
-    NEAREST_M,
-    NO_TIMES,
-    PointTimes,
-    Returns,
-    Sensed,
-    moved,
-    why_none,
-)
+from scanchain.logs.messages.point_times import NAMES, NO_TIMES, PointTimes
 from scanchain.logs.messages.ros import NUMBERS, MalformedMessageError, header, new, point_fields, stamp_ns
 
+_NEAREST_M = float(np.finfo(np.float32).tiny)  # below it a range is zero
+_MOST_GEOMETRIES = 16
+_MOST_TURNS = 2.0  # largest number of turns that the beams of a scan cover; in degrees they seem to cover more
+_FARTHEST_M = float(np.finfo(np.float32).max)
 _MOST_STEP = (1 << 31) - 1
 PLANAR_M = 5e-4  # largest distance from the plane of a point of a planar cloud: rounding of float32
 _FEWEST_POINTS, _ENOUGH_POINTS = 3, 1000  # least number of points of a cloud, and in all, that show a plane
-_SQUARE_OF_FARTHEST = float(np.finfo(np.float32).max)
 
 _LIVOX_POINT_BYTES = 19  # offset_time, x, y, z, reflectivity, tag, line
 _LIVOX_FIELDS = (("offset_time", 0, 6), ("x", 4, 7), ("y", 8, 7), ("z", 12, 7))
+
+
+class Sensed(NamedTuple):
+    """A LaserScan or PointCloud2 of sensor_msgs; pose (4, 4) of its points in its frame, None for its origin."""
+
+    message: Any
+    T_frame_points: Pose | None = None
+
+
+class Returns(NamedTuple):
+    """The valid returns of one scan message.
+
+    ``points`` (N, d) float32 meters, ``times_s`` (N,) float32 seconds after ``stamp_ns`` or (0,); ``dropped``
+    counts what was left out, ``why`` is the reason where nothing is left.
+    """
+
+    stamp_ns: int
+    points: RawPoints
+    times_s: NDArray[np.float32]
+    dropped: int
+    why: str
+
+
+def read_multi_echo_scan(message: Any) -> Sensed:
+    """A sensor_msgs/MultiEchoLaserScan as the scan of each beam's first echo, inf where there is none."""
+    firsts_m = [beam.echoes[0] if len(beam.echoes) else np.inf for beam in message.ranges]
+    message.ranges = np.array(firsts_m, np.float32)
+    return Sensed(message)
+
+
+def decode_laser_scan(data: memoryview, read: Callable[[memoryview], Sensed], config: LogConfig) -> Returns:
+    """Points of the beams that came back: finite, at least range_min, below range_max.
+
+    Scanners write range_max, or more, for a beam without return, and zero for an invalid one; limits that are
+    not positive are taken as unknown. Negative angle increments are as good as positive ones.
+    """
+    message, T_frame_points = read(data)
+    ranges_m = message.ranges
+    low_m = max(message.range_min if message.range_min > 0.0 else 0.0, config.min_range_m, _NEAREST_M)
+    high_m = min(message.range_max if message.range_max > 0.0 else _FARTHEST_M, config.max_range_m, _FARTHEST_M)
+    angles_rad = message.angle_min, message.angle_increment
+    directions, times_s = _beams(*angles_rad, message.time_increment, len(ranges_m))
+    valid = ((ranges_m >= low_m) & (ranges_m < high_m)).nonzero()[0]
+    if len(valid) == len(ranges_m):
+        points = directions * ranges_m[:, None]
+    else:
+        points = directions[valid] * ranges_m[valid, None]
+        times_s = times_s[valid] if len(times_s) else NO_TIMES
+    points = _moved(points, T_frame_points).astype(np.float32, copy=False)
+    why = "" if len(valid) else _why_none(ranges_m, low_m, high_m)
+    return Returns(stamp_ns(message), points, times_s, len(ranges_m) - len(valid), why)
+
+
+@lru_cache(_MOST_GEOMETRIES)
+def _beams(
+    first_rad: float, step_rad: float, beam_s: float, count: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Directions (N, 2) of the beams and their times (N,) after the stamp, (0,) where they are simultaneous."""
+    if not (isfinite(first_rad + step_rad * count) and abs(beam_s) * count < _FARTHEST_M):
+        raise MalformedMessageError(
+            f"its beams lie {step_rad:g} rad and {beam_s:g} s apart from {first_rad:g} rad on, which cannot be"
+        )
+    turns = abs(step_rad) * count / (2.0 * np.pi)
+    if turns > _MOST_TURNS:
+        raise MalformedMessageError(
+            f"its {count} beams, {step_rad:g} rad apart, cover {turns:.3g} turns: degrees? wanted radians"
+        )
+    angles_rad = first_rad + step_rad * np.arange(count)
+    directions = np.column_stack([np.cos(angles_rad), np.sin(angles_rad)]).astype(np.float32)
+    times_s = (beam_s * np.arange(count)).astype(np.float32) if beam_s else NO_TIMES
+    times_s.flags.writeable = False
+    return directions, times_s
 
 
 def read_livox(data: memoryview, encoding: str) -> Sensed:
@@ -70,7 +139,7 @@ def decode_cloud(
     kept = np.empty(len(cloud), np.int32)
     x, y, z = (_as_float32(cloud[name]) for name in "xyz")
     low_m, high_m = times.config.min_range_m, times.config.max_range_m
-    high_square = min(high_m * high_m, _SQUARE_OF_FARTHEST)
+    high_square = min(high_m * high_m, _FARTHEST_M)
     count = keep_valid(x, y, z, low_m**2, high_square, points, kept)
     times_s = NO_TIMES
     for name in (point.names or ())[3:]:
@@ -78,12 +147,12 @@ def decode_cloud(
         times_s = times.from_field(name, stamp_ns(message), values)
     if times.by_azimuth:
         times_s = times.from_azimuth(points[:count])
-    points = moved(points[:count], T_frame_points)
+    points = _moved(points[:count], T_frame_points)
     if plane_m is not None:
         points = _in_plane(points, plane_m)
     why = ""
     if not count:
-        why = why_none(np.hypot(np.hypot(x, y), z), max(low_m, NEAREST_M), np.sqrt(high_square))
+        why = _why_none(np.hypot(np.hypot(x, y), z), max(low_m, _NEAREST_M), np.sqrt(high_square))
     return Returns(stamp_ns(message), points, times_s, len(cloud) - count, why)
 
 
@@ -170,3 +239,19 @@ def _rows(message: Any, point: np.dtype[np.void]) -> NDArray[np.void]:
         return np.frombuffer(body, point, height * width)
     rows = np.ndarray((height, width), point, body, strides=(stride, point.itemsize))
     return rows.reshape(-1)
+
+
+def _moved(points: RawPoints, T: Pose | None) -> RawPoints:
+    """Points (N, d) moved by a pose (4, 4); None moves nothing."""
+    d = points.shape[1]
+    return points if T is None else (points @ T[:d, :d].T + T[:d, 3]).astype(np.float32)
+
+
+def _why_none(ranges_m: NDArray[np.float32], low_m: float, high_m: float) -> str:
+    """Reason why none of the ranges (N,) is a return between these limits."""
+    undefined = int(np.count_nonzero(~np.isfinite(ranges_m)))
+    near = int(np.count_nonzero(ranges_m < low_m)) - int(np.count_nonzero(np.isneginf(ranges_m)))
+    return (
+        f"of {len(ranges_m)} ranges {undefined} are NaN or infinite, {near} are below {low_m:.3g} m, "
+        f"{len(ranges_m) - undefined - near} are at {high_m:.3g} m or beyond"
+    )
