@@ -1,6 +1,7 @@
 """ROS 1 bags: finished or cut off, indexed or not; their messages stay as they are.
 
-A finished bag is indexed by the records at its end; others are walked as MCAP files are, chunk by chunk.
+Bags are walked record by record; the messages of a chunk are counted by the INDEX records behind it, those of a
+chunk without such, and of all chunks of a damaged bag, by unpacking it.
 Format: https://wiki.ros.org/Bags/Format/2.0
 """
 
@@ -25,11 +26,11 @@ from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Mes
 from scanchain.logs.mcap.stream import messages_of
 
 MAGIC = b"#ROSBAG V2.0\n"
-MESSAGE, HEADER, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 5, 6, 7
+MESSAGE, INDEX, CHUNK, CONNECTION = 2, 4, 5, 7
 Data = mmap.mmap | memoryview | bytes
 _LENGTH = struct.Struct("<I")
-_POSITION = struct.Struct("<Q")
 _TIME = struct.Struct("<II")  # seconds, nanoseconds
+_ENTRY = np.dtype([("s", "<u4"), ("ns", "<u4"), ("offset", "<u4")])  # of an INDEX, a message
 _LONGEST_HEAD = 1 << 16  # longest head in bytes; a longer one is damage
 _OPCODE = re.compile(rb"\x04\0\0\0op=[\x05\x07]")  # opcode of a chunk, a connection
 _MOST_BEFORE = 256  # largest number of bytes of a head before its opcode
@@ -130,56 +131,17 @@ def index_ros1_bag(path: Path, number: int) -> FileIndex:
         if file.read(len(MAGIC)) != MAGIC:
             raise InputError(f"{path}: is a bag of an old version; rosbag migrate makes one of version 2.0 of it")
         data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-    index = _new_index(path, number, data)
-    if not _take_summary(index):
-        index = _new_index(path, number, data)
-        _walk(index)
-        index.blocks = [_counted(index, block) for block in index.blocks]
+    index = FileIndex(path, number, data)
+    index.make = partial(_contents, index)
+    head = read_record(data, len(MAGIC))
+    if head is not None and head.text(b"encryptor"):
+        raise InputError(f"{path}: is encrypted ({head.text(b'encryptor')}); decrypt it first")
+    _walk(index)
+    is_sure = not index.damage
+    index.blocks = [block if is_sure and block.counts else _counted(index, block) for block in index.blocks]
     index.counts = dict(index.indexed_counts())
     index.channels = {number: c for number, c in index.channels.items() if index.counts.get(number)}
     return index
-
-
-def _new_index(path: Path, number: int, data: mmap.mmap) -> FileIndex:
-    index = FileIndex(path, number, data)
-    index.make = partial(_contents, index)
-    return index
-
-
-def _take_summary(index: FileIndex) -> bool:
-    """Fill the index by the records at the end of a finished bag; False where they do not give every message."""
-    data, head = index.data, read_record(index.data, len(MAGIC))
-    if head is None or head.opcode != HEADER:
-        return False
-    if head.text(b"encryptor"):
-        raise InputError(f"{index.path}: is encrypted ({head.text(b'encryptor')}); decrypt it first")
-    try:
-        (begin,) = _POSITION.unpack(head.fields.get(b"index_pos", b""))
-        for record in whole_records(data, begin or len(data)):
-            if record.opcode == CONNECTION:
-                _define(index, record, data)
-            elif record.opcode == CHUNK_INFO:
-                index.blocks.append(_stated_chunk(index, record))
-        stated = head.number(b"chunk_count"), head.number(b"conn_count")
-    except (struct.error, ValueError):
-        return False
-    is_complete = begin > 0 and stated == (len(index.blocks), len(index.channels))
-    return is_complete and index.indexed_counts().keys() <= index.channels.keys()
-
-
-def _stated_chunk(index: FileIndex, info: Record) -> Block:
-    """The chunk that a CHUNK_INFO describes. Raises struct.error or ValueError where there is none."""
-    (offset,) = _POSITION.unpack(info.fields.get(b"chunk_pos", b""))
-    record = read_record(index.data, offset)
-    if record is None or record.opcode != CHUNK or record.end > len(index.data):
-        raise struct.error("no chunk")
-    pairs = np.frombuffer(index.data, "<u4", 2 * info.number(b"count"), info.begin).reshape(-1, 2).tolist()
-    return replace(
-        _chunk(index, record),
-        start_ns=info.time_ns(b"start_time"),
-        end_ns=info.time_ns(b"end_time"),
-        counts=dict(pairs),
-    )
 
 
 def _walk(index: FileIndex) -> None:
@@ -210,6 +172,8 @@ def _take(index: FileIndex, record: Record) -> None:
             _define(index, record, index.data)
         elif record.opcode == CHUNK:
             index.blocks.append(_chunk(index, record))
+        elif record.opcode == INDEX and index.blocks:
+            index.blocks[-1] = _indexed(index, record)
     except (struct.error, ValueError) as error:
         what = str(error) if isinstance(error, ValueError) else "is malformed"
         index.damage.append(f"{index.path}: the record at byte {record.offset} {what} and was left out")
@@ -224,6 +188,15 @@ def _chunk(index: FileIndex, record: Record) -> Block:
     name = record.text(b"compression")
     where = {"head": record.begin - record.offset, "is_cut": record.end > end}
     return Block(index.number, record.begin, size, "" if name == "none" else name, claimed, 0, 0, **where)
+
+
+def _indexed(index: FileIndex, record: Record) -> Block:
+    """The last chunk, with the messages of a connection that an INDEX lists."""
+    block, entries = index.blocks[-1], np.frombuffer(index.data[record.begin : record.end], _ENTRY)
+    times_ns = (entries["s"].astype(np.int64) * 1_000_000_000 + entries["ns"]).tolist()
+    span_ns = [*times_ns, *([block.start_ns, block.end_ns] if block.counts else [])] or [0]
+    counts = block.counts | ({record.number(b"conn"): len(times_ns)} if times_ns else {})
+    return replace(block, start_ns=min(span_ns), end_ns=max(span_ns), counts=counts)
 
 
 def _counted(index: FileIndex, block: Block) -> Block:
