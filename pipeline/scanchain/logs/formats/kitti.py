@@ -43,7 +43,8 @@ def index_kitti_raw(folder: Path, number: int) -> FileIndex:
 
 def index_kitti_odometry(folder: Path, number: int) -> FileIndex:
     """A sequence of the odometry benchmark (``sequences/00``); truth lies in ``poses/00.txt`` beside it."""
-    times_ns = read_seconds(folder / "times.txt")
+    times = folder / "times.txt"
+    times_ns = _checked(times, np.rint(_table(times, 1)[:, 0] * _NS))  # lines of seconds
     index = FileIndex(folder, number)
     return _index(index, folder / "velodyne", times_ns, lambda: _benchmark_truth(index, folder, times_ns))
 
@@ -119,11 +120,6 @@ def read_times(file: Path) -> list[int]:
     except ValueError as error:
         raise InputError(f"{file}: is no list of times ({error}); download it again") from error
     return _checked(file, times_ns)
-
-
-def read_seconds(file: Path) -> list[int]:
-    """Nanoseconds of each line that is a number of seconds."""
-    return _checked(file, np.rint(_table(file, 1)[:, 0] * _NS))
 
 
 def _checked(file: Path, times_ns: NDArray[np.int64] | Matrix) -> list[int]:

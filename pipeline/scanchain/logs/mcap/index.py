@@ -148,9 +148,8 @@ class Walk:
     def __init__(self, index: FileIndex) -> None:
         self.index = index
         self.data = index.data
-        self.chunk: Block | None = None
-        self.loose: list[tuple[int, int]] = []  # channel and log time of messages outside of chunks
-        self.loose_from = 0
+        self.open: Block | None = None  # the chunk, or the run of loose messages, that was met last
+        self.times_ns: list[int] = []  # of these messages
         self.loose_sizes: deque[int] = deque(maxlen=8)  # of the records met last
 
     def walk(self) -> None:
@@ -201,23 +200,24 @@ class Walk:
             self._take_chunk(chunk, offset)
         elif opcode == MESSAGE:
             self._take_message(offset, end)
-        elif opcode == MESSAGE_INDEX and self.chunk is None:
+        elif opcode == MESSAGE_INDEX and (self.open is None or not self.open.head):
             index.note_damage(f"{index.path}: the chunk before the message index at byte {offset} is missing")
-        elif opcode == MESSAGE_INDEX and self.chunk is not None:
+        elif opcode == MESSAGE_INDEX and self.open is not None:
             (channel,) = struct.unpack_from("<H", self.data, body)
             if count := (end - body - 6) // 16:
-                self.chunk.counts[channel] = self.chunk.counts.get(channel, 0) + count
+                self.open.counts[channel] = self.open.counts.get(channel, 0) + count
         elif opcode in (SCHEMA, CHANNEL):
             index.define(read_definition(opcode, self.data[body:end]))
         else:
             self._close(offset, complete=True)
 
     def _take_message(self, offset: int, end: int) -> None:
-        if self.chunk is not None or end - self.loose_from > _LOOSE_BYTES:
+        if self.open is None or self.open.head or end - self.open.offset > _LOOSE_BYTES:
             self._close(offset, complete=True)
+            self.open = Block(self.index.number, offset, 0, "", 0, 0, 0, Counter())
         channel, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(self.data, offset + RECORD.size)
-        self.loose_from = self.loose_from if self.loose else offset
-        self.loose.append((channel, log_time_ns))
+        self.open.counts[channel] += 1
+        self.times_ns.append(log_time_ns)
         if end - offset not in self.loose_sizes:
             self.loose_sizes.append(end - offset)
 
@@ -234,7 +234,7 @@ class Walk:
         if self.data[offset] != CHUNK:
             self.index.damage.append(f"{name} is marked as another record; it was read all the same")
         if is_plausible_size(chunk.size, chunk.uncompressed_size):
-            self.chunk = chunk
+            self.open = chunk
             return
         self.index.damage.append(
             f"{name} claims to unpack from {chunk.size} to {chunk.uncompressed_size} bytes, more than is "
@@ -258,15 +258,13 @@ class Walk:
 
     def _close(self, offset: int, *, complete: bool) -> None:
         """End the chunk or the run of loose messages at this byte; incomplete counts are discarded."""
-        if self.chunk is not None:
-            self.index.blocks.append(self.chunk if complete else replace(self.chunk, counts={}))
-        if self.loose:
-            times_ns = [log_time_ns for _, log_time_ns in self.loose]
-            counts = Counter(channel for channel, _ in self.loose)
-            begin, size, span = self.loose_from, offset - self.loose_from, (min(times_ns), max(times_ns))
-            block = Block(self.index.number, begin, size, "", size, *span, counts)
-            self.index.blocks.append(block)
-        self.chunk, self.loose = None, []
+        block, self.open = self.open, None
+        if block is not None and block.head:
+            self.index.blocks.append(block if complete else replace(block, counts={}))
+        elif block is not None:
+            size, span = offset - block.offset, {"start_ns": min(self.times_ns), "end_ns": max(self.times_ns)}
+            self.index.blocks.append(replace(block, size=size, uncompressed_size=size, **span))
+            self.times_ns = []
 
 
 def is_plausible_size(size: int, uncompressed: int) -> bool:

@@ -52,10 +52,6 @@ class Span(NamedTuple):
         """True if the block may hold messages of the span."""
         return block.may_be_empty or (block.end_ns >= self.begin_ns and block.start_ns <= self.end_ns)
 
-    def covers(self, block: Block) -> bool:
-        """True if all messages of the block lie in the span."""
-        return self.begin_ns <= block.start_ns <= block.end_ns <= self.end_ns
-
 
 _LONG_GAP_NS = 60_000_000_000  # without any message
 _LONGEST_GAP_NS = 86_400_000_000_000  # without any message between two files of one log
@@ -158,7 +154,7 @@ def count_messages(indexes: Sequence[FileIndex], topic: str, span: Span) -> int:
     for index in indexes:
         wanted = index.numbers_of(topic)
         for block in filter(span.meets, index.blocks):
-            if block.counts and span.covers(block):
+            if block.counts and span.begin_ns <= block.start_ns <= block.end_ns <= span.end_ns:
                 count += sum(block.counts.get(number, 0) for number in wanted)
             elif index.may_hold(block, wanted):
                 count += sum(span.holds(message) for message in messages_of(index, block, wanted))

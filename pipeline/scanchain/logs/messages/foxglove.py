@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from functools import cache
-from typing import Any, get_type_hints
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -144,9 +143,8 @@ def _pose(position: _Vector, orientation: _Vector, dimension: int) -> Pose:
     return pose_of(position, orientation if is_given else _Vector(w=1.0), dimension)
 
 
-def parse_json(data: memoryview, read: Callable[..., Any]) -> Any:
-    """The record that ``read`` takes. NaN and Infinity, which are no JSON but which Python writes, are taken."""
-    record = _record_of(read)
+def parse_json(data: memoryview, record: type[Struct]) -> Any:
+    """A record of this type. NaN and Infinity, which are no JSON but which Python writes, are taken."""
     try:
         return msgspec.json.decode(data, type=record)
     except msgspec.ValidationError as error:
@@ -157,11 +155,6 @@ def parse_json(data: memoryview, read: Callable[..., Any]) -> Any:
         return msgspec.convert(json.loads(bytes(data)), record)
     except (ValueError, RecursionError) as error:
         raise MalformedMessageError(f"it is no JSON of its type: {error}") from error
-
-
-@cache
-def _record_of(read: Callable[..., Any]) -> Any:
-    return get_type_hints(read)["message"]
 
 
 def protobuf_parser(channel: Channel) -> Callable[[memoryview], Any]:

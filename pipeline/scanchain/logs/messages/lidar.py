@@ -235,10 +235,9 @@ def _rows(message: Any, point: np.dtype[np.void]) -> NDArray[np.void]:
             f"data has {len(body)} bytes, fewer than the {needed} of {height} × {width} points "
             f"of {point.itemsize} bytes"
         )
-    if not needed or stride == row:
-        return np.frombuffer(body, point, height * width)
-    rows = np.ndarray((height, width), point, body, strides=(stride, point.itemsize))
-    return rows.reshape(-1)
+    if not needed:
+        return np.empty(0, point)
+    return np.ndarray((height, width), point, body, strides=(stride, point.itemsize)).reshape(-1)
 
 
 def _moved(points: RawPoints, T: Pose | None) -> RawPoints:
