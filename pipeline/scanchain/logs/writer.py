@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, Literal, NamedTuple, Self
+from typing import IO, Any, NamedTuple, Self
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
@@ -190,30 +190,13 @@ class LogWriter:
         stamp_ns: int,
         frame: str,
         points: NDArray[np.floating],
-        *,
-        times_s: NDArray[np.floating] | None = None,
-        time_field: Literal["t", "time"] = "t",
-        ring: NDArray[np.integer] | None = None,
+        fields: Mapping[str, NDArray[np.number]] | None = None,
         log_time_ns: int | None = None,
     ) -> None:
-        """Append a sensor_msgs/PointCloud2 of one row.
-
-        points : (N, 3) meters
-        times_s : (N,) seconds after ``stamp_ns``; written as ``t`` (uint32 ns, from 0 up) or ``time`` (float32 s)
-        ring : (N,) written as uint16
-        """
-        columns: dict[str, tuple[str, NDArray[np.number]]] = {
-            name: ("<f4", points[:, axis]) for axis, name in enumerate("xyz")
-        }
-        if times_s is not None:
-            whole_ns = np.rint(1e9 * np.asarray(times_s, np.float64)).astype(np.int64)
-            if time_field == "t" and whole_ns.min(initial=0) < 0:
-                raise InputError(f"{topic}: times_s begin at {whole_ns.min():,} ns; t counts from 0 up, give time")
-            columns[time_field] = ("<f4", times_s) if time_field == "time" else ("<u4", whole_ns)
-        if ring is not None:
-            columns["ring"] = ("<u2", ring)
-        codes, values = zip(*columns.values(), strict=True)
-        rows = np.rec.fromarrays(values, dtype=list(zip(columns, codes, strict=True)))
+        """Append a sensor_msgs/PointCloud2 of one row: points (N, 3) in meters, and more fields (N,) by name."""
+        columns = dict(zip("xyz", points.T.astype(np.float32), strict=True)) | dict(fields or {})
+        point = [(name, values.dtype) for name, values in columns.items()]
+        rows = np.rec.fromarrays(list(columns.values()), dtype=point)
         self.append(topic, "sensor_msgs/msg/PointCloud2", pack_cloud(stamp_ns, frame, rows), stamp_ns, log_time_ns)
 
     def append(self, topic: str, schema: str, data: bytes, stamp_ns: int, log_time_ns: int | None = None) -> None:

@@ -75,8 +75,8 @@ def _write(log: LogWriter, path: Path, name: str) -> None:
                 raise InputError(f"points are no (N, {dimension}) as those before; yield one kind")
         rows = np.asarray(points, np.float32)
         rows = np.pad(rows, ((0, 0), (0, 3 - dimension)))  # in the plane z = 0, by which it is known as 2D
-        seconds = np.asarray(times_s, np.float32) if len(scan.times_s) else None
-        log.point_cloud(_TOPIC, scan.stamp_ns, _FRAME, rows, times_s=seconds, time_field="time")
+        fields = {"time": np.asarray(times_s, np.float32)} if len(scan.times_s) else {}
+        log.point_cloud(_TOPIC, scan.stamp_ns, _FRAME, rows, fields)
 
 
 @contextmanager

@@ -7,7 +7,7 @@ import mmap
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -172,17 +172,6 @@ class FileIndex:
         return channel is not None and (channel.schema == 0 or channel.type_name != "")
 
 
-def records_of(data: memoryview | bytes) -> Iterator[tuple[int, int, int]]:
-    """Opcode of each record, begin and end of its body. Raises struct.error for one beyond the end."""
-    offset = 0
-    while offset < len(data):
-        opcode, length = RECORD.unpack_from(data, offset)
-        begin, offset = offset + RECORD.size, offset + RECORD.size + length
-        if offset > len(data):
-            raise struct.error("record beyond the end")
-        yield opcode, begin, offset
-
-
 def read_definition(opcode: int, body: bytes) -> mcap.records.Schema | mcap.records.Channel:
     """The schema or channel that a record defines. Raises one of MALFORMED."""
     stream = ReadDataStream(BytesIO(body))
@@ -206,9 +195,13 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
         return made._replace(messages=[m for m in made.messages if wanted is None or m.channel.key[1] in wanted])
     payload = unpack(index, block)
     messages: list[Message] = []
-    met = undefined = 0
+    met = undefined = end = 0
     try:
-        for opcode, begin, end in records_of(payload):
+        while end < len(payload):
+            opcode, length = RECORD.unpack_from(payload, end)
+            begin, end = end + RECORD.size, end + RECORD.size + length
+            if end > len(payload):
+                raise struct.error("record beyond the end")
             if opcode in (SCHEMA, CHANNEL):
                 index.define(read_definition(opcode, bytes(payload[begin:end])))
             elif opcode == MESSAGE:

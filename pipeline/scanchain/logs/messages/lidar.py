@@ -15,7 +15,7 @@ from scanchain.config import LogConfig
 from scanchain.data import Pose, RawPoints
 from scanchain.errors import one_line
 from scanchain.kernels.scans import keep_valid
-from scanchain.logs.messages.point_times import NAMES, NO_TIMES, PointTimes
+from scanchain.logs.messages.point_times import NO_TIMES, PointTimes
 from scanchain.logs.messages.ros import NUMBERS, MalformedMessageError, header, new, point_fields, stamp_ns
 
 _NEAREST_M = float(np.finfo(np.float32).tiny)  # below it a range is zero
@@ -193,33 +193,25 @@ def _layout(message: Any, times: PointTimes) -> np.dtype[np.void]:
     """A point as a structured type: x, y, z and the time field, if any."""
     if message.point_step > _MOST_STEP:
         raise MalformedMessageError(f"point_step {message.point_step} is more than a point can have")
-    wanted: dict[str, tuple[str, int]] = {}
-    for field in message.fields:
-        if field.name not in ("x", "y", "z") and not times.wants(field.name):
-            continue
+    fields = {field.name: field for field in message.fields}
+    if missing := [name for name in "xyz" if name not in fields]:
+        raise MalformedMessageError(
+            f"the cloud has no field {' '.join(missing)} (it has: {', '.join(fields) or 'none'})"
+        )
+    chosen = ["x", "y", "z", *[name for name in times.fields if name in fields][:1]]
+    numbers: list[np.dtype[np.generic]] = []
+    for name in chosen:
+        field = fields[name]
         if field.datatype not in NUMBERS:
+            raise MalformedMessageError(f"field {name} has data type {field.datatype}; PointField has 1 to 8")
+        numbers.append(np.dtype((">" if message.is_bigendian else "<") + NUMBERS[field.datatype]))
+        end = field.offset + numbers[-1].itemsize
+        if end > message.point_step:
             raise MalformedMessageError(
-                f"field {field.name} has data type {field.datatype}; PointField has 1 to 8"
+                f"field {name} reaches to byte {end} of a point, beyond point_step {message.point_step}"
             )
-        number = np.dtype((">" if message.is_bigendian else "<") + NUMBERS[field.datatype])
-        if field.offset + number.itemsize > message.point_step:
-            raise MalformedMessageError(
-                f"field {field.name} reaches to byte {field.offset + number.itemsize} of a point, "
-                f"beyond point_step {message.point_step}"
-            )
-        wanted[field.name] = (number.str, field.offset)
-    missing = [name for name in "xyz" if name not in wanted]
-    if missing:
-        names = ", ".join(field.name for field in message.fields) or "none"
-        raise MalformedMessageError(f"the cloud has no field {' '.join(missing)} (it has: {names})")
-    time = next((name for name in NAMES if name in wanted), "")
-    chosen = ["x", "y", "z", time] if time else ["x", "y", "z"]
-    return np.dtype({
-        "names": chosen,
-        "formats": [wanted[name][0] for name in chosen],
-        "offsets": [wanted[name][1] for name in chosen],
-        "itemsize": message.point_step,
-    })  # fmt: skip
+    offsets = [fields[name].offset for name in chosen]
+    return np.dtype({"names": chosen, "formats": numbers, "offsets": offsets, "itemsize": message.point_step})
 
 
 def _rows(message: Any, point: np.dtype[np.void]) -> NDArray[np.void]:

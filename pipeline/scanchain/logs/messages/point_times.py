@@ -10,7 +10,7 @@ from scanchain.data import RawPoints
 
 NO_TIMES = np.empty(0, np.float32)
 NO_TIMES.flags.writeable = False
-NAMES = ("t", "time", "timestamp", "offset_time", "time_offset", "timeOffset", "time_stamp")
+_NAMES = ("t", "time", "timestamp", "offset_time", "time_offset", "timeOffset", "time_stamp")
 
 UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _NONE = "no point times: every scan counts as measured at once"
@@ -24,18 +24,16 @@ class PointTimes:
     """Seconds after the stamp for the points of scans, in any order and from any thread.
 
     The unit is that of ``log.point_times`` or, where that is ``auto``, the one that a scan's values suggest.
-    ``assumed`` describes the interpretation of one of the first scans that have times.
+    ``fields`` names those that hold times, the likeliest first; ``assumed`` describes the interpretation of one of
+    the first scans that have times.
     """
 
     def __init__(self, config: LogConfig) -> None:
         self.config = config
         self.unit = config.point_times if config.point_times in UNITS_S else ""
         self.by_azimuth = config.point_times in ("clockwise", "counterclockwise")
+        self.fields = () if self.by_azimuth or config.point_times == "none" else _NAMES
         self.assumed = _NONE
-
-    def wants(self, field: str) -> bool:
-        """True if times are taken from a field of this name."""
-        return field in NAMES and not self.by_azimuth and self.config.point_times != "none"
 
     def from_azimuth(self, points: RawPoints) -> NDArray[np.float32]:
         """Times (N,) of points (N, 3) by the lidar's turn since its start, which is at the stamp."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left, insort
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Sequence
 from math import isfinite, sqrt
 from typing import Any, NamedTuple
@@ -103,15 +103,13 @@ class RecordedPoses:
         self.stamps_ns: list[int] = []  # of the latest readings of the wheels, in order
         self.wheels: dict[int, Pose] = {}
         self.truth: list[StampedPose] = []
-        self.malformed: Counter[str] = Counter()
-        self.reasons: dict[str, str] = {}
+        self.malformed: dict[str, list[str]] = {}  # by topic, what is wrong with each message
 
     def take(self, message: Decoded) -> None:
         """Sort one message in."""
         topic, pose = message.channel.topic, message.value
         if not isinstance(pose, StampedPose):
-            self.malformed[topic] += 1
-            self.reasons.setdefault(topic, str(pose))
+            self.malformed.setdefault(topic, []).append(str(pose))
             return
         if topic == self.ground_truth_topic:
             self.truth.append(pose)
@@ -147,6 +145,6 @@ class RecordedPoses:
     def complaints(self) -> list[str]:
         """One line for each topic that had malformed messages."""
         return [
-            f"{counted(count, 'malformed message')} of {topic} left out (the first: {self.reasons[topic]})"
-            for topic, count in self.malformed.items()
+            f"{counted(len(reasons), 'malformed message')} of {topic} left out (the first: {reasons[0]})"
+            for topic, reasons in self.malformed.items()
         ]
