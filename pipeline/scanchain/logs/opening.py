@@ -129,16 +129,21 @@ def _index(source: Source, number: int, config: LogConfig) -> FileIndex:
         if index is not None:
             return index
     copy = fetch_whole(file)
-    index = _index_path(copy, number, config, source)
+    try:
+        index = _index_path(copy, number, config)
+    except InputError as error:
+        raise InputError(error.text.replace(str(copy), str(source))) from error
     why = "has no index to read it by" if file.has_ranges else "lies on a server that sends no parts of files"
-    index.notes.insert(0, f"{source}: {why}, so all {copy.stat().st_size / 1e6:.1f} MB of it were downloaded")
+    index.notes.insert(0, f"{copy}: {why}, so all {copy.stat().st_size / 1e6:.1f} MB of it were downloaded")
+    index.path = source
+    for lines in (index.notes, index.damage):
+        lines[:] = [line.replace(str(copy), str(source)) for line in lines]
     return index
 
 
-def _index_path(path: Path, number: int, config: LogConfig, address: Source | None = None) -> FileIndex:
-    """Index of a path, which may be the copy of a remote file."""
+def _index_path(path: Path, number: int, config: LogConfig) -> FileIndex:
     if config.format != AUTO and config.format not in FORMATS:
-        return index_scans(path, number, config.format, address)
+        return index_scans(path, number, config.format)
     try:
         head = b""
         if path.is_file():
@@ -148,8 +153,6 @@ def _index_path(path: Path, number: int, config: LogConfig, address: Source | No
         raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
     try:
         index_of = (_claiming(path, head) if config.format == AUTO else FORMATS[config.format]).index_of
-        if index_of is index_file:
-            return index_file(path, number, address)
         if index_of is index_clouds:
             return index_clouds(path, number, config.rate_hz, config.bin_columns)
         return index_of(path, number)

@@ -9,7 +9,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from scanchain.errors import InputError
-from scanchain.files import Source
 from scanchain.logs.mcap.index import index_file
 from scanchain.logs.mcap.records import Block, Channel, FileIndex
 from scanchain.logs.writer import LogWriter, schema_text
@@ -35,13 +34,8 @@ def add_block(
         index.counts[channel] = index.counts.get(channel, 0) + count
 
 
-def temporary_index(
-    path: Path, number: int, write: Callable[[LogWriter], None], source: Source | None = None
-) -> FileIndex:
-    """Index of the messages of a path that ``write`` converts, as the ``number``-th file of a log.
-
-    source : what ``path`` is a copy of, None for itself
-    """
+def temporary_index(path: Path, number: int, write: Callable[[LogWriter], None]) -> FileIndex:
+    """Index of the messages of a path that ``write`` converts, as the ``number``-th file of a log."""
     with TemporaryDirectory(prefix="scanchain-", ignore_cleanup_errors=True) as folder:
         copy = Path(folder) / "log.mcap"
         try:
@@ -49,7 +43,9 @@ def temporary_index(
                 write(log)
         except OSError as error:
             raise InputError(f"{copy}: {path} cannot be converted there ({error.strerror}); set TMPDIR") from error
-        return index_file(copy, number, source or path)  # which maps the file: it may be deleted
+        index = index_file(copy, number)  # which maps the file: it may be deleted
+    index.path = path
+    return index
 
 
 def natural_order(path: Path) -> tuple[tuple[int, ...], str]:

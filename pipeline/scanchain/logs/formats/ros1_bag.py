@@ -11,7 +11,6 @@ import mmap
 import re
 import struct
 from collections import Counter
-from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
 from functools import partial
@@ -83,16 +82,6 @@ def _define(index: FileIndex, record: Record, data: Data) -> None:
     definition = stated[b"message_definition"]
     channel = Channel((index.number, number), topic, "ros1", number + 1, type_name, "ros1msg", definition)
     index.channels.setdefault(number, channel)
-
-
-def whole_records(data: Data, offset: int = 0) -> Iterator[Record]:
-    """One record after the other. Raises struct.error at bytes that are no record, or not all of one."""
-    while offset < len(data):
-        record = read_record(data, offset)
-        if record is None or record.end > len(data):
-            raise struct.error("record that is none, or beyond the end")
-        yield record
-        offset = record.end
 
 
 def next_record(data: Data, offset: int, stated_end: int) -> Record | None:
@@ -211,10 +200,14 @@ def _contents(index: FileIndex, block: Block, _: AbstractSet[int] | None) -> Con
     """The messages of a chunk; connections found there join the index."""
     name = f"{index.path}: the chunk at byte {block.offset}"
     messages: list[Message] = []
-    undefined = 0
+    undefined = offset = 0
     try:
         payload = unpack(index, block)
-        for record in whole_records(payload):
+        while offset < len(payload):
+            record = read_record(payload, offset)
+            if record is None or record.end > len(payload):
+                raise struct.error("record that is none, or beyond the end")
+            offset = record.end
             if record.opcode == CONNECTION:
                 _define(index, record, payload)
             elif record.opcode == MESSAGE:

@@ -28,7 +28,7 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
         reader.open()
     except Exception as error:  # whatever a damaged file makes the libraries below raise
         raise InputError(
-            f"{path}: cannot be read as a ROS bag ({_reason(error)}); "
+            f"{path}: cannot be read as a ROS bag ({one_line(error)}); "
             "ros2 bag reindex mends the folder of a ROS 2 bag"
         ) from error
     index = FileIndex(path, number)
@@ -103,11 +103,7 @@ def _contents(
         except Exception as error:  # whatever a damaged file makes the libraries below raise
             begin_ns = messages[-1].log_time_ns if messages else block.start_ns
             lost = (
-                f"{begin_ns * 1e-9:.3f} to {block.end_ns * 1e-9:.3f} s cannot be read further ({_reason(error)})"
+                f"{begin_ns * 1e-9:.3f} to {block.end_ns * 1e-9:.3f} s cannot be read further ({one_line(error)})"
             )
             return Contents(messages, f"{index.path}: what was recorded from {lost}")
     return Contents(messages, "")
-
-
-def _reason(error: Exception) -> str:
-    return one_line(error) or type(error).__name__

@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 from scanchain import plugins
 from scanchain.data import Scan
 from scanchain.errors import InputError, counted, one_line, shown
-from scanchain.files import Source
 from scanchain.logs.formats import temporary_index
 from scanchain.logs.mcap.records import FileIndex
 from scanchain.logs.writer import LATEST_NS, LogWriter
@@ -37,19 +36,18 @@ class ScanFormat(Protocol):
         ...
 
 
-def index_scans(path: Path, number: int, name: str, source: Source | None = None) -> FileIndex:
+def index_scans(path: Path, number: int, name: str) -> FileIndex:
     """The scans of a path as the class ``name`` reads them, as the ``number``-th file of a log.
 
-    source : what ``path`` is a copy of, None for itself
     Raises InputError where the class fails, or yields something else than scans.
     """
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; check the path")
-    index = temporary_index(path, number, lambda log: _write(log, path, name), source)
+    index = temporary_index(path, number, lambda log: _write(log, path, name))
     scans = sum(index.counts.values())
     if not scans:
         raise InputError(f"{path}: {name} yields no scan of it; check the path and the format")
-    index.notes.append(f"{source or path}: {counted(scans, 'scan')} read by {name} (log.format)")
+    index.notes.append(f"{path}: {counted(scans, 'scan')} read by {name} (log.format)")
     return index
 
 

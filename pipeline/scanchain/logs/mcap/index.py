@@ -22,7 +22,6 @@ from mcap.records import Channel, ChunkIndex, Schema, Statistics
 from mcap.stream_reader import StreamReader
 
 from scanchain.errors import InputError
-from scanchain.files import Source
 from scanchain.logs.files import RemoteFile
 from scanchain.logs.mcap.records import (
     CHANNEL,
@@ -54,11 +53,8 @@ _LOOSE_BYTES = 1 << 20  # messages outside chunks are read in blocks of about th
 _WINDOW = 1 << 20  # bytes searched at once
 
 
-def index_file(path: Path, number: int, source: Source | None = None) -> FileIndex:
-    """Index of one file, the ``number``-th of a log. Raises InputError for what is no MCAP file at all.
-
-    source : the original of a copy, named in messages; None for itself
-    """
+def index_file(path: Path, number: int) -> FileIndex:
+    """Index of one file, the ``number``-th of a log. Raises InputError for what is no MCAP file at all."""
     try:
         with path.open("rb") as file:
             data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
@@ -68,9 +64,9 @@ def index_file(path: Path, number: int, source: Source | None = None) -> FileInd
         raise InputError(f"{path}: is empty (0 bytes); record or copy it again") from error
     if data[: len(MAGIC)] != MAGIC:
         raise InputError(f"{path}: is not an MCAP file (starts with {data[:8]!r}); see scanchain convert --help")
-    index = FileIndex(source or path, number, data)
+    index = FileIndex(path, number, data)
     if not _take_summary(index, len(data), needs_crc=True):
-        index = FileIndex(source or path, number, data, is_consistent=False)
+        index = FileIndex(path, number, data, is_consistent=False)
         Walk(index).walk()
     return index
 

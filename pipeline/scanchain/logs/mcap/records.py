@@ -233,9 +233,7 @@ def unpack(index: FileIndex, block: Block) -> memoryview:
     except (zstandard.ZstdError, RuntimeError, MemoryError, EOFError, OSError, ValueError) as error:
         if block.is_cut:
             return memoryview(b"")
-        raise DamagedBlockError(
-            f"{_name(index, block)}: does not unpack ({one_line(error) or type(error).__name__})"
-        ) from error
+        raise DamagedBlockError(f"{_name(index, block)}: does not unpack ({one_line(error)})") from error
     if not block.is_cut and len(payload) != size:
         raise DamagedBlockError(f"{_name(index, block)}: unpacks to {len(payload)} bytes instead of {size}")
     if not block.is_cut and crc and zlib.crc32(payload) != crc:
