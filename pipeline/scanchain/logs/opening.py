@@ -157,9 +157,10 @@ def _index_path(path: Path, number: int, config: LogConfig) -> FileIndex:
             return index_clouds(path, number, config.rate_hz, config.bin_columns)
         return index_of(path, number)
     except UnknownFormatError as error:
-        if _POSE_GRAPH.search(error.text):
+        text, lack = error.args
+        if _POSE_GRAPH.search(text):
             raise InputError(f"{path}: is a pose graph, no log; give it to scanchain optimize") from None
-        raise InputError(f"{path}: is not a recognized log ({error.lack}); give {_KNOWN}") from None
+        raise InputError(f"{path}: is not a recognized log ({lack}); give {_KNOWN}") from None
 
 
 def _claiming(path: Path, head: bytes) -> LogFormat:

@@ -50,12 +50,10 @@ def pack_laser_scan(
     """A sensor_msgs/LaserScan; (N,) ranges, inf where nothing came back, stamp = first beam."""
     angle_max_rad = angle_min_rad + (len(ranges_m) - 1) * angle_increment_rad
     angles_rad = angle_min_rad, angle_max_rad, angle_increment_rad
-    limits_m = range_min_m, range_max_m
+    limits = time_increment_s, scan_time_s, range_min_m, range_max_m
     ranges = np.ascontiguousarray(ranges_m, np.float32)
-    return packed(
-        "sensor_msgs/msg/LaserScan",
-        header(stamp_ns, frame), *angles_rad, time_increment_s, scan_time_s, *limits_m, ranges, ranges[:0],
-    )  # fmt: skip
+    head = header(stamp_ns, frame)
+    return packed("sensor_msgs/msg/LaserScan", head, *angles_rad, *limits, ranges, ranges[:0])
 
 
 def pack_cloud(stamp_ns: int, frame: str, rows: NDArray[np.void]) -> bytes:
@@ -63,25 +61,19 @@ def pack_cloud(stamp_ns: int, frame: str, rows: NDArray[np.void]) -> bytes:
     layout = (rows.dtype.fields or {}).items()
     fields = point_fields(*((name, offset, _NUMBER_TYPES[kind.str[1:]]) for name, (kind, offset, *_) in layout))
     data = np.frombuffer(rows.tobytes(), np.uint8)
-    return packed(
-        "sensor_msgs/msg/PointCloud2",
-        header(stamp_ns, frame), 1, len(rows), fields, False, rows.itemsize, rows.nbytes, data, True,
-    )  # fmt: skip
+    parts = 1, len(rows), fields, False, rows.itemsize, rows.nbytes, data, True
+    return packed("sensor_msgs/msg/PointCloud2", header(stamp_ns, frame), *parts)
 
 
 def pack_odometry(
     stamp_ns: int, frame: str, child_frame: str, pose: Any, covariance: Matrix | None = None
 ) -> bytes:
     """A nav_msgs/Odometry: place of ``child_frame`` in ``frame``, (6, 6) covariance; no twist."""
-    covariances = np.zeros(36) if covariance is None else covariance.astype(np.float64).ravel(), np.zeros(36)
-    still = new("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
-    return packed(
-        "nav_msgs/msg/Odometry",
-        header(stamp_ns, frame),
-        child_frame,
-        new("geometry_msgs/msg/PoseWithCovariance", pose, covariances[0]),
-        new("geometry_msgs/msg/TwistWithCovariance", new("geometry_msgs/msg/Twist", still, still), covariances[1]),
-    )
+    spread = np.zeros(36) if covariance is None else covariance.astype(np.float64).ravel()
+    posed = new("geometry_msgs/msg/PoseWithCovariance", pose, spread)
+    still = new("geometry_msgs/msg/Twist", *[new("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)] * 2)
+    twist = new("geometry_msgs/msg/TwistWithCovariance", still, np.zeros(36))
+    return packed("nav_msgs/msg/Odometry", header(stamp_ns, frame), child_frame, posed, twist)
 
 
 class Link(NamedTuple):
@@ -94,15 +86,10 @@ class Link(NamedTuple):
 
 def pack_transforms(stamp_ns: int, *links: Link) -> bytes:
     """A tf2_msgs/TFMessage."""
-    transforms = [
-        new(
-            "geometry_msgs/msg/TransformStamped",
-            header(stamp_ns, link.parent),
-            link.child,
-            new("geometry_msgs/msg/Transform", link.pose.position, link.pose.orientation),
-        )
-        for link in links
-    ]
+    transforms = []
+    for parent, child, pose in links:
+        moved = new("geometry_msgs/msg/Transform", pose.position, pose.orientation)
+        transforms.append(new("geometry_msgs/msg/TransformStamped", header(stamp_ns, parent), child, moved))
     return packed("tf2_msgs/msg/TFMessage", transforms)
 
 

@@ -63,9 +63,4 @@ def left_out(folder: Path, taken: str, suffixes: Sequence[str]) -> list[str]:
 
 
 class UnknownFormatError(Exception):
-    """A file or folder that is no log of the assumed format: the expected contents, and what is missing."""
-
-    def __init__(self, text: bytes, lack: str) -> None:
-        super().__init__(lack)
-        self.text = text
-        self.lack = lack
+    """A file or folder that is no log of the assumed format: arguments are its text, and what is missing in it."""

@@ -133,15 +133,9 @@ def read_scan(words: list[bytes], stamp_ns: int, parameters: dict[bytes, float])
         dx, dy, dyaw = (laser - robot for laser, robot in zip(poses[:3], poses[3:], strict=True))
         cosine, sine = math.cos(poses[5]), math.sin(poses[5])
         mounting = planar(cosine * dx + sine * dy, cosine * dy - sine * dx, dyaw)
-    scan = pack_laser_scan(
-        stamp_ns,
-        "laser",
-        first_rad,
-        step_rad,
-        np.array(ranges_m),
-        range_min_m=0.0,
-        range_max_m=min(max_range_m, _LEAST_CODE_M) if max_range_m > 0.0 else _LEAST_CODE_M,
-    )
+    reach_m = min(max_range_m, _LEAST_CODE_M) if max_range_m > 0.0 else _LEAST_CODE_M
+    beams = first_rad, step_rad, np.array(ranges_m)
+    scan = pack_laser_scan(stamp_ns, "laser", *beams, range_min_m=0.0, range_max_m=reach_m)
     return scan, planar(*poses[3:]), mounting
 
 

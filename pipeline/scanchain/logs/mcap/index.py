@@ -12,6 +12,7 @@ import mmap
 import struct
 import zlib
 from collections import Counter, deque
+from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache
 from io import BytesIO
@@ -178,21 +179,18 @@ class Walk:
 
     def _takes_summary(self, offset: int) -> bool:
         """True if the data end here and a summary ends the file; its channels are taken in as a last resort."""
-        if not _is_end(self.data, offset):
-            return False
-        uncertain = FileIndex(self.index.path, self.index.number, b"", channels=self.index.uncertain_channels)
-        try:
-            _fill(uncertain, self.data[offset:])
-        except MALFORMED:
-            return False
-        return True
+        uncertain = FileIndex(self.index.path, self.index.number, channels=self.index.uncertain_channels)
+        with suppress(*MALFORMED):
+            if _is_end(self.data, offset):
+                _fill(uncertain, self.data[offset:])
+                return True
+        return False
 
     def _take(self, offset: int, end: int) -> None:
         """Sort in the record of these bytes."""
         index, body = self.index, offset + RECORD.size
         opcode, chunk = self.data[offset], _chunk_at(index, offset)
         if chunk is not None:
-            self._close(offset, complete=True)
             self._take_chunk(chunk, offset)
         elif opcode == MESSAGE:
             self._take_message(offset, end)
@@ -226,6 +224,7 @@ class Walk:
         )
 
     def _take_chunk(self, chunk: Block, offset: int) -> None:
+        self._close(offset, complete=True)
         name = f"{self.index.path}: the chunk at byte {offset}"
         if self.data[offset] != CHUNK:
             self.index.damage.append(f"{name} is marked as another record; it was read all the same")

@@ -119,13 +119,14 @@ def _sensed(message: _LaserScan | _PointCloud, type_name: str, *parts: Any) -> S
 def pose_in_frame(message: _PoseInFrame, dimension: int) -> StampedPose:
     """A foxglove.PoseInFrame, flattened for dimension 2."""
     pose = _pose(message.pose.position, message.pose.orientation, dimension)
-    return StampedPose(_stamp_ns(message.timestamp), message.frame_id, "", pose)
+    return StampedPose(_stamp_ns(message.timestamp), message.frame_id.lstrip("/"), "", pose)
 
 
 def frame_transform(message: _FrameTransform) -> list[StampedPose]:
     """A foxglove.FrameTransform."""
     pose = _pose(message.translation, message.rotation, 3)
-    return [StampedPose(_stamp_ns(message.timestamp), message.parent_frame_id, message.child_frame_id, pose)]
+    frames = message.parent_frame_id.lstrip("/"), message.child_frame_id.lstrip("/")
+    return [StampedPose(_stamp_ns(message.timestamp), *frames, pose)]
 
 
 def frame_transforms(message: _FrameTransforms) -> list[StampedPose]:

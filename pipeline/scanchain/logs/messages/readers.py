@@ -9,7 +9,7 @@ from typing import Any, Literal, get_type_hints
 from scanchain.logs.mcap.records import Channel
 from scanchain.logs.messages import foxglove
 from scanchain.logs.messages.lidar import Sensed, read_livox, read_multi_echo_scan
-from scanchain.logs.messages.poses import StampedPose, read_odometry, read_pose, read_transforms
+from scanchain.logs.messages.poses import StampedPose, read_pose, read_transforms
 from scanchain.logs.messages.ros import unpacked
 
 Read = Callable[..., Any]
@@ -26,7 +26,7 @@ _TYPES: dict[str, tuple[Role, Read]] = {  # those of ROS are laid out alike in R
     "livox_ros_driver/CustomMsg": ("cloud", read_livox),
     "livox_interfaces/CustomMsg": ("cloud", read_livox),
     "foxglove.PointCloud": ("cloud", foxglove.point_cloud),
-    "nav_msgs/Odometry": ("odometry", read_odometry),
+    "nav_msgs/Odometry": ("odometry", read_pose),
     "geometry_msgs/PoseStamped": ("pose", read_pose),
     "geometry_msgs/PoseWithCovarianceStamped": ("pose", read_pose),
     "foxglove.PoseInFrame": ("pose", foxglove.pose_in_frame),
