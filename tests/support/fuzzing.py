@@ -21,11 +21,11 @@ from scanchain.logs.messages.lidar import decode_cloud, decode_laser_scan
 from scanchain.logs.messages.point_times import PointTimes
 from scanchain.logs.messages.readers import (
     has_poses,
-    has_transforms,
     is_lidar,
     is_scan,
     pose_reader,
     reader,
+    role,
 )
 from scanchain.logs.messages.ros import MalformedMessageError
 from tests.support import recorders
@@ -284,7 +284,7 @@ def decoder_of(channel):
         return partial(decode_laser_scan, read=reader(channel), config=LogConfig())
     if is_lidar(channel):
         return partial(decode_cloud, read=reader(channel), times=PointTimes(LogConfig()))
-    if has_transforms(channel):
+    if role(channel) == "transforms":
         return reader(channel)
     assert has_poses(channel), channel
     return pose_reader(channel, 2)

@@ -26,6 +26,7 @@ from scanchain.logs.topics import find_lidar, topics_of
 from scanchain.logs.writer import LogWriter
 
 _DEFAULTS = LogConfig()
+_FIXED = "tf_static"  # end of the name of a topic of fixed transforms
 _WHOLE = (_DEFAULTS.topic, _DEFAULTS.start_s, _DEFAULTS.end_s, _DEFAULTS.every)
 
 
@@ -64,9 +65,8 @@ def convert(
     total = sum(sum(index.counts.values()) for index in indexes)
     counts = dict.fromkeys(_chosen(indexes, config.topic), 0)
     span = chosen_span(whole_span(indexes), config)
-    if span != EVERYTHING and not any(
-        count_messages(indexes, topic, span) for topic in counts if not _is_fixed(topic)
-    ):
+    moving = [topic for topic in counts if not topic.endswith(_FIXED)]
+    if span != EVERYTHING and not any(count_messages(indexes, topic, span) for topic in moving):
         raise nothing_in_part(f"{name_of(indexes)}: no message", whole_span(indexes), config)
     damage = [line for index in indexes for line in index.damage]
     encodings = {channel.encoding for index in indexes for channel in index.channels.values()}
@@ -92,7 +92,7 @@ def _messages(
 ) -> Iterator[Decoded]:
     """The messages to write. Static transforms come first, and none before the chosen part begins."""
     span = chosen_span(whole_span(indexes), config)
-    fixed = set() if span == EVERYTHING else {topic for topic in topics if _is_fixed(topic)}
+    fixed = set() if span == EVERYTHING else {topic for topic in topics if topic.endswith(_FIXED)}
     for message in decoded_messages(indexes, dict.fromkeys(fixed, bytes), EVERYTHING, damage=[]):
         yield message._replace(log_time_ns=min(max(message.log_time_ns, span.begin_ns), span.end_ns))
     others = dict.fromkeys((topic for topic in topics if topic not in fixed), bytes)
@@ -103,10 +103,6 @@ def _messages(
             continue
         if (scans[message.channel.topic] - 1) % config.every == 0 or not is_lidar(message.channel):
             yield message
-
-
-def _is_fixed(topic: str) -> bool:
-    return topic.endswith("tf_static")
 
 
 def _chosen(indexes: Sequence[FileIndex], topic: str) -> list[str]:

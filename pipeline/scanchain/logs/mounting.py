@@ -13,7 +13,7 @@ from scanchain.data import Pose
 from scanchain.logs.mcap.records import Channel, FileIndex
 from scanchain.logs.mcap.stream import Span, sampled_messages
 from scanchain.logs.messages.poses import StampedPose, chain
-from scanchain.logs.messages.readers import has_transforms, is_odometry, pose_reader, reader
+from scanchain.logs.messages.readers import pose_reader, reader, role
 from scanchain.logs.topics import topics_of
 
 _BASE_FRAMES = ("base_link", "base_footprint", "base")
@@ -77,7 +77,7 @@ def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel 
     fixed = _transforms(indexes, is_fixed=True)
     frame = _frame_of(indexes, lidar)
     stated = None
-    if wheels is not None and is_odometry(wheels):
+    if wheels is not None and role(wheels) == "odometry":
         stated = next(sampled_messages(indexes, wheels.topic, pose_reader(wheels, 3)), None)
     bases = [name for name in ("" if stated is None else stated.child, *_BASE_FRAMES) if name]
     for base in bases:
@@ -180,7 +180,7 @@ def _transforms(indexes: Sequence[FileIndex], *, is_fixed: bool, span: Span | No
     """Transforms of the topics of fixed ones, or of those that may change, from parts spread over the span."""
     found: list[StampedPose] = []
     for topic, channel in topics_of(indexes).items():
-        if has_transforms(channel) and topic.endswith("tf_static") == is_fixed:
+        if role(channel) == "transforms" and topic.endswith("tf_static") == is_fixed:
             for transforms in sampled_messages(indexes, topic, reader(channel), span):
                 found += transforms
     return found

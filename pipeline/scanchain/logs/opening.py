@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from mcap.writer import MCAP0_MAGIC
+
 from scanchain import plugins
 from scanchain.config import LogConfig
 from scanchain.errors import InputError
@@ -20,7 +22,7 @@ from scanchain.logs.formats.ros1_bag import index_ros1_bag
 from scanchain.logs.formats.ros2_bag import index_ros2_bag, parts_of_bag
 from scanchain.logs.formats.user import index_scans
 from scanchain.logs.mcap.index import index_by_summary, index_file
-from scanchain.logs.mcap.records import MAGIC, FileIndex
+from scanchain.logs.mcap.records import FileIndex
 from scanchain.logs.mcap.stream import are_parts, complete
 
 
@@ -34,7 +36,7 @@ class LogFormat(NamedTuple):
 
 FORMATS: dict[str, LogFormat] = {  # the first that claims a path reads it; an empty file is refused as MCAP
     "mcap": LogFormat(
-        "MCAP", lambda path, head: head.startswith(MAGIC) or not (head or path.is_dir()), index_file
+        "MCAP", lambda path, head: head.startswith(MCAP0_MAGIC) or not (head or path.is_dir()), index_file
     ),
     "ros1": LogFormat("a ROS 1 .bag", lambda _, head: head.startswith(b"#ROSBAG"), index_ros1_bag),
     "ros2": LogFormat(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from scanchain.config import NO_TRUTH, LogConfig
 from scanchain.errors import InputError
 from scanchain.logs.mcap.records import Channel, FileIndex, damage_of, name_of
-from scanchain.logs.messages.readers import LIDAR_TYPES, has_poses, is_lidar, is_odometry, kind
+from scanchain.logs.messages.readers import LIDAR_TYPES, has_poses, is_lidar, kind, role
 
 _MOST_LISTED = 8
 _USUAL_TRUTH = LogConfig().ground_truth_topic
@@ -54,7 +54,7 @@ def find_odometry(indexes: Sequence[FileIndex], config: LogConfig, notes: list[s
     if config.odometry_topic:
         return _chosen(indexes, config.odometry_topic, "log.odometry_topic")
     truths = config.ground_truth_topic, _USUAL_TRUTH
-    found = [each for each in topics_of(indexes).values() if is_odometry(each) and each.topic not in truths]
+    found = [each for each in topics_of(indexes).values() if role(each) == "odometry" and each.topic not in truths]
     if len(found) > 1:
         names = ", ".join(channel.topic for channel in found)
         notes.append(f"several odometry topics ({names}), none is used; choose with --log.odometry_topic")

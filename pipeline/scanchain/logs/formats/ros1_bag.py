@@ -27,6 +27,7 @@ from scanchain.logs.mcap.stream import messages_of
 MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, INDEX, CHUNK, CONNECTION = 2, 4, 5, 7
 Data = mmap.mmap | memoryview | bytes
+_NS = 1_000_000_000
 _LENGTH = struct.Struct("<I")
 _TIME = struct.Struct("<II")  # seconds, nanoseconds
 _ENTRY = np.dtype([("s", "<u4"), ("ns", "<u4"), ("offset", "<u4")])  # of an INDEX, a message
@@ -47,11 +48,6 @@ class Record(NamedTuple):
     def number(self, name: bytes) -> int:
         """A field that is a whole number. Raises struct.error where it is absent or of another size."""
         return _LENGTH.unpack(self.fields.get(name, b""))[0]
-
-    def time_ns(self, name: bytes) -> int:
-        """A field that is a time. Raises struct.error where it is absent or of another size."""
-        seconds, nanoseconds = _TIME.unpack(self.fields.get(name, b""))
-        return seconds * 1_000_000_000 + nanoseconds
 
     def text(self, name: bytes) -> str:
         """A field that is text, empty where it is absent."""
@@ -182,7 +178,7 @@ def _chunk(index: FileIndex, record: Record) -> Block:
 def _indexed(index: FileIndex, record: Record) -> Block:
     """The last chunk, with the messages of a connection that an INDEX lists."""
     block, entries = index.blocks[-1], np.frombuffer(index.data[record.begin : record.end], _ENTRY)
-    times_ns = (entries["s"].astype(np.int64) * 1_000_000_000 + entries["ns"]).tolist()
+    times_ns = (entries["s"].astype(np.int64) * _NS + entries["ns"]).tolist()
     span_ns = [*times_ns, *([block.start_ns, block.end_ns] if block.counts else [])] or [0]
     counts = block.counts | ({record.number(b"conn"): len(times_ns)} if times_ns else {})
     return replace(block, start_ns=min(span_ns), end_ns=max(span_ns), counts=counts)
@@ -211,11 +207,13 @@ def _contents(index: FileIndex, block: Block, _: AbstractSet[int] | None) -> Con
             if record.opcode == CONNECTION:
                 _define(index, record, payload)
             elif record.opcode == MESSAGE:
-                number, time_ns = record.number(b"conn"), record.time_ns(b"time")
-                channel = index.channels.get(number)
+                seconds, nanoseconds = _TIME.unpack(record.fields.get(b"time", b""))
+                channel = index.channels.get(record.number(b"conn"))
                 undefined += channel is None
                 if channel is not None:
-                    messages.append(Message(channel, time_ns, payload[record.begin : record.end]))
+                    messages.append(
+                        Message(channel, seconds * _NS + nanoseconds, payload[record.begin : record.end])
+                    )
     except struct.error:
         damage = f"{name}: a record in it is malformed; what follows was left out"
         return Contents(messages, "" if block.is_cut else damage)

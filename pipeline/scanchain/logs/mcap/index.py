@@ -19,30 +19,18 @@ from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Schema, Statistics
 from mcap.stream_reader import StreamReader
+from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from scanchain.errors import InputError
 from scanchain.logs.files import RemoteFile
-from scanchain.logs.mcap.records import (
-    CHANNEL,
-    CHUNK,
-    CHUNK_HEAD,
-    MAGIC,
-    MALFORMED,
-    MESSAGE,
-    MESSAGE_HEAD,
-    MESSAGE_INDEX,
-    RECORD,
-    SCHEMA,
-    Block,
-    FileIndex,
-    read_definition,
-)
+from scanchain.logs.mcap.records import CHUNK_HEAD, MALFORMED, MESSAGE_HEAD, RECORD, Block, FileIndex, definition
 
-HEADER, FOOTER, ATTACHMENT, METADATA, DATA_END = 1, 2, 9, 12, 15
-_LEAST_BYTES = {HEADER: 8, MESSAGE: MESSAGE_HEAD.size, ATTACHMENT: 36, METADATA: 8}  # of a record's body
-_DATA_END = RECORD.pack(DATA_END, 4)
+# least number of bytes of a record's body
+_LEAST_BYTES = {Opcode.HEADER: 8, Opcode.MESSAGE: MESSAGE_HEAD.size, Opcode.ATTACHMENT: 36, Opcode.METADATA: 8}
+_DATA_END = RECORD.pack(Opcode.DATA_END, 4)
 _FOOTER_BYTES = RECORD.size + 20 + len(MAGIC)  # the closing magic included
 _TAIL_BYTES = 65_536  # number of bytes of a file read at first; most summaries lie in it
 _REPEATED = 4  # number of ranges of a remote file retained: the first blocks are read more than once
@@ -85,7 +73,7 @@ def _take_summary(index: FileIndex, size: int, *, needs_crc: bool) -> bool:
     """Fill the index by the summary of a file of this size; False where that does not give every message."""
     tail = bytes(index.bytes_at(max(size - _TAIL_BYTES, 0), min(size, _TAIL_BYTES)))
     footer = tail[-_FOOTER_BYTES:]
-    if len(footer) < _FOOTER_BYTES or not footer.endswith(MAGIC) or footer[0] != FOOTER:
+    if len(footer) < _FOOTER_BYTES or not footer.endswith(MAGIC) or footer[0] != Opcode.FOOTER:
         return False
     begin, _, crc = struct.unpack_from("<QQI", footer, RECORD.size)
     if not 0 < begin <= size - len(footer) or (needs_crc and not crc):
@@ -192,16 +180,16 @@ class Walk:
         opcode, chunk = self.data[offset], _chunk_at(index, offset)
         if chunk is not None:
             self._take_chunk(chunk, offset)
-        elif opcode == MESSAGE:
+        elif opcode == Opcode.MESSAGE:
             self._take_message(offset, end)
-        elif opcode == MESSAGE_INDEX and (self.open is None or not self.open.head):
+        elif opcode == Opcode.MESSAGE_INDEX and (self.open is None or not self.open.head):
             index.note_damage(f"{index.path}: the chunk before the message index at byte {offset} is missing")
-        elif opcode == MESSAGE_INDEX and self.open is not None:
+        elif opcode == Opcode.MESSAGE_INDEX and self.open is not None:
             (channel,) = struct.unpack_from("<H", self.data, body)
             if count := (end - body - 6) // 16:
                 self.open.counts[channel] = self.open.counts.get(channel, 0) + count
-        elif opcode in (SCHEMA, CHANNEL):
-            index.define(read_definition(opcode, self.data[body:end]))
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            index.define(definition(opcode, self.data[body:end]))
         else:
             self._close(offset, complete=True)
 
@@ -217,8 +205,8 @@ class Walk:
 
     def _is_shortened(self, offset: int, end: int) -> bool:
         """True if a loose message ends in a whole one of a size met lately: so many bytes of it are missing."""
-        return self.data[offset] == MESSAGE and any(
-            RECORD.unpack_from(self.data, end - size) == (MESSAGE, size - RECORD.size)
+        return self.data[offset] == Opcode.MESSAGE and any(
+            RECORD.unpack_from(self.data, end - size) == (Opcode.MESSAGE, size - RECORD.size)
             for size in self.loose_sizes
             if size < end - offset
         )
@@ -226,7 +214,7 @@ class Walk:
     def _take_chunk(self, chunk: Block, offset: int) -> None:
         self._close(offset, complete=True)
         name = f"{self.index.path}: the chunk at byte {offset}"
-        if self.data[offset] != CHUNK:
+        if self.data[offset] != Opcode.CHUNK:
             self.index.damage.append(f"{name} is marked as another record; it was read all the same")
         if is_plausible_size(chunk.size, chunk.uncompressed_size):
             self.open = chunk
@@ -283,11 +271,11 @@ def _record_end(index: FileIndex, offset: int) -> int:
         return 0
     if _chunk_at(index, offset):
         return end
-    if opcode == MESSAGE_INDEX:
+    if opcode == Opcode.MESSAGE_INDEX:
         return end if length >= 6 and struct.unpack_from("<I", data, body + 2)[0] == length - 6 else 0
-    if opcode in (SCHEMA, CHANNEL):
+    if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
         try:
-            read_definition(opcode, data[body:end])
+            definition(opcode, data[body:end])
         except MALFORMED:
             return 0
         return end
@@ -318,8 +306,8 @@ def _sought(index: FileIndex) -> tuple[int, ...]:
     No message is searched outside of the chunks of a file that has them: what is left of a damaged chunk,
     unchecked, is not taken for messages.
     """
-    is_chunked = index.blocks or _next_record(index, len(MAGIC), (CHUNK, MESSAGE_INDEX))
-    return (CHUNK,) if is_chunked else (SCHEMA, CHANNEL, MESSAGE)
+    is_chunked = index.blocks or _next_record(index, len(MAGIC), (Opcode.CHUNK, Opcode.MESSAGE_INDEX))
+    return (Opcode.CHUNK,) if is_chunked else (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 
 
 def _next_record(index: FileIndex, offset: int, sought: tuple[int, ...]) -> int:
@@ -330,7 +318,7 @@ def _next_record(index: FileIndex, offset: int, sought: tuple[int, ...]) -> int:
         likely = np.isin(window[:-8], sought) & ((window[6:-2] | window[7:-1] | window[8:]) == 0)
         for candidate in (begin + np.flatnonzero(likely)).tolist():
             end = _record_end(index, candidate)
-            is_sure = data[candidate] == MESSAGE_INDEX or _is_end(data, end)
+            is_sure = data[candidate] == Opcode.MESSAGE_INDEX or _is_end(data, end)
             if _chunk_at(index, candidate) or (end and (is_sure or _record_end(index, end))):
                 return candidate
     return 0

@@ -18,12 +18,11 @@ import mcap.records
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 
 from scanchain.errors import counted, one_line
 from scanchain.files import Source
 
-MAGIC = b"\x89MCAP0\r\n"
-SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = 3, 4, 5, 6, 7
 RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 CHUNK_HEAD = struct.Struct("<BQQQQII")  # record, start, end, uncompressed size, CRC-32, length of a name
@@ -172,10 +171,10 @@ class FileIndex:
         return channel is not None and (channel.schema == 0 or channel.type_name != "")
 
 
-def read_definition(opcode: int, body: bytes) -> mcap.records.Schema | mcap.records.Channel:
+def definition(opcode: int, body: bytes) -> mcap.records.Schema | mcap.records.Channel:
     """The schema or channel that a record defines. Raises one of MALFORMED."""
     stream = ReadDataStream(BytesIO(body))
-    record = (mcap.records.Schema if opcode == SCHEMA else mcap.records.Channel).read(stream)
+    record = (mcap.records.Schema if opcode == Opcode.SCHEMA else mcap.records.Channel).read(stream)
     if stream.count + _MOST_BEHIND < len(body):
         raise struct.error("definition of another length than its record")
     return record
@@ -202,9 +201,9 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
             begin, end = end + RECORD.size, end + RECORD.size + length
             if end > len(payload):
                 raise struct.error("record beyond the end")
-            if opcode in (SCHEMA, CHANNEL):
-                index.define(read_definition(opcode, bytes(payload[begin:end])))
-            elif opcode == MESSAGE:
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                index.define(definition(opcode, bytes(payload[begin:end])))
+            elif opcode == Opcode.MESSAGE:
                 number, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(payload, begin)
                 met += 1
                 channel = index.channels.get(number)

@@ -23,7 +23,7 @@ _MOST_GEOMETRIES = 16
 _MOST_TURNS = 2.0  # largest number of turns that the beams of a scan cover; in degrees they seem to cover more
 _FARTHEST_M = float(np.finfo(np.float32).max)
 _MOST_STEP = (1 << 31) - 1
-PLANAR_M = 5e-4  # largest distance from the plane of a point of a planar cloud: rounding of float32
+_PLANAR_M = 5e-4  # largest distance from the plane of a point of a planar cloud: rounding of float32
 _FEWEST_POINTS, _ENOUGH_POINTS = 3, 1000  # least number of points of a cloud, and in all, that show a plane
 
 _LIVOX_POINT_BYTES = 19  # offset_time, x, y, z, reflectivity, tag, line
@@ -149,22 +149,15 @@ def decode_cloud(
         times_s = times.from_azimuth(points[:count])
     points = _moved(points[:count], T_frame_points)
     if plane_m is not None:
-        points = _in_plane(points, plane_m)
+        off_m = np.abs(points[:, 2] - plane_m).max(initial=0.0)
+        if off_m > _PLANAR_M:
+            where = f"off the plane z = {plane_m:.3g} m, in which all points of the first clouds lie"
+            raise MalformedMessageError(f"a point lies {off_m:.3g} m {where}")
+        points = np.ascontiguousarray(points[:, :2])
     why = ""
     if not count:
         why = _why_none(np.hypot(np.hypot(x, y), z), max(low_m, _NEAREST_M), np.sqrt(high_square))
     return Returns(stamp_ns(message), points, times_s, len(cloud) - count, why)
-
-
-def _in_plane(points: RawPoints, height_m: float) -> RawPoints:
-    """Points (N, 2) of a plane at this height. Raises MalformedMessageError where one is not in it."""
-    off_m = np.abs(points[:, 2] - height_m).max(initial=0.0)
-    if off_m > PLANAR_M:
-        raise MalformedMessageError(
-            f"a point lies {off_m:.3g} m off the plane z = {height_m:.3g} m, in which all points of the "
-            "first clouds lie"
-        )
-    return np.ascontiguousarray(points[:, :2])
 
 
 def plane_height_m(clouds: Iterable[Returns]) -> float | None:
@@ -174,7 +167,7 @@ def plane_height_m(clouds: Iterable[Returns]) -> float | None:
     for cloud in clouds:
         most = max(most, len(cloud.points))
         heights_m = np.concatenate([heights_m, cloud.points[:, 2]])
-        if len(heights_m) and np.ptp(heights_m) > 2.0 * PLANAR_M:
+        if len(heights_m) and np.ptp(heights_m) > 2.0 * _PLANAR_M:
             return None
         if len(heights_m) > _ENOUGH_POINTS:
             break

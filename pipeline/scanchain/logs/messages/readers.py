@@ -60,19 +60,9 @@ def is_lidar(channel: Channel) -> bool:
     return role(channel) in ("scan", "cloud")
 
 
-def is_odometry(channel: Channel) -> bool:
-    """True if its messages are nav_msgs/Odometry."""
-    return role(channel) == "odometry"
-
-
 def has_poses(channel: Channel) -> bool:
     """True if its messages are stamped poses of any supported type."""
     return role(channel) in ("pose", "odometry")
-
-
-def has_transforms(channel: Channel) -> bool:
-    """True if its messages are transforms between frames."""
-    return role(channel) == "transforms"
 
 
 def reader(channel: Channel) -> Read:
