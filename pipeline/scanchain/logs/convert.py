@@ -10,16 +10,8 @@ from pathlib import Path
 from scanchain.config import LogConfig
 from scanchain.errors import InputError, grouped
 from scanchain.files import Source
+from scanchain.logs.mcap import stream
 from scanchain.logs.mcap.records import Decoded, FileIndex, name_of
-from scanchain.logs.mcap.stream import (
-    EVERYTHING,
-    chosen_span,
-    count_messages,
-    decoded_messages,
-    notes_on,
-    nothing_in_part,
-    whole_span,
-)
 from scanchain.logs.messages.readers import is_lidar
 from scanchain.logs.opening import AUTO, index_files
 from scanchain.logs.topics import find_lidar, topics_of
@@ -64,10 +56,10 @@ def convert(
         raise InputError(f"{sources[0]}: is MCAP already; --start, --end, --every or --topic cut it")
     total = sum(sum(index.counts.values()) for index in indexes)
     counts = dict.fromkeys(_chosen(indexes, config.topic), 0)
-    span = chosen_span(whole_span(indexes), config)
+    span = stream.chosen_span(stream.whole_span(indexes), config)
     moving = [topic for topic in counts if not topic.endswith(_FIXED)]
-    if span != EVERYTHING and not any(count_messages(indexes, topic, span) for topic in moving):
-        raise nothing_in_part(f"{name_of(indexes)}: no message", whole_span(indexes), config)
+    if span != stream.EVERYTHING and not any(stream.count_messages(indexes, topic, span) for topic in moving):
+        raise stream.nothing_in_part(f"{name_of(indexes)}: no message", stream.whole_span(indexes), config)
     damage = [line for index in indexes for line in index.damage]
     encodings = {channel.encoding for index in indexes for channel in index.channels.values()}
     profile = "ros2" if encodings == {"cdr"} else "ros1" if encodings == {"ros1"} else ""
@@ -83,7 +75,7 @@ def convert(
                 f"{name_of(indexes)}: holds no message that could be read: "
                 f"{'; '.join(grouped(damage)) or 'it is empty'}"
             )
-    notes = (*(line for index in indexes for line in index.notes), *notes_on(indexes, config))
+    notes = (*(line for index in indexes for line in index.notes), *stream.notes_on(indexes, config))
     return Converted(destination, counts, notes, tuple(grouped(damage)))
 
 
@@ -91,13 +83,13 @@ def _messages(
     indexes: Sequence[FileIndex], topics: Iterable[str], config: LogConfig, damage: list[str]
 ) -> Iterator[Decoded]:
     """The messages to write. Static transforms come first, and none before the chosen part begins."""
-    span = chosen_span(whole_span(indexes), config)
-    fixed = set() if span == EVERYTHING else {topic for topic in topics if topic.endswith(_FIXED)}
-    for message in decoded_messages(indexes, dict.fromkeys(fixed, bytes), EVERYTHING, damage=[]):
+    span = stream.chosen_span(stream.whole_span(indexes), config)
+    fixed = set() if span == stream.EVERYTHING else {topic for topic in topics if topic.endswith(_FIXED)}
+    for message in stream.decoded_messages(indexes, dict.fromkeys(fixed, bytes), stream.EVERYTHING, damage=[]):
         yield message._replace(log_time_ns=min(max(message.log_time_ns, span.begin_ns), span.end_ns))
     others = dict.fromkeys((topic for topic in topics if topic not in fixed), bytes)
     scans = Counter[str]()
-    for message in decoded_messages(indexes, others, span, damage=damage):
+    for message in stream.decoded_messages(indexes, others, span, damage=damage):
         scans[message.channel.topic] += is_lidar(message.channel)
         if not isinstance(message.value, bytes):  # of a file that could not be read
             continue

@@ -68,15 +68,11 @@ def decode_laser_scan(data: memoryview, read: Callable[[memoryview], Sensed], co
     ranges_m = message.ranges
     low_m = max(message.range_min if message.range_min > 0.0 else 0.0, config.min_range_m, _NEAREST_M)
     high_m = min(message.range_max if message.range_max > 0.0 else _FARTHEST_M, config.max_range_m, _FARTHEST_M)
-    angles_rad = message.angle_min, message.angle_increment
-    directions, times_s = _beams(*angles_rad, message.time_increment, len(ranges_m))
+    beams = message.angle_min, message.angle_increment, message.time_increment, len(ranges_m)
+    directions, times_s = _beams(*beams)
     valid = ((ranges_m >= low_m) & (ranges_m < high_m)).nonzero()[0]
-    if len(valid) == len(ranges_m):
-        points = directions * ranges_m[:, None]
-    else:
-        points = directions[valid] * ranges_m[valid, None]
-        times_s = times_s[valid] if len(times_s) else NO_TIMES
-    points = _moved(points, T_frame_points).astype(np.float32, copy=False)
+    times_s = times_s[valid] if len(times_s) else NO_TIMES
+    points = _moved(directions[valid] * ranges_m[valid, None], T_frame_points).astype(np.float32, copy=False)
     why = "" if len(valid) else _why_none(ranges_m, low_m, high_m)
     return Returns(stamp_ns(message), points, times_s, len(ranges_m) - len(valid), why)
 
