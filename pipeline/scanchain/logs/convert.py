@@ -55,7 +55,11 @@ def convert(
     if len(indexes) == 1 and is_mcap and not is_folder and not is_part:
         raise InputError(f"{sources[0]}: is MCAP already; --start, --end, --every or --topic cut it")
     total = sum(sum(index.counts.values()) for index in indexes)
-    counts = dict.fromkeys(_chosen(indexes, config.topic), 0)
+    lidar, channels = find_lidar(indexes, config.topic) if config.topic else None, topics_of(indexes)
+    others = (
+        [] if lidar is None else [name for name in channels if name != lidar.topic and is_lidar(channels[name])]
+    )
+    counts = {name: 0 for name in channels if name not in others}
     span = stream.chosen_span(stream.whole_span(indexes), config)
     moving = [topic for topic in counts if not topic.endswith(_FIXED)]
     if span != stream.EVERYTHING and not any(stream.count_messages(indexes, topic, span) for topic in moving):
@@ -95,10 +99,3 @@ def _messages(
             continue
         if (scans[message.channel.topic] - 1) % config.every == 0 or not is_lidar(message.channel):
             yield message
-
-
-def _chosen(indexes: Sequence[FileIndex], topic: str) -> list[str]:
-    """The topics to write: all, but of several lidars only the requested one."""
-    lidar = find_lidar(indexes, topic) if topic else None
-    channels = topics_of(indexes)
-    return [name for name in channels if lidar is None or name == topic or not is_lidar(channels[name])]

@@ -85,17 +85,21 @@ class Log:
         self.name = name_of(indexes)
         self.notes: list[str] = [line for index in indexes for line in index.notes]
         stream.check_one_log(indexes, config)
-        lidar = find_lidar(indexes, config.topic)
+        self.lidar = lidar = find_lidar(indexes, config.topic)
         wheels = find_odometry(indexes, config, self.notes)
         truth = find_ground_truth(indexes, config.ground_truth_topic)
         self.topic = lidar.topic
         self.odometry_topic = "" if wheels is None else wheels.topic
         self.ground_truth_topic = "" if truth is None else truth.topic
-        self.lidar = lidar
         self._sampled_times = PointTimes(config)
         self.plane_height_m: float | None = None
         if not is_scan(lidar):
-            self.plane_height_m = self._plane_height_m()
+            clouds = stream.sampled_messages(indexes, lidar.topic, self.decoder(self._sampled_times))
+            self.plane_height_m = height_m = plane_height_m(clouds)
+            if height_m is not None:
+                self.notes.append(
+                    f"the clouds of {lidar.topic} are planar (z = {height_m:.3g} m everywhere): read as a 2D log"
+                )
         self.dimension = 2 if is_scan(lidar) or self.plane_height_m is not None else 3
         whole = stream.whole_span(indexes)
         self.duration_s = whole.duration_s
@@ -241,13 +245,3 @@ class Log:
         if is_scan(self.lidar):
             return partial(decode_laser_scan, read=reader(self.lidar), config=self.config)
         return partial(decode_cloud, read=reader(self.lidar), times=times, plane_m=self.plane_height_m)
-
-    def _plane_height_m(self) -> float | None:
-        """Height of all points of the first clouds, None where they differ; samples their point times, too."""
-        decode = self.decoder(self._sampled_times)
-        height_m = plane_height_m(stream.sampled_messages(self.indexes, self.topic, decode))
-        if height_m is not None:
-            self.notes.append(
-                f"the clouds of {self.topic} are planar (z = {height_m:.3g} m everywhere): read as a 2D log"
-            )
-        return height_m

@@ -222,15 +222,27 @@ def index_clouds(folder: Path, number: int, rate_hz: float = 0.0, bin_columns: i
     suffix, files = next(((suffix, files) for suffix, files in kinds.items() if files), ("", []))
     if not files:
         raise InputError(f"{folder}: has no {', '.join(SUFFIXES)} file; name the folder that holds them")
-    stamps_ns = [round(k * _NS / rate_hz) for k in range(len(files))] if rate_hz else _stamps(folder, files)
+    if rate_hz:
+        stamps_ns = [round(k * _NS / rate_hz) for k in range(len(files))]
+    else:
+        stamps_ns = [stamp for file in files if (stamp := stamp_of_name(file.stem)) is not None]
+    if len(set(stamps_ns)) < len(files):
+        raise InputError(
+            f"{folder}: names such as {files[0].name} hold no stamp; set the rate of the scans, "
+            "as in --log.rate_hz 10"
+        )
     index = FileIndex(folder, number)
     raw = point_of_columns(np.dtype("<f4"), bin_columns)
-    if suffix == ".bin":
-        _check_size(files, bin_columns)
+    sizes = [file.stat().st_size for file in files]
+    if suffix == ".bin" and np.mean(np.mod(sizes, raw.itemsize) == 0) < 0.5:  # some of the files may be damaged
+        raise InputError(
+            f"{files[0]}: has {sizes[0]} bytes, no rows of {bin_columns} float32 numbers; set "
+            "their number, as in --log.bin_columns 5, or save clouds as .npy, PCD or PLY"
+        )
     index.notes += [*_found(folder, files, raw), *left_out(folder, suffix, SUFFIXES)]
     channel = add_channel(index, "/points", "sensor_msgs/msg/PointCloud2")
-    for place, (file, stamp_ns) in enumerate(zip(files, stamps_ns, strict=True)):
-        add_block(index, place, file.stat().st_size, [stamp_ns], {channel: 1})
+    for place, (size, stamp_ns) in enumerate(zip(sizes, stamps_ns, strict=True)):
+        add_block(index, place, size, [stamp_ns], {channel: 1})
 
     def make(block: Block, _: AbstractSet[int] | None) -> Contents:
         return contents_of(files[block.offset], channel, block.start_ns, lambda file: read_cloud_file(file, raw))
@@ -278,23 +290,3 @@ def stamp_of_name(stem: str) -> int | None:
     elif match := re.search(r"(?<!\d)([1-9]\d*)$", stem):
         stamp_ns = int(match[1]) * _UNITS_NS.get(len(match[1]), LATEST_NS)
     return stamp_ns if stamp_ns < LATEST_NS else None
-
-
-def _stamps(folder: Path, files: Sequence[Path]) -> list[int]:
-    stamps_ns = [stamp for file in files if (stamp := stamp_of_name(file.stem)) is not None]
-    if len(stamps_ns) < len(files) or len(set(stamps_ns)) < len(files):
-        raise InputError(
-            f"{folder}: names such as {files[0].name} hold no stamp; set the rate of the scans, "
-            "as in --log.rate_hz 10"
-        )
-    return stamps_ns
-
-
-def _check_size(files: Sequence[Path], columns: int) -> None:
-    """Refuse .bin files, headerless float32, most of which are no rows of so many columns; some may be damaged."""
-    whole = sum(file.stat().st_size % (4 * columns) == 0 for file in files)
-    if 2 * whole < len(files):
-        raise InputError(
-            f"{files[0]}: has {files[0].stat().st_size} bytes, no rows of {columns} float32 numbers; set "
-            "their number, as in --log.bin_columns 5, or save clouds as .npy, PCD or PLY"
-        )

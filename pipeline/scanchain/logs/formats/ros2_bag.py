@@ -45,8 +45,13 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
                 (number, id_), each.topic, encoding, id_, each.msgtype, language, definition
             )
             index.counts[id_], connections[id_] = each.msgcount, each
-    if connections:
-        _cut(index, reader.start_time, reader.end_time)
+    if connections:  # spans of time of one length, so many that each holds a few megabytes on average
+        begin_ns, length_ns, size = reader.start_time, reader.end_time - reader.start_time, size_of(path)
+        count = min(max(size // _BLOCK_BYTES, 1), _MOST_BLOCKS, max(length_ns, 1))
+        edges_ns = [begin_ns + length_ns * place // count for place in range(count + 1)]
+        for place, (start_ns, stop_ns) in enumerate(pairwise(edges_ns)):
+            share = size // count
+            index.blocks.append(Block(number, place, share, "", share, start_ns, stop_ns - 1))
     index.make = partial(_contents, index, reader, connections, threading.Lock())
     return index
 
@@ -65,16 +70,6 @@ def parts_of_bag(folder: Path) -> list[Path]:
         raise InputError(f"{folder / 'metadata.yaml'}: is not that of a ROS 2 bag ({reason})") from error
     is_mcap = bool(parts) and all(part.suffix == ".mcap" and part.is_file() for part in parts)
     return parts if is_mcap and not is_packed else [folder]
-
-
-def _cut(index: FileIndex, begin_ns: int, end_ns: int) -> None:
-    """Add spans of time of one length up to the end, so many that each holds a few megabytes on average."""
-    size = size_of(index.path)
-    count = min(max(size // _BLOCK_BYTES, 1), _MOST_BLOCKS, max(end_ns - begin_ns, 1))
-    edges_ns = [begin_ns + (end_ns - begin_ns) * place // count for place in range(count + 1)]
-    for place, (start_ns, stop_ns) in enumerate(pairwise(edges_ns)):
-        share = size // count
-        index.blocks.append(Block(index.number, place, share, "", share, start_ns, stop_ns - 1))
 
 
 def _contents(
