@@ -92,8 +92,11 @@ def index_files(sources: Sequence[Source], config: LogConfig = _DEFAULTS) -> lis
     indexes = [_index(source, number, config) for number, source in enumerate(files)]
     for index in indexes:
         complete(index)
-    if name == AUTO:
-        indexes[0].notes += [note for source in sources for note in _other_parts(source)]
+    for source in sources if name == AUTO else []:
+        parts = _parts(source)
+        if isinstance(source, Path) and source not in parts and not (source / _BAG_FILE).is_file():
+            taken = Path(parts[0].name).suffix
+            indexes[0].notes += left_out(source, taken, (*_PART_SUFFIXES, *SUFFIXES))
     return indexes
 
 
@@ -185,11 +188,3 @@ def _parts(source: Source) -> Sequence[Source]:
         return parts_of_bag(source)
     parts = (sorted(source.glob(f"*{suffix}"), key=natural_order) for suffix in _PART_SUFFIXES)
     return next(filter(None, parts), [source])
-
-
-def _other_parts(source: Source) -> list[str]:
-    """A note on files beside the parts of a log that are no part."""
-    parts = _parts(source)
-    if not isinstance(source, Path) or source in parts or (source / _BAG_FILE).is_file():
-        return []
-    return left_out(source, Path(parts[0].name).suffix, (*_PART_SUFFIXES, *SUFFIXES))

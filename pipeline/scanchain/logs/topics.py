@@ -16,7 +16,6 @@ _IMU = ("sensor_msgs/Imu",)
 _GNSS = (
     "sensor_msgs/NavSatFix", "gps_common/GPSFix", "gps_msgs/GPSFix", "nmea_msgs/Sentence", "foxglove.LocationFix"
 )  # fmt: skip
-_UNDERSTOOD = ", ".join(LIDAR_TYPES)
 
 
 def topics_of(indexes: Sequence[FileIndex]) -> dict[str, Channel]:
@@ -39,7 +38,7 @@ def find_lidar(indexes: Sequence[FileIndex], wanted: str) -> Channel:
     if not lidars:
         absent = f"topic {wanted}, nor any other" if wanted and wanted not in channels else "lidar topic"
         raise InputError(
-            f"{name}: has no {absent} of a type that is understood ({_UNDERSTOOD}); "
+            f"{name}: has no {absent} of a type that is understood ({LIDAR_TYPES}); "
             f"it holds: {_listed(channels.values())}{damage_of(indexes)}"
         )
     if wanted:

@@ -127,7 +127,13 @@ def read_pcd(path: Path) -> NDArray[np.void]:
     with path.open("rb") as file:
         header = {words[0]: words[1:] for words in _header_lines(file, "DATA") if words}
         try:
-            point, count, form = _pcd_point(header), int(header["POINTS"][0]), header["DATA"][0]
+            names, kinds = header["FIELDS"], list(zip(header["TYPE"], header["SIZE"], strict=True))
+            counts = [int(count) for count in header.get("COUNT", ["1"] * len(names))]
+            fields = [  # several numbers of one field are one
+                (f"_{place}" if name == "_" else name, _PCD_TYPES[kind], (count,) if count > 1 else ())
+                for place, (name, kind, count) in enumerate(zip(names, kinds, counts, strict=True))
+            ]
+            point, count, form = np.dtype(fields), int(header["POINTS"][0]), header["DATA"][0]
             if count < 0:
                 raise ValueError(f"how many points there are, but {count}")
         except (KeyError, IndexError, ValueError) as error:
@@ -144,17 +150,6 @@ def _header_lines(file: IO[bytes], last: str) -> Iterator[list[str]]:
         yield words
         if words[:1] == [last]:
             break
-
-
-def _pcd_point(header: dict[str, list[str]]) -> np.dtype[np.void]:
-    """A point: each field by its name, several numbers of one field as one."""
-    names, kinds = header["FIELDS"], list(zip(header["TYPE"], header["SIZE"], strict=True))
-    counts = [int(count) for count in header.get("COUNT", ["1"] * len(names))]
-    fields = [
-        (f"_{place}" if name == "_" else name, _PCD_TYPES[kind], (count,) if count > 1 else ())
-        for place, (name, kind, count) in enumerate(zip(names, kinds, counts, strict=True))
-    ]
-    return np.dtype(fields)
 
 
 def _lzf_unpacked(file: IO[bytes], point: np.dtype[np.void], count: int) -> NDArray[np.void]:

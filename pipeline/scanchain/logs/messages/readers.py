@@ -35,7 +35,7 @@ _TYPES: dict[str, tuple[Role, Read]] = {  # those of ROS are laid out alike in R
     "foxglove.FrameTransform": ("transforms", foxglove.frame_transform),
     "foxglove.FrameTransforms": ("transforms", foxglove.frame_transforms),
 }
-LIDAR_TYPES = tuple(sorted(name for name, (role, _) in _TYPES.items() if role in ("scan", "cloud")))
+LIDAR_TYPES = ", ".join(sorted(name for name, (role, _) in _TYPES.items() if role in ("scan", "cloud")))
 
 
 def kind(channel: Channel) -> str:
