@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from mcap.writer import MCAP0_MAGIC
 
@@ -25,41 +24,16 @@ from scanchain.logs.mcap.index import index_by_summary, index_file
 from scanchain.logs.mcap.records import FileIndex
 from scanchain.logs.mcap.stream import are_parts, complete
 
-
-class LogFormat(NamedTuple):
-    """A log format, described as errors list it."""
-
-    description: str
-    claims: Callable[[Path, bytes], bool]  # by a path's first bytes (none of a folder) or what lies in it
-    index_of: Callable[..., FileIndex]  # of a path as the n-th file of a log; may raise UnknownFormatError
-
-
-FORMATS: dict[str, LogFormat] = {  # the first that claims a path reads it; an empty file is refused as MCAP
-    "mcap": LogFormat(
-        "MCAP", lambda path, head: head.startswith(MCAP0_MAGIC) or not (head or path.is_dir()), index_file
-    ),
-    "ros1": LogFormat("a ROS 1 .bag", lambda _, head: head.startswith(b"#ROSBAG"), index_ros1_bag),
-    "ros2": LogFormat(
-        "a ROS 2 .db3 or the folder of a ROS 2 bag",
-        lambda path, head: head.startswith(b"SQLite format 3\0") or (path / _BAG_FILE).is_file(),
-        index_ros2_bag,
-    ),
-    "carmen": LogFormat("a CARMEN .log or .clf (also .bz2, .gz)", lambda _, head: is_carmen(head), index_carmen),
-    "kitti-raw": LogFormat(
-        "a KITTI raw drive", lambda path, _: (path / "velodyne_points").is_dir(), index_kitti_raw
-    ),
-    "kitti-odometry": LogFormat(
-        "a KITTI odometry sequence",
-        lambda path, _: (path / "velodyne").is_dir() and (path / "times.txt").is_file(),
-        index_kitti_odometry,
-    ),
-    "clouds": LogFormat(
-        "a folder of PCD, PLY, .npy or .bin files",
-        lambda path, _: path.is_dir() and any(each.suffix.lower() in SUFFIXES for each in path.iterdir()),
-        index_clouds,
-    ),
+FORMATS: dict[str, tuple[str, Callable[..., FileIndex]]] = {  # described as errors list them; see _format_of
+    "mcap": ("MCAP", index_file),
+    "ros1": ("a ROS 1 .bag", index_ros1_bag),
+    "ros2": ("a ROS 2 .db3 or the folder of a ROS 2 bag", index_ros2_bag),
+    "carmen": ("a CARMEN .log or .clf (also .bz2, .gz)", index_carmen),
+    "kitti-raw": ("a KITTI raw drive", index_kitti_raw),
+    "kitti-odometry": ("a KITTI odometry sequence", index_kitti_odometry),
+    "clouds": ("a folder of PCD, PLY, .npy or .bin files", index_clouds),
 }
-_KNOWN = ", ".join(form.description for form in FORMATS.values())
+_KNOWN = ", ".join(description for description, _ in FORMATS.values())
 _KNOWN += ", or name a class of your own that reads it, --log.format module:Class"
 AUTO = "auto"  # value of log.format: the format that claims the path
 
@@ -121,7 +95,7 @@ def _is_named_as_log(path: Path) -> bool:
 
 
 def _is_claimed(folder: Path) -> bool:
-    return (folder / _RUN_FILE).is_file() or any(form.claims(folder, b"") for form in FORMATS.values())
+    return (folder / _RUN_FILE).is_file() or _format_of(folder, b"") != ""
 
 
 def _index(source: Source, number: int, config: LogConfig) -> FileIndex:
@@ -157,7 +131,7 @@ def _index_path(path: Path, number: int, config: LogConfig) -> FileIndex:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
     try:
-        index_of = (_claiming(path, head) if config.format == AUTO else FORMATS[config.format]).index_of
+        _, index_of = FORMATS[_claiming(path, head) if config.format == AUTO else config.format]
         if index_of is index_clouds:
             return index_clouds(path, number, config.rate_hz, config.bin_columns)
         return index_of(path, number)
@@ -168,13 +142,26 @@ def _index_path(path: Path, number: int, config: LogConfig) -> FileIndex:
         raise InputError(f"{path}: is not a recognized log ({lack}); give {_KNOWN}") from None
 
 
-def _claiming(path: Path, head: bytes) -> LogFormat:
+def _format_of(path: Path, head: bytes) -> str:
+    """The format of a path by its first bytes, none of a folder, or what lies in it; empty where it has none."""
+    claims = {
+        "mcap": head.startswith(MCAP0_MAGIC) or not (head or path.is_dir()),  # an empty file is refused as such
+        "ros1": head.startswith(b"#ROSBAG"),
+        "ros2": head.startswith(b"SQLite format 3\0") or (path / _BAG_FILE).is_file(),
+        "carmen": is_carmen(head),
+        "kitti-raw": (path / "velodyne_points").is_dir(),
+        "kitti-odometry": (path / "velodyne").is_dir() and (path / "times.txt").is_file(),
+        "clouds": path.is_dir() and any(each.suffix.lower() in SUFFIXES for each in path.iterdir()),
+    }
+    return next((name for name, is_claimed in claims.items() if is_claimed), "")
+
+
+def _claiming(path: Path, head: bytes) -> str:
     """The format that claims a path. Raises UnknownFormatError, or InputError for a folder that is none."""
     if (path / _RUN_FILE).is_file():
         raise InputError(f"{path}: is a run directory, no log; give the log that its {_RUN_FILE} names")
-    for form in FORMATS.values():
-        if form.claims(path, head):
-            return form
+    if name := _format_of(path, head):
+        return name
     if path.is_dir():
         raise InputError(f"{path}: is a folder without a recognized log; give {_KNOWN}")
     raise UnknownFormatError(head, f"starts with {head[:8]!r}")

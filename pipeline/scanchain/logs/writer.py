@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Any, NamedTuple, Self
 
 import numpy as np
@@ -147,15 +146,13 @@ class LogWriter:
             raise InputError(f"{destination}: not writable ({error.strerror}); choose another place") from error
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(profile=profile, library="scanchain")
-        self._numbers: dict[tuple[str | bytes, ...], int] = {}  # of schemas and of channels
+        self._schema, self._channel = cache(self._writer.register_schema), cache(self._writer.register_channel)
         self._sequence = 0
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: object, _: object) -> None:
         try:
             if kind is None:
                 self._writer.finish()
@@ -193,13 +190,9 @@ class LogWriter:
 
     def copy(self, channel: Channel, log_time_ns: int, data: bytes) -> None:
         """Append a message of another log as it is, with its topic, type, encoding and definition."""
-        schema = (channel.type_name, channel.schema_encoding, channel.definition)
-        key = (channel.topic, channel.encoding, *schema)
-        if key not in self._numbers:
-            is_known = bool(channel.type_name or channel.definition)  # 0 stands for none
-            if is_known and schema not in self._numbers:
-                self._numbers[schema] = self._writer.register_schema(*schema)
-            number = self._numbers[schema] if is_known else 0
-            self._numbers[key] = self._writer.register_channel(channel.topic, channel.encoding, number)
-        self._writer.add_message(self._numbers[key], log_time_ns, data, log_time_ns, self._sequence)
+        schema = 0  # which stands for none
+        if channel.type_name or channel.definition:
+            schema = self._schema(channel.type_name, channel.schema_encoding, channel.definition)
+        number = self._channel(channel.topic, channel.encoding, schema)
+        self._writer.add_message(number, log_time_ns, data, log_time_ns, self._sequence)
         self._sequence += 1

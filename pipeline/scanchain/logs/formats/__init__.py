@@ -30,8 +30,6 @@ def add_block(
     held = {channel.key[1]: count for channel, count in counts.items() if count}
     span = min(times_ns), max(times_ns)
     index.blocks.append(Block(index.number, offset, size, "", size, *span, held))
-    for channel, count in held.items():
-        index.counts[channel] = index.counts.get(channel, 0) + count
 
 
 def temporary_index(path: Path, number: int, write: Callable[[LogWriter], None]) -> FileIndex:

@@ -135,7 +135,7 @@ def decode_cloud(
     kept = np.empty(len(cloud), np.int32)
     x, y, z = (_as_float32(cloud[name]) for name in "xyz")
     low_m, high_m = times.config.min_range_m, times.config.max_range_m
-    high_square = min(high_m * high_m, _FARTHEST_M)
+    high_square = min(high_m * high_m, _FARTHEST_M)  # where float32 ends
     count = keep_valid(x, y, z, low_m**2, high_square, points, kept)
     times_s = NO_TIMES
     for name in (point.names or ())[3:]:
