@@ -53,8 +53,8 @@ def shown(value: object) -> str:
 
 
 def one_line(error: BaseException) -> str:
-    """Message of an error without line breaks."""
-    return " ".join(str(error).split())
+    """Message of an error without line breaks; its type where it has none."""
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 _NO_SPACE = "the disk is full; free some space on it, or write to another one"

@@ -21,7 +21,7 @@ from scanchain.batch import batch, task
 from scanchain.batch.batch import collect
 from scanchain.errors import InputError
 from scanchain.files import Address
-from scanchain.logs.writer import ORIGIN, LogWriter, pack_laser_scan, pack_odometry
+from scanchain.logs.writer import LogWriter, pack_laser_scan, pack_odometry, place_of
 from scanchain.processes import Ending, KilledFor, resident_mib
 from scanchain_viz.report.batch import names_of
 from tests.support import made
@@ -286,7 +286,7 @@ def stands_still(path, ranges_m, angles):
     random = np.random.default_rng(0)
     with LogWriter(path) as writer:
         for stamp_ns in range(0, 2_000_000_000, 100_000_000):
-            pose = pack_odometry(stamp_ns, "world", "lidar", ORIGIN)
+            pose = pack_odometry(stamp_ns, "world", "lidar", place_of((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))
             writer.append("/ground_truth", "nav_msgs/msg/Odometry", pose, stamp_ns)
             first = stamp_ns, "lidar", angles[0], angles[1] - angles[0]
             measured_m = ranges_m + 1e-3 * random.standard_normal(len(ranges_m))

@@ -43,10 +43,11 @@ def test_a_cloud_survives_with_its_times_and_rings(tmp_path, count, time_field):
     rng = np.random.default_rng(3)
     points = rng.normal(size=(count, 3)).astype(np.float32)
     times = np.sort(rng.uniform(0.0, 0.1, count)).astype(np.float32)
-    ring = rng.integers(0, 64, count)
-    options = {"times_s": times, "time_field": time_field, "ring": ring, "log_time_ns": STAMP_NS + 5}
+    ring = rng.integers(0, 64, count).astype(np.uint16)
+    written = times if time_field == "time" else np.rint(1e9 * times.astype(float)).astype(np.uint32)
+    fields = {time_field: written, "ring": ring}
     with LogWriter(tmp_path / "a.mcap") as log:
-        log.point_cloud("/points", STAMP_NS, "lidar", points, **options)
+        log.point_cloud("/points", STAMP_NS, "lidar", points, fields, STAMP_NS + 5)
     ((_, _, message, cloud),) = decoded(tmp_path / "a.mcap")
     assert message.log_time == STAMP_NS + 5 and nanoseconds(cloud) == STAMP_NS
     assert (cloud.height, cloud.width, cloud.is_bigendian, cloud.is_dense) == (1, count, False, True)

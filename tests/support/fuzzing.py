@@ -17,17 +17,16 @@ from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.logs import open_log
 from scanchain.logs.mcap.records import Channel
-from scanchain.logs.messages.laser_scan import LaserScanDecoder
-from scanchain.logs.messages.point_cloud import PointCloudDecoder
+from scanchain.logs.messages.lidar import decode_cloud, decode_laser_scan
+from scanchain.logs.messages.point_times import PointTimes
 from scanchain.logs.messages.readers import (
     has_poses,
-    has_transforms,
     is_lidar,
     is_scan,
     pose_reader,
     reader,
+    role,
 )
-from scanchain.logs.messages.returns import PointTimes, RangeLimits
 from scanchain.logs.messages.ros import MalformedMessageError
 from tests.support import recorders
 from tests.support.mutations import (
@@ -281,12 +280,11 @@ def _messages(folder):
 
 
 def decoder_of(channel):
-    limits = RangeLimits(0.0, float("inf"))
     if is_scan(channel):
-        return LaserScanDecoder(limits, reader(channel)).decode
+        return partial(decode_laser_scan, read=reader(channel), config=LogConfig())
     if is_lidar(channel):
-        return PointCloudDecoder(limits, PointTimes(LogConfig()), reader(channel)).decode
-    if has_transforms(channel):
+        return partial(decode_cloud, read=reader(channel), times=PointTimes(LogConfig()))
+    if role(channel) == "transforms":
         return reader(channel)
     assert has_poses(channel), channel
     return pose_reader(channel, 2)

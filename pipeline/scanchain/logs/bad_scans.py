@@ -11,8 +11,8 @@ from scanchain.config import LogConfig, PreprocessConfig
 from scanchain.data import MOST_COPIES, RawPoints, Scan
 from scanchain.errors import InputError, counted
 from scanchain.kernels.geometry import largest_magnitude
-from scanchain.logs.mcap.stream import Decoded
-from scanchain.logs.messages.returns import Returns
+from scanchain.logs.mcap.records import Decoded
+from scanchain.logs.messages.lidar import Returns
 
 _MOST_REPEATED = 0.5  # share of repeated stamps above which it is a warning
 _SPANS = 100  # number of first scans whose point times are compared with the period
@@ -26,16 +26,6 @@ def most_bad_scans(scans: int, config: LogConfig) -> float:
     """Largest number of scans that may be left out; unlimited at 100 %, as a damaged log may hold more scans."""
     share = 0.01 * config.max_bad_scans_percent
     return math.ceil(share * scans) if share < 1.0 else math.inf
-
-
-def check_count(bad: int, scans: int, config: LogConfig, complaint: str) -> None:
-    """Refuse more bad scans than are allowed; ``complaint`` is about the last one. Raises InputError."""
-    if bad > most_bad_scans(scans, config):
-        raise InputError(
-            f"{complaint}; with it {bad} of {counted(scans, 'scan')} cannot be used, more than "
-            f"log.max_bad_scans_percent ({config.max_bad_scans_percent:g}) allows; raise it, or choose "
-            "another --topic"
-        )
 
 
 def defect(message: Decoded, preprocess: PreprocessConfig | None) -> str:
@@ -77,23 +67,28 @@ class ScanCounts:
         self.topic = topic
         self.odometry_topic = odometry_topic
         self.scans = self.bad = self.backwards = self.repeated = self.without_wheels = self.copies = 0
-        self._last_points: RawPoints = np.empty((0, 2), np.float32)
         self.first_complaint = ""
-        self.last_stamp_ns: int | None = None
+        self._last: Scan | None = None
         self.spans_s: list[float] = []
         self.log_times_ns: list[int] = []
 
-    def skip(self, complaint: str) -> None:
-        """Count a scan that is left out."""
+    def skip(self, complaint: str, expected: int, config: LogConfig) -> None:
+        """Count a scan that is left out. Raises InputError for more of the expected number than are allowed."""
         self.scans += 1
         self.bad += 1
         self.first_complaint = self.first_complaint or complaint
+        if self.bad > most_bad_scans(expected, config):
+            raise InputError(
+                f"{complaint}; with it {self.bad} of {counted(expected, 'scan')} cannot be used, more than "
+                f"log.max_bad_scans_percent ({config.max_bad_scans_percent:g}) allows; raise it, or choose "
+                "another --topic"
+            )
 
     def repeats(self, points: RawPoints) -> bool:
         """True if the points of a scan are those of the one before, to the last bit."""
-        last, self._last_points = self._last_points, points
-        if points.shape != last.shape or len(points) < _FEWEST_COPIED:
+        if self._last is None or len(points) < _FEWEST_COPIED:
             return False
+        last = self._last.points
         return np.array_equal(points[:_SAMPLE], last[:_SAMPLE]) and np.array_equal(points, last)
 
     def take(self, scan: Scan) -> None:
@@ -101,10 +96,10 @@ class ScanCounts:
         self.scans += 1
         self.without_wheels += scan.T_odom_base is None
         self.copies += scan.is_copy
-        if self.last_stamp_ns is not None:
-            self.backwards += scan.stamp_ns < self.last_stamp_ns
-            self.repeated += scan.stamp_ns == self.last_stamp_ns
-        self.last_stamp_ns = scan.stamp_ns
+        if self._last is not None:
+            self.backwards += scan.stamp_ns < self._last.stamp_ns
+            self.repeated += scan.stamp_ns == self._last.stamp_ns
+        self._last = scan
         if len(self.log_times_ns) < _SPANS:
             self.log_times_ns.append(scan.log_time_ns)
             self.spans_s += [float(np.ptp(scan.times_s))] if len(scan.times_s) else []

@@ -10,23 +10,15 @@ from pathlib import Path
 from scanchain.config import LogConfig
 from scanchain.errors import InputError, grouped
 from scanchain.files import Source
-from scanchain.logs.mcap.records import FileIndex, name_of
-from scanchain.logs.mcap.stream import (
-    EVERYTHING,
-    Decoded,
-    chosen_span,
-    count_messages,
-    decoded_messages,
-    notes_on,
-    nothing_in_part,
-    whole_span,
-)
+from scanchain.logs.mcap import stream
+from scanchain.logs.mcap.records import Decoded, FileIndex, name_of
 from scanchain.logs.messages.readers import is_lidar
 from scanchain.logs.opening import AUTO, index_files
 from scanchain.logs.topics import find_lidar, topics_of
 from scanchain.logs.writer import LogWriter
 
 _DEFAULTS = LogConfig()
+_FIXED = "tf_static"  # end of the name of a topic of fixed transforms
 _WHOLE = (_DEFAULTS.topic, _DEFAULTS.start_s, _DEFAULTS.end_s, _DEFAULTS.every)
 
 
@@ -63,12 +55,15 @@ def convert(
     if len(indexes) == 1 and is_mcap and not is_folder and not is_part:
         raise InputError(f"{sources[0]}: is MCAP already; --start, --end, --every or --topic cut it")
     total = sum(sum(index.counts.values()) for index in indexes)
-    counts = dict.fromkeys(_chosen(indexes, config.topic), 0)
-    span = chosen_span(whole_span(indexes), config)
-    if span != EVERYTHING and not any(
-        count_messages(indexes, topic, span) for topic in counts if not _is_fixed(topic)
-    ):
-        raise nothing_in_part(f"{name_of(indexes)}: no message", whole_span(indexes), config)
+    lidar, channels = find_lidar(indexes, config.topic) if config.topic else None, topics_of(indexes)
+    others = (
+        [] if lidar is None else [name for name in channels if name != lidar.topic and is_lidar(channels[name])]
+    )
+    counts = {name: 0 for name in channels if name not in others}
+    span = stream.chosen_span(stream.whole_span(indexes), config)
+    moving = [topic for topic in counts if not topic.endswith(_FIXED)]
+    if span != stream.EVERYTHING and not any(stream.count_messages(indexes, topic, span) for topic in moving):
+        raise stream.nothing_in_part(f"{name_of(indexes)}: no message", stream.whole_span(indexes), config)
     damage = [line for index in indexes for line in index.damage]
     encodings = {channel.encoding for index in indexes for channel in index.channels.values()}
     profile = "ros2" if encodings == {"cdr"} else "ros1" if encodings == {"ros1"} else ""
@@ -84,7 +79,7 @@ def convert(
                 f"{name_of(indexes)}: holds no message that could be read: "
                 f"{'; '.join(grouped(damage)) or 'it is empty'}"
             )
-    notes = (*(line for index in indexes for line in index.notes), *notes_on(indexes, config))
+    notes = (*(line for index in indexes for line in index.notes), *stream.notes_on(indexes, config))
     return Converted(destination, counts, notes, tuple(grouped(damage)))
 
 
@@ -92,26 +87,15 @@ def _messages(
     indexes: Sequence[FileIndex], topics: Iterable[str], config: LogConfig, damage: list[str]
 ) -> Iterator[Decoded]:
     """The messages to write. Static transforms come first, and none before the chosen part begins."""
-    span = chosen_span(whole_span(indexes), config)
-    fixed = set() if span == EVERYTHING else {topic for topic in topics if _is_fixed(topic)}
-    for message in decoded_messages(indexes, dict.fromkeys(fixed, bytes), EVERYTHING, damage=[]):
+    span = stream.chosen_span(stream.whole_span(indexes), config)
+    fixed = set() if span == stream.EVERYTHING else {topic for topic in topics if topic.endswith(_FIXED)}
+    for message in stream.decoded_messages(indexes, dict.fromkeys(fixed, bytes), stream.EVERYTHING, damage=[]):
         yield message._replace(log_time_ns=min(max(message.log_time_ns, span.begin_ns), span.end_ns))
     others = dict.fromkeys((topic for topic in topics if topic not in fixed), bytes)
     scans = Counter[str]()
-    for message in decoded_messages(indexes, others, span, damage=damage):
+    for message in stream.decoded_messages(indexes, others, span, damage=damage):
         scans[message.channel.topic] += is_lidar(message.channel)
         if not isinstance(message.value, bytes):  # of a file that could not be read
             continue
         if (scans[message.channel.topic] - 1) % config.every == 0 or not is_lidar(message.channel):
             yield message
-
-
-def _is_fixed(topic: str) -> bool:
-    return topic.endswith("tf_static")
-
-
-def _chosen(indexes: Sequence[FileIndex], topic: str) -> list[str]:
-    """The topics to write: all, but of several lidars only the requested one."""
-    lidar = find_lidar(indexes, topic) if topic else None
-    channels = topics_of(indexes)
-    return [name for name in channels if lidar is None or name == topic or not is_lidar(channels[name])]

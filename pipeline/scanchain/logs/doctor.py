@@ -21,8 +21,8 @@ from scanchain.files import Source
 from scanchain.logs.bad_scans import most_bad_scans
 from scanchain.logs.log import Log, open_log
 from scanchain.logs.mcap.stream import whole_span
+from scanchain.logs.messages.point_times import UNITS_S
 from scanchain.logs.messages.readers import is_scan
-from scanchain.logs.messages.returns import UNITS_S
 
 _GAP_PERIODS = 2.5
 _LONG_GAP_S, _LONG_GAP_ON_WHEELS_S = 0.5, 10.0

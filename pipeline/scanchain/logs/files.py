@@ -84,21 +84,14 @@ def matching(pattern: Address) -> list[Address]:
 def _system_of(address: Address) -> tuple[Any, str]:
     """The fsspec file system of an address, and the path in it."""
     try:
+        from aiohttp import ClientTimeout
         from fsspec.core import url_to_fs
-    except ImportError:
-        raise MissingExtraError("fsspec", "remote") from None
-    options = {}
-    if address.url.lower().startswith(("http://", "https://")):
-        try:
-            from aiohttp import ClientTimeout
-        except ImportError:
-            raise MissingExtraError("aiohttp", "remote") from None
-        silence = ClientTimeout(
-            total=None, sock_connect=_CONNECT_S, sock_read=_SILENCE_S
-        )  # a large file takes long
-        options = {"client_kwargs": {"timeout": silence}}
+    except ImportError as error:
+        raise MissingExtraError(str(error.name).partition(".")[0], "remote") from None
+    silence = ClientTimeout(total=None, sock_connect=_CONNECT_S, sock_read=_SILENCE_S)  # a large file takes long
+    is_web = address.url.lower().startswith(("http://", "https://"))
     try:
-        return url_to_fs(address.url, **options)
+        return url_to_fs(address.url, **({"client_kwargs": {"timeout": silence}} if is_web else {}))
     except ImportError as error:
         raise InputError(f"{address}: {error}") from None
     except ValueError as error:

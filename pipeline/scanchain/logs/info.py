@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 from scanchain.config import LogConfig
@@ -26,7 +27,10 @@ def describe(sources: Sequence[Source], config: LogConfig) -> dict[str, Any]:
     """
     indexes = index_files(sources, config)
     whole = whole_span(indexes)
-    wheels, truth, notes = _pose_topics(indexes, config)
+    notes, (wheels, truth) = [line for index in indexes for line in index.notes], ("", "")
+    with suppress(InputError):  # which is the problem of the log as well
+        channels = find_odometry(indexes, config, notes), find_ground_truth(indexes, config.ground_truth_topic)
+        wheels, truth = (channel.topic if channel else "" for channel in channels)
     try:
         log, problem = Log(indexes, config), ""
     except InputError as error:
@@ -50,17 +54,6 @@ def describe(sources: Sequence[Source], config: LogConfig) -> dict[str, Any]:
         "damage": grouped(line for index in indexes for line in index.damage),
         "problem": problem,
     }
-
-
-def _pose_topics(indexes: Sequence[FileIndex], config: LogConfig) -> tuple[str, str, list[str]]:
-    """Topics of wheels and ground truth, whichever lidar is chosen, and notes; empty where the log has none."""
-    notes = [line for index in indexes for line in index.notes]
-    try:
-        wheels = find_odometry(indexes, config, notes)
-        truth = find_ground_truth(indexes, config.ground_truth_topic)
-    except InputError:  # which is the problem of the log as well
-        return "", "", notes
-    return wheels.topic if wheels else "", truth.topic if truth else "", notes
 
 
 def _topic(indexes: Sequence[FileIndex], topic: str, duration_s: float) -> dict[str, Any]:

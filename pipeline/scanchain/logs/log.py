@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
+from functools import partial
+from itertools import chain
 
 import numpy as np
 from msgspec.structs import replace
@@ -15,28 +17,16 @@ from scanchain.config import LogConfig, PreprocessConfig
 from scanchain.data import Pose, Scan, Trajectory
 from scanchain.errors import InputError, counted, grouped, shown
 from scanchain.files import Source, source_of
-from scanchain.logs.bad_scans import ScanCounts, check_count, defect
-from scanchain.logs.mcap.records import FileIndex, name_of
-from scanchain.logs.mcap.stream import (
-    Decoded,
-    Decoders,
-    check_one_log,
-    chosen_span,
-    count_scans,
-    decoded_messages,
-    gap_notes,
-    notes_on,
-    sampled_messages,
-    whole_span,
-)
-from scanchain.logs.messages.laser_scan import LaserScanDecoder
-from scanchain.logs.messages.point_cloud import PointCloudDecoder, plane_height_m
+from scanchain.logs.bad_scans import ScanCounts, defect
+from scanchain.logs.mcap import stream
+from scanchain.logs.mcap.records import Decoded, FileIndex, name_of
+from scanchain.logs.messages.lidar import Returns, decode_cloud, decode_laser_scan, plane_height_m
+from scanchain.logs.messages.point_times import PointTimes
 from scanchain.logs.messages.poses import RecordedPoses, StampedPose
 from scanchain.logs.messages.readers import is_scan, pose_reader, reader
-from scanchain.logs.messages.returns import PointTimes, RangeLimits, Returns
 from scanchain.logs.mounting import find_mounting, in_plane, is_upside_down
 from scanchain.logs.opening import index_files
-from scanchain.logs.topics import files_with_scans, find_ground_truth, find_lidar, find_odometry
+from scanchain.logs.topics import find_ground_truth, find_lidar, find_odometry
 from scanchain.settings import load_settings, overrides_of
 
 _DEFAULTS = LogConfig()
@@ -94,37 +84,39 @@ class Log:
         self.paths = tuple(index.path for index in indexes)
         self.name = name_of(indexes)
         self.notes: list[str] = [line for index in indexes for line in index.notes]
-        check_one_log(indexes, files_with_scans(indexes), config)
-        lidar = find_lidar(indexes, config.topic)
+        stream.check_one_log(indexes, config)
+        self.lidar = lidar = find_lidar(indexes, config.topic)
         wheels = find_odometry(indexes, config, self.notes)
         truth = find_ground_truth(indexes, config.ground_truth_topic)
         self.topic = lidar.topic
         self.odometry_topic = "" if wheels is None else wheels.topic
         self.ground_truth_topic = "" if truth is None else truth.topic
-        self.lidar = lidar
         self._sampled_times = PointTimes(config)
         self.plane_height_m: float | None = None
         if not is_scan(lidar):
-            self.plane_height_m = self._plane_height_m()
+            clouds = stream.sampled_messages(indexes, lidar.topic, self.decoder(self._sampled_times))
+            self.plane_height_m = height_m = plane_height_m(clouds)
+            if height_m is not None:
+                self.notes.append(
+                    f"the clouds of {lidar.topic} are planar (z = {height_m:.3g} m everywhere): read as a 2D log"
+                )
         self.dimension = 2 if is_scan(lidar) or self.plane_height_m is not None else 3
-        whole = whole_span(indexes)
+        whole = stream.whole_span(indexes)
         self.duration_s = whole.duration_s
-        self.span = chosen_span(whole, config)
-        self.scan_count = count_scans(indexes, self.topic, whole, config)
+        self.span = stream.chosen_span(whole, config)
+        self.scan_count = stream.count_scans(indexes, self.topic, whole, config)
         self.mounting = find_mounting(indexes, lidar, wheels, self.span)
-        self.gaps = gap_notes(indexes, config)  # those of the notes that are of long gaps
-        self.notes += [*notes_on(indexes, config), *self.mounting.notes(self.odometry_topic, self.dimension)]
+        self.gaps = stream.gap_notes(indexes, config)  # those of the notes that are of long gaps
+        self.notes += stream.notes_on(indexes, config)
+        self.notes += self.mounting.notes(self.odometry_topic, self.dimension)
         if self.mounting.motion is not None:
             wheels, self.odometry_topic = None, ""
         T_base_lidar = self.mounting.T_base_lidar
         self.is_mirrored = self.dimension == 2 and is_upside_down(T_base_lidar)
         self.T_base_lidar: Pose = in_plane(T_base_lidar) if self.dimension == 2 else T_base_lidar
         self._damage: list[str] = [line for index in indexes for line in index.damage]
-        self.pose_decoders: Decoders = {
-            channel.topic: pose_reader(channel, self.dimension)
-            for channel in (wheels, truth)
-            if channel is not None
-        }
+        with_poses = [each for each in (wheels, truth) if each is not None]
+        self.pose_decoders = {each.topic: pose_reader(each, self.dimension) for each in with_poses}
         self.scans_with_wheels = 0
         self.bad_scans = 0
         self._opening_notes = tuple(self.notes)
@@ -163,21 +155,19 @@ class Log:
                 count += 1
                 if (count - 1) % self.config.every:
                     continue
-                unusable = defect(message, preprocess)
-                if unusable:
+                returns = message.value
+                if unusable := defect(message, preprocess):
                     path = self.indexes[message.channel.key[0]].path
                     complaint = f"{path}: scan {count - 1} of {self.topic} {unusable}"
-                    counts.skip(complaint)
-                    check_count(counts.bad, self.scan_count, self.config, complaint)
+                    counts.skip(complaint, self.scan_count, self.config)
                     continue
-                returns = message.value
                 assert isinstance(returns, Returns)
-                points = returns.points
+                points = returns.points * np.array([1.0, -1.0], np.float32) if self.is_mirrored else returns.points
                 scan = Scan(
                     index=index,
                     stamp_ns=returns.stamp_ns,
                     log_time_ns=message.log_time_ns,
-                    points=points * np.array([1.0, -1.0], np.float32) if self.is_mirrored else points,
+                    points=points,
                     times_s=returns.times_s,
                     dropped=returns.dropped,
                     T_odom_base=T_odom_base,
@@ -210,11 +200,11 @@ class Log:
 
         ``topic`` : the lidar's or the ground truth's. Raises InputError where it has no message there.
         """
-        decode = self.pose_decoders.get(topic) or self.decoder(PointTimes(self.config)).decode
+        decode = self.pose_decoders.get(topic) or self.decoder(PointTimes(self.config))
         why = ""
-        for message in decoded_messages(self.indexes, {topic: decode}, self.span, ahead=1, damage=[]):
+        for message in stream.decoded_messages(self.indexes, {topic: decode}, self.span, ahead=1, damage=[]):
             if isinstance(message.value, Returns | StampedPose):
-                last_ns = min(self.span.end_ns, whole_span(self.indexes).end_ns)
+                last_ns = min(self.span.end_ns, stream.whole_span(self.indexes).end_ns)
                 first_ns = message.value.stamp_ns
                 return np.array([first_ns, first_ns + last_ns - message.log_time_ns])
             why = why or f" (the first: {message.value})"
@@ -222,53 +212,36 @@ class Log:
 
     def ground_truth(self) -> Trajectory | None:
         """Poses of ``log.ground_truth_topic``, None where there are none; read by itself if before ``scans``."""
-        if self._truth is None and self.ground_truth_topic:
-            poses = RecordedPoses("", self.ground_truth_topic)
-            decoder = self.pose_decoders[self.ground_truth_topic]
-            for message in decoded_messages(
-                self.indexes, {self.ground_truth_topic: decoder}, self.span, damage=[]
-            ):
+        topic = self.ground_truth_topic
+        if self._truth is None and topic:
+            poses, decoders = RecordedPoses("", topic), {topic: self.pose_decoders[topic]}
+            for message in stream.decoded_messages(self.indexes, decoders, self.span, damage=[]):
                 poses.take(message)
             self._truth = poses.ground_truth()
         return self._truth
 
     def _with_poses(self, poses: RecordedPoses, times: PointTimes) -> Iterator[tuple[Decoded, Pose | None]]:
         """Lidar messages with the wheels' pose at their stamp; they wait a little for the readings behind them."""
-        decoders = {self.topic: self.decoder(times).decode, **self.pose_decoders}
+        decoders = {self.topic: self.decoder(times), **self.pose_decoders}
         waiting: deque[Decoded] = deque()
-
-        def next_scan() -> tuple[Decoded, Pose | None]:
-            scan = waiting.popleft()
-            return scan, poses.at(scan.value.stamp_ns) if isinstance(scan.value, Returns) else None
-
-        for message in decoded_messages(self.indexes, decoders, self.span, damage=self._damage):
-            if message.channel.topic == self.topic:
+        messages = stream.decoded_messages(self.indexes, decoders, self.span, damage=self._damage)
+        for message in chain(messages, [None]):
+            if message is not None and message.channel.topic == self.topic:
                 waiting.append(message)
-            else:
+            elif message is not None:
                 poses.take(message)
             while waiting and (
-                len(waiting) > _HOLD_SCANS
+                message is None
+                or len(waiting) > _HOLD_SCANS
                 or message.log_time_ns - waiting[0].log_time_ns > _HOLD_NS
                 or not isinstance(first := waiting[0].value, Returns)
                 or poses.covers(first.stamp_ns)
             ):
-                yield next_scan()
-        while waiting:
-            yield next_scan()
+                scan = waiting.popleft()
+                yield scan, poses.at(scan.value.stamp_ns) if isinstance(scan.value, Returns) else None
 
-    def decoder(self, times: PointTimes) -> LaserScanDecoder | PointCloudDecoder:
+    def decoder(self, times: PointTimes) -> Callable[[memoryview], Returns]:
         """Decoder of the lidar's messages to points; ``times`` collects its assumptions about theirs."""
-        limits = RangeLimits(self.config.min_range_m, self.config.max_range_m)
         if is_scan(self.lidar):
-            return LaserScanDecoder(limits, reader(self.lidar))
-        return PointCloudDecoder(limits, times, reader(self.lidar), self.plane_height_m)
-
-    def _plane_height_m(self) -> float | None:
-        """Height of all points of the first clouds, None where they differ; samples their point times, too."""
-        decode = self.decoder(self._sampled_times).decode
-        height_m = plane_height_m(sampled_messages(self.indexes, self.topic, decode))
-        if height_m is not None:
-            self.notes.append(
-                f"the clouds of {self.topic} are planar (z = {height_m:.3g} m everywhere): read as a 2D log"
-            )
-        return height_m
+            return partial(decode_laser_scan, read=reader(self.lidar), config=self.config)
+        return partial(decode_cloud, read=reader(self.lidar), times=times, plane_m=self.plane_height_m)

@@ -13,7 +13,7 @@ from scanchain.data import Pose
 from scanchain.logs.mcap.records import Channel, FileIndex
 from scanchain.logs.mcap.stream import Span, sampled_messages
 from scanchain.logs.messages.poses import StampedPose, chain
-from scanchain.logs.messages.readers import has_transforms, is_odometry, pose_reader, reader
+from scanchain.logs.messages.readers import pose_reader, reader, role
 from scanchain.logs.topics import topics_of
 
 _BASE_FRAMES = ("base_link", "base_footprint", "base")
@@ -21,8 +21,6 @@ _WORLD_WORDS = {"map", "odom", "world", "earth", "global", "origin", "init"}  # 
 _TURN_RAD, _SHIFT_M = np.radians(0.2), 0.005  # least turn and shift of a mount that moves
 _TILTED_RAD = np.radians(10.0)  # tilt of a planar lidar's plane from which on it is no floor plan
 _TURNED_DEG = 0.5  # least turn of a lidar on its robot that is worth a word
-
-Edge = tuple[str, str]  # parent and child
 
 
 class Mounting(NamedTuple):
@@ -79,17 +77,17 @@ def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel 
     fixed = _transforms(indexes, is_fixed=True)
     frame = _frame_of(indexes, lidar)
     stated = None
-    if wheels is not None and is_odometry(wheels):
+    if wheels is not None and role(wheels) == "odometry":
         stated = next(sampled_messages(indexes, wheels.topic, pose_reader(wheels, 3)), None)
-    bases = [name.lstrip("/") for name in ("" if stated is None else stated.child, *_BASE_FRAMES) if name]
+    bases = [name for name in ("" if stated is None else stated.child, *_BASE_FRAMES) if name]
     for base in bases:
         T_base_lidar = chain(fixed, base, frame)
         if T_base_lidar is not None:
             return Mounting(base, T_base_lidar)
-    joints: dict[Edge, list[StampedPose]] = {}
+    joints: dict[tuple[str, str], list[StampedPose]] = {}
     for each in _transforms(indexes, is_fixed=False, span=span):
         if not _is_world(each.parent):
-            joints.setdefault(_edge(each), []).append(each)
+            joints.setdefault((each.parent, each.child), []).append(each)
     first = [*fixed, *(poses[0] for poses in joints.values())]
     for base in bases:
         T_base_lidar = chain(first, base, frame)
@@ -97,7 +95,7 @@ def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel 
             motion = _motion(joints, first, base, frame)
             source = "by transforms of /tf" + (" that change" if motion else ", which do not change")
             return Mounting(base, T_base_lidar, source, motion)
-    root = _root({child: parent for parent, child in map(_edge, fixed) if not _is_world(parent)}, frame)
+    root = _root([each for each in fixed if not _is_world(each.parent)], frame)
     T_root_lidar = chain(fixed, root, frame)
     if root != frame and T_root_lidar is not None:
         note = f"the log has no transform from {bases[0]} to {frame}: {root} is taken as the base"
@@ -108,12 +106,12 @@ def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel 
 
 
 def _motion(
-    joints: dict[Edge, list[StampedPose]], first: Sequence[StampedPose], base: str, frame: str
+    joints: dict[tuple[str, str], list[StampedPose]], first: Sequence[StampedPose], base: str, frame: str
 ) -> str | None:
     """The joint between base and lidar that turns most, and how far, as text; None where none moves."""
     motion, most_rad = None, -1.0
     for joint, poses in joints.items():
-        if chain([each for each in first if _edge(each) != joint], base, frame) is not None:
+        if chain([each for each in first if (each.parent, each.child) != joint], base, frame) is not None:
             continue  # the lidar does not hang on it
         moved = [lie.apart(poses[0].T_parent_child, pose.T_parent_child) for pose in poses]
         shift_m, turn_rad = np.max(moved, axis=0)
@@ -135,27 +133,22 @@ def moving_frame(
     transforms = _transforms(indexes, is_fixed=True)
     if mounting.base and mounting.motion is None and chain(transforms, mounting.base, frame) is None:
         transforms.append(StampedPose(0, mounting.base, frame, mounting.T_base_lidar))
-    root = _root({child: parent for parent, child in map(_edge, transforms)}, frame)
+    root = _root(transforms, frame)
     T_root_lidar = chain(transforms, root, frame)
     T_root_lidar = np.eye(4) if T_root_lidar is None else T_root_lidar
     return MovingFrame(root, lie.inverse(in_plane(T_root_lidar) if dimension == 2 else T_root_lidar))
 
 
-def _root(parents: dict[str, str], frame: str) -> str:
-    """The topmost frame above one, by the parent of each; the frame itself where it has none."""
-    seen: set[str] = set()
-    while frame in parents and frame not in seen:
-        seen.add(frame)
-        frame = parents[frame]
+def _root(transforms: Sequence[StampedPose], frame: str) -> str:
+    """The topmost frame above one; the frame itself where it has no parent."""
+    parents = {each.child: each.parent for each in transforms}
+    while frame in parents:
+        frame = parents.pop(frame)  # so that a circle ends
     return frame
 
 
 def _is_world(frame: str) -> bool:
     return not _WORLD_WORDS.isdisjoint(re.split(r"[/_]", frame.lower()))
-
-
-def _edge(transform: StampedPose) -> Edge:
-    return transform.parent.lstrip("/"), transform.child.lstrip("/")
 
 
 def is_upside_down(T_base_lidar: Pose) -> bool:
@@ -187,7 +180,7 @@ def _transforms(indexes: Sequence[FileIndex], *, is_fixed: bool, span: Span | No
     """Transforms of the topics of fixed ones, or of those that may change, from parts spread over the span."""
     found: list[StampedPose] = []
     for topic, channel in topics_of(indexes).items():
-        if has_transforms(channel) and topic.endswith("tf_static") == is_fixed:
+        if role(channel) == "transforms" and topic.endswith("tf_static") == is_fixed:
             for transforms in sampled_messages(indexes, topic, reader(channel), span):
                 found += transforms
     return found
@@ -195,5 +188,5 @@ def _transforms(indexes: Sequence[FileIndex], *, is_fixed: bool, span: Span | No
 
 def _frame_of(indexes: Sequence[FileIndex], lidar: Channel) -> str:
     """The frame of a lidar's first messages, empty where they name none."""
-    read = reader(lidar)
-    return next(sampled_messages(indexes, lidar.topic, lambda data: read(data).frame), "").lstrip("/")
+    first = next(sampled_messages(indexes, lidar.topic, reader(lidar)), None)
+    return "" if first is None else first.message.header.frame_id.lstrip("/")

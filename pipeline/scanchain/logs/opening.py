@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
+from mcap.writer import MCAP0_MAGIC
+
+from scanchain import plugins
 from scanchain.config import LogConfig
 from scanchain.errors import InputError
 from scanchain.files import Source
@@ -18,46 +19,22 @@ from scanchain.logs.formats.clouds import SUFFIXES, index_clouds
 from scanchain.logs.formats.kitti import index_kitti_odometry, index_kitti_raw
 from scanchain.logs.formats.ros1_bag import index_ros1_bag
 from scanchain.logs.formats.ros2_bag import index_ros2_bag, parts_of_bag
-from scanchain.logs.formats.user import index_scans, load_format
+from scanchain.logs.formats.user import index_scans
 from scanchain.logs.mcap.index import index_by_summary, index_file
-from scanchain.logs.mcap.records import MAGIC, FileIndex
+from scanchain.logs.mcap.records import FileIndex
 from scanchain.logs.mcap.stream import are_parts, complete
-from scanchain.logs.messages.readers import is_lidar
 
-
-class LogFormat(NamedTuple):
-    """A log format, described as errors list it."""
-
-    description: str
-    claims: Callable[[Path, bytes], bool]  # by a path's first bytes (none of a folder) or what lies in it
-    index_of: Callable[..., FileIndex]  # of a path as the n-th file of a log; may raise UnknownFormatError
-
-
-FORMATS: dict[str, LogFormat] = {  # the first that claims a path reads it; an empty file is refused as MCAP
-    "mcap": LogFormat(
-        "MCAP", lambda path, head: head.startswith(MAGIC) or not (head or path.is_dir()), index_file
-    ),
-    "ros1": LogFormat("a ROS 1 .bag", lambda _, head: head.startswith(b"#ROSBAG"), index_ros1_bag),
-    "ros2": LogFormat(
-        "a ROS 2 .db3 or the folder of a ROS 2 bag",
-        lambda path, head: head.startswith(b"SQLite format 3\0") or (path / _BAG_FILE).is_file(),
-        index_ros2_bag,
-    ),
-    "carmen": LogFormat("a CARMEN .log or .clf (also .bz2, .gz)", lambda _, head: is_carmen(head), index_carmen),
-    "kitti-raw": LogFormat(
-        "a KITTI raw drive", lambda path, _: (path / "velodyne_points").is_dir(), index_kitti_raw
-    ),
-    "kitti-odometry": LogFormat(
-        "a KITTI odometry sequence",
-        lambda path, _: (path / "velodyne").is_dir() and (path / "times.txt").is_file(),
-        index_kitti_odometry,
-    ),
-    "clouds": LogFormat(
-        "a folder of PCD, PLY, .npy or .bin files",
-        lambda path, _: path.is_dir() and any(each.suffix.lower() in SUFFIXES for each in path.iterdir()),
-        index_clouds,
-    ),
+FORMATS: dict[str, tuple[str, Callable[..., FileIndex]]] = {  # described as errors list them; see _format_of
+    "mcap": ("MCAP", index_file),
+    "ros1": ("a ROS 1 .bag", index_ros1_bag),
+    "ros2": ("a ROS 2 .db3 or the folder of a ROS 2 bag", index_ros2_bag),
+    "carmen": ("a CARMEN .log or .clf (also .bz2, .gz)", index_carmen),
+    "kitti-raw": ("a KITTI raw drive", index_kitti_raw),
+    "kitti-odometry": ("a KITTI odometry sequence", index_kitti_odometry),
+    "clouds": ("a folder of PCD, PLY, .npy or .bin files", index_clouds),
 }
+_KNOWN = ", ".join(description for description, _ in FORMATS.values())
+_KNOWN += ", or name a class of your own that reads it, --log.format module:Class"
 AUTO = "auto"  # value of log.format: the format that claims the path
 
 _RUN_FILE, _BAG_FILE = "run.json", "metadata.yaml"
@@ -73,15 +50,13 @@ def index_files(sources: Sequence[Source], config: LogConfig = _DEFAULTS) -> lis
 
     Raises InputError for what is no log, or cannot be read.
     """
-    if not sources:
-        raise InputError("no log was named; give at least one file or folder")
     name = config.format
     if name != AUTO and name not in FORMATS:
         if ":" not in name:
             raise InputError(
                 f"log.format {name!r} is unknown; wanted {AUTO}, {', '.join(FORMATS)} or module:Class"
             )
-        load_format(name)
+        plugins.load(name, "scans")  # before anything is downloaded
         files = list(sources)
     else:
         files = [part for source in sources for part in _parts(source)]
@@ -91,8 +66,11 @@ def index_files(sources: Sequence[Source], config: LogConfig = _DEFAULTS) -> lis
     indexes = [_index(source, number, config) for number, source in enumerate(files)]
     for index in indexes:
         complete(index)
-    if name == AUTO:
-        indexes[0].notes += [note for source in sources for note in _other_parts(source)]
+    for source in sources if name == AUTO else []:
+        parts = _parts(source)
+        if isinstance(source, Path) and source not in parts and not (source / _BAG_FILE).is_file():
+            taken = Path(parts[0].name).suffix
+            indexes[0].notes += left_out(source, taken, (*_PART_SUFFIXES, *SUFFIXES))
     return indexes
 
 
@@ -104,7 +82,7 @@ def logs_in(folder: Path) -> list[Path]:
     if len(found) < 2:
         return [folder]
     try:  # in time they follow one another, or have no topic of a lidar in common
-        is_one = found == _parts(folder) and are_parts(index_files(found), is_lidar)
+        is_one = found == _parts(folder) and are_parts(index_files(found))
     except InputError:
         is_one = False
     return [folder] if is_one else found
@@ -117,7 +95,7 @@ def _is_named_as_log(path: Path) -> bool:
 
 
 def _is_claimed(folder: Path) -> bool:
-    return (folder / _RUN_FILE).is_file() or any(form.claims(folder, b"") for form in FORMATS.values())
+    return (folder / _RUN_FILE).is_file() or _format_of(folder, b"") != ""
 
 
 def _index(source: Source, number: int, config: LogConfig) -> FileIndex:
@@ -130,16 +108,21 @@ def _index(source: Source, number: int, config: LogConfig) -> FileIndex:
         if index is not None:
             return index
     copy = fetch_whole(file)
-    index = _index_path(copy, number, config, source)
+    try:
+        index = _index_path(copy, number, config)
+    except InputError as error:
+        raise InputError(error.text.replace(str(copy), str(source))) from error
     why = "has no index to read it by" if file.has_ranges else "lies on a server that sends no parts of files"
-    index.notes.insert(0, f"{source}: {why}, so all {copy.stat().st_size / 1e6:.1f} MB of it were downloaded")
+    index.notes.insert(0, f"{copy}: {why}, so all {copy.stat().st_size / 1e6:.1f} MB of it were downloaded")
+    index.path = source
+    for lines in (index.notes, index.damage):
+        lines[:] = [line.replace(str(copy), str(source)) for line in lines]
     return index
 
 
-def _index_path(path: Path, number: int, config: LogConfig, address: Source | None = None) -> FileIndex:
-    """Index of a path, which may be the copy of a remote file."""
+def _index_path(path: Path, number: int, config: LogConfig) -> FileIndex:
     if config.format != AUTO and config.format not in FORMATS:
-        return index_scans(path, number, config.format, address)
+        return index_scans(path, number, config.format)
     try:
         head = b""
         if path.is_file():
@@ -147,57 +130,48 @@ def _index_path(path: Path, number: int, config: LogConfig, address: Source | No
                 head = file.read(_HEAD_BYTES)
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
-    index = (_claiming(path, head) if config.format == AUTO else FORMATS[config.format]).index_of
-    if index is index_clouds:
-        index = partial(index, rate_hz=config.rate_hz, bin_columns=config.bin_columns)
-    elif index is index_file:
-        index = partial(index, source=address)
     try:
-        return index(path, number)
+        _, index_of = FORMATS[_claiming(path, head) if config.format == AUTO else config.format]
+        if index_of is index_clouds:
+            return index_clouds(path, number, config.rate_hz, config.bin_columns)
+        return index_of(path, number)
     except UnknownFormatError as error:
-        raise _unknown(path, error.text, error.lack) from None
+        text, lack = error.args
+        if _POSE_GRAPH.search(text):
+            raise InputError(f"{path}: is a pose graph, no log; give it to scanchain optimize") from None
+        raise InputError(f"{path}: is not a recognized log ({lack}); give {_KNOWN}") from None
 
 
-def _claiming(path: Path, head: bytes) -> LogFormat:
-    """The format that claims a path. Raises InputError where none does, and for a run directory."""
+def _format_of(path: Path, head: bytes) -> str:
+    """The format of a path by its first bytes, none of a folder, or what lies in it; empty where it has none."""
+    claims = {
+        "mcap": head.startswith(MCAP0_MAGIC) or not (head or path.is_dir()),  # an empty file is refused as such
+        "ros1": head.startswith(b"#ROSBAG"),
+        "ros2": head.startswith(b"SQLite format 3\0") or (path / _BAG_FILE).is_file(),
+        "carmen": is_carmen(head),
+        "kitti-raw": (path / "velodyne_points").is_dir(),
+        "kitti-odometry": (path / "velodyne").is_dir() and (path / "times.txt").is_file(),
+        "clouds": path.is_dir() and any(each.suffix.lower() in SUFFIXES for each in path.iterdir()),
+    }
+    return next((name for name, is_claimed in claims.items() if is_claimed), "")
+
+
+def _claiming(path: Path, head: bytes) -> str:
+    """The format that claims a path. Raises UnknownFormatError, or InputError for a folder that is none."""
     if (path / _RUN_FILE).is_file():
         raise InputError(f"{path}: is a run directory, no log; give the log that its {_RUN_FILE} names")
-    for form in FORMATS.values():
-        if form.claims(path, head):
-            return form
+    if name := _format_of(path, head):
+        return name
     if path.is_dir():
-        raise InputError(f"{path}: is a folder without a recognized log; give {_known()}")
-    raise _unknown(path, head, f"starts with {head[:8]!r}")
-
-
-def _unknown(path: Path, text: bytes, lack: str) -> InputError:
-    if _POSE_GRAPH.search(text):
-        return InputError(f"{path}: is a pose graph, no log; give it to scanchain optimize")
-    return InputError(f"{path}: is not a recognized log ({lack}); give {_known()}")
-
-
-def _known() -> str:
-    listed = ", ".join(form.description for form in FORMATS.values())
-    return f"{listed}, or name a class of your own that reads it, --log.format module:Class"
+        raise InputError(f"{path}: is a folder without a recognized log; give {_KNOWN}")
+    raise UnknownFormatError(head, f"starts with {head[:8]!r}")
 
 
 def _parts(source: Source) -> Sequence[Source]:
     """The files of a folder that holds the parts of a log, in the order of their names; else the source itself."""
     if not isinstance(source, Path) or not source.is_dir():
         return [source]
-    path = source
-    if (path / _BAG_FILE).is_file():
-        return parts_of_bag(path)
-    for suffix in _PART_SUFFIXES:
-        parts = sorted(path.glob(f"*{suffix}"), key=natural_order)
-        if parts:
-            return parts
-    return [path]
-
-
-def _other_parts(source: Source) -> list[str]:
-    """A note on files beside the parts of a log that are no part."""
-    parts = _parts(source)
-    if not isinstance(source, Path) or source in parts or (source / _BAG_FILE).is_file():
-        return []
-    return left_out(source, Path(parts[0].name).suffix, (*_PART_SUFFIXES, *SUFFIXES))
+    if (source / _BAG_FILE).is_file():
+        return parts_of_bag(source)
+    parts = (sorted(source.glob(f"*{suffix}"), key=natural_order) for suffix in _PART_SUFFIXES)
+    return next(filter(None, parts), [source])

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from scanchain.config import NO_TRUTH, LogConfig
 from scanchain.errors import InputError
 from scanchain.logs.mcap.records import Channel, FileIndex, damage_of, name_of
-from scanchain.logs.messages.readers import LIDAR_TYPES, has_poses, is_lidar, is_odometry, kind
+from scanchain.logs.messages.readers import LIDAR_TYPES, has_poses, is_lidar, kind, role
 
 _MOST_LISTED = 8
 _USUAL_TRUTH = LogConfig().ground_truth_topic
@@ -16,7 +16,6 @@ _IMU = ("sensor_msgs/Imu",)
 _GNSS = (
     "sensor_msgs/NavSatFix", "gps_common/GPSFix", "gps_msgs/GPSFix", "nmea_msgs/Sentence", "foxglove.LocationFix"
 )  # fmt: skip
-_UNDERSTOOD = ", ".join(LIDAR_TYPES)
 
 
 def topics_of(indexes: Sequence[FileIndex]) -> dict[str, Channel]:
@@ -39,7 +38,7 @@ def find_lidar(indexes: Sequence[FileIndex], wanted: str) -> Channel:
     if not lidars:
         absent = f"topic {wanted}, nor any other" if wanted and wanted not in channels else "lidar topic"
         raise InputError(
-            f"{name}: has no {absent} of a type that is understood ({_UNDERSTOOD}); "
+            f"{name}: has no {absent} of a type that is understood ({LIDAR_TYPES}); "
             f"it holds: {_listed(channels.values())}{damage_of(indexes)}"
         )
     if wanted:
@@ -54,7 +53,7 @@ def find_odometry(indexes: Sequence[FileIndex], config: LogConfig, notes: list[s
     if config.odometry_topic:
         return _chosen(indexes, config.odometry_topic, "log.odometry_topic")
     truths = config.ground_truth_topic, _USUAL_TRUTH
-    found = [each for each in topics_of(indexes).values() if is_odometry(each) and each.topic not in truths]
+    found = [each for each in topics_of(indexes).values() if role(each) == "odometry" and each.topic not in truths]
     if len(found) > 1:
         names = ", ".join(channel.topic for channel in found)
         notes.append(f"several odometry topics ({names}), none is used; choose with --log.odometry_topic")
@@ -66,7 +65,8 @@ def find_ground_truth(indexes: Sequence[FileIndex], wanted: str) -> Channel | No
     """The ground truth's channel, None for ``NO_TRUTH``; only a topic that is not the usual one must exist."""
     if wanted == NO_TRUTH:
         return None
-    if wanted == _USUAL_TRUTH and not any(channel.topic == wanted for channel in _with_poses(indexes)):
+    usual = topics_of(indexes).get(_USUAL_TRUTH)
+    if wanted == _USUAL_TRUTH and not (usual and has_poses(usual)):
         return None
     return _chosen(indexes, wanted, "log.ground_truth_topic")
 
@@ -94,36 +94,22 @@ def other_sensors(indexes: Sequence[FileIndex], *, wheels: str, truth: str) -> l
 
 
 def _chosen(indexes: Sequence[FileIndex], wanted: str, key: str) -> Channel:
-    channels = _with_poses(indexes)
-    for channel in channels:
-        if channel.topic == wanted:
-            return channel
+    channels = {topic: channel for topic, channel in topics_of(indexes).items() if has_poses(channel)}
+    if wanted in channels:
+        return channels[wanted]
     raise InputError(
         f"{name_of(indexes)}: {key} {wanted} is no nav_msgs/Odometry topic of the log, nor one of stamped poses; "
-        f"these are: {_listed(channels)}"
+        f"these are: {_listed(channels.values())}"
     )
-
-
-def _with_poses(indexes: Sequence[FileIndex]) -> list[Channel]:
-    return [channel for channel in topics_of(indexes).values() if has_poses(channel)]
-
-
-def files_with_scans(indexes: Sequence[FileIndex]) -> set[int]:
-    """Numbers of the files that hold messages of a lidar."""
-    return {
-        place
-        for place, index in enumerate(indexes)
-        if any(is_lidar(channel) and index.counts.get(number) for number, channel in index.channels.items())
-    }
 
 
 def _listed(channels: Iterable[Channel], indexes: Sequence[FileIndex] = ()) -> str:
     """Channels with their types and, of several files, the first that each is in."""
     names = []
-    channels = list(channels)
-    for channel in channels[:_MOST_LISTED]:
+    for channel in channels:
         unusual = "" if channel.encoding == "cdr" else f" in {channel.encoding or 'an unnamed encoding'}"
         file = f" in {indexes[channel.key[0]].path.name}" if len(indexes) > 1 else ""
         names.append(f"{channel.topic} ({kind(channel) or 'no schema'}{unusual}){file}")
-    names += [f"{len(channels) - _MOST_LISTED} more, see scanchain info"] if len(channels) > _MOST_LISTED else []
+    if len(names) > _MOST_LISTED:
+        names[_MOST_LISTED:] = [f"{len(names) - _MOST_LISTED} more, see scanchain info"]
     return ", ".join(names) or "none"

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from types import TracebackType
-from typing import IO, Any, Literal, NamedTuple, Self
+from typing import IO, Any, NamedTuple, Self
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
@@ -17,31 +16,22 @@ from scanchain import lie
 from scanchain.data import Matrix, Pose
 from scanchain.errors import InputError
 from scanchain.logs.mcap.records import Channel
-from scanchain.logs.messages.ros import new, packed, typestore
+from scanchain.logs.messages.ros import NUMBERS, header, new, packed, point_fields, typestore
 
 LATEST_NS = (1 << 31) * 1_000_000_000  # largest stamp of ROS
-_FIELD_TYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}  # sensor_msgs/PointField
+_NUMBER_TYPES = {code: number for number, code in NUMBERS.items()}
 
 
-class Place(NamedTuple):
-    """A pose in messages: meters and a unit quaternion."""
-
-    x: float
-    y: float
-    z: float
-    qx: float
-    qy: float
-    qz: float
-    qw: float
-
-
-ORIGIN = Place(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-
-
-def place(T: Pose) -> Place:
-    """An SE(2) or SE(3) pose, (3, 3) or (4, 4)."""
+def place(T: Pose) -> Any:
+    """A geometry_msgs/Pose of an SE(2) or SE(3) pose, (3, 3) or (4, 4)."""
     lifted = lie.lift(np.asarray(T, dtype=np.float64))
-    return Place(*lifted[:3, 3].tolist(), *lie.to_quaternion(lifted[:3, :3]).tolist())
+    return place_of(lifted[:3, 3].tolist(), lie.to_quaternion(lifted[:3, :3]).tolist())
+
+
+def place_of(position_m: Sequence[float], quat_xyzw: Sequence[float]) -> Any:
+    """A geometry_msgs/Pose."""
+    position = new("geometry_msgs/msg/Point", *position_m)
+    return new("geometry_msgs/msg/Pose", position, new("geometry_msgs/msg/Quaternion", *quat_xyzw))
 
 
 def pack_laser_scan(
@@ -59,92 +49,64 @@ def pack_laser_scan(
     """A sensor_msgs/LaserScan; (N,) ranges, inf where nothing came back, stamp = first beam."""
     angle_max_rad = angle_min_rad + (len(ranges_m) - 1) * angle_increment_rad
     angles_rad = angle_min_rad, angle_max_rad, angle_increment_rad
-    limits_m = range_min_m, range_max_m
+    limits = time_increment_s, scan_time_s, range_min_m, range_max_m
     ranges = np.ascontiguousarray(ranges_m, np.float32)
-    return packed(
-        "sensor_msgs/msg/LaserScan",
-        _header(stamp_ns, frame), *angles_rad, time_increment_s, scan_time_s, *limits_m, ranges, ranges[:0],
-    )  # fmt: skip
+    head = header(stamp_ns, frame)
+    return packed("sensor_msgs/msg/LaserScan", head, *angles_rad, *limits, ranges, ranges[:0])
 
 
 def pack_cloud(stamp_ns: int, frame: str, rows: NDArray[np.void]) -> bytes:
     """A sensor_msgs/PointCloud2 of one row: the fields of a structured array (N,), little endian."""
-    fields = [
-        new("sensor_msgs/msg/PointField", name, offset, _FIELD_TYPES[number.str[1:]], 1)
-        for name, (number, offset, *_) in (rows.dtype.fields or {}).items()
-    ]
+    layout = (rows.dtype.fields or {}).items()
+    fields = point_fields(*((name, offset, _NUMBER_TYPES[kind.str[1:]]) for name, (kind, offset, *_) in layout))
     data = np.frombuffer(rows.tobytes(), np.uint8)
-    return packed(
-        "sensor_msgs/msg/PointCloud2",
-        _header(stamp_ns, frame), 1, len(rows), fields, False, rows.itemsize, rows.nbytes, data, True,
-    )  # fmt: skip
+    parts = 1, len(rows), fields, False, rows.itemsize, rows.nbytes, data, True
+    return packed("sensor_msgs/msg/PointCloud2", header(stamp_ns, frame), *parts)
 
 
 def pack_odometry(
-    stamp_ns: int, frame: str, child_frame: str, pose: Place, covariance: Matrix | None = None
+    stamp_ns: int, frame: str, child_frame: str, pose: Any, covariance: Matrix | None = None
 ) -> bytes:
-    """A nav_msgs/Odometry: pose of ``child_frame`` in ``frame``, (6, 6) covariance; no twist."""
-    covariances = np.zeros(36) if covariance is None else covariance.astype(np.float64).ravel(), np.zeros(36)
-    still = new("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
-    return packed(
-        "nav_msgs/msg/Odometry",
-        _header(stamp_ns, frame),
-        child_frame,
-        new("geometry_msgs/msg/PoseWithCovariance", _pose(pose), covariances[0]),
-        new("geometry_msgs/msg/TwistWithCovariance", new("geometry_msgs/msg/Twist", still, still), covariances[1]),
-    )
+    """A nav_msgs/Odometry: place of ``child_frame`` in ``frame``, (6, 6) covariance; no twist."""
+    spread = np.zeros(36) if covariance is None else covariance.astype(np.float64).ravel()
+    posed = new("geometry_msgs/msg/PoseWithCovariance", pose, spread)
+    still = new("geometry_msgs/msg/Twist", *[new("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)] * 2)
+    twist = new("geometry_msgs/msg/TwistWithCovariance", still, np.zeros(36))
+    return packed("nav_msgs/msg/Odometry", header(stamp_ns, frame), child_frame, posed, twist)
 
 
 class Link(NamedTuple):
-    """The pose of the frame ``child`` in ``parent``."""
+    """The place of the frame ``child`` in ``parent``."""
 
     parent: str
     child: str
-    pose: Place
+    pose: Any
 
 
 def pack_transforms(stamp_ns: int, *links: Link) -> bytes:
     """A tf2_msgs/TFMessage."""
-    transforms = [
-        new(
-            "geometry_msgs/msg/TransformStamped",
-            _header(stamp_ns, link.parent),
-            link.child,
-            new("geometry_msgs/msg/Transform", *_parts(link.pose, "Vector3")),
-        )
-        for link in links
-    ]
+    transforms = []
+    for parent, child, pose in links:
+        moved = new("geometry_msgs/msg/Transform", pose.position, pose.orientation)
+        transforms.append(new("geometry_msgs/msg/TransformStamped", header(stamp_ns, parent), child, moved))
     return packed("tf2_msgs/msg/TFMessage", transforms)
 
 
-def pack_path(stamp_ns: int, frame: str, stamps_ns: Sequence[int], poses: Sequence[Place]) -> bytes:
-    """A nav_msgs/Path: poses in ``frame``, each with its own stamp."""
+def pack_path(stamp_ns: int, frame: str, stamps_ns: Sequence[int], poses: Sequence[Any]) -> bytes:
+    """A nav_msgs/Path: places in ``frame``, each with its own stamp."""
     stamped = [
-        new("geometry_msgs/msg/PoseStamped", _header(each_ns, frame), _pose(pose))
+        new("geometry_msgs/msg/PoseStamped", header(each_ns, frame), pose)
         for each_ns, pose in zip(stamps_ns, poses, strict=True)
     ]
-    return packed("nav_msgs/msg/Path", _header(stamp_ns, frame), stamped)
+    return packed("nav_msgs/msg/Path", header(stamp_ns, frame), stamped)
 
 
-def pack_grid(stamp_ns: int, frame: str, cells: NDArray[np.int8], resolution_m: float, origin: Place) -> bytes:
+def pack_grid(stamp_ns: int, frame: str, cells: NDArray[np.int8], resolution_m: float, origin: Any) -> bytes:
     """A nav_msgs/OccupancyGrid: (rows, columns) cells 0 free to 100 occupied, −1 unknown, row 0 at the origin."""
     rows, columns = cells.shape
-    header = _header(stamp_ns, frame)
-    about = new("nav_msgs/msg/MapMetaData", header.stamp, resolution_m, columns, rows, _pose(origin))
-    return packed("nav_msgs/msg/OccupancyGrid", header, about, np.ascontiguousarray(cells, np.int8).ravel())
-
-
-def _header(stamp_ns: int, frame: str) -> Any:
-    return new("std_msgs/msg/Header", new("builtin_interfaces/msg/Time", *divmod(stamp_ns, 1_000_000_000)), frame)
-
-
-def _pose(pose: Place) -> Any:
-    return new("geometry_msgs/msg/Pose", *_parts(pose, "Point"))
-
-
-def _parts(pose: Place, kind: str) -> tuple[Any, Any]:
-    """Position, of a type of geometry_msgs, and orientation."""
-    return new(f"geometry_msgs/msg/{kind}", *pose[:3]), new("geometry_msgs/msg/Quaternion", *pose[3:])
+    head = header(stamp_ns, frame)
+    about = new("nav_msgs/msg/MapMetaData", head.stamp, resolution_m, columns, rows, origin)
+    return packed("nav_msgs/msg/OccupancyGrid", head, about, np.ascontiguousarray(cells, np.int8).ravel())
 
 
 @cache
@@ -184,15 +146,13 @@ class LogWriter:
             raise InputError(f"{destination}: not writable ({error.strerror}); choose another place") from error
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(profile=profile, library="scanchain")
-        self._numbers: dict[tuple[str | bytes, ...], int] = {}  # of schemas and of channels
+        self._schema, self._channel = cache(self._writer.register_schema), cache(self._writer.register_channel)
         self._sequence = 0
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: object, _: object) -> None:
         try:
             if kind is None:
                 self._writer.finish()
@@ -214,31 +174,13 @@ class LogWriter:
         stamp_ns: int,
         frame: str,
         points: NDArray[np.floating],
-        *,
-        times_s: NDArray[np.floating] | None = None,
-        time_field: Literal["t", "time"] = "t",
-        ring: NDArray[np.integer] | None = None,
+        fields: Mapping[str, NDArray[np.number]] | None = None,
         log_time_ns: int | None = None,
     ) -> None:
-        """Append a sensor_msgs/PointCloud2 of one row.
-
-        points : (N, 3) meters
-        times_s : (N,) seconds after ``stamp_ns``; written as ``t`` (uint32 ns, from 0 up) or ``time`` (float32 s)
-        ring : (N,) written as uint16
-        """
-        columns: dict[str, tuple[str, NDArray[np.number]]] = {
-            name: ("<f4", points[:, axis]) for axis, name in enumerate("xyz")
-        }
-        if times_s is not None:
-            whole_ns = np.rint(1e9 * np.asarray(times_s, np.float64)).astype(np.int64)
-            if time_field == "t" and whole_ns.min(initial=0) < 0:
-                raise InputError(f"{topic}: times_s begin at {whole_ns.min():,} ns; t counts from 0 up, give time")
-            columns[time_field] = ("<f4", times_s) if time_field == "time" else ("<u4", whole_ns)
-        if ring is not None:
-            columns["ring"] = ("<u2", ring)
-        rows = np.empty(len(points), dtype=[(name, code) for name, (code, _) in columns.items()])
-        for name, (_, values) in columns.items():
-            rows[name] = values
+        """Append a sensor_msgs/PointCloud2 of one row: points (N, 3) in meters, and more fields (N,) by name."""
+        columns = dict(zip("xyz", points.T.astype(np.float32), strict=True)) | dict(fields or {})
+        point = [(name, values.dtype) for name, values in columns.items()]
+        rows = np.rec.fromarrays(list(columns.values()), dtype=point)
         self.append(topic, "sensor_msgs/msg/PointCloud2", pack_cloud(stamp_ns, frame, rows), stamp_ns, log_time_ns)
 
     def append(self, topic: str, schema: str, data: bytes, stamp_ns: int, log_time_ns: int | None = None) -> None:
@@ -248,13 +190,9 @@ class LogWriter:
 
     def copy(self, channel: Channel, log_time_ns: int, data: bytes) -> None:
         """Append a message of another log as it is, with its topic, type, encoding and definition."""
-        schema = (channel.type_name, channel.schema_encoding, channel.definition)
-        key = (channel.topic, channel.encoding, *schema)
-        if key not in self._numbers:
-            is_known = bool(channel.type_name or channel.definition)  # 0 stands for none
-            if is_known and schema not in self._numbers:
-                self._numbers[schema] = self._writer.register_schema(*schema)
-            number = self._numbers[schema] if is_known else 0
-            self._numbers[key] = self._writer.register_channel(channel.topic, channel.encoding, number)
-        self._writer.add_message(self._numbers[key], log_time_ns, data, log_time_ns, self._sequence)
+        schema = 0  # which stands for none
+        if channel.type_name or channel.definition:
+            schema = self._schema(channel.type_name, channel.schema_encoding, channel.definition)
+        number = self._channel(channel.topic, channel.encoding, schema)
+        self._writer.add_message(number, log_time_ns, data, log_time_ns, self._sequence)
         self._sequence += 1

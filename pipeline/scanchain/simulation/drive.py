@@ -274,9 +274,8 @@ def _write_sweep(log: LogWriter, sweep: Sweep, sensor: Sensor, stamp_ns: int) ->
     end_ns = stamp_ns + sensor.period_ns
     if sensor.dimension == 3:
         points, ring = sweep.points(), sweep.rays.ring[sweep.returned]
-        log.point_cloud(
-            "/points", stamp_ns, "lidar", points, times_s=sweep.times_s(), ring=ring, log_time_ns=end_ns
-        )
+        times_ns = np.rint(1e9 * sweep.times_s()).astype(np.uint32)
+        log.point_cloud("/points", stamp_ns, "lidar", points, {"t": times_ns, "ring": ring}, end_ns)
         return
     first, second = sweep.rays.directions[:2]
     angle_min = float(np.arctan2(first[1], first[0]))

@@ -9,7 +9,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from scanchain.errors import InputError
-from scanchain.files import Source
 from scanchain.logs.mcap.index import index_file
 from scanchain.logs.mcap.records import Block, Channel, FileIndex
 from scanchain.logs.writer import LogWriter, schema_text
@@ -30,18 +29,11 @@ def add_block(
     """Append a block: ``index.make`` finds it by ``offset``; ``size`` is about its number of bytes."""
     held = {channel.key[1]: count for channel, count in counts.items() if count}
     span = min(times_ns), max(times_ns)
-    index.blocks.append(Block(index.number, offset, size, "", size, 0, *span, held, is_chunk=False))
-    for channel, count in held.items():
-        index.counts[channel] = index.counts.get(channel, 0) + count
+    index.blocks.append(Block(index.number, offset, size, "", size, *span, held))
 
 
-def temporary_index(
-    path: Path, number: int, write: Callable[[LogWriter], None], source: Source | None = None
-) -> FileIndex:
-    """Index of the messages of a path that ``write`` converts, as the ``number``-th file of a log.
-
-    source : what ``path`` is a copy of, None for itself
-    """
+def temporary_index(path: Path, number: int, write: Callable[[LogWriter], None]) -> FileIndex:
+    """Index of the messages of a path that ``write`` converts, as the ``number``-th file of a log."""
     with TemporaryDirectory(prefix="scanchain-", ignore_cleanup_errors=True) as folder:
         copy = Path(folder) / "log.mcap"
         try:
@@ -49,7 +41,9 @@ def temporary_index(
                 write(log)
         except OSError as error:
             raise InputError(f"{copy}: {path} cannot be converted there ({error.strerror}); set TMPDIR") from error
-        return index_file(copy, number, source or path)  # which maps the file: it may be deleted
+        index = index_file(copy, number)  # which maps the file: it may be deleted
+    index.path = path
+    return index
 
 
 def natural_order(path: Path) -> tuple[tuple[int, ...], str]:
@@ -67,9 +61,4 @@ def left_out(folder: Path, taken: str, suffixes: Sequence[str]) -> list[str]:
 
 
 class UnknownFormatError(Exception):
-    """A file or folder that is no log of the assumed format: the expected contents, and what is missing."""
-
-    def __init__(self, text: bytes, lack: str) -> None:
-        super().__init__(lack)
-        self.text = text
-        self.lack = lack
+    """A file or folder that is no log of the assumed format: arguments are its text, and what is missing in it."""

@@ -14,6 +14,7 @@ import zlib
 from collections import Counter
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,10 +25,10 @@ from scanchain.logs.writer import (
     LATEST_NS,
     Link,
     LogWriter,
-    Place,
     pack_laser_scan,
     pack_odometry,
     pack_transforms,
+    place_of,
 )
 
 _LEAST_STEP_NS = 100_000  # least step between the log times of two scans
@@ -108,7 +109,7 @@ def _write(log: LogWriter, text: bytes, malformed: list[int], others: Counter[by
         log.append("/scan", "sensor_msgs/msg/LaserScan", scan, stamp_ns, scan_ns)
 
 
-def read_scan(words: list[bytes], stamp_ns: int, parameters: dict[bytes, float]) -> tuple[bytes, Place, Place]:
+def read_scan(words: list[bytes], stamp_ns: int, parameters: dict[bytes, float]) -> tuple[bytes, Any, Any]:
     """A FLASER or ROBOTLASER1 line as a message, the robot's pose, and that of the laser on the robot.
 
     parameters : the scanner's reach and its place ahead of the robot's center, as the log's PARAM lines set them
@@ -122,7 +123,7 @@ def read_scan(words: list[bytes], stamp_ns: int, parameters: dict[bytes, float])
         step_rad = _STEPS_RAD.get(count, _HALF_TURN / max(count - 1, 1))
         first_rad = -0.5 * step_rad * (count - 1) if count == 401 else -0.5 * _HALF_TURN
         ranges_m = _numbers(words[2:], count)
-        mounting = Place(offset_m, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+        mounting = planar(offset_m, 0.0, 0.0)
     else:
         first_rad, opening_rad, step_rad, max_range_m = _numbers(words[2:], 4)
         count = int(words[8])
@@ -132,21 +133,15 @@ def read_scan(words: list[bytes], stamp_ns: int, parameters: dict[bytes, float])
         dx, dy, dyaw = (laser - robot for laser, robot in zip(poses[:3], poses[3:], strict=True))
         cosine, sine = math.cos(poses[5]), math.sin(poses[5])
         mounting = planar(cosine * dx + sine * dy, cosine * dy - sine * dx, dyaw)
-    scan = pack_laser_scan(
-        stamp_ns,
-        "laser",
-        first_rad,
-        step_rad,
-        np.array(ranges_m),
-        range_min_m=0.0,
-        range_max_m=min(max_range_m, _LEAST_CODE_M) if max_range_m > 0.0 else _LEAST_CODE_M,
-    )
+    reach_m = min(max_range_m, _LEAST_CODE_M) if max_range_m > 0.0 else _LEAST_CODE_M
+    beams = first_rad, step_rad, np.array(ranges_m)
+    scan = pack_laser_scan(stamp_ns, "laser", *beams, range_min_m=0.0, range_max_m=reach_m)
     return scan, planar(*poses[3:]), mounting
 
 
-def planar(x_m: float, y_m: float, yaw_rad: float) -> Place:
-    """A pose in the plane."""
-    return Place(x_m, y_m, 0.0, 0.0, 0.0, math.sin(0.5 * yaw_rad), math.cos(0.5 * yaw_rad))
+def planar(x_m: float, y_m: float, yaw_rad: float) -> Any:
+    """A place in the plane."""
+    return place_of((x_m, y_m, 0.0), (0.0, 0.0, math.sin(0.5 * yaw_rad), math.cos(0.5 * yaw_rad)))
 
 
 def _numbers(words: list[bytes], count: int) -> list[float]:

@@ -50,23 +50,17 @@ class CloudFileError(Exception):
     """A file that contradicts its header; the message says where."""
 
 
-def ascii_rows(file: IO[bytes], point: np.dtype[np.void], count: int) -> NDArray[np.void]:
-    """``count`` lines of numbers."""
-    lines = list(islice((line for line in file if line.strip()), count))
-    try:
-        rows = np.loadtxt(lines, point, comments=None, ndmin=1) if lines else np.empty(0, point)
-    except ValueError as error:
-        raise CloudFileError(f"is no list of {count} points ({error})") from error
-    return _all_of(rows, count)
-
-
-def binary_rows(file: IO[bytes], point: np.dtype[np.void], count: int) -> NDArray[np.void]:
-    """``count`` points, one after the other."""
-    data = file.read(min(count * point.itemsize, os.fstat(file.fileno()).st_size))  # whatever a header claims
-    return _all_of(np.frombuffer(data, point, len(data) // max(point.itemsize, 1)), count)
-
-
-def _all_of(rows: NDArray[np.void], count: int) -> NDArray[np.void]:
+def _rows(file: IO[bytes], point: np.dtype[np.void], count: int, *, is_text: bool) -> NDArray[np.void]:
+    """``count`` points, one after the other, or as many lines of numbers."""
+    if is_text:
+        lines = list(islice((line for line in file if line.strip()), count))
+        try:
+            rows = np.loadtxt(lines, point, comments=None, ndmin=1) if lines else np.empty(0, point)
+        except ValueError as error:
+            raise CloudFileError(f"is no list of {count} points ({error})") from error
+    else:
+        data = file.read(min(count * point.itemsize, os.fstat(file.fileno()).st_size))  # whatever a header claims
+        rows = np.frombuffer(data, point, len(data) // max(point.itemsize, 1))
     if len(rows) < count:
         raise CloudFileError(f"ends after {len(rows)} of its {count} points")
     return rows
@@ -133,13 +127,20 @@ def read_pcd(path: Path) -> NDArray[np.void]:
     with path.open("rb") as file:
         header = {words[0]: words[1:] for words in _header_lines(file, "DATA") if words}
         try:
-            point, count, form = _pcd_point(header), int(header["POINTS"][0]), header["DATA"][0]
+            names, kinds = header["FIELDS"], list(zip(header["TYPE"], header["SIZE"], strict=True))
+            counts = [int(count) for count in header.get("COUNT", ["1"] * len(names))]
+            fields = [  # several numbers of one field are one
+                (f"_{place}" if name == "_" else name, _PCD_TYPES[kind], (count,) if count > 1 else ())
+                for place, (name, kind, count) in enumerate(zip(names, kinds, counts, strict=True))
+            ]
+            point, count, form = np.dtype(fields), int(header["POINTS"][0]), header["DATA"][0]
             if count < 0:
                 raise ValueError(f"how many points there are, but {count}")
         except (KeyError, IndexError, ValueError) as error:
             raise CloudFileError(f"is no PCD: its header does not state {error}") from error
-        read = {"ascii": ascii_rows, "binary_compressed": _lzf_unpacked}.get(form, binary_rows)
-        return read(file, point, count)
+        if form == "binary_compressed":
+            return _lzf_unpacked(file, point, count)
+        return _rows(file, point, count, is_text=form == "ascii")
 
 
 def _header_lines(file: IO[bytes], last: str) -> Iterator[list[str]]:
@@ -151,32 +152,17 @@ def _header_lines(file: IO[bytes], last: str) -> Iterator[list[str]]:
             break
 
 
-def _pcd_point(header: dict[str, list[str]]) -> np.dtype[np.void]:
-    """A point: each field by its name, several numbers of one field as one."""
-    names, kinds = header["FIELDS"], list(zip(header["TYPE"], header["SIZE"], strict=True))
-    counts = [int(count) for count in header.get("COUNT", ["1"] * len(names))]
-    fields = [
-        (f"_{place}" if name == "_" else name, _PCD_TYPES[kind], (count,) if count > 1 else ())
-        for place, (name, kind, count) in enumerate(zip(names, kinds, counts, strict=True))
-    ]
-    return np.dtype(fields)
-
-
 def _lzf_unpacked(file: IO[bytes], point: np.dtype[np.void], count: int) -> NDArray[np.void]:
     """Points that are packed by LZF, field by field."""
-    sizes = file.read(8)
-    if len(sizes) < 8:
-        raise CloudFileError("ends within its header")
-    packed_size, size = struct.unpack("<II", sizes)
+    packed_size, size = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
     packed = file.read(packed_size)
     if size < count * point.itemsize or size > _MOST_LZF_RATIO * len(packed):
         raise CloudFileError(
             f"does not unpack: {size} bytes are stated for {count} points, {len(packed)} are there"
         )
-    try:
+    data = b""
+    with suppress(ValueError):
         data = lzf.decompress(packed, size)
-    except ValueError:
-        data = None
     if data is None or len(data) != size:
         raise CloudFileError("does not unpack: its bytes are damaged")
     rows = np.empty(count, point)
@@ -192,7 +178,7 @@ def read_ply(path: Path) -> NDArray[np.void]:
     """The vertices of a file, ascii or binary in either byte order, fields as they are."""
     with path.open("rb") as file:
         point, count, form = _ply_header(file)
-        return ascii_rows(file, point, count) if form == "ascii" else binary_rows(file, point, count)
+        return _rows(file, point, count, is_text=form == "ascii")
 
 
 def _ply_header(file: IO[bytes]) -> tuple[np.dtype[np.void], int, str]:
@@ -231,15 +217,27 @@ def index_clouds(folder: Path, number: int, rate_hz: float = 0.0, bin_columns: i
     suffix, files = next(((suffix, files) for suffix, files in kinds.items() if files), ("", []))
     if not files:
         raise InputError(f"{folder}: has no {', '.join(SUFFIXES)} file; name the folder that holds them")
-    stamps_ns = [round(k * _NS / rate_hz) for k in range(len(files))] if rate_hz else _stamps(folder, files)
-    index = FileIndex(folder, number, is_counted=True)
+    if rate_hz:
+        stamps_ns = [round(k * _NS / rate_hz) for k in range(len(files))]
+    else:
+        stamps_ns = [stamp for file in files if (stamp := stamp_of_name(file.stem)) is not None]
+    if len(set(stamps_ns)) < len(files):
+        raise InputError(
+            f"{folder}: names such as {files[0].name} hold no stamp; set the rate of the scans, "
+            "as in --log.rate_hz 10"
+        )
+    index = FileIndex(folder, number)
     raw = point_of_columns(np.dtype("<f4"), bin_columns)
-    if suffix == ".bin":
-        _check_size(files, bin_columns)
+    sizes = [file.stat().st_size for file in files]
+    if suffix == ".bin" and np.mean(np.mod(sizes, raw.itemsize) == 0) < 0.5:  # some of the files may be damaged
+        raise InputError(
+            f"{files[0]}: has {sizes[0]} bytes, no rows of {bin_columns} float32 numbers; set "
+            "their number, as in --log.bin_columns 5, or save clouds as .npy, PCD or PLY"
+        )
     index.notes += [*_found(folder, files, raw), *left_out(folder, suffix, SUFFIXES)]
     channel = add_channel(index, "/points", "sensor_msgs/msg/PointCloud2")
-    for place, (file, stamp_ns) in enumerate(zip(files, stamps_ns, strict=True)):
-        add_block(index, place, file.stat().st_size, [stamp_ns], {channel: 1})
+    for place, (size, stamp_ns) in enumerate(zip(sizes, stamps_ns, strict=True)):
+        add_block(index, place, size, [stamp_ns], {channel: 1})
 
     def make(block: Block, _: AbstractSet[int] | None) -> Contents:
         return contents_of(files[block.offset], channel, block.start_ns, lambda file: read_cloud_file(file, raw))
@@ -287,23 +285,3 @@ def stamp_of_name(stem: str) -> int | None:
     elif match := re.search(r"(?<!\d)([1-9]\d*)$", stem):
         stamp_ns = int(match[1]) * _UNITS_NS.get(len(match[1]), LATEST_NS)
     return stamp_ns if stamp_ns < LATEST_NS else None
-
-
-def _stamps(folder: Path, files: Sequence[Path]) -> list[int]:
-    stamps_ns = [stamp for file in files if (stamp := stamp_of_name(file.stem)) is not None]
-    if len(stamps_ns) < len(files) or len(set(stamps_ns)) < len(files):
-        raise InputError(
-            f"{folder}: names such as {files[0].name} hold no stamp; set the rate of the scans, "
-            "as in --log.rate_hz 10"
-        )
-    return stamps_ns
-
-
-def _check_size(files: Sequence[Path], columns: int) -> None:
-    """Refuse .bin files, headerless float32, most of which are no rows of so many columns; some may be damaged."""
-    whole = sum(file.stat().st_size % (4 * columns) == 0 for file in files)
-    if 2 * whole < len(files):
-        raise InputError(
-            f"{files[0]}: has {files[0].stat().st_size} bytes, no rows of {columns} float32 numbers; set "
-            "their number, as in --log.bin_columns 5, or save clouds as .npy, PCD or PLY"
-        )

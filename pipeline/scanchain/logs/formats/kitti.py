@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from collections.abc import Set as AbstractSet
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -37,22 +38,22 @@ _NS = 1_000_000_000
 def index_kitti_raw(folder: Path, number: int) -> FileIndex:
     """A drive of the raw recordings (``..._sync``); truth is its GPS/INS, moved to the lidar."""
     times_ns = read_times(folder / "velodyne_points" / "timestamps.txt")
-    index = FileIndex(folder, number, is_counted=True)
-    return _index(index, folder / "velodyne_points" / "data", times_ns, lambda: _raw_truth(index, folder))
+    return _index(FileIndex(folder, number), folder / "velodyne_points/data", times_ns, lambda: _raw_truth(folder))
 
 
 def index_kitti_odometry(folder: Path, number: int) -> FileIndex:
     """A sequence of the odometry benchmark (``sequences/00``); truth lies in ``poses/00.txt`` beside it."""
-    times_ns = read_seconds(folder / "times.txt")
-    index = FileIndex(folder, number, is_counted=True)
-    return _index(index, folder / "velodyne", times_ns, lambda: _benchmark_truth(index, folder, times_ns))
+    times = folder / "times.txt"
+    times_ns = _checked(times, np.rint(_table(times, 1)[:, 0] * _NS))  # lines of seconds
+    return _index(
+        FileIndex(folder, number), folder / "velodyne", times_ns, lambda: _benchmark_truth(folder, times_ns)
+    )
 
 
-def _raw_truth(index: FileIndex, folder: Path) -> Truth:
+def _raw_truth(folder: Path) -> Truth:
     calibration, readings = folder.parent / "calib_imu_to_velo.txt", folder / "oxts"
     if absent := next((path for path in (readings, calibration) if not path.exists()), None):
-        index.notes.append(f"{absent}: is absent, so there is no ground truth")
-        return []
+        raise FileNotFoundError(absent)
     times_ns = read_times(readings / "timestamps.txt")
     T_lidar_imu = np.eye(4)
     T_lidar_imu[:3, :3], T_lidar_imu[:3, 3] = _entry(calibration, "R", (3, 3)), _entry(calibration, "T", (3,))
@@ -65,24 +66,24 @@ def _raw_truth(index: FileIndex, folder: Path) -> Truth:
     return list(zip(times_ns, poses, strict=True))
 
 
-def _benchmark_truth(index: FileIndex, folder: Path, times_ns: Sequence[int]) -> Truth:
+def _benchmark_truth(folder: Path, times_ns: Sequence[int]) -> Truth:
     file = folder.resolve().parent.parent / "poses" / f"{folder.resolve().name}.txt"
     if not file.is_file():
-        index.notes.append(f"{file}: is absent, so there is no ground truth")
-        return []
+        raise FileNotFoundError(file)
     return list(zip(times_ns, read_camera_poses(file, folder / "calib.txt"), strict=False))
 
 
 def _index(index: FileIndex, folder: Path, times_ns: Sequence[int], read_truth: Callable[[], Truth]) -> FileIndex:
     """/velodyne_points from the files, whose names count the times, and /ground_truth where it can be read."""
-    files = sorted(folder.glob("*.bin"), key=natural_order)
+    files, truth = sorted(folder.glob("*.bin"), key=natural_order), Truth()
     if not files:
         raise InputError(f"{folder}: has no .bin file; of the raw recordings take the synced ones (..._sync)")
     try:
         truth = read_truth()
+    except FileNotFoundError as absent:
+        index.notes.append(f"{absent}: is absent, so there is no ground truth")
     except (InputError, LinAlgError) as error:
         index.note_damage(f"{error}; until then there is no ground truth")
-        truth = []
     numbers = [int(file.stem) for file in files if file.stem.isdigit()]
     if len(numbers) < len(files) or max(numbers) >= len(times_ns):
         raise InputError(
@@ -93,18 +94,15 @@ def _index(index: FileIndex, folder: Path, times_ns: Sequence[int], read_truth: 
         add_block(index, entry, file.stat().st_size, [times_ns[numbers[entry]]], {lidar: 1})
     if truth:
         poses = add_channel(index, "/ground_truth", "nav_msgs/msg/Odometry")
-        add_block(
-            index, _TRUTH, _POSE_BYTES * len(truth), [stamp_ns for stamp_ns, _ in truth], {poses: len(truth)}
-        )
+        add_block(index, _TRUTH, _POSE_BYTES * len(truth), [each for each, _ in truth], {poses: len(truth)})
 
     def make(block: Block, _: AbstractSet[int] | None) -> Contents:
         channel = index.channels[next(iter(block.counts))]
         if block.offset == _TRUTH:
             said = [(each, pack_odometry(each, "world", "velodyne", place(T))) for each, T in truth]
             return Contents([Message(channel, each, memoryview(data)) for each, data in said], "")
-        return contents_of(
-            files[block.offset], channel, block.start_ns, lambda file: read_raw(file, XYZI), "velodyne"
-        )
+        read = partial(read_raw, point=XYZI)
+        return contents_of(files[block.offset], channel, block.start_ns, read, "velodyne")
 
     index.make = make
     return index
@@ -119,11 +117,6 @@ def read_times(file: Path) -> list[int]:
     except ValueError as error:
         raise InputError(f"{file}: is no list of times ({error}); download it again") from error
     return _checked(file, times_ns)
-
-
-def read_seconds(file: Path) -> list[int]:
-    """Nanoseconds of each line that is a number of seconds."""
-    return _checked(file, np.rint(_table(file, 1)[:, 0] * _NS))
 
 
 def _checked(file: Path, times_ns: NDArray[np.int64] | Matrix) -> list[int]:

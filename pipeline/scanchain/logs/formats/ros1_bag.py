@@ -1,6 +1,7 @@
 """ROS 1 bags: finished or cut off, indexed or not; their messages stay as they are.
 
-A finished bag is indexed by the records at its end; others are walked as MCAP files are, chunk by chunk.
+Bags are walked record by record; the messages of a chunk are counted by the INDEX records behind it, those of a
+chunk without such, and of all chunks of a damaged bag, by unpacking it.
 Format: https://wiki.ros.org/Bags/Format/2.0
 """
 
@@ -10,7 +11,6 @@ import mmap
 import re
 import struct
 from collections import Counter
-from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
 from functools import partial
@@ -25,11 +25,12 @@ from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Mes
 from scanchain.logs.mcap.stream import messages_of
 
 MAGIC = b"#ROSBAG V2.0\n"
-MESSAGE, HEADER, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 5, 6, 7
+MESSAGE, INDEX, CHUNK, CONNECTION = 2, 4, 5, 7
 Data = mmap.mmap | memoryview | bytes
+_NS = 1_000_000_000
 _LENGTH = struct.Struct("<I")
-_POSITION = struct.Struct("<Q")
 _TIME = struct.Struct("<II")  # seconds, nanoseconds
+_ENTRY = np.dtype([("s", "<u4"), ("ns", "<u4"), ("offset", "<u4")])  # of an INDEX, a message
 _LONGEST_HEAD = 1 << 16  # longest head in bytes; a longer one is damage
 _OPCODE = re.compile(rb"\x04\0\0\0op=[\x05\x07]")  # opcode of a chunk, a connection
 _MOST_BEFORE = 256  # largest number of bytes of a head before its opcode
@@ -47,11 +48,6 @@ class Record(NamedTuple):
     def number(self, name: bytes) -> int:
         """A field that is a whole number. Raises struct.error where it is absent or of another size."""
         return _LENGTH.unpack(self.fields.get(name, b""))[0]
-
-    def time_ns(self, name: bytes) -> int:
-        """A field that is a time. Raises struct.error where it is absent or of another size."""
-        seconds, nanoseconds = _TIME.unpack(self.fields.get(name, b""))
-        return seconds * 1_000_000_000 + nanoseconds
 
     def text(self, name: bytes) -> str:
         """A field that is text, empty where it is absent."""
@@ -82,16 +78,6 @@ def _define(index: FileIndex, record: Record, data: Data) -> None:
     definition = stated[b"message_definition"]
     channel = Channel((index.number, number), topic, "ros1", number + 1, type_name, "ros1msg", definition)
     index.channels.setdefault(number, channel)
-
-
-def whole_records(data: Data, offset: int = 0) -> Iterator[Record]:
-    """One record after the other. Raises struct.error at bytes that are no record, or not all of one."""
-    while offset < len(data):
-        record = read_record(data, offset)
-        if record is None or record.end > len(data):
-            raise struct.error("record that is none, or beyond the end")
-        yield record
-        offset = record.end
 
 
 def next_record(data: Data, offset: int, stated_end: int) -> Record | None:
@@ -130,56 +116,17 @@ def index_ros1_bag(path: Path, number: int) -> FileIndex:
         if file.read(len(MAGIC)) != MAGIC:
             raise InputError(f"{path}: is a bag of an old version; rosbag migrate makes one of version 2.0 of it")
         data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-    index = _new_index(path, number, data)
-    if not _take_summary(index):
-        index = _new_index(path, number, data)
-        _walk(index)
-        index.blocks = [_counted(index, block) for block in index.blocks]
+    index = FileIndex(path, number, data)
+    index.make = partial(_contents, index)
+    head = read_record(data, len(MAGIC))
+    if head is not None and head.text(b"encryptor"):
+        raise InputError(f"{path}: is encrypted ({head.text(b'encryptor')}); decrypt it first")
+    _walk(index)
+    is_sure = not index.damage
+    index.blocks = [block if is_sure and block.counts else _counted(index, block) for block in index.blocks]
     index.counts = dict(index.indexed_counts())
     index.channels = {number: c for number, c in index.channels.items() if index.counts.get(number)}
     return index
-
-
-def _new_index(path: Path, number: int, data: mmap.mmap) -> FileIndex:
-    index = FileIndex(path, number, data, is_counted=True)
-    index.make = partial(_contents, index)
-    return index
-
-
-def _take_summary(index: FileIndex) -> bool:
-    """Fill the index by the records at the end of a finished bag; False where they do not give every message."""
-    data, head = index.data, read_record(index.data, len(MAGIC))
-    if head is None or head.opcode != HEADER:
-        return False
-    if head.text(b"encryptor"):
-        raise InputError(f"{index.path}: is encrypted ({head.text(b'encryptor')}); decrypt it first")
-    try:
-        (begin,) = _POSITION.unpack(head.fields.get(b"index_pos", b""))
-        for record in whole_records(data, begin or len(data)):
-            if record.opcode == CONNECTION:
-                _define(index, record, data)
-            elif record.opcode == CHUNK_INFO:
-                index.blocks.append(_stated_chunk(index, record))
-        stated = head.number(b"chunk_count"), head.number(b"conn_count")
-    except (struct.error, ValueError):
-        return False
-    is_complete = begin > 0 and stated == (len(index.blocks), len(index.channels))
-    return is_complete and index.indexed_counts().keys() <= index.channels.keys()
-
-
-def _stated_chunk(index: FileIndex, info: Record) -> Block:
-    """The chunk that a CHUNK_INFO describes. Raises struct.error or ValueError where there is none."""
-    (offset,) = _POSITION.unpack(info.fields.get(b"chunk_pos", b""))
-    record = read_record(index.data, offset)
-    if record is None or record.opcode != CHUNK or record.end > len(index.data):
-        raise struct.error("no chunk")
-    pairs = np.frombuffer(index.data, "<u4", 2 * info.number(b"count"), info.begin).reshape(-1, 2).tolist()
-    return replace(
-        _chunk(index, record),
-        start_ns=info.time_ns(b"start_time"),
-        end_ns=info.time_ns(b"end_time"),
-        counts=dict(pairs),
-    )
 
 
 def _walk(index: FileIndex) -> None:
@@ -210,6 +157,8 @@ def _take(index: FileIndex, record: Record) -> None:
             _define(index, record, index.data)
         elif record.opcode == CHUNK:
             index.blocks.append(_chunk(index, record))
+        elif record.opcode == INDEX and index.blocks:
+            index.blocks[-1] = _indexed(index, record)
     except (struct.error, ValueError) as error:
         what = str(error) if isinstance(error, ValueError) else "is malformed"
         index.damage.append(f"{index.path}: the record at byte {record.offset} {what} and was left out")
@@ -222,8 +171,17 @@ def _chunk(index: FileIndex, record: Record) -> Block:
     if not is_plausible_size(size, claimed):
         raise ValueError(f"claims to unpack from {size} to {claimed} bytes, more than is accepted,")
     name = record.text(b"compression")
-    is_cut = record.end > end
-    return Block(index.number, record.begin, size, "" if name == "none" else name, claimed, 0, 0, 0, is_cut=is_cut)
+    where = {"head": record.begin - record.offset, "is_cut": record.end > end}
+    return Block(index.number, record.begin, size, "" if name == "none" else name, claimed, 0, 0, **where)
+
+
+def _indexed(index: FileIndex, record: Record) -> Block:
+    """The last chunk, with the messages of a connection that an INDEX lists."""
+    block, entries = index.blocks[-1], np.frombuffer(index.data[record.begin : record.end], _ENTRY)
+    times_ns = (entries["s"].astype(np.int64) * _NS + entries["ns"]).tolist()
+    span_ns = [*times_ns, *([block.start_ns, block.end_ns] if block.counts else [])] or [0]
+    counts = block.counts | ({record.number(b"conn"): len(times_ns)} if times_ns else {})
+    return replace(block, start_ns=min(span_ns), end_ns=max(span_ns), counts=counts)
 
 
 def _counted(index: FileIndex, block: Block) -> Block:
@@ -238,18 +196,24 @@ def _contents(index: FileIndex, block: Block, _: AbstractSet[int] | None) -> Con
     """The messages of a chunk; connections found there join the index."""
     name = f"{index.path}: the chunk at byte {block.offset}"
     messages: list[Message] = []
-    undefined = 0
+    undefined = offset = 0
     try:
         payload = unpack(index, block)
-        for record in whole_records(payload):
+        while offset < len(payload):
+            record = read_record(payload, offset)
+            if record is None or record.end > len(payload):
+                raise struct.error("record that is none, or beyond the end")
+            offset = record.end
             if record.opcode == CONNECTION:
                 _define(index, record, payload)
             elif record.opcode == MESSAGE:
-                number, time_ns = record.number(b"conn"), record.time_ns(b"time")
-                channel = index.channels.get(number)
+                seconds, nanoseconds = _TIME.unpack(record.fields.get(b"time", b""))
+                channel = index.channels.get(record.number(b"conn"))
                 undefined += channel is None
                 if channel is not None:
-                    messages.append(Message(channel, time_ns, payload[record.begin : record.end]))
+                    messages.append(
+                        Message(channel, seconds * _NS + nanoseconds, payload[record.begin : record.end])
+                    )
     except struct.error:
         damage = f"{name}: a record in it is malformed; what follows was left out"
         return Contents(messages, "" if block.is_cut else damage)

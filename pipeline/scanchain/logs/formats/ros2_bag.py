@@ -28,10 +28,10 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
         reader.open()
     except Exception as error:  # whatever a damaged file makes the libraries below raise
         raise InputError(
-            f"{path}: cannot be read as a ROS bag ({_reason(error)}); "
+            f"{path}: cannot be read as a ROS bag ({one_line(error)}); "
             "ros2 bag reindex mends the folder of a ROS 2 bag"
         ) from error
-    index = FileIndex(path, number, is_counted=True)
+    index = FileIndex(path, number)
     connections: dict[int, Any] = {}
     for id_, each in enumerate(reader.connections, start=1):
         encoding = each.ext.serialization_format
@@ -45,8 +45,13 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
                 (number, id_), each.topic, encoding, id_, each.msgtype, language, definition
             )
             index.counts[id_], connections[id_] = each.msgcount, each
-    if connections:
-        _cut(index, reader.start_time, reader.end_time)
+    if connections:  # spans of time of one length, so many that each holds a few megabytes on average
+        begin_ns, length_ns, size = reader.start_time, reader.end_time - reader.start_time, size_of(path)
+        count = min(max(size // _BLOCK_BYTES, 1), _MOST_BLOCKS, max(length_ns, 1))
+        edges_ns = [begin_ns + length_ns * place // count for place in range(count + 1)]
+        for place, (start_ns, stop_ns) in enumerate(pairwise(edges_ns)):
+            share = size // count
+            index.blocks.append(Block(number, place, share, "", share, start_ns, stop_ns - 1))
     index.make = partial(_contents, index, reader, connections, threading.Lock())
     return index
 
@@ -65,16 +70,6 @@ def parts_of_bag(folder: Path) -> list[Path]:
         raise InputError(f"{folder / 'metadata.yaml'}: is not that of a ROS 2 bag ({reason})") from error
     is_mcap = bool(parts) and all(part.suffix == ".mcap" and part.is_file() for part in parts)
     return parts if is_mcap and not is_packed else [folder]
-
-
-def _cut(index: FileIndex, begin_ns: int, end_ns: int) -> None:
-    """Add spans of time of one length up to the end, so many that each holds a few megabytes on average."""
-    size = size_of(index.path)
-    count = min(max(size // _BLOCK_BYTES, 1), _MOST_BLOCKS, max(end_ns - begin_ns, 1))
-    edges_ns = [begin_ns + (end_ns - begin_ns) * place // count for place in range(count + 1)]
-    for place, (start_ns, stop_ns) in enumerate(pairwise(edges_ns)):
-        share = size // count
-        index.blocks.append(Block(index.number, place, share, "", share, 0, start_ns, stop_ns - 1, is_chunk=False))
 
 
 def _contents(
@@ -103,11 +98,7 @@ def _contents(
         except Exception as error:  # whatever a damaged file makes the libraries below raise
             begin_ns = messages[-1].log_time_ns if messages else block.start_ns
             lost = (
-                f"{begin_ns * 1e-9:.3f} to {block.end_ns * 1e-9:.3f} s cannot be read further ({_reason(error)})"
+                f"{begin_ns * 1e-9:.3f} to {block.end_ns * 1e-9:.3f} s cannot be read further ({one_line(error)})"
             )
             return Contents(messages, f"{index.path}: what was recorded from {lost}")
     return Contents(messages, "")
-
-
-def _reason(error: Exception) -> str:
-    return one_line(error) or type(error).__name__

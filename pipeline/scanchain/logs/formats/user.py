@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 from scanchain import plugins
 from scanchain.data import Scan
 from scanchain.errors import InputError, counted, one_line, shown
-from scanchain.files import Source
 from scanchain.logs.formats import temporary_index
 from scanchain.logs.mcap.records import FileIndex
 from scanchain.logs.writer import LATEST_NS, LogWriter
@@ -37,30 +36,24 @@ class ScanFormat(Protocol):
         ...
 
 
-def load_format(name: str) -> type[ScanFormat]:
-    """The class that ``module:Class`` names. Raises InputError where there is none, or it is no log format."""
-    return plugins.load(name, "scans")
-
-
-def index_scans(path: Path, number: int, name: str, source: Source | None = None) -> FileIndex:
+def index_scans(path: Path, number: int, name: str) -> FileIndex:
     """The scans of a path as the class ``name`` reads them, as the ``number``-th file of a log.
 
-    source : what ``path`` is a copy of, None for itself
     Raises InputError where the class fails, or yields something else than scans.
     """
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; check the path")
-    index = temporary_index(path, number, lambda log: _write(log, path, name), source)
+    index = temporary_index(path, number, lambda log: _write(log, path, name))
     scans = sum(index.counts.values())
     if not scans:
         raise InputError(f"{path}: {name} yields no scan of it; check the path and the format")
-    index.notes.append(f"{source or path}: {counted(scans, 'scan')} read by {name} (log.format)")
+    index.notes.append(f"{path}: {counted(scans, 'scan')} read by {name} (log.format)")
     return index
 
 
 def _write(log: LogWriter, path: Path, name: str) -> None:
     """Write the scans that the class reads of a path."""
-    make = load_format(name)
+    make: type[ScanFormat] = plugins.load(name, "scans")
     dimension, end = 0, object()
     with _blaming(f"{path}: {name}"):
         scans: Iterator[Any] = iter(make(path).scans())
@@ -80,8 +73,8 @@ def _write(log: LogWriter, path: Path, name: str) -> None:
                 raise InputError(f"points are no (N, {dimension}) as those before; yield one kind")
         rows = np.asarray(points, np.float32)
         rows = np.pad(rows, ((0, 0), (0, 3 - dimension)))  # in the plane z = 0, by which it is known as 2D
-        seconds = np.asarray(times_s, np.float32) if len(scan.times_s) else None
-        log.point_cloud(_TOPIC, scan.stamp_ns, _FRAME, rows, times_s=seconds, time_field="time")
+        fields = {"time": np.asarray(times_s, np.float32)} if len(scan.times_s) else {}
+        log.point_cloud(_TOPIC, scan.stamp_ns, _FRAME, rows, fields)
 
 
 @contextmanager

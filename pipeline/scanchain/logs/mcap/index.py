@@ -12,37 +12,25 @@ import mmap
 import struct
 import zlib
 from collections import Counter, deque
+from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
+from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Schema, Statistics
 from mcap.stream_reader import StreamReader
+from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from scanchain.errors import InputError
-from scanchain.files import Source
 from scanchain.logs.files import RemoteFile
-from scanchain.logs.mcap.records import (
-    CHANNEL,
-    CHUNK,
-    CHUNK_HEAD,
-    MAGIC,
-    MALFORMED,
-    MESSAGE,
-    MESSAGE_HEAD,
-    MESSAGE_INDEX,
-    RECORD,
-    SCHEMA,
-    Block,
-    FileIndex,
-    read_definition,
-)
+from scanchain.logs.mcap.records import CHUNK_HEAD, MALFORMED, MESSAGE_HEAD, RECORD, Block, FileIndex, definition
 
-HEADER, FOOTER, ATTACHMENT, METADATA, DATA_END = 1, 2, 9, 12, 15
-_LEAST_BYTES = {HEADER: 8, MESSAGE: MESSAGE_HEAD.size, ATTACHMENT: 36, METADATA: 8}  # of a record's body
-_DATA_END = RECORD.pack(DATA_END, 4)
+# least number of bytes of a record's body
+_LEAST_BYTES = {Opcode.HEADER: 8, Opcode.MESSAGE: MESSAGE_HEAD.size, Opcode.ATTACHMENT: 36, Opcode.METADATA: 8}
+_DATA_END = RECORD.pack(Opcode.DATA_END, 4)
 _FOOTER_BYTES = RECORD.size + 20 + len(MAGIC)  # the closing magic included
 _TAIL_BYTES = 65_536  # number of bytes of a file read at first; most summaries lie in it
 _REPEATED = 4  # number of ranges of a remote file retained: the first blocks are read more than once
@@ -54,11 +42,8 @@ _LOOSE_BYTES = 1 << 20  # messages outside chunks are read in blocks of about th
 _WINDOW = 1 << 20  # bytes searched at once
 
 
-def index_file(path: Path, number: int, source: Source | None = None) -> FileIndex:
-    """Index of one file, the ``number``-th of a log. Raises InputError for what is no MCAP file at all.
-
-    source : the original of a copy, named in messages; None for itself
-    """
+def index_file(path: Path, number: int) -> FileIndex:
+    """Index of one file, the ``number``-th of a log. Raises InputError for what is no MCAP file at all."""
     try:
         with path.open("rb") as file:
             data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
@@ -68,9 +53,9 @@ def index_file(path: Path, number: int, source: Source | None = None) -> FileInd
         raise InputError(f"{path}: is empty (0 bytes); record or copy it again") from error
     if data[: len(MAGIC)] != MAGIC:
         raise InputError(f"{path}: is not an MCAP file (starts with {data[:8]!r}); see scanchain convert --help")
-    index = FileIndex(source or path, number, data)
+    index = FileIndex(path, number, data)
     if not _take_summary(index, len(data), needs_crc=True):
-        index = FileIndex(source or path, number, data, is_consistent=False)
+        index = FileIndex(path, number, data, is_consistent=False)
         Walk(index).walk()
     return index
 
@@ -88,7 +73,7 @@ def _take_summary(index: FileIndex, size: int, *, needs_crc: bool) -> bool:
     """Fill the index by the summary of a file of this size; False where that does not give every message."""
     tail = bytes(index.bytes_at(max(size - _TAIL_BYTES, 0), min(size, _TAIL_BYTES)))
     footer = tail[-_FOOTER_BYTES:]
-    if len(footer) < _FOOTER_BYTES or not footer.endswith(MAGIC) or footer[0] != FOOTER:
+    if len(footer) < _FOOTER_BYTES or not footer.endswith(MAGIC) or footer[0] != Opcode.FOOTER:
         return False
     begin, _, crc = struct.unpack_from("<QQI", footer, RECORD.size)
     if not 0 < begin <= size - len(footer) or (needs_crc and not crc):
@@ -104,10 +89,10 @@ def _take_summary(index: FileIndex, size: int, *, needs_crc: bool) -> bool:
     if statistics is None or statistics.chunk_count != len(index.blocks):
         return False
     index.blocks.sort(key=lambda block: block.offset)
-    index.counts, index.is_counted = dict(statistics.channel_message_counts), True
+    index.counts = dict(statistics.channel_message_counts)
     is_complete = +Counter(index.counts) == index.indexed_counts()
     return is_complete and all(
-        block.chunk_offset >= 0
+        block.offset >= block.head
         and block.offset + block.size <= size
         and is_plausible_size(block.size, block.uncompressed_size)
         for block in index.blocks
@@ -138,7 +123,8 @@ def _indexed(chunk: ChunkIndex, file: int) -> Block:
         if behind - offset > RECORD.size + 6
     }
     size, times_ns = chunk.compressed_size, (chunk.message_start_time, chunk.message_end_time)
-    return Block(file, end - size, size, chunk.compression, chunk.uncompressed_size, None, *times_ns, counts)
+    head = CHUNK_HEAD.size + len(chunk.compression.encode()) + 8
+    return Block(file, end - size, size, chunk.compression, chunk.uncompressed_size, *times_ns, counts, head)
 
 
 class Walk:
@@ -147,10 +133,8 @@ class Walk:
     def __init__(self, index: FileIndex) -> None:
         self.index = index
         self.data = index.data
-        self.chunk: Block | None = None
-        self.counts = Counter[int]()  # of the chunk, by channel
-        self.loose: list[tuple[int, int]] = []  # channel and log time of messages outside of chunks
-        self.loose_from = 0
+        self.open: Block | None = None  # the chunk, or the run of loose messages, that was met last
+        self.times_ns: list[int] = []  # of these messages
         self.loose_sizes: deque[int] = deque(maxlen=8)  # of the records met last
 
     def walk(self) -> None:
@@ -183,57 +167,57 @@ class Walk:
 
     def _takes_summary(self, offset: int) -> bool:
         """True if the data end here and a summary ends the file; its channels are taken in as a last resort."""
-        if not _is_end(self.data, offset):
-            return False
-        uncertain = FileIndex(self.index.path, self.index.number, b"", channels=self.index.uncertain_channels)
-        try:
-            _fill(uncertain, self.data[offset:])
-        except MALFORMED:
-            return False
-        return True
+        uncertain = FileIndex(self.index.path, self.index.number, channels=self.index.uncertain_channels)
+        with suppress(*MALFORMED):
+            if _is_end(self.data, offset):
+                _fill(uncertain, self.data[offset:])
+                return True
+        return False
 
     def _take(self, offset: int, end: int) -> None:
         """Sort in the record of these bytes."""
         index, body = self.index, offset + RECORD.size
         opcode, chunk = self.data[offset], _chunk_at(index, offset)
         if chunk is not None:
-            self._close(offset, complete=True)
             self._take_chunk(chunk, offset)
-        elif opcode == MESSAGE:
+        elif opcode == Opcode.MESSAGE:
             self._take_message(offset, end)
-        elif opcode == MESSAGE_INDEX and self.chunk is None:
+        elif opcode == Opcode.MESSAGE_INDEX and (self.open is None or not self.open.head):
             index.note_damage(f"{index.path}: the chunk before the message index at byte {offset} is missing")
-        elif opcode == MESSAGE_INDEX and end - body > 6:
+        elif opcode == Opcode.MESSAGE_INDEX and self.open is not None:
             (channel,) = struct.unpack_from("<H", self.data, body)
-            self.counts[channel] += (end - body - 6) // 16
-        elif opcode in (SCHEMA, CHANNEL):
-            index.define(read_definition(opcode, self.data[body:end]))
+            if count := (end - body - 6) // 16:
+                self.open.counts[channel] = self.open.counts.get(channel, 0) + count
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            index.define(definition(opcode, self.data[body:end]))
         else:
             self._close(offset, complete=True)
 
     def _take_message(self, offset: int, end: int) -> None:
-        if self.chunk is not None or end - self.loose_from > _LOOSE_BYTES:
+        if self.open is None or self.open.head or end - self.open.offset > _LOOSE_BYTES:
             self._close(offset, complete=True)
+            self.open = Block(self.index.number, offset, 0, "", 0, 0, 0, Counter())
         channel, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(self.data, offset + RECORD.size)
-        self.loose_from = self.loose_from if self.loose else offset
-        self.loose.append((channel, log_time_ns))
+        self.open.counts[channel] += 1
+        self.times_ns.append(log_time_ns)
         if end - offset not in self.loose_sizes:
             self.loose_sizes.append(end - offset)
 
     def _is_shortened(self, offset: int, end: int) -> bool:
         """True if a loose message ends in a whole one of a size met lately: so many bytes of it are missing."""
-        return self.data[offset] == MESSAGE and any(
-            RECORD.unpack_from(self.data, end - size) == (MESSAGE, size - RECORD.size)
+        return self.data[offset] == Opcode.MESSAGE and any(
+            RECORD.unpack_from(self.data, end - size) == (Opcode.MESSAGE, size - RECORD.size)
             for size in self.loose_sizes
             if size < end - offset
         )
 
     def _take_chunk(self, chunk: Block, offset: int) -> None:
+        self._close(offset, complete=True)
         name = f"{self.index.path}: the chunk at byte {offset}"
-        if self.data[offset] != CHUNK:
+        if self.data[offset] != Opcode.CHUNK:
             self.index.damage.append(f"{name} is marked as another record; it was read all the same")
         if is_plausible_size(chunk.size, chunk.uncompressed_size):
-            self.chunk = chunk
+            self.open = chunk
             return
         self.index.damage.append(
             f"{name} claims to unpack from {chunk.size} to {chunk.uncompressed_size} bytes, more than is "
@@ -257,15 +241,13 @@ class Walk:
 
     def _close(self, offset: int, *, complete: bool) -> None:
         """End the chunk or the run of loose messages at this byte; incomplete counts are discarded."""
-        if self.chunk is not None:
-            self.index.blocks.append(replace(self.chunk, counts=self.counts if complete else {}))
-        if self.loose:
-            times_ns = [log_time_ns for _, log_time_ns in self.loose]
-            counts = Counter(channel for channel, _ in self.loose)
-            begin, size, span = self.loose_from, offset - self.loose_from, (min(times_ns), max(times_ns))
-            block = Block(self.index.number, begin, size, "", size, 0, *span, counts, is_chunk=False)
-            self.index.blocks.append(block)
-        self.chunk, self.counts, self.loose = None, Counter(), []
+        block, self.open = self.open, None
+        if block is not None and block.head:
+            self.index.blocks.append(block if complete else replace(block, counts={}))
+        elif block is not None:
+            size, span = offset - block.offset, {"start_ns": min(self.times_ns), "end_ns": max(self.times_ns)}
+            self.index.blocks.append(replace(block, size=size, uncompressed_size=size, **span))
+            self.times_ns = []
 
 
 def is_plausible_size(size: int, uncompressed: int) -> bool:
@@ -289,11 +271,11 @@ def _record_end(index: FileIndex, offset: int) -> int:
         return 0
     if _chunk_at(index, offset):
         return end
-    if opcode == MESSAGE_INDEX:
+    if opcode == Opcode.MESSAGE_INDEX:
         return end if length >= 6 and struct.unpack_from("<I", data, body + 2)[0] == length - 6 else 0
-    if opcode in (SCHEMA, CHANNEL):
+    if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
         try:
-            read_definition(opcode, data[body:end])
+            definition(opcode, data[body:end])
         except MALFORMED:
             return 0
         return end
@@ -305,7 +287,7 @@ def _chunk_at(index: FileIndex, offset: int) -> Block | None:
     head = index.data[offset : offset + CHUNK_HEAD.size + _LONGEST_NAME + 8]
     if len(head) < CHUNK_HEAD.size + 8:
         return None
-    _, length, *times_ns, uncompressed, crc, name = CHUNK_HEAD.unpack_from(head)
+    _, length, *times_ns, uncompressed, _, name = CHUNK_HEAD.unpack_from(head)
     begin = CHUNK_HEAD.size + name + 8
     if begin > len(head):
         return None
@@ -315,7 +297,7 @@ def _chunk_at(index: FileIndex, offset: int) -> Block | None:
     compression = head[CHUNK_HEAD.size : begin - 8].decode("utf-8", "replace")
     there = len(index.data) - offset - begin
     where = index.number, offset + begin, min(size, there)
-    return Block(*where, compression, uncompressed, crc, *times_ns, is_cut=size > there)
+    return Block(*where, compression, uncompressed, *times_ns, head=begin, is_cut=size > there)
 
 
 def _sought(index: FileIndex) -> tuple[int, ...]:
@@ -324,8 +306,8 @@ def _sought(index: FileIndex) -> tuple[int, ...]:
     No message is searched outside of the chunks of a file that has them: what is left of a damaged chunk,
     unchecked, is not taken for messages.
     """
-    is_chunked = index.blocks or _next_record(index, len(MAGIC), (CHUNK, MESSAGE_INDEX))
-    return (CHUNK,) if is_chunked else (SCHEMA, CHANNEL, MESSAGE)
+    is_chunked = index.blocks or _next_record(index, len(MAGIC), (Opcode.CHUNK, Opcode.MESSAGE_INDEX))
+    return (Opcode.CHUNK,) if is_chunked else (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 
 
 def _next_record(index: FileIndex, offset: int, sought: tuple[int, ...]) -> int:
@@ -336,7 +318,7 @@ def _next_record(index: FileIndex, offset: int, sought: tuple[int, ...]) -> int:
         likely = np.isin(window[:-8], sought) & ((window[6:-2] | window[7:-1] | window[8:]) == 0)
         for candidate in (begin + np.flatnonzero(likely)).tolist():
             end = _record_end(index, candidate)
-            is_sure = data[candidate] == MESSAGE_INDEX or _is_end(data, end)
+            is_sure = data[candidate] == Opcode.MESSAGE_INDEX or _is_end(data, end)
             if _chunk_at(index, candidate) or (end and (is_sure or _record_end(index, end))):
                 return candidate
     return 0

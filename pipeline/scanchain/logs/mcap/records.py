@@ -7,7 +7,7 @@ import mmap
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -18,12 +18,11 @@ import mcap.records
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 
 from scanchain.errors import counted, one_line
 from scanchain.files import Source
 
-MAGIC = b"\x89MCAP0\r\n"
-SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = 3, 4, 5, 6, 7
 RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 CHUNK_HEAD = struct.Struct("<BQQQQII")  # record, start, end, uncompressed size, CRC-32, length of a name
@@ -56,6 +55,14 @@ class Message(NamedTuple):
     defect: str = ""
 
 
+class Decoded(NamedTuple):
+    """A decoded message, or the decoder's error, a MalformedMessageError."""
+
+    channel: Channel
+    log_time_ns: int
+    value: object
+
+
 class Contents(NamedTuple):
     """The messages of a block in the order of the file; ``damage`` describes what is missing behind them."""
 
@@ -70,10 +77,10 @@ class Block:
     Attributes
     ----------
     file, offset, size : where its bytes lie; ``is_cut`` where the file ends inside them
-    compression, uncompressed_size, crc : as the chunk states; crc 0 means unchecked, None that the chunk's head
-        has to be read for it
+    compression, uncompressed_size : as the chunk states
     start_ns, end_ns : log time of the first and last message
     counts : messages by channel id; empty where the file does not state them
+    head : number of bytes of the chunk's record before them; 0 for messages outside of any chunk
     """
 
     file: int
@@ -81,17 +88,11 @@ class Block:
     size: int
     compression: str
     uncompressed_size: int
-    crc: int | None
     start_ns: int
     end_ns: int
     counts: dict[int, int] = field(default_factory=dict)
-    is_chunk: bool = True
+    head: int = 0
     is_cut: bool = False
-
-    @property
-    def chunk_offset(self) -> int:
-        """Offset of a chunk's record, its head included."""
-        return self.offset - (CHUNK_HEAD.size + len(self.compression) + 8 if self.is_chunk else 0)
 
     @property
     def may_be_empty(self) -> bool:
@@ -108,7 +109,7 @@ class FileIndex:
     number : its place among the files of the log
     data : the bytes of an MCAP file; ``fetch`` reads those of a remote one, by offset and size; of another
         format ``make`` makes the contents of a block, at least of the channels that are wanted, None for all
-    counts : messages by channel id; ``is_counted`` once they are complete
+    counts : messages by channel id, empty until they are known
     uncertain_channels : those of a summary that was not accepted, for channels defined nowhere else
     is_consistent : whether the channels that blocks state were checked
     """
@@ -122,19 +123,10 @@ class FileIndex:
     schemas: dict[int, tuple[str, str, bytes]] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     counts: dict[int, int] = field(default_factory=dict)
-    is_counted: bool = False
     is_consistent: bool = True
     uncertain_channels: dict[int, Channel] = field(default_factory=dict)
     damage: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-
-    def stored(self, block: Block) -> tuple[memoryview, int]:
-        """A block's bytes as the file holds them, and the CRC-32 of the unpacked bytes, 0 for unchecked."""
-        if block.crc is not None:
-            return self.bytes_at(block.offset, block.size), block.crc
-        head = block.offset - block.chunk_offset
-        record = self.bytes_at(block.chunk_offset, head + block.size)
-        return record[head:], CHUNK_HEAD.unpack_from(record)[5]
 
     def bytes_at(self, offset: int, size: int) -> memoryview:
         """A part of an MCAP file, wherever it lies."""
@@ -179,21 +171,10 @@ class FileIndex:
         return channel is not None and (channel.schema == 0 or channel.type_name != "")
 
 
-def records_of(data: memoryview | bytes) -> Iterator[tuple[int, int, int]]:
-    """Opcode of each record, begin and end of its body. Raises struct.error for one beyond the end."""
-    offset = 0
-    while offset < len(data):
-        opcode, length = RECORD.unpack_from(data, offset)
-        begin, offset = offset + RECORD.size, offset + RECORD.size + length
-        if offset > len(data):
-            raise struct.error("record beyond the end")
-        yield opcode, begin, offset
-
-
-def read_definition(opcode: int, body: bytes) -> mcap.records.Schema | mcap.records.Channel:
+def definition(opcode: int, body: bytes) -> mcap.records.Schema | mcap.records.Channel:
     """The schema or channel that a record defines. Raises one of MALFORMED."""
     stream = ReadDataStream(BytesIO(body))
-    record = (mcap.records.Schema if opcode == SCHEMA else mcap.records.Channel).read(stream)
+    record = (mcap.records.Schema if opcode == Opcode.SCHEMA else mcap.records.Channel).read(stream)
     if stream.count + _MOST_BEHIND < len(body):
         raise struct.error("definition of another length than its record")
     return record
@@ -213,12 +194,16 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
         return made._replace(messages=[m for m in made.messages if wanted is None or m.channel.key[1] in wanted])
     payload = unpack(index, block)
     messages: list[Message] = []
-    met = undefined = 0
+    met = undefined = end = 0
     try:
-        for opcode, begin, end in records_of(payload):
-            if opcode in (SCHEMA, CHANNEL):
-                index.define(read_definition(opcode, bytes(payload[begin:end])))
-            elif opcode == MESSAGE:
+        while end < len(payload):
+            opcode, length = RECORD.unpack_from(payload, end)
+            begin, end = end + RECORD.size, end + RECORD.size + length
+            if end > len(payload):
+                raise struct.error("record beyond the end")
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                index.define(definition(opcode, bytes(payload[begin:end])))
+            elif opcode == Opcode.MESSAGE:
                 number, _, log_time_ns, _ = MESSAGE_HEAD.unpack_from(payload, begin)
                 met += 1
                 channel = index.channels.get(number)
@@ -239,16 +224,15 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
 
 def unpack(index: FileIndex, block: Block) -> memoryview:
     """The records of a block; of one that is cut off those that are there, unchecked. Raises DamagedBlockError."""
-    stored, crc = index.stored(block)
-    size = block.uncompressed_size
+    record = index.bytes_at(block.offset - block.head, block.head + block.size)
+    size, has_crc = block.uncompressed_size, block.head > 0 and index.make is None  # which bags of ROS 1 have not
+    crc = CHUNK_HEAD.unpack_from(record)[5] if has_crc else 0
     try:
-        payload = _decompressed(stored, block.compression, size, is_cut=block.is_cut)
+        payload = _decompressed(record[block.head :], block.compression, size, is_cut=block.is_cut)
     except (zstandard.ZstdError, RuntimeError, MemoryError, EOFError, OSError, ValueError) as error:
         if block.is_cut:
             return memoryview(b"")
-        raise DamagedBlockError(
-            f"{_name(index, block)}: does not unpack ({one_line(error) or type(error).__name__})"
-        ) from error
+        raise DamagedBlockError(f"{_name(index, block)}: does not unpack ({one_line(error)})") from error
     if not block.is_cut and len(payload) != size:
         raise DamagedBlockError(f"{_name(index, block)}: unpacks to {len(payload)} bytes instead of {size}")
     if not block.is_cut and crc and zlib.crc32(payload) != crc:
@@ -282,7 +266,7 @@ def _decompressed(stored: memoryview, compression: str, size: int, *, is_cut: bo
 
 
 def _name(index: FileIndex, block: Block) -> str:
-    return f"{index.path}: the {'chunk' if block.is_chunk else 'run of messages'} at byte {block.offset}"
+    return f"{index.path}: the {'chunk' if block.head else 'run of messages'} at byte {block.offset}"
 
 
 def name_of(indexes: Sequence[FileIndex]) -> str:

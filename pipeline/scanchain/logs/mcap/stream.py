@@ -19,8 +19,8 @@ from scanchain.config import LogConfig
 from scanchain.errors import InputError, duration
 from scanchain.logs.mcap.records import (
     Block,
-    Channel,
     DamagedBlockError,
+    Decoded,
     FileIndex,
     Message,
     damage_of,
@@ -28,6 +28,7 @@ from scanchain.logs.mcap.records import (
     read_block,
     release,
 )
+from scanchain.logs.messages.readers import is_lidar
 from scanchain.logs.messages.ros import MalformedMessageError
 from scanchain.threads import threads
 
@@ -50,10 +51,6 @@ class Span(NamedTuple):
     def meets(self, block: Block) -> bool:
         """True if the block may hold messages of the span."""
         return block.may_be_empty or (block.end_ns >= self.begin_ns and block.start_ns <= self.end_ns)
-
-    def covers(self, block: Block) -> bool:
-        """True if all messages of the block lie in the span."""
-        return self.begin_ns <= block.start_ns <= block.end_ns <= self.end_ns
 
 
 _LONG_GAP_NS = 60_000_000_000  # without any message
@@ -100,11 +97,16 @@ def gap_notes(indexes: Sequence[FileIndex], config: LogConfig) -> list[str]:
     return notes
 
 
-def check_one_log(indexes: Sequence[FileIndex], scanned: Collection[int], config: LogConfig) -> None:
+def check_one_log(indexes: Sequence[FileIndex], config: LogConfig) -> None:
     """Refuse files with scans that lie too far apart in time to be parts of one log. Raises InputError.
 
-    scanned : numbers of the files with scans; others, as of a calibration, may be of any time
+    Files without scans, as of a calibration, may be of any time.
     """
+    scanned = {
+        index.number
+        for index in indexes
+        if any(is_lidar(channel) and index.counts.get(number) for number, channel in index.channels.items())
+    }
     for before, behind in _long_gaps(indexes, config, scanned):
         gap_ns = behind.start_ns - before.end_ns
         if before.file != behind.file and gap_ns > _LONGEST_GAP_NS:
@@ -114,7 +116,7 @@ def check_one_log(indexes: Sequence[FileIndex], scanned: Collection[int], config
             )
 
 
-def are_parts(indexes: Sequence[FileIndex], is_lidar: Callable[[Channel], bool]) -> bool:
+def are_parts(indexes: Sequence[FileIndex]) -> bool:
     """True if no two files hold the same lidar's scans of one time, and none begins a minute after the others."""
     last: dict[str, int] = {}
     for index in sorted(indexes, key=lambda index: whole_span([index])):
@@ -152,7 +154,7 @@ def count_messages(indexes: Sequence[FileIndex], topic: str, span: Span) -> int:
     for index in indexes:
         wanted = index.numbers_of(topic)
         for block in filter(span.meets, index.blocks):
-            if block.counts and span.covers(block):
+            if block.counts and span.begin_ns <= block.start_ns <= block.end_ns <= span.end_ns:
                 count += sum(block.counts.get(number, 0) for number in wanted)
             elif index.may_hold(block, wanted):
                 count += sum(span.holds(message) for message in messages_of(index, block, wanted))
@@ -185,14 +187,12 @@ def complete(index: FileIndex) -> None:
     counts = index.indexed_counts()
     unknown = {number for number in {*index.counts, *counts} if not index.knows(number)}
     for block in sorted(index.blocks, key=lambda each: unknown.isdisjoint(each.counts)):
-        if unknown or not (block.counts or index.is_counted):
+        if unknown or not (block.counts or index.counts):
             messages = messages_of(index, block)
             counts.update(message.channel.key[1] for message in messages if not block.counts)
             unknown = {number for number in unknown if not index.knows(number)}
     index.channels |= {k: channel for k, channel in index.uncertain_channels.items() if k in unknown}
-    if not index.is_counted:
-        index.counts = dict(counts)
-        index.is_counted = True
+    index.counts = index.counts or dict(counts)
 
 
 def ends_of(indexes: Sequence[FileIndex], topic: str) -> Span:
@@ -222,14 +222,6 @@ _MOST_BYTES_AHEAD = 256_000_000
 
 T = TypeVar("T")
 _SAMPLED_BLOCKS = 8  # number of first blocks of a topic that are searched
-
-
-class Decoded(NamedTuple):
-    """A decoded message, or the decoder's error, a MalformedMessageError."""
-
-    channel: Channel
-    log_time_ns: int
-    value: object
 
 
 def decoded_messages(

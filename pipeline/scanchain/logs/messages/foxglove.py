@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from functools import cache
-from typing import Any, get_type_hints
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -17,12 +16,11 @@ from msgspec import Struct, field
 
 from scanchain.data import Pose
 from scanchain.logs.mcap.records import Channel
-from scanchain.logs.messages.laser_scan import LaserScanMessage
-from scanchain.logs.messages.point_cloud import PointCloudMessage, PointField
+from scanchain.logs.messages.lidar import Sensed
 from scanchain.logs.messages.poses import StampedPose, pose_of
-from scanchain.logs.messages.ros import MalformedMessageError
+from scanchain.logs.messages.ros import MalformedMessageError, header, new, point_fields
 
-_POINT_FIELD = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}  # foxglove.NumericType to sensor_msgs/PointField
+_NUMBERS = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}  # foxglove.NumericType to sensor_msgs/PointField
 
 
 class _Stamp(Struct, frozen=True):
@@ -90,54 +88,45 @@ class _FrameTransforms(Struct, frozen=True):
     transforms: list[_FrameTransform]
 
 
-def laser_scan(message: _LaserScan) -> LaserScanMessage:
+def laser_scan(message: _LaserScan) -> Sensed:
     """The scan, without range limits and times, which Foxglove lacks."""
     with np.errstate(over="ignore"):
         ranges_m = np.array(message.ranges, np.float64).astype(np.float32)
     step_rad = (message.end_angle - message.start_angle) / max(len(ranges_m) - 1, 1)
-    return LaserScanMessage(
-        stamp_ns=_stamp_ns(message.timestamp),
-        frame=message.frame_id,
-        first_rad=message.start_angle,
-        step_rad=step_rad,
-        beam_s=0.0,
-        range_min_m=0.0,
-        range_max_m=0.0,
-        ranges_m=ranges_m,
-        T_frame_scan=_unless_identity(message.pose),
-    )
+    angles_rad = message.start_angle, message.end_angle, step_rad
+    unknown = (0.0,) * 4
+    return _sensed(message, "sensor_msgs/msg/LaserScan", *angles_rad, *unknown, ranges_m, ranges_m[:0])
 
 
-def point_cloud(message: _PointCloud) -> PointCloudMessage:
+def point_cloud(message: _PointCloud) -> Sensed:
     """The cloud, its number types in the codes of sensor_msgs/PointField; little endian."""
-    if not message.point_stride:
+    stride = message.point_stride
+    if not stride:
         raise MalformedMessageError("point_stride is zero")
-    count = len(message.data) // message.point_stride
-    fields = tuple(PointField(each.name, each.offset, _POINT_FIELD.get(each.type, 0)) for each in message.fields)
-    return PointCloudMessage(
-        stamp_ns=_stamp_ns(message.timestamp),
-        frame=message.frame_id,
-        height=1,
-        width=count,
-        fields=fields,
-        is_bigendian=False,
-        point_step=message.point_stride,
-        row_step=count * message.point_stride,
-        data=memoryview(message.data),
-        T_frame_cloud=_unless_identity(message.pose),
-    )
+    count = len(message.data) // stride
+    fields = point_fields(*((each.name, each.offset, _NUMBERS.get(each.type, 0)) for each in message.fields))
+    rows = 1, count, fields, False, stride, count * stride, message.data, True
+    return _sensed(message, "sensor_msgs/msg/PointCloud2", *rows)
+
+
+def _sensed(message: _LaserScan | _PointCloud, type_name: str, *parts: Any) -> Sensed:
+    """A message of sensor_msgs with these parts behind its header."""
+    T = _pose(message.pose.position, message.pose.orientation, 3)
+    head = header(_stamp_ns(message.timestamp), message.frame_id)
+    return Sensed(new(type_name, head, *parts), None if np.array_equal(T, np.eye(4)) else T)
 
 
 def pose_in_frame(message: _PoseInFrame, dimension: int) -> StampedPose:
     """A foxglove.PoseInFrame, flattened for dimension 2."""
     pose = _pose(message.pose.position, message.pose.orientation, dimension)
-    return StampedPose(_stamp_ns(message.timestamp), message.frame_id, "", pose)
+    return StampedPose(_stamp_ns(message.timestamp), message.frame_id.lstrip("/"), "", pose)
 
 
 def frame_transform(message: _FrameTransform) -> list[StampedPose]:
     """A foxglove.FrameTransform."""
     pose = _pose(message.translation, message.rotation, 3)
-    return [StampedPose(_stamp_ns(message.timestamp), message.parent_frame_id, message.child_frame_id, pose)]
+    frames = message.parent_frame_id.lstrip("/"), message.child_frame_id.lstrip("/")
+    return [StampedPose(_stamp_ns(message.timestamp), *frames, pose)]
 
 
 def frame_transforms(message: _FrameTransforms) -> list[StampedPose]:
@@ -149,20 +138,14 @@ def _stamp_ns(stamp: _Stamp) -> int:
     return stamp.seconds * 1_000_000_000 + stamp.nanos
 
 
-def _unless_identity(pose: _Pose) -> Pose | None:
-    T = _pose(pose.position, pose.orientation, 3)
-    return None if np.array_equal(T, np.eye(4)) else T
-
-
 def _pose(position: _Vector, orientation: _Vector, dimension: int) -> Pose:
     """A pose; a quaternion that was left out, zero, turns nothing."""
     is_given = any((orientation.x, orientation.y, orientation.z, orientation.w))
     return pose_of(position, orientation if is_given else _Vector(w=1.0), dimension)
 
 
-def parse_json(data: memoryview, read: Callable[..., Any]) -> Any:
-    """The record that ``read`` takes. NaN and Infinity, which are no JSON but which Python writes, are taken."""
-    record = _record_of(read)
+def parse_json(data: memoryview, record: type[Struct]) -> Any:
+    """A record of this type. NaN and Infinity, which are no JSON but which Python writes, are taken."""
     try:
         return msgspec.json.decode(data, type=record)
     except msgspec.ValidationError as error:
@@ -173,11 +156,6 @@ def parse_json(data: memoryview, read: Callable[..., Any]) -> Any:
         return msgspec.convert(json.loads(bytes(data)), record)
     except (ValueError, RecursionError) as error:
         raise MalformedMessageError(f"it is no JSON of its type: {error}") from error
-
-
-@cache
-def _record_of(read: Callable[..., Any]) -> Any:
-    return get_type_hints(read)["message"]
 
 
 def protobuf_parser(channel: Channel) -> Callable[[memoryview], Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left, insort
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Sequence
 from math import isfinite, sqrt
 from typing import Any, NamedTuple
@@ -13,12 +13,15 @@ import numpy as np
 from scanchain import lie
 from scanchain.data import Pose, Trajectory
 from scanchain.errors import counted
-from scanchain.logs.mcap.stream import Decoded
+from scanchain.logs.mcap.records import Decoded
 from scanchain.logs.messages.ros import MalformedMessageError, stamp_ns
 
 
 class StampedPose(NamedTuple):
-    """A pose of ``child``, empty where it is not named, in ``parent``; (4, 4), or (3, 3) for a planar log."""
+    """A pose of ``child``, empty where it is not named, in ``parent``; (4, 4), or (3, 3) for a planar log.
+
+    Names of frames have no slash before them, as some of ROS 1 have.
+    """
 
     stamp_ns: int
     parent: str
@@ -26,39 +29,31 @@ class StampedPose(NamedTuple):
     T_parent_child: Pose
 
 
-def read_odometry(message: Any, dimension: int = 3) -> StampedPose:
-    """The pose of a nav_msgs/Odometry, flattened for dimension 2."""
-    return read_pose(message, dimension)._replace(child=message.child_frame_id)
-
-
 def read_pose(message: Any, dimension: int = 3) -> StampedPose:
-    """A geometry_msgs/PoseStamped or PoseWithCovarianceStamped, flattened for dimension 2."""
+    """A nav_msgs/Odometry, geometry_msgs/PoseStamped or PoseWithCovarianceStamped, flattened for dimension 2."""
     pose = getattr(message.pose, "pose", message.pose)
     T = pose_of(pose.position, pose.orientation, dimension)
-    return StampedPose(stamp_ns(message), message.header.frame_id, "", T)
+    child = getattr(message, "child_frame_id", "").lstrip("/")  # of an Odometry
+    return StampedPose(stamp_ns(message), message.header.frame_id.lstrip("/"), child, T)
 
 
 def read_transforms(message: Any) -> list[StampedPose]:
     """All transforms of a tf2_msgs/TFMessage."""
-    return [
-        StampedPose(
-            stamp_ns(each),
-            each.header.frame_id,
-            each.child_frame_id,
-            pose_of(each.transform.translation, each.transform.rotation),
-        )
-        for each in message.transforms
-    ]
+    found = []
+    for each in message.transforms:
+        T = pose_of(each.transform.translation, each.transform.rotation)
+        frames = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
+        found.append(StampedPose(stamp_ns(each), *frames, T))
+    return found
 
 
 def chain(transforms: Sequence[StampedPose], target: str, source: str) -> Pose | None:
     """T_target_source (4, 4) through the tree of transforms, None where no path joins the two frames."""
     steps: dict[str, list[tuple[str, Pose]]] = {}
     for step in transforms:
-        parent, child = step.parent.lstrip("/"), step.child.lstrip("/")
-        steps.setdefault(child, []).append((parent, step.T_parent_child))
-        steps.setdefault(parent, []).append((child, lie.inverse(step.T_parent_child)))
-    reached = {source.lstrip("/"): np.eye(4)}  # poses of the source in frames
+        steps.setdefault(step.child, []).append((step.parent, step.T_parent_child))
+        steps.setdefault(step.parent, []).append((step.child, lie.inverse(step.T_parent_child)))
+    reached = {source: np.eye(4)}  # poses of the source in frames
     queue = deque(reached)
     while queue:
         frame = queue.popleft()
@@ -66,7 +61,7 @@ def chain(transforms: Sequence[StampedPose], target: str, source: str) -> Pose |
             if following not in reached:
                 reached[following] = T @ reached[frame]
                 queue.append(following)
-    return reached.get(target.lstrip("/"))
+    return reached.get(target)
 
 
 def pose_of(position: Any, orientation: Any, dimension: int = 3) -> Pose:
@@ -103,15 +98,13 @@ class RecordedPoses:
         self.stamps_ns: list[int] = []  # of the latest readings of the wheels, in order
         self.wheels: dict[int, Pose] = {}
         self.truth: list[StampedPose] = []
-        self.malformed: Counter[str] = Counter()
-        self.reasons: dict[str, str] = {}
+        self.malformed: dict[str, list[str]] = {}  # by topic, what is wrong with each message
 
     def take(self, message: Decoded) -> None:
         """Sort one message in."""
         topic, pose = message.channel.topic, message.value
         if not isinstance(pose, StampedPose):
-            self.malformed[topic] += 1
-            self.reasons.setdefault(topic, str(pose))
+            self.malformed.setdefault(topic, []).append(str(pose))
             return
         if topic == self.ground_truth_topic:
             self.truth.append(pose)
@@ -147,6 +140,6 @@ class RecordedPoses:
     def complaints(self) -> list[str]:
         """One line for each topic that had malformed messages."""
         return [
-            f"{counted(count, 'malformed message')} of {topic} left out (the first: {self.reasons[topic]})"
-            for topic, count in self.malformed.items()
+            f"{counted(len(reasons), 'malformed message')} of {topic} left out (the first: {reasons[0]})"
+            for topic, reasons in self.malformed.items()
         ]

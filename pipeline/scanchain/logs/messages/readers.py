@@ -3,50 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from enum import StrEnum
 from functools import partial
-from typing import Any
+from typing import Any, Literal, get_type_hints
 
 from scanchain.logs.mcap.records import Channel
 from scanchain.logs.messages import foxglove
-from scanchain.logs.messages.laser_scan import read_laser_scan, read_multi_echo_scan
-from scanchain.logs.messages.point_cloud import read_livox, read_point_cloud
-from scanchain.logs.messages.poses import StampedPose, read_odometry, read_pose, read_transforms
+from scanchain.logs.messages.lidar import Sensed, read_livox, read_multi_echo_scan
+from scanchain.logs.messages.poses import StampedPose, read_pose, read_transforms
 from scanchain.logs.messages.ros import unpacked
 
 Read = Callable[..., Any]
 _ROS, _FOXGLOVE = ("cdr", "ros1"), ("json", "protobuf")  # encodings
 
 
-class Role(StrEnum):
-    """Use of a message type."""
-
-    SCAN = "scan"
-    CLOUD = "cloud"
-    ODOMETRY = "odometry"
-    POSE = "pose"
-    TRANSFORMS = "transforms"
-
-
+Role = Literal["scan", "cloud", "odometry", "pose", "transforms"]  # use of a message type
 _TYPES: dict[str, tuple[Role, Read]] = {  # those of ROS are laid out alike in ROS 1 and 2
-    "sensor_msgs/LaserScan": (Role.SCAN, read_laser_scan),
-    "sensor_msgs/MultiEchoLaserScan": (Role.SCAN, read_multi_echo_scan),
-    "foxglove.LaserScan": (Role.SCAN, foxglove.laser_scan),
-    "sensor_msgs/PointCloud2": (Role.CLOUD, read_point_cloud),
-    "livox_ros_driver2/CustomMsg": (Role.CLOUD, read_livox),
-    "livox_ros_driver/CustomMsg": (Role.CLOUD, read_livox),
-    "livox_interfaces/CustomMsg": (Role.CLOUD, read_livox),
-    "foxglove.PointCloud": (Role.CLOUD, foxglove.point_cloud),
-    "nav_msgs/Odometry": (Role.ODOMETRY, read_odometry),
-    "geometry_msgs/PoseStamped": (Role.POSE, read_pose),
-    "geometry_msgs/PoseWithCovarianceStamped": (Role.POSE, read_pose),
-    "foxglove.PoseInFrame": (Role.POSE, foxglove.pose_in_frame),
-    "tf2_msgs/TFMessage": (Role.TRANSFORMS, read_transforms),
-    "tf/tfMessage": (Role.TRANSFORMS, read_transforms),
-    "foxglove.FrameTransform": (Role.TRANSFORMS, foxglove.frame_transform),
-    "foxglove.FrameTransforms": (Role.TRANSFORMS, foxglove.frame_transforms),
+    "sensor_msgs/LaserScan": ("scan", Sensed),
+    "sensor_msgs/MultiEchoLaserScan": ("scan", read_multi_echo_scan),
+    "foxglove.LaserScan": ("scan", foxglove.laser_scan),
+    "sensor_msgs/PointCloud2": ("cloud", Sensed),
+    "livox_ros_driver2/CustomMsg": ("cloud", read_livox),
+    "livox_ros_driver/CustomMsg": ("cloud", read_livox),
+    "livox_interfaces/CustomMsg": ("cloud", read_livox),
+    "foxglove.PointCloud": ("cloud", foxglove.point_cloud),
+    "nav_msgs/Odometry": ("odometry", read_pose),
+    "geometry_msgs/PoseStamped": ("pose", read_pose),
+    "geometry_msgs/PoseWithCovarianceStamped": ("pose", read_pose),
+    "foxglove.PoseInFrame": ("pose", foxglove.pose_in_frame),
+    "tf2_msgs/TFMessage": ("transforms", read_transforms),
+    "tf/tfMessage": ("transforms", read_transforms),
+    "foxglove.FrameTransform": ("transforms", foxglove.frame_transform),
+    "foxglove.FrameTransforms": ("transforms", foxglove.frame_transforms),
 }
-LIDAR_TYPES = tuple(sorted(name for name, (role, _) in _TYPES.items() if role in (Role.SCAN, Role.CLOUD)))
+LIDAR_TYPES = ", ".join(sorted(name for name, (role, _) in _TYPES.items() if role in ("scan", "cloud")))
 
 
 def kind(channel: Channel) -> str:
@@ -63,27 +52,17 @@ def role(channel: Channel) -> Role | None:
 
 def is_scan(channel: Channel) -> bool:
     """True if its messages are planar laser scans of a supported type."""
-    return role(channel) == Role.SCAN
+    return role(channel) == "scan"
 
 
 def is_lidar(channel: Channel) -> bool:
     """True if its messages are scans or clouds of a supported type."""
-    return role(channel) in (Role.SCAN, Role.CLOUD)
-
-
-def is_odometry(channel: Channel) -> bool:
-    """True if its messages are nav_msgs/Odometry."""
-    return role(channel) == Role.ODOMETRY
+    return role(channel) in ("scan", "cloud")
 
 
 def has_poses(channel: Channel) -> bool:
     """True if its messages are stamped poses of any supported type."""
-    return role(channel) in (Role.POSE, Role.ODOMETRY)
-
-
-def has_transforms(channel: Channel) -> bool:
-    """True if its messages are transforms between frames."""
-    return role(channel) == Role.TRANSFORMS
+    return role(channel) in ("pose", "odometry")
 
 
 def reader(channel: Channel) -> Read:
@@ -97,7 +76,7 @@ def reader(channel: Channel) -> Read:
         ros_name = "tf2_msgs/msg/TFMessage" if package == "tf" else f"{package}/msg/{type_name}"
         parse = partial(unpacked, type_name=ros_name, encoding=encoding)
     elif encoding == "json":
-        parse = partial(foxglove.parse_json, read=read)
+        parse = partial(foxglove.parse_json, record=get_type_hints(read)["message"])
     else:
         parse = foxglove.protobuf_parser(channel)
     return lambda data, **options: read(parse(data), **options)

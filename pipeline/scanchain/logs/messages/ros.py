@@ -7,6 +7,7 @@ from typing import Any
 
 from scanchain.errors import one_line
 
+NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # of sensor_msgs/PointField
 _TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 
@@ -45,6 +46,16 @@ def packed(type_name: str, *fields: Any) -> bytes:
 def new(type_name: str, *fields: Any) -> Any:
     """A message of a type, pkg/msg/Type, or a part of one."""
     return typestore().types[type_name](*fields)
+
+
+def header(stamp_ns: int, frame: str) -> Any:
+    """A std_msgs/Header."""
+    return new("std_msgs/msg/Header", new("builtin_interfaces/msg/Time", *divmod(stamp_ns, 1_000_000_000)), frame)
+
+
+def point_fields(*layout: tuple[str, int, int]) -> list[Any]:
+    """A sensor_msgs/PointField for each name, offset and type of number."""
+    return [new("sensor_msgs/msg/PointField", *each, 1) for each in layout]
 
 
 def stamp_ns(message: Any) -> int:

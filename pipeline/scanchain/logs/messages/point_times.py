@@ -1,61 +1,16 @@
-"""Valid returns of a scan message and their times, whatever a driver's name and unit for these."""
+"""Times of the points of a scan, whatever a driver's name and unit for them."""
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.config import LogConfig
-from scanchain.data import Pose, RawPoints
+from scanchain.data import RawPoints
 
-
-class RangeLimits(NamedTuple):
-    """Meters; what lies outside is dropped at the reader and counted."""
-
-    min_m: float
-    max_m: float
-
-
-class Returns(NamedTuple):
-    """The valid returns of one scan message.
-
-    ``points`` (N, d) float32 meters, ``times_s`` (N,) float32 seconds after ``stamp_ns`` or (0,); ``dropped``
-    counts what was left out, ``why`` is the reason where nothing is left.
-    """
-
-    stamp_ns: int
-    points: RawPoints
-    times_s: NDArray[np.float32]
-    dropped: int
-    why: str
-
-
-NEAREST_M = float(np.finfo(np.float32).tiny)  # below it a range is zero
 NO_TIMES = np.empty(0, np.float32)
 NO_TIMES.flags.writeable = False
-
-
-def moved(points: RawPoints, T_frame_cloud: Pose | None) -> RawPoints:
-    """Points (N, d) moved by the pose of their frame; None stands for its origin."""
-    if T_frame_cloud is None:
-        return points
-    d = points.shape[1]
-    return (points @ T_frame_cloud[:d, :d].T + T_frame_cloud[:d, 3]).astype(np.float32)
-
-
-def why_none(ranges_m: NDArray[np.float32], low_m: float, high_m: float) -> str:
-    """Reason why none of the ranges (N,) is a return between these limits."""
-    undefined = int(np.count_nonzero(~np.isfinite(ranges_m)))
-    near = int(np.count_nonzero(ranges_m < low_m)) - int(np.count_nonzero(np.isneginf(ranges_m)))
-    return (
-        f"of {len(ranges_m)} ranges {undefined} are NaN or infinite, {near} are below {low_m:.3g} m, "
-        f"{len(ranges_m) - undefined - near} are at {high_m:.3g} m or beyond"
-    )
-
-
-NAMES = ("t", "time", "timestamp", "offset_time", "time_offset", "timeOffset", "time_stamp")
+_NAMES = ("t", "time", "timestamp", "offset_time", "time_offset", "timeOffset", "time_stamp")
 
 UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _NONE = "no point times: every scan counts as measured at once"
@@ -69,18 +24,16 @@ class PointTimes:
     """Seconds after the stamp for the points of scans, in any order and from any thread.
 
     The unit is that of ``log.point_times`` or, where that is ``auto``, the one that a scan's values suggest.
-    ``assumed`` describes the interpretation of one of the first scans that have times.
+    ``fields`` names those that hold times, the likeliest first; ``assumed`` describes the interpretation of one of
+    the first scans that have times.
     """
 
     def __init__(self, config: LogConfig) -> None:
         self.config = config
         self.unit = config.point_times if config.point_times in UNITS_S else ""
         self.by_azimuth = config.point_times in ("clockwise", "counterclockwise")
+        self.fields = () if self.by_azimuth or config.point_times == "none" else _NAMES
         self.assumed = _NONE
-
-    def wants(self, field: str) -> bool:
-        """True if times are taken from a field of this name."""
-        return field in NAMES and not self.by_azimuth and self.config.point_times != "none"
 
     def from_azimuth(self, points: RawPoints) -> NDArray[np.float32]:
         """Times (N,) of points (N, 3) by the lidar's turn since its start, which is at the stamp."""
