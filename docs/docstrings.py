@@ -29,8 +29,6 @@ def _rewritten(lines: list[str], is_of_class: bool) -> Iterator[str]:
     is_field = False
     for line in lines:
         text = line.strip()
-        if text in ("Attributes", "Parameters") or (text and set(text) == {"-"}):
-            continue
         head = _head(line, is_of_class)
         if head:
             yield from ("", *head)

@@ -43,8 +43,6 @@ Logs = str | Path | Sequence[str | Path]
 class SlamResult(core.SlamResult):
     """The result of a log, with the map and the verdict that a run has.
 
-    Attributes
-    ----------
     trajectory, odometry : T_world_lidar of every scan, after and before optimization
     keyframes : the scans that stand in the graph; T_world_keyframes (K, d+1, d+1) are their final poses
     closures : every loop closure tried

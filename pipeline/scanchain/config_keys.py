@@ -30,8 +30,6 @@ LARGEST = 1e50  # beyond which products of a few numbers are infinite
 class ConfigKey:
     """One leaf of the tree.
 
-    Attributes
-    ----------
     name : with its section, ``matching.max_distance_m``
     kind : type of its values, with their limits
     default : before presets, files and flags

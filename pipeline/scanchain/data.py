@@ -58,8 +58,6 @@ def _brief(value: object) -> str:
 class Scan:
     """One scan as the log holds it, invalid returns removed.
 
-    Attributes
-    ----------
     index : place of the scan in the order of log time, from 0
     stamp_ns : header stamp; the instant at which the scan's pose holds
     log_time_ns : when it was recorded; scans are processed in this order
@@ -135,8 +133,6 @@ class State(StrEnum):
 class Prior(NamedTuple):
     """Prior of a pose before it is matched; a tuple, which compiled code takes as it is.
 
-    Attributes
-    ----------
     T_target_source : (d+1, d+1) the expected pose
     covariance : (k, k) of a twist ξ in the source's own frame, T exp(ξ); m², rad m, rad²
     widest : (k,) standard deviations that hold whatever happens, as when the vehicle brakes
@@ -158,8 +154,6 @@ class Prior(NamedTuple):
 class Match:
     """Result of a registration.
 
-    Attributes
-    ----------
     T_target_source : (d+1, d+1) pose of the source in the target's frame
     information : (k, k) inverse covariance of a twist ξ in the source's own frame, T exp(ξ), as a pose-graph
         edge takes it; m⁻², rad⁻¹m⁻¹, rad⁻²
@@ -225,8 +219,6 @@ class Match:
 class KeyframeErrors(NamedTuple):
     """Errors of a keyframe's pose against the map, and of the map since the keyframe before.
 
-    Attributes
-    ----------
     variance_factor : of the covariance by the residuals, as in ``Match``
     systematic : (k, k) covariance by how sectors of the scans disagree, of a twist in the lidar's own frame
     renewal : share of the map that the lidar exchanged for another since the keyframe before, 0 to 1
@@ -249,8 +241,6 @@ class KeyframePoints(Protocol):
 class Keyframe:
     """A scan that stands in the pose graph.
 
-    Attributes
-    ----------
     index : its number in the graph
     scan_index, stamp_ns : the scan it was made of
     stored : its points, which ``points`` reads
@@ -350,8 +340,6 @@ REJECTED_WEIGHT = 1e-6  # robust weight below which an edge is not in force
 class GraphState:
     """The pose graph after an optimization.
 
-    Attributes
-    ----------
     poses : (K, d+1, d+1) T_world_lidar of every keyframe
     stamps_ns : (K,) int64
     edges : (E, 2) int64 keyframe pairs (i, j), odometry first
@@ -405,8 +393,6 @@ class Timing(msgspec.Struct, frozen=True):
 class Step:
     """Result of one scan.
 
-    Attributes
-    ----------
     scan : the scan itself
     points : (M, d) float64 deskewed, downsampled points that were matched, lidar frame
     T_odom_lidar : pose before optimization: smooth, drifts

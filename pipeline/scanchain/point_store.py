@@ -22,8 +22,6 @@ _MOST_WAITING = 1 << 18  # bytes that are gathered before they are written toget
 class PointStore:
     """Grows by one scan after the other; what is in it never changes.
 
-    Attributes
-    ----------
     dimension : 2 or 3, of the points
     rows : points that are in it
     waiting : bytes of the last of them, which are not in the file yet

@@ -59,8 +59,6 @@ def named(overrides: Sequence[Override], key: str) -> str:
 class Settings:
     """A configuration.
 
-    Attributes
-    ----------
     config : the whole tree
     source : where it came from, in words
     """

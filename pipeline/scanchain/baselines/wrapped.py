@@ -401,8 +401,6 @@ def _import_open3d() -> Any:
 class Entry:
     """A registered baseline.
 
-    Attributes
-    ----------
     make : constructor, given the settings; the package is imported there and not before
     package : distribution whose version is reported
     settings : for 3D scans; planar: for 2D ones, None where it makes no sense for these: nothing sets point-to-

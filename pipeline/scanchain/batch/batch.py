@@ -47,8 +47,6 @@ Work = Callable[[Sequence[Task]], Iterator[Row]]
 class Batch:
     """Logs to run, with configuration and limits.
 
-    Attributes
-    ----------
     logs : a file, folder or address each
     out : the batch's directory, created or resumed
     config_file, overrides : for every log; arguments : the same and more, for ``scanchain run``

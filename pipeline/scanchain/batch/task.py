@@ -45,8 +45,6 @@ class State(StrEnum):
 class Task(Struct, frozen=True):
     """A log to run, with arguments and limits.
 
-    Attributes
-    ----------
     log : the file, folder or address; identity : of its path, size and last change, empty where it cannot be read
     key : of its identity and all that decides about the result
     out : the batch's directory

@@ -37,8 +37,6 @@ _SHARED = "scans"  # in the directory until it is complete: what all methods rea
 class Comparison:
     """A log and the methods to compare on it.
 
-    Attributes
-    ----------
     logs : the files of one log
     out : the directory to make
     methods : names; none are all that make sense; matcher : one of the configuration's, compared as well

@@ -34,8 +34,6 @@ _INTERVAL_S = 0.02  # between two readings of a process's memory
 class StoredScans:
     """Scans in a file, one behind the other, and what is known of all of them.
 
-    Attributes
-    ----------
     points : (N,) numbers of points of each scan
     stamps_ns, log_times_ns : (N,) as in ``Scan``
     wheels : (N, d+1, d+1) T_odom_base, NaN where the log has none
@@ -102,8 +100,6 @@ class Status(StrEnum):
 class EndReport(Struct, frozen=True):
     """Report of a method's process.
 
-    Attributes
-    ----------
     status, reason : how it ended; the reason is empty where all went well
     description : what the method does, with its settings
     start_s : import, loading what is compiled, and a throwaway instance on the first scans
@@ -125,8 +121,6 @@ class EndReport(Struct, frozen=True):
 class Outcome:
     """A run of a method.
 
-    Attributes
-    ----------
     report : how it ended
     odometry : (N, d+1, d+1) pose of each scan straight after it came; NaN from where it failed on
     trajectory : final poses, equal to ``odometry`` except with loop closures; empty if it did not finish

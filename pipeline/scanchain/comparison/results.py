@@ -60,8 +60,6 @@ class Reference:
 class Assessed:
     """Figures of a method over the N scans, by key of ``COLUMNS``, and scan by scan.
 
-    Attributes
-    ----------
     T_reference_estimate : (4, 4) the alignment of the ATE; the true first pose of one that did not come to its
         end; the identity without truth
     by_scan : (N,) ``error_m``, ``error_rad`` and ``nees``, NaN where a scan has no true pose beside it

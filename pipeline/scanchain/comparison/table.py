@@ -29,8 +29,6 @@ class Shown(Struct, frozen=True):
 class Column(Struct, frozen=True):
     """Presentation of a figure.
 
-    Attributes
-    ----------
     key : of the figure
     head, unit : what stands above it
     scale : from the figure's unit to the shown one
@@ -134,8 +132,6 @@ def columns_of(rows: Sequence[Figures], table: str) -> list[Column]:
 class Row(Struct, frozen=True):
     """A method: end of its runs, settings, and figures.
 
-    Attributes
-    ----------
     status, reason : of the first run that did not end well, else ok
     figures : by key of COLUMNS, None where unknown
     settings : whole, as a TOML file for --config would hold them
@@ -176,8 +172,6 @@ class Row(Struct, frozen=True):
 class Table(Struct, frozen=True):
     """A comparison.
 
-    Attributes
-    ----------
     log, topic : what was read, for headings
     truth : reference of the errors; empty without ground truth
     truth_note : how many scans have no true pose, or why a truth could not be used; else empty

@@ -31,8 +31,6 @@ _PAID_FROM_TAU = 2.0  # factor on the part of the cost that is paid from τ: the
 class Certificate:
     """Bound of the distance to the global minimum.
 
-    Attributes
-    ----------
     certified : whether no poses whatever have a χ² lower than this one by more than ``gap``
     gap : χ² less its lower bound, from 0 up; as large as χ² itself where nothing is known
     chi2 : Σ w eᵀΩe that was certified
@@ -172,8 +170,6 @@ class Minorants:
 
     G_i is the rotation of pose i against its estimate, G_i = R_i R_i*ᵀ, t_i its position, both in the world.
 
-    Attributes
-    ----------
     leap : (E, d) l, from pose i to pose j at the estimate, m
     force : (E, d) f, slope of χ² with the position of j
     torque : (E, d, d) [g]×, slope of χ² with the rotation of j, its position held

@@ -57,8 +57,6 @@ class Explained:
 class Explainer:
     """Optimizes a graph with explanations that lower the cost by more than they cost themselves.
 
-    Attributes
-    ----------
     problem_of : the problem under an explanation
     measured, information, is_loop : (E, ...) of all edges, as added
     jumps : whether to look for jumps rather than for a drift, which is one of all odometry
@@ -158,8 +156,6 @@ class LeftOut:
 
     None is near another: those near each other may share a mistake.
 
-    Attributes
-    ----------
     problem, factored : all edges, and those kept with H factored at the poses
     edges : (L,) these loop edges, each of them for ``stride`` such edges
     odometry : (O,) the edges of odometry in the order of the poses

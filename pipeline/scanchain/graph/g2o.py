@@ -33,8 +33,6 @@ ROTATION_COMMENT: dict[Rotation, str] = {
 class Tag(NamedTuple):
     """Kind of a line.
 
-    Attributes
-    ----------
     dimension : 2 or 3
     ids : number of vertex ids that it begins with: 1 of a vertex, 2 of an edge
     columns : which numbers of a whole line follow: a pose (x y θ, or x y z qx qy qz qw), and of an edge the upper
@@ -98,8 +96,6 @@ def to_angles(quat_xyzw: Matrix) -> Matrix:
 class Rows(NamedTuple):
     """Vertices or edges, those of poses before those of points, each in the order of the file.
 
-    Attributes
-    ----------
     lines : (n,) where they stand
     ids : (n, 1) or (n, 2) vertex ids
     numbers : (n, m) whole lines as g2o has them, zero where a tag has no number
@@ -115,8 +111,6 @@ class Rows(NamedTuple):
 class Lines:
     """Content of a file; a line that cannot be understood is an error that names it.
 
-    Attributes
-    ----------
     dimension : 2 or 3
     vertices, edges : their lines; fixed : line and vertex id (n, 2) of every pose that is held
     others : lines of other tags
@@ -303,8 +297,6 @@ Indefinite = Literal["project", "refuse"]
 class Projection:
     """Edges of a file with an indefinite information matrix, and the change by projecting it.
 
-    Attributes
-    ----------
     edges, of : how many edges, of how many
     median, most : ‖Ω − Ω₊‖ / ‖Ω‖ of these, Frobenius
     first : the first of them, by its vertices and its line
@@ -331,8 +323,6 @@ class Projection:
 class G2oFile:
     """A pose graph as read.
 
-    Attributes
-    ----------
     graph : the poses in the order of their ids, then the points in that of theirs; the stamp of each is its id
     ids : (K,) the file's vertex ids
     other_lines : lines about neither poses nor edges, retained to be written again

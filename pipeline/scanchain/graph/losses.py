@@ -153,8 +153,6 @@ class Truncated:
 class RobustLoss:
     """ρ(χ²) with weight w = dρ/dχ², so that w = 1 near zero whatever the scale.
 
-    Attributes
-    ----------
     kernel : which of ``LOSSES``, or module:Class
     scale : s, the χ (a pure number) at which a residual starts to count less
     control : μ of the graduation; 1, or ∞ for truncated least squares, is the loss itself
@@ -228,8 +226,6 @@ def _check(loss: RobustLoss) -> None:
 class InlierSet:
     """Loop edges kept or not, as a loss: a kept edge costs its χ², another its price.
 
-    Attributes
-    ----------
     kept : (L,) bool, of the loop edges
     price : what leaving an edge out costs, in χ²
     """

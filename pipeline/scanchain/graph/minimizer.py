@@ -143,8 +143,6 @@ E = TypeVar("E", bound=Estimate)
 class LocalModel:
     """Quadratic model of the cost, cost(ξ) ≈ cost + 2 gᵀξ + ξᵀH ξ.
 
-    Attributes
-    ----------
     gradient, diagonal : (n,) g and diag H
     solve : −(H + λ diag H)⁻¹ g for a damping λ; raises SingularMatrixError
     bend : H ξ of a step ξ (n,)

@@ -45,8 +45,6 @@ class Loosened:
 class Explanation:
     """Errors of odometry.
 
-    Attributes
-    ----------
     drift : (2,) or (4,) share of its way by which odometry is too short, and radians a meter it turns too little
     loosened : slips and jumps, stretches of odometry that are off by more than their edges say
     """

@@ -62,8 +62,6 @@ def has_loops(state: GraphState) -> bool:
 class Optimization:
     """Result of ``PoseGraph.optimize``.
 
-    Attributes
-    ----------
     state : the graph as it is now
     chi2_before, chi2_after : Σ w eᵀΩe over the edges in force before and after, at the poses of then
     cost_after : what was minimized: Σ eᵀΩe of all edges, with the robust loss of the loop edges

@@ -125,8 +125,6 @@ _SCALE2 = _FREEDOM + 2.0  # the weight (ν + 2) / (ν + χ²) is, but for a fact
 class StudentLoss:
     """ρ(χ²) of a bearing and a range together, ν = 4, times the share of the observation.
 
-    Attributes
-    ----------
     share : (N,) of an independent observation, above 0 up to 1
     """
 

@@ -161,8 +161,6 @@ _ROBOTS = 5  # subjects 1 to 5 are robots, the others landmarks (Leung et al. 20
 class RangeLog:
     """Log of one robot, in order of time.
 
-    Attributes
-    ----------
     name : of the folder and the robot
     times_s, velocities : (M,), (M, 2) wheel odometry: forward in m/s, turning in rad/s, whenever either changes
     seen_s, subjects, measured : (N,), (N,) landmark subjects, (N, 2) bearing in rad and range in m

@@ -20,8 +20,6 @@ Kind = Literal["linear", "bearing-range"]
 class LandmarkData:
     """A landmark problem in the plane, positions only: headings are known, everything is in the world's axes.
 
-    Attributes
-    ----------
     name : of the file
     kind : whether an observation is the landmark's position relative to the pose, or its bearing and range
     measurements : of poses without headings; ``measured`` is relative x, y in m in a linear problem
@@ -69,8 +67,6 @@ _COMPONENTS = ("x", "y", "heading")
 class Layout:
     """Columns of A: pose after pose, the robot's calibration, landmark after landmark.
 
-    Attributes
-    ----------
     poses : how many
     pose_size : unknowns of a pose, 2 (x, y) or 3 (x, y, heading)
     landmarks : (L,) their names, as numbers
@@ -210,8 +206,6 @@ def linear_system(given: Measurements) -> LinearSystem:
 class Linearization:
     """Whitened residuals r at a state and the values of A = ∂r/∂x there.
 
-    Attributes
-    ----------
     prior, calibration, odometry, observations : residuals (p,), (C,), (K − 1, p), (N, 2); pure numbers
     odometry_rows, observation_rows : of A: (K − 1, p, 2 p + C), (N, 2, p + 2)
     """
@@ -228,8 +222,6 @@ class Linearization:
 class Calibration:
     """Unknowns common to all motions of the robot.
 
-    Attributes
-    ----------
     names : (C,) what they are called
     value : (C,) at which the motions were worked out; slope (K − 1, p, C) by how much they change with them
     sigma : (C,) prior about zero
@@ -250,8 +242,6 @@ def no_calibration(motion: Matrix) -> Calibration:
 class Measurements:
     """Measurements of a bearing-range problem.
 
-    Attributes
-    ----------
     first_pose, first_covariance : (p,), (p, p) prior of the first pose; p is 2 without headings, 3 with them
     motion, motion_covariance : (K − 1, p), (K − 1, p, p) from each pose to the next: with headings in the frame
         of the former, without in the world's

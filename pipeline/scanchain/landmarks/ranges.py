@@ -47,8 +47,6 @@ class OdometryNoise:
 class Reckoning:
     """The log cut at its observations.
 
-    Attributes
-    ----------
     motion : (K − 1, 3) from each node to the next, in the frame of the former
     sources, rest : (K − 1, 4, 3, 3), (K − 1, 3, 3) its covariance by each noise of unit density, and by none
     calibration : errors of the robot's velocities, and the motion's Jacobian
@@ -134,8 +132,6 @@ class SightingPairs:
 class Consistency:
     """Consistency of an estimate's residuals with the noise it was found with.
 
-    Attributes
-    ----------
     motion, sensor : χ² of the motions; of bearings and of ranges (2,), weighed
     motion_freedom, redundancy : degrees of freedom of those, observations less what the state takes up
     sensor_freedom : the redundancy, at least a small share of the effective number of observations, (2,)
@@ -207,8 +203,6 @@ _MOST, _ROUGH, _FINE, _LITTLE = 50, 1e-2, 1e-5, 1e-10  # iterations; change of �
 class RangeSolution:
     """A minimum, the noise it was found for, and their consistency.
 
-    Attributes
-    ----------
     nodes_s : (K,) times of the poses, those of the observations
     reckoned : by the velocities as they were logged, every landmark where it was first seen
     problem, guess, minimum : with the noise as estimated; where the first minimization began; where the last

@@ -28,8 +28,6 @@ _NAMED = 6
 class Factor:
     """The triangular factor of a solution, or the inverse where there is none.
 
-    Attributes
-    ----------
     name : such as "U of AᵀA" or "R of A"
     matrix : (n, n) its rows and columns as the method ordered them; may hold zeros where it could have filled in
     order : (n,) column of A at each place of that order
@@ -58,8 +56,6 @@ class LinearSolver:
     A method builds what it factorizes, AᵀA and Aᵀb or the order of A. Where A has not full column rank it raises
     SingularMatrixError or RuntimeError.
 
-    Attributes
-    ----------
     spent_s : (3,) time of all solutions so far: to build, to factor with all analysis, to solve triangular systems
     solutions : their number
     """
@@ -402,8 +398,6 @@ _SLOW_S = 1.0  # seconds of a solution above which it is not repeated
 class MethodResult:
     """One method on one problem.
 
-    Attributes
-    ----------
     method : its name
     build_s, factor_s, solve_s : medians over the repetitions, each with a new solver; sums over the iterations
     again_s : the whole once more with the same solver, which reuses its analysis of the pattern

@@ -41,8 +41,6 @@ _WIDEST_GAP_S = 0.5  # between motion-capture poses that are interpolated
 class Estimate:
     """Poses and landmarks, and their accuracy.
 
-    Attributes
-    ----------
     T_truth_estimate : (3, 3) aligns them to the truth
     poses_m, landmarks_m : root mean squared distances from the truth, NaN without; ``definition`` defines them
     """
@@ -135,8 +133,6 @@ class Options:
 class Study:
     """Results of a study.
 
-    Attributes
-    ----------
     name, facts : of the problem, and lines about it by label
     before, after : optimization
     converged : whether every iteration came to an end by itself

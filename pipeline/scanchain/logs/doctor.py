@@ -52,8 +52,6 @@ class Severity(StrEnum):
 class Finding:
     """Result of one check.
 
-    Attributes
-    ----------
     check : what was looked at, one word or two
     found : what was measured, with units
     effect : what it does to the result, empty where it does nothing

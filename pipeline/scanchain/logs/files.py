@@ -28,8 +28,6 @@ _BLOCK_BYTES = 8_000_000
 class RemoteFile:
     """A file at an address.
 
-    Attributes
-    ----------
     size : bytes, 0 where the server does not state it
     version : its ETag or when it was last changed, empty where the server does not state it
     """

@@ -65,8 +65,6 @@ def sources_of(sources: Source | str | Sequence[Source | str]) -> tuple[Source, 
 class Log:
     """An opened log; ``scans`` can be iterated any number of times.
 
-    Attributes
-    ----------
     paths : its files; name : these as errors name them
     topic, dimension : the lidar's topic; 2 for laser scans and planar clouds, 3 for clouds
     mounting : how the lidar sits on the robot; T_base_lidar : (d+1, d+1) of it

@@ -26,8 +26,6 @@ _TURNED_DEG = 0.5  # least turn of a lidar on its robot that is worth a word
 class Mounting(NamedTuple):
     """The pose of a lidar on its robot.
 
-    Attributes
-    ----------
     base : its frame, empty where the log does not state it
     T_base_lidar : (4, 4), the first one seen where it moves; the identity where the log does not state it
     source : of the pose, as text

@@ -52,8 +52,6 @@ _ALIKE = Problem.plain("another place of the map is as similar")
 class Outline:
     """Upright structure of a map.
 
-    Attributes
-    ----------
     T_map_level : (4, 4) rotation to the frame whose z axis is normal to the ground, on average
     columns : (M, 2) where it is upright, level frame
     size_m : edge length of the cells that the map was seen in

@@ -32,8 +32,6 @@ Underway = Generator[None, None, Sequence[Closure]]
 class Finder(Protocol[Map]):
     """Search for keyframes of a path among older ones, in the plane or in space.
 
-    Attributes
-    ----------
     first_m, least_m, most_m : path of a segment before its first search, and least and largest between two
     follows : whether a log that is joined to a map is sought there again after a while without a match
     searches, alike : number of searches so far, and of those that found several places alike

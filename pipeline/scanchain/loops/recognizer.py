@@ -29,8 +29,6 @@ _SPACING = 1.0 / 3.0  # radii of a submap between the anchors of two submaps alo
 class Query:
     """The keyframe to recognize, with its submap and its expected pose.
 
-    Attributes
-    ----------
     submap : around the keyframe, its ``anchor``; the one that was added last
     max_traveled_m : candidates have at most this ``traveled_m``, so that no scan belongs to both submaps
     T_world_anchor : (d+1, d+1) expected pose of the anchor
@@ -49,8 +47,6 @@ class Query:
 class Candidate:
     """An older keyframe whose surroundings the queried one may revisit.
 
-    Attributes
-    ----------
     target : index of the older keyframe
     T_target_source : (d+1, d+1) initial pose of the queried keyframe in the target's frame, which verification
         refines; it converges from a few voxels and about 20° off

@@ -33,8 +33,6 @@ _MARGIN_SHARE = 0.05  # least difference of two ranges that contradict each othe
 class Verification:
     """The alignment of a proposed loop closure.
 
-    Attributes
-    ----------
     match : of the source's points to the target's surfaces, T_target_source between the two anchors
     overlap : share of the source's points within a voxel of the target's surfaces
     problem : why it is no loop closure, None if it is one

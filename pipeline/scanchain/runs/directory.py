@@ -30,8 +30,6 @@ class RunDirectory:
     that, it stays where it is if ``worth_keeping`` was called, else nothing remains. A directory that is replaced
     stays untouched until the new one is complete.
 
-    Attributes
-    ----------
     destination : the name it will have; path : where its files are now
     """
 

@@ -21,8 +21,6 @@ OpenRecorder = Callable[..., AbstractContextManager[Recorder]]
 class Job:
     """A log to process, with configuration and outputs.
 
-    Attributes
-    ----------
     logs : the files of one log
     out : the run directory
     config_file : on top of the preset; overrides : on top of both

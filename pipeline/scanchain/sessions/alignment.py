@@ -40,8 +40,6 @@ _FOUND = 0.5, 0.05  # m and rad, standard deviations of the pose that they start
 class Alignment:
     """Keyframes placed among those of a map, which stay as they are.
 
-    Attributes
-    ----------
     poses : (K, d+1, d+1) T_target_lidar of the keyframes, without meaning where not ``is_found``
     closures : tried with the map; ``source`` is the number of the map's keyframes plus that of the keyframe
     loops : number of them in force

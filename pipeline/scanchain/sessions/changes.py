@@ -49,8 +49,6 @@ Kind = Literal["appeared", "vanished"]
 class Part:
     """A map, or a session of one, as it takes part in a comparison.
 
-    Attributes
-    ----------
     name : of it
     keyframes, poses : (K, d+1, d+1) T_common_lidar of the keyframes
     """
@@ -64,8 +62,6 @@ class Part:
 class Cluster:
     """Points close to each other that all appeared or all vanished.
 
-    Attributes
-    ----------
     kind, number : of it; numbers count through both kinds, from 1, the largest first
     center : (d,) middle of its box, meters, frame of the earlier map
     size_m : (d,) of the box: the longer and the shorter side on the ground, the height
@@ -92,8 +88,6 @@ class Cluster:
 class Changes:
     """The difference of two maps.
 
-    Attributes
-    ----------
     names : of the earlier and the later map
     points : (N, d) of both, one a voxel; of what is the same those of the earlier map
     labels : (N,) uint8 values of ``Label``

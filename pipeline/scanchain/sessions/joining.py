@@ -47,8 +47,6 @@ _SHORT = "they agree along a short path only"
 class Joined:
     """One or several maps in one frame.
 
-    Attributes
-    ----------
     maps : numbers of the maps, in the order in which they joined
     keyframes : of all of them in this order; ``T_odom_lidar`` is the pose in the common frame
     of_map : (K,) number of each keyframe's map
@@ -93,8 +91,6 @@ class Joined:
 class Doubt(msgspec.Struct, frozen=True):
     """A session that might lie in the frame of another one, but stays apart.
 
-    Attributes
-    ----------
     position_m, yaw_deg : of its first keyframe there
     reason : why it is not certain
     """

@@ -38,8 +38,6 @@ class MapState(StrEnum):
 class Placed:
     """A scan in the map, as known at its time.
 
-    Attributes
-    ----------
     state : how it is known; of one that is ``LOST`` the pose is predicted
     T_map_lidar : pose in the map's frame, None while ``SEARCHING``
     covariance : (k, k) of a twist in the lidar's own frame, None while ``SEARCHING``
@@ -57,8 +55,6 @@ class Placed:
 class Localization:
     """A log in a map, after its last scan.
 
-    Attributes
-    ----------
     states : (N,) of every scan, as known at its time
     is_placed : (N,) bool, scans that are joined to the map in the end, those before they were found too
     trajectory : every scan, T_map_lidar; without meaning where not ``is_placed``

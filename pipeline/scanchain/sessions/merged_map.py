@@ -34,8 +34,6 @@ from scanchain.trajectory import read_tum, write_tum
 class MergedMap:
     """Maps in one frame, with their sessions.
 
-    Attributes
-    ----------
     joined : the graph
     saved : the map; its poses are in the plane finer than those of the graph, its sessions, of all maps, in the
         order of time with names that differ

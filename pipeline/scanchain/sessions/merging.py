@@ -30,8 +30,6 @@ from scanchain.settings import dump, load_settings
 class SessionMetrics(Session, frozen=True):
     """A session as it is in the merged map.
 
-    Attributes
-    ----------
     closures : in force between it and other maps
     removed_points : of its keyframes, that newer sessions saw through; 0 where the map was not updated
     """
@@ -43,8 +41,6 @@ class SessionMetrics(Session, frozen=True):
 class MergeMetrics(msgspec.Struct, frozen=True):
     """Contents of metrics.json of a merge.
 
-    Attributes
-    ----------
     sessions : those in the map, in the order of time
     apart : those that are not, each with the other sessions of its own place, if any
     closures_tried, closures_in_force : between maps

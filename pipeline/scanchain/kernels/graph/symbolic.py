@@ -176,8 +176,6 @@ def _most_zeros(columns: int) -> float:
 class Fronts(NamedTuple):
     """Layout of the fronts. A front is a small dense symmetric matrix: its pivots first, then its update rows.
 
-    Attributes
-    ----------
     row_start : (F + 1,) into ``rows``
     rows : scalar position in the elimination order of every row of every front
     pivots : (F,) number of scalar columns that the front eliminates
@@ -202,8 +200,6 @@ class Fronts(NamedTuple):
 class Blocks(NamedTuple):
     """Destinations of the blocks of the matrix: those of front f are start[f] to start[f + 1].
 
-    Attributes
-    ----------
     start : (F + 1,)
     offset : of the block among the matrix's values, where it is kept row-major
     height, width : of the block as kept

@@ -74,8 +74,6 @@ class Contents(NamedTuple):
 class Block:
     """A run of records: a chunk, or messages outside of any chunk.
 
-    Attributes
-    ----------
     file, offset, size : where its bytes lie; ``is_cut`` where the file ends inside them
     compression, uncompressed_size : as the chunk states
     start_ns, end_ns : log time of the first and last message
@@ -104,8 +102,6 @@ class Block:
 class FileIndex:
     """Index of one file.
 
-    Attributes
-    ----------
     number : its place among the files of the log
     data : the bytes of an MCAP file; ``fetch`` reads those of a remote one, by offset and size; of another
         format ``make`` makes the contents of a block, at least of the channels that are wanted, None for all
