@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from scanchain import lie
+from scanchain.config import Config
 from scanchain.data import Trajectory
-from scanchain.evaluation import disagreement, motion_nees, sampled_map, sharpness
+from scanchain.errors import InputError
+from scanchain.evaluation import disagreement, expected_errors, motion_nees, sampled_map, sharpness
+from scanchain.graph.pose_graph import PoseGraph
 from scanchain.logs import open_log
 from scanchain.trajectory import read_tum, write_wide_tum
 from tests.benchmarks.trust import judged, placed
@@ -35,6 +38,13 @@ def test_a_simulated_drive_errs_as_its_expected_ate_and_its_covariances_say(driv
     assert 0.2 < found.nees < 3.0
     if drive in DRIVES[::2]:
         assert 0.05 < found.gap < 6.0, "smfeval finds the covariances of keyframes too tight or too loose"
+
+
+def test_of_a_graph_without_an_edge_no_error_is_expected(dimension):
+    graph = PoseGraph(dimension)
+    graph.add_pose(lie.identity(dimension), 0)
+    with pytest.raises(InputError, match="has no edge"):
+        expected_errors(graph, (), Config())
 
 
 def test_a_wide_tum_file_has_the_pose_and_the_lower_triangle_of_its_covariance(tmp_path):

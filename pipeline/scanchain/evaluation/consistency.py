@@ -14,6 +14,7 @@ from scipy.spatial import KDTree
 from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import KeyframeErrors, Matrix, Points, Scan, Trajectory
+from scanchain.errors import InputError
 from scanchain.graph.between import turns
 from scanchain.graph.pose_graph import PoseGraph
 
@@ -74,8 +75,10 @@ def expected_errors(
     How well its covariances hold varies from log to log: samples are scaled by a factor whose logarithm has a
     standard deviation of 0.5, as measured on simulated and real logs (tests.benchmarks.trust).
     scans : as in ``expected_ate``
-    Raises InputError where the edges leave poses free.
+    Raises InputError without an edge, or where the edges leave poses free.
     """
+    if not len(graph.edges):
+        raise InputError("the pose graph has no edge, so that no error is expected; give more keyframes")
     drifting, own = with_map_errors(graph, map_errors, config)
     R = _rotations(graph.poses, graph.freedom)
     return _sampled(drifting, scans, R @ own @ np.swapaxes(R, 1, 2), _SCALE_SIGMA)

@@ -125,8 +125,6 @@ def results_of(
 def expected_of(result: SlamResult, config: Config) -> ExpectedErrors | None:
     """Expected errors of the keyframes; None without an edge, or where these leave poses free."""
     starts = [keyframe.scan_index for keyframe in result.keyframes]
-    if len(starts) < 2:
-        return None
     scans = np.diff([*starts, len(result.trajectory)])
     try:
         return expected_errors(result.graph, result.map_errors, config, scans)

@@ -87,9 +87,6 @@ def evidence_of(steps: pa.Table, closures: pa.Table | None, expected: ExpectedEr
     wheels = (
         poses_of(steps, "wheel_", dimension) if "wheel_x" in steps.column_names else np.full_like(poses, np.nan)
     )
-    is_copy = np.zeros(len(poses), np.bool_)
-    if "is_copy" in steps.column_names:  # older runs have none
-        is_copy = steps["is_copy"].to_numpy(zero_copy_only=False)
     return Evidence(
         seconds=(log_times_ns - log_times_ns[0]) * 1e-9,
         poses=poses,
@@ -97,7 +94,7 @@ def evidence_of(steps: pa.Table, closures: pa.Table | None, expected: ExpectedEr
         is_degenerate=states == State.DEGENERATE,
         fit=steps["fit"].to_numpy(),
         starts_segment=steps["starts_segment"].to_numpy(zero_copy_only=False),
-        is_copy=is_copy,
+        is_copy=steps["is_copy"].to_numpy(zero_copy_only=False),
         points=steps["scan_points"].to_numpy(),
         wheels=check_wheels(poses, wheels),
         velocity=check_velocity(stamps_ns, log_times_ns, poses),
