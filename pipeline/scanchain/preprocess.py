@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -19,7 +20,8 @@ from scanchain.config import PreprocessConfig
 from scanchain.data import Points, Scan
 from scanchain.kernels import scans as kernels
 
-_SLOTS, _GROWTH = 1 << 18, 4  # of a table for downsampling: most at first, and growth where voxels have no room
+_LEAST_SLOTS, _MOST_SLOTS = 1 << 10, 1 << 22  # of a table for downsampling; larger ones are not kept
+_GROWTH = 4  # of a table that has no room for all voxels
 _RANGE_VOXELS = 14.0  # least number of voxels of the local map that the median range spans
 _DENSE, _SPARSE = 60_000, 40_000  # returns of a scan from which on it is dense, and below which it no longer is
 _FINE = math.sqrt(0.5)  # factor on the voxels of dense scans, which fill finer ones with points enough for a plane
@@ -102,13 +104,28 @@ def first_per_voxel(
     Raises InputError where the voxels are too small for the points.
     """
     checks.within_voxels(points, voxel_m, "points", max_range_m=max_range_m)
-    slots = min(1 << max(2 * len(points) - 1, 1).bit_length(), _SLOTS)
+    table, chosen = _scratch.table, _scratch.chosen
+    enough = 1 << max(2 * len(points) - 1, 1).bit_length()
     while True:
-        table, chosen = np.empty(slots, np.int64), np.empty(slots // 2, np.int32)
-        count = kernels.first_per_voxel(points, voxel_m, min_range_m, max_range_m, table, chosen)
+        slots = min(len(table), enough)
+        room = table[:slots], chosen[: slots // 2]
+        count = kernels.first_per_voxel(points, voxel_m, min_range_m, max_range_m, *room)
         if count >= 0:
             return chosen[:count].copy()
         slots *= _GROWTH
+        table, chosen = np.empty(slots, np.int64), np.empty(slots // 2, np.int32)
+        if slots <= _MOST_SLOTS:
+            _scratch.table, _scratch.chosen = table, chosen
+
+
+class _Scratch(threading.local):
+    """Arrays of each thread, reused, as large as scans with so many voxels need: small ones stay in the cache."""
+
+    def __init__(self) -> None:
+        self.table, self.chosen = np.empty(_LEAST_SLOTS, np.int64), np.empty(_LEAST_SLOTS // 2, np.int32)
+
+
+_scratch = _Scratch()
 
 
 class Resolution:
