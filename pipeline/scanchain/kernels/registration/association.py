@@ -57,9 +57,9 @@ def associate(voxels, points, T, reach: int, max_distance_m: float, corresponden
                         ey = voxels.cells[voxel, 1] - y
                         ez = voxels.cells[voxel, 2] - z
                         distance = ex * ex + ey * ey + ez * ez
-                        if distance < nearest:
-                            nearest = distance
-                            chosen = voxel
+                        is_nearer = distance < nearest  # which no processor foresees: without a branch
+                        nearest = min(distance, nearest)
+                        chosen += is_nearer * (voxel - chosen)
             covered = (ring - 0.5) * voxels.size_m
             if nearest <= covered * covered:
                 break
