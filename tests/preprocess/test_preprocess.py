@@ -43,7 +43,8 @@ def test_a_thinned_sweep_keeps_the_times_of_its_points_however_many_voxels_there
     assert np.array_equal(thin.points, downsample(sweep.points, 4.0))
     place = {tuple(point): time for point, time in zip(sweep.points, sweep.times_s, strict=True)}
     assert [place[tuple(point)] for point in thin.points] == thin.times_s.tolist()
-    monkeypatch.setattr(preprocess, "_SLOTS", 4)
+    for name, few in (("table", np.empty(4, np.int64)), ("chosen", np.empty(2, np.int32))):
+        monkeypatch.setattr(preprocess._scratch, name, few)
     assert np.array_equal(thin.points, downsample(sweep.points, 4.0))
 
 
