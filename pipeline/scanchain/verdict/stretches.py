@@ -280,7 +280,7 @@ def contradicting_groups(closures: Closures, poses: Matrix, seconds: Floats) -> 
 def which_slipped(
     parts: Sequence[slice], odometry: Matrix, wheels: Matrix, closures: Closures
 ) -> list[tuple[Kind, float]]:
-    """Which of scans and wheels slipped in each part of a trajectory where they disagree, and its error in m.
+    """Kind of slip, of scans or wheels, and its size in m, for each part of a trajectory where the two disagree.
 
     A closure around a part measures once more where its two scans lie. It is predicted with the motion of each
     part by scans or by wheels, in every combination, and with that of the rest by either, in the directions

@@ -178,10 +178,14 @@ def _chunk(index: FileIndex, record: Record) -> Block:
 def _indexed(index: FileIndex, record: Record) -> Block:
     """The last chunk, with the messages of a connection that an INDEX lists."""
     block, entries = index.blocks[-1], np.frombuffer(index.data[record.begin : record.end], _ENTRY)
-    times_ns = (entries["s"].astype(np.int64) * _NS + entries["ns"]).tolist()
-    span_ns = [*times_ns, *([block.start_ns, block.end_ns] if block.counts else [])] or [0]
-    counts = block.counts | ({record.number(b"conn"): len(times_ns)} if times_ns else {})
-    return replace(block, start_ns=min(span_ns), end_ns=max(span_ns), counts=counts)
+    if not len(entries):
+        return block
+    times_ns = entries["s"].astype(np.int64) * _NS + entries["ns"]
+    start_ns, end_ns = int(times_ns.min()), int(times_ns.max())
+    if block.counts:
+        start_ns, end_ns = min(start_ns, block.start_ns), max(end_ns, block.end_ns)
+    counts = block.counts | {record.number(b"conn"): len(entries)}
+    return replace(block, start_ns=start_ns, end_ns=end_ns, counts=counts)
 
 
 def _counted(index: FileIndex, block: Block) -> Block:
