@@ -13,6 +13,7 @@ from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
+from threading import Lock
 from typing import IO
 
 import lzf
@@ -44,6 +45,8 @@ _PLY_TYPES = {
 }  # fmt: skip
 _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
 _MOST_HEADER_LINES = 1000
+
+_ONE_AT_A_TIME = Lock()  # of headers, which NumPy parses by ast: threads of Python 3.11 disturb each other in it
 
 
 class CloudFileError(Exception):
@@ -94,7 +97,8 @@ def read_raw(path: Path, point: np.dtype[np.void]) -> NDArray[np.void]:
 def read_npy(path: Path) -> NDArray[np.void]:
     """The points of a NumPy array, (N, 3) or more columns, x y z first, or (N,) with fields of these names."""
     try:
-        array = np.load(path, allow_pickle=False)
+        with _ONE_AT_A_TIME:
+            array = np.load(path, allow_pickle=False)
     except (ValueError, EOFError, MemoryError) as error:
         raise CloudFileError("is no .npy array of numbers") from error
     if not isinstance(array, np.ndarray):
