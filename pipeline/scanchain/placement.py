@@ -12,9 +12,13 @@ from scanchain.config import LoopsConfig
 from scanchain.data import Closure, ClosureVerdict, GraphState, Keyframe, Matrix, Pose, Problem
 from scanchain.graph.schedule import LAG, Schedule
 from scanchain.loops import ClosureTable, LoopCloser, PlaceTest
+from scanchain.loops.evidence import pose_by
 
 _TOO_FEW = Problem.plain("too few keyframes agree on the place")
-_CONTRADICTED = Problem.plain("withdrawn: what was seen since contradicts the place")
+_CONTRADICTED = Problem.plain("withdrawn: later scans contradict the location")
+_REPLACED = Problem.plain("withdrawn: the evidence for another location in the map is stronger")
+_ELSEWHERE = Problem.plain("contradicts the location of the log in the map, whose evidence is stronger")
+_DRIFT = 0.1  # largest distance of a find from the predicted pose, as a share of the path since the last match
 LARGEST_SIGMAS = (300.0, 30.0)  # m and rad, of an edge: a pose that hangs on less information is lost to rounding
 
 
@@ -23,7 +27,8 @@ class Placement:
 
     Closures of a new segment to older keyframes, of segments before or of a prior map, which come first and are
     fixed, wait until they are evidence enough. Then the segment is moved there. Those that later scans contradict
-    are withdrawn.
+    are withdrawn. While a log that was joined to a map does not match it, other locations are searched for and
+    tested in parallel; one with more evidence replaces that of the log, its earlier scans included.
     """
 
     def __init__(
@@ -36,6 +41,9 @@ class Placement:
         self.T_world_odom = lie.identity(self.graph.dimension)
         self.first = 0  # number of the first keyframe of the log, after those of the map
         self.evidence = PlaceTest(closer.segments)
+        self.rival = PlaceTest(
+            closer.segments
+        )  # of another location in the map, while the log does not match there
         self.by_map: Closure | None = None  # with the map, of the newest keyframe that has one
         self.joined_start = 0  # first keyframe of the last segment that a loop joined to older ones
 
@@ -65,9 +73,11 @@ class Placement:
         """Closures by what the scan completes, and of the newest keyframe if the scan is one."""
         if self.evidence.is_in_vain(self.keyframes[-1]):
             self.give_up()
+        if self.rival.is_in_vain(self.keyframes[-1]) and not self.rival.is_accepted:
+            self.rival.drop(self.closer.segments.starts[-1])
         closures = self.take(self.closer.advance(self.keyframes, self.graph))
         if is_keyframe:
-            closures += self.take(self.closer.close(self.keyframes, self.graph))
+            closures += self.take(self.closer.close(self.keyframes, self.graph), self._at_rival())
         for closure in closures if self.first else ():
             is_by_map = closure.verdict is ClosureVerdict.ACCEPTED and closure.target < self.first
             if is_by_map and (self.by_map is None or closure.source >= self.by_map.source):
@@ -77,11 +87,14 @@ class Placement:
                 self.T_world_odom = lie.normalize(T_world_source @ T_source_odom)
         return closures
 
-    def take(self, closures: tuple[Closure, ...]) -> tuple[Closure, ...]:
-        """Keep closures; those accepted become edges of the graph."""
-        if not closures:
+    def take(self, closures: tuple[Closure, ...], at_rival: tuple[Closure, ...] = ()) -> tuple[Closure, ...]:
+        """Keep closures; those accepted become edges of the graph.
+
+        at_rival : tried at the other location in the map that is being tested
+        """
+        if not closures and not at_rival:
             return ()
-        closures = self._tested(closures) if self.closer.segments.starts[-1] else closures
+        closures = self._tested(closures, at_rival) if self.closer.segments.starts[-1] else closures
         taken = tuple(
             self._add(closure) if closure.verdict is ClosureVerdict.ACCEPTED else closure for closure in closures
         )
@@ -107,6 +120,7 @@ class Placement:
     def start_segment(self, keyframe: int) -> None:
         """Start a segment: the motion to this keyframe, the newest, is not known."""
         self.give_up()
+        self.rival.drop(keyframe)
         self.closer.start_segment(keyframe)
 
     def finish(self) -> None:
@@ -118,6 +132,7 @@ class Placement:
         """The pose that is being tested, if any, is wrong: search the newest segment again."""
         if self.evidence.is_gathering:
             self.evidence.drop(self.closer.segments.starts[-1])
+            self.closer.segments.assume(-1)
             self.closer.search_again()
 
     def set_apart(self) -> bool:
@@ -138,35 +153,71 @@ class Placement:
         T_lidar_odom = lie.inverse(self.keyframes[-1].T_odom_lidar)
         self.T_world_odom = lie.normalize(self.graph.poses[-1] @ T_lidar_odom)
 
-    def _tested(self, closures: tuple[Closure, ...]) -> tuple[Closure, ...]:
+    def _tested(self, closures: tuple[Closure, ...], at_rival: tuple[Closure, ...]) -> tuple[Closure, ...]:
         """Closures; those that would join the newest segment to older ones are rejected until they are enough."""
         start, evidence, world = self.closer.segments.starts[-1], self.evidence, (self.keyframes, self.graph.poses)
+        closures, found = self._told_apart(closures)
+        elsewhere = found + at_rival
+        if elsewhere and not evidence.is_gathering:
+            self.rival.note(elsewhere)
+            if replacing := self.rival.collect(elsewhere, *world, least=evidence.total):
+                return (*self._withdrawn(closures, _REPLACED), *replacing)
         older = [each for each in closures if each.target < start <= each.source]
         evidence.note(older)
         components = self.closer.segments.components(self.graph, with_assumed=False)
         is_joined = (components == components[-1]).tolist()
         known = [each for each in older if is_joined[each.target]]
         if known and not evidence.is_gathering and not evidence.follow(known, *world):
-            return self._withdrawn(closures)
+            return self._withdrawn(closures, _CONTRADICTED)
+        if any(each.verdict is ClosureVerdict.ACCEPTED for each in known):
+            self.rival.drop(start)
         tested = [each for each in older if not is_joined[each.target]]
         was_gathering = evidence.is_gathering
         joining = evidence.collect(tested, *world)
+        self.closer.segments.assume(evidence.waiting[0].target if evidence.is_gathering else -1)
         if evidence.is_gathering and not was_gathering:
             self._move_to(evidence.waiting[0])
             self.follow_graph()
         alone = [each.rejected(_TOO_FEW) if each.verdict is ClosureVerdict.ACCEPTED else each for each in tested]
         others = [each for each in closures if each.source < start or is_joined[each.target]]
-        return (*others, *(joining or alone))
+        return (*others, *(each.rejected(_ELSEWHERE) for each in found), *(joining or alone))
 
-    def _withdrawn(self, closures: tuple[Closure, ...]) -> tuple[Closure, ...]:
+    def _told_apart(self, closures: tuple[Closure, ...]) -> tuple[tuple[Closure, ...], tuple[Closure, ...]]:
+        """Closures, and among them finds in the map far from where the log is taken to be and has no match."""
+        if not self.first or self.closer.is_tracking(self.keyframes):
+            return closures, ()
+        components = self.closer.segments.components(self.graph)
+        traveled_m = self.keyframes[-1].traveled_m - self.closer.search.matched_m
+        limit_m = max(_DRIFT * traveled_m, self.config.min_radius_m)
+
+        def is_elsewhere(each: Closure) -> bool:
+            if each.verdict is ClosureVerdict.REJECTED or components[each.target] != components[-1]:
+                return False
+            T_found = pose_by(each, each.source, self.keyframes, self.graph.poses)
+            return each.target < self.first and lie.apart(self.graph.poses[each.source], T_found)[0] > limit_m
+
+        elsewhere = tuple(filter(is_elsewhere, closures))
+        return tuple(each for each in closures if not is_elsewhere(each)), elsewhere
+
+    def _at_rival(self) -> tuple[Closure, ...]:
+        """The closure of the newest keyframe at the other location that is being tested, if any."""
+        if not self.rival.is_gathering:
+            return ()
+        T_world = pose_by(self.rival.waiting[-1], self.keyframes[-1].index, self.keyframes, self.graph.poses)
+        return self.closer.near.in_map_at(T_world, self.keyframes)
+
+    def _withdrawn(self, closures: tuple[Closure, ...], problem: Problem) -> tuple[Closure, ...]:
         """The newest segment is not where it was joined to older ones: take back all of that; search again."""
         start = self.closer.segments.starts[-1]
-        is_taken_back = self._take_back(range(start, len(self.keyframes)), _CONTRADICTED)
+        is_taken_back = self._take_back(range(start, len(self.keyframes)), problem)
         self.evidence.drop(start)
+        if problem is _REPLACED:
+            self.evidence.replace_by(self.rival)
+        self.rival.drop(start)
         self.closer.search_again()
         self.schedule.stop()
         self.by_map, self.joined_start = None, 0
-        return tuple(each.rejected(_CONTRADICTED) if is_taken_back(each) else each for each in closures)
+        return tuple(each.rejected(problem) if is_taken_back(each) else each for each in closures)
 
     def _take_back(self, segment: range, problem: Problem) -> Callable[[Closure], bool]:
         """Reject the closures that join the keyframes of a segment to older ones; tells which these are."""

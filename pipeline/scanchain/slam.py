@@ -52,8 +52,10 @@ class SlamResult:
     ``map_errors`` are those of the keyframes against the map.
     ``warnings`` has a line on wheels that were left out.
     ``map_log_odds`` are those that the log is where it was placed in a prior map, or, where they do not suffice,
-    might have been; NaN without a map, and where nothing spoke for a place in it. ``map_alike_share`` is the share
-    of the searches of the map that found several places alike.
+    might have been; NaN without a map, and if no keyframe was evidence for a location in it.
+    ``map_rival_log_odds`` are those of another location in it that the last keyframes match, NaN if they do not
+    suffice or there is none.
+    ``map_alike_share`` is the share of the searches of the map that found several similar locations.
     ``components`` (K,) numbers the pieces that the keyframes belong to, which no loop joins; one as a rule.
     """
 
@@ -71,6 +73,7 @@ class SlamResult:
     elevation_sigma_rad: float = math.inf
     calibrated_from: int = 0
     map_log_odds: float = math.nan
+    map_rival_log_odds: float = math.nan
     map_alike_share: float = 0.0
 
     @property
@@ -229,7 +232,7 @@ class Slam:
             fixed, poses = self.keyframes[:first], corrected[scan_of]
             world = (fixed, state.poses[:first]) if fixed else (self.keyframes, poses)
             corrected = refined(corrected, trail.spans.rows, trail.points, *world, self.config)
-        tracking = self.front_end.odometry
+        tracking, rival = self.front_end.odometry, self.placement.rival
         return SlamResult(
             trajectory=Trajectory(odometry.stamps_ns, corrected),
             odometry=odometry,
@@ -244,6 +247,7 @@ class Slam:
             elevation_sigma_rad=tracking.elevation.sigma_rad,
             calibrated_from=tracking.calibrated_from,
             map_log_odds=self.placement.evidence.best if first else math.nan,
+            map_rival_log_odds=rival.log_odds if rival.is_accepted else math.nan,
             map_alike_share=self.closer.alike_share,
         )
 

@@ -17,6 +17,9 @@ path outside before it enters, and inside; path inside until it is found (negati
 that were given inside at their time and are wrong, the median error in the end, NEES then and in the end, the
 verdict. Truth of a simulated world is the simulator's; of a real log it is the trajectory of the whole log, with
 its loops.
+
+--false-find M: the map also holds a copy of the first M meters of the log, put where nothing else lies. The log is
+found there first, and leaves the copy: then it is wrong until it is found where it enters the map.
 """
 
 from __future__ import annotations
@@ -24,7 +27,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from time import process_time
 
@@ -34,7 +37,7 @@ import scanchain as sc
 from scanchain import lie
 from scanchain.data import Trajectory
 from scanchain.errors import ScanchainError
-from scanchain.maps import open_saved_map
+from scanchain.maps import Edges, SavedMap, Session, open_saved_map, write_saved_map
 from scanchain.sessions.localizer import MapState
 from scanchain.trajectory import read_tum
 from tests.benchmarks.harness import options_of, poses_at, settings_of, table, true_in_map
@@ -47,6 +50,7 @@ PLANAR: Options = {"sensor": "lms-270"}  # a world of space, driven through with
 SPATIAL: Options = {"sensor": "vlp-16"}
 LONG: Options = {"sensor": "vlp-16", "seconds": 25.0}
 INSIDE_M = {2: 5.0, 3: 10.0}
+COPY_S, BESIDE_M = 120.0, {2: 100.0, 3: 300.0}  # of a log that is copied into its map, and how far off that lies
 WRONG_M = {2: 1.0, 3: 2.0}  # error from which on a pose is wrong
 HEAD = "log|outside|inside|found after|wrong poses|error|σ then, final|NEES|CPU s|verdict"
 
@@ -185,13 +189,41 @@ def prepared(name: str, seed: int, cache: Path) -> tuple[Path, Path, Options, Tr
     return made.run_of(mapped, cache, out), log, {}, *truths
 
 
+def with_copy(prior: SavedMap, seen: SavedMap, path_m: float, folder: Path) -> Path:
+    """A map in a new folder that also holds the first meters of another one, beyond all that it has itself."""
+    first = [each for each in seen.keyframes if each.traveled_m - seen.keyframes[0].traveled_m <= path_m]
+    count, old, shift = len(first), len(prior.keyframes), lie.identity(prior.dimension)
+    shift[0, -1] = prior.poses[:, 0, -1].max() - seen.poses[:count, 0, -1].min() + BESIDE_M[prior.dimension]
+    begin_m = prior.keyframes[-1].traveled_m + 1e3
+    copied = (
+        replace(each, index=k, traveled_m=begin_m + each.traveled_m, T_odom_lidar=shift @ each.T_odom_lidar)
+        for k, each in enumerate(first, old)
+    )
+    edges = seen.edges.among(np.arange(count))
+    both = SavedMap(
+        folder, prior.dimension, (*prior.keyframes, *copied), np.append(prior.session, np.full(count, 1)),
+        (*prior.sessions[:1], Session("copy", first[0].stamp_ns, first[-1].stamp_ns, count)),
+        Edges.chained(prior.edges, replace(edges, pairs=edges.pairs + old)),
+    )  # fmt: skip
+    write_saved_map(both)
+    return folder
+
+
 def entering(name: str, options: argparse.Namespace) -> tuple[str, ...]:
     """The cells of a case."""
     d = ENTRIES[name].dimension
     out, log, of_log, map_truth, truth = prepared(name, options.seed, options.cache)
     began_s = process_time()
     with tempfile.TemporaryDirectory() as folder:
-        result = sc.localize(log, out, Path(folder) / "out", recording=False, **of_log, **settings_of(options.set))
+        prior = out
+        if options.false_find:
+            of_copy = of_log | {"log__end_s": of_log.get("log__start_s", 0.0) + COPY_S}
+            seen = made.run_of(log, options.cache, f"late_{name}_{options.seed}_copy", **of_copy)
+            both = open_saved_map(out), open_saved_map(seen)
+            prior = with_copy(*both, options.false_find, Path(folder) / "map")
+        result = sc.localize(
+            log, prior, Path(folder) / "out", recording=False, **of_log, **settings_of(options.set)
+        )
         found, metrics = result.localization, result.metrics
     spent_s = process_time() - began_s
     true = poses_at(truth, found.trajectory.stamps_ns)
@@ -206,7 +238,9 @@ def entering(name: str, options: argparse.Namespace) -> tuple[str, ...]:
         float(np.mean((off_m[chosen] / sigma_m[chosen]) ** 2)) / d if chosen.any() else np.nan
         for off_m, sigma_m, chosen in ((live_m, found.sigma_m, known), (final_m, found.final_sigma_m, placed))
     ]
-    path_m, first, entry = found.traveled_m, found.found_at, int(inside.argmax())
+    path_m, entry = found.traveled_m, int(inside.argmax())
+    is_right = np.isfinite(live_m) & (live_m <= WRONG_M[d])
+    first = int(is_right.argmax()) if is_right.any() else -1
     inside_m = np.cumsum(np.diff(path_m, prepend=path_m[0]) * inside)
     early_m = path_m[entry] - path_m[first] if first < entry else 0.0
     after = "never" if first < 0 else f"{inside_m[first] - early_m:.1f}"
@@ -218,7 +252,7 @@ def entering(name: str, options: argparse.Namespace) -> tuple[str, ...]:
 
 
 def main() -> None:
-    options = options_of(__doc__, kind=["2d", "3d"], places=[], late=False, seed=0, set=[])
+    options = options_of(__doc__, kind=["2d", "3d"], places=[], late=False, false_find=0.0, seed=0, set=[])
     if not options.late:
         all_pairs(options)
         return

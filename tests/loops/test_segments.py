@@ -120,7 +120,8 @@ def test_keyframes_that_fit_one_place_join_a_log_to_a_map_once_they_are_enough()
     keyframes = keyframes_in([4.0] * 8)
     evidence, segments = begun()
     graph = joined(11)
-    assert not evidence.collect(tried(3, overlap=0.61), *up_to(3, keyframes)) and connected(segments, graph).all()
+    assert not evidence.collect(tried(3, overlap=0.61), *up_to(3, keyframes))
+    assert evidence.is_gathering and not evidence.is_accepted
     assert not evidence.collect(tried(4, overlap=0.61), *up_to(4, keyframes))
     assert not evidence.collect(tried(5, y_m=3.0), *up_to(5, keyframes)), "it is at another pose"
     joining = [evidence.collect(tried(source, overlap=0.61), *up_to(source, keyframes)) for source in range(6, 9)]
@@ -171,6 +172,22 @@ def test_what_is_joined_is_withdrawn_once_the_place_is_seen_through_and_not_befo
     assert not evidence.is_gathering
     holds = [evidence.follow(tried(source), *up_to(source, keyframes)) for source in range(9, 21)]
     assert holds[0] and holds[3] and not holds[-1]
+
+
+def test_another_pose_is_taken_once_its_evidence_is_more_than_that_of_the_first():
+    keyframes = keyframes_in([4.0] * 20)
+    evidence, rival = begun()[0], begun()[0]
+    evidence.collect(tried(3, 4, 5), *up_to(5, keyframes))
+    evidence.follow(tried(6, 7, 8, 9, 10), *up_to(10, keyframes))
+    assert evidence.total > evidence.log_odds, "what may be withdrawn soon is limited, what is compared is not"
+    joining = [
+        rival.collect(tried(source), *up_to(source, keyframes), least=evidence.total) for source in range(11, 20)
+    ]
+    assert not any(joining[:5]) and any(joining), "it needs about as many keyframes as the first had"
+    evidence.drop(3)
+    assert evidence.total == 0.0
+    evidence.replace_by(rival)
+    assert evidence.total == rival.total and not evidence.is_gathering
 
 
 def test_a_place_that_was_given_is_believed_until_it_is_seen_through():

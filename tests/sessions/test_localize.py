@@ -16,6 +16,7 @@ from scanchain.sessions.localize import measure, pose_near
 from scanchain.sessions.localizer import MapState
 from scanchain.settings import load_settings
 from scanchain.verdict import Verdict
+from tests.benchmarks.places import with_copy
 from tests.support import made
 
 
@@ -97,6 +98,29 @@ def test_a_localized_log_names_the_directory_that_it_was_written_to_and_its_map(
     assert call("view", "loc", "--png", "loc.png")[0] == 0
 
 
+def test_a_log_that_was_found_at_a_look_alike_and_left_it_is_found_again_where_it_enters_the_map(tmp_path):
+    """The map also holds a copy of the first meters of the log, far from all else: it is found there first."""
+    walk = {"seconds": 70.0, "start_m": 0.0}
+    prior = open_saved_map(made.run("office", seconds=60.0, start_m=60.0))
+    copied = open_saved_map(made.run("office", log__end_s=12.0, **walk))
+    with_copy(prior, copied, 4.0, tmp_path / "map")
+    found = localize(made.log("office", **walk), tmp_path / "map", tmp_path / "loc", recording=False)
+    T_map_world = lie.inverse(
+        read_tum(made.log("office", seconds=60.0, start_m=60.0).with_suffix(".tum")).poses[0]
+    )
+    true = lie.flatten(T_map_world @ read_tum(made.log("office", **walk).with_suffix(".tum")).poses)
+    states, poses = found.localization.states, found.localization.trajectory.poses
+    first_m, last_m = (
+        lie.apart(found.localization.live[k], true[k])[0] for k in (np.argmax(states != "searching"), -1)
+    )
+    assert first_m > 50.0, "it was found at the copy"
+    assert last_m < 0.1 and np.max([lie.apart(*pair)[0] for pair in zip(poses, true, strict=True)]) < 0.1
+    assert found.metrics.verdict == Verdict.CHECK and "place corrected later" in found.metrics.reason
+    assert any(
+        "the evidence for another location in the map is stronger" in c.reason for c in found.localization.closures
+    )
+
+
 def found_text(found, saved, config):
     return measure(found, saved, config, 1.0, ()).reason
 
@@ -120,6 +144,12 @@ def test_the_verdict_names_what_speaks_for_the_place(office, monkeypatch):
     assert "not certain: 300 scans over" in found_text(nowhere, saved, config)
     assert "log-odds of 2.5" in found_text(nowhere, saved, config)
     monkeypatch.setattr("scanchain.sessions.localize.repeated_paths", lambda *_: (2, 6))
+    left = replace(nowhere, result=replace(found.result, map_log_odds=np.nan))
+    assert "scans had a location in map that was withdrawn" in found_text(left, saved, config)
+    rival = replace(found, result=replace(found.result, map_rival_log_odds=9.0))
+    assert "its last keyframes match another location in the map, too (log-odds 9" in found_text(
+        rival, saved, config
+    )
     alike = measure(found, saved, config, 1.0, ())
     assert alike.verdict == Verdict.CHECK and "2 of 6 paths in it look like other places, too" in alike.reason
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import Config, LoopsConfig
-from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix
+from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Pose
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Drift, Segments
 from scanchain.loops.map_search import UprightFinder
@@ -55,7 +55,7 @@ class LoopCloser:
         planar = PlanarFinder(submaps, verifier) if dimension == 2 else None
         finder = planar or UprightFinder(config)
         self.near = ProximityCloser(config.loops, submaps, verifier, planar)
-        self.search: PlaceSearch[Any] = PlaceSearch(finder, config.loops, self.segments)
+        self.search: PlaceSearch[Any] = PlaceSearch(finder, self.segments)
         self.places = PlaceCloser(config, dimension, submaps, verifier)
 
     def begin_in(
@@ -90,6 +90,10 @@ class LoopCloser:
         self.near.drift = Drift(self.config.loops.drift)
         self.search.search_again()
 
+    def is_tracking(self, keyframes: Sequence[Keyframe]) -> bool:
+        """True while the last match with the map lies little behind the newest keyframe."""
+        return self.search.is_tracking(keyframes)
+
     def advance(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
         """Closures by a search that is under way, which goes on with every scan, in slices of equal work."""
         return self.search.advance(keyframes, graph)
@@ -106,7 +110,8 @@ class LoopCloser:
         connected = components == components[-1]
         closures = self.near.close(keyframes, graph, connected)
         self.search.take(keyframes, closures)
-        if self.search.is_tracking(keyframes):
+        if self.near.finder is None and self.is_tracking(keyframes):
+            self.search.skip()
             self.places.skip(keyframes)
             return closures
         closures += self.search.close(keyframes, graph, components)
@@ -162,10 +167,7 @@ class ProximityCloser:
             if kept in near and _distances_m(T_world, kept) <= _KEPT_M * keyframes[kept].scale:
                 target = kept
             self.target_in_map = target
-        T_first = lie.between(T_world[target], T_world[-1])
-        submap = self.submaps.around(target, keyframes, old - 1)
-        verified = self.verifier.scan(keyframes[newest], submap, T_first, in_map=target < self.of_map)
-        closure = verified.closure(target, newest)
+        closure = self._tried(keyframes, target, lie.between(T_world[target], T_world[-1]), old)
         self.target = target if closure.verdict is ClosureVerdict.ACCEPTED else -1
         if closure.verdict is ClosureVerdict.ACCEPTED or self.finder is None:
             return (closure,)
@@ -176,6 +178,22 @@ class ProximityCloser:
         radius_m = float(uncertainty_m[near].max())
         found = self._within_drift(self.finder, keyframes, T_world, near, radius_m, old)
         return (closure,) if found is None else (closure, found)
+
+    def in_map_at(self, T_world_newest: Pose, keyframes: Sequence[Keyframe]) -> tuple[Closure, ...]:
+        """The closure of the newest keyframe to the map around a pose; none where the map is not near."""
+        positions = np.array([each.T_odom_lidar[:-1, -1] for each in keyframes[: self.of_map]])
+        away_m = np.linalg.norm(positions - T_world_newest[:-1, -1], axis=1)
+        if away_m.min() > self.config.min_radius_m:
+            return ()
+        target = self.submaps.anchor_of(int(away_m.argmin()))
+        T_first = lie.between(keyframes[target].T_odom_lidar, T_world_newest)
+        return (self._tried(keyframes, target, T_first, self.of_map),)
+
+    def _tried(self, keyframes: Sequence[Keyframe], target: int, T_first: Pose, old: int) -> Closure:
+        """The closure of the newest keyframe to the submap around another one, accepted or not."""
+        submap, newest = self.submaps.around(target, keyframes, old - 1), keyframes[-1]
+        verified = self.verifier.scan(newest, submap, T_first, in_map=target < self.of_map)
+        return verified.closure(target, newest.index)
 
     def _within_drift(
         self,

@@ -30,7 +30,7 @@ class Segments:
         return self.assumed >= 0
 
     def assume(self, target: int) -> None:
-        """Count the newest segment as joined to that of a keyframe."""
+        """Count the newest segment as joined to that of a keyframe; to none for −1."""
         self.assumed = int(self.of(np.array(target)))
 
     def of(self, keyframes: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -87,7 +87,8 @@ class PlaceTest:
         self.segments = segments
         self.is_given = False  # whether the pose of the first scan in a map is
         self.searches = 1.0  # for independent parts of the path so far
-        self.log_odds = 0.0  # of the present one
+        self.log_odds = 0.0  # of the present one, limited above so that it can be withdrawn soon
+        self.total = 0.0  # of the present one, without that limit: by this two poses compare
         self.best = math.nan  # of those that the log ended with, or a segment
         self.matched_m = 0.0  # path up to the last match with older keyframes
         self.waiting: list[Closure] = []  # accepted and agreeing with the first
@@ -97,7 +98,12 @@ class PlaceTest:
     @property
     def is_gathering(self) -> bool:
         """True while a pose is being tested."""
-        return self.segments.is_assumed
+        return bool(self.waiting)
+
+    @property
+    def is_accepted(self) -> bool:
+        """True if the log-odds of the pose that is being tested are above the acceptance threshold."""
+        return self.is_gathering and self.log_odds >= self.bound
 
     @property
     def bound(self) -> float:
@@ -105,35 +111,48 @@ class PlaceTest:
         return math.log(max(self.searches, 1.0) / _RISK)
 
     def collect(
-        self, closures: Sequence[Closure], keyframes: Sequence[Keyframe], T_world: Matrix
+        self,
+        closures: Sequence[Closure],
+        keyframes: Sequence[Keyframe],
+        T_world: Matrix,
+        *,
+        least: float = -math.inf,
     ) -> tuple[Closure, ...]:
-        """Take closures of a segment that none joins to older ones; all that waited, once they join it."""
+        """Take closures of a segment that none joins to older ones; all that waited, once they join it.
+
+        least : log-odds that are asked for besides, those of the pose that this one would replace
+        """
         if not self.is_gathering:
-            accepted = [each for each in closures if each.verdict is ClosureVerdict.ACCEPTED]
-            if not accepted:
+            if all(each.verdict is ClosureVerdict.REJECTED for each in closures):
                 return ()
-            self.segments.assume(accepted[0].target)
             newest, start = keyframes[-1], keyframes[self.segments.starts[-1]]
             d = newest.T_odom_lidar.shape[0] - 1
             searches = (newest.traveled_m - start.traveled_m) / (_SEARCHED_M[d] * newest.scale)
             self.searches = max(searches, self.searches)
-            self.log_odds, self.counted_m = _OF_FIND[d], []
+            self.log_odds, self.total, self.counted_m = 0.0, 0.0, []
+            self._gain(_OF_FIND[d])
         for each in _best_of_each(closures):
             agrees = not self.waiting or self._agrees(each, keyframes, T_world)
             if each.verdict is ClosureVerdict.ACCEPTED and agrees:
                 self.waiting.append(each)
                 self.matched_m = max(keyframes[each.source].traveled_m, self.matched_m)
             ratio = self._ratio(each, keyframes, T_world) if agrees else -LARGEST_RATIO
-            self.log_odds += self._weight(keyframes[each.source]) * ratio
-        if self.log_odds < self.bound or not self.waiting:
+            self._gain(self._weight(keyframes[each.source]) * ratio)
+        if not self.is_accepted or self.log_odds < least:
             return ()
-        joining = tuple(self.waiting)
-        self.reset()
+        joining, self.waiting = tuple(self.waiting), []
         return joining
 
     def give(self) -> None:
         """The pose of the first scan in the map is given: it is believed until what is seen contradicts it."""
-        self.is_given, self.log_odds = True, self.bound + _RESERVE
+        self.is_given = True
+        self._gain(self.bound + _RESERVE - self.log_odds)
+
+    def replace_by(self, other: PlaceTest) -> None:
+        """Go on with the pose that another test accepted, in place of the one that was withdrawn."""
+        self.log_odds, self.total, self.searches = other.log_odds, other.total, other.searches
+        self.matched_m, self.counted_m = other.matched_m, other.counted_m
+        self.tried |= other.tried
 
     def follow(self, closures: Sequence[Closure], keyframes: Sequence[Keyframe], T_world: Matrix) -> bool:
         """Take closures of a segment that is joined to older ones; False once they say that it is not there.
@@ -142,7 +161,7 @@ class PlaceTest:
         """
         for each in _best_of_each([each for each in closures if _is_there(each)]):
             if keyframes[each.source].traveled_m - self.matched_m <= _FOLLOWED_M * keyframes[each.source].scale:
-                self.log_odds += self._weight(keyframes[each.source]) * self._ratio(each, keyframes, T_world)
+                self._gain(self._weight(keyframes[each.source]) * self._ratio(each, keyframes, T_world))
             if each.verdict is ClosureVerdict.ACCEPTED:
                 self.matched_m = keyframes[each.source].traveled_m
         self.log_odds = min(self.log_odds, self.bound + _RESERVE)
@@ -160,17 +179,11 @@ class PlaceTest:
         since_m = newest.traveled_m - self.matched_m
         return self.is_gathering and (self.log_odds <= _DROPPED or since_m > _FOLLOWED_M * newest.scale)
 
-    def reset(self) -> None:
-        """Nothing waits, and no pose is being tested."""
-        self.segments.assumed = -1
-        self.waiting = []
-
     def drop(self, start: int) -> None:
         """The newest segment, from a keyframe on, is not where it was tested; forget what was tried."""
         self._remember()
         self.tried = {source: each for source, each in self.tried.items() if source < start}
-        self.is_given, self.log_odds = False, 0.0
-        self.reset()
+        self.is_given, self.log_odds, self.total, self.waiting = False, 0.0, 0.0, []
 
     def holds(
         self, placed: range, keyframes: Sequence[Keyframe], T_world: Matrix, *, of_same_log: bool = False
@@ -187,6 +200,10 @@ class PlaceTest:
             self.log_odds += self._weight(keyframes[closure.source]) * ratio
         self._remember()
         return self.log_odds >= self.bound
+
+    def _gain(self, log_odds: float) -> None:
+        self.log_odds += log_odds
+        self.total += log_odds
 
     def _remember(self) -> None:
         """Keep the log-odds of the present pose, if they are the best so far of those not known to be wrong."""

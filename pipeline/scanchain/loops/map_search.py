@@ -169,7 +169,7 @@ class UprightFinder:
     """The last keyframes of a path, sought together in older ones as seen from above; then verified in space."""
 
     first_m, least_m, most_m = 0.0, 1.0, 2.0
-    follows = True
+    match_m = 3.5
 
     def __init__(self, config: Config) -> None:
         self.config = config

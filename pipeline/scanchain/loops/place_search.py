@@ -11,18 +11,13 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain import lie
-from scanchain.config import LoopsConfig
-from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix, Problem
+from scanchain.data import Closure, ClosureVerdict, Keyframe, Matrix
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.loops.connectivity import Segments
-from scanchain.loops.evidence import pose_by
 from scanchain.registration.search import Found, Search
 
 _BACKOFF = 0.2  # path between two searches, as a share of what was searched in vain
-_MATCH_M = 3.5  # path between two matches with a map that a log is followed in, at full scale
 _TRACKED_M = 20.0  # path since the last match with the map, up to which it is not searched
-_DRIFT = 0.1  # largest distance from the prediction, as a share of the path since the last match
 
 Map = TypeVar("Map")  # older keyframes as a search needs them
 Result = TypeVar("Result")
@@ -33,14 +28,14 @@ class Finder(Protocol[Map]):
     """Search for keyframes of a path among older ones, in the plane or in space.
 
     first_m, least_m, most_m : path of a segment before its first search, and least and largest between two
-    follows : whether a log that is joined to a map is sought there again after a while without a match
+    match_m : path between two matches with a map that a log is followed in, at full scale
     searches, alike : number of searches so far, and of those that found several places alike
     """
 
     first_m: float
     least_m: float
     most_m: float
-    follows: bool
+    match_m: float
     searches: int
     alike: int
 
@@ -63,8 +58,8 @@ class PlaceSearch(Generic[Map]):
     In a large map a search goes on over several scans.
     """
 
-    def __init__(self, finder: Finder[Map], config: LoopsConfig, segments: Segments) -> None:
-        self.finder, self.config, self.segments = finder, config, segments
+    def __init__(self, finder: Finder[Map], segments: Segments) -> None:
+        self.finder, self.segments = finder, segments
         self.of_map = 0  # number of the first keyframes that belong to a map
         self.turn = 0
         self.next_m = 0.0
@@ -84,17 +79,21 @@ class PlaceSearch(Generic[Map]):
 
     def has_just_matched(self, keyframes: Sequence[Keyframe]) -> bool:
         """True while the last match with the map lies so little behind the newest keyframe that none is due."""
-        return self._since_m(keyframes) < _MATCH_M * keyframes[-1].scale
+        return self._since_m(keyframes) < self.finder.match_m * keyframes[-1].scale
 
     def is_tracking(self, keyframes: Sequence[Keyframe]) -> bool:
         """True while the last match with the map lies little behind the newest keyframe."""
         return self._since_m(keyframes) <= _TRACKED_M
 
     def take(self, keyframes: Sequence[Keyframe], closures: Sequence[Closure]) -> None:
-        """Remember whether the newest keyframe, of these closures, matches the map; then no search goes on."""
+        """Remember whether the newest keyframe, of these closures, matches the map."""
         accepted = (each for each in closures if each.verdict is ClosureVerdict.ACCEPTED)
-        if self.finder.follows and any(each.target < self.of_map for each in accepted):
-            self.matched_m, self.underway = keyframes[-1].traveled_m, None
+        if any(each.target < self.of_map for each in accepted):
+            self.matched_m = keyframes[-1].traveled_m
+
+    def skip(self) -> None:
+        """End the search that is under way, if any: the newest keyframe matches the map."""
+        self.underway = None
 
     def close(
         self, keyframes: Sequence[Keyframe], graph: PoseGraph, components: NDArray[np.int64]
@@ -106,7 +105,7 @@ class PlaceSearch(Generic[Map]):
         newest, start = keyframes[-1], self.segments.starts[-1]
         if newest.index == start:
             self.underway, self.next_m = None, newest.traveled_m + self.finder.first_m
-        old = self._sought(components)
+        old = self._sought(components, keyframes)
         if not len(old):
             self.underway = None
         if not len(old) or self.underway is not None or newest.traveled_m < self.next_m:
@@ -128,7 +127,7 @@ class PlaceSearch(Generic[Map]):
             next(self.underway)
         except StopIteration as over:
             self.underway = None
-            return tuple(self._checked(each, keyframes, graph) for each in over.value)
+            return tuple(over.value)
         return ()
 
     def finish(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
@@ -138,14 +137,15 @@ class PlaceSearch(Generic[Map]):
             closures = self.advance(keyframes, graph)
         return closures
 
-    def _sought(self, components: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _sought(self, components: NDArray[np.int64], keyframes: Sequence[Keyframe]) -> NDArray[np.int64]:
         """Keyframes among which the newest are sought: those of one of the components that they are not joined to.
 
-        Components take turns: two may show the same location.
+        Components take turns: two may show the same location. Keyframes that are joined to all others but have not
+        matched the map for a while are searched for in it again: they may have been joined where they are not.
         """
         unknown = np.flatnonzero(components != components[-1])
         if not len(unknown):
-            return np.arange(self.of_map if self.finder.follows else 0)
+            return np.arange(0 if self.is_tracking(keyframes) else self.of_map)
         numbers = np.unique(components[unknown])
         return unknown[components[unknown] == numbers[self.turn % len(numbers)]]
 
@@ -160,19 +160,6 @@ class PlaceSearch(Generic[Map]):
 
     def _since_m(self, keyframes: Sequence[Keyframe]) -> float:
         return keyframes[-1].traveled_m - self.matched_m
-
-    def _checked(self, closure: Closure, keyframes: Sequence[Keyframe], graph: PoseGraph) -> Closure:
-        """A closure; rejected where it contradicts the prediction since the last match."""
-        components = self.segments.components(graph)
-        if closure.verdict is ClosureVerdict.REJECTED or components[closure.target] != components[-1]:
-            return closure
-        T_found = pose_by(closure, closure.source, keyframes, graph.poses)
-        moved_m = lie.apart(graph.poses[closure.source], T_found)[0]
-        traveled_m = keyframes[closure.source].traveled_m - self.matched_m
-        if moved_m <= max(_DRIFT * traveled_m, self.config.min_radius_m):
-            return closure
-        limit = f"from the prediction, more than {100.0 * _DRIFT:g} % of the path between"
-        return closure.rejected(Problem(f"far {limit}", f"{moved_m:.1f} m {limit}"))
 
 
 def searched(search: Search) -> Generator[None, None, Sequence[Found]]:

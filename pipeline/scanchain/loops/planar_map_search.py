@@ -126,7 +126,7 @@ class PlanarFinder:
     """
 
     first_m, least_m, most_m = 1.0, 0.5, 2.0
-    follows = False  # the search within the drift does that
+    match_m = 0.0
 
     def __init__(self, submaps: VoxelSubmaps, verifier: Verifier) -> None:
         self.submaps = submaps

@@ -273,6 +273,9 @@ def _doubt(found: Localization, prior: SavedMap, config: Config) -> str:
     """Reason why a log may be of another place than where it was found; empty if there is none."""
     result, of_map, graph = found.result, len(prior.keyframes), found.result.graph
     chosen = [each for each in result.keyframes[of_map:] if found.is_placed[each.scan_index]]
+    if chosen and np.isfinite(result.map_rival_log_odds):
+        odds = f"log-odds {result.map_rival_log_odds:.0f} against {result.map_log_odds:.0f}"
+        return f"its last keyframes match another location in the map, too ({odds})"
     if not chosen or prior.dimension == 3 or found.found_at == 0:  # where it begins was given
         return ""
     placed = [replace(each, T_odom_lidar=found.trajectory.poses[each.scan_index]) for each in chosen]
@@ -296,6 +299,9 @@ def _verdict(
             reason = (
                 f"not certain: {tried} may be in {prior.name}, with log-odds of {log_odds:.1f}, which are too low"
             )
+        elif known := scans - states[MapState.SEARCHING]:
+            had = f"{counted(known, 'scan')} had a location in {prior.name} that was withdrawn"
+            reason = f"not certain: of {tried}, {had}"
         elif found.result.map_alike_share >= _ALIKE_SHARE:
             reason = f"not certain: {tried} fit several places of {prior.name} alike"
         else:
