@@ -121,7 +121,10 @@ class Ending:
             return f"took more than --memory-limit ({limits.memory_mib / 1024.0:.3g} GiB)"
         if self.how == KilledFor.MEMORY.value:
             return "killed, as the system does when memory runs out"
-        how = signal.Signals(-self.code).name if self.code < 0 else f"exit code {self.code}"
+        how = f"exit code {self.code}"
+        if self.code < 0:  # of real-time signals only two have a name
+            known = -self.code in set(signal.Signals)
+            how = signal.Signals(-self.code).name if known else f"signal {-self.code}"
         last = " ".join(output.split())[-_LAST_CHARACTERS:]
         return f"ended by {how}" + (f": {last}" if last else "")
 

@@ -136,8 +136,8 @@ class Sink:
 def open_stream(name: str, dimension: int, recording_id: UUID, kind: str = "") -> rr.RecordingStream:
     """A stream that knows its recording's name and adds no timeline of its own; each ``kind`` has its layout.
 
-    rerun keeps two threads for each stream that was closed, until it is told to free those without an owner, as
-    ``rr.init`` does. That waits for streams that take nothing more, and lets go of a recording that the user began.
+    rerun keeps two threads for each stream that was closed until it is told to free those without an owner, as
+    ``rr.init`` does. That waits for streams that take nothing more, and ends a recording that the user began.
     """
     if not _open and rr.get_global_data_recording() is None:
         rr.bindings.flush_and_cleanup_orphaned_recordings()
