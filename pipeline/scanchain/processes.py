@@ -122,9 +122,8 @@ class Ending:
         if self.how == KilledFor.MEMORY.value:
             return "killed, as the system does when memory runs out"
         how = f"exit code {self.code}"
-        if self.code < 0:  # of real-time signals only two have a name
-            known = -self.code in set(signal.Signals)
-            how = signal.Signals(-self.code).name if known else f"signal {-self.code}"
+        if self.code < 0:  # most real-time signals have no name
+            how = next((each.name for each in signal.Signals if each == -self.code), f"signal {-self.code}")
         last = " ".join(output.split())[-_LAST_CHARACTERS:]
         return f"ended by {how}" + (f": {last}" if last else "")
 

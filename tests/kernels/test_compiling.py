@@ -198,11 +198,11 @@ def test_where_no_kernel_can_be_kept_it_is_compiled_with_one_line(tmp_path, kind
     if kind == "a file in its place":
         (tmp_path / "file").touch()
         before = nowhere
-        why = "no folder for them can be written to"
+        why = "Numba finds no folder that takes them"
     elif kind == "no home":
         before = f"{nowhere}import os, pwd\nfor each in ('HOME', 'XDG_CACHE_HOME'): os.environ.pop(each, None)\n"
         before += "def none(uid): raise KeyError(uid)\npwd.getpwuid = none\n"
-        why = "no folder for them can be written to"
+        why = "Numba finds no folder that takes them"
     else:
         before = "import resource, signal\nsignal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
         before += "resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))\n"

@@ -14,7 +14,7 @@ from typing import Any
 
 import numba
 from numba import config
-from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
+from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 _CRC_BYTES = 4
 
@@ -90,13 +90,6 @@ class _Cache(FunctionCache):
             _warn(f"{self.cache_path}: {error.strerror or error}")
 
 
-class _NoCache(NullCache):
-    """In the place of one where no folder takes any."""
-
-    def save_overload(self, sig: Any, cres: Any) -> None:
-        _warn("no folder for them can be written to")
-
-
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """``numba.njit`` of a kernel, whose machine code is kept for later processes; it divides as NumPy does.
 
@@ -109,8 +102,8 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         if not config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
             try:
                 kernel._cache = _Cache(function)
-            except RuntimeError:  # Numba finds no place
-                kernel._cache = _NoCache()
+            except RuntimeError:
+                _warn("Numba finds no folder that takes them")
         return kernel
 
     return compiled
