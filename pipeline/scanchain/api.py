@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
@@ -12,6 +14,7 @@ from scanchain import checks
 from scanchain import slam as core
 from scanchain.config import Config
 from scanchain.data import AnyPoints, Points, Pose, Step, brief
+from scanchain.errors import ScanchainError
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.logs import sources_of
 from scanchain.preprocess import downsample as first_per_voxel
@@ -37,6 +40,19 @@ if TYPE_CHECKING:
     from scanchain_viz.recording.recording import Recording
 
 Logs = str | Path | Sequence[str | Path]
+
+
+@contextmanager
+def _freeing() -> Iterator[None]:
+    """Errors that leave it retain no log, map or file of points, where the caller retains them."""
+    try:
+        yield
+    except (ScanchainError, KeyboardInterrupt) as error:
+        each: BaseException | None = error
+        while each is not None:
+            traceback.clear_frames(each.__traceback__)
+            each = each.__cause__ or each.__context__
+        raise
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +110,7 @@ class Slam(core.Slam):
         return SlamResult(**parts, config=self.config, steps=steps)
 
 
+@_freeing()
 def run(
     log: Logs,
     out: str | Path,
@@ -120,6 +137,7 @@ def run(
     return run_job(job, open_recorder, Progress(), write_report)
 
 
+@_freeing()
 def localize(
     log: Logs,
     prior: str | Path,
@@ -155,6 +173,7 @@ def _optional_path(value: object, name: str) -> Path | None:
     return None if value is None else checks.path(value, name)
 
 
+@_freeing()
 def merge(
     runs: Sequence[str | Path],
     out: str | Path,
@@ -186,6 +205,7 @@ def merge(
     return merge_maps(job, Progress(), present_merge, fixed=is_fixed, update=is_updated)
 
 
+@_freeing()
 def changes(
     earlier: str | Path,
     later: str | Path | None,
@@ -220,6 +240,7 @@ def changes(
     )
 
 
+@_freeing()
 def compare(
     log: Logs,
     out: str | Path,

@@ -6,6 +6,7 @@ import os
 import tempfile
 import threading
 import weakref
+import zlib
 from dataclasses import dataclass
 from io import FileIO
 from pathlib import Path
@@ -25,6 +26,7 @@ class PointStore:
     dimension : 2 or 3, of the points
     rows : points that are in it
     waiting : bytes of the last of them, which are not in the file yet
+    crc : CRC-32 of those that are
     """
 
     def __init__(self, dimension: int, path: Path | None = None) -> None:
@@ -32,6 +34,7 @@ class PointStore:
         self.dimension = dimension
         self.rows = 0
         self.waiting = bytearray()
+        self.crc = 0
         self._take(_nameless() if path is None else path.open("w+b", buffering=0))
 
     def add(self, points: NDArray[np.floating]) -> StoredPoints:
@@ -48,7 +51,9 @@ class PointStore:
         if self.waiting:
             self.file.seek(self.rows * self._row_bytes - len(self.waiting))
         while self.waiting:
-            del self.waiting[: self.file.write(self.waiting)]
+            written = self.waiting[: self.file.write(self.waiting)]
+            self.crc = zlib.crc32(written, self.crc)
+            del self.waiting[: len(written)]
 
     def read(self, first: int, count: int) -> NDArray[np.float32]:
         """(count, d) points from one row on, in any thread. Raises InputError where the file has lost them."""
@@ -66,10 +71,14 @@ class PointStore:
 
     def reopen(self, path: Path) -> None:
         """Reopen the file that another process wrote, truncated to the rows of this state."""
-        size = self.rows * self._row_bytes
-        if not path.is_file() or path.stat().st_size < size:
-            raise InputError(f"{path}: is missing or too short; run without --resume")
-        os.truncate(path, size)
+        size, crc = self.rows * self._row_bytes, 0
+        if path.is_file() and path.stat().st_size >= size:
+            os.truncate(path, size)
+            with path.open("rb") as file:
+                while part := file.read(_MOST_WAITING):
+                    crc = zlib.crc32(part, crc)
+        if not path.is_file() or path.stat().st_size != size or crc != self.crc:
+            raise InputError(f"{path}: is missing, too short or damaged; run without --resume")
         self._take(path.open("r+b", buffering=0))
 
     def close(self) -> None:

@@ -121,7 +121,9 @@ class Ending:
             return f"took more than --memory-limit ({limits.memory_mib / 1024.0:.3g} GiB)"
         if self.how == KilledFor.MEMORY.value:
             return "killed, as the system does when memory runs out"
-        how = signal.Signals(-self.code).name if self.code < 0 else f"exit code {self.code}"
+        how = f"exit code {self.code}"
+        if self.code < 0:  # most real-time signals have no name
+            how = next((each.name for each in signal.Signals if each == -self.code), f"signal {-self.code}")
         last = " ".join(output.split())[-_LAST_CHARACTERS:]
         return f"ended by {how}" + (f": {last}" if last else "")
 

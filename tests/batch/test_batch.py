@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from contextlib import redirect_stderr, redirect_stdout
+from pathlib import Path
 from urllib.parse import unquote
 
 import numpy as np
@@ -115,6 +116,36 @@ def test_of_4_logs_two_are_poison_and_2_have_results_and_a_second_call_runs_only
 
 
 @pytest.mark.usefixtures("in_this_process")
+@pytest.mark.parametrize(
+    ("code", "left", "reason"),
+    [
+        (0, {}, "ended by exit code 0: bye"),
+        (0, {"run.json": "", "metrics.json": ""}, "ended by exit code 0: bye"),
+        (0, {"run.json": "{}", "metrics.json": "{}"}, "ended by exit code 0: bye"),
+        (0, {"metrics.json": "[1, 2"}, "ended by exit code 0: bye"),
+        (-15, {}, "ended by SIGTERM: bye"),
+        (-40, {}, "ended by signal 40: bye"),  # which has no name
+        (1, {"metrics.json": "{"}, "ended by exit code 1: bye"),
+    ],
+)
+def test_a_process_that_ends_without_a_result_is_a_row_that_says_so_and_the_batch_goes_on(
+    drawers, tmp_path, monkeypatch, code, left, reason
+):
+    def run_within(limits, module, words, environment, *, output, **_):
+        output.write_text("bye\n")
+        folder = Path(words[words.index("--out") + 1])
+        for name, text in left.items():
+            folder.mkdir(exist_ok=True)
+            (folder / name).write_text(text)
+        return Ending(code, KilledFor.NOTHING, 100.0, 1.0)
+
+    monkeypatch.setattr(task, "run_within", run_within)
+    out, logs = tmp_path / "out", [str(drawers / f"log_{k:02}.mcap") for k in range(2)]
+    assert main(["batch", *logs, "--out", str(out)]) == 1
+    rows = table(out)
+    assert [(row["state"], row["reason"], row["tries"]) for row in rows.values()] == [("crashed", reason, 2)] * 2
+
+
 def test_what_is_done_is_done_until_the_file_or_the_configuration_changes(drawers, tmp_path, capfd):
     log, out = tmp_path / "log.mcap", tmp_path / "out"
     log.write_bytes((drawers / "log_00.mcap").read_bytes())

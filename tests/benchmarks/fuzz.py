@@ -1,4 +1,4 @@
-"""Reads damaged logs and messages, as many as wanted of each kind, and prints and keeps what is read badly."""
+"""Reads damaged logs, messages, runs and checkpoints, as many as wanted; prints and keeps what is read badly."""
 
 import tempfile
 import time
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from tests.benchmarks.harness import options_of
-from tests.support import fuzzing, fuzzing_formats
+from tests.support import fuzzing, fuzzing_formats, fuzzing_runs
 
 
 def main():
@@ -44,7 +44,7 @@ def _messages(folder, rng, cases):
 
 KINDS = {
     "mcap": _files(fuzzing.seeds), "formats": _files(fuzzing_formats.seeds), "real": _files(fuzzing.real_seeds),
-    "messages": _messages,
+    "messages": _messages, "checkpoint": fuzzing_runs.checkpoint_complaints, "run": fuzzing_runs.run_complaints,
 }  # fmt: skip
 
 if __name__ == "__main__":

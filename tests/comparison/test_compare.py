@@ -3,6 +3,7 @@
 import csv
 import itertools
 import json
+import pickle
 import re
 import subprocess
 import sys
@@ -14,9 +15,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from scanchain.__main__ import main
+from scanchain.comparison import processes, worker
 from scanchain.comparison.compare import Compared, Comparison, compare
 from scanchain.comparison.methods import OURS, default_names, resolve
-from scanchain.comparison.processes import EndReport, Outcome, Status, run_all, store
+from scanchain.comparison.processes import EndReport, Outcome, Status, StoredScans, run_all, store
 from scanchain.comparison.results import method_folder
 from scanchain.comparison.table import COLUMNS, Row, Table, markdown, read_table, text
 from scanchain.data import Trajectory
@@ -274,6 +276,23 @@ def test_stored_scans_are_the_decoded_ones_bit_by_bit(log, tmp_path):
             np.testing.assert_array_equal(getattr(scan, name), getattr(again, name))
         assert again.points.dtype == np.float32 and again.points.flags.c_contiguous
     assert log.dimension == 2 or len(again.times_s) > 1000
+
+
+def test_what_lies_in_the_directory_of_a_comparison_executes_nothing(tmp_path):
+    class Touching:
+        def __reduce__(self):
+            return open, (str(tmp_path / "executed"), "w")
+
+    task, scans = tmp_path / processes.TASK_FILE, tmp_path / "scans"
+    for harm in (pickle.dumps(Touching()), pickle.dumps((Touching(), 1)), b"", b"\x00", bytes(100)):
+        task.write_bytes(harm)
+        with pytest.raises((msgspec.DecodeError, TypeError, ValueError)):
+            worker.run(tmp_path)
+        scans.write_bytes(len(harm).to_bytes(8, "little") + harm)
+        one = np.zeros(1, np.int64)
+        with pytest.raises((msgspec.DecodeError, TypeError, ValueError)):
+            list(StoredScans(scans, one, one, one, np.eye(3)[None], np.eye(3)).scans())
+    assert not (tmp_path / "executed").exists()
 
 
 def test_ours_is_our_odometry_to_the_last_bit(office, good):

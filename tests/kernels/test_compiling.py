@@ -2,6 +2,7 @@
 
 import json
 import os
+import pickle
 import re
 import shutil
 import subprocess
@@ -24,6 +25,7 @@ from scanchain.registration.plicp import settings_of
 from scanchain.runs.job import Job, Progress
 from scanchain.runs.run import run
 from scanchain.settings import load_settings
+from tests.support.scenes import ROOT
 
 
 def kernel(module="scanchain.kernels.voxels"):
@@ -130,6 +132,97 @@ def test_processes_that_compile_a_kernel_for_different_types_keep_all_of_it(tmp_
         told = [each.communicate(timeout=60)[0] for each in together]
         assert [each.returncode for each in together] == [0] * len(values)
         assert told == ["1\n" if first else "0\n"] * len(values)
+
+
+MISSES = """import numpy as np
+from kernel_of_a_test import double
+x = np.arange(3.0)
+assert np.array_equal(double(x), 2 * x) and double(3) == 6
+print(sum(double.stats.cache_misses.values()))
+"""
+
+
+def calling(folder, code=MISSES, cached=(), before="", **environment):
+    """A process that calls a kernel for two types; what it prints, and says on stderr."""
+    (folder / "kernel_of_a_test.py").write_text(
+        "from scanchain.kernels.compiling import njit\n@njit()\ndef double(x):\n    return 2 * x\n"
+    )
+    variables = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    variables |= {"PYTHONPATH": f"{folder}:{os.environ.get('PYTHONPATH', '')}", **environment}
+    words = [sys.executable, "-c", before + code]
+    done = subprocess.run(words, env=variables, capture_output=True, text=True, check=True)
+    return done.stdout.strip(), done.stderr
+
+
+def damages(data):
+    """What a power loss and others leave of a file."""
+    yield from (data[:length] for length in (0, 1, 2, 4, 5, len(data) // 3, len(data) - 4, len(data) - 1))
+    yield from (bytes(len(data)), bytes(4), data[:4096] + bytes(len(data) - 4096), b"\xff" * len(data))
+    page = len(data) // 2
+    yield data[:page] + bytes(16) + data[page + 16 :]
+    yield from (pickle.dumps(value) for value in (None, {}, (1, 2), "0.68.1", ("0.68.1", {})))
+
+
+def twice(x):
+    return 2 * x
+
+
+def test_damaged_files_of_the_cache_are_compiled_again_without_a_word_and_whole_ones_are_not(
+    tmp_path, monkeypatch, caplog
+):
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
+
+    def missed():
+        double = compiling.njit()(twice)
+        assert double(3) == 6 and double(3.5) == 7.0
+        return sum(double.stats.cache_misses.values())
+
+    assert (missed(), missed()) == (2, 0)
+    files = [path for path in tmp_path.rglob("*") if path.is_file() and path.stat().st_size]
+    for path in files:
+        whole = path.read_bytes()
+        for damaged in damages(whole):
+            path.write_bytes(damaged)
+            assert missed() in (1, 2), damaged[:9]
+            assert missed() == 0
+        path.unlink()
+        assert missed() in (1, 2)
+    assert {path for path in tmp_path.rglob("*") if path.is_file() and path.stat().st_size} == set(files)
+    assert not caplog.records
+
+
+@pytest.mark.parametrize("kind", ["a file in its place", "a full disk", "no home"])
+def test_where_no_kernel_can_be_kept_it_is_compiled_with_one_line(tmp_path, kind):
+    place, nowhere = {"XDG_CACHE_HOME": str(tmp_path / "file"), "NUMBA_CACHE_DIR": ""}, "import tempfile\n"
+    nowhere += "def none(**_): raise PermissionError\ntempfile.TemporaryFile = none\n"  # Numba's trial of a folder
+    if kind == "a file in its place":
+        (tmp_path / "file").touch()
+        before = nowhere
+        why = "Numba finds no folder that takes them"
+    elif kind == "no home":
+        before = f"{nowhere}import os, pwd\nfor each in ('HOME', 'XDG_CACHE_HOME'): os.environ.pop(each, None)\n"
+        before += "def none(uid): raise KeyError(uid)\npwd.getpwuid = none\n"
+        why = "Numba finds no folder that takes them"
+    else:
+        before = "import resource, signal\nsignal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        before += "resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))\n"
+        why = f"{tmp_path / 'file' / 'scanchain' / 'kernels'}"
+    printed, told = calling(tmp_path, before=before, **place)
+    assert printed == "2" and told.count("\n") == 1
+    assert told.startswith(f"compiled kernels are not kept, every process compiles them again: {why}")
+    assert told.endswith("; set NUMBA_CACHE_DIR to a folder\n")
+
+
+def test_a_cache_that_others_may_write_to_is_not_used(tmp_path):
+    place = {"XDG_CACHE_HOME": str(tmp_path / "cache")}
+    folder = Path(cache_of(ROOT / "pipeline", tmp_path / "cache"))
+    assert folder.stat().st_mode & 0o777 == 0o700
+    for mode in (0o770, 0o702, 0o777):
+        folder.chmod(mode)
+        assert cache_of(ROOT / "pipeline", tmp_path / "cache") == ""
+    folder.chmod(0o750)
+    assert cache_of(ROOT / "pipeline", tmp_path / "cache") == str(folder)
+    assert calling(tmp_path, **place)[0] == "2"
 
 
 def cache_of(package, cache, **environment):

@@ -1,5 +1,6 @@
 """A run may be killed at any moment: it goes on to the same result."""
 
+import hmac
 import json
 import os
 import pickle
@@ -16,8 +17,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from scanchain.errors import InputError
-from scanchain.files import write_whole
 from scanchain.logs import open_log
+from scanchain.runs import resume
 from scanchain.runs.directory import POINTS_FILE, RECORDING_FILE
 from scanchain.runs.resume import Checkpoints, read_checkpoint
 from scanchain.runs.step_table import StepTable
@@ -63,6 +64,10 @@ def after(code, *words, **options):
     before = "import os, signal, sys, time\nfrom scanchain.__main__ import main\n"
     whole = f"{before}{code}\nsys.exit(main(sys.argv[1:]))"
     return subprocess.Popen([sys.executable, "-c", whole, *words], cwd=ROOT, **options)
+
+
+def signed(body):
+    return body + hmac.digest(resume._key(), body, "sha256")
 
 
 def left_after(steps, log, out, *words):
@@ -251,13 +256,22 @@ def test_resuming_is_refused_where_something_else_was_run(office, call, tmp_path
     assert "scan 0 of the log is not the one that was run" in refusal(other)
     checkpoint = killing.partial(out) / "state.checkpoint"
     data = checkpoint.read_bytes()
-    older = data[:-4].replace(b"(code ", b"(c0de ", 1)
-    checkpoint.write_bytes(older + zlib.crc32(older).to_bytes(4, "little"))
+    checkpoint.write_bytes(signed(data[:-32].replace(b"(code ", b"(c0de ", 1)))
     assert "state.checkpoint: was made by scanchain" in refusal(office)
-    damaged = bytearray(data)
-    damaged[len(data) // 2] ^= 1
-    checkpoint.write_bytes(damaged)
-    assert "is not whole" in refusal(office)
+    for cut in (0, 1, 31, 32, len(data) // 2, len(data) - 1):
+        checkpoint.write_bytes(data[:cut])
+        assert "is damaged, or of another user" in refusal(office)
+    for at in (0, len(data) // 2, len(data) - 1):
+        damaged = bytearray(data)
+        damaged[at] ^= 1
+        checkpoint.write_bytes(damaged)
+        assert "is damaged, or of another user" in refusal(office)
+    checkpoint.write_bytes(data)
+    points = checkpoint.with_name(POINTS_FILE)
+    changed = bytearray(points.read_bytes())
+    changed[0] ^= 1
+    points.write_bytes(changed)
+    assert "points.store: is missing, too short or damaged" in refusal(office)
 
 
 @pytest.mark.parametrize(("limit_kib", "words"), [(64, LIVELY), (400, RECORDED)])
@@ -277,23 +291,80 @@ def test_a_full_disk_is_an_error_and_what_is_on_it_is_whole(office, tmp_path, li
     assert not list(folder.glob("*.new"))
 
 
-def test_a_checkpoint_makes_only_objects_of_slam(tmp_path):
-    class Popen:
-        def __reduce__(self):
-            return subprocess.Popen, (["touch", str(tmp_path / "executed")],)
+class Called:
+    """Pickled, a call of any method of anything by a function of NumPy, which once was admitted."""
 
+    def __init__(self, *parts):
+        self.parts = parts
+
+    def __reduce__(self):
+        return np._core.fromnumeric._wrapfunc, self.parts
+
+
+def attack(path):
+    """A pickle that makes a file when it is read."""
+    of_numpy = Called(np._core.fromnumeric._wrapfunc, "__getattribute__", "__globals__")
+    run = Called(Called(of_numpy, "get", "__builtins__"), "get", "exec")
+    return pickle.dumps(Called(run, "__call__", f"open({str(path)!r}, 'w').close()"))
+
+
+def test_a_checkpoint_of_somebody_else_is_refused_before_it_is_unpickled(office, call, tmp_path, monkeypatch):
+    out, executed = tmp_path / "run", tmp_path / "executed"
+    left = tmp_path / "run.partial-99999999"
+    left.mkdir()
+    (left / "run.json").write_text("{}")
+    pickle.loads(attack(executed))
+    assert executed.exists()
+    executed.unlink()
+    body = resume._version() + attack(executed)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "attacker"))
+    signatures = signed(body)[-32:], zlib.crc32(body).to_bytes(4, "little"), bytes(32), b""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "mine"))
+    for signature in signatures:
+        (left / "state.checkpoint").write_bytes(body + signature)
+        code, _, errors = call("run", office, "--out", out, "--resume")
+        assert code == 2 and errors.count("\n") == 1 and not executed.exists()
+        assert "is damaged, or of another user or machine: not signed with" in errors
+        assert "run without --resume" in errors
+    assert sorted(path.name for path in left.iterdir()) == ["run.json", "state.checkpoint"] and not out.exists()
+
+
+def test_the_key_of_checkpoints_is_the_same_for_all_processes_of_a_user_and_nobody_else_s(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "new" / "state"))
+    code = "import sys; from scanchain.runs.resume import _key; sys.stdout.write(_key().hex())"
+    together = [subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE) for _ in range(2)]
+    assert {child.communicate()[0].decode() for child in together} == {resume._key().hex()}
+    (file,) = (tmp_path / "new" / "state" / "scanchain").iterdir()
+    assert file.stat().st_mode & 0o777 == 0o600 and len(resume._key()) == 32
+    for damage in (lambda: file.chmod(0o644), lambda: file.write_bytes(b""), lambda: file.write_bytes(bytes(33))):
+        damage()
+        with pytest.raises(InputError, match=r"is not a key of this user alone .*; remove it"):
+            resume._key()
+        file.chmod(0o600)
+    file.unlink()
+    assert len(resume._key()) == 32
+
+
+def test_without_a_place_for_a_key_a_run_says_that_it_has_no_checkpoints(office, call, tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
+    words = ("run", office, "--out", tmp_path / "run", "--checkpoint", "0", "--rerun", "off")
+    code, output, errors = call(*words)
+    assert code == 0
+    (line,) = (line for line in (output + errors).splitlines() if "checkpoint" in line)
+    assert line.startswith("no checkpoints, so that --resume would start over: no key to sign them with: ")
+    assert line.endswith("; set XDG_STATE_HOME to a folder of yours")
+
+
+def test_a_state_that_cannot_be_pickled_leaves_the_checkpoint_before(tmp_path):
     slam = Slam(configured(2), dimension=2, points_file=tmp_path / POINTS_FILE)
-    for harm in (Popen(), os.system, write_whole):
-        slam.harm = harm
-        Checkpoints(tmp_path, 10.0).write(slam, StepTable())
-        with pytest.raises(InputError, match="which does not belong there"):
-            read_checkpoint(tmp_path, slam.config)
+    Checkpoints(tmp_path, 10.0).write(slam, StepTable())
     slam.harm = lambda: None
     before = (tmp_path / "state.checkpoint").read_bytes()
     with pytest.raises((AttributeError, pickle.PicklingError)):
         Checkpoints(tmp_path, 10.0).write(slam, StepTable())
     assert (tmp_path / "state.checkpoint").read_bytes() == before
-    assert not list(tmp_path.glob("*.new")) and not (tmp_path / "executed").exists()
+    assert not list(tmp_path.glob("*.new"))
 
 
 def test_a_checkpoint_that_names_code_or_another_configuration_is_not_resumed(office, tmp_path, monkeypatch):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
 from threading import Event
@@ -153,24 +154,25 @@ def _tried(task: Task, stop: Event | None) -> Row:
     state, reason = own or (State(ending.how), ending.reason(task.limits, text))
     run, sha256, metrics = "", "", None
     if state.has_result:
-        run, metrics = task.run.name, _metrics(task)
-        made = msgspec.json.decode((task.run / RUN_FILE).read_bytes(), type=Provenance)
-        sha256 = made.logs[0].sha256
+        run, (sha256, metrics) = task.run.name, _result(task)
     return Row(task.name, sha256, task.key, run, state, reason, 1, ending.duration_s, ending.peak_mib, metrics)
 
 
-def _metrics(task: Task) -> Metrics:
-    return msgspec.json.decode((task.run / METRICS_FILE).read_bytes(), type=Metrics)
+def _result(task: Task) -> tuple[str, Metrics]:
+    """Hash of the log and metrics of its run. Raises OSError or DecodeError where there is no result."""
+    made = msgspec.json.decode((task.run / RUN_FILE).read_bytes(), type=Provenance)
+    return made.logs[0].sha256, msgspec.json.decode((task.run / METRICS_FILE).read_bytes(), type=Metrics)
 
 
 def _own_ending(ending: Ending, task: Task, output: list[str]) -> tuple[State, str] | None:
-    """End state and reason by exit code and output; None of a process that crashed."""
-    if ending.code == 0:
-        return State.DONE, ""
+    """End state and reason by exit code, output and result; None of a process that crashed, or left no result."""
     error = next((line for line in reversed(output) if line.startswith("error: ")), "")
-    if ending.code == 1 and (task.run / METRICS_FILE).is_file():
-        metrics = _metrics(task)
-        if metrics.verdict is Verdict.NOT_TRUSTWORTHY and error.endswith(metrics.sentence):
+    with suppress(OSError, msgspec.DecodeError):
+        metrics = _result(task)[1]
+        if ending.code == 0:
+            return State.DONE, ""
+        is_doubted = metrics.verdict is Verdict.NOT_TRUSTWORTHY and error.endswith(metrics.sentence)
+        if ending.code == 1 and is_doubted:
             return State.NOT_TRUSTWORTHY, metrics.verdict_reason
     if ending.code in (1, 2) and error:
         return State.FAILED, error.removeprefix("error: ")

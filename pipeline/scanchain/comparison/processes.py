@@ -7,11 +7,11 @@ memory of a method would grow with the log. Straight after decoding the files li
 from __future__ import annotations
 
 import os
-import pickle
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -24,9 +24,11 @@ from scanchain.errors import counted
 from scanchain.processes import KilledFor, Limits, run_within
 from scanchain.runs.job import Progress
 
-TASK_FILE, TRACK_FILE, TRAJECTORY_FILE, REPORT_FILE = "task.pickle", "track.npy", "trajectory.npy", "end.json"
+TASK_FILE, TRACK_FILE, TRAJECTORY_FILE, REPORT_FILE = "task.msgpack", "track.npy", "trajectory.npy", "end.json"
 STEPS_FILE, CLOSURES_FILE = "steps.parquet", "loops.parquet"
 
+T = TypeVar("T")
+_SIZE_BYTES = 8  # of the size in front of a stored scan
 _INTERVAL_S = 0.02  # between two readings of a process's memory
 
 
@@ -64,8 +66,29 @@ class StoredScans:
     def scans(self) -> Iterator[Scan]:
         """The scans as they were decoded."""
         with self.file.open("rb") as file:
-            for _ in range(len(self)):
-                yield pickle.load(file)
+            while size := file.read(_SIZE_BYTES):
+                yield decode(file.read(int.from_bytes(size, "little")), Scan)
+
+
+def encode(value: object) -> bytes:
+    """MessagePack of records with arrays: in a directory where others may write, a pickle could run their code."""
+
+    def plain(value: Any) -> object:
+        return str(value) if isinstance(value, Path) else (value.dtype.str, value.shape, value.tobytes())
+
+    return msgspec.msgpack.encode(value, enc_hook=plain)
+
+
+def decode(data: bytes, kind: type[T]) -> T:
+    """The records again."""
+
+    def made(kind: type, value: Any) -> object:
+        if kind is Path:
+            return Path(value)
+        dtype, shape, content = value
+        return np.frombuffer(bytearray(content), dtype).reshape(shape)
+
+    return msgspec.msgpack.decode(data, type=kind, dec_hook=made)
 
 
 def store(scans: Iterable[Scan], T_base_lidar: Pose, path: Path) -> StoredScans:
@@ -75,7 +98,8 @@ def store(scans: Iterable[Scan], T_base_lidar: Pose, path: Path) -> StoredScans:
     unknown = np.full(T_base_lidar.shape, np.nan)
     with path.open("wb") as file:
         for scan in scans:
-            pickle.dump(scan, file, pickle.HIGHEST_PROTOCOL)
+            data = encode(scan)
+            file.write(len(data).to_bytes(_SIZE_BYTES, "little") + data)
             rows.append((len(scan.points), scan.stamp_ns, scan.log_time_ns))
             wheels.append(unknown if scan.T_odom_base is None else scan.T_odom_base)
     points, stamps_ns, log_times_ns = np.array(rows, np.int64).T.copy()
@@ -167,7 +191,7 @@ def run_all(
 def _run(method: Method, scans: StoredScans, folder: Path, limits: Limits) -> Outcome:
     """A run in a process of its own; its folder takes what it writes and prints."""
     folder.mkdir()
-    (folder / TASK_FILE).write_bytes(pickle.dumps((method, scans)))
+    (folder / TASK_FILE).write_bytes(encode((method, scans)))
     # small_gicp's threads spin by default: where somebody else has a core, they spin away the other thread's time
     environment = os.environ | {"OMP_WAIT_POLICY": os.environ.get("OMP_WAIT_POLICY", "PASSIVE")}
     output, own = folder / "output.txt", folder / REPORT_FILE

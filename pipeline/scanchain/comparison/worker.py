@@ -6,7 +6,6 @@ the directory of the comparison, which is removed where its process is killed.
 
 from __future__ import annotations
 
-import pickle
 import sys
 import traceback
 from collections.abc import Iterable
@@ -110,7 +109,8 @@ def main() -> None:
 
 def run(folder: Path) -> None:
     """Run the task of a folder and write the report."""
-    method, scans = pickle.loads((folder / processes.TASK_FILE).read_bytes())
+    task = (folder / processes.TASK_FILE).read_bytes()
+    method, scans = processes.decode(task, tuple[Method, StoredScans])
     compiled: list[str] = []
     with announcing_compilation(compiled.append) if method.is_ours else nullcontext():
         report = _report(scans, method, folder)

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
+import logging
 import os
+import pickle
+import zlib
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numba
 from numba import config
-from numba.core.caching import FunctionCache
+from numba.core.caching import FunctionCache, IndexDataCacheFile
+
+_CRC_BYTES = 4
 
 
 def _cache_by_source() -> None:
@@ -19,35 +24,70 @@ def _cache_by_source() -> None:
 
     Numba looks at the file of a kernel only, not at those of the kernels that it calls: after a change to one of
     them, by an editor or an upgrade, a cache beside the source would go on with what was compiled before. A folder
-    that is chosen by NUMBA_CACHE_DIR stays; where no folder can be made, Numba looks for a place as it is used to.
+    that is chosen by NUMBA_CACHE_DIR stays; where no folder can be made, or others may write to it (what is read
+    is executed), Numba looks for a place as it is used to.
     """
     if os.environ.get("NUMBA_CACHE_DIR"):
         return
     digest = hashlib.sha256()
     for file in sorted(Path(__file__).parent.rglob("*.py")):
         digest.update(file.read_bytes())
-    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    folder = root / "scanchain" / "kernels" / digest.hexdigest()[:16]
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
+        root = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
+        folder = root / "scanchain" / "kernels" / digest.hexdigest()[:16]
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        status = folder.stat()
+    except (OSError, RuntimeError):  # the latter of a user without a home
         return
-    if os.access(folder, os.W_OK):
+    if status.st_uid == os.geteuid() and not status.st_mode & 0o022 and os.access(folder, os.W_OK):
         config.CACHE_DIR = str(folder)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 _cache_by_source()
 
 
-class _SharedCache(FunctionCache):
-    """Saves one at a time: Numba reads an index, adds to it and writes it back."""
+@cache
+def _warn(why: str) -> None:
+    """Say once why kernels are not kept."""
+    told = "compiled kernels are not kept, every process compiles them again: %s; set NUMBA_CACHE_DIR to a folder"
+    logging.getLogger("scanchain").warning(told, why)
+
+
+class _CheckedFiles(IndexDataCacheFile):
+    """A file for each function and types, with a checksum; without Numba's index, which processes would share."""
+
+    def save(self, key: Any, data: Any) -> None:
+        content = self._dump(data)
+        with self._open_for_write(self._path_of(key)) as file:
+            file.write(content + zlib.crc32(content).to_bytes(_CRC_BYTES, "little"))
+
+    def load(self, key: Any) -> Any:
+        try:
+            data = Path(self._path_of(key)).read_bytes()
+        except OSError:
+            return None
+        crc = int.from_bytes(data[-_CRC_BYTES:], "little")
+        is_whole = len(data) > _CRC_BYTES and zlib.crc32(data[:-_CRC_BYTES]) == crc
+        return pickle.loads(data) if is_whole else None
+
+    def _path_of(self, key: Any) -> str:
+        known = hashlib.sha256(repr((self._version, self._source_stamp, key)).encode())
+        return self._data_path(self._data_name(int(known.hexdigest()[:16], 16)))
+
+
+class _Cache(FunctionCache):
+    """Keeps what is compiled where it can, and says once where it cannot."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        stamp = self._impl.locator.get_source_stamp()
+        self._cache_file = _CheckedFiles(self.cache_path, self._impl.filename_base, stamp)
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        folder = Path(self.cache_path)
-        folder.mkdir(parents=True, exist_ok=True)
-        with (folder / "lock").open("w") as lock:
-            fcntl.lockf(lock, fcntl.LOCK_EX)
+        try:
             super().save_overload(sig, data)
+        except OSError as error:
+            _warn(f"{self.cache_path}: {error.strerror or error}")
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -60,7 +100,10 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         chosen: dict[str, Any] = {"error_model": "numpy", "no_cfunc_wrapper": True} | options
         kernel: Any = numba.njit(**chosen)(function)
         if not config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
-            kernel._cache = _SharedCache(function)
+            try:
+                kernel._cache = _Cache(function)
+            except RuntimeError:
+                _warn("Numba finds no folder that takes them")
         return kernel
 
     return compiled

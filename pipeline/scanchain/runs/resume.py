@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import hmac
 import io
 import os
 import pickle
+import platform
+import secrets
 import shlex
 import traceback
 import zlib
 from collections.abc import Generator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -17,11 +21,12 @@ from time import perf_counter
 from typing import Any, BinaryIO
 
 import msgspec
+import numpy as np
 
 from scanchain.clock import working_s
 from scanchain.config import Config
 from scanchain.data import Scan
-from scanchain.errors import InputError, ScanchainError, counted, remedy_of
+from scanchain.errors import InputError, ScanchainError, counted, one_line, remedy_of
 from scanchain.files import without_keys, write_whole
 from scanchain.point_store import PointStore
 from scanchain.registration.matcher import CheckedMatcher, create_matcher
@@ -44,7 +49,7 @@ from scanchain.trajectory import write_tum
 _LEISURE = 20.0  # least time between two checkpoints over the time that one takes to write
 _REMEDY = "run without --resume"
 _NEEDED = (RUN_FILE, "config.toml", CHECKPOINT_FILE, POINTS_FILE)
-_CRC_BYTES = 4
+_KEY_BYTES = _SIGNATURE_BYTES = 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,37 +79,48 @@ class Checkpoints:
         self.every_s = every_s
         self.began_s = working_s() - (0.0 if left is None else left.run_s)
         self.next_s = perf_counter() + every_s
+        self.key, self.absent = b"", ""
+        try:
+            self.key = _key()
+        except InputError as error:
+            self.absent = f"no checkpoints, so that --resume would start over: {error.text}"
 
     def are_due(self) -> bool:
         """True when it is time for the next."""
-        return perf_counter() >= self.next_s
+        return bool(self.key) and perf_counter() >= self.next_s
 
     def write(self, slam: Slam, steps: StepTable, recorded_bytes: int = 0) -> None:
-        """Write one, whole or not at all: a line on the version, a pickle, the CRC-32 of both.
+        """Write one, whole or not at all: a line on the version, a pickle, the signature of both.
 
-        Raises OSError on a full disk; the last checkpoint stays.
+        Raises OSError on a full disk; the last checkpoint stays. Nothing is written where there is no key.
         """
+        if not self.key:
+            return
         started = perf_counter()
         slam.points.flush()
         file = io.BytesIO(self.version)
         file.seek(0, os.SEEK_END)
         _Pickler(file, slam.config).dump((working_s() - self.began_s, self.process, recorded_bytes, slam, steps))
-        file.write(zlib.crc32(file.getvalue()).to_bytes(_CRC_BYTES, "little"))
+        file.write(hmac.digest(self.key, file.getvalue(), "sha256"))
         write_whole(self.path, file.getvalue())
         now = perf_counter()
         self.next_s = now + max(self.every_s, _LEISURE * (now - started))
 
 
 def read_checkpoint(folder: Path, config: Config) -> Checkpoint:
-    """The last checkpoint of a run. Raises InputError for one that is damaged or that other code made.
+    """The last checkpoint of a run. Raises InputError for one that is damaged or that others or other code made.
+
+    Nothing is unpickled before its signature is checked, as a pickle may run any code.
 
     config : of the resuming user, with which it must have been made
     """
     path = folder / CHECKPOINT_FILE
     data = path.read_bytes()
-    body = memoryview(data)[:-_CRC_BYTES]
-    if zlib.crc32(body) != int.from_bytes(data[-_CRC_BYTES:], "little"):
-        raise InputError(f"{path}: is not whole; {_REMEDY}")
+    body, signature = data[:-_SIGNATURE_BYTES], data[-_SIGNATURE_BYTES:]
+    if not hmac.compare_digest(hmac.digest(_key(), body, "sha256"), signature):
+        raise InputError(
+            f"{path}: is damaged, or of another user or machine: not signed with {_key_file()}; {_REMEDY}"
+        )
     file = io.BytesIO(body)
     version = file.readline()
     if version != _version():
@@ -118,10 +134,41 @@ def read_checkpoint(folder: Path, config: Config) -> Checkpoint:
 
 @cache
 def _version() -> bytes:
-    """Version of the package and checksum of its code, as it began: other code would not give the same bits."""
+    """Versions, and checksum of the code, as it began: others would not give the same bits, or read the pickle."""
     package = Path(__file__).parents[1]
     code = b"".join(path.read_bytes() for path in sorted(package.rglob("*.py")))
-    return f"scanchain {package_version('scanchain')} (code {zlib.crc32(code):08x})\n".encode()
+    on = f"Python {platform.python_version()}, NumPy {np.__version__}"
+    return f"scanchain {package_version('scanchain')} (code {zlib.crc32(code):08x}, {on})\n".encode()
+
+
+def _key_file() -> Path:
+    state = os.environ.get("XDG_STATE_HOME") or Path("~/.local/state").expanduser()
+    return Path(state) / "scanchain" / "checkpoints.key"
+
+
+def _key() -> bytes:
+    """Key of this user, random bytes made at first use, with which checkpoints are signed (HMAC).
+
+    Raises InputError where there is none and none can be made, or where it is not this user's alone.
+    """
+    remedy = "set XDG_STATE_HOME to a folder of yours"
+    try:
+        path = _key_file()
+        if not path.exists():
+            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            new = path.with_name(f"{path.name}.{secrets.token_hex(8)}")
+            with open(os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+                file.write(secrets.token_bytes(_KEY_BYTES))
+            with suppress(FileExistsError):  # that of another process, which was faster
+                os.link(new, path)
+            new.unlink()
+        with path.open("rb") as file:
+            status, key = os.fstat(file.fileno()), file.read(_KEY_BYTES + 1)
+    except (OSError, RuntimeError) as error:  # the latter of a user without a home
+        raise InputError(f"no key to sign them with: {one_line(error)}; {remedy}") from error
+    if status.st_uid != os.geteuid() or status.st_mode & 0o077 or len(key) != _KEY_BYTES:
+        raise InputError(f"{path}: is not a key of this user alone ({_KEY_BYTES} bytes, mode 600); remove it")
+    return key
 
 
 class _Pickler(pickle.Pickler):
@@ -133,7 +180,7 @@ class _Pickler(pickle.Pickler):
 
     def persistent_id(self, value: Any) -> tuple[Any, ...] | None:
         if isinstance(value, PointStore):
-            return "points", value.dimension, value.rows
+            return "points", value.dimension, value.rows, value.crc
         if isinstance(value, CheckedMatcher):
             return ("matcher",)
         kind = type(value)
@@ -143,20 +190,12 @@ class _Pickler(pickle.Pickler):
 
 
 class _Unpickler(pickle.Unpickler):
-    """Makes objects of the classes that SLAM consists of, and nothing else."""
+    """Puts in again what was left out."""
 
     def __init__(self, file: BinaryIO, config: Config) -> None:
         super().__init__(file)
         self.config = config
         self.left_out: dict[tuple[Any, ...], Any] = {}
-
-    def find_class(self, module: str, name: str) -> Any:
-        if _is_of_slam(module):
-            found = super().find_class(module, name)
-            home = getattr(found, "__module__", "")
-            if _is_of_slam(home) and (isinstance(found, type) or home.startswith("numpy._core.")):
-                return found
-        raise InputError(f"the checkpoint names {module}.{name}, which does not belong there; {_REMEDY}")
 
     def persistent_load(self, pid: tuple[Any, ...]) -> Any:
         if pid not in self.left_out:
@@ -164,12 +203,8 @@ class _Unpickler(pickle.Unpickler):
             self.left_out[pid] = create_matcher(self.config.matching) if what == "matcher" else None
             if what == "points":
                 self.left_out[pid] = store = PointStore(size[0])
-                store.rows = size[1]  # of the file that it is to reopen
+                store.rows, store.crc = size[1:]  # of the file that it is to reopen
         return self.left_out[pid]
-
-
-def _is_of_slam(module: str) -> bool:
-    return module.split(".")[0] in ("scanchain", "numpy", "collections") or module.startswith("scipy.spatial.")
 
 
 def find_left(out: Path, config: Config) -> Checkpoint | None:
@@ -245,8 +280,6 @@ def rescued(
 ) -> BaseException:
     """The error to raise; the results so far are written, and the error names their directory."""
     is_bug = not isinstance(error, ScanchainError | KeyboardInterrupt | OSError)
-    if not len(steps) and not is_bug:
-        return error
     directory.worth_keeping()
     reason = "interrupted" if isinstance(error, KeyboardInterrupt) else str(error) or type(error).__name__
     if isinstance(error, OSError):

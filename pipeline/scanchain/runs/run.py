@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.config import NO_TRUTH, Config
 from scanchain.data import Scan, Trajectory, brief
-from scanchain.errors import InputError, counted
+from scanchain.errors import InputError, ScanchainError, counted
 from scanchain.evaluation import TruthFile, check_overlap, during, on_the_estimate, read_truth
 from scanchain.files import write_whole
 from scanchain.logs import Log, open_log
@@ -97,6 +97,8 @@ def run(
             metrics, text = this.judge(results, judged, recording.warnings, held_s)
             return this.complete(metrics, text, report)
         except (Exception, KeyboardInterrupt) as error:
+            if not len(this.steps) and isinstance(error, ScanchainError | KeyboardInterrupt | OSError):
+                raise
             raise rescued(error, this.directory, this.steps, this.provenance) from error
 
 
@@ -117,6 +119,8 @@ class _Run:
         self.directory = RunDirectory(job.out, force=job.force, left=left and left.folder)
         self.checkpoints = Checkpoints(self.directory.path, job.checkpoint_s, left)
         log = self.log
+        if self.checkpoints.absent:
+            progress.announce(self.checkpoints.absent)
         progress.say(f"{log.topic}: {log.dimension}D, {counted(log.scan_count, 'scan')}; {self.source}")
         for gap in log.gaps:
             progress.announce(f"warning: {gap}")

@@ -28,7 +28,7 @@ from scanchain_viz.colors import STRETCH_COLORS, rgb
 from scanchain_viz.recording import drawing, entities, viewer
 from scanchain_viz.recording.batching import WARNING, Batcher, events
 from scanchain_viz.recording.drawing import Message, Times
-from scanchain_viz.recording.sinks import Sink, file_sink, open_stream, viewer_sink
+from scanchain_viz.recording.sinks import Sink, file_sink, open_stream, send_layout, viewer_sink
 
 _LISTED = 50  # largest number of stretches in the text of a verdict
 _RADIUS = 3.5  # of a stretch, in points of the screen
@@ -79,7 +79,7 @@ class Recording:
         self._send(lambda: [*self.batcher.messages(), *self.batcher.graph.draw(self.batcher.now)])
         layout = entities.blueprint(self.dimension, self.batcher.box, int(self.batcher.now.scans[0]))
         for sink in self.opened:
-            sink.send(lambda stream: stream.send_blueprint(layout))
+            sink.send(partial(send_layout, blueprint=layout, is_active=True))
             sink.close()
         if self.server is not None:
             viewer.stop(self.server)

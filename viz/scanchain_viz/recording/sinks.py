@@ -14,7 +14,6 @@ import threading
 import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import KW_ONLY, dataclass
-from functools import partial
 from pathlib import Path
 from time import perf_counter
 from uuid import UUID, uuid4
@@ -34,6 +33,7 @@ _COPIED_CHUNKS = 64  # largest number of chunks in memory when a recording is co
 _LOOK_EVERY_S = 0.1
 _FILE_PATIENCE_S = 10.0
 _VIEWER_PATIENCE_S = 5.0
+_open: set[rr.RecordingStream] = set()  # those that were not closed in good order (yet)
 
 
 @dataclass(eq=False)
@@ -105,6 +105,7 @@ class Sink:
                 write(self.stream)
                 self._flush()
             self.stream.disconnect()
+            _open.discard(self.stream)
         except Exception as error:
             self._give_up(str(error))
 
@@ -133,12 +134,32 @@ class Sink:
 
 
 def open_stream(name: str, dimension: int, recording_id: UUID, kind: str = "") -> rr.RecordingStream:
-    """A stream that knows its recording's name and adds no timeline of its own; each ``kind`` has its layout."""
+    """A stream that knows its recording's name and adds no timeline of its own; each ``kind`` has its layout.
+
+    rerun keeps two threads for each stream that was closed until it is told to free those without an owner, as
+    ``rr.init`` does. That waits for streams that take nothing more, and ends a recording that the user began.
+    """
+    if not _open and rr.get_global_data_recording() is None:
+        rr.bindings.flush_and_cleanup_orphaned_recordings()
     application = " ".join(filter(None, ("scanchain", kind, f"{dimension}D")))
     stream = rr.RecordingStream(application, recording_id=recording_id)
+    _open.add(stream)
     stream.set_log_time_enabled(False)
     stream.send_recording_name(name)
     return stream
+
+
+def send_layout(stream: rr.RecordingStream, blueprint: rrb.Blueprint, *, is_active: bool) -> None:
+    """Send a layout by a stream that is closed; that of ``rr.send_blueprint`` stays open with its two threads."""
+    application = stream.get_application_id()
+    layout = rr.RecordingStream._from_native(
+        rr.bindings.new_blueprint(application, make_default=False, make_thread_default=False, default_enabled=True)
+    )
+    layout.set_time("blueprint", sequence=0)
+    blueprint.to_blueprint()._log_to_stream(layout)
+    storage = layout.memory_recording().storage
+    rr.bindings.send_blueprint(storage, is_active, True, recording=stream.to_native())
+    layout.disconnect()
 
 
 def file_sink(path: Path, stream: rr.RecordingStream, blueprint: rrb.Blueprint) -> Sink:
@@ -148,7 +169,8 @@ def file_sink(path: Path, stream: rr.RecordingStream, blueprint: rrb.Blueprint) 
     """
     unnamed = path.with_name(f"{path.name}.new")
     try:
-        stream.set_sinks(rr.FileSink(unnamed), default_blueprint=blueprint)
+        stream.set_sinks(rr.FileSink(unnamed))
+        send_layout(stream, blueprint, is_active=False)
         stream.flush(timeout_sec=_FILE_PATIENCE_S)
         unnamed.replace(path)
     except (RuntimeError, OSError) as error:
@@ -167,13 +189,20 @@ def write_recording(
     """
     stream = open_stream(name.partition(".partial-")[0], dimension, uuid4(), kind)
     memory = stream.memory_recording()
-    stream.send_blueprint(blueprint, make_active=False)
+    send_layout(stream, blueprint, is_active=False)
     for message in (UP, *messages):
         message.send(stream)
-    write_whole(path, memory.drain_as_bytes())
+    data = memory.drain_as_bytes()
+    stream.disconnect()
+    _open.discard(stream)
+    write_whole(path, data)
 
 
 def viewer_sink(address: str, stream: rr.RecordingStream, blueprint: rrb.Blueprint) -> Sink:
     """A viewer at ``address``."""
-    connect = partial(stream.set_sinks, rr.GrpcSink(address), default_blueprint=blueprint)
+
+    def connect() -> None:
+        stream.set_sinks(rr.GrpcSink(address))
+        send_layout(stream, blueprint, is_active=False)
+
     return Sink(f"the viewer at {address}", stream, connect, patience_s=_VIEWER_PATIENCE_S, is_lossless=False)

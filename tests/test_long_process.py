@@ -1,0 +1,69 @@
+"""A server or a notebook that makes many runs: threads, files and errors of the runs before are not retained."""
+
+import gc
+import os
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+import scanchain
+from scanchain import InputError
+from tests.support import made
+
+pytestmark = pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs Linux's /proc")
+
+
+class Failing:
+    """A matcher that fails at its sixth scan."""
+
+    def __init__(self):
+        self.scans = 0
+
+    def align(self, points, surfaces, T_target_source):
+        self.scans += 1
+        raise ValueError("no more")
+
+
+def threads():
+    return len(os.listdir("/proc/self/task"))
+
+
+def files():
+    folder = Path("/proc/self/fd")
+    return Counter(os.readlink(file) for file in folder.iterdir() if file.is_symlink())
+
+
+def test_runs_with_a_recording_leave_no_threads_behind_and_no_open_files(tmp_path):
+    log = made.log("office", seconds=2)
+
+    def again(number):
+        for _ in range(number):
+            scanchain.run(log, tmp_path / "run", force=True)
+            scanchain.localize(log, tmp_path / "run", tmp_path / "localized", force=True)
+        return threads(), files()
+
+    before = again(1)
+    assert again(4) == before
+
+
+def test_errors_that_a_caller_keeps_hold_no_file_open(tmp_path):
+    log, prior, kept = made.log("office", seconds=2), made.run("office", seconds=2), []
+    failing = {"matching__matcher": f"{__name__}:Failing", "recording": False}
+    (tmp_path / "bad.mcap").write_bytes(log.read_bytes()[:90] + bytes(2000) + log.read_bytes()[2090:])
+    gc.collect()
+    gc.disable()  # an error that refers to itself is freed when garbage is collected, who knows when
+    try:
+        before = files()
+        for act in (
+            lambda: scanchain.localize(log, prior, tmp_path / "out", **failing),
+            lambda: scanchain.run(log, tmp_path / "out", **failing),
+            lambda: scanchain.run(tmp_path / "bad.mcap", tmp_path / "out"),
+        ):
+            with pytest.raises(InputError) as caught:
+                act()
+            kept.append(caught.value)
+            assert files() == before, caught.value
+    finally:
+        gc.enable()
+    assert "no more" in str(kept[0]) and "no scan of" in str(kept[2])
