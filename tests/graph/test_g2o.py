@@ -3,9 +3,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from scanchain import lie
+from scanchain.__main__ import main
 from scanchain.errors import InputError
 from scanchain.graph.edge_checks import nearest_semidefinite, positive_semidefinite, ranks
 from scanchain.graph.g2o import read_g2o, write_g2o
+from scanchain.settings import load_settings
 from tests.support.graphs import graph_of
 from tests.support.scenes import shared_data
 
@@ -264,3 +266,63 @@ def test_angles_that_may_be_degrees_are_told(tmp_path, text):
     (tmp_path / "x.g2o").write_text(text)
     with pytest.warns(UserWarning, match=r"x\.g2o:2: an angle of (180|90); degrees\?"):
         read_g2o(tmp_path / "x.g2o")
+
+
+GRAPHS = ("MIT", "intel", "manhattan", "smallGrid3D", "sphere2500", "torus3D")
+
+
+@pytest.mark.parametrize("name", GRAPHS)
+def test_a_graph_has_as_many_loops_as_the_robust_loss_is_given_to(name):
+    path = shared_data(f"graphs/{name}.g2o")
+    quadratic, robust = read_g2o(path).graph, read_g2o(path, loops="robust").graph
+    assert not quadratic.is_loop.any()
+    assert robust.is_loop.sum() > 0
+    assert f"{robust.is_loop.sum():,} of them loops" in repr(robust)
+    assert repr(quadratic) == repr(robust)
+
+
+def test_edges_to_points_and_to_the_next_pose_are_no_loops(read):
+    with pytest.warns(UserWarning, match="EDGE_BEARING"):
+        assert "4 edges, 1 of them loops" in repr(read(SQUARE).graph)
+
+
+LINE = """\
+# made here
+VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1
+VERTEX_SE3:QUAT 1 1 0 0 0 0 0 1
+PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1
+EDGE_SE3:QUAT 0 1 1.5 0 0 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1
+"""
+PRIORS = (
+    "EDGE_SE3_PRIOR 1 0 5 0 0 0 0 0 1 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1",
+    "EDGE_POINTXYZ_PRIOR 1 5 0 0 1 0 0 1 0 1",
+    "GPS 1 5 0 0",
+)
+
+
+@pytest.mark.parametrize("prior", PRIORS)
+def test_constraints_that_are_not_understood_are_said_to_be_in_neither_chi2_nor_certificate(read, prior, capsys):
+    tag = prior.split()[0]
+    with pytest.warns(UserWarning, match=f"2 lines {tag} not understood: in neither χ² nor certificate"):
+        file = read(LINE + f"{prior}\n{prior}\n")
+    graph = file.graph.copy()
+    graph.optimize(load_settings(3).config.graph)
+    for verdict in (graph.certify().verdict, file.graph.copy().certify().verdict):
+        assert verdict.startswith((f"globally optimal of the problem without 2 lines {tag}", "not certified"))
+    assert f"without 2 lines {tag}" in repr(graph)
+
+
+def test_where_every_constraint_is_understood_nothing_is_said(read, recwarn):
+    graph = read(LINE).graph
+    graph.optimize(load_settings(3).config.graph)
+    assert graph.certify().verdict.startswith("globally optimal: ")
+    assert "without" not in repr(graph) and not recwarn.list
+
+
+def test_optimize_says_that_priors_do_not_count_and_keeps_them(tmp_path, capsys):
+    (tmp_path / "a.g2o").write_text(LINE + PRIORS[0] + "\n")
+    assert main(["optimize", str(tmp_path / "a.g2o"), "--out", str(tmp_path / "b.g2o")]) == 0
+    text = capsys.readouterr().out
+    assert "1 line EDGE_SE3_PRIOR not understood: in neither chi2 nor certificate" in text
+    assert "globally optimal of the problem without 1 line EDGE_SE3_PRIOR" in text
+    assert PRIORS[0] in (tmp_path / "b.g2o").read_text().splitlines()

@@ -1,10 +1,16 @@
+import struct
+
 import numpy as np
 import pytest
+from PIL import Image
 
 from scanchain.__main__ import main
+from scanchain.data import Scan
 from scanchain.errors import InputError
 from scanchain.maps import open_saved_map, write_laz, write_pcd, write_ply
 from scanchain.sessions.elsewhere import import_map
+from scanchain.sessions.localizer import Localizer
+from tests.support.scenes import shared_data
 
 
 def hall(step_m: float = 0.2):
@@ -124,3 +130,172 @@ def test_a_missing_file_and_a_cloud_without_room_are_refused(tmp_path):
     with pytest.raises(InputError, match="nowhere"):
         import_map(tmp_path / "few.ply", tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def mapped(folder, pixels, **stated):
+    """Cells (row, column) of ``walls`` that the points of all keyframes lie in, of a grid with these pixels."""
+    grid_files(folder, np.zeros((1, 1), np.uint8), image="map.png", **stated)
+    Image.fromarray(pixels).save(folder / "map.png")
+    import_map(folder / "map.yaml", folder / "room")
+    found = open_saved_map(folder / "room")
+    points = np.vstack([each.points + T[:2, 2] for each, T in zip(found.keyframes, found.poses, strict=True)])
+    return np.unique(np.floor((points - [1.0, 2.0]) / 0.1).astype(int)[:, ::-1], axis=0)
+
+
+OCCUPIED = np.argwhere(walls()[::-1] == 0)
+
+
+@pytest.mark.parametrize("negate", [0, 1])
+def test_of_a_raw_grid_pixels_are_percent_and_255_is_unknown_whatever_negate_is(tmp_path, negate):
+    pixels = np.where(walls() == 0, 100, 0).astype(np.uint8)
+    pixels[:3, 30:50] = 70
+    pixels[3:6, 30:50] = 64  # neither occupied nor free
+    pixels[20:30, 30:40] = 255
+    cells = mapped(tmp_path, pixels, mode="raw", negate=negate)
+    wanted = np.argwhere(np.isin(pixels, (70, 100))[::-1])
+    assert {tuple(each) for each in cells} <= {tuple(each) for each in wanted}
+    assert len(cells) > 0.8 * len(OCCUPIED)
+
+
+@pytest.mark.parametrize("mode", ["trinary", "scale"])
+@pytest.mark.parametrize("alpha", [0, 128, 254])
+def test_cells_that_are_not_opaque_are_unknown(tmp_path, mode, alpha):
+    pixels = np.dstack([np.stack([walls()] * 3, axis=-1), np.full(walls().shape, 255, np.uint8)])
+    pixels[20:30, 30:40] = (0, 0, 0, alpha)
+    cells = mapped(tmp_path, pixels, mode=mode)
+    assert {tuple(each) for each in cells} <= {tuple(each) for each in OCCUPIED}
+    assert len(cells) > 0.9 * len(OCCUPIED)
+
+
+def test_pixels_of_sixteen_bits_are_the_same_grid(tmp_path):
+    assert np.array_equal(mapped(tmp_path, walls().astype(np.uint16) * 257), OCCUPIED)
+
+
+def test_an_unknown_mode_is_refused_in_one_line(tmp_path, capsys):
+    file = grid_files(tmp_path, walls(), mode="Raw")
+    assert main(["map", "import", str(file), "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err.strip()
+    assert "mode is 'Raw', wanted one of trinary, scale, raw" in error
+    assert "\n" not in error
+
+
+def test_the_raw_grid_of_a_public_report_has_walls_where_they_are(tmp_path):
+    import_map(shared_data("reports/j_raw.yaml"), tmp_path / "out")
+    found = open_saved_map(tmp_path / "out")
+    pixels = np.asarray(Image.open(shared_data("reports/raw.pgm")))[::-1]
+    for keyframe, pose in zip(found.keyframes, found.poses, strict=True):
+        column, row = np.floor((keyframe.points + pose[:2, 2] - [-5.35, -5.15]) / 0.05 + 1e-6).astype(int).T
+        assert (pixels[row, column] == 100).all()
+
+
+UTM_M = np.array([451234.5, 5412345.25, 300.0])
+
+
+def ply(path, points, kind):
+    """A PLY of float or double numbers."""
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n"
+    head += "".join(f"property {kind} {axis}\n" for axis in "xyz") + "end_header\n"
+    path.write_bytes(head.encode() + points.astype({"float": "<f4", "double": "<f8"}[kind]).tobytes())
+    return path
+
+
+@pytest.mark.parametrize("kind", ["float", "double"])
+@pytest.mark.parametrize("rounded", [False, True])
+def test_the_step_of_coarse_coordinates_is_said_and_that_it_limits_the_map(tmp_path, capsys, kind, rounded):
+    points = hall() + UTM_M
+    points = (
+        points.astype(np.float32).astype(float)
+        if rounded
+        else points + 1e-4 * np.sqrt(np.arange(len(points)))[:, None]
+    )
+    file = ply(tmp_path / "m.ply", points, kind)
+    assert main(["map", "import", str(file), "--out", str(tmp_path / "out")]) == 0
+    warning = capsys.readouterr().err
+    is_coarse = rounded or kind == "float"
+    assert ("in steps of 0.5 m there: the map and all poses in it are no more accurate" in warning) == is_coarse
+
+
+def test_healthy_clouds_are_imported_without_a_note(tmp_path):
+    for shift_m in (0.0, 1000.0, 50_000.0):
+        file = ply(tmp_path / "m.ply", hall() + shift_m * np.array([1.0, -1.0, 0.0]), "float")
+        assert import_map(file, tmp_path / "out", force=True).notes == ()
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_log_is_localized_in_utm_coordinates_as_in_those_about_the_origin(tmp_path, dimension):
+    """A drive through the map itself, seen from some of its own keyframes; the room looks alike from both ends."""
+    for name, shift_m in (("near", np.zeros(3)), ("utm", UTM_M)):
+        if dimension == 3:
+            rng = np.random.default_rng(0)
+            pillars = np.vstack(
+                [rng.uniform([x - 0.3, y - 0.3, 0.0], [x + 0.3, y + 0.3, 3.5], (200, 3)) for x, y in PILLARS]
+            )
+            file = ply(tmp_path / f"{name}.ply", np.vstack([hall(), pillars]) + shift_m, "double")
+        else:
+            file = grid_files(tmp_path, walls(), origin=[float(1.0 + shift_m[0]), float(2.0 + shift_m[1]), 0.0])
+        import_map(file, tmp_path / name, spacing_m=1.0)
+    near, utm = (open_saved_map(tmp_path / name) for name in ("near", "utm"))
+    positions = (near.poses[:, :-1, -1], utm.poses[:, :-1, -1] - UTM_M[:dimension])
+    np.testing.assert_allclose(*(each[np.lexsort(np.round(each, 3).T)] for each in positions), atol=1e-6)
+    path = [k for k in range(len(near.keyframes)) if abs(near.poses[k, 1, -1] - near.poses[0, 1, -1]) < 0.5]
+    ends = []
+    for prior in (near, utm):
+        first = near.poses[path[0]].copy()
+        first[:-1, -1] += UTM_M[:dimension] * (prior is utm)
+        localizer = Localizer(prior, initial=first if dimension == 2 else None, is_live=False)
+        for step, k in enumerate(path):
+            points = near.keyframes[k].points.astype(np.float32)
+            localizer.process(Scan.of(points, 0.5 * step, index=step))
+        ends.append(localizer.finish())
+    assert ends[0].is_placed.all() and ends[1].is_placed.all()
+    away_m = ends[1].trajectory.poses[:, :-1, -1] - UTM_M[:dimension] - ends[0].trajectory.poses[:, :-1, -1]
+    assert np.abs(away_m).max() < 1e-3
+
+
+PILLARS = ((3.0, 2.0), (5.5, 9.0), (8.0, 4.0), (13.0, 3.0), (14.5, 9.5), (17.0, 5.0))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e7, 3e38])
+@pytest.mark.parametrize("count", [1, 20])
+def test_a_few_coordinates_that_are_huge_or_not_finite_are_left_out_and_counted(tmp_path, capsys, value, count):
+    points = hall()
+    points[100 : 100 + count, np.arange(count) % 3] = value
+    file = ply(tmp_path / "m.ply", points, "float")
+    assert main(["map", "import", str(file), "--out", str(tmp_path / "out")]) == 0
+    out, err = capsys.readouterr()
+    assert f"of {len(points):,} are left out: coordinates that are not finite, or more than 10 times" in err
+    assert f"3D map of {len(points) - count:,} points" in out
+
+
+@pytest.mark.parametrize("value", [1e7, 1e30, 1e49, 1e300])
+def test_a_cloud_of_huge_coordinates_is_refused_in_one_line(tmp_path, value):
+    points = hall()
+    points[::3, 0] = value * np.linspace(0.5, 1.0, len(points[::3]))
+    if value > 1e50:
+        points[:] = value
+    with pytest.raises(InputError, match=r"m large; give a larger|has no points"):
+        import_map(ply(tmp_path / "m.ply", points, "double"), tmp_path / "out")
+
+
+HUGE = ("9" * 19, "9" * 30, "9" * 5000)
+
+
+@pytest.mark.parametrize("count", HUGE)
+@pytest.mark.parametrize("form", ["ascii", "binary"])
+def test_a_cloud_with_a_huge_count_is_refused_in_one_line(tmp_path, count, form):
+    point = b"1 2 3\n" if form == "ascii" else struct.pack("<3f", 1, 2, 3)
+    pcd = f"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nPOINTS {count}\nDATA {form}\n"
+    kind = {"ascii": "ascii", "binary": "binary_little_endian"}[form]
+    head = f"ply\nformat {kind} 1.0\nelement vertex {count}\n"
+    head += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
+    for name, text in (("m.pcd", pcd), ("m.ply", head)):
+        (tmp_path / name).write_bytes(text.encode() + point)
+        with pytest.raises(InputError, match=name):
+            import_map(tmp_path / name, tmp_path / "out")
+
+
+def test_a_point_with_a_huge_number_of_values_is_refused(tmp_path):
+    pcd = "FIELDS x y z d\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 400000000\nPOINTS 1\nDATA ascii\n1 2 3 4\n"
+    (tmp_path / "m.pcd").write_text(pcd)
+    with pytest.raises(InputError, match="ends after 0 of its 1 points"):
+        import_map(tmp_path / "m.pcd", tmp_path / "out")

@@ -66,6 +66,8 @@ def import_file(file: Path, out: Path, **given: Any) -> None:
 
     with Terminal("positions") as terminal:
         made = import_map(file, out, say=terminal.say, **given)
+    for note in made.notes:
+        click.echo(f"warning: {note}", err=True)
     click.echo(
         f"{out}: {made.dimension}D map of {counted(made.points, 'point')}, seen from "
         f"{counted(made.keyframes, 'position')} {made.spacing_m:g} m apart"

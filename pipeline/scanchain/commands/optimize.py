@@ -227,6 +227,10 @@ class _Report:
         """Warnings to read before the rest."""
         after, graph = self.change.after, self.file.graph
         notes = list(filter(None, [self.file.note]))
+        if graph.left_out:
+            notes.append(
+                f"{graph.left_out} not understood: in neither chi2 nor certificate nor covariances; kept in --out"
+            )
         notes += [f"odometry {line}; so are its edges in --out" for line in graph.corrections(self.file.ids)]
         ratio = after.chi2 / max(after.degrees_of_freedom, 1)
         if not graph.is_loop.any() and after.degrees_of_freedom and ratio > _POOR_FIT:

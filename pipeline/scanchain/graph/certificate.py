@@ -37,6 +37,7 @@ class Certificate:
     reason : why there is no certificate; empty where there is one
     time_s : wall time
     is_zero : whether χ² is zero but for rounding
+    left_out : constraints that χ² lacks, in words; empty where there are none
     """
 
     certified: bool
@@ -45,6 +46,7 @@ class Certificate:
     reason: str
     time_s: float
     is_zero: bool = False
+    left_out: str = ""
 
     @property
     def relative_gap(self) -> float:
@@ -54,12 +56,14 @@ class Certificate:
     @property
     def verdict(self) -> str:
         """The certificate as one line of text."""
+        without = f" of the problem without {self.left_out}" if self.left_out else ""
         if self.certified and self.is_zero:
-            return "globally optimal: χ² is zero"
+            return f"globally optimal{without}: χ² is zero"
         if self.certified:
             if self.relative_gap < _EXACT:
-                return "globally optimal to rounding"
-            return f"globally optimal to within {self.gap:.2g} of χ² ({100.0 * self.relative_gap:.1g} %)"
+                return f"globally optimal{without}, to rounding" if without else "globally optimal to rounding"
+            share = f"to within {self.gap:.2g} of χ² ({100.0 * self.relative_gap:.1g} %)"
+            return f"globally optimal{without}, {share}" if without else f"globally optimal {share}"
         return f"not certified: {self.reason}"
 
 

@@ -175,6 +175,11 @@ def has_loop(edges: NDArray[np.int64], pose_count: int) -> bool:
     return len(edges) > pose_count - _parts(edges, pose_count)[0]
 
 
+def skip_poses(edges: NDArray[np.int64], is_point: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """True for edges (E, 2) between poses that do not follow each other, as loops do; is_point (K,)."""
+    return (np.abs(edges[:, 1] - edges[:, 0]) != 1) & ~is_point[edges].any(axis=1)
+
+
 def _parts(edges: NDArray[np.int64], pose_count: int) -> tuple[int, NDArray[np.int32]]:
     """Number of connected components of the poses, and the component of each pose."""
     links = coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(pose_count, pose_count))

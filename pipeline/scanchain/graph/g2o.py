@@ -18,10 +18,11 @@ from scanchain.checks import LARGEST
 from scanchain.data import Matrix, brief
 from scanchain.errors import InputError, counted, shown
 from scanchain.files import write_whole
-from scanchain.graph.edge_checks import nearest_semidefinite, positive_semidefinite
+from scanchain.graph.edge_checks import nearest_semidefinite, positive_semidefinite, skip_poses
 from scanchain.graph.initialize import follow_odometry
 from scanchain.graph.pose_graph import PoseGraph
 
+_NO_CONSTRAINT = ("#", "VERTEX", "PARAMS", "FIX")  # how lines begin that constrain nothing
 _WHOLE_TURN = 2.0 * np.pi + 1e-3  # rad, above which an angle is a turn too many, or degrees
 Rotation = Literal["vector", "quaternion"]  # of which Ω is in 3D
 ROTATION_COMMENT: dict[Rotation, str] = {
@@ -342,7 +343,11 @@ class G2oFile:
     @property
     def other_tags(self) -> tuple[tuple[str, int], ...]:
         """Tags that are not supported, with the number of lines of each."""
-        return tuple(Counter(line.split(maxsplit=1)[0] for line in self.other_lines).items())
+        return _tags(self.other_lines)
+
+
+def _tags(lines: Iterable[str]) -> tuple[tuple[str, int], ...]:
+    return tuple(Counter(line.split(maxsplit=1)[0] for line in lines).items())
 
 
 def read_g2o(
@@ -386,15 +391,18 @@ def read_g2o(
         poses = follow_odometry(poses, is_held, pairs[chain], measurements[chain])
         i, j = pairs[to_points].T
         poses[j, :-1, -1] = (poses[i] @ measurements[to_points])[:, :-1, -1]
-    graph = PoseGraph(dimension, ids)
+    constraints = [line for line in lines.others if not line.lstrip().startswith(_NO_CONSTRAINT)]
+    left_out = " and ".join(f"{counted(count, 'line')} {tag}" for tag, count in _tags(constraints))
+    graph = PoseGraph(dimension, ids, left_out)
     for pose, point, stamp in zip(poses, is_point.tolist(), ids.tolist(), strict=True):
         graph.add_point(pose[:-1, -1], stamp) if point else graph.add_pose(pose, stamp)
-    is_robust = (loops == "robust") & (np.abs(pairs[:, 0] - pairs[:, 1]) != 1) & ~edges.is_point
+    is_robust = (loops == "robust") & skip_poses(pairs, is_point)
     graph.add_edges(pairs, measurements, information, is_robust)
     for index in fixed.tolist():
         graph.fix(index)
-    if lines.note:
-        warnings.warn(lines.note, stacklevel=2)
+    note = f"{path}: {left_out} not understood: in neither χ² nor certificate nor covariances" if left_out else ""
+    for text in filter(None, (lines.note, note)):
+        warnings.warn(text, stacklevel=2)
     return G2oFile(graph, ids, tuple(lines.others), has_guess, projection, lines.note)
 
 

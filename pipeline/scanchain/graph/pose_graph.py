@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import get_args
 
 import numpy as np
@@ -23,6 +24,7 @@ from scanchain.graph.edge_checks import (
     free_text,
     own_equations,
     ranks,
+    skip_poses,
     weakly_joined,
 )
 from scanchain.graph.explanation import Explainer
@@ -41,10 +43,13 @@ class PoseGraph:
     The gauge is fixed by holding pose 0, or those given to ``fix``, where they are.
     """
 
-    def __init__(self, dimension: int, names: NDArray[np.int64] | None = None) -> None:
-        """Make an empty graph of SE(2) (dimension 2) or SE(3) (3) poses with these names in messages."""
+    def __init__(self, dimension: int, names: NDArray[np.int64] | None = None, left_out: str = "") -> None:
+        """Make an empty graph of SE(2) (dimension 2) or SE(3) (3) poses with these names in messages.
+
+        left_out : constraints that it lacks, in words, for the certificate to say so
+        """
         dimension = self.dimension = checks.dimension(dimension)
-        self._names = names
+        self._names, self.left_out = names, left_out
         self.freedom = 3 if dimension == 2 else 6
         pose, k = (dimension + 1, dimension + 1), self.freedom
         self._poses, self._stamps_ns = GrowingArray(pose, np.float64), GrowingArray((), np.int64)
@@ -63,8 +68,10 @@ class PoseGraph:
         return len(self._poses)
 
     def __repr__(self) -> str:
-        edges = f"{counted(len(self.edges), 'edge')}, {self.is_loop.sum():,} of them loops"
-        return f"PoseGraph({counted(len(self), 'pose')} of SE({self.dimension}), {edges})"
+        loops = self.is_loop | skip_poses(self.edges, self.is_point)
+        edges = f"{counted(len(self.edges), 'edge')}, {loops.sum():,} of them loops"
+        without = f"; without {self.left_out}" if self.left_out else ""
+        return f"PoseGraph({counted(len(self), 'pose')} of SE({self.dimension}), {edges}{without})"
 
     @property
     def poses(self) -> Matrix:
@@ -320,7 +327,7 @@ class PoseGraph:
 
     def copy(self) -> PoseGraph:
         """The graph as it is, independent of what becomes of this one."""
-        result = PoseGraph(self.dimension, self._names)
+        result = PoseGraph(self.dimension, self._names, self.left_out)
         for name, rows in vars(self).items():
             if isinstance(rows, GrowingArray):
                 getattr(result, name).extend(rows.rows)
@@ -348,7 +355,8 @@ class PoseGraph:
 
     def certify(self) -> Certificate:
         """Certificate of the global minimum of χ², edges weighed as the last optimization left them."""
-        return certify(self._prepared(), self.poses, self._weight_in_force, self._undetermined(), self.names)
+        found = certify(self._prepared(), self.poses, self._weight_in_force, self._undetermined(), self.names)
+        return replace(found, left_out=self.left_out)
 
     def free_poses(self) -> NDArray[np.int64]:
         """Names of the poses that the edges in force leave free in some direction, at the poses of now."""

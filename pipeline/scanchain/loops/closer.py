@@ -218,7 +218,8 @@ class ProximityCloser:
         placed = {k: replace(keyframes[k], T_odom_lidar=T_world[k]) for k in near.tolist()}
         surfaces = seen_together(list(placed.values()), lie.identity(2))
         grid = SearchGrid.of_points(downsample(surfaces, size_m), size_m)
-        points = seen_together(keyframes[-submaps.half_width :], lie.inverse(newest.T_odom_lidar))
+        first = max(len(keyframes) - submaps.half_width, self.of_map)  # those of a map are in another frame
+        points = seen_together(keyframes[first:], lie.inverse(newest.T_odom_lidar))
         window = Window(T_world[-1], radius_m, _MIN_RAD + _RADIANS_A_METER * radius_m)
         found = find(thinned(points, size_m), grid, window, _WANTED)
         if len(found) != 1:

@@ -52,7 +52,7 @@ _ALIKE = Problem.plain("another place of the map is as similar")
 class Outline:
     """Upright structure of a map.
 
-    T_map_level : (4, 4) rotation to the frame whose z axis is normal to the ground, on average
+    T_map_level : (4, 4) to the frame whose z axis is normal to the ground, on average, its origin at whole 100 km
     columns : (M, 2) where it is upright, level frame
     size_m : edge length of the cells that the map was seen in
     """
@@ -197,6 +197,7 @@ def outline_of(folder: Path | None, keyframes: Sequence[Keyframe], config: Local
         return stored
     size_m = config.voxel_size_m * float(np.median([keyframe.scale for keyframe in keyframes]))
     T_map_level = level_of(keyframes, [keyframe.T_odom_lidar for keyframe in keyframes], config)
+    T_map_level[:3, 3] = np.round(np.mean([each.T_odom_lidar[:3, 3] for each in keyframes], axis=0), -5)
     columns = _columns(keyframes, lie.inverse(T_map_level), size_m).astype(np.float32)  # as it is stored
     if folder is not None:
         data, count = io.BytesIO(), len(keyframes)

@@ -53,12 +53,15 @@ def refined(
     spans : (N, 2) first row and number of each scan's points in the store
     keyframes, T_world_keyframes : of the map
     """
+    T_world_keyframes, result = T_world_keyframes.copy(), poses.copy()
+    origin_m = np.round(T_world_keyframes[:, :2, 2].mean(axis=0), -5)  # whole 100 km: what voxels can address
+    for each in (T_world_keyframes, result):
+        each[:, :2, 2] -= origin_m
     surfaces, least_share = _map_of(T_world_keyframes, keyframes, config), config.matching.min_inlier_share
     settings = settings_of(config.matching, surfaces, wide=False)
     settings = settings._replace(reach=1, last_reach=1, tolerance_m=_TOLERANCE_M, tolerance_rad=_TOLERANCE_RAD)
     sigma = lie.by_component(3, config.odometry.edge_sigma_m, config.odometry.edge_sigma_rad)
     prior = np.diag(sigma**-2.0) * settings.variance
-    result = poses.copy()
 
     def refine_part(part: slice, points: Points) -> None:
         starts = np.append(0, np.cumsum(spans[part, 1]))
@@ -70,6 +73,7 @@ def refined(
             parts = [slice(first + k * _MAX_SCANS, first + (k + 1) * _MAX_SCANS) for k in range(count)]
             clouds = [_points_of(spans[part], store) for part in parts]
             list(pool.map(refine_part, parts, clouds))
+    result[:, :2, 2] += origin_m
     return result
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -14,9 +15,10 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from scanchain import lie
+from scanchain.checks import LARGEST
 from scanchain.config import Config
 from scanchain.data import Keyframe, Matrix, Points, Scan
-from scanchain.errors import InputError, counted
+from scanchain.errors import InputError, counted, shown
 from scanchain.kernels.free_space import nearest_ranges
 from scanchain.logs.formats.clouds import SUFFIXES, CloudFileError, read_cloud_file
 from scanchain.maps import MAP_FOLDER, Edges, SavedMap, SavedPoints, Session, write_saved_map
@@ -37,26 +39,34 @@ _HIDDEN_M = 0.5  # farther than the nearest point of its bin, from which on a po
 _SECTORS, _LEAST_SECTORS = 36, 0.6  # of azimuth, and share of them with points that a position in the plane needs
 _LEAST_POINTS = 100  # in view
 _FLAT_M = 1e-6  # extent in height of points in the plane
-_MAX_POSITIONS = 20_000
+_MAX_POSITIONS, _MAX_CELLS = 20_000, 2_000_000  # of positions, and of those that are tried
 _LEAST_CELL_M, _LARGEST_CELL_M = 1e-3, 1e2  # of a grid
+_PERCENTILE, _OUTLIER = 99.0, 10.0  # of distances from the middle; times that, beyond which points are outliers
+_COARSE_STEP_M = 0.01  # of coordinates, above which their rounding adds to a sensor's noise of 3 cm
+_MODES = ("trinary", "scale", "raw")  # of map_server
 
 
 @dataclass(frozen=True, slots=True)
 class Imported:
-    """An imported map: dimension, numbers of points read and of keyframes made, spacing of these in meters."""
+    """An imported map: dimension, numbers of points used and of keyframes made, and spacing of these in meters.
+
+    notes : what was left out of the file, and how coarse its coordinates are
+    """
 
     dimension: int
     points: int
     keyframes: int
     spacing_m: float
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class _Surfaces:
-    """Points (N, d) of a map, and positions (P, d) that are free, where the file tells."""
+    """Points (N, d) of a map, positions (P, d) that are free, where the file tells, notes as of ``Imported``."""
 
     points: Points
     free: Points | None = None
+    notes: tuple[str, ...] = ()
 
 
 def import_map(
@@ -75,7 +85,7 @@ def import_map(
     Raises InputError for a file that cannot be read, or in which no lidar could have been anywhere.
     """
     say(f"reading {file.name}")
-    surfaces = _read(file)
+    surfaces = _read(file, spacing_m)
     dimension = surfaces.points.shape[1]
     spacing_m = SPACING_M[dimension] if spacing_m is None else spacing_m
     config = load_settings(dimension).config
@@ -98,11 +108,11 @@ def import_map(
         provenance = describe_start(sys.argv, [file], "")
         msgspec.structs.replace(provenance, complete=True).write(directory.path / RUN_FILE)
         directory.complete()
-    return Imported(dimension, len(surfaces.points), len(keyframes), spacing_m)
+    return Imported(dimension, len(surfaces.points), len(keyframes), spacing_m, surfaces.notes)
 
 
-def _read(file: Path) -> _Surfaces:
-    suffix = file.suffix.lower()
+def _read(file: Path, spacing_m: float | None) -> _Surfaces:
+    suffix, notes = file.suffix.lower(), list[str]()
     if suffix in GRID_SUFFIXES:
         return _read_grid(file)
     try:
@@ -110,7 +120,8 @@ def _read(file: Path) -> _Surfaces:
             points = _read_las(file)
         elif suffix in SUFFIXES:
             rows = read_cloud_file(file)
-            points = np.column_stack([rows[name] for name in "xyz"]).astype(np.float64)
+            columns = [rows[name] for name in "xyz"]
+            points = np.column_stack([column.astype(np.float64) for column in columns])
         else:
             known = ", ".join((*SUFFIXES, *LAS_SUFFIXES, *GRID_SUFFIXES))
             raise InputError(f"{file}: is no map that can be read; give one of {known}")
@@ -118,10 +129,42 @@ def _read(file: Path) -> _Surfaces:
         raise InputError(f"{file}: cannot be read ({error.strerror or error})") from error
     except CloudFileError as error:
         raise InputError(f"{file}: {error}") from error
-    points = points[np.isfinite(points).all(axis=1)]
+    count = len(points)
+    points = points[(np.abs(points) < LARGEST).all(axis=1)]
     if not len(points):
         raise InputError(f"{file}: has no points")
-    return _Surfaces(points[:, :2] if np.ptp(points[:, 2]) < _FLAT_M else points)
+    points = _without_outliers(points, spacing_m or SPACING_M[3])
+    if len(points) < count:
+        notes.append(
+            f"{file}: {counted(count - len(points), 'point')} of {count:,} are left out: coordinates that are not "
+            f"finite, or more than {_OUTLIER:g} times as far off as {_PERCENTILE:g} % of the points"
+        )
+    step_m = 0.0 if suffix in LAS_SUFFIXES else max(map(_step_m, columns, points.T))
+    if step_m > _COARSE_STEP_M:
+        notes.append(
+            f"{file}: its coordinates reach {np.abs(points).max():,.0f} m and come in steps of {step_m:g} m "
+            "there: the map and all poses in it are no more accurate; subtract an offset before they are stored, "
+            "or store float64 from the beginning"
+        )
+    return _Surfaces(points[:, :2] if np.ptp(points[:, 2]) < _FLAT_M else points, notes=tuple(notes))
+
+
+def _without_outliers(points: Points, spacing_m: float) -> Points:
+    """Points (N, 3) without a few far off, where the others alone can be seen from positions so far apart."""
+    if np.ptp(points[:, :2], axis=0).max() < math.sqrt(_MAX_CELLS) * spacing_m:
+        return points
+    away_m = np.abs(points - np.median(points, axis=0)).max(axis=1)
+    return points[away_m <= _OUTLIER * np.percentile(away_m, _PERCENTILE)]
+
+
+def _step_m(column: NDArray[Any], values: NDArray[np.float64]) -> float:
+    """Largest step between neighboring numbers of a column, as it was stored, at its values (N,) that are used."""
+    if column.dtype.kind != "f":
+        return 1.0
+    with np.errstate(over="ignore"):
+        is_single = np.array_equal(values.astype(np.float32), values)
+    kind = np.float32 if is_single else column.dtype.type
+    return float(np.spacing(kind(np.abs(values).max())))
 
 
 def _read_las(file: Path) -> Points:
@@ -136,7 +179,11 @@ def _read_las(file: Path) -> Points:
 
 
 def _read_grid(file: Path) -> _Surfaces:
-    """Occupied and free cells of a map of map_server, at their centers; thresholds as it reads them."""
+    """Occupied and free cells of a map of map_server, at their centers; modes and thresholds as nav2 reads them.
+
+    Of trinary and scale, cells that are not opaque are unknown; of raw, a pixel is the occupancy in percent, above
+    100 unknown, and ``negate`` does not count.
+    """
     from PIL import Image
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
@@ -146,10 +193,15 @@ def _read_grid(file: Path) -> _Surfaces:
         with Image.open(file.parent / stated["image"]) as picture:
             if picture.width * picture.height > MAX_CELLS:
                 raise ValueError(f"its image has {picture.width} x {picture.height} cells, over {MAX_CELLS:,}")
-            image = np.asarray(picture.convert("L"))[::-1]
+            deep = np.asarray(picture) / 257 if picture.mode.startswith("I") else picture.convert("L")
+            image = np.rint(deep).astype(np.uint8)  # 16 bits, too, which convert("L") would cut off
+            has_alpha = "A" in picture.getbands() or "transparency" in picture.info
+            is_opaque = np.asarray(picture.convert("RGBA").getchannel("A")) == 255 if has_alpha else np.True_
         resolution_m, (x, y, yaw_rad) = float(stated["resolution"]), map(float, stated["origin"])
         occupied_from, free_to = float(stated["occupied_thresh"]), float(stated["free_thresh"])
-        is_negated = bool(int(stated.get("negate", 0)))
+        is_negated, mode = bool(int(stated.get("negate", 0))), stated.get("mode", "trinary")
+        if mode not in _MODES:
+            raise ValueError(f"mode is {shown(mode)}, wanted one of {', '.join(_MODES)}")
         if not (_LEAST_CELL_M <= resolution_m <= _LARGEST_CELL_M and np.isfinite([x, y, yaw_rad]).all()):
             raise ValueError(f"resolution {resolution_m:g} m, origin {x:g}, {y:g}, {yaw_rad:g}")
     except OSError as error:
@@ -161,30 +213,33 @@ def _read_grid(file: Path) -> _Surfaces:
             f"{file}: is no map of map_server ({type(error).__name__}: {error}); wanted image, resolution, "
             "origin, occupied_thresh, free_thresh"
         ) from error
-    levels = np.arange(256) / 255.0
-    probability = levels if is_negated else 1.0 - levels
+    levels = np.arange(256)
+    if mode == "raw":
+        probability, is_known = levels / 100.0, (levels <= 100)[image]
+    else:
+        probability, is_known = np.abs(levels / 255.0 - (not is_negated)), is_opaque
     T_map_image = lie.pose_2d(x, y, yaw_rad)
 
     def centers(cells: NDArray[np.bool_]) -> Points:
-        rows, columns = np.nonzero(cells)
+        rows, columns = np.nonzero((cells & is_known)[::-1])
         return lie.transform(T_map_image, (np.column_stack([columns, rows]) + 0.5) * resolution_m)
 
-    points = centers((probability > occupied_from)[image])
+    points = centers((probability >= occupied_from)[image])
     if not len(points):
-        raise InputError(f"{file}: has no occupied cells; look at occupied_thresh and negate")
-    return _Surfaces(points, centers((probability < free_to)[image]))
+        raise InputError(f"{file}: has no occupied cells; look at occupied_thresh, mode and negate")
+    return _Surfaces(points, centers((probability <= free_to)[image]))
 
 
 def _positions(surfaces: _Surfaces, spacing_m: float, height_m: float) -> Points:
     """Positions (P, d) on a grid, where a lidar could be, there and back along its rows: each beside the next."""
     points = surfaces.points
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
-    axes = [np.arange(a + 0.5 * min(spacing_m, b - a), b, spacing_m) for a, b in zip(low, high, strict=True)]
-    if len(axes[0]) * len(axes[1]) > 100 * _MAX_POSITIONS:
+    if np.prod((high - low) / spacing_m + 1.0) > _MAX_CELLS:
         raise InputError(
-            f"the map is {high[0] - low[0]:,.0f} x {high[1] - low[1]:,.0f} m large; give a larger --spacing, or a "
+            f"the map is {high[0] - low[0]:,.6g} x {high[1] - low[1]:,.6g} m large; give a larger --spacing, or a "
             "part of it"
         )
+    axes = [np.arange(a + 0.5 * min(spacing_m, b - a), b, spacing_m) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
     if points.shape[1] == 3:
         grid = _above_ground(points, grid, height_m)

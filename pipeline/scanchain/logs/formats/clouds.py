@@ -44,7 +44,7 @@ _PLY_TYPES = {
     "double": "f8", "float64": "f8",
 }  # fmt: skip
 _PLY_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "<"}
-_MOST_HEADER_LINES = 1000
+_MOST_HEADER_LINES, _MOST_DIGITS = 1000, 20  # of a header, and of a count in it
 
 _ONE_AT_A_TIME = Lock()  # of headers, which NumPy parses by ast: threads of Python 3.11 disturb each other in it
 
@@ -55,14 +55,17 @@ class CloudFileError(Exception):
 
 def _rows(file: IO[bytes], point: np.dtype[np.void], count: int, *, is_text: bool) -> NDArray[np.void]:
     """``count`` points, one after the other, or as many lines of numbers."""
+    size = os.fstat(file.fileno()).st_size  # whatever a header claims
     if is_text:
-        lines = list(islice((line for line in file if line.strip()), count))
+        if point.itemsize > 8 * size:
+            raise CloudFileError(f"ends after 0 of its {count} points")
+        lines = list(islice((line for line in file if line.strip()), min(count, size)))
         try:
             rows = np.loadtxt(lines, point, comments=None, ndmin=1) if lines else np.empty(0, point)
         except ValueError as error:
             raise CloudFileError(f"is no list of {count} points ({error})") from error
     else:
-        data = file.read(min(count * point.itemsize, os.fstat(file.fileno()).st_size))  # whatever a header claims
+        data = file.read(min(count * point.itemsize, size))
         rows = np.frombuffer(data, point, len(data) // max(point.itemsize, 1))
     if len(rows) < count:
         raise CloudFileError(f"ends after {len(rows)} of its {count} points")
@@ -194,7 +197,7 @@ def _ply_header(file: IO[bytes]) -> tuple[np.dtype[np.void], int, str]:
             case ["format", form, *_] if form in _PLY_ORDERS:
                 pass
             case ["element", element, number, *_]:
-                if element == "vertex" and number.isdigit():
+                if element == "vertex" and number.isdigit() and len(number) < _MOST_DIGITS:
                     count = int(number)
                 elif not fields:
                     raise CloudFileError(f"has {element} before its vertices, which is not understood")
