@@ -1,12 +1,19 @@
 """Bags of ROS with damage that nothing else tells of: what is there is read, what is lost is told."""
 
 import struct
+import subprocess
+import sys
 from itertools import pairwise
 
+import numpy as np
 import pytest
+import zstandard
 
+from scanchain.errors import InputError
+from scanchain.logs import open_log
 from tests.support import recorders
-from tests.support.naive_logs import ROS1
+from tests.support.messages import says
+from tests.support.naive_logs import ROS1, ROS2
 from tests.support.recorders import Ros
 
 SCANS = 12
@@ -105,3 +112,92 @@ def test_a_healthy_bag_is_undamaged_and_none_of_its_chunks_is_unpacked_to_be_cou
     monkeypatch.setattr("scanchain.logs.formats.ros1_bag.messages_of", None)
     log, scans = recorders.read_undamaged(bag)
     assert len(scans) == log.scan_count == SCANS
+
+
+# ROS 2
+
+
+def bag2(folder, count=40, **options):
+    """A bag in SQLite with clouds of several pages, and odometry."""
+    ros, said = Ros(ROS2), recorders.clouds(count, 700)
+    messages = [*ros.sweeps(said)]
+    messages += [("/odom", "nav_msgs/msg/Odometry", c.stamp_ns + 9, ros.odometry(c.stamp_ns, 0.1)) for c in said]
+    return recorders.bag2_of(folder, sorted(messages, key=lambda each: each[2]), **options)
+
+
+PAGE = 4096
+
+
+@pytest.mark.parametrize("fill", [bytes(PAGE), b"\xff" * PAGE, np.random.default_rng(1).bytes(PAGE)])
+@pytest.mark.parametrize("is_folder", [True, False])
+def test_of_a_database_with_one_page_destroyed_all_other_messages_are_read(tmp_path, fill, is_folder):
+    folder = bag2(tmp_path / "a")
+    path, opened = folder / "a.db3", folder if is_folder else folder / "a.db3"
+    data = path.read_bytes()
+    healthy = {scan.stamp_ns: scan.points for scan in open_log(opened).scans()}
+    topics = data.index(b"sensor_msgs/msg/PointCloud2cdr") // PAGE  # without which nothing can be understood
+    messages = {at // PAGE for at in range(0, len(data), PAGE) if data[at] in (5, 10, 13)}
+    for page in sorted({*messages, *range(0, len(data) // PAGE, 9)} - {topics}):
+        path.write_bytes(data[: page * PAGE] + fill + data[(page + 1) * PAGE :])
+        log = open_log(opened, max_bad_scans_percent=100.0)
+        scans = {scan.stamp_ns: scan.points for scan in log.scans()}
+        whole = [stamp for stamp, points in scans.items() if np.array_equal(points, healthy[stamp])]
+        assert len(whole) >= len(healthy) - 1 - 3 * (page in messages), (page, log.damage)
+        if log.damage or len(scans) < len(healthy):
+            says(log.damage[0], "is damaged", "lost, the others were read page by page")
+        if len(scans) < len(healthy):
+            lost = int(log.damage[0].split("; ")[1].split()[0])
+            assert len(healthy) - len(scans) <= lost <= 8
+    path.write_bytes(data[: topics * PAGE] + fill + data[(topics + 1) * PAGE :])
+    with pytest.raises(InputError, match="its list of topics is destroyed; copy it again"):
+        open_log(opened)
+
+
+def test_a_healthy_database_is_not_read_page_by_page(tmp_path, monkeypatch):
+    monkeypatch.setattr("scanchain.logs.formats.ros2_bag._Pages", None)
+    assert len(recorders.read_undamaged(bag2(tmp_path / "a"))[1]) == 40
+
+
+@pytest.mark.parametrize("cut", [0.3, 0.9])
+def test_a_packed_file_that_is_cut_off_is_read_up_to_there(tmp_path, cut):
+    folder = bag2(tmp_path / "a", compression="FILE")
+    (path,) = folder.glob("*.zstd")
+    path.write_bytes(path.read_bytes()[: int(cut * path.stat().st_size)])
+    log, scans = recorders.read(folder, max_bad_scans_percent=100.0)
+    assert 40 * cut - 10 < len(scans) < 40 and "is damaged" in log.damage[0]
+
+
+def zeros(count, **options):
+    """Zeros, packed chunk by chunk or with their number stated."""
+    packer = zstandard.ZstdCompressor(level=1).compressobj(**options)
+    return b"".join([*(packer.compress(bytes(1 << 20)) for _ in range(count >> 20)), packer.flush()])
+
+
+@pytest.mark.parametrize("size", [-1, 1 << 30])
+def test_a_message_that_unpacks_without_end_is_counted_as_damaged_in_bounded_memory(tmp_path, size):
+    import sqlite3
+
+    folder = bag2(tmp_path / "a", 12, compression="MESSAGE")
+    connection = sqlite3.connect(folder / "a.db3")
+    connection.execute("UPDATE messages SET data = ? WHERE id IN (3, 9)", (zeros(1 << 30, size=size),))
+    connection.commit()
+    connection.close()
+    code = f"""
+import resource
+from scanchain.logs import open_log
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+log = open_log({str(folder)!r}, max_bad_scans_percent=100.0)
+print(len(list(log.scans())), *log.damage, sep="\\n")
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024)"""
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    count, damage, *_, more_mib = output.splitlines()
+    assert int(count) == 10 and int(more_mib) < 400
+    says(damage, "2 of 12 scans of /points were left out", "unpack")
+
+
+def test_a_packed_file_that_unpacks_without_end_is_refused(tmp_path):
+    folder = bag2(tmp_path / "a", 3, compression="FILE")
+    (path,) = folder.glob("*.zstd")
+    path.write_bytes(zeros(1 << 30))
+    with pytest.raises(InputError, match=r"db3.zstd: unpacks to more than [\d,]+ bytes; is it a ROS 2 bag"):
+        open_log(folder)

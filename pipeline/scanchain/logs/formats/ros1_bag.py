@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from scanchain.errors import InputError, counted
-from scanchain.logs.mcap.index import is_plausible_size
+from scanchain.logs.mcap.index import most_unpacked
 from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message, unpack
 from scanchain.logs.mcap.stream import messages_of
 
@@ -223,7 +223,7 @@ def _chunk(index: FileIndex, record: Record) -> Block:
     """A chunk, its messages not counted. Raises struct.error or ValueError where its fields are none."""
     end = len(index.data)
     size, claimed = min(record.end, end) - record.begin, record.number(b"size")
-    if not is_plausible_size(size, claimed):
+    if claimed > most_unpacked(size):
         raise ValueError(f"claims to unpack from {size} to {claimed} bytes, more than is accepted,")
     name = record.text(b"compression")
     where = {"head": record.begin - record.offset, "is_cut": record.end > end}
