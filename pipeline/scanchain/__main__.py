@@ -18,7 +18,7 @@ from scanchain.commands.maps import changes, localize, map_group, merge
 from scanchain.commands.optimize import optimize
 from scanchain.commands.preparing import config, sequence, warm_up
 from scanchain.commands.run import check, run, view
-from scanchain.errors import InputError, ScanchainError, remedy_of
+from scanchain.errors import InputError, ScanchainError, printable, remedy_of
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -92,7 +92,7 @@ def _unforeseen(error: Exception) -> int:
 
 
 def _fail(message: str, code: int) -> int:
-    click.echo(f"error: {' '.join(message.split())}", err=True)
+    click.echo(f"error: {printable(' '.join(message.split()))}", err=True)
     return code
 
 

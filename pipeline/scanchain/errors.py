@@ -52,6 +52,11 @@ def shown(value: object) -> str:
     return text if len(text) <= 40 and text.isprintable() else f"a {type(value).__name__}"
 
 
+def printable(text: str) -> str:
+    """The text on one line; line breaks, escapes of terminals and marks of direction as Python writes them."""
+    return text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
 def one_line(error: BaseException) -> str:
     """Message of an error without line breaks; its type where it has none."""
     return " ".join(str(error).split()) or type(error).__name__

@@ -14,6 +14,7 @@ from scanchain.logs.mcap.records import Channel, FileIndex
 from scanchain.logs.mcap.stream import Span, sampled_messages
 from scanchain.logs.messages.poses import StampedPose, chain
 from scanchain.logs.messages.readers import pose_reader, reader, role
+from scanchain.logs.messages.ros import frame_name
 from scanchain.logs.topics import topics_of
 
 _BASE_FRAMES = ("base_link", "base_footprint", "base")
@@ -187,4 +188,4 @@ def _transforms(indexes: Sequence[FileIndex], *, is_fixed: bool, span: Span | No
 def _frame_of(indexes: Sequence[FileIndex], lidar: Channel) -> str:
     """The frame of a lidar's first messages, empty where they name none."""
     first = next(sampled_messages(indexes, lidar.topic, reader(lidar)), None)
-    return "" if first is None else first.message.header.frame_id.lstrip("/")
+    return "" if first is None else frame_name(first.message.header.frame_id)

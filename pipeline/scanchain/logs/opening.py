@@ -147,7 +147,7 @@ def _format_of(path: Path, head: bytes) -> str:
     claims = {
         "mcap": head.startswith(MCAP0_MAGIC) or not (head or path.is_dir()),  # an empty file is refused as such
         "ros1": head.startswith(b"#ROSBAG"),
-        "ros2": head.startswith(b"SQLite format 3\0") or (path / _BAG_FILE).is_file(),
+        "ros2": head.startswith(b"SQLite format 3\0") or path.suffix == ".db3" or (path / _BAG_FILE).is_file(),
         "carmen": is_carmen(head),
         "kitti-raw": (path / "velodyne_points").is_dir(),
         "kitti-odometry": (path / "velodyne").is_dir() and (path / "times.txt").is_file(),

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.data import Keyframe, Matrix, Points
-from scanchain.errors import InputError, one_line, shown
+from scanchain.errors import InputError, one_line, printable, shown
 from scanchain.files import write_whole
 
 MAP_FOLDER = "map"
@@ -40,12 +40,15 @@ _BLOCK = 1 << 20
 
 
 class Session(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A log that a map was made of: its name, when it began and ended, and its number of keyframes."""
+    """A log that a map was made of: its printable name, when it began and ended, and its number of keyframes."""
 
     name: str
     first_stamp_ns: int
     last_stamp_ns: int
     keyframes: int
+
+    def __post_init__(self) -> None:
+        msgspec.structs.force_setattr(self, "name", printable(self.name))
 
 
 class _Index(msgspec.Struct, frozen=True):

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from scanchain.errors import InputError, counted
+from scanchain.errors import InputError, counted, printable
 from scanchain.logs.formats import UnknownFormatError, temporary_index
 from scanchain.logs.mcap.records import FileIndex
 from scanchain.logs.writer import (
@@ -66,7 +66,9 @@ def index_carmen(path: Path, number: int) -> FileIndex:
         lines = f"{counted(len(malformed), 'malformed line')} left out (the first: line {malformed[0]})"
         index.damage.append(f"{path}: {lines}")
     if others:
-        listed = ", ".join(f"{count} {kind.decode('ascii', 'replace')}" for kind, count in others.items())
+        listed = ", ".join(
+            f"{count} {printable(kind.decode('ascii', 'replace'))}" for kind, count in others.items()
+        )
         index.notes.append(f"{path}: lines of kinds that are not read: {listed}")
     return index
 

@@ -20,7 +20,7 @@ import lzf
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain.errors import InputError, counted
+from scanchain.errors import InputError, counted, printable
 from scanchain.logs.formats import add_block, add_channel, left_out, natural_order
 from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
 from scanchain.logs.writer import LATEST_NS, pack_cloud
@@ -51,6 +51,9 @@ _ONE_AT_A_TIME = Lock()  # of headers, which NumPy parses by ast: threads of Pyt
 
 class CloudFileError(Exception):
     """A file that contradicts its header; the message says where."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(printable(text))
 
 
 def _rows(file: IO[bytes], point: np.dtype[np.void], count: int, *, is_text: bool) -> NDArray[np.void]:
@@ -272,7 +275,9 @@ def _found(folder: Path, files: Sequence[Path], raw: np.dtype[np.void]) -> list[
             points = read_cloud_file(file, raw)
             kinds = ", ".join(dict.fromkeys(points.dtype[name].name for name in points.dtype.names or ()))
             guess = " (log.bin_columns)" if file.suffix.lower() == ".bin" else ""
-            held = f"{' '.join(points.dtype.names or ())}, {kinds}{guess}; {counted(len(points), 'point')}"
+            held = (
+                f"{printable(' '.join(points.dtype.names or ()))}, {kinds}{guess}; {counted(len(points), 'point')}"
+            )
             kind = f"{file.suffix.lower()} file"
             return [f"{folder}: {counted(len(files), kind)} of {held} in {file.name}"]
     return []

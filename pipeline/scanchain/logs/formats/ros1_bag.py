@@ -1,7 +1,8 @@
 """ROS 1 bags: finished or cut off, indexed or not; their messages stay as they are.
 
-Bags are walked record by record; the messages of a chunk are counted by the INDEX records behind it, those of a
-chunk without such, and of all chunks of a damaged bag, by unpacking it.
+Bags are walked record by record; the messages of a chunk are counted by the INDEX records behind it if the end of
+the bag lists the same, else, and in all chunks of a damaged bag, by unpacking it. A record is what its fields are
+those of, whatever its opcode.
 Format: https://wiki.ros.org/Bags/Format/2.0
 """
 
@@ -11,6 +12,7 @@ import mmap
 import re
 import struct
 from collections import Counter
+from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
 from functools import partial
@@ -20,24 +22,33 @@ from typing import NamedTuple
 import numpy as np
 
 from scanchain.errors import InputError, counted
-from scanchain.logs.mcap.index import is_plausible_size
+from scanchain.logs.mcap.index import most_unpacked
 from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message, unpack
 from scanchain.logs.mcap.stream import messages_of
 
 MAGIC = b"#ROSBAG V2.0\n"
-MESSAGE, INDEX, CHUNK, CONNECTION = 2, 4, 5, 7
+MESSAGE, HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
 Data = mmap.mmap | memoryview | bytes
 _NS = 1_000_000_000
 _LENGTH = struct.Struct("<I")
 _TIME = struct.Struct("<II")  # seconds, nanoseconds
+_COUNT = struct.Struct("<II")  # connection, number of its messages
 _ENTRY = np.dtype([("s", "<u4"), ("ns", "<u4"), ("offset", "<u4")])  # of an INDEX, a message
 _LONGEST_HEAD = 1 << 16  # longest head in bytes; a longer one is damage
-_OPCODE = re.compile(rb"\x04\0\0\0op=[\x05\x07]")  # opcode of a chunk, a connection
+_FIELDS = {  # a field that only such a record has; "count" is looked for last
+    MESSAGE: b"time", HEADER: b"index_pos", CHUNK: b"compression", CHUNK_INFO: b"chunk_pos", CONNECTION: b"topic",
+    INDEX: b"count",
+}  # fmt: skip
+_OUTSIDE = re.compile(rb"\x04\0\0\0op=[\x05\x07]")  # opcode of a chunk, a connection
+_INSIDE = re.compile(rb"\x04\0\0\0op=[\x02\x07]")  # of a chunk: opcode of a message, a connection
 _MOST_BEFORE = 256  # largest number of bytes of a head before its opcode
 
 
 class Record(NamedTuple):
-    """A record: its fields by name, and where it begins, its data begin and it ends, maybe beyond the file."""
+    """A record: its fields by name, and where it begins, its data begin and it ends, maybe beyond the file.
+
+    opcode : by its fields; the one that is stated may be another
+    """
 
     opcode: int
     fields: dict[bytes, bytes]
@@ -62,10 +73,14 @@ def read_record(data: Data, offset: int) -> Record | None:
     if end + _LENGTH.size > len(data) or length > _LONGEST_HEAD:
         return None
     fields = _read_fields(bytes(data[begin:end]))
-    if fields is None or len(fields.get(b"op", b"")) != 1:
+    if fields is None:
         return None
+    opcode = fields.get(b"op", b"\0")[0] if fields.get(b"op") else 0
+    if _FIELDS.get(opcode) not in fields:
+        opcode = next((each for each, name in _FIELDS.items() if name in fields), 0)
     data_begin = end + _LENGTH.size
-    return Record(fields[b"op"][0], fields, offset, data_begin, data_begin + _LENGTH.unpack_from(data, end)[0])
+    data_end = data_begin + _LENGTH.unpack_from(data, end)[0]
+    return Record(opcode, fields, offset, data_begin, data_end) if opcode else None
 
 
 def _define(index: FileIndex, record: Record, data: Data) -> None:
@@ -80,13 +95,32 @@ def _define(index: FileIndex, record: Record, data: Data) -> None:
     index.channels.setdefault(number, channel)
 
 
-def next_record(data: Data, offset: int, stated_end: int) -> Record | None:
-    """The first record behind the offset that may stand outside of a chunk; None where there is none.
+def read_records(
+    data: Data, offset: int, sought: re.Pattern[bytes], gaps: list[tuple[int, int]]
+) -> Iterator[Record]:
+    """The records one after the other; behind damage, added to ``gaps``, those from the next that is sought."""
+    record = read_record(data, offset)
+    while offset < len(data):
+        following = None if record is None else read_record(data, record.end)
+        if record is not None and (following is not None or record.end == len(data)):
+            yield record
+            offset, record = record.end, following
+            continue
+        behind = next_record(data, offset, offset if record is None else record.end, sought)
+        limit = len(data) if behind is None else behind.offset
+        if record is not None and (record.end <= limit or (behind is None and record.opcode == CHUNK)):
+            yield record
+        gaps.append((offset, limit))
+        offset, record = limit, behind
+
+
+def next_record(data: Data, offset: int, stated_end: int, sought: re.Pattern[bytes]) -> Record | None:
+    """The first record behind the offset with an opcode that is sought; None where there is none.
 
     stated_end : byte at which the damaged record ends if its length is right; no connection before it is taken, as
         chunks hold such too
     """
-    for match in _OPCODE.finditer(data, offset + 1):
+    for match in sought.finditer(data, offset + 1):
         for begin in range(match.start() - _LENGTH.size, max(offset, match.start() - _MOST_BEFORE), -1):
             record = read_record(data, begin)
             if record is None or record.begin < match.end() or record.end > len(data):
@@ -121,54 +155,75 @@ def index_ros1_bag(path: Path, number: int) -> FileIndex:
     head = read_record(data, len(MAGIC))
     if head is not None and head.text(b"encryptor"):
         raise InputError(f"{path}: is encrypted ({head.text(b'encryptor')}); decrypt it first")
-    _walk(index)
-    is_sure = not index.damage
-    index.blocks = [block if is_sure and block.counts else _counted(index, block) for block in index.blocks]
+    stated = _walk(index)
+    chunks = 0 if head is None else int.from_bytes(head.fields.get(b"chunk_count", b""), "little")
+    if len(index.blocks) < max(chunks, len(stated)):
+        index.damage.append(f"{path}: has {len(index.blocks)} of {counted(max(chunks, len(stated)), 'chunk')}")
+    _count(index, stated)
     index.counts = dict(index.indexed_counts())
     index.channels = {number: c for number, c in index.channels.items() if index.counts.get(number)}
     return index
 
 
-def _walk(index: FileIndex) -> None:
-    """Take in the chunks and connections one after the other, and go on behind damage."""
-    data, offset = index.data, len(MAGIC)
-    while offset < len(data):
-        record = read_record(data, offset)
-        if record is not None and (record.end == len(data) or read_record(data, record.end) is not None):
-            _take(index, record)
-            offset = record.end
-            continue
-        behind = next_record(data, offset, offset if record is None else record.end)
-        limit = len(data) if behind is None else behind.offset
-        if record is not None and (record.end <= limit or (behind is None and record.opcode == CHUNK)):
-            _take(index, record)
-        if behind is None:
-            index.damage.append(f"{index.path}: cut off, or damaged to its end, at byte {offset}")
-            return
-        index.damage.append(
-            f"{index.path}: the record at byte {offset} is damaged; reading went on at byte {behind.offset}"
-        )
-        offset = behind.offset
+def _walk(index: FileIndex) -> dict[int, dict[int, int]]:
+    """Take in chunks and connections; returned are the messages by connection that the end of the bag lists.
+
+    They are those of each chunk, by where it begins.
+    """
+    gaps: list[tuple[int, int]] = []
+    stated: dict[int, dict[int, int]] = {}
+    for record in read_records(index.data, len(MAGIC), _OUTSIDE, gaps):
+        try:
+            if record.fields.get(b"op") != bytes([record.opcode]):
+                name = f"{index.path}: the record at byte {record.offset}"
+                index.damage.append(f"{name} is marked as another record; it was read all the same")
+            _take(index, record, stated)
+        except (struct.error, ValueError) as error:
+            what = str(error) if isinstance(error, ValueError) else "is malformed"
+            index.damage.append(f"{index.path}: the record at byte {record.offset} {what} and was left out")
+    for begin, end in gaps:
+        cut = f"{index.path}: cut off, or damaged to its end, at byte {begin}"
+        resumed = f"{index.path}: the record at byte {begin} is damaged; reading went on at byte {end}"
+        index.damage.append(cut if end == len(index.data) else resumed)
+    return stated
 
 
-def _take(index: FileIndex, record: Record) -> None:
-    try:
-        if record.opcode == CONNECTION:
-            _define(index, record, index.data)
-        elif record.opcode == CHUNK:
-            index.blocks.append(_chunk(index, record))
-        elif record.opcode == INDEX and index.blocks:
-            index.blocks[-1] = _indexed(index, record)
-    except (struct.error, ValueError) as error:
-        what = str(error) if isinstance(error, ValueError) else "is malformed"
-        index.damage.append(f"{index.path}: the record at byte {record.offset} {what} and was left out")
+def _take(index: FileIndex, record: Record, stated: dict[int, dict[int, int]]) -> None:
+    """Take in a record. Raises struct.error or ValueError where its fields are none."""
+    if record.opcode == CONNECTION:
+        _define(index, record, index.data)
+    elif record.opcode == CHUNK:
+        index.blocks.append(_chunk(index, record))
+    elif record.opcode == INDEX and index.blocks:
+        index.blocks[-1] = _indexed(index, record)
+    elif record.opcode == CHUNK_INFO:
+        counts = _COUNT.iter_unpack(index.data[record.begin : record.end])
+        begin = int.from_bytes(record.fields[b"chunk_pos"], "little")
+        stated[begin] = {connection: count for connection, count in counts if count}
+
+
+def _count(index: FileIndex, stated: dict[int, dict[int, int]]) -> None:
+    """Unpack the chunks whose messages are not counted twice alike, by the records behind them and in the end.
+
+    Where no end of the bag counts them, all chunks are read for any topic.
+    """
+    is_sure = not index.damage
+    index.is_consistent = bool(stated) or not is_sure
+    for place, block in enumerate(index.blocks):
+        begin = block.offset - block.head
+        is_contradicted = bool(stated) and stated.get(begin) != block.counts
+        if is_contradicted and is_sure:
+            name = f"{index.path}: the chunk at byte {begin}"
+            index.damage.append(f"{name} has a damaged index; its messages were counted by unpacking it")
+        if is_contradicted or not (is_sure and block.counts):
+            index.blocks[place] = _counted(index, block)
 
 
 def _chunk(index: FileIndex, record: Record) -> Block:
     """A chunk, its messages not counted. Raises struct.error or ValueError where its fields are none."""
     end = len(index.data)
     size, claimed = min(record.end, end) - record.begin, record.number(b"size")
-    if not is_plausible_size(size, claimed):
+    if claimed > most_unpacked(size):
         raise ValueError(f"claims to unpack from {size} to {claimed} bytes, more than is accepted,")
     name = record.text(b"compression")
     where = {"head": record.begin - record.offset, "is_cut": record.end > end}
@@ -200,26 +255,29 @@ def _contents(index: FileIndex, block: Block, _: AbstractSet[int] | None) -> Con
     """The messages of a chunk; connections found there join the index."""
     name = f"{index.path}: the chunk at byte {block.offset}"
     messages: list[Message] = []
-    undefined = offset = 0
-    try:
-        payload = unpack(index, block)
-        while offset < len(payload):
-            record = read_record(payload, offset)
-            if record is None or record.end > len(payload):
-                raise struct.error("record that is none, or beyond the end")
-            offset = record.end
+    met = Counter[int]()
+    gaps: list[tuple[int, int]] = []
+    undefined = malformed = 0
+    payload = unpack(index, block)
+    for record in read_records(payload, 0, _INSIDE, gaps):
+        try:
             if record.opcode == CONNECTION:
                 _define(index, record, payload)
             elif record.opcode == MESSAGE:
                 seconds, nanoseconds = _TIME.unpack(record.fields.get(b"time", b""))
-                channel = index.channels.get(record.number(b"conn"))
+                number = record.number(b"conn")
+                met[number] += 1
+                channel = index.channels.get(number)
                 undefined += channel is None
                 if channel is not None:
                     messages.append(
                         Message(channel, seconds * _NS + nanoseconds, payload[record.begin : record.end])
                     )
-    except struct.error:
-        damage = f"{name}: a record in it is malformed; what follows was left out"
-        return Contents(messages, "" if block.is_cut else damage)
-    lost = f"{name}: {counted(undefined, 'message')} of no known connection" if undefined else ""
-    return Contents(messages, lost)
+        except struct.error:
+            malformed += 1
+    lost = sum(max(count - met[number], 0) for number, count in block.counts.items())
+    if (malformed or gaps) and not block.is_cut:
+        return Contents(messages, f"{name}: records in it are malformed and were left out")
+    if undefined:
+        return Contents(messages, f"{name}: {counted(undefined, 'message')} of no known connection")
+    return Contents(messages, f"{name}: {counted(lost, 'indexed message')} missing in it" if lost else "")

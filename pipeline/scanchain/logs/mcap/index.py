@@ -94,7 +94,7 @@ def _take_summary(index: FileIndex, size: int, *, needs_crc: bool) -> bool:
     return is_complete and all(
         block.offset >= block.head
         and block.offset + block.size <= size
-        and is_plausible_size(block.size, block.uncompressed_size)
+        and block.uncompressed_size <= most_unpacked(block.size)
         for block in index.blocks
     )
 
@@ -216,7 +216,7 @@ class Walk:
         name = f"{self.index.path}: the chunk at byte {offset}"
         if self.data[offset] != Opcode.CHUNK:
             self.index.damage.append(f"{name} is marked as another record; it was read all the same")
-        if is_plausible_size(chunk.size, chunk.uncompressed_size):
+        if chunk.uncompressed_size <= most_unpacked(chunk.size):
             self.open = chunk
             return
         self.index.damage.append(
@@ -250,9 +250,9 @@ class Walk:
             self.times_ns = []
 
 
-def is_plausible_size(size: int, uncompressed: int) -> bool:
-    """True if a chunk of so many bytes may unpack to the size that its record states."""
-    return uncompressed <= min(max(_MODEST_CHUNK, _MOST_TIMES * size), _LARGEST_CHUNK)
+def most_unpacked(size: int) -> int:
+    """Largest number of bytes that a chunk or a message of so many may unpack to."""
+    return min(max(_MODEST_CHUNK, _MOST_TIMES * size), _LARGEST_CHUNK)
 
 
 def _is_end(data: mmap.mmap | bytes, offset: int) -> bool:

@@ -20,7 +20,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
-from scanchain.errors import counted, one_line
+from scanchain.errors import counted, one_line, printable
 from scanchain.files import Source
 
 RECORD = struct.Struct("<BQ")  # opcode, length of what follows
@@ -34,7 +34,7 @@ _MOST_BEHIND = 256  # bytes behind a definition; a longer rest is that of anothe
 class Channel:
     """A stream of messages: ``key`` (file, id) is unique over all files of a log; ``schema`` 0 means none.
 
-    ``definition`` defines the type, in the language ``schema_encoding``.
+    ``definition`` defines the type, in the language ``schema_encoding``; the other texts are made printable.
     """
 
     key: tuple[int, int]
@@ -44,6 +44,10 @@ class Channel:
     type_name: str
     schema_encoding: str
     definition: bytes = b""
+
+    def __post_init__(self) -> None:
+        for name in ("topic", "encoding", "type_name"):
+            object.__setattr__(self, name, printable(getattr(self, name)))
 
 
 class Message(NamedTuple):

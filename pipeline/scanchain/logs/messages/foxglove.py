@@ -18,7 +18,7 @@ from scanchain.data import Pose
 from scanchain.logs.mcap.records import Channel
 from scanchain.logs.messages.lidar import Sensed
 from scanchain.logs.messages.poses import StampedPose, pose_of
-from scanchain.logs.messages.ros import MalformedMessageError, header, new, point_fields
+from scanchain.logs.messages.ros import MalformedMessageError, frame_name, header, new, point_fields
 
 _NUMBERS = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}  # foxglove.NumericType to sensor_msgs/PointField
 
@@ -119,13 +119,13 @@ def _sensed(message: _LaserScan | _PointCloud, type_name: str, *parts: Any) -> S
 def pose_in_frame(message: _PoseInFrame, dimension: int) -> StampedPose:
     """A foxglove.PoseInFrame, flattened for dimension 2."""
     pose = _pose(message.pose.position, message.pose.orientation, dimension)
-    return StampedPose(_stamp_ns(message.timestamp), message.frame_id.lstrip("/"), "", pose)
+    return StampedPose(_stamp_ns(message.timestamp), frame_name(message.frame_id), "", pose)
 
 
 def frame_transform(message: _FrameTransform) -> list[StampedPose]:
     """A foxglove.FrameTransform."""
     pose = _pose(message.translation, message.rotation, 3)
-    frames = message.parent_frame_id.lstrip("/"), message.child_frame_id.lstrip("/")
+    frames = frame_name(message.parent_frame_id), frame_name(message.child_frame_id)
     return [StampedPose(_stamp_ns(message.timestamp), *frames, pose)]
 
 

@@ -14,13 +14,13 @@ from scanchain import lie
 from scanchain.data import Pose, Trajectory
 from scanchain.errors import counted
 from scanchain.logs.mcap.records import Decoded
-from scanchain.logs.messages.ros import MalformedMessageError, stamp_ns
+from scanchain.logs.messages.ros import MalformedMessageError, frame_name, stamp_ns
 
 
 class StampedPose(NamedTuple):
     """A pose of ``child``, empty where it is not named, in ``parent``; (4, 4), or (3, 3) for a planar log.
 
-    Names of frames have no slash before them, as some of ROS 1 have.
+    Names of frames are those of ``frame_name``.
     """
 
     stamp_ns: int
@@ -33,8 +33,8 @@ def read_pose(message: Any, dimension: int = 3) -> StampedPose:
     """A nav_msgs/Odometry, geometry_msgs/PoseStamped or PoseWithCovarianceStamped, flattened for dimension 2."""
     pose = getattr(message.pose, "pose", message.pose)
     T = pose_of(pose.position, pose.orientation, dimension)
-    child = getattr(message, "child_frame_id", "").lstrip("/")  # of an Odometry
-    return StampedPose(stamp_ns(message), message.header.frame_id.lstrip("/"), child, T)
+    child = frame_name(getattr(message, "child_frame_id", ""))  # of an Odometry
+    return StampedPose(stamp_ns(message), frame_name(message.header.frame_id), child, T)
 
 
 def read_transforms(message: Any) -> list[StampedPose]:
@@ -42,7 +42,7 @@ def read_transforms(message: Any) -> list[StampedPose]:
     found = []
     for each in message.transforms:
         T = pose_of(each.transform.translation, each.transform.rotation)
-        frames = each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/")
+        frames = frame_name(each.header.frame_id), frame_name(each.child_frame_id)
         found.append(StampedPose(stamp_ns(each), *frames, T))
     return found
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
-from scanchain.errors import one_line
+from scanchain.errors import one_line, printable
 
 NUMBERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # of sensor_msgs/PointField
 _TRANSFORMS = "tf2_msgs/msg/TFMessage"
@@ -13,6 +13,9 @@ _TRANSFORMS = "tf2_msgs/msg/TFMessage"
 
 class MalformedMessageError(Exception):
     """A message that contradicts its schema; the text says how."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(printable(text))
 
 
 @cache
@@ -56,6 +59,11 @@ def header(stamp_ns: int, frame: str) -> Any:
 def point_fields(*layout: tuple[str, int, int]) -> list[Any]:
     """A sensor_msgs/PointField for each name, offset and type of number."""
     return [new("sensor_msgs/msg/PointField", *each, 1) for each in layout]
+
+
+def frame_name(frame: str) -> str:
+    """The name of a frame, printable, without the slash before it that some of ROS 1 have."""
+    return printable(frame.lstrip("/"))
 
 
 def stamp_ns(message: Any) -> int:
