@@ -27,7 +27,7 @@ from tests.support.naive_logs import (
 from tests.support.scenes import configured, shared_data
 
 STEP_NS = SECOND // 10
-CHECKS = ["gaps", "wheels", "damage", "returns", "no return", "ranges", "duplicates"]
+CHECKS = ["gaps", "wheels", "point times", "damage", "returns", "no return", "ranges", "duplicates"]
 
 
 def diagnose(*paths, **config):
@@ -61,7 +61,7 @@ def saved(folder, said, **options):
 
 
 def test_a_healthy_log_is_all_well(tmp_path):
-    found = diagnose(saved(tmp_path, drive(wheels=True)))
+    found = diagnose(saved(tmp_path, drive(wheels=True, beam_s=3e-4)))
     assert sorted(found) == sorted(CHECKS)
     assert {finding.severity for finding in found.values()} == {"ok"}
     assert found["damage"].found.startswith("40 scans") and "0 of 40 scans without" in found["wheels"].found

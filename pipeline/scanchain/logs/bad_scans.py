@@ -6,17 +6,13 @@ import math
 
 import numpy as np
 
-from scanchain.checks import LONGEST_SWEEP_S
 from scanchain.config import LogConfig, PreprocessConfig
 from scanchain.data import MOST_COPIES, RawPoints, Scan
 from scanchain.errors import InputError, counted
-from scanchain.kernels.geometry import largest_magnitude
 from scanchain.logs.mcap.records import Decoded
 from scanchain.logs.messages.lidar import Returns
 
 _MOST_REPEATED = 0.5  # share of repeated stamps above which it is a warning
-_SPANS = 100  # number of first scans whose point times are compared with the period
-_SHORTEST_PART, _LONGEST_PART = 0.005, 2.0  # shares of the period outside which point times are of another unit
 _FEWEST_COPIED = 10  # least points of a scan that may be a copy
 _COPIES_SHARE = 0.01  # of the scans, up to which copies are no warning
 _SAMPLE = 64  # step of the sample of points tested first: usually one of them is in range
@@ -35,9 +31,6 @@ def defect(message: Decoded, preprocess: PreprocessConfig | None) -> str:
         return f"is malformed: {returns}"
     if message.log_time_ns >= 1 << 63:
         return f"has the log time {message.log_time_ns} ns, which no clock shows"
-    farthest_s = largest_magnitude(returns.times_s)
-    if farthest_s > LONGEST_SWEEP_S:
-        return f"has a point {farthest_s:.3g} s from its stamp (log.point_times sets the unit)"
     if not len(returns.points):
         return f"has no valid point ({returns.why})"
     outside = "" if preprocess is None else _none_retained(returns.points, preprocess)
@@ -69,8 +62,6 @@ class ScanCounts:
         self.scans = self.bad = self.backwards = self.repeated = self.without_wheels = self.copies = 0
         self.first_complaint = ""
         self._last: Scan | None = None
-        self.spans_s: list[float] = []
-        self.log_times_ns: list[int] = []
 
     def skip(self, complaint: str, expected: int, config: LogConfig) -> None:
         """Count a scan that is left out. Raises InputError for more of the expected number than are allowed."""
@@ -100,15 +91,12 @@ class ScanCounts:
             self.backwards += scan.stamp_ns < self._last.stamp_ns
             self.repeated += scan.stamp_ns == self._last.stamp_ns
         self._last = scan
-        if len(self.log_times_ns) < _SPANS:
-            self.log_times_ns.append(scan.log_time_ns)
-            self.spans_s += [float(np.ptp(scan.times_s))] if len(scan.times_s) else []
 
     def _share(self, count: int) -> str:
         return f"{count} of {counted(self.scans, 'scan')} of {self.topic}"
 
     def losses(self) -> list[str]:
-        """Warnings of scans left out or copied, stamps that most scans do not have, and odd point times."""
+        """Warnings of scans left out or copied, and of stamps that most scans do not have."""
         lines = []
         if self.bad:
             were = "was" if self.bad == 1 else "were"
@@ -122,14 +110,6 @@ class ScanCounts:
             lines.append(
                 f"{self._share(self.copies)} are the one before once more, to the last bit: where the driver was "
                 "stuck, the poses stand still though the lidar may have moved (scanchain doctor)"
-            )
-        span_s = float(np.median(self.spans_s)) if self.spans_s else 0.0
-        period_s = 1e-9 * float(np.median(np.diff(self.log_times_ns))) if len(self.log_times_ns) > 1 else 0.0
-        if self.spans_s and period_s > 0.0 and not _SHORTEST_PART < span_s / period_s < _LONGEST_PART:
-            lines.append(
-                f"by their point times scans of {self.topic} last {1e3 * span_s:.3g} ms, {span_s / period_s:.2g} "
-                "of the period: of another unit? scanchain doctor names the flag, --preprocess.deskew false "
-                "ignores them"
             )
         return lines
 

@@ -178,8 +178,7 @@ def _check(seen: Survey, config: Config, most_bad: float) -> Iterator[Finding]:
     """Every finding about a log. ``config`` is what a run of it would use; ``most_bad`` scans it may lack."""
     yield _gaps(seen, bool(seen.wheels) and config.odometry.prior != "constant-velocity")
     yield _wheels(seen)
-    if not is_scan(seen.log.lidar):
-        yield _point_times(seen)
+    yield _point_times(seen)
     yield _damage(seen, config.preprocess, most_bad)
     yield _returns(seen)
     yield _no_return(seen)
@@ -238,19 +237,24 @@ def _wheel_speed_m_s(seen: Survey) -> float:
 
 
 def _point_times(seen: Survey) -> Finding:
-    spans_s = np.array([scan.time_span_s for scan in seen.scans])
-    spans_s = spans_s[np.isfinite(spans_s)]
-    if not len(spans_s):
-        effect = "scans are not freed of the lidar's own motion, which bends them unless the driver did it"
-        return Finding("point times", Severity.NOTE, "none", effect, _by_azimuth(seen))
-    assumed, span_s = seen.log.assumed_point_times(), float(np.median(spans_s))
-    found = f"{assumed.removeprefix('point times: ')}; a scan lasts {1e3 * span_s:.4g} ms"
+    times, spans_s = seen.log.times, [scan.time_span_s for scan in seen.scans]
+    untimed = int(np.count_nonzero(np.isnan(spans_s)))
+    distorted = "scans are not freed of the lidar's own motion, which bends them unless the driver did it"
+    faults = times.faults()
+    if untimed == len(spans_s) and not times.spans_s:
+        grade = Severity.WARNING if faults else Severity.NOTE
+        return Finding("point times", grade, "; ".join(["none", *faults]), distorted, _by_azimuth(seen))
+    span_s = float(np.nanmedian(spans_s if untimed < len(spans_s) else times.spans_s))
+    assumed = times.assumed.removeprefix("point times: ") or "time_increment of the beams"
+    found = f"{assumed}; a scan lasts {1e3 * span_s:.4g} ms"
     part = span_s / seen.period_s if seen.period_s else 1.0
-    if _PART_OF_SCAN < part < _MORE_THAN_SCAN:
-        return Finding("point times", Severity.OK, found)
-    found += f", {part:.2g} of the period"
+    if is_scan(seen.log.lidar) or _PART_OF_SCAN < part < _MORE_THAN_SCAN:
+        grade = Severity.WARNING if untimed else Severity.NOTE if faults else Severity.OK
+        effect = f"{counted(untimed, 'scan')} without: {distorted}" if untimed else "the rest is used"
+        return Finding("point times", grade, "; ".join([found, *faults]), effect if faults else "")
+    found = "; ".join([f"{found}, {part:.2g} of the period", *faults])
     effect = "if that is the wrong unit, deskewing bends every scan instead of straightening it"
-    return Finding("point times", Severity.WARNING, found, effect, _other_unit(assumed, part))
+    return Finding("point times", Severity.WARNING, found, effect, _other_unit(times.assumed, part))
 
 
 def _by_azimuth(seen: Survey) -> str:

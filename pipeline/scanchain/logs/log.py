@@ -26,6 +26,7 @@ from scanchain.logs.messages.poses import RecordedPoses, StampedPose
 from scanchain.logs.messages.readers import is_scan, pose_reader, reader
 from scanchain.logs.mounting import find_mounting, in_plane, is_upside_down
 from scanchain.logs.opening import index_files
+from scanchain.logs.sweep_times import SweepTimes
 from scanchain.logs.topics import find_ground_truth, find_lidar, find_odometry
 from scanchain.settings import load_settings, overrides_of
 
@@ -74,6 +75,7 @@ class Log:
     scans_with_wheels : how many scans had a reading of the wheels near, of those that passed so far
     notes : what was chosen or assumed
     bad_scans : how many scans were left out, once ``scans`` is through or closed
+    times : what was found out about the times of their points
     """
 
     def __init__(self, indexes: Sequence[FileIndex], config: LogConfig) -> None:
@@ -115,8 +117,8 @@ class Log:
         self._damage: list[str] = [line for index in indexes for line in index.damage]
         with_poses = [each for each in (wheels, truth) if each is not None]
         self.pose_decoders = {each.topic: pose_reader(each, self.dimension) for each in with_poses}
-        self.scans_with_wheels = 0
-        self.bad_scans = 0
+        self.scans_with_wheels = self.bad_scans = 0
+        self.times = SweepTimes(config, self.topic)
         self._opening_notes = tuple(self.notes)
         self._truth: Trajectory | None = None
 
@@ -145,7 +147,7 @@ class Log:
         self.notes = list(self._opening_notes)
         poses = RecordedPoses(self.odometry_topic, self.ground_truth_topic)
         counts = ScanCounts(self.topic, self.odometry_topic)
-        times = PointTimes(self.config)
+        self.times = times = SweepTimes(self.config, self.topic)
         self.scans_with_wheels = 0
         count, index, requested_s = 0, 0, working_s()
         try:
@@ -180,9 +182,9 @@ class Log:
             self._truth = poses.ground_truth()
         finally:  # also where the caller wants no more scans
             is_damaged = bool(self._damage)
-            self._damage += [*counts.losses(), *poses.complaints()]
+            self._damage += [*counts.losses(), *times.warnings(), *poses.complaints()]
             self.bad_scans = counts.bad
-            self.notes += [*([] if is_scan(self.lidar) else [times.assumed]), *counts.notes()]
+            self.notes += [*times.notes(), *counts.notes()]
         if not index:
             raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
         if is_damaged:
@@ -218,12 +220,12 @@ class Log:
             self._truth = poses.ground_truth()
         return self._truth
 
-    def _with_poses(self, poses: RecordedPoses, times: PointTimes) -> Iterator[tuple[Decoded, Pose | None]]:
+    def _with_poses(self, poses: RecordedPoses, times: SweepTimes) -> Iterator[tuple[Decoded, Pose | None]]:
         """Lidar messages with the wheels' pose at their stamp; they wait a little for the readings behind them."""
-        decoders = {self.topic: self.decoder(times), **self.pose_decoders}
+        decoders = {self.topic: self.decoder(PointTimes(self.config)), **self.pose_decoders}
         waiting: deque[Decoded] = deque()
         messages = stream.decoded_messages(self.indexes, decoders, self.span, damage=self._damage)
-        for message in chain(messages, [None]):
+        for message in chain(times.judged(messages), [None]):
             if message is not None and message.channel.topic == self.topic:
                 waiting.append(message)
             elif message is not None:
@@ -239,7 +241,7 @@ class Log:
                 yield scan, poses.at(scan.value.stamp_ns) if isinstance(scan.value, Returns) else None
 
     def decoder(self, times: PointTimes) -> Callable[[memoryview], Returns]:
-        """Decoder of the lidar's messages to points; ``times`` collects its assumptions about theirs."""
+        """Decoder of the lidar's messages to points; ``times`` reads theirs."""
         if is_scan(self.lidar):
             return partial(decode_laser_scan, read=reader(self.lidar), config=self.config)
         return partial(decode_cloud, read=reader(self.lidar), times=times, plane_m=self.plane_height_m)

@@ -15,7 +15,7 @@ from scanchain.config import LogConfig
 from scanchain.data import Pose, RawPoints
 from scanchain.errors import one_line
 from scanchain.kernels.scans import keep_valid
-from scanchain.logs.messages.point_times import NO_TIMES, PointTimes
+from scanchain.logs.messages.point_times import NO_TIMES, UNITS_S, Beams, Field, PointTimes, from_azimuth
 from scanchain.logs.messages.ros import NUMBERS, MalformedMessageError, header, new, point_fields, stamp_ns
 
 _NEAREST_M = float(np.finfo(np.float32).tiny)  # below it a range is zero
@@ -40,8 +40,9 @@ class Sensed(NamedTuple):
 class Returns(NamedTuple):
     """The valid returns of one scan message.
 
-    ``points`` (N, d) float32 meters, ``times_s`` (N,) float32 seconds after ``stamp_ns`` or (0,); ``dropped``
-    counts what was left out, ``why`` is the reason where nothing is left.
+    ``points`` (N, d) float32 meters, ``times_s`` (N,) float32 seconds after ``stamp_ns`` or (0,), by the message
+    alone, which has them as ``stated``; ``dropped`` counts what was left out, ``why`` is the reason where nothing
+    is left.
     """
 
     stamp_ns: int
@@ -49,6 +50,7 @@ class Returns(NamedTuple):
     times_s: NDArray[np.float32]
     dropped: int
     why: str
+    stated: Field | Beams | None = None
 
 
 def read_multi_echo_scan(message: Any) -> Sensed:
@@ -68,23 +70,27 @@ def decode_laser_scan(data: memoryview, read: Callable[[memoryview], Sensed], co
     ranges_m = message.ranges
     low_m = max(message.range_min if message.range_min > 0.0 else 0.0, config.min_range_m, _NEAREST_M)
     high_m = min(message.range_max if message.range_max > 0.0 else _FARTHEST_M, config.max_range_m, _FARTHEST_M)
-    beams = message.angle_min, message.angle_increment, message.time_increment, len(ranges_m)
-    directions, times_s = _beams(*beams)
+    directions = _directions(message.angle_min, message.angle_increment, len(ranges_m))
     valid = ((ranges_m >= low_m) & (ranges_m < high_m)).nonzero()[0]
-    times_s = times_s[valid] if len(times_s) else NO_TIMES
-    points = _moved(directions[valid] * ranges_m[valid, None], T_frame_points).astype(np.float32, copy=False)
+    points = directions[valid] * ranges_m[valid, None]
+    times_s, stated = NO_TIMES, None
+    if config.point_times in UNITS_S or config.point_times == "auto":
+        turns = abs(message.angle_increment) * len(ranges_m) / (2.0 * np.pi)
+        stated = Beams(valid, len(ranges_m), turns, message.time_increment, message.scan_time)
+        times_s = stated.seconds(UNITS_S.get(config.point_times, 1.0) * message.time_increment)
+    elif config.point_times != "none":
+        times_s = from_azimuth(points, config)
+    points = _moved(points, T_frame_points).astype(np.float32, copy=False)
     why = "" if len(valid) else _why_none(ranges_m, low_m, high_m)
-    return Returns(stamp_ns(message), points, times_s, len(ranges_m) - len(valid), why)
+    return Returns(stamp_ns(message), points, times_s, len(ranges_m) - len(valid), why, stated)
 
 
 @lru_cache(_MOST_GEOMETRIES)
-def _beams(
-    first_rad: float, step_rad: float, beam_s: float, count: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Directions (N, 2) of the beams and their times (N,) after the stamp, (0,) where they are simultaneous."""
-    if not (isfinite(first_rad + step_rad * count) and abs(beam_s) * count < _FARTHEST_M):
+def _directions(first_rad: float, step_rad: float, count: int) -> NDArray[np.float32]:
+    """Directions (N, 2) of the beams."""
+    if not isfinite(first_rad + step_rad * count):
         raise MalformedMessageError(
-            f"its beams lie {step_rad:g} rad and {beam_s:g} s apart from {first_rad:g} rad on, which cannot be"
+            f"its beams lie {step_rad:g} rad apart from {first_rad:g} rad on, which cannot be"
         )
     turns = abs(step_rad) * count / (2.0 * np.pi)
     if turns > _MOST_TURNS:
@@ -92,10 +98,7 @@ def _beams(
             f"its {count} beams, {step_rad:g} rad apart, cover {turns:.3g} turns: degrees? wanted radians"
         )
     angles_rad = first_rad + step_rad * np.arange(count)
-    directions = np.column_stack([np.cos(angles_rad), np.sin(angles_rad)]).astype(np.float32)
-    times_s = (beam_s * np.arange(count)).astype(np.float32) if beam_s else NO_TIMES
-    times_s.flags.writeable = False
-    return directions, times_s
+    return np.column_stack([np.cos(angles_rad), np.sin(angles_rad)]).astype(np.float32)
 
 
 def read_livox(data: memoryview, encoding: str) -> Sensed:
@@ -137,12 +140,13 @@ def decode_cloud(
     low_m, high_m = times.config.min_range_m, times.config.max_range_m
     high_square = min(high_m * high_m, _FARTHEST_M)  # where float32 ends
     count = keep_valid(x, y, z, low_m**2, high_square, points, kept)
-    times_s = NO_TIMES
-    for name in (point.names or ())[3:]:
+    times_s, stated = NO_TIMES, None
+    for name in (point.names or ())[3:] if count else ():
         values = cloud[name] if count == len(cloud) else cloud[name][kept[:count]]
-        times_s = times.from_field(name, stamp_ns(message), values)
+        stated = times.from_field(name, stamp_ns(message), values)
+        times_s = stated.seconds(stamp_ns(message)) if stated.span else NO_TIMES
     if times.by_azimuth:
-        times_s = times.from_azimuth(points[:count])
+        times_s = from_azimuth(points[:count], times.config)
     points = _moved(points[:count], T_frame_points)
     if plane_m is not None:
         off_m = np.abs(points[:, 2] - plane_m).max(initial=0.0)
@@ -153,7 +157,7 @@ def decode_cloud(
     why = ""
     if not count:
         why = _why_none(np.hypot(np.hypot(x, y), z), max(low_m, _NEAREST_M), np.sqrt(high_square))
-    return Returns(stamp_ns(message), points, times_s, len(cloud) - count, why)
+    return Returns(stamp_ns(message), points, times_s, len(cloud) - count, why, stated)
 
 
 def plane_height_m(clouds: Iterable[Returns]) -> float | None:

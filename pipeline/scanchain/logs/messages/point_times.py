@@ -1,6 +1,9 @@
-"""Times of the points of a scan, whatever a driver's name and unit for them."""
+"""Times of the points of a scan as its message states them, whatever a driver's name and unit for them."""
 
 from __future__ import annotations
+
+from math import isfinite, nan
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,15 +16,67 @@ NO_TIMES.flags.writeable = False
 _NAMES = ("t", "time", "timestamp", "offset_time", "time_offset", "timeOffset", "time_stamp")
 
 UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-_NONE = "no point times: every scan counts as measured at once"
+NONE_ASSUMED = "no point times: every scan counts as measured at once"
+STAMP, EPOCH, CLOCK = "after the stamp", "since the epoch", "of another clock, counted from the first point"
 _SHORTEST_SCAN_NS = 500_000  # span of a scan's whole numbers, below which they are micro- or milliseconds
 _LONGEST_SCAN = 1e4  # span in milliseconds, above which floats are micro- or nanoseconds
 _NEAR_S = 1.0  # largest time between the stamp of a scan and its beginning
 _ABSOLUTE_S = 3600.0  # least absolute time in seconds
+_TAIL = 0.05  # share of a scan's times at either end that do not count for its core
+_SAMPLE = np.sort(np.random.default_rng(0).random(256))  # places, 0 to 1, of the times whose quantiles are taken
+
+
+class Field(NamedTuple):
+    """Times of the points of a cloud.
+
+    values : (N,) int64 or float64, as in the message; kind : their type there
+    low : the least, but for what lies farther below the others than these spread
+    span : from the least to the greatest, NaN where one is not finite
+    begin : the least after a tail; core : the span without both tails, as if they were as dense
+    unit, origin : as the message alone suggests them
+    """
+
+    name: str
+    kind: str
+    values: NDArray[np.int64] | NDArray[np.float64]
+    low: float
+    span: float
+    begin: float
+    core: float
+    unit: str = ""
+    origin: str = ""
+
+    def seconds(self, stamp_ns: int) -> NDArray[np.float64] | NDArray[np.float32]:
+        """Times (N,) after the stamp by unit and origin."""
+        unit_s, zero = UNITS_S[self.unit], self.low if self.origin == CLOCK else 0
+        if self.origin == EPOCH:
+            zero = _in_units(stamp_ns, unit_s, is_whole=self.values.dtype.kind == "i")
+        values = self.values - zero if zero else self.values
+        times_s = np.empty(len(values), np.float32)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.multiply(values, unit_s, out=times_s, dtype=np.float64, casting="unsafe")
+
+    def __str__(self) -> str:
+        return f"point times: field {self.name} ({self.kind}) taken as {self.unit} {self.origin} (log.point_times)"
+
+
+class Beams(NamedTuple):
+    """Times of a laser scan: of its beams ``numbers`` (N,) came back, of so many, which cover so many turns."""
+
+    numbers: NDArray[np.intp]
+    count: int
+    turns: float
+    increment_s: float
+    scan_time_s: float
+
+    def seconds(self, increment_s: float) -> NDArray[np.float32]:
+        """Times (N,) after the stamp; (0,) where the beams are simultaneous."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            return (increment_s * self.numbers).astype(np.float32) if increment_s else NO_TIMES
 
 
 class PointTimes:
-    """Seconds after the stamp for the points of scans, in any order and from any thread.
+    """Seconds after the stamp for the points of scans, in any order and from any thread, by each message alone.
 
     The unit is that of ``log.point_times`` or, where that is ``auto``, the one that a scan's values suggest.
     ``fields`` names those that hold times, the likeliest first; ``assumed`` describes the interpretation of one of
@@ -33,53 +88,55 @@ class PointTimes:
         self.unit = config.point_times if config.point_times in UNITS_S else ""
         self.by_azimuth = config.point_times in ("clockwise", "counterclockwise")
         self.fields = () if self.by_azimuth or config.point_times == "none" else _NAMES
-        self.assumed = _NONE
+        self.assumed = NONE_ASSUMED
+        if self.by_azimuth:
+            turn = f"{config.revolution_start_rad:.3g} rad, {config.revolution_s:g} s a turn"
+            self.assumed = f"point times by the azimuth: {config.point_times} from {turn} (log.point_times)"
 
-    def from_azimuth(self, points: RawPoints) -> NDArray[np.float32]:
-        """Times (N,) of points (N, 3) by the lidar's turn since its start, which is at the stamp."""
-        config = self.config
-        sense = -1.0 if config.point_times == "clockwise" else 1.0
-        turned = sense * (np.arctan2(points[:, 1], points[:, 0]) - config.revolution_start_rad)
-        direction = (
-            f"{config.point_times} from {config.revolution_start_rad:.3g} rad, {config.revolution_s:g} s a turn"
-        )
-        self.assumed = f"point times by the azimuth: {direction} (log.point_times)"
-        return (turned % (2.0 * np.pi) * (config.revolution_s / (2.0 * np.pi))).astype(np.float32)
-
-    def from_field(self, name: str, stamp_ns: int, values: NDArray[np.generic]) -> NDArray[np.float32]:
-        """Times (N,) of raw values (N,); (0,) where not finite or all the same.
+    def from_field(self, name: str, stamp_ns: int, values: NDArray[np.generic]) -> Field:
+        """Raw values (N,), N > 0, with the unit and the origin that they suggest; most of them decide.
 
         Whole numbers are nanoseconds, or the next unit, micro- or milliseconds, in which the whole scan is not
         shorter than half a millisecond. Floats are seconds where they span up to 10, else milli-, micro- or
         nanoseconds by their span. Values within a second of the stamp are absolute, others count from it; those of
         another clock, the sensor's own or one that is off by the leap seconds, count from the first point.
         """
-        if not len(values):
-            return NO_TIMES
         is_whole, kind = values.dtype.kind in "iu", values.dtype.name
         values = values.astype(np.int64 if is_whole else np.float64)
         first, last = values.min(), values.max()  # NaN where one of the values is
-        if not np.isfinite([first, last]).all():
-            return NO_TIMES
-        span = float(last - first)
-        if span == 0.0:  # as where a float32 holds an absolute time
-            return NO_TIMES
-        unit = self.unit or _likely_unit(span, is_whole=is_whole)
-        unit_s = UNITS_S[unit]
-        per_second = round(1.0 / unit_s)
-        stamp = stamp_ns * per_second // 1_000_000_000 if is_whole else stamp_ns * 1e-9 * per_second
-        origin = "after the stamp"
-        if abs(float(first) - float(stamp)) * unit_s < _NEAR_S and float(first) * unit_s > _ABSOLUTE_S:
-            values -= stamp
-            origin = "since the epoch"
-        elif abs(float(first)) * unit_s > _NEAR_S:
-            values -= first
-            origin = "of another clock, counted from the first point"
-        if self.assumed == _NONE:
-            taken = f"field {name} ({kind}) taken as {unit} {origin}"
-            self.assumed = f"point times: {taken} (log.point_times)"
-        times_s = np.empty(len(values), np.float32)
-        return np.multiply(values, unit_s, out=times_s, dtype=np.float64, casting="unsafe")
+        sample = np.sort(values[(_SAMPLE * len(values)).astype(np.intp)])
+        span = float(last) - float(first)
+        if not isfinite(span):
+            span = nan
+            sample, first = sample[np.isfinite(sample)], values.min(where=np.isfinite(values), initial=np.inf)
+        tail = round(_TAIL * len(sample))
+        begin, end = (sample[tail], sample[-1 - tail]) if len(sample) else (first, first)
+        core = (float(end) - float(begin)) / (1.0 - 2.0 * _TAIL)
+        core = span if core > span else core  # of few points
+        low = first if first >= begin - core else values[values >= begin - core].min()
+        unit = self.unit or _likely_unit(core, is_whole=is_whole)
+        unit_s, origin, begin_s = UNITS_S[unit], STAMP, float(begin) * UNITS_S[unit]
+        after_s = (float(begin) - float(_in_units(stamp_ns, unit_s, is_whole=is_whole))) * unit_s
+        if abs(after_s) < _NEAR_S and begin_s > _ABSOLUTE_S:
+            origin = EPOCH
+        elif abs(begin_s) > _NEAR_S:
+            origin = CLOCK
+        field = Field(name, kind, values, low, span, begin, core, unit, origin)
+        if self.assumed == NONE_ASSUMED and core > 0.0:
+            self.assumed = str(field)
+        return field
+
+
+def from_azimuth(points: RawPoints, config: LogConfig) -> NDArray[np.float32]:
+    """Times (N,) of points (N, d) by the lidar's turn since its start, which is at the stamp."""
+    sense = -1.0 if config.point_times == "clockwise" else 1.0
+    turned = sense * (np.arctan2(points[:, 1], points[:, 0]) - config.revolution_start_rad)
+    return (turned % (2.0 * np.pi) * (config.revolution_s / (2.0 * np.pi))).astype(np.float32)
+
+
+def _in_units(stamp_ns: int, unit_s: float, *, is_whole: bool) -> float:
+    per_second = round(1.0 / unit_s)
+    return stamp_ns * per_second // 1_000_000_000 if is_whole else stamp_ns * 1e-9 * per_second
 
 
 def _likely_unit(span: float, *, is_whole: bool) -> str:
