@@ -14,24 +14,26 @@ from numpy.typing import NDArray
 from scanchain.checks import instance
 from scanchain.clock import working_s
 from scanchain.config import LogConfig, PreprocessConfig
-from scanchain.data import Pose, Scan, Trajectory
+from scanchain.data import OtherPoints, Pose, Scan, Trajectory
 from scanchain.errors import InputError, counted, grouped, shown
 from scanchain.files import Source, source_of
 from scanchain.logs.bad_scans import ScanCounts, defect
 from scanchain.logs.mcap import stream
 from scanchain.logs.mcap.records import Decoded, FileIndex, name_of
-from scanchain.logs.messages.lidar import Returns, decode_cloud, decode_laser_scan, plane_height_m
+from scanchain.logs.messages.lidar import Returns, decode_cloud, decode_laser_scan, moved, plane_height_m
 from scanchain.logs.messages.point_times import PointTimes
 from scanchain.logs.messages.poses import RecordedPoses, StampedPose
 from scanchain.logs.messages.readers import is_scan, pose_reader, reader
-from scanchain.logs.mounting import find_mounting, in_plane, is_upside_down
+from scanchain.logs.mounting import between_frames, find_mounting, in_plane, is_upside_down
 from scanchain.logs.opening import index_files
+from scanchain.logs.publishers import LatestPoints, Publishers, with_jumps
 from scanchain.logs.topics import find_ground_truth, find_lidar, find_odometry
 from scanchain.settings import load_settings, overrides_of
 
 _DEFAULTS = LogConfig()
 _HOLD_NS = 500_000_000  # log time that a scan waits for the wheel reading behind it
 _HOLD_SCANS = 32
+_SAMPLED_SCANS, _SAMPLED_CLOUDS = 128, 16  # messages from all over a log that show its publishers
 
 
 def open_log(
@@ -103,7 +105,14 @@ class Log:
         self.duration_s = whole.duration_s
         self.span = stream.chosen_span(whole, config)
         self.scan_count = stream.count_scans(indexes, self.topic, whole, config)
-        self.mounting = find_mounting(indexes, lidar, wheels, self.span)
+        most = _SAMPLED_SCANS if is_scan(lidar) else _SAMPLED_CLOUDS
+        self.publishers = Publishers(
+            list(stream.sampled(indexes, lidar.topic, self.decoder(PointTimes(config)), self.span, most)),
+            partial(between_frames, indexes, self.span),
+            is_planar=self.dimension == 2,
+        )
+        self.notes += self.publishers.notes
+        self.mounting = find_mounting(indexes, self.publishers.frame, wheels, self.span)
         self.gaps = stream.gap_notes(indexes, config)  # those of the notes that are of long gaps
         self.notes += stream.notes_on(indexes, config)
         self.notes += self.mounting.notes(self.odometry_topic, self.dimension)
@@ -117,6 +126,7 @@ class Log:
         self.pose_decoders = {each.topic: pose_reader(each, self.dimension) for each in with_poses}
         self.scans_with_wheels = 0
         self.bad_scans = 0
+        self.jumps: list[str] = []  # of the header stamps, as a line
         self._opening_notes = tuple(self.notes)
         self._truth: Trajectory | None = None
 
@@ -145,12 +155,13 @@ class Log:
         self.notes = list(self._opening_notes)
         poses = RecordedPoses(self.odometry_topic, self.ground_truth_topic)
         counts = ScanCounts(self.topic, self.odometry_topic)
-        times = PointTimes(self.config)
+        times, latest = PointTimes(self.config), LatestPoints()
         self.scans_with_wheels = 0
-        count, index, requested_s = 0, 0, working_s()
+        count, index, requested_s, jump_s = 0, 0, working_s(), 0.0
         try:
-            for message, T_odom_base in self._with_poses(poses, times):
+            for message, T_odom_base, jumped_s in with_jumps(self._used(counts, poses, times)):
                 count += 1
+                jump_s = jumped_s or jump_s
                 if (count - 1) % self.config.every:
                     continue
                 returns = message.value
@@ -160,7 +171,9 @@ class Log:
                     counts.skip(complaint, self.scan_count, self.config)
                     continue
                 assert isinstance(returns, Returns)
-                points = returns.points * np.array([1.0, -1.0], np.float32) if self.is_mirrored else returns.points
+                publisher = self.publishers.of(message.log_time_ns, returns)
+                points = moved(returns.points, publisher.T_first_frame)
+                points = points * np.array([1.0, -1.0], np.float32) if self.is_mirrored else points
                 scan = Scan(
                     index=index,
                     stamp_ns=returns.stamp_ns,
@@ -171,18 +184,24 @@ class Log:
                     T_odom_base=T_odom_base,
                     waited_s=working_s() - requested_s,
                     is_copy=counts.repeats(points),
+                    clock_jump_s=jump_s,
+                    others=latest.others(publisher.frame, returns.stamp_ns, OtherPoints(points, returns.times_s))
+                    if len(self.publishers.known) > 1
+                    else None,
                 )
                 counts.take(scan)
                 self.scans_with_wheels += scan.T_odom_base is not None
                 yield scan
-                index += 1
+                index, jump_s = index + 1, 0.0
                 requested_s = working_s()
             self._truth = poses.ground_truth()
         finally:  # also where the caller wants no more scans
             is_damaged = bool(self._damage)
-            self._damage += [*counts.losses(), *poses.complaints()]
+            self.jumps = counts.jumps()
+            self._damage += [*counts.losses(), *self.jumps, *poses.complaints()]
             self.bad_scans = counts.bad
-            self.notes += [*([] if is_scan(self.lidar) else [times.assumed]), *counts.notes()]
+            found = [note for note in self.publishers.notes if note not in self.notes]
+            self.notes += [*([] if is_scan(self.lidar) else [times.assumed]), *found, *counts.notes()]
         if not index:
             raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
         if is_damaged:
@@ -199,13 +218,20 @@ class Log:
         ``topic`` : the lidar's or the ground truth's. Raises InputError where it has no message there.
         """
         decode = self.pose_decoders.get(topic) or self.decoder(PointTimes(self.config))
-        why = ""
+        why, unset = "", np.empty(0, np.int64)
         for message in stream.decoded_messages(self.indexes, {topic: decode}, self.span, ahead=1, damage=[]):
-            if isinstance(message.value, Returns | StampedPose):
+            value = message.value
+            if isinstance(value, Returns | StampedPose):
+                if isinstance(value, Returns) and not self.publishers.of(message.log_time_ns, value).is_used:
+                    continue
                 last_ns = min(self.span.end_ns, stream.whole_span(self.indexes).end_ns)
-                first_ns = message.value.stamp_ns
-                return np.array([first_ns, first_ns + last_ns - message.log_time_ns])
-            why = why or f" (the first: {message.value})"
+                expected = np.array([value.stamp_ns, value.stamp_ns + last_ns - message.log_time_ns])
+                if value.stamp_ns:
+                    return expected
+                unset = unset if len(unset) else expected
+            why = why or f" (the first: {value})"
+        if len(unset):
+            return unset
         raise InputError(f"{self.name}: no message of {topic} in the part that is read could be understood{why}")
 
     def ground_truth(self) -> Trajectory | None:
@@ -237,6 +263,17 @@ class Log:
             ):
                 scan = waiting.popleft()
                 yield scan, poses.at(scan.value.stamp_ns) if isinstance(scan.value, Returns) else None
+
+    def _used(
+        self, counts: ScanCounts, poses: RecordedPoses, times: PointTimes
+    ) -> Iterator[tuple[Decoded, Pose | None]]:
+        """Lidar messages as ``_with_poses``, without those of other publishers that cannot be used, or are empty."""
+        for message, T_odom_base in self._with_poses(poses, times):
+            returns = message.value
+            if not isinstance(returns, Returns) or counts.uses(
+                self.publishers.of(message.log_time_ns, returns), returns
+            ):
+                yield message, T_odom_base
 
     def decoder(self, times: PointTimes) -> Callable[[memoryview], Returns]:
         """Decoder of the lidar's messages to points; ``times`` collects its assumptions about theirs."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Set as AbstractSet
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -26,6 +27,7 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
     try:
         reader: Any = rosbag2.Reader(path)
         reader.open()
+        begin_ns = reader.start_time or next((time_ns for _, time_ns, _ in reader.messages(start=1)), 0)
     except Exception as error:  # whatever a damaged file makes the libraries below raise
         raise InputError(
             f"{path}: cannot be read as a ROS bag ({one_line(error)}); "
@@ -46,12 +48,14 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
             )
             index.counts[id_], connections[id_] = each.msgcount, each
     if connections:  # spans of time of one length, so many that each holds a few megabytes on average
-        begin_ns, length_ns, size = reader.start_time, reader.end_time - reader.start_time, size_of(path)
+        length_ns, size = reader.end_time - begin_ns, size_of(path)
         count = min(max(size // _BLOCK_BYTES, 1), _MOST_BLOCKS, max(length_ns, 1))
         edges_ns = [begin_ns + length_ns * place // count for place in range(count + 1)]
         for place, (start_ns, stop_ns) in enumerate(pairwise(edges_ns)):
             share = size // count
             index.blocks.append(Block(number, place, share, "", share, start_ns, stop_ns - 1))
+        if not reader.start_time:  # messages of log time 0, which are in the first block
+            index.blocks[0] = replace(index.blocks[0], start_ns=0)
     index.make = partial(_contents, index, reader, connections, threading.Lock())
     return index
 

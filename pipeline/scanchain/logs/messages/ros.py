@@ -58,6 +58,11 @@ def point_fields(*layout: tuple[str, int, int]) -> list[Any]:
     return [new("sensor_msgs/msg/PointField", *each, 1) for each in layout]
 
 
+def frame_of(message: Any) -> str:
+    """The frame of a message's header, without the slash before it that some of ROS 1 have."""
+    return str(message.header.frame_id).lstrip("/")
+
+
 def stamp_ns(message: Any) -> int:
     """The stamp of a message's header."""
     stamp = message.header.stamp
