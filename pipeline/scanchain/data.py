@@ -55,7 +55,7 @@ def _brief(value: object) -> str:
 
 
 class OtherPoints(NamedTuple):
-    """Points (N, d) of other lidars in the frame of a scan, and their times (N,), seconds relative to its stamp."""
+    """Points (N, d) of other lidars in the frame of a scan, and their times (N,), seconds after its stamp."""
 
     points: RawPoints
     times_s: NDArray[np.float32]

@@ -205,8 +205,8 @@ class ScanCounts:
         total = sum(tally.messages for tally in self.publishers.values())
         used = next((tally for tally in self.publishers.values() if not tally.publisher.note), None)
         return [
-            f"{tally.messages:,} of {counted(total, 'message')} of {self.topic} are of another publisher, {tally.text}, "
-            f"and {'was' if tally.messages == 1 else 'were'} left out{f'; used is {used.text}' if used else ''}"
+            f"{tally.messages:,} of {counted(total, 'message')} of {self.topic} left out, of another publisher: "
+            f"{tally.text}{f'; used is {used.text}' if used else ''}"
             for tally in self.publishers.values()
             if not tally.publisher.is_used or (tally.publisher.note and not tally.with_returns)
         ]
@@ -215,14 +215,12 @@ class ScanCounts:
         """A line on jumps of the header stamps, none as a rule."""
         if not self.clock_jumps:
             return []
-        first, largest = self.clock_jumps[0], max(self.clock_jumps, key=lambda jump: abs(jump.step_s))
-        times = "once" if len(self.clock_jumps) == 1 else f"{len(self.clock_jumps):,} times"
-        most = "" if len(self.clock_jumps) == 1 else f", by up to {_signed(largest.step_s)}"
+        first, most_s = self.clock_jumps[0], max((jump.step_s for jump in self.clock_jumps), key=abs)
         return [
-            f"the header stamps of {self.topic} jump {times}{most} (the first: {_signed(first.step_s)} at scan "
-            f"{first.scan:,}, {first.into_s:.1f} s after the first scan, while the log goes on by "
-            f"{first.logged_s:.2g} s): {first.cause}; each begins a new segment, as nothing says how far the lidar "
-            "moved meanwhile"
+            f"{counted(len(self.clock_jumps), 'jump')} of the header stamps of {self.topic}, by up to "
+            f"{_signed(most_s)} (the first at scan {first.scan:,}, {first.into_s:.1f} s after the first scan: "
+            f"{_signed(first.step_s)} while the log goes on by {first.logged_s:.2g} s): {first.cause}; each begins "
+            "a new segment, as nothing says how far the lidar moved meanwhile"
         ]
 
     def notes(self) -> list[str]:
@@ -234,10 +232,8 @@ class ScanCounts:
             )
         if self.backwards:
             steps = counted(self.backwards, "step")
-            lines.append(
-                f"{steps} back in the header stamps of {self.topic}, by up to {1e-9 * self.farthest_back_ns:.2g} s; "
-                "the log's order is kept"
-            )
+            most = f"by up to {1e-9 * self.farthest_back_ns:.2g} s"
+            lines.append(f"{steps} back in the header stamps of {self.topic}, {most}; the log's order is kept")
         if 0 < self.untimed < self.scans - self.bad:
             lines.append(f"{self._share(self.untimed)} with header stamp 0, as before the first /clock")
         if 0 < self.repeated <= _MOST_REPEATED * self.scans:

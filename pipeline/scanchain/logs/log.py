@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from scanchain.checks import instance
 from scanchain.clock import working_s
 from scanchain.config import LogConfig, PreprocessConfig
-from scanchain.data import OtherPoints, Pose, Scan, Trajectory
+from scanchain.data import Pose, Scan, Trajectory
 from scanchain.errors import InputError, counted, grouped, shown
 from scanchain.files import Source, source_of
 from scanchain.logs.bad_scans import ScanCounts, defect
 from scanchain.logs.mcap import stream
 from scanchain.logs.mcap.records import Decoded, FileIndex, name_of
-from scanchain.logs.messages.lidar import Returns, decode_cloud, decode_laser_scan, moved, plane_height_m
+from scanchain.logs.messages.lidar import Returns, decode_cloud, decode_laser_scan, plane_height_m
 from scanchain.logs.messages.point_times import PointTimes
 from scanchain.logs.messages.poses import RecordedPoses, StampedPose
 from scanchain.logs.messages.readers import is_scan, pose_reader, reader
@@ -101,17 +101,10 @@ class Log:
                     f"the clouds of {lidar.topic} are planar (z = {height_m:.3g} m everywhere): read as a 2D log"
                 )
         self.dimension = 2 if is_scan(lidar) or self.plane_height_m is not None else 3
-        whole = stream.whole_span(indexes)
-        self.duration_s = whole.duration_s
+        self.duration_s = (whole := stream.whole_span(indexes)).duration_s
         self.span = stream.chosen_span(whole, config)
         self.scan_count = stream.count_scans(indexes, self.topic, whole, config)
-        most = _SAMPLED_SCANS if is_scan(lidar) else _SAMPLED_CLOUDS
-        self.publishers = Publishers(
-            list(stream.sampled(indexes, lidar.topic, self.decoder(PointTimes(config)), self.span, most)),
-            partial(between_frames, indexes, self.span),
-            is_planar=self.dimension == 2,
-        )
-        self.notes += self.publishers.notes
+        self.publishers = self._publishers()
         self.mounting = find_mounting(indexes, self.publishers.frame, wheels, self.span)
         self.gaps = stream.gap_notes(indexes, config)  # those of the notes that are of long gaps
         self.notes += stream.notes_on(indexes, config)
@@ -124,11 +117,23 @@ class Log:
         self._damage: list[str] = [line for index in indexes for line in index.damage]
         with_poses = [each for each in (wheels, truth) if each is not None]
         self.pose_decoders = {each.topic: pose_reader(each, self.dimension) for each in with_poses}
-        self.scans_with_wheels = 0
-        self.bad_scans = 0
+        self.scans_with_wheels = self.bad_scans = 0
         self.jumps: list[str] = []  # of the header stamps, as a line
         self._opening_notes = tuple(self.notes)
         self._truth: Trajectory | None = None
+
+    def _publishers(self) -> Publishers:
+        """Publishers of the topic by a sample of its messages, a larger one where none has a return."""
+        sample = partial(
+            stream.sampled, self.indexes, self.topic, self.decoder(PointTimes(self.config)), self.span
+        )
+        sampled = list(sample(_SAMPLED_SCANS if is_scan(self.lidar) else _SAMPLED_CLOUDS))
+        if not any(len(returns.points) for _, returns in sampled):
+            sampled = list(sample())
+        between = partial(between_frames, self.indexes, self.span)
+        publishers = Publishers(sampled, between, is_planar=self.dimension == 2)
+        self.notes += publishers.notes
+        return publishers
 
     def __repr__(self) -> str:
         return f"Log({self.name!r}: {counted(self.scan_count, f'{self.dimension}D scan')} of {self.topic})"
@@ -156,8 +161,7 @@ class Log:
         poses = RecordedPoses(self.odometry_topic, self.ground_truth_topic)
         counts = ScanCounts(self.topic, self.odometry_topic)
         times, latest = PointTimes(self.config), LatestPoints()
-        self.scans_with_wheels = 0
-        count, index, requested_s, jump_s = 0, 0, working_s(), 0.0
+        count, index, requested_s, jump_s, self.scans_with_wheels = 0, 0, working_s(), 0.0, 0
         try:
             for message, T_odom_base, jumped_s in with_jumps(self._used(counts, poses, times)):
                 count += 1
@@ -171,9 +175,7 @@ class Log:
                     counts.skip(complaint, self.scan_count, self.config)
                     continue
                 assert isinstance(returns, Returns)
-                publisher = self.publishers.of(message.log_time_ns, returns)
-                points = moved(returns.points, publisher.T_first_frame)
-                points = points * np.array([1.0, -1.0], np.float32) if self.is_mirrored else points
+                points, others = latest.of(self.publishers, message, is_mirrored=self.is_mirrored)
                 scan = Scan(
                     index=index,
                     stamp_ns=returns.stamp_ns,
@@ -185,9 +187,7 @@ class Log:
                     waited_s=working_s() - requested_s,
                     is_copy=counts.repeats(points),
                     clock_jump_s=jump_s,
-                    others=latest.others(publisher.frame, returns.stamp_ns, OtherPoints(points, returns.times_s))
-                    if len(self.publishers.known) > 1
-                    else None,
+                    others=others,
                 )
                 counts.take(scan)
                 self.scans_with_wheels += scan.T_odom_base is not None
@@ -267,12 +267,10 @@ class Log:
     def _used(
         self, counts: ScanCounts, poses: RecordedPoses, times: PointTimes
     ) -> Iterator[tuple[Decoded, Pose | None]]:
-        """Lidar messages as ``_with_poses``, without those of other publishers that cannot be used, or are empty."""
+        """Lidar messages as ``_with_poses``, but for those of other publishers that are of no use, or empty."""
         for message, T_odom_base in self._with_poses(poses, times):
-            returns = message.value
-            if not isinstance(returns, Returns) or counts.uses(
-                self.publishers.of(message.log_time_ns, returns), returns
-            ):
+            returns, of = message.value, self.publishers.of
+            if not isinstance(returns, Returns) or counts.uses(of(message.log_time_ns, returns), returns):
                 yield message, T_odom_base
 
     def decoder(self, times: PointTimes) -> Callable[[memoryview], Returns]:

@@ -141,9 +141,10 @@ def _disagreeing(
     for each in transforms:
         rival = rivals.get((each.parent, each.child))
         if rival and chain([other for other in transforms if other is not each], base, frame) is None:
+            poses = " and then ".join(place_text(pose.T_parent_child) for pose in (rival, each))
             lines.append(
-                f"/tf_static says two things of {each.parent} → {each.child}: {place_text(rival.T_parent_child)}, and "
-                f"later {place_text(each.T_parent_child)}; the latest is used, as in tf2: stop the wrong publisher"
+                f"/tf_static says of {each.parent} → {each.child}: {poses}; the latest is used, as in tf2: stop the "
+                "wrong publisher"
             )
     return "; ".join(lines)
 

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from itertools import chain, groupby, pairwise
+from itertools import groupby, islice, pairwise
 from typing import NamedTuple
 
 import numpy as np
 
-from scanchain.data import OtherPoints, Pose
+from scanchain.data import OtherPoints, Pose, RawPoints
 from scanchain.errors import duration
 from scanchain.logs.mcap.records import Decoded
-from scanchain.logs.messages.lidar import Returns
+from scanchain.logs.messages.lidar import Returns, moved
 from scanchain.logs.mounting import TILTED_RAD, place_text
 
 _STEP_NS, _STEP_PERIODS = (
@@ -114,27 +114,35 @@ class Publishers:
 
 
 class LatestPoints:
-    """The latest points of each publisher, in the frame of the first."""
+    """The latest points of each publisher, in the frame of the first, by frame."""
 
     def __init__(self) -> None:
         self.latest: dict[str, tuple[int, OtherPoints]] = {}
 
-    def others(self, frame: str, stamp_ns: int, own: OtherPoints) -> OtherPoints | None:
-        """Points of the other publishers just before a scan, which is remembered; None where there are none."""
+    def of(
+        self, publishers: Publishers, message: Decoded, *, is_mirrored: bool
+    ) -> tuple[RawPoints, OtherPoints | None]:
+        """Points of a scan, which are remembered, and those of other publishers just before it."""
+        returns = message.value
+        assert isinstance(returns, Returns)
+        points = moved(returns.points, publishers.of(message.log_time_ns, returns).T_first_frame)
+        points = points * np.array([1.0, -1.0], np.float32) if is_mirrored else points
+        if len(publishers.known) < 2:
+            return points, None
         near = [
-            (1e-9 * (other_ns - stamp_ns), other)
-            for name, (other_ns, other) in self.latest.items()
-            if name != frame and 0 <= stamp_ns - other_ns <= _TOGETHER_NS
+            (1e-9 * (other_ns - returns.stamp_ns), other)
+            for frame, (other_ns, other) in self.latest.items()
+            if frame != returns.frame and 0 <= returns.stamp_ns - other_ns <= _TOGETHER_NS
         ]
-        self.latest[frame] = stamp_ns, own
+        self.latest[returns.frame] = returns.stamp_ns, OtherPoints(points, returns.times_s)
         if not near:
-            return None
+            return points, None
         times_s = [
             np.full(len(other.points), away_s) if not len(other.times_s) else other.times_s + away_s
             for away_s, other in near
         ]
-        points = np.concatenate([other.points for _, other in near])
-        return OtherPoints(points, np.concatenate(times_s).astype(np.float32))
+        seen = np.concatenate([other.points for _, other in near])
+        return points, OtherPoints(seen, np.concatenate(times_s).astype(np.float32))
 
 
 def _clocks(sampled: Sequence[Timed]) -> list[int]:
@@ -162,18 +170,24 @@ def _apart(sampled: Sequence[Timed], keys: Sequence[tuple[str, int]], key: objec
 def with_jumps(messages: Iterable[tuple[Decoded, Pose | None]]) -> Iterator[tuple[Decoded, Pose | None, float]]:
     """Messages with the seconds by which their stamps jump since the one before; 0 as a rule.
 
-    A step back, or one ahead that the log does not take, is a jump if the stamps before and after it agree with the
-    log as well as ever, but for the step. Single wrong stamps, jitter and messages that are late do not.
+    A step back, or one ahead that the log does not take, is a jump if the stamps before and after it are as far
+    from the log as ever, but for the step: single wrong stamps, jitter and late messages are none.
     """
     before: deque[tuple[int, int]] = deque(maxlen=_REMEMBERED)
     waiting: deque[tuple[Decoded, Pose | None]] = deque()
-    for each in chain(messages, [None] * _STEADY):
-        if each is not None:
-            waiting.append(each)
-        if waiting and (each is None or len(waiting) > _STEADY):
-            message, T_odom_base = waiting.popleft()
-            coming = [_times(ahead) for ahead in (message, *(ahead for ahead, _ in waiting))]
-            yield message, T_odom_base, _jump_s(before, coming[0], [times for times in coming[1:] if times])
+    rest = iter(messages)
+    while first := waiting.popleft() if waiting else next(rest, None):
+        now, jump_s = _times(first[0]), 0.0
+        if now and before:
+            if len(before) >= _STEADY and not 0 <= now[0] - before[-1][0] <= _STEP_NS:
+                waiting += islice(rest, _STEADY - len(waiting))
+                coming = filter(None, (_times(message) for message, _ in waiting))
+                jump_s = _jump_s(before, now, [offset_ns for _, offset_ns in coming])
+            if jump_s:
+                before.clear()
+        if now:
+            before.append(now)
+        yield *first, jump_s
 
 
 def _times(message: Decoded) -> tuple[int, int] | None:
@@ -183,21 +197,11 @@ def _times(message: Decoded) -> tuple[int, int] | None:
     return (returns.stamp_ns, returns.stamp_ns - message.log_time_ns) if is_timed else None
 
 
-def _jump_s(
-    before: deque[tuple[int, int]], now: tuple[int, int] | None, coming: Sequence[tuple[int, int]]
-) -> float:
-    """Jump of a stamp against those before, to which it is added."""
-    if now is None:
-        return 0.0
-    step_ns = now[0] - before[-1][0] if before else 0
-    is_jump = False
-    if len(before) >= _STEADY and not 0 <= step_ns <= _STEP_NS:
-        stamps_ns, offsets_ns = np.array(before, np.int64).T
-        limit_ns = max(_STEP_NS, _STEP_PERIODS * abs(float(np.median(np.diff(stamps_ns)))))
-        after_ns = [offset_ns for _, offset_ns in (now, *coming)]
-        is_back = step_ns < -limit_ns and max(after_ns) < np.median(offsets_ns) - limit_ns
-        is_jump = bool(is_back or (step_ns > limit_ns and min(after_ns) > offsets_ns.max() + limit_ns))
-    if is_jump:
-        before.clear()
-    before.append(now)
-    return 1e-9 * step_ns if is_jump else 0.0
+def _jump_s(before: Sequence[tuple[int, int]], now: tuple[int, int], coming_ns: Sequence[int]) -> float:
+    """Seconds of a jump, 0 where it is none; ``coming_ns`` are the offsets of the scans behind it."""
+    stamps_ns, offsets_ns = np.array(before, np.int64).T
+    step_ns, limit_ns = now[0] - before[-1][0], max(_STEP_NS, _STEP_PERIODS * float(np.median(np.diff(stamps_ns))))
+    after_ns = [now[1], *coming_ns]
+    is_back = step_ns < -limit_ns and max(after_ns) < np.median(offsets_ns) - limit_ns
+    is_ahead = step_ns > limit_ns and min(after_ns) > offsets_ns.max() + limit_ns
+    return 1e-9 * step_ns if is_back or is_ahead else 0.0

@@ -64,8 +64,9 @@ class Intervals:
     def to(self, scan: Scan) -> float:
         """Seconds since the last scan, 0 for the first.
 
-        After a jump of the clock those of a gap. By the stamps where these agree with the usual interval or with the times of the log, else as usual. Before
-        an interval is usual, by the log where stamps do not go on, and by the points where they took longer.
+        After a jump of the clock those of a gap. By the stamps where these agree with the usual interval or with
+        the times of the log, else as usual. Before an interval is usual, by the log where stamps do not go on, and
+        by the points where they took longer.
         """
         if self.last_scan is None:
             return 0.0

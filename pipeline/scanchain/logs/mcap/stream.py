@@ -215,8 +215,8 @@ def _begin(index: FileIndex) -> None:
             for block in index.blocks
         ]
         index.notes.append(
-            f"{index.path}: {counted(counts.total(), 'message')} of log time 0, as before the first /clock: read as "
-            "of the first time that follows"
+            f"{index.path}: {counted(counts.total(), 'message')} of log time 0, as before the first /clock: read "
+            "as of the first time that follows"
         )
 
 
@@ -343,17 +343,16 @@ def sampled(
     span: Span | None = None,
     most: int | None = None,
 ) -> Iterator[tuple[int, T]]:
-    """As ``sampled_messages``, with their log times; ``most`` of them, at random, in order."""
+    """As ``sampled_messages``, with their log times; ``most`` of the block in the middle, at random, in order."""
     chosen, at_random = EVERYTHING if span is None else span, Random(0)
     blocks = _blocks_of(indexes, [index.numbers_of(topic) for index in indexes], chosen)
     if span is not None and len(blocks) > _SAMPLED_BLOCKS:
         blocks = [blocks[k * (len(blocks) - 1) // (_SAMPLED_BLOCKS - 1)] for k in range(_SAMPLED_BLOCKS)]
-    is_remote = any(index.fetch is not None for index in indexes)
-    for block in (blocks := blocks[: 1 if most is not None and is_remote else _SAMPLED_BLOCKS]):
+    for block in blocks[:_SAMPLED_BLOCKS] if most is None else blocks[len(blocks) // 2 :][:1]:
         messages = messages_of(indexes[block.file], block)
         messages = [each for each in messages if each.channel.topic == topic and chosen.holds(each)]
-        if most is not None and len(messages) > most // len(blocks):
-            messages = [messages[k] for k in sorted(at_random.sample(range(len(messages)), most // len(blocks)))]
+        if most is not None and len(messages) > most:
+            messages = [messages[k] for k in sorted(at_random.sample(range(len(messages)), most))]
         for message in messages:
             with suppress(MalformedMessageError):
                 yield message.log_time_ns, decode(message.data)
