@@ -54,6 +54,13 @@ def _brief(value: object) -> str:
     return text if len(text) <= _SHOWN else f"<{type(value).__name__}{size}>"
 
 
+class OtherPoints(NamedTuple):
+    """Points (N, d) of other lidars in the frame of a scan, and their times (N,), seconds after its stamp."""
+
+    points: RawPoints
+    times_s: NDArray[np.float32]
+
+
 @dataclass(frozen=True, slots=True)
 class Scan:
     """One scan as the log holds it, invalid returns removed.
@@ -67,6 +74,8 @@ class Scan:
     T_odom_base : pose of the robot in the wheel-odometry frame at ``stamp_ns``; None where the log has none
     waited_s : seconds that the reader of the log made its consumer wait for this scan
     is_copy : whether its points are those of the scan before in the log, to the last bit
+    clock_jump_s : jump of the stamp since the scan before that no time passed for; 0 as a rule
+    others : what other lidars that publish on the topic saw just before; None as a rule
 
     Arrays are converted where nothing is lost; InputError where a shape, a dtype or a value is none of these.
     """
@@ -81,6 +90,8 @@ class Scan:
     T_odom_base: Pose | None
     waited_s: float = 0.0
     is_copy: bool = False
+    clock_jump_s: float = 0.0
+    others: OtherPoints | None = None
 
     def __post_init__(self) -> None:
         """Check and convert; the class is frozen, so that what was checked stays so."""

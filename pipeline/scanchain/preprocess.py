@@ -83,12 +83,16 @@ def sweep_of(scan: Scan, config: PreprocessConfig, scale: float = 1.0) -> Sweep:
     scale : of the voxels, 1 for ``preprocess.map_voxel_m``
     """
     voxel_m = scale * config.map_voxel_m
-    chosen = first_per_voxel(scan.points, voxel_m, config.min_range_m, config.max_range_m)
-    points = scan.points.take(chosen, axis=0).astype(np.float64)
-    if not config.deskew or not len(scan.times_s):
+    raw, times_s = scan.points, scan.times_s if config.deskew else scan.times_s[:0]
+    if scan.others is not None:  # as if one lidar had seen it all
+        times_s = times_s if len(times_s) else np.zeros(len(raw), np.float32)
+        raw, times_s = np.concatenate([raw, scan.others.points]), np.concatenate([times_s, scan.others.times_s])
+    chosen = first_per_voxel(raw, voxel_m, config.min_range_m, config.max_range_m)
+    points = raw.take(chosen, axis=0).astype(np.float64)
+    if not len(times_s):
         return Sweep(points, np.empty(0), 0.0)
-    middle_s = 0.5 * (float(scan.times_s.min()) + float(scan.times_s.max()))
-    return Sweep(points, scan.times_s[chosen].astype(np.float64) - middle_s, middle_s)
+    middle_s = 0.5 * (float(times_s.min()) + float(times_s.max()))
+    return Sweep(points, times_s[chosen].astype(np.float64) - middle_s, middle_s)
 
 
 def downsample(points: Points, voxel_m: float) -> Points:

@@ -226,7 +226,8 @@ class Slam:
         if self.placement.set_apart():
             state = self.graph.state()
         odometry, scan_of = trail.odometry, trail.scan_of
-        corrected = spread(state.poses[first:], scan_of, odometry.poses)
+        starts = [start - first for start in self.closer.segments.starts]
+        corrected = spread(state.poses[first:], scan_of, odometry.poses, starts)
         if self._refines:
             progress(f"refining {counted(len(odometry), 'scan')}")
             fixed, poses = self.keyframes[:first], corrected[scan_of]

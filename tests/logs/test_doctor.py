@@ -27,7 +27,7 @@ from tests.support.naive_logs import (
 from tests.support.scenes import configured, shared_data
 
 STEP_NS = SECOND // 10
-CHECKS = ["gaps", "wheels", "point times", "damage", "returns", "no return", "ranges", "duplicates"]
+CHECKS = ["gaps", "stamps", "wheels", "point times", "damage", "returns", "no return", "ranges", "duplicates"]
 
 
 def diagnose(*paths, **config):
@@ -104,7 +104,7 @@ def test_a_gap_is_found_where_it_is(tmp_path):
     path = saved(tmp_path, drive(stamp=hole, log=hole))
     finding = diagnose(path)["gaps"]
     assert (finding.severity, finding.remedy) == ("warning", "--end 1.9")
-    assert finding.found == "1 longer than 2.5 periods, the longest 2.1 s, 1.9 s into the log"
+    assert finding.found == "1 longer than 2.5 periods of 0.1 s, the longest 2.1 s, 1.9 s into the log"
     assert "at constant velocity" in finding.effect
     assert "run what comes before it, as below, and the rest, --start 4, apart" in finding.effect
     later = diagnose(path, start_s=1.0)["gaps"]

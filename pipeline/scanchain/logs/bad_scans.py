@@ -3,19 +3,64 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from scanchain.config import LogConfig, PreprocessConfig
 from scanchain.data import MOST_COPIES, RawPoints, Scan
-from scanchain.errors import InputError, counted
+from scanchain.errors import InputError, counted, duration
 from scanchain.logs.mcap.records import Decoded
 from scanchain.logs.messages.lidar import Returns
+from scanchain.logs.publishers import Publisher
 
 _MOST_REPEATED = 0.5  # share of repeated stamps above which it is a warning
 _FEWEST_COPIED = 10  # least points of a scan that may be a copy
 _COPIES_SHARE = 0.01  # of the scans, up to which copies are no warning
+_AGAIN = 0.1  # share of a jump of the stamps, up to which they begin again as at first
 _SAMPLE = 64  # step of the sample of points tested first: usually one of them is in range
+
+
+class _Jump(NamedTuple):
+    """A jump of the header stamps, and the log's step there; whether the stamps begin again as at first."""
+
+    scan: int
+    into_s: float
+    step_s: float
+    logged_s: float
+    is_loop: bool
+
+    @property
+    def cause(self) -> str:
+        """What may have made it."""
+        if self.is_loop:
+            return "a recording played in a loop, or a simulation that began again"
+        if self.step_s < 0.0:
+            return "a clock that was set back, or a recording of before"
+        return "a clock that was set, or a playback that skipped a part"
+
+
+@dataclass(slots=True)
+class _Tally:
+    """Messages of a publisher, those with returns, and their first and last stamp."""
+
+    publisher: Publisher
+    messages: int = 0
+    with_returns: int = 0
+    begin_ns: int = 0
+    end_ns: int = 0
+
+    @property
+    def text(self) -> str:
+        """The publisher in words."""
+        percent = 100.0 * self.with_returns / self.messages
+        clock = f"stamps {1e-9 * self.begin_ns:.1f} to {1e-9 * self.end_ns:.1f} s"
+        return f"frame {self.publisher.frame or 'without a name'} ({clock}, {percent:.3g} % with returns)"
+
+
+def _signed(time_s: float) -> str:
+    return f"{'-' if time_s < 0.0 else '+'}{duration(abs(time_s))}"
 
 
 def most_bad_scans(scans: int, config: LogConfig) -> float:
@@ -60,6 +105,9 @@ class ScanCounts:
         self.topic = topic
         self.odometry_topic = odometry_topic
         self.scans = self.bad = self.backwards = self.repeated = self.without_wheels = self.copies = 0
+        self.untimed = self.farthest_back_ns = self.begin_ns = self.begin_log_ns = 0
+        self.publishers: dict[tuple[str, int], _Tally] = {}
+        self.clock_jumps: list[_Jump] = []
         self.first_complaint = ""
         self._last: Scan | None = None
 
@@ -75,6 +123,15 @@ class ScanCounts:
                 "another --topic"
             )
 
+    def uses(self, publisher: Publisher, returns: Returns) -> bool:
+        """True if a message is to be used; those of another publisher that are not, or are empty, are counted."""
+        tally = self.publishers.setdefault((publisher.frame, publisher.clock), _Tally(publisher))
+        tally.messages += 1
+        tally.with_returns += len(returns.points) > 0
+        tally.begin_ns, tally.end_ns = tally.begin_ns or returns.stamp_ns, returns.stamp_ns
+        is_idle = publisher.note and not tally.with_returns
+        return publisher.is_used and not is_idle
+
     def repeats(self, points: RawPoints) -> bool:
         """True if the points of a scan are those of the one before, to the last bit."""
         if self._last is None or len(points) < _FEWEST_COPIED:
@@ -88,16 +145,26 @@ class ScanCounts:
         self.without_wheels += scan.T_odom_base is None
         self.copies += scan.is_copy
         if self._last is not None:
-            self.backwards += scan.stamp_ns < self._last.stamp_ns
-            self.repeated += scan.stamp_ns == self._last.stamp_ns
+            back_ns = self._last.stamp_ns - scan.stamp_ns
+            if scan.clock_jump_s:
+                logged_s = 1e-9 * (scan.log_time_ns - self._last.log_time_ns)
+                into_s = 1e-9 * (scan.log_time_ns - self.begin_log_ns)
+                is_loop = abs(scan.stamp_ns - self.begin_ns) < _AGAIN * abs(back_ns)
+                self.clock_jumps.append(_Jump(scan.index, into_s, scan.clock_jump_s, logged_s, is_loop))
+            elif back_ns > 0 and scan.stamp_ns:
+                self.backwards += 1
+                self.farthest_back_ns = max(self.farthest_back_ns, back_ns)
+            self.repeated += back_ns == 0
         self._last = scan
+        self.untimed += scan.stamp_ns == 0
+        self.begin_ns, self.begin_log_ns = self.begin_ns or scan.stamp_ns, self.begin_log_ns or scan.log_time_ns
 
     def _share(self, count: int) -> str:
         return f"{count} of {counted(self.scans, 'scan')} of {self.topic}"
 
     def losses(self) -> list[str]:
         """Warnings of scans left out or copied, and of stamps that most scans do not have."""
-        lines = []
+        lines = self._of_publishers()
         if self.bad:
             were = "was" if self.bad == 1 else "were"
             lines.append(f"{self._share(self.bad)} {were} left out (the first: {self.first_complaint})")
@@ -113,6 +180,29 @@ class ScanCounts:
             )
         return lines
 
+    def _of_publishers(self) -> list[str]:
+        """A line on each publisher that was left out, or had no returns."""
+        total = sum(tally.messages for tally in self.publishers.values())
+        used = next((tally for tally in self.publishers.values() if not tally.publisher.note), None)
+        return [
+            f"{tally.messages:,} of {counted(total, 'message')} of {self.topic} left out, of another publisher: "
+            f"{tally.text}{f'; used is {used.text}' if used else ''}"
+            for tally in self.publishers.values()
+            if not tally.publisher.is_used or (tally.publisher.note and not tally.with_returns)
+        ]
+
+    def jumps(self) -> list[str]:
+        """A line on jumps of the header stamps, none as a rule."""
+        if not self.clock_jumps:
+            return []
+        first, most_s = self.clock_jumps[0], max((jump.step_s for jump in self.clock_jumps), key=abs)
+        return [
+            f"{counted(len(self.clock_jumps), 'jump')} of the header stamps of {self.topic}, by up to "
+            f"{_signed(most_s)} (the first at scan {first.scan:,}, {first.into_s:.1f} s after the first scan: "
+            f"{_signed(first.step_s)} while the log goes on by {first.logged_s:.2g} s): {first.cause}; each begins a "
+            "new segment, as nothing says how far the lidar moved meanwhile"
+        ]
+
     def notes(self) -> list[str]:
         """Lines on a few copies, stamps out of order and missing wheel odometry."""
         lines = []
@@ -122,7 +212,10 @@ class ScanCounts:
             )
         if self.backwards:
             steps = counted(self.backwards, "step")
-            lines.append(f"{steps} back in the header stamps of {self.topic}; the log's order is kept")
+            most = f"by up to {1e-9 * self.farthest_back_ns:.2g} s"
+            lines.append(f"{steps} back in the header stamps of {self.topic}, {most}; the log's order is kept")
+        if 0 < self.untimed < self.scans - self.bad:
+            lines.append(f"{self._share(self.untimed)} with header stamp 0, as before the first /clock")
         if 0 < self.repeated <= _MOST_REPEATED * self.scans:
             lines.append(f"{self._share(self.repeated)} with the header stamp of the one before")
         if self.odometry_topic and self.without_wheels:

@@ -177,6 +177,7 @@ def _turning(points: RawPoints) -> tuple[int, float]:
 def _check(seen: Survey, config: Config, most_bad: float) -> Iterator[Finding]:
     """Every finding about a log. ``config`` is what a run of it would use; ``most_bad`` scans it may lack."""
     yield _gaps(seen, bool(seen.wheels) and config.odometry.prior != "constant-velocity")
+    yield _stamps(seen)
     yield _wheels(seen)
     yield _point_times(seen)
     yield _damage(seen, config.preprocess, most_bad)
@@ -189,11 +190,12 @@ def _check(seen: Survey, config: Config, most_bad: float) -> Iterator[Finding]:
 def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:
     steps_s = np.diff(seen.log_times_ns) * 1e-9
     gaps = np.flatnonzero(steps_s > _GAP_PERIODS * seen.period_s) if seen.period_s else np.empty(0, np.int64)
+    periods = f"{_GAP_PERIODS:g} periods" + (f" of {seen.period_s:.3g} s" if seen.period_s else "")
     if not len(gaps):
-        return Finding("gaps", Severity.OK, f"none longer than {_GAP_PERIODS:g} periods")
+        return Finding("gaps", Severity.OK, f"none longer than {periods}")
     longest = int(gaps[np.argmax(steps_s[gaps])])
     longest_s, at_s = steps_s[longest], seen.into_log_s(longest)
-    found = f"{len(gaps):,} longer than {_GAP_PERIODS:g} periods, the longest {longest_s:.3g} s, "
+    found = f"{len(gaps):,} longer than {periods}, the longest {longest_s:.3g} s, "
     found += f"{at_s:.1f} s into the log"
     effect = f"the motion over a gap is predicted {'by the wheels' if is_on_wheels else 'at constant velocity'}"
     if longest_s < (_LONG_GAP_ON_WHEELS_S if is_on_wheels else _LONG_GAP_S):
@@ -203,6 +205,19 @@ def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:
         f"--start {math.floor(10.0 * (at_s + longest_s)) / 10.0:g}, apart"
     )
     return Finding("gaps", Severity.WARNING, found, effect, f"--end {math.ceil(10.0 * at_s) / 10.0:g}")
+
+
+def _stamps(seen: Survey) -> Finding:
+    """Finding on header stamps that run back or jump."""
+    if seen.log.jumps:
+        effect = "the motion over a jump is unknown: a loop closure may join the segments; else run them apart"
+        return Finding("stamps", Severity.WARNING, "; ".join(seen.log.jumps), effect)
+    back_s = -1e-9 * np.diff(seen.stamps_ns)
+    count = int(np.count_nonzero(back_s > 0.0))
+    if not count:
+        return Finding("stamps", Severity.OK, "none runs back")
+    found = f"{counted(count, 'step')} back, by up to {back_s.max():.2g} s"
+    return Finding("stamps", Severity.NOTE, found, "they jitter: scans are processed in the order of the log")
 
 
 def _wheels(seen: Survey) -> Finding:
@@ -290,7 +305,7 @@ def _other_unit(assumed: str, part: float) -> str:
 def _damage(seen: Survey, preprocess: PreprocessConfig, most_bad: float) -> Finding:
     low_m, high_m = preprocess.min_range_m, preprocess.max_range_m
     outside = sum(bool(scan.ranges_m[0] > high_m or scan.ranges_m[-1] < low_m) for scan in seen.scans)
-    bad, lines = seen.log.bad_scans + outside, list(seen.log.damage)
+    bad, lines = seen.log.bad_scans + outside, [line for line in seen.log.damage if line not in seen.log.jumps]
     if outside:
         limits = f"preprocess.min_range_m ({low_m:g}) and preprocess.max_range_m ({high_m:g})"
         lines.append(f"{counted(outside, 'scan')} without a point between {limits}")

@@ -24,8 +24,9 @@ from scanchain.logs.messages.lidar import Returns, decode_cloud, decode_laser_sc
 from scanchain.logs.messages.point_times import PointTimes
 from scanchain.logs.messages.poses import RecordedPoses, StampedPose
 from scanchain.logs.messages.readers import is_scan, pose_reader, reader
-from scanchain.logs.mounting import find_mounting, in_plane, is_upside_down
+from scanchain.logs.mounting import between_frames, find_mounting, in_plane, is_upside_down
 from scanchain.logs.opening import index_files
+from scanchain.logs.publishers import LatestPoints, Publishers, with_jumps
 from scanchain.logs.sweep_times import SweepTimes
 from scanchain.logs.topics import find_ground_truth, find_lidar, find_odometry
 from scanchain.settings import load_settings, overrides_of
@@ -33,6 +34,7 @@ from scanchain.settings import load_settings, overrides_of
 _DEFAULTS = LogConfig()
 _HOLD_NS = 500_000_000  # log time that a scan waits for the wheel reading behind it
 _HOLD_SCANS = 32
+_SAMPLED_SCANS, _SAMPLED_CLOUDS = 128, 16  # messages from all over a log that show its publishers
 
 
 def open_log(
@@ -75,7 +77,7 @@ class Log:
     scans_with_wheels : how many scans had a reading of the wheels near, of those that passed so far
     notes : what was chosen or assumed
     bad_scans : how many scans were left out, once ``scans`` is through or closed
-    times : what was found out about the times of their points
+    times : what was found out about the times of their points; jumps : a line on jumps of the header stamps
     """
 
     def __init__(self, indexes: Sequence[FileIndex], config: LogConfig) -> None:
@@ -101,11 +103,11 @@ class Log:
                     f"the clouds of {lidar.topic} are planar (z = {height_m:.3g} m everywhere): read as a 2D log"
                 )
         self.dimension = 2 if is_scan(lidar) or self.plane_height_m is not None else 3
-        whole = stream.whole_span(indexes)
-        self.duration_s = whole.duration_s
+        self.duration_s = (whole := stream.whole_span(indexes)).duration_s
         self.span = stream.chosen_span(whole, config)
         self.scan_count = stream.count_scans(indexes, self.topic, whole, config)
-        self.mounting = find_mounting(indexes, lidar, wheels, self.span)
+        self.publishers = self._publishers()
+        self.mounting = find_mounting(indexes, self.publishers.frame, wheels, self.span)
         self.gaps = stream.gap_notes(indexes, config)  # those of the notes that are of long gaps
         self.notes += stream.notes_on(indexes, config)
         self.notes += self.mounting.notes(self.odometry_topic, self.dimension)
@@ -118,9 +120,22 @@ class Log:
         with_poses = [each for each in (wheels, truth) if each is not None]
         self.pose_decoders = {each.topic: pose_reader(each, self.dimension) for each in with_poses}
         self.scans_with_wheels = self.bad_scans = 0
-        self.times = SweepTimes(config, self.topic)
+        self.times, self.jumps = SweepTimes(config, self.topic), list[str]()
         self._opening_notes = tuple(self.notes)
         self._truth: Trajectory | None = None
+
+    def _publishers(self) -> Publishers:
+        """Publishers of the topic by a sample of its messages, a larger one where none has a return."""
+        sample = partial(
+            stream.sampled, self.indexes, self.topic, self.decoder(PointTimes(self.config)), self.span
+        )
+        sampled = list(sample(_SAMPLED_SCANS if is_scan(self.lidar) else _SAMPLED_CLOUDS))
+        if not any(len(returns.points) for _, returns in sampled):
+            sampled = list(sample())
+        between = partial(between_frames, self.indexes, self.span)
+        publishers = Publishers(sampled, between, is_planar=self.dimension == 2)
+        self.notes += publishers.notes
+        return publishers
 
     def __repr__(self) -> str:
         return f"Log({self.name!r}: {counted(self.scan_count, f'{self.dimension}D scan')} of {self.topic})"
@@ -147,12 +162,12 @@ class Log:
         self.notes = list(self._opening_notes)
         poses = RecordedPoses(self.odometry_topic, self.ground_truth_topic)
         counts = ScanCounts(self.topic, self.odometry_topic)
-        self.times = times = SweepTimes(self.config, self.topic)
-        self.scans_with_wheels = 0
-        count, index, requested_s = 0, 0, working_s()
+        self.times, latest = SweepTimes(self.config, self.topic), LatestPoints()
+        count, index, requested_s, jump_s, self.scans_with_wheels = 0, 0, working_s(), 0.0, 0
         try:
-            for message, T_odom_base in self._with_poses(poses, times):
+            for message, T_odom_base, jumped_s in with_jumps(self._used(counts, poses)):
                 count += 1
+                jump_s = jumped_s or jump_s
                 if (count - 1) % self.config.every:
                     continue
                 returns = message.value
@@ -162,7 +177,7 @@ class Log:
                     counts.skip(complaint, self.scan_count, self.config)
                     continue
                 assert isinstance(returns, Returns)
-                points = returns.points * np.array([1.0, -1.0], np.float32) if self.is_mirrored else returns.points
+                points, others = latest.of(self.publishers, message, is_mirrored=self.is_mirrored)
                 scan = Scan(
                     index=index,
                     stamp_ns=returns.stamp_ns,
@@ -173,18 +188,22 @@ class Log:
                     T_odom_base=T_odom_base,
                     waited_s=working_s() - requested_s,
                     is_copy=counts.repeats(points),
+                    clock_jump_s=jump_s,
+                    others=others,
                 )
                 counts.take(scan)
                 self.scans_with_wheels += scan.T_odom_base is not None
                 yield scan
-                index += 1
+                index, jump_s = index + 1, 0.0
                 requested_s = working_s()
             self._truth = poses.ground_truth()
         finally:  # also where the caller wants no more scans
             is_damaged = bool(self._damage)
-            self._damage += [*counts.losses(), *times.warnings(), *poses.complaints()]
+            self.jumps = counts.jumps()
+            self._damage += [*counts.losses(), *self.times.warnings(), *self.jumps, *poses.complaints()]
             self.bad_scans = counts.bad
-            self.notes += [*times.notes(), *counts.notes()]
+            found = [note for note in self.publishers.notes if note not in self.notes]
+            self.notes += [*self.times.notes(), *found, *counts.notes()]
         if not index:
             raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
         if is_damaged:
@@ -201,13 +220,20 @@ class Log:
         ``topic`` : the lidar's or the ground truth's. Raises InputError where it has no message there.
         """
         decode = self.pose_decoders.get(topic) or self.decoder(PointTimes(self.config))
-        why = ""
+        why, unset = "", np.empty(0, np.int64)
         for message in stream.decoded_messages(self.indexes, {topic: decode}, self.span, ahead=1, damage=[]):
-            if isinstance(message.value, Returns | StampedPose):
+            value = message.value
+            if isinstance(value, Returns | StampedPose):
+                if isinstance(value, Returns) and not self.publishers.of(message.log_time_ns, value).is_used:
+                    continue
                 last_ns = min(self.span.end_ns, stream.whole_span(self.indexes).end_ns)
-                first_ns = message.value.stamp_ns
-                return np.array([first_ns, first_ns + last_ns - message.log_time_ns])
-            why = why or f" (the first: {message.value})"
+                expected = np.array([value.stamp_ns, value.stamp_ns + last_ns - message.log_time_ns])
+                if value.stamp_ns:
+                    return expected
+                unset = unset if len(unset) else expected
+            why = why or f" (the first: {value})"
+        if len(unset):
+            return unset
         raise InputError(f"{self.name}: no message of {topic} in the part that is read could be understood{why}")
 
     def ground_truth(self) -> Trajectory | None:
@@ -220,12 +246,12 @@ class Log:
             self._truth = poses.ground_truth()
         return self._truth
 
-    def _with_poses(self, poses: RecordedPoses, times: SweepTimes) -> Iterator[tuple[Decoded, Pose | None]]:
+    def _with_poses(self, poses: RecordedPoses) -> Iterator[tuple[Decoded, Pose | None]]:
         """Lidar messages with the wheels' pose at their stamp; they wait a little for the readings behind them."""
         decoders = {self.topic: self.decoder(PointTimes(self.config)), **self.pose_decoders}
         waiting: deque[Decoded] = deque()
         messages = stream.decoded_messages(self.indexes, decoders, self.span, damage=self._damage)
-        for message in chain(times.judged(messages), [None]):
+        for message in chain(self.times.judged(messages), [None]):
             if message is not None and message.channel.topic == self.topic:
                 waiting.append(message)
             elif message is not None:
@@ -239,6 +265,13 @@ class Log:
             ):
                 scan = waiting.popleft()
                 yield scan, poses.at(scan.value.stamp_ns) if isinstance(scan.value, Returns) else None
+
+    def _used(self, counts: ScanCounts, poses: RecordedPoses) -> Iterator[tuple[Decoded, Pose | None]]:
+        """Lidar messages as ``_with_poses``, but for those of other publishers that are of no use, or empty."""
+        for message, T_odom_base in self._with_poses(poses):
+            returns, of = message.value, self.publishers.of
+            if not isinstance(returns, Returns) or counts.uses(of(message.log_time_ns, returns), returns):
+                yield message, T_odom_base
 
     def decoder(self, times: PointTimes) -> Callable[[memoryview], Returns]:
         """Decoder of the lidar's messages to points; ``times`` reads theirs."""

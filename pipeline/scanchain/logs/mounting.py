@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -14,13 +15,12 @@ from scanchain.logs.mcap.records import Channel, FileIndex
 from scanchain.logs.mcap.stream import Span, sampled_messages
 from scanchain.logs.messages.poses import StampedPose, chain
 from scanchain.logs.messages.readers import pose_reader, reader, role
-from scanchain.logs.messages.ros import frame_name
 from scanchain.logs.topics import topics_of
 
 _BASE_FRAMES = ("base_link", "base_footprint", "base")
 _WORLD_WORDS = {"map", "odom", "world", "earth", "global", "origin", "init"}  # in names of frames that stand still
 _TURN_RAD, _SHIFT_M = np.radians(0.2), 0.005  # least turn and shift of a mount that moves
-_TILTED_RAD = np.radians(10.0)  # tilt of a planar lidar's plane from which on it is no floor plan
+TILTED_RAD = np.radians(10.0)  # tilt of a planar lidar's plane from which on it is no floor plan
 _TURNED_DEG = 0.5  # least turn of a lidar on its robot that is worth a word
 
 
@@ -54,7 +54,7 @@ class Mounting(NamedTuple):
                 f"the lidar moves on the robot ({self.motion}): poses are the lidar's, this motion included{prior}"
             )
         tilted_rad = np.arccos(np.clip(abs(self.T_base_lidar[2, 2]), 0.0, 1.0))
-        if dimension == 2 and tilted_rad > _TILTED_RAD:
+        if dimension == 2 and tilted_rad > TILTED_RAD:
             notes.append(
                 f"the plane of the scans is tilted by {np.degrees(tilted_rad):.0f} deg on {self.base_name} "
                 f"{self.source}: a floor plan takes a level one; correct the transforms, or choose another --topic"
@@ -71,42 +71,96 @@ class MovingFrame(NamedTuple):
     T_lidar_frame: Pose
 
 
-def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel | None, span: Span) -> Mounting:
-    """The mounting of a lidar as the chosen part of a log shows it."""
-    fixed = _transforms(indexes, is_fixed=True)
-    frame = _frame_of(indexes, lidar)
+def find_mounting(indexes: Sequence[FileIndex], frame: str, wheels: Channel | None, span: Span) -> Mounting:
+    """The mounting of a lidar with this frame, empty if it has none, as the chosen part of a log shows it."""
     stated = None
     if wheels is not None and role(wheels) == "odometry":
         stated = next(sampled_messages(indexes, wheels.topic, pose_reader(wheels, 3)), None)
     bases = [name for name in ("" if stated is None else stated.child, *_BASE_FRAMES) if name]
-    for base in bases:
-        T_base_lidar = chain(fixed, base, frame)
+    latest, fixed, rivals = _fixed(indexes)
+    for base, transforms in product(bases, (latest, fixed)):
+        T_base_lidar = chain(transforms, base, frame)
         if T_base_lidar is not None:
-            return Mounting(base, T_base_lidar)
-    joints: dict[tuple[str, str], list[StampedPose]] = {}
-    for each in _transforms(indexes, is_fixed=False, span=span):
-        if not _is_world(each.parent):
-            joints.setdefault((each.parent, each.child), []).append(each)
-    first = [*fixed, *(poses[0] for poses in joints.values())]
+            return Mounting(base, T_base_lidar, note=_disagreeing(transforms, rivals, base, frame))
+    joints, first = _joints(indexes, fixed, span)
     for base in bases:
         T_base_lidar = chain(first, base, frame)
         if T_base_lidar is not None:
             motion = _motion(joints, first, base, frame)
             source = "by transforms of /tf" + (" that change" if motion else ", which do not change")
             return Mounting(base, T_base_lidar, source, motion)
-    root = _root([each for each in fixed if not _is_world(each.parent)], frame)
-    T_root_lidar = chain(fixed, root, frame)
+    root = _root([each for each in latest if not _is_world(each.parent)], frame)
+    T_root_lidar = chain(latest, root, frame)
     if root != frame and T_root_lidar is not None:
         note = f"the log has no transform from {bases[0]} to {frame}: {root} is taken as the base"
-        return Mounting(root, T_root_lidar, note=note)
+        rival = _disagreeing(latest, rivals, root, frame)
+        return Mounting(root, T_root_lidar, note=f"{note}{rival and '; '}{rival}")
     why = f"no static transform from {bases[0]} to {frame or 'the lidar'}"
     note = "" if not fixed and wheels is None else f"{why}: the lidar is taken to sit at the robot's origin"
     return Mounting("", np.eye(4), note=note)
 
 
-def _motion(
-    joints: dict[tuple[str, str], list[StampedPose]], first: Sequence[StampedPose], base: str, frame: str
-) -> str | None:
+def between_frames(indexes: Sequence[FileIndex], span: Span, target: str, source: str) -> Pose | None:
+    """T_target_source (4, 4) of two frames that do not move against each other, None where the log has none."""
+    latest, fixed, _ = _fixed(indexes)
+    found = (chain(transforms, target, source) for transforms in (latest, fixed))
+    T_target_source = next((T for T in found if T is not None), None)
+    if T_target_source is None:
+        joints, first = _joints(indexes, fixed, span)
+        is_moving = _motion(joints, first, target, source) is not None
+        T_target_source = None if is_moving else chain(first, target, source)
+    return T_target_source
+
+
+_Frames = tuple[str, str]  # parent and child
+_Joints = dict[_Frames, list[StampedPose]]
+
+
+def _fixed(
+    indexes: Sequence[FileIndex],
+) -> tuple[list[StampedPose], list[StampedPose], dict[_Frames, StampedPose]]:
+    """Static transforms, the latest of each child as in tf2; those of each pair; others that contradict these."""
+    latest: dict[str, StampedPose] = {}
+    fixed: dict[_Frames, StampedPose] = {}
+    rivals: dict[_Frames, StampedPose] = {}
+    for each in _transforms(indexes, is_fixed=True):
+        frames = each.parent, each.child
+        before = fixed.get(frames, each)
+        shift_m, turn_rad = lie.apart(before.T_parent_child, each.T_parent_child)
+        if shift_m > _SHIFT_M or turn_rad > _TURN_RAD:
+            rivals[frames] = before
+        latest[each.child] = fixed[frames] = each
+    return list(latest.values()), list(fixed.values()), rivals
+
+
+def _disagreeing(
+    transforms: Sequence[StampedPose], rivals: dict[_Frames, StampedPose], base: str, frame: str
+) -> str:
+    """Line on values of static transforms, on which the lidar hangs, that contradict each other; else empty."""
+    lines = []
+    for each in transforms:
+        rival = rivals.get((each.parent, each.child))
+        if rival and chain([other for other in transforms if other is not each], base, frame) is None:
+            poses = " and then ".join(place_text(pose.T_parent_child) for pose in (rival, each))
+            lines.append(
+                f"/tf_static says of {each.parent} → {each.child}: {poses}; the latest is used, as in tf2: stop "
+                "the wrong publisher"
+            )
+    return "; ".join(lines)
+
+
+def _joints(
+    indexes: Sequence[FileIndex], fixed: Sequence[StampedPose], span: Span
+) -> tuple[_Joints, list[StampedPose]]:
+    """Transforms of /tf but for those in the world, and the first of each with the static ones."""
+    joints: _Joints = {}
+    for each in _transforms(indexes, is_fixed=False, span=span):
+        if not _is_world(each.parent):
+            joints.setdefault((each.parent, each.child), []).append(each)
+    return joints, [*fixed, *(poses[0] for poses in joints.values())]
+
+
+def _motion(joints: _Joints, first: Sequence[StampedPose], base: str, frame: str) -> str | None:
     """The joint between base and lidar that turns most, and how far, as text; None where none moves."""
     motion, most_rad = None, -1.0
     for joint, poses in joints.items():
@@ -121,15 +175,13 @@ def _motion(
     return motion
 
 
-def moving_frame(
-    indexes: Sequence[FileIndex], lidar: Channel, mounting: Mounting, *, dimension: int
-) -> MovingFrame:
+def moving_frame(indexes: Sequence[FileIndex], frame: str, mounting: Mounting, *, dimension: int) -> MovingFrame:
     """The root of the fixed transforms above the lidar, the lidar's own frame where the log has none.
 
     Transforms of /tf that join it to the base and do not change are as good as fixed ones.
     """
-    frame = _frame_of(indexes, lidar) or "lidar"
-    transforms = _transforms(indexes, is_fixed=True)
+    frame = frame or "lidar"
+    transforms, _, _ = _fixed(indexes)
     if mounting.base and mounting.motion is None and chain(transforms, mounting.base, frame) is None:
         transforms.append(StampedPose(0, mounting.base, frame, mounting.T_base_lidar))
     root = _root(transforms, frame)
@@ -164,6 +216,13 @@ def turned_by(T_base_lidar: Pose) -> str:
     return ", ".join(f"{name} {angle:.0f} deg" for name, angle in angles if abs(angle) > _TURNED_DEG)
 
 
+def place_text(T: Pose) -> str:
+    """A pose (4, 4) as text: its position, and its orientation by the angles that are not zero."""
+    at = ", ".join(f"{axis} {value_m:.3f} m" for axis, value_m in zip("xyz", T[:3, 3], strict=True))
+    turned = turned_by(T)
+    return f"{at}{turned and ', turned by '}{turned}"
+
+
 def in_plane(T_base_lidar: Pose) -> Pose:
     """T_base_lidar (3, 3) of a planar scanner.
 
@@ -183,9 +242,3 @@ def _transforms(indexes: Sequence[FileIndex], *, is_fixed: bool, span: Span | No
             for transforms in sampled_messages(indexes, topic, reader(channel), span):
                 found += transforms
     return found
-
-
-def _frame_of(indexes: Sequence[FileIndex], lidar: Channel) -> str:
-    """The frame of a lidar's first messages, empty where they name none."""
-    first = next(sampled_messages(indexes, lidar.topic, reader(lidar)), None)
-    return "" if first is None else frame_name(first.message.header.frame_id)

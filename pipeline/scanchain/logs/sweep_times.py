@@ -121,7 +121,9 @@ class SweepTimes:
                 if not ahead or waiting[0] is not ahead[0].message:
                     yield waiting.popleft()
                 elif message is None or len(ahead) > _AFTER:
-                    returns = self._judge(ahead[0], [*behind, *ahead])
+                    frame = ahead[0].returns.frame
+                    around = [each for each in (*behind, *ahead) if each.returns.frame == frame]
+                    returns = self._judge(ahead[0], around)
                     behind.append(ahead.popleft())
                     yield waiting.popleft()._replace(value=returns)
                 else:

@@ -23,15 +23,19 @@ _TOLERANCE_M, _TOLERANCE_RAD = 0.005, 0.002  # step below which another iteratio
 _MAX_SCANS = 2048  # largest number of scans of a thread in memory
 
 
-def spread(T_world_keyframes: Matrix, scan_indices: NDArray[np.int64], odometry: Matrix) -> Matrix:
+def spread(
+    T_world_keyframes: Matrix, scan_indices: NDArray[np.int64], odometry: Matrix, starts: Sequence[int] = ()
+) -> Matrix:
     """World poses (N, d+1, d+1) of all scans: each keyframe's correction, blended between it and the next.
 
     scan_indices : (K,) of the keyframes, the first of them 0; odometry : (N, d+1, d+1) T_odom_lidar
+    starts : keyframes to which the motion is unknown, so that nothing is blended before them
     """
     following = np.append(np.arange(1, len(scan_indices)), -1)
     relative = lie.between(odometry[scan_indices], odometry[scan_indices[following]])
     target = lie.between(T_world_keyframes, T_world_keyframes[following])
     correction = lie.log(target @ lie.inverse(relative))
+    correction[[start - 1 for start in starts if start > 0]] = 0.0
     before = np.searchsorted(scan_indices, np.arange(len(odometry)), side="right") - 1
     span = np.append(np.diff(scan_indices), 1)[before]
     share = np.clip((np.arange(len(odometry)) - scan_indices[before]) / span, 0.0, 1.0)

@@ -64,11 +64,14 @@ class Intervals:
     def to(self, scan: Scan) -> float:
         """Seconds since the last scan, 0 for the first.
 
-        By the stamps where these agree with the usual interval or with the times of the log, else as usual. Before
-        an interval is usual, by the log where stamps do not go on, and by the points where they took longer.
+        After a jump of the clock those of a gap. By the stamps where these agree with the usual interval or with
+        the times of the log, else as usual. Before an interval is usual, by the log where stamps do not go on, and
+        by the points where they took longer.
         """
         if self.last_scan is None:
             return 0.0
+        if scan.clock_jump_s:
+            return float(np.clip(abs(scan.clock_jump_s), 2.0 * _GAP * self.usual_s, _LONGEST * self.usual_s))
         stamped_s, logged_s = _since(self.last_scan, scan)
         if not self.usual_s:
             interval_s = stamped_s if stamped_s > 0.0 else logged_s
@@ -80,9 +83,11 @@ class Intervals:
         return stamped_s if is_plausible else self.usual_s
 
     def silence_s(self, scan: Scan) -> float:
-        """Seconds since the last scan, however many; 0 where the stamps and the log disagree."""
+        """Seconds since the last scan, however many, or of a jump; 0 where the stamps and the log disagree."""
         if self.last_scan is None:
             return 0.0
+        if scan.clock_jump_s:
+            return abs(scan.clock_jump_s)
         stamped_s, logged_s = _since(self.last_scan, scan)
         return stamped_s if _are_alike(stamped_s, logged_s) else 0.0
 

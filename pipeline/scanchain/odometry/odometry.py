@@ -169,7 +169,7 @@ class Odometry:
         self._calibrate(scan, points, registered.state)
         match = registered.match if registered.rival is None else spread(registered.match, registered.rival)
         tracked = Tracked(
-            scan=replace(scan, T_odom_base=None) if self.predictor.is_contradicted else scan,
+            scan=replace(scan, T_odom_base=None) if self.predictor.is_contradicted or scan.clock_jump_s else scan,
             points=points,
             matched=registered.points,
             T_odom_lidar=self.predictor.T_odom_lidar,
@@ -216,6 +216,8 @@ class Odometry:
             match = first_match(prediction.T_odom_last, points, self.config.matching)
             self.first_sweep, self.first_points = sweep, sweep.points
             return _Registered(points, match, State.OK, prediction)
+        if scan.clock_jump_s:
+            return self._reset_map(points, prediction, f"its stamp jumps by {scan.clock_jump_s:+.3g} s")
         usual_cost = self.recovery.usual_cost
         match, rival = self.recovery.align(points, sweep, self.local_map, prediction)
         is_placed = match.inlier_share >= self.config.matching.min_inlier_share
@@ -231,7 +233,8 @@ class Odometry:
         elif state is not State.LOST:
             self.standstill.follow(match)
         if prediction.is_out_of_reach and self.recovery.fits_badly(match, state, usual_cost):
-            return self._reset_map(points, prediction)
+            may_be = f"may be {prediction.reach_m:.0f} m away after a time without scans"
+            return self._reset_map(points, prediction, may_be)
         return _Registered(points, match, state, prediction, rival=None if state is State.LOST else rival)
 
     def _deskewed(self, sparse: Sweep, match: Match, prediction: Prediction) -> tuple[Points, Match, Prediction]:
@@ -253,13 +256,13 @@ class Odometry:
         error = prediction.deskewing_error(match.T_target_source, sparse.duration_s)
         return points, blurred(match, error), prediction
 
-    def _reset_map(self, points: Points, prediction: Prediction) -> _Registered:
+    def _reset_map(self, points: Points, prediction: Prediction, why: str) -> _Registered:
         """Clear the map, to which the scan does not belong; a new one begins where the last scan was."""
         self.map.replace([])
         self.recovery.forget()
         self.elevation.forget()
         self.standstill.begin(prediction.T_odom_last)
-        reason = f"may be {prediction.reach_m:.0f} m away after a time without scans: {NEW_MAP}"
+        reason = f"{why}: {NEW_MAP}"
         match = first_match(prediction.T_odom_last, points, self.config.matching)
         match = replace(match, converged=False, reason=reason)
         return _Registered(points, match, State.OK, prediction, prediction.reach_m)

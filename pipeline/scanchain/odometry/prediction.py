@@ -318,8 +318,8 @@ class Predictor:
 
     def _wheel_motion(self, scan: Scan) -> Pose | None:
         """Motion of the lidar since the last scan by the wheels; None without a reading at both ends."""
-        if self.config.prior == "constant-velocity" or self.intervals.last_scan is None:
-            return None
+        if self.config.prior == "constant-velocity" or self.intervals.last_scan is None or scan.clock_jump_s:
+            return None  # their clock may have jumped as well, and they with it
         last, now = self.T_odom_base, scan.T_odom_base
         if now is None and self.config.prior == "wheel":
             raise InputError(

@@ -36,7 +36,7 @@ def write_results_mcap(path: Path, log: Log, steps: StepTable, result: SlamResul
     of the log's fixed transforms, so that the log's own sensors follow it. The maps are those beside it, the grid
     in a frame of its own.
     """
-    moving = moving_frame(log.indexes, log.lidar, log.mounting, dimension=log.dimension)
+    moving = moving_frame(log.indexes, log.publishers.frame, log.mounting, dimension=log.dimension)
     first_ns, first_log_ns = (int(steps.columns[name][0]) for name in ("stamp_ns", "log_time_ns"))
     with LogWriter(path) as writer:
         trajectory = result.trajectory

@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
 from contextlib import suppress
+from dataclasses import replace
 from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
@@ -56,6 +57,7 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
     try:
         bag.reader = reader = rosbag2.Reader(opened)
         reader.open()
+        begin_ns = reader.start_time or next((time_ns for _, time_ns, _ in reader.messages(start=1)), 0)
     except Exception as error:  # whatever a damaged file makes the libraries below raise
         return _index_of_pages(bag, number, one_line(error))
     index = FileIndex(path, number)
@@ -74,7 +76,9 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
     if bag.is_packed:  # messages are unpacked here, as rosbags sets no limit
         reader.storage.metadata = reader.storage.metadata._replace(compression_mode=None)
     if bag.connections:
-        _add_blocks(index, bag, reader.start_time, reader.end_time)
+        _add_blocks(index, bag, begin_ns, reader.end_time)
+        if not reader.start_time:  # messages of log time 0, which are in the first block
+            index.blocks[0] = replace(index.blocks[0], start_ns=0)
     return index
 
 

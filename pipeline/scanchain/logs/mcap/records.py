@@ -112,6 +112,7 @@ class FileIndex:
     counts : messages by channel id, empty until they are known
     uncertain_channels : those of a summary that was not accepted, for channels defined nowhere else
     is_consistent : whether the channels that blocks state were checked
+    begin_ns : log time of messages that have none, those of 0 before the first /clock; 0 where every one has one
     """
 
     path: Source
@@ -124,6 +125,7 @@ class FileIndex:
     channels: dict[int, Channel] = field(default_factory=dict)
     counts: dict[int, int] = field(default_factory=dict)
     is_consistent: bool = True
+    begin_ns: int = 0
     uncertain_channels: dict[int, Channel] = field(default_factory=dict)
     damage: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -189,6 +191,14 @@ def read_block(index: FileIndex, block: Block, wanted: AbstractSet[int] | None =
 
     Raises DamagedBlockError where a whole block does not unpack to what its header says.
     """
+    contents = _read(index, block, wanted)
+    if not index.begin_ns:
+        return contents
+    timed = [message._replace(log_time_ns=message.log_time_ns or index.begin_ns) for message in contents.messages]
+    return contents._replace(messages=timed)
+
+
+def _read(index: FileIndex, block: Block, wanted: AbstractSet[int] | None) -> Contents:
     if index.make is not None:
         made = index.make(block, wanted)
         return made._replace(messages=[m for m in made.messages if wanted is None or m.channel.key[1] in wanted])

@@ -5,18 +5,20 @@ Chunks and files may overlap; they are unpacked and decoded ahead in threads.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import replace
 from heapq import heappop, heappush
 from itertools import pairwise
 from math import inf
+from random import Random
 from typing import NamedTuple, TypeVar
 
 from scanchain.config import LogConfig
-from scanchain.errors import InputError, duration
+from scanchain.errors import InputError, counted, duration
 from scanchain.logs.mcap.records import (
     Block,
     DamagedBlockError,
@@ -193,6 +195,29 @@ def complete(index: FileIndex) -> None:
             unknown = {number for number in unknown if not index.knows(number)}
     index.channels |= {k: channel for k, channel in index.uncertain_channels.items() if k in unknown}
     index.counts = index.counts or dict(counts)
+    _begin(index)
+
+
+def _begin(index: FileIndex) -> None:
+    """Give log times of 0, as before the first /clock, that of the first other message.
+
+    A log may begin at 0, but then its clock does not stand still there, nor jump from there.
+    """
+    untimed = [block for block in index.blocks if block.start_ns == 0 and not block.may_be_empty]
+    messages = [message for block in untimed for message in messages_of(index, block)]
+    times_ns = [*(message.log_time_ns for message in messages), *(block.start_ns for block in index.blocks)]
+    begin_ns = min(filter(None, times_ns), default=0)
+    counts = Counter(message.channel.key[1] for message in messages if message.log_time_ns == 0)
+    if counts and begin_ns and (max(counts.values()) > 1 or begin_ns > _LONG_GAP_NS):
+        index.begin_ns = begin_ns
+        index.blocks = [
+            replace(block, start_ns=begin_ns, end_ns=max(block.end_ns, begin_ns)) if block in untimed else block
+            for block in index.blocks
+        ]
+        index.notes.append(
+            f"{index.path}: {counted(counts.total(), 'message')} of log time 0, as before the first /clock: read "
+            "as of the first time that follows"
+        )
 
 
 def ends_of(indexes: Sequence[FileIndex], topic: str) -> Span:
@@ -307,12 +332,27 @@ def sampled_messages(
     indexes: Sequence[FileIndex], topic: str, decode: Callable[[memoryview], T], span: Span | None = None
 ) -> Iterator[T]:
     """Decoded messages in a topic's first blocks, or in some from all over a span; malformed ones are left out."""
-    chosen = EVERYTHING if span is None else span
+    for _, decoded in sampled(indexes, topic, decode, span):
+        yield decoded
+
+
+def sampled(
+    indexes: Sequence[FileIndex],
+    topic: str,
+    decode: Callable[[memoryview], T],
+    span: Span | None = None,
+    most: int | None = None,
+) -> Iterator[tuple[int, T]]:
+    """As ``sampled_messages``, with their log times; ``most`` of the block in the middle, at random, in order."""
+    chosen, at_random = EVERYTHING if span is None else span, Random(0)
     blocks = _blocks_of(indexes, [index.numbers_of(topic) for index in indexes], chosen)
     if span is not None and len(blocks) > _SAMPLED_BLOCKS:
         blocks = [blocks[k * (len(blocks) - 1) // (_SAMPLED_BLOCKS - 1)] for k in range(_SAMPLED_BLOCKS)]
-    for block in blocks[:_SAMPLED_BLOCKS]:
-        for message in messages_of(indexes[block.file], block):
-            if message.channel.topic == topic and chosen.holds(message):
-                with suppress(MalformedMessageError):
-                    yield decode(message.data)
+    for block in blocks[:_SAMPLED_BLOCKS] if most is None else blocks[len(blocks) // 2 :][:1]:
+        messages = messages_of(indexes[block.file], block)
+        messages = [each for each in messages if each.channel.topic == topic and chosen.holds(each)]
+        if most is not None and len(messages) > most:
+            messages = [messages[k] for k in sorted(at_random.sample(range(len(messages)), most))]
+        for message in messages:
+            with suppress(MalformedMessageError):
+                yield message.log_time_ns, decode(message.data)

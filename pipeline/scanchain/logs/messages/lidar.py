@@ -16,7 +16,15 @@ from scanchain.data import Pose, RawPoints
 from scanchain.errors import one_line
 from scanchain.kernels.scans import keep_valid
 from scanchain.logs.messages.point_times import NO_TIMES, UNITS_S, Beams, Field, PointTimes, from_azimuth
-from scanchain.logs.messages.ros import NUMBERS, MalformedMessageError, header, new, point_fields, stamp_ns
+from scanchain.logs.messages.ros import (
+    NUMBERS,
+    MalformedMessageError,
+    frame_of,
+    header,
+    new,
+    point_fields,
+    stamp_ns,
+)
 
 _NEAREST_M = float(np.finfo(np.float32).tiny)  # below it a range is zero
 _MOST_GEOMETRIES = 16
@@ -42,7 +50,7 @@ class Returns(NamedTuple):
 
     ``points`` (N, d) float32 meters, ``times_s`` (N,) float32 seconds after ``stamp_ns`` or (0,), by the message
     alone, which has them as ``stated``; ``dropped`` counts what was left out, ``why`` is the reason where nothing
-    is left.
+    is left; ``frame`` is that of the points.
     """
 
     stamp_ns: int
@@ -50,6 +58,7 @@ class Returns(NamedTuple):
     times_s: NDArray[np.float32]
     dropped: int
     why: str
+    frame: str = ""
     stated: Field | Beams | None = None
 
 
@@ -80,9 +89,10 @@ def decode_laser_scan(data: memoryview, read: Callable[[memoryview], Sensed], co
         times_s = stated.seconds(UNITS_S.get(config.point_times, 1.0) * message.time_increment)
     elif config.point_times != "none":
         times_s = from_azimuth(points, config)
-    points = _moved(points, T_frame_points).astype(np.float32, copy=False)
+    points = moved(points, T_frame_points).astype(np.float32, copy=False)
     why = "" if len(valid) else _why_none(ranges_m, low_m, high_m)
-    return Returns(stamp_ns(message), points, times_s, len(ranges_m) - len(valid), why, stated)
+    count = len(ranges_m) - len(valid)
+    return Returns(stamp_ns(message), points, times_s, count, why, frame_of(message), stated)
 
 
 @lru_cache(_MOST_GEOMETRIES)
@@ -147,7 +157,7 @@ def decode_cloud(
         times_s = stated.seconds(stamp_ns(message)) if stated.span else NO_TIMES
     if times.by_azimuth:
         times_s = from_azimuth(points[:count], times.config)
-    points = _moved(points[:count], T_frame_points)
+    points = moved(points[:count], T_frame_points)
     if plane_m is not None:
         off_m = np.abs(points[:, 2] - plane_m).max(initial=0.0)
         if off_m > _PLANAR_M:
@@ -157,7 +167,7 @@ def decode_cloud(
     why = ""
     if not count:
         why = _why_none(np.hypot(np.hypot(x, y), z), max(low_m, _NEAREST_M), np.sqrt(high_square))
-    return Returns(stamp_ns(message), points, times_s, len(cloud) - count, why, stated)
+    return Returns(stamp_ns(message), points, times_s, len(cloud) - count, why, frame_of(message), stated)
 
 
 def plane_height_m(clouds: Iterable[Returns]) -> float | None:
@@ -225,7 +235,7 @@ def _rows(message: Any, point: np.dtype[np.void]) -> NDArray[np.void]:
     return np.ndarray((height, width), point, body, strides=(stride, point.itemsize)).reshape(-1)
 
 
-def _moved(points: RawPoints, T: Pose | None) -> RawPoints:
+def moved(points: RawPoints, T: Pose | None) -> RawPoints:
     """Points (N, d) moved by a pose (4, 4); None moves nothing."""
     d = points.shape[1]
     return points if T is None else (points @ T[:d, :d].T + T[:d, 3]).astype(np.float32)

@@ -96,6 +96,7 @@ class RecordedPoses:
         self.odometry_topic = odometry_topic
         self.ground_truth_topic = ground_truth_topic
         self.stamps_ns: list[int] = []  # of the latest readings of the wheels, in order
+        self.latest_ns = 0  # of the last one, as logged
         self.wheels: dict[int, Pose] = {}
         self.truth: list[StampedPose] = []
         self.malformed: dict[str, list[str]] = {}  # by topic, what is wrong with each message
@@ -109,6 +110,9 @@ class RecordedPoses:
         if topic == self.ground_truth_topic:
             self.truth.append(pose)
         if topic == self.odometry_topic:
+            if self.stamps_ns and pose.stamp_ns < self.latest_ns - _NEAREST_NS:  # the clock jumped back
+                self.stamps_ns, self.wheels = [], {}
+            self.latest_ns = pose.stamp_ns
             if pose.stamp_ns not in self.wheels:
                 insort(self.stamps_ns, pose.stamp_ns)
             self.wheels[pose.stamp_ns] = pose.T_parent_child

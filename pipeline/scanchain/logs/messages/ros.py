@@ -66,6 +66,11 @@ def frame_name(frame: str) -> str:
     return printable(frame.lstrip("/"))
 
 
+def frame_of(message: Any) -> str:
+    """The frame of a message's header."""
+    return frame_name(str(message.header.frame_id))
+
+
 def stamp_ns(message: Any) -> int:
     """The stamp of a message's header."""
     stamp = message.header.stamp
