@@ -67,7 +67,8 @@ class Log:
 
     paths : its files; name : these as errors name them
     topic, dimension : the lidar's topic; 2 for laser scans and planar clouds, 3 for clouds
-    mounting : how the lidar sits on the robot; T_base_lidar : (d+1, d+1) of it
+    mounting : how the lidar sits on the robot; T_base_lidar : (d+1, d+1) of it; stated_mounting : the same, None
+        where it is assumed
     scan_count : scans to expect after start, end and every, by the index
     duration_s : from the first message to the last
     odometry_topic : whose poses the scans carry, empty where there is none
@@ -112,6 +113,7 @@ class Log:
         T_base_lidar = self.mounting.T_base_lidar
         self.is_mirrored = self.dimension == 2 and is_upside_down(T_base_lidar)
         self.T_base_lidar: Pose = in_plane(T_base_lidar) if self.dimension == 2 else T_base_lidar
+        self.stated_mounting = None if self.mounting.is_assumed else self.T_base_lidar
         self._damage: list[str] = [line for index in indexes for line in index.damage]
         with_poses = [each for each in (wheels, truth) if each is not None]
         self.pose_decoders = {each.topic: pose_reader(each, self.dimension) for each in with_poses}

@@ -40,6 +40,11 @@ class Mounting(NamedTuple):
     note: str = ""
 
     @property
+    def is_assumed(self) -> bool:
+        """True if no transform from the wheels' frame or a usual one to the lidar states it."""
+        return not self.base or bool(self.note)
+
+    @property
     def base_name(self) -> str:
         """Name of the base in print: its frame where that is another than usual."""
         return "the base" if not self.base or self.base in _BASE_FRAMES else self.base
@@ -97,9 +102,11 @@ def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel 
     T_root_lidar = chain(fixed, root, frame)
     if root != frame and T_root_lidar is not None:
         note = f"the log has no transform from {bases[0]} to {frame}: {root} is taken as the base"
+        note += ", its place on that of the wheels is estimated" if wheels else ""
         return Mounting(root, T_root_lidar, note=note)
     why = f"no static transform from {bases[0]} to {frame or 'the lidar'}"
-    note = "" if not fixed and wheels is None else f"{why}: the lidar is taken to sit at the robot's origin"
+    taken = "is estimated from the wheels" if wheels else "is assumed: the lidar at the robot's origin"
+    note = "" if not fixed and wheels is None else f"{why}: the mounting {taken}"
     return Mounting("", np.eye(4), note=note)
 
 

@@ -15,6 +15,7 @@ from scanchain.errors import InputError, counted
 from scanchain.kernels.geometry import largest_magnitude
 from scanchain.kernels.matrices import definite_inverse
 from scanchain.kernels.registration.observability import WEAK
+from scanchain.registration.hand_eye import MountingEstimator
 from scanchain.odometry.intervals import Intervals
 
 _EVEN = 2.0  # largest ratio of two intervals from which an acceleration is computed
@@ -220,9 +221,11 @@ class Predictor:
     Where a scan constrains nothing along a direction, the motion there goes on and its variance grows.
     """
 
-    def __init__(self, config: OdometryConfig, T_base_lidar: Pose) -> None:
+    def __init__(self, config: OdometryConfig, T_base_lidar: Pose, *, is_mounted: bool) -> None:
+        """is_mounted : whether ``T_base_lidar`` is known; else it is estimated as the lidar moves."""
         self.config = config
         self.T_base_lidar = T_base_lidar
+        self.mounting = None if is_mounted else MountingEstimator()
         self.T_odom_lidar = lie.identity(T_base_lidar.shape[0] - 1)
         self.T_previous_current = self.T_odom_lidar
         k = lie.twist_size(T_base_lidar)
@@ -244,6 +247,8 @@ class Predictor:
         self.is_contradicted = False
         if wheel is not None:
             motion, covariance = wheel, self.by_wheels.covariance
+            if self.mounting is not None:
+                covariance = covariance + self.mounting.covariance(wheel)
             scans = max(interval_s / times.usual_s, 1.0) if times.usual_s else 1.0
             if largest_magnitude(wheel - self.filter.motion) > _JUMP * scans:
                 jump_m = float(np.linalg.norm(wheel[:-1, -1] - scans * self.filter.motion[:-1, -1]))
@@ -297,6 +302,26 @@ class Predictor:
         self.T_odom_base = None if T_odom_base is None else T_odom_base.copy()
         self.T_odom_lidar = T_odom_lidar
 
+    def learn_mounting(self, T_odom_lidar: Pose, scan: Scan, state: State) -> None:
+        """Take the pose of a scan at its stamp for the mounting, where that is not known."""
+        if self.mounting is None:
+            return
+        T_odom_base = scan.T_odom_base if state is State.OK else None
+        self.mounting.take(T_odom_lidar, T_odom_base, is_open=state is not State.OK)
+        self._mount()
+
+    def notes(self) -> tuple[str, ...]:
+        """How the lidar was taken to sit on its base, where nothing states it, by all scans so far."""
+        if self.mounting is None:
+            return ()
+        self.mounting.estimate()
+        self._mount()
+        return self.mounting.notes()
+
+    def _mount(self) -> None:
+        if self.mounting is not None and self.mounting.found is not None:
+            self.T_base_lidar = self.mounting.found.T_base_lidar
+
     def _update(self, prediction: Prediction, match: Match, state: State) -> None:
         """Correct the filter and the error statistics by the innovation."""
         if state is State.LOST:
@@ -326,7 +351,7 @@ class Predictor:
                 f"scan {scan.index} has no wheel odometry although odometry.prior is 'wheel'; "
                 "set log.odometry_topic, or odometry.prior to 'auto'"
             )
-        if last is None or now is None:
+        if last is None or now is None or (self.mounting is not None and not self.mounting.is_usable):
             return None
         return lie.between(self.T_base_lidar, lie.between(last, now).dot(self.T_base_lidar))
 

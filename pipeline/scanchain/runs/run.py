@@ -139,7 +139,8 @@ class _Run:
         write_whole(folder / "config.toml", dump(self.config).encode())
         scans = self.log.scans(self.config.preprocess)
         if left is None:
-            return Slam(self.config, self.log.T_base_lidar, folder / POINTS_FILE), scans
+            mounting = self.log.stated_mounting
+            return Slam(self.config, mounting, folder / POINTS_FILE, dimension=self.log.dimension), scans
         left.slam.points.reopen(folder / POINTS_FILE)
         scans = after(left, scans)
         set_aside(folder, left)
@@ -222,7 +223,7 @@ class _Run:
                 self.steps, results, judged, run_s=run_s, compile_s=compile_s, ground_truth=truth,
                 warnings=(*lost, *note), stopped=stopped,
             )  # fmt: skip
-            text = summary(metrics, _heading(log, self.config, stopped), self.source, [*log.notes, *idle])
+            text = summary(metrics, _heading(log, self.config, stopped), self.source, [*log.notes, *result.notes, *idle])
             metrics.write(folder / METRICS_FILE)
             (folder / "summary.txt").write_text(text, encoding="utf-8")
         return metrics, text
