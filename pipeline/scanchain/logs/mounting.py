@@ -1,4 +1,4 @@
-"""Mounting of the lidar on the robot, by static transforms or by the first ones of /tf."""
+"""Transforms of a log: the mounting of the lidar on the robot, and wheel odometry that is only on /tf."""
 
 from __future__ import annotations
 
@@ -9,15 +9,17 @@ from typing import NamedTuple
 import numpy as np
 
 from scanchain import lie
+from scanchain.config import LogConfig
 from scanchain.data import Pose
-from scanchain.logs.mcap.records import Channel, FileIndex
+from scanchain.errors import InputError
+from scanchain.logs.mcap.records import Channel, FileIndex, name_of
 from scanchain.logs.mcap.stream import Span, sampled_messages
 from scanchain.logs.messages.poses import StampedPose, chain
-from scanchain.logs.messages.readers import pose_reader, reader, role
+from scanchain.logs.messages.readers import is_moving_transforms, pose_reader, reader, role
 from scanchain.logs.topics import topics_of
 
 _BASE_FRAMES = ("base_link", "base_footprint", "base")
-_WORLD_WORDS = {"map", "odom", "world", "earth", "global", "origin", "init"}  # in names of frames that stand still
+_WORLD_WORDS = {"map", "odom", "odometry", "world", "earth", "global", "origin", "init"}  # in names of frames that stand still
 _TURN_RAD, _SHIFT_M = np.radians(0.2), 0.005  # least turn and shift of a mount that moves
 _TILTED_RAD = np.radians(10.0)  # tilt of a planar lidar's plane from which on it is no floor plan
 _TURNED_DEG = 0.5  # least turn of a lidar on its robot that is worth a word
@@ -68,6 +70,75 @@ class Mounting(NamedTuple):
         return notes
 
 
+class OdometryOnTf(NamedTuple):
+    """Wheel odometry among transforms: the pose of frame ``child`` in ``parent``."""
+
+    channel: Channel
+    parent: str
+    child: str
+    rate_hz: float
+
+    @property
+    def text(self) -> str:
+        """Its topic, frames and rate."""
+        return f"{self.channel.topic}: {self.parent} → {self.child}, {self.rate_hz:.3g} Hz"
+
+
+def find_odometry_on_tf(
+    indexes: Sequence[FileIndex], lidar: Channel, config: LogConfig, span: Span, notes: list[str]
+) -> OdometryOnTf | None:
+    """The transform from an odometry's frame to the robot of the lidar, None where there is none or not one only.
+
+    A SLAM's map → odom is none, nor is the lidar's own frame a robot, nor what never changes an odometry.
+    """
+    wanted, topics = config.odometry_topic, topics_of(indexes).values()
+    truths = config.ground_truth_topic, LogConfig().ground_truth_topic
+    if not wanted and any(role(each) == "odometry" and each.topic not in truths for each in topics):
+        return None
+    links: dict[tuple[str, str], list[StampedPose]] = {}
+    channels: dict[tuple[str, str], Channel] = {}
+    for channel in topics:
+        if is_moving_transforms(channel) and wanted in ("", channel.topic):
+            for transforms in sampled_messages(indexes, channel.topic, reader(channel), span):
+                for each in transforms:
+                    link = each.parent, each.child
+                    links.setdefault(link, []).append(each)
+                    channels.setdefault(link, channel)
+    frame = _frame_of(indexes, lidar)
+    found = [link for link in links if _is_odometry(*link) and link[1] != frame]
+    parents = {each.child: each.parent for each in _transforms(indexes, is_fixed=True)}
+    parents |= {child: parent for parent, child in links if (parent, child) in found or not _is_world(parent)}
+    robot = {frame}
+    while frame in parents:
+        frame = parents.pop(frame)
+        robot.add(frame)
+    if len(robot) > 1 and (own := [link for link in found if link[1] in robot]):
+        found = own
+    elif any(name.rpartition("/")[2] in _BASE_FRAMES for name in robot):
+        found = []  # those of other robots
+    still = [link for link in found if np.ptp([each.T_parent_child for each in links[link]], axis=0).max() == 0.0]
+    if still and not wanted:
+        notes += [f"{parent} → {child} of /tf never changes: no odometry, not used" for parent, child in still]
+        found = [link for link in found if link not in still]
+    if len(found) == 1:
+        stamps_ns = np.unique([each.stamp_ns for each in links[found[0]]])
+        period_ns = float(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else np.inf
+        return OdometryOnTf(channels[found[0]], *found[0], 1e9 / period_ns)
+    names = ", ".join(f"{parent} → {child}" for parent, child in found or links) or "nothing"
+    if wanted:
+        raise InputError(
+            f"{name_of(indexes)}: log.odometry_topic {wanted} has {'several transforms' if found else 'no transform'} "
+            f"from an odometry's frame to the lidar's robot, as odom → base_link; it holds: {names}"
+        )
+    if found:
+        notes.append(f"several odometries on /tf ({names}), none is used")
+    return None
+
+
+def _is_odometry(parent: str, child: str) -> bool:
+    return "odom" in parent.lower() and not _is_world(child)
+
+
 class MovingFrame(NamedTuple):
     """A frame and its pose (d+1, d+1) as seen from the lidar."""
 
@@ -75,14 +146,16 @@ class MovingFrame(NamedTuple):
     T_lidar_frame: Pose
 
 
-def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel | None, span: Span) -> Mounting:
-    """The mounting of a lidar as the chosen part of a log shows it."""
+def find_mounting(
+    indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel | None, span: Span, base_of_wheels: str = ""
+) -> Mounting:
+    """The mounting of a lidar as the chosen part of a log shows it, on the frame of the wheels where they name it."""
     fixed = _transforms(indexes, is_fixed=True)
     frame = _frame_of(indexes, lidar)
-    stated = None
     if wheels is not None and role(wheels) == "odometry":
         stated = next(sampled_messages(indexes, wheels.topic, pose_reader(wheels, 3)), None)
-    bases = [name for name in ("" if stated is None else stated.child, *_BASE_FRAMES) if name]
+        base_of_wheels = "" if stated is None else stated.child
+    bases = [name for name in (base_of_wheels, *_BASE_FRAMES) if name]
     for base in bases:
         T_base_lidar = chain(fixed, base, frame)
         if T_base_lidar is not None:

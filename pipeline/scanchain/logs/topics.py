@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from scanchain.config import NO_TRUTH, LogConfig
 from scanchain.errors import InputError
 from scanchain.logs.mcap.records import Channel, FileIndex, damage_of, name_of
-from scanchain.logs.messages.readers import LIDAR_TYPES, has_poses, is_lidar, kind, role
+from scanchain.logs.messages.readers import LIDAR_TYPES, has_poses, is_lidar, is_moving_transforms, kind, role
 
 _MOST_LISTED = 8
 _USUAL_TRUTH = LogConfig().ground_truth_topic
@@ -49,7 +49,13 @@ def find_lidar(indexes: Sequence[FileIndex], wanted: str) -> Channel:
 
 
 def find_odometry(indexes: Sequence[FileIndex], config: LogConfig, notes: list[str]) -> Channel | None:
-    """The wheel odometry's channel: the configured topic, else the only one apart from those of true poses."""
+    """The wheel odometry's channel: the configured topic, else the only one apart from those of true poses.
+
+    None where it may be on /tf.
+    """
+    named = topics_of(indexes).get(config.odometry_topic)
+    if named is not None and is_moving_transforms(named):
+        return None
     if config.odometry_topic:
         return _chosen(indexes, config.odometry_topic, "log.odometry_topic")
     truths = config.ground_truth_topic, _USUAL_TRUTH
@@ -97,8 +103,9 @@ def _chosen(indexes: Sequence[FileIndex], wanted: str, key: str) -> Channel:
     channels = {topic: channel for topic, channel in topics_of(indexes).items() if has_poses(channel)}
     if wanted in channels:
         return channels[wanted]
+    on_tf = " or of transforms" if key == "log.odometry_topic" else ""
     raise InputError(
-        f"{name_of(indexes)}: {key} {wanted} is no nav_msgs/Odometry topic of the log, nor one of stamped poses; "
+        f"{name_of(indexes)}: {key} {wanted} is no nav_msgs/Odometry topic of the log, nor one of stamped poses{on_tf}; "
         f"these are: {_listed(channels.values())}"
     )
 

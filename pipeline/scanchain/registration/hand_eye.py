@@ -17,6 +17,7 @@ _USUAL_M, _LEAST_M = 0.02, 0.002  # residuals at first, and at least
 _PRIOR_M, _NOWHERE_M = 1.0, 1e-6  # σ of the place where nothing is known, and of the base's origin
 _LARGEST_RESIDUAL = 0.25  # of the motions, above which no mounting explains them
 _YAW_RAD, _PLACE_M = np.radians(5.0), 0.05  # largest σ of what is observable
+_APART_M, _EXPLAINED = 0.15, 0.5  # place, and share of the residual left, from which on a mounting is another
 _LEAST_TURN_RAD, _LEAST_OPPOSED = 1.0, 0.5  # turns in all, and share of them, that tell which way is up
 _LEARNED = 1.2  # growth of the path after which the mounting is estimated once more
 _SIGMAS, _LEAST_TILT_RAD = 3.0, np.radians(2.0)  # of a tilt that is one
@@ -47,6 +48,14 @@ class HandEye(NamedTuple):
     def has_place(self) -> bool:
         """True if they show where it sits: the base turned enough."""
         return self.sigma_m < _PLACE_M
+
+    @property
+    def is_apart(self) -> bool:
+        """True if lidar and base are clearly not one: motions that disagree by far are explained."""
+        yaw_rad, place_m = abs(float(lie.yaw(self.T_base_lidar))), float(np.linalg.norm(self.T_base_lidar[:2, -1]))
+        is_turned = self.has_yaw and yaw_rad > max(_YAW_RAD, _SIGMAS * self.sigma_rad)
+        is_moved = self.has_place and place_m > max(_APART_M, _SIGMAS * self.sigma_m)
+        return (is_turned or is_moved) and self.residual_m < _EXPLAINED * self.unmounted_m
 
     @property
     def text(self) -> str:

@@ -309,7 +309,7 @@ def accuracy_of(
 
 
 def _heading(log: Log, config: Config, stopped: str) -> str:
-    known = f"wheel odometry {log.odometry_topic}" if log.odometry_topic else "no wheel odometry"
+    known = f"wheel odometry {log.wheels}" if log.odometry_topic else "no wheel odometry"
     if log.odometry_topic and config.odometry.prior == "constant-velocity":
         known += ", not used: odometry.prior is constant-velocity"
     elif log.odometry_topic and not log.scans_with_wheels:

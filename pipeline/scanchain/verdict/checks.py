@@ -16,6 +16,7 @@ from scipy.ndimage import median_filter
 
 from scanchain import lie
 from scanchain.data import Matrix
+from scanchain.registration.hand_eye import HandEye, hand_eye
 from scanchain.registration.svd_icp import DegeneratePairsError, rigid_transform
 
 Floats = NDArray[np.float64]
@@ -104,6 +105,7 @@ class WheelCheck(NamedTuple):
     poses : (N, d+1, d+1) of the lidar by the wheels, NaN where unknown
     turn_ratio : turns of the trajectory over those of the wheels; NaN where these turn too little to say
     known_share : share of the scans whose motion the wheels know, at rest too
+    mounting : of the lidar as motions of wheels and lidar show it, where it clearly is another than was taken
     """
 
     innovation: Floats
@@ -112,6 +114,7 @@ class WheelCheck(NamedTuple):
     poses: Matrix
     turn_ratio: float = np.nan
     known_share: float = 0.0
+    mounting: HandEye | None = None
 
 
 def check_wheels(poses: Matrix, wheel_poses: Matrix) -> WheelCheck:
@@ -120,12 +123,18 @@ def check_wheels(poses: Matrix, wheel_poses: Matrix) -> WheelCheck:
     The differences of the motions are summed up in the lidar's frame, so that neither drift of heading nor slopes
     matter, and compared before and after each scan, as medians along the path, so that readings that are late or
     out of time do not matter either. Scale errors, drift and a turned or displaced lidar are calibrated by robust
-    regression over the log; the standard deviations of what is left are learned from the log.
+    regression over the log; the standard deviations of what is left are learned from the log. A mounting that is
+    far from the one taken is corrected first.
     """
+    mounting = hand_eye(poses, wheel_poses)
+    if mounting is not None and mounting.is_apart and not mounting.is_mirrored:
+        wheel_poses = wheel_poses @ mounting.T_base_lidar
+    else:
+        mounting = None
     d, n = poses.shape[-1] - 1, len(poses)
     known = np.isfinite(wheel_poses[:, 0, 0])
     nothing = np.full(n, np.nan)
-    check = WheelCheck(nothing, nothing.copy(), nothing.copy(), wheel_poses, known_share=float(known.mean()))
+    check = WheelCheck(nothing, nothing.copy(), nothing.copy(), wheel_poses, known_share=float(known.mean()), mounting=mounting)
     ends = np.flatnonzero(known & np.concatenate([[False], known[:-1]]))
     matched, wheels = np.zeros((2, n, lie.twist_size(poses[0])))
     matched[ends] = lie.log(lie.between(poses[ends - 1], poses[ends]))
