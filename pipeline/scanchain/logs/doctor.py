@@ -212,7 +212,7 @@ def _wheels(seen: Survey) -> Finding:
         effect = "the motion is predicted from the scans alone"
         return Finding("wheels", Severity.OK, "no wheel odometry", effect)
     missed = len(seen.scans) - len(seen.wheels)
-    found = f"{log.odometry_topic}: {missed} of {scans} without a reading within 0.5 s"
+    found = f"{log.wheels}: {missed} of {scans} without a reading within 0.5 s"
     without = "--odometry.prior constant-velocity"
     if (speed_m_s := _wheel_speed_m_s(seen)) > _FASTEST_M_S:
         found += f"; by them the robot moves at {speed_m_s:.3g} m/s"
@@ -220,9 +220,11 @@ def _wheels(seen: Survey) -> Finding:
         return Finding("wheels", Severity.PROBLEM, found, effect, without)
     if missed:
         return Finding("wheels", Severity.WARNING, found, "the motion of those is predicted from the scans alone")
-    if unmounted := next((line for line in log.notes if line.startswith("no static transform")), ""):
-        effect = "the wheels' turns are taken about the lidar instead of the robot; record /tf_static"
-        return Finding("wheels", Severity.WARNING, f"{found}; {unmounted}", effect, without)
+    if log.stated_mounting is None:
+        effect = (
+            "where the log hardly turns, its place is not observable and taken for the robot's: record /tf_static"
+        )
+        return Finding("wheels", Severity.NOTE, f"{found}; {log.mounting.note}", effect)
     return Finding("wheels", Severity.OK, found)
 
 
@@ -242,7 +244,8 @@ def _point_times(seen: Survey) -> Finding:
     spans_s = spans_s[np.isfinite(spans_s)]
     if not len(spans_s):
         effect = "scans are not freed of the lidar's own motion, which bends them unless the driver did it"
-        return Finding("point times", Severity.NOTE, "none", effect, _by_azimuth(seen))
+        constant = seen.log.assumed_point_times().removeprefix("no point times: ").rpartition("; ")[0]
+        return Finding("point times", Severity.NOTE, constant or "none", effect, _by_azimuth(seen))
     assumed, span_s = seen.log.assumed_point_times(), float(np.median(spans_s))
     found = f"{assumed.removeprefix('point times: ')}; a scan lasts {1e3 * span_s:.4g} ms"
     part = span_s / seen.period_s if seen.period_s else 1.0

@@ -19,7 +19,16 @@ from scanchain.logs.messages.readers import is_moving_transforms, pose_reader, r
 from scanchain.logs.topics import topics_of
 
 _BASE_FRAMES = ("base_link", "base_footprint", "base")
-_WORLD_WORDS = {"map", "odom", "odometry", "world", "earth", "global", "origin", "init"}  # in names of frames that stand still
+_WORLD_WORDS = {
+    "map",
+    "odom",
+    "odometry",
+    "world",
+    "earth",
+    "global",
+    "origin",
+    "init",
+}  # in names of frames that stand still
 _TURN_RAD, _SHIFT_M = np.radians(0.2), 0.005  # least turn and shift of a mount that moves
 _TILTED_RAD = np.radians(10.0)  # tilt of a planar lidar's plane from which on it is no floor plan
 _TURNED_DEG = 0.5  # least turn of a lidar on its robot that is worth a word

@@ -223,7 +223,9 @@ class _Run:
                 self.steps, results, judged, run_s=run_s, compile_s=compile_s, ground_truth=truth,
                 warnings=(*lost, *note), stopped=stopped,
             )  # fmt: skip
-            text = summary(metrics, _heading(log, self.config, stopped), self.source, [*log.notes, *result.notes, *idle])
+            text = summary(
+                metrics, _heading(log, self.config, stopped), self.source, [*log.notes, *result.notes, *idle]
+            )
             metrics.write(folder / METRICS_FILE)
             (folder / "summary.txt").write_text(text, encoding="utf-8")
         return metrics, text

@@ -134,7 +134,9 @@ def check_wheels(poses: Matrix, wheel_poses: Matrix) -> WheelCheck:
     d, n = poses.shape[-1] - 1, len(poses)
     known = np.isfinite(wheel_poses[:, 0, 0])
     nothing = np.full(n, np.nan)
-    check = WheelCheck(nothing, nothing.copy(), nothing.copy(), wheel_poses, known_share=float(known.mean()), mounting=mounting)
+    check = WheelCheck(
+        nothing, nothing.copy(), nothing.copy(), wheel_poses, known_share=float(known.mean()), mounting=mounting
+    )
     ends = np.flatnonzero(known & np.concatenate([[False], known[:-1]]))
     matched, wheels = np.zeros((2, n, lie.twist_size(poses[0])))
     matched[ends] = lie.log(lie.between(poses[ends - 1], poses[ends]))

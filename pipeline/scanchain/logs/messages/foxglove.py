@@ -122,9 +122,7 @@ def pose_in_frame(message: _PoseInFrame, dimension: int) -> StampedPose:
     return StampedPose(_stamp_ns(message.timestamp), message.frame_id.lstrip("/"), "", pose)
 
 
-def frame_transform(
-    message: _FrameTransform, link: Frames | None = None, dimension: int = 3
-) -> list[StampedPose]:
+def frame_transform(message: _FrameTransform, link: Frames | None = None, dimension: int = 3) -> list[StampedPose]:
     """A foxglove.FrameTransform, or none where it is not between these two frames; flattened for dimension 2."""
     frames = message.parent_frame_id.lstrip("/"), message.child_frame_id.lstrip("/")
     if link not in (None, frames):

@@ -13,7 +13,7 @@ NO_TIMES.flags.writeable = False
 _NAMES = ("t", "time", "timestamp", "offset_time", "time_offset", "timeOffset", "time_stamp")
 
 UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-_NONE = "no point times: every scan counts as measured at once"
+_NO, _AT_ONCE = "no point times", "every scan counts as measured at once"
 _SHORTEST_SCAN_NS = 500_000  # span of a scan's whole numbers, below which they are micro- or milliseconds
 _LONGEST_SCAN = 1e4  # span in milliseconds, above which floats are micro- or nanoseconds
 _NEAR_S = 1.0  # largest time between the stamp of a scan and its beginning
@@ -33,7 +33,7 @@ class PointTimes:
         self.unit = config.point_times if config.point_times in UNITS_S else ""
         self.by_azimuth = config.point_times in ("clockwise", "counterclockwise")
         self.fields = () if self.by_azimuth or config.point_times == "none" else _NAMES
-        self.assumed = _NONE
+        self.assumed = f"{_NO}: {_AT_ONCE}"
 
     def from_azimuth(self, points: RawPoints) -> NDArray[np.float32]:
         """Times (N,) of points (N, 3) by the lidar's turn since its start, which is at the stamp."""
@@ -62,7 +62,11 @@ class PointTimes:
         if not np.isfinite([first, last]).all():
             return NO_TIMES
         span = float(last - first)
-        if span == 0.0:  # as where a float32 holds an absolute time
+        if span == 0.0:
+            if len(values) > 1 and self.assumed.startswith(_NO):
+                absolute = ", as absolute times are that a float32 holds" if kind == "float32" and first else ""
+                constant = f"field {name} ({kind}) is there and constant ({first:.10g}{absolute})"
+                self.assumed = f"{_NO}: {constant}; {_AT_ONCE}"
             return NO_TIMES
         unit = self.unit or _likely_unit(span, is_whole=is_whole)
         unit_s = UNITS_S[unit]
@@ -75,7 +79,7 @@ class PointTimes:
         elif abs(float(first)) * unit_s > _NEAR_S:
             values -= first
             origin = "of another clock, counted from the first point"
-        if self.assumed == _NONE:
+        if self.assumed.startswith(_NO):
             taken = f"field {name} ({kind}) taken as {unit} {origin}"
             self.assumed = f"point times: {taken} (log.point_times)"
         times_s = np.empty(len(values), np.float32)
