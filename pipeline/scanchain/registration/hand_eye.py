@@ -40,20 +40,15 @@ class HandEye(NamedTuple):
     is_mirrored: bool
 
     @property
-    def has_yaw(self) -> bool:
-        """True if the motions show how the lidar is turned about the vertical."""
-        return self.sigma_rad < _YAW_RAD
-
-    @property
     def has_place(self) -> bool:
-        """True if they show where it sits: the base turned enough."""
+        """True if the motions show where the lidar sits: the base turned enough."""
         return self.sigma_m < _PLACE_M
 
     @property
     def is_apart(self) -> bool:
         """True if lidar and base are clearly not one: motions that disagree by far are explained."""
         yaw_rad, place_m = abs(float(lie.yaw(self.T_base_lidar))), float(np.linalg.norm(self.T_base_lidar[:2, -1]))
-        is_turned = self.has_yaw and yaw_rad > max(_YAW_RAD, _SIGMAS * self.sigma_rad)
+        is_turned = yaw_rad > max(_YAW_RAD, _SIGMAS * self.sigma_rad)
         is_moved = self.has_place and place_m > max(_APART_M, _SIGMAS * self.sigma_m)
         return (is_turned or is_moved) and self.residual_m < _EXPLAINED * self.unmounted_m
 
@@ -61,8 +56,6 @@ class HandEye(NamedTuple):
     def text(self) -> str:
         """The mounting in words, with standard deviations."""
         T = self.T_base_lidar
-        if not self.has_yaw:
-            return "turn and place are not observable: the log hardly moves, or in one curve only"
         tilt_rad = float(np.arccos(np.clip(T[2, 2], -1.0, 1.0)))
         tilt = f" and tilted by {np.degrees(tilt_rad):.0f} deg" if tilt_rad > 0.0 else ""
         yaw_deg = (float(np.degrees(lie.yaw(T))) + 90.0) % 360.0 - 90.0
@@ -82,7 +75,7 @@ def hand_eye(poses: Matrix, wheels: Matrix) -> HandEye | None:
         (R(θ) − I) ρ t − [a, −b; b, a] t_L = −t_B
     is linear in four numbers (after Censi, Franchi, Marchionni & Oriolo 2013), solved by reweighted least squares
     (Cauchy). In space, the lidar is leveled first: it turns about the vertical of the base.
-    None where too few motions are known, or where no mounting explains them.
+    None where no mounting explains them, or several do: at rest, in one curve or on the spot.
     """
     d = poses.shape[-1] - 1
     first, last = _pairs(poses, wheels)
@@ -97,18 +90,21 @@ def hand_eye(poses: Matrix, wheels: Matrix) -> HandEye | None:
     z = -B[:, :2, d]
     covariance, p, residual = _solved(J, z, _PRIOR_M)
     sigma_m = float(np.sqrt(covariance[:2, :2].diagonal().max()))
-    across = np.array([-p[3], p[2]]) / (p[2:] @ p[2:])  # the yaw's derivative
+    scale = float(np.hypot(*p[2:]))
+    if scale < _LARGEST_RESIDUAL:
+        return None
+    across = np.array([-p[3], p[2]]) / scale**2  # the yaw's derivative
     sigma_rad = float(np.sqrt(across @ covariance[2:, 2:] @ across))
-    if sigma_m >= _PLACE_M and sigma_rad < _YAW_RAD:
+    if sigma_m >= _PLACE_M:
         _, p, residual = _solved(J, z, _NOWHERE_M)
     moved_m = float(np.median(np.hypot(*z.T) + _TURN_M_RAD * np.abs(theta)))
-    scale, residual_m = float(np.hypot(*p[2:])), float(np.median(residual))
-    if not residual_m < _LARGEST_RESIDUAL * moved_m or scale < _LARGEST_RESIDUAL:
+    residual_m = float(np.median(residual))
+    if not residual_m < _LARGEST_RESIDUAL * moved_m or sigma_rad > _YAW_RAD:
         return None
     T = lie.identity(d)
     T[:2, :2] = lie.pose_2d(0.0, 0.0, float(np.arctan2(p[3], p[2])))[:2, :2]
     T[:d, :d] = T[:d, :d] @ (R_level if d == 3 else np.eye(2))
-    T[:2, d] = p[:2] / scale if sigma_m < _PLACE_M or sigma_rad >= _YAW_RAD else 0.0
+    T[:2, d] = p[:2] / scale if sigma_m < _PLACE_M else 0.0
     unmounted_m = float(np.median(np.linalg.norm(z - J @ [0.0, 0.0, 1.0, 0.0], axis=1)))
     return HandEye(T, sigma_rad, sigma_m, residual_m, unmounted_m, bool(d == 2 and R_level[1, 1] < 0.0))
 
@@ -147,7 +143,7 @@ def _leveling(turn: NDArray[np.float64], turned: Matrix) -> Matrix:
         return level
     up /= np.linalg.norm(up)
     off = turned - np.outer(turned @ up, up)
-    sigma_rad = float(np.sqrt((off**2).sum() / 2.0 / total))
+    sigma_rad = float(np.sqrt((off**2).sum() / (2.0 * len(turn) * total)))
     turn_rad = float(np.arctan2(np.hypot(*up[:2]), up[2]))
     if turn_rad < max(_SIGMAS * sigma_rad, _LEAST_TILT_RAD):
         return level
@@ -219,7 +215,7 @@ class MountingEstimator:
         if self.found is None:
             return (
                 "mounting assumed, as if the lidar sat at the base's origin: the log has no transform, and the wheels "
-                "do not show it: lidar and base hardly move, or not alike",
+                "do not show it: at rest, in one curve only, or in other motions than the lidar",
             )
         if self.found.is_mirrored:
             return (
