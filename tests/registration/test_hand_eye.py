@@ -53,7 +53,7 @@ def test_motions_show_yaw_and_place_whatever_scale_and_slips(dimension, yaw_deg,
     assert abs(yaw_rad) < min(4.0 * found.sigma_rad, np.radians(1.0))
     assert np.linalg.norm((found.T_base_lidar - T)[:2, -1]) < min(5.0 * found.sigma_m, 0.03)
     assert found.has_place and not found.is_mirrored
-    assert found.is_apart == (abs(yaw_deg) > 5 or np.hypot(x, y) > 0.15)
+    assert found.is_apart == (abs(yaw_deg) > 5 or np.hypot(x, y) > 0.2)
 
 
 def test_standard_deviations_are_those_of_the_errors():
