@@ -50,8 +50,8 @@ class SlamResult:
     the vertical angles of the lidar were corrected by, from the scan ``calibrated_from`` on; 0 as a rule;
     ``elevation_sigma_rad`` its standard deviation, infinite where none was estimated.
     ``map_errors`` are those of the keyframes against the map.
-    ``warnings`` has a line on wheels that were left out, ``notes`` one on a mounting that was estimated from them;
-    ``T_base_lidar`` (d+1, d+1) is that, or the one given.
+    ``warnings`` has a line on wheels that were left out; ``T_base_lidar`` (d+1, d+1) is the mounting as given, or
+    as estimated from the wheels, of which ``mounting_note`` tells.
     ``map_log_odds`` are those that the log is where it was placed in a prior map, or, where they do not suffice,
     might have been; NaN without a map, and where nothing spoke for a place in it. ``map_alike_share`` is the share
     of the searches of the map that found several places alike.
@@ -68,7 +68,7 @@ class SlamResult:
     components: NDArray[np.int64]
     map_errors: Sequence[KeyframeErrors]
     warnings: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
+    mounting_note: str = ""
     T_base_lidar: Pose | None = None
     elevation_offset_rad: float = 0.0
     elevation_sigma_rad: float = math.inf
@@ -248,7 +248,7 @@ class Slam:
             components=self.closer.segments.components(self.graph),
             map_errors=tuple(trail.map_errors),
             warnings=tracking.predictor.warnings(),
-            notes=tracking.predictor.notes(),
+            mounting_note=tracking.predictor.finish_mounting(),
             T_base_lidar=self.T_base_lidar,
             elevation_offset_rad=tracking.elevation.offset_rad,
             elevation_sigma_rad=tracking.elevation.sigma_rad,

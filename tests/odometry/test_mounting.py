@@ -70,7 +70,9 @@ def test_in_space_they_say_it_too(tmp_path):
 def test_a_transform_that_the_motions_contradict_is_named_and_one_that_they_confirm_is_not(tmp_path):
     wrong = simulated("wrong", mounted(180, 0.2), tmp_path, stated=mounted(0, 0.2))
     _, text = run(wrong, tmp_path)
-    says(text, "contradict the mounting that was taken", "by static transforms the lidar is at x 0.20, y 0.00 m of")
+    says(
+        text, "contradict the mounting that was taken", "by static transforms the lidar is at x 0.20, y 0.00 m of"
+    )
     says(text, "the motions of lidar and wheels say: lidar turned by 180.", "0.20 m ahead of the base")
     assert "disagree" not in text
     right = simulated("right", mounted(90, 0.2), tmp_path, stated=mounted(90, 0.2))

@@ -24,9 +24,9 @@ from scanchain.logs.messages.lidar import Returns, decode_cloud, decode_laser_sc
 from scanchain.logs.messages.point_times import PointTimes
 from scanchain.logs.messages.poses import RecordedPoses, StampedPose
 from scanchain.logs.messages.readers import is_scan, pose_reader, reader
-from scanchain.logs.mounting import find_mounting, find_odometry_on_tf, in_plane, is_upside_down
+from scanchain.logs.mounting import find_mounting, find_wheels, in_plane, is_upside_down
 from scanchain.logs.opening import index_files
-from scanchain.logs.topics import find_ground_truth, find_lidar, find_odometry
+from scanchain.logs.topics import find_ground_truth, find_lidar
 from scanchain.settings import load_settings, overrides_of
 
 _DEFAULTS = LogConfig()
@@ -86,7 +86,6 @@ class Log:
         self.notes: list[str] = [line for index in indexes for line in index.notes]
         stream.check_one_log(indexes, config)
         self.lidar = lidar = find_lidar(indexes, config.topic)
-        wheels = find_odometry(indexes, config, self.notes)
         truth = find_ground_truth(indexes, config.ground_truth_topic)
         self.topic = lidar.topic
         self.ground_truth_topic = "" if truth is None else truth.topic
@@ -104,28 +103,22 @@ class Log:
         self.duration_s = whole.duration_s
         self.span = stream.chosen_span(whole, config)
         self.scan_count = stream.count_scans(indexes, self.topic, whole, config)
-        link, on_tf = None, None if wheels else find_odometry_on_tf(indexes, lidar, config, self.span, self.notes)
-        if on_tf is not None:
-            wheels, link = on_tf.channel, (on_tf.parent, on_tf.child)
-        self.odometry_topic = "" if wheels is None else wheels.topic
-        self.mounting = find_mounting(indexes, lidar, wheels, self.span, link[1] if link else "")
+        wheels = find_wheels(indexes, lidar, config, self.span, self.notes)
+        mounting = find_mounting(indexes, lidar, wheels, self.span)
+        self.mounting = mounting.turned_over() if config.upside_down else mounting
         self.gaps = stream.gap_notes(indexes, config)  # those of the notes that are of long gaps
         self.notes += stream.notes_on(indexes, config)
-        self.notes += self.mounting.notes(self.odometry_topic, self.dimension)
-        if self.mounting.motion is not None:
-            wheels, self.odometry_topic = None, ""
-        self.wheels = on_tf.text if on_tf and wheels else self.odometry_topic
+        self.notes += mounting.notes(wheels.channel.topic if wheels else "", self.dimension)
+        wheels = wheels if mounting.motion is None else None
+        self.odometry_topic, self.wheels = (wheels.channel.topic, wheels.text) if wheels else ("", "")
         T_base_lidar = self.mounting.T_base_lidar
-        if config.upside_down and not is_upside_down(T_base_lidar):
-            T_base_lidar = T_base_lidar @ np.diag([1.0, -1.0, -1.0, 1.0])
         self.is_mirrored = self.dimension == 2 and is_upside_down(T_base_lidar)
         self.T_base_lidar: Pose = in_plane(T_base_lidar) if self.dimension == 2 else T_base_lidar
         self.stated_mounting = None if self.mounting.is_assumed else self.T_base_lidar
         self._damage: list[str] = [line for index in indexes for line in index.damage]
-        with_poses = [each for each in (wheels, truth) if each is not None]
-        self.pose_decoders = {each.topic: pose_reader(each, self.dimension) for each in with_poses}
-        if wheels is not None and link is not None:
-            self.pose_decoders[wheels.topic] = pose_reader(wheels, self.dimension, link)
+        self.pose_decoders = {} if truth is None else {truth.topic: pose_reader(truth, self.dimension)}
+        if wheels is not None:
+            self.pose_decoders[wheels.channel.topic] = pose_reader(wheels.channel, self.dimension, wheels.link)
         self.scans_with_wheels = 0
         self.bad_scans = 0
         self._opening_notes = tuple(self.notes)

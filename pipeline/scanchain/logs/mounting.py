@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,9 +14,9 @@ from scanchain.data import Pose
 from scanchain.errors import InputError
 from scanchain.logs.mcap.records import Channel, FileIndex, name_of
 from scanchain.logs.mcap.stream import Span, sampled_messages
-from scanchain.logs.messages.poses import StampedPose, chain
+from scanchain.logs.messages.poses import Frames, StampedPose, chain
 from scanchain.logs.messages.readers import is_moving_transforms, pose_reader, reader, role
-from scanchain.logs.topics import topics_of
+from scanchain.logs.topics import find_odometry, topics_of
 
 _BASE_FRAMES = ("base_link", "base_footprint", "base")
 _WORLD_WORDS = {
@@ -60,6 +60,11 @@ class Mounting(NamedTuple):
         """Name of the base in print: its frame where that is another than usual."""
         return "the base" if not self.base or self.base in _BASE_FRAMES else self.base
 
+    def turned_over(self) -> Mounting:
+        """The same of a lidar that hangs upside down, whatever is stated."""
+        T = self.T_base_lidar
+        return self if is_upside_down(T) else self._replace(T_base_lidar=T @ np.diag([1.0, -1.0, -1.0, 1.0]))
+
     def notes(self, wheels: str, dimension: int) -> list[str]:
         """Assumptions about a lidar of this dimension, and of wheels with this topic."""
         notes = [self.note] if self.note else []
@@ -79,73 +84,62 @@ class Mounting(NamedTuple):
         return notes
 
 
-class OdometryOnTf(NamedTuple):
-    """Wheel odometry among transforms: the pose of frame ``child`` in ``parent``."""
+class Wheels(NamedTuple):
+    """Wheel odometry: its channel, the same in print, and its two frames where it is a transform among others."""
 
     channel: Channel
-    parent: str
-    child: str
-    rate_hz: float
-
-    @property
-    def text(self) -> str:
-        """Its topic, frames and rate."""
-        return f"{self.channel.topic}: {self.parent} → {self.child}, {self.rate_hz:.3g} Hz"
+    text: str
+    link: Frames | None = None
 
 
-def find_odometry_on_tf(
+def find_wheels(
     indexes: Sequence[FileIndex], lidar: Channel, config: LogConfig, span: Span, notes: list[str]
-) -> OdometryOnTf | None:
-    """The transform from an odometry's frame to the robot of the lidar, None where there is none or not one only.
+) -> Wheels | None:
+    """The wheel odometry: a topic of it or, without any, the transform from an odometry's frame to the lidar's robot.
 
     A SLAM's map → odom is none, nor is the lidar's own frame a robot, nor what never changes an odometry.
     """
-    wanted, topics = config.odometry_topic, topics_of(indexes).values()
-    truths = config.ground_truth_topic, LogConfig().ground_truth_topic
-    if not wanted and any(role(each) == "odometry" and each.topic not in truths for each in topics):
-        return None
-    links: dict[tuple[str, str], list[StampedPose]] = {}
-    channels: dict[tuple[str, str], Channel] = {}
-    for channel in topics:
+    topic = find_odometry(indexes, config, notes)
+    if topic is None or not is_moving_transforms(topic):
+        return None if topic is None else Wheels(topic, topic.topic)
+    wanted = config.odometry_topic
+    links: dict[Frames, list[StampedPose]] = {}
+    channels: dict[Frames, Channel] = {}
+    for channel in topics_of(indexes).values():
         if is_moving_transforms(channel) and wanted in ("", channel.topic):
-            for transforms in sampled_messages(indexes, channel.topic, reader(channel), span):
-                for each in transforms:
-                    link = each.parent, each.child
-                    links.setdefault(link, []).append(each)
-                    channels.setdefault(link, channel)
+            for each in _sampled(indexes, channel, span):
+                links.setdefault((each.parent, each.child), []).append(each)
+                channels.setdefault((each.parent, each.child), channel)
     frame = _frame_of(indexes, lidar)
-    found = [link for link in links if _is_odometry(*link) and link[1] != frame]
+    found = [
+        (parent, child)
+        for parent, child in links
+        if "odom" in parent.lower() and not _is_world(child) and child != frame
+    ]
     parents = {each.child: each.parent for each in _transforms(indexes, is_fixed=True)}
     parents |= {child: parent for parent, child in links if (parent, child) in found or not _is_world(parent)}
-    robot = {frame}
-    while frame in parents:
-        frame = parents.pop(frame)
-        robot.add(frame)
-    if len(robot) > 1 and (own := [link for link in found if link[1] in robot]):
-        found = own
-    elif any(name.rpartition("/")[2] in _BASE_FRAMES for name in robot):
-        found = []  # those of other robots
-    still = [link for link in found if np.ptp([each.T_parent_child for each in links[link]], axis=0).max() == 0.0]
-    if still and not wanted:
-        notes += [f"{parent} → {child} of /tf never changes: no odometry, not used" for parent, child in still]
-        found = [link for link in found if link not in still]
+    robot = [frame, *_above(frame, parents)]
+    own = [link for link in found if link[1] in robot]
+    if own or any(name.rpartition("/")[2] in _BASE_FRAMES for name in robot):
+        found = own  # not those of other robots
+    fixed = [link for link in found if not np.ptp([each.T_parent_child for each in links[link]], axis=0).any()]
+    if fixed and not wanted:
+        found = [link for link in found if link not in fixed]
+        notes.append(f"{' → '.join(fixed[0])} of {channels[fixed[0]].topic} never changes: no odometry, not used")
     if len(found) == 1:
         stamps_ns = np.unique([each.stamp_ns for each in links[found[0]]])
-        period_ns = float(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else np.inf
-        return OdometryOnTf(channels[found[0]], *found[0], 1e9 / period_ns)
-    names = ", ".join(f"{parent} → {child}" for parent, child in found or links) or "nothing"
+        rate_hz = 1e9 / float(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 0.0
+        channel = channels[found[0]]
+        return Wheels(channel, f"{channel.topic}: {' → '.join(found[0])}, {rate_hz:.3g} Hz", found[0])
+    names = ", ".join(" → ".join(link) for link in found or links) or "nothing"
     if wanted:
         raise InputError(
-            f"{name_of(indexes)}: log.odometry_topic {wanted} has {'several transforms' if found else 'no transform'} "
-            f"from an odometry's frame to the lidar's robot, as odom → base_link; it holds: {names}"
+            f"{name_of(indexes)}: log.odometry_topic {wanted} has {'several transforms' if found else 'no transform'}"
+            f" from an odometry's frame to the lidar's robot, as odom → base_link; it holds: {names}"
         )
     if found:
         notes.append(f"several odometries on /tf ({names}), none is used")
     return None
-
-
-def _is_odometry(parent: str, child: str) -> bool:
-    return "odom" in parent.lower() and not _is_world(child)
 
 
 class MovingFrame(NamedTuple):
@@ -155,14 +149,13 @@ class MovingFrame(NamedTuple):
     T_lidar_frame: Pose
 
 
-def find_mounting(
-    indexes: Sequence[FileIndex], lidar: Channel, wheels: Channel | None, span: Span, base_of_wheels: str = ""
-) -> Mounting:
+def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Wheels | None, span: Span) -> Mounting:
     """The mounting of a lidar as the chosen part of a log shows it, on the frame of the wheels where they name it."""
     fixed = _transforms(indexes, is_fixed=True)
     frame = _frame_of(indexes, lidar)
-    if wheels is not None and role(wheels) == "odometry":
-        stated = next(sampled_messages(indexes, wheels.topic, pose_reader(wheels, 3)), None)
+    base_of_wheels = wheels.link[1] if wheels and wheels.link else ""
+    if wheels is not None and role(wheels.channel) == "odometry":
+        stated = next(sampled_messages(indexes, wheels.channel.topic, pose_reader(wheels.channel, 3)), None)
         base_of_wheels = "" if stated is None else stated.child
     bases = [name for name in (base_of_wheels, *_BASE_FRAMES) if name]
     for base in bases:
@@ -228,10 +221,14 @@ def moving_frame(
 
 def _root(transforms: Sequence[StampedPose], frame: str) -> str:
     """The topmost frame above one; the frame itself where it has no parent."""
-    parents = {each.child: each.parent for each in transforms}
+    return [frame, *_above(frame, {each.child: each.parent for each in transforms})][-1]
+
+
+def _above(frame: str, parents: dict[str, str]) -> Iterator[str]:
+    """The frames above one, by a parent of each."""
     while frame in parents:
         frame = parents.pop(frame)  # so that a circle ends
-    return frame
+        yield frame
 
 
 def _is_world(frame: str) -> bool:
@@ -266,11 +263,14 @@ def in_plane(T_base_lidar: Pose) -> Pose:
 def _transforms(indexes: Sequence[FileIndex], *, is_fixed: bool, span: Span | None = None) -> list[StampedPose]:
     """Transforms of the topics of fixed ones, or of those that may change, from parts spread over the span."""
     found: list[StampedPose] = []
-    for topic, channel in topics_of(indexes).items():
-        if role(channel) == "transforms" and topic.endswith("tf_static") == is_fixed:
-            for transforms in sampled_messages(indexes, topic, reader(channel), span):
-                found += transforms
+    for channel in topics_of(indexes).values():
+        if role(channel) == "transforms" and is_moving_transforms(channel) != is_fixed:
+            found += _sampled(indexes, channel, span)
     return found
+
+
+def _sampled(indexes: Sequence[FileIndex], channel: Channel, span: Span | None) -> list[StampedPose]:
+    return [each for told in sampled_messages(indexes, channel.topic, reader(channel), span) for each in told]
 
 
 def _frame_of(indexes: Sequence[FileIndex], lidar: Channel) -> str:

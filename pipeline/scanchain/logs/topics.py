@@ -51,11 +51,11 @@ def find_lidar(indexes: Sequence[FileIndex], wanted: str) -> Channel:
 def find_odometry(indexes: Sequence[FileIndex], config: LogConfig, notes: list[str]) -> Channel | None:
     """The wheel odometry's channel: the configured topic, else the only one apart from those of true poses.
 
-    None where it may be on /tf.
+    Without any, the first of transforms that move, among which it may be.
     """
-    named = topics_of(indexes).get(config.odometry_topic)
-    if named is not None and is_moving_transforms(named):
-        return None
+    moving = [each for each in topics_of(indexes).values() if is_moving_transforms(each)]
+    if named := [each for each in moving if each.topic == config.odometry_topic]:
+        return named[0]
     if config.odometry_topic:
         return _chosen(indexes, config.odometry_topic, "log.odometry_topic")
     truths = config.ground_truth_topic, _USUAL_TRUTH
@@ -64,7 +64,7 @@ def find_odometry(indexes: Sequence[FileIndex], config: LogConfig, notes: list[s
         names = ", ".join(channel.topic for channel in found)
         notes.append(f"several odometry topics ({names}), none is used; choose with --log.odometry_topic")
         return None
-    return found[0] if found else None
+    return next(iter([*found, *moving]), None)
 
 
 def find_ground_truth(indexes: Sequence[FileIndex], wanted: str) -> Channel | None:
@@ -105,8 +105,8 @@ def _chosen(indexes: Sequence[FileIndex], wanted: str, key: str) -> Channel:
         return channels[wanted]
     on_tf = " or of transforms" if key == "log.odometry_topic" else ""
     raise InputError(
-        f"{name_of(indexes)}: {key} {wanted} is no nav_msgs/Odometry topic of the log, nor one of stamped poses{on_tf}; "
-        f"these are: {_listed(channels.values())}"
+        f"{name_of(indexes)}: {key} {wanted} is no nav_msgs/Odometry topic of the log, nor one of stamped poses{on_tf}"
+        f"; these are: {_listed(channels.values())}"
     )
 
 

@@ -15,8 +15,8 @@ from scanchain.errors import InputError, counted
 from scanchain.kernels.geometry import largest_magnitude
 from scanchain.kernels.matrices import definite_inverse
 from scanchain.kernels.registration.observability import WEAK
-from scanchain.registration.hand_eye import MountingEstimator
 from scanchain.odometry.intervals import Intervals
+from scanchain.registration.hand_eye import MountingEstimator
 
 _EVEN = 2.0  # largest ratio of two intervals from which an acceleration is computed
 _LEAST_WINDOW_M, _LEAST_WINDOW_RAD = 0.3, 0.3  # least half width where stamps lie too close
@@ -247,8 +247,6 @@ class Predictor:
         self.is_contradicted = False
         if wheel is not None:
             motion, covariance = wheel, self.by_wheels.covariance
-            if self.mounting is not None:
-                covariance = covariance + self.mounting.covariance(wheel)
             scans = max(interval_s / times.usual_s, 1.0) if times.usual_s else 1.0
             if largest_magnitude(wheel - self.filter.motion) > _JUMP * scans:
                 jump_m = float(np.linalg.norm(wheel[:-1, -1] - scans * self.filter.motion[:-1, -1]))
@@ -304,23 +302,16 @@ class Predictor:
 
     def learn_mounting(self, T_odom_lidar: Pose, scan: Scan, state: State) -> None:
         """Take the pose of a scan at its stamp for the mounting, where that is not known."""
-        if self.mounting is None:
-            return
-        T_odom_base = scan.T_odom_base if state is State.OK else None
-        self.mounting.take(T_odom_lidar, T_odom_base, is_open=state is not State.OK)
-        self._mount()
+        if self.mounting is not None:
+            self.mounting.take(T_odom_lidar, scan.T_odom_base, is_open=state is not State.OK)
+            self.T_base_lidar = self.mounting.found.T_base_lidar if self.mounting.found else self.T_base_lidar
 
-    def notes(self) -> tuple[str, ...]:
-        """How the lidar was taken to sit on its base, where nothing states it, by all scans so far."""
-        if self.mounting is None:
-            return ()
-        self.mounting.estimate()
-        self._mount()
-        return self.mounting.notes()
-
-    def _mount(self) -> None:
+    def finish_mounting(self) -> str:
+        """How the lidar was taken to sit on its base, where nothing states it."""
+        note = "" if self.mounting is None else self.mounting.finish()
         if self.mounting is not None and self.mounting.found is not None:
             self.T_base_lidar = self.mounting.found.T_base_lidar
+        return note
 
     def _update(self, prediction: Prediction, match: Match, state: State) -> None:
         """Correct the filter and the error statistics by the innovation."""

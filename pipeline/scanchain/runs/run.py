@@ -189,8 +189,8 @@ class _Run:
             if (mounting := evidence.wheels.mounting) is not None:
                 shown = mounting._replace(T_base_lidar=self.log.T_base_lidar @ mounting.T_base_lidar)
                 self.notes.append(
-                    f"{self.log.mounting.source} the lidar is {_place(self.log)}, the motions of lidar and wheels say: "
-                    f"{shown.text}; correct the transform"
+                    f"{self.log.mounting.source} the lidar is {_place(self.log)}, the motions of lidar and wheels "
+                    f"say: {shown.text}; correct the transform"
                 )
             record_results(recording, results)
             recording.log_verdict(judged, result.trajectory)
@@ -232,7 +232,10 @@ class _Run:
                 warnings=(*lost, *note), stopped=stopped,
             )  # fmt: skip
             text = summary(
-                metrics, _heading(log, self.config, stopped), self.source, [*log.notes, *result.notes, *idle]
+                metrics,
+                _heading(log, self.config, stopped),
+                self.source,
+                [*log.notes, *filter(None, [result.mounting_note]), *idle],
             )
             metrics.write(folder / METRICS_FILE)
             (folder / "summary.txt").write_text(text, encoding="utf-8")

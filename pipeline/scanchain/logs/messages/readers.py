@@ -83,7 +83,7 @@ def reader(channel: Channel) -> Read:
 
 
 def pose_reader(channel: Channel, dimension: int, link: Frames | None = None) -> Read:
-    """Reader of the channel's poses, flattened for dimension 2; of one of transforms, lists of those of the link."""
+    """Reader of the channel's poses, flattened for dimension 2; of transforms, lists of those of the link."""
     chosen = {} if link is None else {"link": link}
     return partial(reader(channel), dimension=dimension, **chosen)
 
