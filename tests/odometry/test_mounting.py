@@ -70,14 +70,12 @@ def test_in_space_they_say_it_too(tmp_path):
 def test_a_transform_that_the_motions_contradict_is_named_and_one_that_they_confirm_is_not(tmp_path):
     wrong = simulated("wrong", mounted(180, 0.2), tmp_path, stated=mounted(0, 0.2))
     _, text = run(wrong, tmp_path)
-    says(
-        text, "contradict the mounting that was taken", "by static transforms the lidar is at x 0.20, y 0.00 m of"
-    )
-    says(text, "the motions of lidar and wheels say: lidar turned by 180.", "0.20 m ahead of the base")
+    says(text, "lidar at x 0.20, y 0.00 m of the base", "contradict the log's transform: lidar turned by 180.")
+    says(text, "deg, 0.20 m ahead of the base, 0.00 m to its")
     assert "disagree" not in text
     right = simulated("right", mounted(90, 0.2), tmp_path, stated=mounted(90, 0.2))
     _, text = run(right, tmp_path, force=True)
-    assert "contradict the mounting" not in text and "estimated" not in text
+    assert "contradict the log" not in text and "estimated" not in text
 
 
 def test_a_lidar_upside_down_is_named_with_the_flag_that_mirrors_its_scans(tmp_path):
@@ -126,6 +124,6 @@ def test_an_interrupted_estimate_goes_on_to_the_bit(tmp_path):
 
 def test_wheels_of_a_real_robot_say_that_its_lidar_is_turned(tmp_path):
     done, text = run(shared_data("reports/rplidar_turned.bag"), tmp_path)
-    says(text, "mounting estimated from the wheels: lidar turned by 180.", "m behind the base")
+    says(text, "mounting estimated from the wheels: lidar turned by 18", "0.05 m behind the base")
     assert "mounting is wrong" not in text and "disagree" not in text
     assert done.metrics.verdict == "trustworthy"

@@ -104,8 +104,7 @@ class Log:
         self.span = stream.chosen_span(whole, config)
         self.scan_count = stream.count_scans(indexes, self.topic, whole, config)
         wheels = find_wheels(indexes, lidar, config, self.span, self.notes)
-        mounting = find_mounting(indexes, lidar, wheels, self.span)
-        self.mounting = mounting.turned_over() if config.upside_down else mounting
+        self.mounting = mounting = find_mounting(indexes, lidar, wheels, self.span, upside_down=config.upside_down)
         self.gaps = stream.gap_notes(indexes, config)  # those of the notes that are of long gaps
         self.notes += stream.notes_on(indexes, config)
         self.notes += mounting.notes(wheels.channel.topic if wheels else "", self.dimension)
@@ -114,11 +113,10 @@ class Log:
         T_base_lidar = self.mounting.T_base_lidar
         self.is_mirrored = self.dimension == 2 and is_upside_down(T_base_lidar)
         self.T_base_lidar: Pose = in_plane(T_base_lidar) if self.dimension == 2 else T_base_lidar
-        self.stated_mounting = None if self.mounting.is_assumed else self.T_base_lidar
+        self.stated_mounting = self.T_base_lidar if mounting.base and not mounting.note else None
         self._damage: list[str] = [line for index in indexes for line in index.damage]
-        self.pose_decoders = {} if truth is None else {truth.topic: pose_reader(truth, self.dimension)}
-        if wheels is not None:
-            self.pose_decoders[wheels.channel.topic] = pose_reader(wheels.channel, self.dimension, wheels.link)
+        with_poses = [*([(wheels.channel, wheels.link)] if wheels else []), *([(truth, None)] if truth else [])]
+        self.pose_decoders = {each.topic: pose_reader(each, self.dimension, link) for each, link in with_poses}
         self.scans_with_wheels = 0
         self.bad_scans = 0
         self._opening_notes = tuple(self.notes)

@@ -51,19 +51,9 @@ class Mounting(NamedTuple):
     note: str = ""
 
     @property
-    def is_assumed(self) -> bool:
-        """True if no transform from the wheels' frame or a usual one to the lidar states it."""
-        return not self.base or bool(self.note)
-
-    @property
     def base_name(self) -> str:
         """Name of the base in print: its frame where that is another than usual."""
         return "the base" if not self.base or self.base in _BASE_FRAMES else self.base
-
-    def turned_over(self) -> Mounting:
-        """The same of a lidar that hangs upside down, whatever is stated."""
-        T = self.T_base_lidar
-        return self if is_upside_down(T) else self._replace(T_base_lidar=T @ np.diag([1.0, -1.0, -1.0, 1.0]))
 
     def notes(self, wheels: str, dimension: int) -> list[str]:
         """Assumptions about a lidar of this dimension, and of wheels with this topic."""
@@ -95,7 +85,7 @@ class Wheels(NamedTuple):
 def find_wheels(
     indexes: Sequence[FileIndex], lidar: Channel, config: LogConfig, span: Span, notes: list[str]
 ) -> Wheels | None:
-    """The wheel odometry: a topic of it or, without any, the transform from an odometry's frame to the lidar's robot.
+    """The wheel odometry: a topic or, without any, the transform from an odometry's frame to the lidar's robot.
 
     A SLAM's map → odom is none, nor is the lidar's own frame a robot, nor what never changes an odometry.
     """
@@ -134,8 +124,8 @@ def find_wheels(
     names = ", ".join(" → ".join(link) for link in found or links) or "nothing"
     if wanted:
         raise InputError(
-            f"{name_of(indexes)}: log.odometry_topic {wanted} has {'several transforms' if found else 'no transform'}"
-            f" from an odometry's frame to the lidar's robot, as odom → base_link; it holds: {names}"
+            f"{name_of(indexes)}: {wanted} has {'several transforms' if found else 'no transform'} from"
+            f" an odometry's frame to the lidar's robot, as odom → base_link; it holds: {names}"
         )
     if found:
         notes.append(f"several odometries on /tf ({names}), none is used")
@@ -149,8 +139,17 @@ class MovingFrame(NamedTuple):
     T_lidar_frame: Pose
 
 
-def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Wheels | None, span: Span) -> Mounting:
-    """The mounting of a lidar as the chosen part of a log shows it, on the frame of the wheels where they name it."""
+def find_mounting(
+    indexes: Sequence[FileIndex], lidar: Channel, wheels: Wheels | None, span: Span, *, upside_down: bool = False
+) -> Mounting:
+    """The mounting of a lidar as the chosen part of a log shows it, or as ``upside_down`` corrects it."""
+    mounting = _mounting(indexes, lidar, wheels, span)
+    if not upside_down or is_upside_down(mounting.T_base_lidar):
+        return mounting
+    return mounting._replace(T_base_lidar=mounting.T_base_lidar @ np.diag([1.0, -1.0, -1.0, 1.0]))
+
+
+def _mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Wheels | None, span: Span) -> Mounting:
     fixed = _transforms(indexes, is_fixed=True)
     frame = _frame_of(indexes, lidar)
     base_of_wheels = wheels.link[1] if wheels and wheels.link else ""

@@ -105,7 +105,7 @@ def _chosen(indexes: Sequence[FileIndex], wanted: str, key: str) -> Channel:
         return channels[wanted]
     on_tf = " or of transforms" if key == "log.odometry_topic" else ""
     raise InputError(
-        f"{name_of(indexes)}: {key} {wanted} is no nav_msgs/Odometry topic of the log, nor one of stamped poses{on_tf}"
+        f"{name_of(indexes)}: {key} {wanted} is no nav_msgs/Odometry topic of the log, nor of stamped poses{on_tf}"
         f"; these are: {_listed(channels.values())}"
     )
 

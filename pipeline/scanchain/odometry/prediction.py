@@ -304,14 +304,19 @@ class Predictor:
         """Take the pose of a scan at its stamp for the mounting, where that is not known."""
         if self.mounting is not None:
             self.mounting.take(T_odom_lidar, scan.T_odom_base, is_open=state is not State.OK)
-            self.T_base_lidar = self.mounting.found.T_base_lidar if self.mounting.found else self.T_base_lidar
+            self._mount(self.mounting)
 
     def finish_mounting(self) -> str:
         """How the lidar was taken to sit on its base, where nothing states it."""
-        note = "" if self.mounting is None else self.mounting.finish()
-        if self.mounting is not None and self.mounting.found is not None:
-            self.T_base_lidar = self.mounting.found.T_base_lidar
+        if self.mounting is None:
+            return ""
+        note = self.mounting.finish()
+        self._mount(self.mounting)
         return note
+
+    def _mount(self, mounting: MountingEstimator) -> None:
+        if mounting.found is not None and not mounting.is_mirrored:
+            self.T_base_lidar = mounting.found.T_base_lidar
 
     def _update(self, prediction: Prediction, match: Match, state: State) -> None:
         """Correct the filter and the error statistics by the innovation."""

@@ -14,7 +14,6 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain import lie
 from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.config import NO_TRUTH, Config
 from scanchain.data import Scan, Trajectory, brief
@@ -185,13 +184,7 @@ class _Run:
             results = results_of(self.log, self.config, self.steps, result, final)
             write_results(folder, results)
             evidence = evidence_of_run(folder, results.expected and results.expected.ate)
-            judged = judge(evidence)
-            if (mounting := evidence.wheels.mounting) is not None:
-                shown = mounting._replace(T_base_lidar=self.log.T_base_lidar @ mounting.T_base_lidar)
-                self.notes.append(
-                    f"{self.log.mounting.source} the lidar is {_place(self.log)}, the motions of lidar and wheels "
-                    f"say: {shown.text}; correct the transform"
-                )
+            judged = judge(evidence, self.log.T_base_lidar)
             record_results(recording, results)
             recording.log_verdict(judged, result.trajectory)
             with suppress(InputError):  # which is reported with the accuracy
@@ -327,15 +320,11 @@ def _heading(log: Log, config: Config, stopped: str) -> str:
         known += ", not used: odometry.prior is constant-velocity"
     elif log.odometry_topic and not log.scans_with_wheels:
         known += ", not used: no reading is near the stamp of a scan"
+    place, turned = log.T_base_lidar[:-1, -1], turned_by(log.T_base_lidar)
     is_moving = log.mounting.motion is not None
-    if not np.array_equal(log.T_base_lidar, lie.identity(log.dimension)) or is_moving:
-        known += f"; lidar {_place(log)}" + (" at the first scan, moving on it" if is_moving else "")
+    if place.any() or turned or is_moving:
+        at = ", ".join(f"{axis} {value_m:.2f}" for axis, value_m in zip("xyz", place, strict=False))
+        known += f"; lidar at {at} m of {log.mounting.base_name}{turned and f', turned by {turned}'}"
+        known += " at the first scan, moving on it" if is_moving else ""
     paths = ", ".join(map(str, log.paths))
     return f"{paths} {log.topic} ({known})" + (f" (PARTIAL: {stopped})" if stopped else "")
-
-
-def _place(log: Log) -> str:
-    """Where the log says that the lidar is."""
-    turned = turned_by(log.T_base_lidar)
-    at = ", ".join(f"{axis} {at_m:.2f}" for axis, at_m in zip("xyz", log.T_base_lidar[:-1, -1], strict=False))
-    return f"at {at} m of {log.mounting.base_name}{turned and f', turned by {turned}'}"

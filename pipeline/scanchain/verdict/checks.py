@@ -16,7 +16,8 @@ from scipy.ndimage import median_filter
 
 from scanchain import lie
 from scanchain.data import Matrix
-from scanchain.registration.hand_eye import HandEye, hand_eye
+from scanchain.registration import hand_eye
+from scanchain.registration.hand_eye import HandEye
 from scanchain.registration.svd_icp import DegeneratePairsError, rigid_transform
 
 Floats = NDArray[np.float64]
@@ -126,11 +127,8 @@ def check_wheels(poses: Matrix, wheel_poses: Matrix) -> WheelCheck:
     regression over the log; the standard deviations of what is left are learned from the log. A mounting that is
     far from the one taken is corrected first.
     """
-    mounting = hand_eye(poses, wheel_poses)
-    if mounting is not None and mounting.is_apart and not mounting.is_mirrored:
+    if (mounting := _mounting(poses, wheel_poses)) is not None:
         wheel_poses = wheel_poses @ mounting.T_base_lidar
-    else:
-        mounting = None
     d, n = poses.shape[-1] - 1, len(poses)
     known = np.isfinite(wheel_poses[:, 0, 0])
     nothing = np.full(n, np.nan)
@@ -171,6 +169,17 @@ def check_wheels(poses: Matrix, wheel_poses: Matrix) -> WheelCheck:
         innovation = np.maximum(innovation, apart[checked] / sigma)
     check.innovation[checked] = innovation
     return check
+
+
+def _mounting(poses: Matrix, wheel_poses: Matrix) -> HandEye | None:
+    """The mounting by the motions over pieces of the path, where it clearly is another than was taken."""
+    pieces = np.floor(np.cumsum(hand_eye.path_m(lie.between(poses[:-1], poses[1:]))) / hand_eye.PAIR_M)
+    nodes = np.flatnonzero(np.diff(pieces, prepend=-1.0))
+    motions = np.stack([lie.between(each[nodes[:-1]], each[nodes[1:]]) for each in (wheel_poses, poses)])
+    motions = motions[:, np.isfinite(motions[0, :, 0, 0])]
+    has_moved = hand_eye.path_m(motions).max(axis=0, initial=0.0) > 0.5 * hand_eye.PAIR_M
+    found = hand_eye.hand_eye(*motions[:, has_moved])
+    return found if found is not None and found.is_apart and not found.is_upside_down else None
 
 
 def check_velocity(stamps_ns: NDArray[np.int64], log_times_ns: NDArray[np.int64], poses: Matrix) -> Floats:

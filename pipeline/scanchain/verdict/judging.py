@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 
 from scanchain import lie
-from scanchain.data import LEAST_FIT, Matrix
+from scanchain.data import LEAST_FIT, Matrix, Pose
 from scanchain.errors import counted
 from scanchain.verdict.checks import WINDOW_M, Kind, Stretch
 from scanchain.verdict.stretches import KNOWN, Evidence, find_stretches
@@ -63,8 +63,8 @@ class Judged:
         return f"{self.verdict}{f' ({self.vouched})' if self.vouched else ''}: {self.reason}"
 
 
-def judge(evidence: Evidence) -> Judged:
-    """The verdict on a trajectory.
+def judge(evidence: Evidence, T_base_lidar: Pose | None = None) -> Judged:
+    """The verdict on a trajectory, with the mounting that a log states.
 
     Not trustworthy is one most of which is predicted, many of whose scans are contradicted, that accelerates
     impossibly, that the wheels contradict where it is not well measured, or that loop closures and wheels
@@ -78,11 +78,14 @@ def judge(evidence: Evidence) -> Judged:
     slips = [f"{each.kind} at {each.times} ({each.size_m:,.1f} m)" for each in found if each not in stretches]
     rest = _Rest.of(evidence)
     notes = [*([rest.text] if rest.is_shown else []), *slips]
-    if evidence.wheels.mounting is not None:
-        notes.append(
-            "the motions of lidar and wheels contradict the mounting that was taken: seen from there, the "
-            f"{evidence.wheels.mounting.text}"
+    if (mounting := evidence.wheels.mounting) is not None:
+        moved = (
+            mounting
+            if T_base_lidar is None
+            else mounting._replace(T_base_lidar=T_base_lidar @ mounting.T_base_lidar)
         )
+        where = " against where it was taken to be" if T_base_lidar is None else ""
+        notes.append(f"the motions of lidar and wheels contradict the log's transform: {moved.text}{where}")
     error = evidence.error or (f"error below {rest.extent_m:.2g} m" if rest.is_shown else "error unknown")
     if reasons := list(_grave(evidence, stretches)):
         verdict = Verdict.NOT_TRUSTWORTHY
