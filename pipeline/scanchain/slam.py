@@ -138,7 +138,7 @@ class Slam:
     @property
     def T_base_lidar(self) -> Pose:
         """Pose of the lidar on the robot, as given or as estimated so far."""
-        return self.front_end.odometry.predictor.T_base_lidar
+        return self.front_end.odometry.predictor.mounting.T_base_lidar
 
     @property
     def keyframes(self) -> list[Keyframe]:
@@ -248,7 +248,7 @@ class Slam:
             components=self.closer.segments.components(self.graph),
             map_errors=tuple(trail.map_errors),
             warnings=tracking.predictor.warnings(),
-            mounting_note=tracking.predictor.finish_mounting(),
+            mounting_note=tracking.predictor.mounting.finish(),
             T_base_lidar=self.T_base_lidar,
             elevation_offset_rad=tracking.elevation.offset_rad,
             elevation_sigma_rad=tracking.elevation.sigma_rad,

@@ -70,12 +70,16 @@ def test_in_space_they_say_it_too(tmp_path):
 def test_a_transform_that_the_motions_contradict_is_named_and_one_that_they_confirm_is_not(tmp_path):
     wrong = simulated("wrong", mounted(180, 0.2), tmp_path, stated=mounted(0, 0.2))
     _, text = run(wrong, tmp_path)
-    says(text, "lidar at x 0.20, y 0.00 m of the base", "contradict the log's transform: lidar turned by 180.")
-    says(text, "deg, 0.20 m ahead of the base, 0.00 m to its")
+    says(
+        text,
+        "lidar at x 0.20, y 0.00 m of the base",
+        "contradict the mounting that was taken: lidar turned by 180.",
+    )
+    says(text, "deg, 0.20 m ahead of the base, 0.0")
     assert "disagree" not in text
     right = simulated("right", mounted(90, 0.2), tmp_path, stated=mounted(90, 0.2))
     _, text = run(right, tmp_path, force=True)
-    assert "contradict the log" not in text and "estimated" not in text
+    assert "contradict the mounting" not in text and "estimated" not in text
 
 
 def test_a_lidar_upside_down_is_named_with_the_flag_that_mirrors_its_scans(tmp_path):

@@ -104,14 +104,14 @@ class Log:
         self.span = stream.chosen_span(whole, config)
         self.scan_count = stream.count_scans(indexes, self.topic, whole, config)
         wheels = find_wheels(indexes, lidar, config, self.span, self.notes)
-        self.mounting = mounting = find_mounting(indexes, lidar, wheels, self.span, upside_down=config.upside_down)
+        self.mounting = mounting = find_mounting(indexes, lidar, wheels, self.span)
         self.gaps = stream.gap_notes(indexes, config)  # those of the notes that are of long gaps
         self.notes += stream.notes_on(indexes, config)
         self.notes += mounting.notes(wheels.channel.topic if wheels else "", self.dimension)
         wheels = wheels if mounting.motion is None else None
         self.odometry_topic, self.wheels = (wheels.channel.topic, wheels.text) if wheels else ("", "")
         T_base_lidar = self.mounting.T_base_lidar
-        self.is_mirrored = self.dimension == 2 and is_upside_down(T_base_lidar)
+        self.is_mirrored = self.dimension == 2 and (config.upside_down or is_upside_down(T_base_lidar))
         self.T_base_lidar: Pose = in_plane(T_base_lidar) if self.dimension == 2 else T_base_lidar
         self.stated_mounting = self.T_base_lidar if mounting.base and not mounting.note else None
         self._damage: list[str] = [line for index in indexes for line in index.damage]

@@ -19,16 +19,8 @@ from scanchain.logs.messages.readers import is_moving_transforms, pose_reader, r
 from scanchain.logs.topics import find_odometry, topics_of
 
 _BASE_FRAMES = ("base_link", "base_footprint", "base")
-_WORLD_WORDS = {
-    "map",
-    "odom",
-    "odometry",
-    "world",
-    "earth",
-    "global",
-    "origin",
-    "init",
-}  # in names of frames that stand still
+# words in names of frames that stand still
+_WORLD_WORDS = {"map", "odom", "odometry", "world", "earth", "global", "origin", "init"}
 _TURN_RAD, _SHIFT_M = np.radians(0.2), 0.005  # least turn and shift of a mount that moves
 _TILTED_RAD = np.radians(10.0)  # tilt of a planar lidar's plane from which on it is no floor plan
 _TURNED_DEG = 0.5  # least turn of a lidar on its robot that is worth a word
@@ -95,11 +87,10 @@ def find_wheels(
     wanted = config.odometry_topic
     links: dict[Frames, list[StampedPose]] = {}
     channels: dict[Frames, Channel] = {}
-    for channel in topics_of(indexes).values():
-        if is_moving_transforms(channel) and wanted in ("", channel.topic):
-            for each in _sampled(indexes, channel, span):
-                links.setdefault((each.parent, each.child), []).append(each)
-                channels.setdefault((each.parent, each.child), channel)
+    for channel in filter(is_moving_transforms, topics_of(indexes).values()):
+        for each in _sampled(indexes, channel, span) if wanted in ("", channel.topic) else ():
+            links.setdefault((each.parent, each.child), []).append(each)
+            channels.setdefault((each.parent, each.child), channel)
     frame = _frame_of(indexes, lidar)
     found = [
         (parent, child)
@@ -139,17 +130,8 @@ class MovingFrame(NamedTuple):
     T_lidar_frame: Pose
 
 
-def find_mounting(
-    indexes: Sequence[FileIndex], lidar: Channel, wheels: Wheels | None, span: Span, *, upside_down: bool = False
-) -> Mounting:
-    """The mounting of a lidar as the chosen part of a log shows it, or as ``upside_down`` corrects it."""
-    mounting = _mounting(indexes, lidar, wheels, span)
-    if not upside_down or is_upside_down(mounting.T_base_lidar):
-        return mounting
-    return mounting._replace(T_base_lidar=mounting.T_base_lidar @ np.diag([1.0, -1.0, -1.0, 1.0]))
-
-
-def _mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Wheels | None, span: Span) -> Mounting:
+def find_mounting(indexes: Sequence[FileIndex], lidar: Channel, wheels: Wheels | None, span: Span) -> Mounting:
+    """The mounting of a lidar as the chosen part of a log shows it."""
     fixed = _transforms(indexes, is_fixed=True)
     frame = _frame_of(indexes, lidar)
     base_of_wheels = wheels.link[1] if wheels and wheels.link else ""

@@ -184,7 +184,8 @@ class Odometry:
             elsewhere_m=registered.elsewhere_m,
         )
         tracked = self._at_stamp(tracked, sweep, prediction)
-        self.predictor.learn_mounting(tracked.T_odom_lidar, tracked.scan, tracked.state)
+        is_open = tracked.state is not State.OK
+        self.predictor.mounting.take(tracked.T_odom_lidar, tracked.scan.T_odom_base, is_open=is_open)
         return tracked
 
     def _predicted(self, scan: Scan, sparse: Sweep) -> Prediction:

@@ -224,8 +224,7 @@ class Predictor:
     def __init__(self, config: OdometryConfig, T_base_lidar: Pose, *, is_mounted: bool) -> None:
         """is_mounted : whether ``T_base_lidar`` is known; else it is estimated as the lidar moves."""
         self.config = config
-        self.T_base_lidar = T_base_lidar
-        self.mounting = None if is_mounted else MountingEstimator()
+        self.mounting = MountingEstimator(T_base_lidar, is_stated=is_mounted)
         self.T_odom_lidar = lie.identity(T_base_lidar.shape[0] - 1)
         self.T_previous_current = self.T_odom_lidar
         k = lie.twist_size(T_base_lidar)
@@ -300,24 +299,6 @@ class Predictor:
         self.T_odom_base = None if T_odom_base is None else T_odom_base.copy()
         self.T_odom_lidar = T_odom_lidar
 
-    def learn_mounting(self, T_odom_lidar: Pose, scan: Scan, state: State) -> None:
-        """Take the pose of a scan at its stamp for the mounting, where that is not known."""
-        if self.mounting is not None:
-            self.mounting.take(T_odom_lidar, scan.T_odom_base, is_open=state is not State.OK)
-            self._mount(self.mounting)
-
-    def finish_mounting(self) -> str:
-        """How the lidar was taken to sit on its base, where nothing states it."""
-        if self.mounting is None:
-            return ""
-        note = self.mounting.finish()
-        self._mount(self.mounting)
-        return note
-
-    def _mount(self, mounting: MountingEstimator) -> None:
-        if mounting.found is not None and not mounting.is_mirrored:
-            self.T_base_lidar = mounting.found.T_base_lidar
-
     def _update(self, prediction: Prediction, match: Match, state: State) -> None:
         """Correct the filter and the error statistics by the innovation."""
         if state is State.LOST:
@@ -347,9 +328,10 @@ class Predictor:
                 f"scan {scan.index} has no wheel odometry although odometry.prior is 'wheel'; "
                 "set log.odometry_topic, or odometry.prior to 'auto'"
             )
-        if last is None or now is None or (self.mounting is not None and not self.mounting.is_usable):
+        if last is None or now is None or not self.mounting.is_usable:
             return None
-        return lie.between(self.T_base_lidar, lie.between(last, now).dot(self.T_base_lidar))
+        T_base_lidar = self.mounting.T_base_lidar
+        return lie.between(T_base_lidar, lie.between(last, now).dot(T_base_lidar))
 
 
 def _stretched(

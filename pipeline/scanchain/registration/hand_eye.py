@@ -32,9 +32,9 @@ class HandEye(NamedTuple):
     left: float
 
     @property
-    def is_upside_down(self) -> bool:
-        """True if the lidar turns against the base, in the plane by a mirror image."""
-        return bool(np.linalg.det(self.T_base_lidar[:2, :2]) < 0.0)
+    def is_mirrored(self) -> bool:
+        """True if a planar lidar turns against the base, as one does that hangs upside down."""
+        return len(self.T_base_lidar) == 3 and bool(np.linalg.det(self.T_base_lidar) < 0.0)
 
     @property
     def is_apart(self) -> bool:
@@ -49,7 +49,7 @@ class HandEye(NamedTuple):
         yaw_deg = (float(np.degrees(lie.yaw(self.T_base_lidar))) + 90.0) % 360.0 - 90.0
         turned = f"lidar turned by {yaw_deg:.1f} ± {np.degrees(self.sigma_rad):.1f} deg"
         if len(self.T_base_lidar) == 4:
-            turned += f" and {'upside down' if self.is_upside_down else 'upright'}, level as is assumed"
+            turned += f" and {'upside down' if self.T_base_lidar[2, 2] < 0.0 else 'upright'}, level as is assumed"
         if self.sigma_m >= _PLACE_M:
             return f"{turned}; its place is not observable: the log hardly turns"
         x_m, y_m = self.T_base_lidar[:2, -1]
@@ -108,54 +108,55 @@ def _solved(J: Matrix, z: Matrix, prior_m: float) -> tuple[Matrix, NDArray[np.fl
 
 
 class MountingEstimator:
-    """The mounting of a lidar that nothing states, by all scans so far, estimated as the path grows.
+    """The mounting of a lidar, where none is stated estimated by the motions of all scans so far.
 
     Until it is known, the wheels are no prior, except for scans after one whose pose is open.
     """
 
-    def __init__(self) -> None:
-        self.base: list[Pose] = []  # motions, of as many as the lidar's
-        self.lidar: list[Pose] = []
-        self.last: tuple[Pose, Pose] | None = None  # poses of base and lidar that the next motions begin at
+    def __init__(self, T_base_lidar: Pose, *, is_stated: bool) -> None:
+        self.T_base_lidar, self.is_stated = T_base_lidar, is_stated
+        self.motions: list[tuple[Pose, Pose]] = []  # of base and lidar
+        self.last: tuple[Pose, Pose] | None = None  # their poses that the next motions begin at
         self.has_wheels = False
         self.due = 0  # number of motions from which on the next estimate is made
         self.found: HandEye | None = None
-        self.is_usable = False  # the wheels, for the next scan
+        self.is_usable = is_stated  # the wheels, for the next scan
 
     def take(self, T_odom_lidar: Pose, T_odom_base: Pose | None, *, is_open: bool) -> None:
         """Take the poses of a scan."""
+        if self.is_stated:
+            return
         self.has_wheels |= T_odom_base is not None
-        if is_open or T_odom_base is None or self.last is None:
-            self.last = None if is_open or T_odom_base is None else (T_odom_base.copy(), T_odom_lidar)
+        known = None if is_open or T_odom_base is None else (T_odom_base.copy(), T_odom_lidar)
+        if known is None or self.last is None:
+            self.last = known
         else:
-            motions = lie.between(self.last[0], T_odom_base), lie.between(self.last[1], T_odom_lidar)
-            if max(map(path_m, motions)) >= PAIR_M:
-                self.base.append(motions[0])
-                self.lidar.append(motions[1])
-                self.last = T_odom_base.copy(), T_odom_lidar
-        if len(self.base) > self.due:
-            self.due = int(_LEARNED * len(self.base))
-            self.found = hand_eye(np.array(self.base), np.array(self.lidar))
-        self.is_usable = is_open if self.found is None else not self.is_mirrored
-
-    @property
-    def is_mirrored(self) -> bool:
-        """True of a planar lidar that hangs upside down."""
-        return self.found is not None and len(self.found.T_base_lidar) == 3 and self.found.is_upside_down
+            moved = lie.between(self.last[0], known[0]), lie.between(self.last[1], known[1])
+            if max(map(path_m, moved)) >= PAIR_M:
+                self.motions.append(moved)
+                self.last = known
+        if len(self.motions) > self.due:
+            self.due = int(_LEARNED * len(self.motions))
+            self._estimate()
+        self.is_usable = is_open if self.found is None else not self.found.is_mirrored
 
     def finish(self) -> str:
-        """Estimate it by all scans; what is known of it as a sentence, empty without wheels."""
-        self.found = hand_eye(np.array(self.base), np.array(self.lidar))
+        """Estimate it by all scans; what is known of it as a sentence, empty where stated or without wheels."""
+        if not self.has_wheels:
+            return ""
+        self._estimate()
         if self.found is None:
             why = "the wheels do not show it: at rest, in one curve only, or in other motions than the lidar"
-            text = (
+            return (
                 f"mounting assumed, as if the lidar sat at the base's origin: the log has no transform, and {why}"
             )
-        elif self.is_mirrored:
-            text = (
-                "the wheels are not used: the lidar turns left where they turn right, as one does that hangs "
-                "upside down, which no transform states: --log.upside_down true"
-            )
-        else:
-            text = f"mounting estimated from the wheels: {self.found.text}; the log has no transform"
-        return text if self.has_wheels else ""
+        if self.found.is_mirrored:
+            why = "as one does that hangs upside down, which no transform states: --log.upside_down true"
+            return f"the wheels are not used: the lidar turns left where they turn right, {why}"
+        return f"mounting estimated from the wheels: {self.found.text}; the log has no transform"
+
+    def _estimate(self) -> None:
+        if self.motions:
+            self.found = hand_eye(*np.swapaxes(np.array(self.motions), 0, 1))
+        if self.found is not None and not self.found.is_mirrored:
+            self.T_base_lidar = self.found.T_base_lidar

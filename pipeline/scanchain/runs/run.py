@@ -184,7 +184,7 @@ class _Run:
             results = results_of(self.log, self.config, self.steps, result, final)
             write_results(folder, results)
             evidence = evidence_of_run(folder, results.expected and results.expected.ate)
-            judged = judge(evidence, self.log.T_base_lidar)
+            judged = judge(evidence, result.T_base_lidar)
             record_results(recording, results)
             recording.log_verdict(judged, result.trajectory)
             with suppress(InputError):  # which is reported with the accuracy
@@ -224,12 +224,8 @@ class _Run:
                 self.steps, results, judged, run_s=run_s, compile_s=compile_s, ground_truth=truth,
                 warnings=(*lost, *note), stopped=stopped,
             )  # fmt: skip
-            text = summary(
-                metrics,
-                _heading(log, self.config, stopped),
-                self.source,
-                [*log.notes, *filter(None, [result.mounting_note]), *idle],
-            )
+            notes = [*log.notes, *filter(None, [result.mounting_note]), *idle]
+            text = summary(metrics, _heading(log, self.config, stopped), self.source, notes)
             metrics.write(folder / METRICS_FILE)
             (folder / "summary.txt").write_text(text, encoding="utf-8")
         return metrics, text

@@ -179,7 +179,7 @@ def _mounting(poses: Matrix, wheel_poses: Matrix) -> HandEye | None:
     motions = motions[:, np.isfinite(motions[0, :, 0, 0])]
     has_moved = hand_eye.path_m(motions).max(axis=0, initial=0.0) > 0.5 * hand_eye.PAIR_M
     found = hand_eye.hand_eye(*motions[:, has_moved])
-    return found if found is not None and found.is_apart and not found.is_upside_down else None
+    return found if found is not None and found.is_apart and not found.is_mirrored else None
 
 
 def check_velocity(stamps_ns: NDArray[np.int64], log_times_ns: NDArray[np.int64], poses: Matrix) -> Floats:

@@ -64,7 +64,7 @@ class Judged:
 
 
 def judge(evidence: Evidence, T_base_lidar: Pose | None = None) -> Judged:
-    """The verdict on a trajectory, with the mounting that a log states.
+    """The verdict on a trajectory, ``T_base_lidar`` being the mounting that the log states.
 
     Not trustworthy is one most of which is predicted, many of whose scans are contradicted, that accelerates
     impossibly, that the wheels contradict where it is not well measured, or that loop closures and wheels
@@ -79,13 +79,10 @@ def judge(evidence: Evidence, T_base_lidar: Pose | None = None) -> Judged:
     rest = _Rest.of(evidence)
     notes = [*([rest.text] if rest.is_shown else []), *slips]
     if (mounting := evidence.wheels.mounting) is not None:
-        moved = (
-            mounting
-            if T_base_lidar is None
-            else mounting._replace(T_base_lidar=T_base_lidar @ mounting.T_base_lidar)
-        )
-        where = " against where it was taken to be" if T_base_lidar is None else ""
-        notes.append(f"the motions of lidar and wheels contradict the log's transform: {moved.text}{where}")
+        T = mounting.T_base_lidar if T_base_lidar is None else T_base_lidar @ mounting.T_base_lidar
+        where = ", seen from there" if T_base_lidar is None else ""
+        said = mounting._replace(T_base_lidar=T).text
+        notes.append(f"the motions of lidar and wheels contradict the mounting that was taken{where}: {said}")
     error = evidence.error or (f"error below {rest.extent_m:.2g} m" if rest.is_shown else "error unknown")
     if reasons := list(_grave(evidence, stretches)):
         verdict = Verdict.NOT_TRUSTWORTHY

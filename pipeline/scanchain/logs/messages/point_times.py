@@ -62,11 +62,9 @@ class PointTimes:
         if not np.isfinite([first, last]).all():
             return NO_TIMES
         span = float(last - first)
-        if span == 0.0:
+        if span == 0.0:  # as where a float32 holds an absolute time
             if len(values) > 1 and self.assumed.startswith(_NO):
-                absolute = ", as absolute times are that a float32 holds" if kind == "float32" and first else ""
-                constant = f"field {name} ({kind}) is there and constant ({first:.10g}{absolute})"
-                self.assumed = f"{_NO}: {constant}; {_AT_ONCE}"
+                self.assumed = f"{_NO}: field {name} ({kind}) is there and constant ({first:.10g}); {_AT_ONCE}"
             return NO_TIMES
         unit = self.unit or _likely_unit(span, is_whole=is_whole)
         unit_s = UNITS_S[unit]
