@@ -62,8 +62,10 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
 
     format : log format: found automatically, a known one by name, or ``module:Class`` of your own
     topic : lidar topic; found automatically where empty
-    odometry_topic : wheel odometry, ``nav_msgs/Odometry`` or stamped poses; found automatically where empty
+    odometry_topic : wheel odometry, ``nav_msgs/Odometry``, stamped poses, or transforms with odom → base_link;
+        found automatically where empty
     ground_truth_topic : true poses, used for evaluation only; ``none`` leaves those of the log unused
+    upside_down : whether a planar lidar hangs upside down although no transform says so: its scans are mirrored
     start_s : what comes before is left out, counted from the first message
     end_s : what comes after is left out
     every : every N-th scan is taken
@@ -83,6 +85,7 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
     topic: str = ""
     odometry_topic: str = ""
     ground_truth_topic: str = "/ground_truth"
+    upside_down: bool = False
     start_s: NonNegative = 0.0
     end_s: Limit = float("inf")
     every: Count = 1

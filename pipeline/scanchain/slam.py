@@ -50,7 +50,8 @@ class SlamResult:
     the vertical angles of the lidar were corrected by, from the scan ``calibrated_from`` on; 0 as a rule;
     ``elevation_sigma_rad`` its standard deviation, infinite where none was estimated.
     ``map_errors`` are those of the keyframes against the map.
-    ``warnings`` has a line on wheels that were left out.
+    ``warnings`` has a line on wheels that were left out; ``T_base_lidar`` (d+1, d+1) is the mounting as given, or
+    as estimated from the wheels, of which ``mounting_note`` tells.
     ``map_log_odds`` are those that the log is where it was placed in a prior map, or, where they do not suffice,
     might have been; NaN without a map, and if no keyframe was evidence for a location in it.
     ``map_rival_log_odds`` are those of another location in it that the last keyframes match, NaN if they do not
@@ -69,6 +70,8 @@ class SlamResult:
     components: NDArray[np.int64]
     map_errors: Sequence[KeyframeErrors]
     warnings: tuple[str, ...] = ()
+    mounting_note: str = ""
+    T_base_lidar: Pose | None = None
     elevation_offset_rad: float = 0.0
     elevation_sigma_rad: float = math.inf
     calibrated_from: int = 0
@@ -109,10 +112,10 @@ class Slam:
         prior : a map to localize in: its keyframes come before those of the log, and stay where they are
         prior_is_final : whether they lie as well as they ever will; else scans are matched to one pass of them
         """
-        config, self.T_base_lidar = checked_start(config, T_base_lidar, dimension)
-        self.config, self.dimension = config, self.T_base_lidar.shape[0] - 1
+        config, T_start = checked_start(config, T_base_lidar, dimension)
+        self.config, self.dimension = config, T_start.shape[0] - 1
         self.is_live, self.is_finished = is_live, False
-        self.front_end = FrontEnd(config, self.T_base_lidar)
+        self.front_end = FrontEnd(config, T_base_lidar, self.dimension)
         self.live_stamps = LiveStamps()
         self.graph = PoseGraph(self.dimension)
         self.trail = Trail(self.dimension, points_file, keeps_scans=self._refines)
@@ -134,6 +137,11 @@ class Slam:
         self.placement.begin_in(len(prior.keyframes))
         traveled_m = self.closer.begin_in(prior.keyframes, prior.folder, is_final=is_final)
         self.trail.begin_in(prior.keyframes, traveled_m)
+
+    @property
+    def T_base_lidar(self) -> Pose:
+        """Pose of the lidar on the robot, as given or as estimated so far."""
+        return self.front_end.odometry.predictor.mounting.T_base_lidar
 
     @property
     def keyframes(self) -> list[Keyframe]:
@@ -244,6 +252,8 @@ class Slam:
             components=self.closer.segments.components(self.graph),
             map_errors=tuple(trail.map_errors),
             warnings=tracking.predictor.warnings(),
+            mounting_note=tracking.predictor.mounting.finish(),
+            T_base_lidar=self.T_base_lidar,
             elevation_offset_rad=tracking.elevation.offset_rad,
             elevation_sigma_rad=tracking.elevation.sigma_rad,
             calibrated_from=tracking.calibrated_from,

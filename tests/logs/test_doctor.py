@@ -178,7 +178,7 @@ BY_AZIMUTH = "--log.point_times {} --log.revolution_s 0.1 --log.revolution_start
         (drive(stamp=lambda k: -at_times(k)), "damage", "warning", "have the header stamp of the one before", ""),
         (drive(stamp=lambda k: -at_times(k)), "gaps", "ok", "none longer", ""),  # by log time
         (drive(wheels=True, stamp=lambda k: -37 * SECOND), "wheels", "warning", "40 of 40 scans without", ""),
-        (drive(wheels=True, mounted=False), "wheels", "warning", "no static transform from base_link", NO_WHEELS),
+        (drive(wheels=True, mounted=False), "wheels", "note", "no static transform from base_link", ""),
         ([*drive(), *IN_MILLIMETERS], "wheels", "problem", "moves at 1e+03 m/s", NO_WHEELS),
         (drive(ranges=mostly_lost), "returns", "warning", "80 % of the beams without a valid return, 20", ""),
         (drive(ranges=blind_until(25, 40)), "returns", "warning", "3 valid a scan", "--start 2.5"),
@@ -191,6 +191,7 @@ BY_AZIMUTH = "--log.point_times {} --log.revolution_s 0.1 --log.revolution_start
         (drive(ranges=lambda k: room(min(k, 20))), "duplicates", "warning", "20 of them in a row", ""),
         (sweeps(), "point times", "ok", "field time (float32) taken as s after the stamp", ""),
         (sweeps(span=9.5), "point times", "warning", "95 of the period", "--log.point_times none"),  # no unit fits
+        (sweeps(span=0.0), "point times", "note", "field time (float32) is there and constant (0)", ""),
         (clouds(turning(1.0, 1.0)), "point times", "note", "none", BY_AZIMUTH.format("counterclockwise")),
         (clouds(turning(-1.0, 1.0)), "point times", "note", "none", BY_AZIMUTH.format("clockwise")),
         (clouds(turning(1.0, 16.0)), "point times", "note", "none", ""),  # ring by ring

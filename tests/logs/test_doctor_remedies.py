@@ -52,18 +52,6 @@ def a_gap():
             yield said
 
 
-def wheels_far_from_an_unmounted_lidar():
-    """Three meters behind it, scans at 1.7 Hz."""
-    for number, said, contents in said_in(made.log("office", seconds=40)):
-        if said.topic == "/odom":
-            pose = contents.pose.pose
-            yaw = 2.0 * math.atan2(pose.orientation.z, pose.orientation.w)
-            x, y = pose.position.x - 3.0 * math.cos(yaw), pose.position.y - 3.0 * math.sin(yaw)
-            yield odometry_said(said.log_ns, odometry(stamp_of(said.data), x, y, yaw))
-        elif said.topic in TOUCHED and number % 6 == 0:
-            yield said
-
-
 def no_point_times():
     log = open_log(town())
     truth = log.ground_truth()
@@ -77,7 +65,6 @@ def no_point_times():
 
 FAULTS = {
     a_gap: "gaps",
-    wheels_far_from_an_unmounted_lidar: "wheels",
     no_point_times: "point times",
 }
 

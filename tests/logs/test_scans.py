@@ -270,7 +270,7 @@ MAST = ("mast", 1.0, 0.0, np.pi / 2, 0.0)
     ("entries", "wheels_of", "expected", "base", "note"),
     [
         ([("base_link", *MAST), LASER], "base_link", (1.0, 0.5, np.pi / 2), "base_link", ""),
-        ([("map", "camera", 1.0, 0.0, 0.0, 0.0)], "base_link", (0.0, 0.0, 0.0), "", "sit at the robot's origin"),
+        ([("map", "camera", 1.0, 0.0, 0.0, 0.0)], "base_link", (0.0, 0.0, 0.0), "", "estimated from the wheels"),
         (
             [("imu_link", *MAST), LASER], None, (1.0, 0.5, np.pi / 2), "imu_link",
             "the log has no transform from base_link to laser: imu_link is taken as the base",

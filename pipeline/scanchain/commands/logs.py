@@ -63,13 +63,17 @@ def _info_text(log: dict[str, Any]) -> str:
         T_base_lidar = np.array(log["T_base_lidar"])
         place = ", ".join(f"{axis} {at_m:.3f} m" for axis, at_m in zip("xyz", T_base_lidar[:-1, -1], strict=False))
         turned = turned_by(T_base_lidar)
+        at = f"at {place} on {log['base_frame']}{turned and f', turned by {turned}'}"
+        if not log["base_frame"]:
+            at = "assumed at the robot's origin: no transform states it" + (
+                "; a run estimates it from the wheels" if log["odometry"] else ""
+            )
         lines += [
             f"lidar     {log['lidar']}: {log['dimension']}D, {counted(log['scans'], 'scan')}",
-            f"mounting  at {place} on {log['base_frame'] or 'the base'}{turned and f', turned by {turned}'}"
-            + (f" at first; {log['mount_motion']}" if log["mount_motion"] else ""),
+            f"mounting  {at}" + (f" at first; {log['mount_motion']}" if log["mount_motion"] else ""),
         ]
     if log["lidar"] or log["odometry"]:
-        lines.append(f"wheels    {log['odometry'] or 'none: the motion is predicted from the scans alone'}")
+        lines.append(f"wheels    {log['wheels'] or 'none: the motion is predicted from the scans alone'}")
     if log["point_times"]:
         lines.append(f"times     {log['point_times'].removeprefix('point times: ')}")
     lines += [f"sensor    {each.sensor} {each.topic}: {each.use}" for each in log["sensors"]]

@@ -199,8 +199,8 @@ class ScanCounts:
         return [
             f"{counted(len(self.clock_jumps), 'jump')} of the header stamps of {self.topic}, by up to "
             f"{_signed(most_s)} (the first at scan {first.scan:,}, {first.into_s:.1f} s after the first scan: "
-            f"{_signed(first.step_s)} while the log goes on by {first.logged_s:.2g} s): {first.cause}; each begins a "
-            "new segment, as nothing says how far the lidar moved meanwhile"
+            f"{_signed(first.step_s)} while the log goes on by {first.logged_s:.2g} s): {first.cause}; each "
+            "begins a new segment, as nothing says how far the lidar moved meanwhile"
         ]
 
     def notes(self) -> list[str]:

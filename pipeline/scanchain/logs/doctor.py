@@ -226,7 +226,7 @@ def _wheels(seen: Survey) -> Finding:
         effect = "the motion is predicted from the scans alone"
         return Finding("wheels", Severity.OK, "no wheel odometry", effect)
     missed = len(seen.scans) - len(seen.wheels)
-    found = f"{log.odometry_topic}: {missed} of {scans} without a reading within 0.5 s"
+    found = f"{log.wheels}: {missed} of {scans} without a reading within 0.5 s"
     without = "--odometry.prior constant-velocity"
     if (speed_m_s := _wheel_speed_m_s(seen)) > _FASTEST_M_S:
         found += f"; by them the robot moves at {speed_m_s:.3g} m/s"
@@ -234,9 +234,11 @@ def _wheels(seen: Survey) -> Finding:
         return Finding("wheels", Severity.PROBLEM, found, effect, without)
     if missed:
         return Finding("wheels", Severity.WARNING, found, "the motion of those is predicted from the scans alone")
-    if unmounted := next((line for line in log.notes if line.startswith("no static transform")), ""):
-        effect = "the wheels' turns are taken about the lidar instead of the robot; record /tf_static"
-        return Finding("wheels", Severity.WARNING, f"{found}; {unmounted}", effect, without)
+    if log.stated_mounting is None:
+        effect = (
+            "where the log hardly turns, its place is not observable and taken for the robot's: record /tf_static"
+        )
+        return Finding("wheels", Severity.NOTE, f"{found}; {log.mounting.note}", effect)
     return Finding("wheels", Severity.OK, found)
 
 

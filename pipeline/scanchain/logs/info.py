@@ -13,7 +13,7 @@ from scanchain.logs.files import size_of
 from scanchain.logs.log import Log
 from scanchain.logs.mcap.records import FileIndex
 from scanchain.logs.mcap.stream import ends_of, whole_span
-from scanchain.logs.messages.readers import kind
+from scanchain.logs.messages.readers import has_poses, kind
 from scanchain.logs.opening import index_files
 from scanchain.logs.topics import find_ground_truth, find_odometry, other_sensors, topics_of
 
@@ -30,7 +30,7 @@ def describe(sources: Sequence[Source], config: LogConfig) -> dict[str, Any]:
     notes, (wheels, truth) = [line for index in indexes for line in index.notes], ("", "")
     with suppress(InputError):  # which is the problem of the log as well
         channels = find_odometry(indexes, config, notes), find_ground_truth(indexes, config.ground_truth_topic)
-        wheels, truth = (channel.topic if channel else "" for channel in channels)
+        wheels, truth = (channel.topic if channel and has_poses(channel) else "" for channel in channels)
     try:
         log, problem = Log(indexes, config), ""
     except InputError as error:
@@ -44,7 +44,8 @@ def describe(sources: Sequence[Source], config: LogConfig) -> dict[str, Any]:
         "lidar": log.topic if log else "",
         "dimension": log.dimension if log else 0,
         "scans": log.scan_count if log else 0,
-        "odometry": wheels,
+        "odometry": log.odometry_topic if log else wheels,
+        "wheels": log.wheels if log else wheels,
         "sensors": other_sensors(indexes, wheels=wheels, truth=truth),
         "point_times": log.assumed_point_times() if log else "",
         "T_base_lidar": log.T_base_lidar.tolist() if log else [],

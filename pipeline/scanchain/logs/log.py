@@ -24,11 +24,11 @@ from scanchain.logs.messages.lidar import Returns, decode_cloud, decode_laser_sc
 from scanchain.logs.messages.point_times import PointTimes
 from scanchain.logs.messages.poses import RecordedPoses, StampedPose
 from scanchain.logs.messages.readers import is_scan, pose_reader, reader
-from scanchain.logs.mounting import between_frames, find_mounting, in_plane, is_upside_down
+from scanchain.logs.mounting import between_frames, find_mounting, find_wheels, in_plane, is_upside_down
 from scanchain.logs.opening import index_files
 from scanchain.logs.publishers import LatestPoints, Publishers, with_jumps
 from scanchain.logs.sweep_times import SweepTimes
-from scanchain.logs.topics import find_ground_truth, find_lidar, find_odometry
+from scanchain.logs.topics import find_ground_truth, find_lidar
 from scanchain.settings import load_settings, overrides_of
 
 _DEFAULTS = LogConfig()
@@ -70,10 +70,12 @@ class Log:
 
     paths : its files; name : these as errors name them
     topic, dimension : the lidar's topic; 2 for laser scans and planar clouds, 3 for clouds
-    mounting : how the lidar sits on the robot; T_base_lidar : (d+1, d+1) of it
+    mounting : how the lidar sits on the robot; T_base_lidar : (d+1, d+1) of it; stated_mounting : the same, None
+        where it is assumed
     scan_count : scans to expect after start, end and every, by the index
     duration_s : from the first message to the last
-    odometry_topic : whose poses the scans carry, empty where there is none
+    odometry_topic : whose poses the scans carry, empty where there is none; wheels : the same in print, of /tf
+        with frames and rate
     scans_with_wheels : how many scans had a reading of the wheels near, of those that passed so far
     notes : what was chosen or assumed
     bad_scans : how many scans were left out, once ``scans`` is through or closed
@@ -88,10 +90,8 @@ class Log:
         self.notes: list[str] = [line for index in indexes for line in index.notes]
         stream.check_one_log(indexes, config)
         self.lidar = lidar = find_lidar(indexes, config.topic)
-        wheels = find_odometry(indexes, config, self.notes)
         truth = find_ground_truth(indexes, config.ground_truth_topic)
         self.topic = lidar.topic
-        self.odometry_topic = "" if wheels is None else wheels.topic
         self.ground_truth_topic = "" if truth is None else truth.topic
         self._sampled_times = PointTimes(config)
         self.plane_height_m: float | None = None
@@ -107,18 +107,21 @@ class Log:
         self.span = stream.chosen_span(whole, config)
         self.scan_count = stream.count_scans(indexes, self.topic, whole, config)
         self.publishers = self._publishers()
-        self.mounting = find_mounting(indexes, self.publishers.frame, wheels, self.span)
+        frame = self.publishers.frame
+        wheels = find_wheels(indexes, frame, config, self.span, self.notes)
+        self.mounting = mounting = find_mounting(indexes, frame, wheels, self.span)
         self.gaps = stream.gap_notes(indexes, config)  # those of the notes that are of long gaps
         self.notes += stream.notes_on(indexes, config)
-        self.notes += self.mounting.notes(self.odometry_topic, self.dimension)
-        if self.mounting.motion is not None:
-            wheels, self.odometry_topic = None, ""
+        self.notes += mounting.notes(wheels.channel.topic if wheels else "", self.dimension)
+        wheels = wheels if mounting.motion is None else None
+        self.odometry_topic, self.wheels = (wheels.channel.topic, wheels.text) if wheels else ("", "")
         T_base_lidar = self.mounting.T_base_lidar
-        self.is_mirrored = self.dimension == 2 and is_upside_down(T_base_lidar)
+        self.is_mirrored = self.dimension == 2 and (config.upside_down or is_upside_down(T_base_lidar))
         self.T_base_lidar: Pose = in_plane(T_base_lidar) if self.dimension == 2 else T_base_lidar
+        self.stated_mounting = self.T_base_lidar if mounting.is_stated else None
         self._damage: list[str] = [line for index in indexes for line in index.damage]
-        with_poses = [each for each in (wheels, truth) if each is not None]
-        self.pose_decoders = {each.topic: pose_reader(each, self.dimension) for each in with_poses}
+        with_poses = [*([(wheels.channel, wheels.link)] if wheels else []), *([(truth, None)] if truth else [])]
+        self.pose_decoders = {each.topic: pose_reader(each, self.dimension, link) for each, link in with_poses}
         self.scans_with_wheels = self.bad_scans = 0
         self.times, self.jumps = SweepTimes(config, self.topic), list[str]()
         self._opening_notes = tuple(self.notes)

@@ -1,24 +1,27 @@
-"""Mounting of the lidar on the robot, by static transforms or by the first ones of /tf."""
+"""Transforms of a log: the mounting of the lidar on the robot, and wheel odometry that is only on /tf."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 
 from scanchain import lie
+from scanchain.config import LogConfig
 from scanchain.data import Pose
-from scanchain.logs.mcap.records import Channel, FileIndex
+from scanchain.errors import InputError
+from scanchain.logs.mcap.records import Channel, FileIndex, name_of
 from scanchain.logs.mcap.stream import Span, sampled_messages
-from scanchain.logs.messages.poses import StampedPose, chain
-from scanchain.logs.messages.readers import pose_reader, reader, role
-from scanchain.logs.topics import topics_of
+from scanchain.logs.messages.poses import Frames, StampedPose, chain
+from scanchain.logs.messages.readers import is_moving_transforms, pose_reader, reader, role
+from scanchain.logs.topics import find_odometry, topics_of
 
 _BASE_FRAMES = ("base_link", "base_footprint", "base")
-_WORLD_WORDS = {"map", "odom", "world", "earth", "global", "origin", "init"}  # in names of frames that stand still
+# words in names of frames that stand still
+_WORLD_WORDS = {"map", "odom", "odometry", "world", "earth", "global", "origin", "init"}
 _TURN_RAD, _SHIFT_M = np.radians(0.2), 0.005  # least turn and shift of a mount that moves
 TILTED_RAD = np.radians(10.0)  # tilt of a planar lidar's plane from which on it is no floor plan
 _TURNED_DEG = 0.5  # least turn of a lidar on its robot that is worth a word
@@ -31,7 +34,8 @@ class Mounting(NamedTuple):
     T_base_lidar : (4, 4), the first one seen where it moves; the identity where the log does not state it
     source : of the pose, as text
     motion : the joint that moves the lidar and how far, as text; None where it stays where it is
-    note : what was assumed, empty where nothing was
+    note : what was assumed, or is contradicted, empty where nothing was
+    is_stated : whether the log states the pose on the base of the wheels
     """
 
     base: str
@@ -39,6 +43,7 @@ class Mounting(NamedTuple):
     source: str = "by static transforms"
     motion: str | None = None
     note: str = ""
+    is_stated: bool = True
 
     @property
     def base_name(self) -> str:
@@ -64,6 +69,62 @@ class Mounting(NamedTuple):
         return notes
 
 
+class Wheels(NamedTuple):
+    """Wheel odometry: its channel, the same in print, and its two frames where it is a transform among others."""
+
+    channel: Channel
+    text: str
+    link: Frames | None = None
+
+
+def find_wheels(
+    indexes: Sequence[FileIndex], frame: str, config: LogConfig, span: Span, notes: list[str]
+) -> Wheels | None:
+    """The wheel odometry: a topic or, without any, the transform from an odometry's frame to the lidar's robot.
+
+    A SLAM's map → odom is none, nor is the lidar's own frame a robot, nor what never changes an odometry.
+    """
+    topic = find_odometry(indexes, config, notes)
+    if topic is None or not is_moving_transforms(topic):
+        return None if topic is None else Wheels(topic, topic.topic)
+    wanted = config.odometry_topic
+    links: dict[Frames, list[StampedPose]] = {}
+    channels: dict[Frames, Channel] = {}
+    for channel in filter(is_moving_transforms, topics_of(indexes).values()):
+        for each in _sampled(indexes, channel, span) if wanted in ("", channel.topic) else ():
+            links.setdefault((each.parent, each.child), []).append(each)
+            channels.setdefault((each.parent, each.child), channel)
+    found = [
+        (parent, child)
+        for parent, child in links
+        if "odom" in parent.lower() and not _is_world(child) and child != frame
+    ]
+    parents = {each.child: each.parent for each in _transforms(indexes, is_fixed=True)}
+    parents |= {child: parent for parent, child in links if (parent, child) in found or not _is_world(parent)}
+    robot = [frame, *_above(frame, parents)]
+    own = [link for link in found if link[1] in robot]
+    if own or any(name.rpartition("/")[2] in _BASE_FRAMES for name in robot):
+        found = own  # not those of other robots
+    fixed = [link for link in found if not np.ptp([each.T_parent_child for each in links[link]], axis=0).any()]
+    if fixed and not wanted:
+        found = [link for link in found if link not in fixed]
+        notes.append(f"{' → '.join(fixed[0])} of {channels[fixed[0]].topic} never changes: no odometry, not used")
+    if len(found) == 1:
+        stamps_ns = np.unique([each.stamp_ns for each in links[found[0]]])
+        rate_hz = 1e9 / float(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 0.0
+        channel = channels[found[0]]
+        return Wheels(channel, f"{channel.topic}: {' → '.join(found[0])}, {rate_hz:.3g} Hz", found[0])
+    names = ", ".join(" → ".join(link) for link in found or links) or "nothing"
+    if wanted:
+        raise InputError(
+            f"{name_of(indexes)}: {wanted} has {'several transforms' if found else 'no transform'} from"
+            f" an odometry's frame to the lidar's robot, as odom → base_link; it holds: {names}"
+        )
+    if found:
+        notes.append(f"several odometries on /tf ({names}), none is used")
+    return None
+
+
 class MovingFrame(NamedTuple):
     """A frame and its pose (d+1, d+1) as seen from the lidar."""
 
@@ -71,12 +132,13 @@ class MovingFrame(NamedTuple):
     T_lidar_frame: Pose
 
 
-def find_mounting(indexes: Sequence[FileIndex], frame: str, wheels: Channel | None, span: Span) -> Mounting:
+def find_mounting(indexes: Sequence[FileIndex], frame: str, wheels: Wheels | None, span: Span) -> Mounting:
     """The mounting of a lidar with this frame, empty if it has none, as the chosen part of a log shows it."""
-    stated = None
-    if wheels is not None and role(wheels) == "odometry":
-        stated = next(sampled_messages(indexes, wheels.topic, pose_reader(wheels, 3)), None)
-    bases = [name for name in ("" if stated is None else stated.child, *_BASE_FRAMES) if name]
+    base_of_wheels = wheels.link[1] if wheels and wheels.link else ""
+    if wheels is not None and role(wheels.channel) == "odometry":
+        stated = next(sampled_messages(indexes, wheels.channel.topic, pose_reader(wheels.channel, 3)), None)
+        base_of_wheels = "" if stated is None else stated.child
+    bases = [name for name in (base_of_wheels, *_BASE_FRAMES) if name]
     latest, fixed, rivals = _fixed(indexes)
     for base, transforms in product(bases, (latest, fixed)):
         T_base_lidar = chain(transforms, base, frame)
@@ -93,11 +155,13 @@ def find_mounting(indexes: Sequence[FileIndex], frame: str, wheels: Channel | No
     T_root_lidar = chain(latest, root, frame)
     if root != frame and T_root_lidar is not None:
         note = f"the log has no transform from {bases[0]} to {frame}: {root} is taken as the base"
+        note += ", its place on that of the wheels is estimated" if wheels else ""
         rival = _disagreeing(latest, rivals, root, frame)
-        return Mounting(root, T_root_lidar, note=f"{note}{rival and '; '}{rival}")
+        return Mounting(root, T_root_lidar, note=f"{note}{rival and '; '}{rival}", is_stated=False)
     why = f"no static transform from {bases[0]} to {frame or 'the lidar'}"
-    note = "" if not fixed and wheels is None else f"{why}: the lidar is taken to sit at the robot's origin"
-    return Mounting("", np.eye(4), note=note)
+    taken = "is estimated from the wheels" if wheels else "is assumed: the lidar at the robot's origin"
+    note = "" if not fixed and wheels is None else f"{why}: the mounting {taken}"
+    return Mounting("", np.eye(4), note=note, is_stated=False)
 
 
 def between_frames(indexes: Sequence[FileIndex], span: Span, target: str, source: str) -> Pose | None:
@@ -112,17 +176,16 @@ def between_frames(indexes: Sequence[FileIndex], span: Span, target: str, source
     return T_target_source
 
 
-_Frames = tuple[str, str]  # parent and child
-_Joints = dict[_Frames, list[StampedPose]]
+_Joints = dict[Frames, list[StampedPose]]
 
 
 def _fixed(
     indexes: Sequence[FileIndex],
-) -> tuple[list[StampedPose], list[StampedPose], dict[_Frames, StampedPose]]:
+) -> tuple[list[StampedPose], list[StampedPose], dict[Frames, StampedPose]]:
     """Static transforms, the latest of each child as in tf2; those of each pair; others that contradict these."""
     latest: dict[str, StampedPose] = {}
-    fixed: dict[_Frames, StampedPose] = {}
-    rivals: dict[_Frames, StampedPose] = {}
+    fixed: dict[Frames, StampedPose] = {}
+    rivals: dict[Frames, StampedPose] = {}
     for each in _transforms(indexes, is_fixed=True):
         frames = each.parent, each.child
         before = fixed.get(frames, each)
@@ -134,7 +197,7 @@ def _fixed(
 
 
 def _disagreeing(
-    transforms: Sequence[StampedPose], rivals: dict[_Frames, StampedPose], base: str, frame: str
+    transforms: Sequence[StampedPose], rivals: dict[Frames, StampedPose], base: str, frame: str
 ) -> str:
     """Line on values of static transforms, on which the lidar hangs, that contradict each other; else empty."""
     lines = []
@@ -192,10 +255,14 @@ def moving_frame(indexes: Sequence[FileIndex], frame: str, mounting: Mounting, *
 
 def _root(transforms: Sequence[StampedPose], frame: str) -> str:
     """The topmost frame above one; the frame itself where it has no parent."""
-    parents = {each.child: each.parent for each in transforms}
+    return [frame, *_above(frame, {each.child: each.parent for each in transforms})][-1]
+
+
+def _above(frame: str, parents: dict[str, str]) -> Iterator[str]:
+    """The frames above one, by a parent of each."""
     while frame in parents:
         frame = parents.pop(frame)  # so that a circle ends
-    return frame
+        yield frame
 
 
 def _is_world(frame: str) -> bool:
@@ -237,8 +304,11 @@ def in_plane(T_base_lidar: Pose) -> Pose:
 def _transforms(indexes: Sequence[FileIndex], *, is_fixed: bool, span: Span | None = None) -> list[StampedPose]:
     """Transforms of the topics of fixed ones, or of those that may change, from parts spread over the span."""
     found: list[StampedPose] = []
-    for topic, channel in topics_of(indexes).items():
-        if role(channel) == "transforms" and topic.endswith("tf_static") == is_fixed:
-            for transforms in sampled_messages(indexes, topic, reader(channel), span):
-                found += transforms
+    for channel in topics_of(indexes).values():
+        if role(channel) == "transforms" and is_moving_transforms(channel) != is_fixed:
+            found += _sampled(indexes, channel, span)
     return found
+
+
+def _sampled(indexes: Sequence[FileIndex], channel: Channel, span: Span | None) -> list[StampedPose]:
+    return [each for told in sampled_messages(indexes, channel.topic, reader(channel), span) for each in told]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from scanchain.config import NO_TRUTH, LogConfig
 from scanchain.errors import InputError
 from scanchain.logs.mcap.records import Channel, FileIndex, damage_of, name_of
-from scanchain.logs.messages.readers import LIDAR_TYPES, has_poses, is_lidar, kind, role
+from scanchain.logs.messages.readers import LIDAR_TYPES, has_poses, is_lidar, is_moving_transforms, kind, role
 
 _MOST_LISTED = 8
 _USUAL_TRUTH = LogConfig().ground_truth_topic
@@ -49,7 +49,13 @@ def find_lidar(indexes: Sequence[FileIndex], wanted: str) -> Channel:
 
 
 def find_odometry(indexes: Sequence[FileIndex], config: LogConfig, notes: list[str]) -> Channel | None:
-    """The wheel odometry's channel: the configured topic, else the only one apart from those of true poses."""
+    """The wheel odometry's channel: the configured topic, else the only one apart from those of true poses.
+
+    Without any, the first of transforms that move, among which it may be.
+    """
+    moving = [each for each in topics_of(indexes).values() if is_moving_transforms(each)]
+    if named := [each for each in moving if each.topic == config.odometry_topic]:
+        return named[0]
     if config.odometry_topic:
         return _chosen(indexes, config.odometry_topic, "log.odometry_topic")
     truths = config.ground_truth_topic, _USUAL_TRUTH
@@ -58,7 +64,7 @@ def find_odometry(indexes: Sequence[FileIndex], config: LogConfig, notes: list[s
         names = ", ".join(channel.topic for channel in found)
         notes.append(f"several odometry topics ({names}), none is used; choose with --log.odometry_topic")
         return None
-    return found[0] if found else None
+    return next(iter([*found, *moving]), None)
 
 
 def find_ground_truth(indexes: Sequence[FileIndex], wanted: str) -> Channel | None:
@@ -97,9 +103,10 @@ def _chosen(indexes: Sequence[FileIndex], wanted: str, key: str) -> Channel:
     channels = {topic: channel for topic, channel in topics_of(indexes).items() if has_poses(channel)}
     if wanted in channels:
         return channels[wanted]
+    on_tf = " or of transforms" if key == "log.odometry_topic" else ""
     raise InputError(
-        f"{name_of(indexes)}: {key} {wanted} is no nav_msgs/Odometry topic of the log, nor one of stamped poses; "
-        f"these are: {_listed(channels.values())}"
+        f"{name_of(indexes)}: {key} {wanted} is no nav_msgs/Odometry topic of the log, nor of stamped poses{on_tf}"
+        f"; these are: {_listed(channels.values())}"
     )
 
 

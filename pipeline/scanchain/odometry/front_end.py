@@ -38,12 +38,12 @@ class Located(msgspec.Struct, frozen=True):
 class FrontEnd:
     """Odometry and keyframe selection, fed scan by scan; shares nothing with the back end."""
 
-    def __init__(self, config: Config, T_base_lidar: Pose) -> None:
+    def __init__(self, config: Config, T_base_lidar: Pose | None, dimension: int | None = None) -> None:
         self.config = config.odometry
-        self.odometry = Odometry(config, T_base_lidar)
+        self.odometry = Odometry(config, T_base_lidar, dimension=dimension)
         self.T_odom_keyframe = lie.identity(self.odometry.dimension)
         self.T_odom_last = lie.identity(self.odometry.dimension)
-        self.nothing = np.zeros((lie.twist_size(T_base_lidar),) * 2)
+        self.nothing = np.zeros((lie.twist_size(self.T_odom_last),) * 2)
         self.covariance: Matrix | None = self.nothing  # of the motion since the keyframe, None where unknown
         self.doubt = self.nothing  # of the motion, by scans that their correspondences contradict
         self.error_tracker = KeyframeErrorTracker(len(self.nothing))

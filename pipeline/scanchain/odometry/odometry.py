@@ -83,14 +83,15 @@ class Odometry:
 
         config : the preset of the dimension where left out
         T_base_lidar : pose of the lidar on the robot, (3, 3) for laser scans, (4, 4) for clouds; it matters only
-            where wheel odometry is given, the identity where left out
+            where wheel odometry is given, and is estimated from that where left out
         dimension : 2 for laser scans, 3 for clouds; that of ``T_base_lidar``, or 3, where left out
         """
+        is_mounted = T_base_lidar is not None
         config, T_base_lidar = checked_start(config, T_base_lidar, dimension)
         self.config = config
         self.dimension = T_base_lidar.shape[0] - 1
         self.resolution = Resolution(config.preprocess, config.local_map.voxel_size_m)
-        self.predictor = Predictor(config.odometry, T_base_lidar)
+        self.predictor = Predictor(config.odometry, T_base_lidar, is_mounted=is_mounted)
         self.matcher = create_matcher(config.matching)
         self.recovery = Recovery(config.matching, self.matcher)
         self.standstill = Standstill(self.dimension)
@@ -182,7 +183,10 @@ class Odometry:
             map_s=working_s() - aligned,
             elsewhere_m=registered.elsewhere_m,
         )
-        return self._at_stamp(tracked, sweep, prediction)
+        tracked = self._at_stamp(tracked, sweep, prediction)
+        is_open = tracked.state is not State.OK
+        self.predictor.mounting.take(tracked.T_odom_lidar, tracked.scan.T_odom_base, is_open=is_open)
+        return tracked
 
     def _predicted(self, scan: Scan, sparse: Sweep) -> Prediction:
         """The predicted pose; without the wheels where they jump, and the scan fits where they do not lead."""

@@ -16,6 +16,7 @@ from scanchain.kernels.geometry import largest_magnitude
 from scanchain.kernels.matrices import definite_inverse
 from scanchain.kernels.registration.observability import WEAK
 from scanchain.odometry.intervals import Intervals
+from scanchain.registration.hand_eye import MountingEstimator
 
 _EVEN = 2.0  # largest ratio of two intervals from which an acceleration is computed
 _LEAST_WINDOW_M, _LEAST_WINDOW_RAD = 0.3, 0.3  # least half width where stamps lie too close
@@ -220,9 +221,10 @@ class Predictor:
     Where a scan constrains nothing along a direction, the motion there goes on and its variance grows.
     """
 
-    def __init__(self, config: OdometryConfig, T_base_lidar: Pose) -> None:
+    def __init__(self, config: OdometryConfig, T_base_lidar: Pose, *, is_mounted: bool) -> None:
+        """is_mounted : whether ``T_base_lidar`` is known; else it is estimated as the lidar moves."""
         self.config = config
-        self.T_base_lidar = T_base_lidar
+        self.mounting = MountingEstimator(T_base_lidar, is_stated=is_mounted)
         self.T_odom_lidar = lie.identity(T_base_lidar.shape[0] - 1)
         self.T_previous_current = self.T_odom_lidar
         k = lie.twist_size(T_base_lidar)
@@ -326,9 +328,10 @@ class Predictor:
                 f"scan {scan.index} has no wheel odometry although odometry.prior is 'wheel'; "
                 "set log.odometry_topic, or odometry.prior to 'auto'"
             )
-        if last is None or now is None:
+        if last is None or now is None or not self.mounting.is_usable:
             return None
-        return lie.between(self.T_base_lidar, lie.between(last, now).dot(self.T_base_lidar))
+        T_base_lidar = self.mounting.T_base_lidar
+        return lie.between(T_base_lidar, lie.between(last, now).dot(T_base_lidar))
 
 
 def _stretched(

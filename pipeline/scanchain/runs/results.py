@@ -148,7 +148,7 @@ def write_results(folder: Path, results: Results) -> None:
     if graph.is_rejected.any():
         write_g2o(rejected_path(folder / GRAPH_FILE), graph, edges="rejected")
     write_closures(folder / "loops.parquet", results.final, result.keyframes, trajectory.dimension)
-    results.steps.write(folder / "steps.parquet", trajectory, log.T_base_lidar)
+    results.steps.write(folder / "steps.parquet", trajectory, result.T_base_lidar)
     write_map(folder, results.grid)
     if config.outputs.map:
         _write_saved_map(folder / MAP_FOLDER, results)

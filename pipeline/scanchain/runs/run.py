@@ -143,7 +143,8 @@ class _Run:
         write_whole(folder / "config.toml", dump(self.config).encode())
         scans = self.log.scans(self.config.preprocess)
         if left is None:
-            return Slam(self.config, self.log.T_base_lidar, folder / POINTS_FILE), scans
+            mounting = self.log.stated_mounting
+            return Slam(self.config, mounting, folder / POINTS_FILE, dimension=self.log.dimension), scans
         left.slam.points.reopen(folder / POINTS_FILE)
         scans = after(left, scans)
         set_aside(folder, left)
@@ -186,7 +187,8 @@ class _Run:
             final = final_verdicts(result.closures, result.state)
             results = results_of(self.log, self.config, self.steps, result, final)
             write_results(folder, results)
-            judged = judge(evidence_of_run(folder, results.expected and results.expected.ate))
+            evidence = evidence_of_run(folder, results.expected and results.expected.ate)
+            judged = judge(evidence, result.T_base_lidar)
             record_results(recording, results)
             recording.log_verdict(judged, result.trajectory)
             with suppress(InputError):  # which is reported with the accuracy
@@ -226,7 +228,8 @@ class _Run:
                 self.steps, results, judged, run_s=run_s, compile_s=compile_s, ground_truth=truth,
                 warnings=(*lost, *note), stopped=stopped,
             )  # fmt: skip
-            text = summary(metrics, _heading(log, self.config, stopped), self.source, [*log.notes, *idle])
+            notes = [*log.notes, *filter(None, [result.mounting_note]), *idle]
+            text = summary(metrics, _heading(log, self.config, stopped), self.source, notes)
             metrics.write(folder / METRICS_FILE)
             (folder / "summary.txt").write_text(text, encoding="utf-8")
         return metrics, text
@@ -312,7 +315,7 @@ def accuracy_of(
 
 
 def _heading(log: Log, config: Config, stopped: str) -> str:
-    known = f"wheel odometry {log.odometry_topic}" if log.odometry_topic else "no wheel odometry"
+    known = f"wheel odometry {log.wheels}" if log.odometry_topic else "no wheel odometry"
     if log.odometry_topic and config.odometry.prior == "constant-velocity":
         known += ", not used: odometry.prior is constant-velocity"
     elif log.odometry_topic and not log.scans_with_wheels:

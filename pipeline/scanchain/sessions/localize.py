@@ -190,7 +190,7 @@ def _followed(
             if localizer is None:
                 T = None if initial is None else initial(scan.stamp_ns, prior)
                 localizer = Localizer(
-                    prior, config, log.T_base_lidar, initial=T, points_file=points_file, is_live=False
+                    prior, config, log.stated_mounting, initial=T, points_file=points_file, is_live=False
                 )
             localizer.process(scan)
     if localizer is None:

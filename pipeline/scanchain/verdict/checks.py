@@ -16,6 +16,8 @@ from scipy.ndimage import median_filter
 
 from scanchain import lie
 from scanchain.data import Matrix
+from scanchain.registration import hand_eye
+from scanchain.registration.hand_eye import HandEye
 from scanchain.registration.svd_icp import DegeneratePairsError, rigid_transform
 
 Floats = NDArray[np.float64]
@@ -104,6 +106,7 @@ class WheelCheck(NamedTuple):
     poses : (N, d+1, d+1) of the lidar by the wheels, NaN where unknown
     turn_ratio : turns of the trajectory over those of the wheels; NaN where these turn too little to say
     known_share : share of the scans whose motion the wheels know, at rest too
+    mounting : of the lidar as motions of wheels and lidar show it, where it clearly is another than was taken
     """
 
     innovation: Floats
@@ -112,6 +115,7 @@ class WheelCheck(NamedTuple):
     poses: Matrix
     turn_ratio: float = np.nan
     known_share: float = 0.0
+    mounting: HandEye | None = None
 
 
 def check_wheels(poses: Matrix, wheel_poses: Matrix) -> WheelCheck:
@@ -120,12 +124,17 @@ def check_wheels(poses: Matrix, wheel_poses: Matrix) -> WheelCheck:
     The differences of the motions are summed up in the lidar's frame, so that neither drift of heading nor slopes
     matter, and compared before and after each scan, as medians along the path, so that readings that are late or
     out of time do not matter either. Scale errors, drift and a turned or displaced lidar are calibrated by robust
-    regression over the log; the standard deviations of what is left are learned from the log.
+    regression over the log; the standard deviations of what is left are learned from the log. A mounting that is
+    far from the one taken is corrected first.
     """
+    if (mounting := _mounting(poses, wheel_poses)) is not None:
+        wheel_poses = wheel_poses @ mounting.T_base_lidar
     d, n = poses.shape[-1] - 1, len(poses)
     known = np.isfinite(wheel_poses[:, 0, 0])
     nothing = np.full(n, np.nan)
-    check = WheelCheck(nothing, nothing.copy(), nothing.copy(), wheel_poses, known_share=float(known.mean()))
+    check = WheelCheck(
+        nothing, nothing.copy(), nothing.copy(), wheel_poses, known_share=float(known.mean()), mounting=mounting
+    )
     ends = np.flatnonzero(known & np.concatenate([[False], known[:-1]]))
     matched, wheels = np.zeros((2, n, lie.twist_size(poses[0])))
     matched[ends] = lie.log(lie.between(poses[ends - 1], poses[ends]))
@@ -160,6 +169,17 @@ def check_wheels(poses: Matrix, wheel_poses: Matrix) -> WheelCheck:
         innovation = np.maximum(innovation, apart[checked] / sigma)
     check.innovation[checked] = innovation
     return check
+
+
+def _mounting(poses: Matrix, wheel_poses: Matrix) -> HandEye | None:
+    """The mounting by the motions over pieces of the path, where it clearly is another than was taken."""
+    pieces = np.floor(np.cumsum(hand_eye.path_m(lie.between(poses[:-1], poses[1:]))) / hand_eye.PAIR_M)
+    nodes = np.flatnonzero(np.diff(pieces, prepend=-1.0))
+    motions = np.stack([lie.between(each[nodes[:-1]], each[nodes[1:]]) for each in (wheel_poses, poses)])
+    motions = motions[:, np.isfinite(motions[0, :, 0, 0])]
+    has_moved = hand_eye.path_m(motions).max(axis=0, initial=0.0) > 0.5 * hand_eye.PAIR_M
+    found = hand_eye.hand_eye(*motions[:, has_moved])
+    return found if found is not None and found.is_apart and not found.is_mirrored else None
 
 
 def check_velocity(stamps_ns: NDArray[np.int64], log_times_ns: NDArray[np.int64], poses: Matrix) -> Floats:

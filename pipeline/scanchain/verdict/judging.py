@@ -10,7 +10,7 @@ from itertools import product
 import numpy as np
 
 from scanchain import lie
-from scanchain.data import LEAST_FIT, Matrix
+from scanchain.data import LEAST_FIT, Matrix, Pose
 from scanchain.errors import counted
 from scanchain.verdict.checks import WINDOW_M, Kind, Stretch
 from scanchain.verdict.stretches import KNOWN, Evidence, find_stretches
@@ -63,8 +63,8 @@ class Judged:
         return f"{self.verdict}{f' ({self.vouched})' if self.vouched else ''}: {self.reason}"
 
 
-def judge(evidence: Evidence) -> Judged:
-    """The verdict on a trajectory.
+def judge(evidence: Evidence, T_base_lidar: Pose | None = None) -> Judged:
+    """The verdict on a trajectory, ``T_base_lidar`` being the mounting that the log states.
 
     Not trustworthy is one most of which is predicted, many of whose scans are contradicted, that accelerates
     impossibly, that the wheels contradict where it is not well measured, or that loop closures and wheels
@@ -78,6 +78,11 @@ def judge(evidence: Evidence) -> Judged:
     slips = [f"{each.kind} at {each.times} ({each.size_m:,.1f} m)" for each in found if each not in stretches]
     rest = _Rest.of(evidence)
     notes = [*([rest.text] if rest.is_shown else []), *slips]
+    if (mounting := evidence.wheels.mounting) is not None:
+        T = mounting.T_base_lidar if T_base_lidar is None else T_base_lidar @ mounting.T_base_lidar
+        where = ", seen from there" if T_base_lidar is None else ""
+        said = mounting._replace(T_base_lidar=T).text
+        notes.append(f"the motions of lidar and wheels contradict the mounting that was taken{where}: {said}")
     error = evidence.error or (f"error below {rest.extent_m:.2g} m" if rest.is_shown else "error unknown")
     if reasons := list(_grave(evidence, stretches)):
         verdict = Verdict.NOT_TRUSTWORTHY
@@ -150,7 +155,7 @@ def _doubts(evidence: Evidence, stretches: Sequence[Stretch], rest: _Rest) -> It
     if evidence.wheels.turn_ratio < _OPPOSED:
         yield (
             "the lidar turns left where the wheels turn right: the scans are mirrored (a lidar upside down that "
-            "/tf_static does not state so), or the wheels are"
+            "/tf_static does not state so: --log.upside_down true), or the wheels are"
         )
     if rest.is_there and not rest.is_shown:
         yield rest.text
@@ -219,7 +224,7 @@ def _unlike_wheels(evidence: Evidence) -> Iterator[str]:
     apart_m, apart_deg = np.median(wheels.apart_m[known]), np.degrees(np.median(wheels.apart_rad[known]))
     yield (
         f"the wheels disagree with the trajectory all along, by {apart_m:.1f} m and {apart_deg:.0f} deg over "
-        f"{WINDOW_M:g} m (medians): their scale or the mounting is wrong, or the lidar follows what moves along"
+        f"{WINDOW_M:g} m (medians): their scale is wrong, they slip, or the lidar follows what moves along"
     )
 
 

@@ -17,7 +17,7 @@ from msgspec import Struct, field
 from scanchain.data import Pose
 from scanchain.logs.mcap.records import Channel
 from scanchain.logs.messages.lidar import Sensed
-from scanchain.logs.messages.poses import StampedPose, pose_of
+from scanchain.logs.messages.poses import Frames, StampedPose, pose_of
 from scanchain.logs.messages.ros import MalformedMessageError, frame_name, header, new, point_fields
 
 _NUMBERS = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}  # foxglove.NumericType to sensor_msgs/PointField
@@ -122,16 +122,18 @@ def pose_in_frame(message: _PoseInFrame, dimension: int) -> StampedPose:
     return StampedPose(_stamp_ns(message.timestamp), frame_name(message.frame_id), "", pose)
 
 
-def frame_transform(message: _FrameTransform) -> list[StampedPose]:
-    """A foxglove.FrameTransform."""
-    pose = _pose(message.translation, message.rotation, 3)
+def frame_transform(message: _FrameTransform, link: Frames | None = None, dimension: int = 3) -> list[StampedPose]:
+    """A foxglove.FrameTransform, or none where it is not between these two frames; flattened for dimension 2."""
     frames = frame_name(message.parent_frame_id), frame_name(message.child_frame_id)
+    if link not in (None, frames):
+        return []
+    pose = _pose(message.translation, message.rotation, dimension)
     return [StampedPose(_stamp_ns(message.timestamp), *frames, pose)]
 
 
-def frame_transforms(message: _FrameTransforms) -> list[StampedPose]:
-    """All transforms of a foxglove.FrameTransforms."""
-    return [transform for each in message.transforms for transform in frame_transform(each)]
+def frame_transforms(message: _FrameTransforms, **chosen: Any) -> list[StampedPose]:
+    """All transforms of a foxglove.FrameTransforms, or those chosen as above."""
+    return [transform for each in message.transforms for transform in frame_transform(each, **chosen)]
 
 
 def _stamp_ns(stamp: _Stamp) -> int:

@@ -16,7 +16,8 @@ NO_TIMES.flags.writeable = False
 _NAMES = ("t", "time", "timestamp", "offset_time", "time_offset", "timeOffset", "time_stamp")
 
 UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-NONE_ASSUMED = "no point times: every scan counts as measured at once"
+_NO, _AT_ONCE = "no point times", "every scan counts as measured at once"
+NONE_ASSUMED = f"{_NO}: {_AT_ONCE}"
 STAMP, EPOCH, CLOCK = "after the stamp", "since the epoch", "of another clock, counted from the first point"
 _SHORTEST_SCAN_NS = 500_000  # span of a scan's whole numbers, below which they are micro- or milliseconds
 _LONGEST_SCAN = 1e4  # span in milliseconds, above which floats are micro- or nanoseconds
@@ -122,8 +123,10 @@ class PointTimes:
         elif abs(begin_s) > _NEAR_S:
             origin = CLOCK
         field = Field(name, kind, values, low, span, begin, core, unit, origin)
-        if self.assumed == NONE_ASSUMED and core > 0.0:
+        if self.assumed.startswith(_NO) and core > 0.0:
             self.assumed = str(field)
+        elif self.assumed == NONE_ASSUMED and span == 0.0 and len(values) > 1:  # as a float32 holds absolute times
+            self.assumed = f"{_NO}: field {name} ({kind}) is there and constant ({first:.10g}); {_AT_ONCE}"
         return field
 
 

@@ -37,13 +37,17 @@ def read_pose(message: Any, dimension: int = 3) -> StampedPose:
     return StampedPose(stamp_ns(message), frame_name(message.header.frame_id), child, T)
 
 
-def read_transforms(message: Any) -> list[StampedPose]:
-    """All transforms of a tf2_msgs/TFMessage."""
+Frames = tuple[str, str]  # parent and child
+
+
+def read_transforms(message: Any, link: Frames | None = None, dimension: int = 3) -> list[StampedPose]:
+    """All transforms of a tf2_msgs/TFMessage, or those between two frames, flattened for dimension 2."""
     found = []
     for each in message.transforms:
-        T = pose_of(each.transform.translation, each.transform.rotation)
         frames = frame_name(each.header.frame_id), frame_name(each.child_frame_id)
-        found.append(StampedPose(stamp_ns(each), *frames, T))
+        if link in (None, frames):
+            T = pose_of(each.transform.translation, each.transform.rotation, dimension)
+            found.append(StampedPose(stamp_ns(each), *frames, T))
     return found
 
 
@@ -104,6 +108,10 @@ class RecordedPoses:
     def take(self, message: Decoded) -> None:
         """Sort one message in."""
         topic, pose = message.channel.topic, message.value
+        if isinstance(pose, list):  # of /tf, often none of the wheels
+            for each in pose:
+                self.take(message._replace(value=each))
+            return
         if not isinstance(pose, StampedPose):
             self.malformed.setdefault(topic, []).append(str(pose))
             return

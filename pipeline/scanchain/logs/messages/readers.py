@@ -9,7 +9,7 @@ from typing import Any, Literal, get_type_hints
 from scanchain.logs.mcap.records import Channel
 from scanchain.logs.messages import foxglove
 from scanchain.logs.messages.lidar import Sensed, read_livox, read_multi_echo_scan
-from scanchain.logs.messages.poses import StampedPose, read_pose, read_transforms
+from scanchain.logs.messages.poses import Frames, read_pose, read_transforms
 from scanchain.logs.messages.ros import unpacked
 
 Read = Callable[..., Any]
@@ -82,6 +82,12 @@ def reader(channel: Channel) -> Read:
     return lambda data, **options: read(parse(data), **options)
 
 
-def pose_reader(channel: Channel, dimension: int) -> Callable[[memoryview], StampedPose]:
-    """Reader of the channel's poses, flattened for dimension 2."""
-    return partial(reader(channel), dimension=dimension)
+def pose_reader(channel: Channel, dimension: int, link: Frames | None = None) -> Read:
+    """Reader of the channel's poses, flattened for dimension 2; of transforms, lists of those of the link."""
+    chosen = {} if link is None else {"link": link}
+    return partial(reader(channel), dimension=dimension, **chosen)
+
+
+def is_moving_transforms(channel: Channel) -> bool:
+    """True if its messages are transforms that may change."""
+    return role(channel) == "transforms" and not channel.topic.endswith("tf_static")

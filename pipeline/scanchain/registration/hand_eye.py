@@ -1,0 +1,162 @@
+"""How a lidar sits on its base, by the motions of both: hand-eye calibration in closed form."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain import lie
+from scanchain.data import Matrix, Pose
+
+PAIR_M, _TURN_M_RAD = 0.3, 0.5  # path of a pair of motions, and that of a turn on the spot
+_FEWEST, _LEARNED = 6, 1.2  # pairs, for four numbers; growth of their count after which they are solved once more
+_ROUNDS, _USUAL_M, _LEAST_M = 10, 0.02, 0.002  # of the robust regression; residuals at first, and at least
+_PRIOR_M, _NOWHERE_M = 1.0, 1e-6  # σ of the place where nothing is known, and of the base's origin
+_LARGEST_SHARE = 0.25  # of the motions that is left as residual, above which no mounting explains them
+_YAW_RAD, _PLACE_M = np.radians(5.0), 0.05  # largest σ of what is observable
+_APART_M, _EXPLAINED = 0.2, 0.5  # place, and share of the residual left, from which on a mounting is another
+
+
+class HandEye(NamedTuple):
+    """The mounting T_base_lidar (d+1, d+1) by the motions: level, its place 0 where not observable, z always.
+
+    sigma_rad, sigma_m : of its yaw and its place
+    left : share that it leaves of the residuals as if lidar and base were one
+    """
+
+    T_base_lidar: Pose
+    sigma_rad: float
+    sigma_m: float
+    left: float
+
+    @property
+    def is_mirrored(self) -> bool:
+        """True if a planar lidar turns against the base, as one does that hangs upside down."""
+        return len(self.T_base_lidar) == 3 and bool(np.linalg.det(self.T_base_lidar) < 0.0)
+
+    @property
+    def is_apart(self) -> bool:
+        """True if lidar and base are clearly not one: motions that disagree by far are explained."""
+        is_turned = abs(float(lie.yaw(self.T_base_lidar))) > _YAW_RAD + 3.0 * self.sigma_rad
+        is_moved = np.linalg.norm(self.T_base_lidar[:2, -1]) > _APART_M
+        return bool(is_turned or is_moved) and self.left < _EXPLAINED
+
+    @property
+    def text(self) -> str:
+        """The mounting in words, with standard deviations."""
+        yaw_deg = (float(np.degrees(lie.yaw(self.T_base_lidar))) + 90.0) % 360.0 - 90.0
+        turned = f"lidar turned by {yaw_deg:.1f} ± {np.degrees(self.sigma_rad):.1f} deg"
+        if len(self.T_base_lidar) == 4:
+            turned += f" and {'upside down' if self.T_base_lidar[2, 2] < 0.0 else 'upright'}, level as is assumed"
+        if self.sigma_m >= _PLACE_M:
+            return f"{turned}; its place is not observable: the log hardly turns"
+        x_m, y_m = self.T_base_lidar[:2, -1]
+        ahead, aside = "ahead of" if x_m >= 0.0 else "behind", "left" if y_m >= 0.0 else "right"
+        place = f"{abs(x_m):.2f} m {ahead} the base, {abs(y_m):.2f} m to its {aside}"
+        return f"{turned}, {place} (± {self.sigma_m:.2f} m)"
+
+
+def hand_eye(base: Matrix, lidar: Matrix) -> HandEye | None:
+    """The mounting X of a lidar on a base by motions (M, d+1, d+1) of both: B X = X L.
+
+    In the plane, with t the place, θ the turn, (a, b) = ρ (cos φ, sin φ) the yaw φ and the scale ρ of the wheels,
+        (R(θ) − I) ρ t − [a, −b; b, a] t_L = −t_B
+    is linear in four numbers (after Censi, Franchi, Marchionni & Oriolo 2013), solved by reweighted least squares
+    (Cauchy). Motions in space are taken for those of a level lidar, upside down where it turns against the base.
+    None where no mounting explains them, or several do: at rest, in one curve or on the spot.
+    """
+    if len(base) < _FEWEST:
+        return None
+    turn, theta = lie.log(base)[:, -1], lie.log(lidar)[:, -1]
+    up = -1.0 if turn @ theta < -_EXPLAINED * (turn @ turn) else 1.0
+    c, s, x, y = np.cos(theta) - 1.0, up * np.sin(theta), lidar[:, 0, -1], up * lidar[:, 1, -1]
+    J = np.stack([np.stack([c, -s, -x, y], axis=1), np.stack([s, c, -y, -x], axis=1)], axis=1)  # (M, 2, 4)
+    z = -base[:, :2, -1]
+    covariance, p, residual_m = _solved(J, z, _PRIOR_M)
+    sigma_m, scale = float(np.sqrt(covariance[:2, :2].diagonal().max())), float(np.hypot(*p[2:]))
+    if scale < _LARGEST_SHARE:
+        return None
+    across = np.array([-p[3], p[2]]) / scale**2  # the yaw's derivative
+    sigma_rad = float(np.sqrt(across @ covariance[2:, 2:] @ across))
+    if sigma_m >= _PLACE_M:
+        _, p, residual_m = _solved(J, z, _NOWHERE_M)
+    if residual_m > _LARGEST_SHARE * float(np.median(path_m(base))) or sigma_rad > _YAW_RAD:
+        return None
+    T = lie.pose_2d(*(p[:2] / scale if sigma_m < _PLACE_M else (0.0, 0.0)), float(np.arctan2(p[3], p[2])))
+    T = T @ np.diag([1.0, up, 1.0]) if base.shape[-1] == 3 else lie.lift(T) @ np.diag([1.0, up, up, 1.0])
+    left = residual_m / float(np.median(np.linalg.norm(z - J @ [0.0, 0.0, 1.0, 0.0], axis=1)))
+    return HandEye(T, sigma_rad, sigma_m, left)
+
+
+def path_m(motions: Matrix) -> NDArray[np.float64]:
+    """Lengths (...) of motions (..., d+1, d+1), turns on the spot included."""
+    return np.linalg.norm(motions[..., :-1, -1], axis=-1) + _TURN_M_RAD * lie.rotation_angle(motions)
+
+
+def _solved(J: Matrix, z: Matrix, prior_m: float) -> tuple[Matrix, NDArray[np.float64], float]:
+    """Covariance (4, 4) and value (4,) of J (M, 2, 4) p = z (M, 2), the first two 0 ± prior_m; median residual."""
+    weight, variance = np.ones(len(z)), _USUAL_M**2
+    for _ in range(_ROUNDS):
+        H = np.einsum("mij,m,mik->jk", J, weight, J) / variance + np.diag([prior_m**-2.0] * 2 + [1e-6] * 2)
+        p = np.linalg.solve(H, np.einsum("mij,m,mi->j", J, weight, z) / variance)
+        residuals = np.linalg.norm(z - J @ p, axis=1)
+        weight = 1.0 / (1.0 + (residuals / max(1.5 * float(np.median(residuals)), _LEAST_M)) ** 2)
+        variance = max(float(weight @ residuals**2) / max(2.0 * float(weight.sum()) - 4.0, 1.0), _LEAST_M**2)
+    return np.linalg.inv(H), p, float(np.median(residuals))
+
+
+class MountingEstimator:
+    """The mounting of a lidar, where none is stated estimated by the motions of all scans so far.
+
+    Until it is known, the wheels are no prior, except for scans after one whose pose is open.
+    """
+
+    def __init__(self, T_base_lidar: Pose, *, is_stated: bool) -> None:
+        self.T_base_lidar, self.is_stated = T_base_lidar, is_stated
+        self.motions: list[tuple[Pose, Pose]] = []  # of base and lidar
+        self.last: tuple[Pose, Pose] | None = None  # their poses that the next motions begin at
+        self.has_wheels = False
+        self.due = 0  # number of motions from which on the next estimate is made
+        self.found: HandEye | None = None
+        self.is_usable = is_stated  # the wheels, for the next scan
+
+    def take(self, T_odom_lidar: Pose, T_odom_base: Pose | None, *, is_open: bool) -> None:
+        """Take the poses of a scan."""
+        if self.is_stated:
+            return
+        self.has_wheels |= T_odom_base is not None
+        known = None if is_open or T_odom_base is None else (T_odom_base.copy(), T_odom_lidar)
+        if known is None or self.last is None:
+            self.last = known
+        else:
+            moved = lie.between(self.last[0], known[0]), lie.between(self.last[1], known[1])
+            if max(map(path_m, moved)) >= PAIR_M:
+                self.motions.append(moved)
+                self.last = known
+        if len(self.motions) > self.due:
+            self.due = int(_LEARNED * len(self.motions))
+            self._estimate()
+        self.is_usable = is_open if self.found is None else not self.found.is_mirrored
+
+    def finish(self) -> str:
+        """Estimate it by all scans; what is known of it as a sentence, empty where stated or without wheels."""
+        if not self.has_wheels:
+            return ""
+        self._estimate()
+        if self.found is None:
+            why = "the wheels do not show it: at rest, in one curve only, or in other motions than the lidar"
+            return (
+                f"mounting assumed, as if the lidar sat at the base's origin: the log has no transform, and {why}"
+            )
+        if self.found.is_mirrored:
+            why = "as one does that hangs upside down, which no transform states: --log.upside_down true"
+            return f"the wheels are not used: the lidar turns left where they turn right, {why}"
+        return f"mounting estimated from the wheels: {self.found.text}; the log has no transform"
+
+    def _estimate(self) -> None:
+        if self.motions:
+            self.found = hand_eye(*np.swapaxes(np.array(self.motions), 0, 1))
+        if self.found is not None and not self.found.is_mirrored:
+            self.T_base_lidar = self.found.T_base_lidar
