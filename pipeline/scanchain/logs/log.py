@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from functools import partial
-from itertools import chain
+from itertools import chain, tee
 
 import numpy as np
 from msgspec.structs import replace
@@ -26,6 +26,7 @@ from scanchain.logs.messages.poses import RecordedPoses, StampedPose
 from scanchain.logs.messages.readers import is_scan, pose_reader, reader
 from scanchain.logs.mounting import find_mounting, in_plane, is_upside_down
 from scanchain.logs.opening import index_files
+from scanchain.logs.sectors import Assembler, Sampled, find_sectors
 from scanchain.logs.topics import find_ground_truth, find_lidar, find_odometry
 from scanchain.settings import load_settings, overrides_of
 
@@ -89,11 +90,12 @@ class Log:
         self.topic = lidar.topic
         self.odometry_topic = "" if wheels is None else wheels.topic
         self.ground_truth_topic = "" if truth is None else truth.topic
+        self._times_config = config  # with the unit of point times where a sector's duration tells it
         self._sampled_times = PointTimes(config)
         self.plane_height_m: float | None = None
+        sample, sampled = tee(stream.sampled_messages(indexes, lidar.topic, self._sampled))
         if not is_scan(lidar):
-            clouds = stream.sampled_messages(indexes, lidar.topic, self.decoder(self._sampled_times))
-            self.plane_height_m = height_m = plane_height_m(clouds)
+            self.plane_height_m = height_m = plane_height_m(each.returns for each in sample)
             if height_m is not None:
                 self.notes.append(
                     f"the clouds of {lidar.topic} are planar (z = {height_m:.3g} m everywhere): read as a 2D log"
@@ -103,6 +105,14 @@ class Log:
         self.duration_s = whole.duration_s
         self.span = stream.chosen_span(whole, config)
         self.scan_count = stream.count_scans(indexes, self.topic, whole, config)
+        self.sectors = find_sectors(sampled, self._decoder_by, config.point_times)
+        if self.sectors is not None:
+            self._times_config = replace(config, point_times=self.sectors.point_times)
+            self._sampled_times = PointTimes(self._times_config)
+            next(stream.sampled_messages(indexes, lidar.topic, self.decoder(self._sampled_times)), None)
+            messages = stream.count_scans(indexes, self.topic, whole, replace(config, every=1))
+            self.scan_count = -(-self.sectors.sweeps(messages) // config.every)
+            self.notes.append(self.sectors.note(self.topic))
         self.mounting = find_mounting(indexes, lidar, wheels, self.span)
         self.gaps = stream.gap_notes(indexes, config)  # those of the notes that are of long gaps
         self.notes += stream.notes_on(indexes, config)
@@ -145,11 +155,12 @@ class Log:
         self.notes = list(self._opening_notes)
         poses = RecordedPoses(self.odometry_topic, self.ground_truth_topic)
         counts = ScanCounts(self.topic, self.odometry_topic)
-        times = PointTimes(self.config)
+        times = PointTimes(self._times_config)
+        assembler = None if self.sectors is None else Assembler(self.sectors, self.topic)
         self.scans_with_wheels = 0
         count, index, requested_s = 0, 0, working_s()
         try:
-            for message, T_odom_base in self._with_poses(poses, times):
+            for message, T_odom_base in self._with_poses(poses, times, assembler):
                 count += 1
                 if (count - 1) % self.config.every:
                     continue
@@ -182,7 +193,8 @@ class Log:
             is_damaged = bool(self._damage)
             self._damage += [*counts.losses(), *poses.complaints()]
             self.bad_scans = counts.bad
-            self.notes += [*([] if is_scan(self.lidar) else [times.assumed]), *counts.notes()]
+            self.notes += [*filter(None, [self._assumed(times)]), *counts.notes()]
+            self.notes += [] if assembler is None else assembler.notes()
         if not index:
             raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
         if is_damaged:
@@ -191,14 +203,20 @@ class Log:
 
     def assumed_point_times(self) -> str:
         """Assumption of a run about per-point times, by the first scan that has returns; empty for laser scans."""
-        return "" if is_scan(self.lidar) else self._sampled_times.assumed
+        return self._assumed(self._sampled_times)
+
+    def _assumed(self, times: PointTimes) -> str:
+        if is_scan(self.lidar):
+            return ""
+        is_timed = times.assumed.startswith("point times")
+        return times.assumed if is_timed or self.sectors is None else self.sectors.assumed
 
     def expected_stamps(self, topic: str) -> NDArray[np.int64]:
         """(2,) first and last header stamp to expect of a topic in the part that is read, by its first message.
 
         ``topic`` : the lidar's or the ground truth's. Raises InputError where it has no message there.
         """
-        decode = self.pose_decoders.get(topic) or self.decoder(PointTimes(self.config))
+        decode = self.pose_decoders.get(topic) or self.decoder(PointTimes(self._times_config))
         why = ""
         for message in stream.decoded_messages(self.indexes, {topic: decode}, self.span, ahead=1, damage=[]):
             if isinstance(message.value, Returns | StampedPose):
@@ -218,11 +236,14 @@ class Log:
             self._truth = poses.ground_truth()
         return self._truth
 
-    def _with_poses(self, poses: RecordedPoses, times: PointTimes) -> Iterator[tuple[Decoded, Pose | None]]:
-        """Lidar messages with the wheels' pose at their stamp; they wait a little for the readings behind them."""
+    def _with_poses(
+        self, poses: RecordedPoses, times: PointTimes, assembler: Assembler | None
+    ) -> Iterator[tuple[Decoded, Pose | None]]:
+        """Scans with the wheels' pose at their stamp; they wait a little for the readings behind them."""
         decoders = {self.topic: self.decoder(times), **self.pose_decoders}
         waiting: deque[Decoded] = deque()
         messages = stream.decoded_messages(self.indexes, decoders, self.span, damage=self._damage)
+        messages = messages if assembler is None else assembler.sweeps(messages)
         for message in chain(messages, [None]):
             if message is not None and message.channel.topic == self.topic:
                 waiting.append(message)
@@ -243,3 +264,10 @@ class Log:
         if is_scan(self.lidar):
             return partial(decode_laser_scan, read=reader(self.lidar), config=self.config)
         return partial(decode_cloud, read=reader(self.lidar), times=times, plane_m=self.plane_height_m)
+
+    def _decoder_by(self, point_times: str) -> Callable[[memoryview], Returns]:
+        return self.decoder(PointTimes(replace(self.config, point_times=point_times)))
+
+    def _sampled(self, data: memoryview) -> Sampled:
+        frame = str(reader(self.lidar)(data).message.header.frame_id)
+        return Sampled(data, self.decoder(self._sampled_times)(data), frame)
