@@ -157,16 +157,25 @@ def _timed(
     starts_s = [float(times.min()) for each in seen if len(times := decode(each.data).times_s)]
     last_s = sectors.period_s * (1.0 - 1.0 / sectors.per_sweep)  # from the first sector to the last
     is_from_sweep = len(starts_s) > 1 and float(np.ptp(starts_s)) > 0.5 * last_s
+    if is_from_sweep and not sectors.per_sweep.is_integer():  # of the driver's revolution, not of ours
+        return sectors._replace(point_times="none")
     return sectors._replace(point_times=point_times, is_from_sweep=is_from_sweep)
 
 
 class _Part(NamedTuple):
-    """A message of a sweep: the angle of its middle since the start of the sweep, and its direction."""
+    """A message, or a part of one, in a sweep.
+
+    returns : its points, with the stamp of the message
+    angle_rad : of the middle of the message, since the sweep was due to begin; direction_rad : where it looks
+    begin_rad, begin_ns : angle and time at which it begins
+    """
 
     message: Decoded
     returns: Returns
     angle_rad: float
     direction_rad: float
+    begin_rad: float
+    begin_ns: int
 
 
 class Assembler:
@@ -174,79 +183,104 @@ class Assembler:
 
     def __init__(self, sectors: Sectors, topic: str) -> None:
         self.sectors, self.topic = sectors, topic
+        self.half_rad, self.rate = 0.5 * sectors.step_rad, sectors.period_s / _TURN_RAD
         self.incomplete = 0
 
     def sweeps(self, messages: Iterable[Decoded]) -> Iterator[Decoded]:
         """The messages, those of the lidar assembled to sweeps; malformed ones and those of other topics pass.
 
-        A sweep has the stamp of its first message and the log time of its last. It ends where the revolution does
-        or messages of most of one are missing; one over less than half of a revolution is left out.
+        A sweep has the stamp of its beginning and the log time of its last message. It ends where the revolution
+        does, which splits a message where they do not divide it, or where those of most of a revolution are
+        missing. One over less than half of a revolution is left out.
         """
+        is_split = self.sectors.is_stamped and not self.sectors.per_sweep.is_integer()
         parts: list[_Part] = []
         for message in messages:
             if message.channel.topic != self.topic or not isinstance(message.value, Returns):
                 yield message
                 continue
-            part, begins = self._following(parts[-1] if parts else None, message, message.value)
-            if begins:
-                yield from self._complete(parts)
-                parts = []
-            parts.append(part)
+            part, is_apart = self._following(parts[-1] if parts else None, message, message.value)
+            beyond_rad = part.angle_rad - _TURN_RAD
+            if is_split and abs(beyond_rad) < self.half_rad:
+                head, part = self._split(part)
+                parts.append(head)
+            elif beyond_rad >= 0.0:
+                part = self._part(message, part.returns, beyond_rad, part.direction_rad)
+            elif not is_apart:
+                parts.append(part)
+                continue
+            yield from self._complete(parts)
+            parts = [part]
         yield from self._complete(parts)
 
+    def _part(self, message: Decoded, returns: Returns, angle_rad: float, direction_rad: float) -> _Part:
+        begin_rad = angle_rad - self.half_rad
+        return _Part(message, returns, angle_rad, direction_rad, begin_rad, returns.stamp_ns)
+
     def _following(self, last: _Part | None, message: Decoded, returns: Returns) -> tuple[_Part, bool]:
-        """A message as part of a sweep, and whether it begins another one. Empty ones follow by the usual angle."""
-        step_rad, sense = self.sectors.step_rad, self.sectors.sense
-        points = returns.points[:: len(returns.points) // _SAMPLE + 1]
-        direction_rad = _mean(_azimuth(points)) if len(points) else 0.0
-        first = _Part(message, returns, 0.5 * step_rad, direction_rad)
-        if last is None:
-            return first, True
-        since_rad = step_rad
+        """The part that follows another, and whether messages are missing between them, or its clock steps back.
+
+        Messages without points follow by the usual angle.
+        """
+        sectors, points = self.sectors, returns.points[:: len(returns.points) // _SAMPLE + 1]
+        direction_rad = last.direction_rad + sectors.sense * sectors.step_rad if last else 0.0
         if len(points):
-            since_rad = (
-                sense * (direction_rad - last.direction_rad) + 0.5 * step_rad
-            ) % _TURN_RAD - 0.5 * step_rad
-        else:
-            direction_rad = last.direction_rad + sense * step_rad
-        revolutions = 1e-9 * (returns.stamp_ns - last.returns.stamp_ns) / self.sectors.period_s
-        if not self.sectors.is_stamped:
+            direction_rad = _mean(_azimuth(points))
+        if last is None:
+            return self._part(message, returns, self.half_rad, direction_rad), True
+        turned_rad = sectors.sense * (direction_rad - last.direction_rad)
+        turned_rad = (turned_rad + self.half_rad) % _TURN_RAD - self.half_rad
+        revolutions = 1e-9 * (returns.stamp_ns - last.returns.stamp_ns) / sectors.period_s
+        is_apart = not -0.5 < revolutions < turned_rad / _TURN_RAD + _MISSING
+        if not sectors.is_stamped:
             is_apart = returns.stamp_ns != last.returns.stamp_ns
-        else:
-            is_apart = not -0.5 < revolutions < since_rad / _TURN_RAD + _MISSING
-        if is_apart:
-            return first._replace(direction_rad=direction_rad), True
-        angle_rad = last.angle_rad + since_rad
-        begins = angle_rad >= _TURN_RAD
-        return _Part(message, returns, angle_rad - _TURN_RAD * begins, direction_rad), begins
+        angle_rad = self.half_rad if is_apart else last.angle_rad + turned_rad
+        return self._part(message, returns, angle_rad, direction_rad), is_apart
+
+    def _split(self, part: _Part) -> tuple[_Part, _Part]:
+        """The points of a part before the end of its revolution, and those after it."""
+        returns = part.returns
+        is_before = self._angles_rad(part) < _TURN_RAD
+        before, after = (
+            returns._replace(
+                points=returns.points[chosen], times_s=returns.times_s[chosen[: len(returns.times_s)]]
+            )
+            for chosen in (is_before, ~is_before)
+        )
+        begin_ns = returns.stamp_ns + round(1e9 * self.rate * (_TURN_RAD - part.begin_rad))
+        tail = part._replace(returns=after._replace(dropped=0), angle_rad=part.angle_rad - _TURN_RAD)
+        return part._replace(returns=before), tail._replace(begin_rad=0.0, begin_ns=begin_ns)
+
+    def _angles_rad(self, part: _Part) -> NDArray[np.float32]:
+        """Angles (N,) of the points of a part, since its sweep was due to begin."""
+        turned_rad = _wrapped(_azimuth(part.returns.points) - np.float32(part.direction_rad))
+        return np.float32(part.angle_rad) + self.sectors.sense * turned_rad
 
     def _complete(self, parts: list[_Part]) -> Iterator[Decoded]:
         """The sweep of its parts, none where these cover less than half of a revolution."""
         if not parts:
             return
         first, last = parts[0], parts[-1]
-        if last.angle_rad - first.angle_rad + self.sectors.step_rad < 0.5 * _TURN_RAD:
+        if last.angle_rad + self.half_rad - first.begin_rad < 0.5 * _TURN_RAD - self.half_rad * _SAME:
             self.incomplete += 1
             return
         returns = [part.returns for part in parts]
         points = np.concatenate([each.points for each in returns])
         times_s = np.concatenate([self._times_s(part, first) for part in parts])
         why = "" if len(points) else first.returns.why
-        sweep = Returns(first.returns.stamp_ns, points, times_s, sum(each.dropped for each in returns), why)
+        sweep = Returns(first.begin_ns, points, times_s, sum(each.dropped for each in returns), why)
         yield last.message._replace(value=sweep)
 
     def _times_s(self, part: _Part, first: _Part) -> NDArray[np.float32]:
-        """Seconds (N,) of the points of a part after the stamp of the first: by their own times, else by azimuth."""
-        returns, rate = part.returns, self.sectors.period_s / _TURN_RAD
-        turned_s = rate * (part.angle_rad - first.angle_rad)
+        """Seconds (N,) of points after the beginning of their sweep: by their own times, else by their angle."""
+        returns, sectors = part.returns, self.sectors
         if not len(returns.times_s):
-            turned_rad = _wrapped(_azimuth(returns.points) - part.direction_rad)
-            within_s = rate * (self.sectors.sense * turned_rad + 0.5 * self.sectors.step_rad)
-            return (turned_s + within_s).astype(np.float32)
-        after_s = 1e-9 * (returns.stamp_ns - first.returns.stamp_ns)
-        if self.sectors.is_from_sweep:
+            return (self.rate * (self._angles_rad(part) - first.begin_rad)).astype(np.float32)
+        after_s = 1e-9 * (returns.stamp_ns - first.begin_ns)
+        turned_s = self.rate * (part.angle_rad - self.half_rad - first.begin_rad)
+        if sectors.is_from_sweep:
             after_s = 0.0
-        elif not self.sectors.is_stamped or abs(after_s - turned_s) > 0.5 * self.sectors.period_s:
+        elif not sectors.is_stamped or abs(after_s - turned_s) > 0.5 * sectors.period_s:
             after_s = turned_s  # its stamp is that of the revolution, or wrong
         return returns.times_s + np.float32(after_s)
 
