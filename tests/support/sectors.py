@@ -10,6 +10,7 @@ from scanchain.logs.writer import LogWriter, pack_cloud, pack_laser_scan
 from scanchain.simulation import SENSORS, plan, record
 from scanchain.simulation.sensors import _planar
 from tests.support import made
+from tests.support.naive_logs import ROS2
 
 PERIOD_NS = 100_000_000
 UNITS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
@@ -65,8 +66,6 @@ def cut(source, path, how):
 
 
 def _clouds(swept, how):
-    from tests.support.naive_logs import ROS2
-
     stamps, times, points = [], [], []
     for data in swept:
         cloud = ROS2.deserialize_cdr(data, "sensor_msgs/msg/PointCloud2")
@@ -98,8 +97,6 @@ def _clouds(swept, how):
 
 
 def _scans(swept, how):
-    from tests.support.naive_logs import ROS2
-
     scans = [ROS2.deserialize_cdr(data, "sensor_msgs/msg/LaserScan") for data in swept]
     first = scans[0]
     beams = len(first.ranges)
@@ -113,8 +110,9 @@ def _scans(swept, how):
         end = min(end + round(how.overlap_deg / 360.0 * beams), len(ranges))
         part = ranges[start:end]
         yield end_ns, pack_laser_scan(
-            _stamp(begin_ns, end_ns, stamps, how), "lidar", first.angle_min + first.angle_increment * (start % beams),
-            first.angle_increment, np.full_like(part, np.inf) if number in how.empty else part,
+            _stamp(begin_ns, end_ns, stamps, how), "lidar",
+            first.angle_min + first.angle_increment * (start % beams), first.angle_increment,
+            np.full_like(part, np.inf) if number in how.empty else part,
             range_min_m=first.range_min, range_max_m=first.range_max,
             time_increment_s=1e-9 * beam_ns if how.times != "none" else 0.0,
         )  # fmt: skip

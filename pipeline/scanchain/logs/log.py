@@ -90,10 +90,9 @@ class Log:
         self.topic = lidar.topic
         self.odometry_topic = "" if wheels is None else wheels.topic
         self.ground_truth_topic = "" if truth is None else truth.topic
-        self._times_config = config  # with the unit of point times where a sector's duration tells it
         self._sampled_times = PointTimes(config)
         self.plane_height_m: float | None = None
-        sample, sampled = tee(stream.sampled_messages(indexes, lidar.topic, self._sampled))
+        sample, first_messages = tee(stream.sampled_messages(indexes, lidar.topic, self._sampled))
         if not is_scan(lidar):
             self.plane_height_m = height_m = plane_height_m(each.returns for each in sample)
             if height_m is not None:
@@ -104,15 +103,9 @@ class Log:
         whole = stream.whole_span(indexes)
         self.duration_s = whole.duration_s
         self.span = stream.chosen_span(whole, config)
-        self.scan_count = stream.count_scans(indexes, self.topic, whole, config)
-        self.sectors = find_sectors(sampled, self._decoder_by, config.point_times)
-        if self.sectors is not None:
-            self._times_config = replace(config, point_times=self.sectors.point_times)
-            self._sampled_times = PointTimes(self._times_config)
-            next(stream.sampled_messages(indexes, lidar.topic, self.decoder(self._sampled_times)), None)
-            messages = stream.count_scans(indexes, self.topic, whole, replace(config, every=1))
-            self.scan_count = -(-self.sectors.sweeps(messages) // config.every)
-            self.notes.append(self.sectors.note(self.topic))
+        self.sectors = find_sectors(first_messages, self._decoder_by, config.point_times)
+        self.scan_count = self._expected_scans(whole)
+        self.notes += [] if self.sectors is None else [self.sectors.note(self.topic)]
         self.mounting = find_mounting(indexes, lidar, wheels, self.span)
         self.gaps = stream.gap_notes(indexes, config)  # those of the notes that are of long gaps
         self.notes += stream.notes_on(indexes, config)
@@ -155,7 +148,7 @@ class Log:
         self.notes = list(self._opening_notes)
         poses = RecordedPoses(self.odometry_topic, self.ground_truth_topic)
         counts = ScanCounts(self.topic, self.odometry_topic)
-        times = PointTimes(self._times_config)
+        times = self._point_times()
         assembler = None if self.sectors is None else Assembler(self.sectors, self.topic)
         self.scans_with_wheels = 0
         count, index, requested_s = 0, 0, working_s()
@@ -203,7 +196,11 @@ class Log:
 
     def assumed_point_times(self) -> str:
         """Assumption of a run about per-point times, by the first scan that has returns; empty for laser scans."""
-        return self._assumed(self._sampled_times)
+        times = self._sampled_times
+        if self.sectors is not None:
+            times = self._point_times()
+            next(stream.sampled_messages(self.indexes, self.topic, self.decoder(times)), None)
+        return self._assumed(times)
 
     def _assumed(self, times: PointTimes) -> str:
         if is_scan(self.lidar):
@@ -216,7 +213,7 @@ class Log:
 
         ``topic`` : the lidar's or the ground truth's. Raises InputError where it has no message there.
         """
-        decode = self.pose_decoders.get(topic) or self.decoder(PointTimes(self._times_config))
+        decode = self.pose_decoders.get(topic) or self.decoder(self._point_times())
         why = ""
         for message in stream.decoded_messages(self.indexes, {topic: decode}, self.span, ahead=1, damage=[]):
             if isinstance(message.value, Returns | StampedPose):
@@ -265,9 +262,20 @@ class Log:
             return partial(decode_laser_scan, read=reader(self.lidar), config=self.config)
         return partial(decode_cloud, read=reader(self.lidar), times=times, plane_m=self.plane_height_m)
 
-    def _decoder_by(self, point_times: str) -> Callable[[memoryview], Returns]:
-        return self.decoder(PointTimes(replace(self.config, point_times=point_times)))
-
     def _sampled(self, data: memoryview) -> Sampled:
         frame = str(reader(self.lidar)(data).message.header.frame_id)
         return Sampled(data, self.decoder(self._sampled_times)(data), frame)
+
+    def _decoder_by(self, point_times: str) -> Callable[[memoryview], Returns]:
+        return self.decoder(PointTimes(replace(self.config, point_times=point_times)))
+
+    def _point_times(self) -> PointTimes:
+        """Times of the lidar's points, in the unit that the duration of a sector shows."""
+        config, sectors = self.config, self.sectors
+        return PointTimes(config if sectors is None else replace(config, point_times=sectors.point_times))
+
+    def _expected_scans(self, whole: stream.Span) -> int:
+        if self.sectors is None:
+            return stream.count_scans(self.indexes, self.topic, whole, self.config)
+        messages = stream.count_scans(self.indexes, self.topic, whole, replace(self.config, every=1))
+        return -(-self.sectors.sweeps(messages) // self.config.every)

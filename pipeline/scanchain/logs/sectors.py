@@ -57,7 +57,9 @@ class Sectors(NamedTuple):
     def assumed(self) -> str:
         """Times of points that have none of their own."""
         direction = "counterclockwise" if self.sense > 0 else "clockwise"
-        return f"point times by the azimuth: {direction}, {self.period_s:.3g} s a turn, from the first message's stamp"
+        return (
+            f"point times by the azimuth: {direction}, {self.period_s:.3g} s a turn, from the sweep's first stamp"
+        )
 
     def note(self, topic: str) -> str:
         """What was found, and what is done about it."""
@@ -120,19 +122,26 @@ def _sectors(seen: list[Sampled], directions_rad: NDArray[np.float64], width_rad
         sense = int(np.sign(np.sum(orders))) or 1
     steps_rad = (sense * steps_rad) % _TURN_RAD
     step_rad = float(np.percentile(steps_rad, 50.0, method="lower"))
-    is_regular = np.mean(np.abs(_wrapped(steps_rad - step_rad)) < 0.5 * step_rad) >= _REGULAR
+    turned_rad = np.append(0.0, np.cumsum(steps_rad))
+    is_usual = np.abs(_wrapped(steps_rad - step_rad)) <= 0.5 * step_rad
+    step_rad = float(steps_rad[is_usual].mean())
     is_narrow = _WIDTHS[0] * step_rad <= width_rad <= _WIDTHS[1] * step_rad
-    later = round(_TURN_RAD / float(np.mean(steps_rad))) if step_rad > 0.0 else 0
-    if not (is_regular and is_narrow and 2 <= later <= (len(seen) + 1) / _REVOLUTIONS):
+    if not (
+        np.mean(is_usual) >= _REGULAR and is_narrow and turned_rad[-1] + 1.5 * step_rad > _REVOLUTIONS * _TURN_RAD
+    ):
         return None
-    drift_rad = _wrapped(sense * (directions_rad[later:] - directions_rad[:-later]))
+    first = np.flatnonzero(turned_rad + _TURN_RAD < turned_rad[-1] + 0.5 * step_rad)
+    later = np.abs(turned_rad[:, None] - turned_rad[first] - _TURN_RAD).argmin(axis=0)
+    drift_rad = turned_rad[later] - turned_rad[first] - _TURN_RAD
     stamps_ns = np.array([each.returns.stamp_ns for each in seen])
-    seconds = 1e-9 * (stamps_ns[later:] - stamps_ns[:-later])
+    seconds = 1e-9 * (stamps_ns[later] - stamps_ns[first])
     period_s = float(np.median(seconds * _TURN_RAD / (_TURN_RAD + drift_rad)))
     if not 0.0 < period_s < _SLOWEST_S:
         return None
-    recurs = np.median(np.abs(drift_rad)) < _SAME * step_rad
-    per_sweep = float(later) if recurs else float(_TURN_RAD / np.mean(steps_rad))
+    per_sweep = float(_TURN_RAD / np.mean(steps_rad))
+    if np.median(np.abs(drift_rad)) < _SAME * step_rad:  # the same sectors again: as many as there are
+        sorted_rad = np.sort(turned_rad % _TURN_RAD)
+        per_sweep = float(np.sum(np.diff(sorted_rad, append=sorted_rad[0] + _TURN_RAD) > 0.5 * step_rad))
     return Sectors(sense, step_rad, per_sweep, period_s, bool(np.median(np.diff(stamps_ns)) > 0))
 
 

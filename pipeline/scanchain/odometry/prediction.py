@@ -28,9 +28,7 @@ _MEMORY = 0.9  # weight of the mean of the squared errors so far against the nex
 _SUDDEN = 0.25  # share of the last squared error below which the mean does not fall
 _KNOWN = 5  # number of errors needed before the mean is used
 _CAUTION = 2.0  # factor from the root mean square to the standard deviation that is given
-_MOST_DOUBTFUL = (
-    0.5  # share of the last scans whose pose is doubtful, above which scans are no evidence against wheels
-)
+_MOST_DOUBTFUL = 0.5  # share of the last scans, lost or contradicted, above which scans count for nothing
 _LEAST_M, _LEAST_RAD = 0.002, 0.0005  # smallest standard deviation that is given
 
 
@@ -110,8 +108,7 @@ class Prediction(msgspec.Struct, frozen=True):
     interval_s, last_s, usual_s : since the last scan, before that one, and as a rule; 0 where unknown
     silence_s : since the last scan by stamps that the log confirms, else 0
     lost_s : for how long scans have been lost
-    jump_m : distance of a pose by the wheels from where the motion so far leads; 0 if it may have changed so, or the
-        scans are too doubtful to tell
+    jump_m : distance of a pose by the wheels from where the motion so far leads; 0 if it may have changed so
     config : largest speed and turn rate
     """
 
@@ -238,10 +235,7 @@ class Predictor:
         self.lost_s = 0.0
         self.T_odom_base: Pose | None = None  # by the wheels at the last scan, where nothing contradicts it
         self.is_contradicted = False  # the reading at this scan
-        self.scans, self.doubtful = (
-            0,
-            0.0,
-        )  # corrected; running mean of those that are lost, degenerate or contradicted
+        self.scans, self.doubtful = 0, 0.0  # that were corrected; share of the last ones, lost or contradicted
         self.jumps: list[tuple[int, float]] = []  # scan and meters of each reading that was left out
 
     def predict(self, scan: Scan, *, by_wheels: bool = True) -> Prediction:
@@ -277,6 +271,11 @@ class Predictor:
             config=self.config,
         )
 
+    @property
+    def doubts_scans(self) -> bool:
+        """True if most of the last scans were lost or contradicted: they are no evidence against the wheels."""
+        return self.doubtful > _MOST_DOUBTFUL
+
     def drop_wheels(self, scan: Scan, jump_m: float) -> None:
         """Leave out the reading at this scan, which is off by so much, here and for the motion to the next."""
         self.is_contradicted = True
@@ -301,7 +300,7 @@ class Predictor:
             self.velocity = prediction.velocity_by(lie.log(self.T_previous_current))
             self._update(prediction, match, state)
         self.scans += 1
-        is_doubtful = state is not State.OK or match.fit < LEAST_FIT
+        is_doubtful = state is State.LOST or (state is State.OK and match.fit < LEAST_FIT)
         self.doubtful += max(1.0 - _MEMORY, 1.0 / self.scans) * (is_doubtful - self.doubtful)
         self.intervals.take(scan, prediction.interval_s)
         T_odom_base = None if self.is_contradicted else scan.T_odom_base
@@ -324,7 +323,7 @@ class Predictor:
             else:
                 self.filter.correct(innovation, match.information, statistics.covariance)
             is_independent = not is_measured or match.observability >= WEAK
-            is_independent &= not is_measured or self.doubtful <= _MOST_DOUBTFUL
+            is_independent &= not (is_measured and self.doubts_scans)
             if state is State.OK and is_independent and not prediction.is_second:
                 statistics.update(innovation, definite_inverse(match.information).diagonal())
 
