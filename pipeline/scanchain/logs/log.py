@@ -105,10 +105,9 @@ class Log:
         self.span = stream.chosen_span(whole, config)
         self.sectors = find_sectors(first_messages, self._decoder_by, config.point_times)
         self.scan_count = self._expected_scans(whole)
-        self.notes += [] if self.sectors is None else [self.sectors.note(self.topic)]
         self.mounting = find_mounting(indexes, lidar, wheels, self.span)
         self.gaps = stream.gap_notes(indexes, config)  # those of the notes that are of long gaps
-        self.notes += stream.notes_on(indexes, config)
+        self.notes += [*self._notes_on_sectors(), *stream.notes_on(indexes, config)]
         self.notes += self.mounting.notes(self.odometry_topic, self.dimension)
         if self.mounting.motion is not None:
             wheels, self.odometry_topic = None, ""
@@ -118,8 +117,7 @@ class Log:
         self._damage: list[str] = [line for index in indexes for line in index.damage]
         with_poses = [each for each in (wheels, truth) if each is not None]
         self.pose_decoders = {each.topic: pose_reader(each, self.dimension) for each in with_poses}
-        self.scans_with_wheels = 0
-        self.bad_scans = 0
+        self.scans_with_wheels = self.bad_scans = 0
         self._opening_notes = tuple(self.notes)
         self._truth: Trajectory | None = None
 
@@ -150,6 +148,7 @@ class Log:
         counts = ScanCounts(self.topic, self.odometry_topic)
         times = self._point_times()
         assembler = None if self.sectors is None else Assembler(self.sectors, self.topic)
+        messages = self.scan_count if self.sectors is None else round(self.scan_count * self.sectors.per_sweep)
         self.scans_with_wheels = 0
         count, index, requested_s = 0, 0, working_s()
         try:
@@ -161,7 +160,9 @@ class Log:
                 if unusable := defect(message, preprocess):
                     path = self.indexes[message.channel.key[0]].path
                     complaint = f"{path}: scan {count - 1} of {self.topic} {unusable}"
-                    counts.skip(complaint, self.scan_count, self.config)
+                    counts.skip(
+                        complaint, self.scan_count if isinstance(returns, Returns) else messages, self.config
+                    )
                     continue
                 assert isinstance(returns, Returns)
                 points = returns.points * np.array([1.0, -1.0], np.float32) if self.is_mirrored else returns.points
@@ -273,6 +274,9 @@ class Log:
         """Times of the lidar's points, in the unit that the duration of a sector shows."""
         config, sectors = self.config, self.sectors
         return PointTimes(config if sectors is None else replace(config, point_times=sectors.point_times))
+
+    def _notes_on_sectors(self) -> list[str]:
+        return [] if self.sectors is None else [self.sectors.note(self.topic)]
 
     def _expected_scans(self, whole: stream.Span) -> int:
         if self.sectors is None:

@@ -323,7 +323,6 @@ class Predictor:
             else:
                 self.filter.correct(innovation, match.information, statistics.covariance)
             is_independent = not is_measured or match.observability >= WEAK
-            is_independent &= not (is_measured and self.doubts_scans)
             if state is State.OK and is_independent and not prediction.is_second:
                 statistics.update(innovation, definite_inverse(match.information).diagonal())
 
