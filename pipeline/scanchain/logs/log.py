@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from functools import partial
-from itertools import chain
+from itertools import chain, tee
 
 import numpy as np
 from msgspec.structs import replace
@@ -27,6 +27,7 @@ from scanchain.logs.messages.readers import is_scan, pose_reader, reader
 from scanchain.logs.mounting import between_frames, find_mounting, find_wheels, in_plane, is_upside_down
 from scanchain.logs.opening import index_files
 from scanchain.logs.publishers import LatestPoints, Publishers, with_jumps
+from scanchain.logs.sectors import Assembler, Sampled, find_sectors
 from scanchain.logs.sweep_times import SweepTimes
 from scanchain.logs.topics import find_ground_truth, find_lidar
 from scanchain.settings import load_settings, overrides_of
@@ -94,24 +95,20 @@ class Log:
         self.topic = lidar.topic
         self.ground_truth_topic = "" if truth is None else truth.topic
         self._sampled_times = PointTimes(config)
-        self.plane_height_m: float | None = None
-        if not is_scan(lidar):
-            clouds = stream.sampled_messages(indexes, lidar.topic, self.decoder(self._sampled_times))
-            self.plane_height_m = height_m = plane_height_m(clouds)
-            if height_m is not None:
-                self.notes.append(
-                    f"the clouds of {lidar.topic} are planar (z = {height_m:.3g} m everywhere): read as a 2D log"
-                )
+        sample, first_messages = tee(stream.sampled_messages(indexes, lidar.topic, self._sampled))
+        self.plane_height_m: float | None = None  # also while the sample is decoded
+        self.plane_height_m = self._plane_height_m(sample)
         self.dimension = 2 if is_scan(lidar) or self.plane_height_m is not None else 3
         self.duration_s = (whole := stream.whole_span(indexes)).duration_s
         self.span = stream.chosen_span(whole, config)
-        self.scan_count = stream.count_scans(indexes, self.topic, whole, config)
+        self.sectors = find_sectors(first_messages, self._decoder_by, config.point_times)
+        self.scan_count = self._expected_scans(whole)
         self.publishers = self._publishers()
         frame = self.publishers.frame
         wheels = find_wheels(indexes, frame, config, self.span, self.notes)
         self.mounting = mounting = find_mounting(indexes, frame, wheels, self.span)
         self.gaps = stream.gap_notes(indexes, config)  # those of the notes that are of long gaps
-        self.notes += stream.notes_on(indexes, config)
+        self.notes += [*self._notes_on_sectors(), *stream.notes_on(indexes, config)]
         self.notes += mounting.notes(wheels.channel.topic if wheels else "", self.dimension)
         wheels = wheels if mounting.motion is None else None
         self.odometry_topic, self.wheels = (wheels.channel.topic, wheels.text) if wheels else ("", "")
@@ -126,6 +123,13 @@ class Log:
         self.times, self.jumps = SweepTimes(config, self.topic), list[str]()
         self._opening_notes = tuple(self.notes)
         self._truth: Trajectory | None = None
+
+    def _plane_height_m(self, sample: Iterable[Sampled]) -> float | None:
+        height_m = None if is_scan(self.lidar) else plane_height_m(each.returns for each in sample)
+        if height_m is not None:
+            what = f"the clouds of {self.topic} are planar (z = {height_m:.3g} m everywhere)"
+            self.notes.append(f"{what}: read as a 2D log")
+        return height_m
 
     def _publishers(self) -> Publishers:
         """Publishers of the topic by a sample of its messages, a larger one where none has a return."""
@@ -165,20 +169,19 @@ class Log:
         self.notes = list(self._opening_notes)
         poses = RecordedPoses(self.odometry_topic, self.ground_truth_topic)
         counts = ScanCounts(self.topic, self.odometry_topic)
-        self.times, latest = SweepTimes(self.config, self.topic), LatestPoints()
+        assumed = None if self.sectors is None else self.assumed_point_times()
+        self.times, latest = SweepTimes(self.config, self.topic, assumed), LatestPoints()
+        assembler = None if self.sectors is None else Assembler(self.sectors, self.topic)
         count, index, requested_s, jump_s, self.scans_with_wheels = 0, 0, working_s(), 0.0, 0
         try:
-            for message, T_odom_base, jumped_s in with_jumps(self._used(counts, poses)):
+            for message, T_odom_base, jumped_s in with_jumps(self._used(counts, poses, assembler)):
                 count += 1
                 jump_s = jumped_s or jump_s
                 if (count - 1) % self.config.every:
                     continue
-                returns = message.value
-                if unusable := defect(message, preprocess):
-                    path = self.indexes[message.channel.key[0]].path
-                    complaint = f"{path}: scan {count - 1} of {self.topic} {unusable}"
-                    counts.skip(complaint, self.scan_count, self.config)
+                if self._skips(message, count - 1, counts, preprocess):
                     continue
+                returns = message.value
                 assert isinstance(returns, Returns)
                 points, others = latest.of(self.publishers, message, is_mirrored=self.is_mirrored)
                 scan = Scan(
@@ -202,27 +205,52 @@ class Log:
             self._truth = poses.ground_truth()
         finally:  # also where the caller wants no more scans
             is_damaged = bool(self._damage)
-            self.jumps = counts.jumps()
-            self._damage += [*counts.losses(), *self.times.warnings(), *self.jumps, *poses.complaints()]
-            self.bad_scans = counts.bad
-            found = [note for note in self.publishers.notes if note not in self.notes]
-            self.notes += [*self.times.notes(), *found, *counts.notes()]
+            self._conclude(counts, poses, assembler)
         if not index:
             raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
         if is_damaged:
             scans = counted(count - counts.bad, "scan")
             self._damage.append(f"{scans} of {self.topic} {'was' if scans == '1 scan' else 'were'} recovered")
 
+    def _skips(
+        self, message: Decoded, number: int, counts: ScanCounts, preprocess: PreprocessConfig | None
+    ) -> bool:
+        """True of a scan that cannot be used, which is counted; of a malformed message among those expected."""
+        unusable = defect(message, preprocess)
+        if unusable:
+            is_sweep = self.sectors is None or isinstance(message.value, Returns)
+            expected = self.scan_count if is_sweep else round(self.scan_count * self.sectors.per_sweep)
+            path = self.indexes[message.channel.key[0]].path
+            counts.skip(f"{path}: scan {number} of {self.topic} {unusable}", expected, self.config)
+        return bool(unusable)
+
+    def _conclude(self, counts: ScanCounts, poses: RecordedPoses, assembler: Assembler | None) -> None:
+        """Note what was met in all scans."""
+        self.jumps, self.bad_scans = counts.jumps(), counts.bad
+        self._damage += [*counts.losses(), *self.times.warnings(), *self.jumps, *poses.complaints()]
+        found = [note for note in self.publishers.notes if note not in self.notes]
+        self.notes += [*self.times.notes(), *found, *counts.notes(), *(assembler.notes() if assembler else [])]
+
     def assumed_point_times(self) -> str:
         """Assumption of a run about per-point times, by the first scan that has returns; empty for laser scans."""
-        return "" if is_scan(self.lidar) else self._sampled_times.assumed
+        times = self._sampled_times
+        if self.sectors is not None:
+            times = self._point_times()
+            next(stream.sampled_messages(self.indexes, self.topic, self.decoder(times)), None)
+        return self._assumed(times)
+
+    def _assumed(self, times: PointTimes) -> str:
+        if is_scan(self.lidar):
+            return ""
+        is_timed = times.assumed.startswith("point times")
+        return times.assumed if is_timed or self.sectors is None else self.sectors.assumed
 
     def expected_stamps(self, topic: str) -> NDArray[np.int64]:
         """(2,) first and last header stamp to expect of a topic in the part that is read, by its first message.
 
         ``topic`` : the lidar's or the ground truth's. Raises InputError where it has no message there.
         """
-        decode = self.pose_decoders.get(topic) or self.decoder(PointTimes(self.config))
+        decode = self.pose_decoders.get(topic) or self.decoder(self._point_times())
         why, unset = "", np.empty(0, np.int64)
         for message in stream.decoded_messages(self.indexes, {topic: decode}, self.span, ahead=1, damage=[]):
             value = message.value
@@ -249,11 +277,14 @@ class Log:
             self._truth = poses.ground_truth()
         return self._truth
 
-    def _with_poses(self, poses: RecordedPoses) -> Iterator[tuple[Decoded, Pose | None]]:
-        """Lidar messages with the wheels' pose at their stamp; they wait a little for the readings behind them."""
-        decoders = {self.topic: self.decoder(PointTimes(self.config)), **self.pose_decoders}
+    def _with_poses(
+        self, poses: RecordedPoses, assembler: Assembler | None
+    ) -> Iterator[tuple[Decoded, Pose | None]]:
+        """Scans with the wheels' pose at their stamp; they wait a little for the readings behind them."""
+        decoders = {self.topic: self.decoder(self._point_times()), **self.pose_decoders}
         waiting: deque[Decoded] = deque()
         messages = stream.decoded_messages(self.indexes, decoders, self.span, damage=self._damage)
+        messages = messages if assembler is None else assembler.sweeps(messages)
         for message in chain(self.times.judged(messages), [None]):
             if message is not None and message.channel.topic == self.topic:
                 waiting.append(message)
@@ -269,9 +300,11 @@ class Log:
                 scan = waiting.popleft()
                 yield scan, poses.at(scan.value.stamp_ns) if isinstance(scan.value, Returns) else None
 
-    def _used(self, counts: ScanCounts, poses: RecordedPoses) -> Iterator[tuple[Decoded, Pose | None]]:
+    def _used(
+        self, counts: ScanCounts, poses: RecordedPoses, assembler: Assembler | None
+    ) -> Iterator[tuple[Decoded, Pose | None]]:
         """Lidar messages as ``_with_poses``, but for those of other publishers that are of no use, or empty."""
-        for message, T_odom_base in self._with_poses(poses):
+        for message, T_odom_base in self._with_poses(poses, assembler):
             returns, of = message.value, self.publishers.of
             if not isinstance(returns, Returns) or counts.uses(of(message.log_time_ns, returns), returns):
                 yield message, T_odom_base
@@ -279,5 +312,25 @@ class Log:
     def decoder(self, times: PointTimes) -> Callable[[memoryview], Returns]:
         """Decoder of the lidar's messages to points; ``times`` reads theirs."""
         if is_scan(self.lidar):
-            return partial(decode_laser_scan, read=reader(self.lidar), config=self.config)
+            return partial(decode_laser_scan, read=reader(self.lidar), config=times.config)
         return partial(decode_cloud, read=reader(self.lidar), times=times, plane_m=self.plane_height_m)
+
+    def _sampled(self, data: memoryview) -> Sampled:
+        return Sampled(data, self.decoder(self._sampled_times)(data))
+
+    def _decoder_by(self, point_times: str) -> Callable[[memoryview], Returns]:
+        return self.decoder(PointTimes(replace(self.config, point_times=point_times)))
+
+    def _point_times(self) -> PointTimes:
+        """Times of the lidar's points, in the unit that the duration of a sector shows."""
+        config, sectors = self.config, self.sectors
+        return PointTimes(config if sectors is None else replace(config, point_times=sectors.point_times))
+
+    def _notes_on_sectors(self) -> list[str]:
+        return [] if self.sectors is None else [self.sectors.note(self.topic)]
+
+    def _expected_scans(self, whole: stream.Span) -> int:
+        if self.sectors is None:
+            return stream.count_scans(self.indexes, self.topic, whole, self.config)
+        messages = stream.count_scans(self.indexes, self.topic, whole, replace(self.config, every=1))
+        return -(-self.sectors.sweeps(messages) // self.config.every)

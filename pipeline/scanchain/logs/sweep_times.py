@@ -97,10 +97,10 @@ class SweepTimes:
     spans_s, periods_s : time that a sweep usually takes, and from sweep to sweep, at each of them
     """
 
-    def __init__(self, config: LogConfig, topic: str) -> None:
+    def __init__(self, config: LogConfig, topic: str, assumed: str | None = None) -> None:
         self.topic, self.every = topic, config.every
         self.unit = config.point_times if config.point_times in UNITS_S else ""
-        self.assumed = PointTimes(config).assumed
+        self.assumed = PointTimes(config).assumed if assumed is None else assumed
         self.spans_s: list[float] = []
         self.periods_s: list[float] = []
         self.scans = 0

@@ -189,14 +189,17 @@ class Odometry:
         return tracked
 
     def _predicted(self, scan: Scan, sparse: Sweep) -> Prediction:
-        """The predicted pose; without the wheels where they jump, and the scan fits where they do not lead."""
+        """The predicted pose; without the wheels where they jump, and the scan fits where they do not lead.
+
+        Wheels that move as no vehicle does jump in any case. Scans that are in doubt are no evidence of it.
+        """
         prediction = self.predictor.predict(scan)
         if prediction.jump_m == 0.0 or not len(self.map.surfaces):
             return prediction
         free = self.predictor.predict(scan, by_wheels=False)
-        is_wrong = prediction.jump_m > free.farthest_m
+        is_wrong = lie.apart(prediction.T_odom_last, prediction.T_odom_lidar)[0] > free.farthest_m
         points = sparse.from_middle(free.velocity)
-        if not is_wrong and len(points):
+        if not is_wrong and len(points) and not self.predictor.doubts_scans:
             there, here = (
                 self.matcher.align(points, self.local_map, each.T_odom_lidar, each.prior, wide=True)
                 for each in (prediction, free)

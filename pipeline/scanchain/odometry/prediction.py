@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import OdometryConfig
-from scanchain.data import Match, Matrix, Pose, Prior, Scan, State
+from scanchain.data import LEAST_FIT, Match, Matrix, Pose, Prior, Scan, State
 from scanchain.errors import InputError, counted
 from scanchain.kernels.geometry import largest_magnitude
 from scanchain.kernels.matrices import definite_inverse
@@ -29,6 +29,7 @@ _MEMORY = 0.9  # weight of the mean of the squared errors so far against the nex
 _SUDDEN = 0.25  # share of the last squared error below which the mean does not fall
 _KNOWN = 5  # number of errors needed before the mean is used
 _CAUTION = 2.0  # factor from the root mean square to the standard deviation that is given
+_MOST_DOUBTFUL = 0.5  # share of the last scans, lost or contradicted, above which scans count for nothing
 _LEAST_M, _LEAST_RAD = 0.002, 0.0005  # smallest standard deviation that is given
 
 
@@ -236,6 +237,7 @@ class Predictor:
         self.lost_s = 0.0
         self.T_odom_base: Pose | None = None  # by the wheels at the last scan, where nothing contradicts it
         self.is_contradicted = False  # the reading at this scan
+        self.scans, self.doubtful = 0, 0.0  # that were corrected; share of the last ones, lost or contradicted
         self.jumps: list[tuple[int, float]] = []  # scan and meters of each reading that was left out
 
     def predict(self, scan: Scan, *, by_wheels: bool = True) -> Prediction:
@@ -271,6 +273,11 @@ class Predictor:
             config=self.config,
         )
 
+    @property
+    def doubts_scans(self) -> bool:
+        """True if most of the last scans were lost or contradicted: they are no evidence against the wheels."""
+        return self.doubtful > _MOST_DOUBTFUL
+
     def drop_wheels(self, scan: Scan, jump_m: float) -> None:
         """Leave out the reading at this scan, which is off by so much, here and for the motion to the next."""
         self.is_contradicted = True
@@ -294,6 +301,9 @@ class Predictor:
             self.T_previous_current = lie.between(prediction.T_odom_last, T_odom_lidar)
             self.velocity = prediction.velocity_by(lie.log(self.T_previous_current))
             self._update(prediction, match, state)
+        self.scans += 1
+        is_doubtful = state is State.LOST or (state is State.OK and match.fit < LEAST_FIT)
+        self.doubtful += max(1.0 - _MEMORY, 1.0 / self.scans) * (is_doubtful - self.doubtful)
         self.intervals.take(scan, prediction.interval_s)
         T_odom_base = None if self.is_contradicted else scan.T_odom_base
         self.T_odom_base = None if T_odom_base is None else T_odom_base.copy()

@@ -1,0 +1,321 @@
+"""Messages that are sectors of a revolution: recognized among the first ones, and assembled to sweeps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain.data import RawPoints
+from scanchain.errors import counted
+from scanchain.logs.mcap.records import Decoded
+from scanchain.logs.messages.lidar import Returns
+from scanchain.logs.messages.point_times import UNITS_S
+
+_SAMPLE = 500  # points of a message, evenly spread, by which its direction and width are estimated
+_TURN_RAD = 2.0 * np.pi
+_WIDEST_RAD = 4.0 / 3.0 * np.pi  # of a message above which it is a sweep by itself
+_FEWEST, _MOST = (
+    5,
+    2000,
+)  # messages after which a lidar that looks in one direction is ruled out, and of the sample
+_REVOLUTIONS = 2.0  # least number that the sample shows
+_WIDTHS = (0.5, 1.5)  # width of a message over the angle to the next: less leaves holes, more is no sector
+_REGULAR = (
+    0.6  # least share of messages that follow by the usual angle, the others after a blind angle or a dropout
+)
+_SLOWEST_S = 1.5  # longest revolution of a lidar; what turns more slowly may be the robot
+_CLEAR_RAD = 2.0 / 3.0 * np.pi  # angle between messages up to which it shows by itself which way they turn
+_SAME = 0.1  # share of that angle up to which a message a revolution later looks in the same direction
+_MISSING = 0.75  # revolutions of time without messages, above which a gap ends the sweep
+
+
+class Sectors(NamedTuple):
+    """Division of a lidar's revolution into messages.
+
+    sense : 1 if it turns counterclockwise, −1 if clockwise
+    step_rad : usual angle from one message to the next
+    per_sweep : messages per revolution, not whole where they do not divide it
+    period_s : of a revolution
+    is_stamped : whether each message has a stamp of its own, not that of its revolution
+    is_from_sweep : whether point times count from the start of the revolution, whatever the message's stamp
+    point_times : value of ``log.point_times`` for the messages: their unit by the duration of a sector, which that
+        of a sweep would mistake; ``none`` where the azimuth times the points
+    """
+
+    sense: int
+    step_rad: float
+    per_sweep: float
+    period_s: float
+    is_stamped: bool
+    is_from_sweep: bool = False
+    point_times: str = "auto"
+
+    @property
+    def assumed(self) -> str:
+        """Times of points that have none of their own."""
+        direction = "counterclockwise" if self.sense > 0 else "clockwise"
+        return (
+            f"point times by the azimuth: {direction}, {self.period_s:.3g} s a turn, from the sweep's first stamp"
+        )
+
+    def note(self, topic: str) -> str:
+        """What was found, and what is done about it."""
+        holds = f"each message holds {360.0 / self.per_sweep:.3g}° of a revolution"
+        return f"{topic}: {holds}: {self.per_sweep:.3g} messages are assembled to one sweep"
+
+    def sweeps(self, messages: int) -> int:
+        """Number of sweeps that so many messages make, an incomplete one at the end only above half of one."""
+        return max(int(messages / self.per_sweep + 0.5), 1)
+
+
+class Sampled(NamedTuple):
+    """One of the first messages of a lidar: its bytes and its returns."""
+
+    data: memoryview
+    returns: Returns
+
+
+def find_sectors(
+    sample: Iterable[Sampled], decoder: Callable[[str], Callable[[memoryview], Returns]], point_times: str
+) -> Sectors | None:
+    """Sectors in which consecutive messages of one frame look, which recur; None where each is a sweep by itself.
+
+    decoder : decoder of the messages for a value of ``log.point_times``; point_times : the configured one
+    """
+    seen: list[Sampled] = []
+    directions_rad, widths_rad, turned_rad = list[float](), list[float](), 0.0
+    for message in sample:
+        if not len(message.returns.points):
+            continue
+        azimuth_rad = _azimuth(message.returns.points[:: len(message.returns.points) // _SAMPLE + 1])
+        direction_rad = _mean(azimuth_rad)
+        low_rad, high_rad = np.percentile(_wrapped(azimuth_rad - direction_rad), (5.0, 95.0))
+        seen.append(message)
+        directions_rad.append(direction_rad)
+        widths_rad.append((high_rad - low_rad) / 0.9)
+        if widths_rad[-1] > _WIDEST_RAD or message.returns.frame != seen[0].returns.frame:
+            return None
+        steps_rad = np.abs(_wrapped(np.diff(directions_rad[-2:])))
+        turned_rad += float(steps_rad.sum())
+        if len(seen) == _FEWEST:
+            usual_rad = np.median(np.abs(_wrapped(np.diff(directions_rad))))
+            if np.median(widths_rad) > _WIDTHS[1] * max(usual_rad, 1e-9):
+                return None
+        if turned_rad > (_REVOLUTIONS + 1.0) * _TURN_RAD or len(seen) == _MOST:
+            break
+    found = _sectors(seen, np.array(directions_rad), float(np.median(widths_rad or [0.0])))
+    return found and _timed(found, seen, decoder, point_times)
+
+
+def _sectors(seen: list[Sampled], directions_rad: NDArray[np.float64], width_rad: float) -> Sectors | None:
+    """Sectors by the directions (N,) of the first messages, None where these do not turn steadily."""
+    if len(seen) < 3:
+        return None
+    steps_rad = _wrapped(np.diff(directions_rad))
+    sense = int(np.sign(np.median(steps_rad)))
+    if np.median(np.abs(steps_rad)) > _CLEAR_RAD:
+        orders = [_order(each.returns) for each in seen]
+        sense = int(np.sign(np.sum(orders))) or 1
+    steps_rad = (sense * steps_rad) % _TURN_RAD
+    step_rad = float(np.percentile(steps_rad, 50.0, method="lower"))
+    turned_rad = np.append(0.0, np.cumsum(steps_rad))
+    is_usual = np.abs(_wrapped(steps_rad - step_rad)) <= 0.5 * step_rad
+    step_rad = float(steps_rad[is_usual].mean())
+    is_narrow = _WIDTHS[0] * step_rad <= width_rad <= _WIDTHS[1] * step_rad
+    if not (
+        np.mean(is_usual) >= _REGULAR and is_narrow and turned_rad[-1] + 1.5 * step_rad > _REVOLUTIONS * _TURN_RAD
+    ):
+        return None
+    first = np.flatnonzero(turned_rad + _TURN_RAD < turned_rad[-1] + 0.5 * step_rad)
+    later = np.abs(turned_rad[:, None] - turned_rad[first] - _TURN_RAD).argmin(axis=0)
+    drift_rad = turned_rad[later] - turned_rad[first] - _TURN_RAD
+    stamps_ns = np.array([each.returns.stamp_ns for each in seen])
+    seconds = 1e-9 * (stamps_ns[later] - stamps_ns[first])
+    period_s = float(np.median(seconds * _TURN_RAD / (_TURN_RAD + drift_rad)))
+    if not 0.0 < period_s < _SLOWEST_S:
+        return None
+    per_sweep = float(_TURN_RAD / np.mean(steps_rad))
+    if np.median(np.abs(drift_rad)) < _SAME * step_rad:  # the same sectors again: as many as there are
+        sorted_rad = np.sort(turned_rad % _TURN_RAD)
+        per_sweep = float(np.sum(np.diff(sorted_rad, append=sorted_rad[0] + _TURN_RAD) > 0.5 * step_rad))
+    return Sectors(sense, step_rad, per_sweep, period_s, bool(np.median(np.diff(stamps_ns)) > 0))
+
+
+def _timed(
+    sectors: Sectors,
+    seen: list[Sampled],
+    decoder: Callable[[str], Callable[[memoryview], Returns]],
+    configured: str,
+) -> Sectors:
+    """The sectors with the unit and the origin of their point times.
+
+    The unit is the one in which a message lasts about as long as a sector: that of a sweep would mistake it.
+    """
+    point_times = configured if configured in (*UNITS_S, "auto") else "none"
+    if configured == "auto":
+        decode = decoder("s")
+        spans_s = [float(np.ptp(times)) for each in seen if len(times := decode(each.data).times_s)]
+        if spans_s:
+            longer = max(float(np.median(spans_s)), 1e-9) / sectors.period_s * sectors.per_sweep
+            point_times = min(UNITS_S, key=lambda name: abs(np.log(longer * UNITS_S[name])))
+    decode = decoder(point_times)
+    starts_s = [float(times.min()) for each in seen if len(times := decode(each.data).times_s)]
+    last_s = sectors.period_s * (1.0 - 1.0 / sectors.per_sweep)  # from the first sector to the last
+    is_from_sweep = len(starts_s) > 1 and float(np.ptp(starts_s)) > 0.5 * last_s
+    if is_from_sweep and not sectors.per_sweep.is_integer():  # of the driver's revolution, not of ours
+        return sectors._replace(point_times="none")
+    return sectors._replace(point_times=point_times, is_from_sweep=is_from_sweep)
+
+
+class _Part(NamedTuple):
+    """A message, or a part of one, in a sweep.
+
+    returns : its points, with the stamp of the message
+    angle_rad : of the middle of the message, since the sweep was due to begin; direction_rad : where it looks
+    begin_rad, begin_ns : angle and time at which it begins
+    """
+
+    message: Decoded
+    returns: Returns
+    angle_rad: float
+    direction_rad: float
+    begin_rad: float
+    begin_ns: int
+
+
+class Assembler:
+    """Sweeps of the messages that are sectors of them; ``incomplete`` counts those left out."""
+
+    def __init__(self, sectors: Sectors, topic: str) -> None:
+        self.sectors, self.topic = sectors, topic
+        self.half_rad, self.rate = 0.5 * sectors.step_rad, sectors.period_s / _TURN_RAD
+        self.incomplete = 0
+
+    def sweeps(self, messages: Iterable[Decoded]) -> Iterator[Decoded]:
+        """The messages, those of the lidar assembled to sweeps; malformed ones and those of other topics pass.
+
+        A sweep has the stamp of its beginning and the log time of its last message. It ends where the revolution
+        does, which splits a message where they do not divide it, or where those of most of a revolution are
+        missing. One over less than half of a revolution is left out.
+        """
+        is_split = self.sectors.is_stamped and not self.sectors.per_sweep.is_integer()
+        parts: list[_Part] = []
+        for message in messages:
+            if message.channel.topic != self.topic or not isinstance(message.value, Returns):
+                yield message
+                continue
+            part, is_apart = self._following(parts[-1] if parts else None, message, message.value)
+            beyond_rad = part.angle_rad - _TURN_RAD
+            if is_split and abs(beyond_rad) < self.half_rad:
+                head, part = self._split(part)
+                parts.append(head)
+            elif beyond_rad >= 0.0:
+                part = self._part(message, part.returns, beyond_rad, part.direction_rad)
+            elif not is_apart:
+                parts.append(part)
+                continue
+            yield from self._complete(parts)
+            parts = [part]
+        yield from self._complete(parts)
+
+    def _part(self, message: Decoded, returns: Returns, angle_rad: float, direction_rad: float) -> _Part:
+        begin_rad = angle_rad - self.half_rad
+        return _Part(message, returns, angle_rad, direction_rad, begin_rad, returns.stamp_ns)
+
+    def _following(self, last: _Part | None, message: Decoded, returns: Returns) -> tuple[_Part, bool]:
+        """The part that follows another, and whether messages are missing between them, or its clock steps back.
+
+        Messages without points follow by the usual angle.
+        """
+        sectors, points = self.sectors, returns.points[:: len(returns.points) // _SAMPLE + 1]
+        direction_rad = last.direction_rad + sectors.sense * sectors.step_rad if last else 0.0
+        if len(points):
+            direction_rad = _mean(_azimuth(points))
+        if last is None:
+            return self._part(message, returns, self.half_rad, direction_rad), True
+        turned_rad = sectors.sense * (direction_rad - last.direction_rad)
+        turned_rad = (turned_rad + self.half_rad) % _TURN_RAD - self.half_rad
+        revolutions = 1e-9 * (returns.stamp_ns - last.returns.stamp_ns) / sectors.period_s
+        is_apart = not -0.5 < revolutions < turned_rad / _TURN_RAD + _MISSING
+        if not sectors.is_stamped:
+            is_apart = returns.stamp_ns != last.returns.stamp_ns
+        angle_rad = self.half_rad if is_apart else last.angle_rad + turned_rad
+        return self._part(message, returns, angle_rad, direction_rad), is_apart
+
+    def _split(self, part: _Part) -> tuple[_Part, _Part]:
+        """The points of a part before the end of its revolution, and those after it."""
+        returns = part.returns
+        is_before = self._angles_rad(part) < _TURN_RAD
+        before, after = (
+            returns._replace(
+                points=returns.points[chosen], times_s=returns.times_s[chosen[: len(returns.times_s)]]
+            )
+            for chosen in (is_before, ~is_before)
+        )
+        begin_ns = returns.stamp_ns + round(1e9 * self.rate * (_TURN_RAD - part.begin_rad))
+        tail = part._replace(returns=after._replace(dropped=0), angle_rad=part.angle_rad - _TURN_RAD)
+        return part._replace(returns=before), tail._replace(begin_rad=0.0, begin_ns=begin_ns)
+
+    def _angles_rad(self, part: _Part) -> NDArray[np.float32]:
+        """Angles (N,) of the points of a part, since its sweep was due to begin."""
+        turned_rad = _wrapped(_azimuth(part.returns.points) - np.float32(part.direction_rad))
+        return np.float32(part.angle_rad) + self.sectors.sense * turned_rad
+
+    def _complete(self, parts: list[_Part]) -> Iterator[Decoded]:
+        """The sweep of its parts, none where these cover less than half of a revolution."""
+        if not parts:
+            return
+        first, last = parts[0], parts[-1]
+        if last.angle_rad + self.half_rad - first.begin_rad < 0.5 * _TURN_RAD - self.half_rad * _SAME:
+            self.incomplete += 1
+            return
+        returns = [part.returns for part in parts]
+        points = np.concatenate([each.points for each in returns])
+        times_s = np.concatenate([self._times_s(part, first) for part in parts])
+        why, dropped = "" if len(points) else first.returns.why, sum(each.dropped for each in returns)
+        yield last.message._replace(value=Returns(first.begin_ns, points, times_s, dropped, why, returns[0].frame))
+
+    def _times_s(self, part: _Part, first: _Part) -> NDArray[np.float32]:
+        """Seconds (N,) of points after the beginning of their sweep: by their own times, else by their angle."""
+        returns, sectors = part.returns, self.sectors
+        if not len(returns.times_s):
+            return (self.rate * (self._angles_rad(part) - first.begin_rad)).astype(np.float32)
+        after_s = 1e-9 * (returns.stamp_ns - first.begin_ns)
+        turned_s = self.rate * (part.angle_rad - self.half_rad - first.begin_rad)
+        if sectors.is_from_sweep:
+            after_s = 0.0
+        elif not sectors.is_stamped or abs(after_s - turned_s) > 0.5 * sectors.period_s:
+            after_s = turned_s  # its stamp is that of the revolution, or wrong
+        return returns.times_s + np.float32(after_s)
+
+    def notes(self) -> list[str]:
+        """A line on sweeps that were left out."""
+        if not self.incomplete:
+            return []
+        sweeps = counted(self.incomplete, "sweep")
+        return [f"{sweeps} of {self.topic} left out: less than half of a revolution, before a gap or the end"]
+
+
+def _azimuth(points: RawPoints) -> NDArray[np.float32]:
+    return np.arctan2(points[:, 1], points[:, 0])
+
+
+def _mean(azimuth_rad: NDArray[np.float32]) -> float:
+    """The mean direction."""
+    return float(np.arctan2(np.sin(azimuth_rad).mean(), np.cos(azimuth_rad).mean()))
+
+
+def _wrapped(angle_rad: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Angles from −π to π."""
+    return (angle_rad + np.pi) % _TURN_RAD - np.pi
+
+
+def _order(returns: Returns) -> float:
+    """Covariance of azimuth and time, or else order, of the points of a message: positive counterclockwise."""
+    azimuth_rad = _azimuth(returns.points)
+    turned_rad = _wrapped(azimuth_rad - _mean(azimuth_rad))
+    times_s = returns.times_s if len(returns.times_s) else np.linspace(0.0, 1.0, len(turned_rad))
+    return float(np.sign(np.mean(turned_rad * (times_s - np.mean(times_s)))))
