@@ -16,8 +16,8 @@ from scanchain.loops.evidence import pose_by
 
 _TOO_FEW = Problem.plain("too few keyframes agree on the place")
 _CONTRADICTED = Problem.plain("withdrawn: later scans contradict the location")
-_REPLACED = Problem.plain("withdrawn: the evidence for another location in the map is stronger")
-_ELSEWHERE = Problem.plain("contradicts the location of the log in the map, whose evidence is stronger")
+_REPLACED = Problem.plain("withdrawn: more of the path matches at another location in the map")
+_ELSEWHERE = Problem.plain("contradicts the location of the log in the map, at which more of the path matches")
 _DRIFT = 0.1  # largest distance of a find from the predicted pose, as a share of the path since the last match
 LARGEST_SIGMAS = (300.0, 30.0)  # m and rad, of an edge: a pose that hangs on less information is lost to rounding
 
@@ -28,7 +28,7 @@ class Placement:
     Closures of a new segment to older keyframes, of segments before or of a prior map, which come first and are
     fixed, wait until they are evidence enough. Then the segment is moved there. Those that later scans contradict
     are withdrawn. While a log that was joined to a map does not match it, other locations are searched for and
-    tested in parallel; one with more evidence replaces that of the log, its earlier scans included.
+    tested in parallel; one that more of the path matches replaces that of the log, its earlier scans included.
     """
 
     def __init__(
@@ -160,7 +160,7 @@ class Placement:
         elsewhere = found + at_rival
         if elsewhere and not evidence.is_gathering:
             self.rival.note(elsewhere)
-            if replacing := self.rival.collect(elsewhere, *world, least=evidence.total):
+            if replacing := self.rival.collect(elsewhere, *world, least_matches=evidence.matches):
                 return (*self._withdrawn(closures, _REPLACED), *replacing)
         older = [each for each in closures if each.target < start <= each.source]
         evidence.note(older)

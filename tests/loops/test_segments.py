@@ -174,20 +174,21 @@ def test_what_is_joined_is_withdrawn_once_the_place_is_seen_through_and_not_befo
     assert holds[0] and holds[3] and not holds[-1]
 
 
-def test_another_pose_is_taken_once_its_evidence_is_more_than_that_of_the_first():
+def test_another_pose_is_taken_once_more_keyframes_match_there_than_at_the_first():
     keyframes = keyframes_in([4.0] * 20)
     evidence, rival = begun()[0], begun()[0]
     evidence.collect(tried(3, 4, 5), *up_to(5, keyframes))
     evidence.follow(tried(6, 7, 8, 9, 10), *up_to(10, keyframes))
-    assert evidence.total > evidence.log_odds, "what may be withdrawn soon is limited, what is compared is not"
+    assert evidence.matches == 8.0
     joining = [
-        rival.collect(tried(source), *up_to(source, keyframes), least=evidence.total) for source in range(11, 20)
+        rival.collect(tried(source), *up_to(source, keyframes), least_matches=evidence.matches)
+        for source in range(11, 20)
     ]
     assert not any(joining[:5]) and any(joining), "it needs about as many keyframes as the first had"
     evidence.drop(3)
-    assert evidence.total == 0.0
+    assert evidence.matches == 0.0
     evidence.replace_by(rival)
-    assert evidence.total == rival.total and not evidence.is_gathering
+    assert evidence.matches == rival.matches and not evidence.is_gathering
 
 
 def test_a_place_that_was_given_is_believed_until_it_is_seen_through():

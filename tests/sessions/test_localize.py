@@ -117,7 +117,7 @@ def test_a_log_that_was_found_at_a_look_alike_and_left_it_is_found_again_where_i
     assert last_m < 0.1 and np.max([lie.apart(*pair)[0] for pair in zip(poses, true, strict=True)]) < 0.1
     assert found.metrics.verdict == Verdict.CHECK and "place corrected later" in found.metrics.reason
     assert any(
-        "the evidence for another location in the map is stronger" in c.reason for c in found.localization.closures
+        "more of the path matches at another location in the map" in c.reason for c in found.localization.closures
     )
 
 

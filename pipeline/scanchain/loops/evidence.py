@@ -87,8 +87,10 @@ class PlaceTest:
         self.segments = segments
         self.is_given = False  # whether the pose of the first scan in a map is
         self.searches = 1.0  # for independent parts of the path so far
-        self.log_odds = 0.0  # of the present one, limited above so that it can be withdrawn soon
-        self.total = 0.0  # of the present one, without that limit: by this two poses compare
+        self.log_odds = 0.0  # of the present one
+        self.matches = (
+            0.0  # number of independent keyframes that matched there: by this two accepted poses compare
+        )
         self.best = math.nan  # of those that the log ended with, or a segment
         self.matched_m = 0.0  # path up to the last match with older keyframes
         self.waiting: list[Closure] = []  # accepted and agreeing with the first
@@ -116,11 +118,11 @@ class PlaceTest:
         keyframes: Sequence[Keyframe],
         T_world: Matrix,
         *,
-        least: float = -math.inf,
+        least_matches: float = 0.0,
     ) -> tuple[Closure, ...]:
         """Take closures of a segment that none joins to older ones; all that waited, once they join it.
 
-        least : log-odds that are asked for besides, those of the pose that this one would replace
+        least_matches : number of matches that it needs more than, that of the pose which it would replace
         """
         if not self.is_gathering:
             if all(each.verdict is ClosureVerdict.REJECTED for each in closures):
@@ -129,28 +131,26 @@ class PlaceTest:
             d = newest.T_odom_lidar.shape[0] - 1
             searches = (newest.traveled_m - start.traveled_m) / (_SEARCHED_M[d] * newest.scale)
             self.searches = max(searches, self.searches)
-            self.log_odds, self.total, self.counted_m = 0.0, 0.0, []
-            self._gain(_OF_FIND[d])
+            self.log_odds, self.matches, self.counted_m = _OF_FIND[d], 0.0, []
         for each in _best_of_each(closures):
             agrees = not self.waiting or self._agrees(each, keyframes, T_world)
             if each.verdict is ClosureVerdict.ACCEPTED and agrees:
                 self.waiting.append(each)
                 self.matched_m = max(keyframes[each.source].traveled_m, self.matched_m)
             ratio = self._ratio(each, keyframes, T_world) if agrees else -LARGEST_RATIO
-            self._gain(self._weight(keyframes[each.source]) * ratio)
-        if not self.is_accepted or self.log_odds < least:
+            self._count(each, keyframes, ratio)
+        if not self.is_accepted or self.matches <= least_matches:
             return ()
         joining, self.waiting = tuple(self.waiting), []
         return joining
 
     def give(self) -> None:
         """The pose of the first scan in the map is given: it is believed until what is seen contradicts it."""
-        self.is_given = True
-        self._gain(self.bound + _RESERVE - self.log_odds)
+        self.is_given, self.log_odds = True, self.bound + _RESERVE
 
     def replace_by(self, other: PlaceTest) -> None:
         """Go on with the pose that another test accepted, in place of the one that was withdrawn."""
-        self.log_odds, self.total, self.searches = other.log_odds, other.total, other.searches
+        self.log_odds, self.matches, self.searches = other.log_odds, other.matches, other.searches
         self.matched_m, self.counted_m = other.matched_m, other.counted_m
         self.tried |= other.tried
 
@@ -161,7 +161,7 @@ class PlaceTest:
         """
         for each in _best_of_each([each for each in closures if _is_there(each)]):
             if keyframes[each.source].traveled_m - self.matched_m <= _FOLLOWED_M * keyframes[each.source].scale:
-                self._gain(self._weight(keyframes[each.source]) * self._ratio(each, keyframes, T_world))
+                self._count(each, keyframes, self._ratio(each, keyframes, T_world))
             if each.verdict is ClosureVerdict.ACCEPTED:
                 self.matched_m = keyframes[each.source].traveled_m
         self.log_odds = min(self.log_odds, self.bound + _RESERVE)
@@ -183,7 +183,7 @@ class PlaceTest:
         """The newest segment, from a keyframe on, is not where it was tested; forget what was tried."""
         self._remember()
         self.tried = {source: each for source, each in self.tried.items() if source < start}
-        self.is_given, self.log_odds, self.total, self.waiting = False, 0.0, 0.0, []
+        self.is_given, self.log_odds, self.matches, self.waiting = False, 0.0, 0.0, []
 
     def holds(
         self, placed: range, keyframes: Sequence[Keyframe], T_world: Matrix, *, of_same_log: bool = False
@@ -201,9 +201,11 @@ class PlaceTest:
         self._remember()
         return self.log_odds >= self.bound
 
-    def _gain(self, log_odds: float) -> None:
-        self.log_odds += log_odds
-        self.total += log_odds
+    def _count(self, closure: Closure, keyframes: Sequence[Keyframe], ratio: float) -> None:
+        """Count a keyframe, whose logarithm of the likelihood ratio this is, by its share that is independent."""
+        weight = self._weight(keyframes[closure.source])
+        self.log_odds += weight * ratio
+        self.matches += weight * (ratio > 0.0)
 
     def _remember(self) -> None:
         """Keep the log-odds of the present pose, if they are the best so far of those not known to be wrong."""
