@@ -118,7 +118,7 @@ def read_map(folder: Path | str) -> tuple[NDArray[np.int8], float, tuple[float, 
     folder = Path(folder)
     try:
         image = _PGM.fullmatch((folder / "map.pgm").read_bytes())
-        header = _YAML_NUMBERS.search((folder / "map.yaml").read_text(encoding="utf-8"))
+        header = _YAML_NUMBERS.search((folder / "map.yaml").read_text("utf-8", "replace"))
     except OSError as error:
         raise InputError(
             f"{error.filename}: cannot be read ({error.strerror}); scanchain run writes it"
