@@ -15,13 +15,12 @@ pytestmark = pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="ne
 
 
 class Failing:
-    """A matcher that fails at its sixth scan."""
+    """A matcher that fails."""
 
-    def __init__(self):
-        self.scans = 0
+    def __init__(self, config):
+        pass
 
-    def align(self, points, surfaces, T_target_source):
-        self.scans += 1
+    def align(self, *_, **__):
         raise ValueError("no more")
 
 
@@ -30,8 +29,9 @@ def threads():
 
 
 def files():
-    folder = Path("/proc/self/fd")
-    return Counter(os.readlink(file) for file in folder.iterdir() if file.is_symlink())
+    """Open files by name; what is no file, as rerun's sockets, left out."""
+    names = [os.readlink(file) for file in Path("/proc/self/fd").iterdir() if file.is_symlink()]
+    return Counter(name for name in names if name.startswith("/"))
 
 
 def test_runs_with_a_recording_leave_no_threads_behind_and_no_open_files(tmp_path):

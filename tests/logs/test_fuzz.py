@@ -1,9 +1,9 @@
-"""Thousands of damaged logs and messages, from a fixed seed; tests/benchmarks/fuzz.py reads more of them."""
+"""Thousands of damaged logs, messages and runs, from a fixed seed; tests/benchmarks/fuzz.py reads more of them."""
 
 import numpy as np
 import pytest
 
-from tests.support import fuzzing, fuzzing_formats
+from tests.support import fuzzing, fuzzing_formats, fuzzing_runs
 
 MAKES, FORMATS = 13, 20
 SHARES = [pytest.param(6, id="some"), pytest.param(1, id="all", marks=pytest.mark.slow)]
@@ -40,6 +40,16 @@ def test_of_real_logs_cut_off_with_bits_flipped_every_untouched_scan_is_read_and
 @pytest.mark.parametrize("share", SHARES)
 def test_damaged_messages_are_decoded_or_called_malformed(tmp_path, share):
     assert list(fuzzing.payload_complaints(tmp_path, np.random.default_rng(0), MESSAGES // share)) == []
+
+
+@pytest.mark.parametrize("share", SHARES)
+@pytest.mark.parametrize(
+    ("complaints", "count"), [(fuzzing_runs.run_complaints, 600), (fuzzing_runs.checkpoint_complaints, 120)]
+)
+def test_damaged_run_directories_are_refused_in_a_line_and_runs_go_on_from_them_to_the_same(
+    tmp_path, share, complaints, count
+):
+    assert [wrong for wrong, _ in complaints(tmp_path, np.random.default_rng(0), count // share)] == []
 
 
 def test_a_reader_that_loses_a_chunk_is_found_out(seeds, monkeypatch):

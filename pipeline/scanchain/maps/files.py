@@ -46,7 +46,8 @@ negate: 0
 occupied_thresh: 0.65
 free_thresh: 0.196
 """
-_YAML_NUMBERS = re.compile(r"resolution: (\S+)\norigin: \[(\S+), (\S+), 0\]")
+_NUMBER = r"(-?\d{1,15}(?:\.\d+)?(?:e[+-]\d\d)?)"
+_YAML_NUMBERS = re.compile(rf"resolution: {_NUMBER}\norigin: \[{_NUMBER}, {_NUMBER}, 0\]")
 
 
 def write_ply(
@@ -118,12 +119,12 @@ def read_map(folder: Path | str) -> tuple[NDArray[np.int8], float, tuple[float, 
     folder = Path(folder)
     try:
         image = _PGM.fullmatch((folder / "map.pgm").read_bytes())
-        header = _YAML_NUMBERS.search((folder / "map.yaml").read_text(encoding="utf-8"))
+        header = _YAML_NUMBERS.search((folder / "map.yaml").read_text("utf-8", "replace"))
     except OSError as error:
         raise InputError(
             f"{error.filename}: cannot be read ({error.strerror}); scanchain run writes it"
         ) from error
-    if image is None or header is None:
+    if image is None or header is None or float(header[1]) <= 0.0:
         raise InputError(f"{folder}: map.pgm or map.yaml is not as scanchain writes them; run it again")
     columns, rows = int(image[1]), int(image[2])
     pixels = np.frombuffer(image[3], np.uint8)

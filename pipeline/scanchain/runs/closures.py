@@ -48,7 +48,9 @@ def write_closures(path: Path, closures: Sequence[Closure], keyframes: Sequence[
     """Write the table of ``closures_table``."""
     import pyarrow.parquet as pq
 
-    pq.write_table(closures_table(closures, keyframes, dimension), path, compression="zstd")
+    pq.write_table(
+        closures_table(closures, keyframes, dimension), path, compression="zstd", write_page_checksum=True
+    )
 
 
 def closures_table(closures: Sequence[Closure], keyframes: Sequence[Keyframe], dimension: int) -> pa.Table:

@@ -80,7 +80,7 @@ class StepTable:
         """Write the table; ``trajectory`` has the final pose of each step, ``T_base_lidar`` is for the wheels."""
         import pyarrow.parquet as pq
 
-        pq.write_table(self.table(trajectory, T_base_lidar), path, compression="zstd")
+        pq.write_table(self.table(trajectory, T_base_lidar), path, compression="zstd", write_page_checksum=True)
 
     def table(self, trajectory: Trajectory, T_base_lidar: Pose | None = None) -> pa.Table:
         """The table, as ``write`` writes it."""

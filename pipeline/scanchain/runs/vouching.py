@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import VERIFICATION, Matrix, Proposal, Scan, State, Trajectory
-from scanchain.errors import InputError
+from scanchain.errors import InputError, one_line
 from scanchain.evaluation import ExpectedError, pair
 from scanchain.evaluation.consistency import velocities
 from scanchain.files import Source
@@ -52,7 +52,18 @@ class _Known(msgspec.Struct):
 
 def judge_run(folder: Path) -> Judged:
     """The verdict on the tables of a run directory. Raises InputError where it has none."""
-    return judge(evidence_of_run(folder, expected_of_run(folder)))
+    try:
+        return judge(evidence_of_run(folder, expected_of_run(folder)))
+    except (
+        ArithmeticError,
+        AttributeError,
+        LookupError,
+        NotImplementedError,
+        OSError,
+        TypeError,
+        ValueError,
+    ) as error:
+        raise InputError(f"{folder}: its tables are damaged ({one_line(error)}); run the log again") from error
 
 
 def expected_of_run(folder: Path) -> ExpectedError | None:
@@ -70,12 +81,13 @@ def evidence_of_run(folder: Path, expected: ExpectedError | None) -> Evidence:
     if not folder.is_dir():
         raise InputError(f"{folder}: is not a run directory; to check a log, name a --trajectory FILE.tum")
     try:
-        steps = pq.ParquetFile(folder / "steps.parquet").read()
+        steps = pq.ParquetFile(folder / "steps.parquet", page_checksum_verification=True).read()
     except (OSError, ValueError):
         remedy = "name a directory of scanchain run (--resume ends an unfinished one)"
         raise InputError(f"{folder}: has no steps.parquet that can be read; {remedy}") from None
-    loops_file = folder / "loops.parquet"
-    return evidence_of(steps, pq.ParquetFile(loops_file).read() if loops_file.exists() else None, expected)
+    file = folder / "loops.parquet"
+    loops = pq.ParquetFile(file, page_checksum_verification=True).read() if file.exists() else None
+    return evidence_of(steps, loops, expected)
 
 
 def evidence_of(steps: pa.Table, closures: pa.Table | None, expected: ExpectedError | None = None) -> Evidence:

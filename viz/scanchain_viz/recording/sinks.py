@@ -20,6 +20,7 @@ from uuid import UUID, uuid4
 
 import rerun as rr
 import rerun.blueprint as rrb
+import rerun_bindings as bindings
 from rerun.chunk import RrdReader
 from rerun.error_utils import RerunWarning
 
@@ -140,7 +141,7 @@ def open_stream(name: str, dimension: int, recording_id: UUID, kind: str = "") -
     ``rr.init`` does. That waits for streams that take nothing more, and ends a recording that the user began.
     """
     if not _open and rr.get_global_data_recording() is None:
-        rr.bindings.flush_and_cleanup_orphaned_recordings()
+        bindings.flush_and_cleanup_orphaned_recordings()
     application = " ".join(filter(None, ("scanchain", kind, f"{dimension}D")))
     stream = rr.RecordingStream(application, recording_id=recording_id)
     _open.add(stream)
@@ -151,14 +152,14 @@ def open_stream(name: str, dimension: int, recording_id: UUID, kind: str = "") -
 
 def send_layout(stream: rr.RecordingStream, blueprint: rrb.Blueprint, *, is_active: bool) -> None:
     """Send a layout by a stream that is closed; that of ``rr.send_blueprint`` stays open with its two threads."""
-    application = stream.get_application_id()
+    application = stream.get_application_id() or ""
     layout = rr.RecordingStream._from_native(
-        rr.bindings.new_blueprint(application, make_default=False, make_thread_default=False, default_enabled=True)
+        bindings.new_blueprint(application, make_default=False, make_thread_default=False, default_enabled=True)
     )
     layout.set_time("blueprint", sequence=0)
     blueprint.to_blueprint()._log_to_stream(layout)
     storage = layout.memory_recording().storage
-    rr.bindings.send_blueprint(storage, is_active, True, recording=stream.to_native())
+    bindings.send_blueprint(storage, is_active, True, recording=stream.to_native())
     layout.disconnect()
 
 
