@@ -17,7 +17,7 @@ from scanchain.errors import InputError
 from scanchain.kernels.registration.observability import WEAK
 from scanchain.preprocess import downsample
 from scanchain.registration.matcher import create_matcher
-from scanchain.registration.search import SearchGrid, Wanted, Window, find, thinned
+from scanchain.registration.search import SearchGrid, Wanted, Window, evenly, find, thinned
 from scanchain.registration.voxel_map import VoxelMap
 from scanchain.settings import Override, load_settings
 
@@ -28,6 +28,8 @@ _SEEN_FROM = 3.0  # times that distance from the centroid, up to which a cloud w
 _ELSEWHERE_M, _ELSEWHERE_RAD = 0.1, 0.05  # distance from which on two matches are distinct
 AMBIGUOUS = 1.4  # times the cost of the best match, below which a distinct one is a rival: 25 surfaces, odds 150
 _HALVINGS = 2  # of voxels that are tried
+_MOST = 3  # times the number of points wanted, beyond which halved voxels would add work alone
+_SAME = 0.1  # voxels, within which poses found with voxels of two sizes are the same
 _GAIN = 12.5  # times the variance of a range, of cost below which a direction is not worth leaving the guess: 5 σ
 _APART = 10.0  # times that distance between the centroids, from which on the clouds cannot overlap
 
@@ -96,7 +98,7 @@ def align(
 def _at_another_scale(
     match: Match, matched: Callable[[float, Pose], Match], size_m: float, finest_m: float
 ) -> Match:
-    """The match with other voxels, where those of ``size_m`` are too coarse for a body, or too fine for rough ones.
+    """The match with other voxels, where these are too coarse for a body or too fine for rough surfaces.
 
     Voxels that hold both sides of a plank leave its pose undetermined: halved ones are tried, as fine as the points
     allow. Surfaces rougher than the kernel is wide contradict any pose: doubled ones are tried.
@@ -107,10 +109,15 @@ def _at_another_scale(
         size_m = max(0.5 * size_m, finest_m)
         finer = matched(size_m, match.T_target_source)
         if finer.fit >= LEAST_FIT and finer.observability > match.observability:
-            match = finer
+            is_clear = finer.observability >= WEAK or not finer.converged  # a weak one is the sampling's, perhaps
+            match = finer if is_clear else replace(finer, converged=False, reason=match.reason, cause=match.cause)
     if match.fit < LEAST_FIT and match.observability >= 1.0:
         coarser = matched(2.0 * size_m, match.T_target_source)
-        match = coarser if coarser.converged else match
+        if coarser.converged:  # what one scale finds, the other confirms
+            again = matched(size_m, coarser.T_target_source)
+            apart_m, apart_rad = lie.apart(again.T_target_source, coarser.T_target_source)
+            if again.converged or (apart_m < _SAME * size_m and apart_rad < _ELSEWHERE_RAD):
+                match = again if again.converged else coarser
     return match
 
 
@@ -132,6 +139,7 @@ def _matched(
     finer = math.sqrt(len(sparse) / sizes.match_points)
     if finer < 1.0:  # voxels by so much, so that about as many points as wanted remain
         sparse = downsample(source, max(finer * sizes.match_voxel_m, sizes.map_voxel_m))
+    sparse = evenly(sparse, _MOST * sizes.match_points)
     matcher = create_matcher(config.matching)
     match = matcher.align(sparse, local_map, T_first, wide=True)
     if match.observability < WEAK and not match.converged:
