@@ -100,7 +100,7 @@ def _at_another_scale(
 ) -> Match:
     """The match with other voxels, where these are too coarse for a body or too fine for rough surfaces.
 
-    Voxels that hold both sides of a plank leave its pose undetermined: halved ones are tried, as fine as the points
+    Voxels that hold both sides of a plank leave its pose undetermined: halved ones are tried, as fine as points
     allow. Surfaces rougher than the kernel is wide contradict any pose: doubled ones are tried.
     """
     for _ in range(_HALVINGS):
