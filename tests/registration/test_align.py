@@ -10,6 +10,7 @@ import scanchain
 from scanchain import lie
 from scanchain.errors import InputError, below
 from scanchain.logs import open_log
+from scanchain.logs.formats.clouds import read_cloud_file
 from scanchain.odometry import Odometry
 from scanchain.registration.align import _in_units_of
 from tests.support.scenes import configured, kitti_scans, shared_data
@@ -128,6 +129,74 @@ def test_a_reason_is_in_the_unit_of_the_clouds_and_never_reads_like_its_limit():
     told = "residuals are far above the kernel scale of 0.4; lower voxel_size_m (2), spread over 6"
     assert _in_units_of(reason, 2.0) == told
     assert (below(0.5999), below(0.12)) == ("0.59", "0.12")
+
+
+def slab(rng, count, size, noise):
+    """Points on the faces of a box about the origin."""
+    a = np.array(size)
+    face = rng.choice(3, count, p=np.prod(a) / a / (np.prod(a) / a).sum())
+    points = (rng.random((count, 3)) - 0.5) * a
+    points[np.arange(count), face] = rng.choice([-0.5, 0.5], count) * a[face]
+    return points + rng.normal(scale=noise, size=points.shape)
+
+
+@pytest.mark.parametrize(("unit", "count"), [(1.0, 5000), (1000.0, 20_000), (1.0, 60_000)])
+@pytest.mark.parametrize("degrees", [5.0, 10.0])
+@pytest.mark.parametrize("size", [(1.2, 0.2, 0.05), (0.9, 0.3, 0.04)])
+def test_a_thin_body_that_was_turned_is_turned_back(unit, count, degrees, size):
+    """Its yaw is seen by narrow sides alone: no more than voxels of the first size can tell from noise."""
+    rng = np.random.default_rng(count)
+    target, source = (slab(rng, count, size, 0.02 * size[2]) for _ in range(2))
+    truth = lie.exp(np.append(np.zeros(5), np.radians(degrees)))
+    match = scanchain.align(unit * target, unit * lie.transform(lie.inverse(truth), source))
+    apart_m, apart_rad = lie.apart(match.T_target_source, truth)
+    assert np.degrees(apart_rad) < 0.6
+    if match.converged:
+        assert apart_m < 0.02 * unit
+
+
+def test_what_no_surface_determines_is_left_at_the_guess_and_said():
+    """Planes without an end in common, shifted along themselves by the guess."""
+    rng = np.random.default_rng(1)
+    target = np.column_stack([rng.uniform(-8, 8, (40_000, 2)), rng.normal(scale=0.005, size=40_000)])
+    source = target[np.abs(target[:, :2]).max(axis=1) < 4.0] + rng.normal(scale=0.005, size=3)
+    guess = lie.exp(np.array([0.4, -0.3, 0.02, 0.0, 0.0, 0.1]))
+    match = scanchain.align(target, source, guess)
+    assert not match.converged and "undetermined" in match.reason
+    np.testing.assert_allclose(match.T_target_source[:2, 3], guess[:2, 3], atol=0.05)
+    assert lie.apart(match.T_target_source, guess)[1] < 0.02
+
+
+def small_gicp_pair():
+    """The clouds that small_gicp's own tests register, and the true pose."""
+    folder = shared_data("3d/small_gicp_pair")
+    rows = [read_cloud_file(folder / f"{name}.ply") for name in ("target", "source")]
+    clouds = [np.column_stack([each[axis] for axis in "xyz"]).astype(float) for each in rows]
+    return *clouds, np.loadtxt(folder / "T_target_source.txt")
+
+
+@pytest.mark.parametrize("unit", [1.0, 100.0])
+@pytest.mark.parametrize("turned_deg", [0.0, 5.0, 10.0])
+def test_the_pair_of_small_gicp_converges_at_the_true_pose(unit, turned_deg):
+    target, source, truth = small_gicp_pair()
+    guess = np.eye(4) if not turned_deg else truth @ lie.exp(np.append(np.zeros(5), np.radians(turned_deg)))
+    guess, truth = guess.copy(), truth.copy()
+    guess[:3, 3], truth[:3, 3] = unit * guess[:3, 3], unit * truth[:3, 3]
+    match = scanchain.align(unit * target, unit * source, guess)
+    apart_m, apart_rad = lie.apart(match.T_target_source, truth)
+    assert match.converged
+    assert apart_m < 0.04 * unit and np.degrees(apart_rad) < 0.4
+
+
+@pytest.mark.parametrize("turned_deg", [30.0, 60.0, 90.0, 135.0, 180.0])
+def test_from_a_guess_far_off_align_is_right_or_says_that_it_is_not(turned_deg):
+    target, source, truth = small_gicp_pair()
+    for axis in range(3):
+        twist = np.zeros(6)
+        twist[axis], twist[3 + axis] = 1.5, np.radians(turned_deg)
+        match = scanchain.align(target, source, truth @ lie.exp(twist))
+        apart_m, apart_rad = lie.apart(match.T_target_source, truth)
+        assert not match.converged or (apart_m < 0.05 and np.degrees(apart_rad) < 0.5)
 
 
 CLOUD = np.random.default_rng(0).normal(size=(500, 3))

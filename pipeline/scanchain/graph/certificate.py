@@ -56,14 +56,14 @@ class Certificate:
     @property
     def verdict(self) -> str:
         """The certificate as one line of text."""
-        without = f" of the problem without {self.left_out}" if self.left_out else ""
+        without = f" of the problem without {self.left_out}," if self.left_out else ""
         if self.certified and self.is_zero:
-            return f"globally optimal{without}: χ² is zero"
+            return f"globally optimal{without or ':'} χ² is zero"
         if self.certified:
             if self.relative_gap < _EXACT:
-                return f"globally optimal{without}, to rounding" if without else "globally optimal to rounding"
-            share = f"to within {self.gap:.2g} of χ² ({100.0 * self.relative_gap:.1g} %)"
-            return f"globally optimal{without}, {share}" if without else f"globally optimal {share}"
+                return f"globally optimal{without} to rounding"
+            share = f"{self.gap:.2g} of χ² ({100.0 * self.relative_gap:.1g} %)"
+            return f"globally optimal{without} to within {share}"
         return f"not certified: {self.reason}"
 
 

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 
 from scanchain import checks, lie
 from scanchain.config import Config
-from scanchain.data import AnyPoints, Match, Points, Pose
+from scanchain.data import LEAST_FIT, AnyPoints, Match, Points, Pose
 from scanchain.errors import InputError
+from scanchain.kernels.registration.observability import WEAK
 from scanchain.preprocess import downsample
 from scanchain.registration.matcher import create_matcher
-from scanchain.registration.search import SearchGrid, Wanted, Window, find, thinned
+from scanchain.registration.search import SearchGrid, Wanted, Window, evenly, find, thinned
 from scanchain.registration.voxel_map import VoxelMap
 from scanchain.settings import Override, load_settings
 
@@ -25,6 +27,10 @@ _SEEDS, _SEEDS_APART_M, _RIVAL = 6, 1.0, 0.6  # beginnings in the plane: number,
 _SEEN_FROM = 3.0  # times that distance from the centroid, up to which a cloud was seen from its origin
 _ELSEWHERE_M, _ELSEWHERE_RAD = 0.1, 0.05  # distance from which on two matches are distinct
 AMBIGUOUS = 1.4  # times the cost of the best match, below which a distinct one is a rival: 25 surfaces, odds 150
+_HALVINGS = 2  # of voxels that are tried
+_MOST = 3  # times the number of points wanted, beyond which halved voxels would add work alone
+_SAME = 0.1  # voxels, within which poses found with voxels of two sizes are the same
+_GAIN = 12.5  # times the variance of a range, of cost below which a direction is not worth leaving the guess: 5 σ
 _APART = 10.0  # times that distance between the centroids, from which on the clouds cannot overlap
 
 
@@ -62,10 +68,10 @@ def align(
     range_m = float(np.median(np.linalg.norm(target, axis=1)))
     if not range_m > 0.0:
         raise InputError(f"target: its {len(target):,} points lie on one point; wanted a cloud with an extent")
-    if voxel_size_m is None:
-        around = 2.0 * (d - 1) * math.pi  # of a circle or a sphere of radius 1: few points span few voxels
-        voxel_size_m = range_m / min((len(target) / around) ** (1.0 / (d - 1)), _RANGE_VOXELS[d])
-    unit_m = checks.positive(voxel_size_m, "voxel_size_m") / config.local_map.voxel_size_m
+    around = 2.0 * (d - 1) * math.pi  # of a circle or a sphere of radius 1: few points span few voxels
+    finest_m = range_m * (len(target) / around) ** (-1.0 / (d - 1))
+    size_m = max(finest_m, range_m / _RANGE_VOXELS[d]) if voxel_size_m is None else voxel_size_m
+    checks.positive(size_m, "voxel_size_m")
     source = lie.transform(lie.inverse(at_source), source)
     T_first = lie.inverse(at_target) @ T_guess @ at_source
     apart_m = float(np.linalg.norm(T_first[:-1, -1]))
@@ -75,10 +81,44 @@ def align(
             f"{range_m:.3g} m; wanted clouds in one unit that overlap"
         )
     is_near = np.linalg.norm(at_source[:-1, -1]) < _SEEN_FROM * range_m
-    T_pivot_source = _scaled(at_source, is_near / unit_m)
-    T_first = _scaled(T_first, 1.0 / unit_m)
-    match = _matched(target / unit_m, source / unit_m, T_first, T_pivot_source, range_m / unit_m, config)
-    return _restored(match, at_target, at_source, unit_m)
+
+    def matched(voxel_m: float, T_first: Pose) -> Match:
+        """The match of the centered clouds, in their unit, with voxels of this size."""
+        unit_m = voxel_m / config.local_map.voxel_size_m
+        clouds, pivot = (target / unit_m, source / unit_m), _scaled(at_source, is_near / unit_m)
+        match = _matched(*clouds, _scaled(T_first, 1.0 / unit_m), pivot, range_m / unit_m, config)
+        return _restored(match, unit_m)
+
+    match = matched(size_m, T_first)
+    if d == 3 and voxel_size_m is None:
+        match = _at_another_scale(match, matched, size_m, finest_m)
+    return with_source_frame(replace(match, T_target_source=at_target @ match.T_target_source), at_source)
+
+
+def _at_another_scale(
+    match: Match, matched: Callable[[float, Pose], Match], size_m: float, finest_m: float
+) -> Match:
+    """The match with other voxels, where these are too coarse for a body or too fine for rough surfaces.
+
+    Voxels that hold both sides of a plank leave its pose undetermined: halved ones are tried, as fine as points
+    allow. Surfaces rougher than the kernel is wide contradict any pose: doubled ones are tried.
+    """
+    for _ in range(_HALVINGS):
+        if match.observability >= 1.0 or size_m <= finest_m:
+            break
+        size_m = max(0.5 * size_m, finest_m)
+        finer = matched(size_m, match.T_target_source)
+        if finer.fit >= LEAST_FIT and finer.observability > match.observability:
+            is_clear = finer.observability >= WEAK or not finer.converged  # a weak one is the sampling's, perhaps
+            match = finer if is_clear else replace(finer, converged=False, reason=match.reason, cause=match.cause)
+    if match.fit < LEAST_FIT and match.observability >= 1.0:
+        coarser = matched(2.0 * size_m, match.T_target_source)
+        if coarser.converged:  # what one scale finds, the other confirms
+            again = matched(size_m, coarser.T_target_source)
+            apart_m, apart_rad = lie.apart(again.T_target_source, coarser.T_target_source)
+            if again.converged or (apart_m < _SAME * size_m and apart_rad < _ELSEWHERE_RAD):
+                match = again if again.converged else coarser
+    return match
 
 
 def _valid(cloud: AnyPoints, name: str, d: int) -> Points:
@@ -99,8 +139,14 @@ def _matched(
     finer = math.sqrt(len(sparse) / sizes.match_points)
     if finer < 1.0:  # voxels by so much, so that about as many points as wanted remain
         sparse = downsample(source, max(finer * sizes.match_voxel_m, sizes.map_voxel_m))
+    sparse = evenly(sparse, _MOST * sizes.match_points)
     matcher = create_matcher(config.matching)
     match = matcher.align(sparse, local_map, T_first, wide=True)
+    if match.observability < WEAK and not match.converged:
+        unheld = create_matcher(msgspec.structs.replace(config.matching, min_information=0.0, min_signal=0.0))
+        free = unheld.align(sparse, local_map, T_first, wide=True)
+        if free.cost + _GAIN * config.matching.sensor_noise_m**2 < match.cost / AMBIGUOUS:
+            match = matcher.align(sparse, local_map, free.T_target_source)
     if local_map.dimension == 3:
         return match
     grid = SearchGrid.of_voxels(local_map, T_first)
@@ -128,23 +174,19 @@ def as_ambiguous(match: Match, apart_m: float, apart_rad: float) -> Match:
     return replace(match, converged=False, reason=reason, cause="ambiguous: another pose fits nearly as well")
 
 
-def _restored(match: Match, at_target: Pose, at_source: Pose, unit_m: float) -> Match:
-    """A match of centered, scaled clouds as one of the clouds that came.
-
-    With T = C_t T' C_s⁻¹ a right twist ξ' of T' is Ad(C_s) ξ' of T.
-    """
+def _restored(match: Match, unit_m: float) -> Match:
+    """A match of scaled clouds as one of clouds in the unit that came."""
     units = lie.by_component(len(match.information), unit_m, 1.0)
-    scaled = replace(
+    return replace(
         match,
         reason=match.reason if match.converged else _in_units_of(match.reason, unit_m),
         cause=_in_units_of(match.cause, unit_m),
-        T_target_source=at_target @ _scaled(match.T_target_source, unit_m),
+        T_target_source=_scaled(match.T_target_source, unit_m),
         information=match.information / np.outer(units, units),
         cost=match.cost * unit_m**2,
         residual_m=match.residual_m * unit_m,
         degeneracy_direction=units * match.degeneracy_direction,
     )
-    return with_source_frame(scaled, at_source)
 
 
 def _in_units_of(reason: str, unit_m: float) -> str:
@@ -156,7 +198,7 @@ def _in_units_of(reason: str, unit_m: float) -> str:
 
 
 def with_source_frame(match: Match, T_new_old: Pose) -> Match:
-    """The same match with the source seen from another frame that moves with it."""
+    """The same match with the source seen from another frame that moves with it: ξ of T is Ad(T_new_old) ξ."""
     T_old_new = lie.inverse(T_new_old)
     direction = lie.adjoint(T_new_old) @ match.degeneracy_direction
     Ad_inverse = lie.adjoint(T_old_new)

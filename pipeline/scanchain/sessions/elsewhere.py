@@ -112,7 +112,7 @@ def import_map(
 
 
 def _read(file: Path, spacing_m: float | None) -> _Surfaces:
-    suffix, notes = file.suffix.lower(), list[str]()
+    suffix, notes, columns = file.suffix.lower(), list[str](), list[NDArray[Any]]()
     if suffix in GRID_SUFFIXES:
         return _read_grid(file)
     try:
@@ -139,7 +139,7 @@ def _read(file: Path, spacing_m: float | None) -> _Surfaces:
             f"{file}: {counted(count - len(points), 'point')} of {count:,} are left out: coordinates that are not "
             f"finite, or more than {_OUTLIER:g} times as far off as {_PERCENTILE:g} % of the points"
         )
-    step_m = 0.0 if suffix in LAS_SUFFIXES else max(map(_step_m, columns, points.T))
+    step_m = max(map(_step_m, columns, points.T), default=0.0)
     if step_m > _COARSE_STEP_M:
         notes.append(
             f"{file}: its coordinates reach {np.abs(points).max():,.0f} m and come in steps of {step_m:g} m "
@@ -193,8 +193,9 @@ def _read_grid(file: Path) -> _Surfaces:
         with Image.open(file.parent / stated["image"]) as picture:
             if picture.width * picture.height > MAX_CELLS:
                 raise ValueError(f"its image has {picture.width} x {picture.height} cells, over {MAX_CELLS:,}")
-            deep = np.asarray(picture) / 257 if picture.mode.startswith("I") else picture.convert("L")
-            image = np.rint(deep).astype(np.uint8)  # 16 bits, too, which convert("L") would cut off
+            is_deep = picture.mode.startswith("I")  # of 16 bits, which convert("L") would cut off
+            gray = np.asarray(picture) / 257.0 if is_deep else np.asarray(picture.convert("L"))
+            image = np.rint(gray).astype(np.uint8)
             has_alpha = "A" in picture.getbands() or "transparency" in picture.info
             is_opaque = np.asarray(picture.convert("RGBA").getchannel("A")) == 255 if has_alpha else np.True_
         resolution_m, (x, y, yaw_rad) = float(stated["resolution"]), map(float, stated["origin"])
