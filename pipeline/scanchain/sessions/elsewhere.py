@@ -20,6 +20,7 @@ from scanchain.errors import InputError, counted
 from scanchain.kernels.free_space import nearest_ranges
 from scanchain.logs.formats.clouds import SUFFIXES, CloudFileError, read_cloud_file
 from scanchain.maps import MAP_FOLDER, Edges, SavedMap, SavedPoints, Session, write_saved_map
+from scanchain.maps.files import read_las
 from scanchain.maps.occupancy_grid import MAX_CELLS
 from scanchain.preprocess import Resolution
 from scanchain.runs.directory import RUN_FILE, RunDirectory
@@ -107,7 +108,7 @@ def _read(file: Path) -> _Surfaces:
         return _read_grid(file)
     try:
         if suffix in LAS_SUFFIXES:
-            points = _read_las(file)
+            points = read_las(file)
         elif suffix in SUFFIXES:
             rows = read_cloud_file(file)
             points = np.column_stack([rows[name] for name in "xyz"]).astype(np.float64)
@@ -122,17 +123,6 @@ def _read(file: Path) -> _Surfaces:
     if not len(points):
         raise InputError(f"{file}: has no points")
     return _Surfaces(points[:, :2] if np.ptp(points[:, 2]) < _FLAT_M else points)
-
-
-def _read_las(file: Path) -> Points:
-    import laspy
-
-    try:
-        return np.asarray(laspy.read(file).xyz, np.float64)
-    except OSError:
-        raise
-    except Exception as error:  # whatever a damaged file makes laspy and its decoder raise
-        raise InputError(f"{file}: is no LAS or LAZ file ({type(error).__name__}: {error})") from error
 
 
 def _read_grid(file: Path) -> _Surfaces:
