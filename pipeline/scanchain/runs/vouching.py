@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import VERIFICATION, Matrix, Proposal, Scan, State, Trajectory
-from scanchain.errors import InputError
+from scanchain.errors import InputError, one_line
 from scanchain.evaluation import ExpectedError, pair
 from scanchain.evaluation.consistency import velocities
 from scanchain.files import Source
@@ -69,13 +69,16 @@ def evidence_of_run(folder: Path, expected: ExpectedError | None) -> Evidence:
 
     if not folder.is_dir():
         raise InputError(f"{folder}: is not a run directory; to check a log, name a --trajectory FILE.tum")
+    name = "steps.parquet"
     try:
-        steps = pq.ParquetFile(folder / "steps.parquet").read()
-    except (OSError, ValueError):
+        steps, closures = pq.ParquetFile(folder / name).read(), None
+        name = "loops.parquet"
+        if (folder / name).exists():
+            closures = pq.ParquetFile(folder / name).read()
+        return evidence_of(steps, closures, expected)
+    except Exception as error:  # whatever a damaged file, or one of another make, makes Arrow and NumPy raise
         remedy = "name a directory of scanchain run (--resume ends an unfinished one)"
-        raise InputError(f"{folder}: has no steps.parquet that can be read; {remedy}") from None
-    loops_file = folder / "loops.parquet"
-    return evidence_of(steps, pq.ParquetFile(loops_file).read() if loops_file.exists() else None, expected)
+        raise InputError(f"{folder}: has no {name} that can be read ({one_line(error)}); {remedy}") from error
 
 
 def evidence_of(steps: pa.Table, closures: pa.Table | None, expected: ExpectedError | None = None) -> Evidence:
