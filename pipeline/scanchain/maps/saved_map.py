@@ -214,7 +214,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """The arrays of an .npz file. Raises InputError where it cannot be read."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            return dict(file)
+            return {name: file[name].view(np.ndarray) for name in file}  # bytes, which have no view, are no array
     except Exception as error:  # whatever a damaged file makes NumPy, its parser and the decoders raise
         raise _damaged(path, f"cannot be read ({type(error).__name__}: {one_line(error)})") from error
 

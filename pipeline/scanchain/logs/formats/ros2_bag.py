@@ -71,6 +71,8 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
                 (number, id_), each.topic, encoding, id_, each.msgtype, language, definition
             )
             index.counts[id_], bag.connections[id_] = each.msgcount, each
+    if (lost := reader.message_count - sum(each.msgcount for each in reader.connections)) > 0:
+        index.damage.append(f"{path}: {counted(lost, 'message')} of no topic that it lists")
     if bag.is_packed:  # messages are unpacked here, as rosbags sets no limit
         reader.storage.metadata = reader.storage.metadata._replace(compression_mode=None)
     if bag.connections:
