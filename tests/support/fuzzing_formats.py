@@ -101,6 +101,8 @@ def _by_line(text, name):
 
     def untouched(_, damaged):
         touched = damaged.touched
+        if damaged.what.startswith("page 0 "):  # by which the file is recognized
+            return set()
         if not name.endswith(".log"):
             before = damaged.data[: max(0, min(begin for begin, _ in touched) - UNPACKED_AT_ONCE)]
             touched = [(_unpacked(before, name), len(text))]
