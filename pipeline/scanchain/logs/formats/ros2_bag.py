@@ -54,7 +54,8 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
     files = sorted(opened.glob("*.db3"), key=natural_order) if opened.is_dir() else [opened]
     bag = _Bag(path, files, is_packed=mode == "message", folder=folder)
     try:
-        bag.reader = reader = rosbag2.Reader(opened)
+        reader: Any = rosbag2.Reader(opened)
+        bag.reader = reader
         reader.open()
     except Exception as error:  # whatever a damaged file makes the libraries below raise
         return _index_of_pages(bag, number, one_line(error))
