@@ -7,6 +7,7 @@ import errno
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 
 import click
 
@@ -19,6 +20,7 @@ from scanchain.commands.optimize import optimize
 from scanchain.commands.preparing import config, sequence, warm_up
 from scanchain.commands.run import check, run, view
 from scanchain.errors import InputError, ScanchainError, printable, remedy_of
+from scanchain.logs.files import spelled
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -54,13 +56,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _run(list(arguments))
     code = _run(sys.argv[1:])
     atexit._run_exitfuncs()
-    sys.stdout.flush()
-    sys.stderr.flush()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(AttributeError, OSError, ValueError):  # of one that is closed
+            stream.flush()
     os._exit(code)
 
 
 def _run(words: list[str]) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small: threads would wait for each other
+    if odd := next((word for word in words if spelled(word) != word), ""):
+        return _fail(f"{spelled(odd)}: is not UTF-8; rename it, or choose another name", 2)
     try:
         return scanchain.main(words, prog_name="scanchain", standalone_mode=False) or 0
     except click.exceptions.NoArgsIsHelpError as error:

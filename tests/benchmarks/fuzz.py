@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from tests.benchmarks.harness import options_of
-from tests.support import fuzzing, fuzzing_formats, fuzzing_runs
+from tests.support import fuzzing, fuzzing_files, fuzzing_formats, fuzzing_runs
 
 
 def main():
@@ -42,9 +42,18 @@ def _messages(folder, rng, cases):
         yield wrong, None
 
 
+def _of(kinds):
+    def complaints(folder, rng, cases):
+        for wrong in fuzzing_files.complaints(kinds(folder), rng, cases):
+            yield wrong, None
+
+    return complaints
+
+
 KINDS = {
     "mcap": _files(fuzzing.seeds), "formats": _files(fuzzing_formats.seeds), "real": _files(fuzzing.real_seeds),
     "messages": _messages, "checkpoint": fuzzing_runs.checkpoint_complaints, "run": fuzzing_runs.run_complaints,
+    "files": _of(fuzzing_files.kinds), "runs": _of(fuzzing_files.run_kinds),
 }  # fmt: skip
 
 if __name__ == "__main__":

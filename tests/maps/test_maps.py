@@ -236,3 +236,25 @@ def test_the_grid_is_level_however_the_lidar_is_mounted(tilt_deg):
     assert [f"tilted by {tilt_deg:.0f} deg" in warning for warning in found.warnings] == [True] * (tilt_deg > 0.0)
     occupied = found.grid.probability() > OCCUPIED_PROBABILITY
     assert occupied.sum() > 450
+
+
+def test_a_damaged_laz_ends_in_one_line_whatever_it_does_to_its_decoder(tmp_path, monkeypatch):
+    path = tmp_path / "m.laz"
+    points = np.random.default_rng(0).uniform(-20.0, 20.0, (60_000, 3))
+    maps.write_laz(path, points)
+    np.testing.assert_allclose(maps.files.read_las(path), points, atol=0.00051)
+    data = bytearray(path.read_bytes())
+    half = len(data) // 2
+    endless = data[:100] + (2**31 - 1).to_bytes(4, "little") + data[104:]  # as many records before the points
+    for damaged, words in (
+        (data[:half] + data[half + 1 :], "ended by SIGABRT"),  # an abort in Rust, which nothing can catch
+        (data[:-1], "LazrsError"),
+        (endless, "decoding it takes over 9 s"),
+    ):
+        monkeypatch.setattr(maps.files, "_LAS_S", 9.0 if damaged is endless else 300.0)
+        path.write_bytes(damaged)
+        with pytest.raises(InputError, match=f"is no LAS or LAZ file that can be read .*{words}"):
+            maps.files.read_las(path)
+    monkeypatch.setattr(maps.files, "_LAS_MIB", 1.0)
+    with pytest.raises(InputError, match=r"decoding it takes over .* MiB"):
+        maps.files.read_las(path)

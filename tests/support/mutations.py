@@ -54,7 +54,10 @@ def mutant(seed, rng):
 
 def any_mutant(data, rng):
     """A file of whatever format damaged in one way."""
-    kinds = (flipped, flipped, overwritten, cut, lying_anywhere, left_out, repeated, misspelt, emptied)
+    kinds = (
+        flipped, flipped, overwritten, cut, lying_anywhere, left_out, repeated, misspelt, emptied, other_field,
+        other_field, without_page, concatenated, swapped,
+    )  # fmt: skip
     return kinds[rng.integers(len(kinds))](data, rng)
 
 
@@ -131,6 +134,40 @@ def lying_anywhere(whole, rng):
     value = LIES[rng.integers(len(LIES))] % (1 << 8 * size)
     data = whole[:at] + value.to_bytes(size, "little") + whole[at + size :]
     return Mutant(data, f"{size} bytes at {at} say {value}", [(at, at + size)])
+
+
+def other_field(whole, rng):
+    """A field of a record's head, as ROS 1 has them, has one other byte: an opcode, a connection, a count."""
+    fields = list(re.finditer(rb"(op|conn|count|size|ver|time|chunk_\w+|index_pos|compression|topic)=", whole))
+    if not fields:
+        return flipped(whole, rng)
+    at = min(fields[rng.integers(len(fields))].end() + int(rng.choice([0, 0, 0, 1, 4])), len(whole) - 1)
+    value = whole[at] ^ int(rng.choice([1, 2, 4, 3, 7, 255]))
+    data = whole[:at] + bytes([value]) + whole[at + 1 :]
+    return Mutant(data, f"byte {at} of a field is {value} instead of {whole[at]}", [(at, at + 1)])
+
+
+def without_page(whole, rng):
+    """A page of 512 to 4096 bytes is destroyed, as disks lose them."""
+    size = int(rng.choice([512, 4096]))
+    begin = size * int(rng.integers(max(1, len(whole) // size)))
+    end = min(begin + size, len(whole))
+    filling = (bytes(size), b"\xff" * size, rng.bytes(size))[rng.integers(3)][: end - begin]
+    data = whole[:begin] + filling + whole[end:]
+    return Mutant(data, f"page {begin} to {end} is {filling[:4]!r}...", [(begin, end)])
+
+
+def concatenated(whole, rng):
+    """The file once more behind itself, or behind a part of itself."""
+    end = len(whole) if rng.integers(2) else int(rng.integers(1, len(whole) + 1))
+    return Mutant(whole[:end] + whole, f"bytes 0 to {end} before the file", [(0, len(whole))])
+
+
+def swapped(whole, rng):
+    """Two pieces in each other's place."""
+    a, b, c = sorted(int(at) for at in rng.integers(0, len(whole) + 1, 3))
+    data = whole[:a] + whole[b:c] + whole[a:b] + whole[c:]
+    return Mutant(data, f"bytes {a} to {b} behind those to {c}", [(a, c)])
 
 
 def left_out(whole, rng):

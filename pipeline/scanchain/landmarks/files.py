@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.data import Matrix
-from scanchain.errors import InputError, counted
+from scanchain.errors import InputError, counted, one_line
 from scanchain.landmarks.problem import FIRST_SHARE, Kind, LandmarkData, Measurements, no_calibration
 
 _SHAPES = {
@@ -22,6 +21,7 @@ _SHAPES = {
     "sigma_odom": "(2, 2)",
     "sigma_landmark": "(2, 2)",
 }
+_LARGEST = 9e9  # numbers from which on a time in seconds does not fit 64 bits of nanoseconds
 _TRUTH = ("gt_traj", "gt_landmarks")  # what a problem need not have
 
 
@@ -77,8 +77,10 @@ def _read(path: Path) -> dict[str, Matrix]:
             return {name: _table(path, name, file[name]) for name in _SHAPES if name in file}
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}); check the path") from None
-    except (ValueError, EOFError, KeyError, zipfile.BadZipFile, NotImplementedError) as error:
-        reason = "it holds pickled objects" if "pickle" in str(error) else str(error)
+    except InputError:
+        raise
+    except Exception as error:  # whatever a damaged file makes NumPy, its parser and the decoders raise
+        reason = "it holds pickled objects" if "pickle" in str(error) else one_line(error)
         raise InputError(f"{path}: is no npz of plain arrays ({reason}); write it with numpy.savez") from None
 
 
@@ -245,9 +247,9 @@ def _numbers(path: Path, columns: int) -> Matrix:
         raise InputError(f"{path}: is no table of {columns} numbers a line ({error}); check the file") from None
     if not table.size or table.shape[1] != columns:
         raise InputError(f"{path}: is empty or has no {columns} numbers a line; check the file")
-    if not np.isfinite(table).all():
-        row = int(np.flatnonzero(~np.isfinite(table).all(axis=1))[0])
-        raise InputError(f"{path}: row {row + 1} is not finite; correct or remove it")
+    if not (np.abs(table) < _LARGEST).all():
+        row = int(np.flatnonzero(~(np.abs(table) < _LARGEST).all(axis=1))[0])
+        raise InputError(f"{path}: row {row + 1} is not finite, or reaches {_LARGEST:g}; correct or remove it")
     return table
 
 

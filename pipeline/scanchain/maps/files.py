@@ -1,22 +1,27 @@
 """Files of maps: point clouds as PLY, PCD and LAZ, occupancy grids as the map.pgm and map.yaml of map_server.
 
-PLY: Turk 1994. PCD: https://pointclouds.org/documentation/tutorials/pcd_file_format.html. LAZ by laspy.
+PLY: Turk 1994. PCD: https://pointclouds.org/documentation/tutorials/pcd_file_format.html. LAZ by laspy, whose
+decoder aborts or hangs on damage: ``python -m scanchain.maps.files FILE POINTS`` is the process that it gets.
 Points of the plane lie at z = 0.
 """
 
 from __future__ import annotations
 
+import os
 import re
+import sys
 from collections.abc import Mapping
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.data import Points
-from scanchain.errors import InputError
+from scanchain.errors import InputError, one_line
 from scanchain.maps.occupancy_grid import FREE_PROBABILITY, OCCUPIED_PROBABILITY, OccupancyGrid
+from scanchain.processes import KilledFor, Limits, available_mib, die_first, die_with_parent, run_within
 
 _PLY_TYPES = {"f4": "float", "u1": "uchar", "i4": "int"}
 _PLY_COMMENT = "scanchain, meters, world frame"
@@ -33,6 +38,11 @@ POINTS {count}
 DATA binary
 """
 _SCALE_M = 0.001  # LAZ holds whole multiples of it
+_LAS_S, _LAS_S_PER_MIB = 30.0, 1.0  # largest time to decode a file; a MiB takes about 0.05 s
+_LAS_MIB, _LAS_TIMES = (
+    1024.0,
+    100.0,
+)  # largest memory, and times the size of the file: a point of 2 bytes takes 100
 
 _PGM = re.compile(rb"P5\n(\d+) (\d+)\n255\n(.*)", re.DOTALL)
 _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205  # pixels of ROS's map_saver
@@ -93,6 +103,37 @@ def write_laz(path: Path | str, points: Points) -> None:
     cloud.write(str(path))
 
 
+def read_las(path: Path) -> Points:
+    """Points (N, 3) of a LAS or LAZ file. Raises InputError for a damaged one, OSError where it is absent."""
+    size_mib = path.stat().st_size / 2**20
+    limits = Limits(_LAS_S + _LAS_S_PER_MIB * size_mib, min(_LAS_MIB + _LAS_TIMES * size_mib, available_mib()))
+    with TemporaryDirectory(prefix="scanchain-") as folder:
+        points, output = Path(folder) / "points.npy", Path(folder) / "output.txt"
+        words = [str(path.resolve()), str(points)]
+        ending = run_within(limits, "scanchain.maps.files", words, os.environ, output=output, interval_s=0.02)
+        if ending.killed_for is KilledFor.NOTHING and ending.code == 0:
+            return np.load(points)
+        lines = output.read_text("utf-8", "replace").splitlines()
+        last = next((line for line in reversed(lines) if not line.startswith("note:")), "")
+        reason = {
+            KilledFor.TIME: f"decoding it takes over {limits.time_s:.0f} s",
+            KilledFor.MEMORY: f"decoding it takes over {limits.memory_mib:,.0f} MiB",
+        }.get(ending.killed_for, ending.reason(limits, last))
+    raise InputError(f"{path}: is no LAS or LAZ file that can be read ({reason}); copy or write it again")
+
+
+def _decode_las(path: Path, points: Path) -> None:
+    """Write the points of a LAS or LAZ file into another, as this process alone."""
+    import laspy
+
+    die_first()
+    die_with_parent()
+    try:
+        np.save(points, np.asarray(laspy.read(path).xyz, np.float64))
+    except Exception as error:  # whatever a damaged file makes laspy and its decoder raise
+        sys.exit(f"{type(error).__name__}: {one_line(error)}")
+
+
 def write_map(folder: Path | str, grid: OccupancyGrid) -> None:
     """Write ``map.pgm`` and ``map.yaml`` as nav2's map_server and ROS 1's read them.
 
@@ -144,3 +185,7 @@ def _ply_header(count: int, dtype: np.dtype, comment: str) -> str:
 def _in_space(points: Points) -> NDArray[np.float32]:
     """Points (N, d) as (N, 3) little-endian float32."""
     return lie.lift_points(points).astype("<f4")
+
+
+if __name__ == "__main__":
+    _decode_las(*map(Path, sys.argv[1:]))

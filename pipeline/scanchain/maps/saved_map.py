@@ -34,6 +34,7 @@ _ROW = np.dtype([
     ("count", np.int64), ("step_m", np.float64), ("is_wide", np.bool_), ("stamps_ns", np.int64),
     ("scan_index", np.int64), ("traveled_m", np.float64), ("scale", np.float64),
 ])  # fmt: skip
+_WHOLE = ("session", "count", "stamps_ns", "scan_index", "pairs")  # arrays of whole numbers
 _STEP_M = 0.001  # of coordinates on disk, more where the keyframe reaches farther than 33 m
 _WIDE_FROM_M = 0.01  # step from which on they take 32 bits: one far return must not make all points coarse
 _BLOCK = 1 << 20
@@ -182,17 +183,38 @@ def open_saved_map(path: Path) -> SavedMap:
     try:
         if rows["poses"].shape != (K, d + 1, d + 1) or rows["count"].sum() != index.points:
             raise _damaged(folder / _KEYFRAMES, f"holds other keyframes and points than {_INDEX} says")
+        E, k, pose = len(edges["pairs"]), 3 * (d - 1), (d + 1, d + 1)
+        of_edges = ((2,), pose, (k, k), (), ())
+        _check(rows, {"poses": (K, *pose), "session": (K,)} | dict.fromkeys(_ROW.names or (), (K,)))
+        _check(edges, {name: (E, *shape) for name, shape in zip(_EDGE_ARRAYS, of_edges, strict=True)})
+        _check_range(rows["session"], "session", len(index.sessions))
+        _check_range(edges["pairs"], "pairs", K)
+        _check_range(rows["count"], "count", index.points + 1)
         keyframes = _keyframes(rows, folder / _POINTS, d)
         return SavedMap(folder, d, keyframes, rows["session"], index.sessions, Edges(**edges))
     except (LookupError, ValueError, TypeError) as error:  # written by something else, checksums included
         raise _damaged(folder, f"is not as scanchain writes it ({one_line(error)})") from error
 
 
+def _check(arrays: dict[str, NDArray[Any]], shapes: dict[str, tuple[int, ...]]) -> None:
+    """Raise ValueError where an array has another shape or kind of numbers, or is not finite."""
+    for name, shape in shapes.items():
+        kind = {"is_loop": "b", "is_wide": "b", **dict.fromkeys(_WHOLE, "iu")}.get(name, "f")
+        array = arrays[name]
+        if array.shape != shape or array.dtype.kind not in kind or not np.isfinite(array).all():
+            raise ValueError(f"{name} is {array.dtype} {array.shape}, or not finite; wanted {shape}")
+
+
+def _check_range(array: NDArray[np.int64], name: str, limit: int) -> None:
+    if len(array) and not 0 <= int(array.min()) <= int(array.max()) < limit:
+        raise ValueError(f"{name} reaches from {array.min()} to {array.max()}; wanted 0 to {limit - 1}")
+
+
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """The arrays of an .npz file. Raises InputError where it cannot be read."""
     try:
         with np.load(path, allow_pickle=False) as file:
-            return dict(file)
+            return {name: file[name].view(np.ndarray) for name in file}  # bytes, which have no view, are no array
     except Exception as error:  # whatever a damaged file makes NumPy, its parser and the decoders raise
         raise _damaged(path, f"cannot be read ({type(error).__name__}: {one_line(error)})") from error
 

@@ -80,14 +80,16 @@ def evidence_of_run(folder: Path, expected: ExpectedError | None) -> Evidence:
 
     if not folder.is_dir():
         raise InputError(f"{folder}: is not a run directory; to check a log, name a --trajectory FILE.tum")
+    name = "steps.parquet"
     try:
-        steps = pq.ParquetFile(folder / "steps.parquet", page_checksum_verification=True).read()
-    except (OSError, ValueError):
+        steps, closures = pq.ParquetFile(folder / name, page_checksum_verification=True).read(), None
+        name = "loops.parquet"
+        if (folder / name).exists():
+            closures = pq.ParquetFile(folder / name, page_checksum_verification=True).read()
+        return evidence_of(steps, closures, expected)
+    except Exception as error:  # whatever a damaged file, or one of another make, makes Arrow and NumPy raise
         remedy = "name a directory of scanchain run (--resume ends an unfinished one)"
-        raise InputError(f"{folder}: has no steps.parquet that can be read; {remedy}") from None
-    file = folder / "loops.parquet"
-    loops = pq.ParquetFile(file, page_checksum_verification=True).read() if file.exists() else None
-    return evidence_of(steps, loops, expected)
+        raise InputError(f"{folder}: has no {name} that can be read ({one_line(error)}); {remedy}") from error
 
 
 def evidence_of(steps: pa.Table, closures: pa.Table | None, expected: ExpectedError | None = None) -> Evidence:

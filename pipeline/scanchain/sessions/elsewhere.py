@@ -22,6 +22,7 @@ from scanchain.errors import InputError, counted, shown
 from scanchain.kernels.free_space import nearest_ranges
 from scanchain.logs.formats.clouds import SUFFIXES, CloudFileError, read_cloud_file
 from scanchain.maps import MAP_FOLDER, Edges, SavedMap, SavedPoints, Session, write_saved_map
+from scanchain.maps.files import read_las
 from scanchain.maps.occupancy_grid import MAX_CELLS
 from scanchain.preprocess import Resolution
 from scanchain.runs.directory import RUN_FILE, RunDirectory
@@ -117,7 +118,7 @@ def _read(file: Path, spacing_m: float | None) -> _Surfaces:
         return _read_grid(file)
     try:
         if suffix in LAS_SUFFIXES:
-            points = _read_las(file)
+            points = read_las(file)
         elif suffix in SUFFIXES:
             rows = read_cloud_file(file)
             columns = [rows[name] for name in "xyz"]
@@ -165,17 +166,6 @@ def _step_m(column: NDArray[Any], values: NDArray[np.float64]) -> float:
         is_single = np.array_equal(values.astype(np.float32), values)
     kind = np.float32 if is_single else column.dtype.type
     return float(np.spacing(kind(np.abs(values).max())))
-
-
-def _read_las(file: Path) -> Points:
-    import laspy
-
-    try:
-        return np.asarray(laspy.read(file).xyz, np.float64)
-    except OSError:
-        raise
-    except Exception as error:  # whatever a damaged file makes laspy and its decoder raise
-        raise InputError(f"{file}: is no LAS or LAZ file ({type(error).__name__}: {error})") from error
 
 
 def _read_grid(file: Path) -> _Surfaces:

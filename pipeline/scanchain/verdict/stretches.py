@@ -156,9 +156,10 @@ def _extent_m(evidence: Evidence, part: slice, kind: Kind) -> float:
     """Largest distance from the pose before a part; after a gap at least what the speed before it makes of it."""
     positions, last = evidence.poses[:, :-1, -1], max(part.start - 1, 0)
     extent_m = float(np.linalg.norm(positions[part] - positions[last], axis=1).max())
-    if kind is Kind.DEGENERATE or not evidence.is_after_gap[part.start]:
+    period_s = np.median(np.diff(evidence.seconds)) if evidence.is_after_gap[part.start] else 0.0
+    if kind is Kind.DEGENERATE or not period_s > 0.0:
         return extent_m
-    speed_m_s = np.linalg.norm(positions[last] - positions[last - 1]) / np.median(np.diff(evidence.seconds))
+    speed_m_s = np.linalg.norm(positions[last] - positions[last - 1]) / period_s
     return max(extent_m, float(speed_m_s * (evidence.seconds[part.start] - evidence.seconds[last])))
 
 

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import bz2
 import gzip
-import io
 import math
 import zlib
 from collections import Counter
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -40,9 +40,10 @@ _LEAST_CODE_M = 81.83  # of a SICK LMS: from 8183 up its 13 bits are codes, such
 _STEPS_RAD = {180: math.pi / 180, 181: math.pi / 180, 360: math.pi / 360, 361: math.pi / 360, 401: math.pi / 720}
 _HALF_TURN = math.pi
 
-_MOST_BYTES = 2 << 30  # largest size of the text in bytes
-_MOST_RATIO, _LEAST_BYTES = 1000, 1 << 24  # largest ratio of packing, beyond so many bytes of text
+_MOST_RATIO, _LEAST_BYTES = 200, 1 << 24  # largest ratio of packing, beyond so many bytes of text
 _AT_ONCE = 256  # bytes of text that are unpacked at once, of which damage loses all
+_LONGEST_LINE = 1 << 18  # bytes of a line; a longer one is malformed
+_HEAD_BYTES = 1 << 16  # bytes of text by which files of other kinds are recognized
 
 
 def is_carmen(head: bytes) -> bool:
@@ -54,16 +55,20 @@ def is_carmen(head: bytes) -> bool:
 
 def index_carmen(path: Path, number: int) -> FileIndex:
     """The messages of a log's lines. Raises UnknownFormatError where the file has none of a known kind."""
-    text, damage = read_text(path)
-    malformed: list[int] = []
+    malformed, damage = [0, 0], list[str]()
     others = Counter[bytes]()
-    index = temporary_index(path, number, lambda log: _write(log, text, malformed, others))
-    if not index.counts and not malformed:
+    index = temporary_index(path, number, lambda log: _write(log, read_lines(path, damage), malformed, others))
+    if not index.counts and not malformed[1]:
         absent = f"text without a line of {b', '.join(KINDS).decode()}"
-        raise UnknownFormatError(text, damage.removeprefix(f"{path}: ") or absent)
-    index.damage += [damage] if damage else []
-    if malformed:
-        lines = f"{counted(len(malformed), 'malformed line')} left out (the first: line {malformed[0]})"
+        text = bytearray()
+        for line in read_lines(path, []):
+            text += line + b"\n"
+            if len(text) > _HEAD_BYTES:
+                break
+        raise UnknownFormatError(text, "".join(damage).removeprefix(f"{path}: ") or absent)
+    index.damage += damage
+    if malformed[1]:
+        lines = f"{counted(malformed[1], 'malformed line')} left out (the first: line {malformed[0]})"
         index.damage.append(f"{path}: {lines}")
     if others:
         listed = ", ".join(
@@ -73,11 +78,11 @@ def index_carmen(path: Path, number: int) -> FileIndex:
     return index
 
 
-def _write(log: LogWriter, text: bytes, malformed: list[int], others: Counter[bytes]) -> None:
-    """Write the messages of each line of a known kind; numbers and kinds of the others are added to the rest."""
+def _write(log: LogWriter, lines: Iterator[bytes], malformed: list[int], others: Counter[bytes]) -> None:
+    """Write the messages of each line of a known kind; ``malformed`` becomes the first such and their number."""
     parameters: dict[bytes, float] = {}
     scan_ns, is_mounted = 0, False
-    for number, line in enumerate(io.BytesIO(text), start=1):
+    for number, line in enumerate(lines, start=1):
         kind = line[:16].split(maxsplit=1)[0] if line[:16].strip() else b"#"
         if kind not in (*KINDS, b"PARAM"):
             if not kind.startswith((b"#", b"PARAM")):
@@ -99,7 +104,7 @@ def _write(log: LogWriter, text: bytes, malformed: list[int], others: Counter[by
                 continue
             scan, robot, laser = read_scan(words, stamp_ns, parameters)
         except (ValueError, IndexError, OverflowError):
-            malformed.append(number)
+            malformed[:] = malformed[0] or number, malformed[1] + 1
             continue
         scan_ns = max(stamp_ns, scan_ns + _LEAST_STEP_NS)
         if not is_mounted:
@@ -152,23 +157,28 @@ def _numbers(words: list[bytes], count: int) -> list[float]:
     return [float(word) for word in words[:count]]
 
 
-def read_text(path: Path) -> tuple[bytes, str]:
-    """The text of a file, unpacked, and what is missing of it, empty where all is well.
+def read_lines(path: Path, damage: list[str]) -> Iterator[bytes]:
+    """The lines of a file, unpacked; what is missing of them is added to the damage.
 
-    Raises InputError where it cannot be read or unpacks to more than any log does.
+    A line that is too long is cut. Raises InputError where a file cannot be read or unpacks to more than any log.
     """
-    text = bytearray()
+    size, text = 0, bytearray()
     try:
         with path.open("rb") as file:
-            head, most = file.read(3), min(_MOST_BYTES, _LEAST_BYTES + _MOST_RATIO * path.stat().st_size)
+            head, most = file.read(3), _LEAST_BYTES + _MOST_RATIO * path.stat().st_size
         opened = bz2.open if head == b"BZh" else gzip.open if head[:2] == b"\x1f\x8b" else Path.open
         with opened(path, "rb") as file:
             while block := file.read1(_AT_ONCE):
-                text += block
-                if len(text) > most:
+                size += len(block)
+                if size > most:
                     raise InputError(f"{path}: unpacks to more than {most:,} bytes; is it a CARMEN log?")
+                text += block
+                if len(text) > 2 * _LONGEST_LINE:
+                    *lines, rest = bytes(text).split(b"\n")
+                    yield from lines
+                    text = bytearray(rest[:_LONGEST_LINE])
     except (zlib.error, EOFError, ValueError, OSError) as error:
         if isinstance(error, OSError) and error.errno is not None:  # of the system, not of bz2 or gzip
             raise InputError(f"{path}: cannot be read ({error.strerror}); check the file") from error
-        return bytes(text), f"{path}: does not unpack beyond byte {len(text)} of the text ({error})"
-    return bytes(text), ""
+        damage.append(f"{path}: does not unpack beyond byte {size} of the text ({error})")
+    yield from bytes(text).split(b"\n")

@@ -105,7 +105,9 @@ def read_npy(path: Path) -> NDArray[np.void]:
     try:
         with _ONE_AT_A_TIME:
             array = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, MemoryError) as error:
+    except OSError:
+        raise
+    except Exception as error:  # whatever a damaged header makes NumPy, ast and tokenize raise
         raise CloudFileError("is no .npy array of numbers") from error
     if not isinstance(array, np.ndarray):
         raise CloudFileError("is an archive of arrays, no .npy array; save each cloud in a file of its own")

@@ -55,7 +55,8 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
     files = sorted(opened.glob("*.db3"), key=natural_order) if opened.is_dir() else [opened]
     bag = _Bag(path, files, is_packed=mode == "message", folder=folder)
     try:
-        bag.reader = reader = rosbag2.Reader(opened)
+        reader: Any = rosbag2.Reader(opened)
+        bag.reader = reader
         reader.open()
         begin_ns = reader.start_time or next((time_ns for _, time_ns, _ in reader.messages(start=1)), 0)
     except Exception as error:  # whatever a damaged file makes the libraries below raise
@@ -73,6 +74,8 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
                 (number, id_), each.topic, encoding, id_, each.msgtype, language, definition
             )
             index.counts[id_], bag.connections[id_] = each.msgcount, each
+    if (lost := reader.message_count - sum(each.msgcount for each in reader.connections)) > 0:
+        index.damage.append(f"{path}: {counted(lost, 'message')} of no topic that it lists")
     if bag.is_packed:  # messages are unpacked here, as rosbags sets no limit
         reader.storage.metadata = reader.storage.metadata._replace(compression_mode=None)
     if bag.connections:

@@ -90,7 +90,7 @@ class _FrameTransforms(Struct, frozen=True):
 
 def laser_scan(message: _LaserScan) -> Sensed:
     """The scan, without range limits and times, which Foxglove lacks."""
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         ranges_m = np.array(message.ranges, np.float64).astype(np.float32)
     step_rad = (message.end_angle - message.start_angle) / max(len(ranges_m) - 1, 1)
     angles_rad = message.start_angle, message.end_angle, step_rad
