@@ -199,8 +199,8 @@ class ScanCounts:
         return [
             f"{counted(len(self.clock_jumps), 'jump')} of the header stamps of {self.topic}, by up to "
             f"{_signed(most_s)} (the first at scan {first.scan:,}, {first.into_s:.1f} s after the first scan: "
-            f"{_signed(first.step_s)} while the log goes on by {first.logged_s:.2g} s): {first.cause}; each "
-            "begins a new segment, as nothing says how far the lidar moved meanwhile"
+            f"{_signed(first.step_s)} while the log goes on by {first.logged_s:.2g} s): {first.cause}; "
+            "each begins a new segment, as nothing says how far the lidar moved meanwhile"
         ]
 
     def notes(self) -> list[str]:
@@ -214,7 +214,7 @@ class ScanCounts:
             steps = counted(self.backwards, "step")
             most = f"by up to {1e-9 * self.farthest_back_ns:.2g} s"
             lines.append(f"{steps} back in the header stamps of {self.topic}, {most}; the log's order is kept")
-        if 0 < self.untimed < self.scans - self.bad:
+        if 1 < self.untimed < self.scans - self.bad:
             lines.append(f"{self._share(self.untimed)} with header stamp 0, as before the first /clock")
         if 0 < self.repeated <= _MOST_REPEATED * self.scans:
             lines.append(f"{self._share(self.repeated)} with the header stamp of the one before")

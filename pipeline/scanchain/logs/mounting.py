@@ -205,10 +205,8 @@ def _disagreeing(
         rival = rivals.get((each.parent, each.child))
         if rival and chain([other for other in transforms if other is not each], base, frame) is None:
             poses = " and then ".join(place_text(pose.T_parent_child) for pose in (rival, each))
-            lines.append(
-                f"/tf_static says of {each.parent} → {each.child}: {poses}; the latest is used, as in tf2: stop "
-                "the wrong publisher"
-            )
+            told = f"/tf_static says of {each.parent} → {each.child}: {poses}"
+            lines.append(f"{told}; the latest is used, as in tf2: stop the wrong publisher")
     return "; ".join(lines)
 
 

@@ -193,8 +193,9 @@ def with_jumps(messages: Iterable[tuple[Decoded, Pose | None]]) -> Iterator[tupl
 def _times(message: Decoded) -> tuple[int, int] | None:
     """Stamp of a scan, and its offset against the log; None without a stamp or a point."""
     returns = message.value
-    is_timed = isinstance(returns, Returns) and len(returns.points) > 0 and returns.stamp_ns != 0
-    return (returns.stamp_ns, returns.stamp_ns - message.log_time_ns) if is_timed else None
+    if not isinstance(returns, Returns) or not len(returns.points) or not returns.stamp_ns:
+        return None
+    return returns.stamp_ns, returns.stamp_ns - message.log_time_ns
 
 
 def _jump_s(before: Sequence[tuple[int, int]], now: tuple[int, int], coming_ns: Sequence[int]) -> float:

@@ -343,12 +343,12 @@ def sampled(
     span: Span | None = None,
     most: int | None = None,
 ) -> Iterator[tuple[int, T]]:
-    """As ``sampled_messages``, with their log times; ``most`` of the block in the middle, at random, in order."""
+    """As ``sampled_messages``, with their log times; of the first block alone ``most`` at random, in order."""
     chosen, at_random = EVERYTHING if span is None else span, Random(0)
     blocks = _blocks_of(indexes, [index.numbers_of(topic) for index in indexes], chosen)
     if span is not None and len(blocks) > _SAMPLED_BLOCKS:
         blocks = [blocks[k * (len(blocks) - 1) // (_SAMPLED_BLOCKS - 1)] for k in range(_SAMPLED_BLOCKS)]
-    for block in blocks[:_SAMPLED_BLOCKS] if most is None else blocks[len(blocks) // 2 :][:1]:
+    for block in blocks[: _SAMPLED_BLOCKS if most is None else 1]:
         messages = messages_of(indexes[block.file], block)
         messages = [each for each in messages if each.channel.topic == topic and chosen.holds(each)]
         if most is not None and len(messages) > most:
