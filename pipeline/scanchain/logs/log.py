@@ -148,7 +148,6 @@ class Log:
         counts = ScanCounts(self.topic, self.odometry_topic)
         times = self._point_times()
         assembler = None if self.sectors is None else Assembler(self.sectors, self.topic)
-        messages = self.scan_count if self.sectors is None else round(self.scan_count * self.sectors.per_sweep)
         self.scans_with_wheels = 0
         count, index, requested_s = 0, 0, working_s()
         try:
@@ -160,9 +159,7 @@ class Log:
                 if unusable := defect(message, preprocess):
                     path = self.indexes[message.channel.key[0]].path
                     complaint = f"{path}: scan {count - 1} of {self.topic} {unusable}"
-                    counts.skip(
-                        complaint, self.scan_count if isinstance(returns, Returns) else messages, self.config
-                    )
+                    counts.skip(complaint, self._expected_like(returns), self.config)
                     continue
                 assert isinstance(returns, Returns)
                 points = returns.points * np.array([1.0, -1.0], np.float32) if self.is_mirrored else returns.points
@@ -188,7 +185,7 @@ class Log:
             self._damage += [*counts.losses(), *poses.complaints()]
             self.bad_scans = counts.bad
             self.notes += [*filter(None, [self._assumed(times)]), *counts.notes()]
-            self.notes += [] if assembler is None else assembler.notes()
+            self.notes += assembler.notes() if assembler else []
         if not index:
             raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
         if is_damaged:
@@ -277,6 +274,12 @@ class Log:
 
     def _notes_on_sectors(self) -> list[str]:
         return [] if self.sectors is None else [self.sectors.note(self.topic)]
+
+    def _expected_like(self, value: object) -> int:
+        """Number of scans to expect or, for what is malformed, of messages."""
+        if self.sectors is None or isinstance(value, Returns):
+            return self.scan_count
+        return round(self.scan_count * self.sectors.per_sweep)
 
     def _expected_scans(self, whole: stream.Span) -> int:
         if self.sectors is None:

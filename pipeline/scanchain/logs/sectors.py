@@ -14,7 +14,7 @@ from scanchain.logs.mcap.records import Decoded
 from scanchain.logs.messages.lidar import Returns
 from scanchain.logs.messages.point_times import UNITS_S
 
-_SAMPLE = 500  # points of a message, evenly spread, by which its direction and width are estimated
+_SAMPLE = 250  # points of a message, evenly spread, by which its direction and width are estimated
 _TURN_RAD = 2.0 * np.pi
 _WIDEST_RAD = 4.0 / 3.0 * np.pi  # of a message above which it is a sweep by itself
 _FEWEST, _MOST = (
@@ -91,8 +91,8 @@ def find_sectors(
     for message in sample:
         if not len(message.returns.points):
             continue
+        direction_rad = _direction(message.returns.points)
         azimuth_rad = _azimuth(message.returns.points[:: len(message.returns.points) // _SAMPLE + 1])
-        direction_rad = _mean(azimuth_rad)
         low_rad, high_rad = np.percentile(_wrapped(azimuth_rad - direction_rad), (5.0, 95.0))
         seen.append(message)
         directions_rad.append(direction_rad)
@@ -231,10 +231,10 @@ class Assembler:
 
         Messages without points follow by the usual angle.
         """
-        sectors, points = self.sectors, returns.points[:: len(returns.points) // _SAMPLE + 1]
+        sectors = self.sectors
         direction_rad = last.direction_rad + sectors.sense * sectors.step_rad if last else 0.0
-        if len(points):
-            direction_rad = _mean(_azimuth(points))
+        if len(returns.points):
+            direction_rad = _direction(returns.points)
         if last is None:
             return self._part(message, returns, self.half_rad, direction_rad), True
         turned_rad = sectors.sense * (direction_rad - last.direction_rad)
@@ -305,9 +305,11 @@ def _azimuth(points: RawPoints) -> NDArray[np.float32]:
     return np.arctan2(points[:, 1], points[:, 0])
 
 
-def _mean(azimuth_rad: NDArray[np.float32]) -> float:
-    """The mean direction."""
-    return float(np.arctan2(np.sin(azimuth_rad).mean(), np.cos(azimuth_rad).mean()))
+def _direction(points: RawPoints) -> float:
+    """Mean azimuth of points (N, d), by some of them."""
+    x, y = points[:: len(points) // _SAMPLE + 1, :2].T
+    ranges_m = np.maximum(np.hypot(x, y), np.finfo(np.float32).tiny)
+    return float(np.arctan2((y / ranges_m).sum(), (x / ranges_m).sum()))
 
 
 def _wrapped(angle_rad: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -317,7 +319,6 @@ def _wrapped(angle_rad: NDArray[np.floating]) -> NDArray[np.floating]:
 
 def _order(returns: Returns) -> float:
     """Covariance of azimuth and time, or else order, of the points of a message: positive counterclockwise."""
-    azimuth_rad = _azimuth(returns.points)
-    turned_rad = _wrapped(azimuth_rad - _mean(azimuth_rad))
+    turned_rad = _wrapped(_azimuth(returns.points) - _direction(returns.points))
     times_s = returns.times_s if len(returns.times_s) else np.linspace(0.0, 1.0, len(turned_rad))
     return float(np.sign(np.mean(turned_rad * (times_s - np.mean(times_s)))))
