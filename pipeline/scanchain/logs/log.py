@@ -26,7 +26,7 @@ from scanchain.logs.messages.poses import RecordedPoses, StampedPose
 from scanchain.logs.messages.readers import is_scan, pose_reader, reader
 from scanchain.logs.mounting import find_mounting, in_plane, is_upside_down
 from scanchain.logs.opening import index_files
-from scanchain.logs.sectors import Assembler, Sampled, find_sectors
+from scanchain.logs.sectors import Assembler, Sampled, expected_sweeps, find_sectors
 from scanchain.logs.topics import find_ground_truth, find_lidar, find_odometry
 from scanchain.settings import load_settings, overrides_of
 
@@ -104,11 +104,11 @@ class Log:
         self.duration_s = whole.duration_s
         self.span = stream.chosen_span(whole, config)
         self.sectors = find_sectors(first_messages, self._decoder_by, config.point_times)
-        self.scan_count = self._expected_scans(whole)
+        self.scan_count = expected_sweeps(stream.count_scans(indexes, self.topic, whole, config), self.sectors)
         self.mounting = find_mounting(indexes, lidar, wheels, self.span)
         self.gaps = stream.gap_notes(indexes, config)  # those of the notes that are of long gaps
-        self.notes += [*self._notes_on_sectors(), *stream.notes_on(indexes, config)]
-        self.notes += self.mounting.notes(self.odometry_topic, self.dimension)
+        self.notes += [self.sectors.note(self.topic)] if self.sectors else []
+        self.notes += stream.notes_on(indexes, config) + self.mounting.notes(self.odometry_topic, self.dimension)
         if self.mounting.motion is not None:
             wheels, self.odometry_topic = None, ""
         T_base_lidar = self.mounting.T_base_lidar
@@ -159,7 +159,7 @@ class Log:
                 if unusable := defect(message, preprocess):
                     path = self.indexes[message.channel.key[0]].path
                     complaint = f"{path}: scan {count - 1} of {self.topic} {unusable}"
-                    counts.skip(complaint, self._expected_like(returns), self.config)
+                    counts.skip(complaint, self.scan_count, self.config)
                     continue
                 assert isinstance(returns, Returns)
                 points = returns.points * np.array([1.0, -1.0], np.float32) if self.is_mirrored else returns.points
@@ -269,20 +269,5 @@ class Log:
 
     def _point_times(self) -> PointTimes:
         """Times of the lidar's points, in the unit that the duration of a sector shows."""
-        config, sectors = self.config, self.sectors
-        return PointTimes(config if sectors is None else replace(config, point_times=sectors.point_times))
-
-    def _notes_on_sectors(self) -> list[str]:
-        return [] if self.sectors is None else [self.sectors.note(self.topic)]
-
-    def _expected_like(self, value: object) -> int:
-        """Number of scans to expect or, for what is malformed, of messages."""
-        if self.sectors is None or isinstance(value, Returns):
-            return self.scan_count
-        return round(self.scan_count * self.sectors.per_sweep)
-
-    def _expected_scans(self, whole: stream.Span) -> int:
-        if self.sectors is None:
-            return stream.count_scans(self.indexes, self.topic, whole, self.config)
-        messages = stream.count_scans(self.indexes, self.topic, whole, replace(self.config, every=1))
-        return -(-self.sectors.sweeps(messages) // self.config.every)
+        by_sectors = {} if self.sectors is None else {"point_times": self.sectors.point_times}
+        return PointTimes(replace(self.config, **by_sectors))
