@@ -219,6 +219,6 @@ def test_scans_that_slip_do_not_convict_the_wheels(tmp_path):
     log = open_log(cut(whole("town", 3, "os1-32"), tmp_path / "cut.mcap", Cut(30.0, times="none")))
     log.sectors = None  # as if they had not been recognized
     odometry = Odometry(configured(3), log.T_base_lidar)
-    steps = [odometry.process(scan) for scan in islice(log.scans(), 200)]
+    steps = [odometry.process(scan) for scan in islice(log.scans(), 300)]
     assert sum(step.state != "ok" for step in steps) > 100
     assert odometry.predictor.warnings() == ()
