@@ -17,7 +17,7 @@ from scanchain.logs.messages.point_times import UNITS_S
 _SAMPLE = 250  # points of a message, evenly spread, by which its direction and width are estimated
 _TURN_RAD = 2.0 * np.pi
 _WIDEST_RAD = 4.0 / 3.0 * np.pi  # of a message above which it is a sweep by itself
-_FEWEST, _MOST = 5, 2000  # messages that show a lidar which looks in one direction, and of the sample
+_FEWEST, _MOST = 3, 2000  # messages that show a lidar which looks in one direction, and of the sample
 _REVOLUTIONS = 2.0  # least number that the sample shows
 _WIDTHS = (0.5, 1.5)  # width of a message over the angle to the next: less leaves holes, more is no sector
 _REGULAR = 0.6  # least share of messages that follow by the usual angle, not a blind angle or missing ones
