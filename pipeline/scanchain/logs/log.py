@@ -26,7 +26,7 @@ from scanchain.logs.messages.poses import RecordedPoses, StampedPose
 from scanchain.logs.messages.readers import is_scan, pose_reader, reader
 from scanchain.logs.mounting import find_mounting, in_plane, is_upside_down
 from scanchain.logs.opening import index_files
-from scanchain.logs.sectors import Assembler, Sampled, expected_sweeps, find_sectors
+from scanchain.logs.sectors import MOST, Assembler, Sampled, expected_sweeps, find_sectors
 from scanchain.logs.topics import find_ground_truth, find_lidar, find_odometry
 from scanchain.settings import load_settings, overrides_of
 
@@ -92,7 +92,7 @@ class Log:
         self.ground_truth_topic = "" if truth is None else truth.topic
         self._sampled_times = PointTimes(config)
         self.plane_height_m: float | None = None
-        sample, first_messages = tee(stream.sampled_messages(indexes, lidar.topic, self._sampled))
+        sample, first_messages = tee(stream.sampled_messages(indexes, lidar.topic, self._sampled, most=MOST))
         if not is_scan(lidar):
             self.plane_height_m = height_m = plane_height_m(each.returns for each in sample)
             if height_m is not None:

@@ -17,7 +17,8 @@ from scanchain.logs.messages.point_times import UNITS_S
 _SAMPLE = 250  # points of a message, evenly spread, by which its direction and width are estimated
 _TURN_RAD = 2.0 * np.pi
 _WIDEST_RAD = 4.0 / 3.0 * np.pi  # of a message above which it is a sweep by itself
-_FEWEST, _MOST = 3, 2000  # messages that show a lidar which looks in one direction, and of the sample
+_FEWEST = 3  # messages that show a lidar which looks in one direction
+MOST = 1000  # messages of the sample, none of which is read once it is clear that each is a sweep
 _REVOLUTIONS = 2.0  # least number that the sample shows
 _WIDTHS = (0.5, 1.5)  # width of a message over the angle to the next: less leaves holes, more is no sector
 _REGULAR = 0.6  # least share of messages that follow by the usual angle, not a blind angle or missing ones
@@ -95,7 +96,7 @@ def find_sectors(
         is_one_way = len(seen) == _FEWEST and np.median(widths_rad) > _WIDTHS[1] * np.median(steps_rad)
         if widths_rad[-1] > _WIDEST_RAD or message.frame != seen[0].frame or is_one_way:
             return None
-        if steps_rad.sum() > (_REVOLUTIONS + 1.0) * _TURN_RAD or len(seen) == _MOST:
+        if steps_rad.sum() > (_REVOLUTIONS + 1.0) * _TURN_RAD or len(seen) == MOST:
             break
     found = _sectors(seen, np.array(directions_rad), float(np.median(widths_rad))) if len(seen) > 2 else None
     return found and _timed(found, seen, decoder, point_times)

@@ -304,14 +304,21 @@ def _ahead(
 
 
 def sampled_messages(
-    indexes: Sequence[FileIndex], topic: str, decode: Callable[[memoryview], T], span: Span | None = None
+    indexes: Sequence[FileIndex],
+    topic: str,
+    decode: Callable[[memoryview], T],
+    span: Span | None = None,
+    most: int = _SAMPLED_BLOCKS,
 ) -> Iterator[T]:
-    """Decoded messages in a topic's first blocks, or in some from all over a span; malformed ones are left out."""
+    """Decoded messages in a topic's first blocks, or in some from all over a span; malformed ones are left out.
+
+    most : number of blocks that are read
+    """
     chosen = EVERYTHING if span is None else span
     blocks = _blocks_of(indexes, [index.numbers_of(topic) for index in indexes], chosen)
-    if span is not None and len(blocks) > _SAMPLED_BLOCKS:
-        blocks = [blocks[k * (len(blocks) - 1) // (_SAMPLED_BLOCKS - 1)] for k in range(_SAMPLED_BLOCKS)]
-    for block in blocks[:_SAMPLED_BLOCKS]:
+    if span is not None and len(blocks) > most:
+        blocks = [blocks[k * (len(blocks) - 1) // (most - 1)] for k in range(most)]
+    for block in blocks[:most]:
         for message in messages_of(indexes[block.file], block):
             if message.channel.topic == topic and chosen.holds(message):
                 with suppress(MalformedMessageError):
