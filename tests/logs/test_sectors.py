@@ -5,6 +5,7 @@ from itertools import islice
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from scanchain import Odometry
 from scanchain.config import Config, LogConfig
@@ -12,7 +13,7 @@ from scanchain.logs import open_log
 from scanchain.logs.doctor import examine
 from scanchain.simulation import SENSORS
 from tests.support.messages import says
-from tests.support.naive_logs import STAMP_NS, laser_scan, point_cloud, scan_said, write
+from tests.support.naive_logs import STAMP_NS, Said, laser_scan, point_cloud, scan_said, write
 from tests.support.naive_logs import cloud_said as cloud
 from tests.support.scenes import configured, shared_data
 from tests.support.sectors import PERIOD_NS, Cut, cut, whole
@@ -23,6 +24,11 @@ SPATIAL, PLANAR = ("town", 3, "vlp-16"), ("office", 3, "all-around")
 def read(path, **config):
     log = open_log(path, LogConfig(**config))
     return log, list(log.scans())
+
+
+def raw(path):
+    with path.open("rb") as stream:
+        yield from make_reader(stream).iter_messages()
 
 
 def sweeps(tmp_path, how, of=SPATIAL, **config):
@@ -94,6 +100,15 @@ def test_sectors_that_do_not_divide_the_revolution_are_split_at_its_end(tmp_path
         assert scan.times_s.min() > -0.005 and 0.09 < np.ptp(scan.times_s) < 0.105
 
 
+def test_sectors_are_recognized_in_a_file_of_one_message_a_chunk(tmp_path):
+    path = cut(whole(*PLANAR), tmp_path / "cut.mcap", Cut(30.0))
+    said = [
+        Said(channel.topic, schema.name, message.log_time, message.data) for schema, channel, message in raw(path)
+    ]
+    log = open_log(write(tmp_path / "chunks.mcap", said, chunk_size=1))
+    assert log.scan_count == 30 and log.sectors.per_sweep == 12
+
+
 def test_sectors_that_overlap_make_sweeps_too(tmp_path):
     expected, log, scans = sweeps(tmp_path, Cut(90.0, overlap_deg=15.0))
     assert [scan.stamp_ns for scan in scans] == [scan.stamp_ns for scan in expected]
@@ -114,7 +129,7 @@ def test_a_gap_of_more_than_a_revolution_ends_a_sweep(tmp_path):
     expected, log, scans = sweeps(tmp_path, Cut(30.0, dropped=tuple(range(12 * 9 + 2, 12 * 12 + 5))))
     assert_same(scans[:9], expected[:9])
     assert max(np.ptp(scan.times_s) for scan in scans) < 0.101  # no sweep across the gap
-    assert scans[9].stamp_ns == expected[12].stamp_ns + 5 * PERIOD_NS // 12
+    assert abs(scans[9].stamp_ns - expected[12].stamp_ns - 5 * PERIOD_NS // 12) <= 1
     assert any(
         "1 sweep of /points left out" in note or "2 sweeps of /points left out" in note for note in log.notes
     )
@@ -132,13 +147,14 @@ def test_parts_and_every_count_sweeps(tmp_path):
     expected, log, scans = sweeps(tmp_path, Cut(30.0), every=3)
     assert_same(scans, expected[::3])
     assert log.scan_count == len(scans)
+    assert_same(list(log.scans()), scans)  # as a run needs that resumes
     log, scans = read(tmp_path / "cut.mcap", start_s=1.0, end_s=2.0)
     assert abs(log.scan_count - len(scans)) <= 1 and 9 <= len(scans) <= 10
     assert all(np.ptp(scan.times_s) < 0.101 for scan in scans)
     assert min(len(scan.points) for scan in scans[:-1]) > 0.9 * len(expected[0].points)
 
 
-def test_info_doctor_and_run_name_the_sectors_and_a_run_resumes_among_them(call, tmp_path):
+def test_info_doctor_and_run_name_the_sectors_and_count_sweeps(call, tmp_path):
     path = cut(whole(*SPATIAL), tmp_path / "cut.mcap", Cut(90.0))
     line = "/points: each message holds 90° of a revolution: 4 messages are assembled to one sweep"
     code, output, _ = call("info", path)
@@ -219,6 +235,6 @@ def test_scans_that_slip_do_not_convict_the_wheels(tmp_path):
     log = open_log(cut(whole("town", 3, "os1-32"), tmp_path / "cut.mcap", Cut(30.0, times="none")))
     log.sectors = None  # as if they had not been recognized
     odometry = Odometry(configured(3), log.T_base_lidar)
-    steps = [odometry.process(scan) for scan in islice(log.scans(), 200)]
+    steps = [odometry.process(scan) for scan in islice(log.scans(), 300)]
     assert sum(step.state != "ok" for step in steps) > 100
     assert odometry.predictor.warnings() == ()

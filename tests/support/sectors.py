@@ -106,7 +106,7 @@ def _scans(swept, how):
     for number, begin_ns, end_ns in _intervals(stamps, how):
         if number in how.dropped:
             continue
-        start, end = (int(np.ceil((each - stamps[0]) / beam_ns - 1e-6)) for each in (begin_ns, end_ns))
+        start, end = (int(np.ceil((each - stamps[0]) / beam_ns - 1e-3)) for each in (begin_ns, end_ns))
         end = min(end + round(how.overlap_deg / 360.0 * beams), len(ranges))
         part = ranges[start:end]
         yield end_ns, pack_laser_scan(

@@ -27,7 +27,7 @@ from scanchain.logs.messages.readers import is_scan, pose_reader, reader
 from scanchain.logs.mounting import between_frames, find_mounting, find_wheels, in_plane, is_upside_down
 from scanchain.logs.opening import index_files
 from scanchain.logs.publishers import LatestPoints, Publishers, with_jumps
-from scanchain.logs.sectors import Assembler, Sampled, find_sectors
+from scanchain.logs.sectors import MOST, Assembler, Sampled, expected_sweeps, find_sectors
 from scanchain.logs.sweep_times import SweepTimes
 from scanchain.logs.topics import find_ground_truth, find_lidar
 from scanchain.settings import load_settings, overrides_of
@@ -95,20 +95,21 @@ class Log:
         self.topic = lidar.topic
         self.ground_truth_topic = "" if truth is None else truth.topic
         self._sampled_times = PointTimes(config)
-        sample, first_messages = tee(stream.sampled_messages(indexes, lidar.topic, self._sampled))
+        sample, first_messages = tee(stream.sampled_messages(indexes, lidar.topic, self._sampled, most=MOST))
         self.plane_height_m: float | None = None  # also while the sample is decoded
         self.plane_height_m = self._plane_height_m(sample)
         self.dimension = 2 if is_scan(lidar) or self.plane_height_m is not None else 3
         self.duration_s = (whole := stream.whole_span(indexes)).duration_s
         self.span = stream.chosen_span(whole, config)
         self.sectors = find_sectors(first_messages, self._decoder_by, config.point_times)
-        self.scan_count = self._expected_scans(whole)
+        self.scan_count = expected_sweeps(stream.count_scans(indexes, self.topic, whole, config), self.sectors)
         self.publishers = self._publishers()
         frame = self.publishers.frame
         wheels = find_wheels(indexes, frame, config, self.span, self.notes)
         self.mounting = mounting = find_mounting(indexes, frame, wheels, self.span)
         self.gaps = stream.gap_notes(indexes, config)  # those of the notes that are of long gaps
-        self.notes += [*self._notes_on_sectors(), *stream.notes_on(indexes, config)]
+        self.notes += [self.sectors.note(self.topic)] if self.sectors else []
+        self.notes += stream.notes_on(indexes, config)
         self.notes += mounting.notes(wheels.channel.topic if wheels else "", self.dimension)
         wheels = wheels if mounting.motion is None else None
         self.odometry_topic, self.wheels = (wheels.channel.topic, wheels.text) if wheels else ("", "")
@@ -179,7 +180,10 @@ class Log:
                 jump_s = jumped_s or jump_s
                 if (count - 1) % self.config.every:
                     continue
-                if self._skips(message, count - 1, counts, preprocess):
+                if unusable := defect(message, preprocess):
+                    path = self.indexes[message.channel.key[0]].path
+                    complaint = f"{path}: scan {count - 1} of {self.topic} {unusable}"
+                    counts.skip(complaint, self.scan_count, self.config)
                     continue
                 returns = message.value
                 assert isinstance(returns, Returns)
@@ -211,18 +215,6 @@ class Log:
         if is_damaged:
             scans = counted(count - counts.bad, "scan")
             self._damage.append(f"{scans} of {self.topic} {'was' if scans == '1 scan' else 'were'} recovered")
-
-    def _skips(
-        self, message: Decoded, number: int, counts: ScanCounts, preprocess: PreprocessConfig | None
-    ) -> bool:
-        """True of a scan that cannot be used, which is counted; of a malformed message among those expected."""
-        unusable = defect(message, preprocess)
-        if unusable:
-            is_sweep = self.sectors is None or isinstance(message.value, Returns)
-            expected = self.scan_count if is_sweep else round(self.scan_count * self.sectors.per_sweep)
-            path = self.indexes[message.channel.key[0]].path
-            counts.skip(f"{path}: scan {number} of {self.topic} {unusable}", expected, self.config)
-        return bool(unusable)
 
     def _conclude(self, counts: ScanCounts, poses: RecordedPoses, assembler: Assembler | None) -> None:
         """Note what was met in all scans."""
@@ -323,14 +315,5 @@ class Log:
 
     def _point_times(self) -> PointTimes:
         """Times of the lidar's points, in the unit that the duration of a sector shows."""
-        config, sectors = self.config, self.sectors
-        return PointTimes(config if sectors is None else replace(config, point_times=sectors.point_times))
-
-    def _notes_on_sectors(self) -> list[str]:
-        return [] if self.sectors is None else [self.sectors.note(self.topic)]
-
-    def _expected_scans(self, whole: stream.Span) -> int:
-        if self.sectors is None:
-            return stream.count_scans(self.indexes, self.topic, whole, self.config)
-        messages = stream.count_scans(self.indexes, self.topic, whole, replace(self.config, every=1))
-        return -(-self.sectors.sweeps(messages) // self.config.every)
+        by_sectors = {} if self.sectors is None else {"point_times": self.sectors.point_times}
+        return PointTimes(replace(self.config, **by_sectors))

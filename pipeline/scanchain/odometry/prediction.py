@@ -29,7 +29,7 @@ _MEMORY = 0.9  # weight of the mean of the squared errors so far against the nex
 _SUDDEN = 0.25  # share of the last squared error below which the mean does not fall
 _KNOWN = 5  # number of errors needed before the mean is used
 _CAUTION = 2.0  # factor from the root mean square to the standard deviation that is given
-_MOST_DOUBTFUL = 0.5  # share of the last scans, lost or contradicted, above which scans count for nothing
+_MOST_DOUBTFUL = 0.5  # share of the last scans in doubt, above which scans do not contradict the wheels
 _LEAST_M, _LEAST_RAD = 0.002, 0.0005  # smallest standard deviation that is given
 
 
@@ -237,7 +237,7 @@ class Predictor:
         self.lost_s = 0.0
         self.T_odom_base: Pose | None = None  # by the wheels at the last scan, where nothing contradicts it
         self.is_contradicted = False  # the reading at this scan
-        self.scans, self.doubtful = 0, 0.0  # that were corrected; share of the last ones, lost or contradicted
+        self.scans, self.doubtful = 0, 0.0  # that were corrected; share of the last ones in doubt, 1 after a jump
         self.jumps: list[tuple[int, float]] = []  # scan and meters of each reading that was left out
 
     def predict(self, scan: Scan, *, by_wheels: bool = True) -> Prediction:
@@ -275,7 +275,7 @@ class Predictor:
 
     @property
     def doubts_scans(self) -> bool:
-        """True if most of the last scans were lost or contradicted: they are no evidence against the wheels."""
+        """True if most of the last scans were lost or contradicted, or one jumped: no evidence against wheels."""
         return self.doubtful > _MOST_DOUBTFUL
 
     def drop_wheels(self, scan: Scan, jump_m: float) -> None:
@@ -304,6 +304,9 @@ class Predictor:
         self.scans += 1
         is_doubtful = state is State.LOST or (state is State.OK and match.fit < LEAST_FIT)
         self.doubtful += max(1.0 - _MEMORY, 1.0 / self.scans) * (is_doubtful - self.doubtful)
+        is_known = not (prediction.is_guess or prediction.is_second)
+        if is_known and largest_magnitude(T_odom_lidar - prediction.T_odom_lidar) > _JUMP:
+            self.doubtful = 1.0
         self.intervals.take(scan, prediction.interval_s)
         T_odom_base = None if self.is_contradicted else scan.T_odom_base
         self.T_odom_base = None if T_odom_base is None else T_odom_base.copy()

@@ -329,10 +329,17 @@ def _ahead(
 
 
 def sampled_messages(
-    indexes: Sequence[FileIndex], topic: str, decode: Callable[[memoryview], T], span: Span | None = None
+    indexes: Sequence[FileIndex],
+    topic: str,
+    decode: Callable[[memoryview], T],
+    span: Span | None = None,
+    most: int = _SAMPLED_BLOCKS,
 ) -> Iterator[T]:
-    """Decoded messages in a topic's first blocks, or in some from all over a span; malformed ones are left out."""
-    for _, decoded in sampled(indexes, topic, decode, span):
+    """Decoded messages in a topic's first blocks, or in some from all over a span; malformed ones are left out.
+
+    most : number of blocks that are read
+    """
+    for _, decoded in sampled(indexes, topic, decode, span, blocks=most):
         yield decoded
 
 
@@ -342,13 +349,15 @@ def sampled(
     decode: Callable[[memoryview], T],
     span: Span | None = None,
     most: int | None = None,
+    *,
+    blocks: int = _SAMPLED_BLOCKS,
 ) -> Iterator[tuple[int, T]]:
     """As ``sampled_messages``, with their log times; of the first block alone ``most`` at random, in order."""
     chosen, at_random = EVERYTHING if span is None else span, Random(0)
-    blocks = _blocks_of(indexes, [index.numbers_of(topic) for index in indexes], chosen)
-    if span is not None and len(blocks) > _SAMPLED_BLOCKS:
-        blocks = [blocks[k * (len(blocks) - 1) // (_SAMPLED_BLOCKS - 1)] for k in range(_SAMPLED_BLOCKS)]
-    for block in blocks[: _SAMPLED_BLOCKS if most is None else 1]:
+    found = _blocks_of(indexes, [index.numbers_of(topic) for index in indexes], chosen)
+    if span is not None and len(found) > blocks:
+        found = [found[k * (len(found) - 1) // (blocks - 1)] for k in range(blocks)]
+    for block in found[: blocks if most is None else 1]:
         messages = messages_of(indexes[block.file], block)
         messages = [each for each in messages if each.channel.topic == topic and chosen.holds(each)]
         if most is not None and len(messages) > most:
