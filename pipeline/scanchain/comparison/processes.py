@@ -37,7 +37,7 @@ class StoredScans:
     points : (N,) numbers of points of each scan
     stamps_ns, log_times_ns : (N,) as in ``Scan``
     wheels : (N, d+1, d+1) T_odom_base, NaN where the log has none
-    T_base_lidar : (d+1, d+1)
+    T_base_lidar : (d+1, d+1); is_mounted : whether the log states it
     """
 
     file: Path
@@ -46,6 +46,7 @@ class StoredScans:
     log_times_ns: NDArray[np.int64]
     wheels: NDArray[np.float64]
     T_base_lidar: Pose
+    is_mounted: bool = True
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -68,7 +69,7 @@ class StoredScans:
                 yield pickle.load(file)
 
 
-def store(scans: Iterable[Scan], T_base_lidar: Pose, path: Path) -> StoredScans:
+def store(scans: Iterable[Scan], T_base_lidar: Pose, path: Path, *, is_mounted: bool = True) -> StoredScans:
     """Write scans into a file."""
     rows: list[tuple[int, ...]] = []
     wheels: list[Pose] = []
@@ -79,7 +80,7 @@ def store(scans: Iterable[Scan], T_base_lidar: Pose, path: Path) -> StoredScans:
             rows.append((len(scan.points), scan.stamp_ns, scan.log_time_ns))
             wheels.append(unknown if scan.T_odom_base is None else scan.T_odom_base)
     points, stamps_ns, log_times_ns = np.array(rows, np.int64).T.copy()
-    return StoredScans(path, points, stamps_ns, log_times_ns, np.array(wheels), T_base_lidar)
+    return StoredScans(path, points, stamps_ns, log_times_ns, np.array(wheels), T_base_lidar, is_mounted)
 
 
 class Status(StrEnum):
