@@ -1,5 +1,6 @@
 """A lidar whose mounting the log does not state, or states wrongly: the motions of wheels and lidar tell."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -75,7 +76,7 @@ def test_a_transform_that_the_motions_contradict_is_named_and_one_that_they_conf
         "lidar at x 0.20, y 0.00 m of the base",
         "contradict the mounting that was taken: lidar turned by 180.",
     )
-    says(text, "deg, 0.20 m ahead of the base, 0.0")
+    assert re.search(r"deg, 0\.(19|20|21) m ahead of the base", text), text
     assert "disagree" not in text
     right = simulated("right", mounted(90, 0.2), tmp_path, stated=mounted(90, 0.2))
     _, text = run(right, tmp_path, force=True)

@@ -79,7 +79,12 @@ def test_in_space_a_lidar_upside_down_is_so_and_level_is_assumed():
 
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_straight_drive_shows_the_yaw_and_leaves_the_place_at_the_origin(dimension):
-    found = solved(*driven(mounted(90, 0.3, 0.2, dimension), turn_rad=0.0))
+    lidar, wheels = driven(mounted(90, 0.3, 0.2, dimension), turn_rad=0.0)
+    noise = np.random.default_rng(1).normal(0.0, 0.003, len(wheels))  # of the wheels' heading, whatever its sense
+    for sign in (-1.0, 1.0):
+        wobbling = wheels @ lie.exp(np.eye(lie.twist_size(wheels[0]))[-1] * sign * noise[:, None])
+        assert not solved(lidar, wobbling).is_mirrored
+    found = solved(lidar, wheels)
     assert found.sigma_m > 0.1
     np.testing.assert_array_equal(found.T_base_lidar[:-1, -1], 0.0)
     assert abs(float(lie.yaw(found.T_base_lidar)) - np.pi / 2) < 4.0 * found.sigma_rad

@@ -102,7 +102,7 @@ def compare(comparison: Comparison, present: Callable[[Path], None], progress: P
         shared = directory.path / _SHARED
         shared.mkdir()
         decoded = progress.track(log.scans(settings.config.preprocess), log.scan_count)
-        scans = store(decoded, log.T_base_lidar, shared / "scans")
+        scans = store(decoded, log.T_base_lidar, shared / "scans", is_mounted=log.stated_mounting is not None)
         stopped = (
             f"the user stopped the reading: {counted(len(scans), 'scan')} compared" if progress.stopped else ""
         )

@@ -21,13 +21,12 @@ from scanchain.slam import Slam
 class Ours:
     """Odometry, with loop closures and pose graph where the method closes loops."""
 
-    def __init__(self, method: Method, T_base_lidar: Pose) -> None:
+    def __init__(self, method: Method, T_base_lidar: Pose, *, is_mounted: bool = True) -> None:
         self.config = config = msgspec.convert(method.settings, Config)
         self.has_loops = config.loops.enabled
         closing = "; loops closed, pose graph optimized at the end" if self.has_loops else ""
         self.description = f"{_description(config)}{closing}"
-        self.slam = Slam(config, T_base_lidar)
-        self.T_base_lidar = T_base_lidar
+        self.slam = Slam(config, T_base_lidar if is_mounted else None, dimension=len(T_base_lidar) - 1)
         self.steps = StepTable()
 
     def track(self, scan: Scan) -> Pose:
@@ -40,7 +39,7 @@ class Ours:
         """The final poses; tables and the expected ATE go into the folder."""
         result = self.slam.finish()
         trajectory = result.trajectory if self.has_loops else odometry
-        self.steps.write(folder / STEPS_FILE, trajectory, self.T_base_lidar)
+        self.steps.write(folder / STEPS_FILE, trajectory, result.T_base_lidar)
         expected = expected_of(result, self.config)
         known = {"expected_ate_m": expected and expected.ate}
         (folder / METRICS_FILE).write_bytes(msgspec.json.encode(known))

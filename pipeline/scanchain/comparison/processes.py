@@ -39,7 +39,7 @@ class StoredScans:
     points : (N,) numbers of points of each scan
     stamps_ns, log_times_ns : (N,) as in ``Scan``
     wheels : (N, d+1, d+1) T_odom_base, NaN where the log has none
-    T_base_lidar : (d+1, d+1)
+    T_base_lidar : (d+1, d+1); is_mounted : whether the log states it
     """
 
     file: Path
@@ -48,6 +48,7 @@ class StoredScans:
     log_times_ns: NDArray[np.int64]
     wheels: NDArray[np.float64]
     T_base_lidar: Pose
+    is_mounted: bool = True
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -91,7 +92,7 @@ def decode(data: bytes, kind: type[T]) -> T:
     return msgspec.msgpack.decode(data, type=kind, dec_hook=made)
 
 
-def store(scans: Iterable[Scan], T_base_lidar: Pose, path: Path) -> StoredScans:
+def store(scans: Iterable[Scan], T_base_lidar: Pose, path: Path, *, is_mounted: bool = True) -> StoredScans:
     """Write scans into a file."""
     rows: list[tuple[int, ...]] = []
     wheels: list[Pose] = []
@@ -103,7 +104,7 @@ def store(scans: Iterable[Scan], T_base_lidar: Pose, path: Path) -> StoredScans:
             rows.append((len(scan.points), scan.stamp_ns, scan.log_time_ns))
             wheels.append(unknown if scan.T_odom_base is None else scan.T_odom_base)
     points, stamps_ns, log_times_ns = np.array(rows, np.int64).T.copy()
-    return StoredScans(path, points, stamps_ns, log_times_ns, np.array(wheels), T_base_lidar)
+    return StoredScans(path, points, stamps_ns, log_times_ns, np.array(wheels), T_base_lidar, is_mounted)
 
 
 class Status(StrEnum):

@@ -36,13 +36,13 @@ _WARM_UP_SCANS = 4
 _MAX_CHARACTERS = 300  # largest length of the message of an error raised by other code
 
 
-def start(method: Method, T_base_lidar: Pose) -> Ours | _Others:
+def start(method: Method, T_base_lidar: Pose, *, is_mounted: bool = True) -> Ours | _Others:
     """The method before its first scan. Raises MissingExtraError where its package is not installed."""
     if not method.is_ours:
         return _Others(method, len(T_base_lidar) - 1)
     from scanchain.comparison.ours import Ours  # much code, which is not to count as memory of the others
 
-    return Ours(method, T_base_lidar)
+    return Ours(method, T_base_lidar, is_mounted=is_mounted)
 
 
 class _Others:
@@ -69,7 +69,7 @@ def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
     """Track every scan, then finish."""
     began = perf_counter()
     warm_up(scans.scans(), method, scans.T_base_lidar)
-    runner = start(method, scans.T_base_lidar)
+    runner = start(method, scans.T_base_lidar, is_mounted=scans.is_mounted)
     start_s = perf_counter() - began
     track = open_memmap(folder / processes.TRACK_FILE, "w+", scans.track_type, (len(scans),))
     track[:] = np.nan

@@ -16,6 +16,7 @@ _ROUNDS, _USUAL_M, _LEAST_M = 10, 0.02, 0.002  # of the robust regression; resid
 _PRIOR_M, _NOWHERE_M = 1.0, 1e-6  # σ of the place where nothing is known, and of the base's origin
 _LARGEST_SHARE = 0.25  # of the motions that is left as residual, above which no mounting explains them
 _YAW_RAD, _PLACE_M = np.radians(5.0), 0.05  # largest σ of what is observable
+_OPPOSED, _LEAST_TURN_RAD = 0.5, 0.3  # correlation of turns, and these over the log, that show a lidar upside down
 _APART_M, _EXPLAINED = 0.2, 0.5  # place, and share of the residual left, from which on a mounting is another
 
 
@@ -70,7 +71,8 @@ def hand_eye(base: Matrix, lidar: Matrix) -> HandEye | None:
     if len(base) < _FEWEST:
         return None
     turn, theta = lie.log(base)[:, -1], lie.log(lidar)[:, -1]
-    up = -1.0 if turn @ theta < -_EXPLAINED * (turn @ turn) else 1.0
+    is_opposed = turn @ theta < -_OPPOSED * np.linalg.norm(turn) * np.linalg.norm(theta)
+    up = -1.0 if is_opposed and np.linalg.norm(turn) > _LEAST_TURN_RAD else 1.0
     c, s, x, y = np.cos(theta) - 1.0, up * np.sin(theta), lidar[:, 0, -1], up * lidar[:, 1, -1]
     J = np.stack([np.stack([c, -s, -x, y], axis=1), np.stack([s, c, -y, -x], axis=1)], axis=1)  # (M, 2, 4)
     z = -base[:, :2, -1]
@@ -84,10 +86,11 @@ def hand_eye(base: Matrix, lidar: Matrix) -> HandEye | None:
         _, p, residual_m = _solved(J, z, _NOWHERE_M)
     if residual_m > _LARGEST_SHARE * float(np.median(path_m(base))) or sigma_rad > _YAW_RAD:
         return None
-    T = lie.pose_2d(*(p[:2] / scale if sigma_m < _PLACE_M else (0.0, 0.0)), float(np.arctan2(p[3], p[2])))
+    x_m, y_m = p[:2] / scale if sigma_m < _PLACE_M else np.zeros(2)
+    T = lie.pose_2d(x_m, y_m, float(np.arctan2(p[3], p[2])))
     T = T @ np.diag([1.0, up, 1.0]) if base.shape[-1] == 3 else lie.lift(T) @ np.diag([1.0, up, up, 1.0])
-    left = residual_m / float(np.median(np.linalg.norm(z - J @ [0.0, 0.0, 1.0, 0.0], axis=1)))
-    return HandEye(T, sigma_rad, sigma_m, left)
+    as_one_m = float(np.median(np.linalg.norm(z - J @ [0.0, 0.0, 1.0, 0.0], axis=1)))
+    return HandEye(T, sigma_rad, sigma_m, residual_m / max(as_one_m, _LEAST_M))
 
 
 def path_m(motions: Matrix) -> NDArray[np.float64]:
@@ -98,6 +101,7 @@ def path_m(motions: Matrix) -> NDArray[np.float64]:
 def _solved(J: Matrix, z: Matrix, prior_m: float) -> tuple[Matrix, NDArray[np.float64], float]:
     """Covariance (4, 4) and value (4,) of J (M, 2, 4) p = z (M, 2), the first two 0 ± prior_m; median residual."""
     weight, variance = np.ones(len(z)), _USUAL_M**2
+    H, p, residuals = np.eye(4), np.zeros(4), np.zeros(len(z))
     for _ in range(_ROUNDS):
         H = np.einsum("mij,m,mik->jk", J, weight, J) / variance + np.diag([prior_m**-2.0] * 2 + [1e-6] * 2)
         p = np.linalg.solve(H, np.einsum("mij,m,mi->j", J, weight, z) / variance)
