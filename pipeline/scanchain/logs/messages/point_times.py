@@ -22,8 +22,8 @@ _SHORTEST_SCAN_NS = 500_000  # span of a scan's whole numbers, below which they 
 _LONGEST_SCAN = 1e4  # span in milliseconds, above which floats are micro- or nanoseconds
 _NEAR_S = 1.0  # largest time between the stamp of a scan and its beginning
 _ABSOLUTE_S = 3600.0  # least absolute time in seconds
-_TAIL = 0.05  # share of a scan's times at either end that do not count for its core
-_SAMPLE = np.sort(np.random.default_rng(0).random(256))  # places, 0 to 1, of the times whose quantiles are taken
+_TAIL = 0.15  # share of a scan's times at either end that do not count for its core
+_SAMPLE = np.sort(np.random.default_rng(0).random(512))  # places, 0 to 1, of the times whose quantiles are taken
 
 
 class Field(NamedTuple):
@@ -38,7 +38,7 @@ class Field(NamedTuple):
 
     name: str
     kind: str
-    values: NDArray[np.int64] | NDArray[np.float64]
+    values: NDArray[np.int64 | np.float64]
     low: float
     span: float
     begin: float
@@ -46,7 +46,7 @@ class Field(NamedTuple):
     unit: str = ""
     origin: str = ""
 
-    def seconds(self, stamp_ns: int) -> NDArray[np.float64] | NDArray[np.float32]:
+    def seconds(self, stamp_ns: int) -> NDArray[np.float32]:
         """Times (N,) after the stamp by unit and origin."""
         unit_s, zero = UNITS_S[self.unit], self.low if self.origin == CLOCK else 0
         if self.origin == EPOCH:
