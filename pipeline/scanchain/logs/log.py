@@ -26,7 +26,6 @@ from scanchain.logs.messages.poses import RecordedPoses, StampedPose
 from scanchain.logs.messages.readers import is_scan, pose_reader, reader
 from scanchain.logs.mounting import find_mounting, in_plane, is_upside_down
 from scanchain.logs.opening import index_files
-from scanchain.logs.sweep_times import SweepTimes
 from scanchain.logs.topics import find_ground_truth, find_lidar, find_odometry
 from scanchain.settings import load_settings, overrides_of
 
@@ -91,7 +90,7 @@ class Log:
         self.topic = lidar.topic
         self.odometry_topic = "" if wheels is None else wheels.topic
         self.ground_truth_topic = "" if truth is None else truth.topic
-        self._sampled_times = PointTimes(config)
+        self._sampled_times = self.times = PointTimes(config)
         self.plane_height_m: float | None = None
         if not is_scan(lidar):
             clouds = stream.sampled_messages(indexes, lidar.topic, self.decoder(self._sampled_times))
@@ -118,7 +117,6 @@ class Log:
         with_poses = [each for each in (wheels, truth) if each is not None]
         self.pose_decoders = {each.topic: pose_reader(each, self.dimension) for each in with_poses}
         self.scans_with_wheels = self.bad_scans = 0
-        self.times = SweepTimes(config, self.topic)
         self._opening_notes = tuple(self.notes)
         self._truth: Trajectory | None = None
 
@@ -147,7 +145,7 @@ class Log:
         self.notes = list(self._opening_notes)
         poses = RecordedPoses(self.odometry_topic, self.ground_truth_topic)
         counts = ScanCounts(self.topic, self.odometry_topic)
-        self.times = times = SweepTimes(self.config, self.topic)
+        self.times = times = PointTimes(self.config)
         self.scans_with_wheels = 0
         count, index, requested_s = 0, 0, working_s()
         try:
@@ -182,9 +180,9 @@ class Log:
             self._truth = poses.ground_truth()
         finally:  # also where the caller wants no more scans
             is_damaged = bool(self._damage)
-            self._damage += [*counts.losses(), *times.warnings(), *poses.complaints()]
+            self._damage += [*counts.losses(), *times.warnings(self.topic), *poses.complaints()]
             self.bad_scans = counts.bad
-            self.notes += [*times.notes(), *counts.notes()]
+            self.notes += [*filter(None, [times.assumed]), *times.faults(self.topic), *counts.notes()]
         if not index:
             raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
         if is_damaged:
@@ -220,12 +218,12 @@ class Log:
             self._truth = poses.ground_truth()
         return self._truth
 
-    def _with_poses(self, poses: RecordedPoses, times: SweepTimes) -> Iterator[tuple[Decoded, Pose | None]]:
+    def _with_poses(self, poses: RecordedPoses, times: PointTimes) -> Iterator[tuple[Decoded, Pose | None]]:
         """Lidar messages with the wheels' pose at their stamp; they wait a little for the readings behind them."""
-        decoders = {self.topic: self.decoder(PointTimes(self.config)), **self.pose_decoders}
+        decoders = {self.topic: self.decoder(times), **self.pose_decoders}
         waiting: deque[Decoded] = deque()
         messages = stream.decoded_messages(self.indexes, decoders, self.span, damage=self._damage)
-        for message in chain(times.judged(messages), [None]):
+        for message in chain(times.judged(messages, self.topic), [None]):
             if message is not None and message.channel.topic == self.topic:
                 waiting.append(message)
             elif message is not None:
@@ -241,7 +239,7 @@ class Log:
                 yield scan, poses.at(scan.value.stamp_ns) if isinstance(scan.value, Returns) else None
 
     def decoder(self, times: PointTimes) -> Callable[[memoryview], Returns]:
-        """Decoder of the lidar's messages to points; ``times`` reads theirs."""
+        """Decoder of the lidar's messages to points; ``times`` collects its assumptions about theirs."""
         if is_scan(self.lidar):
             return partial(decode_laser_scan, read=reader(self.lidar), config=self.config)
         return partial(decode_cloud, read=reader(self.lidar), times=times, plane_m=self.plane_height_m)
