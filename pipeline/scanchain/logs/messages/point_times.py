@@ -37,10 +37,7 @@ _BEFORE, _AFTER = 12, 3  # scans before and after a scan that are its neighbors
 _SHORT, _LONG = 0.9, 1.2  # shares of the usual span outside which a sweep's times are looked at one by one
 _LOW_RATE, _OVERLAPPED = 0.5, 1.25  # shares of the period outside which it does not confirm the usual span
 _TAILS = 3.0  # spans of its core that a sweep is not longer than where the period says nothing
-_FULL, _LONGEST = (
-    0.85,
-    2.5,
-)  # share of its span from which on a core fills a longer sweep, up to so many usual spans
+_FULL, _LONGEST = 0.85, 2.5  # least share of its core in a longer sweep that is right, up to so many usual spans
 _OVERLAP = 10.0  # periods that no sweep is longer than, not one of a sliding window either
 _STEP = 0.25  # of the usual span: a larger step back from point to point begins a row, or a counter anew
 _COUNTERS, _WRAPPED = (1 << 16, 1 << 32), 0.98  # numbers at which counters wrap; share that the values then span
@@ -82,14 +79,15 @@ class Field(NamedTuple):
         unit_s, zero = UNITS_S[self.unit], self.low if self.origin == _CLOCK else 0
         if self.origin == _EPOCH:
             zero = _in_units(stamp_ns, unit_s, is_whole=self.values.dtype.kind == "i")
-        values = self.values - zero if zero else self.values
-        times_s = np.empty(len(values), np.float32)
+        times_s = np.empty(len(self.values), np.float32)
         with np.errstate(over="ignore", invalid="ignore"):
+            values = self.values - zero if zero else self.values
             return np.multiply(values, unit_s, out=times_s, dtype=np.float64, casting="unsafe")
 
     def steps_back(self, least: float) -> int:
         """Number of points whose values fall so far behind those of the points before them."""
-        return int(np.count_nonzero(np.diff(self.values) < -least))
+        with np.errstate(over="ignore", invalid="ignore"):
+            return int(np.count_nonzero(np.diff(self.values) < -least))
 
 
 class Beams(NamedTuple):
@@ -167,10 +165,13 @@ class PointTimes:
             sample, first = sample[np.isfinite(sample)], values.min(where=np.isfinite(values), initial=np.inf)
             span = nan
         many = int(_CORE * len(sample))
-        core = float((sample[many:] - sample[: len(sample) - many]).min()) / _CORE if many else 0.0
+        with np.errstate(over="ignore"):
+            core = float((sample[many:] - sample[: len(sample) - many]).min()) / _CORE if many else 0.0
         core = span if core > span else core  # of few points
         begin = sample[(len(sample) - many) // 2] if many else first
-        low = first if first >= begin - core else values[values >= begin - core].min()
+        low = first
+        if float(first) < float(begin) - core:
+            low = values.min(where=values >= float(begin) - core, initial=begin)
         unit = self.unit or _likely_unit(core, is_whole=is_whole)
         low_s, origin = float(low) * UNITS_S[unit], _STAMP
         after = float(low) - float(_in_units(stamp_ns, UNITS_S[unit], is_whole=is_whole))
@@ -224,6 +225,8 @@ class PointTimes:
 
     def _judge(self, returns: Returns, around: Sequence[Returns]) -> Returns:
         times_s, points, done, seen = returns.times_s, returns.points, "", ""
+        if not len(points):
+            return returns
         if isinstance(returns.stated, Beams):
             times_s, done, seen = self._of_beams(returns.stated, times_s, around)
         elif returns.stated is not None:
@@ -231,8 +234,13 @@ class PointTimes:
         if done == _LEFT_OUT:
             kept = np.isfinite(times_s)
             times_s, points = times_s[kept], points[kept]
-        elif len(times_s) and not (farthest_s := largest_magnitude(times_s)) <= LONGEST_SWEEP_S:
-            times_s, done, seen = NO_TIMES, _REFUTED, f"a point {farthest_s:.3g} s from the stamp"
+        if len(times_s) and not (farthest_s := largest_magnitude(times_s)) <= LONGEST_SWEEP_S:
+            points, times_s, done, seen = (
+                returns.points,
+                NO_TIMES,
+                _REFUTED,
+                f"a point {farthest_s:.3g} s from the stamp",
+            )
         left = len(returns.points) - len(points)
         if self._number % self.config.every == 0:
             self._counted += 1
@@ -373,7 +381,7 @@ def _wrapped_span_s(field: Field, usual_s: float, period_s: float) -> float:
     """
     if any(_WRAPPED * most < field.span < most and field.low >= 0.0 for most in _COUNTERS):
         return period_s or usual_s
-    first, last = (float(field.values[place] - field.low) for place in (0, -1))
+    first, last = (float(field.values[place]) - float(field.low) for place in (0, -1))
     is_turned = first > _EDGE * field.span and last < (1.0 - _EDGE) * field.span
     is_part = _LOW_RATE * _SHORT * period_s < usual_s < _SHORT * period_s
     is_reset = (is_turned or is_part) and field.steps_back(_STEP * usual_s / UNITS_S[field.unit]) == 1
