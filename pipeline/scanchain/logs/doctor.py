@@ -257,7 +257,7 @@ def _point_times(seen: Survey) -> Finding:
     times, spans_s = seen.log.times, [scan.time_span_s for scan in seen.scans]
     untimed = int(np.count_nonzero(np.isnan(spans_s)))
     distorted = "scans are not freed of the lidar's own motion, which bends them unless the driver did it"
-    faults = times.faults()
+    faults = times.faults(seen.log.topic)
     if untimed == len(spans_s) and not times.spans_s:
         grade = Severity.WARNING if faults else Severity.NOTE
         return Finding("point times", grade, "; ".join(["none", *faults]), distorted, _by_azimuth(seen))

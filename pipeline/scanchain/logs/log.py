@@ -28,7 +28,6 @@ from scanchain.logs.mounting import between_frames, find_mounting, find_wheels, 
 from scanchain.logs.opening import index_files
 from scanchain.logs.publishers import LatestPoints, Publishers, with_jumps
 from scanchain.logs.sectors import MOST, Assembler, Sampled, expected_sweeps, find_sectors
-from scanchain.logs.sweep_times import SweepTimes
 from scanchain.logs.topics import find_ground_truth, find_lidar
 from scanchain.settings import load_settings, overrides_of
 
@@ -94,7 +93,7 @@ class Log:
         truth = find_ground_truth(indexes, config.ground_truth_topic)
         self.topic = lidar.topic
         self.ground_truth_topic = "" if truth is None else truth.topic
-        self._sampled_times = PointTimes(config)
+        self._sampled_times = self.times = PointTimes(config)
         sample, first_messages = tee(stream.sampled_messages(indexes, lidar.topic, self._sampled, most=MOST))
         self.plane_height_m: float | None = None  # also while the sample is decoded
         self.plane_height_m = self._plane_height_m(sample)
@@ -121,7 +120,7 @@ class Log:
         with_poses = [*([(wheels.channel, wheels.link)] if wheels else []), *([(truth, None)] if truth else [])]
         self.pose_decoders = {each.topic: pose_reader(each, self.dimension, link) for each, link in with_poses}
         self.scans_with_wheels = self.bad_scans = 0
-        self.times, self.jumps = SweepTimes(config, self.topic), list[str]()
+        self.jumps: list[str] = []
         self._opening_notes = tuple(self.notes)
         self._truth: Trajectory | None = None
 
@@ -170,8 +169,7 @@ class Log:
         self.notes = list(self._opening_notes)
         poses = RecordedPoses(self.odometry_topic, self.ground_truth_topic)
         counts = ScanCounts(self.topic, self.odometry_topic)
-        assumed = None if self.sectors is None else self.assumed_point_times()
-        self.times, latest = SweepTimes(self.config, self.topic, assumed), LatestPoints()
+        self.times, latest = self._point_times(), LatestPoints()
         assembler = None if self.sectors is None else Assembler(self.sectors, self.topic)
         count, index, requested_s, jump_s, self.scans_with_wheels = 0, 0, working_s(), 0.0, 0
         try:
@@ -219,9 +217,10 @@ class Log:
     def _conclude(self, counts: ScanCounts, poses: RecordedPoses, assembler: Assembler | None) -> None:
         """Note what was met in all scans."""
         self.jumps, self.bad_scans = counts.jumps(), counts.bad
-        self._damage += [*counts.losses(), *self.times.warnings(), *self.jumps, *poses.complaints()]
+        self._damage += [*counts.losses(), *self.times.warnings(self.topic), *self.jumps, *poses.complaints()]
         found = [note for note in self.publishers.notes if note not in self.notes]
-        self.notes += [*self.times.notes(), *found, *counts.notes(), *(assembler.notes() if assembler else [])]
+        self.notes += [*filter(None, [self._assumed(self.times)]), *self.times.faults(self.topic), *found]
+        self.notes += [*counts.notes(), *(assembler.notes() if assembler else [])]
 
     def assumed_point_times(self) -> str:
         """Assumption of a run about per-point times, by the first scan that has returns; empty for laser scans."""
@@ -229,11 +228,9 @@ class Log:
         if self.sectors is not None:
             times = self._point_times()
             next(stream.sampled_messages(self.indexes, self.topic, self.decoder(times)), None)
-        return self._assumed(times)
+        return "" if is_scan(self.lidar) else self._assumed(times)
 
     def _assumed(self, times: PointTimes) -> str:
-        if is_scan(self.lidar):
-            return ""
         is_timed = times.assumed.startswith("point times")
         return times.assumed if is_timed or self.sectors is None else self.sectors.assumed
 
@@ -273,11 +270,11 @@ class Log:
         self, poses: RecordedPoses, assembler: Assembler | None
     ) -> Iterator[tuple[Decoded, Pose | None]]:
         """Scans with the wheels' pose at their stamp; they wait a little for the readings behind them."""
-        decoders = {self.topic: self.decoder(self._point_times()), **self.pose_decoders}
+        decoders = {self.topic: self.decoder(self.times), **self.pose_decoders}
         waiting: deque[Decoded] = deque()
         messages = stream.decoded_messages(self.indexes, decoders, self.span, damage=self._damage)
         messages = messages if assembler is None else assembler.sweeps(messages)
-        for message in chain(self.times.judged(messages), [None]):
+        for message in chain(self.times.judged(messages, self.topic), [None]):
             if message is not None and message.channel.topic == self.topic:
                 waiting.append(message)
             elif message is not None:
@@ -302,7 +299,7 @@ class Log:
                 yield message, T_odom_base
 
     def decoder(self, times: PointTimes) -> Callable[[memoryview], Returns]:
-        """Decoder of the lidar's messages to points; ``times`` reads theirs."""
+        """Decoder of the lidar's messages to points; ``times`` collects its assumptions about theirs."""
         if is_scan(self.lidar):
             return partial(decode_laser_scan, read=reader(self.lidar), config=times.config)
         return partial(decode_cloud, read=reader(self.lidar), times=times, plane_m=self.plane_height_m)

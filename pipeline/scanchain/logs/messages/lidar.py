@@ -15,7 +15,7 @@ from scanchain.config import LogConfig
 from scanchain.data import Pose, RawPoints
 from scanchain.errors import one_line
 from scanchain.kernels.scans import keep_valid
-from scanchain.logs.messages.point_times import NO_TIMES, UNITS_S, Beams, Field, PointTimes, from_azimuth
+from scanchain.logs.messages.point_times import NO_TIMES, UNITS_S, Beams, PointTimes, Returns, from_azimuth
 from scanchain.logs.messages.ros import (
     NUMBERS,
     MalformedMessageError,
@@ -43,23 +43,6 @@ class Sensed(NamedTuple):
 
     message: Any
     T_frame_points: Pose | None = None
-
-
-class Returns(NamedTuple):
-    """The valid returns of one scan message.
-
-    ``points`` (N, d) float32 meters, ``times_s`` (N,) float32 seconds after ``stamp_ns`` or (0,), by the message
-    alone, which has them as ``stated``; ``dropped`` counts what was left out, ``why`` is the reason where nothing
-    is left; ``frame`` is that of the points.
-    """
-
-    stamp_ns: int
-    points: RawPoints
-    times_s: NDArray[np.float32]
-    dropped: int
-    why: str
-    frame: str = ""
-    stated: Field | Beams | None = None
 
 
 def read_multi_echo_scan(message: Any) -> Sensed:
