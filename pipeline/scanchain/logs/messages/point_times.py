@@ -210,7 +210,7 @@ class PointTimes:
         for done, those in self._tallies.items():
             points = sum(points for _, points in those)
             many = f"{counted(points, 'point')} in {len(those)}" if points else f"{len(those)}"
-            if done != _ZERO or len(those) < self._counted:
+            if done not in (_ZERO, _ALL_SAME) or len(those) < self._counted:  # else the note is of all
                 lines.append(f"times of {many} of {scans} {done} (the first: {those[0][0]})")
         return lines
 
@@ -229,7 +229,7 @@ class PointTimes:
         if not len(points):
             return returns
         if isinstance(returns.stated, Beams):
-            times_s, done, seen = self._of_beams(returns.stated, times_s, around)
+            times_s, done, seen = self._of_beams(returns.stated, around)
         elif returns.stated is not None:
             times_s, done, seen = self._of_field(returns, returns.stated, around)
         if done == _LEFT_OUT:
@@ -245,7 +245,7 @@ class PointTimes:
                 self._tallies.setdefault(done, []).append((f"scan {self._number}: {seen}", left))
         return returns._replace(points=points, times_s=times_s, dropped=returns.dropped + left, stated=None)
 
-    def _of_beams(self, beams: Beams, times_s: NDArray[np.float32], around: Sequence[Returns]) -> _Judged:
+    def _of_beams(self, beams: Beams, around: Sequence[Returns]) -> _Judged:
         """Times of a laser scan whose ``time_increment`` agrees with the period, or else with ``scan_time``."""
         if beams.increment_s == 0.0:
             return NO_TIMES, _ZERO, "time_increment"
@@ -257,11 +257,9 @@ class PointTimes:
             is_by_scan, is_by_period = _fits(whole_s, scan_s, turns), _fits(whole_s, period_s, turns)
             if is_by_period or (is_by_scan and whole_s <= _LONG * longest_s):
                 self.spans_s.append(whole_s)
-                self.assumed = (
-                    "" if unit == "s" else f"point times: time_increment taken as {unit} (log.point_times)"
-                )
-                times_s = times_s if unit in ("s", self.unit) else beams.seconds(UNITS_S[unit] * beams.increment_s)
-                return times_s, "" if is_by_scan or scan_s == 0.0 else _NO_SCAN_TIME, f"{beams.scan_time_s:g} s"
+                note = f"point times: time_increment taken as {unit} (log.point_times)"
+                self.assumed, done = "" if unit == "s" else note, "" if is_by_scan or not scan_s else _NO_SCAN_TIME
+                return beams.seconds(UNITS_S[unit] * beams.increment_s), done, f"{beams.scan_time_s:g} s"
         seen = f"time_increment {beams.increment_s:g} s of {beams.beams} beams, scan_time {beams.scan_time_s:g} s"
         return NO_TIMES, _REFUTED, f"{seen}, period {period_s:.3g} s"
 
@@ -271,22 +269,21 @@ class PointTimes:
             return NO_TIMES, _ALL_SAME, f"field {field.name}"
         fields = [each.stated for each in around if isinstance(each.stated, Field) and each.stated.core > 0.0]
         unit, period_s = mode(each.unit for each in fields), median_low(_steps_s(around))
-        unit_s = UNITS_S[unit]
+        unit_s, times_s = UNITS_S[unit], returns.times_s
         usual_s = _usual_span_s(fields, unit_s, period_s)
-        if unit != field.unit:
-            field = field._replace(unit=unit)
-        steps_s = [abs(float(after.low) - float(before.low)) * unit_s for before, after in pairwise(fields)]
-        if (
-            field.origin == _STAMP and median_low(steps_s or [0.0]) > 0.5 * usual_s
-        ):  # it runs on, but was just reset
-            field = field._replace(origin=_CLOCK)
+        steps_s = [abs(float(after.low) - float(before.low)) * unit_s for before, after in pairwise(fields)] or [
+            0.0
+        ]
+        is_running = field.origin == _STAMP and median_low(steps_s) > 0.5 * usual_s  # a clock that was just reset
+        if is_running or unit != field.unit:
+            field = field._replace(unit=unit, origin=_CLOCK if is_running else field.origin)
+            times_s = field.seconds(returns.stamp_ns)
         self.assumed = self.assumed if self.spans_s else _taken(field)
         self.spans_s.append(usual_s)
         self.periods_s.append(period_s)
         seen = f"{field.span * unit_s:.3g} s, usually {usual_s:.3g} s, period {period_s:.3g} s"
         if usual_s > (_MOST_PERIODS * period_s or LONGEST_SWEEP_S):
             return NO_TIMES, _REFUTED, seen
-        times_s = returns.times_s if field is returns.stated else field.seconds(returns.stamp_ns)
         regular = [each for each in fields if _SHORT * usual_s <= each.span * unit_s <= _LONG * usual_s]
         lows_s = [unit_s * float(each.low) for each in regular if each.origin == field.origin == _STAMP]
         low_s = median_low(lows_s or [0.0])
