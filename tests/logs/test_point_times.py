@@ -114,6 +114,12 @@ def test_a_wrap_among_rings_costs_points_of_that_sweep_alone_and_is_said(tmp_pat
     assert f"in 1 of {COUNT} scans" in of_notes(log)[0] and LEFT_OUT in of_notes(log)[0]
 
 
+def test_a_reset_among_rings_costs_the_times_of_that_sweep_alone_and_is_said(tmp_path):
+    log, scans = swept(tmp_path, lambda k, t: np.where((t > 5e7) & (k == 3), t - 5e7, t), order=IN_RINGS)
+    assert [k for k, scan in enumerate(scans) if not len(scan.times_s)] == [3]
+    assert f"times of 1 of {COUNT} scans" in of_notes(log)[0] and UNUSED in of_notes(log)[0]
+
+
 @pytest.mark.parametrize(
     "junk",
     [

@@ -57,7 +57,7 @@ class Field(NamedTuple):
     """Times of a cloud's points: ``values`` (N,) as in the message, of the type ``kind`` there.
 
     low : the least, but for some that lie farther below most than these spread
-    span : of all, NaN where one is not finite; core : the same by the densest part
+    span : of all, infinite where one is not finite; core : the same by the densest part
     unit, origin : by the message alone
     """
 
@@ -161,7 +161,7 @@ class PointTimes:
         span = float(last) - float(first)
         if not isfinite(span):
             sample, first = sample[np.isfinite(sample)], values.min(where=np.isfinite(values), initial=np.inf)
-            span = nan
+            span = inf
         low, core, many = first, 0.0, int(_CORE * len(sample))
         if many:
             with np.errstate(over="ignore"):
@@ -288,8 +288,8 @@ class PointTimes:
         lows_s = [unit_s * float(each.low) for each in regular if each.origin == field.origin == _STAMP]
         low_s = median_low(lows_s or [0.0])
         if not _SHORT * usual_s <= field.span * unit_s <= _LONG * usual_s:
-            is_in_order = not any(each.steps_back(_STEP * usual_s).any() for each in regular[:1])
-            return *_mended(field, times_s, usual_s, low_s, is_in_order=is_in_order), seen
+            usual_back = sum(np.count_nonzero(each.steps_back(_STEP * usual_s)) for each in regular[:1])
+            return *_mended(field, times_s, usual_s, low_s, usual_back), seen
         if lows_s and abs(off_s := unit_s * float(field.low) - low_s) > 0.5 * usual_s:
             return NO_TIMES, _REFUTED, f"begins {off_s:+.3g} s from there"
         return times_s, "", seen
@@ -333,28 +333,28 @@ def _fits(whole_s: float, turn_s: float, turns: float) -> bool:
 
 def _usual_span_s(fields: Sequence[Field], unit_s: float, period_s: float) -> float:
     """Time that sweeps take by their extremes, or by most of their points where the period refutes these."""
-    span_s = unit_s * median_low([each.span if isfinite(each.span) else each.core for each in fields])
+    span_s = unit_s * median_low([each.span for each in fields])
     core_s = unit_s * median_low([each.core for each in fields])
     is_confirmed = core_s >= _DENSE * span_s or span_s <= (_LONG * period_s or 3.0 * core_s)
     return span_s if is_confirmed else max(period_s, core_s)
 
 
 def _mended(
-    field: Field, times_s: NDArray[np.float32], usual_s: float, low_s: float, *, is_in_order: bool
+    field: Field, times_s: NDArray[np.float32], usual_s: float, low_s: float, usual_back: int
 ) -> tuple[NDArray[np.float32], str]:
     """Times of a sweep that lasts longer or shorter than usual, NaN where they are refuted, and what was done.
 
-    low_s : usual time of the first point; is_in_order : whether points are in the order of firing, as far as known
+    low_s : usual time of the first point; usual_back : steps back in a sweep, 0 in the order of firing
     """
     unit_s, span_s = UNITS_S[field.unit], field.span * UNITS_S[field.unit]
-    steps = field.steps_back(_STEP * usual_s) if is_in_order and isfinite(span_s) else np.empty(0)
-    if steps.any():
+    steps = field.steps_back(_STEP * usual_s)
+    if isfinite(span_s) and steps.any() and not usual_back:
         values = field.values - np.append(0, np.cumsum(steps))
         whole_s = unit_s * float(np.ptp(values))
         if _SHORT * usual_s <= whole_s <= _LONG * usual_s:
             return (low_s + unit_s * (values - values.min())).astype(np.float32), _UNWRAPPED
-        if span_s < usual_s:
-            return NO_TIMES, _REFUTED
+    if span_s < usual_s and np.count_nonzero(steps) > 1.5 * usual_back:  # reset, in each row or once
+        return NO_TIMES, _REFUTED
     if span_s < usual_s or (span_s <= _LONGEST * usual_s and field.core * unit_s >= _DENSE * span_s):
         return times_s, ""
     order, most_s = np.sort(times_s[np.isfinite(times_s)]).astype(np.float64), _LONG * usual_s
