@@ -246,7 +246,7 @@ class PointTimes:
         return returns._replace(points=points, times_s=times_s, dropped=returns.dropped + left, stated=None)
 
     def _of_beams(self, beams: Beams, around: Sequence[Returns]) -> _Judged:
-        """Times of a laser scan whose ``time_increment`` agrees with the period, or else with ``scan_time``."""
+        """Times of a laser scan whose ``time_increment`` agrees with the period or ``scan_time``, or is alone."""
         if beams.increment_s == 0.0:
             return NO_TIMES, _ZERO, "time_increment"
         steps_s, turns = _steps_s(around), min(beams.turns, 1.0)
@@ -255,10 +255,11 @@ class PointTimes:
         for unit in [self.unit] if self.unit else UNITS_S:
             whole_s, scan_s = (UNITS_S[unit] * each for each in (all_s, beams.scan_time_s))
             is_by_scan, is_by_period = _fits(whole_s, scan_s, turns), _fits(whole_s, period_s, turns)
-            if is_by_period or (is_by_scan and whole_s <= _LONG * longest_s):
+            if is_by_period or (whole_s <= _LONG * longest_s and (is_by_scan or not period_s)):
                 self.spans_s.append(whole_s)
                 note = f"point times: time_increment taken as {unit} (log.point_times)"
-                self.assumed, done = "" if unit == "s" else note, "" if is_by_scan or not scan_s else _NO_SCAN_TIME
+                self.assumed = "" if unit == "s" else note
+                done = _NO_SCAN_TIME if period_s and scan_s and not is_by_scan else ""
                 return beams.seconds(UNITS_S[unit] * beams.increment_s), done, f"{beams.scan_time_s:g} s"
         seen = f"time_increment {beams.increment_s:g} s of {beams.beams} beams, scan_time {beams.scan_time_s:g} s"
         return NO_TIMES, _REFUTED, f"{seen}, period {period_s:.3g} s"
