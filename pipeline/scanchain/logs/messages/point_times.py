@@ -289,7 +289,7 @@ class PointTimes:
         lows_s = [unit_s * float(each.low) for each in regular if each.origin == field.origin == _STAMP]
         low_s = median_low(lows_s or [0.0])
         if not _SHORT * usual_s <= field.span * unit_s <= _LONG * usual_s:
-            usual_back = sum(np.count_nonzero(each.steps_back(_STEP * usual_s)) for each in regular[:1])
+            usual_back = int(np.count_nonzero(regular[0].steps_back(_STEP * usual_s))) if regular else 0
             return *_mended(field, times_s, usual_s, low_s, usual_back), seen
         if lows_s and abs(off_s := unit_s * float(field.low) - low_s) > 0.5 * usual_s:
             return NO_TIMES, _REFUTED, f"begins {off_s:+.3g} s from there"
