@@ -87,28 +87,37 @@ IN_RINGS = np.argsort(np.arange(POINTS) % 10, kind="stable")
 
 
 @pytest.mark.parametrize(
-    ("change", "order", "repaired"),
+    ("change", "repaired"),
     [
-        (running((1 << 32) - int(1.25e9), 1, 1 << 32), slice(None), 1),
-        (running((1 << 32) - int(1.25e9), 1, 1 << 32), IN_RINGS, 1),
-        (running(1000 * (1 << 32) - int(0.75e9), 1000, 1 << 32), slice(None), 1),
-        (running(int(3598.75e9), 1000, 3_600_000_000), slice(None), 1),  # since the full hour
-        (running(int(0.25e9), 1, 1_000_000_000), slice(None), 2),  # the nanoseconds of a second
-        (lambda k, t: t // 1000 % (1 << 16), slice(None), COUNT),
-        (running(int(0.27e9), 1000, 1 << 16), slice(None), COUNT),
-        (lambda k, t: np.where((t > 5e7) & (k % 5 == 3), t - 5e7, t), slice(None), 4),
-        (lambda k, t: np.where((t > 3e7) & (k == 0), t - 3e7, t), slice(None), 1),
-        (lambda k, t: t % 50_000_000, slice(None), COUNT),
-        (lambda k, t: (t + 60_000_000) % 100_000_000, slice(None), COUNT),  # the turn begins elsewhere
-        (lambda k, t: (t - 50_000_000) % (1 << 32) if k % 5 == 3 else t, slice(None), 4),
+        (running((1 << 32) - int(1.25e9), 1, 1 << 32), 1),
+        (running(1000 * (1 << 32) - int(0.75e9), 1000, 1 << 32), 1),
+        (running(int(3598.75e9), 1000, 3_600_000_000), 1),  # since the full hour
+        (running(int(0.25e9), 1, 1_000_000_000), 2),  # the nanoseconds of a second
+        (lambda k, t: np.where((t > 5e7) & (k % 5 == 3), t - 5e7, t), 4),
+        (lambda k, t: np.where((t > 3e7) & (k == 0), t - 3e7, t), 1),
+        (lambda k, t: (t - 50_000_000) % (1 << 32) if k % 5 == 3 else t, 4),
     ],
 )
-def test_a_counter_that_wraps_or_is_reset_within_a_sweep_is_repaired(tmp_path, change, order, repaired):
-    log, scans = swept(tmp_path, change, order=order)
+def test_a_counter_that_wraps_or_is_reset_within_a_sweep_is_repaired(tmp_path, change, repaired):
+    log, scans = swept(tmp_path, change)
     for scan in scans:
-        np.testing.assert_allclose(scan.times_s, TRUE_S[order], atol=6e-4)
+        np.testing.assert_allclose(scan.times_s, TRUE_S, atol=6e-4)
     (line,) = of_notes(log)
     assert f"times of {repaired} of {COUNT} scans of /points" in line and REPAIRED in line
+
+
+def test_a_wrap_among_rings_costs_points_of_that_sweep_alone_and_is_said(tmp_path):
+    log, scans = swept(tmp_path, running((1 << 32) - int(1.27e9), 1, 1 << 32), order=IN_RINGS)
+    assert [k for k, scan in enumerate(scans) if len(scan.times_s) < POINTS] == [12]
+    for scan in scans:
+        assert len(scan.times_s) == len(scan.points) > POINTS // 2 and np.ptp(scan.times_s) < 0.1
+    assert f"in 1 of {COUNT} scans" in of_notes(log)[0] and LEFT_OUT in of_notes(log)[0]
+
+
+def test_a_reset_among_rings_costs_the_times_of_that_sweep_alone_and_is_said(tmp_path):
+    log, scans = swept(tmp_path, lambda k, t: np.where((t > 5e7) & (k == 3), t - 5e7, t), order=IN_RINGS)
+    assert [k for k, scan in enumerate(scans) if not len(scan.times_s)] == [3]
+    assert f"times of 1 of {COUNT} scans" in of_notes(log)[0] and UNUSED in of_notes(log)[0]
 
 
 @pytest.mark.parametrize(
@@ -172,18 +181,8 @@ def scanned(folder, *, increment=1.0, scan_time_s=0.1, **config):
     return log, scans, [float(np.ptp(scan.times_s)) if len(scan.times_s) else 0.0 for scan in scans]
 
 
+@pytest.mark.parametrize("scan_time_s", [0.1, 0.0, 37.0])
 @pytest.mark.parametrize("factor", [20.0, 0.05, 3.0, 0.25, 1e30, np.inf, np.nan])
-def test_an_increment_that_scan_time_and_the_period_refute_is_replaced_by_scan_time(tmp_path, factor):
-    log, _, spans_s = scanned(tmp_path, increment=factor)
-    np.testing.assert_allclose(spans_s, 0.075, rtol=0.01)
-    assert (
-        "contradict scan_time and the period" in of_notes(log)[0]
-        and f"of {COUNT} scans of /scan" in of_notes(log)[0]
-    )
-
-
-@pytest.mark.parametrize("scan_time_s", [0.0, 37.0])
-@pytest.mark.parametrize("factor", [20.0, 0.05, 1e30, np.inf, np.nan])
 def test_an_increment_that_the_period_refutes_is_ignored_which_is_told(tmp_path, factor, scan_time_s):
     log, _, spans_s = scanned(tmp_path, increment=factor, scan_time_s=scan_time_s)
     assert spans_s == [0.0] * COUNT
@@ -205,8 +204,8 @@ def test_increments_in_nanoseconds_are_known_by_the_period_and_one_bad_scan_by_t
     np.testing.assert_allclose(spans_s, 0.075, rtol=1e-5)
     assert log.notes == ["point times: time_increment taken as ns (log.point_times)"]
     log, _, spans_s = scanned(tmp_path, increment=lambda k: 20.0 if k == 0 else 1.0)
-    np.testing.assert_allclose(spans_s, 0.075, rtol=1e-2)
-    assert f"times of 1 of {COUNT} scans" in of_notes(log)[0]
+    np.testing.assert_allclose(spans_s, [0.0] + 19 * [0.075], rtol=1e-5)
+    assert f"times of 1 of {COUNT} scans" in of_notes(log)[0] and UNUSED in of_notes(log)[0]
 
 
 @pytest.mark.parametrize(("choice", "span_s"), [("none", 0.0), ("s", 0.075), ("counterclockwise", 0.075)])

@@ -52,7 +52,6 @@ def assert_same(scans, expected, *, within_s=2e-6):
     "how",
     [
         Cut(30.0), Cut(90.0), Cut(120.0), Cut(180.0), Cut(5.0),
-        Cut(30.0, times="sweep"), Cut(90.0, times="sweep", stamp="sweep"),
         Cut(30.0, unit="us"), Cut(5.0, unit="ms"), Cut(180.0, unit="s"),
     ],
     ids=str,
@@ -76,9 +75,14 @@ def test_times_count_from_the_stamp_of_the_sweep_where_sectors_are_stamped_at_th
         assert np.allclose(scan.times_s, known.times_s - 0.025, atol=2e-6)
 
 
-@pytest.mark.parametrize("how", [Cut(w, times="none") for w in (5.0, 30.0, 90.0, 180.0)], ids=str)
+UNTIMED = [Cut(w, times="none") for w in (5.0, 30.0, 90.0, 180.0)]
+
+
+@pytest.mark.parametrize(
+    "how", [*UNTIMED, Cut(30.0, times="sweep"), Cut(90.0, times="sweep", stamp="sweep")], ids=str
+)
 @pytest.mark.parametrize("of", [SPATIAL, PLANAR], ids=["space", "plane"])
-def test_points_without_times_are_timed_by_their_place_in_the_revolution(tmp_path, how, of):
+def test_points_without_times_of_their_message_are_timed_by_their_place_in_the_revolution(tmp_path, how, of):
     expected, log, scans = sweeps(tmp_path, how, of)
     assert_same(scans, expected, within_s=3e-3)
     if of is SPATIAL:

@@ -35,8 +35,6 @@ class Sectors(NamedTuple):
     step_rad : usual angle from one message to the next
     per_sweep : messages per revolution, not whole where they do not divide it
     period_s : of a revolution
-    is_stamped : whether each message has a stamp of its own, not that of its revolution
-    is_from_sweep : whether point times count from the start of the revolution, whatever the message's stamp
     point_times : ``log.point_times`` of the messages, the unit by the duration of a sector; ``none`` by azimuth
     """
 
@@ -44,8 +42,6 @@ class Sectors(NamedTuple):
     step_rad: float
     per_sweep: float
     period_s: float
-    is_stamped: bool
-    is_from_sweep: bool = False
     point_times: str = "auto"
 
     @property
@@ -125,9 +121,8 @@ def _sectors(seen: list[Sampled], directions_rad: NDArray[np.float64], width_rad
         return None
     per_sweep = float(_TURN_RAD / np.mean(steps_rad))
     if np.median(np.abs(drift_rad)) < _SAME * step_rad:  # the same sectors again: as many as there are
-        sorted_rad = np.sort(turned_rad % _TURN_RAD)
-        per_sweep = float(np.sum(np.diff(sorted_rad, append=sorted_rad[0] + _TURN_RAD) > 0.5 * step_rad))
-    return Sectors(sense, step_rad, per_sweep, period_s, bool(np.median(np.diff(stamps_ns)) > 0))
+        per_sweep = float(np.max(later - first))
+    return Sectors(sense, step_rad, per_sweep, period_s)
 
 
 def _timed(
@@ -136,9 +131,9 @@ def _timed(
     decoder: Callable[[str], Callable[[memoryview], Returns]],
     configured: str,
 ) -> Sectors:
-    """The sectors with the unit and the origin of their point times.
+    """The sectors with the unit of their point times: that in which a message lasts about as long as a sector.
 
-    The unit is the one in which a message lasts about as long as a sector: that of a sweep would mistake it.
+    They are not used where they count from the beginning of the revolution, or only this has a stamp.
     """
     point_times = configured if configured in (*UNITS_S, "auto") else "none"
     if configured == "auto":
@@ -151,9 +146,8 @@ def _timed(
     starts_s = [float(times.min()) for each in seen if len(times := decode(each.data).times_s)]
     last_s = sectors.period_s * (1.0 - 1.0 / sectors.per_sweep)  # from the first sector to the last
     is_from_sweep = len(starts_s) > 1 and float(np.ptp(starts_s)) > 0.5 * last_s
-    if is_from_sweep and not sectors.per_sweep.is_integer():  # of the driver's revolution, not of ours
-        return sectors._replace(point_times="none")
-    return sectors._replace(point_times=point_times, is_from_sweep=is_from_sweep)
+    is_stamped = np.median(np.diff([each.returns.stamp_ns for each in seen])) > 0
+    return sectors._replace(point_times=point_times if is_stamped and not is_from_sweep else "none")
 
 
 class _Part(NamedTuple):
@@ -171,7 +165,7 @@ class Assembler:
     def __init__(self, sectors: Sectors, topic: str) -> None:
         self.sectors, self.topic = sectors, topic
         self.half_rad, self.rate = 0.5 * sectors.step_rad, sectors.period_s / _TURN_RAD
-        self.is_split = sectors.is_stamped and not sectors.per_sweep.is_integer()
+        self.is_split = not sectors.per_sweep.is_integer()
         self.incomplete = 0
 
     def sweeps(self, messages: Iterable[Decoded]) -> Iterator[Decoded]:
@@ -216,8 +210,6 @@ class Assembler:
         turned_rad = (turned_rad + self.half_rad) % _TURN_RAD - self.half_rad
         revolutions = 1e-9 * (returns.stamp_ns - last.returns.stamp_ns) / sectors.period_s
         is_apart = not -0.5 < revolutions < turned_rad / _TURN_RAD + _MISSING
-        if not sectors.is_stamped:
-            is_apart = revolutions != 0.0
         return (part if is_apart else part._replace(angle_rad=last.angle_rad + turned_rad)), is_apart
 
     def _complete(self, parts: list[_Part]) -> Iterator[Decoded]:
@@ -239,13 +231,9 @@ class Assembler:
 
     def _times_s(self, part: _Part, begin_rad: float, begin_ns: int) -> NDArray[np.float32]:
         """Seconds (N,) of points after the beginning of their sweep: by their own times, else by their angle."""
-        returns, sectors = part.returns, self.sectors
-        if not len(returns.times_s):
-            return (self.rate * (self._angles_rad(part) - begin_rad)).astype(np.float32)
-        after_s = 0.0 if sectors.is_from_sweep else 1e-9 * (returns.stamp_ns - begin_ns)
-        turned_s = self.rate * (part.angle_rad - self.half_rad - begin_rad)
-        is_wrong = abs(after_s - turned_s) > 0.5 * sectors.period_s or not sectors.is_stamped
-        return returns.times_s + np.float32(turned_s if is_wrong and not sectors.is_from_sweep else after_s)
+        if len(part.returns.times_s):
+            return part.returns.times_s + np.float32(1e-9 * (part.returns.stamp_ns - begin_ns))
+        return (self.rate * (self._angles_rad(part) - begin_rad)).astype(np.float32)
 
     def _angles_rad(self, part: _Part) -> NDArray[np.float32]:
         """Angles (N,) of the points of a part, since its sweep was due to begin."""
