@@ -1,29 +1,26 @@
-"""ROS 2 bags, read by rosbags, and page by page where a database of SQLite is damaged; messages stay as they are.
-
-Format of pages: https://www.sqlite.org/fileformat2.html
-"""
+"""ROS 2 bags, read by rosbags, and row by row where a database of SQLite is damaged; messages stay as they are."""
 
 from __future__ import annotations
 
-import mmap
 import re
+import sqlite3
 import threading
 from bisect import bisect_left
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterator
 from collections.abc import Set as AbstractSet
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from itertools import pairwise
+from operator import itemgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import numpy as np
 import zstandard
 
-from scanchain.errors import InputError, counted, one_line, printable
+from scanchain.errors import InputError, counted, one_line
 from scanchain.logs.files import size_of
 from scanchain.logs.formats import natural_order
 from scanchain.logs.mcap.index import most_unpacked
@@ -36,32 +33,22 @@ _MOST_UNPACKED = 1 << 27  # largest number of bytes that the messages of a block
 _MOST_RATIO, _LEAST_BYTES = 200, 1 << 25  # largest ratio of packing of a whole file, beyond so many bytes
 _LATEST_NS = (1 << 63) - 1
 _MODE = re.compile(r"^( *compression_mode:)[ \"']*(\w*).*$", re.MULTILINE)
+_COUNT = re.compile(r"^  message_count: *(\d{1,15})$", re.MULTILINE)
 
-_TABLE, _INDEX = 13, 10  # kinds of pages with the rows of a table, of an index
-_SIZES = (0, 1, 2, 3, 4, 6, 8, 8, 0, 0)  # bytes of a value of the first kinds: NULL, whole numbers, a float, 0, 1
-_PAGE_BYTES, _PAGE_SIZES = 4096, {1 << k for k in range(9, 16)}  # size where none is stated; those of two bytes
+_ROW_BYTES = 16  # bytes of a file that a row takes at least
+_MOST_FAILURES = 100_000  # ranges of rows that fail in a file, about a second
+_DATA = "SELECT data FROM messages NOT INDEXED WHERE id = ?"
+_ROWS = "SELECT id, topic_id, timestamp, data FROM messages NOT INDEXED WHERE id BETWEEN ? AND ?"
+_TOPICS = "SELECT id, name, type, serialization_format FROM topics"
+_DEFINITIONS = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
 
 
 def index_ros2_bag(path: Path, number: int) -> FileIndex:
     """The topics of a .db3 or the folder of a ROS 2 bag; blocks are spans of time. Raises InputError for none."""
-    from rosbags import rosbag2
-
-    opened, mode = path, ""
-    if path.is_dir():
-        found = _MODE.search((path / "metadata.yaml").read_text("utf-8", "replace"))
-        mode = found[2].lower() if found else ""
-    folder = _unpacked_folder(path) if mode == "file" else None
-    opened = path if folder is None else Path(folder.name)
-    files = sorted(opened.glob("*.db3"), key=natural_order) if opened.is_dir() else [opened]
-    bag = _Bag(path, files, is_packed=mode == "message", folder=folder)
-    try:
-        reader: Any = rosbag2.Reader(opened)
-        bag.reader = reader
-        reader.open()
-        begin_ns = reader.start_time or next((time_ns for _, time_ns, _ in reader.messages(start=1)), 0)
-    except Exception as error:  # whatever a damaged file makes the libraries below raise
-        return _index_of_pages(bag, number, one_line(error))
-    index = FileIndex(path, number)
+    bag = _Bag(path)
+    index, reader = FileIndex(path, number, make=bag.contents), bag.reader
+    if bag.damage:
+        index.damage.append(bag.damage)
     for id_, each in enumerate(reader.connections, start=1):
         encoding = each.ext.serialization_format
         are_texts = all(isinstance(text, str) for text in (each.topic, each.msgtype, encoding))
@@ -70,56 +57,24 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
         if each.msgcount:
             language = "ros2idl" if each.msgdef.format.name == "IDL" else "ros2msg"
             definition = each.msgdef.data.encode() or schema_text(each.msgtype)
-            index.channels[id_] = Channel(
-                (number, id_), each.topic, encoding, id_, each.msgtype, language, definition
-            )
-            index.counts[id_], bag.connections[id_] = each.msgcount, each
-    if (lost := reader.message_count - sum(each.msgcount for each in reader.connections)) > 0:
+            named = each.topic, encoding, id_, each.msgtype, language
+            channel = Channel((number, id_), *named, definition)
+            channel = bag.channels.setdefault((each.topic, each.msgtype), channel)
+            index.channels[channel.key[1]] = channel
+            index.counts[channel.key[1]] = index.counts.get(channel.key[1], 0) + each.msgcount
+    lost = reader.message_count - sum(each.msgcount for each in reader.connections)
+    if lost > 0 and not bag.damage:
         index.damage.append(f"{path}: {counted(lost, 'message')} of no topic that it lists")
-    if bag.is_packed:  # messages are unpacked here, as rosbags sets no limit
-        reader.storage.metadata = reader.storage.metadata._replace(compression_mode=None)
-    if bag.connections:
-        _add_blocks(index, bag, begin_ns, reader.end_time)
+    if index.channels:  # spans of one length, so many that each holds a few megabytes on average
+        size, length_ns = size_of(path), reader.end_time - bag.begin_ns
+        count = min(max(size // _BLOCK_BYTES, 1), _MOST_BLOCKS, max(length_ns, 1))
+        edges_ns = [bag.begin_ns + length_ns * place // count for place in range(count + 1)]
+        for place, (start_ns, stop_ns) in enumerate(pairwise(edges_ns)):
+            share = size // count
+            index.blocks.append(Block(number, place, share, "", share, start_ns, stop_ns - 1))
         if not reader.start_time:  # messages of log time 0, which are in the first block
             index.blocks[0] = replace(index.blocks[0], start_ns=0)
-    return index
-
-
-def _add_blocks(index: FileIndex, bag: _Bag, begin_ns: int, end_ns: int) -> None:
-    """Spans of time of one length, so many that each holds a few megabytes on average."""
-    size, length_ns = size_of(bag.path), end_ns - begin_ns
-    count = min(max(size // _BLOCK_BYTES, 1), _MOST_BLOCKS, max(length_ns, 1))
-    edges_ns = [begin_ns + length_ns * place // count for place in range(count + 1)]
-    for place, (start_ns, stop_ns) in enumerate(pairwise(edges_ns)):
-        share = size // count
-        index.blocks.append(Block(index.number, place, share, "", share, start_ns, stop_ns - 1))
-    index.make = partial(bag.contents, index)
-
-
-def _index_of_pages(bag: _Bag, number: int, reason: str) -> FileIndex:
-    """Index of what the pages of a damaged bag hold. Raises InputError where they hold no message of a topic."""
-    index = FileIndex(bag.path, number)
-    try:
-        pages = bag.pages()
-    except (OSError, ValueError):
-        pages = []
-    counts = Counter(topic for each in pages for _, topic, _ in each.messages)
-    if not counts:
-        lack = " and its list of topics is destroyed" if any(each.lost for each in pages) else ""
-        raise InputError(
-            f"{bag.path}: cannot be read as a ROS bag ({reason}){lack}; copy it again from where it was recorded, "
-            "or, if only metadata.yaml is damaged, ros2 bag reindex makes a new one"
-        )
-    topics = {topic: stated for each in pages for topic, stated in each.topics.items()}
-    for id_, (topic, count) in enumerate(counts.items(), start=1):
-        encoding, type_name, language, definition = topics[topic]
-        named = topic, encoding, id_, type_name, language
-        index.channels[id_] = Channel((number, id_), *named, definition or schema_text(type_name))
-        index.counts[id_] = count
-    bag.damage = bag.lost(reason)
-    index.damage.append(bag.damage)
-    times_ns = [time_ns for each in pages for time_ns, _, _ in each.messages]
-    _add_blocks(index, bag, min(times_ns), max(times_ns) + 1)
+        bag.last = len(index.blocks) - 1
     return index
 
 
@@ -140,44 +95,67 @@ def parts_of_bag(folder: Path) -> list[Path]:
 
 
 class _Bag:
-    """The messages of a bag by time, from its reader or, where that meets damage, from the pages of its files.
+    """A bag and its reader: of rosbags or, where that meets ``damage``, row by row; one thread at a time reads.
 
-    damage : what is missing, empty where no damage was met
-    One thread at a time may use the reader of rosbags. ``folder`` is removed with the bag.
+    begin_ns : the first log time that is not 0; ``last`` is the number of the last block
     """
 
-    def __init__(
-        self, path: Path, files: list[Path], *, is_packed: bool, folder: TemporaryDirectory[str] | None
-    ) -> None:
-        self.path, self.is_packed, self.folder, self.damage = path, is_packed, folder, ""
-        self.reader: Any = None
-        self.connections: dict[int, Any] = {}  # by channel
-        self.lock = threading.Lock()
-        self.pages = cache(lambda: [_Pages(file) for file in files])
+    def __init__(self, path: Path) -> None:
+        from rosbags import rosbag2
 
-    def contents(self, index: FileIndex, block: Block, wanted: AbstractSet[int] | None) -> Contents:
-        """The messages of a span of time."""
-        chosen = {k: channel for k, channel in index.channels.items() if wanted is None or k in wanted}
-        is_last = block.offset == len(index.blocks) - 1  # both ends reach as far as time, whatever the metadata
-        begin_ns, end_ns = block.start_ns if block.offset else 0, _LATEST_NS if is_last else block.end_ns + 1
+        text = (path / "metadata.yaml").read_text("utf-8", "replace") if path.is_dir() else ""
+        mode = found[2].lower() if (found := _MODE.search(text)) else ""
+        self.folder = _unpacked_folder(path, text) if mode == "file" else None  # removed with the bag
+        self.path, self.opened = path, Path(self.folder.name) if self.folder else path
+        self.stated = int(found[1]) if (found := _COUNT.search(text)) else 0
+        self.is_packed, self.damage, self.last, self.lock = mode == "message", "", 0, threading.Lock()
+        self.channels: dict[tuple[str, str], Channel] = {}
+        self.reader: Any = None
+        try:
+            reader = rosbag2.Reader(self.opened)
+            reader.open()
+            self.begin_ns, self.reader = _begin_ns(reader), reader
+        except Exception as error:  # whatever a damaged file makes the libraries below raise
+            self._rescue(one_line(error))
+            if self.reader is None:
+                raise InputError(self.damage) from error
+            self.begin_ns = _begin_ns(self.reader)
+        if self.is_packed and not self.damage:  # messages are unpacked here, as rosbags sets no limit
+            self.reader.storage.metadata = self.reader.storage.metadata._replace(compression_mode=None)
+
+    def _rescue(self, reason: str) -> None:
+        """Read row by row from here on if SQLite gives a row."""
+        rows, remedy = (
+            _Rows(self.opened),
+            "a .db3 is saved in part by .recover of sqlite3, a folder by ros2 bag reindex",
+        )
+        left, total = len(rows.rows), max(rows.message_count, self.stated)
+        self.damage = f"{self.path}: cannot be read as a ROS bag ({reason}); copy it again; {remedy}"
+        if left:
+            lost = (
+                f"{total - left:,} of {counted(total, 'message')} lost"
+                if total
+                else f"only {left:,} messages left"
+            )
+            self.damage = f"{self.path}: {lost}: damaged pages ({reason}); the others were read row by row"
+            self.reader = rows
+
+    def contents(self, block: Block, wanted: AbstractSet[int] | None) -> Contents:
+        """The messages of a span of time; both ends reach as far as time, whatever the metadata."""
+        begin_ns, end_ns = block.start_ns if block.offset else 0, block.end_ns + 1
+        end_ns = _LATEST_NS if block.offset == self.last else end_ns
+        chosen = {key: c for key, c in self.channels.items() if wanted is None or c.key[1] in wanted}
         found: list[tuple[Channel, int, bytes]] = []
         with self.lock:
+            reader = self.reader
+            connections = [each for each in reader.connections if (each.topic, each.msgtype) in chosen]
             try:
-                if chosen and not self.damage:
-                    channels = {id(each): index.channels[k] for k, each in self.connections.items()}
-                    connections = [self.connections[k] for k in chosen]
-                    for connection, time_ns, data in self.reader.messages(connections, begin_ns, end_ns):
-                        found.append((channels[id(connection)], time_ns, data))
+                for each, time_ns, data in reader.messages(connections, begin_ns, end_ns) if connections else ():
+                    found.append((chosen[each.topic, each.msgtype], time_ns, data))
             except Exception as error:  # whatever a damaged file makes the libraries below raise
-                self.damage = self.lost(one_line(error))
-            if self.damage and self.pages():
-                by_topic = {channel.topic: channel for channel in chosen.values()}
-                found = [
-                    (by_topic[topic], time_ns, each.row(cell)[1][3])
-                    for each in self.pages()
-                    for time_ns, topic, cell in each.between(begin_ns, end_ns)
-                    if topic in by_topic
-                ]
+                self._rescue(one_line(error))
+        if self.reader is not reader:
+            return self.contents(block, wanted)
         messages, left = list[Message](), _MOST_UNPACKED
         for channel, time_ns, data in found:
             unpacked, defect = _unpacked(data, left) if self.is_packed else (data, "")
@@ -185,13 +163,77 @@ class _Bag:
             messages.append(Message(channel, time_ns, memoryview(unpacked), defect))
         return Contents(messages, self.damage)
 
-    def lost(self, reason: str) -> str:
-        """The damage, and how many messages it costs."""
-        if not self.pages():  # of MCAP, packed
-            return f"{self.path}: cannot be read further ({reason})"
-        there, lost = (sum(each) for each in zip(*((len(p.messages), p.lost) for p in self.pages()), strict=True))
-        of = counted(there + lost, "message")
-        return f"{self.path}: is damaged ({reason}); {lost:,} of {of} are lost, the others were read page by page"
+
+def _begin_ns(reader: Any) -> int:
+    return reader.start_time or next((time_ns for _, time_ns, _ in reader.messages(start=1)), 0)
+
+
+class _Rows:
+    """As a reader of rosbags: what SQLite still gives, row by row, of the damaged databases of a bag.
+
+    message_count : the largest number of a row, with those that are lost, 0 where it is unknown
+    """
+
+    def __init__(self, opened: Path) -> None:
+        self.by_key, self.message_count = dict[tuple[str, str], Any](), 0  # connections by topic and type
+        self.rows: list[
+            tuple[int, tuple[str, str], sqlite3.Connection, int]
+        ] = []  # by time; the last is the number
+        for path in sorted(opened.glob("*.db3"), key=natural_order) if opened.is_dir() else [opened]:
+            with suppress(sqlite3.Error):  # of a header or topics that are destroyed
+                self._read(path)
+        self.rows.sort(key=itemgetter(0))
+        counts = Counter(key for _, key, _, _ in self.rows)
+        self.connections = [each._replace(msgcount=counts[key]) for key, each in self.by_key.items()]
+        self.start_time, self.end_time = (self.rows[0][0], self.rows[-1][0] + 1) if self.rows else (0, 0)
+
+    def _read(self, path: Path) -> None:
+        """Add a database. Raises sqlite3.Error where its topics cannot be read."""
+        from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition
+        from rosbags.interfaces import MessageDefinitionFormat as Form
+
+        base = sqlite3.connect(path.resolve().as_uri() + "?mode=ro&immutable=1", uri=True, check_same_thread=False)
+        base.text_factory = partial(str, encoding="utf-8", errors="replace")
+        base.execute("PRAGMA writable_schema = ON")  # by which SQLite takes a file that is cut off
+        definitions, ends, keys = dict[str, tuple[str, str]](), list[int](), dict[int, tuple[str, str]]()
+        rows = dict[int, tuple[int, tuple[str, str], sqlite3.Connection, int]]()
+        with suppress(sqlite3.Error):
+            definitions = {type_name: (form, text) for type_name, form, text in base.execute(_DEFINITIONS)}
+        for number, *texts in base.execute(_TOPICS):
+            topic, type_name, encoding = map(str, texts)
+            form, text = definitions.get(type_name, ("", ""))
+            definition = MessageDefinition(Form.IDL if form == "ros2idl" else Form.MSG, str(text))
+            extra = ConnectionExtRosbag2(encoding, [])
+            keys[number] = topic, type_name
+            self.by_key[topic, type_name] = Connection(number, topic, type_name, definition, "", 0, extra, self)
+        for sought in ("NOT INDEXED", "INDEXED BY timestamp_idx"):
+            with suppress(sqlite3.Error):
+                ends += [end for (end,) in base.execute(f"SELECT max(id) FROM messages {sought}") if end]
+        ranges, failures = deque([(0, max(ends, default=path.stat().st_size // _ROW_BYTES))]), 0
+        while ranges:
+            first, last = ranges.popleft()
+            try:
+                for number, topic, time_ns, data in base.execute(_ROWS, (first, last)):
+                    first = number + 1
+                    if topic in keys and isinstance(time_ns, int) and isinstance(data, bytes):
+                        rows[number] = time_ns, keys[topic], base, number
+            except sqlite3.Error:
+                failures += 1
+                if first < last and failures < _MOST_FAILURES:
+                    middle = (first + last) // 2
+                    ranges += (first, middle), (middle + 1, last)
+        self.rows += rows.values()
+        self.message_count += max([*rows, *ends]) if ends else 0
+
+    def messages(
+        self, connections: Any = None, start: int = 0, stop: int = _LATEST_NS
+    ) -> Iterator[tuple[Any, int, bytes]]:
+        """The messages of a span of time."""
+        wanted = {(each.topic, each.msgtype): each for each in connections or self.connections}
+        first, behind = (bisect_left(self.rows, time_ns, key=itemgetter(0)) for time_ns in (start, stop))
+        for time_ns, key, base, number in self.rows[first:behind]:
+            if key in wanted:
+                yield wanted[key], time_ns, base.execute(_DATA, (number,)).fetchone()[0]
 
 
 def _unpacked(data: bytes, left: int) -> tuple[bytes, str]:
@@ -205,12 +247,11 @@ def _unpacked(data: bytes, left: int) -> tuple[bytes, str]:
         return b"", f"does not unpack to {most:,} bytes or less ({one_line(error)})"
 
 
-def _unpacked_folder(path: Path) -> TemporaryDirectory[str]:
+def _unpacked_folder(path: Path, metadata: str) -> TemporaryDirectory[str]:
     """A bag whose files are packed, unpacked up to any damage. Raises InputError for one beyond all measure."""
     folder = TemporaryDirectory(prefix="scanchain-", ignore_cleanup_errors=True)
     try:
-        text = (path / "metadata.yaml").read_text("utf-8", "replace")
-        text = _MODE.sub(r"\1 ''", text).replace(".zstd", "")
+        text = _MODE.sub(r"\1 ''", metadata).replace(".zstd", "")
         (Path(folder.name) / "metadata.yaml").write_text(text, "utf-8")
         for file in path.glob("*.zstd"):
             most = _LEAST_BYTES + _MOST_RATIO * file.stat().st_size
@@ -226,107 +267,3 @@ def _unpacked_folder(path: Path) -> TemporaryDirectory[str]:
             f"{folder.name}: {path} cannot be unpacked there ({error.strerror}); set TMPDIR"
         ) from error
     return folder
-
-
-class _Pages:
-    """The messages of a damaged database of SQLite, from those of its pages that are whole.
-
-    topics : encoding, type, and definition with its language of each, by its name
-    messages : time, topic and place in the file of each, by time; ``lost`` is the number of those missing
-    """
-
-    def __init__(self, path: Path) -> None:
-        with path.open("rb") as file:
-            self.data = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        is_stated = self.data[:16] == b"SQLite format 3\0"
-        self.size = int.from_bytes(self.data[16:18], "big") if is_stated else _PAGE_BYTES
-        self.size = self.size if self.size in _PAGE_SIZES else 1 << 16  # which is written as 1
-        self.usable = self.size - (ord(self.data[20:21] or b"\0") if is_stated else 0)
-        topics: dict[int, tuple[str, str, str]] = {}
-        definitions: dict[str, tuple[str, bytes]] = {}
-        rows: dict[int, tuple[int, int, int]] = {}
-        last = 0
-        for is_table, cell in self._cells():
-            try:
-                number, values = self.row(cell, is_table=is_table)
-            except (IndexError, ValueError):
-                continue
-            match values:
-                case [int(), int()] if not is_table:  # of the index of times, which has the number of each message
-                    last = max(last, values[1])
-                case [None, str(type_name), "ros2msg" | "ros2idl" as language, str(text), *_]:
-                    definitions[type_name] = language, text.encode()
-                case [None, str(topic), str(type_name), str(encoding), *_]:
-                    topics[number] = printable(topic), encoding, type_name
-                case [None, int(topic), int(time_ns), bytes()]:
-                    rows[number] = time_ns, topic, cell
-        named = ((time_ns, topics[topic][0], cell) for time_ns, topic, cell in rows.values() if topic in topics)
-        self.messages = sorted(named)
-        self.lost = max([last, *rows]) - len(self.messages)
-        self.topics = {
-            topic: (encoding, type_name, *definitions.get(type_name, ("ros2msg", b"")))
-            for topic, encoding, type_name in topics.values()
-        }
-
-    def between(self, begin_ns: int, end_ns: int) -> list[tuple[int, str, int]]:
-        """The messages of a span of time."""
-        first, behind = (bisect_left(self.messages, (time_ns,)) for time_ns in (begin_ns, end_ns))
-        return self.messages[first:behind]
-
-    def _cells(self) -> Iterator[tuple[bool, int]]:
-        """The rows of all pages but the first: whether each is of a table, and where it begins."""
-        kinds = np.frombuffer(self.data, np.uint8)[self.size :: self.size]
-        for page in (np.flatnonzero((kinds == _TABLE) | (kinds == _INDEX)) + 1).tolist():
-            begin = page * self.size
-            count = int.from_bytes(self.data[begin + 3 : begin + 5], "big")
-            pointers = self.data[begin + 8 : min(begin + 8 + 2 * count, begin + self.size)]
-            for at in range(0, len(pointers) - 1, 2):
-                yield self.data[begin] == _TABLE, begin + int.from_bytes(pointers[at : at + 2], "big")
-
-    def row(self, cell: int, *, is_table: bool = True) -> tuple[int, list[Any]]:
-        """Number and values of a row, of all its pages. Raises ValueError or IndexError for a damaged one."""
-        size, at = _varint(self.data, cell)
-        number, at = _varint(self.data, at) if is_table else (0, at)
-        usable = self.usable
-        most, least = usable - 35, (usable - 12) * 32 // 255 - 23
-        local = size if size <= most else least + (size - least) % (usable - 4)
-        local = local if local <= most else least
-        payload, at = self.data[at : at + local], at + local
-        while len(payload) < size <= len(self.data):
-            at = (int.from_bytes(self.data[at : at + 4], "big") - 1) * self.size
-            part = self.data[at + 4 : at + min(usable, 4 + size - len(payload))] if at >= 0 else b""
-            if not part:
-                break
-            payload += part
-        if len(payload) < size or (local < size and any(self.data[at : at + 4])):  # the last names no further one
-            raise ValueError("row of pages that are destroyed")
-        return number, _values(payload)
-
-
-def _varint(data: mmap.mmap | bytes, at: int) -> tuple[int, int]:
-    """A whole number of SQLite's, and where it ends. Raises IndexError."""
-    value = 0
-    for place in range(at, at + 8):
-        value = value << 7 | data[place] & 0x7F
-        if data[place] < 0x80:
-            return value, place + 1
-    return value << 8 | data[at + 8], at + 9
-
-
-def _values(payload: bytes) -> list[Any]:
-    """The values of a row; of floats None. Raises ValueError or IndexError for one that is damaged."""
-    begin, at = _varint(payload, 0)
-    end, values = begin, list[Any]()
-    while at < begin:
-        kind, at = _varint(payload, at)
-        size = _SIZES[kind] if kind < 12 else (kind - 12) // 2
-        value, end = payload[end : end + size], end + size
-        if kind >= 12:
-            values.append(str(value, "utf-8", "replace") if kind % 2 else value)
-        elif kind in (0, 7):
-            values.append(None)
-        else:
-            values.append(kind - 8 if kind > 7 else int.from_bytes(value, "big", signed=True))
-    if (at, end) != (begin, len(payload)):
-        raise ValueError("row of another length than its head states")
-    return values
