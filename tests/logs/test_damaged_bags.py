@@ -160,7 +160,7 @@ def test_of_a_database_with_one_page_destroyed_all_other_messages_are_read(tmp_p
 
 
 def test_a_healthy_database_is_not_read_row_by_row(tmp_path, monkeypatch):
-    monkeypatch.setattr("scanchain.logs.formats.ros2_bag._Rows", None)
+    monkeypatch.setattr("scanchain.logs.formats.ros2_bag._copy_rows", None)
     assert len(recorders.read_undamaged(bag2(tmp_path / "a"))[1]) == 40
 
 

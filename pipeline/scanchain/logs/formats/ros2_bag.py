@@ -1,19 +1,17 @@
-"""ROS 2 bags, read by rosbags, and row by row where a database of SQLite is damaged; messages stay as they are."""
+"""ROS 2 bags, read by rosbags; a damaged database of SQLite by a copy of the rows that it still gives."""
 
 from __future__ import annotations
 
 import re
 import sqlite3
 import threading
-from bisect import bisect_left
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from collections.abc import Set as AbstractSet
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
-from operator import itemgetter
+from itertools import chain, pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -22,7 +20,6 @@ import zstandard
 
 from scanchain.errors import InputError, counted, one_line
 from scanchain.logs.files import size_of
-from scanchain.logs.formats import natural_order
 from scanchain.logs.mcap.index import most_unpacked
 from scanchain.logs.mcap.records import Block, Channel, Contents, FileIndex, Message
 from scanchain.logs.writer import schema_text
@@ -36,11 +33,17 @@ _MODE = re.compile(r"^( *compression_mode:)[ \"']*(\w*).*$", re.MULTILINE)
 _COUNT = re.compile(r"^  message_count: *(\d{1,15})$", re.MULTILINE)
 
 _ROW_BYTES = 16  # bytes of a file that a row takes at least
-_MOST_FAILURES = 100_000  # ranges of rows that fail in a file, about a second
-_DATA = "SELECT data FROM messages NOT INDEXED WHERE id = ?"
-_ROWS = "SELECT id, topic_id, timestamp, data FROM messages NOT INDEXED WHERE id BETWEEN ? AND ?"
-_TOPICS = "SELECT id, name, type, serialization_format FROM topics"
-_DEFINITIONS = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+_MOST_FAILURES = 100_000  # ranges of rows that fail in a table, about a second
+_TABLES = (
+    "SELECT name, sql FROM sqlite_master WHERE name IN ('schema', 'topics', 'message_definitions', 'messages')"
+)
+_CLEAN = """
+CREATE TABLE IF NOT EXISTS topics(id, name, type, serialization_format);
+CREATE TABLE IF NOT EXISTS messages(id, topic_id, timestamp, data);
+DELETE FROM messages WHERE typeof(timestamp) != 'integer' OR typeof(data) != 'blob'
+    OR topic_id NOT IN (SELECT id FROM topics);
+CREATE INDEX timestamp_idx ON messages (timestamp);
+"""
 
 
 def index_ros2_bag(path: Path, number: int) -> FileIndex:
@@ -95,50 +98,63 @@ def parts_of_bag(folder: Path) -> list[Path]:
 
 
 class _Bag:
-    """A bag and its reader: of rosbags or, where that meets ``damage``, row by row; one thread at a time reads.
+    """A bag and its reader, of rosbags, which one thread at a time uses.
 
-    begin_ns : the first log time that is not 0; ``last`` is the number of the last block
+    begin_ns : first log time that is not 0; ``last`` is the number of the last block, ``folder`` that of a copy
     """
 
     def __init__(self, path: Path) -> None:
-        from rosbags import rosbag2
-
-        text = (path / "metadata.yaml").read_text("utf-8", "replace") if path.is_dir() else ""
-        mode = found[2].lower() if (found := _MODE.search(text)) else ""
-        self.folder = _unpacked_folder(path, text) if mode == "file" else None  # removed with the bag
-        self.path, self.opened = path, Path(self.folder.name) if self.folder else path
-        self.stated = int(found[1]) if (found := _COUNT.search(text)) else 0
-        self.is_packed, self.damage, self.last, self.lock = mode == "message", "", 0, threading.Lock()
-        self.channels: dict[tuple[str, str], Channel] = {}
-        self.reader: Any = None
+        self.metadata = (path / "metadata.yaml").read_text("utf-8", "replace") if path.is_dir() else ""
+        mode = found[2].lower() if (found := _MODE.search(self.metadata)) else ""
+        self.path, self.is_packed, self.damage, self.last = path, mode == "message", "", 0
+        self.lock, self.channels = threading.Lock(), dict[tuple[str, str], Channel]()
+        self.opened, self.folder, self.reader = path, None, None
+        if mode == "file":
+            self.metadata = _MODE.sub(r"\1 ''", self.metadata).replace(".zstd", "")
+            self._copy("*.zstd", _unpack)
         try:
-            reader = rosbag2.Reader(self.opened)
-            reader.open()
-            self.begin_ns, self.reader = _begin_ns(reader), reader
+            self._open()
         except Exception as error:  # whatever a damaged file makes the libraries below raise
             self._rescue(one_line(error))
-            if self.reader is None:
-                raise InputError(self.damage) from error
-            self.begin_ns = _begin_ns(self.reader)
-        if self.is_packed and not self.damage:  # messages are unpacked here, as rosbags sets no limit
-            self.reader.storage.metadata = self.reader.storage.metadata._replace(compression_mode=None)
+
+    def _open(self) -> None:
+        from rosbags import rosbag2
+
+        reader: Any = rosbag2.Reader(self.opened)
+        reader.open()
+        if self.is_packed:  # messages are unpacked here, as rosbags sets no limit
+            reader.storage.metadata = reader.storage.metadata._replace(compression_mode=None)
+        self.begin_ns = reader.start_time or next((time_ns for _, time_ns, _ in reader.messages(start=1)), 0)
+        self.reader = reader
+
+    def _copy(self, pattern: str, copy: Callable[[Path, Path], None]) -> None:
+        """Copy the files into a folder that goes with the bag. Raises InputError where there is no room."""
+        folder = TemporaryDirectory(prefix="scanchain-", ignore_cleanup_errors=True)
+        try:
+            (Path(folder.name) / "metadata.yaml").write_text(self.metadata, "utf-8")
+            for file in self.opened.glob(pattern) if self.opened.is_dir() else [self.opened]:
+                copy(file, Path(folder.name) / file.name.removesuffix(".zstd"))
+        except OSError as error:
+            reason = f"{self.path} cannot be copied there ({error.strerror}); set TMPDIR"
+            raise InputError(f"{folder.name}: {reason}") from error
+        self.opened = Path(folder.name) / ("" if self.opened.is_dir() else self.opened.name)
+        self.folder = folder
 
     def _rescue(self, reason: str) -> None:
-        """Read row by row from here on if SQLite gives a row."""
-        rows, remedy = (
-            _Rows(self.opened),
-            "a .db3 is saved in part by .recover of sqlite3, a folder by ros2 bag reindex",
-        )
-        left, total = len(rows.rows), max(rows.message_count, self.stated)
-        self.damage = f"{self.path}: cannot be read as a ROS bag ({reason}); copy it again; {remedy}"
-        if left:
-            lost = (
-                f"{total - left:,} of {counted(total, 'message')} lost"
-                if total
-                else f"only {left:,} messages left"
-            )
-            self.damage = f"{self.path}: {lost}: damaged pages ({reason}); the others were read row by row"
-            self.reader = rows
+        """Go on with what SQLite still gives. Raises InputError where that is nothing."""
+        counts = Counter[str]()
+        try:
+            self._copy("*.db3", partial(_copy_rows, counts))
+            self._open()
+        except Exception:  # as above
+            counts.clear()
+        if not counts["left"]:
+            remedy = "a .db3 is saved in part by .recover of sqlite3, a folder by ros2 bag reindex"
+            raise InputError(f"{self.path}: cannot be read as a ROS bag ({reason}); copy it again; {remedy}")
+        stated = int(found[1]) if (found := _COUNT.search(self.metadata)) else 0
+        left, total = counts["left"], max(counts["stated"], stated)
+        lost = f"{total - left:,} of {counted(total, 'message')} lost" if total else f"only {left:,} messages left"
+        self.damage = f"{self.path}: {lost}: damaged pages ({reason}); the others were read row by row"
 
     def contents(self, block: Block, wanted: AbstractSet[int] | None) -> Contents:
         """The messages of a span of time; both ends reach as far as time, whatever the metadata."""
@@ -153,7 +169,10 @@ class _Bag:
                 for each, time_ns, data in reader.messages(connections, begin_ns, end_ns) if connections else ():
                     found.append((chosen[each.topic, each.msgtype], time_ns, data))
             except Exception as error:  # whatever a damaged file makes the libraries below raise
-                self._rescue(one_line(error))
+                try:
+                    self._rescue(one_line(error))
+                except InputError as refused:
+                    self.damage = str(refused)
         if self.reader is not reader:
             return self.contents(block, wanted)
         messages, left = list[Message](), _MOST_UNPACKED
@@ -162,78 +181,6 @@ class _Bag:
             left -= len(unpacked)
             messages.append(Message(channel, time_ns, memoryview(unpacked), defect))
         return Contents(messages, self.damage)
-
-
-def _begin_ns(reader: Any) -> int:
-    return reader.start_time or next((time_ns for _, time_ns, _ in reader.messages(start=1)), 0)
-
-
-class _Rows:
-    """As a reader of rosbags: what SQLite still gives, row by row, of the damaged databases of a bag.
-
-    message_count : the largest number of a row, with those that are lost, 0 where it is unknown
-    """
-
-    def __init__(self, opened: Path) -> None:
-        self.by_key, self.message_count = dict[tuple[str, str], Any](), 0  # connections by topic and type
-        self.rows: list[
-            tuple[int, tuple[str, str], sqlite3.Connection, int]
-        ] = []  # by time; the last is the number
-        for path in sorted(opened.glob("*.db3"), key=natural_order) if opened.is_dir() else [opened]:
-            with suppress(sqlite3.Error):  # of a header or topics that are destroyed
-                self._read(path)
-        self.rows.sort(key=itemgetter(0))
-        counts = Counter(key for _, key, _, _ in self.rows)
-        self.connections = [each._replace(msgcount=counts[key]) for key, each in self.by_key.items()]
-        self.start_time, self.end_time = (self.rows[0][0], self.rows[-1][0] + 1) if self.rows else (0, 0)
-
-    def _read(self, path: Path) -> None:
-        """Add a database. Raises sqlite3.Error where its topics cannot be read."""
-        from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition
-        from rosbags.interfaces import MessageDefinitionFormat as Form
-
-        base = sqlite3.connect(path.resolve().as_uri() + "?mode=ro&immutable=1", uri=True, check_same_thread=False)
-        base.text_factory = partial(str, encoding="utf-8", errors="replace")
-        base.execute("PRAGMA writable_schema = ON")  # by which SQLite takes a file that is cut off
-        definitions, ends, keys = dict[str, tuple[str, str]](), list[int](), dict[int, tuple[str, str]]()
-        rows = dict[int, tuple[int, tuple[str, str], sqlite3.Connection, int]]()
-        with suppress(sqlite3.Error):
-            definitions = {type_name: (form, text) for type_name, form, text in base.execute(_DEFINITIONS)}
-        for number, *texts in base.execute(_TOPICS):
-            topic, type_name, encoding = map(str, texts)
-            form, text = definitions.get(type_name, ("", ""))
-            definition = MessageDefinition(Form.IDL if form == "ros2idl" else Form.MSG, str(text))
-            extra = ConnectionExtRosbag2(encoding, [])
-            keys[number] = topic, type_name
-            self.by_key[topic, type_name] = Connection(number, topic, type_name, definition, "", 0, extra, self)
-        for sought in ("NOT INDEXED", "INDEXED BY timestamp_idx"):
-            with suppress(sqlite3.Error):
-                ends += [end for (end,) in base.execute(f"SELECT max(id) FROM messages {sought}") if end]
-        ranges, failures = deque([(0, max(ends, default=path.stat().st_size // _ROW_BYTES))]), 0
-        while ranges:
-            first, last = ranges.popleft()
-            try:
-                for number, topic, time_ns, data in base.execute(_ROWS, (first, last)):
-                    first = number + 1
-                    if topic in keys and isinstance(time_ns, int) and isinstance(data, bytes):
-                        rows[number] = time_ns, keys[topic], base, number
-            except sqlite3.Error:
-                failures += 1
-                if first < last and failures < _MOST_FAILURES:
-                    middle = (first + last) // 2
-                    ranges += (first, middle), (middle + 1, last)
-        self.rows += rows.values()
-        self.message_count += max([*rows, *ends]) if ends else 0
-
-    def messages(
-        self, connections: Any = None, start: int = 0, stop: int = _LATEST_NS
-    ) -> Iterator[tuple[Any, int, bytes]]:
-        """The messages of a span of time."""
-        wanted = {(each.topic, each.msgtype): each for each in connections or self.connections}
-        first, behind = (bisect_left(self.rows, time_ns, key=itemgetter(0)) for time_ns in (start, stop))
-        for time_ns, key, base, number in self.rows[first:behind]:
-            if key in wanted:
-                yield wanted[key], time_ns, base.execute(_DATA, (number,)).fetchone()[0]
 
 
 def _unpacked(data: bytes, left: int) -> tuple[bytes, str]:
@@ -247,23 +194,53 @@ def _unpacked(data: bytes, left: int) -> tuple[bytes, str]:
         return b"", f"does not unpack to {most:,} bytes or less ({one_line(error)})"
 
 
-def _unpacked_folder(path: Path, metadata: str) -> TemporaryDirectory[str]:
-    """A bag whose files are packed, unpacked up to any damage. Raises InputError for one beyond all measure."""
-    folder = TemporaryDirectory(prefix="scanchain-", ignore_cleanup_errors=True)
-    try:
-        text = _MODE.sub(r"\1 ''", metadata).replace(".zstd", "")
-        (Path(folder.name) / "metadata.yaml").write_text(text, "utf-8")
-        for file in path.glob("*.zstd"):
-            most = _LEAST_BYTES + _MOST_RATIO * file.stat().st_size
-            with file.open("rb") as stored, (Path(folder.name) / file.stem).open("wb") as copy:
-                unpacker = zstandard.ZstdDecompressor().stream_reader(stored, read_across_frames=True)
-                with suppress(zstandard.ZstdError):
-                    while data := unpacker.read(1 << 20):
-                        copy.write(data)
-                        if copy.tell() > most:
-                            raise InputError(f"{file}: unpacks to more than {most:,} bytes; is it a ROS 2 bag?")
-    except OSError as error:
-        raise InputError(
-            f"{folder.name}: {path} cannot be unpacked there ({error.strerror}); set TMPDIR"
-        ) from error
-    return folder
+def _unpack(file: Path, unpacked: Path) -> None:
+    """Unpack a file up to any damage. Raises InputError for one beyond all measure."""
+    most = _LEAST_BYTES + _MOST_RATIO * file.stat().st_size
+    with file.open("rb") as stored, unpacked.open("wb") as copy, suppress(zstandard.ZstdError):
+        unpacker = zstandard.ZstdDecompressor().stream_reader(stored, read_across_frames=True)
+        while data := unpacker.read(1 << 20):
+            copy.write(data)
+            if copy.tell() > most:
+                raise InputError(f"{file}: unpacks to more than {most:,} bytes; is it a ROS 2 bag?")
+
+
+def _copy_rows(counts: Counter[str], file: Path, copy: Path) -> None:
+    """Copy what SQLite gives of a database, and add how many messages are left and, if it is known, were stated."""
+    uri = file.resolve().as_uri() + "?mode=ro&immutable=1"
+    with closing(sqlite3.connect(uri, uri=True)) as old, closing(sqlite3.connect(copy)) as new:
+        old.text_factory = partial(str, encoding="utf-8", errors="replace")
+        with suppress(sqlite3.Error):  # of a header or schema that is destroyed
+            old.execute("PRAGMA writable_schema = ON")  # by which SQLite takes a file that is cut off
+            for name, sql in old.execute(_TABLES).fetchall():
+                ends = list[int]()
+                for sought in ("NOT INDEXED", "INDEXED BY timestamp_idx"):
+                    with suppress(sqlite3.Error):
+                        ends += [end for (end,) in old.execute(f"SELECT max(rowid) FROM {name} {sought}") if end]
+                counts["stated"] += max(ends, default=0) if name == "messages" else 0
+                rows = _rows(old, name, max(ends, default=file.stat().st_size // _ROW_BYTES))
+                new.execute(sql)
+                if (row := next(rows, None)) is not None:
+                    marks = ", ".join("?" * len(row))
+                    new.executemany(f"INSERT OR IGNORE INTO {name} VALUES ({marks})", chain([row], rows))
+        new.executescript(_CLEAN)
+        ((left,),) = new.execute("SELECT count(*) FROM messages")
+        counts["left"] += left
+        new.commit()
+
+
+def _rows(base: sqlite3.Connection, table: str, last: int) -> Iterator[list[Any]]:
+    """The rows of a table up to a number, by halves of its range where SQLite fails."""
+    ranges, failures = deque([(0, last)]), 0
+    query = f"SELECT rowid, * FROM {table} NOT INDEXED WHERE rowid BETWEEN ? AND ?"
+    while ranges:
+        first, last = ranges.popleft()
+        try:
+            for number, *row in base.execute(query, (first, last)):
+                first = number + 1
+                yield row
+        except sqlite3.Error:
+            failures += 1
+            if first < last and failures < _MOST_FAILURES:
+                middle = (first + last) // 2
+                ranges += (first, middle), (middle + 1, last)
