@@ -11,7 +11,7 @@ from collections.abc import Set as AbstractSet
 from contextlib import closing, suppress
 from dataclasses import replace
 from functools import partial
-from itertools import chain, pairwise
+from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -49,9 +49,7 @@ CREATE INDEX timestamp_idx ON messages (timestamp);
 def index_ros2_bag(path: Path, number: int) -> FileIndex:
     """The topics of a .db3 or the folder of a ROS 2 bag; blocks are spans of time. Raises InputError for none."""
     bag = _Bag(path)
-    index, reader = FileIndex(path, number, make=bag.contents), bag.reader
-    if bag.damage:
-        index.damage.append(bag.damage)
+    index, reader = FileIndex(path, number, damage=[bag.damage] if bag.damage else []), bag.reader
     for id_, each in enumerate(reader.connections, start=1):
         encoding = each.ext.serialization_format
         are_texts = all(isinstance(text, str) for text in (each.topic, each.msgtype, encoding))
@@ -77,7 +75,7 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
             index.blocks.append(Block(number, place, share, "", share, start_ns, stop_ns - 1))
         if not reader.start_time:  # messages of log time 0, which are in the first block
             index.blocks[0] = replace(index.blocks[0], start_ns=0)
-        bag.last = len(index.blocks) - 1
+        index.make = partial(bag.contents, index)
     return index
 
 
@@ -98,17 +96,16 @@ def parts_of_bag(folder: Path) -> list[Path]:
 
 
 class _Bag:
-    """A bag and its reader, of rosbags, which one thread at a time uses.
+    """A bag and its reader, of rosbags, which one thread at a time uses; ``folder`` is that of a copy.
 
-    begin_ns : first log time that is not 0; ``last`` is the number of the last block, ``folder`` that of a copy
+    begin_ns : first log time that is not 0
     """
 
     def __init__(self, path: Path) -> None:
         self.metadata = (path / "metadata.yaml").read_text("utf-8", "replace") if path.is_dir() else ""
         mode = found[2].lower() if (found := _MODE.search(self.metadata)) else ""
-        self.path, self.is_packed, self.damage, self.last = path, mode == "message", "", 0
+        self.path, self.opened, self.is_packed, self.damage = path, path, mode == "message", ""
         self.lock, self.channels = threading.Lock(), dict[tuple[str, str], Channel]()
-        self.opened, self.folder, self.reader = path, None, None
         if mode == "file":
             self.metadata = _MODE.sub(r"\1 ''", self.metadata).replace(".zstd", "")
             self._copy("*.zstd", _unpack)
@@ -130,36 +127,39 @@ class _Bag:
     def _copy(self, pattern: str, copy: Callable[[Path, Path], None]) -> None:
         """Copy the files into a folder that goes with the bag. Raises InputError where there is no room."""
         folder = TemporaryDirectory(prefix="scanchain-", ignore_cleanup_errors=True)
+        into, is_folder = Path(folder.name), self.opened.is_dir()
         try:
-            (Path(folder.name) / "metadata.yaml").write_text(self.metadata, "utf-8")
-            for file in self.opened.glob(pattern) if self.opened.is_dir() else [self.opened]:
-                copy(file, Path(folder.name) / file.name.removesuffix(".zstd"))
+            (into / "metadata.yaml").write_text(self.metadata, "utf-8")
+            for file in self.opened.glob(pattern) if is_folder else [self.opened]:
+                copy(file, into / file.name.removesuffix(".zstd"))
         except OSError as error:
             reason = f"{self.path} cannot be copied there ({error.strerror}); set TMPDIR"
-            raise InputError(f"{folder.name}: {reason}") from error
-        self.opened = Path(folder.name) / ("" if self.opened.is_dir() else self.opened.name)
-        self.folder = folder
+            raise InputError(f"{into}: {reason}") from error
+        self.folder, self.opened = folder, into if is_folder else into / self.opened.name
 
     def _rescue(self, reason: str) -> None:
         """Go on with what SQLite still gives. Raises InputError where that is nothing."""
+        remedy = "sqlite.org's sqlite3 saves part of a .db3 by .recover, ros2 bag reindex a folder"
+        self.damage = f"{self.path}: cannot be read as a ROS bag ({reason}); copy it again; {remedy}"
         counts = Counter[str]()
         try:
             self._copy("*.db3", partial(_copy_rows, counts))
             self._open()
-        except Exception:  # as above
-            counts.clear()
+        except InputError:
+            raise
+        except Exception as error:  # as above
+            raise InputError(self.damage) from error
         if not counts["left"]:
-            remedy = "a .db3 is saved in part by .recover of sqlite3, a folder by ros2 bag reindex"
-            raise InputError(f"{self.path}: cannot be read as a ROS bag ({reason}); copy it again; {remedy}")
-        stated = int(found[1]) if (found := _COUNT.search(self.metadata)) else 0
-        left, total = counts["left"], max(counts["stated"], stated)
-        lost = f"{total - left:,} of {counted(total, 'message')} lost" if total else f"only {left:,} messages left"
-        self.damage = f"{self.path}: {lost}: damaged pages ({reason}); the others were read row by row"
+            raise InputError(self.damage)
+        left, stated = counts["left"], _COUNT.search(self.metadata)
+        total = max(counts["stated"], int(stated[1]) if stated else 0)
+        lost = f"{total - left:,} of {counted(total, 'message')}" if total else "some messages"
+        self.damage = f"{self.path}: {lost} lost: damaged pages; the others were read row by row"
 
-    def contents(self, block: Block, wanted: AbstractSet[int] | None) -> Contents:
+    def contents(self, index: FileIndex, block: Block, wanted: AbstractSet[int] | None) -> Contents:
         """The messages of a span of time; both ends reach as far as time, whatever the metadata."""
         begin_ns, end_ns = block.start_ns if block.offset else 0, block.end_ns + 1
-        end_ns = _LATEST_NS if block.offset == self.last else end_ns
+        end_ns = _LATEST_NS if block.offset == len(index.blocks) - 1 else end_ns
         chosen = {key: c for key, c in self.channels.items() if wanted is None or c.key[1] in wanted}
         found: list[tuple[Channel, int, bytes]] = []
         with self.lock:
@@ -169,12 +169,10 @@ class _Bag:
                 for each, time_ns, data in reader.messages(connections, begin_ns, end_ns) if connections else ():
                     found.append((chosen[each.topic, each.msgtype], time_ns, data))
             except Exception as error:  # whatever a damaged file makes the libraries below raise
-                try:
+                with suppress(InputError):
                     self._rescue(one_line(error))
-                except InputError as refused:
-                    self.damage = str(refused)
         if self.reader is not reader:
-            return self.contents(block, wanted)
+            return self.contents(index, block, wanted)
         messages, left = list[Message](), _MOST_UNPACKED
         for channel, time_ns, data in found:
             unpacked, defect = _unpacked(data, left) if self.is_packed else (data, "")
@@ -206,23 +204,23 @@ def _unpack(file: Path, unpacked: Path) -> None:
 
 
 def _copy_rows(counts: Counter[str], file: Path, copy: Path) -> None:
-    """Copy what SQLite gives of a database, and add how many messages are left and, if it is known, were stated."""
+    """Copy what SQLite gives of a database, and count messages that are left and, if known, were stated."""
     uri = file.resolve().as_uri() + "?mode=ro&immutable=1"
     with closing(sqlite3.connect(uri, uri=True)) as old, closing(sqlite3.connect(copy)) as new:
+        new.execute("PRAGMA synchronous = OFF")
         old.text_factory = partial(str, encoding="utf-8", errors="replace")
         with suppress(sqlite3.Error):  # of a header or schema that is destroyed
             old.execute("PRAGMA writable_schema = ON")  # by which SQLite takes a file that is cut off
             for name, sql in old.execute(_TABLES).fetchall():
+                new.execute(sql)
                 ends = list[int]()
                 for sought in ("NOT INDEXED", "INDEXED BY timestamp_idx"):
                     with suppress(sqlite3.Error):
                         ends += [end for (end,) in old.execute(f"SELECT max(rowid) FROM {name} {sought}") if end]
                 counts["stated"] += max(ends, default=0) if name == "messages" else 0
+                marks = ", ".join("?" for _ in old.execute(f"SELECT * FROM {name} LIMIT 0").description)
                 rows = _rows(old, name, max(ends, default=file.stat().st_size // _ROW_BYTES))
-                new.execute(sql)
-                if (row := next(rows, None)) is not None:
-                    marks = ", ".join("?" * len(row))
-                    new.executemany(f"INSERT OR IGNORE INTO {name} VALUES ({marks})", chain([row], rows))
+                new.executemany(f"INSERT OR IGNORE INTO {name} VALUES ({marks})", rows)
         new.executescript(_CLEAN)
         ((left,),) = new.execute("SELECT count(*) FROM messages")
         counts["left"] += left
