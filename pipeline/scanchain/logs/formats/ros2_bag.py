@@ -60,9 +60,9 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
             definition = each.msgdef.data.encode() or schema_text(each.msgtype)
             named = each.topic, encoding, id_, each.msgtype, language
             channel = Channel((number, id_), *named, definition)
-            channel = bag.channels.setdefault((each.topic, each.msgtype), channel)
-            index.channels[channel.key[1]] = channel
-            index.counts[channel.key[1]] = index.counts.get(channel.key[1], 0) + each.msgcount
+            _, key = bag.channels.setdefault((each.topic, each.msgtype), channel).key
+            index.channels.setdefault(key, channel)
+            index.counts[key] = index.counts.get(key, 0) + each.msgcount
     lost = reader.message_count - sum(each.msgcount for each in reader.connections)
     if lost > 0 and not bag.damage:
         index.damage.append(f"{path}: {counted(lost, 'message')} of no topic that it lists")
@@ -75,7 +75,7 @@ def index_ros2_bag(path: Path, number: int) -> FileIndex:
             index.blocks.append(Block(number, place, share, "", share, start_ns, stop_ns - 1))
         if not reader.start_time:  # messages of log time 0, which are in the first block
             index.blocks[0] = replace(index.blocks[0], start_ns=0)
-        index.make = partial(bag.contents, index)
+    index.make = partial(bag.contents, index)
     return index
 
 
