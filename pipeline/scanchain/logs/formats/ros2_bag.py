@@ -33,7 +33,7 @@ _MODE = re.compile(r"^( *compression_mode:)[ \"']*(\w*).*$", re.MULTILINE)
 _COUNT = re.compile(r"^  message_count: *(\d{1,15})$", re.MULTILINE)
 
 _ROW_BYTES = 16  # bytes of a file that a row takes at least
-_MOST_FAILURES = 100_000  # ranges of rows that fail in a table, about a second
+_MOST_FAILURES = 5_000  # ranges of rows that fail in a table, about half a second
 _TABLES = (
     "SELECT name, sql FROM sqlite_master WHERE name IN ('schema', 'topics', 'message_definitions', 'messages')"
 )
