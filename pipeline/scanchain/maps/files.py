@@ -39,10 +39,7 @@ DATA binary
 """
 _SCALE_M = 0.001  # LAZ holds whole multiples of it
 _LAS_S, _LAS_S_PER_MIB = 30.0, 1.0  # largest time to decode a file; a MiB takes about 0.05 s
-_LAS_MIB, _LAS_TIMES = (
-    1024.0,
-    100.0,
-)  # largest memory, and times the size of the file: a point of 2 bytes takes 100
+_LAS_MIB, _LAS_TIMES = 1024.0, 100.0  # largest memory, and times the size of the file
 
 _PGM = re.compile(rb"P5\n(\d+) (\d+)\n255\n(.*)", re.DOTALL)
 _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205  # pixels of ROS's map_saver
@@ -115,10 +112,9 @@ def read_las(path: Path) -> Points:
             return np.load(points)
         lines = output.read_text("utf-8", "replace").splitlines()
         last = next((line for line in reversed(lines) if not line.startswith("note:")), "")
-        reason = {
-            KilledFor.TIME: f"decoding it takes over {limits.time_s:.0f} s",
-            KilledFor.MEMORY: f"decoding it takes over {limits.memory_mib:,.0f} MiB",
-        }.get(ending.killed_for, ending.reason(limits, last))
+        reason = ending.reason(limits, last)
+        if ending.killed_for is not KilledFor.NOTHING:
+            reason = f"decoding it takes over {limits.time_s:.0f} s or {limits.memory_mib:,.0f} MiB"
     raise InputError(f"{path}: is no LAS or LAZ file that can be read ({reason}); copy or write it again")
 
 

@@ -13,6 +13,7 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,7 @@ _HALF_TURN = math.pi
 _MOST_RATIO, _LEAST_BYTES = 200, 1 << 24  # largest ratio of packing, beyond so many bytes of text
 _AT_ONCE = 256  # bytes of text that are unpacked at once, of which damage loses all
 _LONGEST_LINE = 1 << 18  # bytes of a line; a longer one is malformed
-_HEAD_BYTES = 1 << 16  # bytes of text by which files of other kinds are recognized
+_HEAD_LINES = 256  # lines of text by which files of other kinds are recognized
 
 
 def is_carmen(head: bytes) -> bool:
@@ -60,21 +61,15 @@ def index_carmen(path: Path, number: int) -> FileIndex:
     index = temporary_index(path, number, lambda log: _write(log, read_lines(path, damage), malformed, others))
     if not index.counts and not malformed[1]:
         absent = f"text without a line of {b', '.join(KINDS).decode()}"
-        text = bytearray()
-        for line in read_lines(path, []):
-            text += line + b"\n"
-            if len(text) > _HEAD_BYTES:
-                break
+        text = b"\n".join(islice(read_lines(path, []), _HEAD_LINES))
         raise UnknownFormatError(text, "".join(damage).removeprefix(f"{path}: ") or absent)
     index.damage += damage
     if malformed[1]:
         lines = f"{counted(malformed[1], 'malformed line')} left out (the first: line {malformed[0]})"
         index.damage.append(f"{path}: {lines}")
     if others:
-        listed = ", ".join(
-            f"{count} {printable(kind.decode('ascii', 'replace'))}" for kind, count in others.items()
-        )
-        index.notes.append(f"{path}: lines of kinds that are not read: {listed}")
+        listed = ", ".join(f"{count} {kind.decode('ascii', 'replace')}" for kind, count in others.items())
+        index.notes.append(f"{path}: lines of kinds that are not read: {printable(listed)}")
     return index
 
 
