@@ -19,8 +19,7 @@ from scanchain.commands.maps import changes, localize, map_group, merge
 from scanchain.commands.optimize import optimize
 from scanchain.commands.preparing import config, sequence, warm_up
 from scanchain.commands.run import check, run, view
-from scanchain.errors import InputError, ScanchainError, printable, remedy_of
-from scanchain.logs.files import spelled
+from scanchain.errors import InputError, ScanchainError, printable, remedy_of, spelled
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
@@ -64,8 +63,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(words: list[str]) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small: threads would wait for each other
-    if odd := next((word for word in words if spelled(word) != word), ""):
-        return _fail(f"{spelled(odd)}: is not UTF-8; rename it, or choose another name", 2)
+    if words[:1] != ["batch"] and (odd := next((word for word in words if spelled(word) != word), "")):
+        return _fail(f"{spelled(odd)}: the name is not UTF-8; rename it", 2)
     try:
         return scanchain.main(words, prog_name="scanchain", standalone_mode=False) or 0
     except click.exceptions.NoArgsIsHelpError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import math
+import os
 import re
 from collections.abc import Iterable
 
@@ -55,6 +56,11 @@ def shown(value: object) -> str:
 def printable(text: str) -> str:
     """The text on one line; line breaks, escapes of terminals and marks of direction as Python writes them."""
     return text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
+def spelled(name: str) -> str:
+    """A name as text; bytes in it that are not UTF-8 are written as numbers (x and two digits)."""
+    return os.fsencode(name).decode("utf-8", "backslashreplace")
 
 
 def one_line(error: BaseException) -> str:

@@ -154,9 +154,9 @@ def test_a_map_with_right_checksums_and_wrong_arrays_is_refused(place, name, arr
 def test_a_name_that_is_no_text_is_refused_in_one_line(call, tmp_path):
     log = write(tmp_path / "a.mcap", office(3))
     odd = os.fsdecode(os.fsencode(tmp_path) + b"/run\xff")
-    for words in (["run", log, "--out", odd], ["batch", odd, "--out", tmp_path / "b"], ["info", odd]):
+    for words in (["run", log, "--out", odd], ["batch", log, "--out", odd], ["info", odd]):
         code, output, errors = call(*words)
-        assert (code, output) == (2, "") and "run\\xff: is not UTF-8; rename it" in errors
+        assert (code, output) == (2, "") and "run\\xff: the name is not UTF-8; rename it" in errors
         assert errors.count("\n") == 1
 
 

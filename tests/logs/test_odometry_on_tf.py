@@ -99,7 +99,8 @@ def test_info_names_frames_and_rate(tmp_path, capfd):
 def test_what_is_no_odometry_of_the_robot_is_not_taken_for_wheels(tmp_path, links, options, note):
     log, scans = read(drive(tmp_path / "a.mcap", links, **options))
     assert log.odometry_topic == "" and all(scan.T_odom_base is None for scan in scans)
-    assert any(note in line for line in log.notes) if note else not log.notes
+    others = [line for line in log.notes if not line.startswith("no point times")]
+    assert any(note in line for line in others) if note else not others
 
 
 def test_of_two_robots_that_of_the_lidar_is_taken(tmp_path):
@@ -135,7 +136,7 @@ def test_a_joint_that_moves_the_lidar_leaves_the_wheels_of_tf_out_as_others(tmp_
     says("\n".join(log.notes), "base_link → laser in /tf turns by up to", "the wheels (/tf) are no prior for it")
     rest = lambda k: [("base_link", "laser", 0.2, 0.0, 0.3, 0.0)]  # noqa: E731
     log, _ = read(drive(tmp_path / "b.mcap", [("odom", "base_link")], fixed=[], also=rest))
-    assert log.odometry_topic == "/tf" and log.notes == []
+    assert log.odometry_topic == "/tf" and not any("/tf" in line for line in log.notes)
 
 
 def test_a_transform_of_another_link_that_is_no_pose_costs_no_reading(tmp_path):

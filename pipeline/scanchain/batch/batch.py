@@ -17,9 +17,9 @@ import msgspec
 import numpy as np
 
 from scanchain.batch.task import ROWS_FOLDER, Row, State, Task, attempt, finished_row, key_of
-from scanchain.errors import InputError, MissingExtraError, counted, duration
+from scanchain.errors import InputError, MissingExtraError, counted, duration, spelled
 from scanchain.files import Source, source_of, write_whole
-from scanchain.logs.files import matching, misspelled, spelled
+from scanchain.logs.files import matching, misspelled
 from scanchain.logs.opening import AUTO, logs_in
 from scanchain.processes import Limits, available_mib
 from scanchain.runs.directory import check_outside_runs
@@ -125,6 +125,8 @@ def run_batch(batch: Batch, progress: Progress, work: Work | None = None) -> Bat
 
 def _check_out(batch: Batch) -> None:
     """Refuse a directory that holds something else than a batch, or lies in a run or in a log that is a folder."""
+    if complaint := misspelled(batch.out):
+        raise InputError(complaint)
     check_outside_runs(batch.out)
     out = batch.out.resolve()
     for log in batch.logs:

@@ -13,8 +13,8 @@ from threading import Event
 import msgspec
 from msgspec import Struct
 
+from scanchain.errors import spelled
 from scanchain.files import source_of
-from scanchain.logs.files import spelled
 from scanchain.processes import Ending, KilledFor, Limits, run_within
 from scanchain.runs.directory import RUN_FILE
 from scanchain.runs.metrics import METRICS_FILE, Metrics

@@ -260,7 +260,10 @@ def _point_times(seen: Survey) -> Finding:
     faults = times.faults(seen.log.topic)
     if untimed == len(spans_s) and not times.spans_s:
         grade = Severity.WARNING if faults else Severity.NOTE
-        return Finding("point times", grade, "; ".join(["none", *faults]), distorted, _by_azimuth(seen))
+        constant = times.assumed.removeprefix("no point times: ").rpartition("; ")[0]
+        return Finding(
+            "point times", grade, "; ".join([constant or "none", *faults]), distorted, _by_azimuth(seen)
+        )
     span_s = float(np.nanmedian(spans_s if untimed < len(spans_s) else times.spans_s))
     assumed = times.assumed.removeprefix("point times: ") or "time_increment of the beams"
     found = f"{assumed}; a scan lasts {1e3 * span_s:.4g} ms"

@@ -13,7 +13,7 @@ from time import sleep
 from typing import Any, TypeVar
 
 from scanchain.download import fetch
-from scanchain.errors import InputError, MissingExtraError
+from scanchain.errors import InputError, MissingExtraError, spelled
 from scanchain.files import Address, Source
 
 T = TypeVar("T")
@@ -153,11 +153,6 @@ def misspelled(source: Source) -> str:
     """Reason why a name is no text, which could not be printed; empty where it is text."""
     name = os.path.realpath(source) if isinstance(source, Path) else str(source)
     return "" if spelled(name) == name else f"{spelled(name)}: the name is not UTF-8; rename it"
-
-
-def spelled(name: str) -> str:
-    """A name as text; bytes in it that are not UTF-8 are written as numbers (x and two digits)."""
-    return os.fsencode(name).decode("utf-8", "backslashreplace")
 
 
 def size_of(source: Source) -> int:

@@ -89,7 +89,8 @@ def evidence_of_run(folder: Path, expected: ExpectedError | None) -> Evidence:
         return evidence_of(steps, closures, expected)
     except Exception as error:  # whatever a damaged file, or one of another make, makes Arrow and NumPy raise
         remedy = "name a directory of scanchain run (--resume ends an unfinished one)"
-        raise InputError(f"{folder}: has no {name} that can be read ({one_line(error)}); {remedy}") from error
+        why = "" if isinstance(error, FileNotFoundError) else f" ({one_line(error)})"
+        raise InputError(f"{folder}: has no {name} that can be read{why}; {remedy}") from error
 
 
 def evidence_of(steps: pa.Table, closures: pa.Table | None, expected: ExpectedError | None = None) -> Evidence:
