@@ -151,9 +151,7 @@ class MountingEstimator:
         self._estimate()
         if self.found is None:
             why = "the wheels do not show it: at rest, in one curve only, or in other motions than the lidar"
-            return (
-                f"mounting assumed, as if the lidar sat at the base's origin: the log has no transform, and {why}"
-            )
+            return f"mounting assumed, as if the lidar sat at the base's origin: no transform states it, and {why}"
         if self.found.is_mirrored:
             why = "as one does that hangs upside down, which no transform states: --log.upside_down true"
             return f"the wheels are not used: the lidar turns left where they turn right, {why}"
