@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scanchain.checks import instance
 from scanchain.clock import working_s
 from scanchain.config import LogConfig, PreprocessConfig
-from scanchain.data import Pose, Scan, Trajectory
+from scanchain.data import OtherPoints, Pose, Scan, Trajectory
 from scanchain.errors import InputError, counted, grouped, shown
 from scanchain.files import Source, source_of
 from scanchain.logs.bad_scans import ScanCounts, defect
@@ -26,7 +26,7 @@ from scanchain.logs.messages.poses import RecordedPoses, StampedPose
 from scanchain.logs.messages.readers import is_scan, pose_reader, reader
 from scanchain.logs.mounting import between_frames, find_mounting, find_wheels, in_plane, is_upside_down
 from scanchain.logs.opening import index_files
-from scanchain.logs.publishers import LatestPoints, Publishers, with_jumps
+from scanchain.logs.publishers import Publishers, seen_together, with_jumps
 from scanchain.logs.sectors import MOST, Assembler, Sampled, expected_sweeps, find_sectors
 from scanchain.logs.topics import find_ground_truth, find_lidar
 from scanchain.settings import load_settings, overrides_of
@@ -150,7 +150,7 @@ class Log:
         self.notes = list(self._opening_notes)
         poses = RecordedPoses(self.odometry_topic, self.ground_truth_topic)
         counts = ScanCounts(self.topic, self.odometry_topic)
-        self.times, latest = self._point_times(), LatestPoints()
+        self.times, latest = self._point_times(), dict[str, tuple[int, OtherPoints]]()
         assembler = None if self.sectors is None else Assembler(self.sectors, self.topic)
         count, index, requested_s, jump_s, self.scans_with_wheels = 0, 0, working_s(), 0.0, 0
         try:
@@ -166,7 +166,7 @@ class Log:
                     continue
                 returns = message.value
                 assert isinstance(returns, Returns)
-                points, others = latest.of(self.publishers, returns, is_mirrored=self.is_mirrored)
+                points, others = seen_together(returns, self.publishers, latest, is_mirrored=self.is_mirrored)
                 scan = Scan(
                     index=index,
                     stamp_ns=returns.stamp_ns,

@@ -145,7 +145,6 @@ def find_mounting(indexes: Sequence[FileIndex], frame: str, wheels: Wheels | Non
     T_root_lidar = chain(fixed, root, frame)
     if root != frame and T_root_lidar is not None:
         note = f"the log has no transform from {bases[0]} to {frame}: {root} is taken as the base"
-        note += ", its place on that of the wheels is estimated" if wheels else ""
         notes = filter(None, [note, _disagreeing(fixed, rivals, root, frame)])
         return Mounting(root, T_root_lidar, note="; ".join(notes), is_stated=False)
     taken = "is estimated from the wheels" if wheels else "is assumed: the lidar at the robot's origin"

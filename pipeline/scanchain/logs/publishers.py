@@ -90,28 +90,22 @@ class Publishers:
         return away_ns[len(away_ns) // 2] if away_ns else 0
 
 
-class LatestPoints:
-    """The latest stamp, points in the frame of the first, and times of each publisher."""
-
-    def __init__(self) -> None:
-        self.latest: dict[str, tuple[int, OtherPoints]] = {}
-
-    def of(
-        self, publishers: Publishers, returns: Returns, *, is_mirrored: bool
-    ) -> tuple[RawPoints, OtherPoints | None]:
-        """Points of a scan, which are remembered, and those of other publishers just before it."""
-        points, times_s = moved(returns.points, publishers.of(returns.frame).T_first_frame), returns.times_s
-        points = points * np.array([1.0, -1.0], np.float32) if is_mirrored else points
-        if len(publishers.known) < 2:
-            return points, None
-        near = [
-            (other.points, other.times_s + 1e-9 * (other_ns - returns.stamp_ns))
-            for frame, (other_ns, other) in self.latest.items()
-            if frame != returns.frame and 0 <= returns.stamp_ns - other_ns <= _TOGETHER_NS
-        ]
-        times_s = times_s if len(times_s) else np.zeros(len(points), np.float32)
-        self.latest[returns.frame] = returns.stamp_ns, OtherPoints(points, times_s)
-        return points, OtherPoints(*map(np.concatenate, zip(*near, strict=True))) if near else None
+def seen_together(
+    returns: Returns, publishers: Publishers, latest: dict[str, tuple[int, OtherPoints]], *, is_mirrored: bool
+) -> tuple[RawPoints, OtherPoints | None]:
+    """Points of a scan in the frame of the first, and those of others just before it, by ``latest`` of each."""
+    points, times_s = moved(returns.points, publishers.of(returns.frame).T_first_frame), returns.times_s
+    points = points * np.array([1.0, -1.0], np.float32) if is_mirrored else points
+    if len(publishers.known) < 2:
+        return points, None
+    near = [
+        (other.points, other.times_s + 1e-9 * (other_ns - returns.stamp_ns))
+        for frame, (other_ns, other) in latest.items()
+        if frame != returns.frame and 0 <= returns.stamp_ns - other_ns <= _TOGETHER_NS
+    ]
+    times_s = times_s if len(times_s) else np.zeros(len(points), np.float32)
+    latest[returns.frame] = returns.stamp_ns, OtherPoints(points, times_s)
+    return points, OtherPoints(*map(np.concatenate, zip(*near, strict=True))) if near else None
 
 
 def with_jumps(messages: Iterable[tuple[Decoded, Pose | None]]) -> Iterator[tuple[Decoded, Pose | None, float]]:
