@@ -90,7 +90,7 @@ class ScanCounts:
         self.topic = topic
         self.odometry_topic = odometry_topic
         self.scans = self.bad = self.backwards = self.repeated = self.without_wheels = self.copies = 0
-        self.untimed = self.farthest_back_ns = self.begin_ns = self.begin_log_ns = 0
+        self.farthest_back_ns = self.begin_ns = 0
         self.publishers: dict[str, _Tally] = {}
         self.jumps_s, self.first_jump = list[float](), ""
         self.first_complaint = ""
@@ -138,19 +138,17 @@ class ScanCounts:
                 self.farthest_back_ns = max(self.farthest_back_ns, back_ns)
             self.repeated += back_ns == 0
         self._last = scan
-        self.untimed += scan.stamp_ns == 0
-        self.begin_ns, self.begin_log_ns = self.begin_ns or scan.stamp_ns, self.begin_log_ns or scan.log_time_ns
+        self.begin_ns = self.begin_ns or scan.stamp_ns
 
     def _jump(self, scan: Scan, last: Scan) -> str:
         """Where and how far the stamps jump at a scan, and what may have made it."""
-        logged_s, into_s = (1e-9 * (scan.log_time_ns - ns) for ns in (last.log_time_ns, self.begin_log_ns))
         cause = "a clock that was set, or a playback that skipped a part"
         if abs(scan.stamp_ns - self.begin_ns) < _AGAIN * abs(last.stamp_ns - scan.stamp_ns):
             cause = "a recording played in a loop, or a simulation that began again"
         elif scan.clock_jump_s < 0.0:
             cause = "a clock that was set back, or a recording of before"
-        where = f"scan {scan.index:,}, {into_s:.1f} s after the first scan"
-        return f"{where}: {_signed(scan.clock_jump_s)} while the log goes on by {logged_s:.2g} s): {cause}"
+        step, logged_s = _signed(scan.clock_jump_s), 1e-9 * (scan.log_time_ns - last.log_time_ns)
+        return f"scan {scan.index:,}: {step} while the log goes on by {logged_s:.2g} s): {cause}"
 
     def _share(self, count: int) -> str:
         return f"{count} of {counted(self.scans, 'scan')} of {self.topic}"
@@ -201,8 +199,6 @@ class ScanCounts:
             steps = counted(self.backwards, "step")
             most = f"by up to {1e-9 * self.farthest_back_ns:.2g} s"
             lines.append(f"{steps} back in the header stamps of {self.topic}, {most}; the log's order is kept")
-        if 1 < self.untimed < self.scans - self.bad:
-            lines.append(f"{self._share(self.untimed)} with header stamp 0, as before the first /clock")
         if 0 < self.repeated <= _MOST_REPEATED * self.scans:
             lines.append(f"{self._share(self.repeated)} with the header stamp of the one before")
         if self.odometry_topic and self.without_wheels:

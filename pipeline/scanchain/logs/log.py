@@ -92,7 +92,7 @@ class Log:
         self.ground_truth_topic = "" if truth is None else truth.topic
         self._sampled_times = self.times = PointTimes(config)
         self.plane_height_m: float | None = None  # also while the sample is decoded
-        sample, messages = tee(stream.sampled_messages(indexes, lidar.topic, self._sampled, most=MOST))
+        sample, messages = tee(stream.sampled_messages(indexes, self.topic, self._sampled, most=MOST))
         self.plane_height_m = None if is_scan(lidar) else plane_height_m(each.returns for each in sample)
         if (z_m := self.plane_height_m) is not None:
             self.notes.append(
@@ -101,7 +101,9 @@ class Log:
         self.dimension = 2 if is_scan(lidar) or self.plane_height_m is not None else 3
         self.duration_s = (whole := stream.whole_span(indexes)).duration_s
         self.span = stream.chosen_span(whole, config)
-        self.sectors = find_sectors(messages, self._decoder_by, config.point_times)
+        self.sectors = find_sectors(
+            messages, lambda unit: self.decoder(PointTimes(replace(config, point_times=unit))), config.point_times
+        )
         self.scan_count = expected_sweeps(stream.count_scans(indexes, self.topic, whole, config), self.sectors)
         sampled = partial(stream.sampled, indexes, self.topic, self.decoder(PointTimes(config)), self.span)
         between = partial(between_frames, indexes, self.span)
@@ -274,9 +276,6 @@ class Log:
 
     def _sampled(self, data: memoryview) -> Sampled:
         return Sampled(data, self.decoder(self._sampled_times)(data))
-
-    def _decoder_by(self, point_times: str) -> Callable[[memoryview], Returns]:
-        return self.decoder(PointTimes(replace(self.config, point_times=point_times)))
 
     def _point_times(self) -> PointTimes:
         """Times of the lidar's points, in the unit that the duration of a sector shows."""

@@ -13,7 +13,7 @@ from scanchain.data import Matrix, Pose
 PAIR_M, _TURN_M_RAD = 0.3, 0.5  # path of a pair of motions, and that of a turn on the spot
 _FEWEST, _LEARNED = 6, 1.2  # pairs, for four numbers; growth of their count after which they are solved once more
 _ROUNDS, _USUAL_M, _LEAST_M = 10, 0.02, 0.002  # of the robust regression; residuals at first, and at least
-_PRIOR_M = 1.0  # σ of the place where nothing is known
+_PRIOR = np.diag(np.array([1.0, 1.0, 1e-6, 1e-6]))  # information of a place within 1 m, nearly none of the rest
 _LARGEST_SHARE = 0.25  # of the motions that is left as residual, above which no mounting explains them
 _YAW_RAD, _PLACE_M = np.radians(5.0), 0.05  # largest σ of what is observable
 _OPPOSED, _LEAST_TURN_RAD = 0.5, 0.3  # correlation of turns, and these over the log, that show a lidar upside down
@@ -96,12 +96,12 @@ def path_m(motions: Matrix) -> NDArray[np.float64]:
     return np.linalg.norm(motions[..., :-1, -1], axis=-1) + _TURN_M_RAD * lie.rotation_angle(motions)
 
 
-def _solved(J: Matrix, z: Matrix) -> tuple[Matrix, NDArray[np.float64], float]:
+def _solved(J: Matrix, z: Matrix) -> tuple[NDArray[np.floating], NDArray[np.float64], float]:
     """Covariance (4, 4) and value (4,) of J (M, 2, 4) p = z (M, 2), with the prior; median residual."""
     weight, variance = np.ones(len(z)), _USUAL_M**2
     H, p, residuals = np.eye(4), np.zeros(4), np.zeros(len(z))
     for _ in range(_ROUNDS):
-        H = np.einsum("mij,m,mik->jk", J, weight, J) / variance + np.diag([_PRIOR_M**-2.0] * 2 + [1e-6] * 2)
+        H = np.einsum("mij,m,mik->jk", J, weight, J) / variance + _PRIOR
         p = np.linalg.solve(H, np.einsum("mij,m,mi->j", J, weight, z) / variance)
         residuals = np.linalg.norm(z - J @ p, axis=1)
         weight = 1.0 / (1.0 + (residuals / max(1.5 * float(np.median(residuals)), _LEAST_M)) ** 2)
