@@ -129,18 +129,9 @@ def find_mounting(indexes: Sequence[FileIndex], frame: str, wheels: Wheels | Non
         stated = next(sampled_messages(indexes, wheels.channel.topic, pose_reader(wheels.channel, 3)), None)
         base_of_wheels = "" if stated is None else stated.child
     bases = [name for name in (base_of_wheels, *_BASE_FRAMES) if name]
+    if (stated := _stated(indexes, bases, frame, span)) is not None:
+        return stated
     fixed, rivals = _fixed(indexes)
-    for base in bases:
-        T_base_lidar = chain(fixed, base, frame)
-        if T_base_lidar is not None:
-            return Mounting(base, T_base_lidar, note=_disagreeing(fixed, rivals, base, frame))
-    joints, first = _joints(indexes, fixed, span)
-    for base in bases:
-        T_base_lidar = chain(first, base, frame)
-        if T_base_lidar is not None:
-            motion = _motion(joints, first, base, frame)
-            source = "by transforms of /tf" + (" that change" if motion else ", which do not change")
-            return Mounting(base, T_base_lidar, source, motion)
     root = _root([each for each in fixed if not _is_world(each.parent)], frame)
     T_root_lidar = chain(fixed, root, frame)
     if root != frame and T_root_lidar is not None:
@@ -154,53 +145,54 @@ def find_mounting(indexes: Sequence[FileIndex], frame: str, wheels: Wheels | Non
 
 def between_frames(indexes: Sequence[FileIndex], span: Span, target: str, source: str) -> Pose | None:
     """T_target_source (4, 4) of two frames that do not move against each other, None where the log has none."""
-    fixed, _ = _fixed(indexes)
-    T_target_source = chain(fixed, target, source)
-    if T_target_source is not None:
-        return T_target_source
-    joints, first = _joints(indexes, fixed, span)
-    return None if _motion(joints, first, target, source) else chain(first, target, source)
+    stated = _stated(indexes, [target], source, span)
+    return None if stated is None or stated.motion else stated.T_base_lidar
 
 
-_Joints = dict[Frames, list[StampedPose]]
+def _stated(indexes: Sequence[FileIndex], bases: Sequence[str], frame: str, span: Span) -> Mounting | None:
+    """The mounting on the first of these frames that static transforms lead to, or else with those of /tf."""
+    fixed, rivals = _fixed(indexes)
+    for base in bases:
+        T_base_lidar = chain(fixed, base, frame)
+        if T_base_lidar is not None:
+            return Mounting(base, T_base_lidar, note=_disagreeing(fixed, rivals, base, frame))
+    joints: dict[Frames, list[StampedPose]] = {}
+    for each in _transforms(indexes, is_fixed=False, span=span):
+        if not _is_world(each.parent):
+            joints.setdefault((each.parent, each.child), []).append(each)
+    first = [*fixed, *(poses[0] for poses in joints.values())]
+    for base in bases:
+        T_base_lidar = chain(first, base, frame)
+        if T_base_lidar is not None:
+            motion = _motion(joints, first, base, frame)
+            source = "by transforms of /tf" + (" that change" if motion else ", which do not change")
+            return Mounting(base, T_base_lidar, source, motion)
+    return None
 
 
-def _fixed(indexes: Sequence[FileIndex]) -> tuple[list[StampedPose], dict[str, StampedPose]]:
-    """Static transforms, the latest of each child as in tf2, and those before by child that contradict them."""
-    latest, rivals = dict[str, StampedPose](), dict[str, StampedPose]()
+def _fixed(indexes: Sequence[FileIndex]) -> tuple[list[StampedPose], dict[str, str]]:
+    """Static transforms, the latest of each child as in tf2, and lines on children with others before."""
+    latest, rivals = dict[str, StampedPose](), dict[str, str]()
     for each in _transforms(indexes, is_fixed=True):
         before = latest.get(each.child, each)
         shift_m, turn_rad = lie.apart(before.T_parent_child, each.T_parent_child)
         if before.parent != each.parent or shift_m > _SHIFT_M or turn_rad > _TURN_RAD:
-            rivals[each.child] = before
+            said = (f"{a.parent} → {a.child}: {place_text(a.T_parent_child)}" for a in (before, each))
+            told = f"/tf_static says of {' and then of '.join(said)}"
+            rivals[each.child] = f"{told}; the latest is used, as in tf2: stop the wrong publisher"
         latest[each.child] = each
     return list(latest.values()), rivals
 
 
-def _disagreeing(fixed: Sequence[StampedPose], rivals: dict[str, StampedPose], base: str, frame: str) -> str:
-    """Line on static transforms between base and lidar that contradict each other; empty as a rule."""
-    lines = [
-        "/tf_static says of "
-        + " and then ".join(f"{a.parent} → {a.child}: {place_text(a.T_parent_child)}" for a in (rival, each))
-        for each in fixed
-        if (rival := rivals.get(each.child))
-        and chain([other for other in fixed if other is not each], base, frame) is None
-    ]
-    return "; ".join(f"{line}; the latest is used, as in tf2: stop the wrong publisher" for line in lines)
+def _disagreeing(fixed: Sequence[StampedPose], rivals: dict[str, str], base: str, frame: str) -> str:
+    """Lines on those of these children on which the lidar hangs."""
+    without = {child: [each for each in fixed if each.child != child] for child in rivals}
+    return "; ".join(rivals[child] for child, rest in without.items() if chain(rest, base, frame) is None)
 
 
-def _joints(
-    indexes: Sequence[FileIndex], fixed: Sequence[StampedPose], span: Span
-) -> tuple[_Joints, list[StampedPose]]:
-    """Transforms of /tf but for those in the world, and the first of each with the static ones."""
-    joints: _Joints = {}
-    for each in _transforms(indexes, is_fixed=False, span=span):
-        if not _is_world(each.parent):
-            joints.setdefault((each.parent, each.child), []).append(each)
-    return joints, [*fixed, *(poses[0] for poses in joints.values())]
-
-
-def _motion(joints: _Joints, first: Sequence[StampedPose], base: str, frame: str) -> str | None:
+def _motion(
+    joints: dict[Frames, list[StampedPose]], first: Sequence[StampedPose], base: str, frame: str
+) -> str | None:
     """The joint between base and lidar that turns most, and how far, as text; None where none moves."""
     motion, most_rad = None, -1.0
     for joint, poses in joints.items():
