@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -22,34 +21,20 @@ _AGAIN = 0.1  # share of a jump of the stamps, up to which they begin again as a
 _SAMPLE = 64  # step of the sample of points tested first: usually one of them is in range
 
 
-class _Jump(NamedTuple):
-    """A jump of the header stamps, and the log's step there; whether the stamps begin again as at first."""
-
-    scan: int
-    into_s: float
-    step_s: float
-    logged_s: float
-    is_loop: bool
-
-    @property
-    def cause(self) -> str:
-        """What may have made it."""
-        if self.is_loop:
-            return "a recording played in a loop, or a simulation that began again"
-        if self.step_s < 0.0:
-            return "a clock that was set back, or a recording of before"
-        return "a clock that was set, or a playback that skipped a part"
-
-
 @dataclass(slots=True)
 class _Tally:
     """Messages of a publisher, those with returns, and their first and last stamp."""
 
     publisher: Publisher
+    begin_ns: int
+    end_ns: int = 0
     messages: int = 0
     with_returns: int = 0
-    begin_ns: int = 0
-    end_ns: int = 0
+
+    @property
+    def is_used(self) -> bool:
+        """Whether its messages are: not those of a second one without a return so far."""
+        return self.publisher.is_used and (not self.publisher.note or self.with_returns > 0)
 
     @property
     def text(self) -> str:
@@ -105,9 +90,9 @@ class ScanCounts:
         self.topic = topic
         self.odometry_topic = odometry_topic
         self.scans = self.bad = self.backwards = self.repeated = self.without_wheels = self.copies = 0
-        self.untimed = self.farthest_back_ns = self.begin_ns = self.begin_log_ns = 0
-        self.publishers: dict[tuple[str, int], _Tally] = {}
-        self.clock_jumps: list[_Jump] = []
+        self.farthest_back_ns = self.begin_ns = 0
+        self.publishers: dict[str, _Tally] = {}
+        self.jumps_s, self.first_jump = list[float](), ""
         self.first_complaint = ""
         self._last: Scan | None = None
 
@@ -124,13 +109,12 @@ class ScanCounts:
             )
 
     def uses(self, publisher: Publisher, returns: Returns) -> bool:
-        """True if a message is to be used; those of another publisher that are not, or are empty, are counted."""
-        tally = self.publishers.setdefault((publisher.frame, publisher.clock), _Tally(publisher))
+        """Count a message of a publisher; True if it is to be used."""
+        tally = self.publishers.setdefault(publisher.frame, _Tally(publisher, returns.stamp_ns))
         tally.messages += 1
         tally.with_returns += len(returns.points) > 0
-        tally.begin_ns, tally.end_ns = tally.begin_ns or returns.stamp_ns, returns.stamp_ns
-        is_idle = publisher.note and not tally.with_returns
-        return publisher.is_used and not is_idle
+        tally.end_ns = returns.stamp_ns
+        return tally.is_used
 
     def repeats(self, points: RawPoints) -> bool:
         """True if the points of a scan are those of the one before, to the last bit."""
@@ -147,24 +131,38 @@ class ScanCounts:
         if self._last is not None:
             back_ns = self._last.stamp_ns - scan.stamp_ns
             if scan.clock_jump_s:
-                logged_s = 1e-9 * (scan.log_time_ns - self._last.log_time_ns)
-                into_s = 1e-9 * (scan.log_time_ns - self.begin_log_ns)
-                is_loop = abs(scan.stamp_ns - self.begin_ns) < _AGAIN * abs(back_ns)
-                self.clock_jumps.append(_Jump(scan.index, into_s, scan.clock_jump_s, logged_s, is_loop))
+                self.jumps_s.append(scan.clock_jump_s)
+                self.first_jump = self.first_jump or self._jump(scan, self._last)
             elif back_ns > 0 and scan.stamp_ns:
                 self.backwards += 1
                 self.farthest_back_ns = max(self.farthest_back_ns, back_ns)
             self.repeated += back_ns == 0
         self._last = scan
-        self.untimed += scan.stamp_ns == 0
-        self.begin_ns, self.begin_log_ns = self.begin_ns or scan.stamp_ns, self.begin_log_ns or scan.log_time_ns
+        self.begin_ns = self.begin_ns or scan.stamp_ns
+
+    def _jump(self, scan: Scan, last: Scan) -> str:
+        """Where and how far the stamps jump at a scan, and what may have made it."""
+        cause = "a clock that was set, or a playback that skipped a part"
+        if abs(scan.stamp_ns - self.begin_ns) < _AGAIN * abs(last.stamp_ns - scan.stamp_ns):
+            cause = "a recording played in a loop, or a simulation that began again"
+        elif scan.clock_jump_s < 0.0:
+            cause = "a clock that was set back, or a recording of before"
+        step, logged_s = _signed(scan.clock_jump_s), 1e-9 * (scan.log_time_ns - last.log_time_ns)
+        return f"scan {scan.index:,}: {step} while the log goes on by {logged_s:.2g} s): {cause}"
 
     def _share(self, count: int) -> str:
         return f"{count} of {counted(self.scans, 'scan')} of {self.topic}"
 
     def losses(self) -> list[str]:
         """Warnings of scans left out or copied, and of stamps that most scans do not have."""
-        lines = self._of_publishers()
+        tallies = self.publishers.values()
+        used = "".join(f"; used is {each.text}" for each in tallies if not each.publisher.note)
+        total = counted(sum(each.messages for each in tallies), "message")
+        lines = [
+            f"{each.messages:,} of {total} of {self.topic} left out, of another publisher: {each.text}{used}"
+            for each in tallies
+            if not each.is_used
+        ]
         if self.bad:
             were = "was" if self.bad == 1 else "were"
             lines.append(f"{self._share(self.bad)} {were} left out (the first: {self.first_complaint})")
@@ -180,26 +178,13 @@ class ScanCounts:
             )
         return lines
 
-    def _of_publishers(self) -> list[str]:
-        """A line on each publisher that was left out, or had no returns."""
-        total = sum(tally.messages for tally in self.publishers.values())
-        used = next((tally for tally in self.publishers.values() if not tally.publisher.note), None)
-        return [
-            f"{tally.messages:,} of {counted(total, 'message')} of {self.topic} left out, of another publisher: "
-            f"{tally.text}{f'; used is {used.text}' if used else ''}"
-            for tally in self.publishers.values()
-            if not tally.publisher.is_used or (tally.publisher.note and not tally.with_returns)
-        ]
-
     def jumps(self) -> list[str]:
         """A line on jumps of the header stamps, none as a rule."""
-        if not self.clock_jumps:
+        if not self.jumps_s:
             return []
-        first, most_s = self.clock_jumps[0], max((jump.step_s for jump in self.clock_jumps), key=abs)
         return [
-            f"{counted(len(self.clock_jumps), 'jump')} of the header stamps of {self.topic}, by up to "
-            f"{_signed(most_s)} (the first at scan {first.scan:,}, {first.into_s:.1f} s after the first scan: "
-            f"{_signed(first.step_s)} while the log goes on by {first.logged_s:.2g} s): {first.cause}; "
+            f"{counted(len(self.jumps_s), 'jump')} of the header stamps of {self.topic}, by up to "
+            f"{_signed(max(self.jumps_s, key=abs))} (the first at {self.first_jump}; "
             "each begins a new segment, as nothing says how far the lidar moved meanwhile"
         ]
 
@@ -214,8 +199,6 @@ class ScanCounts:
             steps = counted(self.backwards, "step")
             most = f"by up to {1e-9 * self.farthest_back_ns:.2g} s"
             lines.append(f"{steps} back in the header stamps of {self.topic}, {most}; the log's order is kept")
-        if 1 < self.untimed < self.scans - self.bad:
-            lines.append(f"{self._share(self.untimed)} with header stamp 0, as before the first /clock")
         if 0 < self.repeated <= _MOST_REPEATED * self.scans:
             lines.append(f"{self._share(self.repeated)} with the header stamp of the one before")
         if self.odometry_topic and self.without_wheels:

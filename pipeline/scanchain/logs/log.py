@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from functools import partial
 from itertools import chain, tee
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scanchain.checks import instance
 from scanchain.clock import working_s
 from scanchain.config import LogConfig, PreprocessConfig
-from scanchain.data import Pose, Scan, Trajectory
+from scanchain.data import OtherPoints, Pose, Scan, Trajectory
 from scanchain.errors import InputError, counted, grouped, shown
 from scanchain.files import Source, source_of
 from scanchain.logs.bad_scans import ScanCounts, defect
@@ -26,7 +26,7 @@ from scanchain.logs.messages.poses import RecordedPoses, StampedPose
 from scanchain.logs.messages.readers import is_scan, pose_reader, reader
 from scanchain.logs.mounting import between_frames, find_mounting, find_wheels, in_plane, is_upside_down
 from scanchain.logs.opening import index_files
-from scanchain.logs.publishers import LatestPoints, Publishers, with_jumps
+from scanchain.logs.publishers import Publishers, seen_together, with_jumps
 from scanchain.logs.sectors import MOST, Assembler, Sampled, expected_sweeps, find_sectors
 from scanchain.logs.topics import find_ground_truth, find_lidar
 from scanchain.settings import load_settings, overrides_of
@@ -34,7 +34,6 @@ from scanchain.settings import load_settings, overrides_of
 _DEFAULTS = LogConfig()
 _HOLD_NS = 500_000_000  # log time that a scan waits for the wheel reading behind it
 _HOLD_SCANS = 32
-_SAMPLED_SCANS, _SAMPLED_CLOUDS = 128, 16  # messages from all over a log that show its publishers
 
 
 def open_log(
@@ -83,66 +82,50 @@ class Log:
     """
 
     def __init__(self, indexes: Sequence[FileIndex], config: LogConfig) -> None:
-        self.config = config
-        self.indexes = indexes
+        self.config, self.indexes = config, indexes
         self.paths = tuple(index.path for index in indexes)
         self.name = name_of(indexes)
         self.notes: list[str] = [line for index in indexes for line in index.notes]
         stream.check_one_log(indexes, config)
         self.lidar = lidar = find_lidar(indexes, config.topic)
-        truth = find_ground_truth(indexes, config.ground_truth_topic)
-        self.topic = lidar.topic
+        self.topic, truth = lidar.topic, find_ground_truth(indexes, config.ground_truth_topic)
         self.ground_truth_topic = "" if truth is None else truth.topic
         self._sampled_times = self.times = PointTimes(config)
-        sample, first_messages = tee(stream.sampled_messages(indexes, lidar.topic, self._sampled, most=MOST))
         self.plane_height_m: float | None = None  # also while the sample is decoded
-        self.plane_height_m = self._plane_height_m(sample)
+        sample, messages = tee(stream.sampled_messages(indexes, self.topic, self._sampled, most=MOST))
+        self.plane_height_m = None if is_scan(lidar) else plane_height_m(each.returns for each in sample)
+        if (z_m := self.plane_height_m) is not None:
+            self.notes.append(
+                f"the clouds of {self.topic} are planar (z = {z_m:.3g} m everywhere): read as a 2D log"
+            )
         self.dimension = 2 if is_scan(lidar) or self.plane_height_m is not None else 3
         self.duration_s = (whole := stream.whole_span(indexes)).duration_s
         self.span = stream.chosen_span(whole, config)
-        self.sectors = find_sectors(first_messages, self._decoder_by, config.point_times)
+        self.sectors = find_sectors(
+            messages, lambda unit: self.decoder(PointTimes(replace(config, point_times=unit))), config.point_times
+        )
         self.scan_count = expected_sweeps(stream.count_scans(indexes, self.topic, whole, config), self.sectors)
-        self.publishers = self._publishers()
-        frame = self.publishers.frame
-        wheels = find_wheels(indexes, frame, config, self.span, self.notes)
-        self.mounting = mounting = find_mounting(indexes, frame, wheels, self.span)
+        sampled = partial(stream.sampled, indexes, self.topic, self.decoder(PointTimes(config)), self.span)
+        between = partial(between_frames, indexes, self.span)
+        self.publishers = Publishers(sampled, between, is_planar=self.dimension == 2)
+        wheels = find_wheels(indexes, self.publishers.frame, config, self.span, self.notes)
+        self.mounting = mounting = find_mounting(indexes, self.publishers.frame, wheels, self.span)
         self.gaps = stream.gap_notes(indexes, config)  # those of the notes that are of long gaps
-        self.notes += [self.sectors.note(self.topic)] if self.sectors else []
-        self.notes += stream.notes_on(indexes, config)
-        self.notes += mounting.notes(wheels.channel.topic if wheels else "", self.dimension)
+        self.notes += self.publishers.notes + ([self.sectors.note(self.topic)] if self.sectors else [])
+        topic = wheels.channel.topic if wheels else ""
+        self.notes += stream.notes_on(indexes, config) + mounting.notes(topic, self.dimension)
         wheels = wheels if mounting.motion is None else None
-        self.odometry_topic, self.wheels = (wheels.channel.topic, wheels.text) if wheels else ("", "")
-        T_base_lidar = self.mounting.T_base_lidar
+        self.odometry_topic, self.wheels = (topic, wheels.text) if wheels else ("", "")
+        T_base_lidar = mounting.T_base_lidar
         self.is_mirrored = self.dimension == 2 and (config.upside_down or is_upside_down(T_base_lidar))
         self.T_base_lidar: Pose = in_plane(T_base_lidar) if self.dimension == 2 else T_base_lidar
         self.stated_mounting = self.T_base_lidar if mounting.is_stated else None
         self._damage: list[str] = [line for index in indexes for line in index.damage]
         with_poses = [*([(wheels.channel, wheels.link)] if wheels else []), *([(truth, None)] if truth else [])]
         self.pose_decoders = {each.topic: pose_reader(each, self.dimension, link) for each, link in with_poses}
-        self.scans_with_wheels = self.bad_scans = 0
-        self.jumps: list[str] = []
+        self.scans_with_wheels, self.bad_scans, self.jumps = 0, 0, list[str]()
         self._opening_notes = tuple(self.notes)
         self._truth: Trajectory | None = None
-
-    def _plane_height_m(self, sample: Iterable[Sampled]) -> float | None:
-        height_m = None if is_scan(self.lidar) else plane_height_m(each.returns for each in sample)
-        if height_m is not None:
-            what = f"the clouds of {self.topic} are planar (z = {height_m:.3g} m everywhere)"
-            self.notes.append(f"{what}: read as a 2D log")
-        return height_m
-
-    def _publishers(self) -> Publishers:
-        """Publishers of the topic by a sample of its messages, a larger one where none has a return."""
-        sample = partial(
-            stream.sampled, self.indexes, self.topic, self.decoder(PointTimes(self.config)), self.span
-        )
-        sampled = list(sample(_SAMPLED_SCANS if is_scan(self.lidar) else _SAMPLED_CLOUDS))
-        if not any(len(returns.points) for _, returns in sampled):
-            sampled = list(sample())
-        between = partial(between_frames, self.indexes, self.span)
-        publishers = Publishers(sampled, between, is_planar=self.dimension == 2)
-        self.notes += publishers.notes
-        return publishers
 
     def __repr__(self) -> str:
         return f"Log({self.name!r}: {counted(self.scan_count, f'{self.dimension}D scan')} of {self.topic})"
@@ -169,11 +152,11 @@ class Log:
         self.notes = list(self._opening_notes)
         poses = RecordedPoses(self.odometry_topic, self.ground_truth_topic)
         counts = ScanCounts(self.topic, self.odometry_topic)
-        self.times, latest = self._point_times(), LatestPoints()
+        self.times, latest = self._point_times(), dict[str, tuple[int, OtherPoints]]()
         assembler = None if self.sectors is None else Assembler(self.sectors, self.topic)
         count, index, requested_s, jump_s, self.scans_with_wheels = 0, 0, working_s(), 0.0, 0
         try:
-            for message, T_odom_base, jumped_s in with_jumps(self._used(counts, poses, assembler)):
+            for message, T_odom_base, jumped_s in with_jumps(self._with_poses(counts, poses, assembler)):
                 count += 1
                 jump_s = jumped_s or jump_s
                 if (count - 1) % self.config.every:
@@ -185,7 +168,7 @@ class Log:
                     continue
                 returns = message.value
                 assert isinstance(returns, Returns)
-                points, others = latest.of(self.publishers, message, is_mirrored=self.is_mirrored)
+                points, others = seen_together(returns, self.publishers, latest, is_mirrored=self.is_mirrored)
                 scan = Scan(
                     index=index,
                     stamp_ns=returns.stamp_ns,
@@ -200,27 +183,22 @@ class Log:
                     others=others,
                 )
                 counts.take(scan)
-                self.scans_with_wheels += scan.T_odom_base is not None
+                self.scans_with_wheels += T_odom_base is not None
                 yield scan
                 index, jump_s = index + 1, 0.0
                 requested_s = working_s()
             self._truth = poses.ground_truth()
         finally:  # also where the caller wants no more scans
-            is_damaged = bool(self._damage)
-            self._conclude(counts, poses, assembler)
+            is_damaged, self.jumps, self.bad_scans = bool(self._damage), counts.jumps(), counts.bad
+            self._damage += [*counts.losses(), *self.times.warnings(self.topic), *self.jumps, *poses.complaints()]
+            self.notes += [note for note in self.publishers.notes if note not in self.notes]
+            self.notes += [*filter(None, [self._assumed(self.times)]), *self.times.faults(self.topic)]
+            self.notes += counts.notes() + (assembler.notes() if assembler else [])
         if not index:
             raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
         if is_damaged:
             scans = counted(count - counts.bad, "scan")
             self._damage.append(f"{scans} of {self.topic} {'was' if scans == '1 scan' else 'were'} recovered")
-
-    def _conclude(self, counts: ScanCounts, poses: RecordedPoses, assembler: Assembler | None) -> None:
-        """Note what was met in all scans."""
-        self.jumps, self.bad_scans = counts.jumps(), counts.bad
-        self._damage += [*counts.losses(), *self.times.warnings(self.topic), *self.jumps, *poses.complaints()]
-        found = [note for note in self.publishers.notes if note not in self.notes]
-        self.notes += [*filter(None, [self._assumed(self.times)]), *self.times.faults(self.topic), *found]
-        self.notes += [*counts.notes(), *(assembler.notes() if assembler else [])]
 
     def assumed_point_times(self) -> str:
         """Assumption of a run about per-point times, by the first scan that has returns; empty for laser scans."""
@@ -240,19 +218,18 @@ class Log:
         ``topic`` : the lidar's or the ground truth's. Raises InputError where it has no message there.
         """
         decode = self.pose_decoders.get(topic) or self.decoder(self._point_times())
-        why, unset = "", np.empty(0, np.int64)
+        why, unset = "", None
         for message in stream.decoded_messages(self.indexes, {topic: decode}, self.span, ahead=1, damage=[]):
             value = message.value
-            if isinstance(value, Returns | StampedPose):
-                if isinstance(value, Returns) and not self.publishers.of(message.log_time_ns, value).is_used:
-                    continue
+            if not isinstance(value, Returns | StampedPose):
+                why = why or f" (the first: {value})"
+            elif not isinstance(value, Returns) or self.publishers.of(value.frame).is_used:
                 last_ns = min(self.span.end_ns, stream.whole_span(self.indexes).end_ns)
                 expected = np.array([value.stamp_ns, value.stamp_ns + last_ns - message.log_time_ns])
                 if value.stamp_ns:
                     return expected
-                unset = unset if len(unset) else expected
-            why = why or f" (the first: {value})"
-        if len(unset):
+                unset = expected if unset is None else unset
+        if unset is not None:
             return unset
         raise InputError(f"{self.name}: no message of {topic} in the part that is read could be understood{why}")
 
@@ -267,7 +244,7 @@ class Log:
         return self._truth
 
     def _with_poses(
-        self, poses: RecordedPoses, assembler: Assembler | None
+        self, counts: ScanCounts, poses: RecordedPoses, assembler: Assembler | None
     ) -> Iterator[tuple[Decoded, Pose | None]]:
         """Scans with the wheels' pose at their stamp; they wait a little for the readings behind them."""
         decoders = {self.topic: self.decoder(self.times), **self.pose_decoders}
@@ -276,7 +253,9 @@ class Log:
         messages = messages if assembler is None else assembler.sweeps(messages)
         for message in chain(self.times.judged(messages, self.topic), [None]):
             if message is not None and message.channel.topic == self.topic:
-                waiting.append(message)
+                value = message.value
+                if not isinstance(value, Returns) or counts.uses(self.publishers.of(value.frame), value):
+                    waiting.append(message)
             elif message is not None:
                 poses.take(message)
             while waiting and (
@@ -289,15 +268,6 @@ class Log:
                 scan = waiting.popleft()
                 yield scan, poses.at(scan.value.stamp_ns) if isinstance(scan.value, Returns) else None
 
-    def _used(
-        self, counts: ScanCounts, poses: RecordedPoses, assembler: Assembler | None
-    ) -> Iterator[tuple[Decoded, Pose | None]]:
-        """Lidar messages as ``_with_poses``, but for those of other publishers that are of no use, or empty."""
-        for message, T_odom_base in self._with_poses(poses, assembler):
-            returns, of = message.value, self.publishers.of
-            if not isinstance(returns, Returns) or counts.uses(of(message.log_time_ns, returns), returns):
-                yield message, T_odom_base
-
     def decoder(self, times: PointTimes) -> Callable[[memoryview], Returns]:
         """Decoder of the lidar's messages to points; ``times`` collects its assumptions about theirs."""
         if is_scan(self.lidar):
@@ -307,10 +277,7 @@ class Log:
     def _sampled(self, data: memoryview) -> Sampled:
         return Sampled(data, self.decoder(self._sampled_times)(data))
 
-    def _decoder_by(self, point_times: str) -> Callable[[memoryview], Returns]:
-        return self.decoder(PointTimes(replace(self.config, point_times=point_times)))
-
     def _point_times(self) -> PointTimes:
         """Times of the lidar's points, in the unit that the duration of a sector shows."""
-        by_sectors = {} if self.sectors is None else {"point_times": self.sectors.point_times}
-        return PointTimes(replace(self.config, **by_sectors))
+        unit = self.sectors.point_times if self.sectors else self.config.point_times
+        return PointTimes(replace(self.config, point_times=unit))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -58,8 +57,7 @@ class Mounting(NamedTuple):
             notes.append(
                 f"the lidar moves on the robot ({self.motion}): poses are the lidar's, this motion included{prior}"
             )
-        tilted_rad = np.arccos(np.clip(abs(self.T_base_lidar[2, 2]), 0.0, 1.0))
-        if dimension == 2 and tilted_rad > TILTED_RAD:
+        if dimension == 2 and (tilted_rad := tilt_rad(self.T_base_lidar)) > TILTED_RAD:
             notes.append(
                 f"the plane of the scans is tilted by {np.degrees(tilted_rad):.0f} deg on {self.base_name} "
                 f"{self.source}: a floor plan takes a level one; correct the transforms, or choose another --topic"
@@ -84,45 +82,37 @@ def find_wheels(
 
     A SLAM's map → odom is none, nor is the lidar's own frame a robot, nor what never changes an odometry.
     """
-    topic = find_odometry(indexes, config, notes)
+    topic, wanted = find_odometry(indexes, config, notes), config.odometry_topic
     if topic is None or not is_moving_transforms(topic):
-        return None if topic is None else Wheels(topic, topic.topic)
-    wanted = config.odometry_topic
-    links: dict[Frames, list[StampedPose]] = {}
-    channels: dict[Frames, Channel] = {}
+        return topic and Wheels(topic, topic.topic)
+    links: dict[Frames, tuple[Channel, list[StampedPose]]] = {}
     for channel in filter(is_moving_transforms, topics_of(indexes).values()):
         for each in _sampled(indexes, channel, span) if wanted in ("", channel.topic) else ():
-            links.setdefault((each.parent, each.child), []).append(each)
-            channels.setdefault((each.parent, each.child), channel)
-    found = [
-        (parent, child)
-        for parent, child in links
-        if "odom" in parent.lower() and not _is_world(child) and child != frame
-    ]
+            links.setdefault((each.parent, each.child), (channel, []))[1].append(each)
     parents = {each.child: each.parent for each in _transforms(indexes, is_fixed=True)}
-    parents |= {child: parent for parent, child in links if (parent, child) in found or not _is_world(parent)}
+    parents |= {child: parent for parent, child in links if not _is_world(parent)}
     robot = [frame, *_above(frame, parents)]
+    found = [(a, b) for a, b in links if "odom" in a.lower() and not _is_world(b) and b != frame]
     own = [link for link in found if link[1] in robot]
     if own or any(name.rpartition("/")[2] in _BASE_FRAMES for name in robot):
         found = own  # not those of other robots
-    fixed = [link for link in found if not np.ptp([each.T_parent_child for each in links[link]], axis=0).any()]
-    if fixed and not wanted:
-        found = [link for link in found if link not in fixed]
-        notes.append(f"{' → '.join(fixed[0])} of {channels[fixed[0]].topic} never changes: no odometry, not used")
-    if len(found) == 1:
-        stamps_ns = np.unique([each.stamp_ns for each in links[found[0]]])
-        rate_hz = 1e9 / float(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 0.0
-        channel = channels[found[0]]
-        return Wheels(channel, f"{channel.topic}: {' → '.join(found[0])}, {rate_hz:.3g} Hz", found[0])
     names = ", ".join(" → ".join(link) for link in found or links) or "nothing"
-    if wanted:
+    if wanted and len(found) != 1:
         raise InputError(
-            f"{name_of(indexes)}: {wanted} has {'several transforms' if found else 'no transform'} from"
-            f" an odometry's frame to the lidar's robot, as odom → base_link; it holds: {names}"
+            f"{name_of(indexes)}: {wanted} has no transform from an odometry's frame to the lidar's robot, as "
+            f"odom → base_link, or several; it holds: {names}"
         )
-    if found:
+    if len(found) > 1:
         notes.append(f"several odometries on /tf ({names}), none is used")
-    return None
+    if len(found) != 1:
+        return None
+    channel, poses = links[found[0]]
+    if not wanted and not np.ptp([each.T_parent_child for each in poses], axis=0).any():
+        notes.append(f"{names} of {channel.topic} never changes: no odometry, not used")
+        return None
+    steps_ns = np.diff(np.unique([each.stamp_ns for each in poses]))
+    rate_hz = 1e9 / float(np.median(steps_ns)) if len(steps_ns) else 0.0
+    return Wheels(channel, f"{channel.topic}: {names}, {rate_hz:.3g} Hz", found[0])
 
 
 class MovingFrame(NamedTuple):
@@ -139,89 +129,70 @@ def find_mounting(indexes: Sequence[FileIndex], frame: str, wheels: Wheels | Non
         stated = next(sampled_messages(indexes, wheels.channel.topic, pose_reader(wheels.channel, 3)), None)
         base_of_wheels = "" if stated is None else stated.child
     bases = [name for name in (base_of_wheels, *_BASE_FRAMES) if name]
-    latest, fixed, rivals = _fixed(indexes)
-    for base, transforms in product(bases, (latest, fixed)):
-        T_base_lidar = chain(transforms, base, frame)
+    if (stated := _stated(indexes, bases, frame, span)) is not None:
+        return stated
+    fixed, rivals = _fixed(indexes)
+    root = _root([each for each in fixed if not _is_world(each.parent)], frame)
+    T_root_lidar = chain(fixed, root, frame)
+    if root != frame and T_root_lidar is not None:
+        note = f"the log has no transform from {bases[0]} to {frame}: {root} is taken as the base"
+        notes = filter(None, [note, _disagreeing(fixed, rivals, root, frame)])
+        return Mounting(root, T_root_lidar, note="; ".join(notes), is_stated=False)
+    taken = "is estimated from the wheels" if wheels else "is assumed: the lidar at the robot's origin"
+    note = f"no static transform from {bases[0]} to {frame or 'the lidar'}: the mounting {taken}"
+    return Mounting("", np.eye(4), note=note if fixed or wheels else "", is_stated=False)
+
+
+def between_frames(indexes: Sequence[FileIndex], span: Span, target: str, source: str) -> Pose | None:
+    """T_target_source (4, 4) of two frames that do not move against each other, None where the log has none."""
+    stated = _stated(indexes, [target], source, span)
+    return None if stated is None or stated.motion else stated.T_base_lidar
+
+
+def _stated(indexes: Sequence[FileIndex], bases: Sequence[str], frame: str, span: Span) -> Mounting | None:
+    """The mounting on the first of these frames that static transforms lead to, or else with those of /tf."""
+    fixed, rivals = _fixed(indexes)
+    for base in bases:
+        T_base_lidar = chain(fixed, base, frame)
         if T_base_lidar is not None:
-            return Mounting(base, T_base_lidar, note=_disagreeing(transforms, rivals, base, frame))
-    joints, first = _joints(indexes, fixed, span)
+            return Mounting(base, T_base_lidar, note=_disagreeing(fixed, rivals, base, frame))
+    joints: dict[Frames, list[StampedPose]] = {}
+    for each in _transforms(indexes, is_fixed=False, span=span):
+        if not _is_world(each.parent):
+            joints.setdefault((each.parent, each.child), []).append(each)
+    first = [*fixed, *(poses[0] for poses in joints.values())]
     for base in bases:
         T_base_lidar = chain(first, base, frame)
         if T_base_lidar is not None:
             motion = _motion(joints, first, base, frame)
             source = "by transforms of /tf" + (" that change" if motion else ", which do not change")
             return Mounting(base, T_base_lidar, source, motion)
-    root = _root([each for each in latest if not _is_world(each.parent)], frame)
-    T_root_lidar = chain(latest, root, frame)
-    if root != frame and T_root_lidar is not None:
-        note = f"the log has no transform from {bases[0]} to {frame}: {root} is taken as the base"
-        note += ", its place on that of the wheels is estimated" if wheels else ""
-        rival = _disagreeing(latest, rivals, root, frame)
-        return Mounting(root, T_root_lidar, note=f"{note}{rival and '; '}{rival}", is_stated=False)
-    why = f"no static transform from {bases[0]} to {frame or 'the lidar'}"
-    taken = "is estimated from the wheels" if wheels else "is assumed: the lidar at the robot's origin"
-    note = "" if not fixed and wheels is None else f"{why}: the mounting {taken}"
-    return Mounting("", np.eye(4), note=note, is_stated=False)
+    return None
 
 
-def between_frames(indexes: Sequence[FileIndex], span: Span, target: str, source: str) -> Pose | None:
-    """T_target_source (4, 4) of two frames that do not move against each other, None where the log has none."""
-    latest, fixed, _ = _fixed(indexes)
-    found = (chain(transforms, target, source) for transforms in (latest, fixed))
-    T_target_source = next((T for T in found if T is not None), None)
-    if T_target_source is None:
-        joints, first = _joints(indexes, fixed, span)
-        is_moving = _motion(joints, first, target, source) is not None
-        T_target_source = None if is_moving else chain(first, target, source)
-    return T_target_source
-
-
-_Joints = dict[Frames, list[StampedPose]]
-
-
-def _fixed(
-    indexes: Sequence[FileIndex],
-) -> tuple[list[StampedPose], list[StampedPose], dict[Frames, StampedPose]]:
-    """Static transforms, the latest of each child as in tf2; those of each pair; others that contradict these."""
-    latest: dict[str, StampedPose] = {}
-    fixed: dict[Frames, StampedPose] = {}
-    rivals: dict[Frames, StampedPose] = {}
+def _fixed(indexes: Sequence[FileIndex]) -> tuple[list[StampedPose], dict[str, str]]:
+    """Static transforms, the latest of each child as in tf2, and lines on children with others before."""
+    latest, rivals = dict[str, StampedPose](), dict[str, str]()
     for each in _transforms(indexes, is_fixed=True):
-        frames = each.parent, each.child
-        before = fixed.get(frames, each)
+        before = latest.get(each.child, each)
         shift_m, turn_rad = lie.apart(before.T_parent_child, each.T_parent_child)
-        if shift_m > _SHIFT_M or turn_rad > _TURN_RAD:
-            rivals[frames] = before
-        latest[each.child] = fixed[frames] = each
-    return list(latest.values()), list(fixed.values()), rivals
+        if before.parent != each.parent or shift_m > _SHIFT_M or turn_rad > _TURN_RAD:
+            said = (f"{a.parent} → {a.child}: {place_text(a.T_parent_child)}" for a in (before, each))
+            told = f"/tf_static says of {' and then of '.join(said)}"
+            rivals[each.child] = f"{told}; the latest is used, as in tf2: stop the wrong publisher"
+        latest[each.child] = each
+    return list(latest.values()), rivals
 
 
-def _disagreeing(
-    transforms: Sequence[StampedPose], rivals: dict[Frames, StampedPose], base: str, frame: str
-) -> str:
-    """Line on values of static transforms, on which the lidar hangs, that contradict each other; else empty."""
-    lines = []
-    for each in transforms:
-        rival = rivals.get((each.parent, each.child))
-        if rival and chain([other for other in transforms if other is not each], base, frame) is None:
-            poses = " and then ".join(place_text(pose.T_parent_child) for pose in (rival, each))
-            told = f"/tf_static says of {each.parent} → {each.child}: {poses}"
-            lines.append(f"{told}; the latest is used, as in tf2: stop the wrong publisher")
-    return "; ".join(lines)
+def _disagreeing(fixed: Sequence[StampedPose], rivals: dict[str, str], base: str, frame: str) -> str:
+    """Lines on those of these children on which the lidar hangs."""
+    without = {child: [each for each in fixed if each.child != child] for child in rivals}
+    return "; ".join(rivals[child] for child, rest in without.items() if chain(rest, base, frame) is None)
 
 
-def _joints(
-    indexes: Sequence[FileIndex], fixed: Sequence[StampedPose], span: Span
-) -> tuple[_Joints, list[StampedPose]]:
-    """Transforms of /tf but for those in the world, and the first of each with the static ones."""
-    joints: _Joints = {}
-    for each in _transforms(indexes, is_fixed=False, span=span):
-        if not _is_world(each.parent):
-            joints.setdefault((each.parent, each.child), []).append(each)
-    return joints, [*fixed, *(poses[0] for poses in joints.values())]
-
-
-def _motion(joints: _Joints, first: Sequence[StampedPose], base: str, frame: str) -> str | None:
+def _motion(
+    joints: dict[Frames, list[StampedPose]], first: Sequence[StampedPose], base: str, frame: str
+) -> str | None:
     """The joint between base and lidar that turns most, and how far, as text; None where none moves."""
     motion, most_rad = None, -1.0
     for joint, poses in joints.items():
@@ -242,7 +213,7 @@ def moving_frame(indexes: Sequence[FileIndex], frame: str, mounting: Mounting, *
     Transforms of /tf that join it to the base and do not change are as good as fixed ones.
     """
     frame = frame or "lidar"
-    transforms, _, _ = _fixed(indexes)
+    transforms, _ = _fixed(indexes)
     if mounting.base and mounting.motion is None and chain(transforms, mounting.base, frame) is None:
         transforms.append(StampedPose(0, mounting.base, frame, mounting.T_base_lidar))
     root = _root(transforms, frame)
@@ -270,6 +241,11 @@ def _is_world(frame: str) -> bool:
 def is_upside_down(T_base_lidar: Pose) -> bool:
     """True if the lidar's z axis points downwards."""
     return bool(T_base_lidar[2, 2] < 0.0)
+
+
+def tilt_rad(T: Pose) -> float:
+    """Angle between the planes of two frames, upside down or not."""
+    return float(np.arccos(np.clip(abs(T[2, 2]), 0.0, 1.0)))
 
 
 def turned_by(T_base_lidar: Pose) -> str:

@@ -13,7 +13,7 @@ from scanchain.data import Matrix, Pose
 PAIR_M, _TURN_M_RAD = 0.3, 0.5  # path of a pair of motions, and that of a turn on the spot
 _FEWEST, _LEARNED = 6, 1.2  # pairs, for four numbers; growth of their count after which they are solved once more
 _ROUNDS, _USUAL_M, _LEAST_M = 10, 0.02, 0.002  # of the robust regression; residuals at first, and at least
-_PRIOR_M, _NOWHERE_M = 1.0, 1e-6  # σ of the place where nothing is known, and of the base's origin
+_PRIOR = np.diag(np.array([1.0, 1.0, 1e-6, 1e-6]))  # information of a place within 1 m, nearly none of the rest
 _LARGEST_SHARE = 0.25  # of the motions that is left as residual, above which no mounting explains them
 _YAW_RAD, _PLACE_M = np.radians(5.0), 0.05  # largest σ of what is observable
 _OPPOSED, _LEAST_TURN_RAD = 0.5, 0.3  # correlation of turns, and these over the log, that show a lidar upside down
@@ -76,14 +76,12 @@ def hand_eye(base: Matrix, lidar: Matrix) -> HandEye | None:
     c, s, x, y = np.cos(theta) - 1.0, up * np.sin(theta), lidar[:, 0, -1], up * lidar[:, 1, -1]
     J = np.stack([np.stack([c, -s, -x, y], axis=1), np.stack([s, c, -y, -x], axis=1)], axis=1)  # (M, 2, 4)
     z = -base[:, :2, -1]
-    covariance, p, residual_m = _solved(J, z, _PRIOR_M)
+    covariance, p, residual_m = _solved(J, z)
     sigma_m, scale = float(np.sqrt(covariance[:2, :2].diagonal().max())), float(np.hypot(*p[2:]))
     if scale < _LARGEST_SHARE:
         return None
     across = np.array([-p[3], p[2]]) / scale**2  # the yaw's derivative
     sigma_rad = float(np.sqrt(across @ covariance[2:, 2:] @ across))
-    if sigma_m >= _PLACE_M:
-        _, p, residual_m = _solved(J, z, _NOWHERE_M)
     if residual_m > _LARGEST_SHARE * float(np.median(path_m(base))) or sigma_rad > _YAW_RAD:
         return None
     x_m, y_m = p[:2] / scale if sigma_m < _PLACE_M else np.zeros(2)
@@ -98,12 +96,12 @@ def path_m(motions: Matrix) -> NDArray[np.float64]:
     return np.linalg.norm(motions[..., :-1, -1], axis=-1) + _TURN_M_RAD * lie.rotation_angle(motions)
 
 
-def _solved(J: Matrix, z: Matrix, prior_m: float) -> tuple[Matrix, NDArray[np.float64], float]:
-    """Covariance (4, 4) and value (4,) of J (M, 2, 4) p = z (M, 2), the first two 0 ± prior_m; median residual."""
+def _solved(J: Matrix, z: Matrix) -> tuple[NDArray[np.floating], NDArray[np.float64], float]:
+    """Covariance (4, 4) and value (4,) of J (M, 2, 4) p = z (M, 2), with the prior; median residual."""
     weight, variance = np.ones(len(z)), _USUAL_M**2
     H, p, residuals = np.eye(4), np.zeros(4), np.zeros(len(z))
     for _ in range(_ROUNDS):
-        H = np.einsum("mij,m,mik->jk", J, weight, J) / variance + np.diag([prior_m**-2.0] * 2 + [1e-6] * 2)
+        H = np.einsum("mij,m,mik->jk", J, weight, J) / variance + _PRIOR
         p = np.linalg.solve(H, np.einsum("mij,m,mi->j", J, weight, z) / variance)
         residuals = np.linalg.norm(z - J @ p, axis=1)
         weight = 1.0 / (1.0 + (residuals / max(1.5 * float(np.median(residuals)), _LEAST_M)) ** 2)
@@ -151,9 +149,7 @@ class MountingEstimator:
         self._estimate()
         if self.found is None:
             why = "the wheels do not show it: at rest, in one curve only, or in other motions than the lidar"
-            return (
-                f"mounting assumed, as if the lidar sat at the base's origin: the log has no transform, and {why}"
-            )
+            return f"mounting assumed, as if the lidar sat at the base's origin: no transform states it, and {why}"
         if self.found.is_mirrored:
             why = "as one does that hangs upside down, which no transform states: --log.upside_down true"
             return f"the wheels are not used: the lidar turns left where they turn right, {why}"
