@@ -226,7 +226,7 @@ class Log:
             elif not isinstance(value, Returns) or self.publishers.of(value.frame).is_used:
                 last_ns = min(self.span.end_ns, stream.whole_span(self.indexes).end_ns)
                 expected = np.array([value.stamp_ns, value.stamp_ns + last_ns - message.log_time_ns])
-                if value.stamp_ns:
+                if value.stamp_ns or isinstance(value, StampedPose):
                     return expected
                 unset = expected if unset is None else unset
         if unset is not None:
