@@ -130,7 +130,10 @@ def bag2(folder, count=40, **options):
 PAGE = 4096
 
 
-@pytest.mark.parametrize("fill", [bytes(PAGE), b"\xff" * PAGE, np.random.default_rng(1).bytes(PAGE)])
+FILLS = [b"\xff" * PAGE, np.random.default_rng(1).bytes(PAGE)]
+
+
+@pytest.mark.parametrize("fill", [bytes(PAGE), *(pytest.param(fill, marks=pytest.mark.slow) for fill in FILLS)])
 @pytest.mark.parametrize("is_folder", [True, False])
 def test_of_a_database_with_one_page_destroyed_all_other_messages_are_read(tmp_path, fill, is_folder):
     folder = bag2(tmp_path / "a")

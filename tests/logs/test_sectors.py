@@ -235,6 +235,7 @@ def test_neither_lidar_of_pandaset_is_assembled(topic):
     assert open_log(shared_data("3d/pandaset_002_sweeps30to55.mcap"), topic=topic).sectors is None
 
 
+@pytest.mark.slow
 def test_scans_that_slip_do_not_convict_the_wheels(tmp_path):
     log = open_log(cut(whole("town", 3, "os1-32"), tmp_path / "cut.mcap", Cut(30.0, times="none")))
     log.sectors = None  # as if they had not been recognized

@@ -61,6 +61,7 @@ def test_the_wheels_say_how_a_lidar_without_transform_is_mounted(tmp_path, yaw_d
     assert "disagree" not in text and "against" not in text
 
 
+@pytest.mark.slow
 def test_in_space_they_say_it_too(tmp_path):
     path = simulated("at90", mounted(90, 0.5, z=1.7), tmp_path, world="town", seconds=15.0, sensor="vlp-16")
     done, text = run(path, tmp_path, loops__enabled=False)
@@ -68,6 +69,7 @@ def test_in_space_they_say_it_too(tmp_path):
     assert done.accuracy.ate_rmse_m < 0.03, text
 
 
+@pytest.mark.slow
 def test_a_transform_that_the_motions_contradict_is_named_and_one_that_they_confirm_is_not(tmp_path):
     wrong = simulated("wrong", mounted(180, 0.2), tmp_path, stated=mounted(0, 0.2))
     _, text = run(wrong, tmp_path)

@@ -79,11 +79,13 @@ def _clouds(swept, how):
         times.append(stamp_ns + rows["t"].astype(np.int64))
         points.append(np.column_stack([rows[name] for name in "xyz"]))
     times, points = np.concatenate(times), np.concatenate(points)
+    order = np.argsort(times)
+    in_order = times[order]
     for number, begin_ns, end_ns in _intervals(stamps, how):
         if number in how.dropped:
             continue
-        chosen = (times >= begin_ns) & (times < end_ns + how.overlap_deg / 360.0 * PERIOD_NS)
-        chosen &= number not in how.empty
+        ends = np.searchsorted(in_order, [begin_ns, end_ns + how.overlap_deg / 360.0 * PERIOD_NS])
+        chosen = np.sort(order[slice(*ends)]) if number not in how.empty else order[:0]
         stamp_ns = _stamp(begin_ns, end_ns, stamps, how)
         origin_ns = (
             stamp_ns if how.times == "message" else stamps[0] + (begin_ns - stamps[0]) // PERIOD_NS * PERIOD_NS
