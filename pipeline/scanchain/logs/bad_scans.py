@@ -33,7 +33,7 @@ class _Tally:
 
     @property
     def is_used(self) -> bool:
-        """Whether its messages are: not those of a second one without a return so far."""
+        """True if its messages are used: not those of a second one without a return so far."""
         return self.publisher.is_used and (not self.publisher.note or self.with_returns > 0)
 
     @property
@@ -141,7 +141,7 @@ class ScanCounts:
         self.begin_ns = self.begin_ns or scan.stamp_ns
 
     def _jump(self, scan: Scan, last: Scan) -> str:
-        """Where and how far the stamps jump at a scan, and what may have made it."""
+        """Jump of the stamps at a scan: its size, where it is, and its likely cause."""
         cause = "a clock that was set, or a playback that skipped a part"
         if abs(scan.stamp_ns - self.begin_ns) < _AGAIN * abs(last.stamp_ns - scan.stamp_ns):
             cause = "a recording played in a loop, or a simulation that began again"

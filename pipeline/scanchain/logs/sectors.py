@@ -53,7 +53,7 @@ class Sectors(NamedTuple):
         )
 
     def note(self, topic: str) -> str:
-        """What was found, and what is done about it."""
+        """The sectors in words, and what is done about them."""
         holds = f"each message holds {360.0 / self.per_sweep:.3g}° of a revolution"
         return f"{topic}: {holds}: {self.per_sweep:.3g} messages are assembled to one sweep"
 

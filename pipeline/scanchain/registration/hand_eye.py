@@ -1,4 +1,4 @@
-"""How a lidar sits on its base, by the motions of both: hand-eye calibration in closed form."""
+"""Mounting of a lidar on its base by the motions of both: hand-eye calibration in closed form."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _PRIOR = np.diag(np.array([1.0, 1.0, 1e-6, 1e-6]))  # information of a place wit
 _LARGEST_SHARE = 0.25  # of the motions that is left as residual, above which no mounting explains them
 _YAW_RAD, _PLACE_M = np.radians(5.0), 0.05  # largest σ of what is observable
 _OPPOSED, _LEAST_TURN_RAD = 0.5, 0.3  # correlation of turns, and these over the log, that show a lidar upside down
-_APART_M, _EXPLAINED = 0.2, 0.5  # place, and share of the residual left, from which on a mounting is another
+_APART_M, _EXPLAINED = 0.2, 0.5  # distance above, and share of the residual below which a mounting is another
 
 
 class HandEye(NamedTuple):
@@ -120,7 +120,7 @@ class MountingEstimator:
         self.motions: list[tuple[Pose, Pose]] = []  # of base and lidar
         self.last: tuple[Pose, Pose] | None = None  # their poses that the next motions begin at
         self.has_wheels = False
-        self.due = 0  # number of motions from which on the next estimate is made
+        self.due = 0  # number of motions above which the next estimate is made
         self.found: HandEye | None = None
         self.is_usable = is_stated  # the wheels, for the next scan
 

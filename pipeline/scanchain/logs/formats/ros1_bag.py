@@ -98,7 +98,7 @@ def _define(index: FileIndex, record: Record, data: Data) -> None:
 def read_records(
     data: Data, offset: int, sought: re.Pattern[bytes], gaps: list[tuple[int, int]]
 ) -> Iterator[Record]:
-    """The records one after the other; behind damage, added to ``gaps``, those from the next that is sought."""
+    """The records one after the other; after damage, added to ``gaps``, those from the next match on."""
     record = read_record(data, offset)
     while offset < len(data):
         following = None if record is None else read_record(data, record.end)
@@ -115,7 +115,7 @@ def read_records(
 
 
 def next_record(data: Data, offset: int, stated_end: int, sought: re.Pattern[bytes]) -> Record | None:
-    """The first record behind the offset with an opcode that is sought; None where there is none.
+    """The first record after the offset whose opcode matches; None where there is none.
 
     stated_end : byte at which the damaged record ends if its length is right; no connection before it is taken, as
         chunks hold such too
