@@ -6,6 +6,7 @@ RUNTIME := .venv/runtime-installed
 DEV := .venv/dev-installed
 BASELINES := .venv/baselines-installed
 DOCS := .venv/docs-installed
+INSTALL := VIRTUAL_ENV=.venv $(BIN)/uv pip install --quiet
 
 .PHONY: help demo test slow lint count docs clean
 
@@ -57,19 +58,20 @@ docs: $(DOCS)
 $(RUNTIME): pyproject.toml
 	@$(PYTHON) -c "import sys; sys.exit(sys.version_info < (3, 11) and 'Python 3.11 or newer is needed: make PYTHON=python3.12')"
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+	$(INSTALL) --editable .
 	touch $@
 
 $(BASELINES): pyproject.toml $(RUNTIME)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[baselines]'
+	$(INSTALL) --editable '.[baselines]'
 	touch $@
 
 $(DEV): pyproject.toml $(RUNTIME)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[baselines,cluster,remote,dev]'
+	$(INSTALL) --editable '.[baselines,cluster,remote,dev]'
 	touch $@
 
 $(DOCS): pyproject.toml $(RUNTIME)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	$(INSTALL) --editable '.[docs]'
 	touch $@
 
 clean:
