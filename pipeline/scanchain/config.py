@@ -299,10 +299,13 @@ class OutputsConfig(Section, frozen=True, forbid_unknown_fields=True):
 
     mcap : whether ``results.mcap`` is written: poses and maps as ROS 2 messages
     map : whether the folder ``map`` is written, which other logs are localized in and merged with
+    error_bars : quick leaves out the systematic errors, for which full runs odometry once more without each of
+        several groups of directions, on a whole short log or parts of a long one
     """
 
     mcap: bool = False
     map: bool = True
+    error_bars: Literal["full", "quick"] = "full"
 
 
 class Config(Struct, frozen=True, forbid_unknown_fields=True):

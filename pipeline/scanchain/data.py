@@ -227,6 +227,20 @@ class Match:
         return self.at_minimum and self.fit >= LEAST_FIT
 
 
+@dataclass(frozen=True, slots=True)
+class Influence:
+    """Influence of each group of directions on the motion from each keyframe to the next.
+
+    twists : (G, K−1, k) by which the motion differs without the group, in the frame of the later keyframe
+    kinds : (G,) of the group: 0 of azimuths, 1 of elevations
+    share : of the scans that were measured; of the others the motions are extrapolated
+    """
+
+    twists: Matrix
+    kinds: NDArray[np.int64]
+    share: float
+
+
 class KeyframeErrors(NamedTuple):
     """Errors of a keyframe's pose against the map, and of the map since the keyframe before.
 

@@ -99,6 +99,12 @@ def below(value: float) -> str:
     return f"{math.floor(100.0 * value) / 100.0:.2f}"
 
 
+def at_most(value: float) -> str:
+    """An upper bound, two significant digits, rounded up."""
+    digits = 1 - math.floor(math.log10(value)) if value > 0.0 else 0
+    return f"{math.ceil(value * 10.0**digits) / 10.0**digits:.{max(digits, 0)}f}"
+
+
 def duration(time_s: float) -> str:
     """A time in the largest unit of which it is more than one."""
     for unit, seconds in (("years", 31_557_600.0), ("days", 86_400.0), ("h", 3600.0), ("min", 60.0)):

@@ -86,7 +86,10 @@ def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
     ended = perf_counter()
     trajectory = runner.finish(Trajectory(scans.stamps_ns, np.array(track["pose"])), folder)
     np.save(folder / processes.TRAJECTORY_FILE, trajectory.poses)
-    return EndReport(Status.OK, "", runner.description, start_s, perf_counter() - ended)
+    report = EndReport(Status.OK, "", runner.description, start_s, perf_counter() - ended)
+    if isinstance(runner, Ours):
+        runner.measure_errors(scans.scans(), folder)
+    return report
 
 
 def warm_up(scans: Iterable[Scan], method: Method, T_base_lidar: Pose) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -13,18 +14,19 @@ from scipy.spatial import KDTree
 
 from scanchain import lie
 from scanchain.config import Config
-from scanchain.data import KeyframeErrors, Matrix, Points, Scan, Trajectory
+from scanchain.data import Influence, KeyframeErrors, Matrix, Points, Scan, Trajectory
 from scanchain.errors import InputError
 from scanchain.graph.between import turns
 from scanchain.graph.pose_graph import PoseGraph
 
 _BATCHES, _BATCH = 50, 10  # of samples, which together would fill the memory
-_BOUNDS = (2.5, 97.5)  # percentiles
+_BOUNDS = (2.5, 97.5)  # percentiles of the error bar
 _RANK_TOLERANCE = 1e-9  # of the largest singular value, below which positions leave a rotation free
 _DRIFT_OF_NOISE = 2.0  # drift of a map over its renewal, in standard deviations of independent errors of the scans
 _DRIFT_OF_SYSTEMATIC = 5.0  # the same of errors that successive scans have in common; measured on simulated worlds
 _REVISIT = 3.0  # variances of the systematic error in a loop edge: of both passes, seen from different sides
-_SCALE_SIGMA = 0.5  # of the logarithm: how far the errors of a log are from these covariances; measured likewise
+_BIAS = 0.75  # true standard deviation over that of the jackknife, measured in simulated worlds and on real logs
+_MOST_MEDIANS = 3.0  # influence of a group of directions over the median, above which the log needs the group
 _LEAST_VARIANCE = 1e-14  # m² or rad², which keeps covariances regular
 
 RADIUS_M = {2: 0.2, 3: 0.5}
@@ -36,16 +38,23 @@ _MIN_COVERAGE = 0.5  # least share of the query points of the best map that anot
 
 
 class ExpectedError(Struct, frozen=True):
-    """Mean of an error, and the bounds that contain it with a probability of 95 %; meters."""
+    """Mean of an error, and its error bar; meters.
+
+    is_random : of random errors only
+    where : the part of the log whose positions are the most uncertain, in words; empty for none
+    """
 
     mean: float
     low: float
     high: float
+    is_random: bool = True
+    where: str = ""
 
     @property
-    def text(self) -> str:
-        """The mean and the bounds."""
-        return f"{self.mean:.3f} m ({self.low:.3f} to {self.high:.3f} with 95 %)"
+    def bounds(self) -> str:
+        """The error bar, rounded outwards."""
+        low, high = math.floor(1e3 * self.low) / 1e3, math.ceil(1e3 * self.high) / 1e3
+        return f"{low:.3f} to {high:.3f} m{', random errors only' if self.is_random else ''}"
 
 
 class ExpectedErrors(NamedTuple):
@@ -64,24 +73,43 @@ def expected_ate(graph: PoseGraph, scans: NDArray[np.int64] | None = None) -> Ex
     scans : (K,) wᵢ, number of scans that each pose stands for, 1 where left out
     Raises InputError where the edges leave poses free.
     """
-    return _sampled(graph, scans, np.zeros((len(graph), graph.freedom, graph.freedom)), 0.0).ate
+    own = np.zeros((len(graph), graph.freedom, graph.freedom))
+    return _expected(_samples(graph, own, _Alignment.of(graph.poses, scans)), graph, scans).ate
 
 
 def expected_errors(
-    graph: PoseGraph, map_errors: Sequence[KeyframeErrors], config: Config, scans: NDArray[np.int64] | None = None
-) -> ExpectedErrors:
-    """Errors of keyframes that were aligned to a map, by ``with_map_errors``.
+    graph: PoseGraph, map_errors: Sequence[KeyframeErrors], config: Config, scans: NDArray[np.int64] | None = None,
+    influence: Influence | None = None,
+) -> ExpectedErrors:  # fmt: skip
+    """Errors of keyframes that were aligned to a map: random ones by ``with_map_errors``, and systematic ones.
 
-    How well its covariances hold varies from log to log: samples are scaled by a factor whose logarithm has a
-    standard deviation of 0.5, as measured on simulated and real logs (tests.benchmarks.trust).
     scans : as in ``expected_ate``
+    influence : of groups of directions on the motions between keyframes; random errors only where left out
     Raises InputError without an edge, or where the edges leave poses free.
     """
+    samples = error_samples(graph, map_errors, config, scans, influence)
+    return _expected(samples, graph, scans, is_random=influence is None)
+
+
+def error_samples(
+    graph: PoseGraph, map_errors: Sequence[KeyframeErrors], config: Config, scans: NDArray[np.int64] | None = None,
+    influence: Influence | None = None,
+) -> Iterator[Matrix]:  # fmt: skip
+    """Samples of the errors of ``expected_errors``, some (n, K, k) at a time, after rigid alignment."""
     if not len(graph.edges):
         raise InputError("the pose graph has no edge, so that no error is expected; give more keyframes")
-    drifting, own = with_map_errors(graph, map_errors, config)
+    random = [each._replace(systematic=np.zeros_like(each.systematic)) for each in map_errors]
+    drifting, own = with_map_errors(graph, random, config)
     R = _rotations(graph.poses, graph.freedom)
-    return _sampled(drifting, scans, R @ own @ np.swapaxes(R, 1, 2), _SCALE_SIGMA)
+    own = R @ own @ np.swapaxes(R, 1, 2)
+    alignment = _Alignment.of(graph.poses, scans)
+    if influence is None:
+        return _samples(drifting, own, alignment)
+    changes = np.zeros((len(influence.twists), *graph.information.shape[:2]))
+    is_odometry = ~graph.is_loop & (graph.edges[:, 1] == graph.edges[:, 0] + 1)
+    changes[:, is_odometry] = influence.twists[:, graph.edges[is_odometry, 0]]
+    influences = alignment.aligned(drifting.displacements(changes))
+    return _samples(drifting, own, alignment, influences, influence.kinds)
 
 
 def with_map_errors(
@@ -136,38 +164,100 @@ def _rotations(poses: Matrix, freedom: int) -> Matrix:
     return result
 
 
-def _sampled(graph: PoseGraph, scans: NDArray[np.int64] | None, own: Matrix, scale_sigma: float) -> ExpectedErrors:
-    """Errors by the edges of a graph, and with a covariance (K, k, k) of its own, world's axes, for each pose."""
-    positions = graph.poses[:, :-1, -1]
-    count, d = positions.shape
-    weight = np.ones(count) if scans is None else scans.astype(np.float64)
-    root = np.sqrt(weight / weight.sum())[:, None]
-    moved = np.concatenate(
-        [np.broadcast_to(np.eye(d), (count, d, d)), turns(positions - positions.mean(axis=0))], axis=2
-    )
-    basis, size, Vt = np.linalg.svd((root[..., None] * moved).reshape(count * d, -1), full_matrices=False)
-    kept = size > _RANK_TOLERANCE * size[0]
-    basis, to_twist = basis[:, kept], (Vt[kept].T / size[kept])
+class _Alignment(NamedTuple):
+    """Rigid alignment of errors of positions, to first order.
+
+    root : (K, 1) roots of the positions' weights, which sum up to 1
+    moved : (K, d, k) by which a twist moves them; basis (K d, r) of these weighted moves; to_twist (k, r)
+    """
+
+    root: Matrix
+    moved: Matrix
+    basis: Matrix
+    to_twist: Matrix
+
+    @classmethod
+    def of(cls, poses: Matrix, scans: NDArray[np.int64] | None) -> _Alignment:
+        """That of poses (K, d+1, d+1), weighted by the number of scans (K,) that each stands for."""
+        positions = poses[:, :-1, -1]
+        count, d = positions.shape
+        weight = np.ones(count) if scans is None else scans.astype(np.float64)
+        root = np.sqrt(weight / weight.sum())[:, None]
+        translated = np.broadcast_to(np.eye(d), (count, d, d))
+        moved = np.concatenate([translated, turns(positions - positions.mean(axis=0))], axis=2)
+        basis, size, Vt = np.linalg.svd((root[..., None] * moved).reshape(count * d, -1), full_matrices=False)
+        kept = size > _RANK_TOLERANCE * size[0]
+        return cls(root, moved, basis[:, kept], Vt[kept].T / size[kept])
+
+    def aligned(self, errors: Matrix) -> Matrix:
+        """The errors (n, K, k), without what one twist of all poses explains."""
+        d = self.moved.shape[1]
+        weighted = (self.root * errors[..., :d]).reshape(len(errors), len(self.basis))
+        twist = weighted @ self.basis @ self.to_twist.T
+        moves = (self.moved @ twist[:, None, :, None])[..., 0]
+        turned = np.broadcast_to(twist[:, None, d:], errors[..., d:].shape)
+        return errors - np.concatenate([moves, turned], axis=2)
+
+    def rms(self, errors: Matrix) -> NDArray[np.float64]:
+        """Root mean squared position error (n,), m."""
+        positions = errors[..., : self.moved.shape[1]]
+        return np.sqrt(np.einsum("k,nki,nki->n", self.root[:, 0] ** 2, positions, positions))
+
+
+def _samples(
+    graph: PoseGraph, own: Matrix, alignment: _Alignment, influences: Matrix | None = None,
+    kinds: NDArray[np.int64] | None = None,
+) -> Iterator[Matrix]:  # fmt: skip
+    """Samples (n, K, k) of errors by the edges of a graph, by covariances (K, k, k) of each pose, and systematic ones.
+
+    own : world's axes; influences (G, K, k), aligned, of groups of directions of these kinds (G,)
+    """
     values, vectors = np.linalg.eigh(own)
     half = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     random = np.random.default_rng(0)
-    ates_m, squares = [], np.zeros((count, graph.freedom, graph.freedom))
+    if influences is not None and kinds is not None:
+        scale, log_sigma = _scales(alignment.rms(influences), kinds)
     for seed in range(_BATCHES):
         errors = graph.pose_errors(_BATCH, seed)
         errors += (half @ random.normal(size=(*errors.shape, 1)))[..., 0]
-        errors *= np.exp(scale_sigma * random.normal(size=(_BATCH, 1, 1)))
-        weighted = (root * errors[..., :d]).reshape(_BATCH, -1)
-        twist = weighted @ basis @ to_twist.T
-        errors[..., :d] -= (moved @ twist[:, None, :, None])[..., 0]
-        errors[..., d:] -= twist[:, None, d:]
-        ates_m.extend(
-            np.sqrt(np.einsum("k,nki,nki->n", root[:, 0] ** 2, errors[..., :d], errors[..., :d])).tolist()
-        )
+        if influences is not None:
+            drawn = scale * random.normal(size=(_BATCH, len(scale)))
+            drawn *= np.exp(log_sigma * random.normal(size=(_BATCH, 1)))
+            errors += np.tensordot(drawn, influences, axes=1)
+        yield alignment.aligned(errors)
+
+
+def _expected(
+    samples: Iterator[Matrix], graph: PoseGraph, scans: NDArray[np.int64] | None, *, is_random: bool = True
+) -> ExpectedErrors:
+    """Mean, bounds and covariances of samples."""
+    alignment = _Alignment.of(graph.poses, scans)
+    ates_m, squares = [], np.zeros((len(graph), graph.freedom, graph.freedom))
+    for errors in samples:
+        ates_m.extend(alignment.rms(errors).tolist())
         squares += np.einsum("nki,nkj->kij", errors, errors)
     low, high = np.percentile(ates_m, _BOUNDS).tolist()
     R = _rotations(graph.poses, graph.freedom)
-    covariances = np.swapaxes(R, 1, 2) @ (squares / (_BATCHES * _BATCH)) @ R
-    return ExpectedErrors(ExpectedError(float(np.mean(ates_m)), low, high), covariances)
+    covariances = np.swapaxes(R, 1, 2) @ (squares / len(ates_m)) @ R
+    return ExpectedErrors(ExpectedError(float(np.mean(ates_m)), low, high, is_random), covariances)
+
+
+def _scales(sizes_m: NDArray[np.float64], kinds: NDArray[np.int64]) -> tuple[NDArray[np.float64], float]:
+    """(G,) factors on the influences of groups by which their squares sum up to the variance, and its uncertainty.
+
+    The variance of the jackknife is (G − 1)/G Σ sᵢ² over the G groups of a kind, of influences sᵢ. It is larger
+    than the true one, by the interactions of the groups (Efron & Stein 1981). The influence of a group without
+    which the log is not observable is unknown: the median takes its place. The uncertainty is the standard
+    deviation of the logarithm of a standard deviation with (Σ sᵢ²)² / Σ sᵢ⁴ degrees of freedom (Satterthwaite 1946).
+    """
+    numbers, usual_m = np.bincount(kinds)[kinds], np.median(sizes_m)
+    is_usual = sizes_m <= _MOST_MEDIANS * usual_m
+    scales = (
+        _BIAS * np.sqrt((numbers - 1) / numbers) * np.where(is_usual, 1.0, usual_m / np.maximum(sizes_m, 1e-12))
+    )
+    squares = (scales * sizes_m) ** 2
+    freedom = squares.sum() ** 2 / max((squares**2).sum(), 1e-300)
+    return scales, float(1.0 / np.sqrt(2.0 * freedom)) if freedom else 0.0
 
 
 def motion_nees(poses: Matrix, covariances: Matrix, reference: Matrix) -> NDArray[np.float64]:

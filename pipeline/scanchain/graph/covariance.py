@@ -57,6 +57,19 @@ def edge_covariances(problem: BetweenProblem, blocks: Matrix) -> Matrix:
     return blocks[i] + blocks[j] - blocks[pair] - np.swapaxes(blocks[pair], 1, 2)
 
 
+def displacements(problem: BetweenProblem, poses: Matrix, weight: NDArray[np.float64], changes: Matrix) -> Matrix:
+    """Changes (G, K, k) of all poses, to first order, where the measured motions T_ij become T_ij exp(change).
+
+    changes : (G, E, k) twists in the frame of j. The left twists ξ of the poses solve H ξ = Σ w JᵀΩ change; returned
+    are changes of position and orientation, along the world's axes.
+    """
+    result = np.zeros((len(changes), len(poses), problem.freedom))
+    for moved, change in zip(result, changes, strict=True):
+        gradient = problem.linearize(poses, change, weight).gradient
+        moved[problem.free] = _moved(problem, poses, problem.cholesky.solve(gradient))
+    return result
+
+
 def pose_errors(problem: BetweenProblem, poses: Matrix, count: int, seed: int) -> NDArray[np.float64]:
     """Errors (count, K, k) of all poses, drawn from their joint distribution; those of fixed poses are zero.
 
@@ -64,14 +77,20 @@ def pose_errors(problem: BetweenProblem, poses: Matrix, count: int, seed: int) -
     ρ + φ × t. (Moving the poses by exp(ξ) overstates the errors where these are large.) Returned are that and φ,
     along the world's axes.
     """
-    d, random = poses.shape[-1] - 1, np.random.default_rng(seed)
-    lever = turns(poses[problem.free, :d, d])
+    random = np.random.default_rng(seed)
     errors = np.zeros((count, len(poses), problem.freedom))
     for k in range(count):
-        twists = problem.packing.spread_rows(problem.cholesky.draw(random.normal(size=problem.pattern.scalars)))
-        twists[:, :d] += (lever @ twists[:, d:, None])[..., 0]
-        errors[k, problem.free] = twists
+        drawn = problem.cholesky.draw(random.normal(size=problem.pattern.scalars))
+        errors[k, problem.free] = _moved(problem, poses, drawn)
     return errors
+
+
+def _moved(problem: BetweenProblem, poses: Matrix, packed: NDArray[np.float64]) -> Matrix:
+    """(n, k) changes of position and orientation of the free poses, moved by left twists."""
+    d = poses.shape[-1] - 1
+    twists = problem.packing.spread_rows(packed)
+    twists[:, :d] += (turns(poses[problem.free, :d, d]) @ twists[:, d:, None])[..., 0]
+    return twists
 
 
 def chosen_poses(text: str, ids: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -16,7 +16,7 @@ from scanchain.errors import InputError, counted
 from scanchain.graph.between import BetweenProblem
 from scanchain.graph.certificate import Certificate, certify
 from scanchain.graph.cholesky import SingularMatrixError
-from scanchain.graph.covariance import difference_covariances, inverse_blocks, pose_errors
+from scanchain.graph.covariance import difference_covariances, displacements, inverse_blocks, pose_errors
 from scanchain.graph.edge_checks import (
     check_connected,
     check_edges,
@@ -419,6 +419,14 @@ class PoseGraph:
         """
         count = checks.integer(count, "count", "a number of samples, 1 or more", least=1)
         return pose_errors(self._factored(), self.poses, count, seed)
+
+    def displacements(self, changes: Matrix) -> NDArray[np.float64]:
+        """Changes (G, K, k) of all poses, to first order, where the measured motions T_ij become T_ij exp(change).
+
+        changes : (G, E, k) twists. Of position and orientation, along the world's axes. Raises InputError where
+        the edges leave poses free.
+        """
+        return displacements(self._factored(), self.poses, self.weight, changes)
 
     def _append(self, T_world: Pose, stamp_ns: int, *, is_point: bool) -> int:
         stamp_ns = checks.integer(stamp_ns, "stamp_ns", "nanoseconds as int; of seconds int(1e9 * stamp_s)")

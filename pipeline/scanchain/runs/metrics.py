@@ -77,8 +77,8 @@ class Metrics(Struct, frozen=True):
     ``chi2`` and its degrees of freedom are those of the edges in force, all that is in graph.g2o.
     ``stopped`` is the reason why a run ended before its log, up to where these figures are; else empty.
     ``contradicted`` scans are matched, but their correspondences contradict the pose (``fit`` below 0.6).
-    ``expected_ate_m`` is the ATE by the covariances of the graph; null where it has no edge or these leave
-    poses free.
+    ``expected_ate_m`` is the ATE as far as it is known without the truth; null where the graph has no edge or its
+    edges leave poses free.
     ``verdict`` is the reliability of the result, ``verdict_reason`` the reason, ``verdict_error`` the error that
     it vouches for, ``stretches`` are what to look at.
     ``elevation_offset_rad`` is what the lidar's vertical angles were corrected by from the scan
@@ -140,7 +140,8 @@ class Metrics(Struct, frozen=True):
             Verdict.CHECK: " if no stretch is wrong",
             Verdict.NOT_TRUSTWORTHY: " if the trajectory were right",
         }
-        return self.expected_ate_m.text + condition[self.verdict]
+        error = self.expected_ate_m
+        return f"{error.mean:.3f} m ({error.bounds})" + condition[self.verdict]
 
     @property
     def judged(self) -> Judged:
@@ -189,6 +190,7 @@ class Metrics(Struct, frozen=True):
 def measure(
     steps: StepTable,
     results: Results,
+    expected: ExpectedError | None,
     judged: Judged,
     *,
     run_s: float,
@@ -240,7 +242,7 @@ def measure(
         verdict_reason=judged.reason,
         stretches=judged.stretches,
         verdict_error=judged.error,
-        expected_ate_m=results.expected and results.expected.ate,
+        expected_ate_m=expected,
         stopped=stopped,
         warnings=tuple(warnings),
         compile_s=compile_s,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import Config, MapsConfig
-from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Trajectory
+from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Scan, Trajectory
 from scanchain.errors import InputError
 from scanchain.evaluation import ExpectedErrors, expected_errors
 from scanchain.graph.g2o import rejected_path, write_g2o
@@ -38,12 +38,13 @@ from scanchain.maps import (
     write_ply,
     write_saved_map,
 )
+from scanchain.odometry.jackknife import influence
 from scanchain.runs.closures import write_closures
 from scanchain.runs.job import Recorder
 from scanchain.runs.results_mcap import write_results_mcap
 from scanchain.runs.step_table import StepTable
 from scanchain.slam import SlamResult
-from scanchain.trajectory import write_kitti, write_tum, write_wide_tum
+from scanchain.trajectory import write_kitti, write_tum
 
 GRAPH_FILE = "graph.g2o"  # the edges in force; rejected ones go to graph_rejected.g2o, if there are any
 _TILTED_RAD = math.radians(5.0)  # tilt of the lidar's first frame to the ground from which on it is said
@@ -72,7 +73,6 @@ class Results:
     final: tuple[Closure, ...]
     drawn: Future[Cloud]
     grid: OccupancyGrid
-    expected: ExpectedErrors | None
     T_world_level: Pose
 
     @property
@@ -119,28 +119,51 @@ def results_of(
     if log.dimension == 3:
         T_world_level = level_of(result.keyframes, result.T_world_keyframes, config.local_map)
     grid = grid_of(result.keyframes, lie.inverse(T_world_level) @ result.T_world_keyframes, config.maps)
-    return Results(log, config, steps, result, final, drawn, grid, expected_of(result, config), T_world_level)
+    return Results(log, config, steps, result, final, drawn, grid, T_world_level)
 
 
-def expected_of(result: SlamResult, config: Config) -> ExpectedErrors | None:
-    """Expected errors of the keyframes; None without an edge, or where these leave poses free."""
-    starts = [keyframe.scan_index for keyframe in result.keyframes]
-    scans = np.diff([*starts, len(result.trajectory)])
-    try:
-        return expected_errors(result.graph, result.map_errors, config, scans)
-    except InputError:
+def expected_of(result: SlamResult, config: Config, scans: Iterable[Scan] | None) -> ExpectedErrors | None:
+    """Expected errors of the keyframes; None without an edge, or where these leave poses free.
+
+    scans : of the log once more, in order, for the systematic errors; without them the random ones
+    Raises InputError where these scans cannot be read again.
+    """
+    if not len(result.graph.edges):
         return None
+    starts = [keyframe.scan_index for keyframe in result.keyframes]
+    of_directions = None
+    if scans is not None:
+        offset_rad = result.elevation_offset_rad
+        of_directions = influence(scans, result.odometry.poses, starts, config, result.T_base_lidar, offset_rad)
+    counts = np.diff([*starts, len(result.trajectory)])
+    try:
+        expected = expected_errors(result.graph, result.map_errors, config, counts, of_directions)
+    except InputError:  # poses that no edge constrains
+        return None
+    where = _most_uncertain(result.keyframe_trajectory, expected.covariances)
+    return expected._replace(ate=msgspec.structs.replace(expected.ate, where=where))
+
+
+def _most_uncertain(keyframes: Trajectory, covariances: Matrix) -> str:
+    """The part of the log around the most uncertain position in which all are at least half as uncertain."""
+    d = keyframes.dimension
+    sigma_m = np.sqrt(np.trace(covariances[:, :d, :d], axis1=1, axis2=2))
+    worst = int(sigma_m.argmax())
+    is_less = np.append(sigma_m < 0.5 * sigma_m[worst], True)
+    last = worst + int(is_less[worst:].argmax()) - 1
+    first = worst + 1 - int(is_less[worst::-1].argmax() or worst + 1)
+    seconds = 1e-9 * (keyframes.stamps_ns - keyframes.stamps_ns[0])
+    at = f"between {seconds[first]:.0f} and {seconds[last]:.0f} s"
+    return f"most {at}, where a position is known to ±{sigma_m[worst]:.2g} m"
 
 
 def write_results(folder: Path, results: Results) -> None:
     """Write every requested output into a run directory; a new format is a writer, and a line here."""
     log, config, result = results.log, results.config, results.result
-    trajectory, graph, expected = result.trajectory, result.graph, results.expected
+    trajectory, graph = result.trajectory, result.graph
     write_tum(folder / "trajectory.tum", trajectory)
     write_kitti(folder / "trajectory.kitti.txt", trajectory)
     write_tum(folder / "odometry.tum", result.odometry)
-    if expected is not None:
-        write_wide_tum(folder / "keyframes.tum", result.keyframe_trajectory, expected.covariances)
     if log.mounting.base and log.mounting.motion is None:  # the robot's, in the frame of the lidar's
         poses = trajectory.poses @ lie.inverse(log.T_base_lidar)
         write_tum(folder / "trajectory_base.tum", Trajectory(trajectory.stamps_ns, poses))

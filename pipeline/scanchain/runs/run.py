@@ -18,7 +18,7 @@ from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.config import NO_TRUTH, Config
 from scanchain.data import Scan, Trajectory, brief
 from scanchain.errors import InputError, ScanchainError, counted
-from scanchain.evaluation import TruthFile, check_overlap, during, on_the_estimate, read_truth
+from scanchain.evaluation import ExpectedErrors, TruthFile, check_overlap, during, on_the_estimate, read_truth
 from scanchain.files import write_whole
 from scanchain.logs import Log, open_log
 from scanchain.logs.mounting import turned_by
@@ -44,14 +44,14 @@ from scanchain.runs.metrics import (
     summary,
 )
 from scanchain.runs.provenance import Hashing, describe_start
-from scanchain.runs.results import Results, record_results, results_of, write_results
+from scanchain.runs.results import Results, expected_of, record_results, results_of, write_results
 from scanchain.runs.resume import Checkpoints, after, find_left, rescued, resume_recording, set_aside
 from scanchain.runs.step_table import StepTable
 from scanchain.runs.vouching import evidence_of_run
 from scanchain.settings import Settings, dump, load_settings, named
 from scanchain.slam import Slam, SlamResult
 from scanchain.threads import threads
-from scanchain.trajectory import write_tum
+from scanchain.trajectory import write_tum, write_wide_tum
 from scanchain.verdict import Judged, judge
 
 _FEW_SCANS = 2  # scans whose trajectory shows at most one motion
@@ -91,10 +91,10 @@ def run(
             slam, scans = this.begin()
             with this.recording(record) as recording:
                 result = this.process(slam, scans, recording)
-                results, judged = this.write(result, recording)
+                results, expected, judged = this.write(result, recording)
                 slam.points.close()
                 held_s = this.hold(recording)
-            metrics, text = this.judge(results, judged, recording.warnings, held_s)
+            metrics, text = this.judge(results, expected, judged, recording.warnings, held_s)
             return this.complete(metrics, text, report)
         except (Exception, KeyboardInterrupt) as error:
             if not len(this.steps) and isinstance(error, ScanchainError | KeyboardInterrupt | OSError):
@@ -180,14 +180,17 @@ class _Run:
         checkpoints.write(slam, self.steps, recording.secure())  # an interruption from here on loses no scan
         return slam.finish(self.progress.say)
 
-    def write(self, result: SlamResult, recording: Recorder) -> tuple[Results, Judged]:
+    def write(self, result: SlamResult, recording: Recorder) -> tuple[Results, ExpectedErrors | None, Judged]:
         """Write the results to the directory, and the verdict on them and on the truth to the recording."""
         self.progress.say("building the maps and writing the results")
         with self.directory.results() as folder:
             final = final_verdicts(result.closures, result.state)
             results = results_of(self.log, self.config, self.steps, result, final)
             write_results(folder, results)
-            evidence = evidence_of_run(folder, results.expected and results.expected.ate)
+            expected = self.expected(result)
+            if expected is not None:
+                write_wide_tum(folder / "keyframes.tum", result.keyframe_trajectory, expected.covariances)
+            evidence = evidence_of_run(folder, expected and expected.ate)
             judged = judge(evidence, result.T_base_lidar)
             record_results(recording, results)
             recording.log_verdict(judged, result.trajectory)
@@ -196,7 +199,21 @@ class _Run:
                 if reference is not None:
                     moved = on_the_estimate(result.trajectory, reference, gap_s=self.job.max_gap_s)
                     recording.log_ground_truth(moved.poses)
-        return results, judged
+        return results, expected, judged
+
+    def expected(self, result: SlamResult) -> ExpectedErrors | None:
+        """Expected errors, with the systematic ones by odometry of scans that are read once more."""
+        if self.config.outputs.error_bars == "full" and not self.progress.stopped:
+            self.progress.say(
+                "measuring systematic errors: odometry without one group of directions after the other"
+            )
+            try:
+                again = open_log(self.job.logs, self.config.log).scans(self.config.preprocess)
+                with closing(again):
+                    return expected_of(result, self.config, again)
+            except (InputError, OSError) as error:
+                self.notes.append(f"the log cannot be read again ({error}): error bars of random errors only")
+        return expected_of(result, self.config, None)
 
     def hold(self, recording: Recorder) -> float:
         """Keep the web viewer open, which lives as long as the recording; seconds until the user ended this."""
@@ -209,8 +226,9 @@ class _Run:
         return perf_counter() - began_s if recording.web_address else 0.0
 
     def judge(
-        self, results: Results, judged: Judged, of_recording: Sequence[str], held_s: float
-    ) -> tuple[Metrics, str]:
+        self, results: Results, expected: ExpectedErrors | None, judged: Judged, of_recording: Sequence[str],
+        held_s: float,
+    ) -> tuple[Metrics, str]:  # fmt: skip
         """Measure the run, and write the figures; these and the summary."""
         log, result = self.log, results.result
         run_s, compile_s = working_s() - self.began_s - held_s, compiled_s() - self.compiled_before_s
@@ -225,8 +243,8 @@ class _Run:
             source = str(self.job.ground_truth or log.ground_truth_topic)
             truth, note = accuracy_of(self.true_poses, source, self.job.max_gap_s, result, folder)
             metrics = measure(
-                self.steps, results, judged, run_s=run_s, compile_s=compile_s, ground_truth=truth,
-                warnings=(*lost, *note), stopped=stopped,
+                self.steps, results, expected and expected.ate, judged, run_s=run_s, compile_s=compile_s,
+                ground_truth=truth, warnings=(*lost, *note), stopped=stopped,
             )  # fmt: skip
             notes = [*log.notes, *filter(None, [result.mounting_note]), *idle]
             text = summary(metrics, _heading(log, self.config, stopped), self.source, notes)

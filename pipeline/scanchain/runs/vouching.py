@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import VERIFICATION, Matrix, Proposal, Scan, State, Trajectory
-from scanchain.errors import InputError, one_line
+from scanchain.errors import InputError, at_most, one_line
 from scanchain.evaluation import ExpectedError, pair
 from scanchain.evaluation.consistency import velocities
 from scanchain.files import Source
@@ -116,7 +116,9 @@ def evidence_of(steps: pa.Table, closures: pa.Table | None, expected: ExpectedEr
         overlap=check_overlap(steps["inliers"].to_numpy() / np.maximum(steps["points"].to_numpy(), 1)),
         closures=_no_closures(poses) if closures is None else _verified(closures, dimension),
         odometry=poses_of(steps, "odom_", dimension),
-        error="" if expected is None else f"ATE {expected.low:.3f} to {expected.high:.3f} m with 95 %",
+        error="" if expected is None else f"ATE {expected.bounds}",
+        bound_m=np.inf if expected is None else expected.high,
+        uncertain="" if expected is None else expected.where,
     )
 
 
@@ -150,8 +152,9 @@ def evidence_of_trajectory(
     if found.wheels.known_share >= KNOWN:
         bounds["wheels"] = wheel_bound_m(trajectory.poses, wheels)
     by = min(bounds, key=bounds.__getitem__, default="")
-    error = f"no jump above {smallest_jump_m(found.seconds):.2g} m, drift unchecked"
-    return replace(found, error=f"ATE below {bounds[by]:.2g} m by {by}" if by else error)
+    if not by:
+        return replace(found, error=f"no jump above {smallest_jump_m(found.seconds):.2g} m, drift unchecked")
+    return replace(found, error=f"ATE below {at_most(bounds[by])} m by {by}", bound_m=bounds[by])
 
 
 def _verified(table: pa.Table, dimension: int) -> Closures:

@@ -11,7 +11,7 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.data import LEAST_FIT, Matrix, Pose
-from scanchain.errors import counted
+from scanchain.errors import at_most, counted
 from scanchain.verdict.checks import WINDOW_M, Kind, Stretch
 from scanchain.verdict.stretches import KNOWN, Evidence, find_stretches
 
@@ -28,6 +28,7 @@ _MOST_OPEN_AT_REST = 0.05  # largest share of scans that leave a direction open,
 _FEWEST_TRIED, _LEAST_ACCEPTED = 10, 0.2  # scans that must try loop closures, and least share of closures accepted
 _OPPOSED = -0.5  # turns of the trajectory over those of the wheels, below which one of the two is mirrored
 _SHOWN = 3  # stretches that the sentence lists
+_WORKABLE, _WORKABLE_M = 0.03, 0.1  # largest upper bound of the error: share of the trajectory's extent, or meters
 
 
 class Verdict(StrEnum):
@@ -160,6 +161,7 @@ def _doubts(evidence: Evidence, stretches: Sequence[Stretch], rest: _Rest) -> It
     if rest.is_there and not rest.is_shown:
         yield rest.text
     yield from _unlike_wheels(evidence)
+    yield from _unbounded(evidence, rest)
     count = int(evidence.is_degenerate.sum())
     if count > _MOST_OPEN * len(evidence):
         source = "the wheels' alone" if evidence.wheels.known_share >= KNOWN else "predicted"
@@ -174,6 +176,18 @@ def _doubts(evidence: Evidence, stretches: Sequence[Stretch], rest: _Rest) -> It
         )
     if stretches:
         yield _listed(stretches)
+
+
+def _unbounded(evidence: Evidence, rest: _Rest) -> Iterator[str]:
+    """That the error is unknown, or may be too large for the size of the trajectory."""
+    limit_m = max(_WORKABLE * rest.extent_m, _WORKABLE_M)
+    if rest.is_shown or evidence.bound_m <= limit_m:
+        return
+    if not np.isfinite(evidence.bound_m):
+        yield "nothing bounds its drift: no closed loops of its own, no wheels, no other estimate"
+        return
+    where = f": {evidence.uncertain}" if evidence.uncertain else ""
+    yield f"its error may be {at_most(evidence.bound_m)} m, more than {limit_m:.2g} m{where}"
 
 
 @dataclass(frozen=True, slots=True)

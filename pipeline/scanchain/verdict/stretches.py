@@ -69,6 +69,8 @@ class Evidence:
     closures : those that verification accepted
     odometry : (N, d+1, d+1) before optimization; None where nothing was optimized
     error : what is known of the error of a trajectory that is right everywhere, in words; empty for nothing
+    bound_m : upper bound of that error; infinite where unknown
+    uncertain : the part of the log whose positions are the most uncertain, in words; empty for none
     """
 
     seconds: Floats
@@ -85,6 +87,8 @@ class Evidence:
     closures: Closures
     odometry: Matrix | None = None
     error: str = ""
+    bound_m: float = np.inf
+    uncertain: str = ""
 
     @property
     def is_contradicted(self) -> NDArray[np.bool_]:

@@ -1,0 +1,172 @@
+"""Errors of odometry by a delete-a-group jackknife over directions (Shao & Tu 1995, section 2.3).
+
+What scans and map have in common, beams that are off or scans that are distorted, leaves no residuals, so that the
+covariance of no match contains it. It shows where the points in one group of directions after the other are left
+out of scans *and* map: odometry then differs by the influence of that group.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from itertools import islice
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain import lie
+from scanchain.config import Config
+from scanchain.data import Influence, Matrix, Pose, Scan
+from scanchain.odometry.elevation import raised
+from scanchain.odometry.odometry import Odometry
+from scanchain.preprocess import Prepared, Resolution, Sweep, prepare
+from scanchain.threads import threads
+
+AZIMUTHS, ELEVATIONS = {2: 16, 3: 6}, {2: 0, 3: 4}  # groups of directions; wide ones leave the plane unobservable
+LONGEST = {2: 150, 3: 60}  # scans of a window; a log that is no longer is measured whole
+_LEAST_SQUARE = 1e-6  # m², sum over a window that stands still
+_TURN_M_RAD = 1.0  # path that counts for a turn, of which error grows as of motion
+
+
+class Window(NamedTuple):
+    """Odometry of successive scans, once with all points and once without each group of directions.
+
+    first : number of the first scan
+    complete : (M, d+1, d+1) poses by all points; without : (G, M, d+1, d+1) without those of a group
+    """
+
+    first: int
+    complete: Matrix
+    without: Matrix
+
+
+def influence(
+    scans: Iterable[Scan], odometry: Matrix, keyframes: Sequence[int], config: Config, T_base_lidar: Pose | None,
+    offset_rad: float = 0.0,
+) -> Influence:  # fmt: skip
+    """Influence of each group of directions, for a log with known odometry.
+
+    A short log is measured whole, a long one in windows evenly spread along the path; between these the influence
+    per path is interpolated.
+    scans : all of the log, in order; odometry : (N, d+1, d+1) their poses; keyframes : (K,) numbers of scans
+    offset_rad : elevation offset of the lidar that was found on the log
+    """
+    d = odometry.shape[-1] - 1
+    kinds = np.repeat([0, 1], [AZIMUTHS[d], ELEVATIONS[d]])
+    path_m = _path_m(odometry)
+    preprocess = msgspec.structs.replace(config.preprocess, calibrate_elevation=False)
+    config = msgspec.structs.replace(config, preprocess=preprocess)
+    measured, scans, position = [], iter(scans), 0
+    for first in first_scans(path_m, d):
+        resolution, window = Resolution(preprocess, config.local_map.voxel_size_m), []
+        for scan in islice(scans, first - position, min(first + LONGEST[d], len(odometry)) - position):
+            window.append(prepare(scan, resolution))
+            resolution = window[-1].after
+        position = first + len(window)
+        measured.append(_measured(first, [_raised(each, offset_rad) for each in window], config, T_base_lidar))
+    twists = _twists(measured, np.asarray(keyframes), path_m)
+    return Influence(twists, kinds, sum(len(each.complete) for each in measured) / len(odometry))
+
+
+def first_scans(path_m: NDArray[np.float64], dimension: int) -> list[int]:
+    """Numbers of the first scans of the windows of a log with this path (N,).
+
+    So many windows that the matches of all groups are about as many as the log has scans, one at least; the middle
+    of each is where its share of the path is.
+    """
+    scans, length = len(path_m), LONGEST[dimension]
+    count = max(scans // (length * (AZIMUTHS[dimension] + ELEVATIONS[dimension] + 1)), 1)
+    middles = np.searchsorted(path_m, (np.arange(count) + 0.5) / count * path_m[-1])
+    firsts = np.maximum(middles - length // 2, length * np.arange(count))  # none begins before the last one ends
+    return np.maximum(np.minimum(firsts, scans - length * np.arange(count, 0, -1)), 0).tolist()
+
+
+def _measured(first: int, window: Sequence[Prepared], config: Config, T_base_lidar: Pose | None) -> Window:
+    """Odometry of a window, the groups in parallel."""
+    d = window[0].sweep.points.shape[1]
+    elevations = _elevation(window[0].sparse.points)
+    limits = np.quantile(elevations, np.arange(1, ELEVATIONS[d]) / ELEVATIONS[d]) if d == 3 else None
+    labels = [tuple(_groups(sweep.points, limits) for sweep in (each.sweep, each.sparse)) for each in window]
+
+    def poses(group: int) -> Matrix:
+        odometry, result = Odometry(config, T_base_lidar, dimension=d), []
+        for prepared, (of_sweep, of_sparse) in zip(window, labels, strict=True):
+            chosen = msgspec.structs.replace(
+                prepared,
+                sweep=_part(prepared.sweep, (of_sweep != group).all(axis=0)),
+                sparse=_part(prepared.sparse, (of_sparse != group).all(axis=0)),
+            )
+            result.append(odometry.place(chosen).T_odom_lidar)
+        return np.array(result)
+
+    with ThreadPoolExecutor(threads()) as pool:
+        complete, *without = pool.map(poses, range(-1, AZIMUTHS[d] + ELEVATIONS[d]))
+    return Window(first, complete, np.array(without))
+
+
+def _groups(points: Matrix, limits: NDArray[np.float64] | None) -> NDArray[np.int64]:
+    """Groups (1 or 2, N) of points (N, d): that of their azimuth and, between these limits, of their elevation."""
+    d = points.shape[1]
+    turn = np.arctan2(points[:, 1], points[:, 0]) / (2.0 * np.pi) + 0.5
+    azimuth = np.minimum((turn * AZIMUTHS[d]).astype(np.int64), AZIMUTHS[d] - 1)
+    if limits is None:
+        return azimuth[None]
+    return np.stack([azimuth, AZIMUTHS[d] + np.searchsorted(limits, _elevation(points))])
+
+
+def _elevation(points: Matrix) -> NDArray[np.float64]:
+    return np.arctan2(points[:, -1], np.hypot(points[:, 0], points[:, 1]))
+
+
+def _part(sweep: Sweep, chosen: NDArray[np.bool_]) -> Sweep:
+    return Sweep(
+        sweep.points[chosen], sweep.times_s[chosen] if sweep.is_distorted else sweep.times_s, sweep.middle_s
+    )
+
+
+def _raised(prepared: Prepared, offset_rad: float) -> Prepared:
+    if not offset_rad:
+        return prepared
+    parts = (replace(each, points=raised(each.points, offset_rad)) for each in (prepared.sweep, prepared.sparse))
+    return msgspec.structs.replace(prepared, **dict(zip(("sweep", "sparse"), parts, strict=True)))
+
+
+def _path_m(poses: Matrix) -> NDArray[np.float64]:
+    """(N,) path up to each pose, turns included."""
+    twists = lie.log(lie.between(poses[:-1], poses[1:]))
+    d = poses.shape[-1] - 1
+    steps_m = np.hypot(np.linalg.norm(twists[:, :d], axis=1), _TURN_M_RAD * np.linalg.norm(twists[:, d:], axis=1))
+    return np.concatenate([[0.0], np.cumsum(steps_m)])
+
+
+def _twists(measured: Sequence[Window], keyframes: NDArray[np.int64], path_m: NDArray[np.float64]) -> Matrix:
+    """(G, K−1, k) of the motions between keyframes: measured, or by the rates of the windows, interpolated."""
+    first, last = keyframes[:-1], keyframes[1:]
+    middles_m = [path_m[each.first + len(each.complete) // 2] for each in measured]
+    rates = np.array([_rates(each, path_m) for each in measured])
+    at_m, length_m = 0.5 * (path_m[first] + path_m[last]), path_m[last] - path_m[first]
+    twists = np.empty((rates.shape[1], len(first), rates.shape[2]))
+    for group, component in np.ndindex(rates.shape[1:]):
+        twists[group, :, component] = length_m * np.interp(at_m, middles_m, rates[:, group, component])
+    for each in measured:
+        inside = (first >= each.first) & (last < each.first + len(each.complete))
+        twists[:, inside] = _changes(each, first[inside] - each.first, last[inside] - each.first)
+    return twists
+
+
+def _rates(window: Window, path_m: NDArray[np.float64]) -> Matrix:
+    """(G, k) twist per path by which motions differ without each group: slopes of the sums over the window."""
+    scans = np.arange(len(window.complete))
+    sums = np.cumsum(_changes(window, scans[:-1], scans[1:]), axis=1)
+    along_m = path_m[window.first + scans[1:]]
+    along_m = along_m - along_m.mean()
+    return along_m @ sums / max(float(along_m @ along_m), _LEAST_SQUARE)
+
+
+def _changes(window: Window, first: NDArray[np.int64], last: NDArray[np.int64]) -> Matrix:
+    """(G, M, k) by which motions between scans of a window differ without each group."""
+    complete = lie.between(window.complete[first], window.complete[last])
+    return lie.log(lie.inverse(complete) @ (lie.inverse(window.without[:, first]) @ window.without[:, last]))
