@@ -1,19 +1,22 @@
-"""Expected ATE and covariances against the truth.
+"""Error bars and covariances against the truth.
 
-Worlds of 3D lidars, sensors and cache are those of ``odometry3d --set``; planar worlds are driven with
-LMS-270 and UTM-30, all without wheels. A line says
+Worlds of 3D lidars, sensors and cache are those of ``odometry3d --set``; planar worlds are driven with LMS-270 and
+UTM-30, all without wheels; with the times of the points and without, every scan and every second. Then real logs,
+their halves, and every second and third of their scans. A line says
 
   ATE       of the final trajectory
-  expected  ATE, and bounds that contain the true one in 95 of 100 cases; over the true one; * where they do not
-  NEES/k    squared error of the motion between two scans over its covariance, mean, divided by its dimension: 1 is
-            exact, more is overconfident; from scans that are neither degenerate nor lost
+  expected  ATE, and its error bar; over the true one; * where it does not contain that
+  wide      upper over lower bound
+  NEES/k    squared error of the motion between two scans over its covariance, median, divided by that of the
+            distribution of right ones: 1 is exact, more is overconfident; from scans that are neither degenerate
+            nor lost
   k         of smfeval, if it is installed: median of the squared error of keyframes after alignment over their
             covariances (keyframes.tum), over that of right ones
 
-Then the same of real logs. Of Intel and ACES, whose truth are relations, the errors of relations between visits
-(10 m of path or more) take the place of the ATE: root mean square, and that which their covariances expect. The
-relations' own noise is part of that; it follows from those below 1 m by comparing relations, wheels and odometry
-without wheels (three-cornered hat: their errors are independent).
+Of Intel and ACES, whose truth are relations, errors of relations between visits (10 m of path or more) take the
+place of the ATE: root mean square, and that of samples. The relations' own noise is part of that; it follows from
+those below 1 m by comparing relations, wheels and odometry without wheels (three-cornered hat: their errors are
+independent).
 """
 
 from __future__ import annotations
@@ -22,18 +25,23 @@ import contextlib
 import io
 import re
 import tempfile
-from collections.abc import Sequence
-from dataclasses import dataclass
+from argparse import Namespace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain, product
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from scanchain import evaluation, lie
 from scanchain.data import Matrix, State, Step, Trajectory
-from scanchain.evaluation.consistency import with_map_errors
+from scanchain.evaluation.consistency import error_samples
 from scanchain.evaluation.pairing import nearest
 from scanchain.logs import open_log
+from scanchain.odometry.jackknife import influence
+from scanchain.runs.results import expected_of
 from scanchain.settings import Override, load_settings
 from scanchain.simulation import SENSORS, WORLDS
 from scanchain.slam import Slam, SlamResult
@@ -45,11 +53,20 @@ WARM_UP_SCANS = 3
 NO_WHEELS = (Override("odometry.prior", "constant-velocity", "this benchmark"),)
 PLANAR, PLANAR_SENSORS = ("office", "identical"), ("lms-270", "utm-30")
 SHORT_M, LONG_M = 1.0, 10.0  # paths of relations that show their own noise, and that show ours
+MOCAP = {"ground_truth_topic": "/vrpn_client_node/jackal/pose"}
 REAL = {  # file, and keys of [log]
     "KITTI 0001": ("3d/kitti_0001_first54.mcap", {}),
     "PandaSet 002": ("3d/pandaset_002_sweeps30to55.mcap", {"topic": "/pandar64/points"}),
-    "mocap room 1": ("2d/mocap_room_1.bag", {"ground_truth_topic": "/vrpn_client_node/jackal/pose"}),
-    "mocap room 2": ("2d/mocap_room_2.bag", {"ground_truth_topic": "/vrpn_client_node/jackal/pose"}),
+    "PandaSet 002, forward": ("3d/pandaset_002_sweeps30to55.mcap", {"topic": "/pandar_gt/points"}),
+    "mocap room 1": ("2d/mocap_room_1.bag", MOCAP),
+    "mocap room 2": ("2d/mocap_room_2.bag", MOCAP),
+}
+PARTS = {  # of real logs
+    "": {},
+    "first half": {"end_s": 0.5},
+    "second half": {"start_s": 0.5},
+    "every 2": {"every": 2},
+    "every 3": {"every": 3},
 }
 
 Floats = NDArray[np.float64]
@@ -66,6 +83,7 @@ class Line:
     high_m: float
     nees: float
     gap: float
+    kind: str = ""
 
     @property
     def ratio(self) -> float:
@@ -79,7 +97,8 @@ class Line:
     def cells(self) -> tuple[str, ...]:
         bounds = f"{self.expected_m:.4f} ({self.low_m:.4f} to {self.high_m:.4f})"
         ratio = f"{self.ratio:.2f}{'' if self.is_covered else '*'}"
-        return self.name, f"{self.true_m:.4f}", bounds, ratio, f"{self.nees:.2f}", f"{self.gap:.2f}"
+        wide = f"{self.high_m / self.low_m:.1f}"
+        return self.name, f"{self.true_m:.4f}", bounds, ratio, wide, f"{self.nees:.2f}", f"{self.gap:.2f}"
 
 
 def placed(
@@ -91,9 +110,7 @@ def placed(
     slam = Slam(config, log.T_base_lidar)
     steps = [slam.process(scan) for scan in log.scans()]
     result = slam.finish()
-    starts = [keyframe.scan_index for keyframe in result.keyframes]
-    scans = np.diff([*starts, len(steps)])
-    expected = evaluation.expected_errors(result.graph, result.map_errors, config, scans)
+    expected = expected_of(result, config, open_log([path], **of_log).scans())
     return result, steps, log.T_base_lidar, expected, log.ground_truth()
 
 
@@ -114,7 +131,7 @@ def judged(
 
 
 def _nees(result: SlamResult, steps: Sequence[Step], truth: Trajectory) -> float:
-    """Mean NEES of the motions between scans; NaN where not every scan has a true pose."""
+    """Median NEES of the motions between scans over that of right ones."""
     pairs = evaluation.pair(result.odometry, truth)
     estimate, reference = pairs.estimate, pairs.reference
     if result.odometry.dimension == 2:
@@ -122,7 +139,9 @@ def _nees(result: SlamResult, steps: Sequence[Step], truth: Trajectory) -> float
     covariances = np.array([step.match.covariance for step in steps])[pairs.places]
     is_sure = np.array([step.state in (State.OK, State.CONTRADICTED) for step in steps])[pairs.places]
     covariances[~is_sure | (pairs.places < WARM_UP_SCANS)] = np.nan
-    return float(np.nanmean(evaluation.motion_nees(estimate, covariances, reference)))
+    nees = evaluation.motion_nees(estimate, covariances, reference)
+    k = covariances.shape[1]
+    return float(np.nanmedian(nees) / (chi2.median(k) / k))
 
 
 def _gap(result: SlamResult, expected: evaluation.ExpectedErrors, truth: Trajectory) -> float:
@@ -149,7 +168,7 @@ def relations_line(name: str) -> Line:
     log = DATA / f"2d/{name}.mcap"
     relations = evaluation.read_relations(log.with_suffix(".relations"))
     unaided, steps, T_base_lidar, _, _ = placed(log)
-    result, _, _, expected, _ = placed(log, ())
+    result = placed(log, ())[0]
     places, off_ns = nearest(relations.stamps_ns.ravel(), result.trajectory.stamps_ns)
     known = (off_ns.reshape(-1, 2) < 1_000_000).all(axis=1)
     a, b = places.reshape(-1, 2)[known].T
@@ -157,19 +176,30 @@ def relations_line(name: str) -> Line:
     path_m = evaluation.path_length(result.odometry.poses)
     length_m = np.abs(path_m[b] - path_m[a])
     noise = _own_noise(true, a, b, length_m < SHORT_M, unaided, steps, T_base_lidar)
-    keyframes = np.array([keyframe.scan_index for keyframe in result.keyframes])
+    keyframes = [keyframe.scan_index for keyframe in result.keyframes]
     first, last = (np.searchsorted(keyframes, scans, side="right") - 1 for scans in (a, b))
     chosen = np.flatnonzero((length_m > LONG_M) & (first != last))
-    graph, own = with_map_errors(result.graph, result.map_errors, load_settings(2).config)
-    ends = zip(first[chosen].tolist(), last[chosen].tolist(), strict=True)
-    covariance = noise + np.array([graph.relative_covariance(i, j) + own[i] + own[j] for i, j in ends])
     poses = result.trajectory.poses
     error = lie.log(lie.between(true, lie.between(poses[a], poses[b])))[chosen]
-    nees = float(np.einsum("ni,nij,nj->n", error, np.linalg.inv(covariance), error).mean()) / 3.0
-    expected_m = float(np.sqrt(covariance[:, [0, 1], [0, 1]].sum(axis=1).mean()))
     true_m = float(np.sqrt((error[:, :2] ** 2).sum(axis=1).mean()))
-    low, high = (expected_m * each / expected.ate.mean for each in (expected.ate.low, expected.ate.high))
-    return Line(f"{name}, relations", true_m, expected_m, low, high, nees, np.nan)
+    config = load_settings(2).config
+    of_directions = influence(open_log([log]).scans(), result.odometry.poses, keyframes, config, T_base_lidar)
+    counts = np.diff([*keyframes, len(steps)])
+    samples = error_samples(result.graph, result.map_errors, config, counts, of_directions)
+    expected_m = np.concatenate(
+        [_relation_errors(each, result.T_world_keyframes, first[chosen], last[chosen]) for each in samples]
+    )
+    expected_m = np.sqrt(expected_m**2 + noise[0, 0] + noise[1, 1])
+    low, high = np.percentile(expected_m, (2.5, 97.5))
+    return Line(f"{name}, relations", true_m, float(expected_m.mean()), low, high, np.nan, np.nan)
+
+
+def _relation_errors(errors: Matrix, poses: Matrix, first: NDArray[np.int64], last: NDArray[np.int64]) -> Floats:
+    """(n,) root mean squared position errors of the motions from first to last poses, of samples (n, K, 3)."""
+    away = poses[last, :2, 2] - poses[first, :2, 2]
+    turned = errors[:, first, 2, None] * np.stack([-away[:, 1], away[:, 0]], axis=1)
+    apart = errors[:, last, :2] - errors[:, first, :2] - turned
+    return np.sqrt((apart**2).sum(axis=2).mean(axis=1))
 
 
 def _own_noise(
@@ -188,39 +218,65 @@ def _own_noise(
     return np.diag(np.maximum(0.5 * (apart[0] + apart[1] - apart[2]), 1e-8))
 
 
-def summary(kind: str, lines: Sequence[Line]) -> None:
-    """Coverage and median ratio of some lines."""
-    ratios = np.array([each.ratio for each in lines])
-    covered = np.mean([each.is_covered for each in lines])
-    print(
-        f"{kind}: {len(lines)} logs, {100 * covered:.0f} % within the bounds, expected over true "
-        f"{np.median(ratios):.2f} "
-        f"(median; {np.percentile(ratios, 10):.2f} to {np.percentile(ratios, 90):.2f} in eight of ten), NEES/k "
-        f"{np.nanmin([each.nees for each in lines]):.2f} to {np.nanmax([each.nees for each in lines]):.2f}",
-        flush=True,
-    )
+def summary(lines: Sequence[Line]) -> None:
+    """Coverage, spread and width by kind."""
+    print()
+    row = table("kind", "logs", "within the bounds", "expected over true", "spread", "wide", "NEES/k")
+    for kind in dict.fromkeys(each.kind for each in lines):
+        chosen = [each for each in lines if each.kind == kind]
+        logarithms = np.log([each.ratio for each in chosen])
+        row(
+            kind,
+            len(chosen),
+            f"{100 * np.mean([each.is_covered for each in chosen]):.0f} %",
+            f"{np.exp(np.median(logarithms)):.2f}",
+            f"{np.exp(np.std(logarithms)):.2f}",
+            f"{np.median([each.high_m / each.low_m for each in chosen]):.1f}",
+            f"{np.nanmedian([each.nees for each in chosen]):.2f}",
+        )
+    far = [each.name for each in lines if each.true_m > 2.0 * each.high_m]
+    print(f"off by more than twice the upper bound: {', '.join(far) or 'none'}", flush=True)
+
+
+def simulated(arguments: Namespace) -> Iterator[tuple[str, str, Path, dict[str, object]]]:
+    """Kind, name, log and keys of [log] of every simulated run."""
+    for world in arguments.worlds.split(","):
+        is_planar = SENSORS[WORLDS[world].sensor].dimension == 2
+        sensors = PLANAR_SENSORS if is_planar else arguments.sensors.split(",")
+        for sensor, seed in product(sensors, map(int, arguments.seeds.split(","))):
+            path, place = (
+                drive_of(world, sensor, arguments.scans, arguments.cache, seed),
+                "2D" if is_planar else "3D",
+            )
+            yield f"simulated, {place}", f"{world} {sensor} {seed}", path, {}
+            yield f"simulated, {place}", f"{world} {sensor} {seed}, every 2", path, {"every": 2}
+            untimed = f"{world} {sensor} {seed}, no times"
+            yield f"simulated without times, {place}", untimed, path, {"point_times": "none"}
+
+
+def real() -> Iterator[tuple[str, str, Path, dict[str, object]]]:
+    """The same of the given real logs, and of their parts."""
+    for (name, (file, of_log)), (part, keys) in product(REAL.items(), PARTS.items()):
+        path = DATA / file
+        log = open_log([path], **of_log)
+        span_s = 1e-9 * np.ptp(log.expected_stamps(log.topic))
+        seconds = {key: value * span_s if key.endswith("_s") else value for key, value in keys.items()}
+        yield f"real, {file[:2].upper()}", ", ".join(filter(None, (name, part))), path, of_log | seconds
 
 
 def main() -> None:
     arguments = options_of(
         __doc__, seeds="1,2,3", real=False, **SEQUENCES | {"worlds": ",".join((*PLACES, *PLANAR)), "scans": 150}
     )
-    row = table("sequence", "ATE m", "expected", "over", "NEES/k", "k")
+    row = table("sequence", "ATE m", "expected", "over", "wide", "NEES/k", "k")
     lines = []
-    for world in [] if arguments.real else arguments.worlds.split(","):
-        is_planar = SENSORS[WORLDS[world].sensor].dimension == 2
-        for sensor in PLANAR_SENSORS if is_planar else arguments.sensors.split(","):
-            for seed in map(int, arguments.seeds.split(",")):
-                path = drive_of(world, sensor, arguments.scans, arguments.cache, seed)
-                lines.append(line(f"{world} {sensor} {seed}", path))
-                row(*lines[-1].cells)
-    if lines:
-        summary("simulated", lines)
-    lines = [line(name, DATA / file, (), **of_log) for name, (file, of_log) in REAL.items()]
-    lines += [relations_line(name) for name in ("intel", "aces")]
-    for each in lines:
-        row(*each.cells)
-    summary("real", lines)
+    for kind, name, path, of_log in chain([] if arguments.real else simulated(arguments), real()):
+        lines.append(replace(line(name, path, **of_log), kind=kind))
+        row(*lines[-1].cells)
+    for name in ("intel", "aces"):
+        lines.append(replace(relations_line(name), kind="real, 2D"))
+        row(*lines[-1].cells)
+    summary(lines)
 
 
 if __name__ == "__main__":

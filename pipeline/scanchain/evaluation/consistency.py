@@ -199,16 +199,18 @@ class _Alignment(NamedTuple):
         return errors - np.concatenate([moves, turned], axis=2)
 
     def rms(self, errors: Matrix) -> NDArray[np.float64]:
-        """Root mean squared position error (n,), m."""
+        """Root mean squared position error (n,), m, of many scans: an alignment of a few fits their errors."""
         positions = errors[..., : self.moved.shape[1]]
-        return np.sqrt(np.einsum("k,nki,nki->n", self.root[:, 0] ** 2, positions, positions))
+        coordinates, fitted = self.basis.shape
+        unfitted = max(1.0 - fitted / coordinates, 1.0 / coordinates)
+        return np.sqrt(np.einsum("k,nki,nki->n", self.root[:, 0] ** 2, positions, positions) / unfitted)
 
 
 def _samples(
     graph: PoseGraph, own: Matrix, alignment: _Alignment, influences: Matrix | None = None,
     kinds: NDArray[np.int64] | None = None,
 ) -> Iterator[Matrix]:  # fmt: skip
-    """Samples (n, K, k) of errors by the edges of a graph, by covariances (K, k, k) of each pose, and systematic ones.
+    """Samples (n, K, k) of errors: by a graph's edges, by covariances (K, k, k) of each pose, and systematic ones.
 
     own : world's axes; influences (G, K, k), aligned, of groups of directions of these kinds (G,)
     """
@@ -248,7 +250,8 @@ def _scales(sizes_m: NDArray[np.float64], kinds: NDArray[np.int64]) -> tuple[NDA
     The variance of the jackknife is (G − 1)/G Σ sᵢ² over the G groups of a kind, of influences sᵢ. It is larger
     than the true one, by the interactions of the groups (Efron & Stein 1981). The influence of a group without
     which the log is not observable is unknown: the median takes its place. The uncertainty is the standard
-    deviation of the logarithm of a standard deviation with (Σ sᵢ²)² / Σ sᵢ⁴ degrees of freedom (Satterthwaite 1946).
+    deviation of the logarithm of a standard deviation with (Σ sᵢ²)² / Σ sᵢ⁴ degrees of freedom (Satterthwaite
+    1946).
     """
     numbers, usual_m = np.bincount(kinds)[kinds], np.median(sizes_m)
     is_usual = sizes_m <= _MOST_MEDIANS * usual_m

@@ -60,8 +60,8 @@ def edge_covariances(problem: BetweenProblem, blocks: Matrix) -> Matrix:
 def displacements(problem: BetweenProblem, poses: Matrix, weight: NDArray[np.float64], changes: Matrix) -> Matrix:
     """Changes (G, K, k) of all poses, to first order, where the measured motions T_ij become T_ij exp(change).
 
-    changes : (G, E, k) twists in the frame of j. The left twists ξ of the poses solve H ξ = Σ w JᵀΩ change; returned
-    are changes of position and orientation, along the world's axes.
+    changes : (G, E, k) twists in the frame of j. The left twists ξ of the poses solve H ξ = Σ w JᵀΩ change;
+    returned are changes of position and orientation, along the world's axes.
     """
     result = np.zeros((len(changes), len(poses), problem.freedom))
     for moved, change in zip(result, changes, strict=True):

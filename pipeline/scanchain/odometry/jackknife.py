@@ -20,12 +20,13 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import Influence, Matrix, Pose, Scan
+from scanchain.errors import InputError
 from scanchain.odometry.elevation import raised
 from scanchain.odometry.odometry import Odometry
 from scanchain.preprocess import Prepared, Resolution, Sweep, prepare
 from scanchain.threads import threads
 
-AZIMUTHS, ELEVATIONS = {2: 16, 3: 6}, {2: 0, 3: 4}  # groups of directions; wide ones leave the plane unobservable
+AZIMUTHS, ELEVATIONS = {2: 16, 3: 6}, {2: 0, 3: 4}  # groups with as many points each; wide ones leave scans open
 LONGEST = {2: 150, 3: 60}  # scans of a window; a log that is no longer is measured whole
 _LEAST_SQUARE = 1e-6  # m², sum over a window that stands still
 _TURN_M_RAD = 1.0  # path that counts for a turn, of which error grows as of motion
@@ -85,10 +86,12 @@ def first_scans(path_m: NDArray[np.float64], dimension: int) -> list[int]:
 
 
 def _measured(first: int, window: Sequence[Prepared], config: Config, T_base_lidar: Pose | None) -> Window:
-    """Odometry of a window, the groups in parallel."""
+    """Odometry of a window, the groups in parallel; a group without which it has no first scan has no influence."""
     d = window[0].sweep.points.shape[1]
-    elevations = _elevation(window[0].sparse.points)
-    limits = np.quantile(elevations, np.arange(1, ELEVATIONS[d]) / ELEVATIONS[d]) if d == 3 else None
+    limits = [
+        np.quantile(angles, np.arange(1, count) / count)
+        for angles, count in zip(_angles(window[0].sparse.points), (AZIMUTHS[d], ELEVATIONS[d]), strict=False)
+    ]
     labels = [tuple(_groups(sweep.points, limits) for sweep in (each.sweep, each.sparse)) for each in window]
 
     def poses(group: int) -> Matrix:
@@ -99,26 +102,27 @@ def _measured(first: int, window: Sequence[Prepared], config: Config, T_base_lid
                 sweep=_part(prepared.sweep, (of_sweep != group).all(axis=0)),
                 sparse=_part(prepared.sparse, (of_sparse != group).all(axis=0)),
             )
-            result.append(odometry.place(chosen).T_odom_lidar)
+            try:
+                result.append(odometry.place(chosen).T_odom_lidar)
+            except InputError:
+                return np.array([])
         return np.array(result)
 
     with ThreadPoolExecutor(threads()) as pool:
         complete, *without = pool.map(poses, range(-1, AZIMUTHS[d] + ELEVATIONS[d]))
-    return Window(first, complete, np.array(without))
+    return Window(first, complete, np.array([each if len(each) else complete for each in without]))
 
 
-def _groups(points: Matrix, limits: NDArray[np.float64] | None) -> NDArray[np.int64]:
-    """Groups (1 or 2, N) of points (N, d): that of their azimuth and, between these limits, of their elevation."""
-    d = points.shape[1]
-    turn = np.arctan2(points[:, 1], points[:, 0]) / (2.0 * np.pi) + 0.5
-    azimuth = np.minimum((turn * AZIMUTHS[d]).astype(np.int64), AZIMUTHS[d] - 1)
-    if limits is None:
-        return azimuth[None]
-    return np.stack([azimuth, AZIMUTHS[d] + np.searchsorted(limits, _elevation(points))])
+def _angles(points: Matrix) -> list[NDArray[np.float64]]:
+    """Azimuths (N,) of points (N, d) and, in space, elevations."""
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    return [azimuth] if points.shape[1] == 2 else [azimuth, np.arctan2(points[:, 2], np.hypot(*points[:, :2].T))]
 
 
-def _elevation(points: Matrix) -> NDArray[np.float64]:
-    return np.arctan2(points[:, -1], np.hypot(points[:, 0], points[:, 1]))
+def _groups(points: Matrix, limits: Sequence[NDArray[np.float64]]) -> NDArray[np.int64]:
+    """Groups (1 or 2, N) of points (N, d), between limits of their azimuths and elevations."""
+    found = [np.searchsorted(limit, angles) for limit, angles in zip(limits, _angles(points), strict=True)]
+    return np.stack([group + place * AZIMUTHS[points.shape[1]] for place, group in enumerate(found)])
 
 
 def _part(sweep: Sweep, chosen: NDArray[np.bool_]) -> Sweep:

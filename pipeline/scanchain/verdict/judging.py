@@ -184,7 +184,7 @@ def _unbounded(evidence: Evidence, rest: _Rest) -> Iterator[str]:
     if rest.is_shown or evidence.bound_m <= limit_m:
         return
     if not np.isfinite(evidence.bound_m):
-        yield "nothing bounds its drift: no closed loops of its own, no wheels, no other estimate"
+        yield "nothing bounds its error: no motion between keyframes, no wheels, no other estimate"
         return
     where = f": {evidence.uncertain}" if evidence.uncertain else ""
     yield f"its error may be {at_most(evidence.bound_m)} m, more than {limit_m:.2g} m{where}"
