@@ -6,6 +6,7 @@ import pytest
 from hypothesis import settings
 
 from scanchain.__main__ import main
+from scanchain.odometry import jackknife
 from tests.support import made
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as in a comparison: threads of baselines spin otherwise
@@ -17,6 +18,13 @@ settings.load_profile("compiling")
 def office():
     """Six seconds in the simulated office, 60 scans, with the truth beside it; shared, so it is only read."""
     return made.log("office", seconds=6)
+
+
+@pytest.fixture(autouse=True)
+def short_windows(request, monkeypatch):
+    """Error bars by a few scans, where nothing is tested of them: a thousand runs would be twice as long."""
+    if not request.node.get_closest_marker("error_bars"):
+        monkeypatch.setattr(jackknife, "LONGEST", {2: 12, 3: 4})
 
 
 @pytest.fixture(params=[2, 3])

@@ -16,6 +16,8 @@ from scanchain.trajectory import read_tum, write_wide_tum
 from tests.benchmarks.trust import judged, placed
 from tests.support import made
 
+pytestmark = pytest.mark.error_bars
+
 DRIVES = [
     ("office", "lms-270", 20.0),
     ("identical", "lms-270", 20.0),

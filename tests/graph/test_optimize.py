@@ -150,6 +150,24 @@ def test_errors_drawn_of_positions_have_the_covariances_of_the_poses(dimension):
     assert np.array_equal(errors[:5], graph.pose_errors(5))
 
 
+def test_displacements_are_those_of_a_graph_that_is_optimized_with_the_changed_measurements(dimension):
+    graph, _ = ring(dimension, count=9, noise=0.02)
+    graph.optimize(PLAIN)
+    change = 1e-4 * np.random.default_rng(1).normal(size=(len(graph.edges), graph.freedom))
+    changed = PoseGraph(dimension)
+    for T in graph.poses:
+        changed.add_pose(T, 0)
+    for (i, j), T_ij, information, twist in zip(
+        graph.edges.tolist(), graph.measurements, graph.information, change, strict=True
+    ):
+        changed.add_edge(i, j, T_ij @ lie.exp(twist), information)
+    changed.optimize(PLAIN)
+    (found,) = graph.displacements(change[None])
+    moved = changed.poses[:, :-1, -1] - graph.poses[:, :-1, -1]
+    assert np.abs(moved).max() > 1e-5
+    np.testing.assert_allclose(found[:, :dimension], moved, atol=0.05 * np.abs(moved).max())
+
+
 def test_of_results_of_redrawn_measurements_95_of_100_lie_within_the_bounds_of_the_expected_ate(dimension):
     rng = np.random.default_rng(0)
     _, true = ring(dimension, count=24)

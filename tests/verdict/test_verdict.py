@@ -66,6 +66,7 @@ def evidence(poses=POSES, *, wheels=None, closures=(), **changes):
         "is_copy": np.zeros(n, bool),
         "points": np.full(n, 500),
         "overlap": np.ones(n),
+        "bound_m": 0.02,
     }
     return Evidence(
         seconds=seconds,
@@ -308,12 +309,21 @@ def test_states_are_counted_as_the_scans_have_them_in_the_verdict_and_within_a_s
 
 
 def test_a_verdict_names_the_error_that_it_vouches_for_where_it_vouches():
-    right = replace(evidence(), error="ATE 0.010 to 0.020 m with 95 %")
-    assert judge(right).sentence.startswith("trustworthy (ATE 0.010 to 0.020 m with 95 %): nothing to check")
+    right = replace(evidence(), error="ATE 0.010 to 0.020 m")
+    assert judge(right).sentence.startswith("trustworthy (ATE 0.010 to 0.020 m): nothing to check")
     doubted = replace(right, fit=np.where(marked(300, 330), 0.5, 0.9))
-    assert judge(doubted).sentence.startswith("check these stretches (otherwise ATE 0.010 to 0.020 m with 95 %): ")
+    assert judge(doubted).sentence.startswith("check these stretches (otherwise ATE 0.010 to 0.020 m): ")
     wrong = replace(right, is_lost=marked(100, 1000))
     assert judge(wrong).sentence.startswith("not trustworthy: ")
+
+
+def test_a_trajectory_is_trustworthy_only_with_an_error_bar_that_is_small_beside_its_extent():
+    unknown = judge(evidence(bound_m=np.inf))
+    assert unknown.verdict is Verdict.CHECK and "nothing bounds its error" in unknown.reason
+    where = "most between 310 and 640 s, where a position is known to ±3 m"
+    wide = judge(evidence(bound_m=20.04, uncertain=where))
+    assert wide.verdict is Verdict.CHECK and "its error may be 21 m, more than " in wide.reason
+    assert wide.reason.endswith(where)
 
 
 @pytest.mark.parametrize("error_m", [0.05, 0.5])

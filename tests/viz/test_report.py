@@ -159,7 +159,7 @@ def test_a_run_says_its_verdict_and_result_first_and_its_time_last(one_run, page
     assert facts[:3] == ["trajectory", "accuracy", "expected ATE"] and facts[-3:] == ["speed", "machine", "made"]
     metrics = msgspec.json.decode((one_run / "metrics.json").read_bytes(), type=Metrics)
     assert 'class="verdict trustworthy"' in text and metrics.verdict_error in text
-    assert re.fullmatch(r"ATE \d\.\d{3} to \d\.\d{3} m with 95 %", metrics.verdict_error)
+    assert re.fullmatch(r"ATE \d\.\d{3} to \d\.\d{3} m", metrics.verdict_error)
     assert metrics.ground_truth.optimized.kitti_definition == ""  # no stretch of 10 m fits
     assert "Versions" in seen("one_run")["text"] and len(seen("one_run")["svgs"]) >= 8
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from urllib.parse import quote
 
@@ -20,7 +21,8 @@ from scanchain.comparison.methods import Method
 from scanchain.comparison.processes import CLOSURES_FILE, STEPS_FILE, Outcome, Status, StoredScans
 from scanchain.comparison.table import COLUMNS, Row, Table
 from scanchain.data import Points, Pose, Trajectory
-from scanchain.errors import InputError
+from scanchain.errors import InputError, at_most
+from scanchain.evaluation import ExpectedError
 from scanchain.logs import Log
 from scanchain.maps import write_ply
 from scanchain.processes import Limits
@@ -284,22 +286,54 @@ def _table(name: str, repeat: int, outcome: Outcome, assessed: Assessed, stamps_
 def judged(outcomes: Mapping[str, Outcome], scans: StoredScans) -> dict[str, Judged]:
     """The verdict on each whole run: on ours by all that is known, on others by wheels and constant velocity.
 
-    The error of others is bounded by the wheels, and by each of ours that is trustworthy.
+    The error of others is bounded by the wheels, or by the distance to one of ours plus its error bar, and is no
+    less than the median distance to all others. Where the other trajectories contradict an error bar of ours, the
+    verdict is to check it.
     """
     whole = {name: outcome for name, outcome in outcomes.items() if outcome.is_whole}
     found = {name: judge_run(each.folder) for name, each in whole.items() if (each.folder / STEPS_FILE).exists()}
-    expected = {name: expected_of_run(whole[name].folder) for name in found}
+    expected = {name: error for name in found if (error := expected_of_run(whole[name].folder)) is not None}
     positions = {name: each.trajectory.poses[:, :-1, -1] for name, each in whole.items()}
+    away_m = {
+        name: {other: apart_m(each, positions[other]) for other in whole if other != name}
+        for name, each in positions.items()
+    }
+    for name, error in expected.items():
+        if found[name].verdict is Verdict.TRUSTWORTHY and (why := _contradiction(name, error, expected, away_m)):
+            found[name] = replace(found[name], verdict=Verdict.CHECK, reason=why)
     wheels = scans.wheels @ scans.T_base_lidar
     for name in [name for name in whole if name not in found]:
+        usual_m = float(np.median(list(away_m[name].values()))) if away_m[name] else 0.0
         bounds_m = {
-            ours: apart_m(positions[name], positions[ours]) + error.high
+            ours: max(away_m[name][ours] + error.high, usual_m)
             for ours, error in expected.items()
-            if error is not None and found[ours].verdict is Verdict.TRUSTWORTHY
+            if found[ours].verdict is Verdict.TRUSTWORTHY
         }
         trajectory = whole[name].trajectory
         found[name] = judge(evidence_of_trajectory(trajectory, scans.log_times_ns, wheels, scans.points, bounds_m))
     return found
+
+
+def _contradiction(
+    name: str, error: ExpectedError, expected: Mapping[str, ExpectedError],
+    away_m: Mapping[str, Mapping[str, float]],
+) -> str:  # fmt: skip
+    """Why the other trajectories contradict an error bar: another's that excludes it, or several that agree."""
+    for other, bar in expected.items():
+        if other != name and away_m[name][other] > error.high + bar.high:
+            return (
+                f"{at_most(away_m[name][other])} m from {other}, more than the error bars of both "
+                f"({at_most(error.high)} and {at_most(bar.high)} m)"
+            )
+    others = list(away_m[name])
+    among_m = [away_m[a][b] for a, b in combinations(others, 2)]
+    usual_m = float(np.median(list(away_m[name].values()))) if others else 0.0
+    if not among_m or usual_m <= error.high + np.median(among_m):
+        return ""
+    return (
+        f"{at_most(usual_m)} m from the other {len(others)} methods, which are "
+        f"{at_most(float(np.median(among_m)))} m from each other (medians)"
+    )
 
 
 def summarize(results: Results, log: Log, limits: Limits, provenance: Provenance) -> Table:

@@ -24,7 +24,7 @@ _BOUNDS = (2.5, 97.5)  # percentiles of the error bar
 _RANK_TOLERANCE = 1e-9  # of the largest singular value, below which positions leave a rotation free
 _DRIFT_OF_NOISE = 2.0  # drift of a map over its renewal, in standard deviations of independent errors of the scans
 _DRIFT_OF_SYSTEMATIC = 5.0  # the same of errors that successive scans have in common; measured on simulated worlds
-_REVISIT = 3.0  # variances of the systematic error in a loop edge: of both passes, seen from different sides
+_REVISIT = 2.0  # variances of the systematic error in a loop edge: of both passes
 _BIAS = 0.75  # true standard deviation over that of the jackknife, measured in simulated worlds and on real logs
 _MOST_MEDIANS = 3.0  # influence of a group of directions over the median, above which the log needs the group
 _LEAST_VARIANCE = 1e-14  # m² or rad², which keeps covariances regular
@@ -98,8 +98,7 @@ def error_samples(
     """Samples of the errors of ``expected_errors``, some (n, K, k) at a time, after rigid alignment."""
     if not len(graph.edges):
         raise InputError("the pose graph has no edge, so that no error is expected; give more keyframes")
-    random = [each._replace(systematic=np.zeros_like(each.systematic)) for each in map_errors]
-    drifting, own = with_map_errors(graph, random, config)
+    drifting, own = with_map_errors(graph, map_errors, config, systematic_drift=0.0)
     R = _rotations(graph.poses, graph.freedom)
     own = R @ own @ np.swapaxes(R, 1, 2)
     alignment = _Alignment.of(graph.poses, scans)
@@ -113,8 +112,9 @@ def error_samples(
 
 
 def with_map_errors(
-    graph: PoseGraph, map_errors: Sequence[KeyframeErrors], config: Config
-) -> tuple[PoseGraph, Matrix]:
+    graph: PoseGraph, map_errors: Sequence[KeyframeErrors], config: Config, *,
+    systematic_drift: float = _DRIFT_OF_SYSTEMATIC,
+) -> tuple[PoseGraph, Matrix]:  # fmt: skip
     """The graph with covariances of edges for judging it, and covariances (K, k, k) of each pose by itself.
 
     Poses that are aligned to one map err by themselves against it, and together as it drifts. With N the
@@ -122,13 +122,14 @@ def with_map_errors(
     the map that is new since the keyframe before, the motion between two keyframes drifts by the covariance
         (2u)² N + (5u)² S.
     A scan aligned to the mean of the m before walks by 2/(m + 1) of its error: hence 2u. S adds up from scan to
-    scan, by a factor that was measured. Every pose errs by N + S beside; loop edges have N + 3 S. The covariances
-    of the graph have floors instead, which serve the optimizer.
+    scan, by a factor that was measured. Every pose also errs by N + S; loop edges, of two passes, have N + 2 S. The
+    covariances of the graph have floors instead, which serve the optimizer.
     map_errors, config : of the run
+    systematic_drift : the 5; 0 where systematic drift is measured instead
     """
     k, source = graph.freedom, graph.edges.max(axis=1)
     chosen = [map_errors[index] for index in source.tolist()]
-    covariance, by_itself = edge_errors(graph.information, graph.is_loop, chosen, config)
+    covariance, by_itself = edge_errors(graph.information, graph.is_loop, chosen, config, systematic_drift)
     information = np.linalg.inv(covariance + _LEAST_VARIANCE * np.eye(k))
     own = np.zeros((len(graph), k, k))
     own[source[~graph.is_loop]] = by_itself[~graph.is_loop]
@@ -136,8 +137,9 @@ def with_map_errors(
 
 
 def edge_errors(
-    information: Matrix, is_loop: NDArray[np.bool_], map_errors: Sequence[KeyframeErrors], config: Config
-) -> tuple[Matrix, Matrix]:
+    information: Matrix, is_loop: NDArray[np.bool_], map_errors: Sequence[KeyframeErrors], config: Config,
+    systematic_drift: float = _DRIFT_OF_SYSTEMATIC,
+) -> tuple[Matrix, Matrix]:  # fmt: skip
     """Covariances (E, k, k) of edges, and of the later pose of each by itself, by ``with_map_errors``.
 
     information : (E, k, k) of the edges in the graph; map_errors : of the later keyframe of each
@@ -151,7 +153,7 @@ def edge_errors(
     factor, systematic, u = (np.array(column) for column in zip(*map_errors, strict=True))
     factor, u = factor[:, None, None], u[:, None, None]
     noise: Matrix = (factor * (np.linalg.inv(information) - floor)).astype(np.float64)
-    drift = np.minimum(_DRIFT_OF_NOISE * u, 1.0) ** 2 * noise + (_DRIFT_OF_SYSTEMATIC * u) ** 2 * systematic
+    drift = np.minimum(_DRIFT_OF_NOISE * u, 1.0) ** 2 * noise + (systematic_drift * u) ** 2 * systematic
     return np.where(is_loop, noise + _REVISIT * systematic, drift), noise + systematic
 
 

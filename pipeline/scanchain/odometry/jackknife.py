@@ -26,8 +26,8 @@ from scanchain.odometry.odometry import Odometry
 from scanchain.preprocess import Prepared, Resolution, Sweep, prepare
 from scanchain.threads import threads
 
-AZIMUTHS, ELEVATIONS = {2: 16, 3: 6}, {2: 0, 3: 4}  # groups with as many points each; wide ones leave scans open
-LONGEST = {2: 150, 3: 60}  # scans of a window; a log that is no longer is measured whole
+AZIMUTHS, ELEVATIONS = {2: 16, 3: 6}, {2: 0, 3: 4}  # groups; without a wide one a plane is open
+LONGEST = {2: 300, 3: 60}  # scans of a window; a log that is no longer is measured whole
 _LEAST_SQUARE = 1e-6  # m², sum over a window that stands still
 _TURN_M_RAD = 1.0  # path that counts for a turn, of which error grows as of motion
 

@@ -1,0 +1,62 @@
+"""The jackknife over directions: which scans it measures; its error bar contains errors that leave no residuals."""
+
+import numpy as np
+import pytest
+
+from scanchain import lie
+from scanchain.evaluation import absolute_error, pair
+from scanchain.logs import open_log
+from scanchain.odometry import jackknife
+from scanchain.runs.results import expected_of
+from scanchain.settings import load_settings
+from scanchain.slam import Slam
+from tests.support import made
+
+pytestmark = pytest.mark.error_bars
+
+
+def result_of(path, **of_log):
+    """Result of a log, its configuration, its expected errors by random and by all errors, and the true ATE."""
+    log = open_log([path], **of_log)
+    config = load_settings(log.dimension).config
+    slam = Slam(config, log.T_base_lidar)
+    for scan in log.scans():
+        slam.process(scan)
+    result = slam.finish()
+    quick, full = (expected_of(result, config, scans).ate for scans in (None, open_log([path], **of_log).scans()))
+    true_m = absolute_error(pair(result.trajectory, log.ground_truth())).translation_m.rmse
+    return result, config, quick, full, true_m
+
+
+def test_the_error_bar_contains_the_error_of_scans_that_are_distorted_by_their_motion():
+    _, _, quick, full, true_m = result_of(made.log("town", sensor="os1-32", seconds=4), point_times="none")
+    assert quick.is_random and not full.is_random
+    assert quick.high < 0.5 * true_m and full.low < true_m < full.high
+
+
+def test_a_short_log_is_measured_whole_and_each_group_differs(office):
+    result, config, _, _, _ = result_of(office)
+    keyframes = [each.scan_index for each in result.keyframes]
+    found = jackknife.influence(open_log([office]).scans(), result.odometry.poses, keyframes, config, None)
+    assert found.share == 1.0 and found.twists.shape == (jackknife.AZIMUTHS[2], len(keyframes) - 1, 3)
+    assert (np.linalg.norm(found.twists, axis=(1, 2)) > 0.0).all()
+
+
+@pytest.mark.parametrize("scans", [10, 60, 61, 1000, 20_000])
+def test_windows_lie_within_the_log_and_apart(scans):
+    path_m = np.concatenate([np.zeros(scans // 2), np.linspace(0.0, 50.0, scans - scans // 2)])  # stands at first
+    firsts = jackknife.first_scans(path_m, 3)
+    length = min(jackknife.LONGEST[3], scans)
+    assert firsts[0] >= 0 and firsts[-1] + length <= scans
+    assert (np.diff(firsts) >= length).all()
+    groups = jackknife.AZIMUTHS[3] + jackknife.ELEVATIONS[3] + 1
+    assert len(firsts) * length * groups <= max(scans, groups * length)
+
+
+def test_influences_between_windows_are_interpolated_by_the_path():
+    motion = lie.exp(np.array([0.5, 0.0, 0.0]))
+    poses = np.array([np.linalg.matrix_power(motion, number) for number in range(100)])
+    off = np.array([np.linalg.matrix_power(motion @ lie.exp(np.array([0.01, 0.0, 0.0])), k) for k in range(100)])
+    windows = [jackknife.Window(first, poses[:20], off[None, :20]) for first in (10, 60)]
+    twists = jackknife._twists(windows, np.arange(0, 100, 3), 0.5 * np.arange(100.0))
+    np.testing.assert_allclose(twists, np.broadcast_to([0.03, 0.0, 0.0], twists.shape), atol=1e-9)
