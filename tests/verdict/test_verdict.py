@@ -9,6 +9,7 @@ import pytest
 
 from scanchain import lie, verdict
 from scanchain.data import Trajectory
+from scanchain.errors import at_most
 from scanchain.runs.step_table import StepTable
 from scanchain.runs.vouching import evidence_of, evidence_of_trajectory
 from scanchain.verdict import Closures, Evidence, Kind, Stretch, Verdict, judge
@@ -342,8 +343,8 @@ def test_the_error_of_another_tool_is_below_its_distance_to_an_independent_estim
     trajectory = Trajectory(times_ns, estimate)
     for wheels, bounds, error in (
         (unknown, {}, "no jump above 0.67 m, drift unchecked"),
-        (other, {}, f"ATE below {verdict.wheel_bound_m(estimate, other):.2g} m by wheels"),
-        (other, {"ours": 0.001}, "ATE below 0.001 m by ours"),
+        (other, {}, f"ATE below {at_most(verdict.wheel_bound_m(estimate, other))} m by wheels"),
+        (other, {"ours": 0.001}, "ATE below 0.0010 m by ours"),
     ):
         found = evidence_of_trajectory(trajectory, times_ns, wheels, np.full(N, 500), bounds)
         assert judge(found).error == error

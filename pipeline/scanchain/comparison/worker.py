@@ -61,6 +61,9 @@ class _Others:
     def track(self, scan: Scan) -> Pose:
         return self.baseline.track(scan.points, scan.times_s, scan.stamp_ns)
 
+    def measure_errors(self, scans: Iterable[Scan], folder: Path) -> None:
+        """Nothing: its error is bounded by the other trajectories."""
+
     def finish(self, odometry: Trajectory, folder: Path) -> Trajectory:
         return odometry
 
@@ -87,8 +90,7 @@ def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
     trajectory = runner.finish(Trajectory(scans.stamps_ns, np.array(track["pose"])), folder)
     np.save(folder / processes.TRAJECTORY_FILE, trajectory.poses)
     report = EndReport(Status.OK, "", runner.description, start_s, perf_counter() - ended)
-    if isinstance(runner, Ours):
-        runner.measure_errors(scans.scans(), folder)
+    runner.measure_errors(scans.scans(), folder)
     return report
 
 

@@ -122,8 +122,8 @@ def with_map_errors(
     the map that is new since the keyframe before, the motion between two keyframes drifts by the covariance
         (2u)² N + (5u)² S.
     A scan aligned to the mean of the m before walks by 2/(m + 1) of its error: hence 2u. S adds up from scan to
-    scan, by a factor that was measured. Every pose also errs by N + S; loop edges, of two passes, have N + 2 S. The
-    covariances of the graph have floors instead, which serve the optimizer.
+    scan, by a factor that was measured. Every pose also errs by N + S; loop edges, of two passes, have N + 2 S.
+    The covariances of the graph have floors instead, which serve the optimizer.
     map_errors, config : of the run
     systematic_drift : the 5; 0 where systematic drift is measured instead
     """
@@ -171,12 +171,14 @@ class _Alignment(NamedTuple):
 
     root : (K, 1) roots of the positions' weights, which sum up to 1
     moved : (K, d, k) by which a twist moves them; basis (K d, r) of these weighted moves; to_twist (k, r)
+    unfitted : share of the errors that is left of all scans, over that of the poses
     """
 
     root: Matrix
     moved: Matrix
     basis: Matrix
     to_twist: Matrix
+    unfitted: float
 
     @classmethod
     def of(cls, poses: Matrix, scans: NDArray[np.int64] | None) -> _Alignment:
@@ -189,7 +191,11 @@ class _Alignment(NamedTuple):
         moved = np.concatenate([translated, turns(positions - positions.mean(axis=0))], axis=2)
         basis, size, Vt = np.linalg.svd((root[..., None] * moved).reshape(count * d, -1), full_matrices=False)
         kept = size > _RANK_TOLERANCE * size[0]
-        return cls(root, moved, basis[:, kept], Vt[kept].T / size[kept])
+        fitted, coordinates = int(kept.sum()), count * d
+        unfitted = (
+            max(weight.sum() * d - fitted, 1.0) / (weight.sum() * d) * coordinates / max(coordinates - fitted, 1)
+        )
+        return cls(root, moved, basis[:, kept], Vt[kept].T / size[kept], float(unfitted))
 
     def aligned(self, errors: Matrix) -> Matrix:
         """The errors (n, K, k), without what one twist of all poses explains."""
@@ -201,11 +207,10 @@ class _Alignment(NamedTuple):
         return errors - np.concatenate([moves, turned], axis=2)
 
     def rms(self, errors: Matrix) -> NDArray[np.float64]:
-        """Root mean squared position error (n,), m, of many scans: an alignment of a few fits their errors."""
+        """Root mean squared position error (n,) of the scans, m, of which an alignment fits less than of few poses."""
         positions = errors[..., : self.moved.shape[1]]
-        coordinates, fitted = self.basis.shape
-        unfitted = max(1.0 - fitted / coordinates, 1.0 / coordinates)
-        return np.sqrt(np.einsum("k,nki,nki->n", self.root[:, 0] ** 2, positions, positions) / unfitted)
+        squares = np.einsum("k,nki,nki->n", self.root[:, 0] ** 2, positions, positions)
+        return np.sqrt(squares * self.unfitted)
 
 
 def _samples(

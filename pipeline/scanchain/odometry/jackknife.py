@@ -86,7 +86,7 @@ def first_scans(path_m: NDArray[np.float64], dimension: int) -> list[int]:
 
 
 def _measured(first: int, window: Sequence[Prepared], config: Config, T_base_lidar: Pose | None) -> Window:
-    """Odometry of a window, the groups in parallel; a group without which it has no first scan has no influence."""
+    """Odometry of a window, the groups in parallel; one without which there is no first scan has no influence."""
     d = window[0].sweep.points.shape[1]
     limits = [
         np.quantile(angles, np.arange(1, count) / count)
