@@ -27,7 +27,7 @@ from scanchain.logs.messages.readers import is_scan, pose_reader, reader
 from scanchain.logs.mounting import between_frames, find_mounting, find_wheels, in_plane, is_upside_down
 from scanchain.logs.opening import index_files
 from scanchain.logs.publishers import Publishers, seen_together, with_jumps
-from scanchain.logs.sectors import MOST, Assembler, Sampled, expected_sweeps, find_sectors
+from scanchain.logs.sectors import MOST, Assembler, expected_sweeps, find_sectors
 from scanchain.logs.topics import find_ground_truth, find_lidar
 from scanchain.settings import load_settings, overrides_of
 
@@ -91,9 +91,10 @@ class Log:
         self.topic, truth = lidar.topic, find_ground_truth(indexes, config.ground_truth_topic)
         self.ground_truth_topic = "" if truth is None else truth.topic
         self._sampled_times = self.times = PointTimes(config)
-        self.plane_height_m: float | None = None  # also while the sample is decoded
-        sample, messages = tee(stream.sampled_messages(indexes, self.topic, self._sampled, most=MOST))
-        self.plane_height_m = None if is_scan(lidar) else plane_height_m(each.returns for each in sample)
+        self.plane_height_m: float | None = None
+        sample = partial(stream.sampled_messages, indexes, self.topic)
+        first, again = tee(each.value for each in sample(self.decoder(self._sampled_times), blocks=MOST))
+        self.plane_height_m = None if is_scan(lidar) else plane_height_m(first)
         if (z_m := self.plane_height_m) is not None:
             self.notes.append(
                 f"the clouds of {self.topic} are planar (z = {z_m:.3g} m everywhere): read as a 2D log"
@@ -101,13 +102,12 @@ class Log:
         self.dimension = 2 if is_scan(lidar) or self.plane_height_m is not None else 3
         self.duration_s = (whole := stream.whole_span(indexes)).duration_s
         self.span = stream.chosen_span(whole, config)
-        self.sectors = find_sectors(
-            messages, lambda unit: self.decoder(PointTimes(replace(config, point_times=unit))), config.point_times
-        )
+        self.sectors = find_sectors(again, config.point_times)
         self.scan_count = expected_sweeps(stream.count_scans(indexes, self.topic, whole, config), self.sectors)
-        sampled = partial(stream.sampled, indexes, self.topic, self.decoder(PointTimes(config)), self.span)
-        between = partial(between_frames, indexes, self.span)
-        self.publishers = Publishers(sampled, between, is_planar=self.dimension == 2)
+        of_part = partial(sample, self.decoder(PointTimes(config)), self.span)
+        self.publishers = Publishers(
+            of_part, partial(between_frames, indexes, self.span), is_planar=self.dimension == 2
+        )
         wheels = find_wheels(indexes, self.publishers.frame, config, self.span, self.notes)
         self.mounting = mounting = find_mounting(indexes, self.publishers.frame, wheels, self.span)
         self.gaps = stream.gap_notes(indexes, config)  # those of the notes that are of long gaps
@@ -116,9 +116,9 @@ class Log:
         self.notes += stream.notes_on(indexes, config) + mounting.notes(topic, self.dimension)
         wheels = wheels if mounting.motion is None else None
         self.odometry_topic, self.wheels = (topic, wheels.text) if wheels else ("", "")
-        T_base_lidar = mounting.T_base_lidar
-        self.is_mirrored = self.dimension == 2 and (config.upside_down or is_upside_down(T_base_lidar))
-        self.T_base_lidar: Pose = in_plane(T_base_lidar) if self.dimension == 2 else T_base_lidar
+        T, is_planar = mounting.T_base_lidar, self.dimension == 2
+        self.is_mirrored = is_planar and (config.upside_down or is_upside_down(T))
+        self.T_base_lidar: Pose = in_plane(T) if is_planar else T
         self.stated_mounting = self.T_base_lidar if mounting.is_stated else None
         self._damage: list[str] = [line for index in indexes for line in index.damage]
         with_poses = [*([(wheels.channel, wheels.link)] if wheels else []), *([(truth, None)] if truth else [])]
@@ -273,9 +273,6 @@ class Log:
         if is_scan(self.lidar):
             return partial(decode_laser_scan, read=reader(self.lidar), config=times.config)
         return partial(decode_cloud, read=reader(self.lidar), times=times, plane_m=self.plane_height_m)
-
-    def _sampled(self, data: memoryview) -> Sampled:
-        return Sampled(data, self.decoder(self._sampled_times)(data))
 
     def _point_times(self) -> PointTimes:
         """Times of the lidar's points, in the unit that the duration of a sector shows."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -63,46 +63,37 @@ def expected_sweeps(messages: int, sectors: Sectors | None) -> int:
     return messages if sectors is None else max(int(messages / sectors.per_sweep + 0.5), 1)
 
 
-class Sampled(NamedTuple):
-    """One of the first messages of a lidar: its bytes and its returns."""
-
-    data: memoryview
-    returns: Returns
-
-
-def find_sectors(
-    sample: Iterable[Sampled], decoder: Callable[[str], Callable[[memoryview], Returns]], point_times: str
-) -> Sectors | None:
+def find_sectors(sample: Iterable[Returns], point_times: str) -> Sectors | None:
     """Sectors in which consecutive messages of one frame look, which recur; None where each is a sweep by itself.
 
-    decoder : decoder of the messages for a value of ``log.point_times``; point_times : the configured one
+    point_times : as configured
     """
-    seen: list[Sampled] = []
+    seen: list[Returns] = []
     directions_rad, widths_rad, steps_rad = list[float](), list[float](), np.empty(0)
-    for message in sample:
-        points = message.returns.points
+    for returns in sample:
+        points = returns.points
         if not len(points):
             continue
-        seen.append(message)
+        seen.append(returns)
         directions_rad.append(_direction(points))
         turned_rad = _wrapped(_azimuth(points[:: len(points) // _SAMPLE + 1]) - directions_rad[-1])
         widths_rad.append(float(np.ptp(np.percentile(turned_rad, (5.0, 95.0)))) / 0.9)
         steps_rad = np.abs(_wrapped(np.diff(directions_rad)))
         is_one_way = len(seen) == _FEWEST and np.median(widths_rad) > _WIDTHS[1] * np.median(steps_rad)
-        if widths_rad[-1] > _WIDEST_RAD or message.returns.frame != seen[0].returns.frame or is_one_way:
+        if widths_rad[-1] > _WIDEST_RAD or returns.frame != seen[0].frame or is_one_way:
             return None
         if steps_rad.sum() > (_REVOLUTIONS + 1.0) * _TURN_RAD or len(seen) == MOST:
             break
     found = _sectors(seen, np.array(directions_rad), float(np.median(widths_rad))) if len(seen) > 2 else None
-    return found and _timed(found, seen, decoder, point_times)
+    return found and _timed(found, seen, point_times)
 
 
-def _sectors(seen: list[Sampled], directions_rad: NDArray[np.float64], width_rad: float) -> Sectors | None:
+def _sectors(seen: Sequence[Returns], directions_rad: NDArray[np.float64], width_rad: float) -> Sectors | None:
     """Sectors by the directions (N,) of the first messages, None where these do not turn steadily."""
     steps_rad = _wrapped(np.diff(directions_rad))
     sense = int(np.sign(np.median(steps_rad)))
     if np.median(np.abs(steps_rad)) > _CLEAR_RAD:
-        sense = int(np.sign(sum(_order(each.returns) for each in seen))) or 1
+        sense = int(np.sign(sum(map(_order, seen)))) or 1
     steps_rad = (sense * steps_rad) % _TURN_RAD
     step_rad = float(np.percentile(steps_rad, 50.0, method="lower"))
     turned_rad = np.append(0.0, np.cumsum(steps_rad))
@@ -114,7 +105,7 @@ def _sectors(seen: list[Sampled], directions_rad: NDArray[np.float64], width_rad
     first = np.flatnonzero(turned_rad + _TURN_RAD < turned_rad[-1] + 0.5 * step_rad)
     later = np.abs(turned_rad[:, None] - turned_rad[first] - _TURN_RAD).argmin(axis=0)
     drift_rad = turned_rad[later] - turned_rad[first] - _TURN_RAD
-    stamps_ns = np.array([each.returns.stamp_ns for each in seen])
+    stamps_ns = np.array([each.stamp_ns for each in seen])
     seconds = 1e-9 * (stamps_ns[later] - stamps_ns[first])
     period_s = float(np.median(seconds * _TURN_RAD / (_TURN_RAD + drift_rad)))
     if not 0.0 < period_s < _SLOWEST_S:
@@ -125,28 +116,22 @@ def _sectors(seen: list[Sampled], directions_rad: NDArray[np.float64], width_rad
     return Sectors(sense, step_rad, per_sweep, period_s)
 
 
-def _timed(
-    sectors: Sectors,
-    seen: list[Sampled],
-    decoder: Callable[[str], Callable[[memoryview], Returns]],
-    configured: str,
-) -> Sectors:
+def _timed(sectors: Sectors, seen: Sequence[Returns], configured: str) -> Sectors:
     """The sectors with the unit of their point times: that in which a message lasts about as long as a sector.
 
     They are not used where they count from the beginning of the revolution, or only this has a stamp.
     """
     point_times = configured if configured in (*UNITS_S, "auto") else "none"
     if configured == "auto":
-        decode = decoder("s")
-        spans_s = [float(np.ptp(times)) for each in seen if len(times := decode(each.data).times_s)]
+        spans_s = [float(np.ptp(times_s)) for each in seen if len(times_s := each.seconds("s"))]
         if spans_s:
             longer = max(float(np.median(spans_s)), 1e-9) / sectors.period_s * sectors.per_sweep
             point_times = min(UNITS_S, key=lambda name: abs(np.log(longer * UNITS_S[name])))
-    decode = decoder(point_times)
-    starts_s = [float(times.min()) for each in seen if len(times := decode(each.data).times_s)]
+    of_each = [each.seconds(point_times) for each in seen] if point_times in UNITS_S else []
+    starts_s = [float(times_s.min()) for times_s in of_each if len(times_s)]
     last_s = sectors.period_s * (1.0 - 1.0 / sectors.per_sweep)  # from the first sector to the last
     is_from_sweep = len(starts_s) > 1 and float(np.ptp(starts_s)) > 0.5 * last_s
-    is_stamped = np.median(np.diff([each.returns.stamp_ns for each in seen])) > 0
+    is_stamped = np.median(np.diff([each.stamp_ns for each in seen])) > 0
     return sectors._replace(point_times=point_times if is_stamped and not is_from_sweep else "none")
 
 
