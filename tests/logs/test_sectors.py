@@ -65,6 +65,7 @@ def test_sectors_make_the_sweeps_that_they_were_cut_from(tmp_path, how, of):
     topic, count = log.topic, round(360 / how.width_deg)
     holds = f"{topic}: each message holds {how.width_deg:g}° of a revolution"
     assert f"{holds}: {count} messages are assembled to one sweep" in log.notes
+    assert not any("azimuth" in note for note in log.notes)
 
 
 def test_times_count_from_the_stamp_of_the_sweep_where_sectors_are_stamped_at_their_ends(tmp_path):

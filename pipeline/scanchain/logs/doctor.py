@@ -195,8 +195,7 @@ def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:
         return Finding("gaps", Severity.OK, f"none longer than {periods}")
     longest = int(gaps[np.argmax(steps_s[gaps])])
     longest_s, at_s = steps_s[longest], seen.into_log_s(longest)
-    found = f"{len(gaps):,} longer than {periods}, the longest {longest_s:.3g} s, "
-    found += f"{at_s:.1f} s into the log"
+    found = f"{len(gaps):,} longer than {periods}, the longest {longest_s:.3g} s, {at_s:.1f} s into the log"
     effect = f"the motion over a gap is predicted {'by the wheels' if is_on_wheels else 'at constant velocity'}"
     if longest_s < (_LONG_GAP_ON_WHEELS_S if is_on_wheels else _LONG_GAP_S):
         return Finding("gaps", Severity.NOTE, found, effect)

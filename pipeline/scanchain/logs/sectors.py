@@ -35,7 +35,8 @@ class Sectors(NamedTuple):
     step_rad : usual angle from one message to the next
     per_sweep : messages per revolution, not whole where they do not divide it
     period_s : of a revolution
-    point_times : ``log.point_times`` of the messages, the unit by the duration of a sector; ``none`` by azimuth
+    point_times : ``log.point_times`` of the messages, the unit by the duration of a sector
+    assumed : times by the azimuth, of points that have none of their own; empty where they have
     """
 
     sense: int
@@ -43,14 +44,7 @@ class Sectors(NamedTuple):
     per_sweep: float
     period_s: float
     point_times: str = "auto"
-
-    @property
-    def assumed(self) -> str:
-        """Times of points that have none of their own."""
-        direction = "counterclockwise" if self.sense > 0 else "clockwise"
-        return (
-            f"point times by the azimuth: {direction}, {self.period_s:.3g} s a turn, from the sweep's first stamp"
-        )
+    assumed: str = ""
 
     def note(self, topic: str) -> str:
         """The sectors in words, and what is done about them."""
@@ -132,7 +126,11 @@ def _timed(sectors: Sectors, seen: Sequence[Returns], configured: str) -> Sector
     last_s = sectors.period_s * (1.0 - 1.0 / sectors.per_sweep)  # from the first sector to the last
     is_from_sweep = len(starts_s) > 1 and float(np.ptp(starts_s)) > 0.5 * last_s
     is_stamped = np.median(np.diff([each.stamp_ns for each in seen])) > 0
-    return sectors._replace(point_times=point_times if is_stamped and not is_from_sweep else "none")
+    point_times = point_times if is_stamped and not is_from_sweep else "none"
+    turn = f"{'counterclockwise' if sectors.sense > 0 else 'clockwise'}, {sectors.period_s:.3g} s a turn"
+    by_azimuth = f"point times by the azimuth: {turn}, from the sweep's first stamp"
+    is_own = bool(starts_s) and point_times != "none"
+    return sectors._replace(point_times=point_times, assumed="" if is_own else by_azimuth)
 
 
 class _Part(NamedTuple):

@@ -284,9 +284,7 @@ class PointTimes:
         unit, period_s = mode(each.unit for each in fields), median_low(_steps_s(around))
         unit_s, times_s = UNITS_S[unit], returns.times_s
         usual_s = _usual_span_s(fields, unit_s, period_s)
-        steps_s = [abs(float(after.low) - float(before.low)) * unit_s for before, after in pairwise(fields)] or [
-            0.0
-        ]
+        steps_s = [unit_s * abs(float(b.low) - float(a.low)) for a, b in pairwise(fields)] or [0.0]
         is_running = field.origin == _STAMP and median_low(steps_s) > 0.5 * usual_s  # a clock that was just reset
         if is_running or unit != field.unit:
             field = field._replace(unit=unit, origin=_CLOCK if is_running else field.origin)
