@@ -35,7 +35,7 @@ class PointStore:
         self.rows = 0
         self.waiting = bytearray()
         self.crc = 0
-        self._take(tempfile.TemporaryFile(buffering=0) if path is None else path.open("w+b", buffering=0))
+        self._take(_nameless() if path is None else path.open("w+b", buffering=0))
 
     def add(self, points: NDArray[np.floating]) -> StoredPoints:
         """Take points (N, d), meters. Raises OSError where the disk is full."""
@@ -119,3 +119,7 @@ def _restored(dimension: int, points: NDArray[np.float32]) -> PointStore:
     store = PointStore(dimension)
     store.add(points)
     return store
+
+
+def _nameless() -> FileIO:
+    return tempfile.TemporaryFile(buffering=0)

@@ -69,7 +69,6 @@ def convert(
     profile = "ros2" if encodings == {"cdr"} else "ros1" if encodings == {"ros1"} else ""
     with LogWriter(destination, force=force, profile=profile) as log:
         for message in _messages(indexes, counts, config, damage):
-            assert isinstance(message.value, bytes)
             log.copy(message.channel, message.log_time_ns, message.value)
             counts[message.channel.topic] += 1
             if progress is not None:

@@ -166,8 +166,7 @@ class Log:
                     complaint = f"{path}: scan {count - 1} of {self.topic} {unusable}"
                     counts.skip(complaint, self.scan_count, self.config)
                     continue
-                returns = message.value
-                assert isinstance(returns, Returns)
+                returns: Returns = message.value
                 points, others = seen_together(returns, self.publishers, latest, is_mirrored=self.is_mirrored)
                 scan = Scan(
                     index=index,
