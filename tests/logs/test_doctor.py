@@ -341,3 +341,13 @@ def test_stamps_and_log_times_of_which_one_is_in_another_unit_are_named(tmp_path
     assert (found["stamps"].found == line) == bool(advance) and "unit?" not in found["damage"].found
     period_s = 1e-9 * np.median(np.diff([scan.stamp_ns for scan in opened.scans()]))
     assert max(spans_s, default=0.0) <= 10.0 * period_s  # else deskewing turns each scan by revolutions
+
+
+def test_scans_of_two_lasers_at_the_same_instants_have_no_gaps_between_these(tmp_path):
+    mountings = ("base_link", "laser", 0.2, 0.0, 0.3, 0.0), ("base_link", "rear", -0.2, 0.0, 0.3, 0.0)
+    said = [transforms_said(STAMP_NS, transforms(*mountings))]
+    for k in range(20):
+        for number, frame in enumerate(("laser", "rear")):
+            data = laser_scan(STAMP_NS + k * STEP_NS, room(k), step=0.02, frame=frame)
+            said.append(scan_said(STAMP_NS + k * STEP_NS + number * 1_000_000, data))
+    assert diagnose(saved(tmp_path, said))["gaps"].found == "none longer than 2.5 periods of 0.1 s"

@@ -151,9 +151,9 @@ class Survey:
 
     @property
     def period_s(self) -> float:
-        """Median time between two scans, by their stamps or, where those do not move, by log time; 0 if alone."""
+        """Median time between scans of different stamps or, where these do not move, log times; 0 if alone."""
         for times_ns in (self.stamps_ns, self.log_times_ns):
-            steps_s = np.diff(times_ns) * 1e-9
+            steps_s = 1e-9 * np.array([step_ns for step_ns in np.diff(times_ns) if step_ns])
             if len(steps_s) and np.median(steps_s) > 0.0:
                 return float(np.median(steps_s))
         return 0.0
