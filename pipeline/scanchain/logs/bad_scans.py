@@ -139,7 +139,7 @@ class ScanCounts:
                 self.backwards += 1
                 self.farthest_back_ns = max(self.farthest_back_ns, back_ns)
             self.repeated += back_ns == 0
-            if not scan.clock_jump_s:
+            if self._last.stamp_ns and not scan.clock_jump_s:  # not from a stamp before the first /clock on
                 self.steps_ns.append((-back_ns, scan.log_time_ns - self._last.log_time_ns))
         self._last = scan
         self.begin_ns = self.begin_ns or scan.stamp_ns
@@ -193,11 +193,10 @@ class ScanCounts:
             )
         steps_s = 1e-9 * np.array(self.steps_ns, np.float64)
         (all_s, all_logged_s), (usual_s, usual_logged_s) = steps_s.sum(axis=0), np.median(steps_s, axis=0)
-        advance = ""
+        is_apart = 0.0 < _MOST_RATE * min(all_s, all_logged_s) < max(all_s, all_logged_s)
+        advance = f"{all_s:.3g} s, log times by {all_logged_s:.3g} s" if is_apart else ""
         if 0.0 < _MOST_RATE * usual_s < usual_logged_s:  # the other way round they are logged in bursts
             advance = f"{usual_s:.3g} s from scan to scan, log times by {usual_logged_s:.3g} s (medians)"
-        elif 0.0 < _MOST_RATE * min(all_s, all_logged_s) < max(all_s, all_logged_s):
-            advance = f"{all_s:.3g} s, log times by {all_logged_s:.3g} s"
         if advance:
             lines.append(f"header stamps of {self.topic} advance by {advance}: is one of them in another unit?")
         return lines

@@ -246,7 +246,8 @@ class Log:
 
     def _lidar_on(self, frame: str) -> Pose:
         """T_frame_lidar (d+1, d+1), the identity where no fixed transform states it."""
-        T = between_frames(self.indexes, self.span, frame, self.publishers.frame) if frame else None
+        is_other = frame not in ("", self.publishers.frame)
+        T = between_frames(self.indexes, self.span, frame, self.publishers.frame) if is_other else None
         T = np.eye(4) if T is None else T
         return in_plane(T) if self.dimension == 2 else T
 
