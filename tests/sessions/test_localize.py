@@ -71,7 +71,7 @@ def test_the_summary_of_a_localized_log_has_the_notes_that_a_run_has(office, tmp
             if channel.topic != "/tf_static"
         ]
     log = write(tmp_path / "a.mcap", said)
-    found = localize(log, office / "map", tmp_path / "loc", recording=False, ground_truth="none", log__end_s=40.0)
+    found = localize(log, office / "map", tmp_path / "loc", recording=False, log__end_s=40.0)
     assert "note           no static transform from base_link to lidar" in found.summary
     assert "note           mounting estimated from the wheels: " in found.summary
 
