@@ -175,6 +175,22 @@ def test_info_doctor_and_run_name_the_sectors_and_count_sweeps(call, tmp_path):
     says(output, line, "scans          30 over")
 
 
+@pytest.mark.parametrize("of", [SPATIAL, PLANAR], ids=["space", "plane"])
+@pytest.mark.parametrize("times", ["message", "none"])
+def test_a_run_and_doctor_name_the_azimuth_where_it_times_the_points_of_sectors_and_only_there(
+    tmp_path, of, times
+):
+    path = cut(whole(*of), tmp_path / "cut.mcap", Cut(90.0, times=times))
+    log, _ = read(path)
+    found = {finding.check: finding.found for finding in _findings(path)}["point times"]
+    for said in ("; ".join(log.notes), found):
+        assert ("by the azimuth: " in said) == (times == "none") and "counts as measured at once" not in said
+
+
+def _findings(path):
+    return examine([path], lambda _: Config(), LogConfig(), lambda *_: None).findings
+
+
 @pytest.mark.parametrize("width_deg", [30.0, 100.0])
 def test_odometry_over_sectors_is_as_good_as_over_sweeps(tmp_path, width_deg):
     expected, log, scans = sweeps(tmp_path, Cut(width_deg))

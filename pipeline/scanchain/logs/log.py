@@ -111,9 +111,13 @@ class Log:
         wheels = find_wheels(indexes, self.publishers.frame, config, self.span, self.notes)
         self.mounting = mounting = find_mounting(indexes, self.publishers.frame, wheels, self.span)
         self.gaps = stream.gap_notes(indexes, config)  # those of the notes that are of long gaps
-        self.notes += self.publishers.notes + ([self.sectors.note(self.topic)] if self.sectors else [])
         topic = wheels.channel.topic if wheels else ""
-        self.notes += stream.notes_on(indexes, config) + mounting.notes(topic, self.dimension)
+        self.notes += self.publishers.notes + ([self.sectors.note(self.topic)] if self.sectors else [])
+        self.notes += stream.notes_on(indexes, config) + (
+            mounting.notes(topic, self.dimension)
+            if self.publishers.known
+            else [f"no message of {self.topic} could be understood"]
+        )
         wheels = wheels if mounting.motion is None else None
         self.odometry_topic, self.wheels = (topic, wheels.text) if wheels else ("", "")
         T, is_planar = mounting.T_base_lidar, self.dimension == 2
@@ -150,10 +154,10 @@ class Log:
         """
         self._damage = [line for index in self.indexes for line in index.damage]
         self.notes = list(self._opening_notes)
-        poses = RecordedPoses(self.odometry_topic, self.ground_truth_topic)
+        poses = RecordedPoses(self.odometry_topic, self.ground_truth_topic, self._lidar_on)
         counts = ScanCounts(self.topic, self.odometry_topic)
         self.times, latest = self._point_times(), dict[str, tuple[int, OtherPoints]]()
-        assembler = None if self.sectors is None else Assembler(self.sectors, self.topic)
+        assembler = None if self.sectors is None else Assembler(self.sectors, self.topic, self.times)
         count, index, requested_s, jump_s, self.scans_with_wheels = 0, 0, working_s(), 0.0, 0
         try:
             for message, T_odom_base, jumped_s in with_jumps(self._with_poses(counts, poses, assembler)):
@@ -191,13 +195,12 @@ class Log:
             is_damaged, self.jumps, self.bad_scans = bool(self._damage), counts.jumps(), counts.bad
             self._damage += [*counts.losses(), *self.times.warnings(self.topic), *self.jumps, *poses.complaints()]
             self.notes += [note for note in self.publishers.notes if note not in self.notes]
-            self.notes += [*filter(None, [self._assumed(self.times)]), *self.times.faults(self.topic)]
-            self.notes += counts.notes() + (assembler.notes() if assembler else [])
+            self.notes += [*filter(None, [self.times.assumed]), *self.times.faults(self.topic)]
+            self.notes += counts.notes() + (assembler.notes() if assembler else []) + poses.notes()
         if not index:
             raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
         if is_damaged:
-            scans = counted(count - counts.bad, "scan")
-            self._damage.append(f"{scans} of {self.topic} {'was' if scans == '1 scan' else 'were'} recovered")
+            self._damage.append(counts.recovered(0 if self.sectors else self.scan_count))
 
     def assumed_point_times(self) -> str:
         """Assumption of a run about per-point times, by the first scan that has returns; empty for laser scans."""
@@ -205,11 +208,9 @@ class Log:
         if self.sectors is not None:
             times = self._point_times()
             next(stream.sampled_messages(self.indexes, self.topic, self.decoder(times)), None)
-        return "" if is_scan(self.lidar) else self._assumed(times)
-
-    def _assumed(self, times: PointTimes) -> str:
-        is_timed = times.assumed.startswith("point times")
-        return times.assumed if is_timed or self.sectors is None else self.sectors.assumed
+            if not times.assumed.startswith("point times"):
+                times.assumed = self.sectors.assumed
+        return "" if is_scan(self.lidar) else times.assumed
 
     def expected_stamps(self, topic: str) -> NDArray[np.int64]:
         """(2,) first and last header stamp to expect of a topic in the part that is read, by its first message.
@@ -236,11 +237,18 @@ class Log:
         """Poses of ``log.ground_truth_topic``, None where there are none; read by itself if before ``scans``."""
         topic = self.ground_truth_topic
         if self._truth is None and topic:
-            poses, decoders = RecordedPoses("", topic), {topic: self.pose_decoders[topic]}
+            poses, decoders = RecordedPoses("", topic, self._lidar_on), {topic: self.pose_decoders[topic]}
             for message in stream.decoded_messages(self.indexes, decoders, self.span, damage=[]):
                 poses.take(message)
             self._truth = poses.ground_truth()
         return self._truth
+
+    def _lidar_on(self, frame: str) -> Pose:
+        """T_frame_lidar (d+1, d+1), the identity where no fixed transform states it."""
+        is_other = frame not in ("", self.publishers.frame)
+        T = between_frames(self.indexes, self.span, frame, self.publishers.frame) if is_other else None
+        T = np.eye(4) if T is None else T
+        return in_plane(T) if self.dimension == 2 else T
 
     def _with_poses(
         self, counts: ScanCounts, poses: RecordedPoses, assembler: Assembler | None

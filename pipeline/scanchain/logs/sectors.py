@@ -12,7 +12,7 @@ from scanchain.data import RawPoints
 from scanchain.errors import counted
 from scanchain.logs.mcap.records import Decoded
 from scanchain.logs.messages.lidar import Returns
-from scanchain.logs.messages.point_times import UNITS_S
+from scanchain.logs.messages.point_times import UNITS_S, PointTimes
 
 _SAMPLE = 250  # points of a message, evenly spread, by which its direction and width are estimated
 _TURN_RAD = 2.0 * np.pi
@@ -145,8 +145,8 @@ class _Part(NamedTuple):
 class Assembler:
     """Sweeps of the messages that are sectors of them; ``incomplete`` counts those left out."""
 
-    def __init__(self, sectors: Sectors, topic: str) -> None:
-        self.sectors, self.topic = sectors, topic
+    def __init__(self, sectors: Sectors, topic: str, times: PointTimes) -> None:
+        self.sectors, self.topic, self.times = sectors, topic, times
         self.half_rad, self.rate = 0.5 * sectors.step_rad, sectors.period_s / _TURN_RAD
         self.is_split = not sectors.per_sweep.is_integer()
         self.incomplete = 0
@@ -214,6 +214,8 @@ class Assembler:
 
     def _times_s(self, part: _Part, begin_rad: float, begin_ns: int) -> NDArray[np.float32]:
         """Seconds (N,) of points after the beginning of their sweep: by their own times, else by their angle."""
+        if not self.times.assumed.startswith("point times") and len(part.returns.points):
+            self.times.assumed = "" if len(part.returns.times_s) else self.sectors.assumed
         if len(part.returns.times_s):
             return part.returns.times_s + np.float32(1e-9 * (part.returns.stamp_ns - begin_ns))
         return (self.rate * (self._angles_rad(part) - begin_rad)).astype(np.float32)

@@ -267,7 +267,8 @@ class PointTimes:
         for unit in [self.unit] if self.unit else UNITS_S:
             whole_s, scan_s = (UNITS_S[unit] * each for each in (all_s, beams.scan_time_s))
             is_by_scan, is_by_period = _fits(whole_s, scan_s, turns), _fits(whole_s, period_s, turns)
-            if is_by_period or (whole_s <= _LONG * longest_s and (is_by_scan or not period_s)):
+            most_s = min(_LONG * longest_s, _MOST_PERIODS * period_s or inf)
+            if is_by_period or (whole_s <= most_s and (is_by_scan or not period_s)):
                 self.spans_s.append(whole_s)
                 note = f"point times: time_increment taken as {unit} (log.point_times)"
                 self.assumed = "" if unit == "s" else note
