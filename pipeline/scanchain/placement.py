@@ -41,9 +41,7 @@ class Placement:
         self.T_world_odom = lie.identity(self.graph.dimension)
         self.first = 0  # number of the first keyframe of the log, after those of the map
         self.evidence = PlaceTest(closer.segments)
-        self.rival = PlaceTest(
-            closer.segments
-        )  # of another location in the map, while the log does not match there
+        self.rival = PlaceTest(closer.segments)  # of another location in the map, while the log has no match
         self.by_map: Closure | None = None  # with the map, of the newest keyframe that has one
         self.joined_start = 0  # first keyframe of the last segment that a loop joined to older ones
 
@@ -75,7 +73,7 @@ class Placement:
             self.give_up()
         if self.rival.is_in_vain(self.keyframes[-1]) and not self.rival.is_accepted:
             self.rival.drop(self.closer.segments.starts[-1])
-        closures = self.take(self.closer.advance(self.keyframes, self.graph))
+        closures = self.take(self.closer.advance())
         if is_keyframe:
             closures += self.take(self.closer.close(self.keyframes, self.graph), self._at_rival())
         for closure in closures if self.first else ():

@@ -291,7 +291,7 @@ def test_what_lies_in_the_directory_of_a_comparison_executes_nothing(tmp_path):
         scans.write_bytes(len(harm).to_bytes(8, "little") + harm)
         one = np.zeros(1, np.int64)
         with pytest.raises((msgspec.DecodeError, TypeError, ValueError)):
-            list(StoredScans(scans, one, one, one, np.eye(3)[None], np.eye(3)).scans())
+            list(StoredScans(str(scans), one, one, one, np.eye(3)[None], np.eye(3)).scans())
     assert not (tmp_path / "executed").exists()
 
 

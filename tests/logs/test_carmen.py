@@ -83,7 +83,12 @@ def test_wheels_mounting_and_truth_of_a_log(tmp_path):
     np.testing.assert_allclose(scan.T_odom_base, lie.pose_2d(1.0, 2.0, 0.5), atol=1e-12)
     np.testing.assert_allclose(log.T_base_lidar, lie.pose_2d(0.35, 0.0, 0.0), atol=1e-12)
     assert log.indexes[0].counts[log.indexes[0].numbers_of("/odom").pop()] == 3
-    np.testing.assert_allclose(log.ground_truth().poses[:, 0, 2], [0.5, 1.5, 2.5])
+    np.testing.assert_allclose(
+        log.ground_truth().poses,  # of the lidar, 0.35 m ahead of the robot's center, which TRUEPOS states
+        [lie.pose_2d(k + 0.5, 2.0, 0.25) @ log.T_base_lidar for k in range(3)],
+        atol=1e-9,
+    )
+    assert "/ground_truth: poses of base_link, moved to the lidar by the transforms" in log.notes
 
 
 def test_a_robotlaser_line_tells_angles_reach_wheels_and_mounting_itself(tmp_path):

@@ -14,6 +14,7 @@ from scanchain.config import LogConfig
 from scanchain.logs import open_log
 from tests.support import recorders
 from tests.support.naive_logs import office, write
+from tests.support.sectors import Cut, cut, whole
 from tests.support.sensor_files import flaser, kitti_odometry, kitti_raw, odom, save, xyzi
 
 
@@ -159,3 +160,20 @@ def test_what_cannot_be_converted_is_one_line_and_leaves_nothing(tmp_path, capfd
     said = capfd.readouterr()
     assert complaint in said.err and said.err.count("\n") == 1 and said.out == ""
     assert sorted(tmp_path.rglob("*")) == before and (tmp_path / "taken.mcap").read_text() == "mine"
+
+
+def test_columns_of_bin_files_are_a_flag_of_convert_as_of_a_run(tmp_path):
+    (tmp_path / "scans").mkdir()
+    for k, cloud in enumerate(recorders.clouds()):
+        np.column_stack([xyzi(cloud), np.zeros(len(xyzi(cloud)), "f4")]).tofile(
+            tmp_path / "scans" / f"{k + 1}.0.bin"
+        )
+    assert main(["convert", str(tmp_path / "scans"), str(tmp_path / "out.mcap"), "--log.bin_columns", "5"]) == 0
+    assert_same_log(open_log(tmp_path / "out.mcap"), open_log(tmp_path / "scans", LogConfig(bin_columns=5)))
+
+
+def test_every_nth_of_messages_that_are_sectors_is_refused_as_it_leaves_holes(tmp_path, capfd):
+    path = cut(whole("office", 3, "all-around"), tmp_path / "cut.mcap", Cut(90.0))
+    assert main(["convert", str(path), str(tmp_path / "out.mcap"), "--every", "2"]) == 2
+    assert "the messages of /scan are sectors of revolutions" in capfd.readouterr().err
+    assert main(["convert", str(path), str(tmp_path / "out.mcap"), "--start", "1"]) == 0

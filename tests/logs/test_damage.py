@@ -213,7 +213,7 @@ def test_a_chunk_with_a_wrong_crc_is_left_out_and_told(tmp_path, compression):
     assert_true(scans)
     np.testing.assert_array_equal(log.T_base_lidar, np.eye(3))
     assert 20 < len(scans) < 40 and any("static transform" in note for note in log.notes)
-    says(" ".join(log.damage), "CRC", f"{len(scans)} scan")
+    says(" ".join(log.damage), "CRC", f"{len(scans)} of 40 scans")
 
 
 @pytest.mark.parametrize("opcode", [1, 7, 0x90])
@@ -231,3 +231,14 @@ def test_an_unknown_compression_is_named(tmp_path):
     path = write(tmp_path / "a.mcap", office(), compression="zstd")
     path.write_bytes(path.read_bytes().replace(struct.pack("<I", 4) + b"zstd", struct.pack("<I", 4) + b"zlib"))
     says(complaint(path), "zlib")
+
+
+def test_scans_of_a_damaged_chunk_are_counted_among_those_that_the_index_states(tmp_path):
+    path = write(tmp_path / "a.mcap", office(30), chunk_size=8_000)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0x10
+    path.write_bytes(data)
+    log = open_log(path)
+    read = len(list(log.scans()))
+    assert read < 30 and "CRC is wrong" in log.damage[0]
+    assert log.damage[-1] == f"{read} of 30 scans of /scan were recovered"

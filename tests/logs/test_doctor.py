@@ -261,7 +261,7 @@ def test_imu_gnss_poses_and_truth_are_named_with_what_is_made_of_them_though_no_
     text = capfd.readouterr().out
     lines = [
         "GNSS /fix: not used",
-        "poses /gps: not used; --gt /gps takes them as the truth",
+        "poses /gps: not used; --gt /gps takes them as the truth, --log.odometry_topic /gps as wheels",
         "ground truth /ground_truth: evaluates the result, is not used for it",
         "IMU /imu/data: not used",
     ]
@@ -308,3 +308,46 @@ def test_a_log_that_a_run_could_not_open_is_refused_in_the_same_words(tmp_path, 
     assert "has no lidar topic" in capfd.readouterr().err
     with pytest.raises(InputError, match="could be read"):
         diagnose(saved(tmp_path, [scan_said(STAMP_NS, b"\0\1\0\0")]))
+
+
+@pytest.mark.parametrize(
+    ("stamp", "log", "advance"),
+    [
+        (
+            lambda k: (k % 10) * (100 - STEP_NS),
+            lambda k: 0,
+            "1e-07 s from scan to scan, log times by 0.1 s (medians)",
+        ),
+        (lambda k: 0, lambda k: k * (STEP_NS // 1000 - STEP_NS), "3.9 s, log times by 0.0039 s"),
+        (lambda k: k * STEP_NS * 999, lambda k: 0, "3.9e+03 s, log times by 3.9 s"),
+        (lambda k: 0, lambda k: (20 - k % 20) * (STEP_NS - 1000), ""),
+        (lambda k: 600 * SECOND * (k > 20), lambda k: 600 * SECOND * (k > 20), ""),
+    ],
+    ids=[
+        "milliseconds as nanoseconds",
+        "log times in us",
+        "stamps in another unit",
+        "logged in bursts",
+        "a pause",
+    ],
+)
+def test_stamps_and_log_times_of_which_one_is_in_another_unit_are_named(tmp_path, stamp, log, advance):
+    path = saved(tmp_path, drive(stamp=stamp, log=log, beam_s=9e-4))
+    opened = open_log(path)
+    spans_s = [float(np.ptp(scan.times_s)) for scan in opened.scans() if len(scan.times_s)]
+    line = f"header stamps of /scan advance by {advance}: is one of them in another unit?"
+    assert (line in opened.damage) == bool(advance) and len(opened.jumps) == bool(advance)
+    found = diagnose(path)
+    assert (found["stamps"].found == line) == bool(advance) and "unit?" not in found["damage"].found
+    period_s = 1e-9 * np.median(np.diff([scan.stamp_ns for scan in opened.scans()]))
+    assert max(spans_s, default=0.0) <= 10.0 * period_s  # else deskewing turns each scan by revolutions
+
+
+def test_scans_of_two_lasers_at_the_same_instants_have_no_gaps_between_these(tmp_path):
+    mountings = ("base_link", "laser", 0.2, 0.0, 0.3, 0.0), ("base_link", "rear", -0.2, 0.0, 0.3, 0.0)
+    said = [transforms_said(STAMP_NS, transforms(*mountings))]
+    for k in range(20):
+        for number, frame in enumerate(("laser", "rear")):
+            data = laser_scan(STAMP_NS + k * STEP_NS, room(k), step=0.02, frame=frame)
+            said.append(scan_said(STAMP_NS + k * STEP_NS + number * 1_000_000, data))
+    assert diagnose(saved(tmp_path, said))["gaps"].found == "none longer than 2.5 periods of 0.1 s"

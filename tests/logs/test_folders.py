@@ -167,6 +167,13 @@ def test_a_name_tells_its_stamp_or_none(stem, stamp_ns):
     assert stamp_of_name(stem) == stamp_ns
 
 
+def test_stamps_are_found_before_both_suffixes_of_nuscenes(tmp_path):
+    for k, cloud in enumerate(recorders.clouds(3)):
+        xyzi(cloud).tofile(tmp_path / f"n015__LIDAR_TOP__153240292764{k}951.pcd.bin")
+    _, scans = read(tmp_path)
+    assert [scan.stamp_ns for scan in scans] == [1_532_402_927_640_951_000 + 1_000_000 * k for k in range(3)]
+
+
 def test_files_that_are_only_numbered_need_a_rate(tmp_path):
     said = recorders.clouds(12)
     for k, cloud in enumerate(said):
@@ -284,3 +291,17 @@ def test_a_folder_of_several_kinds_of_clouds_says_which_it_left_out(tmp_path):
     simulate("office", tmp_path / "part.mcap", duration_s=1.0)
     (note,) = [note for note in open_log(tmp_path).notes if "left out" in note]
     assert note.startswith(f"{tmp_path}: only its .mcap files are read, left out are 1 .pcd, 2 .npy;")
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("file", ["times.txt", "../../poses/07.txt"])
+@pytest.mark.parametrize("number", ["1e308", "-1e308", "inf", "nan"])
+def test_numbers_of_kitti_beyond_all_measure_are_damage_and_no_warnings_of_numpy(tmp_path, file, number):
+    sequence = kitti_odometry(tmp_path, recorders.clouds())
+    lines = (sequence / file).read_text().splitlines()
+    (sequence / file).write_text("\n".join([*lines[:-1], " ".join([number] * len(lines[0].split()))]) + "\n")
+    try:
+        damage = read(sequence)[0].damage[0]
+    except InputError as error:
+        damage = str(error)
+    assert "holds numbers that are not finite or too large" in damage

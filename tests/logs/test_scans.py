@@ -326,10 +326,26 @@ def test_a_truth_that_is_named_does_not_hide_why_no_scan_can_be_read(tmp_path):
         log.expected_stamps("/scan")
 
 
+def test_a_lidar_of_which_no_message_is_understood_is_named_and_not_its_mounting(tmp_path):
+    said = [scan_said(STAMP_NS + k * SECOND, laser_scan(STAMP_NS, [1.0] * 90, step=1.0)) for k in range(5)]
+    said = [transforms_said(STAMP_NS, transforms(("base_link", "laser", 0.2, 0.1, 0.3, 0.0))), *said]
+    assert open_log(write(tmp_path / "a.mcap", said)).notes == ["no message of /scan could be understood"]
+
+
+@pytest.mark.parametrize(("ranges_m", "named"), [((1850.0, 16000.0), True), ((31.0, 90.0), False)])
+def test_ranges_in_millimeters_beyond_the_reach_are_named(tmp_path, ranges_m, named):
+    data = laser_scan(STAMP_NS, np.linspace(*ranges_m, 90), high=30.0)
+    with pytest.raises(InputError) as error:
+        read(write(tmp_path / "a.mcap", [scan_said(STAMP_NS, data)]))
+    assert ("are at 30 m or beyond: millimeters? convert them to meters" in str(error.value)) == named
+
+
 @pytest.mark.parametrize("copies", [6, 1])
 def test_many_copies_of_scans_are_a_warning_and_a_few_are_a_note(tmp_path, copies):
     ranges = [1.0 + 0.05 * np.arange(31) + 0.01 * min(k, 19 - copies) for k in range(20)]
-    said = [scan_said(STAMP_NS + k * SECOND, laser_scan(STAMP_NS + k, each)) for k, each in enumerate(ranges)]
+    said = [
+        scan_said(STAMP_NS + k * SECOND, laser_scan(STAMP_NS + k * SECOND, each)) for k, each in enumerate(ranges)
+    ]
     log, scans = read(write(tmp_path / "a.mcap", said))
     assert len(scans) == 20
     if copies > 1:

@@ -65,6 +65,7 @@ def test_sectors_make_the_sweeps_that_they_were_cut_from(tmp_path, how, of):
     topic, count = log.topic, round(360 / how.width_deg)
     holds = f"{topic}: each message holds {how.width_deg:g}° of a revolution"
     assert f"{holds}: {count} messages are assembled to one sweep" in log.notes
+    assert not any("azimuth" in note for note in log.notes)
 
 
 def test_times_count_from_the_stamp_of_the_sweep_where_sectors_are_stamped_at_their_ends(tmp_path):
@@ -172,6 +173,22 @@ def test_info_doctor_and_run_name_the_sectors_and_count_sweeps(call, tmp_path):
     code, output, _ = call("run", path, "--out", tmp_path / "run", "--rerun", "off")
     assert code == 0
     says(output, line, "scans          30 over")
+
+
+@pytest.mark.parametrize("of", [SPATIAL, PLANAR], ids=["space", "plane"])
+@pytest.mark.parametrize("times", ["message", "none"])
+def test_a_run_and_doctor_name_the_azimuth_where_it_times_the_points_of_sectors_and_only_there(
+    tmp_path, of, times
+):
+    path = cut(whole(*of), tmp_path / "cut.mcap", Cut(90.0, times=times))
+    log, _ = read(path)
+    found = {finding.check: finding.found for finding in _findings(path)}["point times"]
+    for said in ("; ".join(log.notes), found):
+        assert ("by the azimuth: " in said) == (times == "none") and "counts as measured at once" not in said
+
+
+def _findings(path):
+    return examine([path], lambda _: Config(), LogConfig(), lambda *_: None).findings
 
 
 @pytest.mark.parametrize("width_deg", [30.0, 100.0])

@@ -284,7 +284,7 @@ def test_a_search_over_many_scans_finds_what_one_in_a_single_scan_finds(tmp_path
     closer, keyframes = begun_live(mapped, log[0], tmp_path)
     found, scans = closer.close(keyframes, graph_of(keyframes)), 1
     while closer.search.underway is not None:
-        found, scans = closer.advance(keyframes, graph_of(keyframes)), scans + 1
+        found, scans = closer.advance(), scans + 1
     assert scans > 3 and [each.target for each in found] == [each.target for each in at_once]
     np.testing.assert_array_equal(found[0].match.T_target_source, at_once[0].match.T_target_source)
 

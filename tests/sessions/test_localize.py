@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from mcap.reader import make_reader
 
 from scanchain import InputError, Localizer, Trajectory, lie, localize, open_log, read_tum, write_tum
 from scanchain.config import LogConfig
@@ -18,6 +19,7 @@ from scanchain.settings import load_settings
 from scanchain.verdict import Verdict
 from tests.benchmarks.places import with_copy
 from tests.support import made
+from tests.support.naive_logs import Said, write
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +61,19 @@ def test_a_log_is_followed_in_the_map_from_a_rough_pose(office, tmp_path, call):
     assert "ground truth   /ground_truth: " in out and metrics["ground_truth"]["optimized"]["ate_rmse_m"] < 0.03
     assert call("view", tmp_path / "loc", "--png", tmp_path / "loc.png")[0] == 0
     assert (tmp_path / "loc.png").stat().st_size > 10_000
+
+
+def test_the_summary_of_a_localized_log_has_the_notes_that_a_run_has(office, tmp_path):
+    with (office / "office.mcap").open("rb") as stream:
+        said = [
+            Said(channel.topic, schema.name, message.log_time, message.data)
+            for schema, channel, message in make_reader(stream).iter_messages()
+            if channel.topic != "/tf_static"
+        ]
+    log = write(tmp_path / "a.mcap", said)
+    found = localize(log, office / "map", tmp_path / "loc", recording=False, log__end_s=40.0)
+    assert "note           no static transform from base_link to lidar" in found.summary
+    assert "note           mounting estimated from the wheels: " in found.summary
 
 
 def test_a_whole_log_of_another_place_is_never_placed_though_it_returns_to_its_start(office, tmp_path, call):

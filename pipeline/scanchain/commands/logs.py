@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from scanchain.config import Config
     from scanchain.logs.doctor import Diagnosis
 
-_KEYS = tuple(f"log.{name}" for name in ("format", "rate_hz", "topic", "start_s", "end_s", "every"))  # of convert
+# of convert
+_KEYS = tuple(f"log.{key}" for key in ("format", "rate_hz", "bin_columns", "topic", "start_s", "end_s", "every"))
 
 
 @click.command(cls=OverrideCommand)

@@ -167,11 +167,7 @@ def merge(runs: tuple[Path, ...], out: Path, fixed: bool, update: bool, as_json:
     help="Pose of RUN_B's frame in RUN_A's, meters and degrees. [default: found]",
 )
 @click.option(
-    "--voxel",
-    "voxel_size_m",
-    type=ABOVE_ZERO,
-    metavar="METERS",
-    help="Resolution. [default: maps.voxel_size_m]",
+    "--voxel", "voxel_size_m", type=ABOVE_ZERO, metavar="METERS", help="Resolution. [default: maps.voxel_size_m]"
 )
 @click.option(
     "--min-size",
@@ -184,13 +180,7 @@ def merge(runs: tuple[Path, ...], out: Path, fixed: bool, update: bool, as_json:
 )
 @options.threads
 def changes(
-    earlier: Path,
-    later: Path | None,
-    out: Path,
-    aligned: bool,
-    transform: str | None,
-    as_json: bool,
-    **given: Any,
+    earlier: Path, later: Path | None, out: Path, aligned: bool, transform: str | None, as_json: bool, **given: Any
 ) -> None:
     """Compare two maps of one place: what appeared, what vanished, what moved.
 

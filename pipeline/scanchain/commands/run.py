@@ -101,12 +101,7 @@ def _sinks(text: str) -> frozenset[SinkName]:
 
 @click.command(cls=OverrideCommand)
 @click.argument("sources", metavar="RUN|LOG...", nargs=-1, required=True, type=LOG)
-@click.option(
-    "--trajectory",
-    metavar="FILE.tum",
-    type=PATH,
-    help="Check this trajectory of the lidar in LOG.",
-)
+@click.option("--trajectory", metavar="FILE.tum", type=PATH, help="Check this trajectory of the lidar in LOG.")
 @options.part()
 @options.strict
 @options.as_json

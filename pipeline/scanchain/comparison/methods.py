@@ -148,11 +148,7 @@ def _their_settings(name: str, base: str, own: Mapping[str, Any], dimension: int
 
 
 def _our_settings(
-    base: str,
-    own: Sequence[Override],
-    dimension: int,
-    shared: Sequence[Override],
-    overrides: Sequence[Override],
+    base: str, own: Sequence[Override], dimension: int, shared: Sequence[Override], overrides: Sequence[Override]
 ) -> dict[str, Any]:
     """The configuration of one of ours; no wheels unless requested, since nobody else has them."""
     wheels = Override("odometry.prior", "constant-velocity", "scanchain compare")

@@ -42,7 +42,7 @@ class StoredScans:
     T_base_lidar : (d+1, d+1); is_mounted : whether the log states it
     """
 
-    file: Path
+    file: str
     points: NDArray[np.int64]
     stamps_ns: NDArray[np.int64]
     log_times_ns: NDArray[np.int64]
@@ -66,30 +66,24 @@ class StoredScans:
 
     def scans(self) -> Iterator[Scan]:
         """The scans as they were decoded."""
-        with self.file.open("rb") as file:
+        with Path(self.file).open("rb") as file:
             while size := file.read(_SIZE_BYTES):
                 yield decode(file.read(int.from_bytes(size, "little")), Scan)
 
 
 def encode(value: object) -> bytes:
     """MessagePack of records with arrays: in a directory where others may write, a pickle could run their code."""
-
-    def plain(value: Any) -> object:
-        return str(value) if isinstance(value, Path) else (value.dtype.str, value.shape, value.tobytes())
-
-    return msgspec.msgpack.encode(value, enc_hook=plain)
+    return msgspec.msgpack.encode(value, enc_hook=lambda array: (array.dtype.str, array.shape, array.tobytes()))
 
 
 def decode(data: bytes, kind: type[T]) -> T:
     """The records again."""
 
-    def made(kind: type, value: Any) -> object:
-        if kind is Path:
-            return Path(value)
-        dtype, shape, content = value
+    def array(_: type, stored: Any) -> NDArray[Any]:
+        dtype, shape, content = stored
         return np.frombuffer(bytearray(content), dtype).reshape(shape)
 
-    return msgspec.msgpack.decode(data, type=kind, dec_hook=made)
+    return msgspec.msgpack.decode(data, type=kind, dec_hook=array)
 
 
 def store(scans: Iterable[Scan], T_base_lidar: Pose, path: Path, *, is_mounted: bool = True) -> StoredScans:
@@ -104,7 +98,7 @@ def store(scans: Iterable[Scan], T_base_lidar: Pose, path: Path, *, is_mounted: 
             rows.append((len(scan.points), scan.stamp_ns, scan.log_time_ns))
             wheels.append(unknown if scan.T_odom_base is None else scan.T_odom_base)
     points, stamps_ns, log_times_ns = np.array(rows, np.int64).T.copy()
-    return StoredScans(path, points, stamps_ns, log_times_ns, np.array(wheels), T_base_lidar, is_mounted)
+    return StoredScans(str(path), points, stamps_ns, log_times_ns, np.array(wheels), T_base_lidar, is_mounted)
 
 
 class Status(StrEnum):

@@ -118,9 +118,7 @@ def carried(poses: Matrix, edges: NDArray[np.int64], Z: Matrix, others: NDArray[
 
 
 def connected(
-    pairs: NDArray[np.int64],
-    count: int,
-    agree: Callable[..., NDArray[np.bool_]],
+    pairs: NDArray[np.int64], count: int, agree: Callable[..., NDArray[np.bool_]]
 ) -> list[NDArray[np.int64]]:
     """Groups of at least ``FEWEST`` of so many, connected by pairs (P, 2) that agree: a (P,) and b (P,), bool."""
     parts = np.array_split(pairs, 1 + len(pairs) // _AT_ONCE)

@@ -11,13 +11,7 @@ from scanchain.data import Matrix
 from scanchain.graph.cholesky import SingularMatrixError
 from scanchain.graph.losses import RobustLoss
 from scanchain.graph.minimizer import Descent, LocalModel, Optimizer, descend, step_rule
-from scanchain.landmarks.problem import (
-    BearingRangeProblem,
-    Linearization,
-    LinearSystem,
-    Measurements,
-    Values,
-)
+from scanchain.landmarks.problem import BearingRangeProblem, Linearization, LinearSystem, Measurements, Values
 from scanchain.landmarks.solvers import LinearSolver, UndeterminedError
 
 _FIRST, _GROWTH = 16, 2  # number of poses of the first part, and growth factor of each further one

@@ -24,13 +24,7 @@ from scanchain.landmarks.estimate import (
     of_relative_positions,
 )
 from scanchain.landmarks.files import RangeLog, read_mrclam
-from scanchain.landmarks.problem import (
-    BearingRangeProblem,
-    LandmarkData,
-    LinearSystem,
-    Values,
-    linear_system,
-)
+from scanchain.landmarks.problem import BearingRangeProblem, LandmarkData, LinearSystem, Values, linear_system
 from scanchain.landmarks.ranges import OWN, OWN_UNITS, OdometryNoise, RangeSolution, solve_range_log
 from scanchain.landmarks.solvers import Covariance, LinearSolver, MethodResult, compare, create_solver, methods_for
 

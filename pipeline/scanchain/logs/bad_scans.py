@@ -17,6 +17,7 @@ from scanchain.logs.publishers import Publisher
 _MOST_REPEATED = 0.5  # share of repeated stamps above which it is a warning
 _FEWEST_COPIED = 10  # least points of a scan that may be a copy
 _COPIES_SHARE = 0.01  # of the scans, up to which copies are no warning
+_MOST_RATE = 50.0  # of one clock over the other, above which their units differ: by 1000 or more, but for gaps
 _AGAIN = 0.1  # share of a jump of the stamps, up to which they begin again as at first
 _SAMPLE = 64  # step of the sample of points tested first: usually one of them is in range
 
@@ -94,6 +95,7 @@ class ScanCounts:
         self.publishers: dict[str, _Tally] = {}
         self.jumps_s, self.first_jump = list[float](), ""
         self.first_complaint = ""
+        self.steps_ns = [(0, 0)]  # of header stamps and log times from scan to scan, where neither jumps
         self._last: Scan | None = None
 
     def skip(self, complaint: str, expected: int, config: LogConfig) -> None:
@@ -137,6 +139,8 @@ class ScanCounts:
                 self.backwards += 1
                 self.farthest_back_ns = max(self.farthest_back_ns, back_ns)
             self.repeated += back_ns == 0
+            if self._last.stamp_ns and not scan.clock_jump_s:  # not from a stamp before the first /clock on
+                self.steps_ns.append((-back_ns, scan.log_time_ns - self._last.log_time_ns))
         self._last = scan
         self.begin_ns = self.begin_ns or scan.stamp_ns
 
@@ -179,14 +183,29 @@ class ScanCounts:
         return lines
 
     def jumps(self) -> list[str]:
-        """A line on jumps of the header stamps, none as a rule."""
-        if not self.jumps_s:
-            return []
-        return [
-            f"{counted(len(self.jumps_s), 'jump')} of the header stamps of {self.topic}, by up to "
-            f"{_signed(max(self.jumps_s, key=abs))} (the first at {self.first_jump}; "
-            "each begins a new segment, as nothing says how far the lidar moved meanwhile"
-        ]
+        """Lines on jumps of the header stamps, and on a rate that is not that of the log times; none as a rule."""
+        lines = []
+        if self.jumps_s:
+            lines.append(
+                f"{counted(len(self.jumps_s), 'jump')} of the header stamps of {self.topic}, by up to "
+                f"{_signed(max(self.jumps_s, key=abs))} (the first at {self.first_jump}; "
+                "each begins a new segment, as nothing says how far the lidar moved meanwhile"
+            )
+        steps_s = 1e-9 * np.array(self.steps_ns, np.float64)
+        (all_s, all_logged_s), (usual_s, usual_logged_s) = steps_s.sum(axis=0), np.median(steps_s, axis=0)
+        is_apart = 0.0 < _MOST_RATE * min(all_s, all_logged_s) < max(all_s, all_logged_s)
+        advance = f"{all_s:.3g} s, log times by {all_logged_s:.3g} s" if is_apart else ""
+        if 0.0 < _MOST_RATE * usual_s < usual_logged_s:  # the other way round they are logged in bursts
+            advance = f"{usual_s:.3g} s from scan to scan, log times by {usual_logged_s:.3g} s (medians)"
+        if advance:
+            lines.append(f"header stamps of {self.topic} advance by {advance}: is one of them in another unit?")
+        return lines
+
+    def recovered(self, expected: int) -> str:
+        """Number of scans of a damaged log that could be read, of those to expect where there are fewer."""
+        read = self.scans - self.bad
+        scans = counted(read, "scan") if self.scans >= expected else f"{read:,} of {counted(expected, 'scan')}"
+        return f"{scans} of {self.topic} {'was' if read == 1 else 'were'} recovered"
 
     def notes(self) -> list[str]:
         """Lines on a few copies, stamps out of order and missing wheel odometry."""

@@ -7,9 +7,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from msgspec.structs import replace
+
 from scanchain.config import LogConfig
 from scanchain.errors import InputError, grouped
 from scanchain.files import Source
+from scanchain.logs.log import Log
 from scanchain.logs.mcap import stream
 from scanchain.logs.mcap.records import Decoded, FileIndex, name_of
 from scanchain.logs.messages.readers import is_lidar
@@ -60,6 +63,10 @@ def convert(
         [] if lidar is None else [name for name in channels if name != lidar.topic and is_lidar(channels[name])]
     )
     counts = {name: 0 for name in channels if name not in others}
+    for topic in counts:
+        if config.every > 1 and is_lidar(channels[topic]) and Log(indexes, replace(config, topic=topic)).sectors:
+            parts = f"the messages of {topic} are sectors of revolutions, in which --every would leave holes"
+            raise InputError(f"{name_of(indexes)}: {parts}; give it to run instead, which counts sweeps")
     span = stream.chosen_span(stream.whole_span(indexes), config)
     moving = [topic for topic in counts if not topic.endswith(_FIXED)]
     if span != stream.EVERYTHING and not any(stream.count_messages(indexes, topic, span) for topic in moving):
@@ -69,7 +76,6 @@ def convert(
     profile = "ros2" if encodings == {"cdr"} else "ros1" if encodings == {"ros1"} else ""
     with LogWriter(destination, force=force, profile=profile) as log:
         for message in _messages(indexes, counts, config, damage):
-            assert isinstance(message.value, bytes)
             log.copy(message.channel, message.log_time_ns, message.value)
             counts[message.channel.topic] += 1
             if progress is not None:

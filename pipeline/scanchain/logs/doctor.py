@@ -151,9 +151,9 @@ class Survey:
 
     @property
     def period_s(self) -> float:
-        """Median time between two scans, by their stamps or, where those do not move, by log time; 0 if alone."""
+        """Median time between scans of different stamps or, where these do not move, log times; 0 if alone."""
         for times_ns in (self.stamps_ns, self.log_times_ns):
-            steps_s = np.diff(times_ns) * 1e-9
+            steps_s = 1e-9 * np.array([step_ns for step_ns in np.diff(times_ns) if step_ns])
             if len(steps_s) and np.median(steps_s) > 0.0:
                 return float(np.median(steps_s))
         return 0.0
@@ -195,8 +195,7 @@ def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:
         return Finding("gaps", Severity.OK, f"none longer than {periods}")
     longest = int(gaps[np.argmax(steps_s[gaps])])
     longest_s, at_s = steps_s[longest], seen.into_log_s(longest)
-    found = f"{len(gaps):,} longer than {periods}, the longest {longest_s:.3g} s, "
-    found += f"{at_s:.1f} s into the log"
+    found = f"{len(gaps):,} longer than {periods}, the longest {longest_s:.3g} s, {at_s:.1f} s into the log"
     effect = f"the motion over a gap is predicted {'by the wheels' if is_on_wheels else 'at constant velocity'}"
     if longest_s < (_LONG_GAP_ON_WHEELS_S if is_on_wheels else _LONG_GAP_S):
         return Finding("gaps", Severity.NOTE, found, effect)
@@ -208,9 +207,11 @@ def _gaps(seen: Survey, is_on_wheels: bool) -> Finding:
 
 
 def _stamps(seen: Survey) -> Finding:
-    """Finding on header stamps that run back or jump."""
+    """Finding on header stamps that run back, jump, or run at another rate than log times."""
     if seen.log.jumps:
-        effect = "the motion over a jump is unknown: a loop closure may join the segments; else run them apart"
+        effect = "speeds count by header stamps; gaps, --start and --end by log times: correct what is wrong"
+        if "jump" in seen.log.jumps[0]:
+            effect = "the motion over a jump is unknown: a loop closure may join the segments; else run them apart"
         return Finding("stamps", Severity.WARNING, "; ".join(seen.log.jumps), effect)
     back_s = -1e-9 * np.diff(seen.stamps_ns)
     count = int(np.count_nonzero(back_s > 0.0))
@@ -256,7 +257,7 @@ def _wheel_speed_m_s(seen: Survey) -> float:
 def _point_times(seen: Survey) -> Finding:
     times, spans_s = seen.log.times, [scan.time_span_s for scan in seen.scans]
     untimed = int(np.count_nonzero(np.isnan(spans_s)))
-    distorted = "scans are not freed of the lidar's own motion, which bends them unless the driver did it"
+    distorted = "scans are not deskewed: the motion of the lidar distorts them unless the driver did it"
     faults = times.faults(seen.log.topic)
     if untimed == len(spans_s) and not times.spans_s:
         grade = Severity.WARNING if faults else Severity.NOTE
@@ -265,7 +266,7 @@ def _point_times(seen: Survey) -> Finding:
             "point times", grade, "; ".join([constant or "none", *faults]), distorted, _by_azimuth(seen)
         )
     span_s = float(np.nanmedian(spans_s if untimed < len(spans_s) else times.spans_s))
-    assumed = times.assumed.removeprefix("point times: ") or "time_increment of the beams"
+    assumed = times.assumed.removeprefix("point times").lstrip(": ") or "time_increment of the beams"
     found = f"{assumed}; a scan lasts {1e3 * span_s:.4g} ms"
     part = span_s / seen.period_s if seen.period_s else 1.0
     if is_scan(seen.log.lidar) or _PART_OF_SCAN < part < _MORE_THAN_SCAN:
@@ -273,7 +274,7 @@ def _point_times(seen: Survey) -> Finding:
         effect = f"{counted(untimed, 'scan')} without: {distorted}" if untimed else "the rest is used"
         return Finding("point times", grade, "; ".join([found, *faults]), effect if faults else "")
     found = "; ".join([f"{found}, {part:.2g} of the period", *faults])
-    effect = "if that is the wrong unit, deskewing bends every scan instead of straightening it"
+    effect = "if that is the wrong unit, deskewing distorts every scan"
     return Finding("point times", Severity.WARNING, found, effect, _other_unit(times.assumed, part))
 
 

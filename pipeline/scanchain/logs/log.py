@@ -27,7 +27,7 @@ from scanchain.logs.messages.readers import is_scan, pose_reader, reader
 from scanchain.logs.mounting import between_frames, find_mounting, find_wheels, in_plane, is_upside_down
 from scanchain.logs.opening import index_files
 from scanchain.logs.publishers import Publishers, seen_together, with_jumps
-from scanchain.logs.sectors import MOST, Assembler, Sampled, expected_sweeps, find_sectors
+from scanchain.logs.sectors import MOST, Assembler, expected_sweeps, find_sectors
 from scanchain.logs.topics import find_ground_truth, find_lidar
 from scanchain.settings import load_settings, overrides_of
 
@@ -91,9 +91,10 @@ class Log:
         self.topic, truth = lidar.topic, find_ground_truth(indexes, config.ground_truth_topic)
         self.ground_truth_topic = "" if truth is None else truth.topic
         self._sampled_times = self.times = PointTimes(config)
-        self.plane_height_m: float | None = None  # also while the sample is decoded
-        sample, messages = tee(stream.sampled_messages(indexes, self.topic, self._sampled, most=MOST))
-        self.plane_height_m = None if is_scan(lidar) else plane_height_m(each.returns for each in sample)
+        self.plane_height_m: float | None = None
+        sample = partial(stream.sampled_messages, indexes, self.topic)
+        first, again = tee(each.value for each in sample(self.decoder(self._sampled_times), blocks=MOST))
+        self.plane_height_m = None if is_scan(lidar) else plane_height_m(first)
         if (z_m := self.plane_height_m) is not None:
             self.notes.append(
                 f"the clouds of {self.topic} are planar (z = {z_m:.3g} m everywhere): read as a 2D log"
@@ -101,24 +102,27 @@ class Log:
         self.dimension = 2 if is_scan(lidar) or self.plane_height_m is not None else 3
         self.duration_s = (whole := stream.whole_span(indexes)).duration_s
         self.span = stream.chosen_span(whole, config)
-        self.sectors = find_sectors(
-            messages, lambda unit: self.decoder(PointTimes(replace(config, point_times=unit))), config.point_times
-        )
+        self.sectors = find_sectors(again, config.point_times)
         self.scan_count = expected_sweeps(stream.count_scans(indexes, self.topic, whole, config), self.sectors)
-        sampled = partial(stream.sampled, indexes, self.topic, self.decoder(PointTimes(config)), self.span)
-        between = partial(between_frames, indexes, self.span)
-        self.publishers = Publishers(sampled, between, is_planar=self.dimension == 2)
+        of_part = partial(sample, self.decoder(PointTimes(config)), self.span)
+        self.publishers = Publishers(
+            of_part, partial(between_frames, indexes, self.span), is_planar=self.dimension == 2
+        )
         wheels = find_wheels(indexes, self.publishers.frame, config, self.span, self.notes)
         self.mounting = mounting = find_mounting(indexes, self.publishers.frame, wheels, self.span)
         self.gaps = stream.gap_notes(indexes, config)  # those of the notes that are of long gaps
-        self.notes += self.publishers.notes + ([self.sectors.note(self.topic)] if self.sectors else [])
         topic = wheels.channel.topic if wheels else ""
-        self.notes += stream.notes_on(indexes, config) + mounting.notes(topic, self.dimension)
+        self.notes += self.publishers.notes + ([self.sectors.note(self.topic)] if self.sectors else [])
+        self.notes += stream.notes_on(indexes, config) + (
+            mounting.notes(topic, self.dimension)
+            if self.publishers.known
+            else [f"no message of {self.topic} could be understood"]
+        )
         wheels = wheels if mounting.motion is None else None
         self.odometry_topic, self.wheels = (topic, wheels.text) if wheels else ("", "")
-        T_base_lidar = mounting.T_base_lidar
-        self.is_mirrored = self.dimension == 2 and (config.upside_down or is_upside_down(T_base_lidar))
-        self.T_base_lidar: Pose = in_plane(T_base_lidar) if self.dimension == 2 else T_base_lidar
+        T, is_planar = mounting.T_base_lidar, self.dimension == 2
+        self.is_mirrored = is_planar and (config.upside_down or is_upside_down(T))
+        self.T_base_lidar: Pose = in_plane(T) if is_planar else T
         self.stated_mounting = self.T_base_lidar if mounting.is_stated else None
         self._damage: list[str] = [line for index in indexes for line in index.damage]
         with_poses = [*([(wheels.channel, wheels.link)] if wheels else []), *([(truth, None)] if truth else [])]
@@ -150,10 +154,10 @@ class Log:
         """
         self._damage = [line for index in self.indexes for line in index.damage]
         self.notes = list(self._opening_notes)
-        poses = RecordedPoses(self.odometry_topic, self.ground_truth_topic)
+        poses = RecordedPoses(self.odometry_topic, self.ground_truth_topic, self._lidar_on)
         counts = ScanCounts(self.topic, self.odometry_topic)
         self.times, latest = self._point_times(), dict[str, tuple[int, OtherPoints]]()
-        assembler = None if self.sectors is None else Assembler(self.sectors, self.topic)
+        assembler = None if self.sectors is None else Assembler(self.sectors, self.topic, self.times)
         count, index, requested_s, jump_s, self.scans_with_wheels = 0, 0, working_s(), 0.0, 0
         try:
             for message, T_odom_base, jumped_s in with_jumps(self._with_poses(counts, poses, assembler)):
@@ -166,8 +170,7 @@ class Log:
                     complaint = f"{path}: scan {count - 1} of {self.topic} {unusable}"
                     counts.skip(complaint, self.scan_count, self.config)
                     continue
-                returns = message.value
-                assert isinstance(returns, Returns)
+                returns: Returns = message.value
                 points, others = seen_together(returns, self.publishers, latest, is_mirrored=self.is_mirrored)
                 scan = Scan(
                     index=index,
@@ -192,13 +195,12 @@ class Log:
             is_damaged, self.jumps, self.bad_scans = bool(self._damage), counts.jumps(), counts.bad
             self._damage += [*counts.losses(), *self.times.warnings(self.topic), *self.jumps, *poses.complaints()]
             self.notes += [note for note in self.publishers.notes if note not in self.notes]
-            self.notes += [*filter(None, [self._assumed(self.times)]), *self.times.faults(self.topic)]
-            self.notes += counts.notes() + (assembler.notes() if assembler else [])
+            self.notes += [*filter(None, [self.times.assumed]), *self.times.faults(self.topic)]
+            self.notes += counts.notes() + (assembler.notes() if assembler else []) + poses.notes()
         if not index:
             raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
         if is_damaged:
-            scans = counted(count - counts.bad, "scan")
-            self._damage.append(f"{scans} of {self.topic} {'was' if scans == '1 scan' else 'were'} recovered")
+            self._damage.append(counts.recovered(0 if self.sectors else self.scan_count))
 
     def assumed_point_times(self) -> str:
         """Assumption of a run about per-point times, by the first scan that has returns; empty for laser scans."""
@@ -206,11 +208,9 @@ class Log:
         if self.sectors is not None:
             times = self._point_times()
             next(stream.sampled_messages(self.indexes, self.topic, self.decoder(times)), None)
-        return "" if is_scan(self.lidar) else self._assumed(times)
-
-    def _assumed(self, times: PointTimes) -> str:
-        is_timed = times.assumed.startswith("point times")
-        return times.assumed if is_timed or self.sectors is None else self.sectors.assumed
+            if not times.assumed.startswith("point times"):
+                times.assumed = self.sectors.assumed
+        return "" if is_scan(self.lidar) else times.assumed
 
     def expected_stamps(self, topic: str) -> NDArray[np.int64]:
         """(2,) first and last header stamp to expect of a topic in the part that is read, by its first message.
@@ -237,11 +237,18 @@ class Log:
         """Poses of ``log.ground_truth_topic``, None where there are none; read by itself if before ``scans``."""
         topic = self.ground_truth_topic
         if self._truth is None and topic:
-            poses, decoders = RecordedPoses("", topic), {topic: self.pose_decoders[topic]}
+            poses, decoders = RecordedPoses("", topic, self._lidar_on), {topic: self.pose_decoders[topic]}
             for message in stream.decoded_messages(self.indexes, decoders, self.span, damage=[]):
                 poses.take(message)
             self._truth = poses.ground_truth()
         return self._truth
+
+    def _lidar_on(self, frame: str) -> Pose:
+        """T_frame_lidar (d+1, d+1), the identity where no fixed transform states it."""
+        is_other = frame not in ("", self.publishers.frame)
+        T = between_frames(self.indexes, self.span, frame, self.publishers.frame) if is_other else None
+        T = np.eye(4) if T is None else T
+        return in_plane(T) if self.dimension == 2 else T
 
     def _with_poses(
         self, counts: ScanCounts, poses: RecordedPoses, assembler: Assembler | None
@@ -273,9 +280,6 @@ class Log:
         if is_scan(self.lidar):
             return partial(decode_laser_scan, read=reader(self.lidar), config=times.config)
         return partial(decode_cloud, read=reader(self.lidar), times=times, plane_m=self.plane_height_m)
-
-    def _sampled(self, data: memoryview) -> Sampled:
-        return Sampled(data, self.decoder(self._sampled_times)(data))
 
     def _point_times(self) -> PointTimes:
         """Times of the lidar's points, in the unit that the duration of a sector shows."""

@@ -127,7 +127,7 @@ def find_mounting(indexes: Sequence[FileIndex], frame: str, wheels: Wheels | Non
     base_of_wheels = wheels.link[1] if wheels and wheels.link else ""
     if wheels is not None and role(wheels.channel) == "odometry":
         stated = next(sampled_messages(indexes, wheels.channel.topic, pose_reader(wheels.channel, 3)), None)
-        base_of_wheels = "" if stated is None else stated.child
+        base_of_wheels = "" if stated is None else stated.value.child
     bases = [name for name in (base_of_wheels, *_BASE_FRAMES) if name]
     if (stated := _stated(indexes, bases, frame, span)) is not None:
         return stated
@@ -285,4 +285,5 @@ def _transforms(indexes: Sequence[FileIndex], *, is_fixed: bool, span: Span | No
 
 
 def _sampled(indexes: Sequence[FileIndex], channel: Channel, span: Span | None) -> list[StampedPose]:
-    return [each for told in sampled_messages(indexes, channel.topic, reader(channel), span) for each in told]
+    sample = sampled_messages(indexes, channel.topic, reader(channel), span)
+    return [each for message in sample for each in message.value]

@@ -36,21 +36,23 @@ class Publishers:
 
     def __init__(
         self,
-        sample: Callable[[int | None], Iterable[tuple[int, Returns]]],
+        sample: Callable[..., Iterable[Decoded]],
         between: Callable[[str, str], Pose | None],
         *,
         is_planar: bool,
     ) -> None:
-        """Begin with a sample of so many messages, with log times; ``between`` gives T_target_source of frames."""
-        sampled = list(sample(_SAMPLED[is_planar]))
-        if not any(len(returns.points) for _, returns in sampled):
-            sampled = list(sample(None))  # from all over the log
+        """Begin with a sample, of ``most`` messages in a block; ``between`` gives T_target_source of frames."""
+        sampled = list(sample(blocks=1, most=_SAMPLED[is_planar]))
+        if not any(len(each.value.points) for each in sampled):
+            sampled = list(sample())  # from all over the log
         self.between, self.is_planar = between, is_planar
-        self.offsets_ns = [(each.frame, each.stamp_ns - log_ns) for log_ns, each in sampled if each.stamp_ns]
+        self.offsets_ns = [
+            (value.frame, value.stamp_ns - log_ns) for _, log_ns, value in sampled if value.stamp_ns
+        ]
         self.frame, self.known = "", dict[str, Publisher]()
         returned = Counter[str]()
-        for _, returns in sampled:
-            returned[returns.frame] += len(returns.points) > 0
+        for each in sampled:
+            returned[each.value.frame] += len(each.value.points) > 0
         for frame, _ in returned.most_common():
             self.of(frame)
 

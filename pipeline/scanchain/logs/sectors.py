@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +12,7 @@ from scanchain.data import RawPoints
 from scanchain.errors import counted
 from scanchain.logs.mcap.records import Decoded
 from scanchain.logs.messages.lidar import Returns
-from scanchain.logs.messages.point_times import UNITS_S
+from scanchain.logs.messages.point_times import UNITS_S, PointTimes
 
 _SAMPLE = 250  # points of a message, evenly spread, by which its direction and width are estimated
 _TURN_RAD = 2.0 * np.pi
@@ -35,7 +35,8 @@ class Sectors(NamedTuple):
     step_rad : usual angle from one message to the next
     per_sweep : messages per revolution, not whole where they do not divide it
     period_s : of a revolution
-    point_times : ``log.point_times`` of the messages, the unit by the duration of a sector; ``none`` by azimuth
+    point_times : ``log.point_times`` of the messages, the unit by the duration of a sector
+    assumed : times by the azimuth, of points that have none of their own; empty where they have
     """
 
     sense: int
@@ -43,14 +44,7 @@ class Sectors(NamedTuple):
     per_sweep: float
     period_s: float
     point_times: str = "auto"
-
-    @property
-    def assumed(self) -> str:
-        """Times of points that have none of their own."""
-        direction = "counterclockwise" if self.sense > 0 else "clockwise"
-        return (
-            f"point times by the azimuth: {direction}, {self.period_s:.3g} s a turn, from the sweep's first stamp"
-        )
+    assumed: str = ""
 
     def note(self, topic: str) -> str:
         """The sectors in words, and what is done about them."""
@@ -63,46 +57,37 @@ def expected_sweeps(messages: int, sectors: Sectors | None) -> int:
     return messages if sectors is None else max(int(messages / sectors.per_sweep + 0.5), 1)
 
 
-class Sampled(NamedTuple):
-    """One of the first messages of a lidar: its bytes and its returns."""
-
-    data: memoryview
-    returns: Returns
-
-
-def find_sectors(
-    sample: Iterable[Sampled], decoder: Callable[[str], Callable[[memoryview], Returns]], point_times: str
-) -> Sectors | None:
+def find_sectors(sample: Iterable[Returns], point_times: str) -> Sectors | None:
     """Sectors in which consecutive messages of one frame look, which recur; None where each is a sweep by itself.
 
-    decoder : decoder of the messages for a value of ``log.point_times``; point_times : the configured one
+    point_times : as configured
     """
-    seen: list[Sampled] = []
+    seen: list[Returns] = []
     directions_rad, widths_rad, steps_rad = list[float](), list[float](), np.empty(0)
-    for message in sample:
-        points = message.returns.points
+    for returns in sample:
+        points = returns.points
         if not len(points):
             continue
-        seen.append(message)
+        seen.append(returns)
         directions_rad.append(_direction(points))
         turned_rad = _wrapped(_azimuth(points[:: len(points) // _SAMPLE + 1]) - directions_rad[-1])
         widths_rad.append(float(np.ptp(np.percentile(turned_rad, (5.0, 95.0)))) / 0.9)
         steps_rad = np.abs(_wrapped(np.diff(directions_rad)))
         is_one_way = len(seen) == _FEWEST and np.median(widths_rad) > _WIDTHS[1] * np.median(steps_rad)
-        if widths_rad[-1] > _WIDEST_RAD or message.returns.frame != seen[0].returns.frame or is_one_way:
+        if widths_rad[-1] > _WIDEST_RAD or returns.frame != seen[0].frame or is_one_way:
             return None
         if steps_rad.sum() > (_REVOLUTIONS + 1.0) * _TURN_RAD or len(seen) == MOST:
             break
     found = _sectors(seen, np.array(directions_rad), float(np.median(widths_rad))) if len(seen) > 2 else None
-    return found and _timed(found, seen, decoder, point_times)
+    return found and _timed(found, seen, point_times)
 
 
-def _sectors(seen: list[Sampled], directions_rad: NDArray[np.float64], width_rad: float) -> Sectors | None:
+def _sectors(seen: Sequence[Returns], directions_rad: NDArray[np.float64], width_rad: float) -> Sectors | None:
     """Sectors by the directions (N,) of the first messages, None where these do not turn steadily."""
     steps_rad = _wrapped(np.diff(directions_rad))
     sense = int(np.sign(np.median(steps_rad)))
     if np.median(np.abs(steps_rad)) > _CLEAR_RAD:
-        sense = int(np.sign(sum(_order(each.returns) for each in seen))) or 1
+        sense = int(np.sign(sum(map(_order, seen)))) or 1
     steps_rad = (sense * steps_rad) % _TURN_RAD
     step_rad = float(np.percentile(steps_rad, 50.0, method="lower"))
     turned_rad = np.append(0.0, np.cumsum(steps_rad))
@@ -114,7 +99,7 @@ def _sectors(seen: list[Sampled], directions_rad: NDArray[np.float64], width_rad
     first = np.flatnonzero(turned_rad + _TURN_RAD < turned_rad[-1] + 0.5 * step_rad)
     later = np.abs(turned_rad[:, None] - turned_rad[first] - _TURN_RAD).argmin(axis=0)
     drift_rad = turned_rad[later] - turned_rad[first] - _TURN_RAD
-    stamps_ns = np.array([each.returns.stamp_ns for each in seen])
+    stamps_ns = np.array([each.stamp_ns for each in seen])
     seconds = 1e-9 * (stamps_ns[later] - stamps_ns[first])
     period_s = float(np.median(seconds * _TURN_RAD / (_TURN_RAD + drift_rad)))
     if not 0.0 < period_s < _SLOWEST_S:
@@ -125,29 +110,27 @@ def _sectors(seen: list[Sampled], directions_rad: NDArray[np.float64], width_rad
     return Sectors(sense, step_rad, per_sweep, period_s)
 
 
-def _timed(
-    sectors: Sectors,
-    seen: list[Sampled],
-    decoder: Callable[[str], Callable[[memoryview], Returns]],
-    configured: str,
-) -> Sectors:
+def _timed(sectors: Sectors, seen: Sequence[Returns], configured: str) -> Sectors:
     """The sectors with the unit of their point times: that in which a message lasts about as long as a sector.
 
     They are not used where they count from the beginning of the revolution, or only this has a stamp.
     """
     point_times = configured if configured in (*UNITS_S, "auto") else "none"
     if configured == "auto":
-        decode = decoder("s")
-        spans_s = [float(np.ptp(times)) for each in seen if len(times := decode(each.data).times_s)]
+        spans_s = [float(np.ptp(times_s)) for each in seen if len(times_s := each.seconds("s"))]
         if spans_s:
             longer = max(float(np.median(spans_s)), 1e-9) / sectors.period_s * sectors.per_sweep
             point_times = min(UNITS_S, key=lambda name: abs(np.log(longer * UNITS_S[name])))
-    decode = decoder(point_times)
-    starts_s = [float(times.min()) for each in seen if len(times := decode(each.data).times_s)]
+    of_each = [each.seconds(point_times) for each in seen] if point_times in UNITS_S else []
+    starts_s = [float(times_s.min()) for times_s in of_each if len(times_s)]
     last_s = sectors.period_s * (1.0 - 1.0 / sectors.per_sweep)  # from the first sector to the last
     is_from_sweep = len(starts_s) > 1 and float(np.ptp(starts_s)) > 0.5 * last_s
-    is_stamped = np.median(np.diff([each.returns.stamp_ns for each in seen])) > 0
-    return sectors._replace(point_times=point_times if is_stamped and not is_from_sweep else "none")
+    is_stamped = np.median(np.diff([each.stamp_ns for each in seen])) > 0
+    point_times = point_times if is_stamped and not is_from_sweep else "none"
+    turn = f"{'counterclockwise' if sectors.sense > 0 else 'clockwise'}, {sectors.period_s:.3g} s a turn"
+    by_azimuth = f"point times by the azimuth: {turn}, from the sweep's first stamp"
+    is_own = bool(starts_s) and point_times != "none"
+    return sectors._replace(point_times=point_times, assumed="" if is_own else by_azimuth)
 
 
 class _Part(NamedTuple):
@@ -162,8 +145,8 @@ class _Part(NamedTuple):
 class Assembler:
     """Sweeps of the messages that are sectors of them; ``incomplete`` counts those left out."""
 
-    def __init__(self, sectors: Sectors, topic: str) -> None:
-        self.sectors, self.topic = sectors, topic
+    def __init__(self, sectors: Sectors, topic: str, times: PointTimes) -> None:
+        self.sectors, self.topic, self.times = sectors, topic, times
         self.half_rad, self.rate = 0.5 * sectors.step_rad, sectors.period_s / _TURN_RAD
         self.is_split = not sectors.per_sweep.is_integer()
         self.incomplete = 0
@@ -231,6 +214,8 @@ class Assembler:
 
     def _times_s(self, part: _Part, begin_rad: float, begin_ns: int) -> NDArray[np.float32]:
         """Seconds (N,) of points after the beginning of their sweep: by their own times, else by their angle."""
+        if not self.times.assumed.startswith("point times") and len(part.returns.points):
+            self.times.assumed = "" if len(part.returns.times_s) else self.sectors.assumed
         if len(part.returns.times_s):
             return part.returns.times_s + np.float32(1e-9 * (part.returns.stamp_ns - begin_ns))
         return (self.rate * (self._angles_rad(part) - begin_rad)).astype(np.float32)

@@ -95,7 +95,8 @@ def other_sensors(indexes: Sequence[FileIndex], *, wheels: str, truth: str) -> l
         elif kind(channel) in _IMU or kind(channel) in _GNSS:
             found.append(OtherSensor("IMU" if kind(channel) in _IMU else "GNSS", topic, "not used"))
         elif has_poses(channel) and topic != wheels:
-            found.append(OtherSensor("poses", topic, f"not used; --gt {topic} takes them as the truth"))
+            use = f"--gt {topic} takes them as the truth, --log.odometry_topic {topic} as wheels"
+            found.append(OtherSensor("poses", topic, f"not used; {use}"))
     return found
 
 

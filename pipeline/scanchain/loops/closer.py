@@ -94,9 +94,9 @@ class LoopCloser:
         """True while the last match with the map lies little behind the newest keyframe."""
         return self.search.is_tracking(keyframes)
 
-    def advance(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
+    def advance(self) -> tuple[Closure, ...]:
         """Closures by a search that is under way, which goes on with every scan, in slices of equal work."""
-        return self.search.advance(keyframes, graph)
+        return self.search.advance()
 
     def close(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
         """Closures of the newest keyframe, and of submaps that are complete by now; accepted or not.
@@ -116,13 +116,13 @@ class LoopCloser:
             return closures
         closures += self.search.close(keyframes, graph, components)
         if not self.is_live:
-            closures += self.search.finish(keyframes, graph)
+            closures += self.search.finish()
         return closures + self.places.close(keyframes, graph, connected)
 
     def finish(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
         """Closures of the submaps and searches that the end of the log leaves incomplete."""
         components = self.segments.components(graph)
-        closures = self.search.finish(keyframes, graph)
+        closures = self.search.finish()
         return closures + self.places.close(keyframes, graph, components == components[-1], finish=True)
 
 

@@ -22,9 +22,7 @@ _RISK = 1e-3  # that a pose is taken up which is wrong
 _DROPPED = -3.0  # log-odds down to which a pose is tested
 _RESERVE = 5.0  # log-odds above that bound that are kept: what was right for long may turn out wrong
 _FINAL = math.log(10.0)  # log-odds more in the end, when nothing that is seen later can withdraw a pose
-_FOLLOWED_M = (
-    50.0  # path since the last match, up to which keyframes speak against the place, and which it is tested for
-)
+_FOLLOWED_M = 50.0  # path since the last match, up to which keyframes contradict a location, or it is tested
 LARGEST_RATIO = 2.0  # of one keyframe, as a logarithm
 WEIGHTS = (2.8, -0.4, -4.9)  # of fit, no fit and contradiction in the evidence of a keyframe
 _OF_FIND = {2: 4.0, 3: 5.0}  # log-odds of a find by a search: of most right places, of others in 0.004 and 0.001
@@ -88,9 +86,7 @@ class PlaceTest:
         self.is_given = False  # whether the pose of the first scan in a map is
         self.searches = 1.0  # for independent parts of the path so far
         self.log_odds = 0.0  # of the present one
-        self.matches = (
-            0.0  # number of independent keyframes that matched there: by this two accepted poses compare
-        )
+        self.matches = 0.0  # independent keyframes that matched there, by which two accepted poses compare
         self.best = math.nan  # of those that the log ended with, or a segment
         self.matched_m = 0.0  # path up to the last match with older keyframes
         self.waiting: list[Closure] = []  # accepted and agreeing with the first

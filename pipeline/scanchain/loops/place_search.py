@@ -117,9 +117,9 @@ class PlaceSearch(Generic[Map]):
         self.turn += 1
         target = self._drawn(old, keyframes, graph.poses[old])
         self.underway = self.finder.find(keyframes[: newest.index + 1], start, target)
-        return self.advance(keyframes, graph)
+        return self.advance()
 
-    def advance(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
+    def advance(self) -> tuple[Closure, ...]:
         """Go on with the search that is under way, for a scan; closures once it is done."""
         if self.underway is None:
             return ()
@@ -130,11 +130,11 @@ class PlaceSearch(Generic[Map]):
             return tuple(over.value)
         return ()
 
-    def finish(self, keyframes: Sequence[Keyframe], graph: PoseGraph) -> tuple[Closure, ...]:
+    def finish(self) -> tuple[Closure, ...]:
         """Complete the search that is under way, if any."""
         closures: tuple[Closure, ...] = ()
         while self.underway is not None:
-            closures = self.advance(keyframes, graph)
+            closures = self.advance()
         return closures
 
     def _sought(self, components: NDArray[np.int64], keyframes: Sequence[Keyframe]) -> NDArray[np.int64]:

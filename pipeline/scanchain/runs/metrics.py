@@ -13,13 +13,7 @@ from msgspec import Struct
 
 from scanchain.data import BACK_END, VERIFICATION, State, Trajectory, fit_text
 from scanchain.errors import InputError, counted
-from scanchain.evaluation import (
-    ExpectedError,
-    Pairs,
-    absolute_error_of_any_path,
-    kitti_error_of_any_path,
-    pair,
-)
+from scanchain.evaluation import ExpectedError, Pairs, absolute_error_of_any_path, kitti_error_of_any_path, pair
 from scanchain.evaluation.errors import far_off, path_length
 from scanchain.runs.results import Results
 from scanchain.runs.step_table import STAGES, StepTable, inlier_shares

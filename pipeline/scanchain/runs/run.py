@@ -25,14 +25,7 @@ from scanchain.logs.mounting import turned_by
 from scanchain.logs.topics import other_sensors
 from scanchain.preprocess import prepare_ahead
 from scanchain.runs.closures import final_verdicts
-from scanchain.runs.directory import (
-    POINTS_FILE,
-    RECORDING_FILE,
-    RUN_FILE,
-    TRUTH_FILE,
-    RunDirectory,
-    stopped_run,
-)
+from scanchain.runs.directory import POINTS_FILE, RECORDING_FILE, RUN_FILE, TRUTH_FILE, RunDirectory, stopped_run
 from scanchain.runs.job import Job, OpenRecorder, Progress, Recorder
 from scanchain.runs.metrics import (
     METRICS_FILE,

@@ -168,7 +168,8 @@ def localize(
                 truth, note = accuracy_of(poses, source, job.max_gap_s, placed, folder)
                 warnings += note
             metrics = measure(found, prior, config, time_s, warnings, truth)
-            localized = LocalizedLog(directory.destination, prior, found, metrics, _summary(metrics, prior, log))
+            text = _summary(metrics, prior, log, found.result.mounting_note)
+            localized = LocalizedLog(directory.destination, prior, found, metrics, text)
             _write(folder, localized)
             draw(folder, localized)
         localizer.slam.points.close()
@@ -357,7 +358,7 @@ def pose_in_file(path: Path) -> Initial:
     return pose
 
 
-def _summary(m: LocalizeMetrics, prior: SavedMap, log: Log) -> str:
+def _summary(m: LocalizeMetrics, prior: SavedMap, log: Log, mounting_note: str) -> str:
     """Text of summary.txt."""
     names = ", ".join(session.name for session in prior.sessions)
     states = ", ".join(f"{count:,} {state}" for state, count in m.states.items() if count)
@@ -382,6 +383,7 @@ def _summary(m: LocalizeMetrics, prior: SavedMap, log: Log) -> str:
         lines += accuracy_lines(m.ground_truth)
     lines += [f"stretch        {part.text}" for part in m.parts]
     lines += [f"warning        {warning}" for warning in m.warnings]
+    lines += [f"note           {note}" for note in (*log.notes, mounting_note) if note]
     lines.append(f"time           {m.time_s:.1f} s, {m.scans / max(m.time_s, 1e-9):,.0f} scans/s")
     return "\n".join(lines) + "\n"
 

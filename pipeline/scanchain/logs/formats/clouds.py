@@ -232,7 +232,9 @@ def index_clouds(folder: Path, number: int, rate_hz: float = 0.0, bin_columns: i
     if rate_hz:
         stamps_ns = [round(k * _NS / rate_hz) for k in range(len(files))]
     else:
-        stamps_ns = [stamp for file in files if (stamp := stamp_of_name(file.stem)) is not None]
+        stamps_ns = [
+            stamp for file in files if (stamp := stamp_of_name(file.stem.removesuffix(".pcd"))) is not None
+        ]
     if len(set(stamps_ns)) < len(files):
         raise InputError(
             f"{folder}: names such as {files[0].name} hold no stamp; set the rate of the scans, "

@@ -31,6 +31,7 @@ Truth = list[tuple[int, Pose]]  # stamps in nanoseconds, and T_world_lidar
 
 _EARTH_M = 6378137.0
 _MOST_LATITUDE = 89.0  # largest latitude in degrees; Mercator's projection has no poles
+_MOST_NUMBER = 1e12  # largest number in a table, of meters, seconds or degrees; one beyond is damage
 _MOST_CALIBRATION = 1e6  # largest number in a calibration; one beyond, infinite or no number is damage
 _NS = 1_000_000_000
 
@@ -171,7 +172,7 @@ def read_camera_poses(file: Path, calibration: Path) -> Matrix:
 
 
 def _table(file: Path, columns: int) -> Matrix:
-    """The first columns of a file of numbers, all of them finite."""
+    """The first columns of a file of numbers, none of them beyond all measure."""
     lines = _lines(file)
     try:
         rows = np.loadtxt(lines, comments=None, usecols=range(columns), ndmin=2) if lines else np.empty(0)
@@ -179,8 +180,8 @@ def _table(file: Path, columns: int) -> Matrix:
         raise InputError(
             f"{file}: is no table of {columns} numbers a line ({error}); download it again"
         ) from error
-    if not len(rows) or not np.isfinite(rows).all():
-        raise InputError(f"{file}: is empty, or holds numbers that are not finite; download it again")
+    if not len(rows) or not (np.abs(rows) < _MOST_NUMBER).all():
+        raise InputError(f"{file}: is empty, or holds numbers that are not finite or too large; download it again")
     return rows
 
 

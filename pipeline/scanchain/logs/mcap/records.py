@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from io import BytesIO
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import lz4.frame
 import mcap.records
@@ -64,7 +64,7 @@ class Decoded(NamedTuple):
 
     channel: Channel
     log_time_ns: int
-    value: object
+    value: Any
 
 
 class Contents(NamedTuple):

@@ -15,7 +15,7 @@ from heapq import heappop, heappush
 from itertools import pairwise
 from math import inf
 from random import Random
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 from scanchain.config import LogConfig
 from scanchain.errors import InputError, counted, duration
@@ -245,7 +245,6 @@ _BLOCKS_AHEAD = 4  # that wait decoded, at most
 _REMOTE_TIMES = 2  # as many wait of a remote log, each one request
 _MOST_BYTES_AHEAD = 256_000_000
 
-T = TypeVar("T")
 _SAMPLED_BLOCKS = 8  # number of first blocks of a topic that are searched
 
 
@@ -331,37 +330,25 @@ def _ahead(
 def sampled_messages(
     indexes: Sequence[FileIndex],
     topic: str,
-    decode: Callable[[memoryview], T],
+    decode: Callable[[memoryview], object],
     span: Span | None = None,
-    most: int = _SAMPLED_BLOCKS,
-) -> Iterator[T]:
-    """Decoded messages in a topic's first blocks, or in some from all over a span; malformed ones are left out.
-
-    most : number of blocks that are read
-    """
-    for _, decoded in sampled(indexes, topic, decode, span, blocks=most):
-        yield decoded
-
-
-def sampled(
-    indexes: Sequence[FileIndex],
-    topic: str,
-    decode: Callable[[memoryview], T],
-    span: Span | None = None,
-    most: int | None = None,
     *,
     blocks: int = _SAMPLED_BLOCKS,
-) -> Iterator[tuple[int, T]]:
-    """As ``sampled_messages``, with their log times; of the first block alone ``most`` at random, in order."""
+    most: int | None = None,
+) -> Iterator[Decoded]:
+    """Decoded messages in a topic's first blocks, or in some from all over a span; malformed ones are left out.
+
+    blocks : number of those that are read; most : number of messages of each, at random but in order
+    """
     chosen, at_random = EVERYTHING if span is None else span, Random(0)
     found = _blocks_of(indexes, [index.numbers_of(topic) for index in indexes], chosen)
     if span is not None and len(found) > blocks:
-        found = [found[k * (len(found) - 1) // (blocks - 1)] for k in range(blocks)]
-    for block in found[: blocks if most is None else 1]:
+        found = [found[k * (len(found) - 1) // max(blocks - 1, 1)] for k in range(blocks)]
+    for block in found[:blocks]:
         messages = messages_of(indexes[block.file], block)
         messages = [each for each in messages if each.channel.topic == topic and chosen.holds(each)]
         if most is not None and len(messages) > most:
             messages = [messages[k] for k in sorted(at_random.sample(range(len(messages)), most))]
         for message in messages:
             with suppress(MalformedMessageError):
-                yield message.log_time_ns, decode(message.data)
+                yield Decoded(message.channel, message.log_time_ns, decode(message.data))

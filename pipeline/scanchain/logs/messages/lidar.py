@@ -228,7 +228,10 @@ def _why_none(ranges_m: NDArray[np.float32], low_m: float, high_m: float) -> str
     """Reason why none of the ranges (N,) is a return between these limits."""
     undefined = int(np.count_nonzero(~np.isfinite(ranges_m)))
     near = int(np.count_nonzero(ranges_m < low_m)) - int(np.count_nonzero(np.isneginf(ranges_m)))
+    far_m = ranges_m[np.isfinite(ranges_m) & (ranges_m >= high_m)]
+    in_millimeters = len(far_m) and low_m <= 1e-3 * float(far_m.min()) <= 1e-3 * float(far_m.max()) < high_m
+    hint = ": millimeters? convert them to meters" if in_millimeters else ""
     return (
         f"of {len(ranges_m)} ranges {undefined} are NaN or infinite, {near} are below {low_m:.3g} m, "
-        f"{len(ranges_m) - undefined - near} are at {high_m:.3g} m or beyond"
+        f"{len(far_m)} are at {high_m:.3g} m or beyond{hint}"
     )

@@ -67,8 +67,8 @@ class Field(NamedTuple):
     low: float
     span: float
     core: float
-    unit: str
-    origin: str
+    unit: str = ""
+    origin: str = ""
 
     def seconds(self, stamp_ns: int) -> NDArray[np.float32]:
         """Times (N,) after the stamp by unit and origin."""
@@ -79,6 +79,16 @@ class Field(NamedTuple):
         with np.errstate(over="ignore", invalid="ignore"):
             values = self.values - zero if zero else self.values
             return np.multiply(values, unit_s, out=times_s, dtype=np.float64, casting="unsafe")
+
+    def taken_as(self, unit: str, stamp_ns: int) -> Field:
+        """The same in a unit, with the origin that its values suggest then."""
+        unit_s, origin = UNITS_S[unit], _STAMP
+        after = float(self.low) - float(_in_units(stamp_ns, unit_s, is_whole=self.values.dtype.kind == "i"))
+        if abs(after) * unit_s < _NEAR_S and self.low * unit_s > _ABSOLUTE_S:
+            origin = _EPOCH
+        elif abs(self.low * unit_s) > _NEAR_S:
+            origin = _CLOCK
+        return self._replace(unit=unit, origin=origin)
 
     def steps_back(self, least_s: float) -> NDArray[np.int64 | np.float64]:
         """Steps (N - 1,) from point to point, 0 but for those that fall back so far."""
@@ -117,6 +127,14 @@ class Returns(NamedTuple):
     why: str
     frame: str = ""
     stated: Field | Beams | None = None
+
+    def seconds(self, unit: str) -> NDArray[np.float32]:
+        """Times (N,) after the stamp as stated, if in this unit; (0,) where they are not, or constant."""
+        if isinstance(self.stated, Beams):
+            return self.stated.seconds(UNITS_S[unit] * self.stated.increment_s)
+        if self.stated is None or not self.stated.span:
+            return NO_TIMES
+        return self.stated.taken_as(unit, self.stamp_ns).seconds(self.stamp_ns)
 
 
 class PointTimes:
@@ -171,13 +189,7 @@ class PointTimes:
             if float(first) < begin - core:
                 low = values.min(where=values >= begin - core, initial=values.max())
         unit = self.unit or _likely_unit(core, is_whole=is_whole)
-        low_s, origin = float(low) * UNITS_S[unit], _STAMP
-        after = float(low) - float(_in_units(stamp_ns, UNITS_S[unit], is_whole=is_whole))
-        if abs(after) * UNITS_S[unit] < _NEAR_S and low_s > _ABSOLUTE_S:
-            origin = _EPOCH
-        elif abs(low_s) > _NEAR_S:
-            origin = _CLOCK
-        field = Field(name, kind, values, low, span, core, unit, origin)
+        field = Field(name, kind, values, low, span, core).taken_as(unit, stamp_ns)
         if core > 0.0 and self.assumed.startswith(_NO):
             self.assumed = _taken(field)
         elif self.assumed == _NONE and span == 0.0 and len(values) > 1:  # as a float32 holds absolute times
@@ -255,7 +267,8 @@ class PointTimes:
         for unit in [self.unit] if self.unit else UNITS_S:
             whole_s, scan_s = (UNITS_S[unit] * each for each in (all_s, beams.scan_time_s))
             is_by_scan, is_by_period = _fits(whole_s, scan_s, turns), _fits(whole_s, period_s, turns)
-            if is_by_period or (whole_s <= _LONG * longest_s and (is_by_scan or not period_s)):
+            most_s = min(_LONG * longest_s, _MOST_PERIODS * period_s or inf)
+            if is_by_period or (whole_s <= most_s and (is_by_scan or not period_s)):
                 self.spans_s.append(whole_s)
                 note = f"point times: time_increment taken as {unit} (log.point_times)"
                 self.assumed = "" if unit == "s" else note
@@ -272,9 +285,7 @@ class PointTimes:
         unit, period_s = mode(each.unit for each in fields), median_low(_steps_s(around))
         unit_s, times_s = UNITS_S[unit], returns.times_s
         usual_s = _usual_span_s(fields, unit_s, period_s)
-        steps_s = [abs(float(after.low) - float(before.low)) * unit_s for before, after in pairwise(fields)] or [
-            0.0
-        ]
+        steps_s = [unit_s * abs(float(b.low) - float(a.low)) for a, b in pairwise(fields)] or [0.0]
         is_running = field.origin == _STAMP and median_low(steps_s) > 0.5 * usual_s  # a clock that was just reset
         if is_running or unit != field.unit:
             field = field._replace(unit=unit, origin=_CLOCK if is_running else field.origin)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left, insort
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import isfinite, sqrt
 from typing import Any, NamedTuple
 
@@ -94,15 +94,19 @@ _NEAREST_NS = 500_000_000
 
 
 class RecordedPoses:
-    """Pose messages by topic, the wheels' looked up at the stamp of a scan; malformed ones are counted."""
+    """Pose messages by topic, the wheels' looked up at the stamp of a scan; malformed ones are counted.
 
-    def __init__(self, odometry_topic: str, ground_truth_topic: str) -> None:
-        self.odometry_topic = odometry_topic
+    lidar_on : pose of the lidar on a frame, the identity where poses of that frame are the lidar's
+    """
+
+    def __init__(self, odometry_topic: str, ground_truth_topic: str, lidar_on: Callable[[str], Pose]) -> None:
+        self.odometry_topic, self.lidar_on = odometry_topic, lidar_on
         self.ground_truth_topic = ground_truth_topic
         self.stamps_ns: list[int] = []  # of the latest readings of the wheels, in order
         self.latest_ns = 0  # of the last one, as logged
         self.wheels: dict[int, Pose] = {}
         self.truth: list[StampedPose] = []
+        self.moved = ""  # frame of the truth where it is another than the lidar's
         self.malformed: dict[str, list[str]] = {}  # by topic, what is wrong with each message
 
     def take(self, message: Decoded) -> None:
@@ -143,11 +147,18 @@ class RecordedPoses:
         return self.wheels[near[0]] if near else None
 
     def ground_truth(self) -> Trajectory | None:
-        """The true poses so far, in the order in which they were logged; None where there are none."""
+        """The lidar's true poses so far, in the order in which they were logged; None where there are none."""
         if not self.truth:
             return None
         stamps_ns = np.array([pose.stamp_ns for pose in self.truth], np.int64)
-        return Trajectory(stamps_ns, np.array([pose.T_parent_child for pose in self.truth]))
+        T_of = {child: self.lidar_on(child) for child in {pose.child for pose in self.truth}}
+        self.moved = ", ".join(child for child, T in T_of.items() if not np.array_equal(T, np.eye(len(T))))
+        return Trajectory(stamps_ns, np.array([pose.T_parent_child @ T_of[pose.child] for pose in self.truth]))
+
+    def notes(self) -> list[str]:
+        """A line on a ground truth that is of another frame than the lidar's."""
+        moved = f"{self.ground_truth_topic}: poses of {self.moved}, moved to the lidar by the transforms"
+        return [moved] if self.moved else []
 
     def complaints(self) -> list[str]:
         """One line for each topic that had malformed messages."""
