@@ -88,7 +88,17 @@ def expected_errors(
     Raises InputError without an edge, or where the edges leave poses free.
     """
     samples = error_samples(graph, map_errors, config, scans, influence)
-    return _expected(samples, graph, scans, is_random=influence is None)
+    found = _expected(samples, graph, scans)
+    ate, of_poses = found.ate, _unfitted(graph.poses, len(graph))
+    of_scans = of_poses if scans is None else _unfitted(graph.poses, int(scans.sum()))
+    mean, low, high = (math.sqrt(of_scans / of_poses) * each for each in (ate.mean, ate.low, ate.high))
+    return found._replace(ate=ExpectedError(mean, low, high, is_random=influence is None))
+
+
+def _unfitted(poses: Matrix, count: int) -> float:
+    """Share of the squared errors of so many positions that a rigid alignment leaves."""
+    coordinates = count * (poses.shape[-1] - 1)
+    return max(coordinates - lie.twist_size(poses[0]), 1) / coordinates
 
 
 def error_samples(
@@ -171,14 +181,12 @@ class _Alignment(NamedTuple):
 
     root : (K, 1) roots of the positions' weights, which sum up to 1
     moved : (K, d, k) by which a twist moves them; basis (K d, r) of these weighted moves; to_twist (k, r)
-    unfitted : share of the errors that is left of all scans, over that of the poses
     """
 
     root: Matrix
     moved: Matrix
     basis: Matrix
     to_twist: Matrix
-    unfitted: float
 
     @classmethod
     def of(cls, poses: Matrix, scans: NDArray[np.int64] | None) -> _Alignment:
@@ -191,11 +199,7 @@ class _Alignment(NamedTuple):
         moved = np.concatenate([translated, turns(positions - positions.mean(axis=0))], axis=2)
         basis, size, Vt = np.linalg.svd((root[..., None] * moved).reshape(count * d, -1), full_matrices=False)
         kept = size > _RANK_TOLERANCE * size[0]
-        fitted, coordinates = int(kept.sum()), count * d
-        unfitted = (
-            max(weight.sum() * d - fitted, 1.0) / (weight.sum() * d) * coordinates / max(coordinates - fitted, 1)
-        )
-        return cls(root, moved, basis[:, kept], Vt[kept].T / size[kept], float(unfitted))
+        return cls(root, moved, basis[:, kept], Vt[kept].T / size[kept])
 
     def aligned(self, errors: Matrix) -> Matrix:
         """The errors (n, K, k), without what one twist of all poses explains."""
@@ -207,10 +211,9 @@ class _Alignment(NamedTuple):
         return errors - np.concatenate([moves, turned], axis=2)
 
     def rms(self, errors: Matrix) -> NDArray[np.float64]:
-        """Root mean squared position error (n,) of the scans, m, of which an alignment fits less than of few poses."""
+        """Root mean squared position error (n,), m."""
         positions = errors[..., : self.moved.shape[1]]
-        squares = np.einsum("k,nki,nki->n", self.root[:, 0] ** 2, positions, positions)
-        return np.sqrt(squares * self.unfitted)
+        return np.sqrt(np.einsum("k,nki,nki->n", self.root[:, 0] ** 2, positions, positions))
 
 
 def _samples(
@@ -224,6 +227,7 @@ def _samples(
     values, vectors = np.linalg.eigh(own)
     half = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     random = np.random.default_rng(0)
+    scale, log_sigma = np.zeros(0), 0.0
     if influences is not None and kinds is not None:
         scale, log_sigma = _scales(alignment.rms(influences), kinds)
     for seed in range(_BATCHES):
@@ -236,9 +240,7 @@ def _samples(
         yield alignment.aligned(errors)
 
 
-def _expected(
-    samples: Iterator[Matrix], graph: PoseGraph, scans: NDArray[np.int64] | None, *, is_random: bool = True
-) -> ExpectedErrors:
+def _expected(samples: Iterator[Matrix], graph: PoseGraph, scans: NDArray[np.int64] | None) -> ExpectedErrors:
     """Mean, bounds and covariances of samples."""
     alignment = _Alignment.of(graph.poses, scans)
     ates_m, squares = [], np.zeros((len(graph), graph.freedom, graph.freedom))
@@ -248,7 +250,7 @@ def _expected(
     low, high = np.percentile(ates_m, _BOUNDS).tolist()
     R = _rotations(graph.poses, graph.freedom)
     covariances = np.swapaxes(R, 1, 2) @ (squares / len(ates_m)) @ R
-    return ExpectedErrors(ExpectedError(float(np.mean(ates_m)), low, high, is_random), covariances)
+    return ExpectedErrors(ExpectedError(float(np.mean(ates_m)), low, high), covariances)
 
 
 def _scales(sizes_m: NDArray[np.float64], kinds: NDArray[np.int64]) -> tuple[NDArray[np.float64], float]:
