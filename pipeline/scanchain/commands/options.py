@@ -130,6 +130,12 @@ matcher = key(
     help="LM-PLICP (the default), SVD-ICP, or your own class (scanchain.registration.Matcher).",
 )
 no_loops = key("--no-loops", "loops.enabled", value="false", help="Odometry only, no loop closures.")
+error_bars = key(
+    "--error-bars",
+    "outputs.error_bars",
+    metavar="full|quick",
+    help="quick: without the systematic errors, for which odometry runs again without groups of directions.",
+)
 config = click.option("--config", "config_file", metavar="FILE", type=PATH, help="TOML file on top of the preset.")
 relations = click.option(
     "--relations", metavar="FILE", type=PATH, help="Manually verified relative poses (Kümmerle et al. 2009)."

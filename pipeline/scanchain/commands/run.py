@@ -32,6 +32,7 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
     help="Where the recording goes: save, spawn, connect, web, several with commas, or off.",
 )
 @options.no_loops
+@options.error_bars
 @click.option("--resume", is_flag=True, help="Resume a run that was killed or stopped from its last checkpoint.")
 @click.option(
     "--checkpoint",
