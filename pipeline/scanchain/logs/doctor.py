@@ -81,10 +81,12 @@ def examine(
     config_of: Callable[[int], Config],
     log_config: LogConfig,
     progress: Callable[[int, int], None],
+    distortion: Callable[[Log], tuple[str, str]] = lambda log: ("", ""),
 ) -> Diagnosis:
     """Diagnosis from every scan of a log. Raises InputError where a run could not open it either.
 
     config_of : what a run would use for a log of this dimension
+    distortion : that of its scans by the lidar's motion, in words, and the flags that remove it
     """
     log = open_log(sources, replace(log_config, max_bad_scans_percent=100.0))
     notes = tuple(log.notes)
@@ -94,6 +96,7 @@ def examine(
         progress(len(seen.log_times_ns), log.scan_count)
     config = config_of(log.dimension)
     found = list(_check(seen, config, most_bad_scans(seen.messages, log_config)))
+    found += _distortion(*distortion(log))
     ordered = tuple(finding for grade in reversed(Severity) for finding in found if finding.severity is grade)
     return Diagnosis(tuple(map(str, log.paths)), log.topic, log.dimension, ordered, notes)
 
@@ -275,6 +278,13 @@ def _point_times(seen: Survey) -> Finding:
     found = "; ".join([f"{found}, {part:.2g} of the period", *faults])
     effect = "if that is the wrong unit, deskewing bends every scan instead of straightening it"
     return Finding("point times", Severity.WARNING, found, effect, _other_unit(times.assumed, part))
+
+
+def _distortion(found: str, remedy: str) -> Iterator[Finding]:
+    """Finding on the motion of the lidar during a scan, where it was measured."""
+    if found:
+        effect = "distorted scans bend map and trajectory alike, which residuals hardly show" if remedy else ""
+        yield Finding("distortion", Severity.WARNING if remedy else Severity.OK, found, effect, remedy)
 
 
 def _by_azimuth(seen: Survey) -> str:
