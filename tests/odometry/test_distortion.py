@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import scanchain
 from scanchain.__main__ import main
 from scanchain.logs import open_log
 from scanchain.logs.messages import point_times
@@ -46,6 +47,15 @@ def test_clouds_without_times_are_timed_by_the_azimuth_that_explains_them(world,
     assert np.isclose(np.ptp(scan.times_s), 0.1, atol=0.001) and not log.distortion
     list(log.scans())
     assert any("clockwise" in note and "residuals are" in note for note in log.notes)
+
+
+def test_a_run_is_as_good_by_azimuth_as_by_the_times_that_are_missing(tmp_path, no_time_fields):
+    path = made.log("town", seconds=SECONDS, sensor="vlp-16")
+    ates = [
+        scanchain.run(path, tmp_path / choice, recording=False, log__point_times=choice).accuracy.ate_rmse_m
+        for choice in ("none", "auto")
+    ]
+    assert ates[1] < 0.02 < 0.1 < ates[0]
 
 
 def test_scans_that_were_measured_at_once_stay_without_times(no_time_fields):
