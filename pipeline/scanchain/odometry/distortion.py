@@ -18,8 +18,8 @@ from scanchain.logs.messages.point_times import from_azimuth
 from scanchain.odometry.odometry import Odometry
 from scanchain.settings import load_settings
 
-_AT = (0.5, 0.25, 0.75, 0.0, 1.0)  # where windows lie in the log, in the order in which they are tried
-_MOVING, _SCANS = 3, 16  # windows in which the lidar moves, and scans of each
+_AT = (0.5, 0.25, 0.75, 0.0, 1.0, 0.375, 0.625)  # where windows lie in the log, in the order of their trial
+_ENOUGH, _MOST, _SCANS = 3, 5, 16  # windows in which the lidar moves: enough where they are clear; scans of each
 _BEGIN, _BLOCK = 4, 3  # first scans of a window, whose map is small, and scans whose residuals count as one value
 _POINTS, _MATCHED = 8_000, 500  # points of a scan, at random, and those that are matched
 _LEAST_M = 0.03  # distortion of a scan below which it is lost in the noise of the ranges
@@ -109,37 +109,43 @@ def measure_distortion(log: Log, *, of_given: bool = True) -> Distortion | None:
     config, rng = load_settings(log.dimension).config, np.random.default_rng(0)
     preprocess = msgspec.structs.replace(config.preprocess, match_points=_MATCHED, calibrate_elevation=False)
     config = msgspec.structs.replace(config, preprocess=preprocess)
-    windows, sizes, values = list[list[Scan]](), list[tuple[float, str]](), list[NDArray[np.float64]]()
+    sizes, found, timing = list[tuple[float, str]](), list[NDArray[np.float64]](), log.config
     for window in log.windows(_AT, _SCANS):
-        if len(window[0].times_s) and not of_given:
+        is_given = len(window[0].times_s) > 0
+        if is_given and not of_given:
             return None
-        windows.append(window)
-        timing = _by_azimuth(windows[:1], log.config)
+        timing = log.config if is_given else timing if sizes else _by_azimuth(window, log.config)
         scans = [_prepared(scan, timing, rng) for scan in window]
         without, size = _residuals(scans, 0.0, config)
         sizes.append(size)
         if size[0] > _LEAST_M:
             residuals = np.array([without, *(_residuals(scans, sense, config)[0] for sense in (1.0, -1.0))])
-            values += [np.log(residuals)] if residuals.all() else []
-        if len(values) == _MOVING:
+            found += [np.log(residuals)] if residuals.all() else []
+        distortion = _compared(found, max(sizes), timing, window[0])
+        if len(found) == _MOST or (len(found) >= _ENOUGH and abs(distortion.sigmas) > _CLEAR):
             break
-    if not sizes:
-        return None
-    is_given = len(windows[0][0].times_s) > 0
-    without, ahead, back = np.concatenate(values, axis=1) if values else np.zeros((3, 2))
+    return distortion if sizes else None
+
+
+def _compared(
+    found: Sequence[NDArray[np.float64]], size: tuple[float, str], timing: LogConfig, scan: Scan
+) -> Distortion:
+    """The distortion by logarithms of residuals (3, N) of windows: with no times, with times and opposite ones."""
+    without, ahead, back = np.concatenate(found, axis=1) if found else np.zeros((3, 2))
+    is_given = len(scan.times_s) > 0
     if is_given or ahead.mean() <= back.mean():
         sense, better, worse = "clockwise", ahead, back
     else:
         sense, better, worse = "counterclockwise", back, ahead
     gains = without - better
     return Distortion(
-        *max(sizes),
-        config=log.config if is_given else msgspec.structs.replace(timing, point_times=sense),
+        *size,
+        config=timing if is_given else msgspec.structs.replace(timing, point_times=sense),
         is_given=is_given,
         gain=float(gains.mean()),
         loss=float((worse - without).mean()),
         sigmas=_sigmas(gains),
-        is_around=bool(np.median([_seen(window[0]) for window in windows]) > _AROUND),
+        is_around=_seen(scan) > _AROUND,
     )
 
 
@@ -167,14 +173,11 @@ def choose_point_times(log: Log) -> None:
         log.time_points(log.config, note)
 
 
-def _by_azimuth(windows: Sequence[Sequence[Scan]], config: LogConfig) -> LogConfig:
+def _by_azimuth(window: Sequence[Scan], config: LogConfig) -> LogConfig:
     """Clockwise times: a turn from scan to scan, from where the data begin, else as configured."""
-    steps_s = [
-        1e-9 * (after.stamp_ns - before.stamp_ns) for window in windows for before, after in pairwise(window)
-    ]
-    period_s = float(np.median(steps_s or [0.0])) / config.every
-    begins = np.array([scan.points[0, :2] @ (1.0, 1j) for window in windows for scan in window])
-    begin = np.mean(begins / np.maximum(np.abs(begins), 1e-9)) if len(begins) else 0j
+    period_s = 1e-9 * float(np.median(np.diff([scan.stamp_ns for scan in window]))) / config.every
+    begins = np.array([scan.points[0, :2] @ (1.0, 1j) for scan in window])
+    begin = np.mean(begins / np.maximum(np.abs(begins), 1e-9))
     return msgspec.structs.replace(
         config,
         point_times="clockwise",
