@@ -75,8 +75,9 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
         and counted, and a run stops when there are more
     min_range_m : returns nearer than this are dropped by the reader and counted
     max_range_m : returns farther than this are dropped by the reader and counted
-    point_times : unit of the per-point times, or sense of rotation of a spinning lidar without any, whose
-        points are timed by azimuth
+    point_times : unit of the per-point times, or ``none``; ``clockwise`` or ``counterclockwise`` time the points
+        of a spinning lidar by azimuth, ``azimuth`` in the sense that fits better; ``auto`` does so where clouds
+        have no times and show clearly that it is right
     revolution_s : duration of a revolution, for points timed by azimuth
     revolution_start_rad : azimuth at which a revolution begins, at the stamp; π is the rear
     """
@@ -94,7 +95,9 @@ class LogConfig(Section, frozen=True, forbid_unknown_fields=True):
     max_bad_scans_percent: Percent = 10.0
     min_range_m: NonNegative = 0.0
     max_range_m: Limit = float("inf")
-    point_times: Literal["auto", "none", "s", "ms", "us", "ns", "clockwise", "counterclockwise"] = "auto"
+    point_times: Literal["auto", "none", "s", "ms", "us", "ns", "azimuth", "clockwise", "counterclockwise"] = (
+        "auto"
+    )
     revolution_s: Positive = 0.1
     revolution_start_rad: Number = 3.141592653589793
 

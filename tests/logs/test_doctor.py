@@ -150,18 +150,6 @@ def sweep(k, *, span=0.095, fields=ROW, shift_m=0.0):
     return rows
 
 
-def turning(sense, times):
-    """A cloud without times in the order of firing, ``times`` around."""
-    azimuth = sense * np.linspace(0.0, 2.0 * np.pi * times, 640) + 1.0
-    rows = np.zeros(640, ROW.descr[:3])
-    rows["x"], rows["y"] = 10.0 * np.cos(azimuth), 10.0 * np.sin(azimuth)
-    return rows
-
-
-def clouds(rows):
-    return [cloud_said(at_times(k), point_cloud(at_times(k), rows)) for k in range(20)]
-
-
 def sweeps(**options):
     return [cloud_said(at_times(k), point_cloud(at_times(k), sweep(k, **options))) for k in range(20)]
 
@@ -169,7 +157,6 @@ def sweeps(**options):
 NO_RETURN = "--log.max_range_m 29.989"
 NO_WHEELS = "--odometry.prior constant-velocity"
 IN_MILLIMETERS = [odometry_said(at_times(k), odometry(at_times(k), 100.0 * k, 0.0)) for k in range(40)]
-BY_AZIMUTH = "--log.point_times {} --log.revolution_s 0.1 --log.revolution_start_rad 1"
 
 
 @pytest.mark.parametrize(
@@ -192,10 +179,6 @@ BY_AZIMUTH = "--log.point_times {} --log.revolution_s 0.1 --log.revolution_start
         (sweeps(), "point times", "ok", "field time (float32) taken as s after the stamp", ""),
         (sweeps(span=9.5), "point times", "warning", "95 of the period", "--log.point_times none"),  # no unit fits
         (sweeps(span=0.0), "point times", "note", "field time (float32) is there and constant (0)", ""),
-        (clouds(turning(1.0, 1.0)), "point times", "note", "none", BY_AZIMUTH.format("counterclockwise")),
-        (clouds(turning(-1.0, 1.0)), "point times", "note", "none", BY_AZIMUTH.format("clockwise")),
-        (clouds(turning(1.0, 16.0)), "point times", "note", "none", ""),  # ring by ring
-        (clouds(turning(1.0, 0.3)), "point times", "note", "none", ""),
         (sweeps(fields=np.dtype(ROW.descr[:3])), "point times", "note", "none", ""),  # in no order
     ],
 )

@@ -1,25 +1,18 @@
 """Remedies that the doctor prints help: a log with the fault, the error without its flags and with them."""
 
-import itertools
 import json
 import math
 import shlex
 import struct
 
-import numpy as np
 import pytest
 
 from scanchain.__main__ import main
-from scanchain.logs import open_log
 from tests.support import made
 from tests.support.naive_logs import (
     SECOND,
     Said,
-    cloud_said,
     decoded,
-    odometry,
-    odometry_said,
-    point_cloud,
     write,
 )
 
@@ -52,20 +45,8 @@ def a_gap():
             yield said
 
 
-def no_point_times():
-    log = open_log(town())
-    truth = log.ground_truth()
-    for scan in itertools.islice(log.scans(), 80):
-        T = truth.poses[scan.index]
-        pose = odometry(scan.stamp_ns, T[0, 3], T[1, 3], math.atan2(T[1, 0], T[0, 0]), z=T[2, 3])  # a flat town
-        yield odometry_said(scan.stamp_ns, pose, "/ground_truth")
-        rows = np.rec.fromarrays(list(scan.points.T), names="x,y,z")
-        yield cloud_said(scan.stamp_ns + SECOND // 10, point_cloud(scan.stamp_ns, rows))
-
-
 FAULTS = {
     a_gap: "gaps",
-    no_point_times: "point times",
 }
 
 

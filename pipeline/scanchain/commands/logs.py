@@ -99,13 +99,20 @@ def doctor(logs: tuple[Source, ...], as_json: bool, overrides: tuple[Override, .
       scanchain doctor log.mcap --log.point_times ms
     """
     from scanchain.commands.terminal import Terminal
+    from scanchain.logs import Log
     from scanchain.logs.doctor import examine
+    from scanchain.odometry.distortion import measure_distortion
 
     def config_for(dimension: int) -> Config:
         return load_settings(dimension, overrides=overrides).config
 
+    def distortion_of(log: Log) -> tuple[str, str]:
+        found = measure_distortion(log)
+        return ("", "") if found is None else found.advice(log)
+
     with Terminal("scans") as terminal:
-        found = examine(logs, config_for, load_settings(overrides=overrides).config.log, terminal.count)
+        log_config = load_settings(overrides=overrides).config.log
+        found = examine(logs, config_for, log_config, terminal.count, distortion_of)
     click.echo(options.json_text(found) if as_json else _doctor_text(found))
 
 

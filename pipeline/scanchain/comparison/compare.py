@@ -22,6 +22,7 @@ from scanchain.errors import InputError, counted
 from scanchain.evaluation import absolute_error_of_any_path, pair, read_relations, read_truth, relation_error
 from scanchain.files import Source
 from scanchain.logs import Log, open_log
+from scanchain.odometry.distortion import choose_point_times
 from scanchain.processes import Limits, available_mib
 from scanchain.runs.directory import RUN_FILE, RunDirectory
 from scanchain.runs.job import Progress
@@ -87,6 +88,7 @@ def compare(comparison: Comparison, present: Callable[[Path], None], progress: P
     began = perf_counter()
     overrides = (*shared_settings(comparison.config_file), *comparison.overrides)
     log = open_log(comparison.logs, load_settings(overrides=overrides).config.log)
+    choose_point_times(log)
     settings = load_settings(log.dimension, overrides=overrides)
     methods = resolve(
         comparison.methods or default_names(log.dimension),

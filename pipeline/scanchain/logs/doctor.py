@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from scanchain.config import Config, LogConfig, PreprocessConfig
-from scanchain.data import MOST_COPIES, RawPoints, Scan
+from scanchain.data import MOST_COPIES, Scan
 from scanchain.errors import counted
 from scanchain.files import Source
 from scanchain.logs.bad_scans import most_bad_scans
@@ -27,16 +27,12 @@ from scanchain.logs.messages.readers import is_scan
 _GAP_PERIODS = 2.5
 _LONG_GAP_S, _LONG_GAP_ON_WHEELS_S = 0.5, 10.0
 _PART_OF_SCAN, _MORE_THAN_SCAN = 0.3, 1.2  # shares of the period outside which a unit of time is implausible
-_SPINS_AT_S = (0.04, 0.25)
-_SURE = 0.9  # least share of the scans that turn alike, and least agreement of their starts
 _FASTEST_M_S = 100.0  # speed by the wheels above which their unit is another
 _LEAST_STEP_M = 1e-3  # length of a step between two readings from which on the wheels turn
 _MANY_UNUSED = 0.3  # share of unused returns, from which on a wider range is recommended
 _STUCK_SHARE = 0.01  # share of beams at one farthest range that is reported
 _FEW_POINTS = 50
 _SAME_M = 1e-4  # largest difference of ranges that are one number: rounding of float32
-_NEXT_RAD = 0.2  # largest angle from one point to the next, usually, where their order is that of firing
-_ONE_TURN_RAD = (1.5 * np.pi, 2.5 * np.pi)  # one revolution; clouds stored ring by ring turn many times
 
 
 class Severity(StrEnum):
@@ -81,10 +77,12 @@ def examine(
     config_of: Callable[[int], Config],
     log_config: LogConfig,
     progress: Callable[[int, int], None],
+    distortion: Callable[[Log], tuple[str, str]] = lambda log: ("", ""),
 ) -> Diagnosis:
     """Diagnosis from every scan of a log. Raises InputError where a run could not open it either.
 
     config_of : what a run would use for a log of this dimension
+    distortion : that of its scans by the lidar's motion, in words, and the flags that remove it
     """
     log = open_log(sources, replace(log_config, max_bad_scans_percent=100.0))
     notes = tuple(log.notes)
@@ -94,6 +92,7 @@ def examine(
         progress(len(seen.log_times_ns), log.scan_count)
     config = config_of(log.dimension)
     found = list(_check(seen, config, most_bad_scans(seen.messages, log_config)))
+    found += _distortion(*distortion(log))
     ordered = tuple(finding for grade in reversed(Severity) for finding in found if finding.severity is grade)
     return Diagnosis(tuple(map(str, log.paths)), log.topic, log.dimension, ordered, notes)
 
@@ -107,8 +106,6 @@ class Facts(NamedTuple):
     at_farthest: int  # number of returns with just that range
     ranges_m: NDArray[np.float32]  # (101,) percentiles
     time_span_s: float  # of the per-point times, NaN where there are none
-    turn: int  # 1 if the points, in their order, go around once counter-clockwise, −1 if clockwise, else 0
-    start_rad: float  # azimuth of the first point
     is_copy: bool  # the points are those of the scan before, to the last bit
 
 
@@ -129,7 +126,6 @@ class Survey:
         if scan.T_odom_base is not None:
             self.wheels.append((scan.stamp_ns, scan.T_odom_base[:-1, -1]))
         ranges_m = np.sort(np.linalg.norm(scan.points, axis=1))
-        turn, start_rad = _turning(scan.points)
         self.scans.append(
             Facts(
                 kept=len(ranges_m),
@@ -138,8 +134,6 @@ class Survey:
                 at_farthest=int(np.count_nonzero(ranges_m > ranges_m[-1] - _SAME_M)),
                 ranges_m=ranges_m[np.linspace(0, len(ranges_m) - 1, 101).astype(int)],
                 time_span_s=float(np.ptp(scan.times_s)) if len(scan.times_s) else math.nan,
-                turn=turn,
-                start_rad=start_rad,
                 is_copy=scan.is_copy,
             )
         )
@@ -161,17 +155,6 @@ class Survey:
     def into_log_s(self, place: int) -> float:
         """Seconds from the log's first message to a scan, as ``--start`` and ``--end`` count."""
         return (self.log_times_ns[place] - whole_span(self.log.indexes).begin_ns) * 1e-9
-
-
-def _turning(points: RawPoints) -> tuple[int, float]:
-    """Direction in which the points turn, 0 where they make no single turn, and their first azimuth."""
-    if len(points) < 2:
-        return 0, math.nan
-    azimuth = np.arctan2(points[:, 1], points[:, 0])
-    steps = (np.diff(azimuth) + np.pi) % (2.0 * np.pi) - np.pi
-    turned = float(steps.sum())
-    is_turn = _ONE_TURN_RAD[0] < abs(turned) < _ONE_TURN_RAD[1] and float(np.median(np.abs(steps))) < _NEXT_RAD
-    return int(np.sign(turned)) * is_turn, float(azimuth[0])
 
 
 def _check(seen: Survey, config: Config, most_bad: float) -> Iterator[Finding]:
@@ -257,14 +240,12 @@ def _wheel_speed_m_s(seen: Survey) -> float:
 def _point_times(seen: Survey) -> Finding:
     times, spans_s = seen.log.times, [scan.time_span_s for scan in seen.scans]
     untimed = int(np.count_nonzero(np.isnan(spans_s)))
-    distorted = "scans are not deskewed: the motion of the lidar distorts them unless the driver did it"
+    distorted = "scans are distorted by the lidar's motion, unless they are deskewed already or timed by azimuth"
     faults = times.faults(seen.log.topic)
     if untimed == len(spans_s) and not times.spans_s:
         grade = Severity.WARNING if faults else Severity.NOTE
         constant = times.assumed.removeprefix("no point times: ").rpartition("; ")[0]
-        return Finding(
-            "point times", grade, "; ".join([constant or "none", *faults]), distorted, _by_azimuth(seen)
-        )
+        return Finding("point times", grade, "; ".join([constant or "none", *faults]), distorted)
     span_s = float(np.nanmedian(spans_s if untimed < len(spans_s) else times.spans_s))
     assumed = times.assumed.removeprefix("point times").lstrip(": ") or "time_increment of the beams"
     found = f"{assumed}; a scan lasts {1e3 * span_s:.4g} ms"
@@ -278,20 +259,11 @@ def _point_times(seen: Survey) -> Finding:
     return Finding("point times", Severity.WARNING, found, effect, _other_unit(times.assumed, part))
 
 
-def _by_azimuth(seen: Survey) -> str:
-    """Flags for a spinning lidar's times by azimuth, where the order of its points shows how it turns."""
-    turns = np.array([scan.turn for scan in seen.scans])
-    sense = int(np.sign(turns.sum()))
-    start = complex(np.mean(np.exp(1j * np.array([scan.start_rad for scan in seen.scans])[turns == sense])))
-    if not sense or np.mean(turns == sense) < _SURE or abs(start) < _SURE:
-        return ""
-    low_s, high_s = _SPINS_AT_S
-    revolution_s = f"{seen.period_s:.3g}" if low_s < seen.period_s < high_s else "0.1"
-    direction = "counterclockwise" if sense > 0 else "clockwise"
-    start_rad = f"{np.angle(start) % (2.0 * np.pi):.3g}"
-    return (
-        f"--log.point_times {direction} --log.revolution_s {revolution_s} --log.revolution_start_rad {start_rad}"
-    )
+def _distortion(found: str, remedy: str) -> Iterator[Finding]:
+    """Finding on the motion of the lidar during a scan, where it was measured."""
+    if found:
+        effect = "distorted scans bend map and trajectory alike, which residuals hardly show" if remedy else ""
+        yield Finding("distortion", Severity.WARNING if remedy else Severity.OK, found, effect, remedy)
 
 
 def _other_unit(assumed: str, part: float) -> str:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing, suppress
+from copy import copy
 from functools import partial
-from itertools import chain, tee
+from itertools import chain, islice, tee
 
 import numpy as np
 from msgspec.structs import replace
@@ -79,6 +81,7 @@ class Log:
     notes : what was chosen or assumed
     bad_scans : how many scans were left out, once ``scans`` is through or closed
     times : what was found out about the times of their points; jumps : a line on jumps of the header stamps
+    distortion : that of scans without times, in words, where it is not removed
     """
 
     def __init__(self, indexes: Sequence[FileIndex], config: LogConfig) -> None:
@@ -127,7 +130,7 @@ class Log:
         self._damage: list[str] = [line for index in indexes for line in index.damage]
         with_poses = [*([(wheels.channel, wheels.link)] if wheels else []), *([(truth, None)] if truth else [])]
         self.pose_decoders = {each.topic: pose_reader(each, self.dimension, link) for each, link in with_poses}
-        self.scans_with_wheels, self.bad_scans, self.jumps = 0, 0, list[str]()
+        self.scans_with_wheels, self.bad_scans, self.jumps, self.distortion = 0, 0, list[str](), ""
         self._opening_notes = tuple(self.notes)
         self._truth: Trajectory | None = None
 
@@ -201,6 +204,26 @@ class Log:
             raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")
         if is_damaged:
             self._damage.append(counts.recovered(0 if self.sectors else self.scan_count))
+
+    def windows(self, places: Sequence[float], scans: int) -> Iterator[list[Scan]]:
+        """Windows of so many scans, from 0 for the first of the log to 1 for the last; none of a shorter log."""
+        whole = stream.whole_span(self.indexes)
+        begin_ns, end_ns = max(self.span.begin_ns, whole.begin_ns), min(self.span.end_ns, whole.end_ns)
+        last_ns = (end_ns - begin_ns) * max(1.0 - scans / max(self.scan_count - 1, 1), 0.0)
+        for place in places:
+            window = copy(self)  # what it counts and notes is its own
+            window.publishers = copy(self.publishers)
+            window.publishers.known = dict(self.publishers.known)
+            window.span = stream.Span(begin_ns + round(place * last_ns), end_ns)
+            with suppress(InputError), closing(window.scans()) as following:
+                found = list(islice(following, scans))
+                if len(found) == scans:
+                    yield found
+
+    def time_points(self, config: LogConfig, note: str) -> None:
+        """Read scans with the point times of another configuration, which the note explains."""
+        self.config = config
+        self._opening_notes += (note,)
 
     def assumed_point_times(self) -> str:
         """Assumption of a run about per-point times, by the first scan that has returns; empty for laser scans."""

@@ -23,6 +23,7 @@ from scanchain.files import write_whole
 from scanchain.logs import Log, open_log
 from scanchain.logs.mounting import turned_by
 from scanchain.logs.topics import other_sensors
+from scanchain.odometry.distortion import choose_point_times
 from scanchain.preprocess import prepare_ahead
 from scanchain.runs.closures import final_verdicts
 from scanchain.runs.directory import POINTS_FILE, RECORDING_FILE, RUN_FILE, TRUTH_FILE, RunDirectory, stopped_run
@@ -184,7 +185,7 @@ class _Run:
             if expected is not None:
                 write_wide_tum(folder / "keyframes.tum", result.keyframe_trajectory, expected.covariances)
             evidence = evidence_of_run(folder, expected and expected.ate)
-            judged = judge(evidence, result.T_base_lidar)
+            judged = judge(evidence, result.T_base_lidar, self.log.distortion)
             record_results(recording, results)
             recording.log_verdict(judged, result.trajectory)
             with suppress(InputError):  # which is reported with the accuracy
@@ -201,7 +202,7 @@ class _Run:
                 "measuring systematic errors: odometry without one group of directions after the other"
             )
             try:
-                again = open_log(self.job.logs, self.config.log).scans(self.config.preprocess)
+                again = open_log(self.job.logs, self.log.config).scans(self.config.preprocess)
                 with closing(again):
                     return expected_of(result, self.config, again)
             except (InputError, OSError) as error:
@@ -277,6 +278,7 @@ def opened(job: Job) -> tuple[Log, Settings, TruthFile | None]:
     early = load_settings(file=job.config_file, overrides=job.overrides)
     RunDirectory(job.out, force=job.force)  # refused before the log is read
     log = open_log(job.logs, early.config.log)
+    choose_point_times(log)
     settings = load_settings(log.dimension, file=job.config_file, overrides=job.overrides)
     if settings.config.odometry.prior == "wheel" and not log.odometry_topic:
         raise InputError(

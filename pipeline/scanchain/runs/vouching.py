@@ -19,6 +19,7 @@ from scanchain.evaluation import ExpectedError, pair
 from scanchain.evaluation.consistency import velocities
 from scanchain.files import Source
 from scanchain.logs import Log, open_log
+from scanchain.odometry.distortion import choose_point_times
 from scanchain.preprocess import Resolution
 from scanchain.registration import MapKeeper, create_matcher
 from scanchain.runs.metrics import METRICS_FILE
@@ -193,6 +194,7 @@ def judge_trajectory(file: Path, logs: Sequence[Source], overrides: Sequence[Ove
     """
     poses = read_tum(file)
     log = open_log(logs, load_settings(overrides=overrides).config.log)
+    choose_point_times(log)
     config = load_settings(log.dimension, overrides=overrides).config
     stamps_ns, log_times_ns, points, wheels = _table(log, config)
     placeholders = np.tile(np.eye(4), (len(stamps_ns), 1, 1))
@@ -214,7 +216,7 @@ def judge_trajectory(file: Path, logs: Sequence[Source], overrides: Sequence[Ove
         overlap=check_overlap(inlier_shares),
         fit=fit,
     )
-    return judge(evidence), len(stamps_ns) - len(pairs)
+    return judge(evidence, distortion=log.distortion), len(stamps_ns) - len(pairs)
 
 
 def _table(log: Log, config: Config) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Matrix]:

@@ -64,8 +64,8 @@ class Judged:
         return f"{self.verdict}{f' ({self.vouched})' if self.vouched else ''}: {self.reason}"
 
 
-def judge(evidence: Evidence, T_base_lidar: Pose | None = None) -> Judged:
-    """The verdict on a trajectory, ``T_base_lidar`` being the mounting that the log states.
+def judge(evidence: Evidence, T_base_lidar: Pose | None = None, distortion: str = "") -> Judged:
+    """The verdict on a trajectory; the log states the mounting ``T_base_lidar``, scans have this ``distortion``.
 
     Not trustworthy is one most of which is predicted, many of whose scans are contradicted, that accelerates
     impossibly, that the wheels contradict where it is not well measured, or that loop closures and wheels
@@ -78,7 +78,7 @@ def judge(evidence: Evidence, T_base_lidar: Pose | None = None) -> Judged:
     stretches = tuple(each for each in found if each.kind is not Kind.WHEELS_SLIP)
     slips = [f"{each.kind} at {each.times} ({each.size_m:,.1f} m)" for each in found if each not in stretches]
     rest = _Rest.of(evidence)
-    notes = [*([rest.text] if rest.is_shown else []), *slips]
+    notes = [*([rest.text] if rest.is_shown else []), *slips, *filter(None, [distortion])]
     if (mounting := evidence.wheels.mounting) is not None:
         T = mounting.T_base_lidar if T_base_lidar is None else T_base_lidar @ mounting.T_base_lidar
         where = ", seen from there" if T_base_lidar is None else ""

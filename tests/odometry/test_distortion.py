@@ -1,0 +1,117 @@
+"""Distortion of scans: measured on the log itself, removed where times by azimuth clearly explain it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import scanchain
+from scanchain.__main__ import main
+from scanchain.logs import open_log
+from scanchain.logs.messages import point_times
+from scanchain.odometry.distortion import choose_point_times, measure_distortion
+from scanchain.simulation.drive import plan, record
+from tests.support import made
+from tests.support.scenes import shared_data
+
+SECONDS = 10
+
+
+@pytest.fixture
+def no_time_fields(monkeypatch):
+    """Clouds are read as if they had no field of times."""
+    monkeypatch.setattr(point_times, "_NAMES", ())
+
+
+def at_once():
+    """The town by a lidar that takes each scan at one instant."""
+    drive = plan("town", sensor="os1-32", duration_s=float(SECONDS))
+    rays = drive.sensor.rays(0)
+    rays = replace(rays, instants_ns=np.zeros_like(rays.instants_ns))
+    drive = replace(drive, sensor=replace(drive.sensor, rays=lambda index: rays))
+    return made.recorded("town-at-once", lambda path: record(drive, path, force=True))
+
+
+def chosen(path, **options):
+    log = open_log(path, **options)
+    choose_point_times(log)
+    return log, next(iter(log.scans())), log.config
+
+
+@pytest.mark.parametrize(("world", "sensor"), [("town", "os1-32"), ("forest", "vlp-16")])
+def test_clouds_without_times_are_timed_by_the_azimuth_that_explains_them(world, sensor, no_time_fields):
+    path = made.log(world, seconds=SECONDS, sensor=sensor)
+    log, scan, config = chosen(path)
+    assert (config.point_times, config.revolution_s) == ("clockwise", 0.1)
+    assert np.isclose(abs(config.revolution_start_rad), np.pi, atol=0.02)
+    assert np.isclose(np.ptp(scan.times_s), 0.1, atol=0.001) and not log.distortion
+    list(log.scans())
+    assert any("clockwise" in note and "residuals are" in note for note in log.notes)
+
+
+def test_a_run_is_as_good_by_azimuth_as_by_the_times_that_are_missing(tmp_path, no_time_fields):
+    path = made.log("town", seconds=SECONDS, sensor="vlp-16")
+    ates = [
+        scanchain.run(path, tmp_path / choice, recording=False, log__point_times=choice).accuracy.ate_rmse_m
+        for choice in ("none", "auto")
+    ]
+    assert ates[1] < 0.02 < 0.1 < ates[0]
+
+
+def test_scans_that_were_measured_at_once_stay_without_times(no_time_fields):
+    log, scan, config = chosen(at_once())
+    assert config.point_times == "auto" and not len(scan.times_s) and not log.distortion
+    list(log.scans())
+    assert any("not distorted" in note for note in log.notes)
+
+
+@pytest.mark.parametrize("name", ["kitti_0001_first54", "kitti_0005_first60"])
+def test_the_clouds_of_kitti_are_recognized_as_deskewed(name):
+    log, scan, config = chosen(shared_data(f"3d/{name}.mcap"))
+    assert config.point_times == "auto" and not len(scan.times_s) and not log.distortion
+
+
+def test_times_that_are_ignored_are_named_with_the_distortion_and_the_flag():
+    log, scan, config = chosen(made.log("town", seconds=SECONDS, sensor="os1-32"), point_times="none")
+    assert config.point_times == "none" and not len(scan.times_s)
+    assert "distorted by up to" in log.distortion and "--log.point_times auto" in log.distortion
+
+
+def test_a_log_with_times_is_not_measured_before_a_run(monkeypatch):
+    log = open_log(made.log("town", seconds=SECONDS, sensor="os1-32"))
+    monkeypatch.setattr("scanchain.odometry.distortion.Odometry", None)
+    choose_point_times(log)
+    assert log.config.point_times == "auto"
+
+
+def test_the_measured_times_of_a_log_explain_its_scans_and_reversed_ones_do_not():
+    path = shared_data("3d/pandaset_002_sweeps30to55.mcap")
+    found = measure_distortion(open_log(path, topic="/pandar64/points"))
+    assert found.is_given and found.is_shown and found.gain > 0.01 and found.loss > found.gain
+    by_azimuth = measure_distortion(open_log(path, topic="/pandar64/points", point_times="none"))
+    assert by_azimuth.is_shown and by_azimuth.config.point_times == "clockwise"
+    assert np.isclose(by_azimuth.config.revolution_start_rad, -1.54, atol=0.05)
+
+
+def test_a_lidar_that_does_not_spin_is_not_timed_by_azimuth(no_time_fields):
+    log, _, config = chosen(made.log("town", seconds=SECONDS, sensor="rosette"))
+    assert config.point_times == "auto" and "may be distorted" in log.distortion
+
+
+def test_azimuth_is_taken_where_it_is_asked_for_in_the_better_sense():
+    _, scan, config = chosen(made.log("office", seconds=SECONDS), point_times="azimuth")
+    assert config.point_times == "counterclockwise" and len(scan.times_s)
+
+
+def test_a_lidar_that_stands_is_not_called_distorted(no_time_fields):
+    log, _, config = chosen(made.log("hall", seconds=SECONDS, sensor="os1-32"), end_s=1.7)
+    assert config.point_times == "auto" and not log.distortion
+
+
+def test_the_verdict_and_the_doctor_name_distorted_scans(tmp_path, capfd):
+    path = made.log("town", seconds=SECONDS, sensor="vlp-16")
+    main(["run", str(path), "--out", str(tmp_path / "out"), "--rerun", "off", "--log.point_times", "none"])
+    assert "scans are distorted by up to" in capfd.readouterr().out
+    main(["doctor", str(path), "--log.point_times", "none"])
+    said = capfd.readouterr().out
+    assert "scans are distorted by up to" in said and "--log.point_times auto" in said
