@@ -69,8 +69,9 @@ def checked(points: AnyPoints, target: VoxelMap, T_first: Pose) -> tuple[Points,
 
 
 def settings_of(config: MatchingConfig, target: VoxelMap, *, wide: bool) -> Settings:
-    """The configuration as kernels take it."""
+    """The configuration as kernels take it; where ranges are noisier than it says, lengths of residuals grow."""
     wide = checks.truth(wide, "wide")
+    noisier = noisier_by(config, target)
     return Settings(
         optimizer=OPTIMIZERS[config.optimizer],
         max_iterations=config.max_iterations,
@@ -78,16 +79,21 @@ def settings_of(config: MatchingConfig, target: VoxelMap, *, wide: bool) -> Sett
         max_distance_m=target.scale * (config.wide_max_distance_m if wide else config.max_distance_m),
         last_reach=_reach(config.max_distance_m, target),
         last_distance_m=target.scale * config.max_distance_m,
-        first_scale_m=config.wide_kernel_scale_m if wide else config.kernel_scale_m,
-        widest_scale_m=config.wide_kernel_scale_m,
-        scale_m=config.kernel_scale_m,
-        variance=config.sensor_noise_m**2,
+        first_scale_m=noisier * (config.wide_kernel_scale_m if wide else config.kernel_scale_m),
+        widest_scale_m=noisier * config.wide_kernel_scale_m,
+        scale_m=noisier * config.kernel_scale_m,
+        variance=(noisier * config.sensor_noise_m) ** 2,
         min_information=config.min_information,
         min_signal=config.min_signal,
         insertions=target.insertions,
         tolerance_m=config.tolerance_m,
         tolerance_rad=config.tolerance_rad,
     )
+
+
+def noisier_by(config: MatchingConfig, target: VoxelMap) -> float:
+    """Standard deviation of the ranges of a map over ``matching.sensor_noise_m``, 1 or more."""
+    return max(target.noise_m / config.sensor_noise_m, 1.0)
 
 
 def _reach(max_distance_m: float, target: VoxelMap) -> int:
@@ -126,6 +132,7 @@ def _problems(
     result: Result, points: int, target: VoxelMap, observability: float, config: MatchingConfig
 ) -> Iterator[Problem]:
     """Why a result did not converge, the worst first; none if it did."""
+    kernel_scale_m = noisier_by(config, target) * config.kernel_scale_m
     if not math.isfinite(largest_magnitude(result.T)):
         yield Problem.plain("the pose is not finite")
     if result.ending == icp.NO_CORRESPONDENCES:
@@ -150,12 +157,12 @@ def _problems(
         yield Problem(
             f"the correspondences contradict the pose (fit < {LEAST_FIT:g})",
             f"the correspondences contradict the pose: fit {below(result.fit)} < {LEAST_FIT:g}, residuals along "
-            f"one direction are far above matching.kernel_scale_m ({config.kernel_scale_m:g})",
+            f"one direction are far above matching.kernel_scale_m ({kernel_scale_m:g})",
         )
-    if result.residual_m > config.kernel_scale_m:
+    if result.residual_m > kernel_scale_m:
         yield Problem(
             "residual > matching.kernel_scale_m",
-            f"residual {result.residual_m:.2g} m > matching.kernel_scale_m ({config.kernel_scale_m:g})",
+            f"residual {result.residual_m:.2g} m > matching.kernel_scale_m ({kernel_scale_m:g})",
         )
     yield from _chances(result, points, target)
 
