@@ -26,6 +26,7 @@ MEAN_TERM, SLOPE_ACROSS, SLOPE_ALONG = 11, 12, 13
 CELL = 16  # two more than are used, to fill the second cache line
 BORN, SEEN, FITTED = 0, 1, 2
 _GROWN = 1.3  # factor by which the points of a voxel grow until it is fitted again
+_FILLED = 2.5  # standard deviations of a range in a voxel whose mean is off a surface by as much as its points are
 _BROAD = 0.125  # least width, in voxels, of a plane that is fitted to a voxel's own points
 _BLOCK = 256  # points whose voxels are looked up together
 MANY = 30.0  # number of points beyond which more add no information, as their poses share errors
@@ -192,8 +193,8 @@ def _fit(voxels, voxel: int, dimension: int, alone: float, variance: float, sums
     """Mean of the voxel's own points; shape and direction from them, or from the neighbors' too.
 
     The neighbors help where the points are few or show no width: a ring that passes again and again while the
-    lidar stands still leaves many points and no surface. Where points are noisy, the mean is theirs, too: that of
-    a voxel beside a surface would lie where the noise took its points.
+    lidar stands still leaves many points and no surface. Where points are noisy, the mean moves to the plane of
+    all, as far as its variance σ²/n, and more in a voxel that noise fills, goes beyond that of the surface about it.
     """
     ix, iy, iz = unpack(voxels.keys[voxel])
     m, cell, size = voxels.moments[voxel], voxels.cells[voxel], voxels.size_m
@@ -205,9 +206,16 @@ def _fit(voxels, voxel: int, dimension: int, alone: float, variance: float, sums
         _sum_neighborhood(voxels, ix, iy, iz, 1 if dimension == 3 else 0, sums)
         _fit_shape(sums, dimension, variance, cell)
         if variance > 0.0 and cell[SHAPE] == PLANE:
-            cell[0] = (ix + 0.5) * size + sums[1] / sums[0]
-            cell[1] = (iy + 0.5) * size + sums[2] / sums[0]
-            cell[2] = (iz + 0.5) * size + sums[3] / sums[0] if dimension == 3 else 0.0
+            x, y, z = (
+                sums[1] / sums[0] - m[1] / m[0],
+                sums[2] / sums[0] - m[2] / m[0],
+                sums[3] / sums[0] - m[3] / m[0],
+            )
+            along = cell[DIRECTION] * x + cell[DIRECTION + 1] * y + cell[DIRECTION + 2] * z
+            of_mean = variance / m[0] + variance * (_FILLED * _FILLED * variance / (size * size)) ** 2
+            along *= of_mean / (of_mean + max(cell[THICKNESS] - variance, 0.0))
+            for axis in range(3):
+                cell[axis] += along * cell[DIRECTION + axis]
 
 
 @njit(inline="always")

@@ -28,6 +28,9 @@ _REACH, _LARGEST_REACH = 0.4, 8  # share of the largest distance that is searche
 _LEAST_OVERLAP = 0.75  # share of the points with a correspondence: made-up places have more at right poses
 _REDUNDANCY = 10  # correspondences on surfaces for each degree of freedom, below which wrong poses fit by chance
 _SPAN_VOXELS = 4.0  # root mean square range of the points, below which voxels do not resolve their shape
+_KERNEL_SIGMAS = (
+    10.0 / 3.0
+)  # least scale of the kernel in standard deviations of a range: it keeps 0.77 of their weight
 _ENDINGS = {
     icp.OUT_OF_ITERATIONS: "out of iterations (matching.max_iterations)",
     icp.NO_CORRESPONDENCES: "no point has a correspondence in the map",
@@ -71,7 +74,7 @@ def checked(points: AnyPoints, target: VoxelMap, T_first: Pose) -> tuple[Points,
 def settings_of(config: MatchingConfig, target: VoxelMap, *, wide: bool) -> Settings:
     """The configuration as kernels take it; where ranges are noisier than it says, lengths of residuals grow."""
     wide = checks.truth(wide, "wide")
-    noisier = noisier_by(config, target)
+    kernel_scale_m = kernel_scale_of(config, target)
     return Settings(
         optimizer=OPTIMIZERS[config.optimizer],
         max_iterations=config.max_iterations,
@@ -79,10 +82,10 @@ def settings_of(config: MatchingConfig, target: VoxelMap, *, wide: bool) -> Sett
         max_distance_m=target.scale * (config.wide_max_distance_m if wide else config.max_distance_m),
         last_reach=_reach(config.max_distance_m, target),
         last_distance_m=target.scale * config.max_distance_m,
-        first_scale_m=noisier * (config.wide_kernel_scale_m if wide else config.kernel_scale_m),
-        widest_scale_m=noisier * config.wide_kernel_scale_m,
-        scale_m=noisier * config.kernel_scale_m,
-        variance=(noisier * config.sensor_noise_m) ** 2,
+        first_scale_m=config.wide_kernel_scale_m if wide else kernel_scale_m,
+        widest_scale_m=max(config.wide_kernel_scale_m, kernel_scale_m),
+        scale_m=kernel_scale_m,
+        variance=max(config.sensor_noise_m, target.noise_m) ** 2,
         min_information=config.min_information,
         min_signal=config.min_signal,
         insertions=target.insertions,
@@ -91,9 +94,9 @@ def settings_of(config: MatchingConfig, target: VoxelMap, *, wide: bool) -> Sett
     )
 
 
-def noisier_by(config: MatchingConfig, target: VoxelMap) -> float:
-    """Standard deviation of the ranges of a map over ``matching.sensor_noise_m``, 1 or more."""
-    return max(target.noise_m / config.sensor_noise_m, 1.0)
+def kernel_scale_of(config: MatchingConfig, target: VoxelMap) -> float:
+    """Scale of the kernel on residuals, meters: the one configured, or that of noisier ranges."""
+    return max(config.kernel_scale_m, _KERNEL_SIGMAS * target.noise_m)
 
 
 def _reach(max_distance_m: float, target: VoxelMap) -> int:
@@ -132,7 +135,7 @@ def _problems(
     result: Result, points: int, target: VoxelMap, observability: float, config: MatchingConfig
 ) -> Iterator[Problem]:
     """Why a result did not converge, the worst first; none if it did."""
-    kernel_scale_m = noisier_by(config, target) * config.kernel_scale_m
+    kernel_scale_m = kernel_scale_of(config, target)
     if not math.isfinite(largest_magnitude(result.T)):
         yield Problem.plain("the pose is not finite")
     if result.ending == icp.NO_CORRESPONDENCES:

@@ -14,8 +14,13 @@ from scanchain.kernels.voxels import CELL, Voxels, insert, keep
 
 _SLOTS_PER_VOXEL = 4  # keeps the hash table at most a quarter full
 _MIN_POINTS_ALONE = {2: np.inf, 3: 10.0}  # from which on a voxel is fitted without its neighbors
-_NOISE_VOXELS = {2: 2.5, 3: 3.0}  # least size of a voxel in standard deviations of a range: three show a surface then
-_ALONE = 120.0  # variances of a plane across it, over those of a voxel that shows it: 12 of the extent, and 10 of it
+_NOISE_VOXELS = {
+    2: 2.5,
+    3: 3.0,
+}  # least size of a voxel in standard deviations of a range: three show a surface then
+_ALONE = (
+    120.0  # variances of a plane across it, over those of a voxel that shows it: 12 of the extent, and 10 of it
+)
 _LEAST, _LEAST_COMPACT = 1 << 12, 1 << 8  # least number of voxels that there is room for
 _SWEEP_EVERY = 20  # insertions between two rounds of forgetting
 _RECENT = 20  # number of last scans from which a map with other voxels is built
@@ -30,9 +35,7 @@ class VoxelMap:
     ``voxels`` holds the arrays for the kernels; nobody else writes into them.
     """
 
-    def __init__(
-        self, dimension: int, config: LocalMapConfig, scale: float = 1.0, noise_m: float = 0.0
-    ) -> None:
+    def __init__(self, dimension: int, config: LocalMapConfig, scale: float = 1.0, noise_m: float = 0.0) -> None:
         """Make an empty map with voxels of ``scale`` times ``local_map.voxel_size_m``, or larger ones.
 
         noise_m : standard deviation of the ranges where it counts, else 0; voxels that it fills have no shape
@@ -44,7 +47,9 @@ class VoxelMap:
         self.scale = max(checks.positive(scale, "scale"), _NOISE_VOXELS[dimension] * noise_m / config.voxel_size_m)
         self.insertions = 0
         self.voxels = _empty(_LEAST, self.scale * config.voxel_size_m)
-        noisy = 2.0 * (_ALONE * (noise_m / self.voxels.size_m) ** 2) ** 2  # points that show a plane in spite of it
+        noisy = (
+            2.0 * (_ALONE * (noise_m / self.voxels.size_m) ** 2) ** 2
+        )  # points that show a plane in spite of it
         self.alone = max(_MIN_POINTS_ALONE[dimension], noisy)
 
     def __len__(self) -> int:
