@@ -150,7 +150,7 @@ class Resolution:
         self.is_dense = False
         self.match_voxel_m = config.match_voxel_m
         self.tries = _MAX_TRIES
-        self.noise = RangeNoise.none()
+        self.noise = RangeNoise()
         self.is_fixed = config.min_scale == 1.0 and config.match_voxel_m <= config.map_voxel_m
 
     def downsampled(self, scan: Scan) -> tuple[Sweep, Sweep]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -19,6 +19,10 @@ _MEDIAN_WITHIN, _FIFTH = 0.8216, 0.4122  # χ² of 4 degrees of freedom over 4: 
 _WITHIN, _SHARE_WITHIN = 3.0, 0.9826  # variances of a plane's residuals: most that counts as noise, share of those
 _PLANAR = 0.5  # least share of the patches at a range that are planar, of a range whose noise is known
 _FEWEST = 60  # patches at a range
+_CLUTTER, _CLUTTER_M = 0.05, 0.1  # share of the range and meters, above both of which a mode is that of clutter
+_LEAST_M = 1e-4  # smallest standard deviation that is averaged: ranges may be rounded to one number
+_VARIES = 2.0  # ratio of the standard deviations at two ranges from which on each is named
+_KNOWN = 0.3  # least share of the patches at ranges whose noise is known
 _NEAREST_M = 0.05
 _SECTORS, _SECTOR_POINTS = 16, 8000  # of large clouds only parts of 16 sectors are searched for neighbors
 
@@ -34,14 +38,9 @@ class RangeNoise:
     ranges_m, variances_m2 : (P,) median range and variance of every patch so far, of this many scans
     """
 
-    ranges_m: NDArray[np.float64]
-    variances_m2: NDArray[np.float64]
-    scans: int
-
-    @classmethod
-    def none(cls) -> RangeNoise:
-        """That of no scan."""
-        return cls(np.empty(0), np.empty(0), 0)
+    ranges_m: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    variances_m2: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    scans: int = 0
 
     def measured(self, points: RawPoints) -> RangeNoise:
         """With another scan (N, d), as long as it is one of the first."""
@@ -52,29 +51,39 @@ class RangeNoise:
         return RangeNoise(ranges_m, np.concatenate([self.variances_m2, variances_m2]), self.scans + 1)
 
     @cached_property
-    def by_range(self) -> tuple[tuple[float, float], ...]:
-        """Ranges, a factor of √2 apart, and the standard deviation there, of those where it is known; meters."""
-        octave = self._half_octaves
+    def by_range(self) -> tuple[tuple[float, float, int], ...]:
+        """Ranges, a factor of √2 apart, the standard deviation there, and the patches, where it is known; meters."""
+        half_octaves = np.floor(2.0 * np.log2(self.ranges_m))
         found = []
-        for each in np.unique(octave):
-            chosen = self.variances_m2[octave == each]
-            sigma_m, planar = _mode(chosen) if len(chosen) >= _FEWEST else (0.0, 0.0)
-            if planar >= _PLANAR:
-                found.append((2.0 ** (0.5 * (each + 0.5)), sigma_m))
+        for each in np.unique(half_octaves):
+            chosen, range_m = self.variances_m2[half_octaves == each], 2.0 ** (0.5 * (each + 0.5))
+            sigma_m, planar = _mode(chosen)
+            is_clutter = planar < _PLANAR or sigma_m > max(_CLUTTER * range_m, _CLUTTER_M)
+            if len(chosen) >= _FEWEST and not is_clutter:
+                found.append((float(range_m), sigma_m, len(chosen)))
         return tuple(found)
+
+    @property
+    def text(self) -> str:
+        """The standard deviation, by range where it is not the same at all."""
+        sigmas_m = [sigma_m for _, sigma_m, _ in self.by_range]
+        if not self.sigma_m:
+            return "unknown: too few surfaces whose beams lie next to each other"
+        if not sigmas_m or max(sigmas_m) < _VARIES * min(sigmas_m):
+            return f"{100.0 * self.sigma_m:.2g} cm of a range"
+        known = ", ".join(f"{100.0 * sigma_m:.2g} cm at {range_m:.2g} m" for range_m, sigma_m, _ in self.by_range)
+        return f"{100.0 * self.sigma_m:.2g} cm of a typical range: {known}"
 
     @cached_property
     def sigma_m(self) -> float:
-        """Standard deviation of half of the ranges or more, 0 where it is unknown."""
-        if not self.by_range:
-            return _mode(self.variances_m2)[0] if len(self.variances_m2) >= _FEWEST else 0.0
-        known_m, sigmas_m = np.array(self.by_range).T
-        places = np.searchsorted(known_m, 2.0 ** (0.5 * (self._half_octaves + 0.5)), side="right") - 1
-        return float(np.median(sigmas_m[np.maximum(places, 0)]))
-
-    @property
-    def _half_octaves(self) -> NDArray[np.float64]:
-        return np.floor(2.0 * np.log2(self.ranges_m))
+        """Standard deviation of a typical range, the geometric mean of all that are known; 0 where few are."""
+        if len(self.ranges_m) < _FEWEST:
+            return 0.0
+        _, sigmas_m, counts = np.array(self.by_range).reshape(-1, 3).T
+        if counts.sum() >= _KNOWN * len(self.ranges_m):
+            return float(np.exp(np.average(np.log(np.maximum(sigmas_m, _LEAST_M)), weights=counts)))
+        sigma_m, planar = _mode(self.variances_m2)
+        return sigma_m if planar >= _PLANAR else 0.0
 
 
 def _patches(points: RawPoints) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -194,7 +194,7 @@ def _fit(voxels, voxel: int, dimension: int, alone: float, variance: float, sums
 
     The neighbors help where the points are few or show no width: a ring that passes again and again while the
     lidar stands still leaves many points and no surface. Where points are noisy, the mean moves to the plane of
-    all, as far as its variance σ²/n, and more in a voxel that noise fills, goes beyond that of the surface about it.
+    all, by the share of its own variance (σ²/n, more in a voxel that noise fills) in that and the surface's roughness.
     """
     ix, iy, iz = unpack(voxels.keys[voxel])
     m, cell, size = voxels.moments[voxel], voxels.cells[voxel], voxels.size_m
@@ -251,7 +251,7 @@ def _sum_neighborhood(voxels, ix: int, iy: int, iz: int, height: int, sums):
 
 @njit(inline="always")
 def _fit_2d(m, noise: float, cell):
-    """Normal of the points where they lie along a line, by the eigenvalues of their covariance less their noise."""
+    """Normal of the points where they lie along a line, by the eigenvalues of their covariance less the noise."""
     cell[SHAPE] = POINT
     n = m[0]
     if n < 3.0:

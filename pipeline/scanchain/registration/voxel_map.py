@@ -24,6 +24,7 @@ _ALONE = (
 _LEAST, _LEAST_COMPACT = 1 << 12, 1 << 8  # least number of voxels that there is room for
 _SWEEP_EVERY = 20  # insertions between two rounds of forgetting
 _RECENT = 20  # number of last scans from which a map with other voxels is built
+_SAME_NOISE = 0.1  # share of a standard deviation up to which two are one
 _ENOUGH = 10  # number of scans inserted of a lidar that stands
 
 
@@ -120,7 +121,8 @@ class MapKeeper:
 
     def resize(self, scale: float, noise_m: float = 0.0) -> None:
         """Rebuild the map from the last scans where the scale of its voxels changes, or the noise of ranges."""
-        if (scale, noise_m) != (self.scale, self.surfaces.noise_m):
+        is_known = abs(noise_m - self.surfaces.noise_m) <= _SAME_NOISE * noise_m
+        if scale != self.scale or not is_known:
             self.scale = scale
             self._remake(noise_m)
 

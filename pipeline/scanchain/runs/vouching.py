@@ -117,6 +117,7 @@ def evidence_of(steps: pa.Table, closures: pa.Table | None, expected: ExpectedEr
         closures=_no_closures(poses) if closures is None else _verified(closures, dimension),
         odometry=poses_of(steps, "odom_", dimension),
         error="" if expected is None else f"ATE {expected.low:.3f} to {expected.high:.3f} m with 95 %",
+        open_m=_open_m(steps["residual_m"].to_numpy(), steps["inliers"].to_numpy(), dimension),
     )
 
 
@@ -152,6 +153,13 @@ def evidence_of_trajectory(
     by = min(bounds, key=bounds.__getitem__, default="")
     error = f"no jump above {smallest_jump_m(found.seconds):.2g} m, drift unchecked"
     return replace(found, error=f"ATE below {bounds[by]:.2g} m by {by}" if by else error)
+
+
+def _open_m(residuals_m: NDArray[np.float64], inliers: NDArray[np.int64], dimension: int) -> float:
+    """Twice the standard deviation of a pose by its residuals, each of which constrains one of d directions."""
+    sigmas_m = residuals_m / np.sqrt(np.maximum(inliers, 1) / dimension)
+    known_m = sigmas_m[np.isfinite(sigmas_m)]
+    return 2.0 * float(np.median(known_m)) if len(known_m) else 0.0
 
 
 def _verified(table: pa.Table, dimension: int) -> Closures:

@@ -69,6 +69,7 @@ class Evidence:
     closures : those that verification accepted
     odometry : (N, d+1, d+1) before optimization; None where nothing was optimized
     error : what is known of the error of a trajectory that is right everywhere, in words; empty for nothing
+    open_m : error of a pose that the noise of the ranges leaves open, twice its standard deviation
     """
 
     seconds: Floats
@@ -85,6 +86,7 @@ class Evidence:
     closures: Closures
     odometry: Matrix | None = None
     error: str = ""
+    open_m: float = 0.0
 
     @property
     def is_contradicted(self) -> NDArray[np.bool_]:
