@@ -52,7 +52,7 @@ class RangeNoise:
 
     @cached_property
     def by_range(self) -> tuple[tuple[float, float, int], ...]:
-        """Ranges, a factor of √2 apart, the standard deviation there, and the patches, where it is known; meters."""
+        """Ranges, a factor of √2 apart, the standard deviation there, and the patches, where known; meters."""
         half_octaves = np.floor(2.0 * np.log2(self.ranges_m))
         found = []
         for each in np.unique(half_octaves):

@@ -194,7 +194,7 @@ def _fit(voxels, voxel: int, dimension: int, alone: float, variance: float, sums
 
     The neighbors help where the points are few or show no width: a ring that passes again and again while the
     lidar stands still leaves many points and no surface. Where points are noisy, the mean moves to the plane of
-    all, by the share of its own variance (σ²/n, more in a voxel that noise fills) in that and the surface's roughness.
+    all, by the share of its own variance (σ²/n, more where noise fills the voxel) in that and the roughness.
     """
     ix, iy, iz = unpack(voxels.keys[voxel])
     m, cell, size = voxels.moments[voxel], voxels.cells[voxel], voxels.size_m
