@@ -20,7 +20,7 @@ _WITHIN, _SHARE_WITHIN = 3.0, 0.9826  # variances of a plane's residuals: most t
 _PLANAR = 0.5  # least share of the patches at a range that are planar, of a range whose noise is known
 _FEWEST = 60  # patches at a range
 _CLUTTER, _CLUTTER_M = 0.05, 0.1  # share of the range and meters, above both of which a mode is that of clutter
-_LEAST_M = 1e-4  # smallest standard deviation that is averaged: ranges may be rounded to one number
+_LEAST_M = 1e-4  # smallest standard deviation that is told: ranges may be rounded to one number
 _VARIES = 2.0  # ratio of the standard deviations at two ranges from which on each is named
 _KNOWN = 0.3  # least share of the patches at ranges whose noise is known
 _NEAREST_M = 0.05
@@ -57,9 +57,7 @@ class RangeNoise:
         found = []
         for each in np.unique(half_octaves):
             chosen, range_m = self.variances_m2[half_octaves == each], 2.0 ** (0.5 * (each + 0.5))
-            sigma_m, planar = _mode(chosen)
-            is_clutter = planar < _PLANAR or sigma_m > max(_CLUTTER * range_m, _CLUTTER_M)
-            if len(chosen) >= _FEWEST and not is_clutter:
+            if sigma_m := _sigma_m(chosen, range_m):
                 found.append((float(range_m), sigma_m, len(chosen)))
         return tuple(found)
 
@@ -77,24 +75,21 @@ class RangeNoise:
     @cached_property
     def sigma_m(self) -> float:
         """Standard deviation of a typical range, the geometric mean of all that are known; 0 where few are."""
-        if len(self.ranges_m) < _FEWEST:
-            return 0.0
         _, sigmas_m, counts = np.array(self.by_range).reshape(-1, 3).T
-        if counts.sum() >= _KNOWN * len(self.ranges_m):
-            return float(np.exp(np.average(np.log(np.maximum(sigmas_m, _LEAST_M)), weights=counts)))
-        sigma_m, planar = _mode(self.variances_m2)
-        return sigma_m if planar >= _PLANAR else 0.0
+        if counts.sum() > _KNOWN * len(self.ranges_m):
+            return float(np.exp(np.average(np.log(sigmas_m), weights=counts)))
+        return _sigma_m(self.variances_m2, float(np.median(self.ranges_m))) if self.scans else 0.0
 
 
 def _patches(points: RawPoints) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Median range and variance of ranges (P,) of patches of a scan (N, d)."""
     d = points.shape[1]
     size = d + _FREEDOM
-    points = points.astype(np.float64)
     azimuth = np.arctan2(points[:, 1], points[:, 0])
     if (share := _SECTOR_POINTS / max(len(points), 1)) < 1.0:
         chosen = (azimuth * (_SECTORS / (2.0 * math.pi))) % 1.0 < share
         points, azimuth = points[chosen], azimuth[chosen]
+    points = points.astype(np.float64)
     ranges_m = np.linalg.norm(points, axis=1)
     is_used = ranges_m > _NEAREST_M
     points, ranges_m, azimuth = points[is_used], ranges_m[is_used], azimuth[is_used]
@@ -116,12 +111,16 @@ def _patches(points: RawPoints) -> tuple[NDArray[np.float64], NDArray[np.float64
     return median_m, median_m**4 * (residual**2).sum(axis=1) / _FREEDOM
 
 
-def _mode(variances: NDArray[np.float64]) -> tuple[float, float]:
-    """Standard deviation of the lowest mode of variances (P,), and the share of these that belong to it."""
+def _sigma_m(variances: NDArray[np.float64], range_m: float) -> float:
+    """Standard deviation of the lowest mode of variances (P,) at that range; 0 where it is unknown."""
+    if len(variances) < _FEWEST:
+        return 0.0
     variance = float(np.quantile(variances, 0.2)) / _FIFTH
     for _ in range(30):
         before, within = variance, variances[variances <= _WITHIN * variance]
         variance = float(np.median(within)) / _MEDIAN_WITHIN if len(within) else variance
         if abs(variance - before) <= 1e-3 * before:
             break
-    return math.sqrt(variance), float(np.mean(variances <= _WITHIN * variance)) / _SHARE_WITHIN
+    planar, sigma_m = float(np.mean(variances <= _WITHIN * variance)) / _SHARE_WITHIN, math.sqrt(variance)
+    is_clutter = planar < _PLANAR or sigma_m > max(_CLUTTER * range_m, _CLUTTER_M)
+    return 0.0 if is_clutter else max(sigma_m, _LEAST_M)
