@@ -159,7 +159,8 @@ class MatchingConfig(Section, frozen=True, forbid_unknown_fields=True):
         ``kernel_scale_m``
     tolerance_m : translation of a step below which an alignment has converged
     tolerance_rad : rotation of a step below which an alignment has converged
-    sensor_noise_m : standard deviation of a range, which scales information and covariance
+    sensor_noise_m : least standard deviation of a range, which scales information and covariance; where the first
+        scans show a larger one, that counts, and widens voxels and kernel
     min_inlier_share : share of the points with a correspondence below which a scan is lost
     min_information : information per inlier, 0 to 1, below which a direction is degenerate
     min_signal : signal-to-noise ratio of the information below which a direction is degenerate,

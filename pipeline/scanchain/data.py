@@ -273,6 +273,7 @@ class Keyframe:
     traveled_m : length of the path up to it, by odometry
     scale : of the voxels that odometry used there, 1 for those of the configuration; finer ones of dense scans are
         not counted, so that places compare whatever lidar saw them
+    noise_m : standard deviation of its ranges where it is above ``matching.sensor_noise_m``, else 0
     """
 
     __repr__ = brief
@@ -283,6 +284,7 @@ class Keyframe:
     T_odom_lidar: Pose
     traveled_m: float
     scale: float = 1.0
+    noise_m: float = 0.0
 
     @property
     def points(self) -> Points:

@@ -19,6 +19,7 @@ from scanchain.clock import working_s
 from scanchain.config import PreprocessConfig
 from scanchain.data import Points, Scan
 from scanchain.kernels import scans as kernels
+from scanchain.range_noise import RangeNoise
 
 _LEAST_SLOTS, _MOST_SLOTS = 1 << 10, 1 << 22  # of a table for downsampling; larger ones are not kept
 _GROWTH = 4  # of a table that has no room for all voxels
@@ -138,6 +139,7 @@ class Resolution:
     scale : 1, ½, ¼ …, factor on all voxel sizes of the configuration: small in narrow places, so
         that the median range spans about _RANGE_VOXELS voxels of the local map, or more; times √½ for dense scans
     match_voxel_m : voxels of the points to match, so that about ``preprocess.match_points`` remain
+    noise : of the ranges, by the first scans
     """
 
     def __init__(self, config: PreprocessConfig, voxel_size_m: float) -> None:
@@ -148,6 +150,7 @@ class Resolution:
         self.is_dense = False
         self.match_voxel_m = config.match_voxel_m
         self.tries = _MAX_TRIES
+        self.noise = RangeNoise()
         self.is_fixed = config.min_scale == 1.0 and config.match_voxel_m <= config.map_voxel_m
 
     def downsampled(self, scan: Scan) -> tuple[Sweep, Sweep]:
@@ -197,7 +200,8 @@ class Prepared(msgspec.Struct, frozen=True):
 
 def prepare(scan: Scan, resolution: Resolution) -> Prepared:
     """A scan, downsampled at a resolution, which stays as it is."""
-    started, after = working_s(), resolution if resolution.is_fixed else copy(resolution)
+    started, after = working_s(), copy(resolution)
+    after.noise = after.noise.measured(scan.points)
     sweep, sparse = after.downsampled(scan)
     return Prepared(scan, sweep, sparse, after, working_s() - started)
 

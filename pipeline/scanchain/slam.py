@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +36,7 @@ from scanchain.odometry import FrontEnd, LiveStamps, Located, checked_start, own
 from scanchain.placement import LARGEST_SIGMAS, Placement, edge_information
 from scanchain.point_store import PointStore
 from scanchain.preprocess import Prepared
+from scanchain.range_noise import RangeNoise
 from scanchain.trail import Trail
 
 _LOST_SIGMAS = (1.0, 0.2)  # m and rad, standard deviations of the motion over one scan that was lost
@@ -57,6 +58,7 @@ class SlamResult:
     ``map_rival_log_odds`` are those of another location in it that the last keyframes match, NaN if they do not
     suffice or there is none.
     ``map_alike_share`` is the share of the searches of the map that found several similar locations.
+    ``noise`` is that of the ranges, by the first scans.
     ``components`` (K,) numbers the pieces that the keyframes belong to, which no loop joins; one as a rule.
     """
 
@@ -78,6 +80,7 @@ class SlamResult:
     map_log_odds: float = math.nan
     map_rival_log_odds: float = math.nan
     map_alike_share: float = 0.0
+    noise: RangeNoise = field(default_factory=RangeNoise)
 
     @property
     def keyframe_trajectory(self) -> Trajectory:
@@ -260,6 +263,7 @@ class Slam:
             map_log_odds=self.placement.evidence.best if first else math.nan,
             map_rival_log_odds=rival.log_odds if rival.is_accepted else math.nan,
             map_alike_share=self.closer.alike_share,
+            noise=tracking.resolution.noise,
         )
 
     def _check_unfinished(self) -> None:

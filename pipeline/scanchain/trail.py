@@ -67,6 +67,7 @@ class Trail:
                     T_odom_lidar=tracked.T_odom_lidar,
                     traveled_m=self.traveled_m,
                     scale=located.scale,
+                    noise_m=located.noise_m,
                 )
             )
             self.map_errors.append(located.errors)

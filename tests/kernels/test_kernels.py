@@ -26,9 +26,9 @@ def some_points(dimension, n=400, seed=0):
     return np.ascontiguousarray(np.concatenate([wall, pole, clutter])[:, :dimension])
 
 
-def map_of(points, size=0.5, alone=8):
+def map_of(points, size=0.5, alone=8, noise=0.0):
     voxel_map = VoxelMap(points.shape[1], LocalMapConfig(voxel_size_m=size))
-    insert(voxel_map.voxels, points, lie.identity(points.shape[1]), 1, float(alone))
+    insert(voxel_map.voxels, points, lie.identity(points.shape[1]), 1, float(alone), noise)
     return voxel_map
 
 
@@ -98,6 +98,29 @@ def test_voxels_keep_the_mean_and_shape_of_their_points(dimension, alone):
         if direction is not None:
             assert abs(cells[voxel, DIRECTION : DIRECTION + dimension] @ direction) > 1.0 - 1e-9
     assert "plane" in seen
+
+
+@pytest.mark.parametrize("alone", [8, 10**6])
+def test_shapes_of_noisy_points_are_cleared_of_the_noise_and_means_lie_on_the_surface_about_them(dimension, alone):
+    noise = 0.15**2
+    points = some_points(dimension)
+    points += 0.15 * np.random.default_rng(1).normal(size=points.shape)
+    voxel_map = map_of(points, alone=alone, noise=noise)
+    groups, seen, off_m = naive.group(points, 0.5), set(), []
+    for voxel, key in enumerate(keys_of(voxel_map)):
+        around = [members for other, members in groups.items() if other != key and adjacent(other, key)]
+        members = naive.members_of(groups[key], around, alone, 0.5, noise)
+        kind, direction = naive.shape(members, noise)
+        cell, mean = voxel_map.voxels.cells[voxel], groups[key].mean(0)
+        if kind == "plane" and members is not groups[key]:
+            mean = naive.mean_of(groups[key], members, direction, 0.5, noise)
+            off_m.append((abs(mean[1] - 2.0), abs(groups[key].mean(0)[1] - 2.0)))
+        assert SHAPES[cell[SHAPE]] == kind
+        np.testing.assert_allclose(cell[:dimension], mean, atol=1e-9)
+        seen.add(kind)
+    assert {"plane", "point"} <= seen
+    of_plane, of_points = np.mean([pair for pair in off_m if pair[1] < 0.5], axis=0)
+    assert of_plane < 0.7 * of_points
 
 
 def test_a_voxel_map_far_from_its_origin_loses_no_precision():

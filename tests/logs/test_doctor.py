@@ -27,7 +27,9 @@ from tests.support.naive_logs import (
 from tests.support.scenes import configured, shared_data
 
 STEP_NS = SECOND // 10
-CHECKS = ["gaps", "stamps", "wheels", "point times", "damage", "returns", "no return", "ranges", "duplicates"]
+CHECKS = [
+    "gaps", "stamps", "wheels", "point times", "damage", "returns", "noise", "no return", "ranges", "duplicates",
+]  # fmt: skip
 
 
 def diagnose(*paths, **config):

@@ -21,21 +21,30 @@ def group(points, size):
     return {key: np.array(members) for key, members in groups.items()}
 
 
-def members_of(points, neighbors, alone, size):
+def members_of(points, neighbors, alone, size, noise=0.0):
     """A voxel's own points where they are many and show some width, else those of the neighbors too."""
     if len(points) >= alone and len(points) >= (3 if points.shape[1] == 2 else 5):
-        width2 = np.linalg.eigvalsh(np.cov(points.T, bias=True))[1]
+        width2 = np.linalg.eigvalsh(np.cov(points.T, bias=True))[1] - noise
         if width2 >= (size / 8) ** 2:
             return points
     return np.concatenate([points, *neighbors])
 
 
-def shape(members):
-    """Shape name and direction of points."""
+def mean_of(points, members, direction, size, noise):
+    """Mean of a voxel's own points, moved to the plane of all members as far as that is better known."""
+    own, thickness = points.mean(axis=0), np.linalg.eigvalsh(np.cov(members.T, bias=True))[0]
+    variance = noise / len(points) + noise * (2.5**2 * noise / size**2) ** 2
+    share = variance / (variance + max(thickness - noise, 0.0))
+    return own + share * direction * (direction @ (members.mean(axis=0) - own))
+
+
+def shape(members, noise=0.0):
+    """Shape name and direction of points that are so noisy, m²."""
     d = members.shape[1]
     if len(members) < (3 if d == 2 else 5):
         return "point", None
     values, vectors = np.linalg.eigh(np.cov(members.T, bias=True))
+    values -= noise
     if d == 2:
         return ("plane", vectors[:, 0]) if values[0] < 0.1 * values[1] else ("point", None)
     if values[0] < 0.1 * values[1]:

@@ -405,6 +405,12 @@ def test_wheels_that_turn_the_other_way_or_disagree_all_along_are_named(dimensio
     assert "wheels disagree with the trajectory all along" in evenly.reason
 
 
+def test_the_error_of_a_lidar_that_stands_still_is_at_least_what_its_noise_leaves_open():
+    still = np.repeat(POSES[:1], 200, axis=0)
+    assert judge(evidence(still, open_m=0.0012)).error == "error below 0.0012 m"
+    assert judge(evidence(rest(), open_m=0.0012)).error == "error below 0.015 m"
+
+
 @pytest.mark.parametrize("open_scans", [8, 40])
 def test_a_trajectory_that_does_not_move_is_at_rest_unless_scans_leave_a_direction_open(open_scans):
     judged = judge(evidence(rest(), is_degenerate=np.arange(201) % 200 < open_scans))

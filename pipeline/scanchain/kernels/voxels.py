@@ -26,6 +26,7 @@ MEAN_TERM, SLOPE_ACROSS, SLOPE_ALONG = 11, 12, 13
 CELL = 16  # two more than are used, to fill the second cache line
 BORN, SEEN, FITTED = 0, 1, 2
 _GROWN = 1.3  # factor by which the points of a voxel grow until it is fitted again
+_FILLED = 2.5  # standard deviations of a range in a voxel whose mean is off a surface by as much as its points are
 _BROAD = 0.125  # least width, in voxels, of a plane that is fitted to a voxel's own points
 _BLOCK = 256  # points whose voxels are looked up together
 MANY = 30.0  # number of points beyond which more add no information, as their poses share errors
@@ -48,10 +49,11 @@ class Voxels(NamedTuple):
 
 
 @njit(nogil=True)
-def insert(voxels, points, T, tick: int, alone: float):
+def insert(voxels, points, T, tick: int, alone: float, variance: float):
     """Add points (N, d), moved by T into the map's frame, and refit the voxels that have grown by enough.
 
     alone : points from which on a voxel is fitted without its neighbors
+    variance : σ² of the points, m², that shapes are cleared of; 0 where it is small against the voxels
     Room for N more voxels must be there.
     """
     touched = np.empty(points.shape[0], np.int32)
@@ -78,7 +80,7 @@ def insert(voxels, points, T, tick: int, alone: float):
     for k in range(touches):
         voxel = touched[k]
         if voxels.moments[voxel, 0] >= _GROWN * voxels.history[voxel, FITTED]:
-            _fit(voxels, voxel, points.shape[1], alone, sums)
+            _fit(voxels, voxel, points.shape[1], alone, variance, sums)
             voxels.history[voxel, FITTED] = np.int32(voxels.moments[voxel, 0])
 
 
@@ -187,27 +189,39 @@ def covariance_of(m):
 
 
 @njit(nogil=True)
-def _fit(voxels, voxel: int, dimension: int, alone: float, sums):
+def _fit(voxels, voxel: int, dimension: int, alone: float, variance: float, sums):
     """Mean of the voxel's own points; shape and direction from them, or from the neighbors' too.
 
     The neighbors help where the points are few or show no width: a ring that passes again and again while the
-    lidar stands still leaves many points and no surface.
+    lidar stands still leaves many points and no surface. Where points are noisy, the mean moves to the plane of
+    all, by the share of its own variance (σ²/n, more where noise fills the voxel) in that and the roughness.
     """
     ix, iy, iz = unpack(voxels.keys[voxel])
     m, cell, size = voxels.moments[voxel], voxels.cells[voxel], voxels.size_m
     cell[0] = (ix + 0.5) * size + m[1] / m[0]
     cell[1] = (iy + 0.5) * size + m[2] / m[0]
     cell[2] = (iz + 0.5) * size + m[3] / m[0] if dimension == 3 else 0.0
-    width2 = _fit_shape(m, dimension, cell) if m[0] >= alone else 0.0
+    width2 = _fit_shape(m, dimension, variance, cell) if m[0] >= alone else 0.0
     if width2 < (_BROAD * size) ** 2:
         _sum_neighborhood(voxels, ix, iy, iz, 1 if dimension == 3 else 0, sums)
-        _fit_shape(sums, dimension, cell)
+        _fit_shape(sums, dimension, variance, cell)
+        if variance > 0.0 and cell[SHAPE] == PLANE:
+            x, y, z = (
+                sums[1] / sums[0] - m[1] / m[0],
+                sums[2] / sums[0] - m[2] / m[0],
+                sums[3] / sums[0] - m[3] / m[0],
+            )
+            along = cell[DIRECTION] * x + cell[DIRECTION + 1] * y + cell[DIRECTION + 2] * z
+            of_mean = variance / m[0] + variance * (_FILLED * _FILLED * variance / (size * size)) ** 2
+            along *= of_mean / (of_mean + max(cell[THICKNESS] - variance, 0.0))
+            for axis in range(3):
+                cell[axis] += along * cell[DIRECTION + axis]
 
 
 @njit(inline="always")
-def _fit_shape(m, dimension: int, cell) -> float:
+def _fit_shape(m, dimension: int, noise: float, cell) -> float:
     """Shape and direction of the points with the moments m (10,); returns the least variance within that, m²."""
-    return _fit_2d(m, cell) if dimension == 2 else _fit_3d(m, cell)
+    return _fit_2d(m, noise, cell) if dimension == 2 else _fit_3d(m, noise, cell)
 
 
 @njit(inline="always")
@@ -236,25 +250,25 @@ def _sum_neighborhood(voxels, ix: int, iy: int, iz: int, height: int, sums):
 
 
 @njit(inline="always")
-def _fit_2d(m, cell):
-    """Normal of the points where they lie along a line, by the eigenvalues of their covariance."""
+def _fit_2d(m, noise: float, cell):
+    """Normal of the points where they lie along a line, by the eigenvalues of their covariance less the noise."""
     cell[SHAPE] = POINT
     n = m[0]
     if n < 3.0:
         return 0.0
     xx, xy, _, yy, _, _ = covariance_of(m)
     small, large, nx, ny = normal_2d(xx, xy, yy)
-    if large > 1e-12 and small < 0.1 * large:
+    if large > 1e-12 and small - noise < 0.1 * (large - noise):
         cell[SHAPE] = PLANE
         cell[DIRECTION], cell[DIRECTION + 1] = nx, ny
         cell[THICKNESS], cell[MEAN_TERM] = max(small, 0.0), 1.0 / min(n, MANY)
         cell[SLOPE_ALONG] = cell[MEAN_TERM] / large
-    return large
+    return large - noise
 
 
 @njit(inline="always")
-def _fit_3d(m, cell):
-    """Plane, line or point by the eigenvalues λ₁ ≤ λ₂ ≤ λ₃ of the covariance.
+def _fit_3d(m, noise: float, cell):
+    """Plane, line or point by the eigenvalues λ₁ ≤ λ₂ ≤ λ₃ of the covariance, less the noise in each.
 
     A plane is thin against its second extent, a line is thin against its length in both others.
     """
@@ -264,7 +278,7 @@ def _fit_3d(m, cell):
         return 0.0
     xx, xy, xz, yy, yz, zz = covariance_of(m)
     small, middle, large = eigenvalues_3d(xx, xy, xz, yy, yz, zz)
-    if small < 0.1 * middle:
+    if small - noise < 0.1 * max(middle - noise, 0.0):
         cell[SHAPE] = PLANE
         chosen = small
         wx, wy, wz = eigenvector_3d(xx, xy, xz, yy, yz, zz, middle)
@@ -272,17 +286,17 @@ def _fit_3d(m, cell):
         n = min(n, MANY)
         cell[THICKNESS], cell[MEAN_TERM] = small, 1.0 / n
         cell[SLOPE_ACROSS], cell[SLOPE_ALONG] = 1.0 / (n * middle), 1.0 / (n * large)
-    elif middle < 0.1 * large:
+    elif middle - noise < 0.1 * (large - noise):
         cell[SHAPE] = LINE
         chosen = large
         cell[THICKNESS] = middle
     else:
-        return middle
+        return middle - noise
     vx, vy, vz = eigenvector_3d(xx, xy, xz, yy, yz, zz, chosen)
     cell[DIRECTION], cell[DIRECTION + 1], cell[DIRECTION + 2] = vx, vy, vz
     if vx == 0.0 and vy == 0.0 and vz == 0.0:
         cell[SHAPE] = POINT
-    return middle
+    return middle - noise
 
 
 @njit(inline="always")

@@ -23,6 +23,7 @@ from scanchain.logs.log import Log, open_log
 from scanchain.logs.mcap.stream import whole_span
 from scanchain.logs.messages.point_times import UNITS_S
 from scanchain.logs.messages.readers import is_scan
+from scanchain.range_noise import RangeNoise
 
 _GAP_PERIODS = 2.5
 _LONG_GAP_S, _LONG_GAP_ON_WHEELS_S = 0.5, 10.0
@@ -118,11 +119,13 @@ class Survey:
         self.log_times_ns: list[int] = []
         self.stamps_ns: list[int] = []
         self.wheels: list[tuple[int, NDArray[np.float64]]] = []
+        self.noise = RangeNoise()
 
     def take(self, scan: Scan) -> None:
         """Take in the next scan."""
         self.log_times_ns.append(scan.log_time_ns)
         self.stamps_ns.append(scan.stamp_ns)
+        self.noise = self.noise.measured(scan.points)
         if scan.T_odom_base is not None:
             self.wheels.append((scan.stamp_ns, scan.T_odom_base[:-1, -1]))
         ranges_m = np.sort(np.linalg.norm(scan.points, axis=1))
@@ -165,6 +168,7 @@ def _check(seen: Survey, config: Config, most_bad: float) -> Iterator[Finding]:
     yield _point_times(seen)
     yield _damage(seen, config.preprocess, most_bad)
     yield _returns(seen)
+    yield _noise(seen.noise, config.matching.sensor_noise_m)
     yield _no_return(seen)
     yield _ranges(seen, config.preprocess)
     yield _duplicates(seen)
@@ -319,6 +323,15 @@ def _without_ends(seen: Survey, poor: NDArray[np.bool_]) -> str:
     start_s, end_s = (seen.into_log_s(place) for place in (good[0], good[-1]))
     flags = [f"--start {math.floor(1e3 * start_s) / 1e3:g}"] if poor[0] else []
     return " ".join([*flags, *([f"--end {math.ceil(1e3 * end_s) / 1e3:g}"] if poor[-1] else [])])
+
+
+def _noise(noise: RangeNoise, assumed_m: float) -> Finding:
+    """Finding on the noise of ranges, against what a run assumes at least."""
+    found = f"standard deviation {noise.text}"
+    if noise.sigma_m <= assumed_m:
+        return Finding("noise", Severity.OK, found)
+    effect = f"above matching.sensor_noise_m ({assumed_m:g}): a run takes what is measured, and larger voxels"
+    return Finding("noise", Severity.NOTE, found, effect)
 
 
 def _no_return(seen: Survey) -> Finding:

@@ -90,7 +90,7 @@ def _points_of(spans: NDArray[np.int64], store: PointStore) -> Points:
 def _map_of(T_world_keyframes: Matrix, keyframes: Sequence[Keyframe], config: Config) -> VoxelMap:
     """All keyframes in a map that forgets nothing."""
     whole = msgspec.structs.replace(config.local_map, max_distance_m=inf, max_insertions=len(keyframes) + 1)
-    result = VoxelMap(2, whole)
+    result = VoxelMap(2, whole, noise_m=max(keyframe.noise_m for keyframe in keyframes))
     for keyframe, T_world_lidar in zip(keyframes, T_world_keyframes, strict=True):
         result.insert(keyframe.points, T_world_lidar)
     return result

@@ -116,7 +116,7 @@ class VoxelSubmaps:
         return sorted(np.atleast_1d(self.of_map.query(anchor.T_odom_lidar[:-1, -1], count)[1]).tolist())
 
     def _build(self, anchor: Keyframe, members: Sequence[Keyframe]) -> VoxelMap:
-        submap = VoxelMap(self.dimension, self.config, anchor.scale)
+        submap = VoxelMap(self.dimension, self.config, anchor.scale, anchor.noise_m)
         T_anchor_odom = lie.inverse(anchor.T_odom_lidar)
         for keyframe in members:
             submap.insert(keyframe.points, T_anchor_odom @ keyframe.T_odom_lidar)
@@ -124,7 +124,7 @@ class VoxelSubmaps:
 
     def _build_at_once(self, anchor: Keyframe, members: Sequence[Keyframe]) -> VoxelMap:
         """The submap of all points together: every voxel is fitted once, and all of them are equally old."""
-        submap = VoxelMap(self.dimension, self.config, anchor.scale)
+        submap = VoxelMap(self.dimension, self.config, anchor.scale, anchor.noise_m)
         T_anchor_odom = lie.inverse(anchor.T_odom_lidar)
         points = [lie.transform(T_anchor_odom @ each.T_odom_lidar, each.points) for each in members[::_OF_MAP]]
         submap.insert(np.vstack(points), lie.identity(self.dimension))
@@ -137,7 +137,7 @@ def level_frame(keyframe: Keyframe, config: LocalMapConfig) -> Pose:
     The ground is what is planar and lies at less than 32° to the lidar's own horizon; where there is too little
     of it, the lidar is assumed upright. The x axis is as near to the lidar's as it can be.
     """
-    voxels = VoxelMap(3, config, keyframe.scale)
+    voxels = VoxelMap(3, config, keyframe.scale, keyframe.noise_m)
     voxels.insert(keyframe.points, lie.identity(3))
     cells = voxels.voxels.cells[: len(voxels)]
     normals = cells[cells[:, SHAPE] == PLANE, DIRECTION : DIRECTION + 3]

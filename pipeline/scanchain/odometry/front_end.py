@@ -23,7 +23,8 @@ class Located(msgspec.Struct, frozen=True):
     ``information`` (k, k) is that of its motion since the last keyframe, a twist in its own frame, zero unless
     ``is_keyframe``;
     ``errors`` are those of its pose against the map, of the first scan unless ``is_keyframe``;
-    ``first_points`` (M, d) are those of the first scan, which the second may have deskewed again.
+    ``first_points`` (M, d) are those of the first scan, which the second may have deskewed again;
+    ``noise_m`` is the standard deviation of the ranges where it is above the one configured, else 0.
     """
 
     tracked: Tracked
@@ -33,6 +34,7 @@ class Located(msgspec.Struct, frozen=True):
     information: Matrix
     errors: KeyframeErrors
     first_points: Points
+    noise_m: float = 0.0
 
 
 class FrontEnd:
@@ -77,6 +79,7 @@ class FrontEnd:
             information=self.information if is_keyframe else self.nothing,
             errors=self.errors,
             first_points=self.odometry.first_points,
+            noise_m=self.odometry.noise_m,
         )
 
     def _since(self, tracked: Tracked) -> Matrix:

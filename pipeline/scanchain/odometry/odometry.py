@@ -107,6 +107,12 @@ class Odometry:
         self.last_sample = b""  # of its raw points
 
     @property
+    def noise_m(self) -> float:
+        """Standard deviation of the ranges where it is above the one configured, else 0."""
+        measured_m = self.resolution.noise.sigma_m
+        return measured_m if measured_m > self.config.matching.sensor_noise_m else 0.0
+
+    @property
     def local_map(self) -> VoxelMap:
         """The map that scans are aligned to, odom frame."""
         return self.map.surfaces
@@ -159,7 +165,7 @@ class Odometry:
     def _placed(self, prepared: Prepared) -> Tracked:
         started, scan = working_s(), prepared.scan
         sweep, sparse = self.elevation.corrected(prepared.sweep), self.elevation.corrected(prepared.sparse)
-        self.map.resize(self.resolution.scale)
+        self.map.resize(self.resolution.scale, self.noise_m)
         began = working_s()
         prediction = self._predicted(scan, sparse)
         registered = self._register(scan, sweep, sparse, prediction)

@@ -15,6 +15,7 @@ from scanchain.odometry.prediction import Prediction
 from scanchain.preprocess import Sweep
 from scanchain.registration import Matcher, SearchGrid, VoxelMap, Wanted, Window, find, thinned
 from scanchain.registration.align import AMBIGUOUS
+from scanchain.registration.plicp import kernel_scale_of
 from scanchain.registration.search import evenly, upright_columns
 
 _WIDE_SCANS = 3  # number of scans searched wide at the start and after a loss, while no velocity is known
@@ -44,7 +45,7 @@ class Recovery:
         self.usual_cost = 0.0
         self.wide_scans = _WIDE_SCANS
         self.lost_scans = 0
-        self.rough_cost = _ROUGH * 0.5 * config.kernel_scale_m**2  # of a point
+        self.rough_cost = 0.0  # of a point
 
     def align(self, points: Points, sweep: Sweep, surfaces: VoxelMap, prediction: Prediction) -> _Aligned:
         """The alignment from the predicted pose or, where that one is uncertain, the best of several.
@@ -53,6 +54,7 @@ class Recovery:
         points : (N, d) those to be aligned; sweep : all of the scan
         """
         wide = self.wide_scans > 0 or prediction.is_guess
+        self.rough_cost = _ROUGH * 0.5 * kernel_scale_of(self.config, surfaces) ** 2
         best = self.matcher.align(points, surfaces, prediction.T_odom_lidar, prediction.prior, wide=wide)
         tried = [best]
         unusual_cost = max(_UNUSUAL * self.usual_cost, self.rough_cost) * best.points

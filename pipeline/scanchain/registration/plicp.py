@@ -28,6 +28,9 @@ _REACH, _LARGEST_REACH = 0.4, 8  # share of the largest distance that is searche
 _LEAST_OVERLAP = 0.75  # share of the points with a correspondence: made-up places have more at right poses
 _REDUNDANCY = 10  # correspondences on surfaces for each degree of freedom, below which wrong poses fit by chance
 _SPAN_VOXELS = 4.0  # root mean square range of the points, below which voxels do not resolve their shape
+_KERNEL_SIGMAS = (
+    10.0 / 3.0
+)  # least scale of the kernel in standard deviations of a range: it keeps 0.77 of their weight
 _ENDINGS = {
     icp.OUT_OF_ITERATIONS: "out of iterations (matching.max_iterations)",
     icp.NO_CORRESPONDENCES: "no point has a correspondence in the map",
@@ -69,8 +72,9 @@ def checked(points: AnyPoints, target: VoxelMap, T_first: Pose) -> tuple[Points,
 
 
 def settings_of(config: MatchingConfig, target: VoxelMap, *, wide: bool) -> Settings:
-    """The configuration as kernels take it."""
+    """The configuration as kernels take it; where ranges are noisier than it says, lengths of residuals grow."""
     wide = checks.truth(wide, "wide")
+    kernel_scale_m = kernel_scale_of(config, target)
     return Settings(
         optimizer=OPTIMIZERS[config.optimizer],
         max_iterations=config.max_iterations,
@@ -78,16 +82,21 @@ def settings_of(config: MatchingConfig, target: VoxelMap, *, wide: bool) -> Sett
         max_distance_m=target.scale * (config.wide_max_distance_m if wide else config.max_distance_m),
         last_reach=_reach(config.max_distance_m, target),
         last_distance_m=target.scale * config.max_distance_m,
-        first_scale_m=config.wide_kernel_scale_m if wide else config.kernel_scale_m,
-        widest_scale_m=config.wide_kernel_scale_m,
-        scale_m=config.kernel_scale_m,
-        variance=config.sensor_noise_m**2,
+        first_scale_m=config.wide_kernel_scale_m if wide else kernel_scale_m,
+        widest_scale_m=max(config.wide_kernel_scale_m, kernel_scale_m),
+        scale_m=kernel_scale_m,
+        variance=max(config.sensor_noise_m, target.noise_m) ** 2,
         min_information=config.min_information,
         min_signal=config.min_signal,
         insertions=target.insertions,
         tolerance_m=config.tolerance_m,
         tolerance_rad=config.tolerance_rad,
     )
+
+
+def kernel_scale_of(config: MatchingConfig, target: VoxelMap) -> float:
+    """Scale of the kernel on residuals, meters: the one configured, or that of noisier ranges."""
+    return max(config.kernel_scale_m, _KERNEL_SIGMAS * target.noise_m)
 
 
 def _reach(max_distance_m: float, target: VoxelMap) -> int:
@@ -126,6 +135,7 @@ def _problems(
     result: Result, points: int, target: VoxelMap, observability: float, config: MatchingConfig
 ) -> Iterator[Problem]:
     """Why a result did not converge, the worst first; none if it did."""
+    kernel_scale_m = kernel_scale_of(config, target)
     if not math.isfinite(largest_magnitude(result.T)):
         yield Problem.plain("the pose is not finite")
     if result.ending == icp.NO_CORRESPONDENCES:
@@ -150,12 +160,12 @@ def _problems(
         yield Problem(
             f"the correspondences contradict the pose (fit < {LEAST_FIT:g})",
             f"the correspondences contradict the pose: fit {below(result.fit)} < {LEAST_FIT:g}, residuals along "
-            f"one direction are far above matching.kernel_scale_m ({config.kernel_scale_m:g})",
+            f"one direction are far above matching.kernel_scale_m ({kernel_scale_m:g})",
         )
-    if result.residual_m > config.kernel_scale_m:
+    if result.residual_m > kernel_scale_m:
         yield Problem(
             "residual > matching.kernel_scale_m",
-            f"residual {result.residual_m:.2g} m > matching.kernel_scale_m ({config.kernel_scale_m:g})",
+            f"residual {result.residual_m:.2g} m > matching.kernel_scale_m ({kernel_scale_m:g})",
         )
     yield from _chances(result, points, target)
 

@@ -97,7 +97,7 @@ class SvdMatcher:
                 break
             scale_m = max(settings.scale_m, SHRINK * scale_m)
         source, weight = source[:pairs], weight[:pairs]
-        errors, s2 = source - nearest[:pairs], self.config.kernel_scale_m**2
+        errors, s2 = source - nearest[:pairs], settings.scale_m**2
         squares = np.einsum("ij,ij->i", errors, errors)
         fit = Fit(
             H=_information(source - T[:-1, -1], weight),

@@ -14,9 +14,17 @@ from scanchain.kernels.voxels import CELL, Voxels, insert, keep
 
 _SLOTS_PER_VOXEL = 4  # keeps the hash table at most a quarter full
 _MIN_POINTS_ALONE = {2: np.inf, 3: 10.0}  # from which on a voxel is fitted without its neighbors
+_NOISE_VOXELS = {
+    2: 2.5,
+    3: 3.0,
+}  # least size of a voxel in standard deviations of a range: three show a surface then
+_ALONE = (
+    120.0  # variances of a plane across it, over those of a voxel that shows it: 12 of the extent, and 10 of it
+)
 _LEAST, _LEAST_COMPACT = 1 << 12, 1 << 8  # least number of voxels that there is room for
 _SWEEP_EVERY = 20  # insertions between two rounds of forgetting
 _RECENT = 20  # number of last scans from which a map with other voxels is built
+_SAME_NOISE = 0.1  # share of a standard deviation up to which two are one
 _ENOUGH = 10  # number of scans inserted of a lidar that stands
 
 
@@ -28,14 +36,22 @@ class VoxelMap:
     ``voxels`` holds the arrays for the kernels; nobody else writes into them.
     """
 
-    def __init__(self, dimension: int, config: LocalMapConfig, scale: float = 1.0) -> None:
-        """Make an empty map with voxels of ``scale`` times ``local_map.voxel_size_m``."""
+    def __init__(self, dimension: int, config: LocalMapConfig, scale: float = 1.0, noise_m: float = 0.0) -> None:
+        """Make an empty map with voxels of ``scale`` times ``local_map.voxel_size_m``, or larger ones.
+
+        noise_m : standard deviation of the ranges where it counts, else 0; voxels that it fills have no shape
+        """
         checks.instance(config, LocalMapConfig, "config", "load_settings(dimension).config.local_map")
         self.dimension = checks.dimension(dimension)
         self.config = config
-        self.scale = checks.positive(scale, "scale")
+        self.noise_m = noise_m
+        self.scale = max(checks.positive(scale, "scale"), _NOISE_VOXELS[dimension] * noise_m / config.voxel_size_m)
         self.insertions = 0
-        self.voxels = _empty(_LEAST, scale * config.voxel_size_m)
+        self.voxels = _empty(_LEAST, self.scale * config.voxel_size_m)
+        noisy = (
+            2.0 * (_ALONE * (noise_m / self.voxels.size_m) ** 2) ** 2
+        )  # points that show a plane in spite of it
+        self.alone = max(_MIN_POINTS_ALONE[dimension], noisy)
 
     def __len__(self) -> int:
         return int(self.voxels.used[0])
@@ -54,7 +70,7 @@ class VoxelMap:
             self._rebuild(room, T_map_lidar, self.config.max_distance_m)
         elif room > len(self.voxels.cells):
             self._rebuild(2 * room, T_map_lidar, np.inf)
-        insert(self.voxels, points, T_map_lidar, self.insertions, _MIN_POINTS_ALONE[self.dimension])
+        insert(self.voxels, points, T_map_lidar, self.insertions, self.alone, self.noise_m**2)
 
     def points(self) -> Points:
         """The mean of every voxel, (V, d), map frame."""
@@ -80,7 +96,7 @@ class MapKeeper:
 
     def __init__(self, dimension: int, config: LocalMapConfig) -> None:
         self.config = config
-        self.surfaces = VoxelMap(dimension, config)
+        self.surfaces, self.scale = VoxelMap(dimension, config), 1.0
         self.recent: deque[tuple[Points, Pose]] = deque(maxlen=_RECENT)
         self.T_odom_inserted = lie.identity(dimension)
         self.standing_scans = 0
@@ -103,19 +119,21 @@ class MapKeeper:
         self.recent.append((points, T_odom_lidar))
         self.T_odom_inserted = T_odom_lidar
 
-    def resize(self, scale: float) -> None:
-        """Rebuild the map from the last scans where the scale of its voxels changes."""
-        if scale != self.surfaces.scale:
-            self._remake(scale)
+    def resize(self, scale: float, noise_m: float = 0.0) -> None:
+        """Rebuild the map from the last scans where the scale of its voxels changes, or the noise of ranges."""
+        is_known = abs(noise_m - self.surfaces.noise_m) <= _SAME_NOISE * noise_m
+        if scale != self.scale or not is_known:
+            self.scale = scale
+            self._remake(noise_m)
 
     def replace(self, scans: Iterable[tuple[Points, Pose]]) -> None:
         """Rebuild the map from these scans (N, d), each in its own lidar frame, with its pose; none empty it."""
         self.recent.clear()
         self.recent.extend(scans)
-        self._remake(self.surfaces.scale)
+        self._remake(self.surfaces.noise_m)
 
-    def _remake(self, scale: float) -> None:
-        self.surfaces = VoxelMap(self.surfaces.dimension, self.config, scale)
+    def _remake(self, noise_m: float) -> None:
+        self.surfaces = VoxelMap(self.surfaces.dimension, self.config, self.scale, noise_m)
         for points, T_odom_lidar in self.recent:
             self.surfaces.insert(points, T_odom_lidar)
 

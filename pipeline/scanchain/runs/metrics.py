@@ -79,6 +79,8 @@ class Metrics(Struct, frozen=True):
     ``calibrated_from`` on; 0 where no error was found; ``elevation_sigma_rad`` its standard deviation, null where
     none was estimated.
     ``odometry_errors`` : drift, slips and jumps of odometry that loop closures show, corrected in the graph
+    ``range_noise_m`` : standard deviation of the ranges by the first scans, null where unknown; ``range_noise`` by
+    range, in words
     ``warnings`` : data lost, skipped or wrong, a line each
     """
 
@@ -123,6 +125,8 @@ class Metrics(Struct, frozen=True):
     calibrated_from: int = 0
     odometry_errors: tuple[str, ...] = ()
     verdict_error: str = ""
+    range_noise_m: float | None = None
+    range_noise: str = ""
 
     @property
     def expected_ate(self) -> str:
@@ -244,6 +248,8 @@ def measure(
         elevation_sigma_rad=result.elevation_sigma_rad if math.isfinite(result.elevation_sigma_rad) else None,
         calibrated_from=result.calibrated_from,
         odometry_errors=tuple(result.graph.corrections(scan_numbers, "scans")),
+        range_noise_m=result.noise.sigma_m or None,
+        range_noise=result.noise.text,
     )
 
 
@@ -274,6 +280,7 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
         f"map            {counted(m.map_points, 'point')}; {m.moving_points_removed:,} more removed as moving",
         f"matching       inliers {100.0 * m.median_inlier_share:.0f} %, "
         f"residual {m.residual}, {counted(round(m.median_iterations), 'iteration')} (medians)",
+        *([f"lidar noise    {m.range_noise}"] if m.range_noise_m else []),
         *_calibration_lines(m),
         *(f"odometry       {error}" for error in m.odometry_errors),
         f"time           {m.run_s:.1f} s{m.compiling} with map and results, "

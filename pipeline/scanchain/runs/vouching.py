@@ -114,6 +114,7 @@ def evidence_of(steps: pa.Table, closures: pa.Table | None, expected: ExpectedEr
         error="" if expected is None else f"ATE {expected.bounds}",
         bound_m=np.inf if expected is None else expected.high,
         uncertain="" if expected is None else expected.where,
+        open_m=_open_m(steps["residual_m"].to_numpy(), steps["inliers"].to_numpy(), dimension),
     )
 
 
@@ -150,6 +151,13 @@ def evidence_of_trajectory(
     if not by:
         return replace(found, error=f"no jump above {smallest_jump_m(found.seconds):.2g} m, drift unchecked")
     return replace(found, error=f"ATE below {at_most(bounds[by])} m by {by}", bound_m=bounds[by])
+
+
+def _open_m(residuals_m: NDArray[np.float64], inliers: NDArray[np.int64], dimension: int) -> float:
+    """Twice the standard deviation of a pose by its residuals, each of which constrains one of d directions."""
+    sigmas_m = residuals_m / np.sqrt(np.maximum(inliers, 1) / dimension)
+    known_m = sigmas_m[np.isfinite(sigmas_m)]
+    return 2.0 * float(np.median(known_m)) if len(known_m) else 0.0
 
 
 def _verified(table: pa.Table, dimension: int) -> Closures:

@@ -84,7 +84,9 @@ def judge(evidence: Evidence, T_base_lidar: Pose | None = None, distortion: str 
         where = ", seen from there" if T_base_lidar is None else ""
         said = mounting._replace(T_base_lidar=T).text
         notes.append(f"the motions of lidar and wheels contradict the mounting that was taken{where}: {said}")
-    error = evidence.error or (f"error below {rest.extent_m:.2g} m" if rest.is_shown else "error unknown")
+    error = evidence.error or (
+        f"error below {max(rest.extent_m, evidence.open_m):.2g} m" if rest.is_shown else "error unknown"
+    )
     if reasons := list(_grave(evidence, stretches)):
         verdict = Verdict.NOT_TRUSTWORTHY
     elif reasons := list(_doubts(evidence, stretches, rest)):

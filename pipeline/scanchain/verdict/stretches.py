@@ -71,6 +71,7 @@ class Evidence:
     error : what is known of the error of a trajectory that is right everywhere, in words; empty for nothing
     bound_m : upper bound of that error; infinite where unknown
     uncertain : the part of the log whose positions are the most uncertain, in words; empty for none
+    open_m : error of a pose that the noise of the ranges leaves open, twice its standard deviation
     """
 
     seconds: Floats
@@ -89,6 +90,7 @@ class Evidence:
     error: str = ""
     bound_m: float = np.inf
     uncertain: str = ""
+    open_m: float = 0.0
 
     @property
     def is_contradicted(self) -> NDArray[np.bool_]:

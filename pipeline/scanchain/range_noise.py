@@ -1,0 +1,126 @@
+"""Noise of a lidar's ranges, measured on its first scans."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from scanchain.data import RawPoints
+
+_SCANS = 30  # that are measured: the first ones
+_PATCHES = 300  # of a scan, evenly spread
+_FREEDOM = 4  # points of a patch beyond the parameters of its plane
+_MEDIAN_WITHIN, _FIFTH = 0.8216, 0.4122  # χ² of 4 degrees of freedom over 4: median below _WITHIN, first quintile
+_WITHIN, _SHARE_WITHIN = 3.0, 0.9826  # variances of a plane's residuals: most that counts as noise, share of those
+_PLANAR = 0.5  # least share of the patches at a range that are planar, of a range whose noise is known
+_FEWEST = 60  # patches at a range
+_CLUTTER, _CLUTTER_M = 0.05, 0.1  # share of the range and meters, above both of which a mode is that of clutter
+_LEAST_M = 1e-4  # smallest standard deviation that is told: ranges may be rounded to one number
+_VARIES = 2.0  # ratio of the standard deviations at two ranges from which on each is named
+_KNOWN = 0.3  # least share of the patches at ranges whose noise is known
+_NEAREST_M = 0.05
+_SECTORS, _SECTOR_POINTS = 16, 8000  # of large clouds only parts of 16 sectors are searched for neighbors
+
+
+@dataclass(frozen=True)
+class RangeNoise:
+    """Noise of ranges by patches of neighboring beams, each against the plane through its points.
+
+    A plane n·p = c seen along unit directions u has ranges with 1/r = (n/c)·u, which is linear in u: the residuals
+    of least squares, times r², are those of ranges, whatever the incidence. Patches on edges and clutter have
+    larger ones: at each range, the noise is the lowest mode of the variances.
+
+    ranges_m, variances_m2 : (P,) median range and variance of every patch so far, of this many scans
+    """
+
+    ranges_m: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    variances_m2: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    scans: int = 0
+
+    def measured(self, points: RawPoints) -> RangeNoise:
+        """With another scan (N, d), as long as it is one of the first."""
+        if self.scans >= _SCANS:
+            return self
+        ranges_m, variances_m2 = _patches(points)
+        ranges_m = np.concatenate([self.ranges_m, ranges_m])
+        return RangeNoise(ranges_m, np.concatenate([self.variances_m2, variances_m2]), self.scans + 1)
+
+    @cached_property
+    def by_range(self) -> tuple[tuple[float, float, int], ...]:
+        """Ranges, a factor of √2 apart, the standard deviation there, and the patches, where known; meters."""
+        half_octaves = np.floor(2.0 * np.log2(self.ranges_m))
+        found = []
+        for each in np.unique(half_octaves):
+            chosen, range_m = self.variances_m2[half_octaves == each], 2.0 ** (0.5 * (each + 0.5))
+            if sigma_m := _sigma_m(chosen, range_m):
+                found.append((float(range_m), sigma_m, len(chosen)))
+        return tuple(found)
+
+    @property
+    def text(self) -> str:
+        """The standard deviation, by range where it is not the same at all."""
+        sigmas_m = [sigma_m for _, sigma_m, _ in self.by_range]
+        if not self.sigma_m:
+            return "unknown: too few surfaces whose beams lie next to each other"
+        if not sigmas_m or max(sigmas_m) < _VARIES * min(sigmas_m):
+            return f"{100.0 * self.sigma_m:.2g} cm of a range"
+        known = ", ".join(f"{100.0 * sigma_m:.2g} cm at {range_m:.2g} m" for range_m, sigma_m, _ in self.by_range)
+        return f"{100.0 * self.sigma_m:.2g} cm of a typical range: {known}"
+
+    @cached_property
+    def sigma_m(self) -> float:
+        """Standard deviation of a typical range, the geometric mean of all that are known; 0 where few are."""
+        _, sigmas_m, counts = np.array(self.by_range).reshape(-1, 3).T
+        if counts.sum() > _KNOWN * len(self.ranges_m):
+            return float(np.exp(np.average(np.log(sigmas_m), weights=counts)))
+        return _sigma_m(self.variances_m2, float(np.median(self.ranges_m))) if self.scans else 0.0
+
+
+def _patches(points: RawPoints) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Median range and variance of ranges (P,) of patches of a scan (N, d)."""
+    d = points.shape[1]
+    size = d + _FREEDOM
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    if (share := _SECTOR_POINTS / max(len(points), 1)) < 1.0:
+        chosen = (azimuth * (_SECTORS / (2.0 * math.pi))) % 1.0 < share
+        points, azimuth = points[chosen], azimuth[chosen]
+    points = points.astype(np.float64)
+    ranges_m = np.linalg.norm(points, axis=1)
+    is_used = ranges_m > _NEAREST_M
+    points, ranges_m, azimuth = points[is_used], ranges_m[is_used], azimuth[is_used]
+    if len(points) < size:
+        return np.empty(0), np.empty(0)
+    directions = points / ranges_m[:, None]
+    centers = np.linspace(0, len(points) - 1, min(len(points), _PATCHES)).astype(np.int64)
+    if d == 2:
+        order = np.argsort(azimuth, kind="stable")
+        patches = order[(centers[:, None] + np.arange(size)) % len(points)]
+    else:
+        patches = KDTree(directions).query(directions[centers], size)[1]
+    of_patch_m = ranges_m[patches]
+    median_m = np.median(of_patch_m, axis=1)
+    weight = (of_patch_m / median_m[:, None]) ** 2  # of 1/r, whose errors are then those of ranges over r²
+    q, _ = np.linalg.qr(directions[patches] * weight[..., None])
+    y = weight / of_patch_m
+    residual = y - (q @ (np.swapaxes(q, 1, 2) @ y[..., None]))[..., 0]
+    return median_m, median_m**4 * (residual**2).sum(axis=1) / _FREEDOM
+
+
+def _sigma_m(variances: NDArray[np.float64], range_m: float) -> float:
+    """Standard deviation of the lowest mode of variances (P,) at that range; 0 where it is unknown."""
+    if len(variances) < _FEWEST:
+        return 0.0
+    variance = float(np.quantile(variances, 0.2)) / _FIFTH
+    for _ in range(30):
+        before, within = variance, variances[variances <= _WITHIN * variance]
+        variance = float(np.median(within)) / _MEDIAN_WITHIN if len(within) else variance
+        if abs(variance - before) <= 1e-3 * before:
+            break
+    planar, sigma_m = float(np.mean(variances <= _WITHIN * variance)) / _SHARE_WITHIN, math.sqrt(variance)
+    is_clutter = planar < _PLANAR or sigma_m > max(_CLUTTER * range_m, _CLUTTER_M)
+    return 0.0 if is_clutter else max(sigma_m, _LEAST_M)
