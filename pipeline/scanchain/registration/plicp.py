@@ -30,7 +30,7 @@ _REDUNDANCY = 10  # correspondences on surfaces for each degree of freedom, belo
 _SPAN_VOXELS = 4.0  # root mean square range of the points, below which voxels do not resolve their shape
 _KERNEL_SIGMAS = (
     10.0 / 3.0
-)  # least scale of the kernel in standard deviations of a range: it keeps 0.77 of their weight
+)  # least scale of the kernel in standard deviations of a range: weights are 0.77 on average
 _ENDINGS = {
     icp.OUT_OF_ITERATIONS: "out of iterations (matching.max_iterations)",
     icp.NO_CORRESPONDENCES: "no point has a correspondence in the map",

@@ -14,13 +14,8 @@ from scanchain.kernels.voxels import CELL, Voxels, insert, keep
 
 _SLOTS_PER_VOXEL = 4  # keeps the hash table at most a quarter full
 _MIN_POINTS_ALONE = {2: np.inf, 3: 10.0}  # from which on a voxel is fitted without its neighbors
-_NOISE_VOXELS = {
-    2: 2.5,
-    3: 3.0,
-}  # least size of a voxel in standard deviations of a range: three show a surface then
-_ALONE = (
-    120.0  # variances of a plane across it, over those of a voxel that shows it: 12 of the extent, and 10 of it
-)
+_NOISE_VOXELS = {2: 2.5, 3: 3.0}  # least size of a voxel in standard deviations of a range, to show a surface
+_ALONE = 120.0  # variances of a plane across it, over those of a voxel that shows it: 12 of the extent, 10 times
 _LEAST, _LEAST_COMPACT = 1 << 12, 1 << 8  # least number of voxels that there is room for
 _SWEEP_EVERY = 20  # insertions between two rounds of forgetting
 _RECENT = 20  # number of last scans from which a map with other voxels is built
@@ -48,10 +43,8 @@ class VoxelMap:
         self.scale = max(checks.positive(scale, "scale"), _NOISE_VOXELS[dimension] * noise_m / config.voxel_size_m)
         self.insertions = 0
         self.voxels = _empty(_LEAST, self.scale * config.voxel_size_m)
-        noisy = (
-            2.0 * (_ALONE * (noise_m / self.voxels.size_m) ** 2) ** 2
-        )  # points that show a plane in spite of it
-        self.alone = max(_MIN_POINTS_ALONE[dimension], noisy)
+        noisy = 2.0 * (_ALONE * (noise_m / self.voxels.size_m) ** 2) ** 2
+        self.alone = max(_MIN_POINTS_ALONE[dimension], noisy)  # points that show a plane in spite of the noise
 
     def __len__(self) -> int:
         return int(self.voxels.used[0])

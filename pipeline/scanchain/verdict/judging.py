@@ -78,7 +78,7 @@ def judge(evidence: Evidence, T_base_lidar: Pose | None = None, distortion: str 
     stretches = tuple(each for each in found if each.kind is not Kind.WHEELS_SLIP)
     slips = [f"{each.kind} at {each.times} ({each.size_m:,.1f} m)" for each in found if each not in stretches]
     rest = _Rest.of(evidence)
-    notes = [*([rest.text] if rest.is_shown else []), *slips, *filter(None, [distortion])]
+    notes = [*([rest.text] if rest.is_shown else []), *slips]
     if (mounting := evidence.wheels.mounting) is not None:
         T = mounting.T_base_lidar if T_base_lidar is None else T_base_lidar @ mounting.T_base_lidar
         where = ", seen from there" if T_base_lidar is None else ""
@@ -89,7 +89,7 @@ def judge(evidence: Evidence, T_base_lidar: Pose | None = None, distortion: str 
     )
     if reasons := list(_grave(evidence, stretches)):
         verdict = Verdict.NOT_TRUSTWORTHY
-    elif reasons := list(_doubts(evidence, stretches, rest)):
+    elif reasons := [*_doubts(evidence, stretches, rest), *filter(None, [distortion])]:
         verdict = Verdict.CHECK
     else:
         verdict, reasons = Verdict.TRUSTWORTHY, list(_nothing(evidence))
