@@ -62,7 +62,7 @@ def test_scans_that_were_measured_at_once_stay_without_times(no_time_fields):
     log, scan, config = chosen(at_once())
     assert config.point_times == "auto" and not len(scan.times_s) and not log.distortion
     list(log.scans())
-    assert any("not distorted" in note for note in log.notes)
+    assert any("show no distortion" in note for note in log.notes)
 
 
 @pytest.mark.parametrize("name", ["kitti_0001_first54", "kitti_0005_first60"])

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import Config, LogConfig
-from scanchain.data import Scan
+from scanchain.data import Pose, Scan
 from scanchain.logs import Log
 from scanchain.logs.messages.point_times import from_azimuth
 from scanchain.odometry.odometry import Odometry
@@ -39,7 +39,7 @@ class Distortion:
     config : with the times that are tried: the log's own if ``is_given``, else by azimuth in the better sense
     gain, loss : relative changes of residuals from no times: decrease by these, increase by the opposite ones
     sigmas : gain over its standard error
-    is_around : whether the scans look around, so that a spinning lidar may have taken them
+    is_spinning : whether the scans look around and begin at one azimuth, as those of a spinning lidar
     """
 
     size_m: float
@@ -49,7 +49,7 @@ class Distortion:
     gain: float
     loss: float
     sigmas: float
-    is_around: bool
+    is_spinning: bool
 
     @property
     def is_shown(self) -> bool:
@@ -78,10 +78,10 @@ class Distortion:
             if self.is_refuted:
                 return f"scans fit better without point times: {self.changes}", "--log.point_times none"
             return f"scans are {size}, which point times remove: {self.changes}", ""
-        if self.is_refuted and self.is_around:
-            return f"{lack}, but scans are not distorted as by a spinning lidar: {self.changes}", ""
+        if self.is_refuted and self.is_spinning:
+            return f"{lack}, and scans show no distortion: {self.changes}", ""
         if self.is_refuted:
-            return f"{lack}: scans may be {size}, but not as by a spinning lidar: {self.changes}", ""
+            return f"{lack}: scans may be {size}, but not by a lidar that spins so: {self.changes}", ""
         choice = "auto" if self.is_shown and log.dimension == 3 else "azimuth"
         said = "are" if self.is_shown else "may be"
         return f"{lack}: scans {said} {size}: {self.changes}", f"--log.point_times {choice}"
@@ -109,30 +109,38 @@ def measure_distortion(log: Log, *, of_given: bool = True) -> Distortion | None:
     config, rng = load_settings(log.dimension).config, np.random.default_rng(0)
     preprocess = msgspec.structs.replace(config.preprocess, match_points=_MATCHED, calibrate_elevation=False)
     config = msgspec.structs.replace(config, preprocess=preprocess)
-    sizes, found, timing = list[tuple[float, str]](), list[NDArray[np.float64]](), log.config
+    sizes, found, timing, begin = list[tuple[float, str]](), list[NDArray[np.float64]](), log.config, 0.0
+    mounting = log.stated_mounting
     for window in log.windows(_AT, _SCANS):
         is_given = len(window[0].times_s) > 0
         if is_given and not of_given:
             return None
-        timing = log.config if is_given else timing if sizes else _by_azimuth(window, log.config)
+        if not sizes:
+            timing, begin = (log.config, 0.0) if is_given else _by_azimuth(window, log.config)
         scans = [_prepared(scan, timing, rng) for scan in window]
-        without, size = _residuals(scans, 0.0, config)
+        without, size = _residuals(scans, 0.0, config, mounting)
         sizes.append(size)
         if size[0] > _LEAST_M:
-            residuals = np.array([without, *(_residuals(scans, sense, config)[0] for sense in (1.0, -1.0))])
+            with_times = (_residuals(scans, sense, config, mounting)[0] for sense in (1.0, -1.0))
+            residuals = np.array([without, *with_times])
             found += [np.log(residuals)] if residuals.all() else []
-        distortion = _compared(found, max(sizes), timing, window[0])
+        is_spinning = begin > _SURE and _seen(window[0]) > _AROUND
+        distortion = _compared(found, max(sizes), timing, is_given=is_given, is_spinning=is_spinning)
         if len(found) == _MOST or (len(found) >= _ENOUGH and abs(distortion.sigmas) > _CLEAR):
             break
     return distortion if sizes else None
 
 
 def _compared(
-    found: Sequence[NDArray[np.float64]], size: tuple[float, str], timing: LogConfig, scan: Scan
+    found: Sequence[NDArray[np.float64]],
+    size: tuple[float, str],
+    timing: LogConfig,
+    *,
+    is_given: bool,
+    is_spinning: bool,
 ) -> Distortion:
     """The distortion by logarithms of residuals (3, N) of windows: with no times, with times and opposite ones."""
     without, ahead, back = np.concatenate(found, axis=1) if found else np.zeros((3, 2))
-    is_given = len(scan.times_s) > 0
     if is_given or ahead.mean() <= back.mean():
         sense, better, worse = "clockwise", ahead, back
     else:
@@ -145,7 +153,7 @@ def _compared(
         gain=float(gains.mean()),
         loss=float((worse - without).mean()),
         sigmas=_sigmas(gains),
-        is_around=_seen(scan) > _AROUND,
+        is_spinning=is_spinning,
     )
 
 
@@ -166,24 +174,28 @@ def choose_point_times(log: Log) -> None:
     note = f"{text}; {remedy} uses them" if remedy else text
     if found.is_removed(log):
         log.time_points(found.config, text)
-    elif found.is_refuted and found.is_around:
+    elif found.is_refuted and found.is_spinning:
         log.time_points(log.config, note)
     else:
         log.distortion = note
         log.time_points(log.config, note)
 
 
-def _by_azimuth(window: Sequence[Scan], config: LogConfig) -> LogConfig:
-    """Clockwise times: a turn from scan to scan, from where the data begin, else as configured."""
+def _by_azimuth(window: Sequence[Scan], config: LogConfig) -> tuple[LogConfig, float]:
+    """Clockwise times, a turn from scan to scan from where the data begin, and how far scans agree in that.
+
+    The beginning is as configured where they do not, the turn where it would be none of a lidar.
+    """
     period_s = 1e-9 * float(np.median(np.diff([scan.stamp_ns for scan in window]))) / config.every
     begins = np.array([scan.points[0, :2] @ (1.0, 1j) for scan in window])
-    begin = np.mean(begins / np.maximum(np.abs(begins), 1e-9))
-    return msgspec.structs.replace(
+    begin = complex(np.mean(begins / np.maximum(np.abs(begins), 1e-9)))
+    timing = msgspec.structs.replace(
         config,
         point_times="clockwise",
         revolution_s=period_s if _SPINS_AT_S[0] < period_s < _SPINS_AT_S[1] else config.revolution_s,
         revolution_start_rad=float(np.angle(begin)) if abs(begin) > _SURE else config.revolution_start_rad,
     )
+    return timing, abs(begin)
 
 
 def _prepared(scan: Scan, timing: LogConfig, rng: np.random.Generator) -> Scan:
@@ -192,14 +204,14 @@ def _prepared(scan: Scan, timing: LogConfig, rng: np.random.Generator) -> Scan:
     points = scan.points[chosen]
     times_s = scan.times_s[chosen] if len(scan.times_s) else from_azimuth(points, timing)
     times_s = times_s - np.float32(0.5) * (times_s.min() + times_s.max())
-    return replace(scan, points=points, times_s=times_s, T_odom_base=None, others=None)
+    return replace(scan, points=points, times_s=times_s, others=None)
 
 
 def _residuals(
-    scans: Sequence[Scan], sense: float, config: Config
+    scans: Sequence[Scan], sense: float, config: Config, T_base_lidar: Pose | None
 ) -> tuple[NDArray[np.float64], tuple[float, str]]:
     """Mean squared residuals of blocks of scans, their times multiplied; the distortion and the motion by it."""
-    odometry = Odometry(config, dimension=scans[0].points.shape[1])
+    odometry = Odometry(config, T_base_lidar, dimension=scans[0].points.shape[1])
     tracked = [odometry.place(replace(scan, times_s=np.float32(sense) * scan.times_s)) for scan in scans]
     rms_m = np.array([each.match.residual_m for each in tracked[_BEGIN:]])
     blocks = [np.sqrt(np.mean(block**2)) for block in np.array_split(rms_m, len(rms_m) // _BLOCK)]
