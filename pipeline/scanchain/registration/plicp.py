@@ -28,9 +28,7 @@ _REACH, _LARGEST_REACH = 0.4, 8  # share of the largest distance that is searche
 _LEAST_OVERLAP = 0.75  # share of the points with a correspondence: made-up places have more at right poses
 _REDUNDANCY = 10  # correspondences on surfaces for each degree of freedom, below which wrong poses fit by chance
 _SPAN_VOXELS = 4.0  # root mean square range of the points, below which voxels do not resolve their shape
-_KERNEL_SIGMAS = (
-    10.0 / 3.0
-)  # least scale of the kernel in standard deviations of a range: weights are 0.77 on average
+_KERNEL_SIGMAS = 4.0  # least scale of the kernel in standard deviations of a range
 _ENDINGS = {
     icp.OUT_OF_ITERATIONS: "out of iterations (matching.max_iterations)",
     icp.NO_CORRESPONDENCES: "no point has a correspondence in the map",
