@@ -87,9 +87,11 @@ def test_a_log_with_times_is_not_measured_before_a_run(monkeypatch):
 def test_the_measured_times_of_a_log_explain_its_scans_and_reversed_ones_do_not():
     path = shared_data("3d/pandaset_002_sweeps30to55.mcap")
     found = measure_distortion(open_log(path, topic="/pandar64/points"))
-    assert found.is_given and found.is_shown and found.gain > 0.01 and found.loss > found.gain
+    assert (
+        found is not None and found.is_given and found.is_shown and found.gain > 0.01 and found.loss > found.gain
+    )
     by_azimuth = measure_distortion(open_log(path, topic="/pandar64/points", point_times="none"))
-    assert by_azimuth.is_shown and by_azimuth.config.point_times == "clockwise"
+    assert by_azimuth is not None and by_azimuth.is_shown and by_azimuth.config.point_times == "clockwise"
     assert np.isclose(by_azimuth.config.revolution_start_rad, -1.54, atol=0.05)
 
 

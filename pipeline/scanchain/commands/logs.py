@@ -108,7 +108,10 @@ def doctor(logs: tuple[Source, ...], as_json: bool, overrides: tuple[Override, .
 
     def distortion_of(log: Log) -> tuple[str, str]:
         found = measure_distortion(log)
-        return ("", "") if found is None else found.advice(log)
+        if found is None:
+            return "", ""
+        said, remedy = found.advice(log)
+        return f"{said}: {found.changes}", remedy
 
     with Terminal("scans") as terminal:
         log_config = load_settings(overrides=overrides).config.log

@@ -93,7 +93,10 @@ def examine(
         progress(len(seen.log_times_ns), log.scan_count)
     config = config_of(log.dimension)
     found = list(_check(seen, config, most_bad_scans(seen.messages, log_config)))
-    found += _distortion(*distortion(log))
+    if (measured := distortion(log))[0]:
+        effect = "map and trajectory are bent alike, which residuals hardly show" if measured[1] else ""
+        severity = Severity.WARNING if effect else Severity.OK
+        found.append(Finding("distortion", severity, measured[0], effect, measured[1]))
     ordered = tuple(finding for grade in reversed(Severity) for finding in found if finding.severity is grade)
     return Diagnosis(tuple(map(str, log.paths)), log.topic, log.dimension, ordered, notes)
 
@@ -261,13 +264,6 @@ def _point_times(seen: Survey) -> Finding:
     found = "; ".join([f"{found}, {part:.2g} of the period", *faults])
     effect = "if that is the wrong unit, deskewing distorts every scan"
     return Finding("point times", Severity.WARNING, found, effect, _other_unit(times.assumed, part))
-
-
-def _distortion(found: str, remedy: str) -> Iterator[Finding]:
-    """Finding on the motion of the lidar during a scan, where it was measured."""
-    if found:
-        effect = "distorted scans bend map and trajectory alike, which residuals hardly show" if remedy else ""
-        yield Finding("distortion", Severity.WARNING if remedy else Severity.OK, found, effect, remedy)
 
 
 def _other_unit(assumed: str, part: float) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.config import Config, LogConfig
 from scanchain.data import Pose, Scan
+from scanchain.errors import InputError
 from scanchain.logs import Log
 from scanchain.logs.messages.point_times import from_azimuth
 from scanchain.odometry.odometry import Odometry
@@ -69,32 +71,29 @@ class Distortion:
         return self.is_given or (is_chosen and self.size_m > _LEAST_M)
 
     def advice(self, log: Log) -> tuple[str, str]:
-        """What the scans show, in words, and the flag that improves them, empty where none does."""
+        """What a run makes of it, in words, and the flag that improves that, empty where none does."""
         size = f"distorted by up to {self.size_m:.2g} m per scan ({self.motion})"
+        lack = "point times are not used" if log.config.point_times == "none" else "no point times"
         if self.size_m <= _LEAST_M:
             return f"scans are {size}, less than ranges scatter", ""
-        lack = "point times are not used" if log.config.point_times == "none" else "no point times"
+        if self.is_removed(log) and self.is_given and self.is_refuted:
+            return "scans fit better without their point times", "--log.point_times none"
         if self.is_removed(log):
-            if self.is_refuted:
-                return f"scans fit better without point times: {self.changes}", "--log.point_times none"
-            return f"scans are {size}, which point times remove: {self.changes}", ""
-        if self.is_refuted and self.is_spinning:
-            return f"{lack}, and scans show no distortion: {self.changes}", ""
+            return f"scans are {size}, which point times remove", ""
         if self.is_refuted:
-            return f"{lack}: scans may be {size}, but not by a lidar that spins so: {self.changes}", ""
+            may_be = f"scans may be {size}, but not by a lidar that spins so"
+            return f"{lack}: {'scans show no distortion' if self.is_spinning else may_be}", ""
         choice = "auto" if self.is_shown and log.dimension == 3 else "azimuth"
-        said = "are" if self.is_shown else "may be"
-        return f"{lack}: scans {said} {size}: {self.changes}", f"--log.point_times {choice}"
+        return f"{lack}: scans {'are' if self.is_shown else 'may be'} {size}", f"--log.point_times {choice}"
 
     @property
     def changes(self) -> str:
         """What the residuals show, in words."""
-        gain, loss = (
-            f"{abs(100 * each):.2g} % {'smaller' if each < 0 else 'larger'}" for each in (-self.gain, self.loss)
-        )
+        changes = (-self.gain, self.loss)
+        gain, loss = (f"{abs(100 * each):.2g} % {'smaller' if each < 0 else 'larger'}" for each in changes)
         start_rad, turn_s = self.config.revolution_start_rad, self.config.revolution_s
-        turn = f"by azimuth, {self.config.point_times} from {start_rad:.3g} rad, {turn_s:.3g} s a turn"
-        times = "their own times" if self.is_given else f"times {turn}"
+        turn = f"times by azimuth, {self.config.point_times} from {start_rad:.3g} rad, {turn_s:.3g} s a turn"
+        times = "their own times" if self.is_given else turn
         return f"with {times}, residuals are {gain} than without, and {loss} with the opposite times"
 
 
@@ -106,55 +105,46 @@ def measure_distortion(log: Log, *, of_given: bool = True) -> Distortion | None:
 
     of_given : whether times that the log has are measured too; else None for such a log
     """
-    config, rng = load_settings(log.dimension).config, np.random.default_rng(0)
+    config, rng, mounting = load_settings(log.dimension).config, np.random.default_rng(0), log.stated_mounting
     preprocess = msgspec.structs.replace(config.preprocess, match_points=_MATCHED, calibrate_elevation=False)
     config = msgspec.structs.replace(config, preprocess=preprocess)
-    sizes, found, timing, begin = list[tuple[float, str]](), list[NDArray[np.float64]](), log.config, 0.0
-    mounting = log.stated_mounting
+    found, residuals, timing, is_spinning = None, list[NDArray[np.float64]](), log.config, False
     for window in log.windows(_AT, _SCANS):
         is_given = len(window[0].times_s) > 0
         if is_given and not of_given:
             return None
-        if not sizes:
-            timing, begin = (log.config, 0.0) if is_given else _by_azimuth(window, log.config)
+        if found is None and not is_given:
+            timing, is_spinning = _by_azimuth(window, log.config)
         scans = [_prepared(scan, timing, rng) for scan in window]
-        without, size = _residuals(scans, 0.0, config, mounting)
-        sizes.append(size)
-        if size[0] > _LEAST_M:
-            with_times = (_residuals(scans, sense, config, mounting)[0] for sense in (1.0, -1.0))
-            residuals = np.array([without, *with_times])
-            found += [np.log(residuals)] if residuals.all() else []
-        is_spinning = begin > _SURE and _seen(window[0]) > _AROUND
-        distortion = _compared(found, max(sizes), timing, is_given=is_given, is_spinning=is_spinning)
-        if len(found) == _MOST or (len(found) >= _ENOUGH and abs(distortion.sigmas) > _CLEAR):
-            break
-    return distortion if sizes else None
+        with suppress(InputError):  # no point in the range that is used
+            without, size = _residuals(scans, 0.0, config, mounting)
+            if size[0] > _LEAST_M:
+                with_times = (_residuals(scans, sense, config, mounting)[0] for sense in (1.0, -1.0))
+                three = np.array([without, *with_times])
+                residuals += [np.log(three)] if three.all() else []
+            size = size if found is None else max(size, (found.size_m, found.motion))
+            found = _compared(residuals, size, timing, is_given, is_spinning)
+            if len(residuals) == _MOST or (len(residuals) >= _ENOUGH and abs(found.sigmas) > _CLEAR):
+                break
+    return found
 
 
 def _compared(
-    found: Sequence[NDArray[np.float64]],
+    residuals: Sequence[NDArray[np.float64]],
     size: tuple[float, str],
     timing: LogConfig,
-    *,
     is_given: bool,
     is_spinning: bool,
 ) -> Distortion:
     """The distortion by logarithms of residuals (3, N) of windows: with no times, with times and opposite ones."""
-    without, ahead, back = np.concatenate(found, axis=1) if found else np.zeros((3, 2))
+    without, ahead, back = np.concatenate(residuals, axis=1) if residuals else np.zeros((3, 2))
     if is_given or ahead.mean() <= back.mean():
         sense, better, worse = "clockwise", ahead, back
     else:
         sense, better, worse = "counterclockwise", back, ahead
-    gains = without - better
-    return Distortion(
-        *size,
-        config=timing if is_given else msgspec.structs.replace(timing, point_times=sense),
-        is_given=is_given,
-        gain=float(gains.mean()),
-        loss=float((worse - without).mean()),
-        sigmas=_sigmas(gains),
-        is_spinning=is_spinning,
-    )
+    config = timing if is_given else msgspec.structs.replace(timing, point_times=sense)
+    gain, loss, sigmas = (without - better).mean(), (worse - without).mean(), _sigmas(without - better)
+    return Distortion(*size, config, is_given, float(gain), float(loss), sigmas, is_spinning)
 
 
 def choose_point_times(log: Log) -> None:
@@ -168,34 +158,30 @@ def choose_point_times(log: Log) -> None:
     if not is_open or log.sectors is not None or log.is_mirrored:
         return
     found = measure_distortion(log, of_given=wanted != "auto")
-    if found is None or (found.size_m <= _LEAST_M and wanted != "azimuth"):
+    if found is None:
         return
-    text, remedy = found.advice(log)
-    note = f"{text}; {remedy} uses them" if remedy else text
-    if found.is_removed(log):
-        log.time_points(found.config, text)
-    elif found.is_refuted and found.is_spinning:
-        log.time_points(log.config, note)
-    else:
-        log.distortion = note
-        log.time_points(log.config, note)
+    said, remedy = found.advice(log)
+    is_removed, is_none = found.is_removed(log), found.is_refuted and found.is_spinning
+    if found.size_m > _LEAST_M and not is_removed and not is_none:
+        log.distortion = f"{said}; try {remedy}" if remedy else said
+    log.time_points(found.config if is_removed else log.config, f"{said}: {found.changes}")
 
 
-def _by_azimuth(window: Sequence[Scan], config: LogConfig) -> tuple[LogConfig, float]:
-    """Clockwise times, a turn from scan to scan from where the data begin, and how far scans agree in that.
+def _by_azimuth(window: Sequence[Scan], config: LogConfig) -> tuple[LogConfig, bool]:
+    """Clockwise times, a turn from scan to scan from where the data begin, and whether scans look like such turns.
 
-    The beginning is as configured where they do not, the turn where it would be none of a lidar.
+    The beginning is as configured where scans do not agree in it, the turn where it would be none of a lidar.
     """
     period_s = 1e-9 * float(np.median(np.diff([scan.stamp_ns for scan in window]))) / config.every
-    begins = np.array([scan.points[0, :2] @ (1.0, 1j) for scan in window])
-    begin = complex(np.mean(begins / np.maximum(np.abs(begins), 1e-9)))
+    begins = np.exp(1j * np.array([np.arctan2(*scan.points[0, 1::-1]) for scan in window])).mean()
+    seen = np.unique(np.floor(np.arctan2(*window[0].points[:, 1::-1].T) * (18.0 / np.pi)))  # of 36 directions
     timing = msgspec.structs.replace(
         config,
         point_times="clockwise",
         revolution_s=period_s if _SPINS_AT_S[0] < period_s < _SPINS_AT_S[1] else config.revolution_s,
-        revolution_start_rad=float(np.angle(begin)) if abs(begin) > _SURE else config.revolution_start_rad,
+        revolution_start_rad=float(np.angle(begins)) if abs(begins) > _SURE else config.revolution_start_rad,
     )
-    return timing, abs(begin)
+    return timing, bool(abs(begins) > _SURE and len(seen) > 36 * _AROUND)
 
 
 def _prepared(scan: Scan, timing: LogConfig, rng: np.random.Generator) -> Scan:
@@ -215,11 +201,10 @@ def _residuals(
     tracked = [odometry.place(replace(scan, times_s=np.float32(sense) * scan.times_s)) for scan in scans]
     rms_m = np.array([each.match.residual_m for each in tracked[_BEGIN:]])
     blocks = [np.sqrt(np.mean(block**2)) for block in np.array_split(rms_m, len(rms_m) // _BLOCK)]
-    first, last = tracked[_BEGIN], tracked[-1]
-    seconds = max(1e-9 * (last.scan.stamp_ns - first.scan.stamp_ns), 1e-9)
+    seconds = max(1e-9 * (scans[-1].stamp_ns - scans[_BEGIN].stamp_ns), 1e-9)
     steps = [lie.apart(a.T_odom_lidar, b.T_odom_lidar) for a, b in pairwise(tracked[_BEGIN:])]
     m_s, rad_s = np.sum(steps, axis=0) / seconds
-    range_m = float(np.median(np.linalg.norm(last.scan.points, axis=1)))
+    range_m = float(np.median(np.linalg.norm(scans[-1].points, axis=1)))
     sweep_s = float(np.ptp(scans[0].times_s))
     speed, turn = f"at {m_s:.2g} m/s", f"at {np.degrees(rad_s):.2g} deg/s and a range of {range_m:.2g} m"
     return np.array(blocks), max((sweep_s * m_s, speed), (sweep_s * rad_s * range_m, turn))
@@ -230,8 +215,3 @@ def _sigmas(gains: NDArray[np.float64]) -> float:
     limit = float(np.median(np.abs(gains)))
     clipped = np.clip(gains, -limit, limit)
     return float(clipped.mean() / max(np.std(clipped, ddof=1) / np.sqrt(len(gains)), 1e-9))
-
-
-def _seen(scan: Scan) -> float:
-    """Share of the directions, in steps of 10 degrees, in which a scan has points."""
-    return len(np.unique(np.floor(np.arctan2(scan.points[:, 1], scan.points[:, 0]) * (18.0 / np.pi)))) / 36.0

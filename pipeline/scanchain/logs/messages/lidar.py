@@ -15,15 +15,7 @@ from scanchain.config import LogConfig
 from scanchain.data import Pose, RawPoints
 from scanchain.errors import one_line
 from scanchain.kernels.scans import keep_valid
-from scanchain.logs.messages.point_times import (
-    NO_TIMES,
-    SENSES,
-    UNITS_S,
-    Beams,
-    PointTimes,
-    Returns,
-    from_azimuth,
-)
+from scanchain.logs.messages.point_times import NO_TIMES, UNITS_S, Beams, PointTimes, Returns, from_azimuth
 from scanchain.logs.messages.ros import (
     NUMBERS,
     MalformedMessageError,
@@ -78,7 +70,7 @@ def decode_laser_scan(data: memoryview, read: Callable[[memoryview], Sensed], co
         turns = abs(message.angle_increment) * len(ranges_m) / (2.0 * np.pi)
         stated = Beams(valid, len(ranges_m), turns, message.time_increment, message.scan_time)
         times_s = stated.seconds(UNITS_S.get(config.point_times, 1.0) * message.time_increment)
-    elif config.point_times in SENSES:
+    elif config.point_times not in ("none", "azimuth"):
         times_s = from_azimuth(points, config)
     points = moved(points, T_frame_points).astype(np.float32, copy=False)
     why = "" if len(valid) else _why_none(ranges_m, low_m, high_m)

@@ -23,7 +23,6 @@ NO_TIMES = np.empty(0, np.float32)
 NO_TIMES.flags.writeable = False
 _NAMES = ("t", "time", "timestamp", "offset_time", "time_offset", "timeOffset", "time_stamp")
 
-SENSES = ("clockwise", "counterclockwise")
 UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _NO, _AT_ONCE = "no point times", "every scan counts as measured at once"
 _NONE = f"{_NO}: {_AT_ONCE}"
@@ -154,7 +153,7 @@ class PointTimes:
     def __init__(self, config: LogConfig) -> None:
         self.config = config
         self.unit = config.point_times if config.point_times in UNITS_S else ""
-        self.by_azimuth = config.point_times in SENSES
+        self.by_azimuth = config.point_times in ("clockwise", "counterclockwise")
         self.fields = _NAMES if self.unit or config.point_times == "auto" else ()
         self.assumed = _NONE
         if self.by_azimuth:
