@@ -27,7 +27,7 @@ _NEAREST_M = 0.05
 _SECTORS, _SECTOR_POINTS = 16, 8000  # of large clouds only parts of 16 sectors are searched for neighbors
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RangeNoise:
     """Noise of ranges by patches of neighboring beams, each against the plane through its points.
 
