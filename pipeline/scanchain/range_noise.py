@@ -89,17 +89,18 @@ def _patches(points: RawPoints) -> tuple[NDArray[np.float64], NDArray[np.float64
     if (share := _SECTOR_POINTS / max(len(points), 1)) < 1.0:
         chosen = (azimuth * (_SECTORS / (2.0 * math.pi))) % 1.0 < share
         points, azimuth = points[chosen], azimuth[chosen]
-    points = points.astype(np.float64)
-    ranges_m = np.linalg.norm(points, axis=1)
+    rays = points.astype(np.float64)
+    ranges_m = np.linalg.norm(rays, axis=1)
     is_used = ranges_m > _NEAREST_M
-    points, ranges_m, azimuth = points[is_used], ranges_m[is_used], azimuth[is_used]
-    if len(points) < size:
+    rays, ranges_m, azimuth = rays[is_used], ranges_m[is_used], azimuth[is_used]
+    count = len(rays)
+    if count < size:
         return np.empty(0), np.empty(0)
-    directions = points / ranges_m[:, None]
-    centers = np.linspace(0, len(points) - 1, min(len(points), _PATCHES)).astype(np.int64)
+    directions = rays / ranges_m[:, None]
+    centers = np.linspace(0, count - 1, min(count, _PATCHES)).astype(np.int64)
     if d == 2:
         order = np.argsort(azimuth, kind="stable")
-        patches = order[(centers[:, None] + np.arange(size)) % len(points)]
+        patches = order[(centers[:, None] + np.arange(size)) % count]
     else:
         patches = KDTree(directions).query(directions[centers], size)[1]
     of_patch_m = ranges_m[patches]

@@ -20,6 +20,8 @@ import pytest
 from scanchain.__main__ import main
 from tests.support.scenes import ROOT
 
+pytestmark = pytest.mark.error_bars
+
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 GIVEN = {  # what a page takes as done
     "results.md": ("simulate office log.mcap --duration 20", "run log.mcap --out runs/log --rerun off")

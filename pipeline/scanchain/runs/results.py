@@ -122,7 +122,7 @@ def results_of(
     return Results(log, config, steps, result, final, drawn, grid, T_world_level)
 
 
-def expected_of(result: SlamResult, config: Config, scans: Iterable[Scan] | None) -> ExpectedErrors | None:
+def expected_of(result: SlamResult, config: Config, scans: Iterable[Scan] | None = None) -> ExpectedErrors | None:
     """Expected errors of the keyframes; None without an edge, or where these leave poses free.
 
     scans : of the log once more, in order, for the systematic errors; without them the random ones

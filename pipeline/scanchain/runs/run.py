@@ -207,7 +207,7 @@ class _Run:
                     return expected_of(result, self.config, again)
             except (InputError, OSError) as error:
                 self.notes.append(f"the log cannot be read again ({error}): error bars of random errors only")
-        return expected_of(result, self.config, None)
+        return expected_of(result, self.config)
 
     def hold(self, recording: Recorder) -> float:
         """Keep the web viewer open, which lives as long as the recording; seconds until the user ended this."""
