@@ -10,6 +10,7 @@ from scanchain.__main__ import main
 from scanchain.logs import open_log
 from scanchain.logs.messages import point_times
 from scanchain.odometry.distortion import choose_point_times, measure_distortion
+from scanchain.runs.vouching import judge_run
 from scanchain.simulation.drive import plan, record
 from tests.support import made
 from tests.support.scenes import shared_data
@@ -75,6 +76,13 @@ def test_times_that_are_ignored_are_named_with_the_distortion_and_the_flag():
     log, scan, config = chosen(made.log("town", seconds=SECONDS, sensor="os1-32"), point_times="none")
     assert config.point_times == "none" and not len(scan.times_s)
     assert "distorted by up to" in log.distortion and "--log.point_times auto" in log.distortion
+
+
+def test_a_run_whose_scans_remain_distorted_is_to_be_checked_and_so_says_its_directory(tmp_path):
+    log = made.log("town", seconds=SECONDS, sensor="os1-32")
+    done = scanchain.run(log, tmp_path / "run", recording=False, log__point_times="none")
+    assert done.metrics.verdict == "check these stretches" and "distorted by up to" in done.metrics.verdict_reason
+    assert judge_run(tmp_path / "run").sentence == done.metrics.sentence
 
 
 def test_a_log_with_times_is_not_measured_before_a_run(monkeypatch):

@@ -29,7 +29,7 @@ from scanchain.processes import Limits
 from scanchain.runs.provenance import Provenance, package_version
 from scanchain.runs.step_table import COLUMNS as NEES_COLUMNS
 from scanchain.runs.step_table import nees_of_steps, pose_columns
-from scanchain.runs.vouching import evidence_of_trajectory, expected_of_run, judge_run
+from scanchain.runs.vouching import evidence_of_trajectory, judge_run, known_of_run
 from scanchain.trajectory import write_tum
 from scanchain.verdict import Judged, Verdict, apart_m, judge
 
@@ -292,7 +292,9 @@ def judged(outcomes: Mapping[str, Outcome], scans: StoredScans) -> dict[str, Jud
     """
     whole = {name: outcome for name, outcome in outcomes.items() if outcome.is_whole}
     found = {name: judge_run(each.folder) for name, each in whole.items() if (each.folder / STEPS_FILE).exists()}
-    expected = {name: error for name in found if (error := expected_of_run(whole[name].folder)) is not None}
+    expected = {
+        name: error for name in found if (error := known_of_run(whole[name].folder).expected_ate_m) is not None
+    }
     positions = {name: each.trajectory.poses[:, :-1, -1] for name, each in whole.items()}
     away_m = {
         name: {other: apart_m(each, positions[other]) for other in whole if other != name}

@@ -80,7 +80,7 @@ class Metrics(Struct, frozen=True):
     none was estimated.
     ``odometry_errors`` : drift, slips and jumps of odometry that loop closures show, corrected in the graph
     ``range_noise_m`` : standard deviation of the ranges by the first scans, null where unknown; ``range_noise`` by
-    range, in words
+    range, in words; ``distortion`` that of scans without times, in words, where it is not removed
     ``warnings`` : data lost, skipped or wrong, a line each
     """
 
@@ -127,6 +127,7 @@ class Metrics(Struct, frozen=True):
     verdict_error: str = ""
     range_noise_m: float | None = None
     range_noise: str = ""
+    distortion: str = ""
 
     @property
     def expected_ate(self) -> str:
@@ -250,6 +251,7 @@ def measure(
         odometry_errors=tuple(result.graph.corrections(scan_numbers, "scans")),
         range_noise_m=result.noise.sigma_m or None,
         range_noise=result.noise.text,
+        distortion=results.log.distortion,
     )
 
 

@@ -45,28 +45,30 @@ if TYPE_CHECKING:
 _FEWEST = 3  # scans with a pose
 
 
-class _Known(msgspec.Struct):
+class Known(msgspec.Struct):
     """Figures of a run's metrics that a verdict needs."""
 
     expected_ate_m: ExpectedError | None = None
+    distortion: str = ""
 
 
 def judge_run(folder: Path) -> Judged:
     """The verdict on the tables of a run directory. Raises InputError where it has none."""
     try:
-        return judge(evidence_of_run(folder, expected_of_run(folder)))
+        known = known_of_run(folder)
+        return judge(evidence_of_run(folder, known.expected_ate_m), distortion=known.distortion)
     except InputError:
         raise
     except Exception as error:  # whatever damaged figures make NumPy raise
         raise InputError(f"{folder}: its tables are damaged ({one_line(error)}); run the log again") from error
 
 
-def expected_of_run(folder: Path) -> ExpectedError | None:
-    """The expected ATE in the metrics of a run directory; None where these know none."""
+def known_of_run(folder: Path) -> Known:
+    """What the metrics of a run directory tell a verdict; nothing where they cannot be read."""
     try:
-        return msgspec.json.decode((folder / METRICS_FILE).read_bytes(), type=_Known).expected_ate_m
+        return msgspec.json.decode((folder / METRICS_FILE).read_bytes(), type=Known)
     except (OSError, msgspec.DecodeError):
-        return None
+        return Known()
 
 
 def evidence_of_run(folder: Path, expected: ExpectedError | None) -> Evidence:
