@@ -1,11 +1,14 @@
 """The jackknife over directions: which scans it measures, and that it shows errors that leave no residuals."""
 
+from itertools import chain, repeat
+
 import numpy as np
 import pytest
 
+import scanchain
 from scanchain import lie
 from scanchain.evaluation import absolute_error, pair
-from scanchain.logs import open_log
+from scanchain.logs import Log, open_log
 from scanchain.odometry import jackknife
 from scanchain.runs.results import expected_of
 from scanchain.settings import load_settings
@@ -60,3 +63,11 @@ def test_influences_between_windows_are_interpolated_by_the_path():
     windows = [jackknife.Window(first, poses[:20], off[None, :20]) for first in (10, 60)]
     twists = jackknife._twists(windows, np.arange(0, 100, 3), 0.5 * np.arange(100.0))
     np.testing.assert_allclose(twists, np.broadcast_to([0.03, 0.0, 0.0], twists.shape), atol=1e-9)
+
+
+def test_a_log_that_cannot_be_read_again_has_error_bars_of_random_errors(office, tmp_path, monkeypatch):
+    readings = chain([Log.scans], repeat(lambda log, preprocess=None: (scan for scan in ())))
+    monkeypatch.setattr(Log, "scans", lambda log, preprocess=None: next(readings)(log, preprocess))
+    done = scanchain.run(office, tmp_path / "run", recording=False)
+    assert done.metrics.expected_ate_m.is_random
+    assert any(each.startswith("error bars of random errors only: the scans from 0 on") for each in done.warnings)

@@ -51,7 +51,7 @@ def influence(
     """Influence of each group of directions, for a log with known odometry.
 
     A short log is measured whole, a long one in windows evenly spread along the path; between these the influence
-    per path is interpolated.
+    per path is interpolated. Raises InputError where a window has no points.
     scans : all of the log, in order; odometry : (N, d+1, d+1) their poses; keyframes : (K,) numbers of scans
     offset_rad : elevation offset of the lidar that was found on the log
     """
@@ -87,10 +87,13 @@ def first_scans(path_m: NDArray[np.float64], dimension: int) -> list[int]:
 
 def _measured(first: int, window: Sequence[Prepared], config: Config, T_base_lidar: Pose | None) -> Window:
     """Odometry of a window, the groups in parallel; one without which there is no first scan has no influence."""
-    d = window[0].sweep.points.shape[1]
+    points = np.concatenate([each.sparse.points for each in window]) if window else np.empty((0, 3))
+    if not len(points):
+        raise InputError(f"the scans from {first} on have no points that could be left out")
+    d = points.shape[1]
     limits = [
         np.quantile(angles, np.arange(1, count) / count)
-        for angles, count in zip(_angles(window[0].sparse.points), (AZIMUTHS[d], ELEVATIONS[d]), strict=False)
+        for angles, count in zip(_angles(points), (AZIMUTHS[d], ELEVATIONS[d]), strict=False)
     ]
     labels = [tuple(_groups(sweep.points, limits) for sweep in (each.sweep, each.sparse)) for each in window]
 
@@ -105,6 +108,8 @@ def _measured(first: int, window: Sequence[Prepared], config: Config, T_base_lid
             try:
                 result.append(odometry.place(chosen).T_odom_lidar)
             except InputError:
+                if group < 0:
+                    raise
                 return np.array([])
         return np.array(result)
 

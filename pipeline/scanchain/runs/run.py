@@ -206,7 +206,7 @@ class _Run:
                 with closing(again):
                     return expected_of(result, self.config, again)
             except (InputError, OSError) as error:
-                self.notes.append(f"the log cannot be read again ({error}): error bars of random errors only")
+                self.notes.append(f"error bars of random errors only: {error}")
         return expected_of(result, self.config)
 
     def hold(self, recording: Recorder) -> float:
