@@ -28,7 +28,7 @@ from scanchain_viz.colors import STRETCH_COLORS, rgb
 from scanchain_viz.recording import drawing, entities, viewer
 from scanchain_viz.recording.batching import WARNING, Batcher, events
 from scanchain_viz.recording.drawing import Message, Times
-from scanchain_viz.recording.sinks import Sink, file_sink, open_stream, send_layout, viewer_sink
+from scanchain_viz.recording.sinks import Sink, file_sink, is_readable, open_stream, send_layout, viewer_sink
 
 _LISTED = 50  # largest number of stretches in the text of a verdict
 _RADIUS = 3.5  # of a stretch, in points of the screen
@@ -97,6 +97,11 @@ class Recording:
         before : the recording up to there, which is copied; without one, the recording begins here
         """
         self._guard(lambda: self.batcher.restore(steps, closures, graph))
+        if before is not None and not is_readable(before):
+            self.problems.append(
+                f"{before.name} of the stopped run is damaged: the recording begins where it stopped"
+            )
+            before = None
         for sink in self.opened:
             if before is not None:
                 sink.send(partial(sink.copy, before))

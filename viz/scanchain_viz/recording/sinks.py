@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import os
 import queue
+import sys
 import threading
 import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from time import perf_counter
 from uuid import UUID, uuid4
 
@@ -26,6 +29,7 @@ from rerun.error_utils import RerunWarning
 
 from scanchain.errors import InputError, counted
 from scanchain.files import write_whole
+from scanchain.processes import KilledFor, Limits, available_mib, die_first, die_with_parent, run_within
 from scanchain_viz.recording.drawing import Message
 from scanchain_viz.recording.entities import UP
 
@@ -34,6 +38,7 @@ _COPIED_CHUNKS = 64  # largest number of chunks in memory when a recording is co
 _LOOK_EVERY_S = 0.1
 _FILE_PATIENCE_S = 10.0
 _VIEWER_PATIENCE_S = 5.0
+_READ_S, _READ_MIB, _READ_TIMES = 60.0, 1024.0, 50.0  # largest time and memory to read one, and times its size
 _open: set[rr.RecordingStream] = set()  # those that were not closed in good order (yet)
 
 
@@ -134,6 +139,16 @@ class Sink:
             rr.unregister_shutdown()
 
 
+def is_readable(path: Path) -> bool:
+    """Whether a recording can be read, tried in a process of its own: rerun aborts on sizes that are damaged."""
+    size_mib = path.stat().st_size / 2**20
+    limits = Limits(_READ_S + size_mib, min(_READ_MIB + _READ_TIMES * size_mib, available_mib()))
+    with TemporaryDirectory(prefix="scanchain-") as folder:
+        output = Path(folder) / "output.txt"
+        ending = run_within(limits, __name__, [str(path.resolve())], os.environ, output=output, interval_s=0.02)
+    return ending.killed_for is KilledFor.NOTHING and ending.code == 0
+
+
 def open_stream(name: str, dimension: int, recording_id: UUID, kind: str = "") -> rr.RecordingStream:
     """A stream that knows its recording's name and adds no timeline of its own; each ``kind`` has its layout.
 
@@ -207,3 +222,10 @@ def viewer_sink(address: str, stream: rr.RecordingStream, blueprint: rrb.Bluepri
         send_layout(stream, blueprint, is_active=False)
 
     return Sink(f"the viewer at {address}", stream, connect, patience_s=_VIEWER_PATIENCE_S, is_lossless=False)
+
+
+if __name__ == "__main__":  # by ``is_readable``
+    die_first()
+    die_with_parent()
+    for _ in RrdReader(Path(sys.argv[1])).stream().filter(is_static=False):
+        pass
