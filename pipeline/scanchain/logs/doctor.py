@@ -94,7 +94,7 @@ def examine(
     config = config_of(log.dimension)
     found = list(_check(seen, config, most_bad_scans(seen.messages, log_config)))
     if (measured := distortion(log))[0]:
-        effect = "map and trajectory are bent alike, which residuals hardly show" if measured[1] else ""
+        effect = "map and trajectory are distorted together, which residuals hardly show" if measured[1] else ""
         severity = Severity.WARNING if effect else Severity.OK
         found.append(Finding("distortion", severity, measured[0], effect, measured[1]))
     ordered = tuple(finding for grade in reversed(Severity) for finding in found if finding.severity is grade)

@@ -71,7 +71,7 @@ class Distortion:
         return self.is_given or (is_chosen and self.size_m > _LEAST_M)
 
     def advice(self, log: Log) -> tuple[str, str]:
-        """What a run makes of it, in words, and the flag that improves that, empty where none does."""
+        """Distortion and its correction by a run, in words, and the flag that improves it, empty for none."""
         size = f"distorted by up to {self.size_m:.2g} m per scan ({self.motion})"
         lack = "point times are not used" if log.config.point_times == "none" else "no point times"
         if self.size_m <= _LEAST_M:
@@ -88,7 +88,7 @@ class Distortion:
 
     @property
     def changes(self) -> str:
-        """What the residuals show, in words."""
+        """Relative changes of the residuals, in words."""
         changes = (-self.gain, self.loss)
         gain, loss = (f"{abs(100 * each):.2g} % {'smaller' if each < 0 else 'larger'}" for each in changes)
         start_rad, turn_s = self.config.revolution_start_rad, self.config.revolution_s

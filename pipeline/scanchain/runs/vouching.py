@@ -64,7 +64,7 @@ def judge_run(folder: Path) -> Judged:
 
 
 def known_of_run(folder: Path) -> Known:
-    """What the metrics of a run directory tell a verdict; nothing where they cannot be read."""
+    """Expected ATE and distortion in the metrics of a run directory; the defaults where they cannot be read."""
     try:
         return msgspec.json.decode((folder / METRICS_FILE).read_bytes(), type=Known)
     except (OSError, msgspec.DecodeError):
