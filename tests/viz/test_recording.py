@@ -348,7 +348,7 @@ def test_a_recording_goes_on_in_file_and_viewer_from_what_was_secured_of_it(tmp_
     same_recording(again, whole)
 
 
-def test_what_lacks_something_is_not_secured_and_without_sinks_nothing_is_kept(tmp_path):
+def test_what_lacks_something_is_not_secured_and_without_sinks_nothing_is_kept(tmp_path, monkeypatch):
     with opened(None, sinks=()) as recording:
         recording.log(STEPS[2][0])
         assert recording.secure() == 0
@@ -359,8 +359,13 @@ def test_what_lacks_something_is_not_secured_and_without_sinks_nothing_is_kept(t
         assert recording.secure() == (tmp_path / "a.rrd").stat().st_size > 0
         (tmp_path / "b.rrd").write_bytes(b"no recording")
         recording.resume(tmp_path / "b.rrd", table_of(steps), [], steps[20].graph)
+        assert recording.secure() > 0
+        monkeypatch.setattr("scanchain_viz.recording.recording.is_readable", lambda path: True)
+        recording.resume(tmp_path / "b.rrd", table_of(steps), [], steps[20].graph)
         assert recording.secure() == 0
-    assert "a.rrd is incomplete, the run goes on without it" in recording.warnings[0]
+    damaged, incomplete = recording.warnings
+    assert damaged == "b.rrd of the stopped run is damaged: the recording begins where it stopped"
+    assert "a.rrd is incomplete, the run goes on without it" in incomplete
 
 
 def test_a_path_that_cannot_be_written_is_refused_at_the_start(tmp_path):
