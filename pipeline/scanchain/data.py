@@ -229,16 +229,18 @@ class Match:
 
 @dataclass(frozen=True, slots=True)
 class Influence:
-    """Influence of each group of directions on the motion from each keyframe to the next.
+    """Twists by which motions differ without each of G groups of directions, in the frame of the later scan.
 
-    twists : (G, K−1, k) by which the motion differs without the group, in the frame of the later keyframe
+    of_keyframes : (G, K−1, k) from each keyframe to the next
+    of_scans : (G, N, k) from the last keyframe to each scan
+    is_measured : (N,) whether both were measured; other motions are extrapolated
     kinds : (G,) of the group: 0 of azimuths, 1 of elevations
-    share : of the scans that were measured; of the others the motions are extrapolated
     """
 
-    twists: Matrix
+    of_keyframes: Matrix
+    of_scans: Matrix
+    is_measured: NDArray[np.bool_]
     kinds: NDArray[np.int64]
-    share: float
 
 
 class KeyframeErrors(NamedTuple):

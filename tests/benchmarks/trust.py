@@ -40,8 +40,8 @@ from scanchain.data import Matrix, State, Step, Trajectory
 from scanchain.evaluation.consistency import error_samples
 from scanchain.evaluation.pairing import nearest
 from scanchain.logs import open_log
-from scanchain.odometry.jackknife import influence
-from scanchain.runs.results import expected_of
+from scanchain.odometry.distortion import choose_point_times
+from scanchain.runs.results import expected_of, systematic_of
 from scanchain.settings import Override, load_settings
 from scanchain.simulation import SENSORS, WORLDS
 from scanchain.slam import Slam, SlamResult
@@ -106,11 +106,12 @@ def placed(
 ) -> tuple[SlamResult, list[Step], Matrix, evaluation.ExpectedErrors, Trajectory | None]:
     """The result of a log, its steps, T_base_lidar, what is expected of it, and the truth."""
     log = open_log([path], **of_log)
+    choose_point_times(log)
     config = load_settings(log.dimension, overrides=overrides).config
     slam = Slam(config, log.T_base_lidar)
     steps = [slam.process(scan) for scan in log.scans()]
     result = slam.finish()
-    expected = expected_of(result, config, open_log([path], **of_log).scans())
+    expected = expected_of(result, config, open_log([path], log.config).scans(), log.distorted_share)
     return result, steps, log.T_base_lidar, expected, log.ground_truth()
 
 
@@ -176,26 +177,23 @@ def relations_line(name: str) -> Line:
     path_m = evaluation.path_length(result.odometry.poses)
     length_m = np.abs(path_m[b] - path_m[a])
     noise = _own_noise(true, a, b, length_m < SHORT_M, unaided, steps, T_base_lidar)
-    keyframes = [keyframe.scan_index for keyframe in result.keyframes]
-    first, last = (np.searchsorted(keyframes, scans, side="right") - 1 for scans in (a, b))
-    chosen = np.flatnonzero((length_m > LONG_M) & (first != last))
+    chosen = np.flatnonzero(length_m > LONG_M)
     poses = result.trajectory.poses
     error = lie.log(lie.between(true, lie.between(poses[a], poses[b])))[chosen]
     true_m = float(np.sqrt((error[:, :2] ** 2).sum(axis=1).mean()))
     config = load_settings(2).config
-    of_directions = influence(open_log([log]).scans(), result.odometry.poses, keyframes, config, T_base_lidar)
-    counts = np.diff([*keyframes, len(steps)])
-    samples = error_samples(result.graph, result.map_errors, config, counts, of_directions)
-    expected_m = np.concatenate(
-        [_relation_errors(each, result.T_world_keyframes, first[chosen], last[chosen]) for each in samples]
-    )
+    opened = open_log([log])
+    choose_point_times(opened)
+    systematic = systematic_of(result, config, opened.scans(), opened.distorted_share)
+    samples = error_samples(result.graph, result.map_errors, config, *systematic)
+    expected_m = np.concatenate([_relation_errors(each, poses, a[chosen], b[chosen]) for each in samples])
     expected_m = np.sqrt(expected_m**2 + noise[0, 0] + noise[1, 1])
     low, high = np.percentile(expected_m, (2.5, 97.5))
     return Line(f"{name}, relations", true_m, float(expected_m.mean()), low, high, np.nan, np.nan)
 
 
 def _relation_errors(errors: Matrix, poses: Matrix, first: NDArray[np.int64], last: NDArray[np.int64]) -> Floats:
-    """(n,) root mean squared position errors of the motions from first to last poses, of samples (n, K, 3)."""
+    """(n,) root mean squared position errors of the motions from first to last poses, of samples (n, N, 3)."""
     away = poses[last, :2, 2] - poses[first, :2, 2]
     turned = errors[:, first, 2, None] * np.stack([-away[:, 1], away[:, 0]], axis=1)
     apart = errors[:, last, :2] - errors[:, first, :2] - turned

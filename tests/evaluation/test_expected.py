@@ -9,7 +9,7 @@ from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import Trajectory
 from scanchain.errors import InputError
-from scanchain.evaluation import disagreement, expected_errors, motion_nees, sampled_map, sharpness
+from scanchain.evaluation import ScanPoses, disagreement, expected_errors, motion_nees, sampled_map, sharpness
 from scanchain.graph.pose_graph import PoseGraph
 from scanchain.logs import open_log
 from scanchain.trajectory import read_tum, write_wide_tum
@@ -45,8 +45,26 @@ def test_a_simulated_drive_errs_as_its_expected_ate_and_its_covariances_say(driv
 def test_of_a_graph_without_an_edge_no_error_is_expected(dimension):
     graph = PoseGraph(dimension)
     graph.add_pose(lie.identity(dimension), 0)
+    scans = ScanPoses.of(graph.poses, np.zeros(1, np.int64), np.zeros((1, graph.freedom)))
     with pytest.raises(InputError, match="has no edge"):
-        expected_errors(graph, (), Config())
+        expected_errors(graph, (), Config(), scans)
+
+
+def test_scans_move_with_their_keyframes(dimension):
+    rng = np.random.default_rng(0)
+    k = 3 * (dimension - 1)
+    poses, of_keyframes = lie.exp(rng.normal(size=(7, k))), np.array([0, 3, 4])
+    scans = ScanPoses.of(poses, of_keyframes, np.zeros((7, k)))
+    assert scans.keyframe.tolist() == [0, 0, 0, 1, 2, 2, 2]
+    change = 1e-6 * rng.normal(size=(3, k))
+    turn = lie.exp(np.concatenate([np.zeros((3, dimension)), change[:, dimension:]], axis=1))
+    keyframes = poses[of_keyframes]
+    moved = turn @ keyframes
+    moved[:, :dimension, dimension] = keyframes[:, :dimension, dimension] + change[:, :dimension]
+    after = moved[scans.keyframe] @ lie.between(keyframes[scans.keyframe], poses)
+    (found,) = scans.errors(change[None])
+    np.testing.assert_allclose(found[:, :dimension], (after - poses)[:, :dimension, dimension], atol=1e-11)
+    np.testing.assert_allclose(found[:, dimension:], change[scans.keyframe, dimension:])
 
 
 def test_a_wide_tum_file_has_the_pose_and_the_lower_triangle_of_its_covariance(tmp_path):

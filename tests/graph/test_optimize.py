@@ -192,16 +192,6 @@ def redrawn(true, rng):
     return graph
 
 
-def test_a_pose_that_stands_for_many_scans_weighs_as_many_in_the_expected_ate():
-    omega = np.array([1e12 * np.eye(3), np.diag([1.0, 1e12, 1e12])])
-    poses = [lie.pose_2d(x_m, 0.0, 0.0) for x_m in range(3)]
-    graph = graph_of(poses, [(0, 1), (1, 2)], [lie.pose_2d(1.0, 0.0, 0.0)] * 2, omega)
-    alone, among_many = expected_ate(graph), expected_ate(graph, np.array([98, 1, 1]))
-    sigma_m, mean_m = 1.0, np.sqrt(2.0 / np.pi)
-    assert alone.mean == pytest.approx(sigma_m * mean_m * np.sqrt(2.0) / 3.0, rel=0.1)
-    assert among_many.mean == pytest.approx(sigma_m * mean_m * np.sqrt(0.01 * 0.99), rel=0.1)
-
-
 @pytest.mark.parametrize(
     ("i", "j", "information", "words"),
     [

@@ -39,10 +39,15 @@ def test_distorted_scans_widen_the_error_bar_though_they_leave_no_residuals():
 
 def test_a_short_log_is_measured_whole_and_each_group_differs(office):
     result, config, _, _, _ = result_of(office)
-    keyframes = [each.scan_index for each in result.keyframes]
-    found = jackknife.influence(open_log([office]).scans(), result.odometry.poses, keyframes, config, None)
-    assert found.share == 1.0 and found.twists.shape == (jackknife.AZIMUTHS[2], len(keyframes) - 1, 3)
-    assert (np.linalg.norm(found.twists, axis=(1, 2)) > 0.0).all()
+    keyframes = np.array([each.scan_index for each in result.keyframes])
+    odometry = result.odometry.poses
+    every = np.arange(len(odometry))
+    found = jackknife.influence(open_log([office]).scans(), odometry, keyframes, every, config, None)
+    assert found.is_measured.all() and found.of_keyframes.shape == (jackknife.AZIMUTHS[2], len(keyframes) - 1, 3)
+    assert (np.linalg.norm(found.of_keyframes, axis=(1, 2)) > 0.0).all()
+    assert found.of_scans.shape == (jackknife.AZIMUTHS[2], len(every), 3)
+    sizes = np.linalg.norm(found.of_scans, axis=(0, 2))
+    assert sizes[keyframes].max() < 1e-12 and np.median(sizes) > 1e-5
 
 
 @pytest.mark.parametrize("scans", [10, 60, 61, 1000, 20_000])
@@ -61,12 +66,15 @@ def test_influences_between_windows_are_interpolated_by_the_path():
     poses = np.array([np.linalg.matrix_power(motion, number) for number in range(100)])
     off = np.array([np.linalg.matrix_power(motion @ lie.exp(np.array([0.01, 0.0, 0.0])), k) for k in range(100)])
     windows = [jackknife.Window(first, poses[:20], off[None, :20]) for first in (10, 60)]
-    twists = jackknife._twists(windows, np.arange(0, 100, 3), 0.5 * np.arange(100.0))
+    twists, is_measured = jackknife._twists(
+        windows, np.arange(0, 97, 3), np.arange(3, 100, 3), 0.5 * np.arange(100.0)
+    )
+    assert np.flatnonzero(is_measured).tolist() == [4, 5, 6, 7, 8, *range(20, 26)]
     np.testing.assert_allclose(twists, np.broadcast_to([0.03, 0.0, 0.0], twists.shape), atol=1e-9)
 
 
 def test_a_log_that_cannot_be_read_again_has_error_bars_of_random_errors(office, tmp_path, monkeypatch):
-    readings = chain([Log.scans], repeat(lambda log, preprocess=None: (scan for scan in ())))
+    readings = chain([Log.scans] * 2, repeat(lambda log, preprocess=None: (scan for scan in ())))
     monkeypatch.setattr(Log, "scans", lambda log, preprocess=None: next(readings)(log, preprocess))
     done = scanchain.run(office, tmp_path / "run", recording=False)
     assert done.metrics.expected_ate_m.is_random

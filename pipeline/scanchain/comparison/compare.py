@@ -104,7 +104,10 @@ def compare(comparison: Comparison, present: Callable[[Path], None], progress: P
         shared = directory.path / _SHARED
         shared.mkdir()
         decoded = progress.track(log.scans(settings.config.preprocess), log.scan_count)
-        scans = store(decoded, log.T_base_lidar, shared / "scans", is_mounted=log.stated_mounting is not None)
+        scans = store(
+            decoded, log.T_base_lidar, shared / "scans",
+            is_mounted=log.stated_mounting is not None, distorted_share=log.distorted_share,
+        )  # fmt: skip
         stopped = (
             f"the user stopped the reading: {counted(len(scans), 'scan')} compared" if progress.stopped else ""
         )

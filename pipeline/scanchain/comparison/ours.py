@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
 from scanchain.comparison.methods import Method
-from scanchain.comparison.processes import CLOSURES_FILE, STEPS_FILE
+from scanchain.comparison.processes import CLOSURES_FILE, STEPS_FILE, StoredScans
 from scanchain.config import Config
 from scanchain.data import Pose, Scan, Trajectory
 from scanchain.runs.closures import final_verdicts, write_closures
@@ -46,11 +45,10 @@ class Ours:
             write_closures(folder / CLOSURES_FILE, final, result.keyframes, odometry.dimension)
         return trajectory
 
-    def measure_errors(self, scans: Iterable[Scan], folder: Path) -> None:
+    def measure_errors(self, scans: StoredScans, folder: Path) -> None:
         """Write the expected ATE, by all scans once more, into the folder."""
-        expected = expected_of(
-            self.result, self.config, scans if self.config.outputs.error_bars == "full" else None
-        )
+        again = scans.scans() if self.config.outputs.error_bars == "full" else None
+        expected = expected_of(self.result, self.config, again, scans.distorted_share)
         (folder / METRICS_FILE).write_bytes(msgspec.json.encode({"expected_ate_m": expected and expected.ate}))
 
 

@@ -40,6 +40,7 @@ class StoredScans:
     stamps_ns, log_times_ns : (N,) as in ``Scan``
     wheels : (N, d+1, d+1) T_odom_base, NaN where the log has none
     T_base_lidar : (d+1, d+1); is_mounted : whether the log states it
+    distorted_share : as of the log
     """
 
     file: str
@@ -49,6 +50,7 @@ class StoredScans:
     wheels: NDArray[np.float64]
     T_base_lidar: Pose
     is_mounted: bool = True
+    distorted_share: float = 0.0
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -86,7 +88,9 @@ def decode(data: bytes, kind: type[T]) -> T:
     return msgspec.msgpack.decode(data, type=kind, dec_hook=array)
 
 
-def store(scans: Iterable[Scan], T_base_lidar: Pose, path: Path, *, is_mounted: bool = True) -> StoredScans:
+def store(
+    scans: Iterable[Scan], T_base_lidar: Pose, path: Path, *, is_mounted: bool = True, distorted_share: float = 0.0
+) -> StoredScans:
     """Write scans into a file."""
     rows: list[tuple[int, ...]] = []
     wheels: list[Pose] = []
@@ -98,7 +102,9 @@ def store(scans: Iterable[Scan], T_base_lidar: Pose, path: Path, *, is_mounted: 
             rows.append((len(scan.points), scan.stamp_ns, scan.log_time_ns))
             wheels.append(unknown if scan.T_odom_base is None else scan.T_odom_base)
     points, stamps_ns, log_times_ns = np.array(rows, np.int64).T.copy()
-    return StoredScans(str(path), points, stamps_ns, log_times_ns, np.array(wheels), T_base_lidar, is_mounted)
+    return StoredScans(
+        str(path), points, stamps_ns, log_times_ns, np.array(wheels), T_base_lidar, is_mounted, distorted_share
+    )
 
 
 class Status(StrEnum):

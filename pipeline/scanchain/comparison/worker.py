@@ -61,7 +61,7 @@ class _Others:
     def track(self, scan: Scan) -> Pose:
         return self.baseline.track(scan.points, scan.times_s, scan.stamp_ns)
 
-    def measure_errors(self, scans: Iterable[Scan], folder: Path) -> None:
+    def measure_errors(self, scans: StoredScans, folder: Path) -> None:
         """Nothing: its error is bounded by the other trajectories."""
 
     def finish(self, odometry: Trajectory, folder: Path) -> Trajectory:
@@ -90,7 +90,7 @@ def work(scans: StoredScans, method: Method, folder: Path) -> EndReport:
     trajectory = runner.finish(Trajectory(scans.stamps_ns, np.array(track["pose"])), folder)
     np.save(folder / processes.TRAJECTORY_FILE, trajectory.poses)
     report = EndReport(Status.OK, "", runner.description, start_s, perf_counter() - ended)
-    runner.measure_errors(scans.scans(), folder)
+    runner.measure_errors(scans, folder)
     return report
 
 

@@ -2,6 +2,7 @@
 
 from scanchain.evaluation.consistency import ExpectedError as ExpectedError
 from scanchain.evaluation.consistency import ExpectedErrors as ExpectedErrors
+from scanchain.evaluation.consistency import ScanPoses as ScanPoses
 from scanchain.evaluation.consistency import Sharpness as Sharpness
 from scanchain.evaluation.consistency import disagreement as disagreement
 from scanchain.evaluation.consistency import expected_ate as expected_ate

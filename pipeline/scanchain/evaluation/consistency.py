@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
@@ -25,8 +26,8 @@ _RANK_TOLERANCE = 1e-9  # of the largest singular value, below which positions l
 _DRIFT_OF_NOISE = 2.0  # drift of a map over its renewal, in standard deviations of independent errors of the scans
 _DRIFT_OF_SYSTEMATIC = 5.0  # the same of errors that successive scans have in common; measured on simulated worlds
 _REVISIT = 2.0  # variances of the systematic error in a loop edge: of both passes
-_BIAS = 0.75  # true standard deviation over that of the jackknife, measured in simulated worlds and on real logs
 _MOST_MEDIANS = 3.0  # influence of a group of directions over the median, above which the log needs the group
+_MOST_OPEN = 0.5  # largest standard deviation of the instant of a pose in a distorted scan, of its duration
 _LEAST_VARIANCE = 1e-14  # m² or rad², which keeps covariances regular
 
 RADIUS_M = {2: 0.2, 3: 0.5}
@@ -57,6 +58,36 @@ class ExpectedError(Struct, frozen=True):
         return f"{low:.3f} to {high:.3f} m{', random errors only' if self.is_random else ''}"
 
 
+class ScanPoses(NamedTuple):
+    """Poses of scans that hang on those of keyframes.
+
+    poses : (N, d+1, d+1); keyframe : (N,) number of the keyframe of each
+    of_keyframes : (K,) numbers of the scans that are keyframes
+    arms_m : (N, d) from the position of the keyframe, along the world's axes
+    open_motions : (N, k) twists during a scan that may be distorted by them; 0 where it is not
+    """
+
+    poses: Matrix
+    keyframe: NDArray[np.int64]
+    of_keyframes: NDArray[np.int64]
+    arms_m: Matrix
+    open_motions: Matrix
+
+    @classmethod
+    def of(cls, poses: Matrix, of_keyframes: NDArray[np.int64], open_motions: Matrix) -> ScanPoses:
+        """Each scan hangs on the last keyframe up to it."""
+        keyframe = np.searchsorted(of_keyframes, np.arange(len(poses)), side="right") - 1
+        positions = poses[:, :-1, -1]
+        return cls(poses, keyframe, of_keyframes, positions - positions[of_keyframes][keyframe], open_motions)
+
+    def errors(self, of_keyframes: Matrix) -> Matrix:
+        """(n, N, k) errors of the scans as of their keyframes (n, K, k), along the world's axes."""
+        d = self.arms_m.shape[1]
+        errors = of_keyframes[:, self.keyframe]
+        errors[..., :d] += (turns(self.arms_m) @ errors[..., d:, None])[..., 0]
+        return errors
+
+
 class ExpectedErrors(NamedTuple):
     """ATE, and covariance (K, k, k) of each pose after the rigid alignment, of a twist in its own frame."""
 
@@ -64,61 +95,73 @@ class ExpectedErrors(NamedTuple):
     covariances: Matrix
 
 
-def expected_ate(graph: PoseGraph, scans: NDArray[np.int64] | None = None) -> ExpectedError:
+def expected_ate(graph: PoseGraph) -> ExpectedError:
     """ATE (rmse after rigid alignment) of the poses of a graph, if the covariances of its edges are right.
 
     The distribution is that of samples of the position errors δ. To first order the alignment takes from them what
     one twist of all positions explains:
-        ATE² = min over ξ of Σ wᵢ ‖δᵢ − ρ − φ × tᵢ‖² / Σ wᵢ
-    scans : (K,) wᵢ, number of scans that each pose stands for, 1 where left out
+        ATE² = min over ξ of 1/N Σ ‖δᵢ − ρ − φ × tᵢ‖²
     Raises InputError where the edges leave poses free.
     """
-    own = np.zeros((len(graph), graph.freedom, graph.freedom))
-    return _expected(_samples(graph, own, _Alignment.of(graph.poses, scans)), graph, scans).ate
+    alignment = _Alignment.of(graph.poses[:, :-1, -1])
+    errors = (alignment.aligned(graph.pose_errors(_BATCH, seed)) for seed in range(_BATCHES))
+    return _expected(np.concatenate([alignment.rms(each) for each in errors]))
 
 
 def expected_errors(
-    graph: PoseGraph, map_errors: Sequence[KeyframeErrors], config: Config, scans: NDArray[np.int64] | None = None,
+    graph: PoseGraph, map_errors: Sequence[KeyframeErrors], config: Config, scans: ScanPoses,
     influence: Influence | None = None,
 ) -> ExpectedErrors:  # fmt: skip
-    """Errors of keyframes that were aligned to a map: random ones by ``with_map_errors``, and systematic ones.
+    """Errors of scans that were aligned to a map: random ones by ``with_map_errors``, and systematic ones.
 
-    scans : as in ``expected_ate``
-    influence : of groups of directions on the motions between keyframes; random errors only where left out
+    influence : of groups of directions on the motions; random errors only where left out
     Raises InputError without an edge, or where the edges leave poses free.
     """
-    samples = error_samples(graph, map_errors, config, scans, influence)
-    found = _expected(samples, graph, scans)
-    ate, of_poses = found.ate, _unfitted(graph.poses, len(graph))
-    of_scans = of_poses if scans is None else _unfitted(graph.poses, int(scans.sum()))
-    mean, low, high = (math.sqrt(of_scans / of_poses) * each for each in (ate.mean, ate.low, ate.high))
-    return found._replace(ate=ExpectedError(mean, low, high, is_random=influence is None))
-
-
-def _unfitted(poses: Matrix, count: int) -> float:
-    """Share of the squared errors of so many positions that a rigid alignment leaves."""
-    coordinates = count * (poses.shape[-1] - 1)
-    return max(coordinates - lie.twist_size(poses[0]), 1) / coordinates
+    ates_m, squares = [], np.zeros((len(graph), graph.freedom, graph.freedom))
+    for errors in error_samples(graph, map_errors, config, scans, influence):
+        ates_m.append(np.sqrt((errors[..., : scans.arms_m.shape[1]] ** 2).sum(axis=2).mean(axis=1)))
+        of_keyframes = errors[:, scans.of_keyframes]
+        squares += np.einsum("nki,nkj->kij", of_keyframes, of_keyframes)
+    R = _rotations(graph.poses, graph.freedom)
+    covariances = np.swapaxes(R, 1, 2) @ (squares / (_BATCHES * _BATCH)) @ R
+    ate = msgspec.structs.replace(_expected(np.concatenate(ates_m)), is_random=influence is None)
+    return ExpectedErrors(ate, covariances)
 
 
 def error_samples(
-    graph: PoseGraph, map_errors: Sequence[KeyframeErrors], config: Config, scans: NDArray[np.int64] | None = None,
+    graph: PoseGraph, map_errors: Sequence[KeyframeErrors], config: Config, scans: ScanPoses,
     influence: Influence | None = None,
 ) -> Iterator[Matrix]:  # fmt: skip
-    """Samples of the errors of ``expected_errors``, some (n, K, k) at a time, after rigid alignment."""
+    """Samples of the errors of ``expected_errors``, some (n, N, k) of all scans at a time, after rigid alignment.
+
+    Of position and orientation, along the world's axes. The pose of a scan errs as its keyframe; by itself; as
+    the groups of directions say; and where scans may be distorted, as the instant of a scan that its pose is the
+    right one of, which changes with what the lidar sees.
+    """
     if not len(graph.edges):
         raise InputError("the pose graph has no edge, so that no error is expected; give more keyframes")
-    drifting, own = with_map_errors(graph, map_errors, config, systematic_drift=0.0)
-    R = _rotations(graph.poses, graph.freedom)
-    own = R @ own @ np.swapaxes(R, 1, 2)
-    alignment = _Alignment.of(graph.poses, scans)
-    if influence is None:
-        return _samples(drifting, own, alignment)
-    changes = np.zeros((len(influence.twists), *graph.information.shape[:2]))
-    is_odometry = ~graph.is_loop & (graph.edges[:, 1] == graph.edges[:, 0] + 1)
-    changes[:, is_odometry] = influence.twists[:, graph.edges[is_odometry, 0]]
-    influences = alignment.aligned(drifting.displacements(changes))
-    return _samples(drifting, own, alignment, influences, influence.kinds)
+    drifting, by_itself = with_map_errors(graph, map_errors, config, systematic_drift=0.0)
+    alignment, R = _Alignment.of(scans.poses[:, :-1, -1]), _rotations(scans.poses, graph.freedom)
+    own, influences, scale, log_sigma = by_itself[scans.keyframe], np.zeros((0, *R.shape[:2])), np.zeros(0), 0.0
+    if influence is not None:
+        changes = np.zeros((len(influence.kinds), *graph.information.shape[:2]))
+        is_odometry = ~graph.is_loop & (graph.edges[:, 1] == graph.edges[:, 0] + 1)
+        changes[:, is_odometry] = influence.of_keyframes[:, graph.edges[is_odometry, 0]]
+        within = (R @ influence.of_scans[..., None])[..., 0]
+        influences = alignment.aligned(scans.errors(drifting.displacements(changes)) + within)
+        scale, log_sigma = _scales(alignment.rms(influences), influence.kinds)
+        own[influence.is_measured] = 0.0  # the jackknife contains it
+    values, vectors = np.linalg.eigh(R @ own @ np.swapaxes(R, 1, 2))
+    half = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    open_motions, random = (R @ scans.open_motions[..., None])[..., 0], np.random.default_rng(0)
+    for seed in range(_BATCHES):
+        errors = scans.errors(drifting.pose_errors(_BATCH, seed))
+        errors += (half @ random.normal(size=(*errors.shape, 1)))[..., 0]
+        errors += np.tensordot(scale * random.normal(size=(_BATCH, len(scale))), influences, axes=1)
+        errors *= np.exp(log_sigma * random.normal(size=(_BATCH, 1, 1)))
+        instants = random.uniform(0.0, _MOST_OPEN, (_BATCH, 1)) * random.normal(size=(_BATCH, len(graph)))
+        errors += instants[:, scans.keyframe, None] * open_motions
+        yield alignment.aligned(errors)
 
 
 def with_map_errors(
@@ -179,94 +222,54 @@ def _rotations(poses: Matrix, freedom: int) -> Matrix:
 class _Alignment(NamedTuple):
     """Rigid alignment of errors of positions, to first order.
 
-    root : (K, 1) roots of the positions' weights, which sum up to 1
-    moved : (K, d, k) by which a twist moves them; basis (K d, r) of these weighted moves; to_twist (k, r)
+    moved : (N, d, k) by which a twist moves positions; basis (N d, r) of these moves; to_twist (k, r)
     """
 
-    root: Matrix
     moved: Matrix
     basis: Matrix
     to_twist: Matrix
 
     @classmethod
-    def of(cls, poses: Matrix, scans: NDArray[np.int64] | None) -> _Alignment:
-        """That of poses (K, d+1, d+1), weighted by the number of scans (K,) that each stands for."""
-        positions = poses[:, :-1, -1]
+    def of(cls, positions: Matrix) -> _Alignment:
+        """That of positions (N, d)."""
         count, d = positions.shape
-        weight = np.ones(count) if scans is None else scans.astype(np.float64)
-        root = np.sqrt(weight / weight.sum())[:, None]
         translated = np.broadcast_to(np.eye(d), (count, d, d))
         moved = np.concatenate([translated, turns(positions - positions.mean(axis=0))], axis=2)
-        basis, size, Vt = np.linalg.svd((root[..., None] * moved).reshape(count * d, -1), full_matrices=False)
+        basis, size, Vt = np.linalg.svd(moved.reshape(count * d, -1), full_matrices=False)
         kept = size > _RANK_TOLERANCE * size[0]
-        return cls(root, moved, basis[:, kept], Vt[kept].T / size[kept])
+        return cls(moved, basis[:, kept], Vt[kept].T / size[kept])
 
     def aligned(self, errors: Matrix) -> Matrix:
-        """The errors (n, K, k), without what one twist of all poses explains."""
+        """The errors (n, N, k), without what one twist of all poses explains."""
         d = self.moved.shape[1]
-        weighted = (self.root * errors[..., :d]).reshape(len(errors), len(self.basis))
-        twist = weighted @ self.basis @ self.to_twist.T
+        twist = errors[..., :d].reshape(len(errors), len(self.basis)) @ self.basis @ self.to_twist.T
         moves = (self.moved @ twist[:, None, :, None])[..., 0]
         turned = np.broadcast_to(twist[:, None, d:], errors[..., d:].shape)
         return errors - np.concatenate([moves, turned], axis=2)
 
     def rms(self, errors: Matrix) -> NDArray[np.float64]:
         """Root mean squared position error (n,), m."""
-        positions = errors[..., : self.moved.shape[1]]
-        return np.sqrt(np.einsum("k,nki,nki->n", self.root[:, 0] ** 2, positions, positions))
+        return np.sqrt((errors[..., : self.moved.shape[1]] ** 2).sum(axis=2).mean(axis=1))
 
 
-def _samples(
-    graph: PoseGraph, own: Matrix, alignment: _Alignment, influences: Matrix | None = None,
-    kinds: NDArray[np.int64] | None = None,
-) -> Iterator[Matrix]:  # fmt: skip
-    """Samples (n, K, k) of errors: by a graph's edges, by covariances (K, k, k) of each pose, and systematic ones.
-
-    own : world's axes; influences (G, K, k), aligned, of groups of directions of these kinds (G,)
-    """
-    values, vectors = np.linalg.eigh(own)
-    half = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-    random = np.random.default_rng(0)
-    scale, log_sigma = np.zeros(0), 0.0
-    if influences is not None and kinds is not None:
-        scale, log_sigma = _scales(alignment.rms(influences), kinds)
-    for seed in range(_BATCHES):
-        errors = graph.pose_errors(_BATCH, seed)
-        errors += (half @ random.normal(size=(*errors.shape, 1)))[..., 0]
-        if influences is not None:
-            drawn = scale * random.normal(size=(_BATCH, len(scale)))
-            drawn *= np.exp(log_sigma * random.normal(size=(_BATCH, 1)))
-            errors += np.tensordot(drawn, influences, axes=1)
-        yield alignment.aligned(errors)
-
-
-def _expected(samples: Iterator[Matrix], graph: PoseGraph, scans: NDArray[np.int64] | None) -> ExpectedErrors:
-    """Mean, bounds and covariances of samples."""
-    alignment = _Alignment.of(graph.poses, scans)
-    ates_m, squares = [], np.zeros((len(graph), graph.freedom, graph.freedom))
-    for errors in samples:
-        ates_m.extend(alignment.rms(errors).tolist())
-        squares += np.einsum("nki,nkj->kij", errors, errors)
+def _expected(ates_m: NDArray[np.float64]) -> ExpectedError:
+    """Mean and bounds of samples."""
     low, high = np.percentile(ates_m, _BOUNDS).tolist()
-    R = _rotations(graph.poses, graph.freedom)
-    covariances = np.swapaxes(R, 1, 2) @ (squares / len(ates_m)) @ R
-    return ExpectedErrors(ExpectedError(float(np.mean(ates_m)), low, high), covariances)
+    return ExpectedError(float(ates_m.mean()), low, high)
 
 
 def _scales(sizes_m: NDArray[np.float64], kinds: NDArray[np.int64]) -> tuple[NDArray[np.float64], float]:
     """(G,) factors on the influences of groups by which their squares sum up to the variance, and its uncertainty.
 
-    The variance of the jackknife is (G − 1)/G Σ sᵢ² over the G groups of a kind, of influences sᵢ. It is larger
-    than the true one, by the interactions of the groups (Efron & Stein 1981). The influence of a group without
-    which the log is not observable is unknown: the median takes its place. The uncertainty is the standard
-    deviation of the logarithm of a standard deviation with (Σ sᵢ²)² / Σ sᵢ⁴ degrees of freedom (Satterthwaite
-    1946).
+    The variance of the jackknife is (G − 1)/G Σ sᵢ² over the G groups of a kind, of influences sᵢ, averaged over
+    the kinds: each divides all points, and shows all errors. The influence of a group without which the log is not
+    observable is unknown: the median takes its place. The uncertainty is the standard deviation of the logarithm
+    of a standard deviation with (Σ sᵢ²)² / Σ sᵢ⁴ degrees of freedom (Satterthwaite 1946).
     """
     numbers, usual_m = np.bincount(kinds)[kinds], np.median(sizes_m)
     is_usual = sizes_m <= _MOST_MEDIANS * usual_m
-    scales = (
-        _BIAS * np.sqrt((numbers - 1) / numbers) * np.where(is_usual, 1.0, usual_m / np.maximum(sizes_m, 1e-12))
-    )
+    share = (numbers - 1) / (numbers * len(np.unique(kinds)))
+    scales = np.sqrt(share) * np.where(is_usual, 1.0, usual_m / np.maximum(sizes_m, 1e-12))
     squares = (scales * sizes_m) ** 2
     freedom = squares.sum() ** 2 / max((squares**2).sum(), 1e-300)
     return scales, float(1.0 / np.sqrt(2.0 * freedom)) if freedom else 0.0

@@ -82,7 +82,10 @@ class Log:
     bad_scans : how many scans were left out, once ``scans`` is through or closed
     times : what was found out about the times of their points; jumps : a line on jumps of the header stamps
     distortion : that of scans without times, in words, where it is not removed
+    distorted_share : of the motion between scans, by which these may be distorted where nothing removes it
     """
+
+    _truth: Trajectory | None
 
     def __init__(self, indexes: Sequence[FileIndex], config: LogConfig) -> None:
         self.config, self.indexes = config, indexes
@@ -130,9 +133,9 @@ class Log:
         self._damage: list[str] = [line for index in indexes for line in index.damage]
         with_poses = [*([(wheels.channel, wheels.link)] if wheels else []), *([(truth, None)] if truth else [])]
         self.pose_decoders = {each.topic: pose_reader(each, self.dimension, link) for each, link in with_poses}
-        self.scans_with_wheels, self.bad_scans, self.jumps, self.distortion = 0, 0, list[str](), ""
+        self.scans_with_wheels, self.bad_scans, self.distorted_share = 0, 0, 0.0
+        self.distortion, self.jumps, self._truth = "", list[str](), None
         self._opening_notes = tuple(self.notes)
-        self._truth: Trajectory | None = None
 
     def __repr__(self) -> str:
         return f"Log({self.name!r}: {counted(self.scan_count, f'{self.dimension}D scan')} of {self.topic})"

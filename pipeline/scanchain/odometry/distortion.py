@@ -27,7 +27,7 @@ _POINTS, _MATCHED = 8_000, 500  # points of a scan, at random, and those that ar
 _LEAST_M = 0.03  # distortion of a scan below which it is lost in the noise of the ranges
 _CLEAR = 3.5  # standard errors of a mean difference that is clear: of 12 values by chance in 1 of 400
 _LEAST_GAIN = 0.01  # share of the residuals by which times that are adopted lower them
-_MOST_LOSS = 5.0  # loss by opposite times over the gain: 3 where these remove all distortion, 5 at three quarters
+_LEAST_SHARE = 0.75  # of the distortion, that times which are adopted must remove
 _SPINS_AT_S = (0.02, 0.25)  # periods that are those of a revolution
 _SURE = 0.9  # least agreement of the azimuths at which scans begin
 _AROUND = 0.8  # least share of the directions that a lidar sees which looks around
@@ -54,10 +54,19 @@ class Distortion:
     is_spinning: bool
 
     @property
+    def share(self) -> float:
+        """Of the distortion by these times, what residuals show: where the parabola through the three is least.
+
+        1 where it has no least value, or is of times by azimuth for a lidar that does not spin.
+        """
+        if self.loss <= self.gain or not (self.is_given or self.is_spinning):
+            return 1.0
+        return min(0.5 * abs(self.loss + self.gain) / (self.loss - self.gain), 1.0)
+
+    @property
     def is_shown(self) -> bool:
         """True if these times explain the scans clearly better than none, and as no others would."""
-        is_clear = self.gain > _LEAST_GAIN and self.sigmas > _CLEAR
-        return is_clear and 0.0 < self.loss < _MOST_LOSS * self.gain
+        return self.gain > _LEAST_GAIN and self.sigmas > _CLEAR and self.share > _LEAST_SHARE
 
     @property
     def is_refuted(self) -> bool:
@@ -151,20 +160,36 @@ def choose_point_times(log: Log) -> None:
     """Time points by azimuth, where the log's clouds have no times and show clearly that they are distorted so.
 
     ``log.point_times`` ``azimuth`` does so in any case, in the better sense, ``none`` never. Notes of the log say
-    what was found, and ``log.distortion`` what remains.
+    what was found, ``log.distortion`` and ``log.distorted_share`` what remains. Planar scans without times may be
+    distorted in any case.
     """
     wanted = log.config.point_times
     is_open = wanted == "azimuth" or (wanted in ("auto", "none") and log.dimension == 3)
-    if not is_open or log.sectors is not None or log.is_mirrored:
-        return
+    if is_open and log.sectors is None and not log.is_mirrored:
+        _adopt_point_times(log, wanted)
+    if log.dimension == 2:
+        log.distorted_share = _untimed_share(log)
+
+
+def _adopt_point_times(log: Log, wanted: str) -> None:
     found = measure_distortion(log, of_given=wanted != "auto")
     if found is None:
         return
     said, remedy = found.advice(log)
     is_removed, is_none = found.is_removed(log), found.is_refuted and found.is_spinning
-    if found.size_m > _LEAST_M and not is_removed and not is_none:
-        log.distortion = f"{said}; try {remedy}" if remedy else said
+    if found.size_m > _LEAST_M and not is_removed:
+        log.distorted_share = found.share * _untimed_share(log)
+        log.distortion = "" if is_none else f"{said}; try {remedy}" if remedy else said
     log.time_points(found.config if is_removed else log.config, f"{said}: {found.changes}")
+
+
+def _untimed_share(log: Log) -> float:
+    """Duration of scans without times over the time from one to the next; 0 where they have times."""
+    for window in log.windows(_AT[:1], _SCANS):
+        if not len(window[0].times_s):
+            period_s = 1e-9 * float(np.median(np.diff([scan.stamp_ns for scan in window])))
+            return min(_by_azimuth(window, log.config)[0].revolution_s / max(period_s, 1e-9), 1.0)
+    return 0.0
 
 
 def _by_azimuth(window: Sequence[Scan], config: LogConfig) -> tuple[LogConfig, bool]:

@@ -45,14 +45,15 @@ class Window(NamedTuple):
 
 
 def influence(
-    scans: Iterable[Scan], odometry: Matrix, keyframes: Sequence[int], config: Config, T_base_lidar: Pose | None,
-    offset_rad: float = 0.0,
+    scans: Iterable[Scan], odometry: Matrix, keyframes: NDArray[np.int64], chosen: NDArray[np.int64],
+    config: Config, T_base_lidar: Pose | None, offset_rad: float = 0.0,
 ) -> Influence:  # fmt: skip
     """Influence of each group of directions, for a log with known odometry.
 
     A short log is measured whole, a long one in windows evenly spread along the path; between these the influence
     per path is interpolated. Raises InputError where a window has no points.
-    scans : all of the log, in order; odometry : (N, d+1, d+1) their poses; keyframes : (K,) numbers of scans
+    scans : all of the log, in order; odometry : (M, d+1, d+1) their poses
+    keyframes, chosen : (K,) and (N,) numbers of scans whose motions are wanted
     offset_rad : elevation offset of the lidar that was found on the log
     """
     d = odometry.shape[-1] - 1
@@ -68,8 +69,10 @@ def influence(
             resolution = window[-1].after
         position = first + len(window)
         measured.append(_measured(first, [_raised(each, offset_rad) for each in window], config, T_base_lidar))
-    twists = _twists(measured, np.asarray(keyframes), path_m)
-    return Influence(twists, kinds, sum(len(each.complete) for each in measured) / len(odometry))
+    of_keyframes, _ = _twists(measured, keyframes[:-1], keyframes[1:], path_m)
+    before = keyframes[np.searchsorted(keyframes, chosen, side="right") - 1]
+    of_scans, is_measured = _twists(measured, before, chosen, path_m)
+    return Influence(of_keyframes, of_scans, is_measured, kinds)
 
 
 def first_scans(path_m: NDArray[np.float64], dimension: int) -> list[int]:
@@ -151,19 +154,27 @@ def _path_m(poses: Matrix) -> NDArray[np.float64]:
     return np.concatenate([[0.0], np.cumsum(steps_m)])
 
 
-def _twists(measured: Sequence[Window], keyframes: NDArray[np.int64], path_m: NDArray[np.float64]) -> Matrix:
-    """(G, K−1, k) of the motions between keyframes: measured, or by the rates of the windows, interpolated."""
-    first, last = keyframes[:-1], keyframes[1:]
+def _twists(
+    measured: Sequence[Window], first: NDArray[np.int64], last: NDArray[np.int64], path_m: NDArray[np.float64]
+) -> tuple[Matrix, NDArray[np.bool_]]:
+    """(G, M, k) of motions between scans, and (M,) whether they are measured.
+
+    Others have the rates of the windows, interpolated along the path.
+    """
     middles_m = [path_m[each.first + len(each.complete) // 2] for each in measured]
     rates = np.array([_rates(each, path_m) for each in measured])
     at_m, length_m = 0.5 * (path_m[first] + path_m[last]), path_m[last] - path_m[first]
-    twists = np.empty((rates.shape[1], len(first), rates.shape[2]))
+    twists, is_measured = (
+        np.empty((rates.shape[1], len(first), rates.shape[2])),
+        np.zeros(len(first), dtype=np.bool_),
+    )
     for group, component in np.ndindex(rates.shape[1:]):
         twists[group, :, component] = length_m * np.interp(at_m, middles_m, rates[:, group, component])
     for each in measured:
         inside = (first >= each.first) & (last < each.first + len(each.complete))
         twists[:, inside] = _changes(each, first[inside] - each.first, last[inside] - each.first)
-    return twists
+        is_measured |= inside
+    return twists, is_measured
 
 
 def _rates(window: Window, path_m: NDArray[np.float64]) -> Matrix:

@@ -143,6 +143,14 @@ class Metrics(Struct, frozen=True):
         return f"{error.mean:.3f} m ({error.bounds})" + condition[self.verdict]
 
     @property
+    def refuted(self) -> str:
+        """That the ground truth refutes the error bar, in words; empty where it does not."""
+        bar, truth = self.expected_ate_m, self.ground_truth
+        if bar is None or truth is None or bar.low <= truth.optimized.ate_rmse_m <= bar.high:
+            return ""
+        return f"the ground truth refutes the error bar: ATE {truth.optimized.ate_rmse_m:.4f} m, not {bar.bounds}"
+
+    @property
     def judged(self) -> Judged:
         """Verdict, the error that it vouches for, reason and stretches."""
         return Judged(self.verdict, self.verdict_reason, self.stretches, self.verdict_error)

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from scanchain import lie
 from scanchain.config import Config, MapsConfig
-from scanchain.data import Closure, Keyframe, Matrix, Points, Pose, Scan, Trajectory
+from scanchain.data import Closure, Influence, Keyframe, Matrix, Points, Pose, Scan, Trajectory
 from scanchain.errors import InputError
-from scanchain.evaluation import ExpectedErrors, expected_errors
+from scanchain.evaluation import ExpectedErrors, ScanPoses, expected_errors
 from scanchain.graph.g2o import rejected_path, write_g2o
 from scanchain.logs import Log
 from scanchain.loops import level_of, outline_of
@@ -47,6 +47,7 @@ from scanchain.slam import SlamResult
 from scanchain.trajectory import write_kitti, write_tum
 
 GRAPH_FILE = "graph.g2o"  # the edges in force; rejected ones go to graph_rejected.g2o, if there are any
+_MOST_SCANS = 20_000  # evenly spread over the log, whose errors are expected
 _TILTED_RAD = math.radians(5.0)  # tilt of the lidar's first frame to the ground from which on it is said
 
 
@@ -122,26 +123,44 @@ def results_of(
     return Results(log, config, steps, result, final, drawn, grid, T_world_level)
 
 
-def expected_of(result: SlamResult, config: Config, scans: Iterable[Scan] | None = None) -> ExpectedErrors | None:
-    """Expected errors of the keyframes; None without an edge, or where these leave poses free.
+def expected_of(
+    result: SlamResult, config: Config, scans: Iterable[Scan] | None = None, distorted_share: float = 0.0
+) -> ExpectedErrors | None:
+    """Expected errors of scans and keyframes; None without an edge, or where these leave poses free.
 
-    scans : of the log once more, in order, for the systematic errors; without them the random ones
-    Raises InputError where these scans cannot be read again.
+    scans, distorted_share : as in ``systematic_of``; without scans random errors only
+    Raises InputError where the scans cannot be read again.
     """
     if not len(result.graph.edges):
         return None
-    starts = [keyframe.scan_index for keyframe in result.keyframes]
-    of_directions = None
-    if scans is not None:
-        offset_rad = result.elevation_offset_rad
-        of_directions = influence(scans, result.odometry.poses, starts, config, result.T_base_lidar, offset_rad)
-    counts = np.diff([*starts, len(result.trajectory)])
+    systematic = systematic_of(result, config, scans, distorted_share)
     try:
-        expected = expected_errors(result.graph, result.map_errors, config, counts, of_directions)
+        expected = expected_errors(result.graph, result.map_errors, config, *systematic)
     except InputError:  # poses that no edge constrains
         return None
     where = _most_uncertain(result.keyframe_trajectory, expected.covariances)
     return expected._replace(ate=msgspec.structs.replace(expected.ate, where=where))
+
+
+def systematic_of(
+    result: SlamResult, config: Config, scans: Iterable[Scan] | None, distorted_share: float
+) -> tuple[ScanPoses, Influence | None]:
+    """The poses of scans, with what distorts them, and the influence of groups of directions on these.
+
+    Of all scans of a log, or some that are evenly spread and all keyframes.
+    scans : of the log once more, in order; distorted_share : of the motion between two, by which these may be
+        distorted
+    """
+    keyframes, odometry = np.array([keyframe.scan_index for keyframe in result.keyframes]), result.odometry.poses
+    chosen = np.union1d(np.arange(0, len(odometry), math.ceil(len(odometry) / _MOST_SCANS)), keyframes)
+    found, open_motions = None, np.zeros((len(chosen), result.graph.freedom))
+    if scans is not None:
+        mounting, offset_rad = result.T_base_lidar, result.elevation_offset_rad
+        found = influence(scans, odometry, keyframes, chosen, config, mounting, offset_rad)
+        after = np.minimum(chosen, len(odometry) - 2) + 1
+        open_motions = distorted_share * lie.log(lie.between(odometry[after - 1], odometry[after]))
+    poses = result.trajectory.poses[chosen]
+    return ScanPoses.of(poses, np.searchsorted(chosen, keyframes), open_motions), found
 
 
 def _most_uncertain(keyframes: Trajectory, covariances: Matrix) -> str:

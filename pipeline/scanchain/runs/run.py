@@ -204,7 +204,7 @@ class _Run:
             try:
                 again = open_log(self.job.logs, self.log.config).scans(self.config.preprocess)
                 with closing(again):
-                    return expected_of(result, self.config, again)
+                    return expected_of(result, self.config, again, self.log.distorted_share)
             except (InputError, OSError) as error:
                 self.notes.append(f"error bars of random errors only: {error}")
         return expected_of(result, self.config)

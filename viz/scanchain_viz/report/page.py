@@ -154,7 +154,7 @@ class Collapsible:
 class Page:
     """A report; ``facts`` are label and value, ``warnings`` stand out, ``notes`` do not.
 
-    ``judged`` : the verdict, which stands at its head
+    ``judged`` : the verdict, which stands at its head; ``refuted`` : what the truth refutes of it, in red
     """
 
     title: str
@@ -165,6 +165,7 @@ class Page:
     sections: Sequence[Section] = ()
     collapsibles: Sequence[Collapsible] = ()
     judged: Judged | None = None
+    refuted: str = ""
 
 
 def write_page(folder: Path, page: Page) -> None:

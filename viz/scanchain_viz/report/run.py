@@ -63,6 +63,7 @@ def write_run_report(directory: Path) -> None:
         sections=tuple(_sections(directory, metrics)),
         collapsibles=(*sections.provenance_sections(made, {}), sections.configuration(directory)),
         judged=metrics.judged,
+        refuted=metrics.refuted,
     )
     page.write_page(directory, whole)
 
