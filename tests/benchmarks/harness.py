@@ -65,10 +65,10 @@ def settings_of(words: Iterable[str]) -> dict[str, object]:
     return {key.replace(".", "__"): value for key, _, value in (word.partition("=") for word in words)}
 
 
-def drive_of(world: str, sensor: str, scans: int, cache: Path, seed: int = 1) -> Path:
+def drive_of(world: str, sensor: str, scans: int, cache: Path, seed: int = 1, **options: object) -> Path:
     """The simulated log of the first scans of a world."""
     duration_s = min(WORLDS[world].duration_s, scans * SENSORS[sensor].period_ns * 1e-9)
-    return made.log(world, folder=cache, seed=seed, seconds=duration_s, sensor=sensor)
+    return made.log(world, folder=cache, seed=seed, seconds=duration_s, sensor=sensor, **options)
 
 
 def recorded(name: str, drive: Drive, cache: Path) -> Path:

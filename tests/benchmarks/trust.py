@@ -1,7 +1,8 @@
 """Error bars and covariances against the truth.
 
 Worlds of 3D lidars, sensors and cache are those of ``odometry3d --set``; planar worlds are driven with LMS-270 and
-UTM-30, all without wheels; with the times of the points and without, every scan and every second. Then real logs,
+UTM-30, all without wheels; with the times of the points and without, every scan and every second, and with noisy
+ranges of which 30 % are missing (``--noises``, in meters). Then real logs,
 their halves, and every second and third of their scans. A line says
 
   ATE       of the final trajectory
@@ -52,6 +53,7 @@ from tests.support.scenes import DATA
 WARM_UP_SCANS = 3
 NO_WHEELS = (Override("odometry.prior", "constant-velocity", "this benchmark"),)
 PLANAR, PLANAR_SENSORS = ("office", "identical"), ("lms-270", "utm-30")
+DROPOUT = 0.3  # share of the rays of noisy lidars that do not return
 SHORT_M, LONG_M = 1.0, 10.0  # paths of relations that show their own noise, and that show ours
 MOCAP = {"ground_truth_topic": "/vrpn_client_node/jackal/pose"}
 REAL = {  # file, and keys of [log]
@@ -248,6 +250,11 @@ def simulated(arguments: Namespace) -> Iterator[tuple[str, str, Path, dict[str, 
             )
             yield f"simulated, {place}", f"{world} {sensor} {seed}", path, {}
             yield f"simulated, {place}", f"{world} {sensor} {seed}, every 2", path, {"every": 2}
+            for noise_m in filter(None, map(float, arguments.noises.split(","))):
+                noisy = drive_of(
+                    world, sensor, arguments.scans, arguments.cache, seed, noise_m=noise_m, dropout=DROPOUT
+                )
+                yield f"simulated with noise, {place}", f"{world} {sensor} {seed}, {100 * noise_m:g} cm", noisy, {}
             untimed = f"{world} {sensor} {seed}, no times"
             yield f"simulated without times, {place}", untimed, path, {"point_times": "none"}
 
@@ -264,7 +271,11 @@ def real() -> Iterator[tuple[str, str, Path, dict[str, object]]]:
 
 def main() -> None:
     arguments = options_of(
-        __doc__, seeds="1,2,3", real=False, **SEQUENCES | {"worlds": ",".join((*PLACES, *PLANAR)), "scans": 150}
+        __doc__,
+        seeds="1,2,3",
+        noises="0.02,0.04,0.08",
+        real=False,
+        **SEQUENCES | {"worlds": ",".join((*PLACES, *PLANAR)), "scans": 150},
     )
     row = table("sequence", "ATE m", "expected", "over", "wide", "NEES/k", "k")
     lines = []
