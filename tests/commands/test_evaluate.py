@@ -10,7 +10,7 @@ from scanchain import lie
 from scanchain.data import Trajectory
 from scanchain.evaluation.metrics import evaluate
 from scanchain.trajectory import write_tum
-from tests.support.messages import says
+from tests.support.messages import says, unfolded
 from tests.support.naive_logs import SECOND, STAMP_NS
 
 
@@ -37,10 +37,16 @@ def test_evaluate_prints_every_metric_with_its_definition(call, tree, tmp_path):
     assert code == 0
     (warning,) = errors.splitlines()
     says(warning, "warning: far from the ground truth: ATE 0.89 m, 2.8 %")
-    says(output, "ATE rmse", "‖t_ref − t_est‖", "RPE over 10 m along the reference: rmse ", "KITTI: translation")
-    assert output.count("40 of 40 estimated poses") == 1 and "gaps up to" not in output
+    heads, units, *rows = (line.split() for line in output.splitlines()[1:9])
+    assert heads == ["ATE", "RPE", "1", "pose", "RPE", "1", "s", "RPE", "10", "m"] and units == ["m", "deg"] * 4
+    assert [row[0] for row in rows] == ["rmse", "mean", "median", "std", "min", "max"]
+    assert output.count("40 of 40 estimated poses") == 1 and "‖t_ref − t_est‖" not in output
+    assert all(len(line) <= 100 for line in output.splitlines()) and len(output.splitlines()) <= 25
+    says(output, "KITTI translation 10", "not computed: RPE over 100 m")
+    says(unfolded(call("evaluate", estimate, truth, "--verbose")[1]), "‖t_ref − t_est‖", "KITTI: translation")
     found = tree(estimate, truth, "--align", "first")
-    assert set(found) == {"ate", "rpe_1_pose", "rpe_1_s", "rpe_10_m", "rpe_100_m", "kitti"}
+    assert found["start_m"] == pytest.approx(0.08, rel=0.02)
+    assert set(found) - {"start_m"} == {"ate", "rpe_1_pose", "rpe_1_s", "rpe_10_m", "rpe_100_m", "kitti"}
     assert found["ate"]["path_length_m"] == pytest.approx(10.0 * math.pi, rel=1e-3)
     assert found["ate"]["translation_m"]["maximum"] == pytest.approx(0.1 * 20.0 * 2**0.5, rel=1e-6)
     assert found["kitti"]["translation_share"] == pytest.approx(0.1, rel=0.05)
@@ -63,7 +69,7 @@ def test_evaluate_finds_scale_and_time_offset_and_measures_without_them(call, re
     assert (found["scale"], found["time_offset_s"]) == pytest.approx((4.0, -0.13), rel=1e-3, abs=1e-3)
     assert found["ate"]["translation_m"]["rmse"] < 1e-3
     _, output, _ = call("evaluate", estimate, truth, "--scale", "--time-offset", "-0.13")
-    says(output, "time offset -0.1300 s added", "scale 4 put on", "ATE rmse 0.0000")
+    says(output, "time offset -0.1300 s added", "scale 4 put on", "\nrmse     0.0000")
     result = evaluate(estimate, truth, scale=True, time_offset="auto")
     assert (result.scale, result.time_offset_s) == (found["scale"], found["time_offset_s"])
     write_tum(tmp_path / "still.tum", Trajectory(stamps_ns, np.tile(np.eye(4), (400, 1, 1))))
@@ -94,7 +100,7 @@ def test_evaluate_says_which_metric_a_short_way_leaves_out(call, tree, tmp_path)
     code, output, _ = call("evaluate", short, short)
     assert code == 0
     says(
-        output, "ATE rmse", "not computed: RPE over 10 m along the reference: no stretch of that length fits",
+        unfolded(output), "ATE", "not computed: RPE over 10 m along the reference: no stretch of that length fits",
         "not computed: KITTI metric: no stretch of 10 m fits into a path of ",
     )  # fmt: skip
     assert tree(short, short)["kitti"] is None
@@ -107,7 +113,8 @@ def test_evaluate_measures_relations_alone_and_beside_the_truth(call, tree, tmp_
     (tmp_path / "set.relations").write_text(f"103.0 104.0 {x} {y} 0 0 0 {step}\n")
     code, output, _ = call("evaluate", truth, "--relations", tmp_path / "set.relations")
     assert code == 0 and "ATE" not in output
-    says(output, "relations", "Kümmerle", "1 relation, 0 missing")
+    says(unfolded(output), "relations", "1 relation, 0 missing")
+    assert "Kümmerle" in call("evaluate", truth, "--relations", tmp_path / "set.relations", "--verbose")[1]
     found = tree(truth, truth, "--relations", tmp_path / "set.relations")
     assert found["relations"]["translation_m"]["mean"] == pytest.approx(0.05, abs=1e-9)
     assert found["relations"]["rotation_rad"]["mean"] < 1e-9 and "ate" in found

@@ -46,7 +46,6 @@ def test_several_lidars_ask_for_a_choice_by_the_short_option_which_info_and_conv
         ([*RUN, "--checkpoint", "nan"], ["nan is no number"]),
         ([*RUN, "--threads", "100000"], ["--threads"]),
         ([*RUN, "--forec"], ["No such option '--forec'. Did you mean '--force'?; see scanchain run --help"]),
-        (["run", "{office}"], ["'--out'", "scanchain run --help"]),
         (["run"], ["'LOG...'", "scanchain run --help"]),
         (["rum"], ["'rum'", "scanchain --help"]),
         (["run", "absent.mcap", "--out", "{tmp}"], ["{tmp}", "exists", "--force"]),

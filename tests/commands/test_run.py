@@ -3,16 +3,18 @@
 import json
 import re
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from scanchain.data import Trajectory
 from scanchain.logs.writer import LogWriter
+from scanchain.runs.metrics import REASON, shortened, verdict_lines
 from scanchain.settings import flatten
 from scanchain.trajectory import read_tum, write_kitti, write_tum
 from tests.support.in_process import here
-from tests.support.messages import says
+from tests.support.messages import says, unfolded
 from tests.support.naive_logs import SECOND, STAMP_NS, laser_scan, odometry, odometry_said, scan_said, write
 from tests.support.scenes import configured
 
@@ -20,9 +22,13 @@ from tests.support.scenes import configured
 def test_a_run_is_quiet_but_for_its_summary_when_piped(call, tmp_path, office):
     code, output, errors = call("run", office, "--out", tmp_path / "a")
     assert (code, errors) == (0, "")
-    assert output == (tmp_path / "a" / "summary.txt").read_text() + f"written        {tmp_path / 'a'}\n"
+    folder = tmp_path / "a"
+    last = f"written        {folder}\nopen           {folder}/report.html, scanchain view {folder}\n"
+    assert output == (folder / "summary.txt").read_text() + last
+    assert all(len(line) <= 100 for line in output.splitlines()[:-2] if str(office) not in line)
+    assert len(output.splitlines()) <= 25
     says(output, office, "/scan", "preset lidar2d of 2D logs", "60 over 5.9 s: 60 ok")
-    says(output.splitlines()[1], "(wheel odometry /odom; lidar at x 0.15, y 0.00 m of the base)")
+    says(output, f"\n{office} /scan (wheel odometry /odom; lidar at x 0.15, y 0.00 m of the base)\n")
     code, output, errors = call("run", office, "--out", tmp_path / "b", "--json", "--rerun", "off")
     assert (code, errors) == (0, "")
     assert json.loads(output) == json.loads((tmp_path / "b" / "metrics.json").read_text())
@@ -38,18 +44,20 @@ def test_a_run_whose_scans_tell_too_little_says_so_first_and_fails_with_its_resu
         for k in range(20):
             log.point_cloud("/radar", k * SECOND // 10 + STAMP_NS, "radar", rng.uniform(-40.0, 40.0, (12, 3)))
     run = ran(path)
-    assert run.code == 1 and len(run.errors.splitlines()) == 1
+    assert (run.code, run.errors) == (1, "")  # once, on one of the two
     why = run.metrics["verdict_reason"]
     says(why, f"{run.metrics['degenerate']} of 20 scans are degenerate and {run.metrics['lost']} lost")
     says(why, "scans have 12 valid points", "radar", "--topic")
-    assert run.errors.splitlines()[0] == f"error: {run.folder}: not trustworthy: {why}"
     for summary in (run.output, (run.folder / "summary.txt").read_text()):
-        assert summary.splitlines()[0] == f"verdict        not trustworthy: {why}"
-        assert summary.splitlines()[1].startswith(f"{path} /radar")
+        assert summary.splitlines()[0] == "verdict        not trustworthy"
+        said = unfolded(summary).partition(f"\n{path} /radar")[0]
+        assert said.startswith(f"verdict        not trustworthy {why.replace('; ', ' ')}")
+    errors = call("run", path, "--out", tmp_path / "json", "--json")[2]
+    assert errors == f"error: {tmp_path / 'json'}: not trustworthy: {why}\n"
     says((run.folder / "report.html").read_text(), *why.replace("'", "&#39;").split("; "))
     assert json.loads((run.folder / "run.json").read_text())["complete"] and (run.folder / "map.ply").exists()
     code, output, errors = call("check", run.folder)
-    assert (code, output.splitlines()[0], errors) == (1, f"not trustworthy: {why}", "")
+    assert (code, errors) == (1, "") and output.startswith("\n  ".join(["not trustworthy", *why.split("; ")]))
 
 
 def test_a_run_of_the_office_is_trustworthy_and_so_is_its_true_trajectory_but_not_one_that_jumps(
@@ -65,18 +73,43 @@ def test_a_run_of_the_office_is_trustworthy_and_so_is_its_true_trajectory_but_no
     expected = metrics["expected_ate_m"]
     low, high = map(float, re.fullmatch(r"ATE ([\d.]+) to ([\d.]+) m", metrics["verdict_error"]).groups())
     assert low <= expected["low"] < expected["mean"] < expected["high"] <= high < expected["high"] + 0.001
-    said = f"verdict        trustworthy ({metrics['verdict_error']}): {metrics['verdict_reason']}"
-    assert run.output.splitlines()[0] == said
-    assert metrics["verdict_reason"].startswith(f"nothing to check in 60 scans: {metrics['ok']} ok")
+    assert run.output.splitlines()[0] == f"verdict        trustworthy ({metrics['verdict_error']})"
+    assert metrics["ok"] == 60 and metrics["verdict_reason"].startswith(
+        "nothing to check in 60 scans; checked by "
+    )
     truth = office.with_suffix(".tum")
     code, output, _ = call("check", "--trajectory", truth, office)
-    (bound_m,) = map(float, re.findall(r"^trustworthy \(ATE below ([\d.]+) m by scan matching\): ", output))
+    (bound_m,) = map(float, re.findall(r"^trustworthy \(ATE below ([\d.]+) m by scan matching\)\n", output))
     assert code == 0 and 0.0 < bound_m < 0.1 and "wheels" in output
     poses = read_tum(truth)
     poses.poses[len(poses) // 2 :, 0, 3] += 3.0
     write_tum(tmp_path / "jump.tum", poses)
     code, output, _ = call("check", "--trajectory", tmp_path / "jump.tum", office)
-    assert code == 1 and output.startswith("not trustworthy: ") and "impossible acceleration by " in output
+    assert code == 1 and output.startswith("not trustworthy\n")
+    says(output, "impossible acceleration, 3.0 m from where constant velocity leads")
+
+
+def test_a_run_without_a_directory_gets_one_by_its_log_with_a_number_where_that_is_taken(
+    call, tmp_path, office, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my.log.mcap").symlink_to(office)
+    for number, words in (("", ()), ("_2", ()), ("_2", ("--force",))):
+        code, output, _ = call("run", "my.log.mcap", "--rerun", "off", "--end", "2", *words)
+        name = "my" if words else f"my{number}"
+        assert code == 0 and output.endswith(
+            f"written        runs/{name}\nopen           runs/{name}/report.html\n"
+        )
+        assert json.loads(Path("runs", name, "run.json").read_text())["command"][-2:] == ["--out", f"runs/{name}"]
+    assert sorted(path.name for path in Path("runs").iterdir()) == ["my", "my_2"]
+
+
+def test_a_terminal_shows_three_reasons_and_how_many_more_there_are():
+    head = list(verdict_lines("check these stretches", ["a " * 60, "b", "c", "d", "e"]))
+    assert shortened("\n".join([*head, "log.mcap", "   5 %"]) + "\n") == (
+        "\n".join([*head[:4], f"{REASON}2 more in summary.txt", "log.mcap", "   5 %"]) + "\n"
+    )
+    assert shortened("\n".join(head[:3]) + "\nx\n") == "\n".join(head[:3]) + "\nx\n"
 
 
 # flags
@@ -110,7 +143,7 @@ def test_flags_stand_for_keys_and_change_the_preset_and_a_file(tmp_path, office,
     says(run.output, f"configuration  {source}")
     assert json.loads((run.folder / "run.json").read_text())["configuration"] == source
     run = ran(office, "--odometry.prior", "constant-velocity")
-    says(run.output.splitlines()[1], "wheel odometry /odom, not used: odometry.prior is constant-velocity;")
+    says(run.output, "wheel odometry /odom, not used: odometry.prior is constant-velocity;")
 
 
 # true poses

@@ -13,6 +13,7 @@ from scanchain import InputError, Localizer, Trajectory, lie, localize, open_log
 from scanchain.config import LogConfig
 from scanchain.data import Keyframe
 from scanchain.maps import SavedMap, open_saved_map
+from scanchain.runs.metrics import REASON
 from scanchain.sessions.localize import measure, pose_near
 from scanchain.sessions.localizer import MapState
 from scanchain.settings import load_settings
@@ -40,7 +41,7 @@ def test_a_log_is_followed_in_the_map_from_a_rough_pose(office, tmp_path, call):
         "localize", office / "office.mcap", "--start", 110, "--map", office / "map", "--out", tmp_path / "loc",
         "--initial", tmp_path / "rough.tum",
     )  # fmt: skip
-    assert code == 0 and out.startswith("verdict        trustworthy: found in map after 0.0 m"), out
+    assert code == 0 and out.startswith(f"verdict        trustworthy\n{REASON}found in map after 0.0 m"), out
     found = read_tum(tmp_path / "loc/trajectory.tum")
     where = np.searchsorted(stamps_ns, found.stamps_ns)
     off = [lie.apart(a, b) for a, b in zip(lie.flatten(found.poses), true[where], strict=True)]
@@ -80,7 +81,9 @@ def test_a_whole_log_of_another_place_is_never_placed_though_it_returns_to_its_s
     made.run("identical", tmp_path, seed=5, seconds=60.0).rename(tmp_path / "other")
     out = tmp_path / "loc"
     code, said, error = call("localize", office / "office.mcap", "--map", tmp_path / "other", "--out", out)
-    assert code == 1 and "not trustworthy: not from this place: nothing in " in said and "is in other" in error
+    assert (code, error) == (1, "")
+    assert said.startswith(f"verdict        not trustworthy\n{REASON}not from this place: nothing in ")
+    assert said.splitlines()[1].endswith(" is in other")
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["placed"] == metrics["matches"] == 0
     assert metrics["states"]["searching"] == metrics["scans"] and not (out / "trajectory.tum").exists()
@@ -152,7 +155,7 @@ def test_the_verdict_names_what_speaks_for_the_place(office, monkeypatch):
     states = found.states.astype("U30")
     states[len(states) // 2 :], states[-10:] = MapState.UNMATCHED, MapState.OUTSIDE
     text = found_text(replace(found, states=states), saved, config)
-    assert "% of the scans within the map matched, 3 % outside of it; log-odds " in text
+    assert "% of the scans within the map matched, 3 % outside of it" in text and "log-odds" not in text
     nowhere = replace(
         found, is_placed=np.zeros_like(found.is_placed), result=replace(found.result, map_log_odds=2.5)
     )

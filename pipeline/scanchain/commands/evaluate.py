@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import textwrap
+from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +16,9 @@ from scanchain.errors import InputError
 
 if TYPE_CHECKING:
     from scanchain.evaluation.metrics import Results
+
+
+_WIDTH = 100  # characters of a line
 
 
 @click.command()
@@ -46,6 +51,7 @@ if TYPE_CHECKING:
 @click.option("--kitti", is_flag=True, help="All files are KITTI's, 12 numbers a line; poses pair line by line.")
 @click.option("--png", metavar="FILE", type=PATH, help="Draw the estimates, aligned, over the ground truth.")
 @options.force("an existing picture")
+@click.option("--verbose", is_flag=True, help="Print the definitions of the figures, too; --json holds them.")
 @options.as_json
 def evaluate(
     files: tuple[Path, ...],
@@ -54,10 +60,11 @@ def evaluate(
     kitti: bool,
     png: Path | None,
     force: bool,
+    verbose: bool,
     as_json: bool,
     **given: Any,
 ) -> None:
-    """Print ATE, RPE, KITTI metric and error over relations, each with its definition; several EST as a table.
+    """Print ATE, RPE, KITTI metric and error over relations; several EST as a table.
 
     Give the ground truth, or --relations, or both. GT is a TUM file, interpolated at the stamps of EST (positions
     linear, rotations by SLERP, nothing extrapolated), or a KITTI file with one row a pose of EST. A run directory
@@ -92,7 +99,7 @@ def evaluate(
         draw_evaluated(png, {name: (each.aligned, each.reference) for name, each in evaluated.items()})
     trees = {name: _tree(results) for name, results in evaluated.items()}
     tree = trees if len(trees) > 1 else trees.popitem()[1]
-    click.echo(options.json_text(tree) if as_json else _text(evaluated))
+    click.echo(options.json_text(tree) if as_json else _text(evaluated, is_verbose=verbose))
     if png is not None and not as_json:
         click.echo(f"written {png}")
 
@@ -116,21 +123,52 @@ def _evaluated(
     return results
 
 
-def _text(evaluated: dict[str, Results]) -> str:
-    if len(evaluated) > 1:
-        return _table(evaluated)
-    (results,) = evaluated.values()
-    lines = [f"paired {results.pairing}"] if results.pairing else []
+def _text(evaluated: dict[str, Results], *, is_verbose: bool) -> str:
+    definitions = dict.fromkeys(
+        each.definition for results in evaluated.values() for each in results.found.values()
+    )
+    lines = _figures(*evaluated.values()) if len(evaluated) == 1 else _table(evaluated)
+    folded = [textwrap.fill(each, _WIDTH, subsequent_indent="  ") for each in definitions] if is_verbose else []
+    return "\n".join([*lines, *folded])
+
+
+def _figures(results: Results) -> Iterator[str]:
+    """Statistics of one estimate, a row each, in meters and degrees; then the figures that are none."""
+    from scanchain.evaluation.errors import Metric
+
+    if results.pairing:
+        yield f"paired {results.pairing}"
     if results.time_offset_s:
-        lines.append(f"time offset {results.time_offset_s:+.4f} s added to the stamps of the estimate")
+        yield f"time offset {results.time_offset_s:+.4f} s added to the stamps of the estimate"
     if results.scale != 1.0:
-        lines.append(f"scale {results.scale:.6g} put on the positions of the estimate (Umeyama 1991)")
-    lines += [f"{result.summary}\n  {result.definition}" for result in results.found.values()]
-    return "\n".join([*lines, *(f"not computed: {reason}" for reason in results.missing.values())])
+        yield f"scale {results.scale:.6g} put on the positions of the estimate (Umeyama 1991)"
+    errors = {name: error for name, error in results.found.items() if isinstance(error, Metric)}
+    heads = [name.replace("rpe", "RPE").replace("ate", "ATE").replace("_", " ") for name in errors]
+    yield " " * 6 + "".join(f"{head:>18}" for head in heads)
+    yield " " * 6 + f"{'m':>9}{'deg':>9}" * len(heads)
+    for name, field_name in _STATISTICS:
+        pairs = ((each.translation_m, each.rotation_rad.degrees) for each in errors.values())
+        figures = (getattr(each, field_name) for pair in pairs for each in pair)
+        yield f"{name:<6}" + "".join(f"{figure:9.4f}" for figure in figures)
+    for line in _other_figures(results):
+        yield textwrap.fill(line, _WIDTH, subsequent_indent="  ")
 
 
-def _table(evaluated: dict[str, Results]) -> str:
-    """A row an estimate, and below it the definitions of its columns."""
+def _other_figures(results: Results) -> Iterator[str]:
+    """Those that are no statistics of errors of poses or motions."""
+    from scanchain.evaluation.errors import KittiError, RelationError
+
+    if "ate" in results.found and (share := results.ate.share_of_path) is not None:
+        yield f"ATE is {100.0 * share:.3f} % of the path of {results.ate.path_length_m:.1f} m"
+    if results.start_m is not None and results.after_start is not None:
+        after_m = results.after_start.translation_m.rmse
+        yield f"start: first motion off by {results.start_m:.4f} m; ATE from the second pose on {after_m:.4f} m"
+    yield from (each.summary for each in results.found.values() if isinstance(each, RelationError | KittiError))
+    yield from (f"not computed: {reason}" for reason in results.missing.values())
+
+
+def _table(evaluated: dict[str, Results]) -> list[str]:
+    """A row an estimate."""
     computed = dict.fromkeys(key for each in evaluated.values() for key in (*each.found, *each.missing))
     keys = sorted(computed, key=lambda key: key in _FIGURES)
     units, figures = zip(*(_FIGURES.get(key, _RMSE) for key in keys), strict=True)
@@ -142,13 +180,11 @@ def _table(evaluated: dict[str, Results]) -> str:
             row.append(f"{figure(each.found[key]):.4f}" if key in each.found else "-")
         rows.append(row)
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]
-    definitions = dict.fromkeys(
-        each.definition for results in evaluated.values() for each in results.found.values()
-    )
-    return "\n".join([*lines, *definitions])
+    return ["  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]) for row in rows]
 
 
+_STATISTICS = tuple((name, {"min": "minimum", "max": "maximum"}.get(name, name)) for name in
+    ("rmse", "mean", "median", "std", "min", "max"))  # fmt: skip
 _RMSE = ("rmse m", lambda error: error.translation_m.rmse)
 _FIGURES = {  # the unit and the one figure of a metric for a table
     "kitti": ("%", lambda error: 100.0 * error.translation_share),
@@ -165,5 +201,6 @@ def _tree(results: Results) -> dict[str, object]:
         values = ((field.name, getattr(result, field.name)) for field in fields(result))
         tree[name] = {key: value for key, value in values if not isinstance(value, np.ndarray)}
     tree |= dict.fromkeys(results.missing)
+    tree |= {} if results.start_m is None else {"start_m": results.start_m}
     tree |= {"time_offset_s": results.time_offset_s} if results.time_offset_s else {}
     return tree | ({"scale": results.scale} if results.scale != 1.0 else {})

@@ -107,7 +107,7 @@ def localize(prior: Path, out: Path, initial: str | None, strict: bool, as_json:
     with Terminal("scans") as terminal:
         localized = localize_log(job, prior, terminal, present_localization, initial=first)
     fails = localized.metrics.verdict.fails(strict=strict)
-    if fails and not sys.stdout.isatty():
+    if fails and as_json:  # else the summary holds it
         click.echo(f"error: {out}: {localized.metrics.sentence}", err=True)
     options.print_summary(out, localized.summary, as_json=as_json)
     return int(fails)

@@ -253,6 +253,9 @@ class _Report:
         from scanchain.graph.optimization import fit, has_loops
 
         before, after = self.change.before, self.change.after
+        if has_loops(after) and before.degrees_of_freedom == after.degrees_of_freedom:
+            freedom = counted(after.degrees_of_freedom, *FREEDOM)
+            return f"{before.chi2:.6g} before, {after.chi2:.8g} after, over {freedom}"
         first = f"{before.chi2:.6g} before, over {counted(before.degrees_of_freedom, *FREEDOM)}"
         second = f"{after.chi2:.8g} after, over {counted(after.degrees_of_freedom, *FREEDOM)}"
         if has_loops(after):

@@ -178,20 +178,22 @@ def force(replaced: str) -> Callable[[Any], Any]:
     return click.option("--force", is_flag=True, help=f"Replace {replaced}.")
 
 
-def out(what: str = "Directory to create.") -> Callable[[Any], Any]:
-    """``--out``, required."""
-    return click.option("--out", required=True, metavar="DIR", type=PATH, help=what)
+def out(what: str = "Directory to create.", *, required: bool = True) -> Callable[[Any], Any]:
+    """``--out``."""
+    return click.option("--out", required=required, metavar="DIR", type=PATH, help=what)
 
 
-def result(replaced: str, what: str = "Directory to create.") -> Callable[[Any], Any]:
+def result(replaced: str, what: str = "Directory to create.", *, required: bool = True) -> Callable[[Any], Any]:
     """``--out``, ``--force`` and ``--json`` of a command that writes a directory with its metrics."""
     as_metrics = click.option("--json", "as_json", is_flag=True, help="Print metrics.json instead of the summary.")
-    return _together(out(what), force(replaced), as_metrics)
+    return _together(out(what, required=required), force(replaced), as_metrics)
 
 
 def print_summary(out: Path, summary: str, *, as_json: bool) -> None:
     """Print the summary of a result and where it lies, or its metrics as they are in the file."""
-    click.echo((out / "metrics.json").read_text(encoding="utf-8") if as_json else summary, nl=False)
+    from scanchain.runs.metrics import shortened
+
+    click.echo((out / "metrics.json").read_text(encoding="utf-8") if as_json else shortened(summary), nl=False)
     if not as_json:
         click.echo(f"written        {out}")
 

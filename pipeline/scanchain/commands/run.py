@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
+from itertools import chain, count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,9 +22,13 @@ if TYPE_CHECKING:
 _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
 
 
-@click.command(cls=OverrideCommand, options_metavar="--out DIR [OPTIONS] [--section.key VALUE]...")
+@click.command(cls=OverrideCommand, options_metavar="[OPTIONS] [--section.key VALUE]...")
 @options.logs
-@options.result("an existing run directory once the new one is complete", "Run directory to create.")
+@options.result(
+    "an existing run directory once the new one is complete",
+    "Run directory to create.  [default: runs/NAME by the name of LOG, with a number where that is taken]",
+    required=False,
+)
 @options.of_log
 @click.option(
     "--rerun",
@@ -44,7 +50,7 @@ _SINKS: tuple[SinkName, ...] = ("save", "spawn", "connect", "web")
     help="Time between checkpoints; writing them takes at most 5 % of the run.",
 )
 @options.strict
-def run(out: Path, rerun: str, strict: bool, as_json: bool, **given: Any) -> int:
+def run(out: Path | None, rerun: str, strict: bool, as_json: bool, **given: Any) -> int:
     """Compute the trajectory and the map of a log, with a rerun recording.
 
     LOG is an MCAP file, any other format that scanchain convert reads, or the address of one: of an MCAP at
@@ -53,7 +59,7 @@ def run(out: Path, rerun: str, strict: bool, as_json: bool, **given: Any) -> int
 
     \b
     Examples:
-      scanchain run log.mcap --out runs/log
+      scanchain run log.mcap
       scanchain run log.mcap --out runs/log --rerun save,spawn
       scanchain run intel.clf.bz2 --out runs/intel
       scanchain run scans/ --out runs/scans --log.rate_hz 10
@@ -70,20 +76,34 @@ def run(out: Path, rerun: str, strict: bool, as_json: bool, **given: Any) -> int
     from scanchain.runs.resume import how_to_resume
     from scanchain.runs.run import run as run_log
 
-    job = Job(out=out, sinks=_sinks(rerun), command=tuple(sys.argv), **given)
+    command = tuple(sys.argv)
+    if out is None:
+        out = _unnamed(given["logs"][0], is_taken_over=given["resume"] or given["force"])
+        command += ("--out", str(out))
+    job = Job(out=out, sinks=_sinks(rerun), command=command, **given)
     with Terminal("scans") as terminal:
         finished = run_log(job, open_recorder, terminal, write_report)
-    is_seen = sys.stdout.isatty() and not as_json  # the summary holds the same sentences
     fails = finished.metrics.verdict.fails(strict=strict)
-    if fails and not is_seen:
+    if fails and as_json:  # else the summary holds it
         click.echo(f"error: {finished.path}: {finished.metrics.sentence}", err=True)
+    is_seen = sys.stdout.isatty() and not as_json  # a terminal shows both, and the summary holds them
     for warning in [each for each in finished.warnings if not (is_seen and each in finished.summary)]:
         click.echo(f"warning: {warning}", err=True)
     options.print_summary(finished.path if finished.stopped else out, finished.summary, as_json=as_json)
+    if not as_json and not finished.stopped:
+        recording = f", scanchain view {shlex.quote(str(out))}" if "save" in job.sinks else ""
+        click.echo(f"open           {out}/report.html{recording}")
     if finished.stopped:
         again = how_to_resume(job.command)
         raise ScanchainError(f"{finished.stopped}; the results so far are in {finished.path}; {again}")
     return int(fails)
+
+
+def _unnamed(log: Source, *, is_taken_over: bool) -> Path:
+    """Directory of a run of this log where none is given: the first that is free, or a given one is taken over."""
+    name = str(log).rstrip("/").rpartition("/")[2].partition(".")[0] or "log"
+    paths = (Path("runs", each) for each in chain([name], (f"{name}_{number}" for number in count(2))))
+    return next(path for path in paths if is_taken_over or not path.exists())
 
 
 def _sinks(text: str) -> frozenset[SinkName]:
@@ -139,7 +159,7 @@ def check(
             click.echo(
                 f"warning: {counted(missing, 'scan')} without a pose in {trajectory} are left out", err=True
             )
-    lines = [judged.sentence, *(f"  {stretch.text}" for stretch in judged.stretches)]
+    lines = [judged.headline, *(f"  {reason}" for reason in judged.reasons)]
     tree = {
         "verdict": judged.verdict,
         "verdict_reason": judged.reason,

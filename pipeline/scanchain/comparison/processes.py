@@ -178,7 +178,9 @@ def run_all(
                 continue
             outcome = _run(method, scans, folder / f"run_{turn}_{place}", limits)
             if outcome.is_whole and outcome.report.has_compiled:
-                progress.announce(f"{method.name}: compiled its kernels, once after the installation; run again")
+                progress.announce(
+                    f"{method.name}: has compiled its kernels, once after the installation; repeating it"
+                )
                 outcome = _run(method, scans, folder / f"run_{turn}_{place}_compiled", limits)
             outcomes[method.name].append(outcome)
             which = f" {turn + 1}/{repeat}" if repeat > 1 else ""

@@ -93,16 +93,20 @@ def assess(outcomes: Sequence[Outcome], stamps_ns: NDArray[np.int64], reference:
     pairs = None if truth is None else evaluation.pair(outcome.trajectory, truth)
     if truth is None or pairs is None or len(pairs) < 2:  # one pose has no error after alignment
         return Assessed(figures, np.eye(4), by_scan, error, definitions)
+    whole, pairs = pairs, pairs.after_start
     ate = evaluation.absolute_error_of_any_path(pairs)
-    by_scan["error_m"][pairs.places], by_scan["error_rad"][pairs.places] = ate.errors_m, ate.errors_rad
+    aligned = ate.T_reference_estimate @ whole.estimate
+    by_scan["error_m"][whole.places] = np.linalg.norm((whole.reference - aligned)[:, :3, 3], axis=1)
+    by_scan["error_rad"][pairs.places] = ate.errors_rad
     if (steps := _steps(outcome, *NEES_COLUMNS)) is not None:
         by_scan["nees"] = nees_of_steps(steps, Trajectory(stamps_ns, outcome.odometry), truth)
     nees = by_scan["nees"]
     figures |= {
         "ate_m": ate.translation_m.rmse,
+        "start_m": whole.start_error_m,
         "ate_share": ate.share_of_path,
         "ate_rotation_rad": ate.rotation_rad.rmse,
-        "paired_share": pairs.share,
+        "paired_share": whole.share,
         "nees": float(np.nanmean(nees)) if np.isfinite(nees).any() else None,
     }
     relative, _ = evaluation.relative_errors(pairs, _INTERVALS)
@@ -352,6 +356,11 @@ def summarize(results: Results, log: Log, limits: Limits, provenance: Provenance
         if np.isfinite(others_m).any():
             more[name]["disagreement_m"] = float(np.nanmedian(others_m))
     judgments = judged(chosen, scans)
+    for name, judgment in judgments.items():
+        ate_m = results.assessed[name].figures.get("ate_m")
+        if judgment.verdict is Verdict.TRUSTWORTHY and ate_m is not None and ate_m > judgment.bound_m:
+            why = f"the ground truth refutes {judgment.error}: ATE {ate_m:.4f} m"
+            judgments[name] = replace(judgment, verdict=Verdict.CHECK, reason=why, error="")
     rows = [_row(results, method, more[method.name], judgments.get(method.name)) for method in results.methods]
     packages = sorted({BASELINES[method.base].package for method in results.methods if method.base in BASELINES})
     return Table(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -16,6 +17,7 @@ from scanchain.runs.provenance import Provenance
 from scanchain.verdict import Judged, Verdict
 
 TABLE_FILE = "table.json"
+_WIDTH = 100  # characters of a line below the table for a terminal
 Figures = Mapping[str, float | None]  # by key of COLUMNS; unknown without a reference, or after a failure
 
 
@@ -78,8 +80,11 @@ _DEGREES = 57.29577951308232
 
 COLUMNS = (
     Column("ate_m", "ATE", "m", 1.0, 4, "low", "summary",
-        "rmse of positions after rigid alignment, without scale"),
-    Column("ate_share", "ATE/path", "%", 100.0, 3, "low", "accuracy", "the same over the length of the path"),
+        "rmse of positions from the second scan on, after rigid alignment, without scale"),
+    Column("start_m", "start", "m", 1.0, 3, "", "summary",
+        "error of the motion from the first scan to the second, which nothing predicts; in no other figure"),
+    Column("ate_share", "ATE/path", "%", 100.0, 3, "low", "accuracy",
+        "ATE over the length of the true path"),
     Column("ate_rotation_rad", "ATE rot.", "deg", _DEGREES, 3, "low", "accuracy",
         "rmse of the angle after alignment"),
     Column("rpe_1_s_m", "RPE 1 s", "mm", 1e3, 1, "low", "summary", "rmse of the motion over 1 s"),
@@ -257,13 +262,13 @@ def text(table: Table) -> str:
         cells = [cells[place] for place in tried]
         texts = [column.head, column.unit, *(cell.text + (" ", "*")[cell.is_best] for cell in cells)]
         lines = [f"{line}  {text:>{max(map(len, texts))}}" for line, text in zip(lines, texts, strict=True)]
-    verdicts = ["verdict", "", *(row.vouched for row in rows)]
-    lines = [f"{line}  {verdict}" for line, verdict in zip(lines, verdicts, strict=True)]
+    best = "* best of its column. " if any(cell.is_best for cells in shown for cell in cells) else ""
     endings = [f"{row.name}: {row.status}: {row.reason}" for row in rows if row.status is not Status.OK]
     if missing := [row for row in table.rows if row.status is Status.MISSING]:
         commands = dict.fromkeys(row.reason.rpartition(": ")[2] for row in missing)  # that install them
         endings += [f"not installed: {', '.join(row.name for row in missing)}; {' and '.join(commands)}"]
-    endings += [f"{row.name}: {row.sentence}" for row in table.rows if row.is_doubted]
+    endings += [f"{row.name}: {row.sentence if row.is_doubted else row.vouched}" for row in rows if row.verdict]
     endings += [table.provenance.stopped] if table.provenance.stopped else []
     known = [line.rstrip() for line in lines]
-    return "\n".join([*known, f"* best of its column. {table.against}", *endings]) + "\n"
+    below = (textwrap.fill(line, _WIDTH, subsequent_indent="  ") for line in (f"{best}{table.against}", *endings))
+    return "\n".join([*known, *below]) + "\n"

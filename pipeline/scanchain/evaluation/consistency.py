@@ -26,6 +26,7 @@ _RANK_TOLERANCE = 1e-9  # of the largest singular value, below which positions l
 _DRIFT_OF_NOISE = 2.0  # drift of a map over its renewal, in standard deviations of independent errors of the scans
 _DRIFT_OF_SYSTEMATIC = 5.0  # the same of errors that successive scans have in common; measured on simulated worlds
 _REVISIT = 2.0  # variances of the systematic error in a loop edge: of both passes
+_OVERESTIMATE = 2.0  # variance of the jackknife over the true one: see ``_scales``
 _MOST_MEDIANS = 3.0  # influence of a group of directions over the median, above which the log needs the group
 _MOST_OPEN = 0.5  # largest standard deviation of the instant of a pose in a distorted scan, of its duration
 _LEAST_VARIANCE = 1e-14  # m² or rad², which keeps covariances regular
@@ -261,15 +262,17 @@ def _expected(ates_m: NDArray[np.float64]) -> ExpectedError:
 def _scales(sizes_m: NDArray[np.float64], kinds: NDArray[np.int64]) -> tuple[NDArray[np.float64], float]:
     """(G,) factors on the influences of groups by which their squares sum up to the variance, and its uncertainty.
 
-    The variance of the jackknife is (G − 1)/G Σ sᵢ² over the G groups of a kind, of influences sᵢ, averaged over
-    the kinds: each divides all points, and shows all errors. The influence of a group without which the log is not
+    The variance of the jackknife is (G − 1)/G Σ sᵢ² over the G groups of a kind, of influences sᵢ. It is twice the
+    true one: in space both kinds divide all points and show all errors, in the plane a direction often hangs on
+    two groups, of leverage ½ each (MacKinnon & White 1985). The influence of a group without which the log is not
     observable is unknown: the median takes its place. The uncertainty is the standard deviation of the logarithm
     of a standard deviation with (Σ sᵢ²)² / Σ sᵢ⁴ degrees of freedom (Satterthwaite 1946).
     """
     numbers, usual_m = np.bincount(kinds)[kinds], np.median(sizes_m)
     is_usual = sizes_m <= _MOST_MEDIANS * usual_m
-    share = (numbers - 1) / (numbers * len(np.unique(kinds)))
-    scales = np.sqrt(share) * np.where(is_usual, 1.0, usual_m / np.maximum(sizes_m, 1e-12))
+    scales = np.sqrt((numbers - 1) / (_OVERESTIMATE * numbers)) * np.where(
+        is_usual, 1.0, usual_m / np.maximum(sizes_m, 1e-12)
+    )
     squares = (scales * sizes_m) ** 2
     freedom = squares.sum() ** 2 / max((squares**2).sum(), 1e-300)
     return scales, float(1.0 / np.sqrt(2.0 * freedom)) if freedom else 0.0

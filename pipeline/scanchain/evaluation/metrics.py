@@ -103,6 +103,7 @@ class Results:
     """Metrics by name: those computed, and the reason for each that could not be.
 
     ``pairing`` : which poses were compared with the truth; ``warnings`` : why that may mislead, a line each
+    ``start_m`` : error of the motion from the first pose to the second; ``after_start`` : the ATE without that
     ``scale``, ``time_offset_s`` : the factor put on the estimate and the seconds added to its stamps before that
     ``aligned`` : (N, 4, 4) the estimate as the ATE compares it, ``reference`` the true poses beside it
     """
@@ -113,6 +114,8 @@ class Results:
     warnings: Sequence[str] = ()
     scale: float = 1.0
     time_offset_s: float = 0.0
+    start_m: float | None = None
+    after_start: AbsoluteError | None = None
     aligned: Matrix = field(default_factory=lambda: np.empty((0, 4, 4)))
     reference: Matrix = field(default_factory=lambda: np.empty((0, 4, 4)))
 
@@ -183,7 +186,9 @@ def evaluate(
     aligned = ate.T_reference_estimate @ pairs.estimate
     errors, missing = relative_errors(pairs, intervals)
     found: dict[str, Result] = {"ate": ate, **errors}
-    return Results(found, missing, pairs.description, warnings, factor, offset_s, aligned, pairs.reference)
+    after = absolute_error(pairs.after_start, Alignment(align)) if pairs.starts else None
+    start = (pairs.start_error_m, after)
+    return Results(found, missing, pairs.description, warnings, factor, offset_s, *start, aligned, pairs.reference)
 
 
 def _intervals(text: str) -> list[tuple[float, str]]:

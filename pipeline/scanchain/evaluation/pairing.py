@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ _INTERVALS = 5.0  # median intervals of the reference that the default widest ga
 _SAME_S = 1e-6  # largest error of a stamp that was a floating-point number of seconds
 _ROUNDED_S = 5e-4  # largest error of a stamp written in milliseconds
 _FEW = 10  # number of poses below which their error has little meaning
+_FEWEST_AFTER_START = 4  # pairs with the first pose, of which three remain: as many as a rigid alignment takes
 _ROUNDING_SHARE = 0.1  # share of the reference's median interval that either error is at most
 _KITTI_FIELDS = 12
 _SLACK_NS = 1_000_000_000  # largest error of the expected stamps of a log's scans
@@ -58,6 +59,27 @@ class Pairs:
     def share(self) -> float:
         """Share of the estimated poses that have a reference pose."""
         return len(self) / self.estimate_count
+
+    @property
+    def starts(self) -> bool:
+        """True if the first two poses of the estimate, and another, have a reference pose."""
+        return len(self) >= _FEWEST_AFTER_START and self.places[:2].tolist() == [0, 1]
+
+    @property
+    def after_start(self) -> Pairs:
+        """Those from the second pose of the estimate on: the motion up to it is predicted by nothing."""
+        if not self.starts:
+            return self
+        parts = {name: getattr(self, name)[1:] for name in ("stamps_ns", "estimate", "reference", "places")}
+        return replace(self, **parts)
+
+    @property
+    def start_error_m(self) -> float | None:
+        """Error of the motion from the first pose to the second; None where that is unknown."""
+        if not self.starts:
+            return None
+        motion, true_motion = (lie.between(poses[0], poses[1]) for poses in (self.estimate, self.reference))
+        return float(np.linalg.norm(lie.between(true_motion, motion)[:3, 3]))
 
     @property
     def missing(self) -> str:

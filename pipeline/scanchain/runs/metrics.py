@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import takewhile
 from pathlib import Path
 
 import msgspec
@@ -21,7 +23,8 @@ from scanchain.slam import SlamResult
 from scanchain.verdict import Judged, Stretch, Verdict
 
 METRICS_FILE = "metrics.json"
-VERDICT = "verdict"  # first word of a summary
+VERDICT, REASON = "verdict", " " * 15  # first word of a summary, and begin of the reasons below it
+_WIDTH, _FIRST = 100, 3  # characters of such a line, and reasons that a terminal shows
 _NOTICEABLE_S = 0.5  # seconds of compilation time below which it is not reported
 
 
@@ -273,21 +276,44 @@ def compare_with_truth(
     return GroundTruth(source, length_m, optimized, odometry, gap_s), pairs.warnings
 
 
+def verdict_lines(headline: str, reasons: Sequence[str]) -> Iterator[str]:
+    """The first lines of a summary: the verdict, and a line or more each reason, indented."""
+    yield f"{VERDICT:<14} {headline}"
+    for reason in reasons:
+        yield textwrap.fill(reason, _WIDTH, initial_indent=REASON, subsequent_indent=f"{REASON}  ")
+
+
+def shortened(summary: str) -> str:
+    """A summary with the first reasons only, for a terminal."""
+    head, *lines = summary.splitlines(keepends=True)
+    reasons = list(takewhile(lambda line: line.startswith(REASON), lines))
+    begins = [place for place, line in enumerate(reasons) if not line.startswith(f"{REASON}  ")]
+    shown = reasons
+    if len(begins) > _FIRST:
+        shown = [*reasons[: begins[_FIRST]], f"{REASON}{len(begins) - _FIRST:,} more in summary.txt\n"]
+    return "".join([head, *shown, *lines[len(reasons) :]])
+
+
+def removed(points: int) -> str:
+    """Points of moving objects that a map does not have, in words; empty for none."""
+    return f"; {counted(points, 'point')} of moving objects removed" if points else ""
+
+
 def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[str]) -> str:
     """The metrics as text."""
     m = metrics
-    dropped = f", {counted(m.dropped_points, 'invalid return')} left out" if m.dropped_points else ""
     lines = [
-        f"{VERDICT:<14} {m.sentence}",
+        *verdict_lines(m.judged.headline, m.judged.reasons),
         heading,
         f"configuration  {configuration}",
         f"scans          {m.scans:,} over {m.log_span_s:.1f} s: {m.ok:,} ok, "
-        f"{m.contradicted:,} contradicted, {m.degenerate:,} degenerate, {m.lost:,} lost{dropped}",
-        f"trajectory     {m.traveled_m:.1f} m, {counted(m.keyframes, 'keyframe')}",
+        f"{m.contradicted:,} contradicted, {m.degenerate:,} degenerate, {m.lost:,} lost",
+        *([f"points         {counted(m.dropped_points, 'invalid return')} left out"] if m.dropped_points else []),
+        f"trajectory     {m.traveled_m:.1f} m, {counted(m.keyframes, 'keyframe')}{_at_rest(m)}",
         f"expected ATE   {m.expected_ate}",
         f"loop closures  {m.closures}",
         f"pose graph     {m.fit}",
-        f"map            {counted(m.map_points, 'point')}; {m.moving_points_removed:,} more removed as moving",
+        f"map            {counted(m.map_points, 'point')}{removed(m.moving_points_removed)}",
         f"matching       inliers {100.0 * m.median_inlier_share:.0f} %, "
         f"residual {m.residual}, {counted(round(m.median_iterations), 'iteration')} (medians)",
         *([f"lidar noise    {m.range_noise}"] if m.range_noise_m else []),
@@ -342,6 +368,10 @@ def accuracy_lines(truth: GroundTruth) -> list[str]:
             f"max {accuracy.ate_max_m:.4f} m, rotation rmse {rotation:.3f} deg"
         )
     return lines
+
+
+def _at_rest(m: Metrics) -> str:
+    return ": the noise of one that does not move" if "does not move" in m.verdict_reason else ""
 
 
 def _calibration_lines(m: Metrics) -> list[str]:

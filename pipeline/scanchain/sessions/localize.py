@@ -24,7 +24,7 @@ from scanchain.logs import Log
 from scanchain.maps import SavedMap
 from scanchain.runs.directory import POINTS_FILE, RUN_FILE, RunDirectory
 from scanchain.runs.job import Job, Progress
-from scanchain.runs.metrics import GroundTruth, accuracy_lines
+from scanchain.runs.metrics import GroundTruth, accuracy_lines, verdict_lines
 from scanchain.runs.provenance import Hashing, describe_start
 from scanchain.runs.run import accuracy_of, opened, true_poses
 from scanchain.runs.step_table import pose_columns
@@ -315,7 +315,7 @@ def _verdict(
     )
     share = f"{100.0 * matched / max(matched + unmatched, 1):.0f} % of the scans within the map matched"
     away = f", {100.0 * outside / scans:.0f} % outside of it" if outside else ""
-    evidence = f"{share}{away}; log-odds {log_odds:.0f}"
+    evidence = f"{share}{away}"
     doubt = doubt or ("" if matched else "no scan matched the map")
     doubtful = sorted((part for part in parts if part.is_doubtful), key=lambda part: -part.length_m)
     if not doubtful and not doubt:
@@ -363,7 +363,7 @@ def _summary(m: LocalizeMetrics, prior: SavedMap, log: Log, mounting_note: str) 
     names = ", ".join(session.name for session in prior.sessions)
     states = ", ".join(f"{count:,} {state}" for state, count in m.states.items() if count)
     lines = [
-        f"verdict        {m.sentence}",
+        *verdict_lines(m.verdict, m.reason.split("; ")),
         f"log            {', '.join(map(str, log.paths))} {log.topic}: "
         f"{counted(m.scans, 'scan')} over {m.path_m:.1f} m",
         f"map            {prior.folder}: {counted(m.map_keyframes, 'keyframe')} of {names}",
@@ -372,6 +372,8 @@ def _summary(m: LocalizeMetrics, prior: SavedMap, log: Log, mounting_note: str) 
     if m.found_scan >= 0:
         at = f"{m.found_after_s:.1f} s and {m.found_after_m:.1f} m"
         lines.append(f"found          at scan {m.found_scan:,}, after {at}")
+    if m.found_scan >= 0 and np.isfinite(m.log_odds):
+        lines.append(f"evidence       log-odds of {m.log_odds:.0f} that this location is right")
     if m.matches:
         left_out = f", {m.rejected:,} of them left out" if m.rejected else ""
         lines += [

@@ -19,6 +19,7 @@ from scanchain.graph.optimization import fit
 from scanchain.maps import MAP_FOLDER, SavedMap, Session
 from scanchain.runs.directory import RUN_FILE, RunDirectory
 from scanchain.runs.job import Job, Progress
+from scanchain.runs.metrics import removed
 from scanchain.runs.provenance import Hashing, describe_start
 from scanchain.runs.results import Cloud, cloud_of
 from scanchain.sessions.alignment import opened_maps
@@ -246,7 +247,7 @@ def _summary(m: MergeMetrics, first: str, configuration: str, *, fixed: bool) ->
         f"closures       {m.closures_tried:,} tried between maps, {m.closures_in_force:,} in force",
         f"pose graph     {m.fit}",
         f"certificate    {m.certificate}",
-        f"map            {counted(m.map_points, 'point')}; {m.moving_points_removed:,} more removed as moving",
+        f"map            {counted(m.map_points, 'point')}{removed(m.moving_points_removed)}",
         f"time           {m.run_s:.1f} s"
         + (f" (and {m.compile_s:.0f} s compiling)" if m.compile_s >= 1.0 else ""),
     ]

@@ -84,9 +84,12 @@ class Stretch(Struct, frozen=True):
     @property
     def text(self) -> str:
         """The stretch in words."""
-        size = "" if self.size_m is None else f" by {self.size_m:,.1f} m"
-        turn_rad = self.size_rad or 0.0
-        if turn_rad > _SMALL_RAD:
+        size, turn_rad = "" if self.size_m is None else f" by {self.size_m:,.1f} m", self.size_rad or 0.0
+        if self.kind is Kind.ACCELERATION:
+            size = f",{size.removeprefix(' by')} from where constant velocity leads"
+        if turn_rad > np.pi:
+            size += " and more than 180 deg"
+        elif turn_rad > _SMALL_RAD:
             size += f" and {np.degrees(turn_rad):.0f} deg"
         place = f"scan {self.first:,}" if self.first == self.last else f"scans {self.first:,} to {self.last:,}"
         return f"{place} ({self.times}): {self.kind}{size}"

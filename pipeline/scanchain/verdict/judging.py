@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -28,6 +29,7 @@ _MOST_OPEN_AT_REST = 0.05  # largest share of scans that leave a direction open,
 _FEWEST_TRIED, _LEAST_ACCEPTED = 10, 0.2  # scans that must try loop closures, and least share of closures accepted
 _OPPOSED = -0.5  # turns of the trajectory over those of the wheels, below which one of the two is mirrored
 _SHOWN = 3  # stretches that the sentence lists
+_MORE = re.compile(r"and [\d,]+ more")
 _WORKABLE, _WORKABLE_M = 0.03, 0.1  # largest upper bound of the error: share of the trajectory's extent, or meters
 
 
@@ -45,12 +47,16 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """A verdict, its reasons in words, the suspicious stretches, and the error that it vouches for in words."""
+    """A verdict, its reasons in words, the suspicious stretches, and the error that it vouches for.
+
+    error, bound_m : in words, and its upper bound; infinite where that is unknown
+    """
 
     verdict: Verdict
     reason: str
     stretches: tuple[Stretch, ...] = ()
     error: str = ""
+    bound_m: float = np.inf
 
     @property
     def vouched(self) -> str:
@@ -59,9 +65,20 @@ class Judged:
         return f"{words[self.verdict]}{self.error}" if self.error and self.verdict in words else ""
 
     @property
+    def headline(self) -> str:
+        """Verdict and error."""
+        return f"{self.verdict}{f' ({self.vouched})' if self.vouched else ''}"
+
+    @property
+    def reasons(self) -> list[str]:
+        """The reasons, and all stretches, one by one."""
+        said = [each for each in self.reason.split("; ") if not _MORE.fullmatch(each)]
+        return [*said, *(each.text for each in self.stretches if each.text not in said)]
+
+    @property
     def sentence(self) -> str:
-        """Verdict, error and reasons."""
-        return f"{self.verdict}{f' ({self.vouched})' if self.vouched else ''}: {self.reason}"
+        """Verdict, error and reasons, of many stretches the largest."""
+        return f"{self.headline}: {self.reason}"
 
 
 def judge(evidence: Evidence, T_base_lidar: Pose | None = None, distortion: str = "") -> Judged:
@@ -93,7 +110,7 @@ def judge(evidence: Evidence, T_base_lidar: Pose | None = None, distortion: str 
         verdict = Verdict.CHECK
     else:
         verdict, reasons = Verdict.TRUSTWORTHY, list(_nothing(evidence))
-    return Judged(verdict, "; ".join([*reasons, *notes]), stretches, error)
+    return Judged(verdict, "; ".join([*reasons, *notes]), stretches, error, evidence.bound_m)
 
 
 def _grave(evidence: Evidence, stretches: Sequence[Stretch]) -> Iterator[str]:
@@ -252,9 +269,16 @@ def _listed(stretches: Sequence[Stretch]) -> str:
 
 
 def _nothing(evidence: Evidence) -> Iterator[str]:
-    """That no check found anything, with the states of the scans and the checks that were made."""
-    states = f": {evidence.states}" if evidence.states else ""
-    yield f"nothing to check in {counted(len(evidence), 'scan')}{states}"
+    """That no check found anything, why scans that are not well measured need none, and the checks made."""
+    kinds = {
+        "fit the map badly": evidence.is_contradicted,
+        "leave a direction open": evidence.is_degenerate,
+        "have too few correspondences": evidence.is_lost,
+    }
+    counts = [f"{int(found.sum()):,} {words}" for words, found in kinds.items() if found.any()]
+    yield f"nothing to check in {counted(len(evidence), 'scan')}"
+    if counts:
+        yield f"{' and '.join(counts)}, each time for too short a way to move the trajectory"
     checks = {
         "fit": evidence.fit,
         "overlap": evidence.overlap,

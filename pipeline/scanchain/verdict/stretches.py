@@ -108,16 +108,6 @@ class Evidence:
         intervals_s = np.diff(self.seconds, prepend=self.seconds[0])
         return intervals_s > _GAP * np.median(intervals_s)
 
-    @property
-    def states(self) -> str:
-        """Number of scans in each state that there is, as text; empty without matches."""
-        if not np.isfinite(self.fit).any():
-            return ""
-        marks = {"contradicted": self.is_contradicted, "degenerate": self.is_degenerate, "lost": self.is_lost}
-        counts = {name: int(is_marked.sum()) for name, is_marked in marks.items()}
-        counts = {"ok": len(self) - sum(counts.values())} | counts
-        return ", ".join(f"{count:,} {name}" for name, count in counts.items() if count)
-
     def __len__(self) -> int:
         return len(self.seconds)
 

@@ -15,7 +15,7 @@ from scanchain.data import BACK_END, Points
 from scanchain.errors import counted
 from scanchain.maps import read_ply
 from scanchain.runs.directory import RUN_FILE, TRUTH_FILE
-from scanchain.runs.metrics import VERDICT, GroundTruth, Metrics
+from scanchain.runs.metrics import REASON, VERDICT, GroundTruth, Metrics
 from scanchain.runs.provenance import Provenance
 from scanchain.runs.step_table import STAGES
 from scanchain.settings import read_layer
@@ -53,7 +53,7 @@ def write_run_report(directory: Path) -> None:
     metrics = msgspec.json.decode((directory / "metrics.json").read_bytes(), type=Metrics)
     made = msgspec.json.decode((directory / RUN_FILE).read_bytes(), type=Provenance)
     lines = (directory / "summary.txt").read_text(encoding="utf-8").splitlines()
-    heading, *lines = [line for line in lines if not line.startswith(VERDICT)]
+    heading, *lines = [line for line in lines if not line.startswith((VERDICT, REASON))]
     whole = page.Page(
         title=f"Run of {', '.join(Path(log.path).name for log in made.logs)}",
         subtitle=heading,
