@@ -75,6 +75,14 @@ def test_a_log_has_a_length_and_scans_and_slam_gives_the_cloud_and_the_verdict_o
     for record in (*records, log, done, found, found.ate, result.trajectory, sc.optimize(result.graph)):
         assert "\n" not in repr(record) and len(repr(record)) < 600, repr(record)
     assert repr(result.trajectory) == "Trajectory(60 poses of SE(2) over 5.9 s)"
+    closures, keyframes = len(result.closures), len(result.keyframes)
+    assert repr(slam) == f"Slam(60 2D scans, {keyframes} keyframes, {closures} closures tried)"
+    assert repr(found).startswith(f"Results(ate rmse {found.ate.translation_m.rmse:.4f} m, rpe_1_pose rmse 0.0")
+    assert repr(sc.Odometry(dimension=2)) == "Odometry(0 2D scans)"
+    localizer = sc.Localizer(done.path)
+    assert repr(localizer) == "Localizer(0 scans in 'run': searching)"
+    placed = localizer.process(log[0])
+    assert repr(localizer) == f"Localizer(1 scan in 'run': {placed.state})"
 
 
 def test_errors_of_calls_name_arguments_of_the_call(office, tmp_path):

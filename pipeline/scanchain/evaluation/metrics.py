@@ -117,7 +117,10 @@ class Results:
     reference: Matrix = field(default_factory=lambda: np.empty((0, 4, 4)))
 
     def __repr__(self) -> str:
-        return f"<{'; '.join(each.summary for each in self.found.values())}>"
+        shares = {name: e.translation_share for name, e in self.found.items() if isinstance(e, KittiError)}
+        errors = {name: e.translation_m.rmse for name, e in self.found.items() if not isinstance(e, KittiError)}
+        texts = [f"{name} rmse {rmse_m:.4f} m" for name, rmse_m in errors.items()]
+        return f"Results({', '.join(texts + [f'{name} {100.0 * share:.3g} %' for name, share in shares.items()])})"
 
     @property
     def ate(self) -> AbsoluteError:
