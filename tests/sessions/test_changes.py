@@ -184,8 +184,9 @@ def test_what_cannot_be_compared_is_refused_and_leaves_the_maps_as_they_were(tmp
 def test_a_comparison_names_both_maps_and_is_no_run_to_check_or_draw(tmp_path, capsys):
     a, b = saved(tmp_path / "a", part("a", room(BOX))), saved(tmp_path / "b", part("b", room()))
     scanchain.changes(a, b, tmp_path / "ab", T_earlier_later=lie.identity(2), recording=False)
-    logs = json.loads((tmp_path / "ab" / "run.json").read_text())["logs"]
-    assert [log["path"] for log in logs] == [str(a / "map"), str(b / "map")]
+    made = json.loads((tmp_path / "ab" / "run.json").read_text())
+    assert [log["path"] for log in made["logs"]] == [str(a / "map"), str(b / "map")]
+    assert made["command"] == []  # not that of the program that called it
     assert main(["check", str(tmp_path / "ab")]) == 2
     assert "name a directory of scanchain run" in capsys.readouterr().err
     assert main(["view", str(tmp_path / "ab"), "--png", str(tmp_path / "ab.png")]) == 2
