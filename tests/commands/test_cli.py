@@ -85,19 +85,19 @@ def test_a_full_disk_is_one_line_with_what_to_do_and_nothing_is_left(call, monke
 @pytest.mark.parametrize(
     ("error", "said"),
     [
-        (RuntimeError("two\nlines"), "error: RuntimeError: two lines; SCANCHAIN_DEBUG=1 shows the traceback"),
+        (RuntimeError("two\nlines"), "error: RuntimeError: two lines; --debug shows the traceback"),
         (KeyboardInterrupt(), "error: interrupted"),
     ],
 )
 def test_an_error_of_ours_and_ctrl_c_are_one_line_with_exit_code_1_too(call, monkeypatch, error, said):
     monkeypatch.setattr("scanchain.logs.info.describe", Mock(side_effect=error))
-    monkeypatch.delenv("SCANCHAIN_DEBUG", raising=False)
     code, output, errors = call("info", "a.mcap")
     assert (code, output, errors.strip()) == (1, "", said)
     if isinstance(error, RuntimeError):
-        monkeypatch.setenv("SCANCHAIN_DEBUG", "1")
-        with pytest.raises(RuntimeError):
-            call("info", "a.mcap")
+        for words in (("info", "a.mcap", "--debug"), ("--debug", "info", "a.mcap")):
+            code, _, errors = call(*words)
+            assert code == 1 and errors.startswith("Traceback (most recent call last):")
+            assert errors.endswith("\nerror: RuntimeError: two lines\n")
 
 
 def test_an_interruption_while_the_imports_run_is_one_line_too():

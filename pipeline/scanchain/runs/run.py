@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.config import NO_TRUTH, Config
 from scanchain.data import Scan, Trajectory, brief
-from scanchain.errors import InputError, ScanchainError, counted
+from scanchain.errors import InputError, OwnCodeError, ScanchainError, counted
 from scanchain.evaluation import ExpectedErrors, TruthFile, check_overlap, during, on_the_estimate, read_truth
 from scanchain.files import write_whole
 from scanchain.logs import Log, open_log
@@ -77,7 +77,8 @@ def run(
 ) -> Finished:
     """Open the log, process it, write the run directory, to which ``report`` adds its page in the end.
 
-    Raises InputError for bad input, which leaves nothing behind unless scans were processed before it was met.
+    Raises InputError for bad input, which leaves nothing behind unless scans were processed before it was met, and
+    OwnCodeError where code of the user's own fails, which leaves nothing.
     """
     this = _Run(job, progress)
     with this.directory, announcing_compilation(progress.say):
@@ -91,7 +92,8 @@ def run(
             metrics, text = this.judge(results, expected, judged, recording.warnings, held_s)
             return this.complete(metrics, text, report)
         except (Exception, KeyboardInterrupt) as error:
-            if not len(this.steps) and isinstance(error, ScanchainError | KeyboardInterrupt | OSError):
+            is_early = not len(this.steps) and isinstance(error, ScanchainError | KeyboardInterrupt | OSError)
+            if is_early or isinstance(error, OwnCodeError):
                 raise
             raise rescued(error, this.directory, this.steps, this.provenance) from error
 
