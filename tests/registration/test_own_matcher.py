@@ -60,7 +60,7 @@ def test_it_runs_is_stopped_and_goes_on_to_the_same_result(office, folder):
     again = started(folder, *words, "--out", "run", "--resume")
     assert again.wait() == 0, again.stderr.read()
     same_result(folder / "run", folder / "whole")
-    assert "resumed after" in (folder / "run" / "summary.txt").read_text()
+    assert "note           resumed after" in (folder / "run" / "summary.txt").read_text()
 
 
 @pytest.mark.slow
