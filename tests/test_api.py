@@ -107,6 +107,20 @@ def test_slam_of_arrays_places_every_scan():
     assert np.linalg.norm(result.trajectory.poses[-1][:2, 2]) > 1.0
 
 
+def test_every_module_is_imported_where_there_is_no_posix():
+    code = """
+import importlib, os, pkgutil, psutil, sys  # that of Linux needs resource itself
+sys.modules |= dict.fromkeys(("fcntl", "grp", "pwd", "resource", "termios"))
+for name in ("geteuid", "getpgrp", "killpg", "getuid"):
+    delattr(os, name)
+for package in map(importlib.import_module, ("scanchain", "scanchain_viz")):
+    for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+        importlib.import_module(module.name)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 def test_version_and_modules_of_the_reference_are_attributes_of_a_fresh_package():
     code = (
         "import scanchain, sys; assert not any(name.startswith('scanchain.') for name in sys.modules);"
