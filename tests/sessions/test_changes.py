@@ -18,6 +18,7 @@ from scanchain.sessions.joining import Joined
 from scanchain.sessions.merged_map import MergedMap, updated
 from scanchain.settings import load_settings
 from scanchain.simulation.solids import Scenery, Solids
+from scanchain_viz.report.maps import _cluster_grid
 
 NO_EDGES = Edges(np.empty((0, 2), int), *np.empty((2, 0, 3, 3)), np.empty(0, bool), np.empty(0))
 BOX, HIDDEN = (5.0, 3.0), (8.0, 6.5)  # the first stands free, the second behind a wall
@@ -138,6 +139,18 @@ def test_the_command_writes_labels_a_table_and_pictures(tmp_path, capsys):
     assert set(cloud["label"]) >= {Label.SAME, Label.APPEARED, Label.VANISHED}
     with (tmp_path / "ab" / "changes.csv").open() as file:
         assert [row["kind"] for row in csv.DictReader(file)] == sorted(("appeared", "vanished"), reverse=True)
+
+
+def test_boxes_in_the_plan_carry_the_numbers_of_the_table_which_has_no_empty_column(tmp_path):
+    a, b = saved(tmp_path / "a", part("a", room(BOX))), saved(tmp_path / "b", part("b", room((3.0, 3.5))))
+    found = scanchain.changes(a, b, tmp_path / "ab", T_earlier_later=lie.identity(2))
+    page = (tmp_path / "ab" / "report.html").read_text()
+    for number in ("1", "2"):
+        assert page.count(f'text-anchor: start">{number}</text>') == 4  # wide, narrow, and in two close-ups
+    assert "counterpart" not in page
+    moved = replace(found, clusters=(replace(found.clusters[0], counterpart=2), found.clusters[1]))
+    grid = _cluster_grid(moved)
+    assert grid.heads[-1].text == "counterpart" and [row.cells[-1] for row in grid.rows] == ["2", ""]
 
 
 def test_a_given_transform_brings_the_later_map_into_the_frame_of_the_earlier(tmp_path):
