@@ -49,8 +49,8 @@ def test_a_trajectory_becomes_positions_a_data_frame_and_a_picture(d, monkeypatc
     if d == 2:
         assert frame.yaw_rad.tolist() == pytest.approx([0.7])
     else:
-        R = lie.from_quaternion(frame[["qx", "qy", "qz", "qw"]].to_numpy())
-        np.testing.assert_allclose(R, poses[:, :3, :3], atol=1e-12)
+        quaternions = frame[["qx", "qy", "qz", "qw"]]
+        np.testing.assert_allclose(quaternions, lie.to_quaternion(poses[:, :3, :3]), atol=1e-12)
     axes = trajectory.plot()
     assert trajectory.plot(axes) is axes and len(axes.lines) == 2
     np.testing.assert_array_equal(axes.lines[0].get_xydata(), trajectory.positions[:, :2])

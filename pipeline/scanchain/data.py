@@ -498,7 +498,8 @@ class Trajectory:
 
         names, turned = "x_m y_m yaw_rad", np.arctan2(self.poses[:, 1:2, 0], self.poses[:, :1, 0])
         if self.dimension == 3:
-            names, turned = "x_m y_m z_m qx qy qz qw", Rotation.from_matrix(self.poses[:, :3, :3]).as_quat()
+            names = "x_m y_m z_m qx qy qz qw"
+            turned = Rotation.from_matrix(self.poses[:, :3, :3]).as_quat(canonical=True)
         frame = DataFrame(np.hstack([self.positions, turned]), columns=names.split())
         frame.insert(0, "stamp_ns", self.stamps_ns)
         return frame

@@ -36,8 +36,7 @@ class Terminal(Progress):
         self.unit = unit
         self.stopped = self.is_tracking = False
         self.is_seen = sys.stderr.isatty()
-        self.started_s = self.drawn_s = 0.0
-        self.first = 0  # how many were done then
+        self.started_s, self.first, self.drawn_s = 0.0, 0, 0.0  # first: how many were done at the start
         self.bar = ""  # as it stands in the last line
         self.handlers = {}
 
