@@ -63,6 +63,8 @@ def test_a_log_has_a_length_and_scans_and_slam_gives_the_cloud_and_the_verdict_o
         untrue.accuracy  # noqa: B018
     found = sc.evaluate(result.trajectory, log.ground_truth())
     assert found.ate.translation_m.rmse == pytest.approx(done.accuracy.ate_rmse_m)
+    of_run = sc.evaluate(done.path, log.ground_truth())
+    assert of_run.ate.translation_m.rmse == pytest.approx(done.accuracy.ate_rmse_m, rel=1e-6)
     assert list(found.rpe) == ["1_pose", "1_s"] and found.rpe["1_s"].translation_m.rmse < 0.1
     with pytest.raises(InputError, match="KITTI metric: no stretch of 10 m fits"):
         found.kitti  # noqa: B018
@@ -73,6 +75,14 @@ def test_a_log_has_a_length_and_scans_and_slam_gives_the_cloud_and_the_verdict_o
     for record in (*records, log, done, found, found.ate, result.trajectory, sc.optimize(result.graph)):
         assert "\n" not in repr(record) and len(repr(record)) < 600, repr(record)
     assert repr(result.trajectory) == "Trajectory(60 poses of SE(2) over 5.9 s)"
+    closures, keyframes = len(result.closures), len(result.keyframes)
+    assert repr(slam) == f"Slam(60 2D scans, {keyframes} keyframes, {closures} closures tried)"
+    assert repr(found).startswith(f"Results(ate rmse {found.ate.translation_m.rmse:.4f} m, rpe_1_pose rmse 0.0")
+    assert repr(sc.Odometry(dimension=2)) == "Odometry(0 2D scans)"
+    localizer = sc.Localizer(done.path)
+    assert repr(localizer) == "Localizer(0 scans in 'run': searching)"
+    placed = localizer.process(log[0])
+    assert repr(localizer) == f"Localizer(1 scan in 'run': {placed.state})"
 
 
 def test_errors_of_calls_name_arguments_of_the_call(office, tmp_path):
@@ -95,6 +105,20 @@ def test_slam_of_arrays_places_every_scan():
     assert [step.scan.index for step in steps] == list(range(120))
     assert len(result.trajectory) == 120
     assert np.linalg.norm(result.trajectory.poses[-1][:2, 2]) > 1.0
+
+
+def test_every_module_is_imported_where_there_is_no_posix():
+    code = """
+import importlib, os, pkgutil, psutil, sys  # that of Linux needs resource itself
+sys.modules |= dict.fromkeys(("fcntl", "grp", "pwd", "resource", "termios"))
+for name in ("geteuid", "getpgrp", "killpg", "getuid"):
+    delattr(os, name)
+for package in map(importlib.import_module, ("scanchain", "scanchain_viz")):
+    for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+        importlib.import_module(module.name)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_version_and_modules_of_the_reference_are_attributes_of_a_fresh_package():

@@ -1,5 +1,7 @@
 """Trajectory files: what is written is read back, exactly in time."""
 
+import sys
+
 import numpy as np
 import pytest
 
@@ -34,6 +36,27 @@ def test_stamps_survive_to_the_nanosecond_and_in_order_and_poses_to_nine_digits(
     back = read_kitti(tmp_path / "a.txt")
     np.testing.assert_allclose(back.poses, trajectory.poses, atol=1e-8)
     assert back.stamps_ns.tolist() == list(range(7))
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_trajectory_becomes_positions_a_data_frame_and_a_picture(d, monkeypatch):
+    poses = lie.pose_2d(1.5, -2.0, 0.7)[None] if d == 2 else wandering().poses
+    trajectory = Trajectory(np.array(STAMPS_NS[: len(poses)]), poses)
+    np.testing.assert_array_equal(trajectory.positions, poses[:, :d, d])
+    frame = trajectory.to_dataframe()
+    assert list(frame.stamp_ns) == STAMPS_NS[: len(poses)]
+    np.testing.assert_array_equal(frame[["x_m", "y_m", "z_m"][:d]], trajectory.positions)
+    if d == 2:
+        assert frame.yaw_rad.tolist() == pytest.approx([0.7])
+    else:
+        quaternions = frame[["qx", "qy", "qz", "qw"]]
+        np.testing.assert_allclose(quaternions, lie.to_quaternion(poses[:, :3, :3]), atol=1e-12)
+    axes = trajectory.plot()
+    assert trajectory.plot(axes) is axes and len(axes.lines) == 2
+    np.testing.assert_array_equal(axes.lines[0].get_xydata(), trajectory.positions[:, :2])
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(InputError, match="pandas is not installed; install it with: pip install pandas"):
+        trajectory.to_dataframe()
 
 
 def test_evo_reads_what_we_write(tmp_path):

@@ -6,6 +6,7 @@ import atexit
 import errno
 import os
 import sys
+import traceback
 from collections.abc import Sequence
 from contextlib import suppress
 
@@ -19,11 +20,14 @@ from scanchain.commands.maps import changes, localize, map_group, merge
 from scanchain.commands.optimize import optimize
 from scanchain.commands.preparing import config, sequence, warm_up
 from scanchain.commands.run import check, run, view
-from scanchain.errors import InputError, ScanchainError, printable, remedy_of, spelled
+from scanchain.errors import InputError, OwnCodeError, ScanchainError, printable, remedy_of, spelled
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(package_name="scanchain", message="%(prog)s %(version)s")
+@click.option(
+    "--debug", is_flag=True, expose_value=False, help="Print tracebacks of errors; after a command, too."
+)
 def scanchain() -> None:
     """Lidar logs in, trajectory and map out.
 
@@ -65,6 +69,8 @@ def _run(words: list[str]) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small: threads would wait for each other
     if words[:1] != ["batch"] and (odd := next((word for word in words if spelled(word) != word), "")):
         return _fail(f"{spelled(odd)}: the name is not UTF-8; rename it", 2)
+    is_debug = "--debug" in words
+    words = [word for word in words if word != "--debug"]
     try:
         return scanchain.main(words, prog_name="scanchain", standalone_mode=False) or 0
     except click.exceptions.NoArgsIsHelpError as error:
@@ -76,23 +82,26 @@ def _run(words: list[str]) -> int:
     except click.ClickException as error:
         return _fail(error.format_message(), 2)
     except ScanchainError as error:
-        return _fail(error.text, 2 if isinstance(error, InputError) else 1)
+        hint = _traced(error, is_debug) if is_debug or isinstance(error, OwnCodeError) else ""
+        return _fail(error.text + hint, 2 if isinstance(error, InputError) else 1)
     except (KeyboardInterrupt, click.Abort):
         return _fail("interrupted", 1)
     except BrokenPipeError:  # the reader of our output went away, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except Exception as error:
-        return _unforeseen(error)
+        hint = _traced(error, is_debug)
+        if isinstance(error, OSError) and remedy_of(error):
+            return _fail(remedy_of(error), 2 if error.errno == errno.ENAMETOOLONG else 1)
+        return _fail(f"{type(error).__name__}: {error}{hint}", 1)
 
 
-def _unforeseen(error: Exception) -> int:
-    """Exit code of an unexpected error: the remedy of a system error, else how to get the traceback."""
-    if os.environ.get("SCANCHAIN_DEBUG"):
-        raise error
-    if isinstance(error, OSError) and remedy_of(error):
-        return _fail(remedy_of(error), 2 if error.errno == errno.ENAMETOOLONG else 1)
-    return _fail(f"{type(error).__name__}: {error}; SCANCHAIN_DEBUG=1 shows the traceback", 1)
+def _traced(error: Exception, is_debug: bool) -> str:
+    """Print the traceback of an error if asked for, else return how to get it."""
+    if not is_debug:
+        return "; --debug shows the traceback"
+    traceback.print_exception(error)
+    return ""
 
 
 def _fail(message: str, code: int) -> int:

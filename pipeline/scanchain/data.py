@@ -11,7 +11,7 @@ import math
 from collections.abc import Sized
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import msgspec
 import numpy as np
@@ -479,6 +479,39 @@ class Trajectory:
     def dimension(self) -> int:
         """2 for SE(2) poses, 3 for SE(3)."""
         return self.poses.shape[-1] - 1
+
+    @property
+    def positions(self) -> Points:
+        """(N, d) meters."""
+        return self.poses[:, :-1, -1]
+
+    def to_dataframe(self) -> Any:
+        """A pandas DataFrame: ``stamp_ns``, ``x_m`` …, then ``yaw_rad`` in the plane, ``qx`` … ``qw`` in space.
+
+        Raises InputError where pandas is not installed.
+        """
+        try:
+            from pandas import DataFrame
+        except ImportError:
+            raise InputError("pandas is not installed; install it with: pip install pandas") from None
+        from scipy.spatial.transform import Rotation
+
+        names, turned = "x_m y_m yaw_rad", np.arctan2(self.poses[:, 1:2, 0], self.poses[:, :1, 0])
+        if self.dimension == 3:
+            names = "x_m y_m z_m qx qy qz qw"
+            turned = Rotation.from_matrix(self.poses[:, :3, :3]).as_quat(canonical=True)
+        frame = DataFrame(np.hstack([self.positions, turned]), columns=names.split())
+        frame.insert(0, "stamp_ns", self.stamps_ns)
+        return frame
+
+    def plot(self, axes: Any = None) -> Any:
+        """Draw the path, seen from above, by matplotlib; returns the axes, new ones where left out."""
+        if axes is None:
+            from matplotlib import pyplot
+
+            axes = pyplot.figure().add_subplot(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+        axes.plot(*self.positions[:, :2].T)
+        return axes
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

@@ -32,6 +32,10 @@ class InputError(ScanchainError):
     """Bad input or arguments: the thing, its value, the limit, the remedy, on one line. Exit code 2."""
 
 
+class OwnCodeError(InputError):
+    """Code of the user's own raised an error, which is the cause, or returned something else than is wanted."""
+
+
 class MissingExtraError(InputError):
     """A package of an optional extra is not installed."""
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 import importlib
 import re
 import sys
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from scanchain.errors import InputError, one_line
+from scanchain.errors import InputError, OwnCodeError, one_line
 
 CLASS_NAME = r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*"
 
@@ -34,11 +37,11 @@ def load(name: str, *methods: str) -> type:
     try:
         module = importlib.import_module(module_name)
     except Exception as error:  # whatever the module does at its top level
-        reason = f"importing {module_name} failed with {type(error).__name__}: {one_line(error)}"
+        reason = f"importing {module_name} failed with {_located(error)}"
         if isinstance(error, ModuleNotFoundError) and f"{module_name}.".startswith(f"{error.name}."):
             remedy = "go to its folder, or set PYTHONPATH to it"
             reason = f"there is no module {module_name} in {here} or on PYTHONPATH; {remedy}"
-        raise InputError(f"{name}: {reason}") from error
+        raise OwnCodeError(f"{name}: {reason}") from error
     found = getattr(module, class_name, None)
     if not isinstance(found, type):
         raise InputError(f"{name}: {module.__file__} has no class {class_name}; check its name")
@@ -47,3 +50,22 @@ def load(name: str, *methods: str) -> type:
             needs = f"it needs {' and '.join(methods)} (documentation: Extending)"
             raise InputError(f"{name}: the class has no method {method}; {needs}")
     return found
+
+
+@contextmanager
+def own_code(where: str) -> Iterator[None]:
+    """Raise an OwnCodeError that says where, for whatever goes wrong in code of the user's own."""
+    try:
+        yield
+    except InputError as error:
+        raise OwnCodeError(f"{where}: {error.text}") from error
+    except Exception as error:
+        raise OwnCodeError(f"{where} failed with {_located(error)}") from error
+
+
+def _located(error: Exception) -> str:
+    """Kind and message of an error, with the line of the user's own code that led to it, where one did."""
+    ours = (str(Path(__file__).parent), importlib.__file__, "<frozen ")
+    own = [each for each in traceback.extract_tb(error.__traceback__) if not each.filename.startswith(ours)]
+    lines = [f' (File "{e.filename}", line {e.lineno}, in {e.name})' for e in own if e.filename == own[0].filename]
+    return f"{type(error).__name__}: {one_line(error)}{''.join(lines[-1:])}"

@@ -128,6 +128,11 @@ class Slam:
         if prior is not None:
             self._begin_in(prior, prior_is_final)
 
+    def __repr__(self) -> str:
+        scans = counted(len(self.trail.stamps_ns), f"{self.dimension}D scan")
+        tried = counted(len(self.closures), "closure")
+        return f"{type(self).__name__}({scans}, {counted(len(self.keyframes), 'keyframe')}, {tried} tried)"
+
     def _begin_in(self, prior: SavedMap, is_final: bool) -> None:
         """Take the keyframes of a map, fixed where they are; the log begins somewhere, perhaps in it."""
         if prior.dimension != self.dimension:

@@ -11,6 +11,7 @@ import sys
 import time
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
+from unittest.mock import Mock
 from urllib.parse import unquote
 
 import numpy as np
@@ -221,6 +222,12 @@ def test_a_damaged_log_is_done_with_its_warnings_counted_and_told(drawers, tmp_p
     first = told[0].replace(f"{cut}: ", "")
     assert f"warned         {cut}: {first}" in output and "in 1 log" in output and first != told[0]
     assert f'<td class="bad">{len(told)}</td>' in (out / "report.html").read_text(encoding="utf-8")
+
+
+def test_the_time_of_logs_counts_from_the_start_of_a_batch(drawers, tmp_path):
+    progress, job = Mock(), batch.Batch((drawers / "log_00.mcap",), tmp_path / "out")
+    batch.run_batch(job, progress, lambda tasks: iter(()))
+    progress.count.assert_called_once_with(0, 1)
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs signals")

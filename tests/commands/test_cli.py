@@ -17,6 +17,8 @@ import pytest
 from mcap.reader import make_reader
 
 from scanchain.__main__ import scanchain
+from scanchain.commands.terminal import Terminal
+from scanchain.data import Scan
 from scanchain.settings import flatten
 from tests.commands.conftest import FULL
 from tests.support.messages import says
@@ -85,19 +87,19 @@ def test_a_full_disk_is_one_line_with_what_to_do_and_nothing_is_left(call, monke
 @pytest.mark.parametrize(
     ("error", "said"),
     [
-        (RuntimeError("two\nlines"), "error: RuntimeError: two lines; SCANCHAIN_DEBUG=1 shows the traceback"),
+        (RuntimeError("two\nlines"), "error: RuntimeError: two lines; --debug shows the traceback"),
         (KeyboardInterrupt(), "error: interrupted"),
     ],
 )
 def test_an_error_of_ours_and_ctrl_c_are_one_line_with_exit_code_1_too(call, monkeypatch, error, said):
     monkeypatch.setattr("scanchain.logs.info.describe", Mock(side_effect=error))
-    monkeypatch.delenv("SCANCHAIN_DEBUG", raising=False)
     code, output, errors = call("info", "a.mcap")
     assert (code, output, errors.strip()) == (1, "", said)
     if isinstance(error, RuntimeError):
-        monkeypatch.setenv("SCANCHAIN_DEBUG", "1")
-        with pytest.raises(RuntimeError):
-            call("info", "a.mcap")
+        for words in (("info", "a.mcap", "--debug"), ("--debug", "info", "a.mcap")):
+            code, _, errors = call(*words)
+            assert code == 1 and errors.startswith("Traceback (most recent call last):")
+            assert errors.endswith("\nerror: RuntimeError: two lines\n")
 
 
 def test_an_interruption_while_the_imports_run_is_one_line_too():
@@ -219,3 +221,20 @@ print([name for name in ("numba", "scipy", "pyarrow", "rerun") if name in sys.mo
 """
     answer = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert answer.stderr == "[]\n"
+
+
+def test_the_progress_line_tells_only_what_is_known_and_counts_from_where_a_run_is_resumed(monkeypatch, capfd):
+    clock = iter([100.0, 130.0, 160.0, 190.0, 190.0, 190.0, 200.0])
+    monkeypatch.setattr("scanchain.commands.terminal.monotonic", lambda: next(clock))
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    with Terminal("logs") as terminal:
+        for done in range(1, 5):
+            terminal.count(done, 4)
+    lines = [line.split("━ ")[-1].strip() for line in capfd.readouterr().err.split("\r\033[K")[1:]]
+    assert lines == ["1/4 logs", "2/4 logs  0.033 logs/s  60.0 s left", "3/4 logs  0.033 logs/s  30.0 s left",
+                     "4/4 logs  0.033 logs/s"]  # fmt: skip
+    scans = [Scan(index, 0, 0, np.ones((1, 2)), np.empty(0), 0, None) for index in range(369, 372)]
+    with Terminal("scans") as terminal:
+        assert list(terminal.track(iter(scans), 7005)) == scans
+    told = capfd.readouterr().err
+    assert " 370/7,005 scans" in told and " 372/7,005 scans  0.2 scans/s  9.2 h left" in told

@@ -91,7 +91,7 @@ def test_a_run_whose_tables_are_damaged_is_refused_by_their_name(finished, call,
                 evidence_of_run(finished, None)
         path.write_bytes(data[:-9])
         code, _, errors = call("check", finished)
-        assert code == 2 and f"has no {name} that can be read" in errors and "SCANCHAIN_DEBUG" not in errors
+        assert code == 2 and f"has no {name} that can be read" in errors and "--debug" not in errors
     finally:
         path.write_bytes(data)
 

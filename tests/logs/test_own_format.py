@@ -103,7 +103,7 @@ def test_run_info_and_convert_take_the_flag(own, tmp_path, capsys):
         ("yield 1.0, [[1, 2, 3]], None; yield 1.1, [[1, 2]], None", r"scan 1 .* points are no \(N, 3\) as those"),
         (
             "yield 1.0, [[1, 2, 3]], None; 1 / 0",
-            r"scan 1 .*ZeroDivisionError: division by zero \(own_\d+\.py, line",
+            r"scan 1 .*ZeroDivisionError: division by zero \(File .*own_\d+\.py\", line",
         ),
         ("return iter(())", "yields no scan of it"),
     ],

@@ -540,3 +540,19 @@ def test_the_truth_met_on_the_way_is_that_of_a_pass_of_its_own_and_no_prior_and_
     np.testing.assert_array_equal(log.ground_truth().stamps_ns, alone.stamps_ns)
     log = open_log([path], LogConfig(ground_truth_topic="none"))
     assert log.ground_truth() is None and not log.ground_truth_topic and not log.odometry_topic
+
+
+def test_a_scan_of_a_log_is_had_by_its_number_and_leaves_the_log_as_it_was(tmp_path):
+    log = open_log(write(tmp_path / "a.mcap", office()))
+    scans = list(log)
+    notes, damage = list(log.notes), log.damage
+    for number in (0, 5, len(log) - 1):
+        assert log[number].index == number and log[number].stamp_ns == scans[number].stamp_ns
+    assert (log.notes, log.damage) == (notes, damage)
+    for number, words in (
+        (len(log), f"has no scan {len(log)}, 40 scans"),
+        (-1, "index is -1; "),
+        (slice(3), "inde"),
+    ):
+        with pytest.raises(InputError, match=words):
+            log[number]

@@ -60,7 +60,7 @@ def test_it_runs_is_stopped_and_goes_on_to_the_same_result(office, folder):
     again = started(folder, *words, "--out", "run", "--resume")
     assert again.wait() == 0, again.stderr.read()
     same_result(folder / "run", folder / "whole")
-    assert "resumed after" in (folder / "run" / "summary.txt").read_text()
+    assert "note           resumed after" in (folder / "run" / "summary.txt").read_text()
 
 
 @pytest.mark.slow
@@ -95,7 +95,7 @@ def test_one_added_to_the_methods_needs_no_name_of_its_own_there(folder):
         ("my_matcher:PointToPlane", "has no class PointToPlane"),
         ("my_matcher:KDTree", "has no method align"),
         ("broken:Matcher", "importing broken failed with SyntaxError"),
-        ("needy:Matcher", "importing needy failed with ModuleNotFoundError: No module named 'not_there'"),
+        ("needy:Matcher", "No module named 'not_there' (File \"{folder}/needy.py\", line 1, in <module>)"),
         ("my_matcher.PointToPoint", "one of plicp, svd or a class of yours, MODULE:CLASS"),
     ],
 )
@@ -104,7 +104,7 @@ def test_one_that_cannot_be_had_is_one_line_that_says_why(folder, name, words):
     (folder / "needy.py").write_text("import not_there\n")
     with pytest.raises(InputError) as raised:
         create_matcher(MatchingConfig(matcher=name))
-    assert words in str(raised.value) and "\n" not in str(raised.value)
+    assert words.format(folder=folder) in str(raised.value) and "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,7 @@ def test_one_that_cannot_be_had_is_one_line_that_says_why(folder, name, words):
         (
             "def __init__(self, config):",
             "def __init__(self):",
-            r"cannot be made with a MatchingConfig \(TypeError",
+            r"__init__\(self, config\) with a MatchingConfig failed with TypeError",
         ),
         (
             "return Match(",
@@ -134,6 +134,20 @@ def test_one_that_returns_something_else_is_one_line_that_names_it(folder, old, 
     target.insert(wall, np.eye(3))
     with pytest.raises(InputError, match=f"^{module}:PointToPoint.*{words}"):
         create_matcher(MatchingConfig(matcher=f"{module}:PointToPoint")).align(wall, target, np.eye(3))
+
+
+def test_one_that_raises_is_named_with_file_and_line_and_leaves_no_directory(folder, call):
+    line = MATCHER.splitlines().index(next(each for each in MATCHER.splitlines() if "return Match(" in each)) + 1
+    (folder / "raising.py").write_text(MATCHER.replace("return Match(", "np.linalg.inv(np.zeros((2, 2))); Match("))
+    log = made.log("office", folder, seconds=6)
+    words = ("run", log, "--matcher", "raising:PointToPoint", "--rerun", "off", "--out", "out")
+    where = f'align failed with LinAlgError: Singular matrix (File "{folder}/raising.py", line {line}, in align)'
+    code, _, error = call(*words)
+    assert (code, error) == (2, f"error: raising:PointToPoint: {where}; --debug shows the traceback\n")
+    code, _, error = call(*words, "--debug")
+    assert code == 2 and error.startswith("Traceback (most") and error.endswith(f"PointToPoint: {where}\n")
+    assert "np.linalg.inv(np.zeros((2, 2)))" in error
+    assert [path.name for path in folder.iterdir() if path.name.startswith("out")] == []
 
 
 def test_the_working_directory_comes_last(folder, monkeypatch):

@@ -218,6 +218,8 @@ def test_what_a_stopped_run_left_is_named_with_resume_where_its_run_exists(tmp_p
         RunDirectory(tmp_path / "a", force=False)
     resumed = run(job(office, tmp_path / "a", force=True, resume=True), open_recorder, Progress())
     assert resumed.path == tmp_path / "a" and names(tmp_path) == ["a"]
+    assert "note           resumed after 20 scans" in resumed.summary
+    assert not any("resumed" in warning for warning in resumed.warnings)
 
 
 def test_a_complete_run_removes_what_earlier_ones_left_but_not_what_another_process_writes(tmp_path, office):

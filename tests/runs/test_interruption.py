@@ -97,7 +97,7 @@ def test_interrupted_again_and_again_a_run_goes_on_to_the_same_result_and_record
     assert killing.start(log, out, *RECORDED, "--resume").wait() == 0
     assert [path.name for path in tmp_path.iterdir() if path.is_dir()] == ["run"]
     killing.same_result(out, whole)
-    assert "resumed after" in (out / "summary.txt").read_text()
+    assert "note           resumed after" in (out / "summary.txt").read_text()
     assert not list(out.glob("*.checkpoint"))
 
 

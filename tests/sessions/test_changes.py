@@ -18,6 +18,7 @@ from scanchain.sessions.joining import Joined
 from scanchain.sessions.merged_map import MergedMap, updated
 from scanchain.settings import load_settings
 from scanchain.simulation.solids import Scenery, Solids
+from scanchain_viz.report.maps import _cluster_grid
 
 NO_EDGES = Edges(np.empty((0, 2), int), *np.empty((2, 0, 3, 3)), np.empty(0, bool), np.empty(0))
 BOX, HIDDEN = (5.0, 3.0), (8.0, 6.5)  # the first stands free, the second behind a wall
@@ -140,6 +141,18 @@ def test_the_command_writes_labels_a_table_and_pictures(tmp_path, capsys):
         assert [row["kind"] for row in csv.DictReader(file)] == sorted(("appeared", "vanished"), reverse=True)
 
 
+def test_boxes_in_the_plan_carry_the_numbers_of_the_table_which_has_no_empty_column(tmp_path):
+    a, b = saved(tmp_path / "a", part("a", room(BOX))), saved(tmp_path / "b", part("b", room((3.0, 3.5))))
+    found = scanchain.changes(a, b, tmp_path / "ab", T_earlier_later=lie.identity(2))
+    page = (tmp_path / "ab" / "report.html").read_text()
+    for number in ("1", "2"):
+        assert page.count(f'text-anchor: start">{number}</text>') == 4  # wide, narrow, and in two close-ups
+    assert "counterpart" not in page
+    moved = replace(found, clusters=(replace(found.clusters[0], counterpart=2), found.clusters[1]))
+    grid = _cluster_grid(moved)
+    assert grid.heads[-1].text == "counterpart" and [row.cells[-1] for row in grid.rows] == ["2", ""]
+
+
 def test_a_given_transform_brings_the_later_map_into_the_frame_of_the_earlier(tmp_path):
     T = lie.pose_2d(2.0, -1.0, np.pi / 2)
     a = saved(tmp_path / "a", part("a", room(BOX)))
@@ -184,8 +197,9 @@ def test_what_cannot_be_compared_is_refused_and_leaves_the_maps_as_they_were(tmp
 def test_a_comparison_names_both_maps_and_is_no_run_to_check_or_draw(tmp_path, capsys):
     a, b = saved(tmp_path / "a", part("a", room(BOX))), saved(tmp_path / "b", part("b", room()))
     scanchain.changes(a, b, tmp_path / "ab", T_earlier_later=lie.identity(2), recording=False)
-    logs = json.loads((tmp_path / "ab" / "run.json").read_text())["logs"]
-    assert [log["path"] for log in logs] == [str(a / "map"), str(b / "map")]
+    made = json.loads((tmp_path / "ab" / "run.json").read_text())
+    assert [log["path"] for log in made["logs"]] == [str(a / "map"), str(b / "map")]
+    assert made["command"] == []  # not that of the program that called it
     assert main(["check", str(tmp_path / "ab")]) == 2
     assert "name a directory of scanchain run" in capsys.readouterr().err
     assert main(["view", str(tmp_path / "ab"), "--png", str(tmp_path / "ab.png")]) == 2

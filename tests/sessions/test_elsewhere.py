@@ -1,4 +1,6 @@
+import json
 import struct
+import sys
 
 import numpy as np
 import pytest
@@ -73,6 +75,14 @@ def test_a_grid_becomes_a_map_of_its_occupied_cells(tmp_path, negate, yaw_rad):
         in_image = (keyframe.points + pose[:2, 2] - [1.0, 2.0]) @ np.array([[c, -s], [s, c]]) / 0.1
         column, row = np.floor(in_image).astype(int).T
         assert (walls()[::-1][row, column] == 0).all()
+
+
+def test_the_command_line_is_stated_where_there_was_one(tmp_path):
+    grid, out = grid_files(tmp_path, walls()), tmp_path / "room"
+    import_map(grid, out)
+    assert json.loads((out / "run.json").read_text())["command"] == []
+    assert main(["map", "import", str(grid), "--out", str(out), "--force"]) == 0
+    assert json.loads((out / "run.json").read_text())["command"] == sys.argv
 
 
 def test_where_nobody_was_a_grid_is_not_seen_from(tmp_path):

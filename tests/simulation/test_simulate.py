@@ -452,7 +452,7 @@ def test_a_simulated_sequence_is_made_once(tmp_path, monkeypatch):
 
 def test_another_day_changes_movable_objects_alone_keeps_the_path_free_and_is_listed_beside_the_log(tmp_path):
     first, later = (plan("office", seed=3, duration_s=20.0, changed=changed) for changed in (None, 1))
-    assert {change.kind for change in later.changes} == {"removed", "moved", "added"}
+    assert {change.kind for change in later.changes} == {"vanished", "moved", "appeared"}
     kept = set(map(tuple, first.solids.rows)) & set(map(tuple, later.solids.rows))
     assert {row[0] for row in kept} == {BOX, CYLINDER, ELLIPSOID}
     fixed = [drive.solids.part(drive.solids.owner == FIXED).rows for drive in (first, later)]

@@ -110,6 +110,7 @@ def run_batch(batch: Batch, progress: Progress, work: Work | None = None) -> Bat
     readable = [task for task in missing.values() if task.identity]
     if kept:
         progress.say(f"{kept:,} of {len(tasks):,} logs are done already")
+    progress.count(kept, len(tasks))
     try:
         for done, row in enumerate((work or partial(_local, batch.workers))(readable), start=1):
             write_whole(missing[row.key].row_file, msgspec.json.encode(row))

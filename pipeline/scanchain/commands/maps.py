@@ -65,7 +65,7 @@ def import_file(file: Path, out: Path, **given: Any) -> None:
     from scanchain.sessions.elsewhere import import_map
 
     with Terminal("positions") as terminal:
-        made = import_map(file, out, say=terminal.say, **given)
+        made = import_map(file, out, say=terminal.say, command=sys.argv, **given)
     for note in made.notes:
         click.echo(f"warning: {note}", err=True)
     click.echo(
@@ -208,7 +208,7 @@ def changes(
     maps = [earlier] if later is None else [earlier, later]
     T = _pose(earlier, "0,0,0" if aligned else transform)
     with Terminal("maps") as terminal:
-        compare_maps(maps, out, present_changes, terminal.say, T_earlier_later=T, **given)
+        compare_maps(maps, out, present_changes, terminal.say, T_earlier_later=T, command=sys.argv, **given)
     options.print_summary(out, (out / SUMMARY_FILE).read_text(encoding="utf-8"), as_json=as_json)
 
 

@@ -36,7 +36,7 @@ class Terminal(Progress):
         self.unit = unit
         self.stopped = self.is_tracking = False
         self.is_seen = sys.stderr.isatty()
-        self.started_s = self.drawn_s = 0.0
+        self.started_s, self.first, self.drawn_s = 0.0, 0, 0.0  # first: how many were done at the start
         self.bar = ""  # as it stands in the last line
         self.handlers = {}
 
@@ -65,9 +65,9 @@ class Terminal(Progress):
     def track(self, scans: Iterator[Scan], count: int) -> Iterator[Scan]:
         """Pass the scans on until they end or the user stops."""
         self.is_tracking = True
-        for done, scan in enumerate(scans, start=1):
+        for scan in scans:
             yield scan
-            self.count(done, count)
+            self.count(scan.index + 1, count)  # from where a run is resumed on
             if self.stopped:
                 break
         self.is_tracking = False
@@ -76,14 +76,17 @@ class Terminal(Progress):
     def count(self, done: int, total: int) -> None:
         """Draw how many are done, but not more often than an eye can follow."""
         now_s = monotonic()
-        self.started_s = self.started_s or now_s
+        if not self.started_s:
+            self.started_s, self.first = now_s, done
         if not self.is_seen or (now_s - self.drawn_s < _REDRAW_S and done < total):
             return
         self.drawn_s = now_s
-        rate = done / max(now_s - self.started_s, 1e-3)
         bar = "━" * round(_WIDTH * min(done / max(total, 1), 1.0))
-        left = duration(max(total - done, 0) / max(rate, 1e-3))
-        text = f"{bar:<{_WIDTH}} {done:,}/{total:,} {self.unit}  {rate:.0f} {self.unit}/s  {left} left"
+        text = f"{bar:<{_WIDTH}} {done:,}/{total:,} {self.unit}"
+        if done > self.first:
+            rate = (done - self.first) / max(now_s - self.started_s, 1e-3)
+            text += f"  {rate:{'.0f' if rate > 10.0 else '.2g'}} {self.unit}/s"
+            text += f"  {duration((total - done) / rate)} left" if done < total else ""
         self.bar = text[: shutil.get_terminal_size().columns - 1]
         click.echo(_CLEAR + self.bar, nl=False, err=True)
 

@@ -120,7 +120,10 @@ class Results:
     reference: Matrix = field(default_factory=lambda: np.empty((0, 4, 4)))
 
     def __repr__(self) -> str:
-        return f"<{'; '.join(each.summary for each in self.found.values())}>"
+        shares = {name: e.translation_share for name, e in self.found.items() if isinstance(e, KittiError)}
+        errors = {name: e.translation_m.rmse for name, e in self.found.items() if not isinstance(e, KittiError)}
+        texts = [f"{name} rmse {rmse_m:.4f} m" for name, rmse_m in errors.items()]
+        return f"Results({', '.join(texts + [f'{name} {100.0 * share:.3g} %' for name, share in shares.items()])})"
 
     @property
     def ate(self) -> AbsoluteError:
@@ -157,7 +160,7 @@ def evaluate(
 ) -> Results:
     """Every metric that a trajectory and its ground truth allow: ATE, RPE over each interval, KITTI.
 
-    estimate : a trajectory or a TUM file
+    estimate : a trajectory, a TUM file, or a run directory, for its trajectory.tum
     truth : a trajectory, a TUM file, or a KITTI file with one row a pose of the estimate
     align : "rigid", "first" or "none", for the ATE
     max_gap_s : truth is interpolated over at most this; by default five of its usual intervals, 0.1 to 0.6 s
@@ -169,15 +172,17 @@ def evaluate(
     """
     checks.one_of(align, tuple(each.value for each in Alignment), "align")
     intervals = _intervals(rpe)
-    trajectory = read_tum(Path(estimate)) if isinstance(estimate, str | Path) else estimate
-    checks.instance(trajectory, Trajectory, "estimate", "read_tum(path)")
+    if isinstance(estimate, str | Path):
+        path = Path(estimate)
+        estimate = read_tum(path / "trajectory.tum" if path.is_dir() else path)
+    checks.instance(estimate, Trajectory, "estimate", "read_tum(path)")
     if isinstance(truth, str | Path):
-        truth = read_truth(Path(truth)).at(trajectory.stamps_ns)
+        truth = read_truth(Path(truth)).at(estimate.stamps_ns)
     checks.instance(truth, Trajectory, "truth", "read_tum(path)")
     if time_offset == "auto":
-        time_offset = find_time_offset(trajectory, truth, gap_s=max_gap_s, with_scale=scale)
+        time_offset = find_time_offset(estimate, truth, gap_s=max_gap_s, with_scale=scale)
     offset_s = checks.seconds(time_offset, "time_offset")
-    pairs = pair(shifted(trajectory, offset_s), truth, gap_s=max_gap_s)
+    pairs = pair(shifted(estimate, offset_s), truth, gap_s=max_gap_s)
     factor = scale_of(pairs) if scale else 1.0
     pairs = scaled(pairs, factor)
     ate = absolute_error(pairs, Alignment(align))

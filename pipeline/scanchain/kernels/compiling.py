@@ -39,7 +39,8 @@ def _cache_by_source() -> None:
         status = folder.stat()
     except (OSError, RuntimeError):  # the latter of a user without a home
         return
-    if status.st_uid == os.geteuid() and not status.st_mode & 0o022 and os.access(folder, os.W_OK):
+    is_own = hasattr(os, "geteuid") and status.st_uid == os.geteuid()  # never known on Windows
+    if is_own and not status.st_mode & 0o022 and os.access(folder, os.W_OK):
         config.CACHE_DIR = str(folder)  # pyright: ignore[reportAttributeAccessIssue]
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from scanchain.checks import instance
+from scanchain import checks
 from scanchain.clock import working_s
 from scanchain.config import LogConfig, PreprocessConfig
 from scanchain.data import OtherPoints, Pose, Scan, Trajectory
@@ -47,7 +47,9 @@ def open_log(
     Raises InputError for what is no log, or no key.
     """
     named = sources_of(sources)
-    instance(config, LogConfig, "config", 'load_settings().config.log; a topic is chosen by topic="/points"')
+    checks.instance(
+        config, LogConfig, "config", 'load_settings().config.log; a topic is chosen by topic="/points"'
+    )
     if changes:
         short = {name.removeprefix("log__"): value for name, value in changes.items()}
         changed = load_settings(overrides=overrides_of(short, "log")).config.log
@@ -146,6 +148,26 @@ class Log:
     def __iter__(self) -> Generator[Scan, None, None]:
         return self.scans()
 
+    def __getitem__(self, index: int) -> Scan:
+        """The scan of that number, from 0; those before it are read too. Raises InputError where there is none."""
+        number = checks.integer(
+            index, "index", "a scan's number, from 0; islice(log, first, last) for some", least=0
+        )
+        with closing(self._apart().scans()) as scans:
+            scan = next(islice(scans, number, None), None)
+        if scan is None:
+            raise InputError(
+                f"{self.name}: has no scan {number:,}, {counted(self.scan_count, 'scan')} by the index"
+            )
+        return scan
+
+    def _apart(self) -> Log:
+        """The same log, with counts and notes of its own."""
+        other = copy(self)
+        other.publishers = copy(self.publishers)
+        other.publishers.known = dict(self.publishers.known)
+        return other
+
     @property
     def damage(self) -> list[str]:
         """Damage that was met; complete once ``scans`` is through or closed."""
@@ -214,9 +236,7 @@ class Log:
         begin_ns, end_ns = max(self.span.begin_ns, whole.begin_ns), min(self.span.end_ns, whole.end_ns)
         last_ns = (end_ns - begin_ns) * max(1.0 - scans / max(self.scan_count - 1, 1), 0.0)
         for place in places:
-            window = copy(self)  # what it counts and notes is its own
-            window.publishers = copy(self.publishers)
-            window.publishers.known = dict(self.publishers.known)
+            window = self._apart()
             window.span = stream.Span(begin_ns + round(place * last_ns), end_ns)
             with suppress(InputError), closing(window.scans()) as following:
                 found = list(islice(following, scans))

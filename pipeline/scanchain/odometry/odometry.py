@@ -13,7 +13,7 @@ from scanchain import checks, lie
 from scanchain.clock import working_s
 from scanchain.config import Config, MatchingConfig
 from scanchain.data import LEAST_FIT, AnyPoints, Match, Points, Pose, Prior, Scan, State, brief
-from scanchain.errors import InputError, shown
+from scanchain.errors import InputError, counted, shown
 from scanchain.kernels.geometry import largest_magnitude
 from scanchain.odometry.elevation import ElevationCalibration
 from scanchain.odometry.intervals import LiveStamps
@@ -105,6 +105,9 @@ class Odometry:
         self.scans = 0
         self.last: Tracked | None = None
         self.last_sample = b""  # of its raw points
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({counted(self.scans, f'{self.dimension}D scan')})"
 
     @property
     def noise_m(self) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 from scanchain import checks, plugins
 from scanchain.config import MATCHERS, MatchingConfig
 from scanchain.data import AnyPoints, Match, Pose, Prior
-from scanchain.errors import InputError, one_line, shown
+from scanchain.errors import InputError, shown
 from scanchain.registration.voxel_map import VoxelMap
 
 _COUNTS = ("inliers", "points", "iterations")
@@ -43,27 +43,22 @@ class CheckedMatcher:
 
     def __init__(self, name: str, kind: type, config: MatchingConfig) -> None:
         self.name = name
-        try:
+        with plugins.own_code(f"{name}: __init__(self, config) with a MatchingConfig"):
             self.own = kind(config)
-        except Exception as error:  # of the user's own code
-            raise InputError(
-                f"{name}: cannot be made with a MatchingConfig ({type(error).__name__}: {one_line(error)}); "
-                "wanted __init__(self, config)"
-            ) from error
 
     def align(
         self, points: AnyPoints, target: VoxelMap, T_first: Pose, prior: Prior | None = None, *, wide: bool = False
     ) -> Match:
         """The result of the user's ``align``, its arrays of the shape and dtype wanted."""
-        try:
+        with plugins.own_code(f"{self.name}: align"):
             match = self.own.align(points, target, T_first, prior, wide=wide)
-        except Exception as error:  # of the user's own code
-            raise InputError(
-                f"{self.name}: align failed with {type(error).__name__}: {one_line(error)}"
-            ) from error
+        with plugins.own_code(self.name):
+            return self._checked(match, len(T_first) - 1)
+
+    def _checked(self, match: object, d: int) -> Match:
         if not isinstance(match, Match):
-            raise InputError(f"{self.name}: align returned {shown(match)}; wanted a scanchain.Match")
-        d, of = len(T_first) - 1, f"{self.name}: of the Match that align returned,"
+            raise InputError(f"align returned {shown(match)}; wanted a scanchain.Match")
+        of = "of the Match that align returned,"
         k = d * (d + 1) // 2
         for field in (*_COUNTS, *_NUMBERS):
             value = getattr(match, field)

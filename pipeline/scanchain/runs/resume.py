@@ -166,7 +166,7 @@ def _key() -> bytes:
             status, key = os.fstat(file.fileno()), file.read(_KEY_BYTES + 1)
     except (OSError, RuntimeError) as error:  # the latter of a user without a home
         raise InputError(f"no key to sign them with: {one_line(error)}; {remedy}") from error
-    if status.st_uid != os.geteuid() or status.st_mode & 0o077 or len(key) != _KEY_BYTES:
+    if status.st_mode & 0o077 or status.st_uid != os.geteuid() or len(key) != _KEY_BYTES:
         raise InputError(f"{path}: is not a key of this user alone ({_KEY_BYTES} bytes, mode 600); remove it")
     return key
 

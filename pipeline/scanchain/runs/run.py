@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.config import NO_TRUTH, Config
 from scanchain.data import Scan, Trajectory, brief
-from scanchain.errors import InputError, ScanchainError, counted
+from scanchain.errors import InputError, OwnCodeError, ScanchainError, counted
 from scanchain.evaluation import ExpectedErrors, TruthFile, check_overlap, during, on_the_estimate, read_truth
 from scanchain.files import write_whole
 from scanchain.logs import Log, open_log
@@ -77,7 +77,8 @@ def run(
 ) -> Finished:
     """Open the log, process it, write the run directory, to which ``report`` adds its page in the end.
 
-    Raises InputError for bad input, which leaves nothing behind unless scans were processed before it was met.
+    Raises InputError for bad input, which leaves nothing behind unless scans were processed before it was met, and
+    OwnCodeError where code of the user's own fails, which leaves nothing.
     """
     this = _Run(job, progress)
     with this.directory, announcing_compilation(progress.say):
@@ -91,7 +92,8 @@ def run(
             metrics, text = this.judge(results, expected, judged, recording.warnings, held_s)
             return this.complete(metrics, text, report)
         except (Exception, KeyboardInterrupt) as error:
-            if not len(this.steps) and isinstance(error, ScanchainError | KeyboardInterrupt | OSError):
+            is_early = not len(this.steps) and isinstance(error, ScanchainError | KeyboardInterrupt | OSError)
+            if is_early or isinstance(error, OwnCodeError):
                 raise
             raise rescued(error, this.directory, this.steps, this.provenance) from error
 
@@ -108,7 +110,7 @@ class _Run:
         self.true_poses = partial(true_poses, self.log, truth_file, progress)
         self.config, self.source = settings.config, settings.source
         self.provenance = describe_start(job.command, job.logs, self.source)
-        self.steps, self.notes = StepTable(), list[str]()
+        self.steps, self.notes, self.resumed = StepTable(), list[str](), list[str]()
         self.left = left = find_left(job.out, self.config) if job.resume else None
         self.directory = RunDirectory(job.out, force=job.force, left=left and left.folder)
         self.checkpoints = Checkpoints(self.directory.path, job.checkpoint_s, left)
@@ -160,9 +162,9 @@ class _Run:
         if recording.web_address:
             self.progress.announce(f"viewer: {recording.web_address}")
         if self.left is not None:
-            self.notes.append(resume_recording(self.directory.path, self.left, recording, checkpoints))
+            self.resumed = [resume_recording(self.directory.path, self.left, recording, checkpoints)]
         with closing(scans):  # what it left out is counted then, also if the run was stopped
-            tracked = self.progress.track(scans, self.log.scan_count - len(self.steps))
+            tracked = self.progress.track(scans, self.log.scan_count)
             if slam.dimension == 3 and threads() > 1:
                 tracked = prepare_ahead(tracked, slam.front_end.odometry.resolution)
             for scan in tracked:
@@ -240,7 +242,7 @@ class _Run:
                 self.steps, results, expected and expected.ate, judged, run_s=run_s, compile_s=compile_s,
                 ground_truth=truth, warnings=(*lost, *note), stopped=stopped,
             )  # fmt: skip
-            notes = [*log.notes, *filter(None, [result.mounting_note]), *idle]
+            notes = [*self.resumed, *log.notes, *filter(None, [result.mounting_note]), *idle]
             text = summary(metrics, _heading(log, self.config, stopped), self.source, notes)
             metrics.write(folder / METRICS_FILE)
             (folder / "summary.txt").write_text(text, encoding="utf-8")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -45,13 +44,14 @@ def compare_maps(
     voxel_size_m: float | None = None,
     min_size_m: float = 0.2,
     force: bool = False,
+    command: Sequence[str] = (),
 ) -> Changes:
     """The changes, written into the directory ``out``.
 
     runs : directories of the earlier and the later map, or one, whose newest session is compared with all before
     present : adds report and recording to a directory; say : called with each stage when it begins
     T_earlier_later : (d+1, d+1) where it is known; None to find it
-    voxel_size_m, min_size_m : as in ``changes_between``
+    voxel_size_m, min_size_m : as in ``changes_between``; command : the command line, for run.json
     Raises InputError for bad input, and where the maps are not of one place.
     """
     maps = opened_maps(runs, out)
@@ -66,7 +66,7 @@ def compare_maps(
         say("writing")
         _write(directory.path, changes, alignment)
         present(directory.path, changes)
-        provenance = describe_start(sys.argv, [saved.folder for saved in maps], "")
+        provenance = describe_start(command, [saved.folder for saved in maps], "")
         msgspec.structs.replace(provenance, complete=True).write(directory.path / RUN_FILE)
         directory.complete()
     return changes

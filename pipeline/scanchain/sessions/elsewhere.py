@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -78,11 +77,12 @@ def import_map(
     height_m: float = _HEIGHT_M,
     force: bool = False,
     say: Callable[[str], None] = lambda stage: None,
+    command: Sequence[str] = (),
 ) -> Imported:
     """A cloud (PLY, PCD, LAZ, LAS, .npy) or an occupancy grid (.yaml of nav2's or ROS 1's map_server) as a map.
 
     spacing_m : between the virtual keyframes; SPACING_M where left out
-    height_m : of the lidar above the ground, in space
+    height_m : of the lidar above the ground, in space; command : the command line, for run.json
     Raises InputError for a file that cannot be read, or in which no lidar could have been anywhere.
     """
     say(f"reading {file.name}")
@@ -106,7 +106,7 @@ def import_map(
         )
         folder = directory.path / MAP_FOLDER
         write_saved_map(SavedMap(folder, dimension, keyframes, np.zeros(count, np.int64), (session,), none))
-        provenance = describe_start(sys.argv, [file], "")
+        provenance = describe_start(command, [file], "")
         msgspec.structs.replace(provenance, complete=True).write(directory.path / RUN_FILE)
         directory.complete()
     return Imported(dimension, len(surfaces.points), len(keyframes), spacing_m, surfaces.notes)

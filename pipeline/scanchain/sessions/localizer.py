@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scanchain import checks, lie
 from scanchain.config import Config
 from scanchain.data import AnyPoints, Closure, Keyframe, Matrix, Pose, Scan, State, Step, Trajectory, brief
+from scanchain.errors import counted
 from scanchain.evaluation.consistency import edge_errors, with_map_errors
 from scanchain.loops.evidence import is_in_sight
 from scanchain.maps import SavedMap, open_saved_map
@@ -129,6 +130,10 @@ class Localizer:
         self.covariance = np.empty((0, 0))  # of its pose, but for its own error, once it is in the map
         self.own = self.covariance  # covariance of its own error
         self.by_map: Closure | None = None  # its match, or the last one before
+
+    def __repr__(self) -> str:
+        state = self.states[-1] if self.states else MapState.SEARCHING
+        return f"{type(self).__name__}({counted(len(self.states), 'scan')} in {self.map.name!r}: {state})"
 
     def track(
         self,

@@ -15,7 +15,7 @@ from scanchain.data import Matrix
 from scanchain.kernels.raycast import BOX, ELLIPSOID
 from scanchain.simulation.solids import FIXED, Solids
 
-_REMOVED, _MOVED, _ADDED = 0.12, 0.15, 0.08  # shares of the objects that go, move, and get a copy elsewhere
+_VANISHED, _MOVED, _APPEARED = 0.12, 0.15, 0.08  # shares of the objects that go, move, and get a copy elsewhere
 _APART_M = (0.5, 4.0)  # distance of the move
 _TURN_RAD = 0.15  # standard deviation of the turn, beside quarter turns
 _TRIES = 20
@@ -38,7 +38,7 @@ class Change:
     owner : number of the object among the solids of both days
     """
 
-    kind: Literal["removed", "moved", "added"]
+    kind: Literal["vanished", "moved", "appeared"]
     before: NDArray[np.float64]
     after: NDArray[np.float64]
     size_m: NDArray[np.float64]
@@ -57,21 +57,21 @@ def another_day(
         is_of_it = solids.owner == owner
         thing, solids = solids.part(is_of_it), solids.part(~is_of_it)
         fate, elsewhere = rng.random(), None
-        if _REMOVED < fate < _REMOVED + _MOVED + _ADDED:
+        if _VANISHED < fate < _VANISHED + _MOVED + _APPEARED:
             elsewhere = _elsewhere(thing, solids, path, free_m, rng)
         before, gone = _middle(thing), np.full(3, np.nan)
         size_m = np.subtract(*_box(thing)[::-1])
-        if fate < _REMOVED:
-            changes.append(Change("removed", before, gone, size_m, owner))
+        if fate < _VANISHED:
+            changes.append(Change("vanished", before, gone, size_m, owner))
             continue
-        if elsewhere is None or fate > _REMOVED + _MOVED:
+        if elsewhere is None or fate > _VANISHED + _MOVED:
             solids = solids.with_object(thing.rows, owner)
-        if elsewhere is not None and fate <= _REMOVED + _MOVED:
+        if elsewhere is not None and fate <= _VANISHED + _MOVED:
             solids = solids.with_object(elsewhere.rows, owner)
             changes.append(Change("moved", before, _middle(elsewhere), size_m, owner))
         elif elsewhere is not None and _is_free(elsewhere, solids, path, free_m):
             solids = solids.with_object(elsewhere.rows, objects)
-            changes.append(Change("added", gone, _middle(elsewhere), size_m, objects))
+            changes.append(Change("appeared", gone, _middle(elsewhere), size_m, objects))
             objects += 1
     return solids, tuple(changes)
 

@@ -161,6 +161,16 @@ class Plot:
         drawn |= {"markerfacecolor": "none", "markeredgewidth": line} if line else {}
         self._on_axes.append(lambda axes: axes.plot(x, y, linestyle="none", marker=shape, **drawn))
 
+    def text(self, position: Floats, text: str) -> None:
+        """Write above and on the right of a position (2,)."""
+        x, y = self._included(position[None])
+
+        def drawn() -> str:
+            ((left, bottom),) = self._at(x, y).tolist()
+            return _text(left + _BELOW, bottom - _BELOW, text, "start")
+
+        self._within.append(drawn)
+
     def image(
         self,
         pixels: NDArray[np.uint8],

@@ -196,7 +196,9 @@ def _changed(changes: Changes) -> Iterator[page.Section]:
     points = lie.lift_points(changes.points)
     chips = [page.Chip(label.name.lower(), _HEX[label]) for label in _ORDER]
     plan = _changes_picture(points, changes, *maps.surroundings(points[:0], [points]), is_wide=True)
-    drawing = page.Drawing.of("Plan", "Seen from above; boxes around clusters.", plan)
+    drawing = page.Drawing.of(
+        "Plan", "Seen from above; boxes around clusters, with their numbers in the table.", plan
+    )
     yield page.Section("Where", _HOW_TOLD, chips, [drawing])
     if changes.clusters:
         yield page.Section("What changed", grid=_cluster_grid(changes))
@@ -218,12 +220,14 @@ def _changes_picture(
     for cluster in changes.clusters:
         c, s = np.cos(cluster.yaw_rad), np.sin(cluster.yaw_rad)
         corners = 0.5 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]]) * cluster.size_m[:2]
-        figure.line(corners @ np.array([[c, s], [-s, c]]) + cluster.center[:2], INK, 0.8)
+        corners = corners @ np.array([[c, s], [-s, c]]) + cluster.center[:2]
+        figure.line(corners, INK, 0.8)
+        figure.text(corners.max(axis=0), str(cluster.number))
     return figure
 
 
 def _cluster_grid(changes: Changes) -> page.Grid:
-    is_flat = changes.dimension == 2
+    is_flat, has_moved = changes.dimension == 2, any(each.counterpart for each in changes.clusters)
     meters = ("x", "y", "length", "width") if is_flat else ("x", "y", "z", "length", "width", "height")
     heads = (
         page.Head("number"),
@@ -231,13 +235,13 @@ def _cluster_grid(changes: Changes) -> page.Grid:
         *(page.Head(name, "m") for name in meters),
         page.Head("area", "m²") if is_flat else page.Head("volume", "m³"),
         page.Head("points"),
-        page.Head("counterpart", hint="what it became or was when it moved"),
+        *([page.Head("counterpart", hint="what it became or was when it moved")] if has_moved else ()),
     )
     rows = []
     for each in changes.clusters[:_ROWS]:
         numbers = [*each.center.tolist(), *each.size_m.tolist(), each.volume]
-        counterpart = str(each.counterpart) if each.counterpart else ""
-        cells = (each.kind, *(f"{number:.2f}" for number in numbers), f"{each.points:,}", counterpart)
+        cells = (each.kind, *(f"{number:.2f}" for number in numbers), f"{each.points:,}")
+        cells += (str(each.counterpart or ""),) if has_moved else ()
         rows.append(page.Row(str(each.number), cells))
     left = len(changes.clusters) - _ROWS
     return page.Grid(heads, rows, [f"and {left:,} smaller ones: {TABLE_FILE}"] if left > 0 else ())

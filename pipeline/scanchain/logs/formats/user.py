@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Iterator
-from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
 from typing import Any, Protocol
@@ -14,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from scanchain import plugins
 from scanchain.data import Scan
-from scanchain.errors import InputError, counted, one_line, shown
+from scanchain.errors import InputError, counted, shown
 from scanchain.logs.formats import temporary_index
 from scanchain.logs.mcap.records import FileIndex
 from scanchain.logs.writer import LATEST_NS, LogWriter
@@ -55,10 +53,10 @@ def _write(log: LogWriter, path: Path, name: str) -> None:
     """Write the scans that the class reads of a path."""
     make: type[ScanFormat] = plugins.load(name, "scans")
     dimension, end = 0, object()
-    with _blaming(f"{path}: {name}"):
+    with plugins.own_code(f"{path}: {name}"):
         scans: Iterator[Any] = iter(make(path).scans())
     for number in count():
-        with _blaming(f"{path}: scan {number} of {name}"):
+        with plugins.own_code(f"{path}: scan {number} of {name}"):
             given = next(scans, end)
             if given is end:
                 break
@@ -75,16 +73,3 @@ def _write(log: LogWriter, path: Path, name: str) -> None:
         rows = np.pad(rows, ((0, 0), (0, 3 - dimension)))  # in the plane z = 0, by which it is known as 2D
         fields = {"time": np.asarray(times_s, np.float32)} if len(scan.times_s) else {}
         log.point_cloud(_TOPIC, scan.stamp_ns, _FRAME, rows, fields)
-
-
-@contextmanager
-def _blaming(where: str) -> Iterator[None]:
-    """Make an InputError that says where of whatever goes wrong in the user's own code."""
-    try:
-        yield
-    except InputError as error:
-        raise InputError(f"{where}: {error.text}") from error
-    except Exception as error:
-        last = traceback.extract_tb(error.__traceback__)[-1]
-        line = f"{Path(last.filename).name}, line {last.lineno}"
-        raise InputError(f"{where} failed with {type(error).__name__}: {one_line(error)} ({line})") from error
