@@ -74,7 +74,7 @@ def run(case: Case, matcher: str) -> tuple[SlamResult, float]:
 def error(trajectory: Trajectory, reference: Path) -> str:
     """ATE rmse after rigid alignment, or the mean absolute errors over relations."""
     if reference.suffix == ".tum":
-        ate = absolute_error(pair(trajectory, read_tum(reference)))
+        ate = absolute_error(pair(trajectory, read_tum(reference)).after_start)
         return f"{ate.translation_m.rmse:.4f} m ({100.0 * ate.share_of_path:.3f} %)"
     relations = relation_error(trajectory, read_relations(reference))
     return f"{relations.translation_m.mean:.4f} m, {np.degrees(relations.rotation_rad.mean):.3f}°"

@@ -105,4 +105,4 @@ def true_in_map(prior: SavedMap, map_truth: Trajectory, poses: Matrix) -> tuple[
 
 def ate_m(estimate: Trajectory, truth: Trajectory) -> float:
     """Root mean square position error after rigid alignment."""
-    return absolute_error(pair(estimate, truth)).translation_m.rmse
+    return absolute_error(pair(estimate, truth).after_start).translation_m.rmse

@@ -265,7 +265,7 @@ def _amounts(results: Sequence[Metrics]) -> Iterator[tuple[str, str]]:
     speed = np.array([each.times_real_time for each in results])
     yield (
         "scans",
-        f"{scans:,}, {contradicted:,} contradicted, {degenerate:,} degenerate, {lost:,} lost, "
+        f"{scans:,}; of these {contradicted:,} contradicted, {degenerate:,} degenerate, {lost:,} lost, "
         f"over {path} and {time}",
     )
     yield "speed", f"{np.median(speed):.1f} x real time (median), {speed.min():.1f} at the least"
