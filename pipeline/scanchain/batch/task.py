@@ -171,8 +171,8 @@ def _own_ending(ending: Ending, task: Task, output: list[str]) -> tuple[State, s
         metrics = _result(task)[1]
         if ending.code == 0:
             return State.DONE, ""
-        is_doubted = metrics.verdict is Verdict.NOT_TRUSTWORTHY and error.endswith(metrics.sentence)
-        if ending.code == 1 and is_doubted:
+        is_new = f"written        {task.run}" in output  # else these metrics are of a run before
+        if ending.code == 1 and is_new and metrics.verdict is Verdict.NOT_TRUSTWORTHY:
             return State.NOT_TRUSTWORTHY, metrics.verdict_reason
     if ending.code in (1, 2) and error:
         return State.FAILED, error.removeprefix("error: ")
