@@ -32,7 +32,7 @@ NARROW = "--preprocess.max_range_m 4"
 WITHOUT_WHEELS = f"run identical.mcap --out without_wheels {NARROW} --odometry.prior constant-velocity"
 PANDASET = f"{DATA}/3d/pandaset_002_sweeps30to55.mcap"
 THREADS = "threads --scans 16 --log kitti_0005_first60.mcap kitti_0001_first54.mcap"
-LOADING_S = 60.0  # of a recording, in a viewer that draws in software
+LOADING_S = 150.0  # of a recording, in a viewer that draws in software
 PADDING = 20  # px around a part of a page
 
 Drawing = Callable[[Path], Image.Image]
@@ -107,6 +107,9 @@ def recording(path: str) -> Drawing:
             self.send_header("Content-Type", kind)
             self.end_headers()
             self.wfile.write(body.encode())
+
+        def log_message(self, *_: object) -> None:
+            """Nothing is printed of requests."""
 
     def draw(folder: Path) -> Image.Image:
         server, viewer = ThreadingHTTPServer(("127.0.0.1", 0), Handler), start_web(folder / path)
