@@ -108,7 +108,7 @@ def recording(path: str) -> Drawing:
             self.end_headers()
             self.wfile.write(body.encode())
 
-        def log_message(self, *_: object) -> None:
+        def log_message(self, format: str, *args: object) -> None:
             """Nothing is printed of requests."""
 
     def draw(folder: Path) -> Image.Image:
