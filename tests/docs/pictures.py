@@ -17,8 +17,10 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from urllib.parse import quote
 
 from PIL import Image, ImageChops
 
@@ -32,7 +34,7 @@ NARROW = "--preprocess.max_range_m 4"
 WITHOUT_WHEELS = f"run identical.mcap --out without_wheels {NARROW} --odometry.prior constant-velocity"
 PANDASET = f"{DATA}/3d/pandaset_002_sweeps30to55.mcap"
 THREADS = "threads --scans 16 --log kitti_0005_first60.mcap kitti_0001_first54.mcap"
-LOADING_S = 150.0  # of a recording, in a viewer that draws in software
+LOADING_S = 90.0  # of a recording, and playing, in a viewer that draws in software
 PADDING = 20  # px around a part of a page
 
 Drawing = Callable[[Path], Image.Image]
@@ -91,34 +93,36 @@ def benchmark(words: str) -> Drawing:
 
 
 def recording(path: str) -> Drawing:
-    """A recording in the web viewer, once it has been loaded and played.
+    """A recording that plays in the web viewer.
 
     A screenshot is taken when the page is loaded: a picture in it takes as long as the viewer does.
     """
 
-    class Handler(BaseHTTPRequestHandler):
+    class Handler(SimpleHTTPRequestHandler):
         def do_GET(self) -> None:
-            body = f'<body style="margin: 0"><iframe src="{web_address()}" style="border: 0; width: 1600px; '
-            body, kind = f'{body}height: 900px"></iframe><img src="/late"></body>', "text/html"
-            if self.path != "/":
+            if self.path == "/late":
                 time.sleep(LOADING_S)
-                body, kind = "<svg xmlns='http://www.w3.org/2000/svg'/>", "image/svg+xml"
-            self.send_response(200)
-            self.send_header("Content-Type", kind)
-            self.end_headers()
-            self.wfile.write(body.encode())
+            super().do_GET()
+
+        def end_headers(self) -> None:
+            self.send_header("Access-Control-Allow-Origin", "*")
+            super().end_headers()
 
         def log_message(self, format: str, *args: object) -> None:
             """Nothing is printed of requests."""
 
     def draw(folder: Path) -> Image.Image:
-        server, viewer = ThreadingHTTPServer(("127.0.0.1", 0), Handler), start_web(folder / path)
+        server = ThreadingHTTPServer(("127.0.0.1", 0), partial(Handler, directory=str(folder)))
         threading.Thread(target=server.serve_forever, daemon=True).start()
+        here, viewer = f"http://127.0.0.1:{server.server_port}", start_web()
+        address = f"{web_address().partition('?')[0]}?url={quote(f'{here}/{path}', safe='')}"
+        frame = f'<iframe src="{address}" style="border: 0; width: 1600px; height: 900px"></iframe>'
+        (folder / "viewer.html").write_text(f'<body style="margin: 0">{frame}<img src="/late"></body>', "utf-8")
         time.sleep(5.0)
         try:
             flags = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
             dark = "--blink-settings=preferredColorScheme=0"
-            return screenshot(f"http://127.0.0.1:{server.server_port}/", folder, (1600, 900), *flags, dark)
+            return screenshot(f"{here}/viewer.html", folder, (1600, 900), *flags, dark)
         finally:
             stop(viewer)
             server.shutdown()
