@@ -53,6 +53,7 @@ count:
 
 docs: $(DOCS)
 	$(BIN)/python -m sphinx -W --keep-going -q -d build/docs/.doctrees docs build/docs
+	@! grep -rnE '<(script|link rel="stylesheet")[^>]*(src|href)="https?:' build/docs --include '*.html'  # works offline
 	@echo "Open build/docs/index.html"
 
 $(RUNTIME): pyproject.toml

@@ -15,6 +15,8 @@ from scanchain.__main__ import scanchain
 class CommandReference(SphinxDirective):
     """A section for each command, subcommands included, in the order of ``scanchain --help``."""
 
+    has_content = True  # for readers of the source
+
     def run(self) -> list:
         """Nodes of all sections."""
         text = "\n".join(line for name in scanchain.commands for line in _command("scanchain", name))

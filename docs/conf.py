@@ -2,15 +2,16 @@
 
 import sys
 from importlib.metadata import version as installed
+from importlib.util import find_spec
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent))  # command_reference, config_reference and docstrings lie beside it
+sys.path.insert(0, str(Path(__file__).parent))  # the extensions of our own lie here
 
 project = "scanchain"
 version = release = installed("scanchain")
 copyright = "the authors of scanchain"
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "command_reference", "config_reference", "docstrings"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "command_reference", "config_reference", "docstrings", "mathml"]
 myst_enable_extensions = ["amsmath", "attrs_inline", "colon_fence", "deflist", "dollarmath", "fieldlist"]
 myst_heading_anchors = 3
 
@@ -23,7 +24,9 @@ python_use_unqualified_type_names = True
 python_maximum_signature_line_length = 100
 
 html_theme = "furo"
+html_math_renderer = "mathml"
 html_title = f"scanchain {version}"
 html_copy_source = False
-html_static_path = ["style.css"]
+font = Path(find_spec("ziamath").origin).parent / "fonts" / "STIXTwoMath-Regular.ttf"  # of equations; OFL
+html_static_path = ["style.css", str(font)]
 html_css_files = ["style.css"]

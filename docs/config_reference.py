@@ -15,6 +15,8 @@ from scanchain.settings import flatten, load_settings
 class ConfigurationReference(SphinxDirective):
     """A section for each section of the configuration, in its order."""
 
+    has_content = True  # for readers of the source
+
     def run(self) -> list:
         """Nodes of all sections."""
         presets = {dimension: flatten(load_settings(dimension).config) for dimension in (2, 3)}

@@ -2,10 +2,13 @@
 
 import importlib
 import re
+import shlex
 
+import click
 import pytest
 
 import scanchain
+from scanchain.__main__ import scanchain as scanchain_command
 from scanchain.settings import config_keys
 from tests.docs.test_examples import FENCE, PAGES
 from tests.support.scenes import ROOT
@@ -75,3 +78,25 @@ def test_every_link_has_a_text_and_leads_to_a_file_and_a_heading(page):
         assert words, f"a link to {path} has no text"
         assert "://" in path or target.exists(), path
         assert not anchor or "://" in path or anchor in anchors(target), f"{path}#{anchor}"
+
+
+def commands_of(text):
+    """Words of each ``scanchain`` command, in fences and in lines."""
+    for line in re.findall(r"^(?:\$ )?(scanchain [a-z].*)$|`(scanchain\s[a-z][^`]*)`", text, re.MULTILINE):
+        yield shlex.split(re.sub(r"\s+", " ", "".join(line)), comments=True)[1:]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_command_and_flag_on_the_page_exists(page):
+    text = page.read_text(encoding="utf-8")
+    absent = []
+    for words in commands_of(text):
+        command, names = scanchain_command, list(words)
+        while isinstance(command, click.Group) and names and not names[0].startswith("-"):
+            command = command.commands.get(names.pop(0).rstrip(":,"))
+        known = {option for each in command.params for option in each.opts} if command else set()
+        flags = (
+            {word.partition("=")[0] for word in names if word.startswith("--")} - known - {"--help", "--version"}
+        )
+        absent += [(words, flag) for flag in flags if flag.removeprefix("--") not in KEYS] if command else [words]
+    assert absent == []

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scanchain.verdict import Kind
-from scanchain_viz.colors import STRETCH_COLORS, TRUTH, palette_of
+from scanchain_viz.colors import ODOMETRY, OPTIMIZED, STRETCH_COLORS, TRUTH, palette_of, rgb
 from scanchain_viz.pictures.axis import Axis, width_of
 from scanchain_viz.pictures.figure import Line, Plot
 from scanchain_viz.pictures.maps import draw_map, draw_points
@@ -19,8 +19,7 @@ def circle(radius_m):
     return radius_m * np.stack([np.cos(angle), np.sin(angle), np.zeros(100)], axis=1)
 
 
-BLUE, AMBER, MAGENTA = (0.122, 0.373, 0.816), (0.878, 0.482, 0.0), (0.878, 0.149, 0.62)
-PINK, WHITE = (0.839, 0.188, 0.561), (1.0, 1.0, 1.0)
+WHITE = (1.0, 1.0, 1.0)
 
 
 @pytest.fixture
@@ -40,12 +39,13 @@ def share_of(pixels, color, tolerance=0.06):
 
 
 def test_lines_are_drawn_in_their_colors_over_a_map_on_white(drawn):
-    colors = {"#1f5fd0": BLUE, "#e07b00": AMBER, TRUTH: MAGENTA, STRETCH_COLORS[Kind.WHEELS]: PINK}
+    names = (OPTIMIZED, ODOMETRY, TRUTH, STRETCH_COLORS[Kind.WHEELS])
+    colors = {color: np.array(rgb(color)) / 255.0 for color in names}
     lines = [Line("", circle(8.0 + k), color) for k, color in enumerate(colors)]
     pixels, alone = drawn(*lines, path=lines[0].positions), drawn(lines[0])
     assert all(share_of(pixels, color) > 0.001 for color in colors.values())
     assert share_of(pixels, WHITE) > 0.8
-    assert [share_of(alone, color) for color in (AMBER, MAGENTA, PINK)] == [0.0, 0.0, 0.0]
+    assert [share_of(alone, colors[name]) for name in names[1:]] == [0.0, 0.0, 0.0]
     points = np.random.default_rng(3).uniform(-15.0, 15.0, (20_000, 3))
     assert share_of(drawn(lines[0], points=points), WHITE) < 0.95
     assert share_of(drawn(Line("", np.zeros((1, 3)), "#1f5fd0")), WHITE) > 0.9
@@ -59,6 +59,36 @@ def test_a_grid_lies_where_its_origin_says_with_row_0_at_the_bottom(drawn):
     dark_rows = np.nonzero((np.abs(pixels - 0.15) < 0.03).mean(axis=1) > 0.4)[0]
     assert dark_rows.min() > 0.5 * len(pixels)
     assert (np.abs(pixels - 0.90) < 0.01).mean() > 0.15  # unknown is gray, not white
+
+
+CONFUSIONS = {  # of linear red, green, blue (Machado et al. 2009)
+    "none": np.eye(3),
+    "deuteranopia": [[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0.969]],
+    "protanopia": [[0.152, 1.053, -0.205], [0.115, 0.786, 0.099], [-0.004, -0.048, 1.052]],
+}
+TO_LMS = [[0.4122, 0.5363, 0.0514], [0.2119, 0.6807, 0.1074], [0.0883, 0.2817, 0.6300]]  # Oklab (Ottosson 2020)
+TO_LAB = [[0.2105, 0.7936, -0.0041], [1.9780, -2.4286, 0.4506], [0.0259, 0.7828, -0.8087]]
+
+
+@pytest.mark.parametrize("sight", CONFUSIONS)
+def test_lines_of_a_run_have_colors_of_their_own_on_white_and_on_black_for_color_blind_readers_too(sight):
+    kinds = (
+        Kind.DEGENERATE,
+        Kind.LOST,
+        Kind.CONTRADICTED,
+        Kind.WHEELS,
+        Kind.OVERLAP,
+        Kind.ACCELERATION,
+        Kind.LOOPS,
+    )
+    names = [OPTIMIZED, ODOMETRY, TRUTH, *(STRETCH_COLORS[kind] for kind in kinds)]
+    linear = (np.array([rgb(name) for name in names]) / 255.0) ** 2.2
+    seen = np.clip(linear @ np.transpose(CONFUSIONS[sight]), 0.0, 1.0)
+    lab = np.cbrt(seen @ np.transpose(TO_LMS)) @ np.transpose(TO_LAB)
+    apart = np.linalg.norm(lab[:, None] - lab, axis=-1)[np.triu_indices(len(names), 1)]
+    luminance = linear @ [0.2126, 0.7152, 0.0722]
+    contrast = np.minimum(1.05 / (luminance + 0.05), (luminance + 0.05) / 0.057)  # to white, to the dark paper
+    assert apart.min() > 0.05 and contrast.min() > 2.2, (apart.min(), contrast.min())
 
 
 @pytest.mark.parametrize("is_upright", [False, True])
@@ -81,8 +111,10 @@ def test_ticks_are_round_numbers_where_they_belong_that_do_not_touch(is_upright)
 @pytest.mark.parametrize(
     ("ends", "shown"),
     [
-        ((0.05, 30.0), ["0.1", "1", "10"]),
-        ((3.0, 90.0), ["5", "10", "20", "50"]),
+        ((0.05, 30.0), ["0.05", "0.1", "0.2", "0.5", "1", "2", "5", "10", "20"]),
+        ((3.0, 900.0), ["5", "10", "20", "50", "100", "200", "500"]),
+        ((0.02, 200.0), ["0.03", "0.1", "0.3", "1", "3", "10", "30", "100"]),
+        ((4.0, 11.0), ["4", "5", "6", "7", "8", "9", "10", "11"]),
         ((1.2, 1.9), ["1.2", "1.3", "1.4", "1.5", "1.6", "1.7", "1.8", "1.9"]),
         ((1e-9, 1e9), ["1e-09", "1e-06", "0.001", "1", "1000", "1e+06", "1e+09"]),
     ],

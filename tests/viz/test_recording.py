@@ -122,12 +122,12 @@ def weighed(graph, weights):
     return replace(graph, weight=weight)
 
 
-def test_loop_edges_end_on_their_keyframes_and_doubted_ones_are_amber(recorded):
+def test_loop_edges_end_on_their_keyframes_and_doubted_ones_are_pale(recorded):
     strips = np.array(column(recorded[3], entities.ACCEPTED, "LineStrips3D:strips")[-1])
     nodes = np.array(column(recorded[3], entities.KEYFRAMES, "Points3D:positions")[-1])
     np.testing.assert_array_equal(strips, [[nodes[0], nodes[4]], [nodes[0], nodes[8]]])
     colors = column(recorded[3], entities.ACCEPTED, "LineStrips3D:colors")[-1]
-    red, green, blue = entities.ORANGE
+    red, green, blue = entities.PALE_GREEN
     assert colors[0] == (red << 24) + (green << 16) + (blue << 8) + 255 != colors[1]
 
 

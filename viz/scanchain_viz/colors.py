@@ -8,16 +8,17 @@ from numpy.typing import NDArray
 from scanchain.data import BACK_END, VERIFICATION
 from scanchain.verdict import Kind
 
+# Those of a run are apart from each other on white and on black, also for readers who confuse red and green.
 STRETCH_COLORS = {
-    Kind.DEGENERATE: "#d98200",
-    Kind.LOST: "#d6453d",
-    Kind.CONTRADICTED: "#a55bd6",
-    Kind.WHEELS: "#d6308f",
+    Kind.DEGENERATE: "#dc9a00",
+    Kind.LOST: "#b3150c",
+    Kind.CONTRADICTED: "#7638b8",
+    Kind.WHEELS: "#c29086",
     Kind.SCANS_SLIP: "#be123c",
     Kind.WHEELS_SLIP: "#64748b",
-    Kind.ACCELERATION: "#8a1c1c",
-    Kind.LOOPS: "#0f9bb5",
-    Kind.OVERLAP: "#b7791f",
+    Kind.ACCELERATION: "#0a7d8c",
+    Kind.LOOPS: "#3a35ff",
+    Kind.OVERLAP: "#65aae4",
     Kind.DISCONNECTED: "#6b7280",
     Kind.COPIES: "#4d7c0f",
 }
@@ -26,7 +27,8 @@ CLOSURES = {  # by whom a closure was rejected, "" where it was accepted: what i
     BACK_END: ("rejected by the back end", "#eb463c"),
     "": ("accepted", "#3f9b2f"),
 }
-TRUTH = "#e0269e"  # dashed; on white and on black like the others, and never the color of a method
+ODOMETRY, OPTIMIZED = "#d0611d", "#2f7de1"
+TRUTH = "#cf1f86"  # dashed, and never the color of a method
 # Distinguishable on white and on black, also for most color-blind readers.
 _COLORS = (
     "#2f7de1", "#e0532f", "#1aa179", "#c77800", "#a55bd6", "#d6457f", "#0f9bb5", "#7f8c1d", "#8a6d5b", "#8c9096",

@@ -11,7 +11,7 @@ _GAP = 4.0  # least distance between two numbers in points
 _MARGIN = 0.05  # of the range of the values, on both sides of them
 _MOST = 9  # largest number of intervals between ticks
 _ROUND = (1.0, 2.0, 2.5, 5.0, 10.0)  # steps between ticks, times a power of ten
-_FEW_DECADES = 60.0  # ratio of the ends of a logarithmic axis, below which 2 and 5 have ticks, too
+_WITHIN_DECADES = ((1.0, 2.0, 5.0), (1.0, 3.0), (1.0,))  # ticks of a logarithmic axis: the first that have room
 _TINY = 1e-9
 
 
@@ -66,23 +66,28 @@ class Axis:
     def ticks(self, length: float, *, is_upright: bool) -> list[tuple[float, str]]:
         """Fraction and number of each tick on an axis so many points long."""
         low, high = min(self.ends), max(self.ends)
-        values = self._decades(low, high)
+        values = self._decades(low, high, length, is_upright)
         texts = [f"{value:g}" for value in values]
         if not values:
-            values, texts = _round_steps(low, high, length, is_upright)
+            crowded = (high - low) / (high * np.log(high / low)) if self.is_logarithmic else 1.0  # at its end
+            values, texts = _round_steps(low, high, crowded * length, is_upright)
         places = self.fractions(np.array(values, np.float64)).tolist()
         return [(place, text.replace("-", "−")) for place, text in zip(places, texts, strict=True)]
 
-    def _decades(self, low: float, high: float) -> list[float]:
-        """Powers of ten, where they are few their doubles and fivefolds, too; none on a linear axis."""
+    def _decades(self, low: float, high: float, length: float, is_upright: bool) -> list[float]:
+        """Powers of ten, and between them what has room; none on a linear axis."""
         if not self.is_logarithmic:
             return []
         exponents = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
-        factors = (1.0, 2.0, 5.0) if high < _FEW_DECADES * low else (1.0,)
-        every = exponents[:: -(-len(exponents) // _MOST)]
-        values = [float(f"{factor * 10.0**exponent:.0e}") for exponent in every for factor in factors]
-        within = [value for value in values if low <= value <= high]
-        return within if len(within) > 1 else []
+        every, within = exponents[:: -(-len(exponents) // _MOST)], []
+        for factors in _WITHIN_DECADES:
+            values = [float(f"{factor * 10.0**exponent:.0e}") for exponent in every for factor in factors]
+            within = [value for value in values if low <= value <= high]
+            room = length * np.log((*factors, 10.0)[1]) / np.log(high / low) - _GAP
+            widest = FONT if is_upright else max((width_of(f"{value:g}") for value in within), default=0.0)
+            if len(within) <= _MOST and widest <= room:
+                break
+        return within if len(within) > 2 else []
 
 
 def _round_steps(low: float, high: float, length: float, is_upright: bool) -> tuple[list[float], list[str]]:

@@ -20,7 +20,7 @@ from scanchain.maps import SavedMap, open_saved_map, read_map, read_ply
 from scanchain.runs.directory import TRUTH_FILE
 from scanchain.trajectory import read_tum
 from scanchain.verdict import Kind, Stretch
-from scanchain_viz.colors import STRETCH_COLORS, TRUTH, color_of, height_shares, palette_of
+from scanchain_viz.colors import ODOMETRY, OPTIMIZED, STRETCH_COLORS, TRUTH, color_of, height_shares, palette_of
 from scanchain_viz.pictures.figure import DASHED, INK, Floats, Line, Plot, around, write_png
 
 Grid = tuple[NDArray[np.int8], float, tuple[float, float]]  # as ``read_map`` returns it
@@ -38,7 +38,6 @@ _OPAQUE, _OPACITIES = 40_000, (0.4, 1.0)  # points that each are drawn so; one a
 _BULK, _REACH = (0.5, 99.5), 0.5  # percentiles of a map; its sizes that a point may lie outside of these
 _ALL_BUT_FEW, _MARGIN = (0.05, 99.95), 0.02  # percentiles that are shown, and the share of their range around them
 _PNG_INCHES, _PNG_MARGIN = 8.0, (0.04, 1.0)  # width; share of the extent and least meters
-_ODOMETRY, _OPTIMIZED = "#e07b00", "#1f5fd0"
 _NO_POINTS = np.empty((0, 3))
 _INKS = ("#a9b1bd", "#747c88", "#14171b")  # of points in space, by height
 
@@ -204,7 +203,7 @@ def draw_run(directory: Path, picture: Path) -> None:
     elif "placed" in metrics:
         if not metrics["placed"]:
             raise InputError(f"{directory}: {metrics['reason']}; there is no trajectory to draw")
-        lines = [_line("optimized", read_tum(directory / "trajectory.tum").poses, _OPTIMIZED, 1.8)]
+        lines = [_line("optimized", read_tum(directory / "trajectory.tum").poses, OPTIMIZED, 1.8)]
         path = lines[0].positions
     elif "sessions" in metrics:
         names = [each["name"] for each in metrics["sessions"]]
@@ -230,7 +229,7 @@ def _lines_of_run(directory: Path, metrics: dict[str, Any]) -> tuple[list[Line],
     """Trajectories, truth and stretches to check of a run, and its path (N, 3)."""
     optimized, truth_file = read_tum(directory / "trajectory.tum"), directory / TRUTH_FILE
     odometry, path = read_tum(directory / "odometry.tum").poses, optimized.poses[:, :3, 3]
-    lines = [_line("odometry", odometry, _ODOMETRY, 1.0), _line("optimized", optimized.poses, _OPTIMIZED, 1.8)]
+    lines = [_line("odometry", odometry, ODOMETRY, 1.0), _line("optimized", optimized.poses, OPTIMIZED, 1.8)]
     if truth_file.exists():
         accuracy = metrics["ground_truth"] or {}
         truth = on_the_estimate(optimized, read_tum(truth_file), gap_s=accuracy.get("max_gap_s"))

@@ -18,7 +18,7 @@ from scanchain.data import Matrix, Trajectory
 from scanchain.evaluation import absolute_error_of_any_path, pair, path_length
 from scanchain.runs.step_table import STAGES, nees_of_steps
 from scanchain.runs.vouching import poses_of
-from scanchain_viz.colors import color_of
+from scanchain_viz.colors import ODOMETRY, OPTIMIZED, color_of
 from scanchain_viz.pictures.figure import Floats, around
 
 _MARGIN, _MARGIN_Z = (0.08, 1.0), (0.25, 0.1)  # shares of the extent and least meters
@@ -85,8 +85,8 @@ def trajectories_of_run(
         return DrawnTrajectory(name, color, False, poses[:, :3, 3], length_m, errors_m, none, *figures)
 
     return [
-        drawn("optimized", color_of(0), optimized.poses, errors_m, seconds, nees, observability),
-        drawn("odometry", color_of(3), T_world_estimate @ odometry.poses, errors_before_m, *[unknown] * 3),
+        drawn("optimized", OPTIMIZED, optimized.poses, errors_m, seconds, nees, observability),
+        drawn("odometry", ODOMETRY, T_world_estimate @ odometry.poses, errors_before_m, *[unknown] * 3),
     ], true_path
 
 

@@ -83,7 +83,7 @@ class KeyframeGraph:
             return nodes[np.array(pairs, np.int64).reshape(-1, 2)]
 
         accepted = self._of(ClosureVerdict.ACCEPTED)
-        colors = [entities.ORANGE if item.weight < _DOWNWEIGHTED else entities.GREEN for item in accepted]
+        colors = [entities.PALE_GREEN if item.weight < _DOWNWEIGHTED else entities.GREEN for item in accepted]
         return [
             Message(entities.KEYFRAMES, drawing.dots(nodes), times),
             Message(entities.ODOMETRY_EDGES, drawing.lines([nodes]), times),

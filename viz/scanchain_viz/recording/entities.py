@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from scanchain.data import State
 from scanchain.runs.step_table import STAGES
-from scanchain_viz.colors import between, height_shares
+from scanchain.verdict import Kind
+from scanchain_viz.colors import STRETCH_COLORS, between, height_shares, rgb
 from scanchain_viz.recording.drawing import Floats, Message, dots, lines, pixels
 
 WORLD = "world"
@@ -60,7 +61,7 @@ COVARIANCE_SCALE = 100.0  # a standard deviation of 1 mm is drawn 10 cm long
 
 YELLOW, GRAY, WHITE = (255, 205, 60), (110, 120, 135), (235, 235, 235)
 BLUE, GREEN, RED, ORANGE, VIOLET = (70, 150, 255), (60, 200, 90), (235, 70, 60), (255, 140, 40), (190, 120, 255)
-CYAN = (70, 210, 210)
+CYAN, PALE_GREEN = (70, 210, 210), (190, 240, 160)
 
 _HEIGHT_COLORS = ((50, 60, 150), (40, 140, 170), (60, 190, 120), (220, 210, 80), (240, 240, 230))
 
@@ -77,7 +78,7 @@ _LEGEND = f"""
 - **cyan line**: trajectory after the last optimization, over all scans
 - **white line**: ground truth, aligned to the optimized trajectory as for the ATE
 - **violet dots, gray edges**: keyframes and the odometry between them
-- **green edges**: accepted loop closures; amber where the back end lowered their weight below ½
+- **green edges**: accepted loop closures; pale where the back end lowered their weight below ½
 - **red edges**: loop closures that the matcher or, later, the back end rejected
 - **thick lines**: stretches to check, listed in the verdict and in the events
 - **violet ellipsoid**: standard deviation of the position by the matcher, {COVARIANCE_SCALE:.0f} times as large
@@ -102,7 +103,8 @@ def constants(dimension: int) -> list[Message]:
     """Static messages: axes, colors, line widths, names of the series."""
     size_m = 0.5 if dimension == 2 else 2.0
     stages = rr.SeriesLines(names=[f"{stage} [ms]" for stage in STAGES], colors=[CYAN, GREEN, BLUE, YELLOW, RED])
-    states = rr.StateConfiguration(values=list(State), labels=list(State), colors=[GREEN, VIOLET, ORANGE, RED])
+    marked = [rgb(STRETCH_COLORS[kind]) for kind in (Kind.CONTRADICTED, Kind.DEGENERATE, Kind.LOST)]
+    states = rr.StateConfiguration(values=list(State), labels=list(State), colors=[GREEN, *marked])
     return [
         UP,
         Message(LIDAR, rr.TransformAxes3D(axis_length=size_m)),

@@ -112,7 +112,8 @@ class Grid:
 class Drawing:
     """A picture with its caption; ``svg`` comes from a ``Plot`` or is a map to move, all else is escaped.
 
-    ``is_wide`` : over the whole width of the page; ``is_scripted`` : drawn by ``SCRIPT``
+    ``is_wide`` : over the whole width of the page; ``is_scripted`` : drawn by ``SCRIPT``; ``is_still`` : shown
+    instead of a scripted one in print and where scripts do not run
     """
 
     title: str
@@ -121,6 +122,7 @@ class Drawing:
     chip: Named | None = None
     is_wide: bool = False
     is_scripted: bool = False
+    is_still: bool = False
 
     @classmethod
     def of(cls, title: str, caption: str, figure: Plot, chip: Named | None = None) -> Drawing:

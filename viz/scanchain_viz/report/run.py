@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -21,7 +22,7 @@ from scanchain.runs.step_table import STAGES
 from scanchain.settings import read_layer
 from scanchain.trajectory import read_tum
 from scanchain.verdict import VELOCITY_LIMIT, WHEEL_LIMIT, Kind, Stretch
-from scanchain_viz.colors import CLOSURES, STRETCH_COLORS, TRUTH, color_of
+from scanchain_viz.colors import CLOSURES, OPTIMIZED, STRETCH_COLORS, TRUTH, color_of
 from scanchain_viz.pictures.figure import Floats, Line, Plot, broken
 from scanchain_viz.pictures.maps import VIRIDIS, over_map, surroundings
 from scanchain_viz.pictures.trajectories import column_of, frame, trajectories_of_run
@@ -40,7 +41,7 @@ _ACCURACY = (  # a column's head, the field of ``Accuracy``, the factor to the h
     (page.Head("KITTI", "%"), "kitti_translation_share", 100.0, 3),
     (page.Head("KITTI rot.", "deg/m"), "kitti_rotation_rad_per_m", np.degrees(1.0), 4),
 )
-_SHADE = "#d6308f"
+_SHADE = "#8c9096"
 _MAX_ROWS = 100  # largest number of stretches in the table; the longest
 _MAX_CLOSURES = 1500  # largest number of closures of a verdict that are drawn
 _DISPUTED = "at closures rejected by the back end"
@@ -124,11 +125,13 @@ def map_section(lines: Sequence[Line], points: Points, box: Floats, grain_m: flo
     is_flat, path = not len(points) or not np.ptp(points[:, 2]), lines[0].positions
     corners = surroundings(box, [points])
     around = "Seen from above; circle: start, square: end."
-    drawings = [page.Drawing.of("Trajectory over the map", around, over_map(lines, points, *corners, path=path))]
+    still = page.Drawing.of("Trajectory over the map", around, over_map(lines, points, *corners, path=path))
+    drawings = [replace(still, is_still=is_flat)]  # the interactive map shows a flat one from above, too
     if not is_flat:
         text, figure = "dark is low, bright is high.", over_map([], points, *corners, colors=VIRIDIS)
         drawings.append(page.Drawing.of("Map", f"map.ply, seen from above; {text}", figure))
-    drawings.append(page.interactive_map(points, lines, *corners, grain_m=grain_m, is_flat=is_flat))
+    scene = page.interactive_map(points, lines, *corners, grain_m=grain_m, is_flat=is_flat)
+    drawings.append(replace(scene, is_wide=True))
     return page.Section("Trajectory and map", chips=lines, drawings=drawings)
 
 
@@ -136,7 +139,7 @@ def trajectory_lines(
     path: Floats, steps: pa.Table, closures: pa.Table | None, stretches: Sequence[Stretch], truth: Floats | None
 ) -> list[Line]:
     """The trajectory, closures by verdict, what is to check on it, a scan in several of them, and the truth."""
-    lines = [Line("trajectory", path, color_of(0), 1.2)]
+    lines = [Line("trajectory", path, OPTIMIZED, 1.2)]
     if closures is not None and len(closures):
         lines += _closure_lines(path, closures)
     states = np.array(steps["state"].to_pylist())

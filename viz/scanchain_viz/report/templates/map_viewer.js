@@ -68,7 +68,17 @@ function show(canvas) {
     context.putImageData(image, 0, 0);
     const scale = width / canvas.clientWidth;
     for (const line of lines) stroke(line, scale, near, focal, c, s, ct, st, cx, cy);
+    if (scene.flat) ruler(scale, view.away / focal);
     canvas.dataset.drawn = count;
+  }
+
+  function ruler(scale, meter) {  // a round length below left; meter: of a pixel
+    const most = 0.2 * canvas.width * meter, decade = 10 ** Math.floor(Math.log10(most));
+    const length = decade * (most >= 5 * decade ? 5 : most >= 2 * decade ? 2 : 1), x = 12 * scale, y = canvas.height - x;
+    context.setLineDash([]); context.lineWidth = 2 * scale; context.strokeStyle = context.fillStyle = "#e7eaee";
+    context.font = `${12 * scale}px system-ui, sans-serif`;
+    context.beginPath(); context.moveTo(x, y); context.lineTo(x + length / meter, y); context.stroke();
+    context.fillText(`${+length.toPrecision(1)} m`, x, y - 6 * scale);
   }
 
   function stroke(line, scale, near, focal, c, s, ct, st, cx, cy) {
