@@ -69,6 +69,15 @@ def test_an_index_of_another_version_or_without_sense_is_refused(written, before
         open_saved_map(written[0])
 
 
+def test_points_out_of_this_world_are_refused_whatever_the_checksums_say(written):
+    folder, saved = written
+    stored = SavedPoints(np.array([[1e300, 0.0]]), 1.0)
+    keyframes = (replace(saved.keyframes[0], stored=stored), *saved.keyframes[1:])
+    write_saved_map(replace(saved, folder=folder / "far", keyframes=keyframes))
+    with pytest.raises(InputError, match="is not as scanchain writes it .step_m reaches"):
+        open_saved_map(folder / "far")
+
+
 def test_a_folder_without_a_map_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"holds no map \(map/map.json\); give the directory of a finished run"):
         open_saved_map(tmp_path)

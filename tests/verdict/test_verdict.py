@@ -227,7 +227,7 @@ FOUND = {
     ),
     "a corridor that the wheels hold": (
         lambda: evidence(wheels=wheels_of(POSES), is_degenerate=marked(300, 1000)), CHECK, {Kind.DEGENERATE},
-        "the wheels' alone",
+        "those of the prediction, by wheels where these are used",
     ),
     "often degenerate though the wheels hold": (
         lambda: evidence(wheels=wheels_of(POSES), is_degenerate=np.arange(N) % 30 < 9), CHECK, set(),

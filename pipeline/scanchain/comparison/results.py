@@ -375,7 +375,7 @@ def summarize(results: Results, log: Log, limits: Limits, provenance: Provenance
         rows=rows,
         disagreement_m=[[value if np.isfinite(value) else None for value in row] for row in apart_m.tolist()],
         notes=[
-            f"every run may take {limits.time_s:,.0f} s and {limits.memory_mib / 1024.0:.1f} GiB",
+            f"a run is stopped at its limits: {limits.time_s:,.0f} s, {limits.memory_mib / 1024.0:.1f} GiB",
             *log.notes,
             *log.damage,
         ],

@@ -36,6 +36,7 @@ _ROW = np.dtype([
 ])  # fmt: skip
 _WHOLE = ("session", "count", "stamps_ns", "scan_index", "pairs")  # arrays of whole numbers
 _STEP_M = 0.001  # of coordinates on disk, more where the keyframe reaches farther than 33 m
+_MOST_STEP_M = 1e6  # of a map of points that are not damaged
 _WIDE_FROM_M = 0.01  # step from which on they take 32 bits: one far return must not make all points coarse
 _BLOCK = 1 << 20
 
@@ -190,6 +191,10 @@ def open_saved_map(path: Path) -> SavedMap:
         _check_range(rows["session"], "session", len(index.sessions))
         _check_range(edges["pairs"], "pairs", K)
         _check_range(rows["count"], "count", index.points + 1)
+        if (np.abs(rows["step_m"]) > _MOST_STEP_M).any():
+            raise ValueError(
+                f"step_m reaches {np.abs(rows['step_m']).max():.3g} m; wanted at most {_MOST_STEP_M:g}"
+            )
         keyframes = _keyframes(rows, folder / _POINTS, d)
         return SavedMap(folder, d, keyframes, rows["session"], index.sessions, Edges(**edges))
     except (LookupError, ValueError, TypeError) as error:  # written by something else, checksums included

@@ -183,9 +183,9 @@ def _doubts(evidence: Evidence, stretches: Sequence[Stretch], rest: _Rest) -> It
     yield from _unbounded(evidence, rest)
     count = int(evidence.is_degenerate.sum())
     if count > _MOST_OPEN * len(evidence):
-        source = "the wheels' alone" if evidence.wheels.known_share >= KNOWN else "predicted"
         yield (
-            f"{count:,} of {len(evidence):,} scans are degenerate: along at least one direction poses are {source}"
+            f"{count:,} of {len(evidence):,} scans are degenerate: in at least one direction poses are those of "
+            "the prediction, by wheels where these are used"
         )
     tried, accepted = evidence.closures.tried, int(evidence.closures.is_accepted.sum())
     if tried >= _FEWEST_TRIED and accepted < _LEAST_ACCEPTED * tried:
