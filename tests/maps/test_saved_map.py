@@ -74,7 +74,7 @@ def test_points_out_of_this_world_are_refused_whatever_the_checksums_say(written
     stored = SavedPoints(np.array([[1e300, 0.0]]), 1.0)
     keyframes = (replace(saved.keyframes[0], stored=stored), *saved.keyframes[1:])
     write_saved_map(replace(saved, folder=folder / "far", keyframes=keyframes))
-    with pytest.raises(InputError, match="is not as scanchain writes it .step_m reaches"):
+    with pytest.raises(InputError, match=r"is not as scanchain writes it \(step_m reaches"):
         open_saved_map(folder / "far")
 
 
