@@ -10,6 +10,7 @@ from scanchain import evaluation as ev
 from scanchain import lie
 from scanchain.data import Trajectory
 from scanchain.errors import InputError
+from scanchain.evaluation.metrics import evaluate
 from scanchain.evaluation.pairing import nearest
 from scanchain.logs import open_log
 from scanchain.odometry import Odometry
@@ -115,6 +116,15 @@ def test_rpe_over_distance_and_time_equals_evo_on_the_same_stretches(each, measu
     np.testing.assert_allclose(ours.errors_m, [np.linalg.norm(error[:3, 3]) for error in theirs], atol=1e-9)
     turns = [lie_algebra.so3_log_angle(error[:3, :3]) for error in theirs]
     np.testing.assert_allclose(ours.errors_rad, turns, atol=1e-9)
+
+
+def test_where_the_rest_is_straight_the_start_alone_has_no_error_of_the_rest():
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[:, :3, 3] = np.arange(6)[:, None] * [1.0, 0.0, 0.1]
+    poses[0, :3, 3] = 0.0, 1.0, 1.0
+    line = Trajectory(np.arange(6) * 10**9, poses)
+    found = evaluate(line, line)
+    assert found.ate.translation_m.rmse < 1e-9 and found.start_m == 0.0 and found.after_start is None
 
 
 def test_stretches_end_at_the_first_pose_far_or_late_enough(pairs):

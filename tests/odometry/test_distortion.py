@@ -63,6 +63,7 @@ def test_scans_that_were_measured_at_once_stay_without_times(no_time_fields):
     log, scan, config = chosen(at_once())
     assert config.point_times == "auto" and not len(scan.times_s) and not log.distortion
     list(log.scans())
+    assert len([note for note in log.notes if "no point times" in note]) == 1
     assert any("show no distortion" in note for note in log.notes)
 
 

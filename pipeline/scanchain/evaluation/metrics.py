@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, TypeVar
@@ -191,9 +192,11 @@ def evaluate(
     aligned = ate.T_reference_estimate @ pairs.estimate
     errors, missing = relative_errors(pairs, intervals)
     found: dict[str, Result] = {"ate": ate, **errors}
-    after = absolute_error(pairs.after_start, Alignment(align)) if pairs.starts else None
-    start = (pairs.start_error_m, after)
-    return Results(found, missing, pairs.description, warnings, factor, offset_s, *start, aligned, pairs.reference)
+    start_m, after = pairs.start_error_m, None
+    with suppress(InputError):  # no alignment is determined without the first pose
+        after = absolute_error(pairs.after_start, Alignment(align)) if pairs.starts else None
+    said = (found, missing, pairs.description, warnings, factor, offset_s, start_m, after)
+    return Results(*said, aligned, pairs.reference)
 
 
 def _intervals(text: str) -> list[tuple[float, str]]:

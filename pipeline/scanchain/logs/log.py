@@ -23,7 +23,7 @@ from scanchain.logs.bad_scans import ScanCounts, defect
 from scanchain.logs.mcap import stream
 from scanchain.logs.mcap.records import Decoded, FileIndex, name_of
 from scanchain.logs.messages.lidar import Returns, decode_cloud, decode_laser_scan, plane_height_m
-from scanchain.logs.messages.point_times import PointTimes
+from scanchain.logs.messages.point_times import UNTIMED, PointTimes
 from scanchain.logs.messages.poses import RecordedPoses, StampedPose
 from scanchain.logs.messages.readers import is_scan, pose_reader, reader
 from scanchain.logs.mounting import between_frames, find_mounting, find_wheels, in_plane, is_upside_down
@@ -223,7 +223,9 @@ class Log:
             is_damaged, self.jumps, self.bad_scans = bool(self._damage), counts.jumps(), counts.bad
             self._damage += [*counts.losses(), *self.times.warnings(self.topic), *self.jumps, *poses.complaints()]
             self.notes += [note for note in self.publishers.notes if note not in self.notes]
-            self.notes += [*filter(None, [self.times.assumed]), *self.times.faults(self.topic)]
+            is_said = any(note.startswith(UNTIMED.partition(":")[0]) for note in self._opening_notes)
+            assumed = "" if is_said and self.times.assumed == UNTIMED else self.times.assumed
+            self.notes += [*filter(None, [assumed]), *self.times.faults(self.topic)]
             self.notes += counts.notes() + (assembler.notes() if assembler else []) + poses.notes()
         if not index:
             raise InputError(f"{self.name}: no scan of {self.topic} could be read: {'; '.join(self.damage)}")

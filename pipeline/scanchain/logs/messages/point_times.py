@@ -25,7 +25,7 @@ _NAMES = ("t", "time", "timestamp", "offset_time", "time_offset", "timeOffset", 
 
 UNITS_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _NO, _AT_ONCE = "no point times", "every scan counts as measured at once"
-_NONE = f"{_NO}: {_AT_ONCE}"
+UNTIMED = f"{_NO}: {_AT_ONCE}"
 _STAMP, _EPOCH, _CLOCK = "after the stamp", "since the epoch", "of another clock, counted from the first point"
 _SHORTEST_SCAN_NS = 500_000  # span of a scan's whole numbers, below which they are micro- or milliseconds
 _LONGEST_SCAN = 1e4  # span in milliseconds, above which floats are micro- or nanoseconds
@@ -155,7 +155,7 @@ class PointTimes:
         self.unit = config.point_times if config.point_times in UNITS_S else ""
         self.by_azimuth = config.point_times in ("clockwise", "counterclockwise")
         self.fields = _NAMES if self.unit or config.point_times == "auto" else ()
-        self.assumed = _NONE
+        self.assumed = UNTIMED
         if self.by_azimuth:
             turn = f"{config.revolution_start_rad:.3g} rad, {config.revolution_s:g} s a turn"
             self.assumed = f"point times by the azimuth: {config.point_times} from {turn} (log.point_times)"
@@ -192,7 +192,7 @@ class PointTimes:
         field = Field(name, kind, values, low, span, core).taken_as(unit, stamp_ns)
         if core > 0.0 and self.assumed.startswith(_NO):
             self.assumed = _taken(field)
-        elif self.assumed == _NONE and span == 0.0 and len(values) > 1:  # as a float32 holds absolute times
+        elif self.assumed == UNTIMED and span == 0.0 and len(values) > 1:  # as a float32 holds absolute times
             self.assumed = f"{_NO}: field {name} ({kind}) is there and constant ({first:.10g}); {_AT_ONCE}"
         return field
 
