@@ -106,7 +106,7 @@ def expected_ate(graph: PoseGraph) -> ExpectedError:
     """
     alignment = _Alignment.of(graph.poses[:, :-1, -1])
     errors = (alignment.aligned(graph.pose_errors(_BATCH, seed)) for seed in range(_BATCHES))
-    return _expected(np.concatenate([alignment.rms(each) for each in errors]))
+    return _expected(np.concatenate([_rms_m(each, graph.poses.shape[-1] - 1) for each in errors]))
 
 
 def expected_errors(
@@ -120,7 +120,7 @@ def expected_errors(
     """
     ates_m, squares = [], np.zeros((len(graph), graph.freedom, graph.freedom))
     for errors in error_samples(graph, map_errors, config, scans, influence):
-        ates_m.append(np.sqrt((errors[..., : scans.arms_m.shape[1]] ** 2).sum(axis=2).mean(axis=1)))
+        ates_m.append(_rms_m(errors, scans.arms_m.shape[1]))
         of_keyframes = errors[:, scans.of_keyframes]
         squares += np.einsum("nki,nkj->kij", of_keyframes, of_keyframes)
     R = _rotations(graph.poses, graph.freedom)
@@ -150,7 +150,7 @@ def error_samples(
         changes[:, is_odometry] = influence.of_keyframes[:, graph.edges[is_odometry, 0]]
         within = (R @ influence.of_scans[..., None])[..., 0]
         influences = alignment.aligned(scans.errors(drifting.displacements(changes)) + within)
-        scale, log_sigma = _scales(alignment.rms(influences), influence.kinds)
+        scale, log_sigma = _scales(_rms_m(influences, scans.arms_m.shape[1]), influence.kinds)
         own[influence.is_measured] = 0.0  # the jackknife contains it
     values, vectors = np.linalg.eigh(R @ own @ np.swapaxes(R, 1, 2))
     half = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
@@ -248,9 +248,10 @@ class _Alignment(NamedTuple):
         turned = np.broadcast_to(twist[:, None, d:], errors[..., d:].shape)
         return errors - np.concatenate([moves, turned], axis=2)
 
-    def rms(self, errors: Matrix) -> NDArray[np.float64]:
-        """Root mean squared position error (n,), m."""
-        return np.sqrt((errors[..., : self.moved.shape[1]] ** 2).sum(axis=2).mean(axis=1))
+
+def _rms_m(errors: Matrix, d: int) -> NDArray[np.float64]:
+    """Root mean squared position error (n,), m, of errors (n, N, k)."""
+    return np.sqrt((errors[..., :d] ** 2).sum(axis=2).mean(axis=1))
 
 
 def _expected(ates_m: NDArray[np.float64]) -> ExpectedError:

@@ -27,7 +27,7 @@ _POINTS, _MATCHED = 8_000, 500  # points of a scan, at random, and those that ar
 _LEAST_M = 0.03  # distortion of a scan below which it is lost in the noise of the ranges
 _CLEAR = 3.5  # standard errors of a mean difference that is clear: of 12 values by chance in 1 of 400
 _LEAST_GAIN = 0.01  # share of the residuals by which times that are adopted lower them
-_LEAST_SHARE = 0.75  # of the distortion, that times which are adopted must remove
+_MOST_LOSS = 5.0  # loss by opposite times over the gain: 3 where these remove all distortion, 5 at three quarters
 _SPINS_AT_S = (0.02, 0.25)  # periods that are those of a revolution
 _SURE = 0.9  # least agreement of the azimuths at which scans begin
 _AROUND = 0.8  # least share of the directions that a lidar sees which looks around
@@ -66,7 +66,8 @@ class Distortion:
     @property
     def is_shown(self) -> bool:
         """True if these times explain the scans clearly better than none, and as no others would."""
-        return self.gain > _LEAST_GAIN and self.sigmas > _CLEAR and self.share > _LEAST_SHARE
+        is_clear = self.gain > _LEAST_GAIN and self.sigmas > _CLEAR
+        return is_clear and 0.0 < self.loss < _MOST_LOSS * self.gain
 
     @property
     def is_refuted(self) -> bool:
