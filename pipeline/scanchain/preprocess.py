@@ -25,7 +25,7 @@ _LEAST_SLOTS, _MOST_SLOTS = 1 << 10, 1 << 22  # of a table for downsampling; lar
 _GROWTH = 4  # of a table that has no room for all voxels
 _RANGE_VOXELS = 14.0  # least number of voxels of the local map that the median range spans
 _DENSE, _SPARSE = 60_000, 40_000  # returns of a scan from which on it is dense, and below which it no longer is
-_FINE = math.sqrt(0.5)  # factor on the voxels of dense scans, which fill finer ones with points enough for a plane
+_FINE = math.sqrt(0.5)  # factor on the voxels of the map of dense scans, whose points fill finer ones
 _HYSTERESIS = 0.75  # powers of two between the present scale and the target scale, from which on it changes
 _STEP = 2.0  # factor by which the voxels of matching shrink or grow from one scan to the next, at most
 _MAX_TRIES = 8  # number of times the first scan is downsampled, at most
@@ -136,8 +136,9 @@ _scratch = _Scratch()
 class Resolution:
     """Voxel sizes chosen scan by scan.
 
-    scale : 1, ½, ¼ …, factor on all voxel sizes of the configuration: small in narrow places, so
-        that the median range spans about _RANGE_VOXELS voxels of the local map, or more; times √½ for dense scans
+    octave : 1, ½, ¼ …, factor on all voxel sizes of the configuration: small in narrow places, so
+        that the median range spans about _RANGE_VOXELS voxels of the local map, or more
+    scale : of the local map's voxels, times √½ for dense scans; their points stay as many
     match_voxel_m : voxels of the points to match, so that about ``preprocess.match_points`` remain
     noise : of the ranges, by the first scans
     """
@@ -158,8 +159,8 @@ class Resolution:
 
         Its points set the sizes for the next scan; the first scan is downsampled again until they fit.
         """
-        sweep = sweep_of(scan, self.config, self.scale)
-        is_coarse = self.match_voxel_m <= self.scale * self.config.map_voxel_m
+        sweep = sweep_of(scan, self.config, self.octave)
+        is_coarse = self.match_voxel_m <= self.octave * self.config.map_voxel_m
         sparse = sweep if is_coarse else sweep.downsampled(self.match_voxel_m)
         if self.is_fixed or not len(sparse.points):
             return sweep, sparse
@@ -178,7 +179,7 @@ class Resolution:
         target_m = self.match_voxel_m * min(
             max(math.sqrt(len(points) / self.config.match_points), 1.0 / _STEP), _STEP
         )
-        coarse_m, fine_m = self.octave * self.config.match_voxel_m, self.scale * self.config.map_voxel_m
+        coarse_m, fine_m = self.octave * self.config.match_voxel_m, self.octave * self.config.map_voxel_m
         target_m = min(max(target_m, fine_m), coarse_m)
         if not _ENOUGH < target_m / self.match_voxel_m < 1.0 / _ENOUGH:
             self.match_voxel_m = target_m

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,7 @@ from scipy.spatial import KDTree
 
 from scanchain.data import RawPoints
 
-_SCANS = 30  # that are measured: the first ones
+_SCANS, _EVERY = 30, 3  # scans within which noise is measured, and of which each that many is
 _PATCHES = 300  # of a scan, evenly spread
 _FREEDOM = 4  # points of a patch beyond the parameters of its plane
 _MEDIAN_WITHIN, _FIFTH = 0.8216, 0.4122  # χ² of 4 degrees of freedom over 4: median below _WITHIN, first quintile
@@ -35,31 +34,31 @@ class RangeNoise:
     of least squares, times r², are those of ranges, whatever the incidence. Patches on edges and clutter have
     larger ones: at each range, the noise is the lowest mode of the variances.
 
-    ranges_m, variances_m2 : (P,) median range and variance of every patch so far, of this many scans
+    ranges_m, variances_m2 : (P,) median range and variance of every patch so far
+    scans : number of scans so far
+    by_range : ranges, a factor of √2 apart, the standard deviation there, and the patches, where known; meters
+    sigma_m : standard deviation of a typical range, the geometric mean of all that are known; 0 where few are
     """
 
     ranges_m: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     variances_m2: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     scans: int = 0
+    by_range: tuple[tuple[float, float, int], ...] = ()
+    sigma_m: float = 0.0
 
     def measured(self, points: RawPoints) -> RangeNoise:
         """With another scan (N, d), as long as it is one of the first."""
         if self.scans >= _SCANS:
             return self
+        if self.scans % _EVERY:
+            return replace(self, scans=self.scans + 1)
         ranges_m, variances_m2 = _patches(points)
         ranges_m = np.concatenate([self.ranges_m, ranges_m])
-        return RangeNoise(ranges_m, np.concatenate([self.variances_m2, variances_m2]), self.scans + 1)
-
-    @cached_property
-    def by_range(self) -> tuple[tuple[float, float, int], ...]:
-        """Ranges, a factor of √2 apart, the standard deviation there, and the patches, where known; meters."""
-        half_octaves = np.floor(2.0 * np.log2(self.ranges_m))
-        found = []
-        for each in np.unique(half_octaves):
-            chosen, range_m = self.variances_m2[half_octaves == each], 2.0 ** (0.5 * (each + 0.5))
-            if sigma_m := _sigma_m(chosen, range_m):
-                found.append((float(range_m), sigma_m, len(chosen)))
-        return tuple(found)
+        variances_m2 = np.concatenate([self.variances_m2, variances_m2])
+        by_range = _by_range(ranges_m, variances_m2)
+        return RangeNoise(
+            ranges_m, variances_m2, self.scans + 1, by_range, _typical_m(by_range, ranges_m, variances_m2)
+        )
 
     @property
     def text(self) -> str:
@@ -72,13 +71,28 @@ class RangeNoise:
         known = ", ".join(f"{100.0 * sigma_m:.2g} cm at {range_m:.2g} m" for range_m, sigma_m, _ in self.by_range)
         return f"{100.0 * self.sigma_m:.2g} cm of a typical range: {known}"
 
-    @cached_property
-    def sigma_m(self) -> float:
-        """Standard deviation of a typical range, the geometric mean of all that are known; 0 where few are."""
-        _, sigmas_m, counts = np.array(self.by_range).reshape(-1, 3).T
-        if counts.sum() > _KNOWN * len(self.ranges_m):
-            return float(np.exp(np.average(np.log(sigmas_m), weights=counts)))
-        return _sigma_m(self.variances_m2, float(np.median(self.ranges_m))) if self.scans else 0.0
+
+def _by_range(
+    ranges_m: NDArray[np.float64], variances_m2: NDArray[np.float64]
+) -> tuple[tuple[float, float, int], ...]:
+    half_octaves = np.floor(2.0 * np.log2(ranges_m))
+    found = []
+    for each in np.unique(half_octaves):
+        chosen, range_m = variances_m2[half_octaves == each], 2.0 ** (0.5 * (each + 0.5))
+        if sigma_m := _sigma_m(chosen, range_m):
+            found.append((float(range_m), sigma_m, len(chosen)))
+    return tuple(found)
+
+
+def _typical_m(
+    by_range: tuple[tuple[float, float, int], ...],
+    ranges_m: NDArray[np.float64],
+    variances_m2: NDArray[np.float64],
+) -> float:
+    _, sigmas_m, counts = np.array(by_range).reshape(-1, 3).T
+    if counts.sum() > _KNOWN * len(ranges_m):
+        return float(np.exp(np.average(np.log(sigmas_m), weights=counts)))
+    return _sigma_m(variances_m2, float(np.median(ranges_m))) if len(ranges_m) else 0.0
 
 
 def _patches(points: RawPoints) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -87,7 +101,8 @@ def _patches(points: RawPoints) -> tuple[NDArray[np.float64], NDArray[np.float64
     size = d + _FREEDOM
     azimuth = np.arctan2(points[:, 1], points[:, 0])
     if (share := _SECTOR_POINTS / max(len(points), 1)) < 1.0:
-        chosen = (azimuth * (_SECTORS / (2.0 * math.pi))) % 1.0 < share
+        sector = azimuth * (_SECTORS / (2.0 * math.pi))
+        chosen = sector - np.floor(sector) < share
         points, azimuth = points[chosen], azimuth[chosen]
     rays = points.astype(np.float64)
     ranges_m = np.linalg.norm(rays, axis=1)
@@ -116,12 +131,15 @@ def _sigma_m(variances: NDArray[np.float64], range_m: float) -> float:
     """Standard deviation of the lowest mode of variances (P,) at that range; 0 where it is unknown."""
     if len(variances) < _FEWEST:
         return 0.0
-    variance = float(np.quantile(variances, 0.2)) / _FIFTH
+    variances = np.sort(variances)
+    variance = float(variances[len(variances) // 5]) / _FIFTH
     for _ in range(30):
-        before, within = variance, variances[variances <= _WITHIN * variance]
-        variance = float(np.median(within)) / _MEDIAN_WITHIN if len(within) else variance
+        before, count = variance, int(np.searchsorted(variances, _WITHIN * variance, side="right"))
+        if count:
+            variance = 0.5 * float(variances[(count - 1) // 2] + variances[count // 2]) / _MEDIAN_WITHIN
         if abs(variance - before) <= 1e-3 * before:
             break
-    planar, sigma_m = float(np.mean(variances <= _WITHIN * variance)) / _SHARE_WITHIN, math.sqrt(variance)
+    planar = np.searchsorted(variances, _WITHIN * variance, side="right") / len(variances) / _SHARE_WITHIN
+    sigma_m = math.sqrt(variance)
     is_clutter = planar < _PLANAR or sigma_m > max(_CLUTTER * range_m, _CLUTTER_M)
     return 0.0 if is_clutter else max(sigma_m, _LEAST_M)

@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 
 from scanchain import lie
-from scanchain.config import PreprocessConfig
-from scanchain.data import Scan
 from scanchain.kernels.registration.plane_adjustment import plane_equations, planes
 from scanchain.logs import open_log
 from scanchain.odometry import Odometry
-from scanchain.odometry.elevation import ElevationCalibration, _combined, adjusted, raised
+from scanchain.odometry.elevation import Adjusting, ElevationCalibration, _combined, raised
 from scanchain.trajectory import read_tum
 from tests.support import made, naive
 from tests.support.scenes import configured, kitti_scans, shared_data
@@ -30,6 +28,12 @@ def seen(T, rng, points=3000):
     return lie.transform(lie.inverse(T), world)
 
 
+def adjusted(scans, poses):
+    """What an adjustment finds in cells of 1 m, step by step."""
+    adjusting = Adjusting(scans, poses, 1.0)
+    return next(found for found in iter(adjusting.step, "never") if found is not None)
+
+
 @pytest.mark.parametrize("offset_deg", [0.0, 0.3, -0.2])
 def test_the_offset_and_the_poses_are_found_on_ground_of_any_shape(offset_deg):
     rng = np.random.default_rng(0)
@@ -37,7 +41,7 @@ def test_the_offset_and_the_poses_are_found_on_ground_of_any_shape(offset_deg):
     scans = [raised(seen(T, rng), -offset_rad) for T in POSES]
     shifted = POSES @ lie.exp(rng.normal(0.0, [0.03] * 3 + [0.003] * 3, (8, 6)))
     shifted[-1] = POSES[-1]
-    found = adjusted(scans, shifted, 1.0)
+    found = adjusted(scans, shifted)
     assert found.offset_rad == pytest.approx(offset_rad, abs=math.radians(0.02))
     assert found.sigma_rad < math.radians(0.03)
     assert np.abs(lie.between(found.poses[:-1], found.poses[1:]) - lie.between(POSES[:-1], POSES[1:])).max() < 0.02
@@ -90,11 +94,10 @@ def test_points_in_planes_are_those_of_flat_cells_that_three_scans_see():
 
 def calibrated(poses, offset_deg, rng, *, is_wanted=True, points=3000):
     """A calibration that took scans from these poses, and how often it asked for another map."""
-    calibration, rebuilt = ElevationCalibration(PreprocessConfig(), is_wanted=is_wanted), 0
-    for index, T in enumerate(poses):
+    calibration, rebuilt = ElevationCalibration(is_wanted=is_wanted), 0
+    for T in poses:
         cloud = raised(seen(T, rng, points), -math.radians(offset_deg))
-        scan = Scan.of(cloud.astype(np.float32), 0.1 * index, index=index)
-        rebuilt += bool(calibration.take(scan, cloud, T, np.ones(6)))
+        rebuilt += bool(calibration.take(raised(cloud, calibration.offset_rad), T))
     return calibration, rebuilt
 
 
@@ -110,12 +113,12 @@ def test_nothing_is_estimated_where_unwanted_or_at_rest(is_wanted, poses):
 
 def test_an_offset_is_refined_as_the_lidar_moves_on_with_a_map_built_anew_but_once_and_none_is_known_to_be_none():
     sigma_deg = {}
-    for scans, offset_deg in ((14, -0.2), (48, -0.2), (48, 0.0)):
+    for scans, offset_deg in ((20, -0.2), (60, -0.2), (60, 0.0)):
         calibration, rebuilt = calibrated(drive(scans), offset_deg, np.random.default_rng(3))
         assert math.degrees(calibration.offset_rad) == pytest.approx(offset_deg, abs=0.02 if offset_deg else 0.0)
         assert rebuilt == (offset_deg != 0.0)
         sigma_deg[scans, offset_deg] = math.degrees(calibration.sigma_rad)
-    assert sigma_deg[48, -0.2] < 0.6 * sigma_deg[14, -0.2] < 0.015 and sigma_deg[48, 0.0] < 0.015
+    assert sigma_deg[60, -0.2] < 0.6 * sigma_deg[20, -0.2] < 0.015 and sigma_deg[60, 0.0] < 0.015
 
 
 def test_windows_that_contradict_each_other_say_so_in_the_deviation():
@@ -128,7 +131,7 @@ def test_windows_that_contradict_each_other_say_so_in_the_deviation():
 def test_a_few_flat_points_give_no_offset():
     rng = np.random.default_rng(3)
     for scans in ([seen(T, rng, 2) for T in POSES], [np.zeros((50, 3))] * 8, [np.empty((0, 3))] * 8):
-        assert adjusted(scans, POSES, 1.0).sigma_rad > math.radians(0.1)
+        assert adjusted(scans, POSES).sigma_rad > math.radians(0.1)
 
 
 def pitch_per_meter(poses, truth):

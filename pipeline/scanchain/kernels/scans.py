@@ -125,6 +125,18 @@ def deskew_in_space(points, shares, twist):
             flat[3 * i + 2] = w + share * rw + x * ev - y * eu
 
 
+@njit(nogil=True)
+def raise_elevation(points, offset_rad: float):
+    """Points (N, 3) in the lidar frame with their elevation angles raised."""
+    sine, cosine, raised = np.sin(offset_rad), np.cos(offset_rad), np.empty(points.shape)
+    for i in range(points.shape[0]):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        level = max(np.sqrt(x * x + y * y), 1e-9)
+        stretch = cosine - sine * z / level
+        raised[i, 0], raised[i, 1], raised[i, 2] = stretch * x, stretch * y, cosine * z + sine * level
+    return raised
+
+
 @njit(forceinline=True)
 def _series(s: float, first: int) -> float:
     """Σ sⁿ/(2n + first)!, to 1e-17 for |s| ≤ 1."""

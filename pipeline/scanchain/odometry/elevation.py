@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 
 from scanchain import lie
-from scanchain.config import PreprocessConfig
-from scanchain.data import Matrix, Points, Pose, Scan
+from scanchain.data import Matrix, Points, Pose
 from scanchain.kernels.registration.plane_adjustment import plane_equations, planes
-from scanchain.preprocess import Sweep, sweep_of
+from scanchain.kernels.scans import raise_elevation
+from scanchain.preprocess import Sweep
 from scanchain.registration.search import evenly
 
 _FIRST, _LATER = (14, 0.6), (16, 0.9)  # scans adjusted together, and distance of two in cells: soon, then well
-_CELL_M, _POINT_M = 1.0, 0.3  # edge of a cell, and of the voxels to which scans are downsampled
+_CELL_M = 1.0  # edge of a cell
 _RANGE_CELLS = 14.0  # least number of cells that the median range spans: they are small in narrow surroundings
 _SMALLEST = 0.125  # smallest factor by which they shrink
-_POINTS = 7000  # largest number of points of each scan, evenly spread
-_ROUNDS, _STEP_RAD, _TURN_RAD = 8, 1e-4, 1e-3  # most Gauss-Newton steps, offset and turns of the last of them
+_POINTS = 3500  # largest number of points of each scan, evenly spread
+_STEPS, _STEP_RAD, _TURN_RAD = 8, 1e-4, 1e-3  # most Gauss-Newton steps, offset and turns of the last of them
 _KERNEL = 1.5 / 0.6745  # scale of the robust weight over the median residual
 _RIDGE = 1e-6  # keeps directions that no plane sees from a division by zero
 _SCATTER_RAD = math.radians(0.02)  # standard deviation assumed of a window, beyond its own, before others are seen
@@ -48,8 +48,7 @@ class ElevationCalibration:
     sigma_rad : standard deviation of that mean, by the scatter of the windows; infinite before the first one
     """
 
-    def __init__(self, config: PreprocessConfig, *, is_wanted: bool) -> None:
-        self.config = msgspec.structs.replace(config, map_voxel_m=_POINT_M)
+    def __init__(self, *, is_wanted: bool) -> None:
         self.is_wanted = is_wanted
         self.offset_rad, self.sigma_rad = 0.0, math.inf
         self.scale = 1.0
@@ -65,17 +64,23 @@ class ElevationCalibration:
         """Forget the scans that were collected: the next pose does not follow from theirs."""
         self.T_odom_last: Pose | None = None
         self.left_out = 0
-        self.collected: list[tuple[Points, Points, Pose]] = []
+        self.collected: list[tuple[Points, Pose]] = []
+        self.adjusting: Adjusting | None = None  # the scans collected, a step at a scan
+        self.since: list[tuple[Points, Pose]] = []  # the scans since then
 
-    def take(self, scan: Scan, points: Points, T_odom_lidar: Pose, velocity: Matrix) -> list[tuple[Points, Pose]]:
-        """Collect a scan; empty unless it completes a window that changes the offset by as much as matters.
+    def take(self, points: Points, T_odom_lidar: Pose) -> list[tuple[Points, Pose]]:
+        """Collect a scan; empty unless a window is adjusted and changes the offset by as much as matters.
 
-        Then the scans of the window are returned, corrected, with adjusted poses, of which the last one stays as
-        it was. After n windows n scans are left out, and any without a velocity, as the first one.
+        Then its scans, with adjusted poses, of which the last one stays as it was, and those since are returned,
+        corrected. After n windows n scans are left out.
 
-        points : (N, 3) of the map, deskewed and corrected; velocity : (6,) by which the scan is deskewed
+        points : (N, 3) of the map, deskewed and corrected
         """
-        if not self.is_wanted or not velocity.any():
+        if self.adjusting is not None:
+            self.since.append((points, T_odom_lidar))
+            found = self.adjusting.step()
+            return self._adopt(found) if found is not None else []
+        if not self.is_wanted:
             return []
         scans, spacing = _LATER if self.windows else _FIRST
         spacing_m = spacing * self.scale * _CELL_M
@@ -85,29 +90,32 @@ class ElevationCalibration:
         if self.left_out < self.windows:
             self.left_out += 1
             return []
-        own = sweep_of(scan, self.config, self.scale).from_middle(velocity)
         if not self.collected:
-            octaves = round(math.log2(float(np.median(np.linalg.norm(own, axis=1))) / (_RANGE_CELLS * _CELL_M)))
-            self.scale = min(max(2.0**octaves, _SMALLEST), 1.0)
-        self.collected.append((evenly(own, _POINTS), points, T_odom_lidar))
-        return self._adjust() if len(self.collected) == scans else []
+            range_m = float(np.median(np.linalg.norm(points, axis=1)))
+            self.scale = min(max(2.0 ** round(math.log2(range_m / (_RANGE_CELLS * _CELL_M))), _SMALLEST), 1.0)
+        self.collected.append((points, T_odom_lidar))
+        if len(self.collected) == scans:
+            clouds, poses = zip(*self.collected, strict=True)
+            few = [evenly(cloud, _POINTS) for cloud in clouds]
+            self.adjusting = Adjusting(few, np.array(poses), self.scale * _CELL_M)
+        return []
 
-    def _adjust(self) -> list[tuple[Points, Pose]]:
-        own, clouds, poses = zip(*self.collected, strict=True)
-        found = adjusted(list(own), np.array(poses), self.scale * _CELL_M, self.offset_rad)
+    def _adopt(self, found: Adjustment) -> list[tuple[Points, Pose]]:
+        collected, since = self.collected, self.since
         self.windows += 1
-        self.left_out, self.collected = 0, []
-        if not math.isfinite(found.sigma_rad) or abs(found.offset_rad) > _LARGEST_RAD:
+        self.left_out, self.collected, self.adjusting, self.since = 0, [], None, []
+        offset_rad = self.offset_rad + found.offset_rad
+        if not math.isfinite(found.sigma_rad) or abs(offset_rad) > _LARGEST_RAD:
             return []
-        self.estimates.append((found.offset_rad, found.sigma_rad))
+        self.estimates.append((offset_rad, found.sigma_rad))
         mean_rad, self.sigma_rad = _combined(np.array(self.estimates))
         is_significant = abs(mean_rad) > max(_LEAST_RAD, _SIGMAS * self.sigma_rad)
         before_rad, self.offset_rad = self.offset_rad, mean_rad if is_significant else 0.0
         change_rad = self.offset_rad - before_rad
         if abs(change_rad) < _LEAST_RAD:
             return []
-        corrected = (raised(cloud, change_rad) for cloud in clouds)
-        return list(zip(corrected, found.poses, strict=True))
+        placed = [(points, pose) for (points, _), pose in zip(collected, found.poses, strict=True)]
+        return [(raised(points, change_rad), pose) for points, pose in placed + since]
 
 
 def _combined(estimates: Matrix) -> tuple[float, float]:
@@ -126,38 +134,45 @@ def _combined(estimates: Matrix) -> tuple[float, float]:
 
 def raised(points: Points, offset_rad: float) -> Points:
     """Points (N, 3) in the lidar frame with their elevation angles raised."""
-    x, y, z = np.asarray(points, np.float64).T
-    sine, cosine, level = math.sin(offset_rad), math.cos(offset_rad), np.maximum(np.sqrt(x**2 + y**2), 1e-9)
-    stretch = cosine - sine * z / level
-    return np.column_stack([stretch * x, stretch * y, cosine * z + sine * level])
+    return raise_elevation(np.ascontiguousarray(points, np.float64), offset_rad)
 
 
-def adjusted(scans: list[Points], poses: Matrix, cell_m: float, offset_rad: float = 0.0) -> Adjustment:
-    """Poses and elevation offset with which the planes that several scans (N, 3) see are thinnest.
+class Adjusting:
+    """Adjustment of poses and elevation offset such that the planes that several scans (N, 3) see are thinnest.
 
-    Gauss-Newton over all poses and the offset δ, from ``offset_rad`` on: with p(δ) the raised point of scan k, the
+    Gauss-Newton over all poses and the offset δ: with p(δ) the raised point of scan k, the
     residuals are the distances of T_k p(δ) from the planes, free too, of cells of a grid whose points, of at least
     three scans, are flat (plane adjustment; Liu and Zhang 2021). The ground may have any shape.
     """
-    points, number = np.concatenate(scans), np.repeat(np.arange(len(scans)), [len(scan) for scan in scans])
-    sigma_rad, last, n, size = math.inf, poses[-1], len(points), 6 * len(poses) + 1
-    beside, normals, residual, plane = np.empty((n, 3)), np.empty((n, 3)), np.empty(n), np.empty(n, np.int32)
-    for _ in range(_ROUNDS):
-        lifted = raised(points, offset_rad)
-        count = planes(lifted, number, poses, cell_m, beside, residual, plane, normals)
+
+    def __init__(self, scans: Sequence[Points], poses: Matrix, cell_m: float) -> None:
+        self.points, self.number = np.concatenate(scans), np.repeat(np.arange(len(scans)), [*map(len, scans)])
+        self.poses, self.last, self.cell_m = poses, poses[-1], cell_m
+        self.offset_rad, self.steps = 0.0, 0
+
+    def step(self) -> Adjustment | None:
+        """One step; what is found after the last one, with an infinite σ where there are no planes."""
+        n, size = len(self.points), 6 * len(self.poses) + 1
+        beside, normals, residual, plane = np.empty((n, 3)), np.empty((n, 3)), np.empty(n), np.empty(n, np.int32)
+        lifted = raised(self.points, self.offset_rad)
+        count = planes(lifted, self.number, self.poses, self.cell_m, beside, residual, plane, normals)
         if not count:
-            return Adjustment(poses, 0.0, math.inf)
+            return Adjustment(self.poses, 0.0, math.inf)
         scale_m = max(_KERNEL * float(np.median(np.abs(residual[plane >= 0]))), 1e-6)
         H, of_planes = np.zeros((size + 1, size + 1)), (plane, beside, residual, normals[:count])
-        variance, gain = plane_equations(lifted, number, *of_planes, poses, scale_m, H)
+        variance, gain = plane_equations(lifted, self.number, *of_planes, self.poses, scale_m, H)
         H, b = H[:-1, :-1], H[:-1, -1]
         inverse = np.linalg.inv(H + _RIDGE * np.trace(H) / size * np.eye(size))
         step = -gain * inverse @ b
-        sigma_rad = math.sqrt(variance * inverse[-1, -1])
-        offset_rad += float(step[-1])
-        twists = step[:-1].reshape(len(poses), 6)
-        poses = poses @ lie.exp(twists)
+        self.offset_rad += float(step[-1])
+        twists = step[:-1].reshape(-1, 6)
+        self.poses = self.poses @ lie.exp(twists)
+        self.steps += 1
         has_converged = abs(step[-1]) < _STEP_RAD and np.abs(twists[:, 3:]).max() < _TURN_RAD
-        if has_converged or abs(offset_rad) > _LARGEST_RAD:
-            break
-    return Adjustment(last @ lie.between(poses[-1], poses), offset_rad, sigma_rad)
+        if not has_converged and abs(self.offset_rad) <= _LARGEST_RAD and self.steps < _STEPS:
+            return None
+        poses, sigma_rad = (
+            self.last @ lie.between(self.poses[-1], self.poses),
+            math.sqrt(variance * inverse[-1, -1]),
+        )
+        return Adjustment(poses, self.offset_rad, sigma_rad)

@@ -97,7 +97,7 @@ class Odometry:
         self.standstill = Standstill(self.dimension)
         self.map = MapKeeper(self.dimension, config.local_map)
         is_wanted = self.dimension == 3 and config.preprocess.calibrate_elevation
-        self.elevation = ElevationCalibration(config.preprocess, is_wanted=is_wanted)
+        self.elevation = ElevationCalibration(is_wanted=is_wanted)
         self.calibrated_from = 0  # the first scan whose points are corrected by it
         self.first_sweep = Sweep(np.empty((0, self.dimension)), np.empty(0), 0.0)
         self.first_points = self.first_sweep.points  # deskewed to its stamp, once the second scan is there
@@ -176,7 +176,7 @@ class Odometry:
         self.predictor.correct(scan, registered.prediction, registered.match, registered.state)
         points = sweep.from_middle(self.predictor.velocity)
         self._extend(points, registered)
-        self._calibrate(scan, points, registered.state)
+        self._calibrate(points, registered.state)
         match = registered.match if registered.rival is None else spread(registered.match, registered.rival)
         tracked = Tracked(
             scan=replace(scan, T_odom_base=None) if self.predictor.is_contradicted or scan.clock_jump_s else scan,
@@ -298,12 +298,13 @@ class Odometry:
         if registered.is_standing or not self.standstill.is_standing:  # else drawn aside by what moves past
             self.map.extend(points, self.predictor.T_odom_lidar, is_standing=registered.is_standing)
 
-    def _calibrate(self, scan: Scan, points: Points, state: State) -> None:
+    def _calibrate(self, points: Points, state: State) -> None:
         """Take the scan for the elevation offset; where one is found, rebuild the map without it."""
         if state is State.LOST:
             self.elevation.forget()
+        if state is State.LOST or not self.predictor.velocity.any():  # the first scan cannot be deskewed
             return
-        corrected = self.elevation.take(scan, points, self.predictor.T_odom_lidar, self.predictor.velocity)
+        corrected = self.elevation.take(points, self.predictor.T_odom_lidar)
         if corrected:
             self.calibrated_from = self.calibrated_from or self.scans
             self.map.replace(corrected)
