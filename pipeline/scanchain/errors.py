@@ -6,7 +6,10 @@ import errno
 import math
 import os
 import re
+import shutil
+import textwrap
 from collections.abc import Iterable
+from functools import partial
 
 _OPTION = re.compile(r"scanchain [^;,()]*|--([a-z][\w.-]*\w)")  # commands, and arguments of the one that runs
 _KEYWORDS = {name: name for name in ("out", "config", "methods", "rpe")} | {
@@ -90,6 +93,7 @@ def remedy_of(error: OSError) -> str:
 
 
 _SHOWN = 3  # of lines that are alike
+_LABEL = re.compile(r" +|(\S+( \S+)* {2,}){1,2}")  # names before the text of a line
 FREEDOM = ("degree of freedom", "degrees of freedom")
 
 
@@ -115,6 +119,16 @@ def duration(time_s: float) -> str:
         if time_s > seconds:
             return f"{time_s / seconds:.1f} {unit}"
     return f"{time_s:.1f} s"
+
+
+def folded(text: str) -> str:
+    """Text with lines no longer than the terminal, else 100; the rest of one stands below, behind its label."""
+    width, lines = shutil.get_terminal_size((100, 25)).columns, text.split("\n")
+    labels = [_LABEL.match(line) for line in lines]
+    indents = [" " * (label.end() + 2 * label[0].isspace()) if label else "  " for label in labels]
+    fold = partial(textwrap.wrap, width=max(width, 40), break_on_hyphens=False, break_long_words=False)
+    folds = (fold(line, subsequent_indent=indent) or [""] for line, indent in zip(lines, indents, strict=True))
+    return "\n".join(part for fold in folds for part in fold)
 
 
 def grouped(lines: Iterable[str]) -> list[str]:

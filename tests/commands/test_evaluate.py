@@ -31,7 +31,8 @@ def tree(call):
     return lambda *words: json.loads(call("evaluate", *words, "--json")[1])
 
 
-def test_evaluate_prints_every_metric_with_its_definition(call, tree, tmp_path):
+def test_evaluate_prints_every_metric_with_its_definition(call, tree, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
     estimate, truth = quarter(tmp_path / "est.tum", 1.1), quarter(tmp_path / "gt.tum")
     code, output, errors = call("evaluate", estimate, truth)
     assert code == 0

@@ -11,7 +11,7 @@ import click
 
 from scanchain.commands import options
 from scanchain.commands.options import PATH, OverrideCommand
-from scanchain.errors import FREEDOM, InputError, counted
+from scanchain.errors import FREEDOM, InputError, counted, folded
 from scanchain.settings import Override, load_settings
 
 if TYPE_CHECKING:
@@ -120,7 +120,7 @@ def optimize(
     written = _write(file, change, chosen, out, png, recording)
     lines = [*report.lines(), *(("written", path) for path in written)]
     text = "\n".join(f"{name:<15}{fact}" for name, fact in lines)
-    click.echo(options.json_text(report.tree() | {"written": written}) if as_json else text)
+    click.echo(options.json_text(report.tree() | {"written": written}) if as_json else folded(text))
     return int(not done.converged)
 
 

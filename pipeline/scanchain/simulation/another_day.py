@@ -11,7 +11,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain.data import Matrix
+from scanchain import lie
+from scanchain.data import Matrix, Pose
 from scanchain.kernels.raycast import BOX, ELLIPSOID
 from scanchain.simulation.solids import FIXED, Solids
 
@@ -33,7 +34,8 @@ _COLUMNS = (
 class Change:
     """A movable object that is not where it was on the first day.
 
-    before, after : (3,) middle of its bounding box, meters; NaN where it was or is not there
+    before, after : (3,) middle of its bounding box, meters; NaN where it was or is not there; as listed beside a
+        log, in the frame of the first scan of the same drive on the first day, which its map has
     size_m : (3,) length, width and height of its upright bounding box when it was at yaw 0
     owner : number of the object among the solids of both days
     """
@@ -43,6 +45,10 @@ class Change:
     after: NDArray[np.float64]
     size_m: NDArray[np.float64]
     owner: int
+
+    def seen_from(self, T: Pose) -> Change:
+        """The same, moved by a pose (4, 4)."""
+        return replace(self, before=lie.transform(T, self.before), after=lie.transform(T, self.after))
 
 
 def another_day(
