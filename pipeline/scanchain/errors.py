@@ -93,7 +93,7 @@ def remedy_of(error: OSError) -> str:
 
 
 _SHOWN = 3  # of lines that are alike
-_LABEL = re.compile(r" +|(\S+( \S+)* {2,}){1,2}")  # names before the text of a line
+_LABEL = re.compile(r" *(\S+( \S+)* {2,}){1,2}| +")  # names before the text of a line
 FREEDOM = ("degree of freedom", "degrees of freedom")
 
 

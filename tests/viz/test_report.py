@@ -34,6 +34,7 @@ from scanchain_viz.report.page import (
     Row,
     Section,
     interactive_map,
+    verdict_cell,
     write_page,
 )  # fmt: skip
 from scanchain_viz.report.run import map_section, trajectory_lines
@@ -300,6 +301,13 @@ def test_a_map_is_shown_whole_whatever_the_trajectory_but_for_outliers():
     low, high = surroundings(np.array([[-1.0, -1.0, 0.0], [30.0, 1.0, 0.1]]), [points])
     assert (low > [-96.0, -22.0, -3.0]).all() and (low < [-89.9, -19.9, -1.9]).all()
     assert (high > [129.9, 19.9, 7.9]).all() and (high < [136.0, 22.0, 9.0]).all()
+
+
+def test_a_verdict_in_a_column_of_text_stands_where_the_text_of_the_others_does(tmp_path):
+    rows = [Row(each, (verdict_cell(each),)) for each in (Verdict.TRUSTWORTHY, Verdict.NOT_TRUSTWORTHY)]
+    grid = Grid((Head("method"), Head("verdict", is_text=True)), rows)
+    write_page(tmp_path, Page("a", "b", sections=[Section("Summary", grid=grid)]))
+    assert re.findall(r'<td class="(.*?)"', (tmp_path / "report.html").read_text()) == ["text", "bad text"]
 
 
 def test_stretches_and_closures_by_verdict_are_told_apart_and_a_scan_of_several_findings_counts_in_each():

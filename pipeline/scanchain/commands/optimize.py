@@ -253,13 +253,12 @@ class _Report:
         from scanchain.graph.optimization import fit, has_loops
 
         before, after = self.change.before, self.change.after
-        if has_loops(after) and before.degrees_of_freedom == after.degrees_of_freedom:
-            freedom = counted(after.degrees_of_freedom, *FREEDOM)
-            return f"{before.chi2:.6g} before, {after.chi2:.8g} after, over {freedom}"
-        first = f"{before.chi2:.6g} before, over {counted(before.degrees_of_freedom, *FREEDOM)}"
-        second = f"{after.chi2:.8g} after, over {counted(after.degrees_of_freedom, *FREEDOM)}"
+        of_before, of_after = (each.degrees_of_freedom for each in (before, after))
         if has_loops(after):
-            return f"{first}; {second}"
+            both = f"{of_before:,} and " if of_before != of_after else ""
+            freedom = f"{both}{counted(of_after, *FREEDOM)}"
+            return f"{before.chi2:.6g} before, {after.chi2:.8g} after, over {freedom}"
+        first = f"{before.chi2:.6g} before, over {counted(of_before, *FREEDOM)}"
         return f"{first}; after, {fit(after)}" if has_loops(before) else fit(after)
 
     def tree(self) -> dict[str, object]:
