@@ -9,7 +9,6 @@ import re
 import shutil
 import textwrap
 from collections.abc import Iterable
-from functools import partial
 
 _OPTION = re.compile(r"scanchain [^;,()]*|--([a-z][\w.-]*\w)")  # commands, and arguments of the one that runs
 _KEYWORDS = {name: name for name in ("out", "config", "methods", "rpe")} | {
@@ -123,12 +122,13 @@ def duration(time_s: float) -> str:
 
 def folded(text: str) -> str:
     """Text with lines no longer than the terminal, else 100; the rest of one stands below, behind its label."""
-    width, lines = shutil.get_terminal_size((100, 25)).columns, text.split("\n")
-    labels = [_LABEL.match(line) for line in lines]
-    indents = [" " * (label.end() + 2 * label[0].isspace()) if label else "  " for label in labels]
-    fold = partial(textwrap.wrap, width=max(width, 40), break_on_hyphens=False, break_long_words=False)
-    folds = (fold(line, subsequent_indent=indent) or [""] for line, indent in zip(lines, indents, strict=True))
-    return "\n".join(part for fold in folds for part in fold)
+    wrapper = textwrap.TextWrapper(shutil.get_terminal_size((100, 25)).columns, break_long_words=False)
+    wrapper.break_on_hyphens, folds = False, list[str]()
+    for line in text.split("\n"):
+        label = _LABEL.match(line)
+        wrapper.subsequent_indent = " " * (label.end() + 2 * label[0].isspace() if label else 2)
+        folds += wrapper.wrap(line) or [line]
+    return "\n".join(folds)
 
 
 def grouped(lines: Iterable[str]) -> list[str]:

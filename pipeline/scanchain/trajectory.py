@@ -27,8 +27,7 @@ def read_tum(path: Path | str) -> Trajectory:
 
     Stamps are taken from their decimal text, so that nanoseconds stay exact; they need not increase.
     """
-    path = Path(path)
-    path = path / "trajectory.tum" if path.is_dir() else path
+    path = Path(path, "trajectory.tum") if Path(path).is_dir() else path
     places, stamps_ns, values = table(path, "TUM line", _TUM_FIELDS, stamps=1)
     norms = np.linalg.norm(values[:, 3:], axis=1)
     for bad in np.flatnonzero(np.abs(norms - 1.0) > _UNIT)[:1]:

@@ -34,8 +34,7 @@ _COLUMNS = (
 class Change:
     """A movable object that is not where it was on the first day.
 
-    before, after : (3,) middle of its bounding box, meters; NaN where it was or is not there; as listed beside a
-        log, in the frame of the first scan of the same drive on the first day, which its map has
+    before, after : (3,) middle of its bounding box, meters; NaN where it was or is not there
     size_m : (3,) length, width and height of its upright bounding box when it was at yaw 0
     owner : number of the object among the solids of both days
     """
@@ -47,7 +46,7 @@ class Change:
     owner: int
 
     def seen_from(self, T: Pose) -> Change:
-        """The same, moved by a pose (4, 4)."""
+        """The same, moved by a pose (4, 4), as into the frame of a map."""
         return replace(self, before=lie.transform(T, self.before), after=lie.transform(T, self.after))
 
 

@@ -124,8 +124,8 @@ def map_section(lines: Sequence[Line], points: Points, box: Floats, grain_m: flo
     """The map (M, 3) of grains so far apart and lines, the trajectory first, which lie within corners (2, 3)."""
     is_flat, path = not len(points) or not np.ptp(points[:, 2]), lines[0].positions
     corners = surroundings(box, [points])
-    around = "Seen from above; circle: start, square: end."
-    still = page.Drawing.of("Trajectory over the map", around, over_map(lines, points, *corners, path=path))
+    over = over_map(lines, points, *corners, path=path)
+    still = page.Drawing.of("Trajectory over the map", "Seen from above; circle: start, square: end.", over)
     scene = page.interactive_map(points, lines, *corners, grain_m=grain_m, is_flat=is_flat)
     drawings = [replace(still, is_still=True), replace(scene, is_wide=True)]  # the scene shows it from above, too
     return page.Section("Trajectory and map", chips=lines, drawings=drawings)
