@@ -101,8 +101,8 @@ def test_evaluate_says_which_metric_a_short_way_leaves_out(call, tree, tmp_path)
     code, output, _ = call("evaluate", short, short)
     assert code == 0
     says(
-        unfolded(output), "ATE", "not computed: RPE over 10 m along the reference: no stretch of that length fits",
-        "not computed: KITTI metric: no stretch of 10 m fits into a path of ",
+        unfolded(output), "ATE", "not computed: RPE over 10 m along the reference: no segment of that length fits",
+        "not computed: KITTI metric: no segment of 10 m fits into a path of ",
     )  # fmt: skip
     assert tree(short, short)["kitti"] is None
 

@@ -327,7 +327,7 @@ def test_wheels_that_slip_are_named_and_doubt_no_run_that_closes_loops_around(tm
     assert 19.0 < start_s < 21.0 and 23.0 < end_s < 25.0 and 4.0 < size_m < 6.5
     stated = metrics.ground_truth.optimized.kitti_definition
     page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
-    assert "stretches of 10, 20, 40 m from every pose" in stated and stated in html.unescape(page)
+    assert "segments of 10, 20, 40 m from every pose" in stated and stated in html.unescape(page)
 
 
 @pytest.mark.parametrize("world", WORLDS)

@@ -161,7 +161,7 @@ def test_a_run_says_its_verdict_and_result_first_and_its_time_last(one_run, page
     metrics = msgspec.json.decode((one_run / "metrics.json").read_bytes(), type=Metrics)
     assert 'class="verdict trustworthy"' in text and metrics.verdict_error in text
     assert re.fullmatch(r"ATE \d\.\d{3} to \d\.\d{3} m", metrics.verdict_error)
-    assert metrics.ground_truth.optimized.kitti_definition == ""  # no stretch of 10 m fits
+    assert metrics.ground_truth.optimized.kitti_definition == ""  # no segment of 10 m fits
     assert "Versions" in seen("one_run")["text"] and len(seen("one_run")["svgs"]) >= 8
 
 
