@@ -20,6 +20,14 @@ def office():
     return made.log("office", seconds=6)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def wide_terminal():
+    """Lines are not folded where nothing is tested of that."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("COLUMNS", "1000")
+        yield
+
+
 @pytest.fixture(autouse=True)
 def short_windows(request, monkeypatch):
     """Error bars by a few scans, where nothing is tested of them: a thousand runs would be twice as long."""

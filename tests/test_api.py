@@ -66,7 +66,7 @@ def test_a_log_has_a_length_and_scans_and_slam_gives_the_cloud_and_the_verdict_o
     of_run = sc.evaluate(done.path, log.ground_truth())
     assert of_run.ate.translation_m.rmse == pytest.approx(done.accuracy.ate_rmse_m, rel=1e-6)
     assert list(found.rpe) == ["1_pose", "1_s"] and found.rpe["1_s"].translation_m.rmse < 0.1
-    with pytest.raises(InputError, match="KITTI metric: no stretch of 10 m fits"):
+    with pytest.raises(InputError, match="KITTI metric: no segment of 10 m fits"):
         found.kitti  # noqa: B018
     for wrong, words in (((result, log), "estimate is"), ((result.trajectory, 3), "path is 3|truth is")):
         with pytest.raises(InputError, match=words):

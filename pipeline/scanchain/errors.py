@@ -6,6 +6,8 @@ import errno
 import math
 import os
 import re
+import shutil
+import textwrap
 from collections.abc import Iterable
 
 _OPTION = re.compile(r"scanchain [^;,()]*|--([a-z][\w.-]*\w)")  # commands, and arguments of the one that runs
@@ -90,6 +92,7 @@ def remedy_of(error: OSError) -> str:
 
 
 _SHOWN = 3  # of lines that are alike
+_LABEL = re.compile(r" *(\S+( \S+)* {2,}){1,2}| +")  # names before the text of a line
 FREEDOM = ("degree of freedom", "degrees of freedom")
 
 
@@ -115,6 +118,17 @@ def duration(time_s: float) -> str:
         if time_s > seconds:
             return f"{time_s / seconds:.1f} {unit}"
     return f"{time_s:.1f} s"
+
+
+def folded(text: str) -> str:
+    """Text with lines no longer than the terminal, else 100; the rest of one stands below, behind its label."""
+    wrapper = textwrap.TextWrapper(shutil.get_terminal_size((100, 25)).columns, break_long_words=False)
+    wrapper.break_on_hyphens, folds = False, list[str]()
+    for line in text.split("\n"):
+        label = _LABEL.match(line)
+        wrapper.subsequent_indent = " " * (label.end() + 2 * label[0].isspace() if label else 2)
+        folds += wrapper.wrap(line) or [line]
+    return "\n".join(folds)
 
 
 def grouped(lines: Iterable[str]) -> list[str]:

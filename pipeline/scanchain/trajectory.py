@@ -23,10 +23,11 @@ _ORTHONORMAL = 1e-3  # largest deviation of RᵀR from identity in a KITTI file,
 
 
 def read_tum(path: Path | str) -> Trajectory:
-    """SE(3) poses of a TUM file, ``stamp x y z qx qy qz qw`` a line, in the order of the file.
+    """SE(3) poses of a TUM file, ``stamp x y z qx qy qz qw`` a line, or of a run directory, in order.
 
     Stamps are taken from their decimal text, so that nanoseconds stay exact; they need not increase.
     """
+    path = Path(path, "trajectory.tum") if Path(path).is_dir() else path
     places, stamps_ns, values = table(path, "TUM line", _TUM_FIELDS, stamps=1)
     norms = np.linalg.norm(values[:, 3:], axis=1)
     for bad in np.flatnonzero(np.abs(norms - 1.0) > _UNIT)[:1]:

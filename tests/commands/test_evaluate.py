@@ -31,7 +31,8 @@ def tree(call):
     return lambda *words: json.loads(call("evaluate", *words, "--json")[1])
 
 
-def test_evaluate_prints_every_metric_with_its_definition(call, tree, tmp_path):
+def test_evaluate_prints_every_metric_with_its_definition(call, tree, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
     estimate, truth = quarter(tmp_path / "est.tum", 1.1), quarter(tmp_path / "gt.tum")
     code, output, errors = call("evaluate", estimate, truth)
     assert code == 0
@@ -100,8 +101,8 @@ def test_evaluate_says_which_metric_a_short_way_leaves_out(call, tree, tmp_path)
     code, output, _ = call("evaluate", short, short)
     assert code == 0
     says(
-        unfolded(output), "ATE", "not computed: RPE over 10 m along the reference: no stretch of that length fits",
-        "not computed: KITTI metric: no stretch of 10 m fits into a path of ",
+        unfolded(output), "ATE", "not computed: RPE over 10 m along the reference: no segment of that length fits",
+        "not computed: KITTI metric: no segment of 10 m fits into a path of ",
     )  # fmt: skip
     assert tree(short, short)["kitti"] is None
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from scanchain.data import Trajectory
+from scanchain.errors import folded
 from scanchain.logs.writer import LogWriter
 from scanchain.runs.metrics import REASON, shortened, verdict_lines
 from scanchain.settings import flatten
@@ -24,8 +25,8 @@ def test_a_run_is_quiet_but_for_its_summary_when_piped(call, tmp_path, office):
     assert (code, errors) == (0, "")
     folder = tmp_path / "a"
     last = f"written        {folder}\nopen           {folder}/report.html, scanchain view {folder}\n"
-    assert output == (folder / "summary.txt").read_text() + last
-    assert all(len(line) <= 100 for line in output.splitlines()[:-2] if str(office) not in line)
+    summary = (folder / "summary.txt").read_text()
+    assert output == shortened(summary) + last and "\nms per scan " in summary and "ms per scan" not in output
     assert len(output.splitlines()) <= 25
     says(output, office, "/scan", "preset lidar2d of 2D logs", "60 over 5.9 s: 60 ok")
     says(output, f"\n{office} /scan (wheel odometry /odom; lidar at x 0.15, y 0.00 m of the base)\n")
@@ -107,9 +108,19 @@ def test_a_run_without_a_directory_gets_one_by_its_log_with_a_number_where_that_
 def test_a_terminal_shows_three_reasons_and_how_many_more_there_are():
     head = list(verdict_lines("check these stretches", ["a " * 60, "b", "c", "d", "e"]))
     assert shortened("\n".join([*head, "log.mcap", "   5 %"]) + "\n") == (
-        "\n".join([*head[:4], f"{REASON}2 more in summary.txt", "log.mcap", "   5 %"]) + "\n"
+        "\n".join([*(line.rstrip() for line in head[:4]), f"{REASON}2 more in summary.txt", "log.mcap", "   5 %"])
+        + "\n"
     )
-    assert shortened("\n".join(head[:3]) + "\nx\n") == "\n".join(head[:3]) + "\nx\n"
+    assert shortened("\n".join([head[0], *head[2:4], "x"]) + "\n") == "\n".join([head[0], *head[2:4], "x"]) + "\n"
+
+
+def test_lines_are_folded_behind_their_labels_to_the_width_of_the_terminal_and_rows_of_tables_are_not(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "60")
+    said = f"note           {'text --log.point_times ' * 4}end"
+    shown = folded(f"{said}\n{REASON}{'word ' * 20}end\n\nmethod    ATE      RPE\n").splitlines()
+    assert all(len(line) <= 60 for line in shown) and all(line.startswith(REASON) for line in shown[1:6])
+    assert shown[4].startswith(f"{REASON}  word") and shown[-2:] == ["", "method    ATE      RPE"]
+    assert unfolded("\n".join(shown[:3])) == said
 
 
 # flags

@@ -314,7 +314,7 @@ def test_stretches_that_do_not_fit_or_cross_a_gap_are_none_of_the_size_asked_for
         lambda: ev.relative_error_over_time(coarse, 1.0),
         lambda: ev.relative_error_over_distance(coarse, 0.5),
     ):
-        with pytest.raises(InputError, match=r"no stretch of .* fits into"):
+        with pytest.raises(InputError, match=r"no segment of .* fits into"):
             measure()
     holed = np.delete(np.arange(100), range(40, 80))
     pairs = ev.pair(Trajectory(drive(100).stamps_ns[holed], drive(100).poses[holed]), drive(100))

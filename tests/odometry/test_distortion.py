@@ -9,7 +9,7 @@ import scanchain
 from scanchain.__main__ import main
 from scanchain.logs import open_log
 from scanchain.logs.messages import point_times
-from scanchain.odometry.distortion import choose_point_times, measure_distortion
+from scanchain.odometry.distortion import Distortion, choose_point_times, measure_distortion
 from scanchain.runs.vouching import judge_run
 from scanchain.simulation.drive import plan, record
 from tests.support import made
@@ -107,6 +107,29 @@ def test_the_measured_times_of_a_log_explain_its_scans_and_reversed_ones_do_not(
 def test_a_lidar_that_does_not_spin_is_not_timed_by_azimuth(no_time_fields):
     log, _, config = chosen(made.log("town", seconds=SECONDS, sensor="rosette"))
     assert config.point_times == "auto" and "may be distorted" in log.distortion
+
+
+def test_times_by_azimuth_are_not_adopted_where_opposite_ones_explain_the_scans_as_well_whether_or_not_it_spins():
+    config = open_log(made.log("town", seconds=SECONDS, sensor="os1-32")).config
+    for loss in (-0.1, 0.0, 0.3, 0.7):
+        spinning, rosette = (
+            Distortion(0.1, "at 1 m/s", config, False, gain=0.1, loss=loss, sigmas=9.0, is_spinning=spins)
+            for spins in (True, False)
+        )
+        assert spinning.is_shown == rosette.is_shown == (loss == 0.3) and rosette.share == 1.0
+
+
+def test_scans_that_a_run_does_not_deskew_count_as_distorted_as_far_as_they_are():
+    town = made.log("town", seconds=SECONDS, sensor="os1-32")
+    shares = []
+    for deskew in (True, False):
+        log = open_log(town)
+        choose_point_times(log, deskew=deskew)
+        shares.append(log.distorted_share)
+    assert shares[0] == 0.0 and 0.7 < shares[1] <= 1.0
+    planar = open_log(made.log("office", seconds=SECONDS))
+    choose_point_times(planar, deskew=False)
+    assert planar.distorted_share == 1.0
 
 
 def test_azimuth_is_taken_where_it_is_asked_for_in_the_better_sense():

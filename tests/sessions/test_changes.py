@@ -18,7 +18,7 @@ from scanchain.sessions.joining import Joined
 from scanchain.sessions.merged_map import MergedMap, updated
 from scanchain.settings import load_settings
 from scanchain.simulation.solids import Scenery, Solids
-from scanchain_viz.report.maps import _cluster_grid
+from scanchain_viz.report.maps import _changes_picture, _cluster_grid
 
 NO_EDGES = Edges(np.empty((0, 2), int), *np.empty((2, 0, 3, 3)), np.empty(0, bool), np.empty(0))
 BOX, HIDDEN = (5.0, 3.0), (8.0, 6.5)  # the first stands free, the second behind a wall
@@ -151,6 +151,18 @@ def test_boxes_in_the_plan_carry_the_numbers_of_the_table_which_has_no_empty_col
     moved = replace(found, clusters=(replace(found.clusters[0], counterpart=2), found.clusters[1]))
     grid = _cluster_grid(moved)
     assert grid.heads[-1].text == "counterpart" and [row.cells[-1] for row in grid.rows] == ["2", ""]
+
+
+def test_a_pixel_of_the_plan_is_a_voxel_of_the_comparison(tmp_path, monkeypatch):
+    edges_m = []
+    monkeypatch.setattr(
+        "scanchain_viz.pictures.figure.Plot.image",
+        lambda _, pixels, palette, low, high: edges_m.append((high - low[:2]) / pixels.shape[::-1]),
+    )
+    found = compared(room(BOX), room((3.0, 3.5)))
+    points = lie.lift_points(found.points)
+    _changes_picture(points, found, points.min(axis=0), points.max(axis=0))
+    assert len(edges_m) > 2 and np.allclose(edges_m, 0.05)
 
 
 def test_a_given_transform_brings_the_later_map_into_the_frame_of_the_earlier(tmp_path):

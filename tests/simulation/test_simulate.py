@@ -327,7 +327,7 @@ def test_wheels_that_slip_are_named_and_doubt_no_run_that_closes_loops_around(tm
     assert 19.0 < start_s < 21.0 and 23.0 < end_s < 25.0 and 4.0 < size_m < 6.5
     stated = metrics.ground_truth.optimized.kitti_definition
     page = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
-    assert "stretches of 10, 20, 40 m from every pose" in stated and stated in html.unescape(page)
+    assert "segments of 10, 20, 40 m from every pose" in stated and stated in html.unescape(page)
 
 
 @pytest.mark.parametrize("world", WORLDS)
@@ -462,3 +462,14 @@ def test_another_day_changes_movable_objects_alone_keeps_the_path_free_and_is_li
     record(replace(later, scans=later.scans[:10]), tmp_path / "later.mcap")
     lines = (tmp_path / "later.changes.csv").read_text().splitlines()
     assert lines[0].startswith("kind,x_before,") and len(lines) == 1 + len(later.changes)
+
+
+def test_changes_are_listed_in_the_frame_of_the_map_of_the_first_day():
+    first, later = (plan("office", seed=3, duration_s=20.0, changed=changed) for changed in (None, 1))
+    first_pose, later_pose = (drive.motion.lidar(np.zeros(1))[0] for drive in (first, later))
+    assert not np.allclose(first_pose, later_pose) and not np.allclose(first_pose, np.eye(4))
+    gone = [change for change in later.changes if change.kind == "vanished"]
+    for change in gone:
+        rows = first.solids.part(first.solids.owner == change.owner).rows
+        away_m = np.linalg.norm(rows[:, 1:3] - lie.transform(first_pose, change.before)[:2], axis=1)
+        assert away_m.max() < 0.5 * np.linalg.norm(change.size_m[:2]) + 1e-6

@@ -304,7 +304,7 @@ def test_states_are_counted_as_the_scans_have_them_in_the_verdict_and_within_a_s
     assert judged.verdict is Verdict.TRUSTWORTHY and "contradiction" not in judged.sentence
     assert judged.reasons[:2] == [
         "nothing to check in 1,200 scans",
-        "30 fit the map badly and 4 leave a direction open, each time for too short a way to move the trajectory",
+        "30 fit the map badly and 4 leave a direction open, each over too short a path to move the trajectory",
     ]
     fit = np.where(marked(300, 340), 0.5, 0.9)
     fit[345] = 0.5  # alone

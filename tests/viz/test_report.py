@@ -34,6 +34,7 @@ from scanchain_viz.report.page import (
     Row,
     Section,
     interactive_map,
+    verdict_cell,
     write_page,
 )  # fmt: skip
 from scanchain_viz.report.run import map_section, trajectory_lines
@@ -160,7 +161,7 @@ def test_a_run_says_its_verdict_and_result_first_and_its_time_last(one_run, page
     metrics = msgspec.json.decode((one_run / "metrics.json").read_bytes(), type=Metrics)
     assert 'class="verdict trustworthy"' in text and metrics.verdict_error in text
     assert re.fullmatch(r"ATE \d\.\d{3} to \d\.\d{3} m", metrics.verdict_error)
-    assert metrics.ground_truth.optimized.kitti_definition == ""  # no stretch of 10 m fits
+    assert metrics.ground_truth.optimized.kitti_definition == ""  # no segment of 10 m fits
     assert "Versions" in seen("one_run")["text"] and len(seen("one_run")["svgs"]) >= 8
 
 
@@ -302,6 +303,13 @@ def test_a_map_is_shown_whole_whatever_the_trajectory_but_for_outliers():
     assert (high > [129.9, 19.9, 7.9]).all() and (high < [136.0, 22.0, 9.0]).all()
 
 
+def test_a_verdict_in_a_column_of_text_stands_where_the_text_of_the_others_does(tmp_path):
+    rows = [Row(each, (verdict_cell(each),)) for each in (Verdict.TRUSTWORTHY, Verdict.NOT_TRUSTWORTHY)]
+    grid = Grid((Head("method"), Head("verdict", is_text=True)), rows)
+    write_page(tmp_path, Page("a", "b", sections=[Section("Summary", grid=grid)]))
+    assert re.findall(r'<td class="(.*?)"', (tmp_path / "report.html").read_text()) == ["text", "bad text"]
+
+
 def test_stretches_and_closures_by_verdict_are_told_apart_and_a_scan_of_several_findings_counts_in_each():
     states = ["contradicted"] * 2 + ["ok"] * 8 + ["degenerate"] * 4 + ["ok"] * 5 + ["lost"] * 3 + ["ok"] * 18
     keyframes = [k // 5 if k % 5 == 0 else -1 for k in range(40)]
@@ -329,7 +337,7 @@ def test_stretches_and_closures_by_verdict_are_told_apart_and_a_scan_of_several_
     assert all(chip.color in section.drawings[0].svg for chip in section.chips)
     flat = map_section(lines, points * [1.0, 1.0, 0.0], positions, 0.2)
     shown = [[drawing.is_still for drawing in each.drawings] for each in (section, flat)]
-    assert shown == [[False, False, False], [True, False]]  # the map of a planar log is there once
+    assert shown == [[True, False], [True, False]]  # the map is there once
 
 
 @BOTH

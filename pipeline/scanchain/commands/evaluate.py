@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
@@ -12,13 +11,10 @@ import click
 
 from scanchain.commands import options
 from scanchain.commands.options import PATH
-from scanchain.errors import InputError
+from scanchain.errors import InputError, folded
 
 if TYPE_CHECKING:
     from scanchain.evaluation.metrics import Results
-
-
-_WIDTH = 100  # characters of a line
 
 
 @click.command()
@@ -107,13 +103,12 @@ def evaluate(
 def _evaluated(
     estimate: Path, gt: Path | None, relations: Path | None, kitti: bool, given: dict[str, Any]
 ) -> Results:
-    """Every metric of a file, or of the trajectory of a run directory."""
+    """Every metric of a file, or of a run directory."""
     from scanchain.evaluation import read_relations, read_truth, relation_error
     from scanchain.evaluation.metrics import Results, evaluate
     from scanchain.trajectory import read_kitti, read_tum
 
-    path = estimate / "trajectory.tum" if estimate.is_dir() else estimate
-    trajectory = read_kitti(path) if kitti else read_tum(path)
+    trajectory = read_kitti(estimate) if kitti else read_tum(estimate)
     results = Results({}, {})
     if gt is not None:
         truth = read_kitti(gt) if kitti else read_truth(gt).at(trajectory.stamps_ns)
@@ -128,8 +123,7 @@ def _text(evaluated: dict[str, Results], *, is_verbose: bool) -> str:
         each.definition for results in evaluated.values() for each in results.found.values()
     )
     lines = _figures(*evaluated.values()) if len(evaluated) == 1 else _table(evaluated)
-    folded = [textwrap.fill(each, _WIDTH, subsequent_indent="  ") for each in definitions] if is_verbose else []
-    return "\n".join([*lines, *folded])
+    return folded("\n".join([*lines, *(definitions if is_verbose else ())]))
 
 
 def _figures(results: Results) -> Iterator[str]:
@@ -150,8 +144,7 @@ def _figures(results: Results) -> Iterator[str]:
         pairs = ((each.translation_m, each.rotation_rad.degrees) for each in errors.values())
         figures = (getattr(each, field_name) for pair in pairs for each in pair)
         yield f"{name:<6}" + "".join(f"{figure:9.4f}" for figure in figures)
-    for line in _other_figures(results):
-        yield textwrap.fill(line, _WIDTH, subsequent_indent="  ")
+    yield from _other_figures(results)
 
 
 def _other_figures(results: Results) -> Iterator[str]:

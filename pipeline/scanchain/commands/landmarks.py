@@ -12,7 +12,7 @@ from click.core import ParameterSource
 
 from scanchain.commands import options
 from scanchain.commands.options import PATH
-from scanchain.errors import InputError
+from scanchain.errors import InputError, folded
 
 if TYPE_CHECKING:
     from scanchain.landmarks.ranges import OdometryNoise
@@ -134,7 +134,7 @@ def landmarks(
 
             record_landmarks(studies, recording)
         directory.complete()
-    click.echo(figures if as_json else "\n\n".join(text_of(study) for study in studies))
+    click.echo(figures if as_json else folded("\n\n".join(map(text_of, studies))))
     if not as_json:
         click.echo("".join(f"\nwritten        {path}" for path in (out, recording) if path is not None))
     return int(not all(study.converged for study in studies))

@@ -10,7 +10,7 @@ import click
 
 from scanchain.commands import options
 from scanchain.commands.options import LOG, PATH, OverrideCommand
-from scanchain.errors import InputError, counted
+from scanchain.errors import InputError, counted, folded
 from scanchain.files import Source
 from scanchain.settings import Override, load_settings
 
@@ -116,7 +116,7 @@ def doctor(logs: tuple[Source, ...], as_json: bool, overrides: tuple[Override, .
     with Terminal("scans") as terminal:
         log_config = load_settings(overrides=overrides).config.log
         found = examine(logs, config_for, log_config, terminal.count, distortion_of)
-    click.echo(options.json_text(found) if as_json else _doctor_text(found))
+    click.echo(options.json_text(found) if as_json else folded(_doctor_text(found)))
 
 
 def _doctor_text(found: Diagnosis) -> str:

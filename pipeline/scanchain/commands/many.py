@@ -11,7 +11,7 @@ import click
 
 from scanchain.commands import options
 from scanchain.commands.options import LOG, PATH, OverrideCommand
-from scanchain.errors import InputError, ScanchainError, counted
+from scanchain.errors import InputError, ScanchainError, counted, folded
 from scanchain.files import Source
 from scanchain.settings import Override, load_settings
 
@@ -108,7 +108,7 @@ def batch(
 
     with Terminal("logs") as terminal:
         batched = run_batch(job, terminal, None if ray is None else on_cluster(ray))
-    click.echo(batched.summary, nl=False)
+    click.echo(folded(batched.summary), nl=False)
     write_batch_report(job.out, batched.rows, sys.argv)
     files = "batch.parquet, report.html, summary.txt"
     click.echo(f"written        {out}: {files}; {counted(batched.kept, 'result')} from before")

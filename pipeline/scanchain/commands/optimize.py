@@ -11,7 +11,7 @@ import click
 
 from scanchain.commands import options
 from scanchain.commands.options import PATH, OverrideCommand
-from scanchain.errors import FREEDOM, InputError, counted
+from scanchain.errors import FREEDOM, InputError, counted, folded
 from scanchain.settings import Override, load_settings
 
 if TYPE_CHECKING:
@@ -120,7 +120,7 @@ def optimize(
     written = _write(file, change, chosen, out, png, recording)
     lines = [*report.lines(), *(("written", path) for path in written)]
     text = "\n".join(f"{name:<15}{fact}" for name, fact in lines)
-    click.echo(options.json_text(report.tree() | {"written": written}) if as_json else text)
+    click.echo(options.json_text(report.tree() | {"written": written}) if as_json else folded(text))
     return int(not done.converged)
 
 
@@ -253,13 +253,12 @@ class _Report:
         from scanchain.graph.optimization import fit, has_loops
 
         before, after = self.change.before, self.change.after
-        if has_loops(after) and before.degrees_of_freedom == after.degrees_of_freedom:
-            freedom = counted(after.degrees_of_freedom, *FREEDOM)
-            return f"{before.chi2:.6g} before, {after.chi2:.8g} after, over {freedom}"
-        first = f"{before.chi2:.6g} before, over {counted(before.degrees_of_freedom, *FREEDOM)}"
-        second = f"{after.chi2:.8g} after, over {counted(after.degrees_of_freedom, *FREEDOM)}"
+        of_before, of_after = (each.degrees_of_freedom for each in (before, after))
         if has_loops(after):
-            return f"{first}; {second}"
+            both = f"{of_before:,} and " if of_before != of_after else ""
+            freedom = f"{both}{counted(of_after, *FREEDOM)}"
+            return f"{before.chi2:.6g} before, {after.chi2:.8g} after, over {freedom}"
+        first = f"{before.chi2:.6g} before, over {counted(of_before, *FREEDOM)}"
         return f"{first}; after, {fit(after)}" if has_loops(before) else fit(after)
 
     def tree(self) -> dict[str, object]:

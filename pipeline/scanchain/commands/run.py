@@ -12,7 +12,7 @@ import click
 
 from scanchain.commands import options
 from scanchain.commands.options import LOG, PATH, NumberRange, OverrideCommand
-from scanchain.errors import InputError, ScanchainError, counted
+from scanchain.errors import InputError, ScanchainError, counted, folded
 from scanchain.files import Source
 from scanchain.settings import Override
 
@@ -159,14 +159,14 @@ def check(
             click.echo(
                 f"warning: {counted(missing, 'scan')} without a pose in {trajectory} are left out", err=True
             )
-    lines = [judged.headline, *(f"  {reason}" for reason in judged.reasons)]
+    text = folded("\n".join([judged.headline, *(f"  {reason}" for reason in judged.reasons)]))
     tree = {
         "verdict": judged.verdict,
         "verdict_reason": judged.reason,
         "verdict_error": judged.error,
         "stretches": judged.stretches,
     }
-    click.echo(options.json_text(tree) if as_json else "\n".join(lines))
+    click.echo(options.json_text(tree) if as_json else text)
     return int(judged.verdict.fails(strict=strict))
 
 

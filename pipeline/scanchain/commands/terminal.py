@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Self
 
 import click
 
-from scanchain.errors import duration
+from scanchain.errors import duration, folded
 from scanchain.runs.job import Progress
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class Terminal(Progress):
     def say(self, line: str) -> None:
         """Show a line on a terminal only, above the bar."""
         if self.is_seen:
-            click.echo(f"{_CLEAR}{line}\n{self.bar}", nl=False, err=True)
+            click.echo(f"{_CLEAR}{folded(line)}\n{self.bar}", nl=False, err=True)
 
     def announce(self, line: str) -> None:
         """Show a line on a terminal or in a pipe."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import math
-import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -13,11 +12,11 @@ import msgspec
 from msgspec import Struct
 
 from scanchain.comparison.processes import Status
+from scanchain.errors import folded
 from scanchain.runs.provenance import Provenance
 from scanchain.verdict import Judged, Verdict
 
 TABLE_FILE = "table.json"
-_WIDTH = 100  # characters of a line below the table for a terminal
 Figures = Mapping[str, float | None]  # by key of COLUMNS; unknown without a reference, or after a failure
 
 
@@ -270,5 +269,4 @@ def text(table: Table) -> str:
     endings += [f"{row.name}: {row.sentence if row.is_doubted else row.vouched}" for row in rows if row.verdict]
     endings += [table.provenance.stopped] if table.provenance.stopped else []
     known = [line.rstrip() for line in lines]
-    below = (textwrap.fill(line, _WIDTH, subsequent_indent="  ") for line in (f"{best}{table.against}", *endings))
-    return "\n".join([*known, *below]) + "\n"
+    return "\n".join([*known, *map(folded, (f"{best}{table.against}", *endings))]) + "\n"

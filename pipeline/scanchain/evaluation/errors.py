@@ -27,7 +27,7 @@ RELATION_LIMIT_S = 1e-3
 _PLANAR = 1e-9  # meters of height and radians of tilt below which poses count as planar
 _FAR_OFF_SHARE, _FAR_OFF_M = 0.02, 0.1  # ATE above both of which odometry failed: share of the path, meters
 _SHORTEST_PATH_M = 1.0  # shortest path of which an error is given as a share
-_LARGEST = 2.0  # largest length of a stretch over the requested one
+_LARGEST = 2.0  # largest length of a segment over the requested one
 _LONG_PATH_M = 200.0  # length of the path from which on the published lengths leave a choice of starts
 _FIELDS = "stamp1 stamp2 x y z roll pitch yaw"
 
@@ -246,9 +246,9 @@ def _turned(estimate: Matrix, reference: Matrix) -> Matrix:
 
 @dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class RelativeError(Metric):
-    """RPE over stretches of one size (Sturm et al. 2012, eq. 1; Kümmerle et al. 2009).
+    """RPE over segments of one size (Sturm et al. 2012, eq. 1; Kümmerle et al. 2009).
 
-    size : of the stretches, in words
+    size : of the segments, in words
     translation_m, rotation_rad : of E = (R_i⁻¹ R_j)⁻¹ (P_i⁻¹ P_j), R the reference and P the estimate
     stretches : (M, 2) int64 places i, j among the pairs
     """
@@ -262,7 +262,7 @@ class RelativeError(Metric):
         return (
             f"RPE over {self.size}: rmse {self.translation_m.rmse:.4f} m (mean {self.translation_m.mean:.4f}, "
             f"max {self.translation_m.maximum:.4f}), rotation rmse {self.rotation_rad.degrees.rmse:.4f} deg "
-            f"over {counted(self.translation_m.count, 'stretch', 'stretches')}"
+            f"over {counted(self.translation_m.count, 'segment')}"
         )
 
 
@@ -297,7 +297,7 @@ def _relative_error(pairs: Pairs, along: Floats | NDArray[np.int64], size: float
     start = np.flatnonzero((end < len(pairs)) & (reached - along <= _LARGEST * size))
     if not len(start):
         raise InputError(
-            f"RPE over {words}: no stretch of that length fits into {counted(len(pairs), 'paired pose')}"
+            f"RPE over {words}: no segment of that length fits into {counted(len(pairs), 'paired pose')}"
         )
     stretches = np.stack([start, end[start]], axis=1)
     errors_m, errors_rad = _motion_errors(pairs, stretches)
@@ -305,7 +305,7 @@ def _relative_error(pairs: Pairs, along: Floats | NDArray[np.int64], size: float
         size=words,
         definition=(
             f"RPE: translation and angle of (R_i⁻¹ R_j)⁻¹ (P_i⁻¹ P_j) over {words}, from every start, "
-            f"{counted(len(stretches), 'stretch', 'stretches')}"
+            f"{counted(len(stretches), 'segment')}"
         ),
         pairing=pairs.description,
         stretches=stretches,
@@ -315,7 +315,7 @@ def _relative_error(pairs: Pairs, along: Floats | NDArray[np.int64], size: float
 
 
 def _motion_errors(pairs: Pairs, stretches: NDArray[np.int64]) -> tuple[Floats, Floats]:
-    """Translation (M,) and angle (M,) of E = (R_i⁻¹ R_j)⁻¹ (P_i⁻¹ P_j) of each stretch (i, j)."""
+    """Translation (M,) and angle (M,) of E = (R_i⁻¹ R_j)⁻¹ (P_i⁻¹ P_j) of each segment (i, j)."""
     i, j = stretches[:, 0], stretches[:, 1]
     reference = lie.between(pairs.reference[i], pairs.reference[j])
     estimate = lie.between(pairs.estimate[i], pairs.estimate[j])
@@ -329,7 +329,7 @@ def _sizes(error: Matrix) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, slots=True)
 class LengthError:
-    """Mean drift over the stretches of one length; None where none fits."""
+    """Mean drift over the segments of one length; None where none fits."""
 
     length_m: float
     stretches: int
@@ -339,7 +339,7 @@ class LengthError:
 
 @dataclass(frozen=True, slots=True)
 class KittiError:
-    """Drift, averaged over all stretches of all lengths (Geiger et al. 2012).
+    """Drift, averaged over all segments of all lengths (Geiger et al. 2012).
 
     definition : of the figures, as text; pairing : over which poses
     translation_share : ‖t‖ / length; times 100 it is the published per cent
@@ -362,14 +362,14 @@ class KittiError:
         return (
             f"KITTI translation {100.0 * self.translation_share:.4f} %, rotation "
             f"{np.degrees(self.rotation_rad_per_m):.6f} deg/m over "
-            f"{counted(self.stretches, 'stretch', 'stretches')}"
+            f"{counted(self.stretches, 'segment')}"
         )
 
 
 def kitti_error(pairs: Pairs, lengths_m: Sequence[float] = KITTI_LENGTHS_M, *, every: int = 10) -> KittiError:
-    """The odometry metric of KITTI, over stretches that start at every ``every``-th pose.
+    """The odometry metric of KITTI, over segments that start at every ``every``-th pose.
 
-    A stretch ends at the first pose more than its length further along the reference's path, and its error is
+    A segment ends at the first pose more than its length further along the reference's path, and its error is
     divided by the nominal length, as in the benchmark's own code (step 10, lengths 100 to 800 m).
     """
     if every < 1 or not lengths_m or min(lengths_m) <= 0.0:
@@ -387,14 +387,14 @@ def kitti_error(pairs: Pairs, lengths_m: Sequence[float] = KITTI_LENGTHS_M, *, e
     share, turn = np.concatenate(shares), np.concatenate(turns)
     if not len(share):
         raise InputError(
-            f"KITTI metric: no stretch of {min(lengths_m):g} m fits into a path of {traveled_m[-1]:.1f} m"
+            f"KITTI metric: no segment of {min(lengths_m):g} m fits into a path of {traveled_m[-1]:.1f} m"
         )
     starts = "pose" if every == 1 else f"{every}th pose"
     lengths = ", ".join(f"{length_m:g}" for length_m in lengths_m)
     return KittiError(
         definition=(
             f"KITTI: translation and angle of (P_i⁻¹ P_j)⁻¹ (R_i⁻¹ R_j) over the length, mean of {len(share)} "
-            f"stretches of {lengths} m from every {starts}"
+            f"segments of {lengths} m from every {starts}"
         ),
         pairing=pairs.description,
         translation_share=float(share.mean()),

@@ -174,8 +174,7 @@ def evaluate(
     checks.one_of(align, tuple(each.value for each in Alignment), "align")
     intervals = _intervals(rpe)
     if isinstance(estimate, str | Path):
-        path = Path(estimate)
-        estimate = read_tum(path / "trajectory.tum" if path.is_dir() else path)
+        estimate = read_tum(estimate)
     checks.instance(estimate, Trajectory, "estimate", "read_tum(path)")
     if isinstance(truth, str | Path):
         truth = read_truth(Path(truth)).at(estimate.stamps_ns)

@@ -87,7 +87,7 @@ _AT_ONCE = 10_000  # pairs of edges that are compared at once, of many
 def agreeing_groups(
     problem: BetweenProblem, poses: Matrix, is_loop: NDArray[np.bool_], chosen: NDArray[np.bool_], limit: float
 ) -> list[NDArray[np.int64]]:
-    """Edges of each group among those chosen (E,): they join the same two stretches of poses and agree there.
+    """Edges of each group among those chosen (E,): they join the same two segments of poses and agree there.
 
     Two agree where one predicts the other along the poses between their ends: the squared Mahalanobis distance,
     with the noise of both and of an odometry edge for each of these poses, is below the limit.

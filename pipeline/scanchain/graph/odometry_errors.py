@@ -1,4 +1,4 @@
-"""Errors of odometry that loop edges show: drift that is the same all along, and stretches that are loosened."""
+"""Errors of odometry that loop edges show: constant drift, and segments of inflated covariance."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Explanation:
     """Errors of odometry.
 
     drift : (2,) or (4,) share of its way by which odometry is too short, and radians a meter it turns too little
-    loosened : slips and jumps, stretches of odometry that are off by more than their edges say
+    loosened : slips and jumps, segments of odometry that are off by more than their edges say
     """
 
     drift: Vector
@@ -174,9 +174,9 @@ def spread(measured: Matrix, information: Matrix, *, is_jump: bool) -> Matrix:
 
 
 def _loosened(information: Matrix, twists: Matrix) -> Matrix:
-    """Information (n, k, k) of the edges of a stretch with its errors added to theirs, (Ω⁻¹ + n BBᵀ)⁻¹.
+    """Information (n, k, k) of the edges of a segment with its errors added to theirs, (Ω⁻¹ + n BBᵀ)⁻¹.
 
-    twists : (n, k, p) B; n times its covariance on each edge make that of the whole stretch, as errors that are
+    twists : (n, k, p) B; n times its covariance on each edge make that of the whole segment, as errors that are
         independent. By Woodbury's identity, Ω may be singular.
     """
     pull = np.sqrt(len(twists)) * information @ twists
@@ -185,7 +185,7 @@ def _loosened(information: Matrix, twists: Matrix) -> Matrix:
 
 
 def cost_of(claimed: Matrix, *, is_jump: bool, price: float, nominal: float) -> Vector:
-    """Cost of stretches in χ², −2 log of the likelihood over that of none: 2 log(1/p) + log |1 + Σ BᵀΩB|.
+    """Cost of segments in χ², −2 log of the likelihood over that of none: 2 log(1/p) + log |1 + Σ BᵀΩB|.
 
     The better the edges are measured, the less likely an error was missed. A jump also costs three loop edges left
     out, and its likelihood is scaled as their price is.

@@ -111,7 +111,7 @@ class PoseGraph:
 
     @property
     def loosened(self) -> tuple[Loosened, ...]:
-        """Slips and jumps: stretches of odometry that loop edges show to be off by more than their edges say."""
+        """Slips and jumps: segments of odometry that loop edges show to be off by more than their edges say."""
         return self._explanation.loosened
 
     def corrections(self, names: NDArray[np.int64], noun: str = "poses") -> list[str]:

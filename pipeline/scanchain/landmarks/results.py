@@ -44,9 +44,9 @@ def _row(method: MethodResult) -> tuple[str, ...]:
 
 def text_of(study: Study) -> str:
     """The whole study for a terminal."""
-    lines = [study.name, *(f"  {label:<15}{value}" for label, value in study.facts.items())]
-    lines += [f"  {label:<15}{value}" for label, value in accuracy_lines(study)]
-    lines.append(f"  {'A':<15}{size_of(study)}")
+    lines = [study.name, *(f"  {label:<16}{value}" for label, value in study.facts.items())]
+    lines += [f"  {label:<16}{value}" for label, value in accuracy_lines(study)]
+    lines.append(f"  {'A':<16}{size_of(study)}")
     rows = table_of(study)
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for method, *figures in rows:

@@ -157,19 +157,21 @@ def _compared(
     return Distortion(*size, config, is_given, float(gain), float(loss), sigmas, is_spinning)
 
 
-def choose_point_times(log: Log) -> None:
+def choose_point_times(log: Log, *, deskew: bool = True) -> None:
     """Time points by azimuth, where the log's clouds have no times and show clearly that they are distorted so.
 
     ``log.point_times`` ``azimuth`` does so in any case, in the better sense, ``none`` never. Notes of the log say
     what was found, ``log.distortion`` and ``log.distorted_share`` what remains. Planar scans without times may be
-    distorted in any case.
+    distorted in any case, and scans with times where a run does not ``deskew`` them.
     """
     wanted = log.config.point_times
     is_open = wanted == "azimuth" or (wanted in ("auto", "none") and log.dimension == 3)
     if is_open and log.sectors is None and not log.is_mirrored:
         _adopt_point_times(log, wanted)
     if log.dimension == 2:
-        log.distorted_share = _untimed_share(log)
+        log.distorted_share = _sweep_share(log, deskew=deskew)
+    elif not deskew and (found := measure_distortion(log)) is not None and found.is_given:
+        log.distorted_share = found.share * _sweep_share(log, deskew=deskew)
 
 
 def _adopt_point_times(log: Log, wanted: str) -> None:
@@ -179,15 +181,15 @@ def _adopt_point_times(log: Log, wanted: str) -> None:
     said, remedy = found.advice(log)
     is_removed, is_none = found.is_removed(log), found.is_refuted and found.is_spinning
     if found.size_m > _LEAST_M and not is_removed:
-        log.distorted_share = found.share * _untimed_share(log)
+        log.distorted_share = found.share * _sweep_share(log)
         log.distortion = "" if is_none else f"{said}; try {remedy}" if remedy else said
     log.time_points(found.config if is_removed else log.config, f"{said}: {found.changes}")
 
 
-def _untimed_share(log: Log) -> float:
-    """Duration of scans without times over the time from one to the next; 0 where they have times."""
+def _sweep_share(log: Log, *, deskew: bool = True) -> float:
+    """Duration of scans over the time from one to the next; 0 where their times deskew them."""
     for window in log.windows(_AT[:1], _SCANS):
-        if not len(window[0].times_s):
+        if not (deskew and len(window[0].times_s)):
             period_s = 1e-9 * float(np.median(np.diff([scan.stamp_ns for scan in window])))
             return min(_by_azimuth(window, log.config)[0].revolution_s / max(period_s, 1e-9), 1.0)
     return 0.0

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import textwrap
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from itertools import takewhile
 from pathlib import Path
 
 import msgspec
@@ -14,7 +12,7 @@ import numpy as np
 from msgspec import Struct
 
 from scanchain.data import BACK_END, VERIFICATION, State, Trajectory, fit_text
-from scanchain.errors import InputError, counted
+from scanchain.errors import InputError, counted, folded
 from scanchain.evaluation import ExpectedError, Pairs, absolute_error_of_any_path, kitti_error_of_any_path, pair
 from scanchain.evaluation.errors import far_off, path_length
 from scanchain.runs.results import Results
@@ -24,7 +22,10 @@ from scanchain.verdict import Judged, Stretch, Verdict
 
 METRICS_FILE = "metrics.json"
 VERDICT, REASON = "verdict", " " * 15  # first word of a summary, and begin of the reasons below it
-_WIDTH, _FIRST = 100, 3  # characters of such a line, and reasons that a terminal shows
+_FIRST, _BY_STAGE = (
+    3,
+    ("ms per scan", "  median", "  95th perc."),
+)  # reasons that a terminal shows, lines that it does not
 _NOTICEABLE_S = 0.5  # seconds of compilation time below which it is not reported
 
 
@@ -277,21 +278,17 @@ def compare_with_truth(
 
 
 def verdict_lines(headline: str, reasons: Sequence[str]) -> Iterator[str]:
-    """The first lines of a summary: the verdict, and a line or more each reason, indented."""
+    """The first lines of a summary: the verdict, and a line each reason, indented."""
     yield f"{VERDICT:<14} {headline}"
-    for reason in reasons:
-        yield textwrap.fill(reason, _WIDTH, initial_indent=REASON, subsequent_indent=f"{REASON}  ")
+    yield from (f"{REASON}{reason}" for reason in reasons)
 
 
 def shortened(summary: str) -> str:
-    """A summary with the first reasons only, for a terminal."""
-    head, *lines = summary.splitlines(keepends=True)
-    reasons = list(takewhile(lambda line: line.startswith(REASON), lines))
-    begins = [place for place, line in enumerate(reasons) if not line.startswith(f"{REASON}  ")]
-    shown = reasons
-    if len(begins) > _FIRST:
-        shown = [*reasons[: begins[_FIRST]], f"{REASON}{len(begins) - _FIRST:,} more in summary.txt\n"]
-    return "".join([head, *shown, *lines[len(reasons) :]])
+    """A summary for a terminal: folded, with the first reasons only, without times by stage."""
+    lines = [line for line in summary.splitlines() if not line.startswith(_BY_STAGE)]
+    reasons = [line for line in lines if line.startswith(REASON)]
+    more = [f"{REASON}{len(reasons) - _FIRST:,} more in summary.txt"] if len(reasons) > _FIRST else []
+    return folded("\n".join([*lines[:1], *reasons[:_FIRST], *more, *lines[1 + len(reasons) :]])) + "\n"
 
 
 def removed(points: int) -> str:
@@ -321,7 +318,7 @@ def summary(metrics: Metrics, heading: str, configuration: str, notes: Sequence[
         *(f"odometry       {error}" for error in m.odometry_errors),
         f"time           {m.run_s:.1f} s{m.compiling} with map and results, "
         f"{counted(round(m.scans_per_s), 'scan')}/s, {m.times_real_time:.1f} x real time",
-        "ms a scan      " + "".join(f"{stage:>12}" for stage in STAGES),
+        "ms per scan    " + "".join(f"{stage:>12}" for stage in STAGES),
         "  median       " + "".join(f"{m.median_ms[stage]:12.2f}" for stage in STAGES),
         "  95th perc.   " + "".join(f"{m.p95_ms[stage]:12.2f}" for stage in STAGES),
     ]

@@ -280,7 +280,7 @@ def opened(job: Job) -> tuple[Log, Settings, TruthFile | None]:
     early = load_settings(file=job.config_file, overrides=job.overrides)
     RunDirectory(job.out, force=job.force)  # refused before the log is read
     log = open_log(job.logs, early.config.log)
-    choose_point_times(log)
+    choose_point_times(log, deskew=early.config.preprocess.deskew)
     settings = load_settings(log.dimension, file=job.config_file, overrides=job.overrides)
     if settings.config.odometry.prior == "wheel" and not log.odometry_topic:
         raise InputError(

@@ -29,7 +29,7 @@ COLORS = {
     Label.VANISHED: (214, 69, 65),
     Label.UNKNOWN: (96, 125, 175),
 }
-_LARGEST = 10  # clusters of each kind in the summary
+_LARGEST = 7  # clusters of each kind in the summary
 _COMMENT = """scanchain changes, meters, frame of the earlier map
 label 0 same, 1 appeared, 2 vanished, 3 unknown; cluster 0 for none"""
 

@@ -295,7 +295,7 @@ def _verdict(
     tried = f"{counted(scans, 'scan')} over {path_m:.1f} m"
     if not found.is_placed.any():
         if path_m < _SHORT_M[found.trajectory.dimension]:
-            reason = f"not found in {prior.name}: {tried} are too short a way to tell"
+            reason = f"not found in {prior.name}: {tried} are too short a path to tell"
         elif np.isfinite(log_odds):
             reason = (
                 f"not certain: {tried} may be in {prior.name}, with log-odds of {log_odds:.1f}, which are too low"

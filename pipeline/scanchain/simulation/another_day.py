@@ -11,7 +11,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from scanchain.data import Matrix
+from scanchain import lie
+from scanchain.data import Matrix, Pose
 from scanchain.kernels.raycast import BOX, ELLIPSOID
 from scanchain.simulation.solids import FIXED, Solids
 
@@ -43,6 +44,10 @@ class Change:
     after: NDArray[np.float64]
     size_m: NDArray[np.float64]
     owner: int
+
+    def seen_from(self, T: Pose) -> Change:
+        """The same, moved by a pose (4, 4), as into the frame of a map."""
+        return replace(self, before=lie.transform(T, self.before), after=lie.transform(T, self.after))
 
 
 def another_day(

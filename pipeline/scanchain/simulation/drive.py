@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -105,19 +106,22 @@ def plan(
             f"wheels_slip from {start_s:g} to {end_s:g} s by {size_m:g} m: begin at 0 s or later, end later"
         )
     solids = scene.build(_random(seed, _PLACE))
-    rng, driven_s = _random(seed, _DEVIATION, changed), length_s + lidar.period_ns * 1e-9
+    driven_s = length_s + lidar.period_ns * 1e-9
     if isinstance(scene.route, tuple):
         if reverse or start_m:
             raise InputError(f"{world} is no route round which one could drive; leave reverse and start_m out")
-        motion = pivots(scene.route, scene.vehicle, solids, duration_s=driven_s, rng=rng)
+        moving = partial(pivots, scene.route, scene.vehicle, solids, duration_s=driven_s)
     else:
         route = begun_at(scene.route[::-1] if reverse else scene.route, start_m)
-        motion = laps(route, scene.vehicle, solids, duration_s=driven_s, rng=rng)
+        moving = partial(laps, route, scene.vehicle, solids, duration_s=driven_s)
+    motion = moving(rng=_random(seed, _DEVIATION, changed))
     changes: tuple[Change, ...] = ()
     if changed is not None:
         path = motion.base(np.arange(0.0, length_s, _PATH_STEP_S))[:, :2, 3]
         free_m = scene.vehicle.radius_m + scene.vehicle.deviation_m + _SPARE_M
         solids, changes = another_day(solids, path, free_m, _random(seed, _PLACE, changed))
+        T_world_map = moving(rng=_random(seed, _DEVIATION)).lidar(np.zeros(1))[0]
+        changes = tuple(change.seen_from(lie.inverse(T_world_map)) for change in changes)
     scans = _recorded(scene, motion, lidar, count)
     return Drive(
         solids, motion, lidar, scene.vehicle.T_base_lidar, scans, seed, changed, drift, wheels_slip,

@@ -47,7 +47,7 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """A verdict, its reasons in words, the suspicious stretches, and the error that it vouches for.
+    """A verdict, its reasons in words, the suspicious segments, and the error estimate.
 
     error, bound_m : in words, and its upper bound; infinite where that is unknown
     """
@@ -60,7 +60,7 @@ class Judged:
 
     @property
     def vouched(self) -> str:
-        """The error as far as it is vouched for: elsewhere than in the stretches to check, or not at all."""
+        """The error estimate as far as it is valid: outside of the segments to check, or not at all."""
         words = {Verdict.TRUSTWORTHY: "", Verdict.CHECK: "otherwise "}
         return f"{words[self.verdict]}{self.error}" if self.error and self.verdict in words else ""
 
@@ -262,7 +262,7 @@ def _unlike_wheels(evidence: Evidence) -> Iterator[str]:
 
 
 def _listed(stretches: Sequence[Stretch]) -> str:
-    """The largest stretches in words, and how many more there are."""
+    """The largest segments in words, and how many more there are."""
     largest = sorted(stretches, key=lambda each: (each.size_m or 0.0, each.scans), reverse=True)[:_SHOWN]
     more = len(stretches) - len(largest)
     return "; ".join(each.text for each in largest) + (f"; and {more:,} more" if more else "")
@@ -278,7 +278,7 @@ def _nothing(evidence: Evidence) -> Iterator[str]:
     counts = [f"{int(found.sum()):,} {words}" for words, found in kinds.items() if found.any()]
     yield f"nothing to check in {counted(len(evidence), 'scan')}"
     if counts:
-        yield f"{' and '.join(counts)}, each time for too short a way to move the trajectory"
+        yield f"{' and '.join(counts)}, each over too short a path to move the trajectory"
     checks = {
         "fit": evidence.fit,
         "overlap": evidence.overlap,

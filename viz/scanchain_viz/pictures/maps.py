@@ -99,18 +99,20 @@ def over_map(
     return figure
 
 
-def draw_points(figure: Plot, points: Points, low: Floats, high: Floats, colors: Sequence[str] = (GRAY,)) -> None:
+def draw_points(
+    figure: Plot, points: Points, low: Floats, high: Floats, colors: Sequence[str], grain_m: float = 0.0
+) -> None:
     """Draw points (M, 3) as seen from above, within corners, in one color, or in several by height, if any.
 
-    A pixel has the color of its highest point and an opacity by their number.
+    A pixel, as large as their grains if known, has the color of its highest point and an opacity by their number.
     """
     points = points[:: max(1, -(-len(points) // _MAX_POINTS))]
     points = points[((points[:, :2] > low[:2]) & (points[:, :2] < high[:2])).all(axis=1)]
     if not len(points):
         return
     colors = colors if len(colors) == 1 or np.ptp(points[:, 2]) else (GRAY,)
-    width = float(np.clip(_PIXELS_A_POINT * np.sqrt(len(points)), *_WIDTHS))
-    edge_m = float(high[0] - low[0]) / width
+    size_m, width = float(high[0] - low[0]), float(np.clip(_PIXELS_A_POINT * np.sqrt(len(points)), *_WIDTHS))
+    edge_m = max(grain_m, size_m / _WIDTHS[1]) if grain_m else size_m / width
     columns, rows = np.ceil((high[:2] - low[:2]) / edge_m).astype(int)
     column, row = ((points[:, :2] - low[:2]) / edge_m).astype(int).T
     pixel = row * columns + column

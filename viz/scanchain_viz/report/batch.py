@@ -38,7 +38,7 @@ _HEADS = (
     page.Head("KITTI", "%", "translational error of the KITTI metric"),
     page.Head("inliers", "%", "median over the scans"),
     page.Head("residual", "mm", "median over the scans"),
-    page.Head("speed", "× real time"),
+    page.Head("speed", "×", "times real time"),
     page.Head("time", "s", "of the whole process"),
     page.Head("memory", "MiB", "peak of the process"),
 )

@@ -216,7 +216,7 @@ def _changes_picture(
     """Points (M, 3) in the colors of their labels, seen from above, and boxes of clusters."""
     figure = Plot.of_plan(low, high, is_wide=is_wide)
     for label in _ORDER:
-        maps.draw_points(figure, points[changes.labels == label], low, high, (_HEX[label],))
+        maps.draw_points(figure, points[changes.labels == label], low, high, (_HEX[label],), changes.voxel_size_m)
     for cluster in changes.clusters:
         c, s = np.cos(cluster.yaw_rad), np.sin(cluster.yaw_rad)
         corners = 0.5 * np.array([[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]]) * cluster.size_m[:2]

@@ -24,7 +24,7 @@ from scanchain.trajectory import read_tum
 from scanchain.verdict import VELOCITY_LIMIT, WHEEL_LIMIT, Kind, Stretch
 from scanchain_viz.colors import CLOSURES, OPTIMIZED, STRETCH_COLORS, TRUTH, color_of
 from scanchain_viz.pictures.figure import Floats, Line, Plot, broken
-from scanchain_viz.pictures.maps import VIRIDIS, over_map, surroundings
+from scanchain_viz.pictures.maps import over_map, surroundings
 from scanchain_viz.pictures.trajectories import column_of, frame, trajectories_of_run
 from scanchain_viz.report import page, sections
 
@@ -124,14 +124,10 @@ def map_section(lines: Sequence[Line], points: Points, box: Floats, grain_m: flo
     """The map (M, 3) of grains so far apart and lines, the trajectory first, which lie within corners (2, 3)."""
     is_flat, path = not len(points) or not np.ptp(points[:, 2]), lines[0].positions
     corners = surroundings(box, [points])
-    around = "Seen from above; circle: start, square: end."
-    still = page.Drawing.of("Trajectory over the map", around, over_map(lines, points, *corners, path=path))
-    drawings = [replace(still, is_still=is_flat)]  # the interactive map shows a flat one from above, too
-    if not is_flat:
-        text, figure = "dark is low, bright is high.", over_map([], points, *corners, colors=VIRIDIS)
-        drawings.append(page.Drawing.of("Map", f"map.ply, seen from above; {text}", figure))
+    over = over_map(lines, points, *corners, path=path)
+    still = page.Drawing.of("Trajectory over the map", "Seen from above; circle: start, square: end.", over)
     scene = page.interactive_map(points, lines, *corners, grain_m=grain_m, is_flat=is_flat)
-    drawings.append(replace(scene, is_wide=True))
+    drawings = [replace(still, is_still=True), replace(scene, is_wide=True)]  # the scene shows it from above, too
     return page.Section("Trajectory and map", chips=lines, drawings=drawings)
 
 
