@@ -66,10 +66,13 @@ class Program:
         with np.load(out) as measured:
             return dict(measured)
 
-    def run(self, log: Path, folder: str, kernels: Path | None = None) -> tuple[float, float, float]:
+    def run(
+        self, log: Path, folder: str, words: Sequence[str] = (), kernels: Path | None = None
+    ) -> tuple[float, float, float]:
         """What a whole run takes, as ``spent``."""
-        words = ("run", str(log), "--out", f"{folder}/run", "--force")
-        return self.spent("-m", "scanchain", *words, kernels=kernels)
+        options = [part for word in words for part in ("--" + word).split("=", 1)]
+        command = ("-m", "scanchain", "run", str(log), "--out", f"{folder}/run", "--force")
+        return self.spent(*command, *options, kernels=kernels)
 
 
 def main() -> None:
@@ -111,11 +114,11 @@ def compared(
     runs: list[list[tuple[float, float, float]]] = [[], []]
     with TemporaryDirectory() as folder:
         for program in (now, then):
-            program.run(log, folder)  # compiles
+            program.run(log, folder, words)  # compiles
         for _ in range(repeats):
             for which, program in enumerate((now, then)):
                 tracked[which].append(program.tracked(log, folder, words))
-                runs[which].append(program.run(log, folder))
+                runs[which].append(program.run(log, folder, words))
     new, old = (figures(each) for each in tracked)
     new_poses, old_poses = (each[0]["poses"] for each in tracked)
     is_equal = np.array_equal(new_poses, old_poses)
@@ -139,7 +142,7 @@ def show_cold(now: Program, then: Program) -> None:
         cells = []
         for program in (now, then):
             with TemporaryDirectory() as folder:
-                first, second = (program.run(log, folder, Path(folder, "kernels")) for _ in range(2))
+                first, second = (program.run(log, folder, kernels=Path(folder, "kernels")) for _ in range(2))
                 cells += [f"{first[1] - second[1]:.1f} s", f"{first[0] - second[0]:.1f} s"]
         show(log.stem, *cells)
 

@@ -19,8 +19,8 @@ FEW = 10  # of those that build a map
 
 def main() -> None:
     log_file, out, *words = sys.argv[1:]
-    log = open_log(log_file)
     overrides = tuple(Override(*word.split("=", 1), "against") for word in words)
+    log = open_log(log_file, load_settings(overrides=overrides).config.log)
     config = load_settings(log.dimension, overrides=overrides).config
     odometry = Odometry(config, log.T_base_lidar)
     cpu_s, wall_s, stages_s, poses = [], [], [], []
