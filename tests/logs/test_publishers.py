@@ -225,8 +225,23 @@ def test_a_clock_that_jumps_is_named_and_starts_a_segment(tmp_path, shift_s, siz
         [
             said_by(k, "laser", stamp_ns=at(k) - 20 * SECOND * (k < 2)) for k in range(60)
         ],  # the first ones are stale
+        [
+            said_by(k, "laser", stamp_ns=at(k + 90 * (k == 59)), log_ns=(1 << 64) - 90 + k if k > 57 else at(k))
+            for k in range(60)
+        ],  # damaged
     ],
-    ids=["wrong", "jitter", "noise", "late", "late and lost", "paused", "waited", "without clock", "stale"],
+    ids=[
+        "wrong",
+        "jitter",
+        "noise",
+        "late",
+        "late and lost",
+        "paused",
+        "waited",
+        "without clock",
+        "stale",
+        "damaged",
+    ],
 )
 def test_stamps_that_are_wrong_late_or_paused_do_not_jump(tmp_path, said):
     log, scans = read(write(tmp_path / "a.mcap", said))

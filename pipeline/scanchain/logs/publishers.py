@@ -141,7 +141,7 @@ def _times(message: Decoded) -> tuple[int, int] | None:
 
 def _jump_s(before: Sequence[tuple[int, int]], after: Sequence[tuple[int, int]]) -> float:
     """Seconds of a jump by ``_times`` of the scans on both sides, 0 where it is none."""
-    stamps_ns, offsets_ns = np.array(before, np.int64).T
+    stamps_ns, offsets_ns = np.array(before, np.float64).T  # times of a damaged log exceed integers
     step_ns, after_ns = after[0][0] - before[-1][0], [offset_ns for _, offset_ns in after]
     limit_ns = max(_STEP_NS, _STEP_PERIODS * float(np.median(np.diff(stamps_ns))))
     is_back = step_ns < -limit_ns and max(after_ns) < np.median(offsets_ns) - limit_ns
