@@ -126,8 +126,9 @@ def assess(voxels, points, T, expected, iterations: int, ending: int, settings):
     problem = problem_of(voxels, points, T, np.zeros((k, k)), settings)
     fit = _fit_near(problem, T, iterations, ending)
     spectrum = spectrum_of(fit.H, fit.total_weight, problem.range_m)
-    add_signals(problem, T, spectrum)
     is_fused = expected.is_measured and k == 3
+    if is_fused or k == 6:
+        add_signals(problem, T, spectrum)
     if is_below(spectrum, 0, 1.0 if is_fused else WEAK, settings):
         believed = _about_target(definite_inverse(expected.covariance), T, settings.variance)
         prior = weak_prior(spectrum, fit.total_weight, believed, is_fused, settings)
@@ -141,6 +142,7 @@ def assess(voxels, points, T, expected, iterations: int, ending: int, settings):
             substitute(factor, pull, twist)
             perturb(twist, T.copy(), problem.origin, T)
             fit = _fit_near(problem, T, iterations, ending)
+    add_signals(problem, T, spectrum)
     return _result(problem, T, T, fit, fit, spectrum, _spread(problem, T, fit))
 
 
