@@ -216,12 +216,12 @@ def test_pairs_of_the_closed_form_are_points_and_the_closest_ones_on_planes_and_
     assert {kind for _, _, kind, _ in pairs} >= ({"plane", "point"} if dimension == 2 else set(SHAPES.values()))
     assert count == len(pairs)
     for k, (i, mean, kind, direction) in enumerate(pairs):
-        r = naive.residual(moved[i], mean, kind, direction, 1.0)
+        r, a = naive.residual(moved[i], mean, kind, direction, 1.0), problem.weight[i]
         if kind == "plane":
             r = r * direction
         np.testing.assert_allclose(source[k], moved[i], atol=1e-12)
         np.testing.assert_allclose(closest[k], moved[i] - r, atol=1e-12)
-        assert weight[k] == pytest.approx(problem.weight[i] * (scale_m**2 / (scale_m**2 + r @ r)) ** 2, rel=1e-9)
+        assert weight[k] == pytest.approx(a * (scale_m**2 / (scale_m**2 + a * r @ r)) ** 2, rel=1e-9)
 
 
 def test_normal_equations_are_the_gradient_and_hessian_of_the_cost(dimension):

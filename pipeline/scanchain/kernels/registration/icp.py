@@ -162,8 +162,8 @@ def correspond(problem, T, reach: int, max_distance_m: float):
 def closest_pairs(problem, T, scale_m: float, source, closest, weight):
     """Number of pairs; the point moved by T, the closest one on the surface of its voxel, and the weight of each.
 
-    The closest point is the foot on a plane or line (Besl & McKay 1992), of a voxel without a shape the mean. The
-    weight of the correspondence, which is made anew, is multiplied by Geman–McClure's (s²/(s²+r²))².
+    The closest point is the foot on a plane or line (Besl & McKay 1992), of a voxel without a shape the mean.
+    Correspondences and their weights are made anew; weights are those of ``normal_equations``.
 
     scale_m : s; source, closest (N, d), weight (N,) : room for the pairs, one row a pair
     """
@@ -190,7 +190,7 @@ def closest_pairs(problem, T, scale_m: float, source, closest, weight):
         for axis in range(points.shape[1]):
             source[pairs, axis] = p[axis]
             closest[pairs, axis] = p[axis] - e[axis]
-        ratio = s2 / (s2 + e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
+        ratio = s2 / (s2 + of_surface[i] * (e[0] * e[0] + e[1] * e[1] + e[2] * e[2]))
         weight[pairs] = of_surface[i] * ratio * ratio
         pairs += 1
     return pairs
