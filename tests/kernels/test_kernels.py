@@ -206,6 +206,24 @@ def associated(voxel_map, points, T):
     return problem._replace(origin=np.zeros(3))
 
 
+def test_pairs_of_the_closed_form_are_points_and_the_closest_ones_on_planes_and_lines(dimension):
+    points, T, scale_m = some_points(dimension), lie.exp(np.linspace(0.05, -0.08, 3 if dimension == 2 else 6)), 0.2
+    voxel_map = map_of(points)
+    problem = associated(voxel_map, points, T)
+    source, closest, weight = np.empty_like(points), np.empty_like(points), np.empty(len(points))
+    count = icp.closest_pairs(problem, T, scale_m, source, closest, weight)
+    pairs, moved = paired(voxel_map, problem.correspondence), lie.transform(T, points)
+    assert {kind for _, _, kind, _ in pairs} >= ({"plane", "point"} if dimension == 2 else set(SHAPES.values()))
+    assert count == len(pairs)
+    for k, (i, mean, kind, direction) in enumerate(pairs):
+        r, a = naive.residual(moved[i], mean, kind, direction, 1.0), problem.weight[i]
+        if kind == "plane":
+            r = r * direction
+        np.testing.assert_allclose(source[k], moved[i], atol=1e-12)
+        np.testing.assert_allclose(closest[k], moved[i] - r, atol=1e-12)
+        assert weight[k] == pytest.approx(a * (scale_m**2 / (scale_m**2 + a * r @ r)) ** 2, rel=1e-9)
+
+
 def test_normal_equations_are_the_gradient_and_hessian_of_the_cost(dimension):
     points = some_points(dimension)
     voxel_map = map_of(points)

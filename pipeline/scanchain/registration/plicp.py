@@ -55,8 +55,9 @@ class PointToShapeMatcher:
         Raises InputError where points or first pose do not fit the map.
         """
         points, T_first = checked(points, target, T_first)
-        expected = _expected(prior, T_first)
-        result = match(target.voxels, points, T_first, expected, settings_of(self.config, target, wide=wide))
+        result = match(
+            target.voxels, points, T_first, expected(prior, T_first), settings_of(self.config, target, wide=wide)
+        )
         return match_of(result, len(points), target, self.config)
 
 
@@ -201,7 +202,7 @@ def _ratio(known: float, least: float) -> float:
     return known / least if least else math.inf
 
 
-def _expected(prior: Prior | None, T_first: Pose) -> Prior:
+def expected(prior: Prior | None, T_first: Pose) -> Prior:
     """The prior as kernels take it; without one the first pose, of no information."""
     if prior is None:
         k = lie.twist_size(T_first)

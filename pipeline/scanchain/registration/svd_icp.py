@@ -1,4 +1,4 @@
-"""SVD-ICP: nearest voxel means and the closed-form rigid transformation between them, in turn."""
+"""SVD-ICP: closest points on the surfaces of a voxel map and the closed-form rigid transformation, in turn."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ from numpy.typing import NDArray
 
 from scanchain import checks, lie
 from scanchain.config import MatchingConfig
-from scanchain.data import AnyPoints, Match, Points, Pose, Prior
+from scanchain.data import AnyPoints, Match, Pose, Prior
 from scanchain.errors import InputError, ScanchainError, counted
 from scanchain.kernels.registration import icp
-from scanchain.kernels.registration.association import associate, weighted_pairs
-from scanchain.kernels.registration.icp import SHRINK, Fit
+from scanchain.kernels.registration.icp import SHRINK
 from scanchain.kernels.registration.match import assess
-from scanchain.registration.plicp import checked, match_of, settings_of
+from scanchain.registration.plicp import checked, expected, match_of, settings_of
 from scanchain.registration.voxel_map import VoxelMap
 
+_RELAXATION = 1.5  # factor on a step of the closed form, of which one below 2 raises no cost
+_LEFT = 0.1  # share of the tolerances below which a step has converged: what is left may be so many times as much
 _RANK_TOLERANCE = 1e-9  # of the largest singular value
 _ROUNDINGS = 64.0  # of the products of the means, below which a singular value is noise
 
@@ -73,57 +74,33 @@ class SvdMatcher:
     ) -> Match:
         """Pose of the scan in the map's frame, near the first one; arguments as ``Matcher.align``.
 
-        The closed form has no place for the prediction's information; ``prior`` is not used.
+        Points that are free to move along their surfaces hold the closed form back: its steps are lengthened and,
+        while they shrink, extrapolated by the last one (Anderson acceleration; Walker & Ni 2011, Pavlov et al.
+        2018). The closed form has no place for the prediction, which counts afterwards, where surfaces say little.
         """
-        del prior
         points, T_first = checked(points, target, T_first)
-        settings = settings_of(self.config, target, wide=wide)
-        T, scale_m = T_first.copy(), settings.first_scale_m
-        correspondence = np.empty(len(points), np.int32)
-        source, nearest, weight = np.empty_like(points), np.empty_like(points), np.empty(len(points))
-        ending, iterations, pairs = icp.OUT_OF_ITERATIONS, 0, 0
-        for _ in range(settings.max_iterations):
+        settings, predicted = settings_of(self.config, target, wide=wide), expected(prior, T_first)
+        problem = icp.problem_of(target.voxels, points, T_first, np.zeros_like(predicted.covariance), settings)
+        source, closest, weight = np.empty_like(points), np.empty_like(points), np.empty(len(points))
+        lengths = lie.by_component(len(predicted.widest), 1.0, problem.range_m)  # that a twist moves a point by
+        limits = _LEFT * lie.by_component(len(lengths), settings.tolerance_m, settings.tolerance_rad) * lengths
+        last = moved = np.zeros(len(lengths))
+        T, scale_m, iterations, ending = T_first.copy(), settings.first_scale_m, 0, icp.OUT_OF_ITERATIONS
+        while ending == icp.OUT_OF_ITERATIONS and iterations < settings.max_iterations:
             iterations += 1
-            associate(target.voxels, points, T, settings.reach, settings.max_distance_m, correspondence)
-            pairs = weighted_pairs(target.voxels, points, T, correspondence, scale_m, source, nearest, weight)
+            pairs = icp.closest_pairs(problem, T, scale_m, source, closest, weight)
             try:
-                correction = rigid_transform(source[:pairs], nearest[:pairs], weight[:pairs])
+                closed_form = rigid_transform(source[:pairs], closest[:pairs], weight[:pairs])
             except DegeneratePairsError:
                 ending = icp.SINGULAR if pairs else icp.NO_CORRESPONDENCES
                 break
-            T = lie.normalize(correction @ T)
-            if scale_m <= settings.scale_m and self._is_small(correction, T):
+            step = _RELAXATION * lengths * lie.log(lie.between(T, closed_form @ T))
+            change, is_shrinking = step - last, step @ step < last @ last
+            share = (step @ change) / (change @ change) if is_shrinking else 0.0
+            last, moved = step, step - share * (moved + change)
+            T = lie.normalize(T @ lie.exp(moved / lengths))
+            if scale_m <= settings.scale_m and (np.abs(moved) < limits).all():
                 ending = icp.CONVERGED
-                break
             scale_m = max(settings.scale_m, SHRINK * scale_m)
-        source, weight = source[:pairs], weight[:pairs]
-        errors, s2 = source - nearest[:pairs], settings.scale_m**2
-        squares = np.einsum("ij,ij->i", errors, errors)
-        fit = Fit(
-            H=_information(source - T[:-1, -1], weight),
-            cost=0.5 * float((s2 * squares / (s2 + squares)).sum()) + 0.5 * s2 * (len(points) - pairs),
-            total_weight=float(weight.sum()),
-            squares=float(weight @ squares),
-            pairs=pairs,
-            iterations=iterations,
-            ending=ending,
-        )
-        return match_of(assess(target.voxels, points, T, fit, settings), len(points), target, self.config)
-
-    def _is_small(self, correction: Pose, T: Pose) -> bool:
-        position = T[:-1, -1]
-        shift = lie.transform(correction, position[None])[0] - position
-        turn = lie.rotation_angle(correction)
-        return float(shift @ shift) < self.config.tolerance_m**2 and float(turn) < self.config.tolerance_rad
-
-
-def _information(points: Points, weight: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Σ w JᵀJ of point-to-point residuals about the lidar: J = [I, −p×], in 2D J = [I, (−p_y, p_x)ᵀ]."""
-    d = points.shape[1]
-    J = np.zeros((len(points), d, 3 if d == 2 else 6))
-    J[:, :, :d] = np.eye(d)
-    if d == 2:
-        J[:, 0, 2], J[:, 1, 2] = -points[:, 1], points[:, 0]
-    else:
-        J[:, :, 3:] = -lie.hat(points)
-    return np.einsum("n,nij,nik->jk", weight, J, J, optimize=True)
+        result = assess(target.voxels, points, T, predicted, iterations, ending, settings)
+        return match_of(result, len(points), target, self.config)

@@ -109,31 +109,6 @@ def weigh(voxels, points, T, correspondence, variance: float, weight):
             weight[i] = without_shape
 
 
-@njit(nogil=True)
-def weighted_pairs(voxels, points, T, correspondence, scale_m: float, source, target, weight):
-    """Number of pairs; the moved point, voxel mean and Geman–McClure weight (s²/(s²+r²))² of each, one row a pair.
-
-    points : (N, d) meters, source frame; correspondence : (N,) rows of the map, −1 for none
-    source, target : (N, d) and weight : (N,), room for the pairs
-    """
-    pairs = 0
-    s2 = scale_m * scale_m
-    for i in range(points.shape[0]):
-        voxel = correspondence[i]
-        if voxel < 0:
-            continue
-        moved = move(T, points, i)
-        r2 = 0.0
-        for axis in range(points.shape[1]):
-            source[pairs, axis] = moved[axis]
-            target[pairs, axis] = voxels.cells[voxel, axis]
-            r2 += (source[pairs, axis] - target[pairs, axis]) ** 2
-        ratio = s2 / (s2 + r2)
-        weight[pairs] = ratio * ratio
-        pairs += 1
-    return pairs
-
-
 @njit(inline="always")
 def _plane_variance(cell, ex, ey, ez) -> float:
     """Variance of the fitted plane at (ex, ey, ez) from the mean, over that of a point on it."""

@@ -15,7 +15,7 @@ from scanchain.kernels.registration.residuals import (
     normal_equations,
     robust_sums,
 )
-from scanchain.kernels.voxels import POINT, SHAPE
+from scanchain.kernels.voxels import LINE, PLANE, POINT, SHAPE, move, shape_of
 
 CONVERGED, OUT_OF_ITERATIONS, NO_CORRESPONDENCES, SINGULAR = 0, 1, 2, 3
 
@@ -155,6 +155,44 @@ def correspond(problem, T, reach: int, max_distance_m: float):
         weigh(problem.voxels, problem.points, T, problem.correspondence, problem.settings.variance, problem.weight)
     else:
         problem.weight.fill(0.0)
+    return pairs
+
+
+@njit(nogil=True)
+def closest_pairs(problem, T, scale_m: float, source, closest, weight):
+    """Number of pairs; the point moved by T, the closest one on the surface of its voxel, and the weight of each.
+
+    The closest point is the foot on a plane or line (Besl & McKay 1992), of a voxel without a shape the mean.
+    Correspondences and their weights are made anew; weights are those of ``normal_equations``.
+
+    scale_m : s; source, closest (N, d), weight (N,) : room for the pairs, one row a pair
+    """
+    correspond(problem, T, problem.settings.reach, problem.settings.max_distance_m)
+    cells, points, correspondence, of_surface = (
+        problem.voxels.cells,
+        problem.points,
+        problem.correspondence,
+        problem.weight,
+    )
+    pairs, s2 = 0, scale_m * scale_m
+    for i in range(points.shape[0]):
+        if correspondence[i] < 0:
+            continue
+        p = move(T, points, i)
+        shape, q, n = shape_of(cells, correspondence[i])
+        e = p[0] - q[0], p[1] - q[1], p[2] - q[2]
+        along = n[0] * e[0] + n[1] * e[1] + n[2] * e[2]
+        foot = along * n[0], along * n[1], along * n[2]
+        if shape == PLANE:
+            e = foot
+        elif shape == LINE:
+            e = e[0] - foot[0], e[1] - foot[1], e[2] - foot[2]
+        for axis in range(points.shape[1]):
+            source[pairs, axis] = p[axis]
+            closest[pairs, axis] = p[axis] - e[axis]
+        ratio = s2 / (s2 + of_surface[i] * (e[0] * e[0] + e[1] * e[1] + e[2] * e[2]))
+        weight[pairs] = of_surface[i] * ratio * ratio
+        pairs += 1
     return pairs
 
 

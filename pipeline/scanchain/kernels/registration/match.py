@@ -7,9 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scanchain.kernels.compiling import njit
-from scanchain.kernels.geometry import adjoint, between, centered, inverse, twist_2d, twist_3d
+from scanchain.kernels.geometry import adjoint, between, centered, inverse, perturb, twist_2d, twist_3d
 from scanchain.kernels.matrices import congruent, definite_inverse, factorize, substitute
-from scanchain.kernels.registration.icp import NO_CORRESPONDENCES, align, fit_at, gradients_of_sectors, problem_of
+from scanchain.kernels.registration.icp import (
+    NO_CORRESPONDENCES,
+    Fit,
+    align,
+    correspond,
+    fit_at,
+    gradients_of_sectors,
+    problem_of,
+    shape_information,
+)
 from scanchain.kernels.registration.observability import (
     WEAK,
     add_signals,
@@ -20,7 +29,12 @@ from scanchain.kernels.registration.observability import (
     spectrum_of,
     weak_prior,
 )
-from scanchain.kernels.registration.residuals import WITHOUT_KERNEL_M, gradient_spread, normal_equations
+from scanchain.kernels.registration.residuals import (
+    WITHOUT_KERNEL_M,
+    gradient_spread,
+    normal_equations,
+    robust_sums,
+)
 
 _TURN_INFORMATION = 25.0  # rad⁻² of a turn that nothing determines
 _POOLED_RESIDUALS = 10.0  # number of residuals that the sensor's variance counts for
@@ -102,18 +116,44 @@ def match(voxels, points, T_first, expected, settings):
 
 
 @njit(nogil=True)
-def assess(voxels, points, T, fit, settings):
-    """``Result`` of a fit by another method at T (d+1, d+1), its information about T itself.
+def assess(voxels, points, T, expected, iterations: int, ending: int, settings):
+    """``Result`` at T (d+1, d+1), which another method found without the prediction.
 
-    The means of voxels constrain a pose in every direction, whether the surfaces do or not; observability is
-    therefore that of the surfaces.
+    Along weak directions the pose moves, in place, to the predicted one, as far as the prior of ``match`` says.
+    iterations, ending : of that method
     """
     k = 3 if points.shape[1] == 2 else 6
     problem = problem_of(voxels, points, T, np.zeros((k, k)), settings)
-    last = fit_at(problem, T, fit)
-    spectrum = spectrum_of(last.H, last.total_weight, problem.range_m)
+    fit = _fit_near(problem, T, iterations, ending)
+    spectrum = spectrum_of(fit.H, fit.total_weight, problem.range_m)
+    is_fused = expected.is_measured and k == 3
+    if is_fused or k == 6:
+        add_signals(problem, T, spectrum)
+    if is_below(spectrum, 0, 1.0 if is_fused else WEAK, settings):
+        believed = _about_target(definite_inverse(expected.covariance), T, settings.variance)
+        prior = weak_prior(spectrum, fit.total_weight, believed, is_fused, settings)
+        away, pull = _twist_between(expected.T_target_source, T), np.zeros(k)
+        for i in range(k):
+            for j in range(k):
+                pull[i] += prior[i, j] * away[j]
+                prior[i, j] += fit.H[i, j]
+        factor, twist = np.empty((k, k)), np.zeros(k)
+        if factorize(prior, 0.0, factor):
+            substitute(factor, pull, twist)
+            perturb(twist, T.copy(), problem.origin, T)
+            fit = _fit_near(problem, T, iterations, ending)
     add_signals(problem, T, spectrum)
-    return _result(problem, T, T, fit, last, spectrum, np.zeros((0, 0)))
+    return _result(problem, T, T, fit, fit, spectrum, _spread(problem, T, fit))
+
+
+@njit(nogil=True)
+def _fit_near(problem, T, iterations: int, ending: int):
+    """``Fit`` at the pose T by correspondences within the last distance."""
+    settings = problem.settings
+    pairs = correspond(problem, T, settings.last_reach, settings.last_distance_m)
+    cost, total_weight, squares = robust_sums(problem, T, settings.scale_m)
+    cost += 0.5 * settings.scale_m**2 * (problem.points.shape[0] - pairs)
+    return Fit(shape_information(problem, T), cost, total_weight, squares, pairs, iterations, ending)
 
 
 @njit(nogil=True)
