@@ -22,10 +22,8 @@ from scanchain.verdict import Judged, Stretch, Verdict
 
 METRICS_FILE = "metrics.json"
 VERDICT, REASON = "verdict", " " * 15  # first word of a summary, and begin of the reasons below it
-_FIRST, _BY_STAGE = (
-    3,
-    ("ms per scan", "  median", "  95th perc."),
-)  # reasons that a terminal shows, lines that it does not
+_FIRST = 3  # number of reasons that a terminal shows
+_BY_STAGE = ("ms per scan", "  median", "  95th perc.")  # lines that it does not
 _NOTICEABLE_S = 0.5  # seconds of compilation time below which it is not reported
 
 
