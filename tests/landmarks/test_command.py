@@ -78,7 +78,7 @@ def test_pinv_is_left_out_of_all_above_its_limit_and_refused_by_name(call, small
     assert code == 2 and "70 unknowns" in errors and "name other --methods" in errors
     assert not (tmp_path / "out").exists()
     code, output, _ = call(*words, "all")
-    assert code == 0 and "not compared   pinv" in output and "70 unknowns, its limit is 70" in output
+    assert code == 0 and "not compared    pinv" in output and "70 unknowns, its limit is 70" in output
     assert methods_of(tmp_path / "out") == [method for method in METHODS if method != "pinv"]
 
 

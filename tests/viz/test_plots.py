@@ -160,7 +160,7 @@ def test_a_line_of_many_points_is_as_long_as_it_looks_and_ends_where_it_ends():
 def test_the_pixels_of_a_map_are_square_and_begin_at_its_corner():
     low, high = np.zeros(3), np.array([13.7, 6.95, 0.0])
     figure = Plot.of_plan(low, high)
-    draw_points(figure, np.random.default_rng(0).uniform(low, high, (1000, 3)), low, high)
+    draw_points(figure, np.random.default_rng(0).uniform(low, high, (1000, 3)), low, high, ("#000000",))
     box = re.search(r'<image x="(.*?)" y="(.*?)" width="(.*?)" height="(.*?)"', figure.svg()).groups()
     (x, y, width, height), (rows, columns) = map(float, box), image_in(figure).shape[:2]
     assert width / columns == pytest.approx(height / rows, rel=1e-3)
