@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from scanchain.data import RawPoints
 
-_SCANS, _EVERY = 30, 3  # scans within which noise is measured, and of which each that many is
+_SCANS, _EVERY = 30, 3  # number of the first scans, of which every third is measured
 _PATCHES = 300  # of a scan, evenly spread
 _FREEDOM = 4  # points of a patch beyond the parameters of its plane
 _MEDIAN_WITHIN, _FIFTH = 0.8216, 0.4122  # χ² of 4 degrees of freedom over 4: median below _WITHIN, first quintile

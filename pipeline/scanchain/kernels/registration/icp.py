@@ -120,13 +120,13 @@ def align(problem, T, offset, first_scale_m: float):
 
 
 @njit(nogil=True)
-def fit_at(problem, T, fit):
-    """``Fit`` at the pose T itself, by correspondences within the last distance; cost and ending of ``fit``."""
+def fit_at(problem, T, iterations: int, ending: int):
+    """``Fit`` at the pose T itself, by correspondences within the last distance; the rest is given."""
     settings = problem.settings
     pairs = correspond(problem, T, settings.last_reach, settings.last_distance_m)
-    _, total_weight, squares = robust_sums(problem, T, settings.scale_m)
-    H = shape_information(problem, T)
-    return Fit(H, fit.cost, total_weight, squares, pairs, fit.iterations, fit.ending)
+    cost, total_weight, squares = robust_sums(problem, T, settings.scale_m)
+    cost += 0.5 * settings.scale_m**2 * (problem.points.shape[0] - pairs)
+    return Fit(shape_information(problem, T), cost, total_weight, squares, pairs, iterations, ending)
 
 
 @njit(inline="always")
@@ -163,17 +163,13 @@ def closest_pairs(problem, T, scale_m: float, source, closest, weight):
     """Number of pairs; the point moved by T, the closest one on the surface of its voxel, and the weight of each.
 
     The closest point is the foot on a plane or line (Besl & McKay 1992), of a voxel without a shape the mean.
-    Correspondences and their weights are made anew; weights are those of ``normal_equations``.
+    Correspondences are updated; weights are those of ``normal_equations``.
 
     scale_m : s; source, closest (N, d), weight (N,) : room for the pairs, one row a pair
     """
     correspond(problem, T, problem.settings.reach, problem.settings.max_distance_m)
-    cells, points, correspondence, of_surface = (
-        problem.voxels.cells,
-        problem.points,
-        problem.correspondence,
-        problem.weight,
-    )
+    cells, points = problem.voxels.cells, problem.points
+    correspondence, of_surface = problem.correspondence, problem.weight
     pairs, s2 = 0, scale_m * scale_m
     for i in range(points.shape[0]):
         if correspondence[i] < 0:

@@ -9,16 +9,7 @@ from numpy.typing import NDArray
 from scanchain.kernels.compiling import njit
 from scanchain.kernels.geometry import adjoint, between, centered, inverse, perturb, twist_2d, twist_3d
 from scanchain.kernels.matrices import congruent, definite_inverse, factorize, substitute
-from scanchain.kernels.registration.icp import (
-    NO_CORRESPONDENCES,
-    Fit,
-    align,
-    correspond,
-    fit_at,
-    gradients_of_sectors,
-    problem_of,
-    shape_information,
-)
+from scanchain.kernels.registration.icp import NO_CORRESPONDENCES, align, fit_at, gradients_of_sectors, problem_of
 from scanchain.kernels.registration.observability import (
     WEAK,
     add_signals,
@@ -29,12 +20,7 @@ from scanchain.kernels.registration.observability import (
     spectrum_of,
     weak_prior,
 )
-from scanchain.kernels.registration.residuals import (
-    WITHOUT_KERNEL_M,
-    gradient_spread,
-    normal_equations,
-    robust_sums,
-)
+from scanchain.kernels.registration.residuals import WITHOUT_KERNEL_M, gradient_spread, normal_equations
 
 _TURN_INFORMATION = 25.0  # rad⁻² of a turn that nothing determines
 _POOLED_RESIDUALS = 10.0  # number of residuals that the sensor's variance counts for
@@ -107,7 +93,7 @@ def match(voxels, points, T_first, expected, settings):
     spread = _spread(problem, T, fit)
     last = fit
     if settings.reach != settings.last_reach or settings.max_distance_m != settings.last_distance_m:
-        last = fit_at(problem, T, fit)
+        last = fit_at(problem, T, fit.iterations, fit.ending)
     if points.shape[1] == 2 and not is_fused:
         add_signals(problem, T, spectrum)
     if is_fused:
@@ -124,7 +110,7 @@ def assess(voxels, points, T, expected, iterations: int, ending: int, settings):
     """
     k = 3 if points.shape[1] == 2 else 6
     problem = problem_of(voxels, points, T, np.zeros((k, k)), settings)
-    fit = _fit_near(problem, T, iterations, ending)
+    fit = fit_at(problem, T, iterations, ending)
     spectrum = spectrum_of(fit.H, fit.total_weight, problem.range_m)
     is_fused = expected.is_measured and k == 3
     if is_fused or k == 6:
@@ -141,19 +127,9 @@ def assess(voxels, points, T, expected, iterations: int, ending: int, settings):
         if factorize(prior, 0.0, factor):
             substitute(factor, pull, twist)
             perturb(twist, T.copy(), problem.origin, T)
-            fit = _fit_near(problem, T, iterations, ending)
+            fit = fit_at(problem, T, iterations, ending)
     add_signals(problem, T, spectrum)
     return _result(problem, T, T, fit, fit, spectrum, _spread(problem, T, fit))
-
-
-@njit(nogil=True)
-def _fit_near(problem, T, iterations: int, ending: int):
-    """``Fit`` at the pose T by correspondences within the last distance."""
-    settings = problem.settings
-    pairs = correspond(problem, T, settings.last_reach, settings.last_distance_m)
-    cost, total_weight, squares = robust_sums(problem, T, settings.scale_m)
-    cost += 0.5 * settings.scale_m**2 * (problem.points.shape[0] - pairs)
-    return Fit(shape_information(problem, T), cost, total_weight, squares, pairs, iterations, ending)
 
 
 @njit(nogil=True)
