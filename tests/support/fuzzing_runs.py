@@ -3,9 +3,10 @@
 import os
 import shutil
 import warnings
-from contextlib import redirect_stderr, redirect_stdout
+from contextlib import nullcontext, redirect_stderr, redirect_stdout
 from functools import partial
 from io import StringIO
+from unittest.mock import patch
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from tests.support.fuzzing import within_bounds
 from tests.support.mutations import any_mutant
 
 _LEFT_AFTER = 12  # scans
+_READABLE = "scanchain_viz.recording.recording.is_readable"  # tried in a process: most of the time of a case
 _NOBODY = 99_999_999  # no process has this number
 
 
@@ -53,7 +55,8 @@ def checkpoint_complaints(folder, rng, count):
         return "" if np.array_equal(read_tum(done.path / "trajectory.tum").poses, truth) else "other poses"
 
     for place, damaged, name in _damaged(left, folder / f"run.partial-{_NOBODY}", rng, count):
-        wrong = _of(resumed)
+        with nullcontext() if name.endswith(".rrd") else patch(_READABLE, lambda path: True):
+            wrong = _of(resumed)
         if wrong:
             yield f"checkpoint: {name}: {damaged.what}: {wrong}", damaged.data
         for path in [folder / "run", *folder.glob("run.*"), place]:
