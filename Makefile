@@ -6,6 +6,7 @@ RUNTIME := .venv/runtime-installed
 DEV := .venv/dev-installed
 BASELINES := .venv/baselines-installed
 DOCS := .venv/docs-installed
+unexport PYTHONDONTWRITEBYTECODE  # where it is set, each of many processes would compile all that it imports
 INSTALL := VIRTUAL_ENV=.venv $(BIN)/uv pip install --quiet
 
 .PHONY: help demo test slow lint count docs clean

@@ -54,6 +54,16 @@ _compilation = _Compilation()
 event.register("numba:compile", _compilation)
 
 
+@contextmanager
+def standing_still() -> Iterator[None]:
+    """Count what is done meanwhile as compiling, in other processes."""
+    began_s = perf_counter()
+    try:
+        yield
+    finally:
+        _compilation.ended_s += perf_counter() - began_s
+
+
 def warn_of_compilation() -> None:
     """Log a warning when kernels are next compiled, so that callers of the Python API know of the delay."""
     _compilation.is_silent = False

@@ -23,7 +23,9 @@ _LEAST_M = 1e-4  # smallest standard deviation that is told: ranges may be round
 _VARIES = 2.0  # ratio of the standard deviations at two ranges above which each is named
 _KNOWN = 0.3  # least share of the patches at ranges whose noise is known
 _NEAREST_M = 0.05
-_SECTORS, _SECTOR_POINTS = 16, 8000  # of large clouds only parts of 16 sectors are searched for neighbors
+_SECTORS, _SECTOR_POINTS = 16, 8000  # of the first cloud, if large, parts of 16 sectors are searched for neighbors
+_WEDGE_POINTS, _WEDGE_PATCHES = 2000, 75  # of those that follow a wedge about another azimuth each
+_GOLDEN = 0.618034  # of the cloud, from the point in the middle of one wedge to that of the next
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +54,12 @@ class RangeNoise:
             return self
         if self.scans % _EVERY:
             return replace(self, scans=self.scans + 1)
-        ranges_m, variances_m2 = _patches(points)
+        if self.scans and points.shape[1] == 3 and len(points) > _SECTOR_POINTS:
+            ranges_m, variances_m2 = _patches(
+                _wedge(points, int(_GOLDEN * self.scans % 1.0 * len(points))), _WEDGE_PATCHES
+            )
+        else:
+            ranges_m, variances_m2 = _patches(points, _PATCHES)
         ranges_m = np.concatenate([self.ranges_m, ranges_m])
         variances_m2 = np.concatenate([self.variances_m2, variances_m2])
         by_range = _by_range(ranges_m, variances_m2)
@@ -95,8 +102,15 @@ def _typical_m(
     return _sigma_m(variances_m2, float(np.median(ranges_m))) if len(ranges_m) else 0.0
 
 
-def _patches(points: RawPoints) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Median range and variance of ranges (P,) of patches of a scan (N, d)."""
+def _wedge(points: RawPoints, middle: int) -> RawPoints:
+    """Points of a cloud (N, 3) at azimuths about that of one, as many as there would be of one without gaps."""
+    x, y = points[:, 0], points[:, 1]
+    across = np.abs(x[middle] * y - y[middle] * x)
+    return points[across < math.tan(math.pi * _WEDGE_POINTS / len(points)) * (x[middle] * x + y[middle] * y)]
+
+
+def _patches(points: RawPoints, most: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Median range and variance of ranges (P,) of at most so many patches of a scan (N, d)."""
     d = points.shape[1]
     size = d + _FREEDOM
     azimuth = np.arctan2(points[:, 1], points[:, 0])
@@ -112,7 +126,7 @@ def _patches(points: RawPoints) -> tuple[NDArray[np.float64], NDArray[np.float64
     if count < size:
         return np.empty(0), np.empty(0)
     directions = rays / ranges_m[:, None]
-    centers = np.linspace(0, count - 1, min(count, _PATCHES)).astype(np.int64)
+    centers = np.linspace(0, count - 1, min(count, most)).astype(np.int64)
     if d == 2:
         order = np.argsort(azimuth, kind="stable")
         patches = order[(centers[:, None] + np.arange(size)) % count]

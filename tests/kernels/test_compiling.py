@@ -15,7 +15,6 @@ import pytest
 from numba import config, njit
 
 from scanchain import lie
-from scanchain.__main__ import main
 from scanchain.api import open_recorder
 from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.kernels import compiling
@@ -45,23 +44,6 @@ def test_each_module_of_kernels_is_named_once_and_others_and_what_is_compiled_al
             assert kernel(module)(2) == 4
     kernel("scanchain.kernels.matrices")(2)
     assert told == ["compiling, once after the installation:", "  kernels.voxels"]
-
-
-def test_the_command_goes_through_what_needs_kernels_and_names_what_failed(monkeypatch, capsys):
-    called, code = [], {"run": 1}
-
-    def remembered(words, **options):
-        called.append(words[4:])
-        return subprocess.CompletedProcess(words, code.get(words[4], 0), "", "error: no disk\n")
-
-    monkeypatch.setattr(subprocess, "run", remembered)
-    assert main(["warm-up", "3d"]) == 0
-    assert [words[0] for words in called] == ["simulate", "run", "simulate", "localize", "run", "merge"]
-    assert capsys.readouterr().out.splitlines()[0].startswith("compiling what 3D logs need")
-    code["localize"] = 2
-    assert main(["warm-up", "2d"]) == 1
-    error = capsys.readouterr().err
-    assert error.startswith("error: scanchain localize ") and error.endswith(": no disk\n")
 
 
 def test_the_clock_stands_still_while_a_kernel_and_those_it_calls_are_compiled():

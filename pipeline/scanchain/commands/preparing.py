@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import textwrap
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import wraps
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from time import perf_counter
 from typing import Any
 
@@ -159,16 +155,12 @@ def get_sequence(name: str, out: Path, force: bool, as_json: bool) -> None:
     click.echo(options.json_text({"name": name, "path": str(path)}) if as_json else path)
 
 
-_WORLDS = {"2d": ("office", 8), "3d": ("town", 3)}  # with the seconds driven there
-_EXPECTED = (0, 1)  # 1: logs this short are not all judged trustworthy
-
-
 @click.command()
 @click.argument("which", default="all", type=click.Choice(("2d", "3d", "all")))
 def warm_up(which: str) -> None:
     """Compile what run, localize, merge and simulate need into the cache, instead of in the first of them.
 
-    For container images and CI: a minute and a half on two cores, seconds where all is compiled. The cache is of
+    For container images and CI: on all cores, half a minute on two, nothing where all is compiled. The cache is of
     this machine's kind of processor; it lies in the folder NUMBA_CACHE_DIR, by default in ~/.cache/scanchain.
 
     \b
@@ -178,30 +170,16 @@ def warm_up(which: str) -> None:
     """
     from numba import config
 
-    kinds = tuple(_WORLDS) if which == "all" else (which,)
-    named = " and ".join(kind.upper() for kind in kinds)
-    click.echo(f"compiling what {named} logs need, once after an installation")
+    from scanchain.ahead import KINDS, compile_ahead
+    from scanchain.commands.terminal import Terminal
+
+    kinds = KINDS if which == "all" else (which, "rest")
     began = perf_counter()
-    with TemporaryDirectory() as folder, ThreadPoolExecutor(len(kinds)) as together:
-        list(together.map(_go_through, kinds, [Path(folder, kind) for kind in kinds]))
-    where = config.CACHE_DIR or "beside the source"  # pyright: ignore[reportAttributeAccessIssue]
+    with Terminal("kernels") as terminal:
+        is_whole = compile_ahead(kinds, terminal.compiling)
+    where: str = config.CACHE_DIR  # pyright: ignore[reportAttributeAccessIssue]
+    if not where:
+        raise ScanchainError("no folder can keep what is compiled: set NUMBA_CACHE_DIR to one that can be written")
+    if not is_whole:
+        raise ScanchainError("a process that compiles ended early (out of memory?); runs compile what they call")
     click.echo(f"compiled in {perf_counter() - began:.0f} s: {where}")
-
-
-def _go_through(kind: str, folder: Path) -> None:
-    """Process a short synthetic log by every command whose kernels are compiled ahead."""
-    world, seconds = _WORLDS[kind]
-    log, later, run, again = f"{folder}.mcap", f"{folder}_later.mcap", f"{folder}/run", f"{folder}/again"
-    for words in (
-        ("simulate", world, log, "--duration", f"{seconds}"),
-        ("run", log, "--out", run),
-        ("simulate", world, later, "--duration", f"{seconds + 1}", "--changed", "1"),
-        ("localize", later, "--map", run, "--out", f"{folder}/found"),
-        ("run", later, "--out", again, "--rerun", "off"),
-        ("merge", run, again, "--out", f"{folder}/merged"),
-    ):
-        done = subprocess.run(
-            [sys.executable, "-P", "-m", "scanchain", *words], capture_output=True, text=True, check=False
-        )
-        if done.returncode not in _EXPECTED:
-            raise ScanchainError(f"scanchain {' '.join(words)}: {done.stderr.strip().rpartition('error: ')[2]}")

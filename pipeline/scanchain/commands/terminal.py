@@ -73,6 +73,12 @@ class Terminal(Progress):
         self.is_tracking = False
         self._close()
 
+    def compiling(self, done: int, total: int) -> None:
+        """Draw how many of all kernels are compiled."""
+        if self.is_seen:
+            text = f"compiling kernels, once after an installation: {done} of {total}"
+            click.echo(f"{_CLEAR}{text}", nl=done == total, err=True)
+
     def count(self, done: int, total: int) -> None:
         """Draw how many are done, but not more often than an eye can follow."""
         now_s = monotonic()

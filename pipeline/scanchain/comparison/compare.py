@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 
 from scanchain import lie
+from scanchain.ahead import compile_ahead
 from scanchain.comparison.methods import default_names, resolve, shared_settings
 from scanchain.comparison.processes import StoredScans, run_all, store
 from scanchain.comparison.results import Reference, results_of, summarize, write_results
@@ -101,6 +102,8 @@ def compare(comparison: Comparison, present: Callable[[Path], None], progress: P
     provenance = describe_start(comparison.command, comparison.logs, ", ".join(method.name for method in methods))
     hashing = Hashing(comparison.logs)
     with directory:
+        if any(method.is_ours for method in methods):
+            compile_ahead([f"{log.dimension}d", "rest"], progress.compiling)
         shared = directory.path / _SHARED
         shared.mkdir()
         decoded = progress.track(log.scans(settings.config.preprocess), log.scan_count)

@@ -158,7 +158,7 @@ class BetweenProblem:
         blocks = np.zeros((len(self.pattern.rows), self.freedom, self.freedom))
         gradient = np.zeros((len(self.free), self.freedom))
         jacobian = self.jacobians(poses, errors)
-        between.scatter_between(jacobian, errors, self.information, weights, self.slots, blocks, gradient)
+        between.scatter_between(jacobian, errors, self.information, _kept(weights), self.slots, blocks, gradient)
         return NormalEquations(self.packing.values(blocks), self.packing.rows(gradient))
 
     def scattered(self, of_i: Matrix, of_j: Matrix, coupling: Matrix) -> Matrix:

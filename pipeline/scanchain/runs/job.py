@@ -57,6 +57,9 @@ class Progress:
     def announce(self, line: str) -> None:
         """Show a line on a terminal or in a pipe."""
 
+    def compiling(self, done: int, total: int) -> None:
+        """Show that so many of all kernels are compiled."""
+
     def count(self, done: int, total: int) -> None:
         """Show that so many of all are done."""
 

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from scanchain.ahead import compile_ahead
 from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.config import NO_TRUTH, Config
 from scanchain.data import Scan, Trajectory, brief
@@ -83,6 +84,7 @@ def run(
     this = _Run(job, progress)
     with this.directory, announcing_compilation(progress.say):
         try:
+            compile_ahead([f"{this.log.dimension}d"], progress.compiling)
             slam, scans = this.begin()
             with this.recording(record) as recording:
                 result = this.process(slam, scans, recording)

@@ -15,6 +15,7 @@ from msgspec import Struct, json, structs
 from numpy.typing import NDArray
 
 from scanchain import lie
+from scanchain.ahead import compile_ahead
 from scanchain.clock import working_s
 from scanchain.config import Config
 from scanchain.data import ClosureVerdict, Pose, brief
@@ -151,6 +152,7 @@ def localize(
     progress.say(f"{log.topic}: {counted(log.scan_count, 'scan')}; map {prior.name}")
     provenance, hashing = describe_start(job.command, job.logs, settings.source), Hashing(job.logs)
     with RunDirectory(job.out, force=job.force) as directory:
+        compile_ahead([f"{log.dimension}d", "rest"], progress.compiling)
         provenance.write(directory.path / RUN_FILE)
         write_whole(directory.path / "config.toml", dump(config).encode())
         localizer = _followed(log, prior, config, initial, directory.path / POINTS_FILE, progress)

@@ -10,6 +10,7 @@ from typing import Any
 
 import msgspec
 
+from scanchain.ahead import compile_ahead
 from scanchain.clock import announcing_compilation, compiled_s, working_s
 from scanchain.config import Config
 from scanchain.data import REJECTED_WEIGHT, Closure, ClosureVerdict, brief
@@ -104,6 +105,7 @@ def merge(
     names = session_names(maps, order)
     provenance, hashing = describe_start(job.command, folders, settings.source), Hashing(folders)
     with directory, announcing_compilation(progress.say):
+        compile_ahead([f"{maps[0].dimension}d", "rest"], progress.compiling)
         groups, uncertain = join_all(maps, order, [each[0] for each in names], config, held, progress.say)
         joined = _chosen(groups, held, maps, uncertain)
         progress.say(f"making the map of {counted(len(joined.keyframes), 'keyframe')}")

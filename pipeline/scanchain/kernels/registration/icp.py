@@ -221,7 +221,7 @@ def refine(voxels, points, starts, poses, prior, least_share, settings):
         problem = problem_of(voxels, scan, T, prior, settings)
         fit = align(problem, T, offset, settings.first_scale_m)
         if fit.ending == CONVERGED and fit.pairs >= least_share * scan.shape[0]:
-            poses[k] = T
+            _copy(T, poses[k])
 
 
 @njit(nogil=True)
@@ -283,11 +283,20 @@ def _evaluate(problem, scale_m: float, iterate):
 
 @njit(inline="always")
 def _accept(now, trial):
-    now.T[:] = trial.T
-    now.offset[:] = trial.offset
-    now.H[:] = trial.H
-    now.b[:] = trial.b
-    now.sums[:] = trial.sums
+    _copy(trial.T, now.T)
+    _copy(trial.H, now.H)
+    for i in range(now.b.shape[0]):
+        now.offset[i], now.b[i] = trial.offset[i], trial.b[i]
+    for i in range(now.sums.shape[0]):
+        now.sums[i] = trial.sums[i]
+
+
+@njit(inline="always")
+def _copy(matrix, out):
+    """Copy a matrix by its entries: of an assignment Numba compiles a check of shapes, which takes seconds."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[i, j] = matrix[i, j]
 
 
 @njit(inline="always")

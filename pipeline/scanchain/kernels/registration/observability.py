@@ -42,7 +42,7 @@ class Spectrum(NamedTuple):
     signals: NDArray[np.float64]
 
 
-@njit(inline="always")
+@njit(nogil=True)
 def spectrum_of(H, total_weight: float, range_m: float):
     """``Spectrum`` of the information H (k, k) of residuals with this sum of weights."""
     k = H.shape[0]
@@ -102,7 +102,7 @@ def is_below(spectrum, m: int, times: float, settings) -> bool:
     return is_blind or spectrum.signals[m] < times * settings.min_signal
 
 
-@njit(inline="always")
+@njit(nogil=True)
 def weak_prior(spectrum, total_weight: float, believed, is_fused: bool, settings):
     """Information (k, k), times the variance of a residual, of the prior along the weak directions alone.
 
@@ -166,7 +166,7 @@ def add_signals(problem, T, spectrum):
             break
 
 
-@njit(inline="always")
+@njit(nogil=True)
 def signal_along(problem, T, twist) -> float:
     """Signal-to-noise ratio of the information along a twist (k,) (after Hatleskog & Alexis 2024).
 
