@@ -49,7 +49,7 @@ TOPICS = {"pandaset_002_sweeps30to55.mcap": "/pandar64/points"}  # of a log with
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """What a method made of a log; the poses after a ``failure`` (empty if there was none) are NaN.
+    """What a method made of a log, up to its ``failure``, which is empty if there was none.
 
     ``seconds`` (N,) passed on the clock while a scan was tracked, ``cpu_seconds`` were spent by all threads.
     """
@@ -97,7 +97,11 @@ def run_all(log: Log, scans: list[Scan], methods: Sequence[str]) -> list[Run]:
                 failures[m] = f"scan {k}: {type(error).__name__}: {error}"
             seconds[m, k], cpu_seconds[m, k] = perf_counter() - started, process_time() - cpu_started
     stamps_ns = np.array([scan.stamp_ns for scan in scans])
-    trajectories = [Trajectory(stamps_ns, each) for each in poses]
+    held = [
+        int(np.isfinite(each).all(axis=(1, 2)).argmin() if failed else len(each))
+        for each, failed in zip(poses, failures, strict=True)
+    ]
+    trajectories = [Trajectory(stamps_ns[:count], each[:count]) for each, count in zip(poses, held, strict=True)]
     descriptions = [racer.description for racer in racers]
     return list(map(Run, methods, descriptions, trajectories, seconds, cpu_seconds, failures))
 
@@ -168,7 +172,7 @@ def scores(path: Path, methods: Sequence[str]) -> list[Score]:
 def score(run: Run, truth: Trajectory | None) -> Score:
     """Errors of a run against the truth."""
     median_s = float(np.median(run.seconds[1:]))
-    if truth is None or not np.isfinite(run.trajectory.poses).all():
+    if truth is None or run.failure:
         return Score(median_s)
     pairs = pair(run.trajectory, truth).after_start  # no method can predict the first motion
     absolute = absolute_error(pairs)

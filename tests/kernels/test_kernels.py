@@ -179,6 +179,21 @@ def weighed(voxel_map, points, T, max_distance_m):
     return correspondence, weight
 
 
+def test_points_on_lines_have_no_negative_weight():
+    """The variances across a line are rounded to either side of zero, one of points at one place to all of them."""
+    rng = np.random.default_rng(0)
+    count, size = 400, 6
+    begin, direction = rng.uniform(-60.0, 60.0, (count, 3)), rng.normal(size=(count, 3))
+    along = rng.uniform(0.0, 0.3, (count, size)) * (rng.uniform(size=(count, 1)) > 0.1)
+    direction[: count // 2, :2] = 0.0  # upright ones
+    points = np.ascontiguousarray((begin[:, None] + along[..., None] * direction[:, None]).reshape(-1, 3))
+    voxel_map = map_of(points, size=1.0, alone=5)
+    cells = voxel_map.voxels.cells[: len(voxel_map)]
+    assert (cells[:, voxels.THICKNESS] >= 0.0).all() and (cells[:, SHAPE] == 2.0).any()
+    correspondence, weight = weighed(voxel_map, points, np.eye(4), 1.0)
+    assert (correspondence >= 0).all() and ((weight >= 0.0) & (weight <= 1.0)).all()
+
+
 def ring_on(surface_m):
     """Where one ring strikes a surface that is surface_m(azimuth) away, good to 2 cm along the ray."""
     rng = np.random.default_rng(0)

@@ -270,7 +270,8 @@ def _fit_2d(m, noise: float, cell):
 def _fit_3d(m, noise: float, cell):
     """Plane, line or point by the eigenvalues λ₁ ≤ λ₂ ≤ λ₃ of the covariance, less the noise in each.
 
-    A plane is thin against its second extent, a line is thin against its length in both others.
+    A plane is thin against its second extent, a line is thin against its length in both others. Of points on one
+    line, rounding makes the first two negative.
     """
     cell[SHAPE] = POINT
     n = m[0]
@@ -278,18 +279,18 @@ def _fit_3d(m, noise: float, cell):
         return 0.0
     xx, xy, xz, yy, yz, zz = covariance_of(m)
     small, middle, large = eigenvalues_3d(xx, xy, xz, yy, yz, zz)
-    if small - noise < 0.1 * max(middle - noise, 0.0):
+    if middle > 0.0 and small - noise < 0.1 * max(middle - noise, 0.0):
         cell[SHAPE] = PLANE
         chosen = small
         wx, wy, wz = eigenvector_3d(xx, xy, xz, yy, yz, zz, middle)
         cell[ACROSS], cell[ACROSS + 1], cell[ACROSS + 2] = wx, wy, wz
         n = min(n, MANY)
-        cell[THICKNESS], cell[MEAN_TERM] = small, 1.0 / n
+        cell[THICKNESS], cell[MEAN_TERM] = max(small, 0.0), 1.0 / n
         cell[SLOPE_ACROSS], cell[SLOPE_ALONG] = 1.0 / (n * middle), 1.0 / (n * large)
     elif middle - noise < 0.1 * (large - noise):
         cell[SHAPE] = LINE
         chosen = large
-        cell[THICKNESS] = middle
+        cell[THICKNESS] = max(middle, 0.0)
     else:
         return middle - noise
     vx, vy, vz = eigenvector_3d(xx, xy, xz, yy, yz, zz, chosen)
