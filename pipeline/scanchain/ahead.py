@@ -82,26 +82,26 @@ def _compile_all(kinds: Sequence[str], cores: int, count: Callable[[int, int], N
     order.prepare()
     ready: list[str] = []
     done, is_whole, running = 0, True, dict[Future[bool], tuple[str, _Worker]]()
-    with ExitStack() as stack:
-        workers = [stack.enter_context(_Worker(kinds)) for _ in range(min(cores, len(names)))]
-        pool = stack.enter_context(ThreadPoolExecutor(len(workers)))
-        while order.is_active():
+    with ThreadPoolExecutor(cores) as pool, ExitStack() as stack:  # which ends processes that threads wait for
+        workers = [stack.enter_context(_Worker(kinds)) for _ in range(cores)]
+        while order.is_active() and (workers or running):
             ready = sorted([*ready, *order.get_ready()], key=heights.__getitem__)
             while ready and workers:
                 worker, name = workers.pop(), ready.pop()
                 running[pool.submit(worker.compile, name)] = name, worker
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 name, worker = running.pop(future)
-                workers.append(worker)
-                is_whole = is_whole and future.result()
                 order.done(name)
+                if future.result():
+                    workers.append(worker)
+                is_whole = is_whole and future.result()
                 done += 1
                 count(done, len(names))
     return is_whole
 
 
 class _Worker:
-    """A process that compiles the kernels named to it; a context manager."""
+    """A process that compiles the kernels named to it. A context manager."""
 
     def __init__(self, kinds: Sequence[str]) -> None:
         self.process = subprocess.Popen(

@@ -180,7 +180,7 @@ def weighed(voxel_map, points, T, max_distance_m):
 
 
 def test_points_on_lines_have_no_negative_weight():
-    """The variances across a line are rounded to either side of zero, one of points at one place to all of them."""
+    """The variances across a line are rounded to either side of zero, as all those of points at one place."""
     rng = np.random.default_rng(0)
     count, size = 400, 6
     begin, direction = rng.uniform(-60.0, 60.0, (count, 3)), rng.normal(size=(count, 3))

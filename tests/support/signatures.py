@@ -68,9 +68,10 @@ def words_of(signature, tuples):
     return words
 
 
-def record(place, kind):
-    """Run what a kind needs, and print what was compiled as the table has it."""
-    ahead.compile_ahead = lambda *_: True  # before other modules take it by its name
+def record(place, kind, *, is_cold=False):
+    """Run what a kind needs, and write what it called as the table has it; if cold, what was compiled as well."""
+    if is_cold:
+        ahead.compile_ahead = lambda *_: True  # before other modules take it by its name
     for words in _RUNS[kind]:
         assert main([*words.format(place).split(), "--force"]) in (0, 1), words
     tuples = {}
@@ -82,7 +83,7 @@ def record(place, kind):
 
 def _recorded(place, kind, cache):
     environment = os.environ | {"NUMBA_CACHE_DIR": str(cache), "SCANCHAIN_THREADS": "1"}
-    subprocess.run([sys.executable, "-m", __spec__.name, place, kind], env=environment, check=True)
+    subprocess.run([sys.executable, "-m", __spec__.name, place, kind, "cold"], env=environment, check=True)
     return json.loads(Path(place, f"{kind}.json").read_text())
 
 
@@ -108,4 +109,4 @@ def write():
 
 
 if __name__ == "__main__":
-    record(*sys.argv[1:]) if sys.argv[1:] else write()
+    record(*sys.argv[1:3], is_cold="cold" in sys.argv) if sys.argv[1:] else write()
