@@ -35,7 +35,7 @@ _MOST = 8  # processes; the longest chain of calls takes as long as an eighth of
 
 
 class Signature(NamedTuple):
-    """What a kernel, ``module:function``, is compiled for, and the kinds of run that need it."""
+    """Argument types that a kernel, ``module:function``, is compiled for, and the kinds of run that need it."""
 
     kernel: str
     kinds: tuple[str, ...]
@@ -161,7 +161,7 @@ def name_of(kernel: Dispatcher) -> str:
 
 
 def _named(name: str) -> Any:
-    """What ``module:name`` is, a kernel or a class: the inverse of ``name_of``."""
+    """Kernel or class named ``module:name``; the inverse of ``name_of``."""
     module, _, function = name.partition(":")
     return getattr(import_module(f"scanchain.{module}"), function)
 
