@@ -66,11 +66,8 @@ def compile_ahead(kinds: Sequence[str], count: Callable[[int, int], None]) -> bo
 @cache
 def _state() -> str:
     """Name of all that decides what is compiled: sources, signatures, versions, processor."""
-    digest = sha256(f"{sys.version} {numba.__version__} {binding.get_host_cpu_name()}".encode())
-    for file in sorted(TABLE.parent.rglob("*.py")):
-        digest.update(file.read_bytes())
-    digest.update(TABLE.read_bytes())
-    return digest.hexdigest()[:16]
+    made_by = f"{sys.version} {numba.__version__} {binding.get_host_cpu_name()} {compiling.digest_of_sources()}"
+    return sha256(made_by.encode() + TABLE.read_bytes()).hexdigest()[:16]
 
 
 def _compile_all(kinds: Sequence[str], cores: int, count: Callable[[int, int], None]) -> bool:

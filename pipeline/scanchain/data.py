@@ -371,7 +371,7 @@ class GraphState:
 
     poses : (K, d+1, d+1) T_world_lidar of every keyframe
     stamps_ns : (K,) int64
-    edges : (E, 2) int64 keyframe pairs (i, j), odometry first
+    edges : (E, 2) int64 keyframe pairs (i, j), loops last; i is −1 of what one keyframe measures by itself
     is_loop : (E,) bool
     weight : (E,) robust weight in [0, 1] that the optimizer left to each edge; 1 for odometry
     chi2 : Σ w eᵀΩe of the edges in force: all but the rejected ones

@@ -14,8 +14,8 @@ import numpy as np
 
 from scanchain import lie
 from scanchain.config import GraphConfig
-from scanchain.graph.between import BetweenProblem
 from scanchain.graph.g2o import read_g2o, write_g2o
+from scanchain.graph.problem import GraphProblem
 from tests.benchmarks.harness import options_of, table
 from tests.support.graphs import BEST
 from tests.support.scenes import DATA
@@ -88,7 +88,7 @@ class Gtsam:
 
 def half_chi2(path, poses):
     graph = read_g2o(path).graph
-    problem = BetweenProblem(graph.edges, graph.measurements, graph.information, graph.fixed)
+    problem = GraphProblem(graph.edges, graph.measurements, graph.information, graph.fixed)
     return 0.5 * float(problem.chi2(problem.errors(lie.inverse(poses[0]) @ poses)).sum())
 
 

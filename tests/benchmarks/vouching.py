@@ -39,7 +39,7 @@ from scanchain import lie
 from scanchain.data import Matrix, Trajectory
 from scanchain.evaluation import absolute_error, pair, read_relations, relation_error
 from scanchain.evaluation.pairing import nearest
-from scanchain.runs.vouching import evidence_of
+from scanchain.runs.vouching import evidence_of, known_of_run
 from scanchain.trajectory import read_tum
 from scanchain.verdict import judge
 from tests.benchmarks import harness
@@ -104,8 +104,10 @@ def judged(case: Case, cache: Path, out: Path) -> Row:
     if case.wheels == "no wheels":
         steps = steps.drop_columns([name for name in steps.column_names if name.startswith("wheel_")])
     loops_file = out / "loops.parquet"
-    evidence = evidence_of(steps, pq.read_table(loops_file) if loops_file.exists() else None)
-    verdict = judge(evidence)
+    known = known_of_run(out)
+    closures = pq.read_table(loops_file) if loops_file.exists() else None
+    evidence = evidence_of(steps, closures, known.expected_ate_m)
+    verdict = judge(evidence, distortion=known.distortion)
     trajectory = Trajectory(steps["stamp_ns"].to_numpy(), evidence.poses)
     reference = case.log.files(cache)[1] or out / "ground_truth.tum"
     motions, quality = _compared(trajectory, reference, case.log.dimension)

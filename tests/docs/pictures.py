@@ -2,7 +2,7 @@
 
     python -m tests.docs.pictures [NAME ...]
 
-Names are those of the files in docs/pictures, without ending; all without any. vouching_roc takes 25
+Names are those of the files in docs/pictures, without ending; all without any. vouching_roc takes 45
 minutes. Real logs come from ../shared/data (or SCANCHAIN_DATA); a picture whose log is absent is left as it is,
 and named. Pages and the rerun viewer, which draws by WebGL, are taken in a Chromium without a window.
 """

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from scanchain import lie
-from scanchain.graph.between import BetweenProblem
 from scanchain.graph.losses import RobustLoss, robust_loss
+from scanchain.graph.problem import GraphProblem
 from tests.support import naive_graph
 
 ANGLES = [0.0, 1e-9, 1e-5, 1e-3, 0.05, 0.1, 1.0, 2.5, np.pi - 1e-3, np.pi - 1e-5]
@@ -20,7 +20,7 @@ def _problem_with_error(dimension, angle, seed=0):
     error[dimension:] *= angle / np.linalg.norm(error[dimension:])
     Z = lie.inverse(poses[0]) @ poses[1] @ lie.inverse(lie.exp(error))
     A = rng.normal(size=(k, k))
-    problem = BetweenProblem(np.array([[0, 1]]), Z[None], (A @ A.T + np.eye(k))[None], np.array([True, False]))
+    problem = GraphProblem(np.array([[0, 1]]), Z[None], (A @ A.T + np.eye(k))[None], np.array([True, False]))
     return problem, poses, error
 
 
@@ -56,7 +56,7 @@ def test_normal_equations_equal_dense_finite_differences(dimension):
     )
     fixed = np.array([False, False, True, False, False])
     weights = rng.uniform(0.2, 1.0, len(edges))
-    problem = BetweenProblem(edges, measured, information, fixed)
+    problem = GraphProblem(edges, measured, information, fixed)
     equations = problem.linearize(poses, problem.errors(poses), weights)
     H, g = naive_graph.normal_equations(poses, edges, measured, information, weights, fixed)
     assert np.allclose(
@@ -94,7 +94,7 @@ def test_an_edge_of_position_alone_measures_the_position_whatever_the_rotation(d
     full, poses, _ = _problem_with_error(dimension, angle)
     Z, information = full.measurements, full.information.copy()
     information[:, dimension:], information[:, :, dimension:] = 0.0, 0.0
-    problem = BetweenProblem(full.edges, Z, information, np.array([True, False]))
+    problem = GraphProblem(full.edges, Z, information, np.array([True, False]))
     mismatch = lie.inverse(Z[0]) @ lie.inverse(poses[0]) @ poses[1]
     assert np.allclose(problem.errors(poses)[0, :dimension], mismatch[:-1, -1])
     assert not problem.errors(poses)[0, dimension:].any()

@@ -5,9 +5,9 @@ import pytest
 
 from scanchain import lie
 from scanchain.config import GraphConfig
-from scanchain.graph.between import BetweenProblem
 from scanchain.graph.certificate import Minorants, dual_matrix, minorize
 from scanchain.graph.cholesky import BlockPattern
+from scanchain.graph.problem import GraphProblem
 from tests.support import naive_graph
 from tests.support.graphs import PLAIN, closed_ring, graph_of, published
 
@@ -27,7 +27,7 @@ def everywhere(problem, T_i, T_j):
     count = len(T_i)
     Z, omega = (np.repeat(each, count, axis=0) for each in (problem.measurements, problem.information))
     edges = np.arange(2 * count).reshape(2, -1).T.copy()
-    of_all = BetweenProblem(edges, Z, omega, np.zeros(2 * count, bool))
+    of_all = GraphProblem(edges, Z, omega, np.zeros(2 * count, bool))
     return of_all.chi2(of_all.errors(np.concatenate([T_i, T_j])))
 
 
@@ -43,7 +43,7 @@ def test_the_bound_of_an_edge_touches_its_chi2_and_is_nowhere_above_it(dimension
         omega = (0.1 * A @ A.T + np.eye(k)) / noise**2
         if is_of_position:
             omega[dimension:], omega[:, dimension:] = 0.0, 0.0
-        problem = BetweenProblem(np.array([[0, 1]]), Z[None], omega[None], np.array([True, False]))
+        problem = GraphProblem(np.array([[0, 1]]), Z[None], omega[None], np.array([True, False]))
         bound = minorize(problem, poses, np.ones(1))
         if np.isnan(bound.kappa[0]):
             continue
@@ -68,7 +68,7 @@ def test_the_dual_matrix_is_the_sum_of_the_bounds_of_the_edges(dimension):
     edges = np.array([[0, 1], [2, 1], [2, 3], [4, 3], [4, 0], [1, 3]])
     measured = lie.inverse(poses[edges[:, 0]]) @ poses[edges[:, 1]] @ lie.exp(0.005 * rng.normal(size=(6, k)))
     A = rng.normal(size=(6, k, k))
-    problem = BetweenProblem(edges, measured, A @ np.swapaxes(A, 1, 2) + np.eye(k), np.zeros(count, bool))
+    problem = GraphProblem(edges, measured, A @ np.swapaxes(A, 1, 2) + np.eye(k), np.zeros(count, bool))
     bound = minorize(problem, poses, np.ones(6))
     blocks, residual = dual_matrix(problem, bound, np.ones(6, bool))
     pattern = BlockPattern(np.full(count, dimension + 1), problem.pattern.pairs)

@@ -6,9 +6,9 @@ import pytest
 from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.errors import InputError
-from scanchain.graph.between import BetweenProblem
 from scanchain.graph.edge_checks import free_poses, ranks
 from scanchain.graph.pose_graph import PoseGraph
+from scanchain.graph.problem import GraphProblem
 from tests.support import naive_graph
 from tests.support.graphs import PLAIN, graph_of
 
@@ -95,7 +95,7 @@ def test_free_is_what_lies_in_the_null_space_of_the_dense_matrix(dimension):
         silent = rng.random((len(edges), k)) < 0.15
         information = (~silent).astype(float)[:, :, None] * np.eye(k)
         fixed = np.arange(count) == 0
-        problem = BetweenProblem(edges, Z, information, fixed)
+        problem = GraphProblem(edges, Z, information, fixed)
         found = free_poses(problem, poses, np.ones(len(edges)), ranks(information), np.arange(count))
         equations = problem.linearize(poses, problem.errors(poses), np.ones(len(edges)))
         H = naive_graph.dense(problem.pattern, equations.values)

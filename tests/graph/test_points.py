@@ -6,7 +6,7 @@ from scipy.optimize import least_squares
 
 from scanchain import lie
 from scanchain.config import GraphConfig
-from scanchain.graph.between import BetweenProblem
+from scanchain.graph.problem import GraphProblem
 from tests.support.graphs import PLAIN, closed_ring, graph_of
 from tests.support.naive_graph import dense
 
@@ -69,7 +69,7 @@ def test_poses_and_points_reach_the_minimum_that_a_dense_solver_finds():
 def test_covariances_of_points_equal_the_dense_inverse():
     graph = field()
     graph.optimize(PLAIN)
-    problem = BetweenProblem(graph.edges, graph.measurements, graph.information, graph.fixed, graph.is_point)
+    problem = GraphProblem(graph.edges, graph.measurements, graph.information, graph.fixed, graph.is_point)
     equations = problem.linearize(graph.poses, problem.errors(graph.poses), np.ones(len(graph.edges)))
     P = np.linalg.inv(dense(problem.pattern, equations.values))
     found = graph.covariances()

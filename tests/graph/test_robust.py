@@ -8,10 +8,10 @@ import pytest
 from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.errors import InputError
-from scanchain.graph.between import BetweenProblem
 from scanchain.graph.consistency import Consistency
 from scanchain.graph.odometry_errors import corrected
 from scanchain.graph.pose_graph import PoseGraph
+from scanchain.graph.problem import GraphProblem
 from tests.benchmarks.wrong_edges import try_wrong_loops
 from tests.support.graphs import graph_of, published
 from tests.support.scenes import shared_data
@@ -66,7 +66,7 @@ def test_a_contradiction_is_what_chi2_falls_by_without_the_edge_and_rises_by_wit
 
     everything = np.ones(len(pairs), bool)
     whole, with_all = optimized(everything)
-    problem = BetweenProblem(pairs, measured, whole.information, whole.fixed)
+    problem = GraphProblem(pairs, measured, whole.information, whole.fixed)
     for edge in range(count - 1, len(pairs)):
         others = everything.copy()
         others[edge] = False

@@ -6,7 +6,7 @@ import pytest
 from tests.support import fuzzing, fuzzing_formats, fuzzing_runs
 
 MAKES, FORMATS = 13, 20
-SHARES = [pytest.param(6, id="some"), pytest.param(1, id="all", marks=pytest.mark.slow)]
+SHARES = [pytest.param(6, id="some"), pytest.param(2, id="half", marks=pytest.mark.slow)]
 MESSAGES = 3000
 CASES = {fuzzing.McapSeed: 300, fuzzing.Seed: 60}  # of files in MCAP, and four cuts at every record; others
 

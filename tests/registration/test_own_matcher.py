@@ -47,7 +47,8 @@ def started(folder, *words):
 
 @pytest.mark.slow
 def test_it_runs_is_stopped_and_goes_on_to_the_same_result(office, folder):
-    words = ("run", office, "--matcher", NAME, "--rerun", "off", "--checkpoint", "0.1")
+    words = ("run", office, "--matcher", NAME, "--end", "10", "--error-bars", "quick", "--rerun", "off")
+    words = (*words, "--checkpoint", "0.1")
     whole = started(folder, *words, "--out", "whole")
     assert whole.wait() == 0, whole.stderr.read()
     assert NAME in (folder / "whole" / "config.toml").read_text()

@@ -17,7 +17,7 @@ from scanchain import lie
 from scanchain.config import Config
 from scanchain.data import Influence, KeyframeErrors, Matrix, Points, Scan, Trajectory
 from scanchain.errors import InputError
-from scanchain.graph.between import turns
+from scanchain.graph.factors import turns
 from scanchain.graph.pose_graph import PoseGraph
 
 _BATCHES, _BATCH = 50, 10  # of samples, which together would fill the memory
@@ -146,7 +146,7 @@ def error_samples(
     own, influences, scale, log_sigma = by_itself[scans.keyframe], np.zeros((0, *R.shape[:2])), np.zeros(0), 0.0
     if influence is not None:
         changes = np.zeros((len(influence.kinds), *graph.information.shape[:2]))
-        is_odometry = ~graph.is_loop & (graph.edges[:, 1] == graph.edges[:, 0] + 1)
+        is_odometry = graph.is_odometry & (graph.edges[:, 1] == graph.edges[:, 0] + 1)
         changes[:, is_odometry] = influence.of_keyframes[:, graph.edges[is_odometry, 0]]
         within = (R @ influence.of_scans[..., None])[..., 0]
         influences = alignment.aligned(scans.errors(drifting.displacements(changes)) + within)
@@ -181,13 +181,19 @@ def with_map_errors(
     map_errors, config : of the run
     systematic_drift : the 5; 0 where systematic drift is measured instead
     """
-    k, source = graph.freedom, graph.edges.max(axis=1)
+    k, of_scans = graph.freedom, np.flatnonzero(graph.is_odometry | graph.is_loop)
+    source, is_loop, information = (
+        graph.edges[of_scans].max(axis=1),
+        graph.is_loop[of_scans],
+        graph.information.copy(),
+    )
     chosen = [map_errors[index] for index in source.tolist()]
-    covariance, by_itself = edge_errors(graph.information, graph.is_loop, chosen, config, systematic_drift)
-    information = np.linalg.inv(covariance + _LEAST_VARIANCE * np.eye(k))
+    covariance, by_itself = edge_errors(information[of_scans], is_loop, chosen, config, systematic_drift)
+    judged = np.linalg.inv(covariance + _LEAST_VARIANCE * np.eye(k))
+    information[of_scans] = 0.5 * (judged + np.swapaxes(judged, 1, 2))
     own = np.zeros((len(graph), k, k))
-    own[source[~graph.is_loop]] = by_itself[~graph.is_loop]
-    return graph.with_information(0.5 * (information + np.swapaxes(information, 1, 2))), own
+    own[source[~is_loop]] = by_itself[~is_loop]
+    return graph.with_information(information), own
 
 
 def edge_errors(

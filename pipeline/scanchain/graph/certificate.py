@@ -12,9 +12,10 @@ from scanchain import lie
 from scanchain.clock import working_s
 from scanchain.data import Matrix
 from scanchain.errors import counted
-from scanchain.graph.between import BetweenProblem, turns
 from scanchain.graph.cholesky import BlockPattern, Packing, SingularMatrixError, SparseCholesky
 from scanchain.graph.edge_checks import is_connected
+from scanchain.graph.factors import turns
+from scanchain.graph.problem import GraphProblem
 
 _ZERO_CHI2 = 1e-9  # of the largest information, or of 1 if that is less: below it χ² is zero but for rounding
 _EXACT = 1e-12  # share of χ² that rounding alone may amount to
@@ -68,7 +69,7 @@ class Certificate:
 
 
 def certify(
-    problem: BetweenProblem,
+    problem: GraphProblem,
     poses: Matrix,
     weights: NDArray[np.float64],
     undetermined: str,
@@ -100,7 +101,7 @@ def certify(
 
 
 def _gap(
-    problem: BetweenProblem,
+    problem: GraphProblem,
     poses: Matrix,
     weights: NDArray[np.float64],
     of_edges: NDArray[np.float64],
@@ -108,6 +109,10 @@ def _gap(
 ) -> tuple[float, str]:
     """χ² less its lower bound; where there is none, all of it and why. ``of_edges`` (E,) make up χ²."""
     chi2, n, d = float(of_edges.sum()), len(problem.free), poses.shape[-1] - 1
+    unknown = ~problem.is_bounded
+    if unknown.any():
+        what = sorted({problem.factors[kind].name for kind in problem.kind[unknown].tolist()})
+        return chi2, f"there is no bound for {counted(int(unknown.sum()), 'edge')} of {' and '.join(what)}"
     if len(poses) - n > 1:
         return chi2, f"{len(poses) - n} poses are fixed; the bound is for one"
     centered = poses.copy()
@@ -138,7 +143,7 @@ def _gap(
     return chi2, "the dual matrix is not positive definite, as at a local minimum"
 
 
-def dual_matrix(problem: BetweenProblem, bound: Minorants, kept: NDArray[np.bool_]) -> tuple[Matrix, Matrix]:
+def dual_matrix(problem: GraphProblem, bound: Minorants, kept: NDArray[np.bool_]) -> tuple[Matrix, Matrix]:
     """S = Q − Λ of the bounds of the edges kept (E,), as blocks of the problem's pattern, and S X* (n, d+1, d).
 
     Unknowns are G_i, the rotation of pose i against its estimate, seen from the world, and t_i, its position; at
@@ -188,7 +193,7 @@ class Minorants:
     kappa: NDArray[np.float64]
 
 
-def minorize(problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64]) -> Minorants:
+def minorize(problem: GraphProblem, poses: Matrix, weights: NDArray[np.float64]) -> Minorants:
     """Bounds that touch the χ² of every edge, times its weight (E,), at these poses.
 
     They cost a part of its isotropic information, most of it of κ.
@@ -212,7 +217,7 @@ def minorize(problem: BetweenProblem, poses: Matrix, weights: NDArray[np.float64
     cost += 0.5 * norm(torque - 2.0 * kappa[:, None] * turned)
     kappa = (1.0 - 0.5 * _BEND * theta**2) * (kappa - cost / np.maximum(1.0 - theta, 1e-12))
     kappa[~(kappa > 0.0) | (theta >= _FARTHEST)] = np.nan
-    seen = problem.sightings  # of points: quadratic in the position of the point, and nothing else
+    seen = ~problem.is_whole  # positions: quadratic in that of j, whatever its rotation
     left[seen], kappa[seen] = np.linalg.eigvalsh(information[seen, :d, :d])[:, 0], 0.0
     crossed = lie.hat(torque) if d == 3 else torque[:, :, None] * np.array([[0.0, -1.0], [1.0, 0.0]])
     return Minorants(poses[j, :d, d] - poses[i, :d, d], force, crossed, left, kappa)

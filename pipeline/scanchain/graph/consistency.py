@@ -12,8 +12,8 @@ from scipy.spatial import KDTree
 
 from scanchain import lie
 from scanchain.data import Matrix
-from scanchain.graph.between import BetweenProblem
 from scanchain.graph.covariance import difference_covariances, edge_covariances, inverse_blocks
+from scanchain.graph.problem import GraphProblem
 
 _ROUNDING = 1e-9  # keeps edges without which their poses would be loose from a division by zero
 
@@ -27,7 +27,7 @@ class Consistency:
     The residual alone is too small: a kept edge bends the graph toward itself.
     """
 
-    def __init__(self, problem: BetweenProblem, poses: Matrix, kept: NDArray[np.bool_]) -> None:
+    def __init__(self, problem: GraphProblem, poses: Matrix, kept: NDArray[np.bool_]) -> None:
         """Kept (E,): the edges in force at these poses."""
         self._problem, self._kept = problem, kept
         self._errors = problem.errors(poses)
@@ -85,19 +85,19 @@ _AT_ONCE = 10_000  # pairs of edges that are compared at once, of many
 
 
 def agreeing_groups(
-    problem: BetweenProblem, poses: Matrix, is_loop: NDArray[np.bool_], chosen: NDArray[np.bool_], limit: float
+    problem: GraphProblem, poses: Matrix, chosen: NDArray[np.bool_], limit: float
 ) -> list[NDArray[np.int64]]:
-    """Edges of each group among those chosen (E,): they join the same two segments of poses and agree there.
+    """Loop edges of each group among those chosen (E,): they join the same two segments of poses and agree there.
 
     Two agree where one predicts the other along the poses between their ends: the squared Mahalanobis distance,
     with the noise of both and of an odometry edge for each of these poses, is below the limit.
     """
-    loops = np.flatnonzero(chosen & is_loop)
+    loops = np.flatnonzero(chosen & problem.is_loop)
     if len(loops) < FEWEST:
         return []
     edges, Z = problem.edges[loops], problem.measurements[loops]
     noise = np.linalg.pinv(problem.information[loops], hermitian=True)
-    odometry = problem.information[~is_loop]
+    odometry = problem.information[problem.is_odometry]
     step = np.linalg.pinv(np.median(odometry, axis=0), hermitian=True) if len(odometry) else 0.0
 
     def agree(a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.bool_]:

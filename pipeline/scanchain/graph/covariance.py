@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 from scanchain.data import Matrix
 from scanchain.errors import InputError
 from scanchain.files import write_whole
-from scanchain.graph.between import BetweenProblem, turns
+from scanchain.graph.factors import turns
+from scanchain.graph.problem import GraphProblem
 
 _NAMES = {3: ("x", "y", "yaw"), 6: ("x", "y", "z", "roll", "pitch", "yaw")}
 
 
-def responses(problem: BetweenProblem, i: int, j: int) -> Matrix:
+def responses(problem: GraphProblem, i: int, j: int) -> Matrix:
     """Cov(ξ, ξ_j − ξ_i), (K, k, k), of the left twists of all poses, by k solves with the factor of H."""
     result = np.zeros((len(problem.variable), problem.freedom, problem.freedom))
     result[j] += np.eye(problem.freedom)
@@ -26,7 +27,7 @@ def responses(problem: BetweenProblem, i: int, j: int) -> Matrix:
     return result
 
 
-def difference_covariances(problem: BetweenProblem, pairs: NDArray[np.int64]) -> Matrix:
+def difference_covariances(problem: GraphProblem, pairs: NDArray[np.int64]) -> Matrix:
     """Cov(ξ_j − ξ_i, ξ_b − ξ_a), (P, P, k, k), at [(a, b), (i, j)], of the left twists of pairs (P, 2) of poses.
 
     By the factor of H, as far as it concerns these poses.
@@ -45,19 +46,19 @@ def difference_covariances(problem: BetweenProblem, pairs: NDArray[np.int64]) ->
     return np.ascontiguousarray(joint.transpose(2, 0, 1, 3))
 
 
-def inverse_blocks(problem: BetweenProblem) -> Matrix:
+def inverse_blocks(problem: GraphProblem) -> Matrix:
     """Blocks (…, k, k) of H⁻¹ where H may be nonzero, and a last one of zeros, found by −1, of the fixed poses."""
     blocks = problem.packing.blocks(problem.cholesky.inverse_blocks())
     return np.concatenate([blocks, np.zeros((1, *blocks.shape[1:]))])
 
 
-def edge_covariances(problem: BetweenProblem, blocks: Matrix) -> Matrix:
+def edge_covariances(problem: GraphProblem, blocks: Matrix) -> Matrix:
     """Cov(ξ_j − ξ_i), (E, k, k), of the left twists of the ends of every edge, of these ``inverse_blocks``."""
     i, j, pair = problem.slots.T
     return blocks[i] + blocks[j] - blocks[pair] - np.swapaxes(blocks[pair], 1, 2)
 
 
-def displacements(problem: BetweenProblem, poses: Matrix, weight: NDArray[np.float64], changes: Matrix) -> Matrix:
+def displacements(problem: GraphProblem, poses: Matrix, weight: NDArray[np.float64], changes: Matrix) -> Matrix:
     """Changes (G, K, k) of all poses, to first order, where the measured motions T_ij become T_ij exp(change).
 
     changes : (G, E, k) twists in the frame of j. The left twists ξ of the poses solve H ξ = Σ w JᵀΩ change;
@@ -70,7 +71,7 @@ def displacements(problem: BetweenProblem, poses: Matrix, weight: NDArray[np.flo
     return result
 
 
-def pose_errors(problem: BetweenProblem, poses: Matrix, count: int, seed: int) -> NDArray[np.float64]:
+def pose_errors(problem: GraphProblem, poses: Matrix, count: int, seed: int) -> NDArray[np.float64]:
     """Errors (count, K, k) of all poses, drawn from their joint distribution; those of fixed poses are zero.
 
     Of the linearized problem with H = Uᵀ U: left twists ξ = U⁻¹ z of independent normal z move a position t by
@@ -85,7 +86,7 @@ def pose_errors(problem: BetweenProblem, poses: Matrix, count: int, seed: int) -
     return errors
 
 
-def _moved(problem: BetweenProblem, poses: Matrix, packed: NDArray[np.float64]) -> Matrix:
+def _moved(problem: GraphProblem, poses: Matrix, packed: NDArray[np.float64]) -> Matrix:
     """(n, k) changes of position and orientation of the free poses, moved by left twists."""
     d = poses.shape[-1] - 1
     twists = problem.packing.spread_rows(packed)

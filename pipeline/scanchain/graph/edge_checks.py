@@ -11,8 +11,9 @@ from scanchain import lie
 from scanchain.checks import LARGEST
 from scanchain.data import Matrix
 from scanchain.errors import InputError, counted
-from scanchain.graph.between import BetweenProblem
 from scanchain.graph.cholesky import SingularMatrixError
+from scanchain.graph.factors import ORIGIN
+from scanchain.graph.problem import GraphProblem
 from scanchain.kernels.geometry import largest_magnitude
 
 _MOST = 100  # largest number of directions of the null space that are computed
@@ -29,7 +30,7 @@ def free_text(names: NDArray[np.int64]) -> str:
 
 
 def free_poses(
-    problem: BetweenProblem,
+    problem: GraphProblem,
     poses: Matrix,
     weights: NDArray[np.float64],
     ranks: NDArray[np.int64],
@@ -89,7 +90,7 @@ def _shares(information: Matrix) -> Matrix:
     return result
 
 
-def own_equations(problem: BetweenProblem, poses: Matrix, information: Matrix) -> NDArray[np.float64]:
+def own_equations(problem: GraphProblem, poses: Matrix, information: Matrix) -> NDArray[np.float64]:
     """Block values of H = Σ JᵀΩJ, with Ω (E, k, k), over twists of every pose in its own frame, T exp(ξ)."""
     jacobian, adjoint = problem.jacobians(poses, problem.errors(poses)), lie.adjoint(poses)
     i, j = problem.edges.T
@@ -103,9 +104,20 @@ _NO_INFORMATION = 1e-9  # eigenvalue of a matrix of unit diagonal up to which a 
 _ROUNDING = 1e-6  # share of the largest entry that a negative eigenvalue may have, from printed digits
 
 
-def check_edges(edges: NDArray[np.int64], measurements: Matrix, information: Matrix, pose_count: int) -> None:
-    """Refuse edges to unknown poses, from a pose to itself, or with impossible numbers."""
-    is_known = ((edges >= 0) & (edges < pose_count)).all(axis=1)
+def check_edges(
+    edges: NDArray[np.int64],
+    measurements: Matrix,
+    information: Matrix,
+    pose_count: int,
+    *,
+    with_origin: bool = False,
+) -> None:
+    """Refuse edges to unknown poses, from a pose to itself, or with impossible numbers.
+
+    with_origin : whether they may begin at the origin of the world
+    """
+    least = np.array([ORIGIN if with_origin else 0, 0])
+    is_known = ((edges >= least) & (edges < pose_count)).all(axis=1)
     is_sound = positive_semidefinite(information)
     largest = max(largest_magnitude(each.reshape(-1, each.shape[-1])) for each in (measurements, information))
     if is_known.all() and is_sound.all() and largest <= LARGEST and (edges[:, 0] != edges[:, 1]).all():

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.config import GraphConfig
 from scanchain.data import REJECTED_WEIGHT, Matrix
-from scanchain.graph.between import BetweenProblem
 from scanchain.graph.consistency import apart
 from scanchain.graph.covariance import difference_covariances, edge_covariances, inverse_blocks, responses
 from scanchain.graph.initialize import Initialization
@@ -30,6 +29,7 @@ from scanchain.graph.odometry_errors import (
     spread,
 )
 from scanchain.graph.optimization import Since, solve
+from scanchain.graph.problem import GraphProblem
 
 _LARGE = 2000  # edges of odometry from which on groups of loop edges are judged once, under the last explanation
 _FEWEST = 2  # least number of loop edges left out, none near another, that are to be explained
@@ -48,7 +48,7 @@ _ROUNDS = 3  # of the least squares over the loop edges that one explains
 class Explained:
     """The minimum of the problem under an explanation."""
 
-    problem: BetweenProblem
+    problem: GraphProblem
     minimum: Minimum
     explanation: Explanation
 
@@ -58,14 +58,13 @@ class Explainer:
     """Optimizes a graph with explanations that lower the cost by more than they cost themselves.
 
     problem_of : the problem under an explanation
-    measured, information, is_loop : (E, ...) of all edges, as added
+    measured, information : (E, ...) of all edges, as added
     jumps : whether to look for jumps rather than for a drift, which is one of all odometry
     """
 
-    problem_of: Callable[[Explanation], BetweenProblem]
+    problem_of: Callable[[Explanation], GraphProblem]
     measured: Matrix
     information: Matrix
-    is_loop: NDArray[np.bool_]
     config: GraphConfig
     jumps: bool
 
@@ -79,13 +78,13 @@ class Explainer:
         if since is not None and self.config.robust == "truncated":
             return self._solved(explanation, poses, initialize, since=since)
         best = first = self._solved(explanation, poses, initialize)
-        explains = not len(best.problem.sightings)
+        explains = not best.problem.has_landmarks
         for _ in range(_MAX_STEPS):
             better = self._better(best) if explains and best.minimum.price else best
             if better is best:
                 break
             best = better
-        if best is not first and self._is_large:
+        if best is not first and self._is_large(best):
             best = self._solved(best.explanation, best.minimum.estimate.poses, "given")
         return best
 
@@ -93,7 +92,7 @@ class Explainer:
         """The same under the most promising explanation that lowers the cost; itself where none does."""
         price, poses = best.minimum.price, best.minimum.estimate.poses
         for explanation in self._candidates(best):
-            trial = self._solved(explanation, poses, "given", groups=not self._is_large)
+            trial = self._solved(explanation, poses, "given", groups=not self._is_large(best))
             if self._cost(trial, price) < self._cost(best, price) - _SETTLED * price:
                 return trial
         return best
@@ -102,10 +101,10 @@ class Explainer:
         """Explanations that may lower the cost, those that promise most first."""
         problem, now, price = best.problem, best.explanation, best.minimum.price
         kept = best.minimum.weights > REJECTED_WEIGHT
-        rejected = np.flatnonzero(~kept)
+        rejected = np.flatnonzero(problem.is_loop & ~kept)
         if len(rejected) < _FEWEST or len(apart(problem.edges, rejected)) < _FEWEST:
             return []
-        odometry = odometry_of(problem.edges, self.is_loop)
+        odometry = odometry_of(problem.edges, problem.is_odometry)
         left_out = LeftOut(problem, best.minimum.estimate.poses, odometry, kept)
         found: list[tuple[float, Explanation]] = []
         if not self.jumps and (now.drift.any() or len(rejected) > FEWEST):
@@ -130,19 +129,20 @@ class Explainer:
         groups: bool = True,
     ) -> Explained:
         problem = self.problem_of(explanation)
-        minimum = solve(problem, poses, self.is_loop, self.config, initialize, since, groups=groups)
+        minimum = solve(problem, poses, self.config, initialize, since, groups=groups)
         return Explained(problem, minimum, explanation)
 
     def _cost(self, explained: Explained, price: float) -> float:
         """Cost of a minimum at this price of a loop edge, and of its explanation."""
-        minimum, odometry = explained.minimum, odometry_of(explained.problem.edges, self.is_loop)
+        minimum, problem = explained.minimum, explained.problem
+        odometry = odometry_of(problem.edges, problem.is_odometry)
         kept = minimum.weights > REJECTED_WEIGHT
         own = explained.explanation.cost(self.measured[odometry], self.information[odometry], price, self._nominal)
         return float(minimum.estimate.chi2[kept].sum()) + price * int((~kept).sum()) + own
 
-    @property
-    def _is_large(self) -> bool:
-        return int((~self.is_loop).sum()) >= _LARGE
+    @staticmethod
+    def _is_large(explained: Explained) -> bool:
+        return int(explained.problem.is_odometry.sum()) >= _LARGE
 
     @property
     def _nominal(self) -> float:
@@ -166,12 +166,10 @@ class LeftOut:
     """
 
     def __init__(
-        self, problem: BetweenProblem, poses: Matrix, odometry: NDArray[np.int64], kept: NDArray[np.bool_]
+        self, problem: GraphProblem, poses: Matrix, odometry: NDArray[np.int64], kept: NDArray[np.bool_]
     ) -> None:
         """Those of a minimum with the edges kept (E,)."""
-        is_loop = np.ones(len(kept), np.bool_)
-        is_loop[odometry] = False
-        edges = apart(problem.edges, np.flatnonzero(is_loop & ~kept))
+        edges = apart(problem.edges, np.flatnonzero(problem.is_loop & ~kept))
         most = min(_MOST_LEFT_OUT, _MOST_ENTRIES // (max(len(odometry), 1) * problem.freedom**2))
         self.stride = max(1, -(-len(edges) // max(most, 1)))
         self.problem, self.odometry, self.edges = problem, odometry, edges[:: self.stride]

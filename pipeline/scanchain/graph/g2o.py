@@ -19,6 +19,7 @@ from scanchain.data import Matrix, brief
 from scanchain.errors import InputError, counted, shown
 from scanchain.files import write_whole
 from scanchain.graph.edge_checks import nearest_semidefinite, positive_semidefinite, skip_poses
+from scanchain.graph.factors import Position, Prior
 from scanchain.graph.initialize import follow_odometry
 from scanchain.graph.pose_graph import PoseGraph
 
@@ -60,6 +61,12 @@ TAGS = {
     "VERTEX3": Tag(3, 1, tuple(range(6)), is_toro=True),
     "EDGE3": Tag(3, 2, (*range(6), *range(7, 28)), is_toro=True),
 }
+PRIOR_TAGS = {  # of edges from the origin; in space the vertex is followed by the number of a sensor's offset
+    "EDGE_PRIOR_SE2": Tag(2, 1, tuple(range(9))),
+    "EDGE_PRIOR_SE2_XY": Tag(2, 1, (0, 1, 3, 4, 6)),
+    "EDGE_SE3_PRIOR": Tag(3, 2, tuple(range(28))),
+}
+_NO_OFFSET = "PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1"
 _WIDTHS = {(2, 1): 3, (2, 2): 9, (3, 1): 7, (3, 2): 28}  # numbers of a whole line, by dimension and ids
 
 
@@ -113,7 +120,8 @@ class Lines:
     """Content of a file; a line that cannot be understood is an error that names it.
 
     dimension : 2 or 3
-    vertices, edges : their lines; fixed : line and vertex id (n, 2) of every pose that is held
+    vertices, edges, priors : their lines, those of priors with the vertex twice
+    fixed : line and vertex id (n, 2) of every pose that is held
     others : lines of other tags
     note : as of ``G2oFile``
     rotation : of which the information is, by the comment that ``write_g2o`` writes
@@ -124,7 +132,7 @@ class Lines:
         self.rotation: Rotation = "vector"
         self.others, self.note = list[str](), ""
         comments: dict[str, Rotation] = {comment: name for name, comment in ROTATION_COMMENT.items()}
-        fixed, rows = list[tuple[int, int]](), list[tuple[int, Tag, list[int], list[float]]]()
+        fixed, rows, priors = list[tuple[int, int]](), list[_Row](), list[_Row]()
         for number, line in enumerate(self._text().splitlines(), start=1):
             words = line.split()
             if words[:1] == ["FIX"]:
@@ -133,11 +141,16 @@ class Lines:
                 self.rotation = comments[line]
             elif words and words[0] in TAGS:
                 rows.append((number, TAGS[words[0]], *self._parsed(number, words)))
+            elif words and words[0] in PRIOR_TAGS:
+                (vertex, *offset), numbers = self._parsed(number, words)
+                self._check_offset(number, offset)
+                priors.append((number, PRIOR_TAGS[words[0]], [vertex, vertex], numbers))
             elif words:
                 self.others.append(line)
         self.fixed = np.array(fixed, np.int64).reshape(-1, 2)
         rows.sort(key=lambda row: row[1].is_point)
         self.vertices, self.edges = (self._whole([row for row in rows if row[1].ids == n], n) for n in (1, 2))
+        self.priors = self._whole(priors, 2)
         if not len(self.edges.lines):
             raise InputError(f"{path}: holds no EDGE_SE2 and no EDGE_SE3:QUAT line; is it a g2o pose graph?")
 
@@ -185,7 +198,7 @@ class Lines:
 
     def _parsed(self, line: int, words: list[str]) -> tuple[list[int], list[float]]:
         """Vertex ids and numbers of a line."""
-        name, tag = words[0], TAGS[words[0]]
+        name, tag = words[0], (TAGS | PRIOR_TAGS)[words[0]]
         if self.dimension not in (0, tag.dimension):
             raise self.error(line, f"{name} in an SE({self.dimension}) graph; keep to one dimension a file")
         self.dimension = tag.dimension
@@ -203,6 +216,15 @@ class Lines:
             raise self.error(line, f"{fault}; write meters and radians, and an inverse covariance of these")
         return ids, numbers
 
+    def _check_offset(self, line: int, offset: list[int]) -> None:
+        """Refuse a prior of a sensor that is not at the vertex itself, by the PARAMS lines above."""
+        for words in map(str.split, self.others):
+            is_its = words[:2] == ["PARAMS_SE3OFFSET", *map(str, offset)]
+            if is_its and words[2:8] != _NO_OFFSET.split()[2:8] and list(map(float, words[2:8])) != [0.0] * 6:
+                raise self.error(
+                    line, "EDGE_SE3_PRIOR with an offset of the sensor; give it for the vertex itself"
+                )
+
     def _vertex_id(self, line: int, tag: str, word: str) -> int:
         try:
             return int(np.int64(word))
@@ -210,7 +232,7 @@ class Lines:
             text = f"{tag}: vertex id {shown(word)} is no whole number of 64 bits; write 0, 1, 2, ..."
             raise self.error(line, text) from None
 
-    def _whole(self, rows: list[tuple[int, Tag, list[int], list[float]]], ids: int) -> Rows:
+    def _whole(self, rows: list[_Row], ids: int) -> Rows:
         """Vertices or edges as whole lines."""
         numbers = np.zeros((len(rows), _WIDTHS.get((self.dimension, ids), 0)))
         for tag in {row[1] for row in rows}:
@@ -230,6 +252,7 @@ class Lines:
         return Rows(lines, np.array([row[2] for row in rows], np.int64).reshape(-1, ids), numbers, is_point)
 
 
+_Row = tuple[int, Tag, list[int], list[float]]  # line, tag, vertex ids, numbers
 TORO_SUFFIXES = (".graph", ".toro")
 GRAPH_SUFFIXES = (".g2o", *TORO_SUFFIXES)
 
@@ -259,6 +282,7 @@ def write_g2o(
         package, GTSAM and published graphs have it, or "quaternion" for the vector part of the unit quaternion,
         half as long, as g2o itself has it
     force : whether a file that is there is replaced; else InputError, as for a graph with points in TORO
+    Warns of edges of factors of one's own, which the format lacks.
     """
     checks.instance(graph, PoseGraph, "graph", "read_g2o(path).graph")
     checks.one_of(rotation, get_args(Rotation), "rotation")
@@ -266,10 +290,13 @@ def write_g2o(
     is_toro = path.suffix in TORO_SUFFIXES
     if is_toro and graph.is_point.any():
         raise InputError(f"{path}: TORO has no points, and the graph has {graph.is_point.sum()}; write .g2o")
+    if is_toro and graph.is_of_origin.any():
+        raise InputError(f"{path}: TORO has no priors, and the graph has {graph.is_of_origin.sum()}; write .g2o")
     names = np.arange(len(graph)) if ids is None else ids
     has_quaternions = d == 3 and not is_toro
     chosen = graph.is_rejected if edges == "rejected" else ~graph.is_rejected
-    pairs = graph.edges[chosen]
+    chosen = _written(path, graph, chosen)
+    pairs, is_prior = graph.edges[chosen], graph.is_of_origin[chosen]
     units = lie.by_component(graph.freedom, 1.0, 2.0 if has_quaternions and rotation == "quaternion" else 1.0)
     weight = np.ones(len(pairs)) if edges == "rejected" else graph.weight[chosen]
     information = weight[:, None, None] * (graph.information[chosen] * np.outer(units, units))
@@ -278,9 +305,32 @@ def write_g2o(
     lines = [ROTATION_COMMENT[rotation]] if has_quaternions else []
     lines += write_lines(d, names[:, None], _numbers(graph.poses), graph.is_point, is_toro=is_toro)
     lines += [f"FIX {names[index]}" for index in graph.held]
-    lines += write_lines(d, names[pairs], of_edges, graph.is_point[pairs[:, 1]], is_toro=is_toro)
+    between, of_one = pairs[~is_prior], of_edges[is_prior]
+    lines += write_lines(d, names[between], of_edges[~is_prior], graph.is_point[between[:, 1]], is_toro=is_toro)
+    lines += _prior_lines(d, names[pairs[is_prior, 1]], of_one, information[is_prior])
     with checks.writing(path, force=force):
         write_whole(path, "\n".join([*lines, *other_lines, ""]).encode())
+
+
+def _written(path: Path, graph: PoseGraph, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The chosen edges (E,) that the format has."""
+    left_out = chosen & graph.is_custom
+    if left_out.any():
+        text = (
+            f"{path}: g2o has no tag for {counted(int(left_out.sum()), 'edge')} of factors of one's own; left out"
+        )
+        warnings.warn(text, stacklevel=3)
+    return chosen & ~graph.is_custom
+
+
+def _prior_lines(d: int, names: NDArray[np.int64], numbers: Matrix, information: Matrix) -> list[str]:
+    """Lines of priors (n,) on whole poses or, where Ω has no rotation, on positions."""
+    lines = [_NO_OFFSET] if d == 3 and len(names) else []
+    for name, row, omega in zip(names.tolist(), numbers.tolist(), information, strict=True):
+        tag = "EDGE_SE3_PRIOR" if d == 3 else "EDGE_PRIOR_SE2" if omega[d:].any() else "EDGE_PRIOR_SE2_XY"
+        ids = [str(name), "0"][: PRIOR_TAGS[tag].ids]
+        lines.append(" ".join([tag, *ids, *(repr(row[column]) for column in PRIOR_TAGS[tag].columns)]))
+    return lines
 
 
 def _numbers(poses: Matrix) -> Matrix:
@@ -376,13 +426,8 @@ def read_g2o(
         i, j = edges.ids[bad]
         raise lines.error(edges.lines[bad], f"edge {i}-{j} joins a vertex to itself; remove it")
     fixed = lines.indices(lines.fixed[:, 0], lines.fixed[:, 1:], ids)[:, 0]
-    measurements, k = lines.poses(edges), 3 if dimension == 2 else 6
-    information = np.zeros((len(pairs), k, k))
-    a, b = np.triu_indices(k)
-    information[:, a, b] = information[:, b, a] = edges.numbers[:, -len(a) :]
-    if dimension == 3 and (rotation or lines.rotation) == "quaternion":
-        units = lie.by_component(6, 1.0, 0.5)
-        information *= np.outer(units, units)
+    is_quaternion = dimension == 3 and (rotation or lines.rotation) == "quaternion"
+    measurements, information = lines.poses(edges), _information(edges, dimension, is_quaternion=is_quaternion)
     projection = _project(lines, information, indefinite)
     has_guess = bool(len(lines.vertices.lines))
     if not has_guess:
@@ -398,12 +443,31 @@ def read_g2o(
         graph.add_point(pose[:-1, -1], stamp) if point else graph.add_pose(pose, stamp)
     is_robust = (loops == "robust") & skip_poses(pairs, is_point)
     graph.add_edges(pairs, measurements, information, is_robust)
+    priors, of_priors = lines.priors, _information(lines.priors, dimension, is_quaternion=is_quaternion)
+    seen = lines.indices(priors.lines, priors.ids, ids)[:, 1].tolist()
+    for index, Z, omega in zip(seen, lines.poses(priors), of_priors, strict=True):
+        if omega[dimension:].any():
+            graph.add_factor(Prior(), index, omega, Z)
+        else:
+            graph.add_factor(Position(), index, omega[:dimension, :dimension], Z)
     for index in fixed.tolist():
         graph.fix(index)
     note = f"{path}: {left_out} not understood: in neither χ² nor certificate nor covariances" if left_out else ""
     for text in filter(None, (lines.note, note)):
         warnings.warn(text, stacklevel=2)
     return G2oFile(graph, ids, tuple(lines.others), has_guess, projection, lines.note)
+
+
+def _information(rows: Rows, dimension: int, *, is_quaternion: bool) -> Matrix:
+    """Information (n, k, k) that rows of edges end with."""
+    k = 3 if dimension == 2 else 6
+    information = np.zeros((len(rows.lines), k, k))
+    a, b = np.triu_indices(k)
+    information[:, a, b] = information[:, b, a] = rows.numbers[:, -len(a) :]
+    if is_quaternion:
+        units = lie.by_component(6, 1.0, 0.5)
+        information *= np.outer(units, units)
+    return information
 
 
 def _project(lines: Lines, information: Matrix, indefinite: Indefinite) -> Projection | None:

@@ -12,8 +12,8 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
 from scanchain import lie
 from scanchain.data import Matrix
-from scanchain.graph.between import BetweenProblem
 from scanchain.graph.cholesky import BlockPattern, SingularMatrixError, SparseCholesky
+from scanchain.graph.problem import GraphProblem
 
 Initialization = Literal["auto", "given", "odometry", "spanning-tree", "chordal"]
 
@@ -21,7 +21,7 @@ _GOOD_GUESS = 2.0  # χ² per degree of freedom up to which the given poses need
 
 
 def first_guess(
-    problem: BetweenProblem, poses: Matrix, initialize: Initialization, *, outlier_free: bool
+    problem: GraphProblem, poses: Matrix, initialize: Initialization, *, outlier_free: bool
 ) -> tuple[Matrix, Initialization]:
     """Initial poses, and the method that they come from.
 
@@ -31,7 +31,8 @@ def first_guess(
     fixed, to_point = problem.variable < 0, np.asarray(problem.is_point[problem.edges].any(axis=1))
     if initialize in ("odometry", "spanning-tree"):
         follow = follow_odometry if initialize == "odometry" else follow_spanning_tree
-        chained = follow(poses, fixed, problem.edges[~to_point], problem.measurements[~to_point])
+        whole = problem.is_whole
+        chained = follow(poses, fixed, problem.edges[whole], problem.measurements[whole])
         return _with_points(problem, chained, to_point), initialize
     if initialize == "chordal":
         return relax_chordally(problem, poses), initialize
@@ -52,7 +53,7 @@ def first_guess(
     return guess, "given"
 
 
-def _with_points(problem: BetweenProblem, poses: Matrix, to_point: NDArray[np.bool_]) -> Matrix:
+def _with_points(problem: GraphProblem, poses: Matrix, to_point: NDArray[np.bool_]) -> Matrix:
     """Poses with every free point where it is seen from its poses, on average, by these edges (E,)."""
     i, j = problem.edges[to_point].T
     total = np.zeros(poses.shape)
@@ -101,15 +102,15 @@ def _pairs(i: NDArray[np.int64], j: NDArray[np.int64], count: int) -> NDArray[np
     return np.minimum(i, j) * count + np.maximum(i, j)
 
 
-def relax_chordally(problem: BetweenProblem, poses: Matrix) -> Matrix:
+def relax_chordally(problem: GraphProblem, poses: Matrix) -> Matrix:
     """Poses (K, d+1, d+1) from two linear least-squares problems (Martinec & Pajdla 2007; Carlone et al. 2015).
 
     Rotations: minimize Σ κ ‖R_j − R_i R_z‖² over any matrices, then take the nearest rotation of each.
     Translations: minimize Σ τ ‖t_j − t_i − R_i t_z‖². κ and τ are the mean rotational and translational
-    information of the edge. The problem's fixed poses stay where ``poses`` has them.
+    information of the edge, none of factors of one's own. The problem's fixed poses stay where ``poses`` has them.
     """
     d = poses.shape[-1] - 1
-    Z, information = problem.measurements, problem.information
+    Z, information = problem.measurements, problem.is_bounded[:, None, None] * problem.information
     result = poses.copy()
     kappa = np.trace(information[:, d:, d:], axis1=1, axis2=2)
     R_z_t = np.swapaxes(Z[:, :d, :d], 1, 2)
@@ -125,7 +126,7 @@ def relax_chordally(problem: BetweenProblem, poses: Matrix) -> Matrix:
 
 
 def _least_squares(
-    problem: BetweenProblem, A: Matrix, weight: NDArray[np.float64], offset: Matrix, known: Matrix
+    problem: GraphProblem, A: Matrix, weight: NDArray[np.float64], offset: Matrix, known: Matrix
 ) -> Matrix:
     """X (K, b, m) that minimizes Σ w ‖X_j − A X_i − c‖², with A (E, b, b) orthogonal and X given where fixed.
 

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from scanchain.data import Matrix
 from scanchain.errors import counted
-from scanchain.graph.between import BetweenProblem
 from scanchain.graph.cholesky import SingularMatrixError
 from scanchain.graph.initialize import Initialization
 from scanchain.graph.losses import InlierSet, RobustLoss
+from scanchain.graph.problem import GraphProblem
 
 Loss = RobustLoss | InlierSet
 
@@ -55,15 +55,12 @@ class Minimum:
 
 
 class Minimizer:
-    """Minimizes Σ χ² of the quadratic edges plus Σ ρ(χ²) of loop edges, with one step rule throughout."""
+    """Minimizes Σ χ² of the quadratic edges plus Σ ρ(χ²) of robust ones, with one step rule throughout."""
 
-    def __init__(
-        self, problem: BetweenProblem, is_loop: NDArray[np.bool_], optimizer: Optimizer, limits: Limits
-    ) -> None:
-        """Loop edges (E,) bool get the robust loss; the others stay quadratic."""
+    def __init__(self, problem: GraphProblem, optimizer: Optimizer, limits: Limits) -> None:
         self.problem, self.limits = problem, limits
         self.optimizer: Optimizer = optimizer
-        self.is_loop, self.loops = is_loop, np.flatnonzero(is_loop)
+        self.robust = np.flatnonzero(problem.is_robust)
         self._rule = step_rule(optimizer)
 
     def evaluate(self, poses: Matrix, loss: Loss) -> Evaluation:
@@ -78,12 +75,12 @@ class Minimizer:
 
     def restricted(self, kept: NDArray[np.bool_]) -> Minimizer:
         """The same with a subset of the edges, kept (E,)."""
-        return Minimizer(self.problem.restricted(kept), self.is_loop[kept], self.optimizer, self.limits)
+        return Minimizer(self.problem.restricted(kept), self.optimizer, self.limits)
 
     def weights(self, chi2: NDArray[np.float64], loss: Loss) -> NDArray[np.float64]:
         """Robust weight of every edge, (E,); 1 for the quadratic ones."""
         result = np.ones(len(chi2))
-        result[self.loops] = loss.weight(chi2[self.loops])
+        result[self.robust] = loss.weight(chi2[self.robust])
         return result
 
     def descend(self, now: Evaluation, loss: Loss, limits: Limits | None = None) -> Minimum:
@@ -111,10 +108,10 @@ class Minimizer:
         return LocalModel(equations.gradient, diagonal, solve, partial(problem.pattern.multiply, equations.values))
 
     def _cost(self, chi2: NDArray[np.float64], loss: Loss) -> float:
-        if loss.kernel == "none" or not len(self.loops):
+        if loss.kernel == "none" or not len(self.robust):
             return float(chi2.sum())
-        loops = chi2[self.loops]
-        return float(chi2.sum() - loops.sum() + loss.loss(loops).sum())
+        of_robust = chi2[self.robust]
+        return float(chi2.sum() - of_robust.sum() + loss.loss(of_robust).sum())
 
 
 Optimizer = Literal["gauss-newton", "levenberg-marquardt", "gradient-descent"]

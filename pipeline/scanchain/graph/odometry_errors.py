@@ -58,7 +58,7 @@ class Explanation:
         return cls(np.zeros(2 if freedom == 3 else 4))
 
     def applied(
-        self, edges: NDArray[np.int64], measured: Matrix, information: Matrix, is_loop: NDArray[np.bool_]
+        self, edges: NDArray[np.int64], measured: Matrix, information: Matrix, is_odometry: NDArray[np.bool_]
     ) -> tuple[Matrix, Matrix]:
         """Measurements (E, d+1, d+1) without drift, and their information (E, k, k), slips and jumps loosened.
 
@@ -67,7 +67,7 @@ class Explanation:
         """
         if not self.drift.any() and not self.loosened:
             return measured, information
-        odometry = odometry_of(edges, is_loop)
+        odometry = odometry_of(edges, is_odometry)
         of_odometry, Z = information[odometry], measured[odometry]
         for stretch in self.loosened:
             twists = stretch.spread(Z, information[odometry])
@@ -120,9 +120,9 @@ class Explanation:
         return [f"corrected by loop closures: {what}" for what in found]
 
 
-def odometry_of(edges: NDArray[np.int64], is_loop: NDArray[np.bool_]) -> NDArray[np.int64]:
+def odometry_of(edges: NDArray[np.int64], is_odometry: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Edges of odometry (O,), in the order of the poses."""
-    odometry = np.flatnonzero(~is_loop)
+    odometry = np.flatnonzero(is_odometry)
     return odometry[np.argsort(edges[odometry].min(axis=1), kind="stable")]
 
 

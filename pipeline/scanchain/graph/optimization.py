@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from scanchain.config import GraphConfig
 from scanchain.data import REJECTED_WEIGHT, GraphState, Matrix, brief, fit_text
 from scanchain.errors import counted
-from scanchain.graph.between import BetweenProblem
 from scanchain.graph.consistency import Consistency, agreeing_groups
 from scanchain.graph.edge_checks import has_loop, is_connected
 from scanchain.graph.initialize import Initialization, first_guess
 from scanchain.graph.losses import InlierSet, RobustLoss, fair_price, rejection_limit, robust_loss
 from scanchain.graph.minimizer import Evaluation, Limits, Loss, Minimizer, Minimum
+from scanchain.graph.problem import GraphProblem
 
 Rejection = Literal["update", "judge"]
 
@@ -89,31 +89,30 @@ class Optimization:
 
 
 def solve(
-    problem: BetweenProblem,
+    problem: GraphProblem,
     poses: Matrix,
-    is_loop: NDArray[np.bool_],
     config: GraphConfig,
     initialize: Initialization,
     since: Since | None = None,
     *,
     groups: bool = True,
 ) -> Minimum:
-    """Minimize from the chosen guess; fixed poses stay to the bit. Loop edges (E,) bool get the robust loss.
+    """Minimize from the chosen guess; fixed poses stay to the bit.
 
     since : for an update, under the truncated loss; groups : otherwise, as for ``minimize``
     Raises SingularMatrixError where the edges leave a pose free, and the optimizer minds.
     """
-    outlier_free = config.robust == "none" or not is_loop.any()
+    outlier_free = config.robust == "none" or not problem.is_robust.any()
     guess, source = first_guess(problem, poses, initialize, outlier_free=outlier_free)
     joined = np.unique(problem.edges) if len(problem.edges) else slice(None)
     shift = guess[joined, :-1, -1].mean(axis=0)  # left twists turn about the origin: bring it into the middle
     guess[:, :-1, -1] -= shift
     loss = robust_loss(config.robust, config.robust_scale, problem.freedom)
     if since is not None:
-        minimum = update(Minimizer(problem, is_loop, config.optimizer, _LIMITS), guess, loss, since)
+        minimum = update(Minimizer(problem, config.optimizer, _LIMITS), guess, loss, since)
     else:
         limits = Limits(config.max_iterations, config.tolerance)
-        minimum = minimize(Minimizer(problem, is_loop, config.optimizer, limits), guess, loss, groups=groups)
+        minimum = minimize(Minimizer(problem, config.optimizer, limits), guess, loss, groups=groups)
     found = _orthonormal(minimum.estimate.poses)
     found[:, :-1, -1] += shift
     fixed = problem.variable < 0
@@ -135,9 +134,9 @@ def minimize(minimizer: Minimizer, poses: Matrix, loss: RobustLoss, *, groups: b
     Truncated edges are judged by how much each contradicts the others, with ``groups`` also by groups that agree.
     """
     now, used = minimizer.evaluate(poses, loss), 0
-    if len(minimizer.loops):
+    if len(minimizer.robust):
         now, loss, used = _graduate(minimizer, now, loss)
-    if loss.kernel == "truncated" and len(minimizer.loops):
+    if loss.kernel == "truncated" and len(minimizer.robust):
         minimum = _refine(minimizer, now, loss, groups=groups)
     else:
         minimum = minimizer.descend(now, loss)
@@ -152,7 +151,7 @@ def _graduate(minimizer: Minimizer, now: Evaluation, loss: RobustLoss) -> tuple[
     A loss that sharpens is as good as itself once its weights are all 0 or 1.
     """
     used, focus, final = 0, Focus(minimizer), loss
-    for loss in final.graduated(now.chi2[minimizer.loops]):
+    for loss in final.graduated(now.chi2[minimizer.robust]):
         weights = minimizer.weights(now.chi2, loss)
         is_crisp = np.isinf(final.control) and np.all((weights < _CRISP) | (weights > 1.0 - _CRISP))
         if loss == final or is_crisp:
@@ -168,7 +167,7 @@ def _settle_without_outliers(minimizer: Minimizer, minimum: Minimum, loss: Robus
     A loss that does not cut edges off leaves them some weight. They keep it where poses would be loose without.
     """
     problem, limit = minimizer.problem, rejection_limit(loss.scale, minimizer.problem.freedom)
-    rejected = minimizer.is_loop & ((minimum.estimate.chi2 > limit) | (minimum.weights < REJECTED_WEIGHT))
+    rejected = problem.is_robust & ((minimum.estimate.chi2 > limit) | (minimum.weights < REJECTED_WEIGHT))
     if not rejected.any() or not is_connected(problem.edges[~rejected], problem.variable < 0):
         return minimum
     rest = minimizer.restricted(~rejected)
@@ -188,9 +187,9 @@ class Focus:
 
     def __init__(self, minimizer: Minimizer) -> None:
         self._whole = self._chosen = minimizer
-        self._kept = np.ones(len(minimizer.is_loop), np.bool_)
         problem = minimizer.problem
-        self._is_free = is_connected(problem.edges[~minimizer.is_loop], problem.variable < 0)
+        self._kept = np.ones(len(problem.edges), np.bool_)
+        self._is_free = is_connected(problem.edges[~problem.is_robust], problem.variable < 0)
 
     def descend(self, start: Evaluation, loss: Loss, limits: Limits | None = None) -> Minimum:
         """The minimum near these poses, by the edges that have weight there and hardly any other."""
@@ -201,7 +200,7 @@ class Focus:
             self._kept, self._chosen = wanted, whole.restricted(wanted)
         inner = loss
         if isinstance(loss, InlierSet):
-            inner = InlierSet(loss.kept[self._kept[whole.loops]], loss.price)
+            inner = InlierSet(loss.kept[self._kept[whole.robust]], loss.price)
         minimum = self._chosen.descend(self._chosen.evaluate(start.poses, inner), inner, limits)
         estimate = whole.evaluate(minimum.estimate.poses, loss)
         return replace(minimum, estimate=estimate, weights=whole.weights(estimate.chi2, loss))
@@ -209,7 +208,7 @@ class Focus:
 
 def _refine(minimizer: Minimizer, now: Evaluation, loss: RobustLoss, *, groups: bool) -> Minimum:
     """The minimum with the present inliers, and then with those that the other edges do not contradict."""
-    kept, nominal = loss.weight(now.chi2[minimizer.loops]) > 0.5, loss.scale**2
+    kept, nominal = loss.weight(now.chi2[minimizer.robust]) > 0.5, loss.scale**2
     minimum = Focus(minimizer).descend(now, InlierSet(kept, nominal))
     problem = minimizer.problem
     if not is_connected(problem.edges[minimum.weights > 0.5], problem.variable < 0):
@@ -225,7 +224,7 @@ def _refine(minimizer: Minimizer, now: Evaluation, loss: RobustLoss, *, groups: 
 
 def _refine_edges(minimizer: Minimizer, minimum: Minimum, against: NDArray[np.float64], price: float) -> Minimum:
     """The minimum after rounds of changes of single edges, as long as the cost falls; ``against`` (L,) them."""
-    kept, share = minimum.weights[minimizer.loops] > 0.5, 1.0
+    kept, share = minimum.weights[minimizer.robust] > 0.5, 1.0
     for _ in range(_MAX_ROUNDS):
         gain = np.where(kept, against - price, price - against)
         if share < _FEWEST or not (gain > 0.0).any():
@@ -256,7 +255,7 @@ def _refine_groups(minimizer: Minimizer, minimum: Minimum, price: float, limit: 
         tried.add(tuple(group.tolist()))
         kept = minimum.weights > 0.5
         kept[group] ^= True
-        inliers = InlierSet(kept[minimizer.loops], price)
+        inliers = InlierSet(kept[minimizer.robust], price)
         trial = Focus(minimizer).descend(minimum.estimate, inliers)
         against = _against(minimizer, trial, price)
         trial = _refine_edges(minimizer, trial, against, price)
@@ -271,15 +270,15 @@ def _next_group(
     minimizer: Minimizer, minimum: Minimum, price: float, limit: float, tried: set[tuple[int, ...]]
 ) -> NDArray[np.int64]:
     """The group whose change promises the largest fall of the cost; none where no group of edges is left out."""
-    problem, poses, is_loop = minimizer.problem, minimum.estimate.poses, minimizer.is_loop
+    problem, poses = minimizer.problem, minimum.estimate.poses
     kept = minimum.weights > 0.5
     best, most = np.empty(0, np.int64), 0.0
-    out = agreeing_groups(problem, poses, is_loop, is_loop & ~kept, limit)
+    out = agreeing_groups(problem, poses, ~kept, limit)
     if not out:
         return best
     consistency = Consistency(problem, poses, kept)
     against = consistency.of_each(price)
-    for group in (*out, *agreeing_groups(problem, poses, is_loop, is_loop & kept, limit)):
+    for group in (*out, *agreeing_groups(problem, poses, kept, limit)):
         is_kept, worth, rest = bool(kept[group[0]]), price * len(group), kept.copy()
         rest[group] = False
         if tuple(group.tolist()) in tried or (not is_kept and against[group].max() > worth):
@@ -296,7 +295,7 @@ def _next_group(
 def _against(minimizer: Minimizer, minimum: Minimum, price: float) -> NDArray[np.float64]:
     """Cost of every loop edge in the χ² of the others, (L,)."""
     kept = minimum.weights > 0.5
-    return Consistency(minimizer.problem, minimum.estimate.poses, kept).of_each(price)[minimizer.loops]
+    return Consistency(minimizer.problem, minimum.estimate.poses, kept).of_each(price)[minimizer.robust]
 
 
 def update(minimizer: Minimizer, poses: Matrix, loss: RobustLoss, since: Since) -> Minimum:
@@ -306,8 +305,8 @@ def update(minimizer: Minimizer, poses: Matrix, loss: RobustLoss, since: Since) 
     may agree with it all the same. New ones and groups of them that do are taken in where the cost falls.
     """
     minimum = Focus(minimizer).descend(minimizer.evaluate(poses, loss), loss)
-    left_out = minimizer.is_loop & (minimum.weights < 0.5)
     problem = minimizer.problem
+    left_out = problem.is_robust & (minimum.weights < 0.5)
     if not left_out[since.updated :].any() or not is_connected(problem.edges[~left_out], problem.variable < 0):
         return minimum
     promising = _promising(minimizer, minimum, loss.scale**2, since)
@@ -315,7 +314,7 @@ def update(minimizer: Minimizer, poses: Matrix, loss: RobustLoss, since: Since) 
         return minimum
     kept = ~left_out
     kept[np.concatenate(promising)] = True
-    inliers = InlierSet(kept[minimizer.loops], loss.scale**2)
+    inliers = InlierSet(kept[minimizer.robust], loss.scale**2)
     trial = Focus(minimizer).descend(minimum.estimate, inliers)
     used = minimum.iterations + trial.iterations
     trial = Focus(minimizer).descend(trial.estimate, loss)
@@ -326,9 +325,9 @@ def update(minimizer: Minimizer, poses: Matrix, loss: RobustLoss, since: Since) 
 def _promising(minimizer: Minimizer, minimum: Minimum, limit: float, since: Since) -> list[NDArray[np.int64]]:
     """New edges left out with which the cost falls to first order, alone or as groups that agree."""
     problem, poses, kept = minimizer.problem, minimum.estimate.poses, minimum.weights > 0.5
-    left_out = minimizer.is_loop & ~kept
+    left_out = problem.is_robust & ~kept
     left_out[: since.judged] = False
-    groups = agreeing_groups(problem, poses, minimizer.is_loop, left_out, limit)
+    groups = agreeing_groups(problem, poses, left_out, limit)
     for group in groups:
         left_out[group] = False
     consistency = Consistency(problem, poses, kept)

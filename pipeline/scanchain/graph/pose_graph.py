@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,6 @@ from scanchain.clock import working_s
 from scanchain.config import GraphConfig
 from scanchain.data import REJECTED_WEIGHT, GraphState, Matrix, Pose
 from scanchain.errors import InputError, counted
-from scanchain.graph.between import BetweenProblem
 from scanchain.graph.certificate import Certificate, certify
 from scanchain.graph.cholesky import SingularMatrixError
 from scanchain.graph.covariance import difference_covariances, displacements, inverse_blocks, pose_errors
@@ -28,10 +27,12 @@ from scanchain.graph.edge_checks import (
     weakly_joined,
 )
 from scanchain.graph.explanation import Explainer
+from scanchain.graph.factors import FACTORS, LOOPS, ODOMETRY, ORIGIN, Factor, kinds_of, of_residuals
 from scanchain.graph.growing_array import GrowingArray
 from scanchain.graph.initialize import Initialization
 from scanchain.graph.odometry_errors import Explanation, Loosened, corrected, odometry_of
 from scanchain.graph.optimization import Optimization, Rejection, Since
+from scanchain.graph.problem import GraphProblem
 
 
 class PoseGraph:
@@ -40,7 +41,8 @@ class PoseGraph:
     Every covariance and information matrix, given or returned, is that of a right twist, T exp(ξ): in the pose's
     own frame, (translation, rotation). ``Match.information`` is one, so that it serves an edge as it is.
 
-    The gauge is fixed by holding pose 0, or those given to ``fix``, where they are.
+    The gauge is fixed by holding pose 0, or those given to ``fix``, where they are; in a graph with factors of
+    single poses, which hang on the origin of the world, by that.
     """
 
     def __init__(self, dimension: int, names: NDArray[np.int64] | None = None, left_out: str = "") -> None:
@@ -54,21 +56,22 @@ class PoseGraph:
         pose, k = (dimension + 1, dimension + 1), self.freedom
         self._poses, self._stamps_ns = GrowingArray(pose, np.float64), GrowingArray((), np.int64)
         self._edges, self._measurements = GrowingArray((2,), np.int64), GrowingArray(pose, np.float64)
-        self._information, self._is_loop = GrowingArray((k, k), np.float64), GrowingArray((), np.bool_)
+        self._information, self._kind = GrowingArray((k, k), np.float64), GrowingArray((), np.int64)
+        self._factors: list[Factor] = list(FACTORS)
         self._weight, self._is_point = GrowingArray((), np.float64), GrowingArray((), np.bool_)
         self._rank = GrowingArray((), np.int64)
         self._fixed: set[int] = set()
         self.since = Since(0, 0)
         self.work = 0.0  # multiplications that the factorizations of the last optimization took
         self._explanation = Explanation.none(k)
-        self._problem: BetweenProblem | None = None
+        self._problem: GraphProblem | None = None
         self._factor_is_now = False
 
     def __len__(self) -> int:
         return len(self._poses)
 
     def __repr__(self) -> str:
-        loops = self.is_loop | skip_poses(self.edges, self.is_point)
+        loops = self.is_loop | (skip_poses(self.edges, self.is_point) & ~self.is_of_origin)
         edges = f"{counted(len(self.edges), 'edge')}, {loops.sum():,} of them loops"
         without = f"; without {self.left_out}" if self.left_out else ""
         return f"PoseGraph({counted(len(self), 'pose')} of SE({self.dimension}), {edges}{without})"
@@ -93,7 +96,7 @@ class PoseGraph:
 
     @property
     def edges(self) -> NDArray[np.int64]:
-        """Pose pairs (i, j), (E, 2), in the order they were added."""
+        """Pose pairs (i, j), (E, 2), in the order they were added; i is ``ORIGIN``, −1, of factors of one pose."""
         return self._edges.rows
 
     @property
@@ -118,8 +121,8 @@ class PoseGraph:
         """Drift, slips and jumps in words, a line each; ``names`` (K,) number the poses for the reader."""
         if not self.drift.any() and not self.loosened:
             return []
-        odometry = odometry_of(self.edges, self.is_loop)
-        errors = self._prepared().errors(self.poses)[odometry]
+        odometry = odometry_of(self.edges, self.is_odometry)
+        errors = self._prepared().errors(self._vertices)[odometry]
         arrays = self._measurements.rows[odometry], self._information.rows[odometry]
         return self._explanation.lines(names[self.edges[odometry]], noun, errors, *arrays)
 
@@ -131,18 +134,33 @@ class PoseGraph:
     def added_since(self, first: int) -> tuple[Matrix, Matrix]:
         """``measurements`` and ``information`` of the edges from this one on, at the cost of these alone."""
         explanation, new = self._explanation, slice(first, None)
-        before = int((~self.is_loop[:first]).sum())
+        before = int(self.is_odometry[:first].sum())
         if any(stretch.edges.stop > before for stretch in explanation.loosened):
             return self.measurements[new], self.information[new]
         drift = Explanation(explanation.drift)
         return drift.applied(
-            self.edges[new], self._measurements.rows[new], self._information.rows[new], self.is_loop[new]
+            self.edges[new], self._measurements.rows[new], self._information.rows[new], self.is_odometry[new]
         )
 
     @property
     def is_loop(self) -> NDArray[np.bool_]:
-        """True for every edge with a robust loss, (E,)."""
-        return self._is_loop.rows
+        """True for every loop edge, (E,)."""
+        return (self._kind.rows == LOOPS[0]) | (self._kind.rows == LOOPS[1])
+
+    @property
+    def is_odometry(self) -> NDArray[np.bool_]:
+        """True for every edge of odometry, (E,)."""
+        return self._kind.rows == ODOMETRY
+
+    @property
+    def is_of_origin(self) -> NDArray[np.bool_]:
+        """True for every edge that concerns one pose only, (E,)."""
+        return self.edges[:, 0] == ORIGIN
+
+    @property
+    def is_custom(self) -> NDArray[np.bool_]:
+        """True for every edge of a factor that is not of this package, (E,)."""
+        return self._kind.rows >= len(FACTORS)
 
     @property
     def weight(self) -> NDArray[np.float64]:
@@ -161,9 +179,9 @@ class PoseGraph:
 
     @property
     def fixed(self) -> NDArray[np.bool_]:
-        """True for every fixed pose, (K,); pose 0 where none was named."""
+        """True for every fixed pose, (K,); pose 0 where none was named and no factor hangs on the origin."""
         held = np.zeros(len(self), np.bool_)
-        held[sorted(self._fixed) or slice(0, 1)] = True
+        held[sorted(self._fixed) or slice(0, 0 if self._has_origin else 1)] = True
         return held
 
     @property
@@ -194,6 +212,30 @@ class PoseGraph:
         pair = [checks.integer(each, name, "the index of a pose") for each, name in ((i, "i"), (j, "j"))]
         self._add_edges(np.array([pair], np.int64), T_ij[None], information[None], np.array([is_loop]))
 
+    def add_factor(
+        self, factor: Factor, j: int, information: Matrix, Z: Pose | None = None, i: int = ORIGIN
+    ) -> None:
+        """Add what a factor of ``scanchain.graph.factors``, or one's own, measures of pose j.
+
+        information : (m, m) inverse covariance of its m residuals
+        Z : (d+1, d+1) what is measured, where the factor asks for it
+        i : the pose from which it is measured; by default the origin of the world
+        Raises InputError for a pose that is not there, and information that is not of its residuals.
+        """
+        checks.instance(factor, Factor, "factor", "an instance of a subclass of scanchain.graph.factors.Factor")
+        Z = lie.identity(self.dimension) if Z is None else checks.pose(Z, "Z", self.dimension)
+        pair = [checks.integer(each, name, "the index of a pose") for each, name in ((i, "i"), (j, "j"))]
+        whole = of_residuals(information, self.freedom, factor)
+        edge = np.array([pair], np.int64), Z[None], whole[None]
+        check_edges(*edge, len(self), with_origin=True)
+        T_i = lie.identity(self.dimension) if i == ORIGIN else self.poses[i]
+        factor.check(lie.between(T_i, self.poses[j]), Z, len(np.asarray(information)))
+        known = (kind for kind, each in enumerate(self._factors) if each is factor or each.stands_for(factor))
+        kind = next(known, len(self._factors))
+        if kind == len(self._factors):
+            self._factors.append(factor)
+        self._extend(*edge, np.array([kind]))
+
     def add_edges(
         self, edges: NDArray[np.int64], measurements: Matrix, information: Matrix, is_loop: NDArray[np.bool_]
     ) -> None:
@@ -213,19 +255,24 @@ class PoseGraph:
         self, edges: NDArray[np.int64], measurements: Matrix, information: Matrix, is_loop: NDArray[np.bool_]
     ) -> None:
         check_edges(edges, measurements, information, len(self))
+        self._extend(edges, measurements, information, kinds_of(edges, information, self.is_point, is_loop))
+
+    def _extend(
+        self, edges: NDArray[np.int64], measurements: Matrix, information: Matrix, kind: NDArray[np.int64]
+    ) -> None:
         self._changed()
         self._edges.extend(edges)
         self._measurements.extend(measurements)
         self._information.extend(information)
         self._rank.extend(ranks(information))
-        self._is_loop.extend(is_loop)
+        self._kind.extend(kind)
         self._weight.extend(np.ones(len(edges)))
 
     def remove_loops(self, is_removed: NDArray[np.bool_]) -> None:
         """Take loop edges out of the graph, True for each of the edges (E,) that goes."""
         self._changed()
         for column in (
-            self._edges, self._measurements, self._information, self._rank, self._is_loop, self._weight,
+            self._edges, self._measurements, self._information, self._rank, self._kind, self._weight,
         ):  # fmt: skip
             column.replace(column.rows[~is_removed])
         self.since = Since(0, 0)
@@ -271,16 +318,16 @@ class PoseGraph:
         checks.one_of(rejection, get_args(Rejection), "rejection")
         begin = working_s()
         problem = self._prepared()
-        chi2_before = self._in_force(problem.chi2(problem.errors(self.poses)))
-        arrays = self._measurements.rows, self._information.rows, self.is_loop
+        chi2_before = self._in_force(problem.chi2(problem.errors(self._vertices)))
+        arrays = self._measurements.rows, self._information.rows
         explainer = Explainer(self._problem_of, *arrays, config, jumps=False)
         since = self.since if rejection == "update" else None
         try:
-            explained = explainer.solve(self._explanation, self.poses, initialize, since)
+            explained = explainer.solve(self._explanation, self._vertices, initialize, since)
         except SingularMatrixError as error:
             raise self._singular(error, self.fixed) from error
         self._problem, self._explanation, minimum = explained.problem, explained.explanation, explained.minimum
-        self._poses.replace(minimum.estimate.poses)
+        self._poses.replace(minimum.estimate.poses[: len(self)])
         self._weight.replace(minimum.weights)
         self._factor_is_now = False
         edges = len(self.edges)
@@ -304,24 +351,25 @@ class PoseGraph:
         rejection : as in ``optimize``; what is judged is also explained by jumps of odometry there
         """
         chosen = np.flatnonzero((self.edges >= first).any(axis=1))
-        edges, is_loop, before = self.edges[chosen], self.is_loop[chosen], int((~self.is_loop).sum())
+        edges, kind, is_odometry = self._joined[chosen], self._kind.rows[chosen], self.is_odometry[chosen]
         measured, information = (each[chosen - chosen[0]] for each in self.added_since(int(chosen[0])))
-        fixed = (np.arange(len(self)) < first) | self.fixed
+        fixed = self._of_vertices((np.arange(len(self)) < first) | self.fixed, of_origin=True)
 
-        def problem_of(explanation: Explanation) -> BetweenProblem:
-            applied = explanation.applied(edges, measured, information, is_loop)
-            return BetweenProblem(edges, *applied, fixed, self.is_point)
+        def problem_of(explanation: Explanation) -> GraphProblem:
+            applied = explanation.applied(edges, measured, information, is_odometry)
+            return GraphProblem(edges, *applied, fixed, self._is_point_vertex, kind, self._factors)
 
-        explainer = Explainer(problem_of, measured, information, is_loop, config, jumps=True)
+        explainer = Explainer(problem_of, measured, information, config, jumps=True)
         since = Since(0, 0) if rejection == "update" else None
         try:
-            end = explainer.solve(Explanation.none(self.freedom), self.poses, "given", since)
+            end = explainer.solve(Explanation.none(self.freedom), self._vertices, "given", since)
         except SingularMatrixError as error:
             raise self._singular(error, fixed) from error
-        self._explanation = self._explanation.with_later(end.explanation, before - int((~is_loop).sum()))
+        before = int(self.is_odometry.sum() - is_odometry.sum())
+        self._explanation = self._explanation.with_later(end.explanation, before)
         weight = self.weight.copy()
         weight[chosen] = end.minimum.weights
-        self._poses.replace(end.minimum.estimate.poses)
+        self._poses.replace(end.minimum.estimate.poses[: len(self)])
         self._weight.replace(weight)
         self._changed()
 
@@ -332,6 +380,7 @@ class PoseGraph:
             if isinstance(rows, GrowingArray):
                 getattr(result, name).extend(rows.rows)
         result._fixed, result._explanation = set(self._fixed), self._explanation
+        result._factors = list(self._factors)
         result.since, result.work = self.since, self.work
         return result
 
@@ -355,24 +404,24 @@ class PoseGraph:
 
     def certify(self) -> Certificate:
         """Certificate of the global minimum of χ², edges weighed as the last optimization left them."""
-        found = certify(self._prepared(), self.poses, self._weight_in_force, self._undetermined(), self.names)
+        found = certify(self._prepared(), self._vertices, self._weight_in_force, self._undetermined(), self.names)
         return replace(found, left_out=self.left_out)
 
     def free_poses(self) -> NDArray[np.int64]:
         """Names of the poses that the edges in force leave free in some direction, at the poses of now."""
         self._factor_is_now = False
-        return free_poses(self._prepared(), self.poses, self._weight_in_force, self._rank.rows, self.names)
+        return free_poses(self._prepared(), self._vertices, self._weight_in_force, self._rank.rows, self.names)
 
     def weakly_joined(self) -> NDArray[np.int64]:
         """Names of the poses that hang on edges in force of next to no information."""
         kept = ~self.is_rejected
         information = self.weight[kept, None, None] * self.information[kept]
-        return self.names[weakly_joined(self.edges[kept], information, self.fixed)]
+        return self.names[weakly_joined(self._joined[kept], information, self._fixed_vertices)]
 
     def state(self) -> GraphState:
         """The graph as it is, for files and recordings; odometry edges first."""
         order, problem = np.argsort(self.is_loop, kind="stable"), self._prepared()
-        chi2 = problem.chi2(problem.errors(self.poses))
+        chi2 = problem.chi2(problem.errors(self._vertices))
         return GraphState(
             poses=self.poses.copy(),
             stamps_ns=self.stamps_ns.copy(),
@@ -405,7 +454,7 @@ class PoseGraph:
         self._factor_is_now = False
         try:
             information = self._weight_in_force[:, None, None] * self.information
-            problem.cholesky.factorize(own_equations(problem, self.poses, information))
+            problem.cholesky.factorize(own_equations(problem, self._vertices, information))
         except SingularMatrixError as error:
             raise self._singular(error, self.fixed) from error
         result = np.zeros((len(self), self.freedom, self.freedom))
@@ -418,7 +467,7 @@ class PoseGraph:
         Of position and orientation, along the world's axes. Raises InputError where the edges leave poses free.
         """
         count = checks.integer(count, "count", "a number of samples, 1 or more", least=1)
-        return pose_errors(self._factored(), self.poses, count, seed)
+        return pose_errors(self._factored(), self._vertices, count, seed)[:, : len(self)]
 
     def displacements(self, changes: Matrix) -> NDArray[np.float64]:
         """Changes (G, K, k) of all poses, to first order, where the measured motions T_ij become T_ij exp(change).
@@ -426,7 +475,7 @@ class PoseGraph:
         changes : (G, E, k) twists. Of position and orientation, along the world's axes. Raises InputError where
         the edges leave poses free.
         """
-        return displacements(self._factored(), self.poses, self.weight, changes)
+        return displacements(self._factored(), self._vertices, self.weight, changes)[:, : len(self)]
 
     def _append(self, T_world: Pose, stamp_ns: int, *, is_point: bool) -> int:
         stamp_ns = checks.integer(stamp_ns, "stamp_ns", "nanoseconds as int; of seconds int(1e9 * stamp_s)")
@@ -435,11 +484,11 @@ class PoseGraph:
         self._is_point.append(is_point)
         return self._poses.append(T_world)
 
-    def _factored(self) -> BetweenProblem:
+    def _factored(self) -> GraphProblem:
         """The problem, with the factor of the undamped H in its solver."""
         problem = self._prepared()
         if not self._factor_is_now:
-            equations = problem.linearize(self.poses, problem.errors(self.poses), self.weight)
+            equations = problem.linearize(self._vertices, problem.errors(self._vertices), self.weight)
             try:
                 problem.cholesky.factorize(equations.values)
             except SingularMatrixError as error:
@@ -447,23 +496,25 @@ class PoseGraph:
             self._factor_is_now = True
         return problem
 
-    def _prepared(self) -> BetweenProblem:
+    def _prepared(self) -> GraphProblem:
         """The least-squares problem; rebuilt after the graph has grown."""
         if self._problem is None:
-            fixed = self.fixed
-            check_connected(self.edges[self._rank.rows > 0], fixed, self.names)
+            check_connected(self._joined[self._rank.rows > 0], self._fixed_vertices, self.names)
             self._problem = self._problem_of(self._explanation)
         return self._problem
 
-    def _problem_of(self, explanation: Explanation) -> BetweenProblem:
+    def _problem_of(self, explanation: Explanation) -> GraphProblem:
         """The problem under an explanation; the one that is there already, if it is that."""
         if self._problem is not None and explanation is self._explanation:
             return self._problem
-        return BetweenProblem(self.edges, *self._applied(explanation), self.fixed, self.is_point)
+        applied, kind = self._applied(explanation), self._kind.rows
+        return GraphProblem(
+            self._joined, *applied, self._fixed_vertices, self._is_point_vertex, kind, self._factors
+        )
 
     def _applied(self, explanation: Explanation) -> tuple[Matrix, Matrix]:
         """Measurements and information of all edges under an explanation."""
-        return explanation.applied(self.edges, self._measurements.rows, self._information.rows, self.is_loop)
+        return explanation.applied(self.edges, self._measurements.rows, self._information.rows, self.is_odometry)
 
     def _undetermined(self) -> str:
         """Free poses, with which nothing can be computed, as text; empty without any."""
@@ -474,6 +525,32 @@ class PoseGraph:
         """The error for poses that their edges leave free, or as good as free."""
         variable = np.flatnonzero(~fixed)[[error.variable]]
         return _refused(self._undetermined() or free_text(self.names[variable]))
+
+    @property
+    def _has_origin(self) -> bool:
+        """Whether some factor hangs on the origin, which is then a vertex more, the last one, and fixed."""
+        return bool(self.is_of_origin.any())
+
+    @property
+    def _vertices(self) -> Matrix:
+        return self._of_vertices(self.poses, of_origin=lie.identity(self.dimension))
+
+    @property
+    def _fixed_vertices(self) -> NDArray[np.bool_]:
+        return self._of_vertices(self.fixed, of_origin=True)
+
+    @property
+    def _is_point_vertex(self) -> NDArray[np.bool_]:
+        return self._of_vertices(self.is_point, of_origin=False)
+
+    @property
+    def _joined(self) -> NDArray[np.int64]:
+        """Pairs of vertices that the edges join, (E, 2)."""
+        return np.where(self.edges == ORIGIN, len(self), self.edges) if self._has_origin else self.edges
+
+    def _of_vertices(self, of_poses: NDArray[Any], of_origin: object) -> NDArray[Any]:
+        """The same (K, ...) with that of the origin behind it, where the graph has it."""
+        return np.concatenate([of_poses, np.asarray(of_origin)[None]]) if self._has_origin else of_poses
 
     @property
     def _weight_in_force(self) -> NDArray[np.float64]:

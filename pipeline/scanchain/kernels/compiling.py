@@ -19,6 +19,15 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 _CRC_BYTES = 4
 
 
+@cache
+def digest_of_sources() -> str:
+    """SHA-256 of the sources of all kernels, in hexadecimal."""
+    digest = hashlib.sha256()
+    for file in sorted(Path(__file__).parent.rglob("*.py")):
+        digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
 def _cache_by_source() -> None:
     """Keep compiled kernels in a folder of the user's cache that is named after their source.
 
@@ -29,12 +38,9 @@ def _cache_by_source() -> None:
     """
     if os.environ.get("NUMBA_CACHE_DIR"):
         return
-    digest = hashlib.sha256()
-    for file in sorted(Path(__file__).parent.rglob("*.py")):
-        digest.update(file.read_bytes())
     try:
         root = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
-        folder = root / "scanchain" / "kernels" / digest.hexdigest()[:16]
+        folder = root / "scanchain" / "kernels" / digest_of_sources()[:16]
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         status = folder.stat()
     except (OSError, RuntimeError):  # the latter of a user without a home

@@ -74,16 +74,20 @@ class Drift:
         self.lengths = GrowingArray((), np.float64)
 
     def measure(self, graph: PoseGraph) -> None:
-        """Take the lengths of the edges that are new since the last call, odometry corrected as it is now."""
+        """Take the lengths of the edges that are new since the last call, odometry corrected as it is now.
+
+        What is neither odometry nor a loop is no path.
+        """
         if len(self.lengths) == len(graph.edges):
             return
         new = slice(len(self.lengths), len(graph.edges))
         d = graph.dimension
         measurements, information = graph.added_since(len(self.lengths))
-        translations_m = np.linalg.norm(measurements[:, :d, d], axis=1)
-        covariances = np.linalg.inv(information)
+        lengths, is_odometry = np.where(graph.is_loop[new], _LOOP_LENGTH_M, np.inf), graph.is_odometry[new]
+        covariances = np.linalg.inv(information[is_odometry])
         sigmas_m = np.sqrt(np.trace(covariances[:, :d, :d], axis1=1, axis2=2))
-        lengths = np.where(graph.is_loop[new], _LOOP_LENGTH_M, np.maximum(translations_m, sigmas_m / self.drift))
+        translations_m = np.linalg.norm(measurements[is_odometry, :d, d], axis=1)
+        lengths[is_odometry] = np.maximum(translations_m, sigmas_m / self.drift)
         self.lengths.extend(lengths)
 
     def between(self, graph: PoseGraph, keyframe: int, limit_m: float) -> NDArray[np.float64]:

@@ -100,7 +100,7 @@ def _write_saved_map(path: Path, results: Results) -> None:
     poses = result.T_world_keyframes
     keyframes = tuple(replace(result.keyframes[k], T_odom_lidar=poses[k]) for k in chosen.tolist())
     edges = Edges(graph.edges, graph.measurements, graph.information, graph.is_loop, graph.weight)
-    in_force = edges.where(~graph.is_rejected).among(chosen)
+    in_force = edges.where(~graph.is_rejected & (graph.is_odometry | graph.is_loop)).among(chosen)
     stamps_ns = result.trajectory.stamps_ns
     session = Session(Path(results.log.name).name, int(stamps_ns[0]), int(stamps_ns[-1]), len(keyframes))
     numbers = np.zeros(len(keyframes), np.int64)

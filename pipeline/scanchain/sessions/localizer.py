@@ -205,7 +205,7 @@ class Localizer:
     def _follow(self) -> None:
         """State and covariance of the newest keyframe: by its match with the map, or by the motion to it."""
         slam, by_map, newest = self.slam, self.slam.placement.by_map, self.slam.keyframes[-1]
-        of_newest = (slam.graph.edges[:, 1] == newest.index) & ~slam.graph.is_loop
+        of_newest = (slam.graph.edges[:, 1] == newest.index) & slam.graph.is_odometry
         information = slam.graph.added_since(int(np.flatnonzero(of_newest)[-1]))[1][:1]
         motion, own = self._errors(information, newest.index, is_loop=False)
         if by_map is not None and (by_map is not self.by_map or not len(self.covariance)):

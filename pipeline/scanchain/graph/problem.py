@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,52 +12,8 @@ from numpy.typing import NDArray
 from scanchain import lie
 from scanchain.data import Matrix
 from scanchain.graph.cholesky import BlockPattern, Packing, SparseCholesky, analyze
+from scanchain.graph.factors import FACTORS, LOOPS, ODOMETRY, SIGHTINGS, WHOLE, Factor, kinds_of, read_only
 from scanchain.kernels.graph import between
-
-
-class Between:
-    """e = log(Z⁻¹ T_i⁻¹ T_j): the twist that the relative pose is off by on its right, T_i⁻¹ T_j = Z exp(e).
-
-    As every factor it depends on T_i⁻¹ T_j alone: one and the same left twist of both poses changes nothing, hence
-    ∂e/∂ξ_i = −∂e/∂ξ_j. What concerns one pose only, as a prior, has a fixed pose at the origin for its i.
-    """
-
-    def residual(self, poses: Matrix, edges: NDArray[np.int64], Z: Matrix) -> Matrix:
-        """Residuals e (E, k) of edges (E, 2) that measure Z (E, d+1, d+1), at these poses (K, d+1, d+1)."""
-        d = poses.shape[-1] - 1
-        errors = np.empty((len(edges), d * (d + 1) // 2))
-        residuals = between.residuals_2d if d == 2 else between.residuals_3d
-        residuals(_kept(poses), _kept(edges), _kept(Z), errors)
-        return errors
-
-    def linearize(self, poses: Matrix, edges: NDArray[np.int64], Z: Matrix, errors: Matrix) -> Matrix:
-        """∂e/∂ξ_j (E, k, k) for left twists, T_j ← exp(ξ_j) T_j, where the residuals are these errors (E, k)."""
-        jacobian = np.empty((*errors.shape, errors.shape[1]))
-        if errors.shape[1] == 3:
-            between.jacobians_2d(_kept(poses), _kept(edges), _kept(Z), jacobian)
-        else:
-            between.jacobians_3d(_kept(poses), _kept(edges), errors, jacobian)
-        return jacobian
-
-
-class Position:
-    """e = (R_zᵀ(R_iᵀ(t_j − t_i) − t_z), 0): the position of j in frame i, whatever its rotation, as g2o has it."""
-
-    def residual(self, poses: Matrix, edges: NDArray[np.int64], Z: Matrix) -> Matrix:
-        """As of ``Between``, zero in the rotation."""
-        d, (T_i, T_j) = poses.shape[-1] - 1, poses[edges.T]
-        errors = np.zeros((len(edges), d * (d + 1) // 2))
-        seen = (T_j[:, None, :d, d] - T_i[:, None, :d, d]) @ T_i[:, :d, :d]
-        errors[:, :d] = ((seen - Z[:, None, :d, d]) @ Z[:, :d, :d])[:, 0]
-        return errors
-
-    def linearize(self, poses: Matrix, edges: NDArray[np.int64], Z: Matrix, errors: Matrix) -> Matrix:
-        """R_zᵀ R_iᵀ [I, ∂t_j/∂φ]."""
-        d, (T_i, T_j) = poses.shape[-1] - 1, poses[edges.T]
-        R_t = np.swapaxes(T_i[:, :d, :d] @ Z[:, :d, :d], 1, 2)
-        jacobian = np.zeros((*errors.shape, errors.shape[1]))
-        jacobian[:, :d, :d], jacobian[:, :d, d:] = R_t, R_t @ turns(T_j[:, :d, d])
-        return jacobian
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,15 +24,14 @@ class NormalEquations:
     gradient: NDArray[np.float64]
 
 
-class BetweenProblem:
+class GraphProblem:
     """Factors of one graph, χ² = Σ eᵀΩe; the structure is worked out once.
 
     Poses move by left twists, T ← exp(ξ) T. The gauge is fixed by leaving the fixed poses out of the system:
     ``variable`` (K,) is the block of each pose, -1 where it is fixed, ``free`` (n,) the pose of each block,
     ``slots`` (E, 3) the blocks of i, of j and of the pair in the matrix.
 
-    Edges whose Ω has no information about the rotation are ``sightings`` of a position. In the plane, j of these
-    may be a point: a pose without a heading, its rotation the identity, whose block holds the translation alone.
+    A pose may be a point of the plane: its rotation is the identity, and its block holds the translation alone.
     """
 
     def __init__(
@@ -86,9 +41,15 @@ class BetweenProblem:
         information: Matrix,
         fixed: NDArray[np.bool_],
         is_point: NDArray[np.bool_] | None = None,
+        kind: NDArray[np.int64] | None = None,
+        factors: Sequence[Factor] = FACTORS,
     ) -> None:
-        """Edges (E, 2) pairs (i, j), Z (E, d+1, d+1) measurements, Ω (E, k, k); fixed, is_point (K,)."""
-        self.edges, self.measurements, self.information = _kept(edges), _kept(measurements), _kept(information)
+        """Edges (E, 2) pairs (i, j), Z (E, d+1, d+1) measurements, Ω (E, k, k); fixed, is_point (K,).
+
+        kind : (E,) places in the table of factors; by default as ``kinds_of`` edges none of which is a loop
+        """
+        self.edges, self.information = read_only(edges), read_only(information)
+        self.measurements = read_only(measurements)
         self.freedom = information.shape[-1]
         self.free = np.flatnonzero(~fixed)
         variable = np.full(len(fixed), -1, np.int64)
@@ -103,11 +64,10 @@ class BetweenProblem:
         self.slots[:, :2] = ends
         self.slots[joined, 2] = len(self.free) + which
         self.is_point = np.zeros(len(fixed), np.bool_) if is_point is None else is_point
-        d = measurements.shape[-1] - 1
-        is_seen = self.is_point[edges].any(axis=1) | ~information[:, d:].any(axis=(1, 2))
-        self.sightings = np.flatnonzero(is_seen)
-        factors = (Between(), np.flatnonzero(~is_seen)), (Position(), self.sightings)
-        self._factors = [(factor, of) for factor, of in factors if len(of)]
+        if kind is None:
+            kind = kinds_of(edges, information, self.is_point)
+        self.kind, self.factors = kind, factors
+        self._by_factor = [(factors[each], np.flatnonzero(kind == each)) for each in np.unique(kind).tolist()]
         sizes = np.where(self.is_point[self.free], 2, self.freedom)
         self.pattern = BlockPattern(sizes, np.stack(np.divmod(unique, count), axis=1))
         self.packing = Packing(self.pattern, self.freedom, at_end=False)
@@ -117,12 +77,46 @@ class BetweenProblem:
         """The solver; analyzed when it is first needed."""
         return SparseCholesky(self.pattern, analyze(self.pattern))
 
-    def restricted(self, kept: NDArray[np.bool_]) -> BetweenProblem:
+    def restricted(self, kept: NDArray[np.bool_]) -> GraphProblem:
         """The problem of the same poses with some of its edges, kept (E,)."""
-        measurements, information = self.measurements[kept], self.information[kept]
-        return BetweenProblem(self.edges[kept], measurements, information, self.variable < 0, self.is_point)
+        edges, measurements, information = self.edges[kept], self.measurements[kept], self.information[kept]
+        fixed, kind = self.variable < 0, self.kind[kept]
+        return GraphProblem(edges, measurements, information, fixed, self.is_point, kind, self.factors)
 
-    def factored(self, poses: Matrix, errors: Matrix, kept: NDArray[np.bool_]) -> BetweenProblem:
+    @cached_property
+    def is_robust(self) -> NDArray[np.bool_]:
+        """True for every edge with the robust loss, (E,)."""
+        return self._are("is_robust")
+
+    @cached_property
+    def is_bounded(self) -> NDArray[np.bool_]:
+        """True for every edge of whose χ² the certificate has a lower bound, (E,)."""
+        return self._are("is_bounded")
+
+    @property
+    def has_landmarks(self) -> bool:
+        """Whether positions are seen from poses."""
+        return bool(np.isin(self.kind, SIGHTINGS).any())
+
+    @property
+    def is_loop(self) -> NDArray[np.bool_]:
+        """True for every loop edge, (E,)."""
+        return np.isin(self.kind, LOOPS)
+
+    @property
+    def is_odometry(self) -> NDArray[np.bool_]:
+        """True for every edge of odometry, (E,)."""
+        return self.kind == ODOMETRY
+
+    @property
+    def is_whole(self) -> NDArray[np.bool_]:
+        """True for every edge that measures position and rotation, (E,)."""
+        return np.isin(self.kind, WHOLE)
+
+    def _are(self, name: str) -> NDArray[np.bool_]:
+        return np.array([getattr(factor, name) for factor in self.factors], np.bool_)[self.kind]
+
+    def factored(self, poses: Matrix, errors: Matrix, kept: NDArray[np.bool_]) -> GraphProblem:
         """The problem of some of the edges, kept (E,), with H factored at these poses and their errors (E, k).
 
         The factor of this one is given up: two of a long log would take the most memory of all.
@@ -136,7 +130,7 @@ class BetweenProblem:
     def errors(self, poses: Matrix) -> Matrix:
         """Residuals e (E, k) at these poses (K, d+1, d+1)."""
         errors = np.empty((len(self.edges), self.freedom))
-        for factor, of in self._factors:
+        for factor, of in self._by_factor:
             errors[of] = factor.residual(poses, self.edges[of], self.measurements[of])
         return errors
 
@@ -149,7 +143,7 @@ class BetweenProblem:
     def jacobians(self, poses: Matrix, errors: Matrix) -> Matrix:
         """∂e/∂ξ_j (E, k, k); ∂e/∂ξ_i is its negative."""
         jacobian = np.empty((*errors.shape, self.freedom))
-        for factor, of in self._factors:
+        for factor, of in self._by_factor:
             jacobian[of] = factor.linearize(poses, self.edges[of], self.measurements[of], errors[of])
         return jacobian
 
@@ -158,7 +152,9 @@ class BetweenProblem:
         blocks = np.zeros((len(self.pattern.rows), self.freedom, self.freedom))
         gradient = np.zeros((len(self.free), self.freedom))
         jacobian = self.jacobians(poses, errors)
-        between.scatter_between(jacobian, errors, self.information, _kept(weights), self.slots, blocks, gradient)
+        between.scatter_between(
+            jacobian, errors, self.information, read_only(weights), self.slots, blocks, gradient
+        )
         return NormalEquations(self.packing.values(blocks), self.packing.rows(gradient))
 
     def scattered(self, of_i: Matrix, of_j: Matrix, coupling: Matrix) -> Matrix:
@@ -178,17 +174,3 @@ class BetweenProblem:
         result = poses.copy()
         result[self.free] = lie.exp(self.packing.spread_rows(step)) @ poses[self.free]
         return result
-
-
-def turns(positions: Matrix) -> Matrix:
-    """∂t/∂φ (E, d, 1 or 3) of positions (E, d) turned about the origin."""
-    if positions.shape[1] == 3:
-        return -lie.hat(positions)
-    return np.stack([-positions[:, 1], positions[:, 0]], axis=1)[..., None]
-
-
-def _kept(array: NDArray[Any]) -> NDArray[Any]:
-    """A read-only view: for one kind of array a kernel is compiled once."""
-    view = array.view()
-    view.flags.writeable = False
-    return view

@@ -1,0 +1,210 @@
+"""Factors: what the edges of a pose graph measure. A new kind is a class here and a line in ``FACTORS``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scanchain import checks, lie
+from scanchain.data import Matrix, Pose
+from scanchain.errors import InputError
+from scanchain.kernels.graph import between
+
+ORIGIN = -1  # for the i of an edge that concerns one pose only: the origin of the world, which is fixed
+_STEP = 1e-6  # m or rad, of central differences: the cube root of the rounding
+
+
+class Factor:
+    """A kind of edges: the residual e(T_ij, Z) of the pose of j seen from i, T_ij = T_i⁻¹ T_j, that measures Z.
+
+    A factor of one's own defines ``name`` and ``error``, ``jacobian`` where that should be exact, and enters a
+    graph by ``PoseGraph.add_factor``.
+
+    name : in messages; is_robust : whether edges have the robust loss, so that they can be rejected
+    is_bounded : whether the certificate has a lower bound of χ²
+    """
+
+    name: str = "factor"
+    is_robust: bool = False
+    is_bounded: bool = False
+
+    def stands_for(self, other: Factor) -> bool:
+        """Whether another is the same kind: of the same class, neither with parameters of its own."""
+        return type(self) is type(other) and not vars(self) and not vars(other)
+
+    def error(self, T_ij: Matrix, Z: Matrix) -> Matrix:
+        """Residuals (E, m), m up to the degrees of freedom of a pose, of relative poses (E, d+1, d+1)."""
+        raise NotImplementedError(f"{type(self).__name__}.error(T_ij, Z) is missing")
+
+    def jacobian(self, T_ij: Matrix, Z: Matrix) -> Matrix:
+        """∂e/∂ξ (E, m, k) for right twists, T_ij exp(ξ); by central differences."""
+        k = lie.twist_size(T_ij)
+        ahead, behind = (lie.exp(sign * _STEP * np.eye(k)) for sign in (1.0, -1.0))
+        columns = [
+            (self.error(T_ij @ ahead[axis], Z) - self.error(T_ij @ behind[axis], Z)) / (2.0 * _STEP)
+            for axis in range(k)
+        ]
+        return np.stack(columns, axis=-1)
+
+    def check(self, T_ij: Pose, Z: Pose, count: int) -> None:
+        """Refuse a factor whose residuals at a pose are not so many finite numbers."""
+        found = np.asarray(self.error(T_ij[None], Z[None]))
+        if found.shape != (1, count) or not np.isfinite(found).all():
+            wanted = f"finite numbers of the shape (1, {count}), as information is {count} x {count}"
+            raise InputError(f"{type(self).__name__}.error returned {found.tolist()}; wanted {wanted}")
+
+    def residual(self, poses: Matrix, edges: NDArray[np.int64], Z: Matrix) -> Matrix:
+        """Residuals e (E, k) of edges (E, 2) that measure Z (E, d+1, d+1), at these poses; zero from m on."""
+        error = self.error(lie.between(*poses[edges.T]), Z)
+        errors = np.zeros((len(edges), lie.twist_size(poses)))
+        errors[:, : error.shape[1]] = error
+        return errors
+
+    def linearize(self, poses: Matrix, edges: NDArray[np.int64], Z: Matrix, errors: Matrix) -> Matrix:
+        """∂e/∂ξ_j (E, k, k) for left twists, T_j ← exp(ξ_j) T_j, where the residuals are these errors (E, k).
+
+        Since e depends on T_i⁻¹ T_j alone, one and the same left twist of both poses changes nothing, and
+        ∂e/∂ξ_i = −∂e/∂ξ_j.
+        """
+        T_i, T_j = poses[edges.T]
+        of_error = self.jacobian(lie.between(T_i, T_j), Z) @ lie.adjoint(lie.inverse(T_j))
+        jacobian = np.zeros((*errors.shape, errors.shape[1]))
+        jacobian[:, : of_error.shape[1]] = of_error
+        return jacobian
+
+
+class Between(Factor):
+    """e = log(Z⁻¹ T_i⁻¹ T_j): the twist that the relative pose is off by on its right, T_i⁻¹ T_j = Z exp(e)."""
+
+    is_bounded = True
+
+    def error(self, T_ij: Matrix, Z: Matrix) -> Matrix:
+        """As of ``Factor``."""
+        return lie.log(lie.between(Z, T_ij))
+
+    def residual(self, poses: Matrix, edges: NDArray[np.int64], Z: Matrix) -> Matrix:
+        """As of ``Factor``, compiled."""
+        errors = np.empty((len(edges), lie.twist_size(poses)))
+        residuals = between.residuals_2d if errors.shape[1] == 3 else between.residuals_3d
+        residuals(read_only(poses), read_only(edges), read_only(Z), errors)
+        return errors
+
+    def linearize(self, poses: Matrix, edges: NDArray[np.int64], Z: Matrix, errors: Matrix) -> Matrix:
+        """As of ``Factor``, compiled."""
+        jacobian = np.empty((*errors.shape, errors.shape[1]))
+        if errors.shape[1] == 3:
+            between.jacobians_2d(read_only(poses), read_only(edges), read_only(Z), jacobian)
+        else:
+            between.jacobians_3d(read_only(poses), read_only(edges), errors, jacobian)
+        return jacobian
+
+
+class Odometry(Between):
+    """The motion between successive poses."""
+
+    name = "odometry"
+
+
+class Loop(Between):
+    """The pose at a revisit, which may be wrong."""
+
+    name = "loop"
+    is_robust = True
+
+
+class Position(Factor):
+    """e = R_zᵀ(R_iᵀ(t_j − t_i) − t_z): the position of j in frame i, whatever its rotation, as g2o has it."""
+
+    name = "position"
+    is_bounded = True
+
+    def error(self, T_ij: Matrix, Z: Matrix) -> Matrix:
+        """As of ``Factor``."""
+        d = Z.shape[-1] - 1
+        return ((T_ij[:, None, :d, d] - Z[:, None, :d, d]) @ Z[:, :d, :d])[:, 0]
+
+    def residual(self, poses: Matrix, edges: NDArray[np.int64], Z: Matrix) -> Matrix:
+        """As of ``Factor``, without the rotation of j."""
+        d, (T_i, T_j) = poses.shape[-1] - 1, poses[edges.T]
+        seen = (T_j[:, None, :d, d] - T_i[:, None, :d, d]) @ T_i[:, :d, :d]
+        errors = np.zeros((len(edges), lie.twist_size(poses)))
+        errors[:, :d] = ((seen - Z[:, None, :d, d]) @ Z[:, :d, :d])[:, 0]
+        return errors
+
+    def linearize(self, poses: Matrix, edges: NDArray[np.int64], Z: Matrix, errors: Matrix) -> Matrix:
+        """R_zᵀ R_iᵀ [I, ∂t_j/∂φ]."""
+        d, (T_i, T_j) = poses.shape[-1] - 1, poses[edges.T]
+        R_t = np.swapaxes(T_i[:, :d, :d] @ Z[:, :d, :d], 1, 2)
+        jacobian = np.zeros((*errors.shape, errors.shape[1]))
+        jacobian[:, :d, :d], jacobian[:, :d, d:] = R_t, R_t @ turns(T_j[:, :d, d])
+        return jacobian
+
+
+class Prior(Between):
+    """The whole pose in the world."""
+
+    name = "prior"
+
+
+class Sighting(Position):
+    """The position of a point, or of a pose, seen from another pose."""
+
+    name = "sighting"
+
+
+class LoopSighting(Sighting):
+    """The position at a revisit, of a loop that measures no rotation."""
+
+    name = "loop"
+    is_robust = True
+
+
+FACTORS: tuple[Factor, ...] = (Odometry(), Loop(), Sighting(), LoopSighting(), Prior(), Position())
+ODOMETRY, LOOP, SIGHTING, LOOP_SIGHTING, PRIOR, _ = range(len(FACTORS))  # kind of an edge: its place in the table
+LOOPS, SIGHTINGS = (LOOP, LOOP_SIGHTING), (SIGHTING, LOOP_SIGHTING)
+WHOLE = (ODOMETRY, LOOP, PRIOR)  # that measure position and rotation
+
+
+def kinds_of(
+    edges: NDArray[np.int64],
+    information: Matrix,
+    is_point: NDArray[np.bool_],
+    is_loop: NDArray[np.bool_] | None = None,
+) -> NDArray[np.int64]:
+    """Kind (E,) of edges between poses: those to points, or whose Ω (E, k, k) has no rotation, are sightings.
+
+    is_point : (K,) of the poses; is_loop : (E,), by default none
+    """
+    d = 2 if information.shape[-1] == 3 else 3
+    is_sighting = is_point[edges].any(axis=1) | ~information[:, d:].any(axis=(1, 2))
+    kind = np.where(is_sighting, SIGHTING, ODOMETRY)
+    return kind if is_loop is None else kind + is_loop
+
+
+def of_residuals(information: Matrix, freedom: int, factor: Factor) -> Matrix:
+    """Ω (k, k) of a factor's m residuals, of theirs (m, m), zero from m on."""
+    shape = np.shape(information)
+    count = shape[0] if shape else 0
+    if not 0 < count <= freedom:
+        wanted = f"(m, m) for the m residuals of {factor.name}, 1 to {freedom}"
+        raise InputError(f"information has the shape {shape}; wanted {wanted}")
+    information = checks.matrices(information, "information", (count, count))
+    result = np.zeros((freedom, freedom))
+    result[:count, :count] = information
+    return result
+
+
+def turns(positions: Matrix) -> Matrix:
+    """∂t/∂φ (E, d, 1 or 3) of positions (E, d) turned about the origin."""
+    if positions.shape[1] == 3:
+        return -lie.hat(positions)
+    return np.stack([-positions[:, 1], positions[:, 0]], axis=1)[..., None]
+
+
+def read_only(array: NDArray[Any]) -> NDArray[Any]:
+    """A read-only view: for one kind of array a kernel is compiled once."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
